@@ -1,0 +1,396 @@
+//! The one type that every kind of input ends as: observations of tracks in views.
+
+use serde::{Deserialize, Serialize};
+
+use super::error::{InvalidInput, Violation, Violations};
+use super::limits::Limits;
+
+/// Width and height of an image in pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ImageSize {
+    pub width_px: u32,
+    pub height_px: u32,
+}
+
+impl ImageSize {
+    /// Sides above this are a unit mistake: no camera has them.
+    pub const MAX_SIDE_PX: u32 = 1_000_000;
+}
+
+/// What the caller knows of the focal length beforehand (EXIF, a network's guess).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct FocalPrior {
+    pub focal_px: f64,
+    /// One standard deviation of the natural logarithm of the focal length.
+    pub sigma_log: f64,
+}
+
+/// One image.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct View {
+    /// The image's size; where unknown, the extent of the points stands in, with a warning.
+    pub size: Option<ImageSize>,
+    /// Views of one group share one constant calibration.
+    pub camera_group: u32,
+    pub focal_prior: Option<FocalPrior>,
+}
+
+/// An input as a caller states it, before any check. Structure of arrays: one entry an observation.
+///
+/// Field names in violations are prefixed by `prefix`, so that each front door speaks of its own fields.
+#[derive(Debug, Clone, Default)]
+pub struct RawInput {
+    pub views: Vec<View>,
+    pub track_count: usize,
+    /// View of each observation, counted from 0.
+    pub view: Vec<u32>,
+    /// Track of each observation, counted from 0.
+    pub track: Vec<u32>,
+    /// Pixels; the centre of the top-left pixel is (0, 0).
+    pub x: Vec<f64>,
+    pub y: Vec<f64>,
+    /// Projective depths, all or none; empty: none.
+    pub depth: Vec<f64>,
+}
+
+/// A checked input: every number finite, every index in range, no observation twice, something in at least two views.
+///
+/// Observations are sorted by (track, view). Tracks and views keep the caller's indices; a track or a view may be
+/// without observations (padding).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Input {
+    views: Vec<View>,
+    track_count: usize,
+    view: Vec<u32>,
+    track: Vec<u32>,
+    x: Vec<f64>,
+    y: Vec<f64>,
+    depth: Option<Vec<f64>>,
+    /// Position of each observation in the caller's order.
+    caller_order: Vec<u32>,
+}
+
+impl Input {
+    /// Coordinates beyond this many pixels are a unit mistake or a hostile file.
+    pub const MAX_COORDINATE_PX: f64 = 1e7;
+
+    /// Checks a raw input and sorts its observations.
+    ///
+    /// # Errors
+    /// Every violation found, its field prefixed by `prefix` (`track_set`, `measurement_matrix`).
+    pub fn new(raw: RawInput, limits: &Limits, prefix: &str) -> Result<Self, InvalidInput> {
+        let field = |name: &str| format!("{prefix}.{name}");
+        let mut found = Violations::default();
+        check_counts(&raw, limits, &field, &mut found);
+        check_views(&raw.views, &field, &mut found);
+        if !found.is_empty() {
+            found.into_result()?;
+        }
+        check_observations(&raw, &field, &mut found);
+        let mut order: Vec<u32> = (0..raw.view.len() as u32).collect();
+        order.sort_by_key(|&k| (raw.track[k as usize], raw.view[k as usize], k));
+        check_duplicates(&raw, &order, &field, &mut found);
+        check_views_with_observations(&raw, &field, &mut found);
+        found.into_result()?;
+        let pick = |values: &[f64]| order.iter().map(|&k| values[k as usize]).collect::<Vec<f64>>();
+        Ok(Self {
+            view: order.iter().map(|&k| raw.view[k as usize]).collect(),
+            track: order.iter().map(|&k| raw.track[k as usize]).collect(),
+            x: pick(&raw.x),
+            y: pick(&raw.y),
+            depth: (!raw.depth.is_empty()).then(|| pick(&raw.depth)),
+            views: raw.views,
+            track_count: raw.track_count,
+            caller_order: order,
+        })
+    }
+
+    pub fn views(&self) -> &[View] {
+        &self.views
+    }
+
+    pub fn view_count(&self) -> usize {
+        self.views.len()
+    }
+
+    pub fn track_count(&self) -> usize {
+        self.track_count
+    }
+
+    pub fn observation_count(&self) -> usize {
+        self.view.len()
+    }
+
+    /// View of observation `k` (sorted order).
+    pub fn view_of(&self, k: usize) -> usize {
+        self.view[k] as usize
+    }
+
+    /// Track of observation `k` (sorted order).
+    pub fn track_of(&self, k: usize) -> usize {
+        self.track[k] as usize
+    }
+
+    /// Pixel coordinates of observation `k` (sorted order).
+    pub fn point_px(&self, k: usize) -> [f64; 2] {
+        [self.x[k], self.y[k]]
+    }
+
+    /// Whether projective depths were given.
+    pub fn has_depths(&self) -> bool {
+        self.depth.is_some()
+    }
+
+    /// Projective depth of observation `k` (sorted order), if depths were given.
+    pub fn depth(&self, k: usize) -> Option<f64> {
+        self.depth.as_ref().map(|depth| depth[k])
+    }
+
+    /// Where observation `k` (sorted order) stood in the caller's arrays.
+    pub fn caller_index(&self, k: usize) -> usize {
+        self.caller_order[k] as usize
+    }
+
+    /// The input as its caller stated it, observations in the caller's order.
+    pub fn to_raw(&self) -> RawInput {
+        let count = self.observation_count();
+        let mut raw = RawInput {
+            views: self.views.clone(),
+            track_count: self.track_count,
+            view: vec![0; count],
+            track: vec![0; count],
+            x: vec![0.0; count],
+            y: vec![0.0; count],
+            depth: if self.has_depths() { vec![0.0; count] } else { Vec::new() },
+        };
+        for k in 0..count {
+            let to = self.caller_index(k);
+            raw.view[to] = self.view[k];
+            raw.track[to] = self.track[k];
+            raw.x[to] = self.x[k];
+            raw.y[to] = self.y[k];
+            if let Some(depth) = &self.depth {
+                raw.depth[to] = depth[k];
+            }
+        }
+        raw
+    }
+}
+
+fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String, found: &mut Violations) {
+    let mut bound = |name: &str, count: usize, max: usize, what: &str| {
+        if count > max {
+            found.push(Violation::of(field(name), format!("{count} {what} are above this server's limit of {max}")));
+        }
+    };
+    bound("views", raw.views.len(), limits.max_views, "views");
+    bound("track_count", raw.track_count, limits.max_tracks, "tracks");
+    bound("x", raw.x.len(), limits.max_observations, "observations");
+    if raw.views.len() < 2 {
+        found.push(Violation::of(
+            field("views"),
+            format!("{} views given, at least 2 are needed", raw.views.len()),
+        ));
+    }
+    if raw.track_count == 0 {
+        found.push(Violation::of(field("track_count"), "no tracks given, at least 1 is needed"));
+    }
+    if raw.x.is_empty() {
+        found.push(Violation::of(field("x"), "no observations given"));
+    }
+    let lengths = [("view", raw.view.len()), ("track", raw.track.len()), ("y", raw.y.len())];
+    for (name, length) in lengths {
+        if length != raw.x.len() {
+            found.push(Violation::of(
+                field(name),
+                format!("has {length} entries where x has {}; all must have one an observation", raw.x.len()),
+            ));
+        }
+    }
+    if !raw.depth.is_empty() && raw.depth.len() != raw.x.len() {
+        found.push(Violation::of(
+            field("depth"),
+            format!("has {} entries where x has {}; give one an observation or none", raw.depth.len(), raw.x.len()),
+        ));
+    }
+}
+
+fn check_views(views: &[View], field: &impl Fn(&str) -> String, found: &mut Violations) {
+    for (index, view) in views.iter().enumerate() {
+        if let Some(size) = view.size {
+            let sides = [size.width_px, size.height_px];
+            if sides.iter().any(|&side| side == 0 || side > ImageSize::MAX_SIDE_PX) {
+                found.push(Violation::at(
+                    field("views"),
+                    index,
+                    format!(
+                        "size {} x {} px is not within 1..={}; leave both out when unknown",
+                        size.width_px,
+                        size.height_px,
+                        ImageSize::MAX_SIDE_PX
+                    ),
+                ));
+            }
+        }
+        if let Some(prior) = view.focal_prior {
+            let positive = |value: f64| value.is_finite() && value > 0.0;
+            if !positive(prior.focal_px) || !positive(prior.sigma_log) {
+                found.push(Violation::at(
+                    field("views"),
+                    index,
+                    format!(
+                        "focal prior {} px with sigma {} is not positive and finite",
+                        prior.focal_px, prior.sigma_log
+                    ),
+                ));
+            }
+        }
+    }
+}
+
+fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &mut Violations) {
+    for k in 0..raw.x.len() {
+        if raw.view[k] as usize >= raw.views.len() {
+            found.push(Violation::at(
+                field("view"),
+                k,
+                format!("view {} is outside the {} views given", raw.view[k], raw.views.len()),
+            ));
+        }
+        if raw.track[k] as usize >= raw.track_count {
+            found.push(Violation::at(
+                field("track"),
+                k,
+                format!("track {} is outside the declared count of {}", raw.track[k], raw.track_count),
+            ));
+        }
+        for (name, value) in [("x", raw.x[k]), ("y", raw.y[k])] {
+            if !value.is_finite() {
+                found.push(Violation::at(field(name), k, format!("{value} is not a finite number")));
+            } else if value.abs() > Input::MAX_COORDINATE_PX {
+                found.push(Violation::at(
+                    field(name),
+                    k,
+                    format!("{value} px is beyond {:e} px; coordinates are in pixels", Input::MAX_COORDINATE_PX),
+                ));
+            }
+        }
+        if let Some(&depth) = raw.depth.get(k)
+            && !(depth.is_finite() && depth != 0.0)
+        {
+            found.push(Violation::at(
+                field("depth"),
+                k,
+                format!("{depth} is not a finite number other than 0; leave an unobserved point out"),
+            ));
+        }
+    }
+}
+
+fn check_duplicates(raw: &RawInput, order: &[u32], field: &impl Fn(&str) -> String, found: &mut Violations) {
+    for pair in order.windows(2) {
+        let (first, second) = (pair[0] as usize, pair[1] as usize);
+        if raw.track[first] == raw.track[second] && raw.view[first] == raw.view[second] {
+            found.push(Violation::at(
+                field("track"),
+                second,
+                format!(
+                    "track {} is observed a second time in view {} (first at index {first})",
+                    raw.track[second], raw.view[second]
+                ),
+            ));
+        }
+    }
+}
+
+fn check_views_with_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &mut Violations) {
+    let mut seen = vec![false; raw.views.len()];
+    for &view in &raw.view {
+        if let Some(seen) = seen.get_mut(view as usize) {
+            *seen = true;
+        }
+    }
+    let count = seen.iter().filter(|&&seen| seen).count();
+    if count < 2 {
+        found.push(Violation::of(
+            field("view"),
+            format!("observations lie in {count} view(s), at least 2 are needed"),
+        ));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn raw() -> RawInput {
+        RawInput {
+            views: vec![View::default(); 2],
+            track_count: 2,
+            view: vec![1, 0, 0, 1],
+            track: vec![1, 1, 0, 0],
+            x: vec![3.0, 2.0, 0.0, 1.0],
+            y: vec![30.0, 20.0, 0.0, 10.0],
+            depth: Vec::new(),
+        }
+    }
+
+    fn violations(raw: RawInput) -> Vec<String> {
+        let error = Input::new(raw, &Limits::default(), "track_set").expect_err("invalid input was accepted");
+        error.violations().iter().map(Violation::path).collect()
+    }
+
+    #[test]
+    fn sorts_and_remembers_the_callers_order() {
+        let input = Input::new(raw(), &Limits::default(), "track_set").expect("valid");
+        let points: Vec<f64> = (0..4).map(|k| input.point_px(k)[0]).collect();
+        assert_eq!(points, [0.0, 1.0, 2.0, 3.0]);
+        assert_eq!((0..4).map(|k| input.caller_index(k)).collect::<Vec<_>>(), [2, 3, 1, 0]);
+        let back = input.to_raw();
+        assert_eq!((back.view, back.track, back.x), (raw().view, raw().track, raw().x));
+    }
+
+    #[test]
+    fn names_field_and_index_of_what_is_wrong() {
+        let with = |change: &dyn Fn(&mut RawInput)| {
+            let mut raw = raw();
+            change(&mut raw);
+            violations(raw)
+        };
+        assert_eq!(with(&|raw| raw.x[2] = f64::NAN), ["track_set.x[2]"]);
+        assert_eq!(with(&|raw| raw.y[3] = f64::INFINITY), ["track_set.y[3]"]);
+        assert_eq!(with(&|raw| raw.y[1] = 1e300), ["track_set.y[1]"]);
+        assert_eq!(with(&|raw| raw.track[0] = 2), ["track_set.track[0]"]);
+        assert_eq!(with(&|raw| raw.view[3] = 7), ["track_set.view[3]"]);
+        assert_eq!(with(&|raw| raw.track[1] = 0), ["track_set.track[2]"]);
+        assert_eq!(with(&|raw| raw.depth = vec![1.0, 0.0, 1.0, 1.0]), ["track_set.depth[1]"]);
+        assert_eq!(with(&|raw| raw.depth = vec![1.0]), ["track_set.depth"]);
+        assert_eq!(with(&|raw| raw.y.truncate(3)), ["track_set.y"]);
+        assert_eq!(with(&|raw| raw.track_count = 0), ["track_set.track_count"]);
+        assert_eq!(with(&|raw| raw.views.truncate(1)), ["track_set.views"]);
+        let half_a_size = View { size: Some(ImageSize { width_px: 640, height_px: 0 }), ..View::default() };
+        assert_eq!(with(&|raw| raw.views[1] = half_a_size.clone()), ["track_set.views[1]"]);
+        assert_eq!(with(&|raw| raw.view = vec![0, 0, 0, 0]), ["track_set.track[1]", "track_set.track[3]", "track_set.view"]);
+    }
+
+    #[test]
+    fn refuses_what_is_above_the_limits_before_looking_at_numbers() {
+        let limits = Limits { max_views: 1, max_tracks: 1, max_observations: 3 };
+        let error = Input::new(raw(), &limits, "track_set").expect_err("above the limits");
+        assert_eq!(error.violations().len(), 3);
+    }
+
+    #[test]
+    fn lists_a_bounded_number_of_violations() {
+        let mut raw = raw();
+        raw.track_count = 1000;
+        raw.x = vec![f64::NAN; 500];
+        raw.y = vec![0.0; 500];
+        raw.view = vec![0; 500];
+        raw.view[0] = 1;
+        raw.track = (0..500).collect();
+        let error = Input::new(raw, &Limits::default(), "track_set").expect_err("all NaN");
+        assert_eq!(error.violations().len(), InvalidInput::MAX_LISTED);
+        assert_eq!(error.unlisted(), 480);
+    }
+}

@@ -1,0 +1,21 @@
+//! What the service talks about: inputs, settings, progress, results, jobs and their limits.
+//!
+//! Pure data and rules: no I/O, no async, no linear algebra. Everything else may depend on this module; it depends
+//! on nothing of ours.
+
+pub mod error;
+pub mod input;
+pub mod job;
+pub mod limits;
+pub mod progress;
+pub mod result;
+pub mod settings;
+pub mod stop;
+
+pub use error::{InvalidInput, Violation};
+pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
+pub use limits::Limits;
+pub use progress::{Losses, Observer, Progress, Silent, Stage};
+pub use result::{Calibration, Grade, Prior, Solution, Status, Warning, WarningCode};
+pub use settings::{Backend, Method, SolveSettings};
+pub use stop::{StopReason, StopToken};

@@ -1,0 +1,227 @@
+//! What a solve returns. An unsolvable scene is a result with its reason, not an error.
+
+use serde::{Deserialize, Serialize};
+
+use super::progress::{Progress, Stage};
+use super::settings::Method;
+
+/// Whether a reconstruction stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum Status {
+    Solved,
+    /// No consensus that geometry can verify; the reason is among the warnings.
+    NoReconstruction,
+}
+
+/// How far a calibration can be relied on, from the standard deviation of the log of the focal length.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum Grade {
+    /// sigma < .02
+    Metric,
+    /// .02 <= sigma <= .1
+    Weak,
+    /// sigma > .1, or a motion or scene that carries no calibration: only the projective part is to be used.
+    ProjectiveOnly,
+}
+
+/// What proposed the tracks that the accepted hypothesis was sampled from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum Prior {
+    /// The network's weights.
+    Network,
+    /// Iteratively reweighted least squares on the subspace.
+    Irls,
+    /// Agreement of a track's motion over the views.
+    Consistency,
+    /// None: uniform sampling.
+    Uniform,
+}
+
+impl Prior {
+    /// Every prior.
+    pub const ALL: [Prior; 4] = [Prior::Network, Prior::Irls, Prior::Consistency, Prior::Uniform];
+
+    /// The prior's name in files, metrics and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Prior::Network => "network",
+            Prior::Irls => "irls",
+            Prior::Consistency => "consistency",
+            Prior::Uniform => "uniform",
+        }
+    }
+}
+
+/// What a caller must know about a result, by a code that programs can match.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum WarningCode {
+    /// The points of the consensus lie on a plane, or the camera only rotated: a homography explains the views.
+    PlanarOrRotation,
+    /// The motion leaves the focal length (nearly) free.
+    UnobservableFocal,
+    /// Another calibration explains the data about as well.
+    SecondMinimum,
+    /// The metric model fits notably worse than the projective one: distortion, a zoom, a wrong principal point.
+    ModelMismatch,
+    /// Too few inlier tracks to verify or to calibrate.
+    FewInliers,
+    /// Points lie behind cameras.
+    Cheirality,
+    /// No consensus was found.
+    NoConsensus,
+    /// Views were left out; the detail lists them.
+    ViewsLeftOut,
+    /// No image size was given; the extent of the points stood in.
+    AssumedImageSize,
+    /// Views of several camera groups or sizes were treated as one camera.
+    CameraGroupsMerged,
+    /// The deadline stopped the search; this is the best found by then.
+    StoppedEarly,
+}
+
+impl WarningCode {
+    /// The code as it stands in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            WarningCode::PlanarOrRotation => "PLANAR_OR_ROTATION",
+            WarningCode::UnobservableFocal => "UNOBSERVABLE_FOCAL",
+            WarningCode::SecondMinimum => "SECOND_MINIMUM",
+            WarningCode::ModelMismatch => "MODEL_MISMATCH",
+            WarningCode::FewInliers => "FEW_INLIERS",
+            WarningCode::Cheirality => "CHEIRALITY",
+            WarningCode::NoConsensus => "NO_CONSENSUS",
+            WarningCode::ViewsLeftOut => "VIEWS_LEFT_OUT",
+            WarningCode::AssumedImageSize => "ASSUMED_IMAGE_SIZE",
+            WarningCode::CameraGroupsMerged => "CAMERA_GROUPS_MERGED",
+            WarningCode::StoppedEarly => "STOPPED_EARLY",
+        }
+    }
+}
+
+/// A warning in words.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Warning {
+    pub code: WarningCode,
+    pub detail: String,
+}
+
+impl Warning {
+    pub fn new(code: WarningCode, detail: impl Into<String>) -> Self {
+        Self { code, detail: detail.into() }
+    }
+}
+
+/// Intrinsics of one camera group, with their uncertainty.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Calibration {
+    pub focal_px: f64,
+    /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable (infinite).
+    pub sigma_log_focal: Option<f64>,
+    pub principal_point_px: [f64; 2],
+}
+
+/// One view of the result.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ViewResult {
+    /// 3x4 projective camera in pixels, row by row, in the frame `P1 = [I|0]` of the first registered view.
+    /// `None`: the view is not registered.
+    pub projection: Option<[[f64; 4]; 3]>,
+    /// Metric pose: `x ~ K (R X + t)`; row by row. `None` where there is no metric reconstruction.
+    pub rotation: Option<[[f64; 3]; 3]>,
+    pub translation: Option<[f64; 3]>,
+}
+
+/// What the geometry says of every track of the input (parallel arrays, one entry a track).
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct TrackResults {
+    /// AUTO, GEOMETRY, PSFM: probability that the track is an inlier; PAPER: the network's own weight. 0 for tracks
+    /// that were not judged.
+    pub weight: Vec<f32>,
+    pub inlier: Vec<bool>,
+    /// The network's own weight; empty where no network ran.
+    pub network_weight: Vec<f32>,
+    /// Point of each track: metric where the result is metric, else in the projective frame (dehomogenised).
+    /// `None` for tracks that are not inliers.
+    pub point: Vec<Option<[f64; 3]>>,
+}
+
+/// What the geometry says of every observation (parallel arrays in the caller's order).
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ObservationResults {
+    pub inlier: Vec<bool>,
+    /// Reprojection error in pixels; `None` where the observation was not judged.
+    pub residual_px: Vec<Option<f64>>,
+}
+
+/// Seconds spent in a stage.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct StageTime {
+    pub stage: Stage,
+    pub seconds: f64,
+}
+
+/// When a prior, verified alone, first stood at a consensus as good as the accepted one.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PriorTime {
+    pub prior: Prior,
+    /// Seconds of that prior's own work, proposing and verifying; `None`: it never did within the search.
+    pub seconds: Option<f64>,
+    /// Network iterations (network) or hypotheses (others) it had used by then.
+    pub iterations: u32,
+}
+
+/// Result of a solve.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Solution {
+    pub status: Status,
+    /// `None` without a reconstruction.
+    pub grade: Option<Grade>,
+    pub method: Method,
+    /// Prior whose sample led to the accepted consensus; `None` where nothing was accepted or nothing was sampled.
+    pub winning_prior: Option<Prior>,
+    /// Network iterations spent.
+    pub iterations: u32,
+    pub seed: u64,
+    /// One entry a camera group; empty without a metric reconstruction.
+    pub calibrations: Vec<Calibration>,
+    /// Plane at infinity `(n, 1)` in pixels and in the frame `P1 = [I|0]` of the first registered view.
+    pub plane_at_infinity: Option<[f64; 3]>,
+    /// One entry a view of the input.
+    pub views: Vec<ViewResult>,
+    pub tracks: TrackResults,
+    pub observations: ObservationResults,
+    /// Estimated observation noise, one standard deviation of a coordinate, in pixels.
+    pub noise_px: Option<f64>,
+    /// Root mean square and mean of the reprojection errors (distances) over the inlier observations, in pixels.
+    pub reprojection_rms_px: Option<f64>,
+    pub reprojection_mean_px: Option<f64>,
+    pub warnings: Vec<Warning>,
+    pub seconds: f64,
+    pub stages: Vec<StageTime>,
+    /// Debug output: what each prior alone would have needed.
+    pub prior_times: Vec<PriorTime>,
+    /// Curves for the report: progress records thinned to at most [`Solution::MAX_HISTORY`].
+    pub history: Vec<Progress>,
+}
+
+impl Solution {
+    /// Points of the curves in a report; more than a plot has pixels for is waste.
+    pub const MAX_HISTORY: usize = 500;
+
+    /// Indices of the registered views.
+    pub fn registered_views(&self) -> Vec<usize> {
+        (0..self.views.len()).filter(|&i| self.views[i].projection.is_some()).collect()
+    }
+
+    pub fn inlier_track_count(&self) -> usize {
+        self.tracks.inlier.iter().filter(|&&inlier| inlier).count()
+    }
+
+    pub fn inlier_observation_count(&self) -> usize {
+        self.observations.inlier.iter().filter(|&&inlier| inlier).count()
+    }
+}

@@ -1,0 +1,165 @@
+//! How to solve: the method and its parameters, with the reason for every default.
+
+use serde::{Deserialize, Serialize};
+
+use super::error::{InvalidInput, Violation, Violations};
+
+/// Which tracks are right is decided by...
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum Method {
+    /// ...the network's prior and geometry together: the network proposes, geometry disposes.
+    #[default]
+    Auto,
+    /// ...the paper's own output: the network's weights, thresholded at 1/2.
+    Paper,
+    /// ...geometry alone, no network.
+    Geometry,
+    /// ...plain projective factorisation (Sturm & Triggs 1996) with a residual threshold.
+    Psfm,
+}
+
+impl Method {
+    /// Every method, in the order of the API's enum.
+    pub const ALL: [Method; 4] = [Method::Auto, Method::Paper, Method::Geometry, Method::Psfm];
+
+    /// The method's name in files and on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Method::Auto => "AUTO",
+            Method::Paper => "PAPER",
+            Method::Geometry => "GEOMETRY",
+            Method::Psfm => "PSFM",
+        }
+    }
+
+    /// Whether the method optimises the network.
+    pub fn uses_network(self) -> bool {
+        matches!(self, Method::Auto | Method::Paper)
+    }
+}
+
+/// Tensor backend that the network runs on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Backend {
+    /// `burn-flex`, the faster of the two.
+    #[default]
+    Flex,
+    /// `burn-ndarray`, which burn deprecates in favour of flex.
+    Ndarray,
+}
+
+/// How one job is solved. Every field has a default with its reason; see the associated constants.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct SolveSettings {
+    pub method: Method,
+    /// Whether the DAQ residual takes part: as a loss of the network and as a score of hypotheses.
+    pub use_daq: bool,
+    /// Weight of L_proj.
+    pub alpha: f64,
+    /// Weight of L_DAQ.
+    pub beta: f64,
+    /// Least number of inliers that L_num asks for, the paper's `t`.
+    pub min_inliers: f64,
+    /// Slope of the sigmoid in L_num.
+    pub kappa: f64,
+    /// Adam's learning rate.
+    pub learning_rate: f64,
+    /// Network iterations at most; AUTO usually stops earlier, at a decisive consensus.
+    pub iterations: u32,
+    /// Width of the PointNet as a share of the original (64-64-64-128-1024).
+    pub network_width: f64,
+    /// Seed of every random choice: one seed, one answer.
+    pub seed: u64,
+    /// What the caller believes the observation noise to be, one standard deviation in pixels. A start, not a
+    /// verdict: the noise is estimated from the data.
+    pub noise_px: Option<f64>,
+    /// Interim weights every so many network iterations; 0: never.
+    pub weights_every: u32,
+    /// Backend of the network; `None` takes the server's.
+    pub backend: Option<Backend>,
+}
+
+impl SolveSettings {
+    /// Ten times the paper's 1: with alpha 1 mean F1 at 90 % outliers is worse as soon as the DAQ term joins.
+    pub const DEFAULT_ALPHA: f64 = 10.0;
+    /// The paper's value.
+    pub const DEFAULT_BETA: f64 = 1.0;
+    /// The paper's value.
+    pub const DEFAULT_MIN_INLIERS: f64 = 15.0;
+    /// The paper's literal sigmoid (slope 1) lets all weights collapse to 0; 20 to 50 work.
+    pub const DEFAULT_KAPPA: f64 = 20.0;
+    /// The paper's value.
+    pub const DEFAULT_LEARNING_RATE: f64 = 1e-3;
+    /// The weights converge within 300 to 500 iterations.
+    pub const DEFAULT_ITERATIONS: u32 = 400;
+    /// A quarter of the PointNet (about 1e5 parameters) ranks tracks as well as the whole (1.5e6) at a fraction of
+    /// the time.
+    pub const DEFAULT_NETWORK_WIDTH: f64 = 0.25;
+    /// Iterations that one job may ask for: 25 times the default; more is a slip of the finger.
+    pub const MAX_ITERATIONS: u32 = 10_000;
+    /// Twice the original PointNet, beyond which memory grows and nothing was ever gained.
+    pub const MAX_NETWORK_WIDTH: f64 = 2.0;
+
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// Each violation names its field as `settings.<field>`.
+    pub fn validate(&self) -> Result<(), InvalidInput> {
+        let mut found = Violations::default();
+        let mut positive = |name: &str, value: f64| {
+            if !(value.is_finite() && value > 0.0) {
+                found.push(Violation::of(
+                    format!("settings.{name}"),
+                    format!("{value} is not a positive finite number"),
+                ));
+            }
+        };
+        positive("alpha", self.alpha);
+        positive("min_inliers", self.min_inliers);
+        positive("kappa", self.kappa);
+        positive("learning_rate", self.learning_rate);
+        positive("network_width", self.network_width);
+        if let Some(noise_px) = self.noise_px {
+            positive("noise_px", noise_px);
+        }
+        if !(self.beta.is_finite() && self.beta >= 0.0) {
+            found.push(Violation::of("settings.beta", format!("{} is not a finite number >= 0", self.beta)));
+        }
+        if self.network_width > Self::MAX_NETWORK_WIDTH {
+            found.push(Violation::of(
+                "settings.network_width",
+                format!("{} is above the largest width {}", self.network_width, Self::MAX_NETWORK_WIDTH),
+            ));
+        }
+        if self.iterations == 0 || self.iterations > Self::MAX_ITERATIONS {
+            found.push(Violation::of(
+                "settings.iterations",
+                format!("{} is not in 1..={}", self.iterations, Self::MAX_ITERATIONS),
+            ));
+        }
+        found.into_result()
+    }
+}
+
+impl Default for SolveSettings {
+    fn default() -> Self {
+        Self {
+            method: Method::default(),
+            use_daq: true,
+            alpha: Self::DEFAULT_ALPHA,
+            beta: Self::DEFAULT_BETA,
+            min_inliers: Self::DEFAULT_MIN_INLIERS,
+            kappa: Self::DEFAULT_KAPPA,
+            learning_rate: Self::DEFAULT_LEARNING_RATE,
+            iterations: Self::DEFAULT_ITERATIONS,
+            network_width: Self::DEFAULT_NETWORK_WIDTH,
+            seed: 0,
+            noise_px: None,
+            weights_every: 0,
+            backend: None,
+        }
+    }
+}

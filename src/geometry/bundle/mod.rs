@@ -1,0 +1,1 @@
+//! Bundle adjustment by Levenberg-Marquardt on the Schur complement of the points, projective and metric.

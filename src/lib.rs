@@ -1,0 +1,28 @@
+//! Self-calibrating projective structure from motion, as a library and as a long-running gRPC service.
+//!
+//! Tracks of uncalibrated images go in, most of them possibly wrong; which tracks are right, the intrinsics with
+//! their uncertainty, the plane at infinity and the projective and metric reconstruction come out, or the honest
+//! statement that the motion carries no calibration.
+//!
+//! Direction of dependence, top to bottom; nothing points upwards:
+//!
+//! ```text
+//! cli -> rpc -> engine -> { store, solver } -> { network, geometry } -> domain
+//! ```
+//!
+//! Only [`rpc`] (and the client side of [`cli`]) sees prost and tonic, only [`store`] sees SQL, only [`network`]
+//! sees burn; [`geometry`] is plain f64 linear algebra.
+
+pub mod cli;
+pub mod config;
+pub mod domain;
+pub mod engine;
+pub mod formats;
+pub mod geometry;
+pub mod network;
+pub mod report;
+pub mod rpc;
+pub mod solver;
+pub mod store;
+pub mod synthetic;
+pub mod telemetry;
