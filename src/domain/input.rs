@@ -187,10 +187,7 @@ fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String
     bound("track_count", raw.track_count, limits.max_tracks, "tracks");
     bound("x", raw.x.len(), limits.max_observations, "observations");
     if raw.views.len() < 2 {
-        found.push(Violation::of(
-            field("views"),
-            format!("{} views given, at least 2 are needed", raw.views.len()),
-        ));
+        found.push(Violation::of(field("views"), format!("{} views given, at least 2 are needed", raw.views.len())));
     }
     if raw.track_count == 0 {
         found.push(Violation::of(field("track_count"), "no tracks given, at least 1 is needed"));
@@ -312,10 +309,7 @@ fn check_views_with_observations(raw: &RawInput, field: &impl Fn(&str) -> String
     }
     let count = seen.iter().filter(|&&seen| seen).count();
     if count < 2 {
-        found.push(Violation::of(
-            field("view"),
-            format!("observations lie in {count} view(s), at least 2 are needed"),
-        ));
+        found.push(Violation::of(field("view"), format!("observations lie in {count} view(s), at least 2 are needed")));
     }
 }
 
@@ -370,7 +364,10 @@ mod tests {
         assert_eq!(with(&|raw| raw.views.truncate(1)), ["track_set.views"]);
         let half_a_size = View { size: Some(ImageSize { width_px: 640, height_px: 0 }), ..View::default() };
         assert_eq!(with(&|raw| raw.views[1] = half_a_size.clone()), ["track_set.views[1]"]);
-        assert_eq!(with(&|raw| raw.view = vec![0, 0, 0, 0]), ["track_set.track[1]", "track_set.track[3]", "track_set.view"]);
+        assert_eq!(
+            with(&|raw| raw.view = vec![0, 0, 0, 0]),
+            ["track_set.track[1]", "track_set.track[3]", "track_set.view"]
+        );
     }
 
     #[test]

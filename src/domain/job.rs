@@ -1,6 +1,57 @@
-//! The job's state machine.
+//! Jobs: their names, their state machine, their record and their events.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
+
+use super::progress::Progress;
+use super::result::{Grade, Prior, Status};
+use super::settings::SolveSettings;
+
+/// Tenant of callers without an API key.
+pub const DEFAULT_TENANT: &str = "default";
+
+/// A job's resource name, `tenants/{tenant}/jobs/{job}`.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct JobName {
+    pub tenant: String,
+    pub job: String,
+}
+
+impl JobName {
+    /// Longest tenant or job id, AIP-122's bound for a user-settable id.
+    pub const MAX_ID_LENGTH: usize = 63;
+
+    /// The name of that form; ids are 1 to 63 of `a-z`, `0-9` and `-`, and do not begin or end with `-`.
+    pub fn parse(name: &str) -> Option<Self> {
+        let mut parts = name.split('/');
+        match (parts.next(), parts.next(), parts.next(), parts.next(), parts.next()) {
+            (Some("tenants"), Some(tenant), Some("jobs"), Some(job), None)
+                if Self::is_id(tenant) && Self::is_id(job) =>
+            {
+                Some(Self { tenant: tenant.into(), job: job.into() })
+            }
+            _ => None,
+        }
+    }
+
+    /// Whether `id` may stand in a resource name.
+    pub fn is_id(id: &str) -> bool {
+        !id.is_empty()
+            && id.len() <= Self::MAX_ID_LENGTH
+            && !id.starts_with('-')
+            && !id.ends_with('-')
+            && id.bytes().all(|byte| matches!(byte, b'a'..=b'z' | b'0'..=b'9' | b'-'))
+    }
+}
+
+impl fmt::Display for JobName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "tenants/{}/jobs/{}", self.tenant, self.job)
+    }
+}
 
 /// Where a job stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -61,9 +112,103 @@ impl JobState {
     }
 }
 
+/// What a job answers in a line, without its arrays.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    pub status: Status,
+    pub grade: Option<Grade>,
+    pub focal_px: Option<f64>,
+    pub sigma_log_focal: Option<f64>,
+    pub inlier_tracks: u32,
+    pub registered_views: u32,
+    pub reprojection_rms_px: Option<f64>,
+    pub winning_prior: Option<Prior>,
+    pub iterations: u32,
+    pub seconds: f64,
+    /// Size of the encoded result in bytes, as `ReadJobResult` streams it.
+    pub result_bytes: u64,
+}
+
+/// Why a job failed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failure {
+    /// Upper-case reason, stable for programs: `INTERNAL`, `ATTEMPTS_EXHAUSTED`.
+    pub reason: String,
+    pub message: String,
+}
+
+/// A job as its owner sees it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Job {
+    pub name: JobName,
+    pub state: JobState,
+    /// Attempts begun so far; the fencing token of the one that runs.
+    pub attempt: u32,
+    pub settings: SolveSettings,
+    pub view_count: u32,
+    pub track_count: u32,
+    pub observation_count: u32,
+    pub labels: BTreeMap<String, String>,
+    /// Larger is sooner; 0 is the default.
+    pub priority: i32,
+    pub create_time: SystemTime,
+    /// When the first attempt began.
+    pub start_time: Option<SystemTime>,
+    pub end_time: Option<SystemTime>,
+    /// A job without a result at this time expires.
+    pub deadline: Option<SystemTime>,
+    /// The latest progress, at most half a second old while running.
+    pub progress: Option<Progress>,
+    /// Sequence number of the latest event.
+    pub last_sequence: u64,
+    pub summary: Option<Summary>,
+    pub failure: Option<Failure>,
+    /// A cancel was asked for and has not yet reached the worker.
+    pub cancel_requested: bool,
+}
+
+/// Something that happened to a job.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct JobEvent {
+    pub name: JobName,
+    /// 0 before the first attempt.
+    pub attempt: u32,
+    /// Strictly increasing within a job, from 1. `None` for interim weights, which are latest-only and not replayed.
+    pub sequence: Option<u64>,
+    pub time: SystemTime,
+    pub body: EventBody,
+}
+
+/// What happened.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum EventBody {
+    /// The job entered a state; a failure carries its reason.
+    State {
+        state: JobState,
+        failure: Option<Failure>,
+    },
+    Progress(Progress),
+    /// Interim weights, one per track.
+    Weights {
+        iteration: u32,
+        weights: Vec<f32>,
+    },
+    /// The result stands and can be read; always followed by the terminal state.
+    Result(Summary),
+}
+
 #[cfg(test)]
 mod tests {
-    use super::JobState;
+    use super::{JobName, JobState};
+
+    #[test]
+    fn names_round_trip_and_bad_names_are_refused() {
+        let name = JobName::parse("tenants/default/jobs/a-1").expect("valid");
+        assert_eq!(name.to_string(), "tenants/default/jobs/a-1");
+        for bad in ["", "tenants/a/jobs/", "tenants/A/jobs/b", "tenants/a/jobs/b/c", "jobs/b", "tenants/a/jobs/-b"] {
+            assert_eq!(JobName::parse(bad), None, "{bad}");
+        }
+    }
 
     #[test]
     fn terminal_states_are_final_and_names_round_trip() {

@@ -41,15 +41,7 @@ pub struct SceneOptions {
 impl Default for SceneOptions {
     /// The paper's centre of all sweeps, without depths.
     fn default() -> Self {
-        Self {
-            views: 10,
-            tracks: 200,
-            noise: 0.003,
-            outliers: 0.9,
-            max_rotation_rad: 0.4,
-            with_depths: false,
-            seed: 0,
-        }
+        Self { views: 10, tracks: 200, noise: 0.003, outliers: 0.9, max_rotation_rad: 0.4, with_depths: false, seed: 0 }
     }
 }
 
@@ -121,9 +113,7 @@ impl Scene {
         let focal_px = rng.random_range(FOCAL_RANGE_PX.0..FOCAL_RANGE_PX.1);
         let centre_px = (f64::from(IMAGE_SIDE_PX) - 1.0) / 2.0;
         let points: Vec<Vector3<f64>> = (0..options.tracks)
-            .map(|_| {
-                Vector3::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0), rng.random_range(2.0..4.0))
-            })
+            .map(|_| Vector3::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0), rng.random_range(2.0..4.0)))
             .collect();
         let mut cameras = Vec::with_capacity(options.views);
         for _ in 0..options.views {
@@ -195,7 +185,8 @@ fn draw_camera(
     rng: &mut ChaCha8Rng,
 ) -> Result<(Matrix3<f64>, Vector3<f64>), InvalidInput> {
     for _ in 0..MAX_DRAWS {
-        let mut angle = || if max_rotation_rad > 0.0 { rng.random_range(-max_rotation_rad..max_rotation_rad) } else { 0.0 };
+        let mut angle =
+            || if max_rotation_rad > 0.0 { rng.random_range(-max_rotation_rad..max_rotation_rad) } else { 0.0 };
         let (about_x, about_y, about_z) = (angle(), angle(), angle());
         let rotation = Rotation3::from_axis_angle(&Vector3::x_axis(), about_x)
             * Rotation3::from_axis_angle(&Vector3::y_axis(), about_y)
@@ -210,7 +201,8 @@ fn draw_camera(
             return Ok((*rotation.matrix(), translation));
         }
     }
-    Err(Violation::of("rotation", format!("no camera sees the whole scene with rotations up to {max_rotation_rad}")).into())
+    Err(Violation::of("rotation", format!("no camera sees the whole scene with rotations up to {max_rotation_rad}"))
+        .into())
 }
 
 /// Box-Muller; one of the pair is enough here.
@@ -233,7 +225,8 @@ mod tests {
         for k in 0..input.observation_count() {
             let (view, track) = (input.view_of(k), input.track_of(k));
             let rotation = Matrix3::from_fn(|row, column| scene.truth.rotations[view][row][column]);
-            let seen = rotation * Vector3::from(scene.truth.points[track]) + Vector3::from(scene.truth.translations[view]);
+            let seen =
+                rotation * Vector3::from(scene.truth.points[track]) + Vector3::from(scene.truth.translations[view]);
             let [px, py] = scene.truth.principal_point_px;
             let x = scene.truth.focal_px * seen.x / seen.z + px;
             let y = scene.truth.focal_px * seen.y / seen.z + py;
@@ -250,7 +243,8 @@ mod tests {
 
     #[test]
     fn one_seed_one_scene() {
-        let generate = |seed| Scene::generate(&SceneOptions { seed, ..SceneOptions::default() }).expect("valid").input.x;
+        let generate =
+            |seed| Scene::generate(&SceneOptions { seed, ..SceneOptions::default() }).expect("valid").input.x;
         assert_eq!(generate(3), generate(3));
         assert_ne!(generate(3), generate(4));
     }
