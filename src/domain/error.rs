@@ -51,7 +51,7 @@ impl InvalidInput {
     /// Violations that are listed one by one; a file with a million wrong lines needs no million sentences.
     pub const MAX_LISTED: usize = 20;
 
-    /// The violations, in the order of the input.
+    /// The violations, grouped by rule.
     pub fn violations(&self) -> &[Violation] {
         &self.violations
     }
@@ -85,11 +85,6 @@ impl Violations {
         } else {
             self.unlisted += 1;
         }
-    }
-
-    /// Whether nothing was found so far.
-    pub fn is_empty(&self) -> bool {
-        self.listed.is_empty()
     }
 
     /// `Err` with everything found, `Ok` when there is nothing.

@@ -83,9 +83,8 @@ impl Input {
         let mut found = Violations::default();
         check_counts(&raw, limits, &field, &mut found);
         check_views(&raw.views, &field, &mut found);
-        if !found.is_empty() {
-            found.into_result()?;
-        }
+        found.into_result()?;
+        let mut found = Violations::default();
         check_observations(&raw, &field, &mut found);
         let mut order: Vec<u32> = (0..raw.view.len() as u32).collect();
         order.sort_by_key(|&k| (raw.track[k as usize], raw.view[k as usize], k));
@@ -366,7 +365,7 @@ mod tests {
         assert_eq!(with(&|raw| raw.views[1] = half_a_size.clone()), ["track_set.views[1]"]);
         assert_eq!(
             with(&|raw| raw.view = vec![0, 0, 0, 0]),
-            ["track_set.track[1]", "track_set.track[3]", "track_set.view"]
+            ["track_set.track[3]", "track_set.track[1]", "track_set.view"]
         );
     }
 
