@@ -25,16 +25,29 @@
     const canvas = document.getElementById("image"), hover = document.getElementById("hover");
     const [view, colour, outliers, flow] = ["view", "colour", "outliers", "flow"].map((id) => document.getElementById(id));
     views.forEach(([label, registered], k) => view.add(new Option(label + (registered ? "" : " (not registered)"), k)));
-    view.value = Math.max(0, views.findIndex((v) => v[1]));
+    // Begin with the view that has the most inliers within its image.
+    const counts = views.map(() => 0);
+    for (const [, , , points] of tracks) for (let k = 0; k < points.length; k += 4) {
+      const [, , x0, y0, x1, y1] = views[points[k]], [x, y] = [points[k + 1], points[k + 2]];
+      if (points[k + 3] && x >= x0 && x <= x1 && y >= y0 && y <= y1) counts[points[k]] += 1;
+    }
+    view.value = counts.indexOf(Math.max(...counts));
     const legend = hover.textContent;
     let drawn = [];
     const draw = () => {
       const chosen = +view.value, [, , x0, y0, x1, y1] = views[chosen];
-      const ratio = Math.min(1, Math.max(0.4, (y1 - y0) / Math.max(1, x1 - x0)));
-      const [context, width, height] = fit(canvas, ratio);
-      // Outliers may lie outside the image: a margin keeps the nearest of them in the picture.
-      const margin = 24, scale = Math.min((width - 2 * margin) / (x1 - x0 || 1), (height - 2 * margin) / (y1 - y0 || 1));
-      const place = (x, y) => [width / 2 + (x - (x0 + x1) / 2) * scale, height / 2 + (y - (y0 + y1) / 2) * scale];
+      // Synthetic points may lie outside the image: what shows is the image and the inliers, up to an image beyond it.
+      const shown = [x0, y0, x1, y1], [w, h] = [x1 - x0, y1 - y0];
+      for (const [, , , points] of tracks) for (let k = 0; k < points.length; k += 4) if (points[k] === chosen && points[k + 3]) {
+        const [x, y] = [points[k + 1], points[k + 2]];
+        shown[0] = Math.max(x0 - w, Math.min(shown[0], x)); shown[1] = Math.max(y0 - h, Math.min(shown[1], y));
+        shown[2] = Math.min(x1 + w, Math.max(shown[2], x)); shown[3] = Math.min(y1 + h, Math.max(shown[3], y));
+      }
+      const [across, down] = [shown[2] - shown[0] || 1, shown[3] - shown[1] || 1];
+      const [context, width, height] = fit(canvas, Math.min(0.7, Math.max(0.4, down / across)));
+      const margin = 14, scale = Math.min((width - 2 * margin) / across, (height - 2 * margin) / down);
+      const place = (x, y) => [
+        width / 2 + (x - (shown[0] + shown[2]) / 2) * scale, height / 2 + (y - (shown[1] + shown[3]) / 2) * scale];
       const [inside, outside, bad] = [theme("in"), theme("out"), theme("bad")];
       context.strokeStyle = theme("edge");
       context.strokeRect(...place(x0, y0), (x1 - x0) * scale, (y1 - y0) * scale);
@@ -99,7 +112,7 @@
       const [context, width, height] = fit(canvas, 0.6);
       const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
       const R = [cy, 0, sy, sp * sy, cp, -sp * cy, -cp * sy, sp, cp * cy];
-      const scale = zoom * 0.42 * Math.min(width, height) / radius;
+      const scale = zoom * 0.55 * Math.min(width, height) / radius;
       const place = (p) => {
         const [x, y, z] = turn(R, [0, 1, 2].map((k) => p[k] - focus[k]));
         const nearness = 1 / Math.max(0.2, 1 + 0.25 * z / radius);

@@ -48,8 +48,9 @@ pub fn headline(solution: &Solution) -> String {
         let noise = solution.noise_px.map_or_else(String::new, |px| format!("RMS; noise {} px", short(px)));
         card("reprojection error", format!("{} px", short(rms_px)), noise);
     }
-    let prior = solution.winning_prior.map_or_else(String::new, |prior| format!(", prior {}", prior.name()));
-    card("method", format!("{}{prior}", solution.method.name()), format!("{} network iterations", solution.iterations));
+    let prior =
+        solution.winning_prior.map_or_else(String::new, |prior| format!(", found by the prior {}", prior.name()));
+    card("method", solution.method.name().into(), format!("{} network iterations{prior}", solution.iterations));
     card("time", format!("{:.2} s", solution.seconds), stage_times(solution));
     html.push_str("</dl>\n</header>\n");
     html
