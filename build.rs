@@ -16,7 +16,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     // What the reflection service answers from.
     let descriptors = PathBuf::from(env::var("OUT_DIR")?).join("scpsfm_descriptors.bin");
     fs::write(descriptors, files.encode_to_vec())?;
-    // Maps in key order, so that the same message has the same bytes.
-    tonic_prost_build::configure().btree_map(".").compile_fds(files)?;
+    tonic_prost_build::configure()
+        // Maps in key order, so that the same message has the same bytes.
+        .btree_map(".")
+        // A result is cut into chunks without copying it.
+        .bytes(".scpsfm.v1.ResultChunk.data")
+        .compile_fds(files)?;
     Ok(())
 }

@@ -2,4 +2,5 @@
 //!
 //! Depends on `engine`, `telemetry` and `domain`; only this module and the client side of `cli` see prost and tonic.
 
+pub mod convert;
 pub mod proto;
