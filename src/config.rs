@@ -7,6 +7,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::num::NonZero;
 use std::path::{Path, PathBuf};
 
+use serde::de::IntoDeserializer;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::domain::{Backend, Limits};
@@ -129,6 +130,7 @@ impl Engine {
 pub struct Compute {
     /// `flex` or `ndarray`; a job may ask for the other. Flex, because burn deprecates ndarray in its favour and it
     /// is the faster of the two.
+    #[serde(deserialize_with = "word")]
     pub backend: Backend,
 }
 
@@ -137,6 +139,7 @@ pub struct Compute {
 #[serde(default, deny_unknown_fields)]
 pub struct Log {
     /// `human` or `json`. Human, because who starts the server by hand reads it; deploy/ sets json.
+    #[serde(deserialize_with = "word")]
     pub format: Format,
     /// Levels by module, e.g. `info,scpsfm::engine=debug`.
     pub filter: String,
@@ -278,6 +281,11 @@ fn address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<SocketAddr, D::
         let message = format!("`{text}` is not an IP address and port, such as 127.0.0.1:7070 or [::1]:7070");
         serde::de::Error::custom(message)
     })
+}
+
+/// One word of a few; the error lists them, which the `config` crate's own does not.
+fn word<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<T, D::Error> {
+    String::deserialize(deserializer).and_then(|text| T::deserialize(text.into_deserializer()))
 }
 
 #[cfg(test)]
