@@ -16,14 +16,14 @@ USER 10001
 WORKDIR /var/lib/scpsfm
 VOLUME /var/lib/scpsfm
 # Inside a container loopback reaches nobody; what is published decides who may connect.
-ENV SCPSFM_SERVER__LISTEN=0.0.0.0:7070 \
-    SCPSFM_METRICS__LISTEN=0.0.0.0:7071 \
+ENV SCPSFM_SERVER__LISTEN=0.0.0.0:50051 \
+    SCPSFM_METRICS__LISTEN=0.0.0.0:9464 \
     SCPSFM_STORE__DATA_DIR=/var/lib/scpsfm \
     SCPSFM_LOG__FORMAT=json
-EXPOSE 7070 7071
+EXPOSE 50051 9464
 # bash opens the connection itself: the image needs no client for its own check.
 HEALTHCHECK --interval=10s --timeout=3s --start-period=20s --retries=3 \
-    CMD ["bash", "-c", "exec 3<>/dev/tcp/127.0.0.1/7071 && printf 'GET /readyz HTTP/1.0\\r\\n\\r\\n' >&3 && head -n 1 <&3 | grep -q ' 200 '"]
+    CMD ["bash", "-c", "exec 3<>/dev/tcp/127.0.0.1/9464 && printf 'GET /readyz HTTP/1.0\\r\\n\\r\\n' >&3 && head -n 1 <&3 | grep -q ' 200 '"]
 # The server is process 1 and takes SIGTERM itself: it drains, then exits.
 ENTRYPOINT ["scpsfm"]
 CMD ["serve"]
