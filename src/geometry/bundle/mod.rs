@@ -5,6 +5,7 @@
 //!
 //! Image coordinates are normalised throughout: pixels minus the guessed principal point, over the larger image side.
 
+mod cholesky;
 mod covariance;
 mod engine;
 pub mod metric;
