@@ -479,3 +479,6 @@ impl Drop for StoreTimer {
         histogram!(STORE_DURATION.name, "operation" => self.operation).record(self.begun.elapsed().as_secs_f64());
     }
 }
+
+#[cfg(test)]
+mod tests;
