@@ -14,11 +14,14 @@ pub mod sqlite;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
-use crate::domain::job::{Job, JobEvent, JobName, JobState};
+use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 
 pub use query::{JobPage, JobQuery, Order};
-pub use record::{Bound, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, Outcome, QueueBounds, Request};
+pub use record::{
+    Bound, CancelReply, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, Outcome, QueueBounds, Request,
+    Swept,
+};
 
 /// Why the store did not do what it was asked.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -97,32 +100,32 @@ pub trait Store: Send + Sync + 'static {
     /// [`Error::Fenced`].
     async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error>;
 
-    /// Ends an attempt and its job, with the result where there is one: the only way from running to a final state.
+    /// Ends an attempt and its job, with the result where there is one. Returns the job as it stands then.
     ///
     /// # Errors
     /// [`Error::Fenced`].
-    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<(), Error>;
+    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error>;
 
     /// Gives a lease back. The job returns to the queue, or ends if its cancel was asked for; the attempt does not
-    /// count against the cap. Returns the new state.
+    /// count against the cap. Returns the job as it stands then.
     ///
     /// # Errors
     /// [`Error::Fenced`].
-    async fn release(&self, lease: &Lease, now: SystemTime) -> Result<JobState, Error>;
+    async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error>;
 
     /// Asks for the end of a job: a queued one ends at once, a running one is flagged for its worker, an ended one is
-    /// left as it is. Returns the job as it stands then.
+    /// left as it is.
     ///
     /// # Errors
     /// [`Error::NotFound`].
-    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<Job, Error>;
+    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error>;
 
     /// Takes back every lease that no living process can hold; called once, before the first claim. A job that lost
     /// `max_attempts` attempts this way fails with `ATTEMPTS_EXHAUSTED`. Returns the jobs that changed.
-    async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<(JobName, JobState)>, Error>;
+    async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error>;
 
-    /// Takes back leases that ran out and ends queued jobs that are past their deadline. Returns the jobs that changed.
-    async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<(JobName, JobState)>, Error>;
+    /// Takes back leases that ran out, as [`Store::recover`] does, and ends queued jobs that are past their deadline.
+    async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error>;
 
     /// The encoded result of a job; `None` where there is none.
     ///

@@ -125,6 +125,8 @@ pub struct Claimed {
     pub job: Job,
     pub lease: Lease,
     pub trace_parent: Option<String>,
+    /// When the job last entered the queue.
+    pub queue_time: SystemTime,
 }
 
 /// What a heartbeat brings back.
@@ -153,4 +155,22 @@ pub enum Outcome {
     Failed(Failure),
     Cancelled,
     Expired,
+}
+
+/// What asking for a cancel came to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CancelReply {
+    /// The job as it stands now.
+    pub job: Job,
+    /// Whether this call ended it.
+    pub ended_now: bool,
+}
+
+/// What a sweep changed; the jobs as they stand now.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Swept {
+    /// Their leases had run out: queued again, or ended.
+    pub lost: Vec<Job>,
+    /// They had waited past their deadline.
+    pub expired: Vec<Job>,
 }

@@ -8,7 +8,7 @@ use super::jobs;
 use super::rows::{self, Standing, append, held, leave, micros, select_jobs, standing};
 use crate::domain::job::{EventBody, Failure, Job, JobName, JobState};
 use crate::domain::progress::Progress;
-use crate::store::record::{Claimed, Ending, Heartbeat, Lease, Outcome};
+use crate::store::record::{CancelReply, Claimed, Ending, Heartbeat, Lease, Outcome};
 use crate::store::{ATTEMPTS_EXHAUSTED, Error, payload};
 
 /// Whether anything is queued.
@@ -41,7 +41,12 @@ pub(super) async fn claim(
     let row = sqlx::query(select_jobs!("WHERE id = ?")).bind(id).fetch_one(connection).await?;
     let job = rows::job(&row)?;
     let lease = Lease { name: job.name.clone(), attempt };
-    Ok(Some(Claimed { job, lease, trace_parent: row.try_get("trace_parent")? }))
+    Ok(Some(Claimed {
+        job,
+        lease,
+        trace_parent: row.try_get("trace_parent")?,
+        queue_time: rows::time(row.try_get("queue_time")?),
+    }))
 }
 
 /// Extends a lease.
@@ -87,7 +92,7 @@ pub(super) async fn finish(
     lease: &Lease,
     ending: &Ending,
     now: SystemTime,
-) -> Result<(), Error> {
+) -> Result<Job, Error> {
     let job = held(connection, lease).await?;
     if let Some(progress) = &ending.progress {
         keep_progress(connection, job.id, progress).await?;
@@ -101,12 +106,13 @@ pub(super) async fn finish(
                 .execute(&mut *connection)
                 .await?;
             append(connection, job.id, job.attempt, &EventBody::Result(summary.clone()), now).await?;
-            leave(connection, &job, JobState::Succeeded, None, now).await
+            leave(connection, &job, JobState::Succeeded, None, now).await?;
         }
-        Outcome::Failed(failure) => leave(connection, &job, JobState::Failed, Some(failure.clone()), now).await,
-        Outcome::Cancelled => leave(connection, &job, JobState::Cancelled, None, now).await,
-        Outcome::Expired => leave(connection, &job, JobState::Expired, None, now).await,
+        Outcome::Failed(failure) => leave(connection, &job, JobState::Failed, Some(failure.clone()), now).await?,
+        Outcome::Cancelled => leave(connection, &job, JobState::Cancelled, None, now).await?,
+        Outcome::Expired => leave(connection, &job, JobState::Expired, None, now).await?,
     }
+    jobs::get(connection, &lease.name).await
 }
 
 async fn insert_result(connection: &mut SqliteConnection, id: i64, bytes: &[u8]) -> Result<(), Error> {
@@ -122,15 +128,11 @@ async fn insert_result(connection: &mut SqliteConnection, id: i64, bytes: &[u8])
 }
 
 /// Gives a lease back.
-pub(super) async fn release(
-    connection: &mut SqliteConnection,
-    lease: &Lease,
-    now: SystemTime,
-) -> Result<JobState, Error> {
+pub(super) async fn release(connection: &mut SqliteConnection, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
     let job = held(connection, lease).await?;
     let next = if job.cancel_requested { JobState::Cancelled } else { JobState::Queued };
     leave(connection, &job, next, None, now).await?;
-    Ok(next)
+    jobs::get(connection, &lease.name).await
 }
 
 /// Asks for the end of a job.
@@ -138,19 +140,15 @@ pub(super) async fn request_cancel(
     connection: &mut SqliteConnection,
     name: &JobName,
     now: SystemTime,
-) -> Result<Job, Error> {
+) -> Result<CancelReply, Error> {
     let job = standing(connection, name).await?;
-    match job.state {
-        JobState::Queued => leave(connection, &job, JobState::Cancelled, None, now).await?,
-        JobState::Running => {
-            sqlx::query("UPDATE jobs SET cancel_requested = 1 WHERE id = ?")
-                .bind(job.id)
-                .execute(&mut *connection)
-                .await?;
-        }
-        _ => {}
+    let ended_now = job.state == JobState::Queued;
+    if ended_now {
+        leave(connection, &job, JobState::Cancelled, None, now).await?;
+    } else if job.state == JobState::Running {
+        sqlx::query("UPDATE jobs SET cancel_requested = 1 WHERE id = ?").bind(job.id).execute(&mut *connection).await?;
     }
-    jobs::get(connection, name).await
+    Ok(CancelReply { job: jobs::get(connection, name).await?, ended_now })
 }
 
 /// Takes back the leases that ran out at `expired_at`, or all of them.
@@ -159,7 +157,7 @@ pub(super) async fn take_back(
     expired_at: Option<SystemTime>,
     now: SystemTime,
     max_attempts: u32,
-) -> Result<Vec<(JobName, JobState)>, Error> {
+) -> Result<Vec<Job>, Error> {
     let rows = sqlx::query(
         "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline FROM jobs \
          WHERE state = 'RUNNING' AND lease_expires <= ? ORDER BY id",
@@ -178,7 +176,7 @@ pub(super) async fn take_back(
             .await?;
         let (next, failure) = after_loss(&job, lost_attempts, now, max_attempts);
         leave(connection, &job, next, failure, now).await?;
-        changed.push((job.name, next));
+        changed.push(jobs::get(connection, &job.name).await?);
     }
     Ok(changed)
 }
@@ -211,10 +209,7 @@ pub(super) async fn needs_sweep(connection: &mut SqliteConnection, now: SystemTi
 }
 
 /// Ends the queued jobs that are past their deadline.
-pub(super) async fn expire_queued(
-    connection: &mut SqliteConnection,
-    now: SystemTime,
-) -> Result<Vec<(JobName, JobState)>, Error> {
+pub(super) async fn expire_queued(connection: &mut SqliteConnection, now: SystemTime) -> Result<Vec<Job>, Error> {
     let rows = sqlx::query(
         "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline FROM jobs \
          WHERE state = 'QUEUED' AND deadline IS NOT NULL AND deadline <= ? ORDER BY id",
@@ -226,7 +221,7 @@ pub(super) async fn expire_queued(
     for row in &rows {
         let job = Standing::from_row(row)?;
         leave(connection, &job, JobState::Expired, None, now).await?;
-        changed.push((job.name, JobState::Expired));
+        changed.push(jobs::get(connection, &job.name).await?);
     }
     Ok(changed)
 }

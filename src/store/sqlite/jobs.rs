@@ -101,13 +101,14 @@ async fn insert_job(
     now: SystemTime,
 ) -> Result<i64, Error> {
     let id: i64 = sqlx::query_scalar(
-        "INSERT INTO jobs (tenant, job, state, priority, create_time, deadline, input_id, input_bytes, view_count, \
+        "INSERT INTO jobs (tenant, job, state, priority, create_time, queue_time, deadline, input_id, input_bytes, view_count, \
          track_count, observation_count, settings, labels, trace_parent) \
-         VALUES (?, ?, 'QUEUED', ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id",
+         VALUES (?, ?, 'QUEUED', ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id",
     )
     .bind(&new.name.tenant)
     .bind(&new.name.job)
     .bind(new.priority)
+    .bind(micros(now))
     .bind(micros(now))
     .bind(new.deadline.map(micros))
     .bind(input_id)

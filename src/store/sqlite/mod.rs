@@ -17,9 +17,9 @@ use sqlx::sqlite::{
 };
 use sqlx::{SqlSafeStr, Sqlite as Database, Transaction};
 
-use super::record::{Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, QueueBounds};
+use super::record::{CancelReply, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, QueueBounds, Swept};
 use super::{Error, JobPage, JobQuery, Store};
-use crate::domain::job::{Job, JobEvent, JobName, JobState};
+use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 
 /// The database within the data directory.
@@ -179,45 +179,45 @@ impl Store for Sqlite {
         Ok(sequence)
     }
 
-    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<(), Error> {
+    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error> {
         let mut transaction = self.begin().await?;
-        attempts::finish(&mut transaction, lease, ending, now).await?;
-        transaction.commit().await?;
-        Ok(())
-    }
-
-    async fn release(&self, lease: &Lease, now: SystemTime) -> Result<JobState, Error> {
-        let mut transaction = self.begin().await?;
-        let state = attempts::release(&mut transaction, lease, now).await?;
-        transaction.commit().await?;
-        Ok(state)
-    }
-
-    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<Job, Error> {
-        let mut transaction = self.begin().await?;
-        let job = attempts::request_cancel(&mut transaction, name, now).await?;
+        let job = attempts::finish(&mut transaction, lease, ending, now).await?;
         transaction.commit().await?;
         Ok(job)
     }
 
+    async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
+        let mut transaction = self.begin().await?;
+        let job = attempts::release(&mut transaction, lease, now).await?;
+        transaction.commit().await?;
+        Ok(job)
+    }
+
+    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error> {
+        let mut transaction = self.begin().await?;
+        let reply = attempts::request_cancel(&mut transaction, name, now).await?;
+        transaction.commit().await?;
+        Ok(reply)
+    }
+
     /// The lock on the directory says that no other process lives here, so that every lease is a dead one's.
-    async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<(JobName, JobState)>, Error> {
+    async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {
         let mut transaction = self.begin().await?;
         let changed = attempts::take_back(&mut transaction, None, now, max_attempts).await?;
         transaction.commit().await?;
         Ok(changed)
     }
 
-    async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<(JobName, JobState)>, Error> {
+    async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
         // Most sweeps find nothing: a look through a reader spares the writer, and the disk, a transaction.
         if !attempts::needs_sweep(&mut *self.readers.acquire().await?, now).await? {
-            return Ok(Vec::new());
+            return Ok(Swept::default());
         }
         let mut transaction = self.begin().await?;
-        let mut changed = attempts::take_back(&mut transaction, Some(now), now, max_attempts).await?;
-        changed.extend(attempts::expire_queued(&mut transaction, now).await?);
+        let lost = attempts::take_back(&mut transaction, Some(now), now, max_attempts).await?;
+        let expired = attempts::expire_queued(&mut transaction, now).await?;
         transaction.commit().await?;
-        Ok(changed)
+        Ok(Swept { lost, expired })
     }
 
     async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error> {

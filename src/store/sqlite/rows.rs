@@ -15,7 +15,7 @@ macro_rules! select_jobs {
         concat!(
             "SELECT id, tenant, job, state, attempt, settings, view_count, track_count, observation_count, labels, ",
             "priority, create_time, start_time, end_time, deadline, progress, last_sequence, summary, failure, ",
-            "cancel_requested, trace_parent FROM jobs ",
+            "cancel_requested, trace_parent, queue_time FROM jobs ",
             $clauses
         )
     };
@@ -183,10 +183,11 @@ pub(super) async fn leave(
         return Err(Error::Corrupt(format!("{} cannot go from {from} to {to} here", job.name)));
     }
     sqlx::query(
-        "UPDATE jobs SET state = ?, lease_worker = NULL, lease_expires = NULL, cancel_requested = 0, end_time = ?, \
-         failure = ? WHERE id = ?",
+        "UPDATE jobs SET state = ?, lease_worker = NULL, lease_expires = NULL, cancel_requested = 0, \
+         queue_time = COALESCE(?, queue_time), end_time = ?, failure = ? WHERE id = ?",
     )
     .bind(next.name())
+    .bind((next == JobState::Queued).then(|| micros(now)))
     .bind(next.is_terminal().then(|| micros(now)))
     .bind(failure.as_ref().map(payload::encode).transpose()?)
     .bind(job.id)

@@ -33,6 +33,8 @@ CREATE TABLE jobs (
     cancel_requested  INTEGER NOT NULL DEFAULT 0,
     priority          INTEGER NOT NULL,
     create_time       INTEGER NOT NULL,
+    -- When the job last entered the queue.
+    queue_time        INTEGER NOT NULL,
     start_time        INTEGER,
     end_time          INTEGER,
     deadline          INTEGER,
