@@ -37,10 +37,7 @@ type Messages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 #[tonic::async_trait]
 impl proto::job_service_server::JobService for Jobs {
-    async fn create_job(
-        &self,
-        request: Request<proto::CreateJobRequest>,
-    ) -> Result<Response<proto::Job>, Status> {
+    async fn create_job(&self, request: Request<proto::CreateJobRequest>) -> Result<Response<proto::Job>, Status> {
         let caller = Caller::of(&request);
         let span = telemetry::tracing::submit_span("CreateJob", caller.trace_parent());
         let created = async {
@@ -139,11 +136,7 @@ fn result_chunks(encoded: Bytes, from: usize) -> impl Iterator<Item = proto::Res
         let begin = at?;
         let end = total.min(begin + RESULT_CHUNK_BYTES);
         at = (end < total).then_some(end);
-        Some(proto::ResultChunk {
-            data: encoded.slice(begin..end),
-            offset: begin as i64,
-            total_size: total as i64,
-        })
+        Some(proto::ResultChunk { data: encoded.slice(begin..end), offset: begin as i64, total_size: total as i64 })
     })
 }
 

@@ -95,10 +95,7 @@ impl HttpBody for MeteredBody {
     type Data = Bytes;
     type Error = Status;
 
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         let frame = Pin::new(&mut self.body).poll_frame(context);
         let code = match &frame {
             Poll::Ready(Some(Ok(frame))) => frame.trailers_ref().map(|trailers| code_in(trailers).unwrap_or("UNKNOWN")),

@@ -16,16 +16,15 @@ use super::calibration::Calibration;
 use super::inputs::Inputs;
 use super::jobs::Jobs;
 use super::meter::Meter;
+use super::proto::FILE_DESCRIPTOR_SET;
 use super::proto::calibration_service_server::CalibrationServiceServer;
 use super::proto::input_service_server::InputServiceServer;
 use super::proto::job_service_server::JobServiceServer;
-use super::proto::FILE_DESCRIPTOR_SET;
 use crate::domain::Limits;
 use crate::engine::Engine;
 
 /// Services whose health is told one by one; the empty name is the server's own.
-const HEALTH_NAMES: [&str; 4] =
-    ["", "scpsfm.v1.CalibrationService", "scpsfm.v1.JobService", "scpsfm.v1.InputService"];
+const HEALTH_NAMES: [&str; 4] = ["", "scpsfm.v1.CalibrationService", "scpsfm.v1.JobService", "scpsfm.v1.InputService"];
 
 /// Calls open at once on one connection: some hundred watchers and room for the rest. More wait on the client's side.
 const MAX_STREAMS_PER_CONNECTION: u32 = 1_024;
