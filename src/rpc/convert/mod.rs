@@ -4,9 +4,11 @@
 //! What cannot be read is a [`Violation`] that names its field: the server refuses the request with it, the client
 //! refuses the answer.
 
+pub mod create;
 pub mod enums;
 pub mod input;
 pub mod job;
+pub mod list;
 pub mod matrix;
 pub mod names;
 pub mod progress;
