@@ -5,6 +5,8 @@
 pub mod args;
 pub mod exit;
 pub mod progress;
+pub mod serve;
+pub mod service;
 pub mod solve;
 pub mod summary;
 pub mod synth;
@@ -31,6 +33,7 @@ pub struct Cli {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    Serve(serve::Args),
     Solve(solve::Args),
     Synth(synth::Args),
 }
@@ -53,6 +56,7 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         .build()
         .map_err(|error| Failure::internal(format_args!("cannot start the runtime: {error}")))?;
     match command {
+        Command::Serve(args) => runtime.block_on(serve::run(args)),
         Command::Solve(args) => runtime.block_on(solve::run(args)),
         Command::Synth(args) => synth::run(args),
     }
