@@ -15,8 +15,8 @@ use super::{client, job_view, print, summary};
 use crate::config::Config;
 use crate::domain::job::JobEvent;
 use crate::domain::{Solution, SolveSettings};
-use crate::formats::result_files::{self, pretty};
 use crate::formats::LabelledInput;
+use crate::formats::result_files::{self, pretty};
 use crate::synthetic::Scene;
 use crate::synthetic::metrics::{Agreement, agreement};
 
@@ -83,9 +83,15 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let input = LabelledInput::unlabelled(scene.input.clone(), Path::new(result_files::OBSERVATIONS));
     result_files::write(&args.out, &solution, Some(&input))?;
     let comparison = Comparison::new(&scene, &solution);
-    print(if args.json { comparison.json(&args, &solution)? } else { comparison.text(&args, &scene, &solution) }.trim_end())?;
+    print(
+        if args.json { comparison.json(&args, &solution)? } else { comparison.text(&args, &scene, &solution) }
+            .trim_end(),
+    )?;
     if comparison.inliers.f1 < LEAST_F1 {
-        let what = format!("the inliers found agree badly with the truth: F1 {:.3} is below {LEAST_F1}", comparison.inliers.f1);
+        let what = format!(
+            "the inliers found agree badly with the truth: F1 {:.3} is below {LEAST_F1}",
+            comparison.inliers.f1
+        );
         return Err(Failure::internal(what));
     }
     Ok(Exit::Done)
@@ -130,7 +136,8 @@ impl Comparison {
 
     fn text(&self, args: &Args, scene: &Scene, solution: &Solution) -> String {
         let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
-        let mut lines = vec![summary::text(solution), String::new(), format!("  {:<16}{:>12}{:>12}", "", "found", "true")];
+        let mut lines =
+            vec![summary::text(solution), String::new(), format!("  {:<16}{:>12}{:>12}", "", "found", "true")];
         lines.push(format!(
             "  {:<16}{:>12}{right:>12}   F1 {:.3} (precision {:.3}, recall {:.3})",
             "inlier tracks",
