@@ -1,0 +1,92 @@
+//! `scpsfm solve`: one input, start to end, in process or through a server.
+
+use std::path::PathBuf;
+
+use super::args::{InputArgs, SettingsArgs};
+use super::exit::{Exit, Failure};
+use super::progress::ProgressView;
+use super::{print, summary};
+use crate::domain::{Limits, Solution, SolveSettings, StopReason, StopToken};
+use crate::formats::{LabelledInput, result_files};
+use crate::solver;
+
+const EXAMPLES: &str = "\
+Examples:
+  scpsfm solve observations.csv --width 3072 --height 2048 --out answer
+  scpsfm solve observations.csv --out answer --json | jq .focal_px
+  scpsfm solve observations.csv --out answer --server http://127.0.0.1:50051
+
+Files in the output directory: result.json (the summary), tracks.csv, observations.csv (every answer under the ids of
+the input), cameras.json, points.ply and report.html (open it in a browser).";
+
+/// Solve one input
+///
+/// In this process by default, through a server with --server; the files are the same. Shows progress on stderr and the
+/// result in words on stdout.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
+pub struct Args {
+    #[command(flatten)]
+    pub input: InputArgs,
+
+    /// Directory for the result files; created, files of these names in it are replaced
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+
+    /// Print what result.json holds on stdout, instead of words
+    #[arg(long)]
+    pub json: bool,
+
+    /// Show no progress and no words
+    #[arg(long, short)]
+    pub quiet: bool,
+
+    #[command(flatten)]
+    pub settings: SettingsArgs,
+}
+
+/// Runs the command.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let settings = args.settings.settings()?;
+    let input = args.input.read()?;
+    // Found out now rather than after the work.
+    result_files::create_directory(&args.out)?;
+    let mut progress = ProgressView::new(args.quiet);
+    let solution = in_process(&input, &settings, &mut progress)?;
+    progress.finish();
+    deliver(&args, &solution, &input)
+}
+
+/// Solves here; Ctrl-C stops it within 50 ms or one network iteration.
+fn in_process(
+    input: &LabelledInput,
+    settings: &SolveSettings,
+    progress: &mut ProgressView,
+) -> Result<Solution, Failure> {
+    let checked = input.check(&Limits::default())?;
+    let stop = StopToken::default();
+    let on_interrupt = stop.clone();
+    let listener = tokio::spawn(async move {
+        if tokio::signal::ctrl_c().await.is_ok() {
+            on_interrupt.stop(StopReason::Cancelled);
+        }
+    });
+    let outcome = tokio::task::block_in_place(|| solver::solve(&checked, settings, progress, &stop));
+    listener.abort();
+    outcome.map_err(|error| match error {
+        solver::Error::Stopped(_) => Failure::interrupted(),
+        solver::Error::Internal(_) => Failure::internal(error),
+    })
+}
+
+/// Writes the files and tells what they hold.
+fn deliver(args: &Args, solution: &Solution, input: &LabelledInput) -> Result<Exit, Failure> {
+    result_files::write(&args.out, solution, Some(input))?;
+    if args.json {
+        print(result_files::result_json(solution)?.trim_end())?;
+    } else if !args.quiet {
+        print(&summary::text(solution))?;
+        print(&format!("  files        {}", args.out.display()))?;
+    }
+    Ok(Exit::of(solution))
+}
