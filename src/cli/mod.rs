@@ -3,11 +3,23 @@
 //! May depend on everything; only `client.rs` and the commands that talk to a server see prost and tonic.
 
 pub mod args;
+pub mod cancel;
+pub mod client;
+pub mod demo;
 pub mod exit;
+pub mod get;
+pub mod interrupt;
+pub mod job_view;
+pub mod list;
 pub mod progress;
+pub mod result;
+pub mod serve;
+pub mod service;
 pub mod solve;
+pub mod submit;
 pub mod summary;
 pub mod synth;
+pub mod watch;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -31,7 +43,15 @@ pub struct Cli {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    Demo(demo::Args),
+    Serve(serve::Args),
     Solve(solve::Args),
+    Submit(submit::Args),
+    Watch(watch::Args),
+    Get(get::Args),
+    List(list::Args),
+    Cancel(cancel::Args),
+    Result(result::Args),
     Synth(synth::Args),
 }
 
@@ -53,7 +73,15 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         .build()
         .map_err(|error| Failure::internal(format_args!("cannot start the runtime: {error}")))?;
     match command {
+        Command::Demo(args) => runtime.block_on(demo::run(args)),
+        Command::Serve(args) => runtime.block_on(serve::run(args)),
         Command::Solve(args) => runtime.block_on(solve::run(args)),
+        Command::Submit(args) => runtime.block_on(submit::run(args)),
+        Command::Watch(args) => runtime.block_on(watch::run(args)),
+        Command::Get(args) => runtime.block_on(get::run(args)),
+        Command::List(args) => runtime.block_on(list::run(args)),
+        Command::Cancel(args) => runtime.block_on(cancel::run(args)),
+        Command::Result(args) => runtime.block_on(result::run(args)),
         Command::Synth(args) => synth::run(args),
     }
 }

@@ -1,5 +1,7 @@
 //! Inputs as they arrive, in one message or in chunks, and as a client sends them.
 
+use std::borrow::Borrow;
+
 use super::matrix;
 use crate::domain::{FocalPrior, ImageSize, Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::rpc::proto;
@@ -198,19 +200,25 @@ pub fn to_wire(raw: &RawInput) -> proto::TrackSet {
 
 /// The observations of an input in chunks. Arrays of unequal lengths are sent as they are: the server says what is
 /// wrong with them.
-pub fn chunks(raw: &RawInput) -> impl Iterator<Item = proto::TrackSetChunk> + '_ {
+pub fn chunks<R: Borrow<RawInput>>(raw: R) -> impl Iterator<Item = proto::TrackSetChunk> {
     fn slice<T: Clone>(values: &[T], from: usize) -> Vec<T> {
         values.iter().skip(from).take(CHUNK_OBSERVATIONS).cloned().collect()
     }
-    let lengths = [raw.view.len(), raw.track.len(), raw.x.len(), raw.y.len(), raw.depth.len()];
-    let longest = lengths.into_iter().max().unwrap_or(0);
-    (0..longest).step_by(CHUNK_OBSERVATIONS).map(|from| proto::TrackSetChunk {
-        view: slice(&raw.view, from),
-        track: slice(&raw.track, from),
-        x: slice(&raw.x, from),
-        y: slice(&raw.y, from),
-        sigma: Vec::new(),
-        depth: slice(&raw.depth, from),
+    let longest = {
+        let raw = raw.borrow();
+        let lengths = [raw.view.len(), raw.track.len(), raw.x.len(), raw.y.len(), raw.depth.len()];
+        lengths.into_iter().max().unwrap_or(0)
+    };
+    (0..longest).step_by(CHUNK_OBSERVATIONS).map(move |from| {
+        let raw = raw.borrow();
+        proto::TrackSetChunk {
+            view: slice(&raw.view, from),
+            track: slice(&raw.track, from),
+            x: slice(&raw.x, from),
+            y: slice(&raw.y, from),
+            sigma: Vec::new(),
+            depth: slice(&raw.depth, from),
+        }
     })
 }
 
