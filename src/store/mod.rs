@@ -8,8 +8,8 @@ pub mod query;
 pub mod record;
 pub mod sqlite;
 
-// #[cfg(test)]
-// mod contract;
+#[cfg(test)]
+mod contract;
 
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
