@@ -9,8 +9,8 @@ pub mod record;
 pub mod sqlite;
 pub mod timed;
 
-// #[cfg(test)]
-// mod contract;
+#[cfg(test)]
+mod contract;
 
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
