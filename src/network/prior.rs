@@ -12,6 +12,11 @@ use crate::domain::{Backend, Losses};
 /// Share of the planned iterations after which L_DAQ acts on the weights. Earlier it pulls them into false minima: mean
 /// F1 .80 against .995 at 90 % outliers.
 pub const DAQ_ONSET: f64 = 0.6;
+/// Learning rate of log f as a multiple of the network's. Adam moves a parameter by about one rate a step, and log f may
+/// have to travel .6: at the network's own 1e-3 it does not arrive. Median focal error after 300 iterations at 50, 70
+/// and 90 % outliers (20 scenes each): 1.2, 1.9 and 6.0 % at the network's rate, .1, .2 and .5 % at five times, no
+/// better at twenty.
+const FOCAL_RATE: f32 = 5.0;
 /// Weight of every track before the first step: the network's logits start near 0.
 const INITIAL_WEIGHT: f64 = 0.5;
 
@@ -98,7 +103,7 @@ impl PriorNetwork {
             }
         }
         if self.settings.use_daq {
-            self.replaced_gradients += self.log_focal.step(&[log_focal], rate);
+            self.replaced_gradients += self.log_focal.step(&[log_focal], FOCAL_RATE * rate);
         }
         self.iteration += 1;
         Ok(Iteration { iteration: self.iteration, losses })

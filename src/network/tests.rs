@@ -6,6 +6,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{DAQ_ONSET, Error, Iteration, NetworkSettings, PriorNetwork};
 use crate::domain::Backend;
+use crate::synthetic::metrics::agreement;
 use crate::synthetic::scene::IMAGE_SIDE_PX;
 use crate::synthetic::{Scene, SceneOptions};
 
@@ -75,26 +76,44 @@ fn distance(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).fold(0.0f64, |largest, (a, b)| largest.max((a - b).abs()))
 }
 
-/// Measured over 20 seeds at each share, 300 iterations: 1.0 throughout, but for single seeds at 95 % outliers.
+/// Measured over 20 seeds: mean precision of the top 8 is 1.0 after 25 iterations at 50 % outliers, .98 to .99 after 50
+/// at 90 %, .94 after 150 at 95 %, where 10 of the 200 tracks are inliers.
 #[test]
 fn the_largest_weights_belong_to_inliers() {
-    for (outliers, steps, least) in [(0.5, 50, 0.9), (0.9, 150, 0.9), (0.95, 300, 0.8)] {
-        let mut sum = 0.0;
+    for (outliers, steps, least) in [(0.5, 25, 0.95), (0.9, 50, 0.9), (0.95, 150, 0.8)] {
         let seeds = 0..5;
-        for seed in seeds.clone() {
+        let of_seed = |seed| {
             let scene = contaminated_scene(10, 200, outliers, seed);
             let mut network = network(&balanced_matrix(&scene), &settings(Backend::Flex, seed));
             run(&mut network, steps);
-            sum += precision_at(8, network.weights(), &scene.truth.inlier);
-        }
-        let mean = sum / seeds.count() as f64;
-        assert!(mean >= least, "mean precision of the top 8 is {mean} at {outliers} outliers after {steps} iterations");
+            precision_at(8, network.weights(), &scene.truth.inlier)
+        };
+        let all: Vec<f64> = seeds.clone().map(of_seed).collect();
+        let mean = all.iter().sum::<f64>() / all.len() as f64;
+        assert!(mean >= least, "precision of the top 8 of seeds {seeds:?} is {all:?} at {outliers} after {steps}");
     }
 }
 
-/// Weights of the backends apart after twenty iterations: rounding differs between their sums, and Adam turns the sign
-/// of a gradient near 0 into a whole step.
-const MAX_BACKEND_DRIFT: f64 = 0.01;
+/// The paper's own output, weights above 1/2 and the focal length: over 20 seeds at 90 % outliers the mean F1 is .99
+/// and the median focal error .5 %.
+#[test]
+fn a_full_run_separates_and_calibrates() {
+    for seed in 0..2 {
+        let scene = contaminated_scene(10, 200, 0.9, seed);
+        let mut network = network(&balanced_matrix(&scene), &settings(Backend::Flex, seed));
+        let last = run(&mut network, 300);
+        let kept: Vec<bool> = network.weights().iter().map(|&w| w > 0.5).collect();
+        let score = agreement(&kept, &scene.truth.inlier);
+        let focal_error = network.focal() * f64::from(IMAGE_SIDE_PX) / scene.truth.focal_px - 1.0;
+        assert!(score.f1 > 0.9, "seed {seed}: {score:?}");
+        assert!(focal_error.abs() < 0.05, "seed {seed}: focal length off by {focal_error}");
+        assert!(last.losses.daq < 1.0, "seed {seed}: L_DAQ {}", last.losses.daq);
+    }
+}
+
+/// Weights of the backends apart after twenty iterations; 1e-7 was measured, a few units in the last place of f32. The
+/// room is for other processors' order of summation.
+const MAX_BACKEND_DRIFT: f64 = 1e-3;
 
 /// Forward and backward of one iteration, then twenty with L_DAQ from the first.
 #[test]
@@ -117,9 +136,11 @@ fn backends_agree() {
         assert!(norm(a) > 0.0, "array {index} has no gradient");
         assert!(norm(&difference) <= 1e-4 * norm(a), "array {index}: {} of {}", norm(&difference), norm(a));
     }
+    let before = flex.weights().to_vec();
     run(&mut flex, 20);
     run(&mut ndarray, 20);
     let apart = distance(flex.weights(), ndarray.weights());
+    assert!(distance(flex.weights(), &before) > 0.01, "twenty iterations moved nothing");
     assert!(apart < MAX_BACKEND_DRIFT, "weights differ by {apart} after twenty iterations");
 }
 
