@@ -1,1 +1,99 @@
 //! Bundle adjustment by Levenberg-Marquardt on the Schur complement of the points, projective and metric.
+//!
+//! One engine serves both problems; what they share (observations, robust loss, options, report) lives here. May
+//! depend on nothing of `geometry` but linear algebra.
+//!
+//! Image coordinates are normalised throughout: pixels minus the guessed principal point, over the larger image side.
+
+mod cholesky;
+mod covariance;
+mod engine;
+pub mod metric;
+pub mod projective;
+mod reduced;
+#[cfg(test)]
+pub(crate) mod testing;
+
+use nalgebra::Vector2;
+
+/// One image point, as indices into the slices of cameras and points that are adjusted together.
+///
+/// Observations with an index out of range or a coordinate that is not finite are ignored.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Observation {
+    pub camera: usize,
+    pub point: usize,
+    /// Normalised image coordinates.
+    pub xy: Vector2<f64>,
+}
+
+/// What a residual costs, as a function of its norm `r` in normalised image units.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Loss {
+    /// `r^2`
+    Squared,
+    /// `s^2 ln(1 + r^2 / s^2)` with `s` the scale; iteratively reweighted.
+    Cauchy { scale: f64 },
+}
+
+impl Loss {
+    /// Cost of a residual of this squared norm.
+    #[inline]
+    pub fn cost(self, squared: f64) -> f64 {
+        match self {
+            Loss::Squared => squared,
+            Loss::Cauchy { scale } => scale * scale * (squared / (scale * scale)).ln_1p(),
+        }
+    }
+
+    /// Factor on residual and Jacobian that makes least squares follow the loss: the root of its derivative.
+    #[inline]
+    pub fn root_weight(self, squared: f64) -> f64 {
+        match self {
+            Loss::Squared => 1.0,
+            Loss::Cauchy { scale } => (1.0 + squared / (scale * scale)).sqrt().recip(),
+        }
+    }
+}
+
+/// How to adjust.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Options {
+    /// Accepted steps at most.
+    pub max_iterations: usize,
+    /// Ends when a step lowers the cost by less than this share of it.
+    pub relative_tolerance: f64,
+    /// First damping, relative to the diagonal of the normal equations.
+    pub initial_damping: f64,
+    pub loss: Loss,
+}
+
+impl Options {
+    /// Plain least squares with these iterations.
+    pub fn squared(max_iterations: usize) -> Self {
+        Self { max_iterations, ..Self::default() }
+    }
+
+    /// Cauchy loss of this scale (normalised image units) with these iterations.
+    pub fn cauchy(scale: f64, max_iterations: usize) -> Self {
+        Self { max_iterations, loss: Loss::Cauchy { scale }, ..Self::default() }
+    }
+}
+
+impl Default for Options {
+    /// Converges from an algebraic solution: 30 steps are rarely used up, and a cost that moves by less than 1e-7 is
+    /// far below the noise it is compared with.
+    fn default() -> Self {
+        Self { max_iterations: 30, relative_tolerance: 1e-7, initial_damping: 1e-4, loss: Loss::Squared }
+    }
+}
+
+/// What an adjustment did.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Report {
+    /// Sum of the loss over the observations, before and after.
+    pub initial_cost: f64,
+    pub cost: f64,
+    /// Accepted steps.
+    pub iterations: usize,
+}

@@ -1,0 +1,180 @@
+//! The Levenberg-Marquardt loop, and what a problem has to say for it to run.
+
+use nalgebra::{SMatrix, SVector, Vector2};
+
+use super::reduced::{Linearisation, Reduced};
+use super::{Loss, Observation, Options, Report};
+use crate::domain::StopToken;
+
+/// Squared residual at which an observation counts as undefined (depth zero or nearly so, not a number): a million
+/// image sides. It then costs just this and pulls at nothing, so that costs stay finite and comparable.
+const UNDEFINED_SQUARED: f64 = 1e12;
+/// Dampings tried for one step before the state is declared a minimum; they span 8^8 = 1.7e7.
+const MAX_ATTEMPTS: usize = 8;
+/// Factor on the damping after a rejected step, and its divisor after an accepted one.
+const DAMPING_UP: f64 = 8.0;
+const DAMPING_DOWN: f64 = 5.0;
+/// Least damping: below it, rounding in the gauge directions would be amplified into the step.
+const MIN_DAMPING: f64 = 1e-10;
+
+/// Derivatives of one residual, transposed: column `k` is the gradient of residual component `k`.
+#[derive(Debug, Clone)]
+pub(super) struct Jacobian<const G: usize, const C: usize, const P: usize> {
+    pub globals: SMatrix<f64, G, 2>,
+    pub camera: SMatrix<f64, C, 2>,
+    pub point: SMatrix<f64, P, 2>,
+}
+
+/// Takes residuals (predicted minus observed) and, if it wants them, their derivatives.
+///
+/// A problem writes residual and Jacobian once; the cost, the normal equations and the test by finite differences
+/// are sinks of the same code.
+pub(super) trait Sink<const G: usize, const C: usize, const P: usize> {
+    fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>);
+}
+
+/// A change of the unknowns in the tangent space.
+#[derive(Debug, Clone)]
+pub(super) struct Step<const G: usize, const C: usize, const P: usize> {
+    pub globals: SVector<f64, G>,
+    pub cameras: Vec<SVector<f64, C>>,
+    pub points: Vec<SVector<f64, P>>,
+}
+
+impl<const G: usize, const C: usize, const P: usize> Step<G, C, P> {
+    pub fn zeros(cameras: usize, points: usize) -> Self {
+        Self {
+            globals: SVector::zeros(),
+            cameras: vec![SVector::zeros(); cameras],
+            points: vec![SVector::zeros(); points],
+        }
+    }
+
+    fn is_finite(&self) -> bool {
+        let finite = |values: &[f64]| values.iter().all(|value| value.is_finite());
+        finite(self.globals.as_slice())
+            && self.cameras.iter().all(|camera| finite(camera.as_slice()))
+            && self.points.iter().all(|point| finite(point.as_slice()))
+    }
+}
+
+/// A bundle adjustment: `G` unknowns shared by all views, `C` a camera, `P` a point.
+pub(super) trait Problem<const G: usize, const C: usize, const P: usize>: Clone {
+    fn camera_count(&self) -> usize;
+    fn point_count(&self) -> usize;
+    /// Hands the residual of one observation, and its Jacobian on demand, to `sink`.
+    fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, C, P>);
+    /// Overwrites `self` with `from` moved by `step`; both have the same counts.
+    fn retract(&mut self, from: &Self, step: &Step<G, C, P>);
+    /// Direction in which a homogeneous camera moves without changing any residual; zero where there is none.
+    fn camera_gauge(&self, _camera: usize) -> SVector<f64, C> {
+        SVector::zeros()
+    }
+    /// The same for a homogeneous point.
+    fn point_gauge(&self, _point: usize) -> SVector<f64, P> {
+        SVector::zeros()
+    }
+}
+
+/// Observations sorted by point, then camera; observations of point `j` are `starts[j]..starts[j + 1]`.
+#[derive(Debug, Clone)]
+pub(super) struct Layout {
+    pub observations: Vec<Observation>,
+    pub starts: Vec<usize>,
+}
+
+impl Layout {
+    pub fn new(observations: &[Observation], cameras: usize, points: usize) -> Self {
+        let mut kept: Vec<Observation> = observations
+            .iter()
+            .filter(|seen| seen.camera < cameras && seen.point < points && seen.xy.iter().all(|x| x.is_finite()))
+            .copied()
+            .collect();
+        kept.sort_by_key(|seen| (seen.point, seen.camera));
+        let mut starts = vec![0; points + 1];
+        for seen in &kept {
+            starts[seen.point + 1] += 1;
+        }
+        for point in 0..points {
+            starts[point + 1] += starts[point];
+        }
+        Self { observations: kept, starts }
+    }
+}
+
+/// Whether a residual can be used: finite, and not at a depth of (nearly) zero.
+pub(super) fn usable_squared_norm(residual: &Vector2<f64>) -> Option<f64> {
+    let squared = residual.norm_squared();
+    // Written so that NaN fails.
+    (squared < UNDEFINED_SQUARED).then_some(squared)
+}
+
+/// Sums the loss.
+struct Cost {
+    loss: Loss,
+    sum: f64,
+}
+
+impl<const G: usize, const C: usize, const P: usize> Sink<G, C, P> for Cost {
+    #[inline]
+    fn take(&mut self, residual: Vector2<f64>, _jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+        self.sum += self.loss.cost(usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
+    }
+}
+
+fn cost<const G: usize, const C: usize, const P: usize>(
+    problem: &impl Problem<G, C, P>,
+    layout: &Layout,
+    loss: Loss,
+) -> f64 {
+    let mut total = Cost { loss, sum: 0.0 };
+    for seen in &layout.observations {
+        problem.observe(seen, &mut total);
+    }
+    total.sum
+}
+
+/// Minimises the loss over all unknowns, starting from and ending in `problem`.
+///
+/// The cost never rises. `stop` is asked before every step; a stopped, stuck or degenerate problem keeps its last
+/// good state.
+pub(super) fn minimise<const G: usize, const C: usize, const P: usize>(
+    problem: &mut impl Problem<G, C, P>,
+    observations: &[Observation],
+    options: &Options,
+    stop: &StopToken,
+) -> Report {
+    let layout = Layout::new(observations, problem.camera_count(), problem.point_count());
+    let initial_cost = cost(problem, &layout, options.loss);
+    let mut report = Report { initial_cost, cost: initial_cost, iterations: 0 };
+    if layout.observations.is_empty() {
+        return report;
+    }
+    let mut linearisation = Linearisation::new(&layout, problem.camera_count());
+    let mut reduced = Reduced::new(&layout, problem.camera_count());
+    let mut step = Step::zeros(problem.camera_count(), problem.point_count());
+    let mut trial = problem.clone();
+    let mut damping = options.initial_damping.max(MIN_DAMPING);
+    while report.iterations < options.max_iterations && report.cost > 0.0 && !stop.is_stopped() {
+        linearisation.fill(problem, &layout, options.loss);
+        let accepted = (0..MAX_ATTEMPTS).find_map(|_| {
+            let lowered = (reduced.solve(problem, &layout, &linearisation, damping, &mut step) && step.is_finite())
+                .then(|| {
+                    trial.retract(problem, &step);
+                    cost(&trial, &layout, options.loss)
+                })
+                .filter(|cost| *cost < report.cost);
+            damping = if lowered.is_some() { (damping / DAMPING_DOWN).max(MIN_DAMPING) } else { damping * DAMPING_UP };
+            lowered
+        });
+        let Some(cost) = accepted else { break };
+        std::mem::swap(problem, &mut trial);
+        let gain = report.cost - cost;
+        report.cost = cost;
+        report.iterations += 1;
+        if gain < options.relative_tolerance * cost {
+            break;
+        }
+    }
+    report
+}
