@@ -11,6 +11,8 @@ const LEFT: f64 = 56.0;
 const RIGHT: f64 = 14.0;
 const TOP: f64 = 30.0;
 const BOTTOM: f64 = 34.0;
+/// Room for the name of a mark.
+const MARK_NAME: f64 = 40.0;
 /// Ticks that an axis aims at.
 const TICKS: f64 = 5.0;
 /// Decades below the largest value that a logarithmic axis shows; what is smaller is drawn at its lower end.
@@ -72,17 +74,7 @@ impl LineChart<'_> {
         let x = axis(all().map(|(x, _)| x), LEFT, WIDTH - RIGHT, 0.0);
         let y = axis(all().map(|(_, y)| y), HEIGHT - BOTTOM, TOP, 0.06);
         self.frame(&mut svg, &x, &y);
-        for (position, name) in &self.marks {
-            let at = x.place(*position);
-            if (LEFT..=WIDTH - RIGHT).contains(&at) {
-                let _ = write!(
-                    svg,
-                    "<line class=\"mark\" x1=\"{at:.1}\" x2=\"{at:.1}\" y1=\"{TOP}\" y2=\"{:.1}\"/>",
-                    HEIGHT - BOTTOM
-                );
-                text(&mut svg, at + 3.0, TOP + 9.0, "start", "tiny", name);
-            }
-        }
+        self.draw_marks(&mut svg, &x);
         for (index, (_, points)) in series.iter().enumerate() {
             let path: Vec<String> =
                 points.iter().map(|&(px, py)| format!("{:.1},{:.1}", x.place(px), y.place(py))).collect();
@@ -122,6 +114,23 @@ impl LineChart<'_> {
             text(svg, x.place(tick), HEIGHT - BOTTOM + 14.0, "middle", "tick", &short(tick));
         }
         text(svg, (LEFT + WIDTH - RIGHT) / 2.0, HEIGHT - 5.0, "middle", "mute", self.x_label);
+    }
+
+    /// Vertical lines, named above the plot where there is room.
+    fn draw_marks(&self, svg: &mut String, x: &Axis) {
+        let mut free_from = f64::NEG_INFINITY;
+        for (position, name) in &self.marks {
+            let at = x.place(*position);
+            if !(LEFT..=WIDTH - RIGHT).contains(&at) {
+                continue;
+            }
+            let bottom = HEIGHT - BOTTOM;
+            let _ = write!(svg, "<line class=\"mark\" x1=\"{at:.1}\" x2=\"{at:.1}\" y1=\"{TOP}\" y2=\"{bottom}\"/>");
+            if at >= free_from && at + MARK_NAME <= WIDTH {
+                text(svg, at, TOP - 3.0, "start", "tiny", name);
+                free_from = at + MARK_NAME;
+            }
+        }
     }
 
     fn legend(&self, svg: &mut String) {

@@ -5,7 +5,8 @@ use std::fmt::Write;
 use super::chart::{self, LineChart, Series};
 use super::html::{escape, script_json, short};
 use super::{scene, words};
-use crate::domain::{Grade, Progress, Solution, Stage, Status};
+use crate::domain::result::PriorTime;
+use crate::domain::{Grade, Losses, Progress, Solution, Status};
 use crate::formats::LabelledInput;
 use crate::formats::result_json::view_label;
 
@@ -84,16 +85,18 @@ pub fn warnings(solution: &Solution) -> String {
     html
 }
 
-/// The curves: losses over the network's iterations, the rest over the share of work done.
+/// The curves: losses over the network's iterations, the rest over the reports of the solver.
 ///
-/// Neither axis is time: two runs of one input then give the same page.
+/// Neither axis is time: two runs of one input then give the same page. Nor is it the share of work done, which stands
+/// still where the solver tries again with other views.
 pub fn convergence(solution: &Solution) -> String {
     let history = &solution.history;
-    let loss = |pick: fn(&crate::domain::Losses) -> f64| -> Vec<(f64, f64)> {
-        history.iter().filter_map(|record| Some((f64::from(record.iteration), pick(record.losses.as_ref()?)))).collect()
+    let iterations = iterations_in_all(history);
+    let loss = |pick: fn(&Losses) -> f64| -> Vec<(f64, f64)> {
+        history.iter().zip(&iterations).filter_map(|(record, &at)| Some((at, pick(record.losses.as_ref()?)))).collect()
     };
-    let over_work = |pick: fn(&Progress) -> Option<f64>| -> Vec<(f64, f64)> {
-        history.iter().filter_map(|record| Some((record.fraction, pick(record)?))).collect()
+    let over_steps = |pick: fn(&Progress) -> Option<f64>| -> Vec<(f64, f64)> {
+        history.iter().enumerate().filter_map(|(step, record)| Some((step as f64, pick(record)?))).collect()
     };
     let losses = LineChart {
         title: "Losses",
@@ -109,7 +112,7 @@ pub fn convergence(solution: &Solution) -> String {
     };
     let single = |title: &'static str, points: Vec<(f64, f64)>, clip: Option<(f64, f64)>| LineChart {
         title,
-        x_label: "share of the work done",
+        x_label: "report of the solver",
         series: vec![Series { name: title, points }],
         logarithmic: false,
         clip,
@@ -118,23 +121,51 @@ pub fn convergence(solution: &Solution) -> String {
     let clip = solution.calibrations.first().map(|camera| (camera.focal_px / FOCAL_CLIP, camera.focal_px * FOCAL_CLIP));
     let charts = [
         losses,
-        single("Inliers of the best hypothesis", over_work(|record| Some(f64::from(record.inliers))), None),
-        single("Focal length of the best hypothesis (px)", over_work(|record| record.focal_px), clip),
-        single("Score of the best hypothesis (0 best, 1 none)", over_work(|record| record.best_score), None),
+        single("Inliers of the best hypothesis", over_steps(|record| Some(f64::from(record.inliers))), None),
+        single("Focal length of the best hypothesis (px)", over_steps(|record| record.focal_px), clip),
+        single("Score of the best hypothesis (0 best, 1 none)", over_steps(|record| record.best_score), None),
     ];
     let svgs: Vec<String> = charts.iter().map(|chart| format!("<figure>{}</figure>\n", chart.svg())).collect();
     format!(
-        "<section id=\"convergence\">\n<h2>Convergence</h2>\n<div class=\"grid\">\n{}</div>\n</section>\n",
-        svgs.concat()
+        "<section id=\"convergence\">\n<h2>Convergence</h2>\n<div class=\"grid\">\n{}</div>\n{}</section>\n",
+        svgs.concat(),
+        prior_times(solution)
     )
 }
 
-/// Where on the axis of work each stage began.
+/// The network's iterations over all tries; each try counts its own from 0.
+fn iterations_in_all(history: &[Progress]) -> Vec<f64> {
+    let (mut before, mut last) = (0, 0);
+    let in_all = |record: &Progress| {
+        if record.iteration < last {
+            before += last;
+        }
+        last = record.iteration;
+        f64::from(before + last)
+    };
+    history.iter().map(in_all).collect()
+}
+
+/// Where among the reports each stage began.
 fn stage_starts(history: &[Progress]) -> Vec<(f64, &'static str)> {
-    Stage::ALL
-        .into_iter()
-        .filter_map(|stage| Some((history.iter().find(|record| record.stage == stage)?.fraction, stage.name())))
-        .collect()
+    let begins = |step: usize| step == 0 || history[step - 1].stage != history[step].stage;
+    (0..history.len()).filter(|&step| begins(step)).map(|step| (step as f64, history[step].stage.name())).collect()
+}
+
+/// What each prior alone would have needed, on one line: it holds times.
+fn prior_times(solution: &Solution) -> String {
+    if solution.prior_times.is_empty() {
+        return String::new();
+    }
+    let sentence = |time: &PriorTime| {
+        let seconds = time.seconds.map_or_else(|| "never".into(), |seconds| format!("{seconds:.2} s"));
+        format!("{} {seconds} ({} steps)", time.prior.name(), time.iterations)
+    };
+    let times: Vec<String> = solution.prior_times.iter().map(sentence).collect();
+    format!(
+        "<p class=\"note\" id=\"prior-times\">Until a consensus as good as the accepted one, each prior alone: {}.</p>\n",
+        escape(&times.join(", "))
+    )
 }
 
 /// How the weights are distributed.
@@ -256,4 +287,33 @@ pub fn views(solution: &Solution, input: Option<&LabelledInput>) -> String {
 /// What made the page.
 pub fn footer(solution: &Solution) -> String {
     format!("<footer>scpsfm {}, seed {}</footer>\n", env!("CARGO_PKG_VERSION"), solution.seed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::Stage;
+    use crate::formats::fixture;
+
+    #[test]
+    fn tries_follow_each_other_on_the_axes() {
+        let (_, solution) = fixture::solved();
+        let mut history = solution.history[..4].to_vec();
+        for (record, (iteration, stage)) in
+            history.iter_mut().zip([(25, Stage::Search), (50, Stage::Refine), (25, Stage::Search), (30, Stage::Search)])
+        {
+            (record.iteration, record.stage) = (iteration, stage);
+        }
+        assert_eq!(iterations_in_all(&history), [25.0, 50.0, 75.0, 80.0]);
+        assert_eq!(stage_starts(&history), [(0.0, "search"), (1.0, "refine"), (2.0, "search")]);
+        assert!(iterations_in_all(&[]).is_empty() && stage_starts(&[]).is_empty());
+    }
+
+    #[test]
+    fn priors_that_never_sufficed_say_so() {
+        let (_, mut solution) = fixture::solved();
+        assert!(prior_times(&solution).contains("uniform never (600 steps)"));
+        solution.prior_times.clear();
+        assert!(prior_times(&solution).is_empty());
+    }
 }

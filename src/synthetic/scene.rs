@@ -235,8 +235,8 @@ mod tests {
                 far[track] += 1;
             }
         }
-        for track in 0..options.tracks {
-            assert_eq!(far[track] == 0, scene.truth.inlier[track], "track {track}");
+        for (track, (&far, &inlier)) in far.iter().zip(&scene.truth.inlier).enumerate() {
+            assert_eq!(far == 0, inlier, "track {track}");
         }
         assert_eq!(scene.truth.inlier.iter().filter(|&&inlier| inlier).count(), 20);
     }
