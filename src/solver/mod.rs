@@ -2,6 +2,8 @@
 //!
 //! Depends on `network`, `geometry` and `domain`; knows nothing of jobs, transport or files.
 
+pub mod calibration;
+
 use crate::domain::{Input, Observer, Solution, SolveSettings, StopReason, StopToken};
 
 /// Why a solve ended without a solution. A scene that cannot be solved is a solution, not an error.
