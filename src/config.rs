@@ -7,6 +7,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::num::NonZero;
 use std::path::{Path, PathBuf};
 
+use serde::de::IntoDeserializer;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::domain::{Backend, Limits};
@@ -40,8 +41,8 @@ pub struct Server {
 impl Default for Server {
     fn default() -> Self {
         Self {
-            // Loopback: whoever opens the service to a network should have meant to.
-            listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7070),
+            // Loopback: whoever opens the service to a network should have meant to. 50051 is gRPC's customary port.
+            listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 50051),
             // Two million observations of at most 33 bytes fit into one message; larger inputs come in chunks.
             max_message_bytes: 64 << 20,
         }
@@ -59,8 +60,8 @@ pub struct Metrics {
 
 impl Default for Metrics {
     fn default() -> Self {
-        // Loopback for the same reason as the gRPC port, and the port after it.
-        Self { listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7071) }
+        // Loopback for the same reason as the gRPC port; 9464 is the customary port of such an exporter.
+        Self { listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 9464) }
     }
 }
 
@@ -87,6 +88,10 @@ pub struct Engine {
     pub workers: usize,
     /// Waiting jobs at which new ones are refused.
     pub queue_capacity: usize,
+    /// Bytes of waiting inputs at which new jobs are refused.
+    pub queue_bytes: u64,
+    /// Observations of waiting inputs at which new jobs are refused.
+    pub queue_observations: u64,
     /// Seconds without a heartbeat after which a job may be taken over.
     pub lease_seconds: u64,
     /// Seconds that running jobs get to finish once the server was told to stop; then they go back to the queue.
@@ -103,6 +108,10 @@ impl Default for Engine {
             // At about 3 s a job, what a 4-core server works off in some three minutes; beyond, a caller does better
             // to come back than to wait.
             queue_capacity: 256,
+            // Ten of the largest inputs, on a disk that should not fill up unseen.
+            queue_bytes: 1 << 30,
+            // Four of the largest inputs: what a server can work off before its callers give up.
+            queue_observations: 16_000_000,
             // Several missed heartbeats, so that a busy disk loses no lease, and still a short wait after a crash.
             lease_seconds: 15,
             // Kubernetes kills 30 s after it asks; this leaves a third of it for the rest of the exit.
@@ -129,6 +138,7 @@ impl Engine {
 pub struct Compute {
     /// `flex` or `ndarray`; a job may ask for the other. Flex, because burn deprecates ndarray in its favour and it
     /// is the faster of the two.
+    #[serde(deserialize_with = "word")]
     pub backend: Backend,
 }
 
@@ -137,6 +147,7 @@ pub struct Compute {
 #[serde(default, deny_unknown_fields)]
 pub struct Log {
     /// `human` or `json`. Human, because who starts the server by hand reads it; deploy/ sets json.
+    #[serde(deserialize_with = "word")]
     pub format: Format,
     /// Levels by module, e.g. `info,scpsfm::engine=debug`.
     pub filter: String,
@@ -228,6 +239,8 @@ impl Config {
         };
         at_least_one("server.max_message_bytes", self.server.max_message_bytes as u64)?;
         at_least_one("engine.queue_capacity", self.engine.queue_capacity as u64)?;
+        at_least_one("engine.queue_bytes", self.engine.queue_bytes)?;
+        at_least_one("engine.queue_observations", self.engine.queue_observations)?;
         at_least_one("engine.lease_seconds", self.engine.lease_seconds)?;
         at_least_one("engine.max_attempts", u64::from(self.engine.max_attempts))?;
         at_least_one("limits.max_views", self.limits.max_views as u64)?;
@@ -275,9 +288,14 @@ fn is_plain_http(endpoint: &str) -> bool {
 fn address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<SocketAddr, D::Error> {
     let text = String::deserialize(deserializer)?;
     text.parse().map_err(|_| {
-        let message = format!("`{text}` is not an IP address and port, such as 127.0.0.1:7070 or [::1]:7070");
+        let message = format!("`{text}` is not an IP address and port, such as 127.0.0.1:50051 or [::1]:50051");
         serde::de::Error::custom(message)
     })
+}
+
+/// One word of a few; the error lists them, which the `config` crate's own does not.
+fn word<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<T, D::Error> {
+    String::deserialize(deserializer).and_then(|text| T::deserialize(text.into_deserializer()))
 }
 
 #[cfg(test)]
@@ -351,7 +369,7 @@ mod tests {
         let cases: [(Result<Config, Error>, &[&str]); 9] = [
             (from_file("[engine]\nwrokers = 1\n"), &["wrokers", "workers"]),
             (from_file("[engine]\nqueue_capacity = 0\n"), &["engine.queue_capacity", "from 1 on"]),
-            (from_file("[server]\nlisten = \"localhost\"\n"), &["server.listen", "127.0.0.1:7070"]),
+            (from_file("[server]\nlisten = \"localhost\"\n"), &["server.listen", "127.0.0.1:50051"]),
             (from_file("[compute]\nbackend = \"cuda\"\n"), &["compute.backend", "flex", "ndarray"]),
             (from_file("[log]\nfilter = \"scpsfm=loud\"\n"), &["log.filter", "`info`"]),
             (from_variable("SCPSFM_ENGINE__WORKERS", "many"), &["engine.workers", "many", "environment"]),

@@ -5,12 +5,16 @@
 pub mod args;
 pub mod cancel;
 pub mod client;
+pub mod demo;
 pub mod exit;
 pub mod get;
+pub mod interrupt;
 pub mod job_view;
 pub mod list;
 pub mod progress;
 pub mod result;
+pub mod serve;
+pub mod service;
 pub mod solve;
 pub mod submit;
 pub mod summary;
@@ -39,6 +43,8 @@ pub struct Cli {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    Demo(demo::Args),
+    Serve(serve::Args),
     Solve(solve::Args),
     Submit(submit::Args),
     Watch(watch::Args),
@@ -67,6 +73,8 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         .build()
         .map_err(|error| Failure::internal(format_args!("cannot start the runtime: {error}")))?;
     match command {
+        Command::Demo(args) => runtime.block_on(demo::run(args)),
+        Command::Serve(args) => runtime.block_on(serve::run(args)),
         Command::Solve(args) => runtime.block_on(solve::run(args)),
         Command::Submit(args) => runtime.block_on(submit::run(args)),
         Command::Watch(args) => runtime.block_on(watch::run(args)),

@@ -2,10 +2,12 @@
 
 use std::path::PathBuf;
 
-use super::args::{InputArgs, SettingsArgs};
+use super::args::{InputArgs, ServerArgs, SettingsArgs};
 use super::exit::{Exit, Failure};
+use super::interrupt::Interrupt;
 use super::progress::ProgressView;
-use super::{print, summary};
+use super::{client, job_view, print, summary};
+use crate::domain::job::JobEvent;
 use crate::domain::{Limits, Solution, SolveSettings, StopReason, StopToken};
 use crate::formats::{LabelledInput, result_files};
 use crate::solver;
@@ -28,6 +30,10 @@ the input), cameras.json, points.ply and report.html (open it in a browser).";
 pub struct Args {
     #[command(flatten)]
     pub input: InputArgs,
+
+    /// Solve on this server instead of in this process
+    #[arg(long, value_name = "URL")]
+    pub server: Option<String>,
 
     /// Directory for the result files; created, files of these names in it are replaced
     #[arg(long, value_name = "DIR")]
@@ -52,7 +58,10 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     // Found out now rather than after the work.
     result_files::create_directory(&args.out)?;
     let mut progress = ProgressView::new(args.quiet);
-    let solution = in_process(&input, &settings, &mut progress)?;
+    let solution = match &args.server {
+        Some(server) => on_server(server, &input, &settings, &mut progress).await?,
+        None => in_process(&input, &settings, &mut progress)?,
+    };
     progress.finish();
     deliver(&args, &solution, &input)
 }
@@ -65,17 +74,40 @@ fn in_process(
 ) -> Result<Solution, Failure> {
     let checked = input.check(&Limits::default())?;
     let stop = StopToken::default();
-    let on_interrupt = stop.clone();
-    let listener = tokio::spawn(async move {
-        if tokio::signal::ctrl_c().await.is_ok() {
-            on_interrupt.stop(StopReason::Cancelled);
-        }
+    let interrupt = Interrupt::listen();
+    let (asked, token) = (stop.clone(), interrupt.token());
+    let relay = tokio::spawn(async move {
+        token.cancelled().await;
+        asked.stop(StopReason::Cancelled);
     });
     let outcome = tokio::task::block_in_place(|| solver::solve(&checked, settings, progress, &stop));
-    listener.abort();
+    relay.abort();
     outcome.map_err(|error| match error {
         solver::Error::Stopped(_) => Failure::interrupted(),
         solver::Error::Internal(_) => Failure::internal(error),
+    })
+}
+
+/// Solves on a server; Ctrl-C cancels the job there.
+async fn on_server(
+    server: &str,
+    input: &LabelledInput,
+    settings: &SolveSettings,
+    progress: &mut ProgressView,
+) -> Result<Solution, Failure> {
+    let server = ServerArgs { server: server.to_owned() };
+    let interrupt = Interrupt::listen();
+    let mut on_event = |event: &JobEvent| job_view::show_event(progress, event);
+    let outcome = client::solve(&server, &input.raw, settings, &mut on_event, interrupt.token()).await;
+    outcome.map_err(|error| match error {
+        // The server speaks of fields and indices; the user has lines.
+        client::Error::Invalid(violations, _)
+            if violations.iter().any(|violation| !violation.field.starts_with("settings")) =>
+        {
+            input.explain_all(&violations, 0).into()
+        }
+        client::Error::Cancelled if interrupt.token().is_cancelled() => Failure::interrupted(),
+        error => error.into(),
     })
 }
 

@@ -1,12 +1,12 @@
 //! `scpsfm synth`: the paper's scenes as files.
 
 use std::fmt::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::exit::{Exit, Failure};
 use crate::domain::RawInput;
 use crate::formats::result_files::{OBSERVATIONS, create_directory, pretty, write_atomically};
-use crate::synthetic::scene::IMAGE_SIDE_PX;
+pub use crate::synthetic::scene::IMAGE_SIDE_PX;
 use crate::synthetic::{Scene, SceneOptions, Truth};
 
 /// Name of the file that holds what the scene was made of.
@@ -98,24 +98,35 @@ struct TruthJson<'a> {
 /// Runs the command.
 pub fn run(args: Args) -> Result<Exit, Failure> {
     let scene = args.scene.generate(args.depths)?;
-    create_directory(&args.out)?;
-    write_atomically(&args.out, OBSERVATIONS, observations_csv(&scene.input).as_bytes())?;
+    write_scene(&args.out, &scene)?;
+    eprintln!("{}: {}", describe(&scene), args.out.display());
+    Ok(Exit::Done)
+}
+
+/// The scene in a line.
+pub fn describe(scene: &Scene) -> String {
+    let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
+    format!(
+        "{} views, {} tracks of which {right} are right, focal {:.1} px",
+        scene.options.views, scene.options.tracks, scene.truth.focal_px
+    )
+}
+
+/// Writes observations.csv and truth.json.
+///
+/// # Errors
+/// The file that cannot be written.
+pub fn write_scene(directory: &Path, scene: &Scene) -> Result<(), Failure> {
+    create_directory(directory)?;
+    write_atomically(directory, OBSERVATIONS, observations_csv(&scene.input).as_bytes())?;
     let truth = TruthJson {
         options: &scene.options,
         image_width_px: IMAGE_SIDE_PX,
         image_height_px: IMAGE_SIDE_PX,
         truth: &scene.truth,
     };
-    write_atomically(&args.out, TRUTH, pretty(&truth)?.as_bytes())?;
-    let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
-    eprintln!(
-        "{} views, {} tracks of which {right} are right, focal {:.1} px: {}",
-        scene.options.views,
-        scene.options.tracks,
-        scene.truth.focal_px,
-        args.out.display()
-    );
-    Ok(Exit::Done)
+    write_atomically(directory, TRUTH, pretty(&truth)?.as_bytes())?;
+    Ok(())
 }
 
 /// `view,track,x,y[,depth]`; every number as short as it reads back exactly.

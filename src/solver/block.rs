@@ -8,7 +8,7 @@ use crate::geometry::measurement::{CompleteBlock, Normalization};
 /// Tracks that a block should have: twice the eight that verification needs, for half of them may be wrong.
 const WANTED_TRACKS: usize = 16;
 /// Tracks below which no block is tried: verification needs eight inliers.
-const LEAST_TRACKS: usize = 8;
+pub const LEAST_TRACKS: usize = 8;
 /// Views below which a projective reconstruction carries no calibration worth searching for.
 pub const LEAST_VIEWS: usize = 3;
 /// Views that a block grows to. Real tracks are short: longer blocks hold few of them.
@@ -154,9 +154,7 @@ fn greedy_views(input: &Input, ranges: &[usize], least: usize) -> Vec<Vec<usize>
                 break;
             }
             views.push(next);
-            tracks.retain(|&track| {
-                (ranges[track]..ranges[track + 1]).any(|k| input.view_of(k) == next)
-            });
+            tracks.retain(|&track| (ranges[track]..ranges[track + 1]).any(|k| input.view_of(k) == next));
             if views.len() >= LEAST_VIEWS {
                 let value = count.min(ENOUGH_TRACKS) * (views.len() - 2);
                 if best.as_ref().is_none_or(|(most, _)| value > *most) {
@@ -208,7 +206,8 @@ mod tests {
 
     /// Tracks given as lists of the views that see them.
     fn input(views: usize, tracks: &[Vec<usize>]) -> Input {
-        let mut raw = RawInput { views: vec![View::default(); views], track_count: tracks.len(), ..RawInput::default() };
+        let mut raw =
+            RawInput { views: vec![View::default(); views], track_count: tracks.len(), ..RawInput::default() };
         for (track, seen) in tracks.iter().enumerate() {
             for &view in seen {
                 raw.view.push(view as u32);

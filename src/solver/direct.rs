@@ -88,8 +88,7 @@ pub fn reconstruct(block: &CompleteBlock, inlier: &[bool], noise: f64, stop: &St
     }
     let matrix = balance(&block.measurement_matrix()).select_columns(&support);
     let mut cameras = cameras_of(&dominant_subspace(&matrix, subspace::RANK)?);
-    let mut points: Vec<_> =
-        support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();
+    let mut points: Vec<_> = support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();
     let options =
         bundle::Options { max_iterations: ADJUSTMENT_ITERATIONS, loss: grow::robust(noise), ..Default::default() };
     projective::adjust(&mut cameras, &mut points, &grow::observations_of(block, &support), &options, stop);

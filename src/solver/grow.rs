@@ -252,8 +252,7 @@ pub fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToke
         let noise = estimate_noise(&current, &inliers).clamp(NOISE_BOUNDS.0, NOISE_BOUNDS.1);
         let settled = (noise / current.noise - 1.0).abs() < NOISE_SETTLED;
         let points = inliers.iter().map(|&track| current.points[track]).collect();
-        let cameras =
-            adjust(block, &current.cameras, points, &inliers, robust(noise), ADJUSTMENTS.0, stop);
+        let cameras = adjust(block, &current.cameras, points, &inliers, robust(noise), ADJUSTMENTS.0, stop);
         let refitted = polish(block, judge(block, cameras, noise), stop);
         // A noise level at which the consensus falls apart was estimated from a fit too flexible to trust.
         if refitted.inlier_count() < LEAST_SUPPORT + 1 {

@@ -76,9 +76,8 @@ pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry) -> Judged {
     // Triangulation wants a slice; unregistered views are never sighted.
     let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
     for track in 0..count {
-        let seen: Vec<usize> = (ranges[track]..ranges[track + 1])
-            .filter(|&k| geometry.cameras[input.view_of(k)].is_some())
-            .collect();
+        let seen: Vec<usize> =
+            (ranges[track]..ranges[track + 1]).filter(|&k| geometry.cameras[input.view_of(k)].is_some()).collect();
         if seen.len() < LEAST_RETAINED {
             continue;
         }
@@ -117,12 +116,7 @@ fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry) 
         let residual = |&k: &usize| {
             triangulation::reprojection(&cameras[sightings[k].view], &point, &sightings[k].xy).norm_squared()
         };
-        let Some((place, worst)) = retained
-            .iter()
-            .map(residual)
-            .enumerate()
-            .max_by(|a, b| a.1.total_cmp(&b.1))
-        else {
+        let Some((place, worst)) = retained.iter().map(residual).enumerate().max_by(|a, b| a.1.total_cmp(&b.1)) else {
             break;
         };
         if worst <= gate {

@@ -34,7 +34,7 @@ const SHORTLIST: usize = 2;
 const LN_DECISIVE: f64 = -40.0;
 const LN_ACCEPTABLE: f64 = -7.0;
 /// Inliers that geometry can verify: one more than determine the cameras.
-const LEAST_INLIERS: usize = LEAST_SUPPORT + 1;
+pub const LEAST_INLIERS: usize = LEAST_SUPPORT + 1;
 
 /// What the search found.
 pub struct Found {
@@ -139,9 +139,9 @@ impl<'a> Portfolio<'a> {
             self.propose(Prior::Uniform, &vec![1.0; self.block.tracks()]);
             self.stand(recorder);
             recorder.tell(f64::from(round + 1) / f64::from(rounds));
-            let seen_enough = network.as_ref().is_none_or(|network| {
-                network.iteration() >= LEAST_ITERATIONS.min(self.settings.iterations)
-            });
+            let seen_enough = network
+                .as_ref()
+                .is_none_or(|network| network.iteration() >= LEAST_ITERATIONS.min(self.settings.iterations));
             if (seen_enough && self.is_decisive()) || self.stop.is_stopped() {
                 break;
             }
@@ -183,9 +183,7 @@ impl<'a> Portfolio<'a> {
     fn propose_geometric(&mut self) {
         let begun = Instant::now();
         let (irls, consistency) = match &self.search {
-            Search::Affine(search) => {
-                (priors::affine_irls(search.centred()), priors::consistency(search.centred(), 2))
-            }
+            Search::Affine(search) => (priors::affine_irls(search.centred()), priors::consistency(search.centred(), 2)),
             Search::Subspace(search) => {
                 let centred = centred_rows(search.balanced());
                 (priors::irls(search.balanced(), subspace::RANK), priors::consistency(&centred, 3))
@@ -292,9 +290,8 @@ impl<'a> Portfolio<'a> {
 
     fn finish(self, network: Option<PriorNetwork>) -> Found {
         let Self { best, accounts, spread, .. } = self;
-        let accepted = best.filter(|(best, _)| {
-            best.inlier_count() >= LEAST_INLIERS && best.ln_false_alarms(spread) < LN_ACCEPTABLE
-        });
+        let accepted = best
+            .filter(|(best, _)| best.inlier_count() >= LEAST_INLIERS && best.ln_false_alarms(spread) < LN_ACCEPTABLE);
         let with_network = network.is_some();
         let prior_times = accounts
             .into_iter()
@@ -328,13 +325,12 @@ fn prior_time(account: &Account, accepted: Option<&Consensus>) -> PriorTime {
 }
 
 /// Root mean squared deviation of the image points from their view's mean, one coordinate, normalised units.
-fn spread(block: &CompleteBlock) -> f64 {
+pub fn spread(block: &CompleteBlock) -> f64 {
     let mut squared = 0.0;
     for view in 0..block.views() {
         let count = block.tracks().max(1) as f64;
         let mean = (0..block.tracks()).map(|track| block.point(view, track)).sum::<nalgebra::Vector2<f64>>() / count;
-        let deviation: f64 =
-            (0..block.tracks()).map(|track| (block.point(view, track) - mean).norm_squared()).sum();
+        let deviation: f64 = (0..block.tracks()).map(|track| (block.point(view, track) - mean).norm_squared()).sum();
         squared += deviation / (2.0 * count);
     }
     (squared / block.views().max(1) as f64).sqrt().max(f64::MIN_POSITIVE)

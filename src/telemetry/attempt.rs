@@ -12,6 +12,7 @@ use crate::domain::job::{JobName, JobState};
 /// An attempt that runs: its span, its stages and the busy worker. Dropped without [`Attempt::end`] (an early return,
 /// a panic), it counts as one that did not end its job.
 #[must_use = "the attempt ends when this is dropped"]
+#[derive(Debug)]
 pub struct Attempt {
     span: Span,
     current: Option<CurrentStage>,
@@ -19,6 +20,7 @@ pub struct Attempt {
     _busy: Held,
 }
 
+#[derive(Debug)]
 struct CurrentStage {
     stage: Stage,
     begun: Instant,

@@ -346,12 +346,12 @@ pub fn build_info(backend: &'static str) {
 }
 
 /// Tells how many jobs wait. Call it from one task only, after reading the store: the last call wins.
-pub fn queue_depth(jobs: usize) {
+pub fn queue_depth(jobs: u64) {
     gauge!(QUEUE_DEPTH.name).set(jobs as f64);
 }
 
 /// Tells how many jobs may wait and how many threads work; once, at the start of the engine.
-pub fn engine_size(queue_capacity: usize, workers: usize) {
+pub fn engine_size(queue_capacity: u64, workers: usize) {
     gauge!(QUEUE_CAPACITY.name).set(queue_capacity as f64);
     gauge!(WORKERS.name).set(workers as f64);
 }
@@ -404,6 +404,7 @@ pub fn attempt_lost(reason: AttemptLost) {
 
 /// Holds a gauge one higher for as long as it lives, whatever way its scope is left.
 #[must_use = "the gauge falls when this is dropped"]
+#[derive(Debug)]
 pub struct Held(metrics::Gauge);
 
 impl Held {
@@ -479,3 +480,6 @@ impl Drop for StoreTimer {
         histogram!(STORE_DURATION.name, "operation" => self.operation).record(self.begun.elapsed().as_secs_f64());
     }
 }
+
+#[cfg(test)]
+mod tests;

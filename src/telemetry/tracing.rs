@@ -69,7 +69,8 @@ pub enum Error {
     AlreadySet,
 }
 
-/// Ends the export: sends what is left when dropped. Drop it while the runtime still runs.
+/// Ends the export: sends what is left when dropped, which may block for seconds. Drop it while the runtime, of more
+/// than one thread, still runs: the connection to the collector lives there.
 #[must_use = "traces are flushed when this is dropped"]
 #[derive(Debug)]
 pub struct Guard {
@@ -202,3 +203,10 @@ pub fn attempt_span(job: &JobName, attempt: u32, traceparent: Option<&str>) -> S
 pub fn stage_span(attempt: &Span, stage: Stage) -> Span {
     error_span!(target: SCOPE, parent: attempt, "stage", otel.name = stage.name(), stage = stage.name())
 }
+
+#[cfg(test)]
+#[path = "../../tests/it/support/collector.rs"]
+mod collector;
+
+#[cfg(test)]
+mod tests;

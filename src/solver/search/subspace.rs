@@ -86,7 +86,10 @@ impl Search {
 
     fn truncated_cost(&self, basis: &DMatrix<f64>) -> f64 {
         let truncation = self.tolerance * self.tolerance;
-        subspace_residuals(&self.balanced, basis).iter().map(|residual| (residual * residual / truncation).min(1.0)).sum()
+        subspace_residuals(&self.balanced, basis)
+            .iter()
+            .map(|residual| (residual * residual / truncation).min(1.0))
+            .sum()
     }
 
     /// Truncated cost plus the weighted DAQ residual of the cameras in the subspace.
@@ -128,14 +131,8 @@ impl Search {
     pub fn seed_from_basis(&self, block: &CompleteBlock, basis: &DMatrix<f64>) -> Seed {
         let support = nearest(&subspace_residuals(&self.balanced, basis), self.tolerance);
         let cameras = cameras_of(basis);
-        let points =
-            support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();
+        let points = support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();
         Seed { cameras, points, support }
-    }
-
-    /// The columns within the tolerance of a seed's subspace decide by depths alone whether a track is right.
-    pub fn tolerance(&self) -> f64 {
-        self.tolerance
     }
 }
 

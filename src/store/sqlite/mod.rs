@@ -6,6 +6,8 @@
 mod attempts;
 mod jobs;
 mod rows;
+#[cfg(test)]
+mod tests;
 
 use std::fs::{File, TryLockError};
 use std::path::Path;
