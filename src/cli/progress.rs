@@ -11,7 +11,7 @@ const BAR_STEPS: u64 = 1_000;
 /// Plain lines appear at a change of stage, after this share of the work, ...
 const LINE_EVERY_SHARE: f64 = 0.1;
 /// ... or after this many seconds, ...
-const LINE_EVERY_SECONDS: f64 = 0.5;
+const LINE_EVERY_SECONDS: f64 = 0.2;
 /// ... but not before this share of the time already spent: short jobs show that they live, hour-long ones fill no log.
 const LINE_EVERY_SPENT: f64 = 0.1;
 
