@@ -73,7 +73,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let service = Service::start(&config(data.path())).await?;
     let server = ServerArgs { server: format!("http://{}", service.address()) };
     progress.state(&format!("server: {}, store in {}", server.server, data.path().display()));
-    let interrupt = Interrupt::listen();
+    let interrupt = Interrupt::listen()?;
     let mut on_event = |event: &JobEvent| job_view::show_event(&mut progress, event);
     let settings = SolveSettings::default();
     let outcome = client::solve(&server, &scene.input, &settings, &mut on_event, interrupt.token()).await;

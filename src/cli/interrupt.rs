@@ -1,11 +1,11 @@
-//! Ctrl-C as a token.
+//! Ctrl-C and SIGTERM, in order.
 
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
-use super::exit::Exit;
+use super::exit::{Exit, Failure};
 
-/// While this lives, the first Ctrl-C cancels its token, and the second ends the process.
+/// While this lives, the first SIGINT or SIGTERM cancels its token, and the second ends the process.
 pub struct Interrupt {
     token: CancellationToken,
     listener: JoinHandle<()>,
@@ -13,23 +13,24 @@ pub struct Interrupt {
 
 impl Interrupt {
     /// Listens from now on. To be called within a runtime.
-    pub fn listen() -> Self {
+    ///
+    /// # Errors
+    /// The operating system refuses.
+    pub fn listen() -> Result<Self, Failure> {
+        let mut signals = Signals::listen()?;
         let token = CancellationToken::new();
         let cancels = token.clone();
         let listener = tokio::spawn(async move {
-            if tokio::signal::ctrl_c().await.is_err() {
-                return;
-            }
+            signals.next().await;
             cancels.cancel();
-            if tokio::signal::ctrl_c().await.is_ok() {
-                // Stopping in order was asked for and takes too long for whoever asks twice.
-                std::process::exit(Exit::Interrupted as i32);
-            }
+            signals.next().await;
+            // Stopping in order was asked for and takes too long for whoever asks twice.
+            std::process::exit(Exit::Interrupted as i32);
         });
-        Self { token, listener }
+        Ok(Self { token, listener })
     }
 
-    /// Cancelled by Ctrl-C.
+    /// Cancelled by the first signal.
     pub fn token(&self) -> CancellationToken {
         self.token.clone()
     }
@@ -38,5 +39,43 @@ impl Interrupt {
 impl Drop for Interrupt {
     fn drop(&mut self) {
         self.listener.abort();
+    }
+}
+
+/// SIGTERM and SIGINT.
+pub struct Signals {
+    #[cfg(unix)]
+    terminate: tokio::signal::unix::Signal,
+    #[cfg(unix)]
+    interrupt: tokio::signal::unix::Signal,
+}
+
+impl Signals {
+    /// From now on, the signals are ours.
+    #[cfg(unix)]
+    pub fn listen() -> Result<Self, Failure> {
+        use tokio::signal::unix::{SignalKind, signal};
+        Ok(Self { terminate: signal(SignalKind::terminate())?, interrupt: signal(SignalKind::interrupt())? })
+    }
+
+    /// Waits for the next one.
+    #[cfg(unix)]
+    pub async fn next(&mut self) {
+        tokio::select! {
+            _ = self.terminate.recv() => {}
+            _ = self.interrupt.recv() => {}
+        }
+    }
+
+    #[cfg(not(unix))]
+    pub fn listen() -> Result<Self, Failure> {
+        Ok(Self {})
+    }
+
+    #[cfg(not(unix))]
+    pub async fn next(&mut self) {
+        if tokio::signal::ctrl_c().await.is_err() {
+            std::future::pending::<()>().await;
+        }
     }
 }

@@ -6,6 +6,7 @@ use clap::ValueEnum;
 
 use super::args::BackendArg;
 use super::exit::{Exit, Failure};
+use super::interrupt::Signals;
 use super::print;
 use super::service::Service;
 use crate::config::Config;
@@ -140,44 +141,6 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     tracing::info!(finished = drained.finished, given_back = drained.given_back, "drained");
     metrics.shutdown().await;
     Ok(Exit::Done)
-}
-
-/// SIGTERM and SIGINT.
-struct Signals {
-    #[cfg(unix)]
-    terminate: tokio::signal::unix::Signal,
-    #[cfg(unix)]
-    interrupt: tokio::signal::unix::Signal,
-}
-
-impl Signals {
-    /// From now on, the signals are ours.
-    #[cfg(unix)]
-    fn listen() -> Result<Self, Failure> {
-        use tokio::signal::unix::{SignalKind, signal};
-        Ok(Self { terminate: signal(SignalKind::terminate())?, interrupt: signal(SignalKind::interrupt())? })
-    }
-
-    /// Waits for the next one.
-    #[cfg(unix)]
-    async fn next(&mut self) {
-        tokio::select! {
-            _ = self.terminate.recv() => {}
-            _ = self.interrupt.recv() => {}
-        }
-    }
-
-    #[cfg(not(unix))]
-    fn listen() -> Result<Self, Failure> {
-        Ok(Self {})
-    }
-
-    #[cfg(not(unix))]
-    async fn next(&mut self) {
-        if tokio::signal::ctrl_c().await.is_err() {
-            std::future::pending::<()>().await;
-        }
-    }
 }
 
 #[cfg(test)]

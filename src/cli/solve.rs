@@ -74,7 +74,7 @@ fn in_process(
 ) -> Result<Solution, Failure> {
     let checked = input.check(&Limits::default())?;
     let stop = StopToken::default();
-    let interrupt = Interrupt::listen();
+    let interrupt = Interrupt::listen()?;
     let (asked, token) = (stop.clone(), interrupt.token());
     let relay = tokio::spawn(async move {
         token.cancelled().await;
@@ -96,7 +96,7 @@ async fn on_server(
     progress: &mut ProgressView,
 ) -> Result<Solution, Failure> {
     let server = ServerArgs { server: server.to_owned() };
-    let interrupt = Interrupt::listen();
+    let interrupt = Interrupt::listen()?;
     let mut on_event = |event: &JobEvent| job_view::show_event(progress, event);
     let outcome = client::solve(&server, &input.raw, settings, &mut on_event, interrupt.token()).await;
     outcome.map_err(|error| match error {

@@ -1,6 +1,5 @@
 //! Reading `observations.csv`: `view,track,x,y[,depth]`, one observation a line.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -326,9 +325,11 @@ impl Table {
 
 /// The distinct ids, ascending, and the position of each entry's id among them.
 fn dense(ids: &[u64]) -> (Vec<u64>, Vec<u32>) {
-    let labels: Vec<u64> = ids.iter().copied().collect::<BTreeSet<u64>>().into_iter().collect();
-    let position: BTreeMap<u64, u32> = labels.iter().zip(0u32..).map(|(&label, position)| (label, position)).collect();
-    let indices = ids.iter().filter_map(|id| position.get(id).copied()).collect();
+    let mut labels = ids.to_vec();
+    labels.sort_unstable();
+    labels.dedup();
+    // Every id is among the labels, and the limits keep their number within 32 bits.
+    let indices = ids.iter().map(|id| labels.partition_point(|label| label < id) as u32).collect();
     (labels, indices)
 }
 

@@ -16,7 +16,7 @@ const MARK_NAME: f64 = 40.0;
 /// Ticks that an axis aims at.
 const TICKS: f64 = 5.0;
 /// Decades below the largest value that a logarithmic axis shows; what is smaller is drawn at its lower end.
-const DECADES: f64 = 9.0;
+const DECADES: f64 = 8.0;
 
 /// One curve: a name for the legend and its points.
 pub struct Series<'a> {

@@ -118,11 +118,12 @@
         const nearness = 1 / Math.max(0.2, 1 + 0.25 * z / radius);
         return [width / 2 + x * scale * nearness, height / 2 + y * scale * nearness, z];
       };
+      const size = points.length < 500 ? 5 : 3;
       context.globalAlpha = 0.85;
       const depth = points.map((p) => [place(p), p[3]]).sort((a, b) => b[0][2] - a[0][2]);
       for (const [[x, y], weight] of depth) {
         context.fillStyle = byWeight(weight);
-        context.fillRect(x - 1.5, y - 1.5, 3, 3);
+        context.fillRect(x - size / 2, y - size / 2, size, size);
       }
       context.globalAlpha = 1;
       context.strokeStyle = theme("ink"); context.fillStyle = theme("mute"); context.font = "11px system-ui, sans-serif";

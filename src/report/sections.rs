@@ -99,7 +99,7 @@ pub fn convergence(solution: &Solution) -> String {
         history.iter().enumerate().filter_map(|(step, record)| Some((step as f64, pick(record)?))).collect()
     };
     let losses = LineChart {
-        title: "Losses",
+        title: "Losses (logarithmic)",
         x_label: "network iteration",
         series: vec![
             Series { name: "L_num", points: loss(|losses| losses.num) },
