@@ -1,9 +1,16 @@
 //! Ctrl-C and SIGTERM, in order.
 
+use std::time::Duration;
+
 use tokio::task::JoinHandle;
+use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use super::exit::{Exit, Failure};
+
+/// Signals within this time of the first are the same request: `timeout` and some supervisors signal a process and its
+/// group, so that it arrives twice.
+const SAME_REQUEST: Duration = Duration::from_secs(1);
 
 /// While this lives, the first SIGINT or SIGTERM cancels its token, and the second ends the process.
 pub struct Interrupt {
@@ -23,7 +30,7 @@ impl Interrupt {
         let listener = tokio::spawn(async move {
             signals.next().await;
             cancels.cancel();
-            signals.next().await;
+            signals.again().await;
             // Stopping in order was asked for and takes too long for whoever asks twice.
             std::process::exit(Exit::Interrupted as i32);
         });
@@ -56,6 +63,17 @@ impl Signals {
     pub fn listen() -> Result<Self, Failure> {
         use tokio::signal::unix::{SignalKind, signal};
         Ok(Self { terminate: signal(SignalKind::terminate())?, interrupt: signal(SignalKind::interrupt())? })
+    }
+
+    /// Waits for one that is a second request, to be called right after the first.
+    pub async fn again(&mut self) {
+        let first = Instant::now();
+        loop {
+            self.next().await;
+            if first.elapsed() >= SAME_REQUEST {
+                return;
+            }
+        }
     }
 
     /// Waits for the next one.

@@ -136,7 +136,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     tracing::info!(bound_seconds = config.engine.drain_seconds, "draining; a second signal ends at once");
     let drained = tokio::select! {
         drained = service.stop() => drained?,
-        () = signals.next() => return Err(Failure { exit: Exit::Interrupted, message: "ended before the drain did".into() }),
+        () = signals.again() => return Err(Failure { exit: Exit::Interrupted, message: "ended before the drain did".into() }),
     };
     tracing::info!(finished = drained.finished, given_back = drained.given_back, "drained");
     metrics.shutdown().await;

@@ -178,6 +178,8 @@ fn a_server_gives_the_same_files_as_the_program_itself_and_drains_on_sigterm() {
     let unknown = run(["get", "tenants/default/jobs/unknown", "--server", &serving.grpc]);
     assert_eq!(unknown.code, Some(65), "{unknown:?}");
 
+    // As `timeout` does it: the process and its group are told, so that it hears twice.
+    serving.running.signal(Signal::TERM);
     serving.running.signal(Signal::TERM);
     assert_eq!(serving.running.wait().code(), Some(0));
 }
