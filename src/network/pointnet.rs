@@ -242,3 +242,41 @@ fn standard_normal(rng: &mut ChaCha8Rng) -> f64 {
     let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
     radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The first segmentation layer on [local | global], as PointNet has it, says the same whatever the global feature.
+    #[test]
+    fn the_global_feature_cancels_in_the_segmentation_head() {
+        const COLUMNS: usize = 40;
+        let device = Device::flex();
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut draw = |count: usize| (0..count).map(|_| standard_normal(&mut rng) as f32).collect::<Vec<f32>>();
+        let tensor = |values: Vec<f32>, shape| constant(values, shape, &device);
+        let (local, global) = (tensor(draw(6 * COLUMNS), [6, COLUMNS]), tensor(draw(9), [9, 1]));
+        let (on_local, on_global) = (tensor(draw(12 * 6), [12, 6]), tensor(draw(12 * 9), [12, 9]));
+        let bias = tensor(draw(12), [12, 1]);
+        let layer = |weight| Layer { weight, gain: None, bias: bias.clone() };
+
+        let every_column = global.repeat_dim(1, COLUMNS);
+        let concatenated = layer(Tensor::cat(vec![on_local.clone(), on_global], 1))
+            .normalised(centre(Tensor::cat(vec![local.clone(), every_column], 0)));
+        let alone = layer(on_local).normalised(centre(local));
+        let pair = values_of(concatenated).expect("f32").into_iter().zip(values_of(alone).expect("f32"));
+        assert!(pair.clone().any(|(a, _)| a > 1.0));
+        for (a, b) in pair {
+            assert!((a - b).abs() < 1e-5, "{a} and {b}");
+        }
+    }
+
+    #[test]
+    fn widths_are_shares_of_the_original() {
+        let shapes = |width| PointNet::new(30, width, 0).trunk.iter().map(|layer| layer.bias.values().len()).collect();
+        let (full, quarter, narrowest): (Vec<_>, Vec<_>, Vec<_>) = (shapes(1.0), shapes(0.25), shapes(0.01));
+        assert_eq!(full, TRUNK);
+        assert_eq!(quarter, [16, 16, 16, 32, 256]);
+        assert_eq!(narrowest, [8, 8, 8, 8, 10]);
+    }
+}

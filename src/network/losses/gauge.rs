@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, Matrix3x4, Matrix4x3, MatrixXx3, MatrixXx4, RowVector4, 
 
 /// Added to the diagonal of `B Bᵀ`: keeps the inverse finite where the first view sees the span edge on.
 const GRAM_FLOOR: f64 = 1e-12;
-/// Added to `|a|²`: keeps the scale finite where every camera is `[A|0]`.
+/// Added to `|a|²` and `|A|²` where they divide: keeps the scale finite where every camera is `[A|0]` or `[0|a]`.
 const NORM_FLOOR: f64 = 1e-20;
 
 /// The cameras `[A_i|a_i] = Z_i H` of a span Z (3n x 4) in the frame where the first is `[I|0]`.
@@ -56,7 +56,7 @@ impl CanonicalCameras {
     /// Derivative with respect to the span (3n x 4) from those with respect to every `A_i` and `a_i`.
     pub fn pull_back(&self, grad_rotational: &[Matrix3<f64>], grad_translational: &[Vector3<f64>]) -> MatrixXx4<f64> {
         let norm_squared = self.unscaled.norm_squared() + NORM_FLOOR;
-        let rotational_squared: f64 = self.rotational.iter().map(Matrix3::norm_squared).sum();
+        let rotational_squared = self.rotational.iter().map(Matrix3::norm_squared).sum::<f64>() + NORM_FLOOR;
         // The scale is a function of both: d log|scale| = <A, dA>/|A|² - <a, da>/|a|².
         let along: f64 = grad_translational
             .iter()

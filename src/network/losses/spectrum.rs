@@ -41,10 +41,13 @@ impl Spectrum {
         if scatter.iter().any(|entry| !entry.is_finite()) {
             return Err(Error::NoDecomposition { rows });
         }
-        let scatter = Mat::from_fn(rows, rows, |row, column| scatter[(row, column)]);
+        // The decomposition is of the matrix at unit scale: it does not converge on subnormal numbers.
+        let largest = scatter.amax();
+        let scale = if largest > f64::MIN_POSITIVE { largest } else { f64::INFINITY };
+        let scatter = Mat::from_fn(rows, rows, |row, column| scatter[(row, column)] / scale);
         let eigen = scatter.self_adjoint_eigen(Side::Lower).map_err(|_| Error::NoDecomposition { rows })?;
         let (ascending, vectors) = (eigen.S().column_vector(), eigen.U());
-        let values = (0..rows).map(|k| ascending[rows - 1 - k].max(0.0)).collect();
+        let values = (0..rows).map(|k| largest * ascending[rows - 1 - k].max(0.0)).collect();
         let vectors = DMatrix::from_fn(rows, rows, |row, k| vectors[(row, rows - 1 - k)]);
         let coordinates = vectors.tr_mul(balanced);
         Ok(Self { values, vectors, coordinates })
