@@ -1,7 +1,10 @@
 //! Metrics, logs and traces of the real program: what a solved, a failed and a cancelled job change.
 
+use std::fs::File;
+use std::process::Stdio;
 use std::time::Duration;
 
+use rustix::process::Signal;
 use scpsfm::domain::Stage;
 use scpsfm::rpc::convert;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
@@ -11,7 +14,7 @@ use tonic::Code;
 use tonic::transport::Channel;
 
 use crate::support::collector::{Collector, attribute, hex, only};
-use crate::support::process::Process;
+use crate::support::program::Serving;
 use crate::support::scrape::Page;
 use crate::support::server::soon;
 use crate::support::wire::{create, state_of};
@@ -33,6 +36,15 @@ fn endless() -> proto::CreateJobRequest {
     request
 }
 
+async fn connected(server: &Serving) -> JobServiceClient<Channel> {
+    JobServiceClient::connect(server.grpc.clone()).await.expect("a connection")
+}
+
+/// What `/metrics` shows now.
+fn scrape(server: &Serving) -> Page {
+    Page::parse(&server.page("/metrics"))
+}
+
 async fn created(jobs: &mut JobServiceClient<Channel>, request: proto::CreateJobRequest) -> String {
     jobs.create_job(request).await.expect("a job").into_inner().name
 }
@@ -50,10 +62,10 @@ async fn reaches(jobs: &mut JobServiceClient<Channel>, name: &str, states: &[Job
 }
 
 /// The first page that shows `wanted`: metrics follow the commit that a watcher sees, so they may come a moment later.
-async fn scrape_until(server: &Process, wanted: impl Fn(&Page) -> bool) -> Page {
+async fn scrape_until(server: &Serving, wanted: impl Fn(&Page) -> bool) -> Page {
     soon(async {
         loop {
-            let page = server.scrape().await;
+            let page = scrape(server);
             if wanted(&page) {
                 return page;
             }
@@ -89,9 +101,9 @@ const CREATED_BAD: &str =
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
     let directory = tempfile::tempdir().expect("a temporary directory");
-    let server = Process::serve(&directory.path().join("data"), &[]);
-    let mut jobs = server.jobs().await;
-    let before = server.scrape().await;
+    let server = Serving::start(&directory.path().join("data"));
+    let mut jobs = connected(&server).await;
+    let before = scrape(&server);
     assert_idle(&before);
     assert_eq!(before.value("scpsfm_workers"), 1.0);
     assert_eq!(before.sum("scpsfm_build_info"), 1.0);
@@ -135,7 +147,7 @@ async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
 
     let name = created(&mut jobs, endless()).await;
     reaches(&mut jobs, &name, &[JobState::Running]).await;
-    assert_eq!(server.scrape().await.value("scpsfm_workers_busy"), 1.0);
+    assert_eq!(scrape(&server).value("scpsfm_workers_busy"), 1.0);
     jobs.cancel_job(proto::CancelJobRequest { name: name.clone() }).await.expect("a cancel");
     reaches(&mut jobs, &name, &[JobState::Cancelled]).await;
     let cancelled =
@@ -161,15 +173,16 @@ async fn a_job_that_takes_its_server_down_fails_and_is_counted_by_the_next() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let data_dir = directory.path().join("data");
     let once = [("SCPSFM_ENGINE__MAX_ATTEMPTS", "1")];
-    let server = Process::serve(&data_dir, &once);
-    let mut jobs = server.jobs().await;
+    let server = Serving::start_with(&data_dir, &once, Stdio::null());
+    let mut jobs = connected(&server).await;
     let name = created(&mut jobs, endless()).await;
     reaches(&mut jobs, &name, &[JobState::Running]).await;
-    assert_eq!(server.scrape().await.value("scpsfm_jobs_total{state=\"FAILED\"}"), 0.0);
-    server.kill();
+    assert_eq!(scrape(&server).value("scpsfm_jobs_total{state=\"FAILED\"}"), 0.0);
+    // Killed without a warning, as by a power cut.
+    drop(server);
 
-    let server = Process::serve(&data_dir, &once);
-    let mut jobs = server.jobs().await;
+    let server = Serving::start_with(&data_dir, &once, Stdio::null());
+    let mut jobs = connected(&server).await;
     reaches(&mut jobs, &name, &[JobState::Failed]).await;
     // Counters begin at 0 with the process: what stands there is what this one did.
     let page =
@@ -188,15 +201,19 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
     let (collector, address) = Collector::start().await;
     let directory = tempfile::tempdir().expect("a temporary directory");
     let data_dir = directory.path().join("data");
-    let server = Process::serve(&data_dir, &[("SCPSFM_OTLP__ENDPOINT", &format!("http://{address}"))]);
-    let mut jobs = server.jobs().await;
+    let log = directory.path().join("log");
+    let endpoint = format!("http://{address}");
+    let export = [("SCPSFM_OTLP__ENDPOINT", endpoint.as_str())];
+    let mut server = Serving::start_with(&data_dir, &export, File::create(&log).expect("a log file"));
+    let mut jobs = connected(&server).await;
     let mut request = tonic::Request::new(easy());
     let traceparent = format!("00-{TRACE_ID}-{CALLER_SPAN}-01");
     request.metadata_mut().insert("traceparent", traceparent.parse().expect("ASCII"));
     let name = jobs.create_job(request).await.expect("a job").into_inner().name;
     reaches(&mut jobs, &name, &[JobState::Succeeded]).await;
     // A server that drains sends what it has: nothing is waited for.
-    assert!(server.terminate().success());
+    server.running.signal(Signal::TERM);
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success());
 
     let mut spans = collector.spans();
     spans.retain(|span| hex(&span.trace_id) == TRACE_ID);
@@ -215,7 +232,7 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
         assert!(of_stage.all(|span| span.parent_span_id == attempt.span_id), "{stage}");
     }
 
-    let log = std::fs::read_to_string(Process::log(&data_dir)).expect("a log");
+    let log = std::fs::read_to_string(&log).expect("a log");
     let lines = log.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON"));
     let of_attempt: Vec<_> = lines.filter(|line| line["target"] == "scpsfm::engine::attempt").collect();
     assert!(of_attempt.len() >= 2, "an attempt's begin and end are logged:\n{log}");

@@ -1,7 +1,7 @@
 //! What tests share: a server on a free port with a store of its own, and stand-ins for the solver.
 
 pub mod collector;
-pub mod process;
+pub mod program;
 pub mod scrape;
 pub mod server;
 pub mod solvers;
