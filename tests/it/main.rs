@@ -2,5 +2,6 @@
 
 mod api;
 mod cli;
+mod readme;
 mod support;
 mod telemetry;
