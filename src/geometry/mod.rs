@@ -6,7 +6,9 @@
 pub mod bundle;
 pub mod daq;
 pub mod factorization;
+pub mod homography;
 pub mod measurement;
+pub mod metric;
 pub mod statistics;
 pub mod triangulation;
 

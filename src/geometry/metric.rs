@@ -1,0 +1,132 @@
+//! From a projective to a metric reconstruction, given the DAQ.
+
+use nalgebra::{Matrix3, Matrix4, Vector3};
+
+use super::bundle::Observation;
+use super::bundle::metric::{Pose, Reconstruction};
+use super::daq::{Daq, FirstViewFrame};
+
+/// Distance at which points are held, in median depths: beyond it the depth of a point moves no observation, while a
+/// point at infinity would have no coordinates.
+const FARTHEST: f64 = 1e3;
+
+/// Homography `H` with `P H` metric and `H^-1 X` Euclidean: `[K 0; -n' K 1]`.
+pub fn upgrading_homography(daq: &Daq) -> Matrix4<f64> {
+    let calibration = daq.intrinsics.matrix();
+    let mut homography = Matrix4::identity();
+    homography.fixed_view_mut::<3, 3>(0, 0).copy_from(&calibration);
+    homography.fixed_view_mut::<1, 3>(3, 0).copy_from(&-(daq.plane_at_infinity.transpose() * calibration));
+    homography
+}
+
+/// Upgrades a projective reconstruction: the nearest rotations, and of the two mirror images the one with more
+/// observations in front of their cameras. The median depth becomes 1.
+///
+/// Returns `None` when a pose or the depth is not a number: a camera without rank, a DAQ without meaning.
+pub fn upgrade(frame: &FirstViewFrame, daq: &Daq, observations: &[Observation]) -> Option<Reconstruction> {
+    let homography = upgrading_homography(daq);
+    let back = homography.try_inverse()?;
+    let uncalibrate = daq.intrinsics.matrix().try_inverse()?;
+    let mut poses = Vec::with_capacity(frame.cameras.len());
+    for camera in &frame.cameras {
+        let upgraded = uncalibrate * camera * homography;
+        poses.push(pose(&upgraded.fixed_columns::<3>(0).into_owned(), &upgraded.column(3).into_owned())?);
+    }
+    let points = frame.points.iter().map(|point| {
+        let moved = back * point;
+        let position = moved.xyz() / moved.w;
+        // Only the direction of a point at infinity is known.
+        if position.iter().all(|value| value.is_finite()) { position } else { moved.xyz() * f64::MAX.sqrt() }
+    });
+    let mut reconstruction = Reconstruction { intrinsics: daq.intrinsics, poses, points: points.collect() };
+    if cheirality(&reconstruction, observations) < 0.5 {
+        reconstruction.poses.iter_mut().for_each(|pose| pose.translation.neg_mut());
+        reconstruction.points.iter_mut().for_each(|point| point.neg_mut());
+    }
+    scale_to_median_depth(&mut reconstruction, observations)?;
+    Some(reconstruction)
+}
+
+/// The rotation nearest to a 3x3 matrix up to scale, and the translation at that scale.
+fn pose(left: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Pose> {
+    let sign = if left.determinant() < 0.0 { -1.0 } else { 1.0 };
+    if left.iter().any(|value| !value.is_finite()) {
+        return None;
+    }
+    let decomposition = (left * sign).svd(true, true);
+    let rotation = decomposition.u? * decomposition.v_t?;
+    let translation = right * (sign / decomposition.singular_values.mean());
+    let usable = rotation.determinant() > 0.0 && translation.iter().all(|value| value.is_finite());
+    usable.then_some(Pose { rotation, translation })
+}
+
+/// Scales the scene to a median depth of 1 and holds far points at [`FARTHEST`].
+fn scale_to_median_depth(reconstruction: &mut Reconstruction, observations: &[Observation]) -> Option<()> {
+    let mut depths: Vec<f64> = depths(reconstruction, observations).map(f64::abs).collect();
+    depths.sort_by(f64::total_cmp);
+    let median = *depths.get(depths.len() / 2)?;
+    if !(median > f64::MIN_POSITIVE && median.is_finite()) {
+        return None;
+    }
+    reconstruction.poses.iter_mut().for_each(|pose| pose.translation /= median);
+    for point in &mut reconstruction.points {
+        *point /= median;
+        let norm = point.norm();
+        if norm > FARTHEST {
+            *point = if norm.is_finite() { *point * (FARTHEST / norm) } else { Vector3::new(0.0, 0.0, FARTHEST) };
+        }
+    }
+    Some(())
+}
+
+fn depths<'a>(reconstruction: &'a Reconstruction, observations: &'a [Observation]) -> impl Iterator<Item = f64> + 'a {
+    observations.iter().filter_map(|seen| {
+        let (pose, point) = (reconstruction.poses.get(seen.camera)?, reconstruction.points.get(seen.point)?);
+        Some(pose.apply(point).z)
+    })
+}
+
+/// Share of the observations whose point lies in front of its camera; 0 without observations.
+pub fn cheirality(reconstruction: &Reconstruction, observations: &[Observation]) -> f64 {
+    let (count, front) = depths(reconstruction, observations)
+        .fold((0usize, 0usize), |(count, front), depth| (count + 1, front + usize::from(depth > 0.0)));
+    if count > 0 { front as f64 / count as f64 } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::bundle::testing;
+    use super::super::daq::{Free, refine, scan, to_first_view_frame};
+    use super::*;
+
+    #[test]
+    fn upgrades_an_exact_reconstruction_exactly() {
+        for seed in 0..5 {
+            let scene = testing::scene(seed, 8, 20, 0.0);
+            let (cameras, points) = testing::projectively_transformed(&scene, seed);
+            let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
+            let refined = scan(&frame.cameras, 40, 4)
+                .into_iter()
+                .take(8)
+                .map(|(start, _)| refine(&frame.cameras, start, Free::FocalAndPlane, 80));
+            let (daq, _) = refined.min_by(|a, b| a.1.total_cmp(&b.1)).expect("starts");
+            let upgraded = upgrade(&frame, &daq, &scene.observations).expect("metric");
+            assert_eq!(cheirality(&upgraded, &scene.observations), 1.0, "seed {seed}");
+            for seen in &scene.observations {
+                let error = upgraded.residual(seen).norm();
+                assert!(error < 1e-5, "seed {seed}: {error}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_meaningless_quadric_or_scene_gives_none() {
+        let scene = testing::scene(1, 4, 8, 0.0);
+        let (cameras, points) = testing::projectively_transformed(&scene, 1);
+        let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
+        let nan = Daq::new(1.0, Vector3::from_element(f64::NAN));
+        assert!(upgrade(&frame, &nan, &scene.observations).is_none());
+        assert!(upgrade(&frame, &Daq::new(0.0, Vector3::zeros()), &scene.observations).is_none());
+        assert!(upgrade(&frame, &Daq::new(1.0, Vector3::zeros()), &[]).is_none());
+    }
+}

@@ -1,0 +1,166 @@
+//! Self-calibration of a projective reconstruction, with what it is worth.
+//!
+//! The DAQ residual finds starts, metric bundle adjustment with one calibration for all views decides among them, and
+//! nothing is returned without a grade: a motion or scene that carries no calibration is said to.
+
+mod grading;
+mod search;
+#[cfg(test)]
+mod tests;
+
+use nalgebra::{Matrix3x4, Vector3, Vector4};
+
+use crate::domain::{Grade, StopReason, StopToken, Warning, WarningCode};
+use crate::geometry::bundle::metric::{IntrinsicsModel, Reconstruction};
+use crate::geometry::bundle::{Observation, Options, projective};
+use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
+use crate::geometry::homography;
+
+/// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
+/// caller has adjusted it before.
+const PROJECTIVE_ITERATIONS: usize = 10;
+/// Median homography residual, in units of the noise, below which the scene counts as planar or the camera as only
+/// rotating. Measured: 1.1 to 1.8 for those, above 11 for general motion.
+const HOMOGRAPHY_LIMIT: f64 = 3.0;
+/// Inlier tracks below which geometry cannot verify a consensus.
+const LEAST_INLIERS: usize = 8;
+/// Iterations that place the plane at infinity in the caller's frame.
+const PLANE_ITERATIONS: usize = 40;
+
+/// A projective reconstruction to calibrate; inliers only.
+#[derive(Debug, Clone, Copy)]
+pub struct Problem<'a> {
+    /// 3x4, any projective frame and scale.
+    pub cameras: &'a [Matrix3x4<f64>],
+    /// Homogeneous.
+    pub points: &'a [Vector4<f64>],
+    /// Normalised image coordinates.
+    pub observations: &'a [Observation],
+    /// Assumed standard deviation of a coordinate, in normalised units.
+    pub noise: f64,
+}
+
+/// What came of it.
+#[derive(Debug, Clone)]
+pub struct Outcome {
+    /// `None` when no metric reconstruction was found or looked for. With grade PROJECTIVE_ONLY it may stand but is
+    /// not to be used as metric.
+    pub metric: Option<Reconstruction>,
+    /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable.
+    pub sigma_log_focal: Option<f64>,
+    pub grade: Grade,
+    pub warnings: Vec<Warning>,
+    /// Which intrinsics the data could carry.
+    pub model: IntrinsicsModel,
+    /// `n` of the plane `(n, 1)`, in the frame that [`to_first_view_frame`] gives the problem's cameras.
+    pub plane_at_infinity: Option<Vector3<f64>>,
+    /// Share of the observations in front of their cameras.
+    pub cheirality: f64,
+    /// Posterior noise of the metric over that of the projective reconstruction; 1 when the calibration is right.
+    pub rms_ratio: f64,
+}
+
+impl Outcome {
+    fn refused(warnings: Vec<Warning>) -> Self {
+        Self {
+            metric: None,
+            sigma_log_focal: None,
+            grade: Grade::ProjectiveOnly,
+            warnings,
+            model: IntrinsicsModel::Focal,
+            plane_at_infinity: None,
+            cheirality: 0.0,
+            rms_ratio: 1.0,
+        }
+    }
+}
+
+/// The stop token ended the calibration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("stopped while calibrating: {0:?}")]
+pub struct Stopped(pub StopReason);
+
+impl Stopped {
+    fn check(stop: &StopToken) -> Result<(), Self> {
+        stop.reason().map_or(Ok(()), |reason| Err(Self(reason)))
+    }
+}
+
+impl From<Stopped> for super::Error {
+    fn from(Stopped(reason): Stopped) -> Self {
+        Self::Stopped(reason)
+    }
+}
+
+/// Calibrates a projective reconstruction and grades the result.
+///
+/// `scale_px` is the length of a normalised unit in pixels, for the words of the warnings.
+///
+/// # Errors
+/// [`Stopped`] when `stop` fired; what stands by then is not worth returning.
+pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<Outcome, Stopped> {
+    Stopped::check(stop)?;
+    let mut warnings = Vec::new();
+    let inliers = observed_points(problem);
+    if inliers < LEAST_INLIERS {
+        let detail = format!("{inliers} inlier tracks cannot be verified by geometry, which takes {LEAST_INLIERS}");
+        warnings.push(Warning::new(WarningCode::FewInliers, detail));
+    }
+    let mut cameras = problem.cameras.to_vec();
+    let mut points = problem.points.to_vec();
+    let options = Options::squared(PROJECTIVE_ITERATIONS);
+    let adjusted = projective::adjust(&mut cameras, &mut points, problem.observations, &options, stop);
+    Stopped::check(stop)?;
+    let fit = grading::ProjectiveFit::new(adjusted.cost, problem, inliers);
+    let noise = fit.noise.max(problem.noise);
+    if let Some(residual) = homography::median_residual(problem.observations, cameras.len(), noise)
+        && residual < HOMOGRAPHY_LIMIT
+    {
+        let detail = format!(
+            "homographies between the views miss by a median of {residual:.1} standard deviations of the noise \
+             ({:.2} px): the scene is planar or the camera only rotated, which carries no calibration",
+            noise * scale_px
+        );
+        warnings.push(Warning::new(WarningCode::PlanarOrRotation, detail));
+        return Ok(Outcome::refused(warnings));
+    }
+    let minima = match to_first_view_frame(&cameras, &points) {
+        Some(frame) => search::minima(&frame, problem, stop)?,
+        None => Vec::new(),
+    };
+    if minima.is_empty() {
+        let detail = "no start of the self-calibration led to a metric reconstruction";
+        warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
+        return Ok(Outcome::refused(warnings));
+    }
+    let mut outcome = grading::grade(problem, &fit, minima, scale_px, warnings, stop)?;
+    outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem, metric));
+    Ok(outcome)
+}
+
+/// Points with an observation.
+fn observed_points(problem: &Problem) -> usize {
+    let mut seen = vec![false; problem.points.len()];
+    for observation in problem.observations {
+        if let Some(seen) = seen.get_mut(observation.point) {
+            *seen = true;
+        }
+    }
+    seen.iter().filter(|seen| **seen).count()
+}
+
+/// The plane at infinity of the caller's cameras that goes best with the calibration found.
+fn plane_at_infinity(problem: &Problem, metric: &Reconstruction) -> Option<Vector3<f64>> {
+    let frame = to_first_view_frame(problem.cameras, &[])?;
+    let starts = daq::widest_views(&frame.cameras)
+        .into_iter()
+        .take(4)
+        .filter_map(|view| daq::plane_from_second_view(&frame.cameras[view], metric.intrinsics.focal))
+        .flatten()
+        .map(|plane| Daq { intrinsics: metric.intrinsics, plane_at_infinity: plane });
+    starts
+        .map(|start| daq::refine(&frame.cameras, start, Free::Plane, PLANE_ITERATIONS))
+        .filter(|(daq, cost)| cost.is_finite() && daq.plane_at_infinity.iter().all(|value| value.is_finite()))
+        .min_by(|a, b| a.1.total_cmp(&b.1))
+        .map(|(daq, _)| daq.plane_at_infinity)
+}

@@ -1,0 +1,206 @@
+//! The search for the metric reconstruction: many starts, few that converge.
+
+use nalgebra::{Matrix4, Vector3, Vector4};
+
+use super::{Problem, Stopped};
+use crate::domain::StopToken;
+use crate::geometry::bundle::metric::{self, IntrinsicsModel, Reconstruction};
+use crate::geometry::bundle::{Observation, Options};
+use crate::geometry::daq::{self, Daq, FirstViewFrame, Free};
+use crate::geometry::metric::{cheirality, upgrade};
+
+/// The scan of focal lengths: 40 in the range, from the 4 widest views.
+const SCAN_FOCALS: usize = 40;
+const SCAN_VIEWS: usize = 4;
+/// Refined starts kept, and the iterations of their refinement; it converges in 10 to 20.
+const REFINED_STARTS: usize = 4;
+const REFINE_ITERATIONS: usize = 40;
+/// Best entries of the scan that are refined.
+const REFINED_FROM_SCAN: usize = 3;
+/// Starts that are adjusted. With the refined ones alone a third of the scenes at .3 % noise was within 1 % of the
+/// focal length, with these .92.
+const STARTS: usize = 8;
+/// Windows of the scan, in image sides, whose best entry is a start as it stands: they keep starts apart that the
+/// refinement would draw into one minimum.
+const WINDOW_RANGE: (f64, f64) = (0.45, 3.2);
+/// Half width of a window in log focal; neighbours touch.
+const WINDOW_HALF_WIDTH: f64 = 0.15;
+/// Difference in log focal below which refined starts are the same.
+const SAME_START: f64 = 0.02;
+/// Iterations and tolerance of the first adjustment, which only has to rank the starts.
+const FIRST_ITERATIONS: usize = 12;
+const FIRST_TOLERANCE: f64 = 1e-4;
+/// Starts that are adjusted to convergence, and the iterations allowed.
+const CONVERGED: usize = 3;
+const FINAL_ITERATIONS: usize = 60;
+const FINAL_TOLERANCE: f64 = 1e-9;
+/// Adjusted starts this near in log focal, and within this share in cost, are the same minimum.
+const SAME_MINIMUM: f64 = 0.01;
+const SAME_COST: f64 = 0.1;
+/// Focal lengths that the refinement may end at, in image sides; beyond, it ran away along a null direction.
+const PLAUSIBLE_FOCAL: std::ops::Range<f64> = 0.05..50.0;
+/// Points that take part in the search; more tell no minimum from another that these do not.
+const SEARCH_POINTS: usize = 150;
+
+/// A converged metric reconstruction.
+#[derive(Debug, Clone)]
+pub(super) struct Minimum {
+    pub reconstruction: Reconstruction,
+    pub cost: f64,
+    pub cheirality: f64,
+}
+
+impl Minimum {
+    pub fn log_focal(&self) -> f64 {
+        self.reconstruction.intrinsics.focal.ln()
+    }
+
+    /// Adjusts to convergence from here with this model.
+    pub fn adjusted(&self, observations: &[Observation], model: IntrinsicsModel, stop: &StopToken) -> Self {
+        let mut reconstruction = self.reconstruction.clone();
+        let report = metric::adjust(&mut reconstruction, observations, model, &converge(), stop);
+        let cheirality = cheirality(&reconstruction, observations);
+        Self { reconstruction, cost: report.cost, cheirality }
+    }
+}
+
+fn converge() -> Options {
+    Options { max_iterations: FINAL_ITERATIONS, relative_tolerance: FINAL_TOLERANCE, ..Options::default() }
+}
+
+/// Metric reconstructions with the focal length free that different starts converge to, cheapest first.
+pub(super) fn minima(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
+    let (subset, chosen) = subsample(frame, problem.observations);
+    let observations = subset.as_deref().unwrap_or(problem.observations);
+    let mut found: Vec<Minimum> = Vec::new();
+    for start in starts(frame) {
+        Stopped::check(stop)?;
+        let Some(mut reconstruction) = upgrade(frame, &start, observations) else { continue };
+        let options =
+            Options { max_iterations: FIRST_ITERATIONS, relative_tolerance: FIRST_TOLERANCE, ..Options::default() };
+        let report = metric::adjust(&mut reconstruction, observations, IntrinsicsModel::Focal, &options, stop);
+        found.push(Minimum { cheirality: 0.0, cost: report.cost, reconstruction });
+    }
+    let mut found = distinct(found);
+    found.truncate(CONVERGED);
+    for minimum in &mut found {
+        Stopped::check(stop)?;
+        *minimum = minimum.adjusted(observations, IntrinsicsModel::Focal, stop);
+        if let Some(chosen) = &chosen {
+            fill_points(minimum, chosen, problem.observations);
+            *minimum = minimum.adjusted(problem.observations, IntrinsicsModel::Focal, stop);
+        }
+    }
+    Stopped::check(stop)?;
+    Ok(distinct(found))
+}
+
+/// Cheapest first, without those that repeat a cheaper one.
+fn distinct(mut found: Vec<Minimum>) -> Vec<Minimum> {
+    found.retain(|minimum| minimum.cost.is_finite() && minimum.log_focal().is_finite());
+    found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+    let mut kept: Vec<Minimum> = Vec::with_capacity(found.len());
+    for candidate in found {
+        let repeats = kept.iter().any(|minimum| {
+            (candidate.log_focal() - minimum.log_focal()).abs() < SAME_MINIMUM
+                && candidate.cost < (1.0 + SAME_COST) * minimum.cost
+        });
+        if !repeats {
+            kept.push(candidate);
+        }
+    }
+    kept
+}
+
+/// Different starts: the linear DAQ and the best of the scan, refined, then the best of each window of the scan.
+fn starts(frame: &FirstViewFrame) -> Vec<Daq> {
+    let cameras = &frame.cameras;
+    let scanned = daq::scan(cameras, SCAN_FOCALS, SCAN_VIEWS);
+    let best_near = |focal: f64, half_width: f64| {
+        scanned.iter().find(|(daq, _)| (daq.intrinsics.focal / focal).ln().abs() < half_width).map(|(daq, _)| *daq)
+    };
+    let mut to_refine: Vec<Daq> = daq::linear(cameras).into_iter().collect();
+    to_refine.extend(scanned.iter().take(REFINED_FROM_SCAN).map(|(daq, _)| *daq));
+    to_refine.extend([0.5, 1.0, 2.0, 4.0].into_iter().filter_map(|focal| best_near(focal, 0.5 * 2f64.ln())));
+    let mut refined: Vec<(Daq, f64)> = to_refine
+        .into_iter()
+        .map(|start| daq::refine(cameras, start, Free::FocalAndPlane, REFINE_ITERATIONS))
+        .filter(|(daq, cost)| cost.is_finite() && PLAUSIBLE_FOCAL.contains(&daq.intrinsics.focal))
+        .collect();
+    refined.sort_by(|a, b| a.1.total_cmp(&b.1));
+
+    let mut kept: Vec<Daq> = Vec::with_capacity(STARTS);
+    for (daq, _) in refined {
+        let repeats = kept.iter().any(|other| {
+            (daq.intrinsics.focal / other.intrinsics.focal).ln().abs() < SAME_START
+                && (daq.plane_at_infinity - other.plane_at_infinity).norm()
+                    < 0.05 * (1.0 + daq.plane_at_infinity.norm())
+        });
+        if !repeats && kept.len() < REFINED_STARTS {
+            kept.push(daq);
+        }
+    }
+    let windows = STARTS - 1;
+    let ratio = (WINDOW_RANGE.1 / WINDOW_RANGE.0).ln() / windows as f64;
+    let mut windowed: Vec<(Daq, f64)> = (0..=windows)
+        .filter_map(|k| best_near(WINDOW_RANGE.0 * (ratio * k as f64).exp(), WINDOW_HALF_WIDTH))
+        .map(|daq| (daq, daq::residual(cameras, &daq)))
+        .collect();
+    windowed.sort_by(|a, b| a.1.total_cmp(&b.1));
+    kept.extend(windowed.into_iter().map(|(daq, _)| daq).take(STARTS - kept.len()));
+    kept
+}
+
+/// Every so many-th point, when there are more than the search needs: their observations, and which were chosen.
+fn subsample(frame: &FirstViewFrame, observations: &[Observation]) -> (Option<Vec<Observation>>, Option<Vec<bool>>) {
+    let points = frame.points.len();
+    if points <= SEARCH_POINTS {
+        return (None, None);
+    }
+    let mut chosen = vec![false; points];
+    (0..SEARCH_POINTS).for_each(|k| chosen[k * points / SEARCH_POINTS] = true);
+    // A view that would be left with too few points keeps all of its own.
+    let mut left = vec![0usize; frame.cameras.len()];
+    let in_range = |seen: &&Observation| seen.camera < frame.cameras.len() && seen.point < points;
+    for seen in observations.iter().filter(in_range) {
+        left[seen.camera] += usize::from(chosen[seen.point]);
+    }
+    for seen in observations.iter().filter(in_range) {
+        if left[seen.camera] < LEAST_POINTS_OF_A_VIEW {
+            chosen[seen.point] = true;
+        }
+    }
+    let subset = observations.iter().filter(in_range).filter(|seen| chosen[seen.point]).copied().collect();
+    (Some(subset), Some(chosen))
+}
+
+/// Points below which the search does not thin out a view.
+const LEAST_POINTS_OF_A_VIEW: usize = 20;
+
+/// Triangulates the points that took no part in the search with the cameras it found.
+fn fill_points(minimum: &mut Minimum, chosen: &[bool], observations: &[Observation]) {
+    let reconstruction = &mut minimum.reconstruction;
+    let mut normals = vec![Matrix4::<f64>::zeros(); reconstruction.points.len()];
+    for seen in observations {
+        let (Some(pose), Some(normal)) = (reconstruction.poses.get(seen.camera), normals.get_mut(seen.point)) else {
+            continue;
+        };
+        let camera = pose.camera(&reconstruction.intrinsics);
+        for (row, target) in [seen.xy.x, seen.xy.y].into_iter().enumerate() {
+            let equation: Vector4<f64> = (camera.row(row) - camera.row(2) * target).transpose();
+            *normal += equation * equation.transpose();
+        }
+    }
+    for ((point, normal), chosen) in reconstruction.points.iter_mut().zip(&normals).zip(chosen) {
+        let trace = normal.trace();
+        if *chosen || !(trace > 0.0 && trace.is_finite()) {
+            continue;
+        }
+        let eigen = normal.symmetric_eigen();
+        let homogeneous = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+        let position: Vector3<f64> = homogeneous.xyz() / homogeneous.w;
+        if position.iter().all(|value| value.is_finite()) {
+            *point = position;
+        }
+    }
+}

@@ -1,0 +1,185 @@
+use nalgebra::Vector2;
+
+use super::*;
+use crate::geometry::bundle::testing::{self, Motion, NOISE, TestScene};
+
+const SIDE_PX: f64 = 1000.0;
+
+/// A scene as the solver would hand it over: in a projective frame of its own, adjusted to the noisy observations.
+fn projective_problem(scene: &TestScene, seed: u64) -> (Vec<Matrix3x4<f64>>, Vec<Vector4<f64>>) {
+    let (mut cameras, mut points) = testing::projectively_transformed(scene, seed);
+    projective::adjust(&mut cameras, &mut points, &scene.observations, &Options::squared(40), &StopToken::default());
+    (cameras, points)
+}
+
+fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
+    let (cameras, points) = projective_problem(scene, seed);
+    let problem = Problem { cameras: &cameras, points: &points, observations: &scene.observations, noise };
+    calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
+}
+
+fn focal_error(outcome: &Outcome, scene: &TestScene) -> f64 {
+    let metric = outcome.metric.as_ref().expect("a metric reconstruction");
+    (metric.intrinsics.focal / scene.intrinsics.focal - 1.0).abs()
+}
+
+fn codes(outcome: &Outcome) -> Vec<&'static str> {
+    outcome.warnings.iter().map(|warning| warning.code.name()).collect()
+}
+
+#[test]
+fn general_motion_is_calibrated() {
+    let mut errors = Vec::new();
+    for seed in 0..12 {
+        let scene = testing::scene(seed, 10, 20, NOISE);
+        let begun = std::time::Instant::now();
+        let outcome = calibrated(&scene, seed, NOISE);
+        let error = focal_error(&outcome, &scene);
+        println!(
+            "seed {seed}: error {error:.5}, sigma {:?}, {:?}, rms ratio {:.3}, {:?} {:?} in {:?}",
+            outcome.sigma_log_focal,
+            outcome.grade,
+            outcome.rms_ratio,
+            outcome.model,
+            codes(&outcome),
+            begun.elapsed()
+        );
+        assert_ne!(outcome.grade, Grade::ProjectiveOnly, "seed {seed}");
+        assert_eq!(outcome.cheirality, 1.0, "seed {seed}");
+        assert!(error < 5.0 * outcome.sigma_log_focal.expect("observable"), "seed {seed}");
+        errors.push(error);
+    }
+    errors.sort_by(f64::total_cmp);
+    let median = 0.5 * (errors[5] + errors[6]);
+    println!("median {median:.5}, worst {:.5}", errors[11]);
+    assert!(median <= 0.005 && errors[11] <= 0.05, "{errors:?}");
+}
+
+#[test]
+fn critical_motions_and_scenes_are_refused() {
+    for (name, motion, planar) in [
+        ("translation", Motion::Translation, false),
+        ("forward", Motion::Forward, false),
+        ("rotation", Motion::Rotation, false),
+        ("plane", Motion::General, true),
+    ] {
+        for tracks in [20, 60] {
+            for seed in 0..10 {
+                let scene = testing::scene_of(seed, 10, tracks, NOISE, motion, planar);
+                let outcome = calibrated(&scene, seed, NOISE);
+                println!(
+                    "{name}, {tracks} tracks, seed {seed}: {:?}, sigma {:?}, {:?}",
+                    outcome.grade,
+                    outcome.sigma_log_focal,
+                    codes(&outcome)
+                );
+                assert_eq!(outcome.grade, Grade::ProjectiveOnly, "{name}, seed {seed}");
+                let expected = match motion {
+                    Motion::Translation | Motion::Forward => {
+                        [WarningCode::UnobservableFocal, WarningCode::SecondMinimum]
+                    }
+                    Motion::Rotation | Motion::General => [WarningCode::PlanarOrRotation; 2],
+                };
+                assert!(
+                    outcome.warnings.iter().any(|warning| expected.contains(&warning.code)),
+                    "{name}, seed {seed}: {:?}",
+                    outcome.warnings
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn three_views_are_graded_honestly() {
+    for seed in 0..6 {
+        let scene = testing::scene(seed, 3, 40, NOISE);
+        let outcome = calibrated(&scene, seed, NOISE);
+        let error = focal_error(&outcome, &scene);
+        println!(
+            "seed {seed}: error {error:.4}, sigma {:?}, {:?} {:?}",
+            outcome.sigma_log_focal,
+            outcome.grade,
+            codes(&outcome)
+        );
+        if outcome.grade != Grade::ProjectiveOnly {
+            assert!(error < 5.0 * outcome.sigma_log_focal.expect("graded"), "seed {seed}");
+        }
+    }
+}
+
+#[test]
+fn a_displaced_principal_point_is_found_and_a_central_one_is_left_alone() {
+    for seed in 0..4 {
+        let mut scene = testing::scene(seed, 10, 60, 0.0);
+        scene.intrinsics.principal_point = Vector2::new(0.05, -0.03);
+        let mut rng = rand::SeedableRng::seed_from_u64(seed);
+        scene.observe(0.001, &mut rng);
+        let outcome = calibrated(&scene, seed, 0.001);
+        let found = outcome.metric.as_ref().expect("a metric reconstruction").intrinsics;
+        println!("seed {seed}: {found:?}, true {:?}, {:?}", scene.intrinsics, codes(&outcome));
+        assert_ne!(outcome.model, IntrinsicsModel::Focal, "seed {seed}");
+        assert!((found.principal_point - scene.intrinsics.principal_point).norm() < 0.01, "seed {seed}");
+        assert!(focal_error(&outcome, &scene) < 0.01, "seed {seed}");
+
+        let central = calibrated(&testing::scene(seed, 10, 60, 0.001), seed, 0.001);
+        assert_eq!(central.model, IntrinsicsModel::Focal, "seed {seed}");
+    }
+}
+
+#[test]
+fn the_plane_at_infinity_fits_the_callers_frame() {
+    let scene = testing::scene(3, 10, 30, 1e-5);
+    let (cameras, points) = projective_problem(&scene, 3);
+    let problem = Problem { cameras: &cameras, points: &points, observations: &scene.observations, noise: 1e-5 };
+    let outcome = calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it");
+    let plane = outcome.plane_at_infinity.expect("a plane");
+    let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
+    let intrinsics = outcome.metric.expect("a metric reconstruction").intrinsics;
+    let residual = daq::residual(&frame.cameras, &Daq { intrinsics, plane_at_infinity: plane });
+    assert!(residual < 1e-5, "{residual}");
+}
+
+#[test]
+fn many_points_are_all_adjusted() {
+    let scene = testing::scene(2, 8, 400, NOISE);
+    let outcome = calibrated(&scene, 2, NOISE);
+    assert!(focal_error(&outcome, &scene) < 0.01);
+    let metric = outcome.metric.expect("a metric reconstruction");
+    assert_eq!(metric.points.len(), 400);
+    let squared: f64 = scene.observations.iter().map(|seen| metric.residual(seen).norm_squared()).sum();
+    let rms = (squared / (2 * scene.observations.len()) as f64).sqrt();
+    assert!(rms < 1.05 * NOISE, "{rms}");
+}
+
+#[test]
+fn hostile_input_is_refused_without_panic() {
+    let scene = testing::scene(1, 4, 12, NOISE);
+    let (cameras, points) = projective_problem(&scene, 1);
+    let run = |cameras: &[Matrix3x4<f64>], points: &[Vector4<f64>], observations: &[Observation], noise| {
+        let problem = Problem { cameras, points, observations, noise };
+        calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
+    };
+    let nothing = run(&[], &[], &[], NOISE);
+    assert_eq!(nothing.grade, Grade::ProjectiveOnly);
+    assert!(codes(&nothing).contains(&"FEW_INLIERS"));
+    assert_eq!(run(&cameras, &points, &[], NOISE).grade, Grade::ProjectiveOnly);
+    assert_eq!(run(&cameras[..1], &points, &scene.observations, NOISE).grade, Grade::ProjectiveOnly);
+    let nan = vec![Matrix3x4::from_element(f64::NAN); 4];
+    assert_eq!(run(&nan, &points, &scene.observations, NOISE).grade, Grade::ProjectiveOnly);
+    let zero = vec![Vector4::zeros(); 12];
+    assert_eq!(run(&cameras, &zero, &scene.observations, NOISE).grade, Grade::ProjectiveOnly);
+    let huge: Vec<_> = cameras.iter().map(|camera| camera * 1e200).collect();
+    run(&huge, &points, &scene.observations, NOISE);
+    run(&cameras, &points, &scene.observations, 0.0);
+}
+
+#[test]
+fn a_stopped_token_ends_it() {
+    let scene = testing::scene(1, 4, 12, NOISE);
+    let (cameras, points) = projective_problem(&scene, 1);
+    let problem = Problem { cameras: &cameras, points: &points, observations: &scene.observations, noise: NOISE };
+    let stop = StopToken::default();
+    stop.stop(StopReason::Cancelled);
+    assert_eq!(calibrate(&problem, SIDE_PX, &stop).map(|_| ()), Err(Stopped(StopReason::Cancelled)));
+}
