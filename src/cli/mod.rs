@@ -1,1 +1,98 @@
-//! TODO
+//! The command line: one file a subcommand, plus what they share (arguments, exit codes, progress).
+//!
+//! May depend on everything; only `client.rs` and the commands that talk to a server see prost and tonic.
+
+pub mod args;
+pub mod cancel;
+pub mod client;
+pub mod demo;
+pub mod exit;
+pub mod get;
+pub mod interrupt;
+pub mod job_view;
+pub mod list;
+pub mod progress;
+pub mod result;
+pub mod serve;
+pub mod service;
+pub mod solve;
+pub mod submit;
+pub mod summary;
+pub mod synth;
+pub mod watch;
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+pub use exit::{Exit, Failure};
+
+/// Threads of the runtime that drives a command's I/O; solving never runs on them.
+const RUNTIME_THREADS: usize = 2;
+
+/// Robust, self-calibrating projective structure from motion: which tracks of uncalibrated images are right, the
+/// camera's focal length with its uncertainty, and the projective and metric reconstruction.
+#[derive(Debug, Parser)]
+#[command(name = "scpsfm", version, after_help = exit::HELP)]
+pub struct Cli {
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// What to do.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    Demo(demo::Args),
+    Serve(serve::Args),
+    Solve(solve::Args),
+    Submit(submit::Args),
+    Watch(watch::Args),
+    Get(get::Args),
+    List(list::Args),
+    Cancel(cancel::Args),
+    Result(result::Args),
+    Synth(synth::Args),
+}
+
+/// Runs a parsed command line; an error is printed on stderr, once.
+pub fn run(cli: Cli) -> ExitCode {
+    match dispatch(cli.command) {
+        Ok(exit) => exit.into(),
+        Err(failure) => {
+            eprintln!("error: {failure}");
+            failure.exit.into()
+        }
+    }
+}
+
+fn dispatch(command: Command) -> Result<Exit, Failure> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(RUNTIME_THREADS)
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::internal(format_args!("cannot start the runtime: {error}")))?;
+    match command {
+        Command::Demo(args) => runtime.block_on(demo::run(args)),
+        Command::Serve(args) => runtime.block_on(serve::run(args)),
+        Command::Solve(args) => runtime.block_on(solve::run(args)),
+        Command::Submit(args) => runtime.block_on(submit::run(args)),
+        Command::Watch(args) => runtime.block_on(watch::run(args)),
+        Command::Get(args) => runtime.block_on(get::run(args)),
+        Command::List(args) => runtime.block_on(list::run(args)),
+        Command::Cancel(args) => runtime.block_on(cancel::run(args)),
+        Command::Result(args) => runtime.block_on(result::run(args)),
+        Command::Synth(args) => synth::run(args),
+    }
+}
+
+/// Writes `text` and a newline to stdout. A reader that went away (`| head`) is no error.
+pub(crate) fn print(text: &str) -> Result<(), Failure> {
+    let mut stdout = std::io::stdout().lock();
+    match writeln!(stdout, "{text}").and_then(|()| stdout.flush()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(Failure::internal(format_args!("cannot write to stdout: {error}")))
+        }
+        _ => Ok(()),
+    }
+}

@@ -1,1 +1,299 @@
-//! TODO
+//! The job engine: admission, queue, workers, leases, watching and draining, on top of a store and a solver.
+//!
+//! Knows nothing of transport. Depends on `store`, `solver`, `telemetry` and `domain`; its channels never leave it.
+
+mod attempt;
+mod drain;
+mod error;
+mod hub;
+mod observe;
+mod slot;
+mod submit;
+mod watch;
+mod worker;
+
+#[cfg(test)]
+mod tests;
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, SystemTime};
+
+use tokio::sync::{Notify, watch as channel};
+
+pub use crate::store::{JobPage, JobQuery, Load, Order, QueueBounds};
+pub use drain::Drained;
+pub use error::Error;
+pub use submit::{Deadline, NewJob};
+pub use watch::Watch;
+
+use crate::domain::job::{Job, JobName, JobState};
+use crate::domain::{Input, Observer, Solution, SolveSettings, StopReason, StopToken};
+use crate::solver;
+use crate::store::{Store, payload};
+
+/// What workers run; [`default_solver`] in earnest, a stand-in in tests.
+pub type Solver =
+    Arc<dyn Fn(&Input, &SolveSettings, &mut dyn Observer, &StopToken) -> Result<Solution, solver::Error> + Send + Sync>;
+
+/// The real solver.
+pub fn default_solver() -> Solver {
+    Arc::new(solver::solve)
+}
+
+/// How an engine works.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// Worker threads, one job each; at least one is started.
+    pub workers: usize,
+    /// What may wait at once.
+    pub queue: QueueBounds,
+    /// How long a worker may be silent before its job is taken from it.
+    pub lease: Duration,
+    /// Attempts that may be lost before a job fails.
+    pub max_attempts: u32,
+    /// What callers of a full queue are told to wait.
+    pub retry_after: Duration,
+    /// Tells this process apart in the store.
+    pub worker_name: String,
+}
+
+impl Options {
+    /// Jobs that may wait: at some 3 s a job and one worker, about a quarter of an hour.
+    pub const DEFAULT_MAX_JOBS: u64 = 256;
+    /// Encoded inputs that may wait: ten of the largest inputs that the limits allow.
+    pub const DEFAULT_MAX_BYTES: u64 = 2 << 30;
+    /// Observations that may wait: ten of the largest inputs that the limits allow.
+    pub const DEFAULT_MAX_OBSERVATIONS: u64 = 40_000_000;
+    /// Survives a stalled disk or a paused virtual machine, and still frees a dead worker's job within a minute.
+    pub const DEFAULT_LEASE: Duration = Duration::from_secs(30);
+    /// Twice is bad luck, three times is the job.
+    pub const DEFAULT_MAX_ATTEMPTS: u32 = 3;
+    /// About the time of one job.
+    pub const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(3);
+}
+
+impl Default for Options {
+    /// One worker a core.
+    fn default() -> Self {
+        Self {
+            workers: std::thread::available_parallelism().map_or(1, usize::from),
+            queue: QueueBounds {
+                max_jobs: Self::DEFAULT_MAX_JOBS,
+                max_bytes: Self::DEFAULT_MAX_BYTES,
+                max_observations: Self::DEFAULT_MAX_OBSERVATIONS,
+            },
+            lease: Self::DEFAULT_LEASE,
+            max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
+            retry_after: Self::DEFAULT_RETRY_AFTER,
+            worker_name: format!("process-{}", std::process::id()),
+        }
+    }
+}
+
+/// A handle on a running engine; clones are the same engine.
+///
+/// Jobs are stored before [`Engine::submit`] returns, and go on after a restart. End it with [`Engine::drain`]; one
+/// that is merely dropped with its runtime leaves its running jobs to the next start, as a crash would.
+#[derive(Clone)]
+pub struct Engine {
+    inner: Arc<Inner>,
+}
+
+/// Whether new work is taken on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    Open,
+    /// Nothing is admitted or claimed, what runs may finish.
+    Draining,
+    /// Nothing runs.
+    Closed,
+}
+
+struct Inner {
+    options: Options,
+    store: Arc<dyn Store>,
+    hub: Arc<hub::Hub>,
+    /// Jobs that run in this process, for a cancel to reach them at once.
+    running: Mutex<HashMap<JobName, StopToken>>,
+    /// Counts the reasons to look for a job to claim; slots wait for a change.
+    work: channel::Sender<u64>,
+    /// Wakes the task that counts the queue.
+    queue_changed: Notify,
+    phase: channel::Sender<Phase>,
+    crew: Mutex<drain::Crew>,
+}
+
+impl Engine {
+    /// Takes back the jobs of dead processes, starts the workers and takes up what is queued. To be called within a
+    /// tokio runtime, which must outlive the engine.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when the store or a thread refuses.
+    pub async fn start(options: Options, store: Arc<dyn Store>, solver: Solver) -> Result<Self, Error> {
+        let recovered = store.recover(SystemTime::now(), options.max_attempts).await?;
+        let inner = Arc::new(Inner {
+            store,
+            hub: Arc::default(),
+            running: Mutex::default(),
+            work: channel::Sender::new(0),
+            queue_changed: Notify::new(),
+            phase: channel::Sender::new(Phase::Open),
+            crew: Mutex::default(),
+            options,
+        });
+        observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
+        inner.taken_back(&recovered);
+        inner.hire(solver)?;
+        inner.queue_changed();
+        Ok(Self { inner })
+    }
+
+    /// Admits and stores a job. A repeated request id with the same body gives the job that the first call made.
+    ///
+    /// # Errors
+    /// [`Error::QueueFull`] at once when too much waits, [`Error::AlreadyExists`] for a taken job id or a request id
+    /// with another body, [`Error::InvalidArgument`], [`Error::Draining`].
+    pub async fn submit(&self, new: NewJob) -> Result<Job, Error> {
+        self.inner.clone().submit(new).await
+    }
+
+    /// One job.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    pub async fn job(&self, name: &JobName) -> Result<Job, Error> {
+        Ok(self.inner.store.job(name).await?)
+    }
+
+    /// One page of a tenant's jobs.
+    ///
+    /// # Errors
+    /// [`Error::InvalidArgument`] for a page token of another query.
+    pub async fn list(&self, query: &JobQuery) -> Result<JobPage, Error> {
+        Ok(self.inner.store.jobs(query).await?)
+    }
+
+    /// Replays a job's events after a sequence number (0: all of them), then follows it to its end. See [`Watch`].
+    ///
+    /// # Errors
+    /// [`Error::NotFound`]; [`Error::InvalidArgument`] for a number beyond the job's latest event.
+    pub async fn watch(&self, name: &JobName, after_sequence: u64) -> Result<Watch, Error> {
+        Watch::open(self.inner.clone(), name.clone(), after_sequence).await
+    }
+
+    /// Ends a queued job, asks a running one to stop, leaves an ended one as it is. Returns the job as it stands then:
+    /// a running one ends soon after, which its events tell.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    pub async fn cancel(&self, name: &JobName) -> Result<Job, Error> {
+        let (inner, name) = (self.inner.clone(), name.clone());
+        // On its own task: a caller that goes away must not leave a stored cancel untold.
+        finished(tokio::spawn(async move { inner.cancel(&name).await })).await
+    }
+
+    /// The result of a succeeded job.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::NotReady`] for a job in any other state.
+    pub async fn result(&self, name: &JobName) -> Result<Solution, Error> {
+        let state = self.inner.store.job(name).await?.state;
+        if state != JobState::Succeeded {
+            return Err(Error::NotReady(state));
+        }
+        let bytes = self.inner.store.result(name).await?.ok_or_else(|| Error::NotFound(name.clone()))?;
+        // Megabytes of arrays: not on a thread that serves others.
+        let decoded = tokio::task::spawn_blocking(move || payload::decode(&bytes, "a result"));
+        finished(decoded).await
+    }
+
+    /// What waits and what runs.
+    ///
+    /// # Errors
+    /// [`Error::Internal`].
+    pub async fn load(&self) -> Result<Load, Error> {
+        Ok(self.inner.store.load().await?)
+    }
+
+    /// Whether a drain has begun.
+    pub fn is_draining(&self) -> bool {
+        self.inner.phase() != Phase::Open
+    }
+
+    /// Stops claiming, lets what runs finish within `bound`, gives the rest back to the queue, ends the workers and
+    /// the watchers. A second call returns at once with nothing done.
+    pub async fn drain(&self, bound: Duration) -> Drained {
+        self.inner.clone().drain(bound).await
+    }
+}
+
+impl std::fmt::Debug for Engine {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Engine").field("options", &self.inner.options).field("phase", &self.inner.phase()).finish()
+    }
+}
+
+impl Inner {
+    fn phase(&self) -> Phase {
+        *self.phase.borrow()
+    }
+
+    /// Tells the slots that a job may be waiting.
+    fn work_waits(&self) {
+        self.work.send_modify(|count| *count = count.wrapping_add(1));
+    }
+
+    /// Has the queue counted anew.
+    fn queue_changed(&self) {
+        self.queue_changed.notify_one();
+    }
+
+    async fn cancel(&self, name: &JobName) -> Result<Job, Error> {
+        let reply = self.store.request_cancel(name, SystemTime::now()).await?;
+        if let Some(stop) = locked(&self.running).get(name) {
+            stop.stop(StopReason::Cancelled);
+        }
+        if reply.ended_now {
+            self.ended(&reply.job);
+        }
+        Ok(reply.job)
+    }
+
+    /// Tells everyone that a job ended; called once a job, by whoever committed its end.
+    fn ended(&self, job: &Job) {
+        observe::job_ended(job);
+        self.hub.wake(&job.name);
+        self.queue_changed();
+    }
+
+    /// Tells everyone of jobs whose workers vanished.
+    fn taken_back(&self, jobs: &[Job]) {
+        for job in jobs {
+            tracing::warn!(job = %job.name, attempt = job.attempt, state = job.state.name(), "worker vanished");
+            observe::attempt_lost(observe::AttemptLost::LeaseExpired);
+            if job.state.is_terminal() {
+                self.ended(job);
+            } else {
+                self.hub.wake(&job.name);
+            }
+        }
+        if !jobs.is_empty() {
+            self.work_waits();
+            self.queue_changed();
+        }
+    }
+}
+
+/// Locks; a panic elsewhere while it was held left no half-done change, since all changes are single map operations.
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// What a task of ours came to.
+async fn finished<T, E: Into<Error>>(task: tokio::task::JoinHandle<Result<T, E>>) -> Result<T, Error> {
+    match task.await {
+        Ok(result) => result.map_err(Into::into),
+        Err(error) => Err(Error::Internal(format!("a task of the engine broke off: {error}"))),
+    }
+}

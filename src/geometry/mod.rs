@@ -1,8 +1,21 @@
-//! Multiple-view geometry: pure functions and types in f64, cameras in normalised image units.
+//! Multi-view geometry as pure functions and types: cameras, measurements, factorisation, triangulation, the dual
+//! absolute quadric, bundle adjustment, degeneracy.
 //!
-//! May depend on `domain` (for its stop token) and linear algebra; knows nothing of networks, jobs or I/O.
+//! f64 throughout. May depend on `domain` (the stop token) and linear algebra; knows nothing of networks, jobs or I/O.
 
 pub mod bundle;
 pub mod daq;
+pub mod factorization;
 pub mod homography;
+pub mod measurement;
 pub mod metric;
+pub mod statistics;
+pub mod triangulation;
+
+use nalgebra::{Matrix3x4, Vector4};
+
+/// Projective camera, 3x4, defined up to scale.
+pub type Camera = Matrix3x4<f64>;
+
+/// Homogeneous point, defined up to scale.
+pub type Point = Vector4<f64>;

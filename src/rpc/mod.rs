@@ -1,1 +1,29 @@
-//! TODO
+//! The gRPC side: generated messages, their translation from and to the domain, and one file a service.
+//!
+//! Depends on `engine`, `telemetry` and `domain`; only this module and the client side of `cli` see prost and tonic.
+
+pub mod calibration;
+pub mod caller;
+pub mod convert;
+pub mod follow;
+pub mod inputs;
+pub mod jobs;
+pub mod meter;
+pub mod proto;
+pub mod server;
+pub mod status;
+pub mod submission;
+
+use tonic::Status;
+
+use crate::domain::{InvalidInput, Violation};
+
+/// A single violation of a field of the request itself.
+fn violation(field: &str, description: impl Into<String>) -> InvalidInput {
+    Violation::of(field, description).into()
+}
+
+/// Runs what computes for long on a thread that serves no one else.
+async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
+    tokio::task::spawn_blocking(work).await.map_err(|error| status::internal(&error))
+}

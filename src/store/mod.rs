@@ -1,1 +1,145 @@
-//! TODO
+//! The state that outlives the process: jobs, inputs, events, results, leases and request ids, behind one trait.
+//!
+//! Only this module sees SQL. Depends on `domain` and `telemetry`; the state machine's rules are the domain's, what is
+//! written in one transaction is decided here.
+
+pub mod payload;
+pub mod query;
+pub mod record;
+pub mod sqlite;
+pub mod timed;
+
+#[cfg(test)]
+mod contract;
+
+use std::path::PathBuf;
+use std::time::{Duration, SystemTime};
+
+use crate::domain::job::{Job, JobEvent, JobName};
+use crate::domain::progress::Progress;
+
+pub use query::{JobPage, JobQuery, Order};
+pub use record::{
+    Bound, CancelReply, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, Outcome, QueueBounds, Request,
+    Swept,
+};
+
+/// Why the store did not do what it was asked.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Error {
+    #[error("{0} does not exist")]
+    NotFound(JobName),
+    /// The job id is taken, or the request id stands for another body.
+    #[error("{0}")]
+    AlreadyExists(String),
+    /// The lease is no longer held: the job was taken over, given back or ended. The write was dropped.
+    #[error("the lease on {} (attempt {}) is no longer held", .0.name, .0.attempt)]
+    Fenced(Lease),
+    /// Admission refused the job.
+    #[error("{0}")]
+    QueueFull(Bound),
+    /// A page token that this query did not give out.
+    #[error("page token is not one that this query returned")]
+    PageToken,
+    /// Another process holds this data directory.
+    #[error("{} is in use by another server", .0.display())]
+    InUse(PathBuf),
+    /// The database or the file system failed; trying again later may help.
+    #[error("store unavailable: {0}")]
+    Unavailable(String),
+    /// What was read is not what was written.
+    #[error("store corrupt: {0}")]
+    Corrupt(String),
+}
+
+/// A store of jobs. Every method is one transaction: state, event and lease change together or not at all.
+///
+/// `now` is the caller's clock, so that tests need not wait; times are kept to the microsecond.
+#[async_trait::async_trait]
+pub trait Store: Send + Sync + 'static {
+    /// Stores a queued job with its input and its first event, unless the request id is known or admission refuses.
+    ///
+    /// # Errors
+    /// [`Error::AlreadyExists`], [`Error::QueueFull`].
+    async fn create_job(&self, new: NewRecord, bounds: &QueueBounds, now: SystemTime) -> Result<Created, Error>;
+
+    /// # Errors
+    /// [`Error::NotFound`].
+    async fn job(&self, name: &JobName) -> Result<Job, Error>;
+
+    /// One page of a tenant's jobs.
+    ///
+    /// # Errors
+    /// [`Error::PageToken`].
+    async fn jobs(&self, query: &JobQuery) -> Result<JobPage, Error>;
+
+    /// At most `limit` events with a sequence number above `after`, in order.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    async fn events_after(&self, name: &JobName, after: u64, limit: u32) -> Result<Vec<JobEvent>, Error>;
+
+    /// Leases the queued job that is next by priority, then age; `None` when nothing is queued. Jobs past their
+    /// deadline are left to [`Store::sweep`].
+    async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error>;
+
+    /// The encoded input of a job.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    async fn input(&self, name: &JobName) -> Result<Vec<u8>, Error>;
+
+    /// Extends a lease and brings back what its holder must know.
+    ///
+    /// # Errors
+    /// [`Error::Fenced`].
+    async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error>;
+
+    /// Appends a progress event; returns its sequence number.
+    ///
+    /// # Errors
+    /// [`Error::Fenced`].
+    async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error>;
+
+    /// Ends an attempt and its job, with the result where there is one. Returns the job as it stands then.
+    ///
+    /// # Errors
+    /// [`Error::Fenced`].
+    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error>;
+
+    /// Gives a lease back. The job returns to the queue, or ends if its cancel was asked for; the attempt does not
+    /// count against the cap. Returns the job as it stands then.
+    ///
+    /// # Errors
+    /// [`Error::Fenced`].
+    async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error>;
+
+    /// Asks for the end of a job: a queued one ends at once, a running one is flagged for its worker, an ended one is
+    /// left as it is.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error>;
+
+    /// Takes back every lease that no living process can hold; called once, before the first claim. A job that lost
+    /// `max_attempts` attempts this way fails with `ATTEMPTS_EXHAUSTED`. Returns the jobs that changed.
+    async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error>;
+
+    /// Takes back leases that ran out, as [`Store::recover`] does, and ends queued jobs that are past their deadline.
+    async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error>;
+
+    /// The encoded result of a job; `None` where there is none.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error>;
+
+    /// What waits and what runs.
+    async fn load(&self) -> Result<Load, Error>;
+
+    /// Closes every connection; what was acknowledged is durable without it.
+    async fn close(&self);
+}
+
+/// `Failure::reason` of a job whose workers vanished too often.
+pub const ATTEMPTS_EXHAUSTED: &str = "ATTEMPTS_EXHAUSTED";

@@ -1,0 +1,169 @@
+//! Arguments that several commands share.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+use super::exit::Failure;
+use crate::domain::{Backend, ImageSize, Limits, Method, SolveSettings};
+use crate::formats::{self, LabelledInput};
+
+/// Where the server listens by default; `serve --listen` has the same port.
+pub const DEFAULT_SERVER: &str = "http://127.0.0.1:50051";
+
+/// Which server to talk to.
+#[derive(Debug, Clone, Args)]
+pub struct ServerArgs {
+    /// Address of the server
+    #[arg(long, value_name = "URL", env = "SCPSFM_SERVER", default_value = DEFAULT_SERVER)]
+    pub server: String,
+}
+
+/// Which tracks to solve.
+#[derive(Debug, Clone, Args)]
+pub struct InputArgs {
+    /// Tracks as observations.csv: a header `view,track,x,y[,depth]`, then one observation a line, in pixels; the centre
+    /// of the top-left pixel is (0, 0). Ids are any whole numbers; other columns are ignored
+    #[arg(value_name = "INPUT")]
+    pub input: PathBuf,
+
+    /// Width of the images in pixels; without it the extent of the points stands in, with a warning
+    #[arg(long, value_name = "PX", requires = "height", value_parser = clap::value_parser!(u32).range(1..))]
+    pub width: Option<u32>,
+
+    /// Height of the images in pixels
+    #[arg(long, value_name = "PX", requires = "width", value_parser = clap::value_parser!(u32).range(1..))]
+    pub height: Option<u32>,
+}
+
+impl InputArgs {
+    /// Reads the file.
+    ///
+    /// # Errors
+    /// What is wrong with it, by line ([`Exit::BadInput`](super::exit::Exit::BadInput)).
+    pub fn read(&self) -> Result<LabelledInput, Failure> {
+        let size = self.width.zip(self.height).map(|(width_px, height_px)| ImageSize { width_px, height_px });
+        Ok(formats::read(&self.input, &Limits::default(), size)?)
+    }
+}
+
+/// How to solve.
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = "How to solve")]
+pub struct SettingsArgs {
+    /// What decides which tracks are right
+    #[arg(long, value_enum, default_value_t = MethodArg::Auto)]
+    pub method: MethodArg,
+
+    /// Seed of every random choice: one seed, one answer
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+
+    /// Network iterations at most; `auto` usually stops earlier
+    #[arg(long, value_name = "N", default_value_t = SolveSettings::DEFAULT_ITERATIONS)]
+    pub iterations: u32,
+
+    /// Leave the DAQ residual (self-calibration) out of the losses and scores
+    #[arg(long)]
+    pub no_daq: bool,
+
+    /// Noise of the observations in pixels, one standard deviation, where known: a start, the noise is estimated
+    #[arg(long, value_name = "PX")]
+    pub noise_px: Option<f64>,
+
+    /// Tensor backend of the network [default: flex, or what the server is configured with]
+    #[arg(long, value_enum)]
+    pub backend: Option<BackendArg>,
+
+    /// Weight of the loss L_proj
+    #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_ALPHA)]
+    pub alpha: f64,
+
+    /// Weight of the loss L_DAQ
+    #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_BETA)]
+    pub beta: f64,
+
+    /// Least number of inliers that the loss L_num asks for, the paper's t
+    #[arg(long, hide_short_help = true, value_name = "T", default_value_t = SolveSettings::DEFAULT_MIN_INLIERS)]
+    pub min_inliers: f64,
+
+    /// Slope of the sigmoid in L_num
+    #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_KAPPA)]
+    pub kappa: f64,
+
+    /// Learning rate of Adam
+    #[arg(long, hide_short_help = true, value_name = "RATE", default_value_t = SolveSettings::DEFAULT_LEARNING_RATE)]
+    pub learning_rate: f64,
+
+    /// Width of the network as a share of the original PointNet
+    #[arg(long, hide_short_help = true, value_name = "SHARE", default_value_t = SolveSettings::DEFAULT_NETWORK_WIDTH)]
+    pub network_width: f64,
+}
+
+impl SettingsArgs {
+    /// The settings, checked.
+    ///
+    /// # Errors
+    /// A value out of range, as wrong usage.
+    pub fn settings(&self) -> Result<SolveSettings, Failure> {
+        let settings = SolveSettings {
+            method: self.method.into(),
+            use_daq: !self.no_daq,
+            alpha: self.alpha,
+            beta: self.beta,
+            min_inliers: self.min_inliers,
+            kappa: self.kappa,
+            learning_rate: self.learning_rate,
+            iterations: self.iterations,
+            network_width: self.network_width,
+            seed: self.seed,
+            noise_px: self.noise_px,
+            backend: self.backend.map(Backend::from),
+            ..SolveSettings::default()
+        };
+        settings.validate().map_err(Failure::usage)?;
+        Ok(settings)
+    }
+}
+
+/// [`Method`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum MethodArg {
+    /// The network's prior and geometry together
+    Auto,
+    /// The paper's own output: the network's weights, thresholded at 1/2
+    Paper,
+    /// Geometry alone, no network
+    Geometry,
+    /// Plain projective factorisation (Sturm and Triggs 1996)
+    Psfm,
+}
+
+impl From<MethodArg> for Method {
+    fn from(method: MethodArg) -> Self {
+        match method {
+            MethodArg::Auto => Method::Auto,
+            MethodArg::Paper => Method::Paper,
+            MethodArg::Geometry => Method::Geometry,
+            MethodArg::Psfm => Method::Psfm,
+        }
+    }
+}
+
+/// [`Backend`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum BackendArg {
+    /// burn-flex, the faster of the two
+    Flex,
+    /// burn-ndarray
+    Ndarray,
+}
+
+impl From<BackendArg> for Backend {
+    fn from(backend: BackendArg) -> Self {
+        match backend {
+            BackendArg::Flex => Backend::Flex,
+            BackendArg::Ndarray => Backend::Ndarray,
+        }
+    }
+}

@@ -1,0 +1,138 @@
+//! What can go wrong with a call, in sentences.
+
+use std::error::Error as _;
+
+use tonic::{Code, Status};
+use tonic_types::StatusExt;
+
+use crate::cli::exit::{Exit, Failure};
+use crate::domain::{InvalidInput, Violation};
+
+/// Why a call came to nothing.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Error {
+    /// No server answers, it is going down, or its queue is full: another try may help.
+    #[error("{0}")]
+    Unavailable(String),
+    /// The server found fault with the input; the fields are those of the API.
+    #[error("{1}")]
+    Invalid(Vec<Violation>, String),
+    /// The server will not do it: no such job, no result yet, an id that is taken.
+    #[error("{0}")]
+    Refused(String),
+    #[error("the job was cancelled")]
+    Cancelled,
+    /// The job or the server failed.
+    #[error("{0}")]
+    Failed(String),
+}
+
+impl Error {
+    /// From the status of a call to `server`.
+    pub(super) fn from_status(server: &str, status: &Status) -> Self {
+        if status.source().is_some() && status.get_details_error_info().is_none() {
+            return Error::Unavailable(format!("the connection to {server} broke: {}", root_cause(status)));
+        }
+        let message = status.message().to_owned();
+        match status.code() {
+            Code::Unavailable => Error::Unavailable(format!("{server}: {message}")),
+            Code::ResourceExhausted => {
+                let retry = status.get_details_retry_info().and_then(|info| info.retry_delay);
+                let hint = retry.map(|delay| format!("; try again in {} s", delay.as_secs_f64())).unwrap_or_default();
+                Error::Unavailable(format!("{server}: {message}{hint}"))
+            }
+            Code::InvalidArgument => Error::Invalid(violations(status), message),
+            // What the transport says of a message above the server's limit.
+            Code::OutOfRange => Error::Refused(format!("{message}; `solve --server` sends a large input in parts")),
+            Code::NotFound
+            | Code::AlreadyExists
+            | Code::PermissionDenied
+            | Code::FailedPrecondition
+            | Code::Unauthenticated => Error::Refused(message),
+            Code::Cancelled => Error::Cancelled,
+            code => Error::Failed(format!("{server}: {message} ({code:?})")),
+        }
+    }
+}
+
+/// Whether the same call may fare better soon: the connection broke, or the server is going down.
+pub(super) fn is_transient(status: &Status) -> bool {
+    status.code() == Code::Unavailable || (status.source().is_some() && status.get_details_error_info().is_none())
+}
+
+/// No connection to begin with.
+pub(super) fn not_connected(server: &str, error: &tonic::transport::Error) -> Error {
+    let cause = root_cause(error);
+    Error::Unavailable(format!(
+        "no server answers at {server}: {cause}; start one with `scpsfm serve`, or say --server"
+    ))
+}
+
+/// The innermost error: what the layers above wrap says nothing to a user.
+fn root_cause(error: &dyn std::error::Error) -> String {
+    let mut cause = error;
+    while let Some(inner) = cause.source() {
+        cause = inner;
+    }
+    cause.to_string()
+}
+
+/// The violations that a status carries, index and all.
+fn violations(status: &Status) -> Vec<Violation> {
+    let fields = status.get_details_bad_request().map(|request| request.field_violations).unwrap_or_default();
+    fields.into_iter().map(|found| violation(&found.field, found.description)).collect()
+}
+
+/// Reads `track_set.x[17]` back into field and index.
+fn violation(path: &str, description: String) -> Violation {
+    let indexed = path.strip_suffix(']').and_then(|path| path.rsplit_once('['));
+    match indexed.and_then(|(field, index)| Some((field, index.parse().ok()?))) {
+        Some((field, index)) => Violation::at(field, index, description),
+        None => Violation::of(path, description),
+    }
+}
+
+/// An answer that cannot be read.
+impl From<Violation> for Error {
+    fn from(violation: Violation) -> Self {
+        Error::Failed(format!("the server's answer cannot be read: {violation}"))
+    }
+}
+
+/// An answer that cannot be read.
+impl From<InvalidInput> for Error {
+    fn from(error: InvalidInput) -> Self {
+        Error::Failed(format!("the server's answer cannot be read: {error}"))
+    }
+}
+
+impl From<Error> for Failure {
+    fn from(error: Error) -> Self {
+        let exit = match &error {
+            Error::Unavailable(_) => Exit::Unavailable,
+            Error::Invalid(..) | Error::Refused(_) => Exit::BadInput,
+            Error::Cancelled => Exit::Interrupted,
+            Error::Failed(_) => Exit::Internal,
+        };
+        Failure { exit, message: error.to_string() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rpc::status;
+
+    #[test]
+    fn violations_come_back_with_field_and_index() {
+        let sent = Violation::at("track_set.x", 17, "NaN is not a finite number");
+        let status = status::invalid(&sent.clone().into());
+        let Error::Invalid(violations, message) = Error::from_status("http://a", &status) else {
+            panic!("not invalid: {status}");
+        };
+        assert_eq!(violations, [sent]);
+        assert_eq!(message, "track_set.x[17]: NaN is not a finite number");
+        let whole = violation("settings.alpha", "is wrong".into());
+        assert_eq!(whole, Violation::of("settings.alpha", "is wrong"));
+    }
+}

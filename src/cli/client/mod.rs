@@ -1,0 +1,377 @@
+//! The client side of the API: what every command that talks to a server shares.
+//!
+//! Calls that may be repeated are repeated when the connection breaks, for a bounded time: a watch goes on after its last
+//! event, a result after its last byte, a creation under its request id.
+
+mod backoff;
+mod error;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use prost::Message;
+use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding::Gzip;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Request, Status, Streaming};
+
+pub use error::Error;
+
+use self::backoff::Backoff;
+use super::args::ServerArgs;
+use crate::domain::job::{DEFAULT_TENANT, EventBody, Job, JobEvent, JobName, JobState};
+use crate::domain::{RawInput, Solution, SolveSettings};
+use crate::rpc::convert;
+use crate::rpc::proto::{self, calibration_service_client as calibration, job_service_client as jobs};
+
+/// A server that does not answer within this is not there.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// A silent connection is asked this often whether it lives, so that a watch of a long job notices a lost server.
+const KEEPALIVE: Duration = Duration::from_secs(20);
+
+/// Largest answer that is taken: interim weights of the most tracks that any server allows are below it.
+const MAX_MESSAGE_BYTES: usize = 64 << 20;
+
+/// What a caller says of a job beside input and settings.
+#[derive(Debug, Clone, Default)]
+pub struct JobOptions {
+    pub job_id: Option<String>,
+    /// `None`: one is made, so that a broken call can be repeated.
+    pub request_id: Option<String>,
+    pub labels: BTreeMap<String, String>,
+    pub priority: i32,
+    pub time_limit: Option<Duration>,
+}
+
+/// One page of a list.
+#[derive(Debug)]
+pub struct Page {
+    pub jobs: Vec<Job>,
+    /// Empty on the last page.
+    pub next_page_token: String,
+}
+
+/// A connection to a server; reconnects by itself.
+#[derive(Debug, Clone)]
+pub struct Client {
+    jobs: jobs::JobServiceClient<Channel>,
+    calibration: calibration::CalibrationServiceClient<Channel>,
+    server: String,
+}
+
+impl Client {
+    /// Connects.
+    ///
+    /// # Errors
+    /// [`Error::Unavailable`] where no server answers, [`Error::Refused`] for what is not a URL.
+    pub async fn connect(server: &str) -> Result<Self, Error> {
+        if !server.starts_with("http://") {
+            return Err(Error::Refused(format!("{server:?} is not a URL of the form http://HOST:PORT")));
+        }
+        let endpoint = Endpoint::from_shared(server.to_owned())
+            .map_err(|_| Error::Refused(format!("{server:?} is not a URL of the form http://HOST:PORT")))?
+            .connect_timeout(CONNECT_TIMEOUT)
+            .tcp_nodelay(true)
+            .http2_keep_alive_interval(KEEPALIVE);
+        let channel = endpoint.connect().await.map_err(|error| error::not_connected(server, &error))?;
+        let jobs = jobs::JobServiceClient::new(channel.clone());
+        let calibration = calibration::CalibrationServiceClient::new(channel);
+        Ok(Self {
+            jobs: jobs.accept_compressed(Gzip).send_compressed(Gzip).max_decoding_message_size(MAX_MESSAGE_BYTES),
+            calibration: calibration
+                .accept_compressed(Gzip)
+                .send_compressed(Gzip)
+                .max_decoding_message_size(MAX_MESSAGE_BYTES),
+            server: server.to_owned(),
+        })
+    }
+
+    fn error(&self, status: Status) -> Error {
+        Error::from_status(&self.server, &status)
+    }
+
+    /// Creates a job that lives on without this client.
+    ///
+    /// # Errors
+    /// See [`Error`].
+    pub async fn create(
+        &mut self,
+        input: &RawInput,
+        settings: &SolveSettings,
+        options: JobOptions,
+    ) -> Result<Job, Error> {
+        let whole = convert::input::to_wire(input);
+        let request = create_request(whole, settings, options);
+        let mut backoff = Backoff::default();
+        loop {
+            match self.jobs.create_job(request.clone()).await {
+                Ok(job) => return Ok(convert::job::from_wire(job.into_inner())?),
+                Err(status) => self.pause(&mut backoff, status).await?,
+            }
+        }
+    }
+
+    /// # Errors
+    /// See [`Error`].
+    pub async fn get(&mut self, name: &JobName) -> Result<Job, Error> {
+        let answer = self.jobs.get_job(proto::GetJobRequest { name: name.to_string() }).await;
+        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+    }
+
+    /// One page of the jobs that `filter` lets through, the newest first.
+    ///
+    /// # Errors
+    /// See [`Error`].
+    pub async fn list(&mut self, filter: &str, page_size: u16, page_token: &str) -> Result<Page, Error> {
+        let request = proto::ListJobsRequest {
+            parent: parent(),
+            page_size: page_size.into(),
+            page_token: page_token.to_owned(),
+            filter: filter.to_owned(),
+            order_by: String::new(),
+        };
+        let page = self.jobs.list_jobs(request).await.map_err(|status| self.error(status))?.into_inner();
+        let jobs = page.jobs.into_iter().map(convert::job::from_wire).collect::<Result<_, _>>()?;
+        Ok(Page { jobs, next_page_token: page.next_page_token })
+    }
+
+    /// # Errors
+    /// See [`Error`].
+    pub async fn cancel(&mut self, name: &JobName) -> Result<Job, Error> {
+        let answer = self.jobs.cancel_job(proto::CancelJobRequest { name: name.to_string() }).await;
+        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+    }
+
+    /// Tells a job's events after a sequence number until its end, over broken connections and restarts of the server.
+    ///
+    /// # Errors
+    /// What went wrong with the watch. How the job ended is in the event that is returned, its last.
+    pub async fn watch(
+        &mut self,
+        name: &JobName,
+        after_sequence: u64,
+        on_event: &mut (dyn FnMut(&JobEvent) + Send),
+    ) -> Result<JobEvent, Error> {
+        let mut told = Told { last_sequence: after_sequence, on_event };
+        let mut backoff = Backoff::default();
+        loop {
+            let request = proto::WatchJobRequest { name: name.to_string(), after_sequence: told.last_sequence };
+            let outcome = match self.jobs.watch_job(request).await {
+                Ok(events) => told.follow(events.into_inner(), &mut backoff).await?,
+                Err(status) => Err(status),
+            };
+            match outcome {
+                Ok(Some(last)) => return Ok(last),
+                // The job had ended before `after_sequence`, so that there is nothing to tell.
+                Ok(None) => return Err(Error::Refused(format!("there are no events after {after_sequence}"))),
+                Err(status) => self.pause(&mut backoff, status).await?,
+            }
+        }
+    }
+
+    /// Creates a job, follows it to its end and reads its result. When `stop` is cancelled, so is the job.
+    ///
+    /// # Errors
+    /// See [`Error`]; a job that ended without a result is an error here.
+    pub async fn solve(
+        &mut self,
+        input: &RawInput,
+        settings: &SolveSettings,
+        on_event: &mut (dyn FnMut(&JobEvent) + Send),
+        stop: CancellationToken,
+    ) -> Result<Solution, Error> {
+        let mut name = None;
+        let mut on_named_event = |event: &JobEvent| {
+            name.get_or_insert_with(|| event.name.clone());
+            on_event(event);
+        };
+        let mut solving = self.clone();
+        let last = tokio::select! {
+            last = solving.follow_solve(input, settings, &mut on_named_event) => last?,
+            () = stop.cancelled() => {
+                if let Some(name) = &name {
+                    self.cancel(name).await?;
+                }
+                return Err(Error::Cancelled);
+            }
+        };
+        ended(&last)?;
+        self.read_result(&last.name).await
+    }
+
+    /// A broken call is made again under the same request id: it takes up the job within the server's grace period, and
+    /// tells its events anew, of which only new ones are passed on.
+    async fn follow_solve(
+        &mut self,
+        input: &RawInput,
+        settings: &SolveSettings,
+        on_event: &mut (dyn FnMut(&JobEvent) + Send),
+    ) -> Result<JobEvent, Error> {
+        let input = Arc::new(input.clone());
+        let config = create_request(convert::input::head_to_wire(&input), settings, JobOptions::default());
+        let mut told = Told { last_sequence: 0, on_event };
+        let mut backoff = Backoff::default();
+        loop {
+            use proto::solve_request::Message;
+            let chunks = convert::input::chunks(Arc::clone(&input)).map(Message::TrackSetChunk);
+            let messages = std::iter::once(Message::Config(config.clone())).chain(chunks);
+            let messages = messages.map(|message| proto::SolveRequest { message: Some(message) });
+            let outcome = match self.calibration.solve(Request::new(tokio_stream::iter(messages))).await {
+                Ok(events) => told.follow(events.into_inner(), &mut backoff).await?,
+                Err(status) => Err(status),
+            };
+            match outcome {
+                Ok(Some(last)) => return Ok(last),
+                Ok(None) => return Err(Error::Failed("the server ended a solve without its last event".into())),
+                Err(status) => self.pause(&mut backoff, status).await?,
+            }
+        }
+    }
+
+    /// Reads a result.
+    ///
+    /// # Errors
+    /// See [`Error`]; [`Error::Refused`] while there is none.
+    pub async fn read_result(&mut self, name: &JobName) -> Result<Solution, Error> {
+        let mut bytes = Vec::new();
+        let mut backoff = Backoff::default();
+        while let Err(status) = self.read_on(name, &mut bytes, &mut backoff).await? {
+            self.pause(&mut backoff, status).await?;
+        }
+        let result = proto::JobResult::decode(bytes.as_slice())
+            .map_err(|error| Error::Failed(format!("the server's result cannot be decoded: {error}")))?;
+        Ok(convert::result::from_wire(result)?)
+    }
+
+    /// Reads on from what is there; the inner error is worth another try.
+    async fn read_on(
+        &mut self,
+        name: &JobName,
+        bytes: &mut Vec<u8>,
+        backoff: &mut Backoff,
+    ) -> Result<Result<(), Status>, Error> {
+        let request = proto::ReadJobResultRequest { name: name.to_string(), offset: bytes.len() as i64 };
+        let mut chunks = match self.jobs.read_job_result(request).await {
+            Ok(chunks) => chunks.into_inner(),
+            Err(status) => return Ok(Err(status)),
+        };
+        let mut total = 0;
+        loop {
+            match chunks.message().await {
+                Ok(Some(chunk)) if chunk.offset == bytes.len() as i64 => {
+                    total = chunk.total_size;
+                    bytes.extend_from_slice(&chunk.data);
+                    backoff.reset();
+                }
+                Ok(Some(chunk)) => {
+                    let text = format!("a chunk begins at {} where {} was due", chunk.offset, bytes.len());
+                    return Err(Error::Failed(text));
+                }
+                Ok(None) if total == bytes.len() as i64 => return Ok(Ok(())),
+                Ok(None) => return Err(Error::Failed(format!("the result ended at {} of {total}", bytes.len()))),
+                Err(status) => return Ok(Err(status)),
+            }
+        }
+    }
+
+    /// Waits before another try, or gives up: for good reason, or after too many.
+    async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
+        if error::is_transient(&status) && backoff.pause().await { Ok(()) } else { Err(self.error(status)) }
+    }
+}
+
+/// Passes events on, each sequenced one once.
+struct Told<'a> {
+    last_sequence: u64,
+    on_event: &'a mut (dyn FnMut(&JobEvent) + Send),
+}
+
+impl Told<'_> {
+    /// Follows one stream to its end. The inner error is worth another try; `None`: it ended without a terminal state.
+    async fn follow(
+        &mut self,
+        mut events: Streaming<proto::JobEvent>,
+        backoff: &mut Backoff,
+    ) -> Result<Result<Option<JobEvent>, Status>, Error> {
+        loop {
+            let event = match events.message().await {
+                Ok(Some(event)) => convert::job::event_from_wire(event)?,
+                Ok(None) => return Ok(Ok(None)),
+                Err(status) => return Ok(Err(status)),
+            };
+            if event.sequence.is_some_and(|sequence| sequence <= self.last_sequence) {
+                continue;
+            }
+            backoff.reset();
+            self.last_sequence = event.sequence.unwrap_or(self.last_sequence);
+            (self.on_event)(&event);
+            if matches!(event.body, EventBody::State { state, .. } if state.is_terminal()) {
+                return Ok(Ok(Some(event)));
+            }
+        }
+    }
+}
+
+/// `Ok` when a job's last event says that its result stands.
+///
+/// # Errors
+/// [`Error::Cancelled`], or [`Error::Failed`] with the reason.
+pub fn ended(last: &JobEvent) -> Result<(), Error> {
+    match &last.body {
+        EventBody::State { state: JobState::Succeeded, .. } => Ok(()),
+        EventBody::State { state: JobState::Cancelled, .. } => Err(Error::Cancelled),
+        EventBody::State { state: JobState::Expired, .. } => {
+            Err(Error::Failed(format!("{} expired: its deadline passed before a result stood", last.name)))
+        }
+        EventBody::State { failure: Some(failure), .. } => {
+            Err(Error::Failed(format!("{} failed: {} ({})", last.name, failure.message, failure.reason)))
+        }
+        _ => Err(Error::Failed(format!("{} did not succeed", last.name))),
+    }
+}
+
+fn parent() -> String {
+    format!("tenants/{DEFAULT_TENANT}")
+}
+
+fn create_request(input: proto::TrackSet, settings: &SolveSettings, options: JobOptions) -> proto::CreateJobRequest {
+    // A limit beyond what a duration holds is no limit.
+    let time_limit = options.time_limit.and_then(|limit| prost_types::Duration::try_from(limit).ok());
+    proto::CreateJobRequest {
+        parent: parent(),
+        job_id: options.job_id.unwrap_or_default(),
+        request_id: options.request_id.unwrap_or_else(|| uuid::Uuid::now_v7().to_string()),
+        job: Some(proto::Job {
+            settings: Some(convert::settings::to_wire(settings)),
+            labels: options.labels,
+            priority: options.priority,
+            deadline: time_limit.map(proto::job::Deadline::TimeLimit),
+            ..proto::Job::default()
+        }),
+        input: Some(proto::create_job_request::Input::TrackSet(input)),
+    }
+}
+
+/// Runs one job on a server: what `scpsfm solve --server` and `scpsfm demo` do. See [`Client::solve`].
+///
+/// # Errors
+/// See [`Error`].
+pub async fn solve(
+    server: &ServerArgs,
+    input: &RawInput,
+    settings: &SolveSettings,
+    on_event: &mut (dyn FnMut(&JobEvent) + Send),
+    stop: CancellationToken,
+) -> Result<Solution, Error> {
+    Client::connect(&server.server).await?.solve(input, settings, on_event, stop).await
+}
+
+/// Reads the result of a job on a server.
+///
+/// # Errors
+/// See [`Error`].
+pub async fn read_result(server: &ServerArgs, job: &JobName) -> Result<Solution, Error> {
+    Client::connect(&server.server).await?.read_result(job).await
+}

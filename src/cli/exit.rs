@@ -1,0 +1,122 @@
+//! How a command ends: a code for scripts, and one sentence when it failed.
+
+use std::fmt;
+use std::process::ExitCode;
+
+use crate::domain::{InvalidInput, Solution, Status};
+use crate::formats;
+
+/// The codes, as every `--help` shows them.
+pub const HELP: &str = "\
+Exit codes:
+    0  done; of a solve: solved (the grade may still be PROJECTIVE_ONLY: see result.json)
+    1  internal or I/O error, or a job that failed or expired
+    2  wrong usage
+    3  no reconstruction: the result files were written and say why
+   64  bad configuration
+   65  bad input data; no such job
+   69  server unavailable or its queue full: try again
+  130  interrupted or cancelled";
+
+/// How a command ended. 2 is clap's own; 64, 65 and 69 are `EX_USAGE`, `EX_DATAERR` and `EX_UNAVAILABLE` of
+/// sysexits.h; 130 is what a shell reports of a program ended by Ctrl-C.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Exit {
+    Done = 0,
+    Internal = 1,
+    Usage = 2,
+    NoReconstruction = 3,
+    BadConfig = 64,
+    BadInput = 65,
+    Unavailable = 69,
+    Interrupted = 130,
+}
+
+impl Exit {
+    /// How a solve that ended with this solution ends its command.
+    pub fn of(solution: &Solution) -> Self {
+        Self::of_status(solution.status)
+    }
+
+    /// The same where only the status is at hand.
+    pub fn of_status(status: Status) -> Self {
+        match status {
+            Status::Solved => Exit::Done,
+            Status::NoReconstruction => Exit::NoReconstruction,
+        }
+    }
+}
+
+impl From<Exit> for ExitCode {
+    fn from(exit: Exit) -> Self {
+        ExitCode::from(exit as u8)
+    }
+}
+
+/// Why a command failed. `message` is printed once, on stderr, by [`run`](super::run).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Failure {
+    pub exit: Exit,
+    pub message: String,
+}
+
+impl Failure {
+    fn new(exit: Exit, message: impl fmt::Display) -> Self {
+        Self { exit, message: message.to_string() }
+    }
+
+    pub fn internal(message: impl fmt::Display) -> Self {
+        Self::new(Exit::Internal, message)
+    }
+
+    pub fn usage(message: impl fmt::Display) -> Self {
+        Self::new(Exit::Usage, message)
+    }
+
+    pub fn bad_config(message: impl fmt::Display) -> Self {
+        Self::new(Exit::BadConfig, message)
+    }
+
+    pub fn bad_input(message: impl fmt::Display) -> Self {
+        Self::new(Exit::BadInput, message)
+    }
+
+    pub fn unavailable(message: impl fmt::Display) -> Self {
+        Self::new(Exit::Unavailable, message)
+    }
+
+    pub fn interrupted() -> Self {
+        Self::new(Exit::Interrupted, "interrupted; no result was written")
+    }
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl From<std::io::Error> for Failure {
+    fn from(error: std::io::Error) -> Self {
+        Self::internal(error)
+    }
+}
+
+impl From<anyhow::Error> for Failure {
+    fn from(error: anyhow::Error) -> Self {
+        Self::internal(format_args!("{error:#}"))
+    }
+}
+
+impl From<InvalidInput> for Failure {
+    fn from(error: InvalidInput) -> Self {
+        Self::bad_input(error)
+    }
+}
+
+impl From<formats::Error> for Failure {
+    fn from(error: formats::Error) -> Self {
+        Self::bad_input(error)
+    }
+}

@@ -1,0 +1,37 @@
+//! `scpsfm get`: one job.
+
+use super::args::ServerArgs;
+use super::client::Client;
+use super::exit::{Exit, Failure};
+use super::{job_view, print};
+use crate::domain::job::JobName;
+
+const EXAMPLES: &str = "\
+Examples:
+  scpsfm get tenants/default/jobs/a1b2
+  scpsfm get a1b2 --json | jq -r .state";
+
+/// Show a job
+///
+/// Ends with 0 whatever the job's state is: a failed job's reason is part of the answer.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
+pub struct Args {
+    /// The job's name, or the last part of it
+    #[arg(value_name = "NAME", value_parser = job_view::parse_name)]
+    pub name: JobName,
+
+    #[command(flatten)]
+    pub server: ServerArgs,
+
+    /// Everything, as JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Runs the command.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let job = Client::connect(&args.server.server).await?.get(&args.name).await?;
+    print(&if args.json { format!("{:#}", job_view::job_json(&job)) } else { job_view::job_line(&job) })?;
+    Ok(Exit::Done)
+}

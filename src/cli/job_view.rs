@@ -1,0 +1,153 @@
+//! Jobs and events on stdout: a line for people, JSON for programs.
+
+use std::time::SystemTime;
+
+use serde_json::{Value, json};
+
+use super::client::{self, Client};
+use super::exit::{Exit, Failure};
+use super::print;
+use super::progress::ProgressView;
+use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState, Summary};
+use crate::domain::{Grade, Status};
+
+/// Reads a job's name; the id alone stands for a job of the default tenant.
+pub fn parse_name(text: &str) -> Result<JobName, String> {
+    let name = if text.contains('/') { text.to_owned() } else { format!("tenants/default/jobs/{text}") };
+    JobName::parse(&name).ok_or_else(|| format!("{text:?} is not a job's name, such as tenants/default/jobs/a1b2"))
+}
+
+/// A job in a line.
+pub fn job_line(job: &Job) -> String {
+    let mut line = format!("{}  {:<9}  {}", job.name, job.state.name(), time(job.create_time));
+    line.push_str(&format!("  {} views, {} tracks", job.view_count, job.track_count));
+    if let Some(summary) = &job.summary {
+        line.push_str(&format!("  {}", summary_words(summary)));
+    } else if let Some(failure) = &job.failure {
+        line.push_str(&format!("  {}: {}", failure.reason, failure.message));
+    } else if let Some(progress) = job.progress.filter(|_| job.state == JobState::Running) {
+        line.push_str(&format!("  {} {:.0} %", progress.stage.name(), 100.0 * progress.fraction));
+    }
+    line
+}
+
+fn summary_words(summary: &Summary) -> String {
+    if summary.status == Status::NoReconstruction {
+        return "no reconstruction".into();
+    }
+    let grade = match summary.grade {
+        Some(Grade::Metric) => "METRIC",
+        Some(Grade::Weak) => "WEAK",
+        Some(Grade::ProjectiveOnly) => "PROJECTIVE_ONLY",
+        None => "solved",
+    };
+    let focal = summary.focal_px.map(|focal_px| format!(", focal {focal_px:.1} px")).unwrap_or_default();
+    format!("{grade}, {} inlier tracks{focal}, {:.1} s", summary.inlier_tracks, summary.seconds)
+}
+
+/// A job for programs; times as RFC 3339.
+pub fn job_json(job: &Job) -> Value {
+    json!({
+        "name": job.name.to_string(),
+        "state": job.state,
+        "attempt": job.attempt,
+        "settings": job.settings,
+        "views": job.view_count,
+        "tracks": job.track_count,
+        "observations": job.observation_count,
+        "labels": job.labels,
+        "priority": job.priority,
+        "create_time": time(job.create_time),
+        "start_time": job.start_time.map(time),
+        "end_time": job.end_time.map(time),
+        "deadline_time": job.deadline.map(time),
+        "progress": job.progress,
+        "last_sequence": job.last_sequence,
+        "summary": job.summary,
+        "error": job.failure,
+        "cancel_requested": job.cancel_requested,
+    })
+}
+
+/// An event for programs.
+pub fn event_json(event: &JobEvent) -> Value {
+    let (kind, body) = match &event.body {
+        EventBody::State { state, failure } => ("state_change", json!({ "state": state, "error": failure })),
+        EventBody::Progress(progress) => ("progress", json!(progress)),
+        EventBody::Weights { iteration, weights } => ("weights", json!({ "iteration": iteration, "weight": weights })),
+        EventBody::Result(summary) => ("result", json!(summary)),
+    };
+    json!({
+        "name": event.name.to_string(),
+        "attempt": event.attempt,
+        "sequence": event.sequence,
+        "time": time(event.time),
+        kind: body,
+    })
+}
+
+fn time(time: SystemTime) -> String {
+    prost_types::Timestamp::from(time).to_string()
+}
+
+/// Shows an event on the progress view.
+pub fn show_event(view: &mut ProgressView, event: &JobEvent) {
+    match &event.body {
+        EventBody::State { state, failure: None } => view.state(&format!("{} {}", event.name, state.name())),
+        EventBody::State { state, failure: Some(failure) } => {
+            view.state(&format!("{} {}: {}", event.name, state.name(), failure.message));
+        }
+        EventBody::Progress(progress) => view.show(progress),
+        EventBody::Weights { .. } => {}
+        EventBody::Result(summary) => view.state(&summary_words(summary)),
+    }
+}
+
+/// Follows a job to its end and tells how it ended; with `json` one event a line on stdout.
+pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json: bool) -> Result<Exit, Failure> {
+    let mut view = ProgressView::new(json);
+    let mut status = None;
+    let mut unprinted = Ok(());
+    let mut on_event = |event: &JobEvent| {
+        if let EventBody::Result(summary) = &event.body {
+            status = Some(summary.status);
+        }
+        if !json {
+            show_event(&mut view, event);
+        } else if unprinted.is_ok() {
+            unprinted = print(&event_json(event).to_string());
+        }
+    };
+    let last = client.watch(name, after, &mut on_event).await?;
+    view.finish();
+    unprinted?;
+    client::ended(&last)?;
+    Ok(status.map_or(Exit::Done, Exit::of_status))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_may_be_given_in_full_or_by_their_id() {
+        let full = parse_name("tenants/default/jobs/a-1").expect("a name");
+        assert_eq!(parse_name("a-1"), Ok(full));
+        assert!(parse_name("A").is_err());
+        assert!(parse_name("jobs/a").is_err());
+    }
+
+    #[test]
+    fn an_event_is_json_under_its_kind() {
+        let event = JobEvent {
+            name: parse_name("a").expect("a name"),
+            attempt: 1,
+            sequence: Some(3),
+            time: SystemTime::UNIX_EPOCH,
+            body: EventBody::State { state: JobState::Running, failure: None },
+        };
+        let value = event_json(&event);
+        assert_eq!(value["state_change"]["state"], "RUNNING");
+        assert_eq!((&value["sequence"], &value["time"]), (&json!(3), &json!("1970-01-01T00:00:00Z")));
+    }
+}

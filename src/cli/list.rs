@@ -1,0 +1,90 @@
+//! `scpsfm list`: a server's jobs.
+
+use clap::ValueEnum;
+
+use super::args::ServerArgs;
+use super::client::Client;
+use super::exit::{Exit, Failure};
+use super::{job_view, print};
+use crate::domain::job::JobState;
+
+const EXAMPLES: &str = "\
+Examples:
+  scpsfm list
+  scpsfm list --state queued --state running
+  scpsfm list --filter 'labels.site = \"north\"' --json | jq -r .name";
+
+/// List jobs, the newest first
+///
+/// Prints one page; where there are more, the token of the next page goes to stderr.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
+pub struct Args {
+    #[command(flatten)]
+    pub server: ServerArgs,
+
+    /// Only jobs in this state; may be given more than once
+    #[arg(long = "state", value_enum, ignore_case = true)]
+    pub states: Vec<StateArg>,
+
+    /// Only jobs that match, such as 'labels.site = "north"'; see the API for what it may say
+    #[arg(long, default_value = "")]
+    pub filter: String,
+
+    /// Jobs in a page
+    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    pub page_size: u16,
+
+    /// The page that follows another
+    #[arg(long, value_name = "TOKEN", default_value = "")]
+    pub page_token: String,
+
+    /// One job a line, as JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// [`JobState`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum StateArg {
+    Queued,
+    Running,
+    Succeeded,
+    Failed,
+    Cancelled,
+    Expired,
+}
+
+impl From<StateArg> for JobState {
+    fn from(state: StateArg) -> Self {
+        match state {
+            StateArg::Queued => JobState::Queued,
+            StateArg::Running => JobState::Running,
+            StateArg::Succeeded => JobState::Succeeded,
+            StateArg::Failed => JobState::Failed,
+            StateArg::Cancelled => JobState::Cancelled,
+            StateArg::Expired => JobState::Expired,
+        }
+    }
+}
+
+/// Runs the command.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let mut client = Client::connect(&args.server.server).await?;
+    let page = client.list(&filter(&args), args.page_size, &args.page_token).await?;
+    for job in &page.jobs {
+        print(&if args.json { job_view::job_json(job).to_string() } else { job_view::job_line(job) })?;
+    }
+    if !page.next_page_token.is_empty() {
+        eprintln!("more: --page-token {}", page.next_page_token);
+    }
+    Ok(Exit::Done)
+}
+
+/// States and filter together.
+fn filter(args: &Args) -> String {
+    let states: Vec<String> =
+        args.states.iter().map(|&state| format!("state = {}", JobState::from(state).name())).collect();
+    let terms = [states.join(" OR "), args.filter.clone()];
+    terms.into_iter().filter(|term| !term.trim().is_empty()).collect::<Vec<_>>().join(" AND ")
+}

@@ -1,0 +1,142 @@
+//! Showing how far a job is: a bar on a terminal, a few plain lines elsewhere. Always on stderr.
+
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::domain::{Observer, Progress, Stage};
+
+/// Steps of the bar: finer than any terminal is wide.
+const BAR_STEPS: u64 = 1_000;
+/// Plain lines appear at a change of stage, after this share of the work, ...
+const LINE_EVERY_SHARE: f64 = 0.1;
+/// ... or after this time, so that a log of an hour-long job shows that it lives.
+const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// Shows progress; nothing when quiet.
+pub struct ProgressView {
+    shown: Shown,
+}
+
+enum Shown {
+    Nothing,
+    Bar(ProgressBar),
+    Lines { last: Option<(Stage, f64)>, last_time: Instant },
+}
+
+impl ProgressView {
+    /// A bar when stderr is a terminal, lines when it is not, nothing when `quiet`.
+    pub fn new(quiet: bool) -> Self {
+        let shown = if quiet {
+            Shown::Nothing
+        } else if std::io::stderr().is_terminal() {
+            let bar = ProgressBar::new(BAR_STEPS);
+            if let Ok(style) = ProgressStyle::with_template("{prefix:>9} [{bar:24}] {percent:>3}% {wide_msg}") {
+                bar.set_style(style.progress_chars("=> "));
+            }
+            Shown::Bar(bar)
+        } else {
+            Shown::Lines { last: None, last_time: Instant::now() }
+        };
+        Self { shown }
+    }
+
+    /// Shows a state that is no progress: `queued`, `connected to ...`.
+    pub fn state(&mut self, text: &str) {
+        match &self.shown {
+            Shown::Nothing => {}
+            Shown::Bar(bar) => bar.println(text),
+            Shown::Lines { .. } => eprintln!("{text}"),
+        }
+    }
+
+    /// Shows progress.
+    pub fn show(&mut self, progress: &Progress) {
+        match &mut self.shown {
+            Shown::Nothing => {}
+            Shown::Bar(bar) => {
+                bar.set_prefix(progress.stage.name());
+                bar.set_position((progress.fraction.clamp(0.0, 1.0) * BAR_STEPS as f64) as u64);
+                bar.set_message(describe(progress));
+            }
+            Shown::Lines { last, last_time } => {
+                let due = last.is_none_or(|(stage, fraction)| {
+                    stage != progress.stage || progress.fraction >= fraction + LINE_EVERY_SHARE
+                });
+                if due || last_time.elapsed() >= LINE_EVERY {
+                    *last = Some((progress.stage, progress.fraction));
+                    *last_time = Instant::now();
+                    let percent = progress.fraction * 100.0;
+                    eprintln!("{:>9} {percent:3.0}% {}", progress.stage.name(), describe(progress));
+                }
+            }
+        }
+    }
+
+    /// Takes the bar away.
+    pub fn finish(&mut self) {
+        if let Shown::Bar(bar) = &self.shown {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+impl Drop for ProgressView {
+    fn drop(&mut self) {
+        self.finish();
+    }
+}
+
+impl Observer for ProgressView {
+    fn progress(&mut self, progress: &Progress) {
+        self.show(progress);
+    }
+}
+
+/// What a progress record says, in a line.
+fn describe(progress: &Progress) -> String {
+    let mut text = format!("{} inliers", progress.inliers);
+    if let Some(focal_px) = progress.focal_px {
+        text.push_str(&format!(", focal {focal_px:.1} px"));
+    }
+    if let Some(score) = progress.best_score {
+        text.push_str(&format!(", score {score:.4}"));
+    }
+    if let Some(losses) = progress.losses {
+        text.push_str(&format!(
+            ", iteration {}, L_num {:.2e} L_proj {:.3} L_DAQ {:.3}",
+            progress.iteration, losses.num, losses.proj, losses.daq
+        ));
+    }
+    text.push_str(&format!(", {:.1} s", progress.elapsed_seconds));
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::Losses;
+
+    #[test]
+    fn a_line_holds_what_is_known_and_nothing_else() {
+        let mut progress = Progress {
+            stage: Stage::Search,
+            fraction: 0.5,
+            iteration: 120,
+            losses: None,
+            inliers: 19,
+            focal_px: None,
+            best_score: None,
+            elapsed_seconds: 1.25,
+        };
+        assert_eq!(describe(&progress), "19 inliers, 1.2 s");
+        progress.focal_px = Some(1204.26);
+        progress.best_score = Some(0.25);
+        progress.losses = Some(Losses { num: 1e-4, proj: 0.5, daq: 2.0 });
+        assert_eq!(
+            describe(&progress),
+            "19 inliers, focal 1204.3 px, score 0.2500, iteration 120, L_num 1.00e-4 L_proj 0.500 L_DAQ 2.000, 1.2 s"
+        );
+    }
+}

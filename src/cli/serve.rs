@@ -1,0 +1,225 @@
+//! `scpsfm serve`: the server.
+
+use std::path::PathBuf;
+
+use clap::ValueEnum;
+
+use super::args::BackendArg;
+use super::exit::{Exit, Failure};
+use super::print;
+use super::service::Service;
+use crate::config::Config;
+use crate::telemetry;
+
+const HELP: &str = "\
+Configuration: defaults, then the file, then the environment, then flags; later ones win. Every key of the file may
+stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__WORKERS=4. --print-config shows all keys.
+
+When it serves, two lines on stdout say where: `grpc http://...` and `metrics http://...`. SIGTERM or Ctrl-C drains: new
+jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start.
+
+Examples:
+  scpsfm serve
+  scpsfm serve --data-dir /var/lib/scpsfm --listen 0.0.0.0:50051 --workers 4 --log-format json
+  scpsfm serve --print-config > scpsfm.toml";
+
+/// Run the server
+///
+/// Takes jobs over gRPC (scpsfm.v1), keeps them in a data directory and solves them on worker threads. A restart knows
+/// every job and takes up those that were queued or running.
+#[derive(Debug, clap::Args)]
+#[command(after_help = HELP)]
+pub struct Args {
+    /// Configuration file (TOML)
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+
+    /// Address of the gRPC port; port 0 takes a free one [default: 127.0.0.1:50051]
+    #[arg(long, value_name = "ADDRESS")]
+    pub listen: Option<String>,
+
+    /// Address of /metrics, /healthz and /readyz [default: 127.0.0.1:9464]
+    #[arg(long, value_name = "ADDRESS")]
+    pub metrics_listen: Option<String>,
+
+    /// Directory of the embedded store; created [default: scpsfm-data]
+    #[arg(long, value_name = "DIR")]
+    pub data_dir: Option<PathBuf>,
+
+    /// Worker threads, one job each; 0: one a core [default: 0]
+    #[arg(long, value_name = "N")]
+    pub workers: Option<usize>,
+
+    /// Waiting jobs at which new ones are refused [default: 256]
+    #[arg(long, value_name = "N")]
+    pub queue: Option<usize>,
+
+    /// Tensor backend of jobs that ask for none [default: flex]
+    #[arg(long, value_enum)]
+    pub backend: Option<BackendArg>,
+
+    /// How log lines are written, on stderr [default: human]
+    #[arg(long, value_enum)]
+    pub log_format: Option<LogFormat>,
+
+    /// Print the configuration that would be used, as TOML, and exit
+    #[arg(long)]
+    pub print_config: bool,
+}
+
+/// How log lines are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// For eyes
+    Human,
+    /// One JSON object a line
+    Json,
+}
+
+impl Args {
+    /// The flags that were given, as the configuration's keys.
+    fn overrides(&self) -> Vec<(&'static str, String)> {
+        let word = |value: Option<clap::builder::PossibleValue>| value.map(|value| value.get_name().to_owned());
+        let given = [
+            ("server.listen", self.listen.clone()),
+            ("metrics.listen", self.metrics_listen.clone()),
+            ("store.data_dir", self.data_dir.as_ref().map(|path| path.display().to_string())),
+            ("engine.workers", self.workers.map(|count| count.to_string())),
+            ("engine.queue_capacity", self.queue.map(|count| count.to_string())),
+            ("compute.backend", word(self.backend.and_then(|backend| backend.to_possible_value()))),
+            ("log.format", word(self.log_format.and_then(|format| format.to_possible_value()))),
+        ];
+        given.into_iter().filter_map(|(key, value)| Some((key, value?))).collect()
+    }
+}
+
+/// Runs the command: until a signal asks it to drain, or the server fails.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let config = Config::load(args.config.as_deref(), &args.overrides()).map_err(Failure::bad_config)?;
+    if args.print_config {
+        let text = config.to_toml().map_err(Failure::bad_config)?;
+        print(text.trim_end())?;
+        return Ok(Exit::Done);
+    }
+    // Held to the end: it sends the last traces when dropped, inside the runtime.
+    let _tracing = telemetry::tracing::init(telemetry::tracing::Options {
+        format: config.log.format,
+        filter: &config.log.filter,
+        otlp_endpoint: config.otlp.endpoint.as_deref(),
+        service_name: "scpsfm",
+    })
+    .map_err(Failure::bad_config)?;
+    let mut signals = Signals::listen()?;
+    let scrape = telemetry::metrics::install().map_err(Failure::internal)?;
+    let backend = if config.compute.backend == crate::domain::Backend::Flex { "flex" } else { "ndarray" };
+    telemetry::metrics::build_info(backend);
+    let ready = telemetry::Readiness::default();
+    let metrics = telemetry::server::bind(telemetry::server::Options {
+        listen: config.metrics.listen,
+        scrape,
+        ready: ready.clone(),
+    })
+    .await
+    .map_err(|error| {
+        Failure::internal(format_args!("cannot listen on {} (metrics): {error}", config.metrics.listen))
+    })?;
+    let mut service = Service::start(&config).await?;
+    ready.set(true);
+    print(&format!("grpc http://{}", service.address()))?;
+    print(&format!("metrics http://{}/metrics", metrics.address()))?;
+    tokio::select! {
+        failed = service.wait() => failed?,
+        () = signals.next() => {}
+    }
+    ready.set(false);
+    tracing::info!(bound_seconds = config.engine.drain_seconds, "draining; a second signal ends at once");
+    let drained = tokio::select! {
+        drained = service.stop() => drained?,
+        () = signals.next() => return Err(Failure { exit: Exit::Interrupted, message: "ended before the drain did".into() }),
+    };
+    tracing::info!(finished = drained.finished, given_back = drained.given_back, "drained");
+    metrics.shutdown().await;
+    Ok(Exit::Done)
+}
+
+/// SIGTERM and SIGINT.
+struct Signals {
+    #[cfg(unix)]
+    terminate: tokio::signal::unix::Signal,
+    #[cfg(unix)]
+    interrupt: tokio::signal::unix::Signal,
+}
+
+impl Signals {
+    /// From now on, the signals are ours.
+    #[cfg(unix)]
+    fn listen() -> Result<Self, Failure> {
+        use tokio::signal::unix::{SignalKind, signal};
+        Ok(Self { terminate: signal(SignalKind::terminate())?, interrupt: signal(SignalKind::interrupt())? })
+    }
+
+    /// Waits for the next one.
+    #[cfg(unix)]
+    async fn next(&mut self) {
+        tokio::select! {
+            _ = self.terminate.recv() => {}
+            _ = self.interrupt.recv() => {}
+        }
+    }
+
+    #[cfg(not(unix))]
+    fn listen() -> Result<Self, Failure> {
+        Ok(Self {})
+    }
+
+    #[cfg(not(unix))]
+    async fn next(&mut self) {
+        if tokio::signal::ctrl_c().await.is_err() {
+            std::future::pending::<()>().await;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::cli::{Cli, Command};
+
+    fn overrides(flags: &[&str]) -> Vec<(&'static str, String)> {
+        let line = ["scpsfm", "serve"].iter().chain(flags);
+        match Cli::try_parse_from(line).expect("valid flags").command {
+            Command::Serve(args) => args.overrides(),
+            other => panic!("parsed as {other:?}"),
+        }
+    }
+
+    #[test]
+    fn flags_become_keys_that_the_configuration_knows() {
+        assert_eq!(overrides(&[]), []);
+        let all = overrides(&[
+            "--listen",
+            "127.0.0.1:0",
+            "--metrics-listen",
+            "127.0.0.1:1",
+            "--data-dir",
+            "d",
+            "--workers",
+            "3",
+            "--queue",
+            "9",
+            "--backend",
+            "ndarray",
+            "--log-format",
+            "json",
+        ]);
+        assert_eq!(all.len(), 7);
+        let config = Config::load(None, &all).expect("valid");
+        assert_eq!(config.engine.workers, 3);
+        assert_eq!(config.engine.queue_capacity, 9);
+        assert_eq!(config.store.data_dir, PathBuf::from("d"));
+        assert_eq!(config.compute.backend, crate::domain::Backend::Ndarray);
+        assert_eq!(config.log.format, telemetry::tracing::Format::Json);
+    }
+}

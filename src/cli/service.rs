@@ -1,0 +1,92 @@
+//! The service as `serve` and `demo` run it: store, engine and gRPC server, put together from a configuration.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::exit::Failure;
+use crate::config::Config;
+use crate::domain::Backend;
+use crate::engine::{self, Engine};
+use crate::rpc::server::{self, Server};
+use crate::store::QueueBounds;
+use crate::store::sqlite::Sqlite;
+
+/// How long calls may outlast the engine's drain: their streams end with it, so this is for the network only.
+const CALLS_BOUND: Duration = Duration::from_secs(5);
+
+/// A running service.
+pub struct Service {
+    engine: Engine,
+    server: Server,
+    drain_bound: Duration,
+}
+
+impl Service {
+    /// Opens the store, takes up the jobs it holds and serves. When this returns, calls are answered.
+    ///
+    /// # Errors
+    /// A data directory that cannot be used or an address that cannot be had.
+    pub async fn start(config: &Config) -> Result<Self, Failure> {
+        let directory = &config.store.data_dir;
+        let store = Sqlite::open(directory).await.map_err(|error| {
+            Failure::internal(format_args!("cannot open the data directory {}: {error}", directory.display()))
+        })?;
+        let options = engine::Options {
+            workers: config.engine.worker_count(),
+            queue: QueueBounds {
+                max_jobs: config.engine.queue_capacity as u64,
+                max_bytes: config.engine.queue_bytes,
+                max_observations: config.engine.queue_observations,
+            },
+            lease: Duration::from_secs(config.engine.lease_seconds),
+            max_attempts: config.engine.max_attempts,
+            ..engine::Options::default()
+        };
+        let engine = Engine::start(options, Arc::new(store), solver_on(config.compute.backend))
+            .await
+            .map_err(|error| Failure::internal(format_args!("cannot start the engine: {error}")))?;
+        let options = server::Options {
+            listen: config.server.listen,
+            limits: config.limits.clone(),
+            max_message_bytes: config.server.max_message_bytes,
+            ..server::Options::default()
+        };
+        let server = Server::bind(options, engine.clone()).await.map_err(Failure::internal)?;
+        Ok(Self { engine, server, drain_bound: Duration::from_secs(config.engine.drain_seconds) })
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> SocketAddr {
+        self.server.address()
+    }
+
+    /// Ends only when the server fails.
+    ///
+    /// # Errors
+    /// Why it failed.
+    pub async fn wait(&mut self) -> Result<(), Failure> {
+        self.server.wait().await.map_err(Failure::internal)
+    }
+
+    /// Drains: health says NOT_SERVING, running jobs get their time and then go back to the queue, calls end.
+    ///
+    /// # Errors
+    /// Why the server had failed before.
+    pub async fn stop(self) -> Result<engine::Drained, Failure> {
+        self.server.set_draining().await;
+        let drained = self.engine.drain(self.drain_bound).await;
+        self.server.shutdown(CALLS_BOUND).await.map_err(Failure::internal)?;
+        Ok(drained)
+    }
+}
+
+/// The solver, on this backend where a job asks for none.
+fn solver_on(backend: Backend) -> engine::Solver {
+    let solve = engine::default_solver();
+    Arc::new(move |input, settings, observer, stop| {
+        let mut settings = settings.clone();
+        settings.backend.get_or_insert(backend);
+        solve(input, &settings, observer, stop)
+    })
+}

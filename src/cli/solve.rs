@@ -1,0 +1,124 @@
+//! `scpsfm solve`: one input, start to end, in process or through a server.
+
+use std::path::PathBuf;
+
+use super::args::{InputArgs, ServerArgs, SettingsArgs};
+use super::exit::{Exit, Failure};
+use super::interrupt::Interrupt;
+use super::progress::ProgressView;
+use super::{client, job_view, print, summary};
+use crate::domain::job::JobEvent;
+use crate::domain::{Limits, Solution, SolveSettings, StopReason, StopToken};
+use crate::formats::{LabelledInput, result_files};
+use crate::solver;
+
+const EXAMPLES: &str = "\
+Examples:
+  scpsfm solve observations.csv --width 3072 --height 2048 --out answer
+  scpsfm solve observations.csv --out answer --json | jq .focal_px
+  scpsfm solve observations.csv --out answer --server http://127.0.0.1:50051
+
+Files in the output directory: result.json (the summary), tracks.csv, observations.csv (every answer under the ids of
+the input), cameras.json, points.ply and report.html (open it in a browser).";
+
+/// Solve one input
+///
+/// In this process by default, through a server with --server; the files are the same. Shows progress on stderr and the
+/// result in words on stdout.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
+pub struct Args {
+    #[command(flatten)]
+    pub input: InputArgs,
+
+    /// Solve on this server instead of in this process
+    #[arg(long, value_name = "URL")]
+    pub server: Option<String>,
+
+    /// Directory for the result files; created, files of these names in it are replaced
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+
+    /// Print what result.json holds on stdout, instead of words
+    #[arg(long)]
+    pub json: bool,
+
+    /// Show no progress and no words
+    #[arg(long, short)]
+    pub quiet: bool,
+
+    #[command(flatten)]
+    pub settings: SettingsArgs,
+}
+
+/// Runs the command.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let settings = args.settings.settings()?;
+    let input = args.input.read()?;
+    // Found out now rather than after the work.
+    result_files::create_directory(&args.out)?;
+    let mut progress = ProgressView::new(args.quiet);
+    let solution = match &args.server {
+        Some(server) => on_server(server, &input, &settings, &mut progress).await?,
+        None => in_process(&input, &settings, &mut progress)?,
+    };
+    progress.finish();
+    deliver(&args, &solution, &input)
+}
+
+/// Solves here; Ctrl-C stops it within 50 ms or one network iteration.
+fn in_process(
+    input: &LabelledInput,
+    settings: &SolveSettings,
+    progress: &mut ProgressView,
+) -> Result<Solution, Failure> {
+    let checked = input.check(&Limits::default())?;
+    let stop = StopToken::default();
+    let interrupt = Interrupt::listen();
+    let (asked, token) = (stop.clone(), interrupt.token());
+    let relay = tokio::spawn(async move {
+        token.cancelled().await;
+        asked.stop(StopReason::Cancelled);
+    });
+    let outcome = tokio::task::block_in_place(|| solver::solve(&checked, settings, progress, &stop));
+    relay.abort();
+    outcome.map_err(|error| match error {
+        solver::Error::Stopped(_) => Failure::interrupted(),
+        solver::Error::Internal(_) => Failure::internal(error),
+    })
+}
+
+/// Solves on a server; Ctrl-C cancels the job there.
+async fn on_server(
+    server: &str,
+    input: &LabelledInput,
+    settings: &SolveSettings,
+    progress: &mut ProgressView,
+) -> Result<Solution, Failure> {
+    let server = ServerArgs { server: server.to_owned() };
+    let interrupt = Interrupt::listen();
+    let mut on_event = |event: &JobEvent| job_view::show_event(progress, event);
+    let outcome = client::solve(&server, &input.raw, settings, &mut on_event, interrupt.token()).await;
+    outcome.map_err(|error| match error {
+        // The server speaks of fields and indices; the user has lines.
+        client::Error::Invalid(violations, _)
+            if violations.iter().any(|violation| !violation.field.starts_with("settings")) =>
+        {
+            input.explain_all(&violations, 0).into()
+        }
+        client::Error::Cancelled if interrupt.token().is_cancelled() => Failure::interrupted(),
+        error => error.into(),
+    })
+}
+
+/// Writes the files and tells what they hold.
+fn deliver(args: &Args, solution: &Solution, input: &LabelledInput) -> Result<Exit, Failure> {
+    result_files::write(&args.out, solution, Some(input))?;
+    if args.json {
+        print(result_files::result_json(solution)?.trim_end())?;
+    } else if !args.quiet {
+        print(&summary::text(solution))?;
+        print(&format!("  files        {}", args.out.display()))?;
+    }
+    Ok(Exit::of(solution))
+}

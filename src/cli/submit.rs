@@ -1,0 +1,95 @@
+//! `scpsfm submit`: leaves a job with a server.
+
+use std::time::Duration;
+
+use super::args::{InputArgs, ServerArgs, SettingsArgs};
+use super::client::{self, Client, JobOptions};
+use super::exit::{Exit, Failure};
+use super::{job_view, print};
+use crate::formats::LabelledInput;
+
+const EXAMPLES: &str = "\
+Examples:
+  scpsfm submit observations.csv --width 3072 --height 2048
+  scpsfm submit observations.csv --label site=north --time-limit 60 --watch
+  job=$(scpsfm submit observations.csv) && scpsfm watch $job && scpsfm result $job --out answer";
+
+/// Leave a job with a server
+///
+/// Prints the job's name. The job goes on without this command, and over restarts of the server.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
+pub struct Args {
+    #[command(flatten)]
+    pub input: InputArgs,
+
+    #[command(flatten)]
+    pub server: ServerArgs,
+
+    /// Follow the job to its end, as `scpsfm watch` does
+    #[arg(long)]
+    pub watch: bool,
+
+    /// A mark to find the job by; may be given more than once
+    #[arg(long = "label", value_name = "KEY=VALUE", value_parser = parse_label)]
+    pub labels: Vec<(String, String)>,
+
+    /// Larger is sooner
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    pub priority: i32,
+
+    /// Let the job expire when it has no result after this time
+    #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
+    pub time_limit: Option<Duration>,
+
+    /// Last part of the job's name; the server chooses one otherwise
+    #[arg(long, value_name = "ID")]
+    pub job_id: Option<String>,
+
+    /// Makes this command safe to repeat: the same id and job give the same job
+    #[arg(long, value_name = "ID")]
+    pub request_id: Option<String>,
+
+    #[command(flatten)]
+    pub settings: SettingsArgs,
+}
+
+/// Runs the command.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let settings = args.settings.settings()?;
+    let input = args.input.read()?;
+    let mut client = Client::connect(&args.server.server).await?;
+    let options = JobOptions {
+        job_id: args.job_id,
+        request_id: args.request_id,
+        labels: args.labels.into_iter().collect(),
+        priority: args.priority,
+        time_limit: args.time_limit,
+    };
+    let job = client.create(&input.raw, &settings, options).await.map_err(|error| at_lines(error, &input))?;
+    print(&job.name.to_string())?;
+    if args.watch { job_view::watch_to_end(&mut client, &job.name, 0, false).await } else { Ok(Exit::Done) }
+}
+
+/// Tells violations by file and line.
+fn at_lines(error: client::Error, input: &LabelledInput) -> Failure {
+    match &error {
+        client::Error::Invalid(violations, _) if !violations.is_empty() => input.explain_all(violations, 0).into(),
+        _ => error.into(),
+    }
+}
+
+fn parse_label(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((key, value)) if !key.is_empty() => Ok((key.to_owned(), value.to_owned())),
+        _ => Err("is not of the form KEY=VALUE".into()),
+    }
+}
+
+fn parse_seconds(text: &str) -> Result<Duration, String> {
+    let seconds: f64 = text.parse().map_err(|_| "is not a number of seconds".to_owned())?;
+    match Duration::try_from_secs_f64(seconds) {
+        Ok(duration) if duration > Duration::ZERO => Ok(duration),
+        _ => Err("is not a positive number of seconds".into()),
+    }
+}

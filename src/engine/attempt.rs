@@ -1,0 +1,260 @@
+//! One attempt at a job, from its claim to its end: feeds the worker, stores progress, keeps the lease.
+
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use tokio::sync::{oneshot, watch};
+use tokio::time::{Instant, MissedTickBehavior, interval_at, sleep, sleep_until};
+use tracing::Instrument;
+
+use super::observe::{self, Attempt, AttemptLost};
+use super::worker::{Assignment, Report, Verdict, Worker};
+use super::{Inner, locked};
+use crate::domain::job::{Failure, Job, JobName};
+use crate::domain::{Progress, StopReason, StopToken};
+use crate::store::{self, Claimed, Ending, Lease, Outcome};
+
+/// Least time between two stored progress events of a job: twice a second is as fast as people look, and a commit
+/// each is cheap for the disk.
+const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
+
+/// Heartbeats within the time of a lease: two may be lost.
+const HEARTBEATS_A_LEASE: u32 = 3;
+
+/// Pause before a write is tried again that the store could not take.
+const RETRY_PAUSE: Duration = Duration::from_millis(500);
+
+/// `Failure::reason` of a defect of ours.
+const INTERNAL: &str = "INTERNAL";
+
+/// Makes one attempt at a claimed job and commits what it came to.
+pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) {
+    let Claimed { job, lease, trace_parent, queue_time } = claimed;
+    let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref(), queue_time);
+    let span = attempt.span().clone();
+    Course::begin(inner, job, lease).run(worker, attempt).instrument(span).await;
+}
+
+/// An attempt under way.
+struct Course<'a> {
+    inner: &'a Arc<Inner>,
+    job: Job,
+    lease: Lease,
+    stop: StopToken,
+    /// Until then the lease holds for sure.
+    leased_until: Instant,
+    /// The lease is gone: nothing more is written.
+    lost: bool,
+    /// The last progress that was stored.
+    stored: Option<Progress>,
+    _running: Running<'a>,
+}
+
+/// Lists a job among the running ones as long as it lives.
+struct Running<'a> {
+    inner: &'a Inner,
+    name: JobName,
+}
+
+impl<'a> Running<'a> {
+    fn list(inner: &'a Inner, name: &JobName, stop: &StopToken) -> Self {
+        locked(&inner.running).insert(name.clone(), stop.clone());
+        Self { inner, name: name.clone() }
+    }
+}
+
+impl Drop for Running<'_> {
+    fn drop(&mut self) {
+        locked(&self.inner.running).remove(&self.name);
+    }
+}
+
+impl<'a> Course<'a> {
+    fn begin(inner: &'a Arc<Inner>, job: Job, lease: Lease) -> Self {
+        let left = job.deadline.map(|deadline| deadline.duration_since(SystemTime::now()).unwrap_or_default());
+        // A deadline beyond what the clock can express is none.
+        let stop = StopToken::with_deadline(left.and_then(|left| std::time::Instant::now().checked_add(left)));
+        let running = Running::list(inner, &job.name, &stop);
+        let leased_until = Instant::now() + inner.options.lease;
+        inner.hub.wake(&job.name);
+        tracing::info!("attempt begins");
+        Self { inner, job, lease, stop, leased_until, lost: false, stored: None, _running: running }
+    }
+
+    async fn run(mut self, worker: &Worker, attempt: Attempt) {
+        let input = match self.prepare().await {
+            Ok(input) => input,
+            Err(verdict) => return self.conclude(verdict, None, Some(attempt)).await,
+        };
+        let subscription = self.inner.hub.subscribe(&self.job.name);
+        // Weights of an attempt before this one are nobody's any more.
+        subscription.topic().weights.send_replace(None);
+        let (progress, reported) = watch::channel(None);
+        let (reply, answer) = oneshot::channel();
+        let assignment = Assignment {
+            name: self.job.name.clone(),
+            number: self.lease.attempt,
+            input,
+            settings: self.job.settings.clone(),
+            stop: self.stop.clone(),
+            progress,
+            subscription,
+            attempt,
+            reply,
+        };
+        worker.assign(assignment).await;
+        let (report, latest) = self.attend(answer, reported).await;
+        match report {
+            Some(Report { verdict, attempt }) => self.conclude(verdict, latest, Some(attempt)).await,
+            None => self.conclude(Verdict::Stopped(StopReason::Interrupted), latest, None).await,
+        }
+    }
+
+    /// Reads the input, and the cancel that may have come before the job was listed as running. A store that is out
+    /// of reach is asked again as long as the lease holds.
+    async fn prepare(&mut self) -> Result<Vec<u8>, Verdict> {
+        loop {
+            match self.read().await {
+                Ok(input) => return Ok(input),
+                Err(error @ store::Error::Unavailable(_)) => self.store_failed(&error),
+                Err(error) => return Err(Verdict::Broken(error.to_string())),
+            }
+            if self.lost {
+                return Err(Verdict::Stopped(StopReason::Interrupted));
+            }
+            sleep(RETRY_PAUSE).await;
+        }
+    }
+
+    async fn read(&self) -> Result<Vec<u8>, store::Error> {
+        if self.inner.store.job(&self.job.name).await?.cancel_requested {
+            self.stop.stop(StopReason::Cancelled);
+        }
+        self.inner.store.input(&self.job.name).await
+    }
+
+    /// Keeps the lease and stores progress until the worker reports. Returns the report, if the worker lived to give
+    /// one, and the latest progress.
+    async fn attend(
+        &mut self,
+        mut answer: oneshot::Receiver<Report>,
+        mut reported: watch::Receiver<Option<Progress>>,
+    ) -> (Option<Report>, Option<Progress>) {
+        let beat = self.inner.options.lease / HEARTBEATS_A_LEASE;
+        let mut heartbeats = interval_at(Instant::now() + beat, beat);
+        heartbeats.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut next_store = Instant::now();
+        let mut news = false;
+        let report = loop {
+            tokio::select! {
+                report = &mut answer => break report.ok(),
+                Ok(()) = reported.changed(), if !news && !self.lost => news = true,
+                () = sleep_until(next_store), if news => {
+                    let progress = *reported.borrow_and_update();
+                    self.store_progress(progress).await;
+                    news = false;
+                    next_store = Instant::now() + PROGRESS_PERIOD;
+                }
+                _ = heartbeats.tick(), if !self.lost => self.heartbeat().await,
+            }
+        };
+        let latest = *reported.borrow();
+        (report, latest)
+    }
+
+    async fn store_progress(&mut self, progress: Option<Progress>) {
+        let Some(progress) = progress else { return };
+        match self.inner.store.record(&self.lease, &progress, SystemTime::now()).await {
+            Ok(_) => {
+                self.stored = Some(progress);
+                self.inner.hub.wake(&self.job.name);
+            }
+            Err(error) => self.store_failed(&error),
+        }
+    }
+
+    async fn heartbeat(&mut self) {
+        let sent = Instant::now();
+        match self.inner.store.heartbeat(&self.lease, SystemTime::now(), self.inner.options.lease).await {
+            Ok(heartbeat) => {
+                self.leased_until = sent + self.inner.options.lease;
+                if heartbeat.cancel_requested {
+                    self.stop.stop(StopReason::Cancelled);
+                }
+                // The wall clock is what was promised; the token's own deadline runs on the other one.
+                if heartbeat.deadline.is_some_and(|deadline| deadline <= SystemTime::now()) {
+                    self.stop.stop(StopReason::DeadlineExceeded);
+                }
+            }
+            Err(error) => self.store_failed(&error),
+        }
+    }
+
+    /// Ends the attempt where the lease is gone, or may be.
+    fn store_failed(&mut self, error: &store::Error) {
+        let fenced = matches!(error, store::Error::Fenced(_));
+        tracing::warn!(%error, "the store fails");
+        if fenced || Instant::now() >= self.leased_until {
+            self.lost = true;
+            self.stop.stop(StopReason::Interrupted);
+        }
+    }
+
+    /// Commits what the attempt came to.
+    async fn conclude(mut self, verdict: Verdict, latest: Option<Progress>, attempt: Option<Attempt>) {
+        let outcome = match verdict {
+            Verdict::Solved { summary, result } => Some(Outcome::Succeeded { summary, result }),
+            Verdict::Broken(message) => Some(Outcome::Failed(Failure { reason: INTERNAL.into(), message })),
+            Verdict::Stopped(StopReason::Cancelled) => Some(Outcome::Cancelled),
+            Verdict::Stopped(StopReason::DeadlineExceeded) => Some(Outcome::Expired),
+            Verdict::Stopped(StopReason::Interrupted) => None,
+        };
+        let ending = outcome.map(|outcome| Ending { outcome, progress: latest.filter(|_| self.stored != latest) });
+        let committed = self.commit(ending.as_ref()).await;
+        self.announce(committed, attempt);
+    }
+
+    /// Ends the job or gives it back, trying again as long as the lease holds. `None`: the lease is gone.
+    async fn commit(&mut self, ending: Option<&Ending>) -> Option<Job> {
+        let store = &self.inner.store;
+        while !self.lost {
+            let written = match ending {
+                Some(ending) => store.finish(&self.lease, ending, SystemTime::now()).await,
+                None => store.release(&self.lease, SystemTime::now()).await,
+            };
+            match written {
+                Ok(job) => return Some(job),
+                Err(error) => self.store_failed(&error),
+            }
+            if !self.lost {
+                sleep(RETRY_PAUSE).await;
+            }
+        }
+        None
+    }
+
+    fn announce(self, committed: Option<Job>, attempt: Option<Attempt>) {
+        let ended_in = committed.as_ref().map(|job| job.state).filter(|state| state.is_terminal());
+        if let Some(attempt) = attempt {
+            attempt.end(ended_in);
+        }
+        match (committed, ended_in) {
+            (Some(job), Some(state)) => {
+                tracing::info!(state = state.name(), "job ended");
+                self.inner.ended(&job);
+                self.inner.crew_finished_one();
+            }
+            (Some(_), None) => {
+                tracing::info!("job given back to the queue");
+                observe::attempt_lost(AttemptLost::GivenBack);
+                self.inner.crew_gave_one_back();
+                self.inner.hub.wake(&self.job.name);
+                self.inner.queue_changed();
+            }
+            (None, _) => {
+                tracing::warn!("lease lost, the outcome is dropped");
+                observe::attempt_lost(AttemptLost::Fenced);
+            }
+        }
+    }
+}

@@ -1,0 +1,124 @@
+//! Hiring the workers at the start, and letting them go at the end.
+
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
+
+use super::worker::Worker;
+use super::{Error, Inner, Phase, Solver, locked, slot};
+use crate::domain::StopReason;
+
+/// How long a job that was asked to stop may take to do so: ten times the solver's promise of 200 ms, and a slow disk.
+const GIVE_BACK_GRACE: Duration = Duration::from_secs(5);
+
+/// What a drain came to.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Drained {
+    /// Jobs that ran when the drain began and reached their end.
+    pub finished: usize,
+    /// Jobs that returned to the queue.
+    pub given_back: usize,
+}
+
+/// Those who work for an engine, and what they did since its drain began.
+#[derive(Debug, Default)]
+pub(super) struct Crew {
+    slots: Vec<JoinHandle<()>>,
+    sweeper: Option<JoinHandle<()>>,
+    threads: Vec<thread::JoinHandle<()>>,
+    /// Closes when the last thread has ended.
+    threads_ended: Option<mpsc::Receiver<()>>,
+    drained: Drained,
+}
+
+impl Inner {
+    /// Starts worker threads, their slots and the sweeper.
+    pub(super) fn hire(self: &Arc<Self>, solver: Solver) -> Result<(), Error> {
+        let (alive, threads_ended) = mpsc::channel(1);
+        let mut crew = Crew { threads_ended: Some(threads_ended), ..Crew::default() };
+        let mut workers = Vec::new();
+        for index in 0..self.options.workers.max(1) {
+            let (worker, thread) = Worker::start(index, solver.clone(), alive.clone())
+                .map_err(|error| Error::Internal(format!("cannot start worker thread {index}: {error}")))?;
+            workers.push(worker);
+            crew.threads.push(thread);
+        }
+        crew.slots = workers.into_iter().map(|worker| tokio::spawn(slot::run(self.clone(), worker))).collect();
+        crew.sweeper = Some(tokio::spawn(slot::sweep(self.clone())));
+        *locked(&self.crew) = crew;
+        Ok(())
+    }
+
+    pub(super) fn crew_finished_one(&self) {
+        if self.phase() != Phase::Open {
+            locked(&self.crew).drained.finished += 1;
+        }
+    }
+
+    pub(super) fn crew_gave_one_back(&self) {
+        if self.phase() != Phase::Open {
+            locked(&self.crew).drained.given_back += 1;
+        }
+    }
+
+    pub(super) async fn drain(self: Arc<Self>, bound: Duration) -> Drained {
+        let begun = self.phase.send_if_modified(|phase| {
+            let first = *phase == Phase::Open;
+            if first {
+                *phase = Phase::Draining;
+            }
+            first
+        });
+        if !begun {
+            return Drained::default();
+        }
+        let (mut slots, sweeper, threads, threads_ended) = {
+            let mut crew = locked(&self.crew);
+            let slots = std::mem::take(&mut crew.slots);
+            (slots, crew.sweeper.take(), std::mem::take(&mut crew.threads), crew.threads_ended.take())
+        };
+        if timeout(bound, all_ended(&mut slots)).await.is_err() {
+            for stop in locked(&self.running).values() {
+                stop.stop(StopReason::Interrupted);
+            }
+            if timeout(GIVE_BACK_GRACE, all_ended(&mut slots)).await.is_err() {
+                // Their leases run out, or are taken back at the next start.
+                tracing::warn!("jobs did not stop within {GIVE_BACK_GRACE:?}, their leases are left behind");
+                slots.iter().for_each(JoinHandle::abort);
+            }
+        }
+        self.phase.send_replace(Phase::Closed);
+        if let Some(sweeper) = sweeper {
+            // It only ends early by a panic, which has been reported.
+            let _ = sweeper.await;
+        }
+        join(threads, threads_ended).await;
+        locked(&self.crew).drained
+    }
+}
+
+/// Waits for the tasks that are left; dropping the future keeps those that have not ended.
+async fn all_ended(tasks: &mut Vec<JoinHandle<()>>) {
+    while let Some(task) = tasks.last_mut() {
+        // A slot ends early only by a panic, which has been reported; its lease runs out.
+        let _ = task.await;
+        tasks.pop();
+    }
+}
+
+/// Joins the worker threads; one that does not stop is left to the end of the process.
+async fn join(threads: Vec<thread::JoinHandle<()>>, ended: Option<mpsc::Receiver<()>>) {
+    let Some(mut ended) = ended else { return };
+    if timeout(GIVE_BACK_GRACE, ended.recv()).await.is_err() {
+        tracing::warn!("a worker thread does not stop");
+        return;
+    }
+    for thread in threads {
+        // Panics of the solver are caught inside.
+        let _ = thread.join();
+    }
+}

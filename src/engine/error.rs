@@ -1,0 +1,50 @@
+//! Why the engine refused or could not answer.
+
+use std::time::Duration;
+
+use crate::domain::job::{JobName, JobState};
+use crate::domain::{InvalidInput, Violation};
+use crate::store;
+
+/// Why the engine refused or could not answer.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Error {
+    #[error("{0} does not exist")]
+    NotFound(JobName),
+    /// The job id is taken, or the request id stands for another body.
+    #[error("{0}")]
+    AlreadyExists(String),
+    /// Too much waits already; `reason` names the bound for programs.
+    #[error("{message}; try again in {} s", .retry_after.as_secs_f64())]
+    QueueFull { retry_after: Duration, reason: &'static str, message: String },
+    #[error(transparent)]
+    InvalidArgument(#[from] InvalidInput),
+    /// There is no result in this state.
+    #[error("the job is {}, it has no result", .0.name())]
+    NotReady(JobState),
+    /// This server is going down and takes on nothing new; what it was given goes on after its restart.
+    #[error("the server is draining")]
+    Draining,
+    /// Not the caller's fault: the store or the engine itself failed.
+    #[error("{0}")]
+    Internal(String),
+}
+
+impl From<store::Error> for Error {
+    fn from(error: store::Error) -> Self {
+        match error {
+            store::Error::NotFound(name) => Error::NotFound(name),
+            store::Error::AlreadyExists(message) => Error::AlreadyExists(message),
+            store::Error::PageToken => Error::InvalidArgument(Violation::of("page_token", error.to_string()).into()),
+            store::Error::QueueFull(bound) => Error::QueueFull {
+                retry_after: super::Options::DEFAULT_RETRY_AFTER,
+                reason: bound.name(),
+                message: bound.to_string(),
+            },
+            store::Error::Fenced(_)
+            | store::Error::InUse(_)
+            | store::Error::Unavailable(_)
+            | store::Error::Corrupt(_) => Error::Internal(error.to_string()),
+        }
+    }
+}

@@ -1,0 +1,75 @@
+//! The tasks that run beside the worker threads: one slot a worker, which claims jobs for it, and the sweeper.
+
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use super::worker::Worker;
+use super::{Inner, Phase, attempt, observe};
+
+/// How often a slot looks for work unasked: jobs of other processes and of a store that failed come without a wake-up.
+const CLAIM_POLL: Duration = Duration::from_secs(1);
+
+/// How often leases and deadlines are looked over: a queued job expires at most this late.
+const SWEEP_PERIOD: Duration = Duration::from_secs(1);
+
+/// Claims jobs for one worker, one after the other, until the engine drains.
+pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
+    let mut work = inner.work.subscribe();
+    let mut phase = inner.phase.subscribe();
+    while *phase.borrow_and_update() == Phase::Open {
+        // Before the look, so that a job that is stored during it is not missed.
+        work.mark_unchanged();
+        let options = &inner.options;
+        match inner.store.claim(&options.worker_name, SystemTime::now(), options.lease).await {
+            Ok(Some(claimed)) => {
+                inner.queue_changed();
+                attempt::run(&inner, &worker, claimed).await;
+                if worker.is_gone() {
+                    tracing::error!("a worker thread is gone, its slot ends");
+                    return;
+                }
+                continue;
+            }
+            Ok(None) => {}
+            Err(error) => tracing::warn!(%error, "cannot claim a job"),
+        }
+        tokio::select! {
+            _ = work.changed() => {}
+            _ = phase.changed() => {}
+            () = tokio::time::sleep(CLAIM_POLL) => {}
+        }
+    }
+}
+
+/// Ends what waited too long, takes back what was left lying, and counts the queue whenever it changed.
+pub(super) async fn sweep(inner: Arc<Inner>) {
+    let mut phase = inner.phase.subscribe();
+    let mut ticks = tokio::time::interval(SWEEP_PERIOD);
+    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    while *phase.borrow_and_update() != Phase::Closed {
+        tokio::select! {
+            _ = phase.changed() => {}
+            () = inner.queue_changed.notified() => {}
+            _ = ticks.tick() => inner.sweep().await,
+        }
+        match inner.store.load().await {
+            Ok(load) => observe::queue_depth(load.queued),
+            Err(error) => tracing::warn!(%error, "cannot count the queue"),
+        }
+    }
+}
+
+impl Inner {
+    async fn sweep(&self) {
+        match self.store.sweep(SystemTime::now(), self.options.max_attempts).await {
+            Ok(swept) => {
+                self.taken_back(&swept.lost);
+                for job in &swept.expired {
+                    tracing::info!(job = %job.name, "expired while queued");
+                    self.ended(job);
+                }
+            }
+            Err(error) => tracing::warn!(%error, "cannot sweep the queue"),
+        }
+    }
+}

@@ -1,0 +1,156 @@
+//! Admission: from what a caller wants to a stored job, or a refusal.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use sha2::{Digest, Sha256};
+
+use super::{Error, Inner, Phase, finished, observe};
+use crate::domain::error::{Violation, Violations};
+use crate::domain::job::{Job, JobName};
+use crate::domain::{Input, SolveSettings};
+use crate::store::{self, NewRecord, Request, payload};
+
+/// Longest request id: a UUID with room for a prefix.
+const MAX_REQUEST_ID_BYTES: usize = 128;
+
+/// When a job without a result expires.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Deadline {
+    At(SystemTime),
+    /// After its creation.
+    After(Duration),
+}
+
+/// What a caller wants solved.
+#[derive(Debug, Clone)]
+pub struct NewJob {
+    pub tenant: String,
+    /// Last part of the job's name; `None`: made here.
+    pub job_id: Option<String>,
+    /// Makes creation idempotent; scoped to the tenant.
+    pub request_id: Option<String>,
+    pub input: Input,
+    pub settings: SolveSettings,
+    pub deadline: Option<Deadline>,
+    /// Larger is sooner; 0 is the default.
+    pub priority: i32,
+    pub labels: BTreeMap<String, String>,
+    /// W3C `traceparent` of the call.
+    pub trace_parent: Option<String>,
+}
+
+impl NewJob {
+    /// A job with nothing but what every job has.
+    pub fn new(tenant: impl Into<String>, input: Input, settings: SolveSettings) -> Self {
+        Self {
+            tenant: tenant.into(),
+            job_id: None,
+            request_id: None,
+            input,
+            settings,
+            deadline: None,
+            priority: 0,
+            labels: BTreeMap::new(),
+            trace_parent: None,
+        }
+    }
+
+    fn validate(&self) -> Result<(), Error> {
+        let mut found = Violations::default();
+        let id_rule = "1 to 63 of a-z, 0-9 and -, not beginning or ending with -";
+        if !JobName::is_id(&self.tenant) {
+            found.push(Violation::of("tenant", format!("{:?} is not an id: {id_rule}", self.tenant)));
+        }
+        if let Some(id) = self.job_id.as_ref().filter(|id| !JobName::is_id(id)) {
+            found.push(Violation::of("job_id", format!("{id:?} is not an id: {id_rule}")));
+        }
+        if let Some(id) = self.request_id.as_ref().filter(|id| id.is_empty() || id.len() > MAX_REQUEST_ID_BYTES) {
+            let length = id.len();
+            found.push(Violation::of("request_id", format!("{length} bytes are not in 1..={MAX_REQUEST_ID_BYTES}")));
+        }
+        found.into_result()?;
+        Ok(self.settings.validate()?)
+    }
+
+    /// What is stored. Encodes and, for a request id, hashes the whole input: not for an async thread.
+    fn into_record(self, now: SystemTime) -> Result<NewRecord, Error> {
+        let input = payload::encode(&self.input)?;
+        let request = match &self.request_id {
+            Some(id) => Some(Request { id: id.clone(), digest: self.digest(&input)? }),
+            None => None,
+        };
+        let deadline = match self.deadline {
+            None => None,
+            Some(Deadline::At(time)) => Some(time),
+            Some(Deadline::After(duration)) => Some(now.checked_add(duration).ok_or_else(|| {
+                Error::InvalidArgument(Violation::of("deadline", "lies beyond the end of time").into())
+            })?),
+        };
+        let job = self.job_id.unwrap_or_else(|| uuid::Uuid::now_v7().to_string());
+        Ok(NewRecord {
+            name: JobName { tenant: self.tenant, job },
+            request,
+            // Bounded by the limits on inputs, which are far below what a u32 holds.
+            view_count: u32::try_from(self.input.view_count()).unwrap_or(u32::MAX),
+            track_count: u32::try_from(self.input.track_count()).unwrap_or(u32::MAX),
+            observation_count: u32::try_from(self.input.observation_count()).unwrap_or(u32::MAX),
+            input,
+            settings: self.settings,
+            deadline,
+            priority: self.priority,
+            labels: self.labels,
+            trace_parent: self.trace_parent,
+        })
+    }
+
+    /// What two requests must share to be the same: all that the caller stated but the trace, which tells the calls
+    /// apart. A relative deadline counts as stated, so that a retry is the same request.
+    fn digest(&self, input: &[u8]) -> Result<[u8; 32], Error> {
+        let deadline = match self.deadline {
+            None => None,
+            Some(Deadline::At(time)) => Some(("at", time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default())),
+            Some(Deadline::After(duration)) => Some(("after", duration)),
+        };
+        let rest = payload::encode(&(&self.job_id, &self.settings, deadline, self.priority, &self.labels))?;
+        let mut hash = Sha256::new();
+        hash.update((rest.len() as u64).to_le_bytes());
+        hash.update(rest);
+        hash.update(input);
+        Ok(hash.finalize().into())
+    }
+}
+
+impl Inner {
+    pub(super) async fn submit(self: Arc<Self>, new: NewJob) -> Result<Job, Error> {
+        new.validate()?;
+        if self.phase() != Phase::Open {
+            observe::refused(observe::Refusal::Draining);
+            return Err(Error::Draining);
+        }
+        let now = SystemTime::now();
+        let record = finished(tokio::task::spawn_blocking(move || new.into_record(now))).await?;
+        // On its own task: a caller that goes away must not leave a stored job untold.
+        finished(tokio::spawn(async move { self.store_job(record, now).await })).await
+    }
+
+    async fn store_job(&self, record: NewRecord, now: SystemTime) -> Result<Job, Error> {
+        match self.store.create_job(record, &self.options.queue, now).await {
+            Ok(created) => {
+                if created.new {
+                    observe::job_created();
+                    self.work_waits();
+                    self.queue_changed();
+                }
+                Ok(created.job)
+            }
+            Err(store::Error::QueueFull(bound)) => {
+                observe::refused(observe::Refusal::QueueFull);
+                let retry_after = self.options.retry_after;
+                Err(Error::QueueFull { retry_after, reason: bound.name(), message: bound.to_string() })
+            }
+            Err(error) => Err(error.into()),
+        }
+    }
+}

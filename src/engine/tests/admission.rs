@@ -1,0 +1,123 @@
+//! What is taken on and what is refused.
+
+use super::*;
+use crate::engine::{Error, JobQuery};
+
+#[tokio::test]
+async fn a_full_queue_refuses_at_once_and_takes_on_again() {
+    let mut options = workers(1);
+    options.queue.max_jobs = 1;
+    options.retry_after = Duration::from_secs(17);
+    let bench = Bench::start(options).await;
+    bench.submit(Script::Wait).await;
+    bench.gate.until_waiting(1).await;
+    let waiting = bench.submit(Script::Wait).await;
+    match bench.engine.submit(new_job(Script::Wait)).await {
+        Err(Error::QueueFull { retry_after, reason, message }) => {
+            assert_eq!((retry_after, reason), (Duration::from_secs(17), "queue_jobs"));
+            assert_eq!(message, "the queue is full: 1 of at most 1 jobs wait");
+        }
+        other => panic!("{other:?}"),
+    }
+    bench.engine.cancel(&waiting).await.expect("exists");
+    bench.submit(Script::Wait).await;
+}
+
+#[tokio::test]
+async fn one_request_is_one_job_however_often_it_is_sent() {
+    let bench = Bench::start(workers(1)).await;
+    let request = |script| NewJob { request_id: Some("r-1".into()), ..new_job(script) };
+    let calls = (0..20).map(|_| bench.engine.submit(request(Script::Succeed)));
+    let jobs = futures_util::future::join_all(calls).await;
+    let name = jobs[0].as_ref().expect("admitted").name.clone();
+    for job in jobs {
+        assert_eq!(job.expect("the same request").name, name);
+    }
+    bench.ended(&name).await;
+    let late = bench.engine.submit(request(Script::Succeed)).await.expect("the same request");
+    assert_eq!((&late.name, late.state), (&name, JobState::Succeeded));
+    let traced = NewJob { trace_parent: Some("another call".into()), ..request(Script::Succeed) };
+    assert_eq!(bench.engine.submit(traced).await.expect("the same request").name, name);
+    for other in [
+        request(Script::Wait),
+        NewJob { priority: 1, ..request(Script::Succeed) },
+        NewJob { job_id: Some("mine".into()), ..request(Script::Succeed) },
+        NewJob { deadline: Some(crate::engine::Deadline::After(Duration::from_secs(1))), ..request(Script::Succeed) },
+    ] {
+        assert!(matches!(bench.engine.submit(other).await, Err(Error::AlreadyExists(_))));
+    }
+    assert_eq!(bench.gate.calls.load(Ordering::SeqCst), 1);
+    assert_eq!(bench.engine.list(&JobQuery::default()).await.expect("lists").jobs.len(), 1);
+}
+
+#[tokio::test]
+async fn bad_arguments_name_their_field() {
+    let bench = Bench::start(workers(1)).await;
+    let fields = |error: Error| match error {
+        Error::InvalidArgument(invalid) => {
+            invalid.violations().iter().map(|violation| violation.field.clone()).collect::<Vec<_>>()
+        }
+        other => panic!("{other:?}"),
+    };
+    let mut bad = new_job(Script::Succeed);
+    bad.tenant = "A".into();
+    bad.job_id = Some("-".into());
+    bad.request_id = Some(String::new());
+    let error = bench.engine.submit(bad).await.expect_err("refused");
+    assert_eq!(fields(error), ["tenant", "job_id", "request_id"]);
+    let mut bad = new_job(Script::Succeed);
+    bad.settings.alpha = f64::NAN;
+    assert_eq!(fields(bench.engine.submit(bad).await.expect_err("refused")), ["settings.alpha"]);
+    let query = JobQuery { page_token: Some("x".into()), ..JobQuery::default() };
+    assert_eq!(fields(bench.engine.list(&query).await.expect_err("refused")), ["page_token"]);
+    let name = bench.submit(Script::Succeed).await;
+    let last = bench.ended(&name).await.last_sequence;
+    assert_eq!(fields(bench.engine.watch(&name, last + 1).await.expect_err("refused")), ["after_sequence"]);
+}
+
+#[tokio::test]
+async fn job_ids_are_the_callers_or_made() {
+    let bench = Bench::start(workers(1)).await;
+    let mine = || NewJob { job_id: Some("mine".into()), ..new_job(Script::Succeed) };
+    let job = bench.engine.submit(mine()).await.expect("admitted");
+    assert_eq!(job.name.to_string(), "tenants/default/jobs/mine");
+    let taken = bench.engine.submit(mine()).await.expect_err("taken");
+    assert_eq!(taken, Error::AlreadyExists("tenants/default/jobs/mine already exists".into()));
+    let made = bench.submit(Script::Succeed).await;
+    assert!(JobName::parse(&made.to_string()).is_some(), "{made}");
+    let missing = JobName { tenant: "other".into(), job: "mine".into() };
+    assert_eq!(bench.engine.job(&missing).await, Err(Error::NotFound(missing.clone())));
+    assert_eq!(bench.engine.cancel(&missing).await, Err(Error::NotFound(missing.clone())));
+    assert_eq!(bench.engine.watch(&missing, 0).await.map(|_| ()), Err(Error::NotFound(missing)));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_hundred_jobs_of_twenty_callers_on_two_workers_all_end() {
+    let bench = Bench::start(workers(2)).await;
+    let callers = (0..20).map(|_| {
+        let engine = bench.engine.clone();
+        tokio::spawn(async move {
+            let mut names = Vec::new();
+            for _ in 0..5 {
+                names.push(engine.submit(new_job(Script::Succeed)).await.expect("admitted").name);
+            }
+            for name in &names {
+                let mut watch = engine.watch(name, 0).await.expect("exists");
+                let events = rest(&mut watch).await;
+                assert_contiguous(&events, 1);
+                assert_eq!(events.last().and_then(terminal), Some(JobState::Succeeded));
+            }
+            names
+        })
+    });
+    let mut names = Vec::new();
+    for caller in futures_util::future::join_all(callers).await {
+        names.extend(caller.expect("no panic"));
+    }
+    names.sort();
+    names.dedup();
+    assert_eq!(names.len(), 100);
+    assert_eq!(bench.gate.calls.load(Ordering::SeqCst), 100);
+    assert_eq!(bench.engine.load().await.expect("counts"), crate::engine::Load::default());
+    eventually(|| async { (bench.engine.inner.hub.topic_count() == 0).then_some(()) }).await;
+}

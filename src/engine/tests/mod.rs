@@ -1,0 +1,235 @@
+//! The engine over a real SQLite store and a solver that does as it is told.
+
+mod admission;
+mod lifecycle;
+mod survival;
+mod watching;
+
+use std::future::Future;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::time::Duration;
+
+use tempfile::TempDir;
+
+use super::{Engine, NewJob, Options, Solver};
+use crate::domain::job::{DEFAULT_TENANT, EventBody, Job, JobEvent, JobName, JobState};
+use crate::domain::{
+    Input, Limits, Method, Observer, Progress, RawInput, Solution, SolveSettings, Stage, Status, StopToken, View,
+};
+use crate::solver;
+use crate::store::Store;
+use crate::store::sqlite::Sqlite;
+
+/// What the solver is to do with a job, told through the job's seed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Script {
+    /// One progress, then the solution.
+    Succeed = 0,
+    Fail = 1,
+    Panic = 2,
+    /// One progress, then nothing until it is stopped or the gate opens, then the solution.
+    Wait = 3,
+    /// The same, deaf to being stopped.
+    Deaf = 4,
+    /// Interim weights 1 to 50, then as [`Script::Wait`].
+    Weights = 5,
+    /// A thousand progress records at once, then as [`Script::Wait`].
+    Chatter = 6,
+}
+
+/// Lets the solvers of a test through, and counts their calls.
+#[derive(Debug, Default)]
+struct Gate {
+    open: AtomicU32,
+    calls: AtomicU64,
+    /// Jobs that reached their waiting point.
+    waiting: AtomicU32,
+}
+
+impl Gate {
+    fn open(&self) {
+        self.open.store(1, Ordering::SeqCst);
+    }
+
+    /// Until `count` solvers in all have come to their waiting point.
+    async fn until_waiting(&self, count: u32) {
+        eventually(|| async { (self.waiting.load(Ordering::SeqCst) >= count).then_some(()) }).await;
+    }
+
+    fn solver(self: &Arc<Self>) -> Solver {
+        let gate = self.clone();
+        Arc::new(move |input, settings, observer, stop| gate.solve(input, settings, observer, stop))
+    }
+
+    fn solve(
+        &self,
+        input: &Input,
+        settings: &SolveSettings,
+        observer: &mut dyn Observer,
+        stop: &StopToken,
+    ) -> Result<Solution, solver::Error> {
+        let call = self.calls.fetch_add(1, Ordering::SeqCst) + 1;
+        let is = |script: Script| settings.seed == script as u64;
+        observer.stage(Stage::Prepare);
+        if is(Script::Fail) {
+            return Err(solver::Error::Internal("told to fail".into()));
+        }
+        if is(Script::Panic) {
+            panic!("told to panic");
+        }
+        observer.stage(Stage::Search);
+        for iteration in 1..=if is(Script::Chatter) { 1000 } else { 1 } {
+            observer.progress(&progress(iteration));
+        }
+        if is(Script::Weights) {
+            (1..=50).for_each(|iteration| observer.weights(iteration, &[iteration as f32; 3]));
+        }
+        self.waiting.fetch_add(1, Ordering::SeqCst);
+        while !is(Script::Succeed) && self.open.load(Ordering::SeqCst) == 0 {
+            if let Some(reason) = stop.reason().filter(|_| !is(Script::Deaf)) {
+                return Err(solver::Error::Stopped(reason));
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        Ok(solution(input, call))
+    }
+}
+
+fn progress(iteration: u32) -> Progress {
+    Progress {
+        stage: Stage::Search,
+        fraction: 0.1,
+        iteration,
+        losses: None,
+        inliers: 2,
+        focal_px: None,
+        best_score: None,
+        elapsed_seconds: 0.0,
+    }
+}
+
+/// A solution that tells which call of the solver made it, by its iterations.
+fn solution(input: &Input, call: u64) -> Solution {
+    Solution {
+        status: Status::NoReconstruction,
+        grade: None,
+        method: Method::Auto,
+        winning_prior: None,
+        iterations: call as u32,
+        seed: 0,
+        calibrations: Vec::new(),
+        plane_at_infinity: Some([0.0, -1.5, f64::MIN_POSITIVE]),
+        views: vec![Default::default(); input.view_count()],
+        tracks: Default::default(),
+        observations: Default::default(),
+        noise_px: None,
+        reprojection_rms_px: Some(0.5),
+        reprojection_mean_px: None,
+        warnings: Vec::new(),
+        seconds: 0.0,
+        stages: Vec::new(),
+        prior_times: Vec::new(),
+        history: vec![progress(1)],
+    }
+}
+
+fn input() -> Input {
+    let raw = RawInput {
+        views: vec![View::default(); 2],
+        track_count: 2,
+        view: vec![0, 1, 0, 1],
+        track: vec![0, 0, 1, 1],
+        x: vec![1.0, 2.0, 3.0, 4.0],
+        y: vec![5.0, 6.0, 7.0, 8.0],
+        depth: Vec::new(),
+    };
+    Input::new(raw, &Limits::default(), "test").expect("valid")
+}
+
+fn new_job(script: Script) -> NewJob {
+    NewJob::new(DEFAULT_TENANT, input(), SolveSettings { seed: script as u64, ..SolveSettings::default() })
+}
+
+/// An engine over a store in a directory of its own.
+struct Bench {
+    engine: Engine,
+    store: Arc<dyn Store>,
+    gate: Arc<Gate>,
+    directory: TempDir,
+}
+
+impl Bench {
+    async fn start(options: Options) -> Self {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let gate = Arc::new(Gate::default());
+        let (engine, store) = start(options, &directory, &gate).await;
+        Self { engine, store, gate, directory }
+    }
+
+    async fn submit(&self, script: Script) -> JobName {
+        self.engine.submit(new_job(script)).await.expect("admitted").name
+    }
+
+    /// The job once it has ended.
+    async fn ended(&self, name: &JobName) -> Job {
+        ended(&self.engine, name).await
+    }
+}
+
+async fn start(options: Options, directory: &TempDir, gate: &Arc<Gate>) -> (Engine, Arc<dyn Store>) {
+    // The engine before may still be letting go of the directory.
+    let store = eventually(|| async { Sqlite::open(directory.path()).await.ok() }).await;
+    let store: Arc<dyn Store> = Arc::new(store);
+    let engine = Engine::start(options, store.clone(), gate.solver()).await.expect("starts");
+    (engine, store)
+}
+
+fn workers(workers: usize) -> Options {
+    Options { workers, ..Options::default() }
+}
+
+async fn ended(engine: &Engine, name: &JobName) -> Job {
+    eventually(|| async { Some(engine.job(name).await.expect("exists")).filter(|job| job.state.is_terminal()) }).await
+}
+
+/// Asks until there is an answer; the bound is for a hang, nothing is expected to come near it.
+async fn eventually<T, F: Future<Output = Option<T>>>(mut ask: impl FnMut() -> F) -> T {
+    let asking = async {
+        loop {
+            if let Some(answer) = ask().await {
+                return answer;
+            }
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(120), asking).await.expect("an answer within two minutes")
+}
+
+/// The rest of a watch, which must end with a terminal state.
+async fn rest(watch: &mut super::Watch) -> Vec<JobEvent> {
+    let reading = async {
+        let mut events = Vec::new();
+        while let Some(event) = watch.next().await {
+            events.push(event.expect("no error"));
+        }
+        events
+    };
+    let events = tokio::time::timeout(Duration::from_secs(120), reading).await.expect("an end within two minutes");
+    assert!(events.last().is_none_or(|event| terminal(event).is_some()), "{events:?}");
+    events
+}
+
+fn terminal(event: &JobEvent) -> Option<JobState> {
+    match event.body {
+        EventBody::State { state, .. } => Some(state).filter(|state| state.is_terminal()),
+        _ => None,
+    }
+}
+
+/// Numbered events must be `first..`, one after the other.
+fn assert_contiguous(events: &[JobEvent], first: u64) {
+    let sequences: Vec<u64> = events.iter().filter_map(|event| event.sequence).collect();
+    let expected: Vec<u64> = (first..first + sequences.len() as u64).collect();
+    assert_eq!(sequences, expected);
+}

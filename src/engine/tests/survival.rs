@@ -1,0 +1,158 @@
+//! What outlives a drain, a crash and a lost lease.
+
+use std::time::{Duration, SystemTime};
+
+use tokio::runtime::Runtime;
+
+use super::*;
+use crate::engine::{Drained, Error};
+
+#[tokio::test]
+async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
+    let bench = Bench::start(workers(1)).await;
+    let running = bench.submit(Script::Wait).await;
+    bench.gate.until_waiting(1).await;
+    let queued = bench.submit(Script::Wait).await;
+    let engine = bench.engine.clone();
+    let drain = tokio::spawn(async move { engine.drain(Duration::from_secs(120)).await });
+    eventually(|| async { bench.engine.is_draining().then_some(()) }).await;
+    assert_eq!(bench.engine.submit(new_job(Script::Wait)).await, Err(Error::Draining));
+    bench.gate.open();
+    assert_eq!(drain.await.expect("no panic"), Drained { finished: 1, given_back: 0 });
+    assert_eq!(bench.engine.job(&running).await.expect("exists").state, JobState::Succeeded);
+    assert_eq!(bench.engine.job(&queued).await.expect("exists").state, JobState::Queued);
+    assert_eq!(bench.engine.drain(Duration::ZERO).await, Drained::default(), "once is enough");
+}
+
+#[tokio::test]
+async fn a_drain_gives_back_what_does_not_finish_and_the_next_engine_takes_it_up() {
+    let bench = Bench::start(workers(2)).await;
+    let names = [bench.submit(Script::Wait).await, bench.submit(Script::Wait).await, bench.submit(Script::Wait).await];
+    bench.gate.until_waiting(2).await;
+    let mut watch = bench.engine.watch(&names[0], 0).await.expect("exists");
+    assert_eq!(bench.engine.drain(Duration::ZERO).await, Drained { finished: 0, given_back: 2 });
+    let mut seen = Vec::new();
+    let end = loop {
+        match watch.next().await.expect("an event or an error") {
+            Ok(event) => seen.push(event),
+            Err(error) => break error,
+        }
+    };
+    assert_eq!(end, Error::Draining);
+    assert!(watch.next().await.is_none());
+    let Bench { engine, store, gate, directory } = bench;
+    for name in &names {
+        assert_eq!(engine.job(name).await.expect("exists").state, JobState::Queued);
+    }
+    drop((engine, store, watch));
+
+    gate.open();
+    let (engine, _store) = start(workers(1), &directory, &gate).await;
+    for name in &names {
+        assert_eq!(ended(&engine, name).await.state, JobState::Succeeded);
+    }
+    let after = seen.last().and_then(|event| event.sequence).expect("numbered");
+    let mut watch = engine.watch(&names[0], after).await.expect("exists");
+    seen.extend(rest(&mut watch).await);
+    assert_contiguous(&seen, 1);
+    assert_eq!(seen.iter().filter_map(terminal).collect::<Vec<_>>(), [JobState::Succeeded]);
+    assert_eq!(engine.job(&names[0]).await.expect("exists").attempt, 2);
+}
+
+/// An engine and its runtime in one, to be torn down without a word.
+#[test]
+fn after_a_crash_every_job_is_finished_exactly_once() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let gate = Arc::new(Gate::default());
+    let first = Runtime::new().expect("a runtime");
+    let (running, queued, mut seen) = first.block_on(async {
+        let (engine, _) = start(workers(1), &directory, &gate).await;
+        let running = engine.submit(new_job(Script::Wait)).await.expect("admitted").name;
+        let mut watch = engine.watch(&running, 0).await.expect("exists");
+        let mut seen = Vec::new();
+        while !seen.iter().any(|event: &JobEvent| matches!(event.body, EventBody::Progress(_))) {
+            seen.push(watch.next().await.expect("an event").expect("no error"));
+        }
+        let queued = engine.submit(new_job(Script::Succeed)).await.expect("admitted").name;
+        (running, queued, seen)
+    });
+    first.shutdown_background();
+
+    let second = Runtime::new().expect("a runtime");
+    second.block_on(async {
+        let (engine, _) = start(workers(1), &directory, &gate).await;
+        gate.open();
+        for name in [&running, &queued] {
+            assert_eq!(ended(&engine, name).await.state, JobState::Succeeded);
+        }
+        assert_eq!(engine.job(&running).await.expect("exists").attempt, 2);
+        let after = seen.last().and_then(|event| event.sequence).expect("numbered");
+        seen.extend(rest(&mut engine.watch(&running, after).await.expect("exists")).await);
+        assert_contiguous(&seen, 1);
+        assert_eq!(seen.iter().filter_map(terminal).collect::<Vec<_>>(), [JobState::Succeeded]);
+        let attempts: Vec<u32> = seen.iter().map(|event| event.attempt).collect();
+        assert!(attempts.is_sorted() && attempts.ends_with(&[2]), "{attempts:?}");
+    });
+}
+
+#[test]
+fn a_job_that_takes_its_process_down_each_time_fails() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let gate = Arc::new(Gate::default());
+    let options = Options { max_attempts: 2, ..workers(1) };
+    let mut name = None;
+    for life in 1..=2 {
+        let runtime = Runtime::new().expect("a runtime");
+        runtime.block_on(async {
+            let (engine, _) = start(options.clone(), &directory, &gate).await;
+            if name.is_none() {
+                name = Some(engine.submit(new_job(Script::Wait)).await.expect("admitted").name);
+            }
+            gate.until_waiting(life).await;
+        });
+        runtime.shutdown_background();
+    }
+    Runtime::new().expect("a runtime").block_on(async {
+        let (engine, _) = start(options, &directory, &gate).await;
+        let job = engine.job(&name.expect("submitted")).await.expect("exists");
+        assert_eq!((job.state, job.attempt), (JobState::Failed, 2));
+        assert_eq!(job.failure.expect("a reason").reason, "ATTEMPTS_EXHAUSTED");
+    });
+}
+
+#[tokio::test]
+async fn a_worker_whose_lease_was_taken_over_changes_nothing() {
+    // Heartbeats far apart: the first worker learns of its loss only when it wants to write its result.
+    let options = Options { lease: Duration::from_secs(3000), ..workers(2) };
+    let bench = Bench::start(options).await;
+    let name = bench.submit(Script::Deaf).await;
+    bench.gate.until_waiting(1).await;
+    let much_later = SystemTime::now() + Duration::from_secs(4000);
+    let lost = bench.store.sweep(much_later, 3).await.expect("sweeps").lost;
+    assert_eq!(lost.len(), 1);
+    // The second worker finds the job by itself; both wait now, and end in any order.
+    bench.gate.until_waiting(2).await;
+    bench.gate.open();
+    let job = bench.ended(&name).await;
+    assert_eq!((job.state, job.attempt), (JobState::Succeeded, 2));
+    assert_eq!(bench.engine.result(&name).await.expect("ready").iterations, 2, "the second call's");
+    bench.engine.drain(Duration::from_secs(120)).await;
+    assert_eq!(bench.engine.job(&name).await, Ok(job), "also after the first worker has ended");
+    let events = bench.store.events_after(&name, 0, 100).await.expect("events");
+    assert_contiguous(&events, 1);
+    assert_eq!(events.iter().filter_map(terminal).count(), 1);
+}
+
+#[tokio::test]
+async fn a_lost_lease_stops_the_work() {
+    let options = Options { lease: Duration::from_millis(300), ..workers(1) };
+    let bench = Bench::start(options).await;
+    let name = bench.submit(Script::Wait).await;
+    bench.gate.until_waiting(1).await;
+    let much_later = SystemTime::now() + Duration::from_secs(60);
+    bench.store.sweep(much_later, 10).await.expect("sweeps");
+    // The one worker can only take the job up again after the first attempt has stopped.
+    bench.gate.until_waiting(2).await;
+    bench.gate.open();
+    assert_eq!(bench.ended(&name).await.state, JobState::Succeeded);
+}

@@ -1,0 +1,129 @@
+//! Following a job: replay from the store, then wait for more.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use futures_util::stream::{self, Stream};
+use tokio::sync::watch as channel;
+
+use super::hub::Subscription;
+use super::{Error, Inner, Phase};
+use crate::domain::Violation;
+use crate::domain::job::{EventBody, JobEvent, JobName};
+
+/// Events read from the store at once: a job has some dozens; a reader of thousands holds no more than this.
+const READ_AHEAD: u32 = 128;
+
+/// The events of a job, in order, without gap or repeat, up to the event of its terminal state.
+///
+/// Durable events are read from the store when they are asked for: a slow watcher holds nothing and delays nobody.
+/// Interim weights arrive between them, only the latest.
+pub struct Watch {
+    inner: Arc<Inner>,
+    name: JobName,
+    version: channel::Receiver<u64>,
+    weights: channel::Receiver<Option<Arc<JobEvent>>>,
+    phase: channel::Receiver<Phase>,
+    /// Read and not yet handed out.
+    ahead: VecDeque<JobEvent>,
+    /// Sequence number of the last event that was read.
+    after: u64,
+    /// Nothing was in the store beyond `after` when this version of the topic was seen.
+    caught_up: bool,
+    ended: bool,
+    /// After the receivers: keeps their senders alive.
+    _subscription: Subscription,
+}
+
+impl std::fmt::Debug for Watch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Watch").field("name", &self.name).field("after", &self.after).finish_non_exhaustive()
+    }
+}
+
+impl Watch {
+    pub(super) async fn open(inner: Arc<Inner>, name: JobName, after: u64) -> Result<Self, Error> {
+        // First listen, then look: what is committed in between is seen either way.
+        let subscription = inner.hub.subscribe(&name);
+        let version = subscription.topic().version.subscribe();
+        let mut weights = subscription.topic().weights.subscribe();
+        if weights.borrow().is_some() {
+            weights.mark_changed();
+        }
+        let job = inner.store.job(&name).await?;
+        if after > job.last_sequence {
+            let description =
+                format!("{after} is beyond the job's latest event {}; start from one received", job.last_sequence);
+            return Err(Error::InvalidArgument(Violation::of("after_sequence", description).into()));
+        }
+        // The terminal event is the last: nothing after it, nothing to wait for.
+        let ended = job.state.is_terminal() && after == job.last_sequence;
+        let phase = inner.phase.subscribe();
+        Ok(Self {
+            inner,
+            name,
+            version,
+            weights,
+            phase,
+            ahead: VecDeque::new(),
+            after,
+            caught_up: false,
+            ended,
+            _subscription: subscription,
+        })
+    }
+
+    /// The next event; `None` after the terminal state's. After an error nothing follows.
+    ///
+    /// Dropping the future loses nothing.
+    ///
+    /// # Errors
+    /// [`Error::Draining`] when the server goes down before the job's end: reconnect with the last sequence number.
+    pub async fn next(&mut self) -> Option<Result<JobEvent, Error>> {
+        if self.ended {
+            return None;
+        }
+        let event = self.advance().await;
+        self.ended = match &event {
+            Ok(JobEvent { body: EventBody::State { state, .. }, .. }) => state.is_terminal(),
+            Ok(_) => false,
+            Err(_) => true,
+        };
+        Some(event)
+    }
+
+    /// The same as a stream.
+    pub fn into_stream(self) -> impl Stream<Item = Result<JobEvent, Error>> + Send + 'static {
+        stream::unfold(self, |mut watch| async move { watch.next().await.map(|event| (event, watch)) })
+    }
+
+    async fn advance(&mut self) -> Result<JobEvent, Error> {
+        loop {
+            if let Some(event) = self.ahead.pop_front() {
+                return Ok(event);
+            }
+            if !self.caught_up || self.version.has_changed().unwrap_or(true) {
+                self.version.mark_unchanged();
+                self.caught_up = false;
+                self.ahead = self.inner.store.events_after(&self.name, self.after, READ_AHEAD).await?.into();
+                self.caught_up = self.ahead.is_empty();
+                self.after = self.ahead.back().and_then(|event| event.sequence).unwrap_or(self.after);
+                continue;
+            }
+            if *self.phase.borrow_and_update() == Phase::Closed {
+                return Err(Error::Draining);
+            }
+            tokio::select! {
+                biased;
+                // Receivers only fail when their sender is gone, which this watch itself prevents.
+                _ = self.version.changed() => self.caught_up = false,
+                _ = self.phase.changed() => self.caught_up = false,
+                _ = self.weights.changed() => {
+                    if let Some(event) = self.weights.borrow_and_update().clone() {
+                        return Ok(event.as_ref().clone());
+                    }
+                }
+            }
+        }
+    }
+}

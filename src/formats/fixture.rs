@@ -1,0 +1,115 @@
+//! A hand-made solution for tests: the truth of a synthetic scene, dressed as an answer.
+
+use nalgebra::{Matrix3, Matrix3x4, Vector3};
+use std::path::Path;
+
+use super::LabelledInput;
+use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, ViewResult};
+use crate::domain::{
+    Calibration, Grade, Losses, Method, Prior, Progress, Solution, Stage, Status, Warning, WarningCode,
+};
+use crate::synthetic::{Scene, SceneOptions};
+
+/// A solved scene of 5 views and 40 tracks, labels 10 x view + 3 and 2 x track + 100.
+pub(crate) fn solved() -> (LabelledInput, Solution) {
+    solved_with(&SceneOptions { views: 5, tracks: 40, outliers: 0.5, seed: 7, ..SceneOptions::default() })
+}
+
+/// The same for a scene of any size.
+pub(crate) fn solved_with(options: &SceneOptions) -> (LabelledInput, Solution) {
+    let scene = Scene::generate(options).expect("valid options");
+    let mut input = LabelledInput::unlabelled(scene.input.clone(), Path::new("observations.csv"));
+    input.view_labels.iter_mut().for_each(|label| *label = 10 * *label + 3);
+    input.track_labels.iter_mut().for_each(|label| *label = 2 * *label + 100);
+    let solution = solution(&scene);
+    (input, solution)
+}
+
+fn solution(scene: &Scene) -> Solution {
+    let truth = &scene.truth;
+    let [cx, cy] = truth.principal_point_px;
+    let k = Matrix3::new(truth.focal_px, 0.0, cx, 0.0, truth.focal_px, cy, 0.0, 0.0, 1.0);
+    let cameras: Vec<Matrix3x4<f64>> = (0..scene.options.views)
+        .map(|view| {
+            let mut pose = Matrix3x4::zeros();
+            pose.fixed_columns_mut::<3>(0)
+                .copy_from(&Matrix3::from_fn(|row, column| truth.rotations[view][row][column]));
+            pose.set_column(3, &Vector3::from(truth.translations[view]));
+            k * pose
+        })
+        .collect();
+    let inlier = &truth.inlier;
+    let residual = |n: usize| {
+        let track = scene.input.track[n] as usize;
+        let seen = cameras[scene.input.view[n] as usize] * Vector3::from(truth.points[track]).push(1.0);
+        (seen.x / seen.z - scene.input.x[n]).hypot(seen.y / seen.z - scene.input.y[n])
+    };
+    let inlier_of = |n: usize| inlier[scene.input.track[n] as usize];
+    let count = scene.input.x.len();
+    let kept: Vec<f64> = (0..count).filter(|&n| inlier_of(n)).map(residual).collect();
+    let weight = |hit: f32, miss: f32| inlier.iter().map(|&yes| if yes { hit } else { miss }).collect::<Vec<f32>>();
+    Solution {
+        status: Status::Solved,
+        grade: Some(Grade::Metric),
+        method: Method::Auto,
+        winning_prior: Some(Prior::Network),
+        iterations: 150,
+        seed: scene.options.seed,
+        calibrations: vec![Calibration {
+            focal_px: truth.focal_px,
+            sigma_log_focal: Some(0.004),
+            principal_point_px: truth.principal_point_px,
+        }],
+        plane_at_infinity: Some([1e-4, -2e-5, 0.03]),
+        views: cameras
+            .iter()
+            .enumerate()
+            .map(|(view, camera)| ViewResult {
+                projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| camera[(row, column)]))),
+                rotation: Some(truth.rotations[view]),
+                translation: Some(truth.translations[view]),
+            })
+            .collect(),
+        tracks: TrackResults {
+            weight: weight(0.98, 0.03),
+            inlier: inlier.clone(),
+            network_weight: weight(0.8, 0.2),
+            point: inlier.iter().zip(&truth.points).map(|(&yes, &point)| yes.then_some(point)).collect(),
+        },
+        observations: ObservationResults {
+            inlier: (0..count).map(inlier_of).collect(),
+            residual_px: (0..count).map(|n| inlier_of(n).then(|| residual(n))).collect(),
+        },
+        noise_px: Some(3.1),
+        reprojection_rms_px: Some((kept.iter().map(|r| r * r).sum::<f64>() / kept.len() as f64).sqrt()),
+        reprojection_mean_px: Some(kept.iter().sum::<f64>() / kept.len() as f64),
+        warnings: vec![Warning::new(WarningCode::FewInliers, "<b>hostile</b> & \"quoted\" detail")],
+        seconds: 1.5,
+        stages: Stage::ALL.iter().map(|&stage| StageTime { stage, seconds: 0.3 }).collect(),
+        prior_times: vec![PriorTime { prior: Prior::Uniform, seconds: None, iterations: 600 }],
+        history: history(truth.focal_px),
+    }
+}
+
+fn history(focal_px: f64) -> Vec<Progress> {
+    (0..150u32)
+        .map(|iteration| {
+            let share = f64::from(iteration) / 150.0;
+            Progress {
+                stage: Stage::ALL[(share * 5.0) as usize],
+                fraction: share,
+                iteration,
+                losses: Some(Losses {
+                    num: 1e4 * (-12.0 * share).exp(),
+                    proj: 3.0 - 2.0 * share,
+                    daq: 0.5 + (1.0 - share),
+                }),
+                inliers: (20.0 * share) as u32,
+                focal_px: (iteration > 30)
+                    .then(|| focal_px * (1.0 + 0.1 * (1.0 - share) * (f64::from(iteration)).sin())),
+                best_score: (iteration > 10).then_some(1.0 - 0.5 * share),
+                elapsed_seconds: share * 1.5,
+            }
+        })
+        .collect()
+}

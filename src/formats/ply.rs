@@ -1,0 +1,70 @@
+//! `points.ply`: the points of the inlier tracks, coloured by weight.
+
+use std::fmt::Write;
+
+use super::LabelledInput;
+use super::result_json::track_label;
+use crate::domain::Solution;
+
+/// The points as an ASCII PLY: text, so that results can be compared line by line.
+///
+/// A vertex has `x y z` (metric where the result is metric, else projective), a colour from orange (weight 0) to blue
+/// (weight 1), the weight, and the caller's id of the track.
+pub fn points(solution: &Solution, input: Option<&LabelledInput>) -> String {
+    let vertices: Vec<(usize, [f64; 3])> =
+        solution.tracks.point.iter().enumerate().filter_map(|(track, point)| Some((track, (*point)?))).collect();
+    let frame = if solution.calibrations.is_empty() { "projective" } else { "metric up to scale" };
+    let mut text = format!(
+        "ply\nformat ascii 1.0\ncomment scpsfm points, {frame}, coloured by weight\nelement vertex {}\n\
+         property double x\nproperty double y\nproperty double z\n\
+         property uchar red\nproperty uchar green\nproperty uchar blue\n\
+         property float weight\nproperty double track\nend_header\n",
+        vertices.len()
+    );
+    for (track, [x, y, z]) in vertices {
+        let weight = solution.tracks.weight.get(track).copied().unwrap_or(0.0);
+        let [red, green, blue] = colour(weight);
+        let label = track_label(input, track);
+        // Writing to a String cannot fail.
+        let _ = writeln!(text, "{x} {y} {z} {red} {green} {blue} {weight} {label}");
+    }
+    text
+}
+
+/// The colour of a weight: a straight line from orange (0) to blue (1), apart for the colour-blind too.
+pub fn colour(weight: f32) -> [u8; 3] {
+    const LOW: [f32; 3] = [230.0, 120.0, 20.0];
+    const HIGH: [f32; 3] = [30.0, 100.0, 220.0];
+    let share = if weight.is_finite() { weight.clamp(0.0, 1.0) } else { 0.0 };
+    std::array::from_fn(|k| (LOW[k] + (HIGH[k] - LOW[k]) * share).round() as u8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::formats::fixture;
+
+    #[test]
+    fn declares_as_many_vertices_as_it_holds() {
+        let (input, solution) = fixture::solved();
+        let text = points(&solution, Some(&input));
+        let body = text.split_once("end_header\n").expect("a header").1;
+        let inliers = solution.inlier_track_count();
+        assert!(inliers > 0);
+        assert!(text.contains(&format!("element vertex {inliers}\n")));
+        assert_eq!(body.lines().count(), inliers);
+        let first = body.lines().next().expect("a vertex").split(' ').collect::<Vec<_>>();
+        let track = solution.tracks.inlier.iter().position(|&inlier| inlier).expect("an inlier");
+        assert_eq!(first.len(), 8);
+        assert_eq!(first[7], input.track_labels[track].to_string());
+        assert_eq!(first[0], solution.tracks.point[track].expect("a point")[0].to_string());
+    }
+
+    #[test]
+    fn colours_are_ordered_and_survive_nonsense() {
+        assert_eq!(colour(0.0), [230, 120, 20]);
+        assert_eq!(colour(1.0), [30, 100, 220]);
+        assert_eq!(colour(f32::NAN), colour(0.0));
+        assert_eq!(colour(7.0), colour(1.0));
+    }
+}

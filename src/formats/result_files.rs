@@ -1,0 +1,135 @@
+//! Writing the result files into a directory: each appears whole or not at all.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use super::LabelledInput;
+use super::ply;
+use super::result_json::{CamerasJson, ResultJson, track_label, view_label};
+use crate::domain::Solution;
+use crate::report;
+
+/// Names of the files, in the order in which they are written; `result.json` comes last, so that whoever waits for it
+/// finds the others.
+pub const TRACKS: &str = "tracks.csv";
+pub const OBSERVATIONS: &str = "observations.csv";
+pub const CAMERAS: &str = "cameras.json";
+pub const POINTS: &str = "points.ply";
+pub const REPORT: &str = "report.html";
+pub const RESULT: &str = "result.json";
+
+/// What `result.json` holds.
+pub fn summary(solution: &Solution) -> ResultJson {
+    ResultJson::from(solution)
+}
+
+/// `result.json` as text.
+///
+/// # Errors
+/// None is expected: every field is serialisable.
+pub fn result_json(solution: &Solution) -> io::Result<String> {
+    pretty(&summary(solution))
+}
+
+/// Writes the result files into `directory`, which is created. Without the input, indices stand for labels, there is
+/// no `observations.csv` and the report has no picture of the tracks.
+///
+/// # Errors
+/// The first file that cannot be written, named.
+pub fn write(directory: &Path, solution: &Solution, input: Option<&LabelledInput>) -> io::Result<()> {
+    create_directory(directory)?;
+    write_atomically(directory, TRACKS, tracks_csv(solution, input).as_bytes())?;
+    if let Some(input) = input {
+        write_atomically(directory, OBSERVATIONS, observations_csv(solution, input).as_bytes())?;
+    }
+    write_atomically(directory, CAMERAS, pretty(&CamerasJson::new(solution, input))?.as_bytes())?;
+    write_atomically(directory, POINTS, ply::points(solution, input).as_bytes())?;
+    write_atomically(directory, REPORT, report::page(solution, input).as_bytes())?;
+    write_atomically(directory, RESULT, result_json(solution)?.as_bytes())
+}
+
+/// Creates a directory and what is above it.
+///
+/// # Errors
+/// The directory cannot be created; the message names it.
+pub fn create_directory(directory: &Path) -> io::Result<()> {
+    fs::create_dir_all(directory)
+        .map_err(|error| named(&error, &format!("cannot create the directory {}", directory.display())))
+}
+
+/// Writes a file under a temporary name and renames it, so that no reader sees half of it and a full disk leaves the
+/// old one standing.
+///
+/// # Errors
+/// The file cannot be written; the message names it.
+pub fn write_atomically(directory: &Path, name: &str, bytes: &[u8]) -> io::Result<()> {
+    let target = directory.join(name);
+    let temporary = TemporaryFile(directory.join(format!(".{name}.{}", std::process::id())));
+    let attempt = || {
+        let mut file = File::create(&temporary.0)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&temporary.0, &target)
+    };
+    attempt().map_err(|error| named(&error, &format!("cannot write {}", target.display())))
+}
+
+/// Removes the file when dropped; after the rename there is nothing left to remove.
+struct TemporaryFile(PathBuf);
+
+impl Drop for TemporaryFile {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+fn named(error: &io::Error, what: &str) -> io::Error {
+    io::Error::new(error.kind(), format!("{what}: {error}"))
+}
+
+/// JSON for people too: indented, with a newline at the end.
+pub fn pretty(value: &impl serde::Serialize) -> io::Result<String> {
+    let mut text = serde_json::to_string_pretty(value).map_err(io::Error::other)?;
+    text.push('\n');
+    Ok(text)
+}
+
+/// `track,weight,inlier`, and `network_weight` where a network ran; one line a track.
+fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
+    let tracks = &solution.tracks;
+    let has_network = !tracks.network_weight.is_empty();
+    let mut text = String::from("track,weight,inlier");
+    text.push_str(if has_network { ",network_weight\n" } else { "\n" });
+    for (track, (weight, &inlier)) in tracks.weight.iter().zip(&tracks.inlier).enumerate() {
+        text.push_str(&format!("{},{weight},{}", track_label(input, track), u8::from(inlier)));
+        if has_network {
+            text.push_str(&format!(",{}", tracks.network_weight.get(track).copied().unwrap_or(0.0)));
+        }
+        text.push('\n');
+    }
+    text
+}
+
+/// `view,track,inlier,residual_px` in the order of the caller's file; an observation that was not judged has an empty
+/// residual.
+fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {
+    let judged = &solution.observations;
+    let mut text = String::from("view,track,inlier,residual_px\n");
+    for (k, (&view, &track)) in input.raw.view.iter().zip(&input.raw.track).enumerate() {
+        let inlier = judged.inlier.get(k).copied().unwrap_or(false);
+        let residual = judged.residual_px.get(k).copied().flatten();
+        text.push_str(&format!(
+            "{},{},{},{}\n",
+            view_label(Some(input), view as usize),
+            track_label(Some(input), track as usize),
+            u8::from(inlier),
+            residual.map_or_else(String::new, |px| px.to_string()),
+        ));
+    }
+    text
+}
+
+#[cfg(test)]
+#[path = "result_files_tests.rs"]
+mod tests;

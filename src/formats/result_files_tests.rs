@@ -1,0 +1,216 @@
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+use super::*;
+use crate::domain::{Calibration, Grade, Status};
+use crate::formats::fixture;
+
+fn json(solution: &Solution) -> Value {
+    serde_json::from_str(&result_json(solution).expect("serialisable")).expect("JSON")
+}
+
+fn keys(value: &Value) -> Vec<&str> {
+    value.as_object().expect("an object").keys().map(String::as_str).collect()
+}
+
+/// Every file of a directory.
+fn contents(directory: &Path) -> BTreeMap<String, String> {
+    let entries = fs::read_dir(directory).expect("a directory");
+    entries
+        .map(|entry| entry.expect("an entry").path())
+        .map(|path| {
+            let name = path.file_name().expect("a name").to_string_lossy().into_owned();
+            (name, fs::read_to_string(&path).expect("text"))
+        })
+        .collect()
+}
+
+#[test]
+fn the_fields_of_result_json_are_a_contract() {
+    let (_, solution) = fixture::solved();
+    let result = json(&solution);
+    let mut found = keys(&result);
+    found.sort_unstable();
+    let mut wanted = [
+        "status",
+        "grade",
+        "focal_px",
+        "sigma_log_focal",
+        "focal_unobservable",
+        "principal_point_px",
+        "plane_at_infinity",
+        "inlier_tracks",
+        "inlier_observations",
+        "registered_views",
+        "reprojection_rms_px",
+        "reprojection_mean_px",
+        "warnings",
+        "method",
+        "iterations",
+        "winning_prior",
+        "noise_px",
+        "seconds",
+        "stages",
+        "prior_times",
+        "seed",
+        "version",
+    ];
+    wanted.sort_unstable();
+    assert_eq!(found, wanted);
+    assert_eq!(result["status"], "SOLVED");
+    assert_eq!(result["grade"], "METRIC");
+    assert_eq!(result["method"], "AUTO");
+    assert_eq!(result["winning_prior"], "network");
+    assert_eq!(result["inlier_tracks"], 20);
+    assert_eq!(result["inlier_observations"], 100);
+    assert_eq!(result["registered_views"], 5);
+    assert_eq!(result["focal_unobservable"], false);
+    assert_eq!(keys(&result["warnings"][0]), ["code", "detail"]);
+    assert_eq!(result["warnings"][0]["code"], "FEW_INLIERS");
+    assert_eq!(keys(&result["stages"][0]), ["name", "seconds"]);
+    assert_eq!(result["stages"][0]["name"], "prepare");
+    assert_eq!(result["prior_times"][0]["prior"], "uniform");
+    assert_eq!(result["prior_times"][0]["seconds"], Value::Null);
+}
+
+#[test]
+fn infinity_is_null_and_said() {
+    let (_, mut solution) = fixture::solved();
+    solution.calibrations[0].sigma_log_focal = None;
+    let result = json(&solution);
+    assert_eq!(result["sigma_log_focal"], Value::Null);
+    assert_eq!(result["focal_unobservable"], true);
+    solution.calibrations.clear();
+    solution.status = Status::NoReconstruction;
+    solution.grade = None;
+    let result = json(&solution);
+    assert_eq!(result["status"], "NO_RECONSTRUCTION");
+    for field in ["grade", "focal_px", "sigma_log_focal", "focal_unobservable", "principal_point_px"] {
+        assert_eq!(result[field], Value::Null, "{field}");
+    }
+    solution.grade = Some(Grade::ProjectiveOnly);
+    assert_eq!(json(&solution)["grade"], "PROJECTIVE_ONLY");
+}
+
+#[test]
+fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
+    let (mut input, mut solution) = fixture::solved();
+    let second = Calibration { focal_px: 77.0, sigma_log_focal: None, principal_point_px: [1.0, 2.0] };
+    solution.calibrations.push(second);
+    input.raw.views[3].camera_group = 9;
+    let result = json(&solution);
+    assert_eq!(result["cameras"].as_array().expect("a list").len(), 2);
+    assert_eq!(
+        keys(&result["cameras"][1]),
+        ["focal_px", "focal_unobservable", "principal_point_px", "sigma_log_focal"]
+    );
+    assert_eq!(result["cameras"][1]["focal_unobservable"], true);
+    let cameras = CamerasJson::new(&solution, Some(&input));
+    let focal: Vec<f64> = cameras.views.iter().map(|view| view.K.expect("metric")[0][0]).collect();
+    let first = solution.calibrations[0].focal_px;
+    assert_eq!(focal, [first, first, first, 77.0, first]);
+}
+
+#[test]
+fn a_view_without_a_pose_has_no_matrices() {
+    let (input, mut solution) = fixture::solved();
+    solution.views[1] = Default::default();
+    solution.views[2].rotation = None;
+    let cameras = serde_json::to_value(CamerasJson::new(&solution, Some(&input))).expect("serialisable");
+    let view = |k: usize| &cameras["views"][k];
+    assert_eq!(view(0)["view"], 3);
+    assert_eq!(view(0)["K"][0][0], solution.calibrations[0].focal_px);
+    assert!(view(0)["R"].is_array() && view(0)["t"].is_array() && view(0)["P"].is_array());
+    assert_eq!(view(1)["registered"], false);
+    assert_eq!(view(1)["P"], Value::Null);
+    assert_eq!(view(2)["registered"], true);
+    for matrix in ["K", "R", "t"] {
+        assert_eq!(view(2)[matrix], Value::Null, "{matrix}");
+    }
+}
+
+#[test]
+fn answers_carry_the_callers_ids_in_the_callers_order() {
+    let (mut input, solution) = fixture::solved();
+    input.raw.view.swap(0, 1);
+    input.raw.track.swap(0, 1);
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let out = directory.path().join("a/b");
+    write(&out, &solution, Some(&input)).expect("written");
+    let files = contents(&out);
+    assert_eq!(files.keys().collect::<Vec<_>>(), [CAMERAS, OBSERVATIONS, POINTS, REPORT, RESULT, TRACKS]);
+    let tracks: Vec<&str> = files[TRACKS].lines().collect();
+    assert_eq!(tracks[0], "track,weight,inlier,network_weight");
+    assert_eq!(tracks.len(), 41);
+    let expected = if solution.tracks.inlier[1] { "102,0.98,1,0.8" } else { "102,0.03,0,0.2" };
+    assert_eq!(tracks[2], expected);
+    let observations: Vec<&str> = files[OBSERVATIONS].lines().collect();
+    assert_eq!(observations[0], "view,track,inlier,residual_px");
+    assert_eq!(observations.len(), 201);
+    assert!(observations[1].starts_with("3,102,"), "{}", observations[1]);
+    let outlier = solution.observations.inlier.iter().position(|&inlier| !inlier).expect("an outlier");
+    assert!(observations[outlier + 1].ends_with(",0,"), "{}", observations[outlier + 1]);
+}
+
+#[test]
+fn without_a_network_there_is_no_fourth_column_and_without_the_input_no_observations() {
+    let (_, mut solution) = fixture::solved();
+    solution.tracks.network_weight.clear();
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    write(directory.path(), &solution, None).expect("written");
+    let files = contents(directory.path());
+    assert!(!files.contains_key(OBSERVATIONS));
+    assert_eq!(files[TRACKS].lines().next(), Some("track,weight,inlier"));
+    assert!(files[TRACKS].lines().nth(1).expect("a track").starts_with("0,"));
+}
+
+#[test]
+fn the_same_solution_gives_the_same_bytes_but_for_times() {
+    let (input, solution) = fixture::solved();
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let written = |name: &str, solution: &Solution| {
+        let out = directory.path().join(name);
+        write(&out, solution, Some(&input)).expect("written");
+        contents(&out)
+    };
+    let first = written("first", &solution);
+    assert_eq!(first, written("again", &solution));
+    let mut later = solution.clone();
+    later.seconds = 99.0;
+    later.stages[0].seconds = 98.0;
+    later.history.iter_mut().for_each(|progress| progress.elapsed_seconds += 7.0);
+    let second = written("later", &later);
+    for name in [TRACKS, OBSERVATIONS, CAMERAS, POINTS] {
+        assert_eq!(first[name], second[name], "{name}");
+    }
+    let differing =
+        |name: &str| first[name].lines().zip(second[name].lines()).filter(|(before, after)| before != after).count();
+    assert_eq!(differing(RESULT), 2);
+    assert!(differing(REPORT) <= 2, "{} lines of the report depend on times", differing(REPORT));
+}
+
+#[test]
+fn a_second_result_replaces_the_first_and_leaves_no_temporary_files() {
+    let (input, mut solution) = fixture::solved();
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    write(directory.path(), &solution, Some(&input)).expect("written");
+    solution.iterations = 12_345;
+    write(directory.path(), &solution, Some(&input)).expect("written");
+    let files = contents(directory.path());
+    assert_eq!(files.len(), 6);
+    assert!(files[RESULT].contains("12345"));
+}
+
+#[test]
+fn what_cannot_be_written_is_named() {
+    let (input, solution) = fixture::solved();
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let file = directory.path().join("file");
+    fs::write(&file, "x").expect("written");
+    let error = write(&file, &solution, Some(&input)).expect_err("a file stands there");
+    assert!(error.to_string().contains("cannot create the directory"), "{error}");
+    fs::create_dir_all(directory.path().join(TRACKS)).expect("created");
+    let error = write(directory.path(), &solution, Some(&input)).expect_err("a directory stands there");
+    assert!(error.to_string().contains(TRACKS), "{error}");
+}

@@ -1,0 +1,154 @@
+//! Points from cameras and image points.
+
+use nalgebra::{Matrix2x4, Matrix4, RowVector4, SymmetricEigen, Vector2};
+
+use super::measurement::Sighting;
+use super::{Camera, Point};
+
+/// Smallest homogeneous depth that is divided by; points nearer to the principal plane have no image.
+const MIN_DEPTH: f64 = 1e-9;
+/// Levenberg damping at the start of a refinement, relative to the diagonal.
+const INITIAL_DAMPING: f64 = 1e-3;
+
+/// Reprojection residual, projected minus observed, in the units of the image points.
+///
+/// # Pitfall
+/// A point on the camera's principal plane is projected as if it were [`MIN_DEPTH`] off it: the residual is then huge
+/// but finite, and its sign means nothing.
+pub fn reprojection(camera: &Camera, point: &Point, xy: &Vector2<f64>) -> Vector2<f64> {
+    let image = camera * point;
+    image.xy() / away_from_zero(image.z) - xy
+}
+
+/// Sum of squared reprojection residuals of a point over its sightings.
+pub fn squared_residual(cameras: &[Camera], point: &Point, sightings: &[Sighting]) -> f64 {
+    sightings.iter().map(|sighting| reprojection(&cameras[sighting.view], point, &sighting.xy).norm_squared()).sum()
+}
+
+/// Linear triangulation (Hartley & Zisserman, section 12.2): the unit 4-vector that is least inconsistent with
+/// `x (P3 X) = P1 X`, `y (P3 X) = P2 X` over all sightings, each camera's rows scaled by the norm of its third.
+///
+/// Needs two sightings or more; with fewer the point returned is one of many.
+pub fn linear(cameras: &[Camera], sightings: &[Sighting]) -> Point {
+    let mut normal = Matrix4::zeros();
+    for sighting in sightings {
+        let camera = &cameras[sighting.view];
+        let third = camera.row(2).into_owned();
+        let weight = 1.0
+            / (third.fixed_columns::<3>(0).norm_squared() + f64::EPSILON * third.norm_squared()).max(f64::MIN_POSITIVE);
+        let mut accumulate = |row: RowVector4<f64>| normal += row.tr_mul(&row) * weight;
+        accumulate(third * sighting.xy.x - camera.row(0));
+        accumulate(third * sighting.xy.y - camera.row(1));
+    }
+    if normal.iter().any(|entry| !entry.is_finite()) {
+        return Point::new(0.0, 0.0, 0.0, 1.0);
+    }
+    let eigen = SymmetricEigen::new(normal);
+    eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned()
+}
+
+/// Refines a point by Levenberg-Marquardt on its squared reprojection residuals, at most `iterations` steps.
+///
+/// Returns the point, of unit norm, and its sum of squared residuals; never worse than the start.
+pub fn refine(cameras: &[Camera], sightings: &[Sighting], start: Point, iterations: usize) -> (Point, f64) {
+    let mut point = start.normalize();
+    let mut cost = squared_residual(cameras, &point, sightings);
+    let mut damping = INITIAL_DAMPING;
+    for _ in 0..iterations {
+        let mut normal = Matrix4::zeros();
+        let mut gradient = Point::zeros();
+        for sighting in sightings {
+            let camera = &cameras[sighting.view];
+            let image = camera * point;
+            let depth = away_from_zero(image.z);
+            let projected = image.xy() / depth;
+            let jacobian: Matrix2x4<f64> = (camera.fixed_rows::<2>(0) - projected * camera.row(2)) / depth;
+            normal += jacobian.tr_mul(&jacobian);
+            gradient += jacobian.tr_mul(&(projected - sighting.xy));
+        }
+        // The scale of the homogeneous point is free: pin it.
+        normal += point * point.transpose() * normal.trace();
+        for k in 0..4 {
+            normal[(k, k)] *= 1.0 + damping;
+        }
+        let Some(step) = normal.cholesky().map(|factor| factor.solve(&gradient)) else { break };
+        let candidate = (point - step).normalize();
+        let candidate_cost = squared_residual(cameras, &candidate, sightings);
+        if candidate_cost < cost {
+            let gain = (cost - candidate_cost) / cost;
+            (point, cost) = (candidate, candidate_cost);
+            damping /= 5.0;
+            if gain < RELATIVE_TOLERANCE {
+                break;
+            }
+        } else {
+            damping *= 10.0;
+        }
+    }
+    (point, cost)
+}
+
+/// Gain below which a refinement has arrived: ranking and gates do not see a part in a thousand.
+const RELATIVE_TOLERANCE: f64 = 1e-3;
+
+fn away_from_zero(depth: f64) -> f64 {
+    if depth.abs() < MIN_DEPTH { MIN_DEPTH.copysign(depth) } else { depth }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cameras() -> Vec<Camera> {
+        (0..4)
+            .map(|view| {
+                let t = view as f64;
+                Camera::new(1.2, 0.1 * t, 0.0, 0.4 * t, 0.0, 1.2, 0.05 * t, -0.2, 0.02 * t, 0.0, 1.0, 3.0 + 0.1 * t)
+            })
+            .collect()
+    }
+
+    fn sightings(cameras: &[Camera], point: &Point, shift: f64) -> Vec<Sighting> {
+        cameras
+            .iter()
+            .enumerate()
+            .map(|(view, camera)| {
+                let image = camera * point;
+                let wobble = Vector2::new((view as f64 * 2.1).sin(), (view as f64 * 3.7).cos()) * shift;
+                Sighting { view, xy: image.xy() / image.z + wobble }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn exact_points_are_found_exactly_also_at_infinity() {
+        let cameras = cameras();
+        for truth in [Point::new(0.3, -0.4, 1.0, 1.0), Point::new(0.1, 0.2, 1.0, 0.0)] {
+            let seen = sightings(&cameras, &truth, 0.0);
+            let found = linear(&cameras, &seen);
+            assert!(squared_residual(&cameras, &found, &seen) < 1e-18);
+        }
+    }
+
+    #[test]
+    fn refinement_reaches_a_stationary_point_and_never_gets_worse() {
+        let cameras = cameras();
+        let seen = sightings(&cameras, &Point::new(0.3, -0.4, 1.0, 1.0), 0.01);
+        let start = linear(&cameras, &seen);
+        let (point, cost) = refine(&cameras, &seen, start, 20);
+        assert!(cost <= squared_residual(&cameras, &start, &seen));
+        for axis in 0..4 {
+            let mut moved = point;
+            moved[axis] += 1e-4;
+            assert!(squared_residual(&cameras, &moved, &seen) >= cost * (1.0 - 1e-3));
+        }
+    }
+
+    #[test]
+    fn degenerate_cameras_give_finite_points() {
+        let flat = vec![Camera::zeros(); 3];
+        let seen: Vec<Sighting> = (0..3).map(|view| Sighting { view, xy: Vector2::new(0.1, 0.2) }).collect();
+        let (point, cost) = refine(&flat, &seen, linear(&flat, &seen), 5);
+        assert!(point.iter().all(|entry| entry.is_finite()) && cost.is_finite());
+    }
+}

@@ -1,0 +1,50 @@
+//! What the network is told.
+
+use crate::domain::{Backend, SolveSettings};
+
+/// Settings of one optimisation; the defaults and their reasons are those of [`SolveSettings`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct NetworkSettings {
+    /// Width of the PointNet as a share of the original.
+    pub width: f64,
+    /// Weight of L_proj.
+    pub alpha: f64,
+    /// Weight of L_DAQ.
+    pub beta: f64,
+    /// The paper's `t`.
+    pub min_inliers: f64,
+    /// Slope of the sigmoid in L_num.
+    pub kappa: f64,
+    /// Adam's learning rate.
+    pub learning_rate: f64,
+    /// Iterations planned in total. More may be run; this only places the onset of L_DAQ.
+    pub iterations: u32,
+    /// Whether L_DAQ is optimised. Its value is reported either way.
+    pub use_daq: bool,
+    /// Seed of the initial weights.
+    pub seed: u64,
+    pub backend: Backend,
+}
+
+impl From<&SolveSettings> for NetworkSettings {
+    fn from(settings: &SolveSettings) -> Self {
+        Self {
+            width: settings.network_width,
+            alpha: settings.alpha,
+            beta: settings.beta,
+            min_inliers: settings.min_inliers,
+            kappa: settings.kappa,
+            learning_rate: settings.learning_rate,
+            iterations: settings.iterations,
+            use_daq: settings.use_daq,
+            seed: settings.seed,
+            backend: settings.backend.unwrap_or_default(),
+        }
+    }
+}
+
+impl Default for NetworkSettings {
+    fn default() -> Self {
+        Self::from(&SolveSettings::default())
+    }
+}

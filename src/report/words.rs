@@ -1,0 +1,45 @@
+//! Codes in plain words.
+
+use crate::domain::{Grade, Solution, Status, WarningCode};
+
+/// What a warning means for whoever uses the result.
+pub fn warning(code: WarningCode) -> &'static str {
+    match code {
+        WarningCode::PlanarOrRotation => {
+            "The points lie on one plane, or the camera only turned. Such views carry no calibration: do not use the focal length."
+        }
+        WarningCode::UnobservableFocal => {
+            "The camera's motion leaves the focal length free. Whatever value is shown, others fit as well."
+        }
+        WarningCode::SecondMinimum => "Another calibration explains the tracks about as well as the one shown.",
+        WarningCode::ModelMismatch => {
+            "One constant, distortion-free camera fits notably worse than free cameras do: expect lens distortion, a zoom or a displaced principal point."
+        }
+        WarningCode::FewInliers => "So few tracks agree that the result can hardly be verified.",
+        WarningCode::Cheirality => "Some points come out behind the cameras that saw them.",
+        WarningCode::NoConsensus => "No set of tracks was found that one rigid scene explains.",
+        WarningCode::ViewsLeftOut => "Not every view takes part in the result.",
+        WarningCode::AssumedImageSize => {
+            "No image size was given, so the extent of the points stood in; the principal point may be off."
+        }
+        WarningCode::CameraGroupsMerged => "Views of different cameras or sizes were treated as one camera.",
+        WarningCode::StoppedEarly => "Time ran out; this is the best that was found until then.",
+    }
+}
+
+/// What the outcome means.
+pub fn outcome(solution: &Solution) -> &'static str {
+    match (solution.status, solution.grade) {
+        (Status::NoReconstruction, _) => "No reconstruction stands. The warnings say why.",
+        (_, Some(Grade::Metric)) => {
+            "The focal length is known to better than 2 %; cameras and points are metric, up to scale."
+        }
+        (_, Some(Grade::Weak)) => {
+            "The focal length is known to 2 to 10 % only; use the metric reconstruction with care."
+        }
+        (_, Some(Grade::ProjectiveOnly)) => {
+            "Which tracks are right is known, and the projective reconstruction stands; the data carry no focal length to rely on."
+        }
+        (_, None) => "Which tracks are right is known; nothing was calibrated.",
+    }
+}

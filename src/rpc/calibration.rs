@@ -1,0 +1,132 @@
+//! `CalibrationService`.
+
+use std::pin::Pin;
+use std::time::Duration;
+
+use tokio_stream::{Stream, StreamExt};
+use tonic::{Request, Response, Status, Streaming};
+use tracing::Instrument;
+
+use super::caller::Caller;
+use super::convert::enums::Twin;
+use super::convert::{job, settings};
+use super::follow::{Follower, Followers};
+use super::submission::Submission;
+use super::{proto, status};
+use crate::domain::job::EventBody;
+use crate::domain::{Backend, Limits, Method, SolveSettings};
+use crate::engine::{self, Engine};
+use crate::telemetry;
+
+/// How long a `Solve` may be silent before its input is complete. A dead connection is found by keep-alive long before;
+/// this is for a caller that lives and forgets.
+const INPUT_PATIENCE: Duration = Duration::from_secs(60);
+
+/// The service.
+#[derive(Clone)]
+pub struct Calibration {
+    engine: Engine,
+    limits: Limits,
+    max_message_bytes: usize,
+    followers: Followers,
+}
+
+impl Calibration {
+    /// `grace`: how long after the last `Solve` that follows a job was dropped the job is cancelled.
+    pub fn new(engine: Engine, limits: Limits, max_message_bytes: usize, grace: Duration) -> Self {
+        let followers = Followers::new(engine.clone(), grace);
+        Self { engine, limits, max_message_bytes, followers }
+    }
+
+    /// Reads the whole of a stream.
+    async fn receive(
+        &self,
+        caller: &Caller,
+        mut messages: Streaming<proto::SolveRequest>,
+    ) -> Result<Submission, Status> {
+        let Some(proto::SolveRequest { message: Some(proto::solve_request::Message::Config(config)) }) =
+            next(&mut messages).await?
+        else {
+            return Err(status::invalid(&super::violation("config", "is not the first message")));
+        };
+        let mut submission = Submission::open(caller, config, &self.limits)?;
+        while let Some(message) = next(&mut messages).await? {
+            submission.append(message)?;
+        }
+        Ok(submission)
+    }
+
+    /// Stores the job and follows it.
+    async fn submit(&self, new: engine::NewJob) -> Result<Follower, Status> {
+        let (engine, followers) = (self.engine.clone(), self.followers.clone());
+        // In a task of its own: if this call is dropped while the job is being stored, the follower is made all the
+        // same, is dropped with the task's outcome, and cancels the job.
+        let stored = async move { engine.submit(new).await.map(|job| followers.follow(job.name)) };
+        let outcome = tokio::spawn(stored.in_current_span()).await;
+        outcome.map_err(|error| status::internal(&error))?.map_err(status::from_engine)
+    }
+}
+
+async fn next(messages: &mut Streaming<proto::SolveRequest>) -> Result<Option<proto::SolveRequest>, Status> {
+    match tokio::time::timeout(INPUT_PATIENCE, messages.message()).await {
+        Ok(message) => message,
+        Err(_) => Err(status::input_stalled(INPUT_PATIENCE)),
+    }
+}
+
+#[tonic::async_trait]
+impl proto::calibration_service_server::CalibrationService for Calibration {
+    type SolveStream = Pin<Box<dyn Stream<Item = Result<proto::JobEvent, Status>> + Send>>;
+
+    async fn solve(
+        &self,
+        request: Request<Streaming<proto::SolveRequest>>,
+    ) -> Result<Response<Self::SolveStream>, Status> {
+        let caller = Caller::of(&request);
+        let span = telemetry::tracing::submit_span("Solve", caller.trace_parent());
+        let accepted = async {
+            let submission = self.receive(&caller, request.into_inner()).await?;
+            let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
+            let new = submission.close(trace_parent).await?;
+            let follower = self.submit(new).await?;
+            telemetry::tracing::record_job(&span, follower.job());
+            Ok::<_, Status>(follower)
+        };
+        let mut follower = accepted.instrument(span.clone()).await?;
+        let watch = self.engine.watch(follower.job(), 0).await.map_err(status::from_engine)?;
+        let watching = telemetry::metrics::watcher();
+        let events = watch.into_stream().map(move |event| {
+            let _ = &watching;
+            match &event {
+                Ok(event) if matches!(event.body, EventBody::State { state, .. } if state.is_terminal()) => {
+                    follower.release();
+                }
+                // The job goes back to the queue, for a caller that comes again with the same request id.
+                Err(engine::Error::Draining) => follower.release(),
+                _ => {}
+            }
+            event.map(job::event_to_wire).map_err(status::from_engine)
+        });
+        Ok(Response::new(Box::pin(events)))
+    }
+
+    async fn get_capabilities(
+        &self,
+        _request: Request<proto::GetCapabilitiesRequest>,
+    ) -> Result<Response<proto::Capabilities>, Status> {
+        // Counts above 32 bits cannot be asked for on the wire.
+        let count = |limit: usize| u32::try_from(limit).unwrap_or(u32::MAX);
+        Ok(Response::new(proto::Capabilities {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            limits: Some(proto::InputLimits {
+                max_views: count(self.limits.max_views),
+                max_tracks: count(self.limits.max_tracks),
+                max_observations: count(self.limits.max_observations),
+                max_message_bytes: self.max_message_bytes as u64,
+            }),
+            methods: Method::ALL.map(Twin::to_wire).to_vec(),
+            backends: [Backend::Flex, Backend::Ndarray].map(Twin::to_wire).to_vec(),
+            default_settings: Some(settings::to_wire(&SolveSettings::default())),
+        }))
+    }
+}

@@ -1,0 +1,66 @@
+//! Who calls, and what that caller may name.
+
+use tonic::Request;
+
+use super::convert::names;
+use super::status;
+use crate::domain::job::{DEFAULT_TENANT, JobName};
+use tonic::Status;
+
+/// Header of the W3C trace context.
+const TRACE_PARENT: &str = "traceparent";
+
+/// The caller of one call. Without API keys every caller is of the default tenant.
+#[derive(Debug, Clone)]
+pub struct Caller {
+    tenant: String,
+    trace_parent: Option<String>,
+}
+
+impl Caller {
+    pub fn of<T>(request: &Request<T>) -> Self {
+        let trace_parent = request.metadata().get(TRACE_PARENT).and_then(|value| value.to_str().ok());
+        Self { tenant: DEFAULT_TENANT.to_owned(), trace_parent: trace_parent.map(str::to_owned) }
+    }
+
+    /// The trace that the call belongs to.
+    pub fn trace_parent(&self) -> Option<&str> {
+        self.trace_parent.as_deref()
+    }
+
+    /// The tenant that `parent` names, which must be the caller's own.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` for another form, `PERMISSION_DENIED` for another tenant.
+    pub fn parent(&self, parent: &str) -> Result<String, Status> {
+        let tenant = names::tenant(parent).map_err(|error| status::invalid(&error))?;
+        if tenant == self.tenant { Ok(tenant) } else { Err(status::tenant_forbidden(&tenant)) }
+    }
+
+    /// The job that `name` names; another tenant's is as one that never was.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
+    pub fn job(&self, name: &str) -> Result<JobName, Status> {
+        let name = names::job(name).map_err(|error| status::invalid(&error))?;
+        if name.tenant == self.tenant { Ok(name) } else { Err(status::job_not_found(&name)) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tonic::Code;
+
+    use super::*;
+
+    #[test]
+    fn other_tenants_are_out_of_reach() {
+        let caller = Caller::of(&Request::new(()));
+        assert_eq!(caller.parent("tenants/default").expect("own"), "default");
+        assert_eq!(caller.parent("tenants/other").expect_err("another's").code(), Code::PermissionDenied);
+        assert_eq!(caller.parent("default").expect_err("malformed").code(), Code::InvalidArgument);
+        assert!(caller.job("tenants/default/jobs/a").is_ok());
+        assert_eq!(caller.job("tenants/other/jobs/a").expect_err("another's").code(), Code::NotFound);
+        assert_eq!(caller.job("jobs/a").expect_err("malformed").code(), Code::InvalidArgument);
+    }
+}

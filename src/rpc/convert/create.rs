@@ -1,0 +1,138 @@
+//! What a caller says of a job beside its input.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use super::{settings, time_from_wire};
+use crate::domain::error::Violations;
+use crate::domain::{InvalidInput, SolveSettings, Violation};
+use crate::engine::Deadline;
+use crate::rpc::proto;
+use proto::job::Deadline as WireDeadline;
+
+/// Labels of one job: enough to find it again, too few to be a database.
+const MAX_LABELS: usize = 64;
+/// Longest label key and value in bytes; the key's bound is that of a resource id.
+const MAX_LABEL_KEY: usize = 63;
+const MAX_LABEL_VALUE: usize = 255;
+/// Priorities are a few classes with room between them.
+const MAX_PRIORITY: i32 = 1_000;
+/// Longest request id: a UUID has 36 characters.
+const MAX_REQUEST_ID: usize = 128;
+
+/// A job's description, checked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Description {
+    pub job_id: Option<String>,
+    pub request_id: Option<String>,
+    pub settings: SolveSettings,
+    pub labels: BTreeMap<String, String>,
+    pub priority: i32,
+    pub deadline: Option<Deadline>,
+}
+
+/// Reads and checks everything but parent and input. Fields of the job that are the server's are ignored.
+///
+/// # Errors
+/// Every violation found.
+pub fn from_wire(job_id: String, request_id: String, job: Option<proto::Job>) -> Result<Description, InvalidInput> {
+    let job = job.unwrap_or_default();
+    let settings = settings::from_wire(job.settings)?;
+    let deadline = job.deadline.map(deadline_from_wire).transpose()?;
+    let mut found = Violations::default();
+    check_labels(&job.labels, &mut found);
+    if !(-MAX_PRIORITY..=MAX_PRIORITY).contains(&job.priority) {
+        let text = format!("{} is not in -{MAX_PRIORITY}..={MAX_PRIORITY}", job.priority);
+        found.push(Violation::of("job.priority", text));
+    }
+    if request_id.len() > MAX_REQUEST_ID || !request_id.bytes().all(|byte| byte.is_ascii_graphic()) {
+        let text = format!("is not 1 to {MAX_REQUEST_ID} visible ASCII characters; a UUID is");
+        found.push(Violation::of("request_id", text));
+    }
+    found.into_result()?;
+    let given = |id: String| (!id.is_empty()).then_some(id);
+    Ok(Description {
+        job_id: given(job_id),
+        request_id: given(request_id),
+        settings,
+        labels: BTreeMap::from_iter(job.labels),
+        priority: job.priority,
+        deadline,
+    })
+}
+
+fn check_labels(labels: &BTreeMap<String, String>, found: &mut Violations) {
+    if labels.len() > MAX_LABELS {
+        found.push(Violation::of("job.labels", format!("{} labels are above the limit of {MAX_LABELS}", labels.len())));
+    }
+    for (key, value) in labels.iter().take(MAX_LABELS) {
+        if key.is_empty() || key.len() > MAX_LABEL_KEY {
+            let text = format!("the key {:?} is not 1 to {MAX_LABEL_KEY} bytes", shortened(key));
+            found.push(Violation::of("job.labels", text));
+        }
+        if value.len() > MAX_LABEL_VALUE {
+            let text = format!("the value of {:?} is longer than {MAX_LABEL_VALUE} bytes", shortened(key));
+            found.push(Violation::of("job.labels", text));
+        }
+    }
+}
+
+/// So much of a key as an error may repeat.
+fn shortened(key: &str) -> String {
+    key.chars().take(MAX_LABEL_KEY).collect()
+}
+
+fn deadline_from_wire(deadline: WireDeadline) -> Result<Deadline, Violation> {
+    match deadline {
+        WireDeadline::DeadlineTime(time) => Ok(Deadline::At(time_from_wire(time, "job.deadline_time")?)),
+        WireDeadline::TimeLimit(limit) => match Duration::try_from(limit) {
+            Ok(limit) if limit > Duration::ZERO => Ok(Deadline::After(limit)),
+            _ => Err(Violation::of("job.time_limit", "is not a positive duration")),
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn described(job: proto::Job) -> Result<Description, Vec<String>> {
+        from_wire(String::new(), "r-1".into(), Some(job))
+            .map_err(|error| error.violations().iter().map(Violation::path).collect())
+    }
+
+    fn limit(seconds: i64) -> Option<WireDeadline> {
+        Some(WireDeadline::TimeLimit(prost_types::Duration { seconds, nanos: 0 }))
+    }
+
+    #[test]
+    fn an_empty_description_is_all_defaults() {
+        let description = from_wire(String::new(), String::new(), None).expect("valid");
+        assert_eq!(description.settings, SolveSettings::default());
+        assert_eq!((description.job_id, description.request_id, description.deadline), (None, None, None));
+    }
+
+    #[test]
+    fn deadlines_come_as_a_time_or_as_a_duration() {
+        let after = described(proto::Job { deadline: limit(90), ..Default::default() }).expect("valid");
+        assert_eq!(after.deadline, Some(Deadline::After(Duration::from_secs(90))));
+        let time = prost_types::Timestamp { seconds: 1_800_000_000, nanos: 0 };
+        let at = described(proto::Job { deadline: Some(WireDeadline::DeadlineTime(time)), ..Default::default() });
+        let expected = std::time::UNIX_EPOCH + Duration::from_secs(1_800_000_000);
+        assert_eq!(at.expect("valid").deadline, Some(Deadline::At(expected)));
+    }
+
+    #[test]
+    fn what_is_out_of_bounds_is_named() {
+        let wrong = |job| described(job).expect_err("invalid");
+        assert_eq!(wrong(proto::Job { priority: 1001, ..Default::default() }), ["job.priority"]);
+        assert_eq!(wrong(proto::Job { deadline: limit(0), ..Default::default() }), ["job.time_limit"]);
+        assert_eq!(wrong(proto::Job { deadline: limit(-5), ..Default::default() }), ["job.time_limit"]);
+        let labels = BTreeMap::from([("k".repeat(64), String::new()), ("v".into(), "x".repeat(256))]);
+        assert_eq!(wrong(proto::Job { labels, ..Default::default() }), ["job.labels", "job.labels"]);
+        let many = (0..65).map(|k| (k.to_string(), String::new())).collect();
+        assert_eq!(wrong(proto::Job { labels: many, ..Default::default() }), ["job.labels"]);
+        let error = from_wire(String::new(), "a b".into(), None).expect_err("a space");
+        assert_eq!(error.violations()[0].field, "request_id");
+    }
+}

@@ -1,0 +1,105 @@
+//! Enums: the domain's and the wire's have the same variants, but for the wire's `UNSPECIFIED`.
+
+use crate::domain::job::JobState;
+use crate::domain::{Backend, Grade, Method, Prior, Stage, Status, Violation, WarningCode};
+use crate::rpc::proto;
+
+/// A domain enum that has a twin on the wire.
+pub trait Twin: Sized {
+    /// Reads the wire's number; `None` for `UNSPECIFIED`.
+    ///
+    /// # Errors
+    /// A violation of `field` for a number that this version does not know.
+    fn from_wire(number: i32, field: &str) -> Result<Option<Self>, Violation>;
+
+    /// Reads the wire's number where `UNSPECIFIED` will not do.
+    ///
+    /// # Errors
+    /// A violation of `field`.
+    fn required(number: i32, field: &str) -> Result<Self, Violation> {
+        super::required(Self::from_wire(number, field)?, field)
+    }
+
+    /// The wire's number.
+    fn to_wire(self) -> i32;
+}
+
+/// Implements [`Twin`] for pairs of enums with the same variants; one that is missing does not compile.
+macro_rules! twins {
+    ($($domain:ident = $wire:ident { $($variant:ident),+ $(,)? })+) => {$(
+        impl Twin for $domain {
+            fn from_wire(number: i32, field: &str) -> Result<Option<Self>, Violation> {
+                match proto::$wire::try_from(number) {
+                    Ok(proto::$wire::Unspecified) => Ok(None),
+                    $(Ok(proto::$wire::$variant) => Ok(Some($domain::$variant)),)+
+                    Err(_) => Err(Violation::of(field, format!("{number} is not a known {}", stringify!($wire)))),
+                }
+            }
+
+            fn to_wire(self) -> i32 {
+                match self {
+                    $($domain::$variant => proto::$wire::$variant as i32,)+
+                }
+            }
+        }
+    )+};
+}
+
+twins! {
+    Method = Method { Auto, Paper, Geometry, Psfm }
+    Backend = Backend { Flex, Ndarray }
+    Stage = Stage { Prepare, Search, Refine, Calibrate, Judge }
+    Status = ResultStatus { Solved, NoReconstruction }
+    Grade = Grade { Metric, Weak, ProjectiveOnly }
+    Prior = Prior { Network, Irls, Consistency, Uniform }
+    JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, Expired }
+    WarningCode = WarningCode {
+        PlanarOrRotation,
+        UnobservableFocal,
+        SecondMinimum,
+        ModelMismatch,
+        FewInliers,
+        Cheirality,
+        NoConsensus,
+        ViewsLeftOut,
+        AssumedImageSize,
+        CameraGroupsMerged,
+        StoppedEarly,
+    }
+}
+
+/// The wire's number of an optional value; `UNSPECIFIED` for `None`.
+pub fn optional_to_wire<T: Twin>(value: Option<T>) -> i32 {
+    value.map_or(0, Twin::to_wire)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_round_trip_and_unknown_ones_name_the_field() {
+        for method in Method::ALL {
+            assert_eq!(Method::from_wire(method.to_wire(), "method"), Ok(Some(method)));
+        }
+        for state in JobState::ALL {
+            assert_eq!(JobState::required(state.to_wire(), "state"), Ok(state));
+        }
+        assert_eq!(Method::from_wire(0, "method"), Ok(None));
+        assert!(JobState::required(0, "state").is_err());
+        let violation = Method::from_wire(99, "settings.method").expect_err("unknown");
+        assert_eq!(violation.to_string(), "settings.method: 99 is not a known Method");
+    }
+
+    #[test]
+    fn names_on_the_wire_are_the_domains_with_the_enums_prefix() {
+        for code in [WarningCode::PlanarOrRotation, WarningCode::StoppedEarly, WarningCode::CameraGroupsMerged] {
+            let wire = proto::WarningCode::try_from(code.to_wire()).expect("known");
+            assert_eq!(wire.as_str_name(), format!("WARNING_CODE_{}", code.name()));
+        }
+        for state in JobState::ALL {
+            let wire = proto::JobState::try_from(state.to_wire()).expect("known");
+            assert_eq!(wire.as_str_name(), format!("JOB_STATE_{}", state.name()));
+        }
+    }
+}

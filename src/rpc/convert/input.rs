@@ -1,0 +1,291 @@
+//! Inputs as they arrive, in one message or in chunks, and as a client sends them.
+
+use std::borrow::Borrow;
+
+use super::matrix;
+use crate::domain::{FocalPrior, ImageSize, Input, InvalidInput, Limits, RawInput, View, Violation};
+use crate::rpc::proto;
+use proto::create_job_request::Input as Inline;
+
+/// Name of a track set in violations.
+const TRACK_SET: &str = "track_set";
+
+/// Observations in one chunk that a client sends: at most 2.3 MB, well below any server's message limit.
+const CHUNK_OBSERVATIONS: usize = 65_536;
+
+/// An input that may not be complete yet. Never holds more than the limits allow and one message on top.
+#[derive(Debug)]
+pub struct Draft {
+    body: Body,
+    limits: Limits,
+}
+
+#[derive(Debug)]
+enum Body {
+    TrackSet(proto::TrackSet),
+    Matrix(proto::MeasurementMatrix),
+}
+
+impl Draft {
+    /// Begins with what came with the job: a whole input or the head of one.
+    ///
+    /// # Errors
+    /// A violation of `input` where there is none; see [`Draft::check_size`].
+    pub fn begin(input: Option<Inline>, limits: &Limits) -> Result<Self, InvalidInput> {
+        let body = match input {
+            Some(Inline::TrackSet(set)) => Body::TrackSet(set),
+            Some(Inline::MeasurementMatrix(matrix)) => Body::Matrix(matrix),
+            Some(Inline::InputName(_)) | None => {
+                return Err(Violation::of("input", "is not set; give a track_set or a measurement_matrix").into());
+            }
+        };
+        Ok(Self { body, limits: limits.clone() })
+    }
+
+    /// Appends observations.
+    ///
+    /// # Errors
+    /// A violation where the input is a matrix; see [`Draft::check_size`].
+    pub fn append_track_set(&mut self, mut chunk: proto::TrackSetChunk) -> Result<(), InvalidInput> {
+        let Body::TrackSet(set) = &mut self.body else {
+            return Err(Violation::of("track_set_chunk", "the config holds a measurement_matrix").into());
+        };
+        set.view.append(&mut chunk.view);
+        set.track.append(&mut chunk.track);
+        set.x.append(&mut chunk.x);
+        set.y.append(&mut chunk.y);
+        set.sigma.append(&mut chunk.sigma);
+        set.depth.append(&mut chunk.depth);
+        Ok(())
+    }
+
+    /// Appends numbers and visibility.
+    ///
+    /// # Errors
+    /// A violation where the input is a track set; see [`Draft::check_size`].
+    pub fn append_matrix(&mut self, mut chunk: proto::MeasurementMatrixChunk) -> Result<(), InvalidInput> {
+        let Body::Matrix(matrix) = &mut self.body else {
+            return Err(Violation::of("measurement_matrix_chunk", "the config holds a track_set").into());
+        };
+        matrix.values.append(&mut chunk.values);
+        matrix.visibility.append(&mut chunk.visibility);
+        Ok(())
+    }
+
+    /// Refuses what is above the limits already, by what is claimed and by what has arrived, so that an endless
+    /// stream ends early.
+    ///
+    /// # Errors
+    /// A violation of the first field that is too long.
+    pub fn check_size(&self) -> Result<(), InvalidInput> {
+        match &self.body {
+            Body::TrackSet(set) => check_track_set_size(set, &self.limits),
+            Body::Matrix(matrix) => matrix::check_size(matrix, &self.limits),
+        }
+    }
+
+    /// Checks the whole.
+    ///
+    /// # Errors
+    /// Every violation found, by field and index.
+    pub fn finish(self) -> Result<Input, InvalidInput> {
+        match self.body {
+            Body::TrackSet(set) => {
+                check_sigma(&set)?;
+                Input::new(track_set_to_raw(set), &self.limits, TRACK_SET)
+            }
+            Body::Matrix(matrix) => matrix::to_input(matrix, &self.limits),
+        }
+    }
+}
+
+fn check_track_set_size(set: &proto::TrackSet, limits: &Limits) -> Result<(), InvalidInput> {
+    let lengths = [
+        ("views", set.views.len(), limits.max_views),
+        ("track_count", set.track_count as usize, limits.max_tracks),
+        ("view", set.view.len(), limits.max_observations),
+        ("track", set.track.len(), limits.max_observations),
+        ("x", set.x.len(), limits.max_observations),
+        ("y", set.y.len(), limits.max_observations),
+        ("sigma", set.sigma.len(), limits.max_observations),
+        ("depth", set.depth.len(), limits.max_observations),
+    ];
+    within(TRACK_SET, &lengths)
+}
+
+/// Refuses the first of `(field, count, limit)` that is above its limit.
+pub(super) fn within(prefix: &str, counts: &[(&str, usize, usize)]) -> Result<(), InvalidInput> {
+    match counts.iter().find(|(_, count, limit)| count > limit) {
+        Some((field, count, limit)) => {
+            Err(Violation::of(format!("{prefix}.{field}"), format!("{count} are above this server's limit of {limit}"))
+                .into())
+        }
+        None => Ok(()),
+    }
+}
+
+/// The noise of single observations is not used yet, but what is wrong today is wrong tomorrow.
+fn check_sigma(set: &proto::TrackSet) -> Result<(), InvalidInput> {
+    if !set.sigma.is_empty() && set.sigma.len() != set.x.len() {
+        return Err(Violation::of(
+            "track_set.sigma",
+            format!("has {} entries where x has {}; give one an observation or none", set.sigma.len(), set.x.len()),
+        )
+        .into());
+    }
+    match set.sigma.iter().position(|&sigma| !(sigma.is_finite() && sigma > 0.0)) {
+        Some(index) => Err(Violation::at(
+            "track_set.sigma",
+            index,
+            format!("{} is not a positive finite number of pixels", set.sigma[index]),
+        )
+        .into()),
+        None => Ok(()),
+    }
+}
+
+fn track_set_to_raw(set: proto::TrackSet) -> RawInput {
+    RawInput {
+        views: set.views.iter().map(view_from_wire).collect(),
+        track_count: set.track_count as usize,
+        view: set.view,
+        track: set.track,
+        x: set.x,
+        y: set.y,
+        depth: set.depth,
+    }
+}
+
+pub(super) fn view_from_wire(view: &proto::View) -> View {
+    View {
+        size: view.size.map(|proto::ImageSize { width_px, height_px }| ImageSize { width_px, height_px }),
+        camera_group: view.camera_group,
+        focal_prior: view
+            .focal_prior
+            .map(|proto::FocalPrior { focal_px, sigma_log }| FocalPrior { focal_px, sigma_log }),
+    }
+}
+
+fn view_to_wire(view: &View) -> proto::View {
+    proto::View {
+        size: view.size.map(|ImageSize { width_px, height_px }| proto::ImageSize { width_px, height_px }),
+        camera_group: view.camera_group,
+        focal_prior: view
+            .focal_prior
+            .map(|FocalPrior { focal_px, sigma_log }| proto::FocalPrior { focal_px, sigma_log }),
+    }
+}
+
+/// Counts and views of an input, without its observations: what precedes [`chunks`].
+pub fn head_to_wire(raw: &RawInput) -> proto::TrackSet {
+    proto::TrackSet {
+        // A count that does not fit is above every server's limit; saturated, it is refused there with its sentence.
+        track_count: u32::try_from(raw.track_count).unwrap_or(u32::MAX),
+        views: raw.views.iter().map(view_to_wire).collect(),
+        ..proto::TrackSet::default()
+    }
+}
+
+/// A whole input in one message.
+pub fn to_wire(raw: &RawInput) -> proto::TrackSet {
+    proto::TrackSet {
+        view: raw.view.clone(),
+        track: raw.track.clone(),
+        x: raw.x.clone(),
+        y: raw.y.clone(),
+        depth: raw.depth.clone(),
+        ..head_to_wire(raw)
+    }
+}
+
+/// The observations of an input in chunks. Arrays of unequal lengths are sent as they are: the server says what is
+/// wrong with them.
+pub fn chunks<R: Borrow<RawInput>>(raw: R) -> impl Iterator<Item = proto::TrackSetChunk> {
+    fn slice<T: Clone>(values: &[T], from: usize) -> Vec<T> {
+        values.iter().skip(from).take(CHUNK_OBSERVATIONS).cloned().collect()
+    }
+    let longest = {
+        let raw = raw.borrow();
+        let lengths = [raw.view.len(), raw.track.len(), raw.x.len(), raw.y.len(), raw.depth.len()];
+        lengths.into_iter().max().unwrap_or(0)
+    };
+    (0..longest).step_by(CHUNK_OBSERVATIONS).map(move |from| {
+        let raw = raw.borrow();
+        proto::TrackSetChunk {
+            view: slice(&raw.view, from),
+            track: slice(&raw.track, from),
+            x: slice(&raw.x, from),
+            y: slice(&raw.y, from),
+            sigma: Vec::new(),
+            depth: slice(&raw.depth, from),
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn raw(observations: usize) -> RawInput {
+        let tracks = observations.div_ceil(2);
+        let size = ImageSize { width_px: 640, height_px: 480 };
+        let focal_prior = FocalPrior { focal_px: 500.0, sigma_log: 0.1 };
+        RawInput {
+            views: vec![View { size: Some(size), camera_group: 3, focal_prior: Some(focal_prior) }, View::default()],
+            track_count: tracks,
+            view: (0..observations as u32).map(|k| k % 2).collect(),
+            track: (0..observations as u32).map(|k| k / 2).collect(),
+            x: (0..observations).map(|k| k as f64 / 3.0).collect(),
+            y: (0..observations).map(|k| -(k as f64)).collect(),
+            depth: (0..observations).map(|k| 1.0 + k as f64).collect(),
+        }
+    }
+
+    #[test]
+    fn chunks_add_up_to_the_whole() {
+        let raw = raw(CHUNK_OBSERVATIONS + 7);
+        let limits = Limits::default();
+        let mut draft = Draft::begin(Some(Inline::TrackSet(head_to_wire(&raw))), &limits).expect("a head");
+        let mut count = 0;
+        for chunk in chunks(&raw) {
+            draft.append_track_set(chunk).expect("a chunk");
+            draft.check_size().expect("within the limits");
+            count += 1;
+        }
+        assert_eq!(count, 2);
+        let whole = Draft::begin(Some(Inline::TrackSet(to_wire(&raw))), &limits).expect("a whole");
+        let expected = Input::new(raw, &limits, TRACK_SET).expect("valid");
+        assert_eq!(draft.finish().expect("valid"), expected);
+        assert_eq!(whole.finish().expect("valid"), expected);
+    }
+
+    #[test]
+    fn an_endless_stream_is_refused_as_soon_as_it_is_above_the_limits() {
+        let limits = Limits { max_observations: 10, ..Limits::default() };
+        let mut draft = Draft::begin(Some(Inline::TrackSet(head_to_wire(&raw(4)))), &limits).expect("a head");
+        let chunk = proto::TrackSetChunk { y: vec![0.0; 6], ..Default::default() };
+        draft.append_track_set(chunk.clone()).expect("a chunk");
+        assert_eq!(draft.check_size(), Ok(()));
+        draft.append_track_set(chunk).expect("a chunk");
+        let error = draft.check_size().expect_err("12 of 10");
+        assert_eq!(error.to_string(), "track_set.y: 12 are above this server's limit of 10");
+    }
+
+    #[test]
+    fn a_chunk_of_the_other_kind_is_refused() {
+        let limits = Limits::default();
+        let mut draft = Draft::begin(Some(Inline::TrackSet(head_to_wire(&raw(4)))), &limits).expect("a head");
+        assert!(draft.append_matrix(proto::MeasurementMatrixChunk::default()).is_err());
+    }
+
+    #[test]
+    fn wrong_sigmas_name_their_index() {
+        let mut set = to_wire(&raw(4));
+        set.sigma = vec![1.0, 0.5, f64::NAN, 1.0];
+        let finish = |set| Draft::begin(Some(Inline::TrackSet(set)), &Limits::default()).expect("set").finish();
+        let error = finish(set.clone()).expect_err("NaN");
+        assert_eq!(error.violations()[0].path(), "track_set.sigma[2]");
+        set.sigma = vec![1.0];
+        assert_eq!(finish(set).expect_err("short").violations()[0].path(), "track_set.sigma");
+    }
+}

@@ -1,0 +1,250 @@
+//! Jobs and their events.
+
+use std::collections::BTreeMap;
+
+use super::enums::{Twin, optional_to_wire};
+use super::{optional_time, progress, required, settings, time_from_wire};
+use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState, Summary};
+use crate::domain::{Grade, InvalidInput, Prior, Status, Violation};
+use crate::rpc::proto;
+use proto::job_event::Body;
+
+pub fn to_wire(job: &Job) -> proto::Job {
+    proto::Job {
+        name: job.name.to_string(),
+        state: job.state.to_wire(),
+        settings: Some(settings::to_wire(&job.settings)),
+        labels: job.labels.clone(),
+        priority: job.priority,
+        deadline: job.deadline.map(|time| proto::job::Deadline::DeadlineTime(time.into())),
+        attempt: job.attempt,
+        view_count: job.view_count,
+        track_count: job.track_count,
+        observation_count: job.observation_count,
+        create_time: Some(job.create_time.into()),
+        start_time: job.start_time.map(Into::into),
+        end_time: job.end_time.map(Into::into),
+        progress: job.progress.as_ref().map(progress::to_wire),
+        last_sequence: job.last_sequence,
+        summary: job.summary.as_ref().map(summary_to_wire),
+        error: job.failure.as_ref().map(failure_to_wire),
+        cancel_requested: job.cancel_requested,
+    }
+}
+
+/// # Errors
+/// Violations that name the fields which no server of this version would send.
+pub fn from_wire(job: proto::Job) -> Result<Job, InvalidInput> {
+    let deadline = match job.deadline {
+        Some(proto::job::Deadline::DeadlineTime(time)) => Some(time_from_wire(time, "deadline_time")?),
+        Some(proto::job::Deadline::TimeLimit(_)) => {
+            return Err(Violation::of("time_limit", "is an input only, not part of an answer").into());
+        }
+        None => None,
+    };
+    Ok(Job {
+        name: name_from_wire(&job.name)?,
+        state: JobState::required(job.state, "state")?,
+        attempt: job.attempt,
+        settings: settings::from_wire(job.settings)?,
+        view_count: job.view_count,
+        track_count: job.track_count,
+        observation_count: job.observation_count,
+        labels: BTreeMap::from_iter(job.labels),
+        priority: job.priority,
+        create_time: time_from_wire(required(job.create_time, "create_time")?, "create_time")?,
+        start_time: optional_time(job.start_time, "start_time")?,
+        end_time: optional_time(job.end_time, "end_time")?,
+        deadline,
+        progress: job.progress.as_ref().map(progress::from_wire).transpose()?,
+        last_sequence: job.last_sequence,
+        summary: job.summary.as_ref().map(summary_from_wire).transpose()?,
+        failure: job.error.map(failure_from_wire),
+        cancel_requested: job.cancel_requested,
+    })
+}
+
+pub fn event_to_wire(event: JobEvent) -> proto::JobEvent {
+    let body = match event.body {
+        EventBody::State { state, failure } => Body::StateChange(proto::StateChange {
+            state: state.to_wire(),
+            error: failure.as_ref().map(failure_to_wire),
+        }),
+        EventBody::Progress(record) => Body::Progress(progress::to_wire(&record)),
+        EventBody::Weights { iteration, weights } => {
+            Body::Weights(proto::InterimWeights { iteration, weight: weights })
+        }
+        EventBody::Result(summary) => Body::Result(summary_to_wire(&summary)),
+    };
+    proto::JobEvent {
+        name: event.name.to_string(),
+        attempt: event.attempt,
+        sequence: event.sequence.unwrap_or(0),
+        time: Some(event.time.into()),
+        body: Some(body),
+    }
+}
+
+/// # Errors
+/// A violation that names the field which no server of this version would send.
+pub fn event_from_wire(event: proto::JobEvent) -> Result<JobEvent, Violation> {
+    let body = match required(event.body, "body")? {
+        Body::StateChange(change) => EventBody::State {
+            state: JobState::required(change.state, "state_change.state")?,
+            failure: change.error.map(failure_from_wire),
+        },
+        Body::Progress(record) => EventBody::Progress(progress::from_wire(&record)?),
+        Body::Weights(interim) => EventBody::Weights { iteration: interim.iteration, weights: interim.weight },
+        Body::Result(summary) => EventBody::Result(summary_from_wire(&summary)?),
+    };
+    Ok(JobEvent {
+        name: name_from_wire(&event.name)?,
+        attempt: event.attempt,
+        sequence: (event.sequence > 0).then_some(event.sequence),
+        time: time_from_wire(required(event.time, "time")?, "time")?,
+        body,
+    })
+}
+
+fn name_from_wire(name: &str) -> Result<JobName, Violation> {
+    JobName::parse(name).ok_or_else(|| Violation::of("name", format!("{name:?} is not a job's name")))
+}
+
+fn failure_to_wire(failure: &Failure) -> proto::JobError {
+    proto::JobError { reason: failure.reason.clone(), message: failure.message.clone() }
+}
+
+fn failure_from_wire(error: proto::JobError) -> Failure {
+    Failure { reason: error.reason, message: error.message }
+}
+
+fn summary_to_wire(summary: &Summary) -> proto::JobSummary {
+    proto::JobSummary {
+        status: summary.status.to_wire(),
+        grade: optional_to_wire(summary.grade),
+        focal_px: summary.focal_px,
+        sigma_log_focal: summary.sigma_log_focal,
+        inlier_tracks: summary.inlier_tracks,
+        registered_views: summary.registered_views,
+        reprojection_rms_px: summary.reprojection_rms_px,
+        winning_prior: optional_to_wire(summary.winning_prior),
+        iterations: summary.iterations,
+        seconds: summary.seconds,
+        result_bytes: summary.result_bytes,
+    }
+}
+
+fn summary_from_wire(summary: &proto::JobSummary) -> Result<Summary, Violation> {
+    Ok(Summary {
+        status: Status::required(summary.status, "summary.status")?,
+        grade: Grade::from_wire(summary.grade, "summary.grade")?,
+        focal_px: summary.focal_px,
+        sigma_log_focal: summary.sigma_log_focal,
+        inlier_tracks: summary.inlier_tracks,
+        registered_views: summary.registered_views,
+        reprojection_rms_px: summary.reprojection_rms_px,
+        winning_prior: Prior::from_wire(summary.winning_prior, "summary.winning_prior")?,
+        iterations: summary.iterations,
+        seconds: summary.seconds,
+        result_bytes: summary.result_bytes,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, SystemTime};
+
+    use super::*;
+    use crate::domain::{Progress, SolveSettings, Stage};
+
+    fn name() -> JobName {
+        JobName { tenant: "default".into(), job: "a-1".into() }
+    }
+
+    fn time(seconds: u64) -> SystemTime {
+        SystemTime::UNIX_EPOCH + Duration::new(1_700_000_000 + seconds, 123_456_789)
+    }
+
+    fn summary() -> Summary {
+        Summary {
+            status: Status::Solved,
+            grade: Some(Grade::Metric),
+            focal_px: Some(1200.0),
+            sigma_log_focal: None,
+            inlier_tracks: 20,
+            registered_views: 10,
+            reprojection_rms_px: Some(0.4),
+            winning_prior: Some(Prior::Network),
+            iterations: 60,
+            seconds: 1.25,
+            result_bytes: 12_345,
+        }
+    }
+
+    fn progress() -> Progress {
+        Progress {
+            stage: Stage::Refine,
+            fraction: 0.5,
+            iteration: 3,
+            losses: None,
+            inliers: 4,
+            focal_px: None,
+            best_score: Some(0.0),
+            elapsed_seconds: 2.0,
+        }
+    }
+
+    #[test]
+    fn jobs_survive_the_wire() {
+        let job = Job {
+            name: name(),
+            state: JobState::Failed,
+            attempt: 3,
+            settings: SolveSettings { seed: 5, ..SolveSettings::default() },
+            view_count: 10,
+            track_count: 200,
+            observation_count: 2000,
+            labels: BTreeMap::from([("site".to_owned(), "north 3".to_owned())]),
+            priority: -2,
+            create_time: time(0),
+            start_time: Some(time(1)),
+            end_time: Some(time(2)),
+            deadline: Some(time(3)),
+            progress: Some(progress()),
+            last_sequence: 17,
+            summary: Some(summary()),
+            failure: Some(Failure { reason: "INTERNAL".into(), message: "a defect".into() }),
+            cancel_requested: true,
+        };
+        assert_eq!(from_wire(to_wire(&job)), Ok(job.clone()));
+        let bare = Job {
+            state: JobState::Queued,
+            labels: BTreeMap::new(),
+            start_time: None,
+            end_time: None,
+            deadline: None,
+            progress: None,
+            summary: None,
+            failure: None,
+            cancel_requested: false,
+            ..job
+        };
+        assert_eq!(from_wire(to_wire(&bare)), Ok(bare));
+    }
+
+    #[test]
+    fn events_survive_the_wire() {
+        let failure = Some(Failure { reason: "ATTEMPTS_EXHAUSTED".into(), message: "three attempts".into() });
+        let bodies = [
+            (Some(1), EventBody::State { state: JobState::Queued, failure: None }),
+            (Some(2), EventBody::Progress(progress())),
+            (None, EventBody::Weights { iteration: 5, weights: vec![0.5, 1.0] }),
+            (Some(3), EventBody::Result(summary())),
+            (Some(u64::MAX), EventBody::State { state: JobState::Failed, failure }),
+        ];
+        for (sequence, body) in bodies {
+            let event = JobEvent { name: name(), attempt: 1, sequence, time: time(0), body };
+            assert_eq!(event_from_wire(event_to_wire(event.clone())), Ok(event));
+        }
+    }
+}

@@ -1,0 +1,202 @@
+//! Filter and order of a list: the subset of AIP-160 and AIP-132 that jobs need.
+
+use std::collections::BTreeMap;
+
+use crate::domain::job::JobState;
+use crate::domain::{InvalidInput, Violation};
+use crate::engine::{JobQuery, Order};
+use crate::rpc::proto;
+
+/// The largest page; larger wishes are cut to it (AIP-158).
+const MAX_PAGE_SIZE: i32 = 1_000;
+
+/// Which jobs a filter lets through.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Filter {
+    /// `None`: every state. Empty: none, since the terms exclude each other.
+    pub states: Option<Vec<JobState>>,
+    pub labels: BTreeMap<String, String>,
+}
+
+/// The query of a list, `None` where its filter lets nothing through.
+///
+/// # Errors
+/// Violations of `page_size`, `filter` or `order_by`.
+pub fn from_wire(tenant: String, request: proto::ListJobsRequest) -> Result<Option<JobQuery>, InvalidInput> {
+    if request.page_size < 0 {
+        return Err(Violation::of("page_size", format!("{} is negative", request.page_size)).into());
+    }
+    let order = match request.order_by.split_whitespace().collect::<Vec<_>>().as_slice() {
+        [] | ["create_time", "desc"] => Order::CreateTimeDescending,
+        ["create_time"] => Order::CreateTimeAscending,
+        _ => {
+            let text = format!("{:?} is neither \"create_time\" nor \"create_time desc\"", request.order_by);
+            return Err(Violation::of("order_by", text).into());
+        }
+    };
+    let Filter { states, labels } = parse_filter(&request.filter)?;
+    if states.as_ref().is_some_and(Vec::is_empty) {
+        return Ok(None);
+    }
+    Ok(Some(JobQuery {
+        tenant,
+        states: states.unwrap_or_default(),
+        labels,
+        order,
+        page_size: request.page_size.min(MAX_PAGE_SIZE).unsigned_abs(),
+        page_token: (!request.page_token.is_empty()).then_some(request.page_token),
+    }))
+}
+
+/// Parses a filter: terms joined by `AND`, states within a term also by `OR`.
+///
+/// # Errors
+/// A violation of `filter` that says which part was not understood.
+pub fn parse_filter(text: &str) -> Result<Filter, Violation> {
+    let tokens = tokens(text)?;
+    let mut filter = Filter::default();
+    if tokens.is_empty() {
+        return Ok(filter);
+    }
+    for term in tokens.split(|token| *token == Token::Word("AND")) {
+        let mut states = Vec::new();
+        for comparison in term.split(|token| *token == Token::Word("OR")) {
+            match *comparison {
+                [Token::Word("state"), Token::Equals, Token::Word(name) | Token::Quoted(name)] => {
+                    states.push(state(name)?);
+                }
+                [Token::Word(field), Token::Equals, Token::Word(value) | Token::Quoted(value)]
+                    if field.starts_with("labels.") && !term.contains(&Token::Word("OR")) =>
+                {
+                    add_label(&mut filter, &field["labels.".len()..], value)?;
+                }
+                _ => return Err(not_understood(text)),
+            }
+        }
+        if !states.is_empty() {
+            let others = filter.states.take();
+            filter.states = Some(match others {
+                Some(others) => others.into_iter().filter(|state| states.contains(state)).collect(),
+                None => states,
+            });
+        }
+    }
+    Ok(filter)
+}
+
+fn state(name: &str) -> Result<JobState, Violation> {
+    JobState::from_name(name).ok_or_else(|| {
+        let known = JobState::ALL.map(JobState::name).join(", ");
+        Violation::of("filter", format!("{name:?} is not a state; states are {known}"))
+    })
+}
+
+fn add_label(filter: &mut Filter, key: &str, value: &str) -> Result<(), Violation> {
+    match filter.labels.insert(key.to_owned(), value.to_owned()) {
+        Some(other) if other != value => {
+            Err(Violation::of("filter", format!("labels.{key} cannot be both {other:?} and {value:?}")))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn not_understood(text: &str) -> Violation {
+    let example = "state = QUEUED OR state = RUNNING AND labels.site = \"north 3\"";
+    Violation::of("filter", format!("{text:?} was not understood; an example: {example}"))
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Token<'a> {
+    Word(&'a str),
+    Quoted(&'a str),
+    Equals,
+}
+
+fn tokens(text: &str) -> Result<Vec<Token<'_>>, Violation> {
+    let mut tokens = Vec::new();
+    let mut rest = text.trim_start();
+    while let Some(first) = rest.chars().next() {
+        let (token, after) = match first {
+            '=' => (Token::Equals, &rest[1..]),
+            '"' => {
+                let end = rest[1..].find('"').ok_or_else(|| Violation::of("filter", "a quote is not closed"))?;
+                (Token::Quoted(&rest[1..=end]), &rest[end + 2..])
+            }
+            _ => {
+                let end = rest.find(|c: char| c.is_whitespace() || c == '=' || c == '"').unwrap_or(rest.len());
+                (Token::Word(&rest[..end]), &rest[end..])
+            }
+        };
+        tokens.push(token);
+        rest = after.trim_start();
+    }
+    Ok(tokens)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn filter(states: Option<&[JobState]>, labels: &[(&str, &str)]) -> Filter {
+        Filter {
+            states: states.map(<[JobState]>::to_vec),
+            labels: labels.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect(),
+        }
+    }
+
+    #[test]
+    fn filters_are_understood() {
+        use JobState::{Queued, Running};
+        let cases = [
+            ("", filter(None, &[])),
+            ("  ", filter(None, &[])),
+            ("state=RUNNING", filter(Some(&[Running]), &[])),
+            ("state = \"RUNNING\"", filter(Some(&[Running]), &[])),
+            ("state = QUEUED OR state = RUNNING", filter(Some(&[Queued, Running]), &[])),
+            ("labels.site = \"north = 3\"", filter(None, &[("site", "north = 3")])),
+            ("labels.a=b AND state = QUEUED OR state = RUNNING", filter(Some(&[Queued, Running]), &[("a", "b")])),
+            ("state = QUEUED AND state = RUNNING", filter(Some(&[]), &[])),
+            ("labels.a = \"\"", filter(None, &[("a", "")])),
+        ];
+        for (text, expected) in cases {
+            assert_eq!(parse_filter(text), Ok(expected), "{text}");
+        }
+    }
+
+    #[test]
+    fn what_is_not_understood_is_refused() {
+        for text in [
+            "state",
+            "state = ",
+            "state = LOST",
+            "state > QUEUED",
+            "focal = 3",
+            "labels.a = b OR labels.c = d",
+            "labels.a = b AND labels.a = c",
+            "labels.a = \"b",
+            "AND",
+            "state = QUEUED state = RUNNING",
+            "é",
+        ] {
+            assert_eq!(parse_filter(text).map_err(|violation| violation.field), Err("filter".to_owned()), "{text}");
+        }
+    }
+
+    #[test]
+    fn pages_and_orders_are_checked() {
+        let list = |page_size, order_by: &str, filter: &str| {
+            let request = proto::ListJobsRequest {
+                page_size,
+                order_by: order_by.into(),
+                filter: filter.into(),
+                ..Default::default()
+            };
+            from_wire("default".into(), request).map_err(|error| error.violations()[0].field.clone())
+        };
+        assert_eq!(list(-1, "", "").err(), Some("page_size".into()));
+        assert_eq!(list(0, "name", "").err(), Some("order_by".into()));
+        assert!(list(0, "", "state = QUEUED AND state = RUNNING").expect("valid").is_none());
+        let query = list(5_000, "create_time", "").expect("valid").expect("some");
+        assert_eq!((query.page_size, query.order), (1_000, Order::CreateTimeAscending));
+    }
+}

@@ -1,0 +1,38 @@
+//! Resource names in requests, against the tenant that calls.
+
+use crate::domain::job::JobName;
+use crate::domain::{InvalidInput, Violation};
+
+/// The tenant of `tenants/{tenant}`.
+///
+/// # Errors
+/// A violation of `parent` where the name has another form.
+pub fn tenant(parent: &str) -> Result<String, InvalidInput> {
+    match parent.strip_prefix("tenants/") {
+        Some(tenant) if JobName::is_id(tenant) => Ok(tenant.to_owned()),
+        _ => Err(Violation::of("parent", format!("{parent:?} is not of the form tenants/{{tenant}}: tenants/default"))
+            .into()),
+    }
+}
+
+/// The job of `tenants/{tenant}/jobs/{job}`.
+///
+/// # Errors
+/// A violation of `name` where the name has another form.
+pub fn job(name: &str) -> Result<JobName, InvalidInput> {
+    JobName::parse(name).ok_or_else(|| {
+        Violation::of("name", format!("{name:?} is not of the form tenants/{{tenant}}/jobs/{{job}}")).into()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn reads_parents_and_refuses_other_forms() {
+        assert_eq!(super::tenant("tenants/default").as_deref(), Ok("default"));
+        for bad in ["", "default", "tenants/", "tenants/a/jobs/b", "tenants/A"] {
+            let error = super::tenant(bad).expect_err(bad);
+            assert_eq!(error.violations()[0].field, "parent", "{bad}");
+        }
+    }
+}

@@ -1,0 +1,310 @@
+//! Results, without loss: a client writes the same files from a [`proto::JobResult`] as a solve in process would.
+
+use super::enums::{Twin, optional_to_wire};
+use super::{progress, required};
+use crate::domain::job::JobName;
+use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, ViewResult};
+use crate::domain::{Calibration, Grade, Method, Prior, Solution, Stage, Status, Violation, Warning, WarningCode};
+use crate::rpc::proto;
+
+pub fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
+    proto::JobResult {
+        job: name.to_string(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        status: solution.status.to_wire(),
+        grade: optional_to_wire(solution.grade),
+        method: solution.method.to_wire(),
+        winning_prior: optional_to_wire(solution.winning_prior),
+        iterations: solution.iterations,
+        seed: solution.seed,
+        calibrations: solution.calibrations.iter().map(calibration_to_wire).collect(),
+        plane_at_infinity: solution.plane_at_infinity.map(|[x, y, z]| proto::PlaneAtInfinity { x, y, z }),
+        views: solution.views.iter().map(view_to_wire).collect(),
+        tracks: Some(tracks_to_wire(&solution.tracks)),
+        observations: Some(observations_to_wire(&solution.observations)),
+        noise_px: solution.noise_px,
+        reprojection_rms_px: solution.reprojection_rms_px,
+        reprojection_mean_px: solution.reprojection_mean_px,
+        warnings: solution
+            .warnings
+            .iter()
+            .map(|warning| proto::Warning { code: warning.code.to_wire(), detail: warning.detail.clone() })
+            .collect(),
+        seconds: solution.seconds,
+        stages: solution
+            .stages
+            .iter()
+            .map(|time| proto::StageTime { stage: time.stage.to_wire(), seconds: time.seconds })
+            .collect(),
+        prior_times: solution
+            .prior_times
+            .iter()
+            .map(|time| proto::PriorTime {
+                prior: time.prior.to_wire(),
+                seconds: time.seconds,
+                iterations: time.iterations,
+            })
+            .collect(),
+        history: solution.history.iter().map(progress::to_wire).collect(),
+    }
+}
+
+/// # Errors
+/// A violation that names the field which no server of this version would send.
+pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
+    Ok(Solution {
+        status: Status::required(result.status, "status")?,
+        grade: Grade::from_wire(result.grade, "grade")?,
+        method: Method::required(result.method, "method")?,
+        winning_prior: Prior::from_wire(result.winning_prior, "winning_prior")?,
+        iterations: result.iterations,
+        seed: result.seed,
+        calibrations: result.calibrations.iter().map(calibration_from_wire).collect(),
+        plane_at_infinity: result.plane_at_infinity.map(|plane| [plane.x, plane.y, plane.z]),
+        views: result.views.iter().enumerate().map(view_from_wire).collect::<Result<_, _>>()?,
+        tracks: tracks_from_wire(required(result.tracks, "tracks")?)?,
+        observations: observations_from_wire(required(result.observations, "observations")?)?,
+        noise_px: result.noise_px,
+        reprojection_rms_px: result.reprojection_rms_px,
+        reprojection_mean_px: result.reprojection_mean_px,
+        warnings: result
+            .warnings
+            .into_iter()
+            .map(|warning| Ok(Warning::new(WarningCode::required(warning.code, "warnings.code")?, warning.detail)))
+            .collect::<Result<_, Violation>>()?,
+        seconds: result.seconds,
+        stages: result
+            .stages
+            .iter()
+            .map(|time| Ok(StageTime { stage: Stage::required(time.stage, "stages.stage")?, seconds: time.seconds }))
+            .collect::<Result<_, Violation>>()?,
+        prior_times: result
+            .prior_times
+            .iter()
+            .map(|time| {
+                let prior = Prior::required(time.prior, "prior_times.prior")?;
+                Ok(PriorTime { prior, seconds: time.seconds, iterations: time.iterations })
+            })
+            .collect::<Result<_, Violation>>()?,
+        history: result.history.iter().map(progress::from_wire).collect::<Result<_, _>>()?,
+    })
+}
+
+fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
+    proto::Calibration {
+        focal_px: calibration.focal_px,
+        sigma_log_focal: calibration.sigma_log_focal,
+        principal_point_x_px: calibration.principal_point_px[0],
+        principal_point_y_px: calibration.principal_point_px[1],
+    }
+}
+
+fn calibration_from_wire(calibration: &proto::Calibration) -> Calibration {
+    Calibration {
+        focal_px: calibration.focal_px,
+        sigma_log_focal: calibration.sigma_log_focal,
+        principal_point_px: [calibration.principal_point_x_px, calibration.principal_point_y_px],
+    }
+}
+
+fn view_to_wire(view: &ViewResult) -> proto::ViewResult {
+    proto::ViewResult {
+        projection: view.projection.iter().flatten().flatten().copied().collect(),
+        rotation: view.rotation.iter().flatten().flatten().copied().collect(),
+        translation: view.translation.iter().flatten().copied().collect(),
+    }
+}
+
+fn view_from_wire((index, view): (usize, &proto::ViewResult)) -> Result<ViewResult, Violation> {
+    let wrong = |name: &str, count: usize, numbers: &[f64]| {
+        Violation::at(format!("views.{name}"), index, format!("{} numbers, not 0 or {count}", numbers.len()))
+    };
+    Ok(ViewResult {
+        projection: rows(&view.projection).map_err(|()| wrong("projection", 12, &view.projection))?,
+        rotation: rows(&view.rotation).map_err(|()| wrong("rotation", 9, &view.rotation))?,
+        translation: match view.translation.as_slice() {
+            [] => None,
+            &[x, y, z] => Some([x, y, z]),
+            other => return Err(wrong("translation", 3, other)),
+        },
+    })
+}
+
+/// Three rows of `N` numbers each, or none at all.
+fn rows<const N: usize>(numbers: &[f64]) -> Result<Option<[[f64; N]; 3]>, ()> {
+    if numbers.is_empty() {
+        return Ok(None);
+    }
+    if numbers.len() != 3 * N {
+        return Err(());
+    }
+    Ok(Some(std::array::from_fn(|row| std::array::from_fn(|column| numbers[N * row + column]))))
+}
+
+/// Points are few among many tracks: they travel as indices and coordinates.
+fn tracks_to_wire(tracks: &TrackResults) -> proto::TrackResults {
+    let with_point = || tracks.point.iter().enumerate().filter_map(|(track, point)| Some((track, (*point)?)));
+    proto::TrackResults {
+        weight: tracks.weight.clone(),
+        inlier: tracks.inlier.clone(),
+        network_weight: tracks.network_weight.clone(),
+        point_track: with_point().map(|(track, _)| track as u32).collect(),
+        point: with_point().flat_map(|(_, point)| point).collect(),
+    }
+}
+
+fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violation> {
+    let count = tracks.weight.len();
+    if tracks.inlier.len() != count || !(tracks.network_weight.is_empty() || tracks.network_weight.len() == count) {
+        return Err(Violation::of("tracks", format!("arrays of different lengths beside {count} weights")));
+    }
+    if tracks.point.len() != 3 * tracks.point_track.len() {
+        return Err(Violation::of(
+            "tracks.point",
+            format!("{} numbers for {} points", tracks.point.len(), tracks.point_track.len()),
+        ));
+    }
+    let mut point = vec![None; count];
+    for (index, (&track, xyz)) in tracks.point_track.iter().zip(tracks.point.chunks_exact(3)).enumerate() {
+        let slot = point.get_mut(track as usize).ok_or_else(|| {
+            Violation::at("tracks.point_track", index, format!("track {track} is outside the {count} tracks"))
+        })?;
+        *slot = Some([xyz[0], xyz[1], xyz[2]]);
+    }
+    Ok(TrackResults { weight: tracks.weight, inlier: tracks.inlier, network_weight: tracks.network_weight, point })
+}
+
+fn observations_to_wire(observations: &ObservationResults) -> proto::ObservationResults {
+    proto::ObservationResults {
+        inlier: observations.inlier.clone(),
+        judged: observations.residual_px.iter().map(Option::is_some).collect(),
+        residual_px: observations.residual_px.iter().map(|residual| residual.unwrap_or(0.0)).collect(),
+    }
+}
+
+fn observations_from_wire(observations: proto::ObservationResults) -> Result<ObservationResults, Violation> {
+    let count = observations.inlier.len();
+    if observations.judged.len() != count || observations.residual_px.len() != count {
+        return Err(Violation::of("observations", "arrays of different lengths"));
+    }
+    let residual_px = observations.judged.iter().zip(&observations.residual_px);
+    Ok(ObservationResults {
+        residual_px: residual_px.map(|(&judged, &residual)| judged.then_some(residual)).collect(),
+        inlier: observations.inlier,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use prost::Message;
+
+    use super::*;
+    use crate::domain::{Losses, Progress};
+
+    fn name() -> JobName {
+        JobName { tenant: "default".into(), job: "a".into() }
+    }
+
+    /// Every field set to something that is not its default, every optional thing both present and absent.
+    pub(super) fn rich() -> Solution {
+        let projection = Some([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0], [0.1, 0.2, 0.3, f64::MIN_POSITIVE]]);
+        let rotation = Some([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]);
+        let progress = Progress {
+            stage: Stage::Search,
+            fraction: 0.3,
+            iteration: 7,
+            losses: Some(Losses { num: 1.0, proj: 2.0, daq: 3.0 }),
+            inliers: 20,
+            focal_px: Some(1200.5),
+            best_score: Some(0.9),
+            elapsed_seconds: 0.25,
+        };
+        Solution {
+            status: Status::Solved,
+            grade: Some(Grade::Weak),
+            method: Method::Auto,
+            winning_prior: Some(Prior::Irls),
+            iterations: 150,
+            seed: u64::MAX,
+            calibrations: vec![
+                Calibration { focal_px: 1.0 / 3.0, sigma_log_focal: Some(0.05), principal_point_px: [499.5, 399.5] },
+                Calibration { focal_px: 900.0, sigma_log_focal: None, principal_point_px: [0.0, 0.0] },
+            ],
+            plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),
+            views: vec![
+                ViewResult { projection, rotation, translation: Some([0.0, -1.0, 2.0]) },
+                ViewResult { projection, ..ViewResult::default() },
+                ViewResult::default(),
+            ],
+            tracks: TrackResults {
+                weight: vec![0.0, 1.0, 0.25],
+                inlier: vec![false, true, true],
+                network_weight: vec![0.1, 0.2, 0.3],
+                point: vec![None, Some([1.0, -2.0, 3.5]), None],
+            },
+            observations: ObservationResults {
+                inlier: vec![true, false, false],
+                residual_px: vec![Some(0.0), Some(17.25), None],
+            },
+            noise_px: Some(0.5),
+            reprojection_rms_px: Some(0.7),
+            reprojection_mean_px: Some(0.6),
+            warnings: vec![Warning::new(WarningCode::ViewsLeftOut, "views 3, 4")],
+            seconds: 1.5,
+            stages: vec![StageTime { stage: Stage::Prepare, seconds: 0.1 }],
+            prior_times: vec![
+                PriorTime { prior: Prior::Network, seconds: Some(0.5), iterations: 80 },
+                PriorTime { prior: Prior::Uniform, seconds: None, iterations: 6000 },
+            ],
+            history: vec![progress, Progress { losses: None, focal_px: None, best_score: None, ..progress }],
+        }
+    }
+
+    fn over_the_wire(solution: &Solution) -> Solution {
+        let bytes = to_wire(&name(), solution).encode_to_vec();
+        from_wire(proto::JobResult::decode(bytes.as_slice()).expect("decodes")).expect("well formed")
+    }
+
+    #[test]
+    fn a_solution_survives_the_wire_unchanged() {
+        assert_eq!(over_the_wire(&rich()), rich());
+    }
+
+    #[test]
+    fn a_solution_without_a_reconstruction_survives_too() {
+        let bare = Solution {
+            status: Status::NoReconstruction,
+            grade: None,
+            winning_prior: None,
+            calibrations: Vec::new(),
+            plane_at_infinity: None,
+            views: vec![ViewResult::default(); 2],
+            tracks: TrackResults::default(),
+            observations: ObservationResults::default(),
+            noise_px: None,
+            reprojection_rms_px: None,
+            reprojection_mean_px: None,
+            ..rich()
+        };
+        assert_eq!(over_the_wire(&bare), bare);
+    }
+
+    #[test]
+    fn a_malformed_answer_names_its_field() {
+        let with = |change: &dyn Fn(&mut proto::JobResult)| {
+            let mut result = to_wire(&name(), &rich());
+            change(&mut result);
+            from_wire(result).expect_err("malformed").path()
+        };
+        assert_eq!(with(&|result| result.status = 0), "status");
+        assert_eq!(with(&|result| result.grade = 9), "grade");
+        assert_eq!(with(&|result| result.tracks = None), "tracks");
+        assert_eq!(with(&|result| result.views[1].projection.truncate(5)), "views.projection[1]");
+        let tracks = |result: &mut proto::JobResult, change: &dyn Fn(&mut proto::TrackResults)| {
+            change(result.tracks.as_mut().expect("set"));
+        };
+        assert_eq!(with(&|result| tracks(result, &|tracks| tracks.inlier.truncate(1))), "tracks");
+        assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_track[0] = 3)), "tracks.point_track[0]");
+        assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point.truncate(2))), "tracks.point");
+    }
+}

@@ -1,0 +1,163 @@
+//! `JobService`.
+
+use std::pin::Pin;
+
+use prost::Message;
+use prost::bytes::Bytes;
+use tokio_stream::{Stream, StreamExt};
+use tonic::{Request, Response, Status};
+use tracing::Instrument;
+
+use super::caller::Caller;
+use super::convert::{job, list, result};
+use super::submission::Submission;
+use super::{proto, status};
+use crate::domain::Limits;
+use crate::engine::Engine;
+use crate::telemetry;
+
+/// Bytes of a result in one message: large enough that a hundred megabytes are some hundred messages, small enough for
+/// every client's default limit of 4 MiB.
+const RESULT_CHUNK_BYTES: usize = 256 * 1024;
+
+/// The service.
+#[derive(Clone)]
+pub struct Jobs {
+    engine: Engine,
+    limits: Limits,
+}
+
+impl Jobs {
+    pub fn new(engine: Engine, limits: Limits) -> Self {
+        Self { engine, limits }
+    }
+}
+
+type Messages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+#[tonic::async_trait]
+impl proto::job_service_server::JobService for Jobs {
+    async fn create_job(&self, request: Request<proto::CreateJobRequest>) -> Result<Response<proto::Job>, Status> {
+        let caller = Caller::of(&request);
+        let span = telemetry::tracing::submit_span("CreateJob", caller.trace_parent());
+        let created = async {
+            let submission = Submission::open(&caller, request.into_inner(), &self.limits)?;
+            let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
+            let new = submission.close(trace_parent).await?;
+            let created = self.engine.submit(new).await.map_err(status::from_engine)?;
+            telemetry::tracing::record_job(&span, &created.name);
+            Ok(Response::new(job::to_wire(&created)))
+        };
+        created.instrument(span.clone()).await
+    }
+
+    async fn batch_create_jobs(
+        &self,
+        _request: Request<proto::BatchCreateJobsRequest>,
+    ) -> Result<Response<proto::BatchCreateJobsResponse>, Status> {
+        Err(status::not_implemented("BatchCreateJobs"))
+    }
+
+    async fn get_job(&self, request: Request<proto::GetJobRequest>) -> Result<Response<proto::Job>, Status> {
+        let name = Caller::of(&request).job(&request.get_ref().name)?;
+        let found = self.engine.job(&name).await.map_err(status::from_engine)?;
+        Ok(Response::new(job::to_wire(&found)))
+    }
+
+    async fn list_jobs(
+        &self,
+        request: Request<proto::ListJobsRequest>,
+    ) -> Result<Response<proto::ListJobsResponse>, Status> {
+        let tenant = Caller::of(&request).parent(&request.get_ref().parent)?;
+        let query = list::from_wire(tenant, request.into_inner()).map_err(|error| status::invalid(&error))?;
+        let Some(query) = query else {
+            return Ok(Response::new(proto::ListJobsResponse::default()));
+        };
+        let page = self.engine.list(&query).await.map_err(status::from_engine)?;
+        Ok(Response::new(proto::ListJobsResponse {
+            jobs: page.jobs.iter().map(job::to_wire).collect(),
+            next_page_token: page.next_page_token.unwrap_or_default(),
+        }))
+    }
+
+    type WatchJobStream = Messages<proto::JobEvent>;
+
+    async fn watch_job(
+        &self,
+        request: Request<proto::WatchJobRequest>,
+    ) -> Result<Response<Self::WatchJobStream>, Status> {
+        let name = Caller::of(&request).job(&request.get_ref().name)?;
+        let after_sequence = request.get_ref().after_sequence;
+        let watch = self.engine.watch(&name, after_sequence).await.map_err(status::from_engine)?;
+        let watching = telemetry::metrics::watcher();
+        let events = watch.into_stream().map(move |event| {
+            // Counted for as long as the stream lives.
+            let _ = &watching;
+            event.map(job::event_to_wire).map_err(status::from_engine)
+        });
+        Ok(Response::new(Box::pin(events)))
+    }
+
+    async fn cancel_job(&self, request: Request<proto::CancelJobRequest>) -> Result<Response<proto::Job>, Status> {
+        let name = Caller::of(&request).job(&request.get_ref().name)?;
+        let cancelled = self.engine.cancel(&name).await.map_err(status::from_engine)?;
+        Ok(Response::new(job::to_wire(&cancelled)))
+    }
+
+    async fn delete_job(&self, _request: Request<proto::DeleteJobRequest>) -> Result<Response<()>, Status> {
+        Err(status::not_implemented("DeleteJob"))
+    }
+
+    type ReadJobResultStream = Messages<proto::ResultChunk>;
+
+    async fn read_job_result(
+        &self,
+        request: Request<proto::ReadJobResultRequest>,
+    ) -> Result<Response<Self::ReadJobResultStream>, Status> {
+        let name = Caller::of(&request).job(&request.get_ref().name)?;
+        let offset = request.get_ref().offset;
+        let solution = self.engine.result(&name).await.map_err(status::from_engine)?;
+        let encode = move || Bytes::from(result::to_wire(&name, &solution).encode_to_vec());
+        let encoded = super::blocking(encode).await?;
+        let Some(from) = usize::try_from(offset).ok().filter(|&from| from <= encoded.len()) else {
+            let text = format!("{offset} is not within the {} bytes of the result", encoded.len());
+            return Err(status::invalid(&super::violation("offset", text)));
+        };
+        let chunks = result_chunks(encoded, from).map(Ok);
+        Ok(Response::new(Box::pin(tokio_stream::iter(chunks))))
+    }
+}
+
+/// Cuts a result into messages without copying it. One message at least, so that every read learns the size.
+fn result_chunks(encoded: Bytes, from: usize) -> impl Iterator<Item = proto::ResultChunk> + Send {
+    let total = encoded.len();
+    let mut at = Some(from);
+    std::iter::from_fn(move || {
+        let begin = at?;
+        let end = total.min(begin + RESULT_CHUNK_BYTES);
+        at = (end < total).then_some(end);
+        Some(proto::ResultChunk { data: encoded.slice(begin..end), offset: begin as i64, total_size: total as i64 })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chunks_cover_a_result_from_any_offset() {
+        let total = 2 * RESULT_CHUNK_BYTES + 10;
+        let encoded = Bytes::from((0..total).map(|k| (k % 251) as u8).collect::<Vec<_>>());
+        for (from, count) in [(0, 3), (1, 3), (RESULT_CHUNK_BYTES, 2), (total - 10, 1), (total, 1)] {
+            let chunks: Vec<_> = result_chunks(encoded.clone(), from).collect();
+            assert_eq!(chunks.len(), count, "from {from}");
+            let mut at = from;
+            for chunk in &chunks {
+                assert_eq!((chunk.offset, chunk.total_size), (at as i64, total as i64));
+                assert_eq!(chunk.data, encoded.slice(at..at + chunk.data.len()));
+                at += chunk.data.len();
+            }
+            assert_eq!(at, total);
+        }
+    }
+}

@@ -1,0 +1,189 @@
+//! The server: services, health, reflection, compression and limits, put together in one place.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+use tokio::task::{JoinError, JoinHandle};
+use tokio_util::sync::CancellationToken;
+use tonic::codec::CompressionEncoding::Gzip;
+use tonic::transport::server::{Router, TcpIncoming};
+use tonic_health::ServingStatus;
+use tonic_health::server::HealthReporter;
+use tower::layer::util::{Identity, Stack};
+
+use super::calibration::Calibration;
+use super::inputs::Inputs;
+use super::jobs::Jobs;
+use super::meter::Meter;
+use super::proto::FILE_DESCRIPTOR_SET;
+use super::proto::calibration_service_server::CalibrationServiceServer;
+use super::proto::input_service_server::InputServiceServer;
+use super::proto::job_service_server::JobServiceServer;
+use crate::domain::Limits;
+use crate::engine::Engine;
+
+/// Services whose health is told one by one; the empty name is the server's own.
+const HEALTH_NAMES: [&str; 4] = ["", "scpsfm.v1.CalibrationService", "scpsfm.v1.JobService", "scpsfm.v1.InputService"];
+
+/// Calls open at once on one connection: some hundred watchers and room for the rest. More wait on the client's side.
+const MAX_STREAMS_PER_CONNECTION: u32 = 1_024;
+
+/// Requests at work at once on one connection, each of which may hold a whole message in memory.
+const MAX_REQUESTS_PER_CONNECTION: usize = 64;
+
+/// A connection that is silent for this long is asked whether it lives, so that a `Solve` whose caller lost its power
+/// is noticed.
+const KEEPALIVE: Duration = Duration::from_secs(30);
+
+/// How long the answer to that may take.
+const KEEPALIVE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// What a server needs to know.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// Port 0 takes a free one.
+    pub listen: SocketAddr,
+    /// What one input may hold.
+    pub limits: Limits,
+    /// Largest message that is taken.
+    pub max_message_bytes: usize,
+    /// How long after a `Solve` was dropped its job is cancelled.
+    pub solve_grace: Duration,
+}
+
+impl Options {
+    /// What the API promises: long enough for a client to come back over a flaky network, short enough to free a
+    /// worker soon.
+    pub const SOLVE_GRACE: Duration = Duration::from_secs(5);
+
+    /// Two million observations of at most 33 bytes; a larger input goes in chunks.
+    pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
+}
+
+impl Default for Options {
+    /// A free port of the loopback interface.
+    fn default() -> Self {
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+            limits: Limits::default(),
+            max_message_bytes: Self::MAX_MESSAGE_BYTES,
+            solve_grace: Self::SOLVE_GRACE,
+        }
+    }
+}
+
+/// Why a server did not come up, or went down.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("cannot listen on {address}: {source}")]
+    Listen { address: SocketAddr, source: std::io::Error },
+    #[error("cannot serve reflection: {0}")]
+    Reflection(#[from] tonic_reflection::server::Error),
+    #[error("the transport failed: {0}")]
+    Transport(#[from] tonic::transport::Error),
+    #[error("the server's task ended: {0}")]
+    Task(#[from] JoinError),
+}
+
+/// A running server. Dropping it stops it at once.
+#[derive(Debug)]
+pub struct Server {
+    address: SocketAddr,
+    health: HealthReporter,
+    stop: CancellationToken,
+    task: JoinHandle<Result<(), tonic::transport::Error>>,
+}
+
+impl Server {
+    /// Listens and serves. When this returns, connections are taken and health says SERVING.
+    ///
+    /// # Errors
+    /// [`Error::Listen`] where the address cannot be had.
+    pub async fn bind(options: Options, engine: Engine) -> Result<Self, Error> {
+        let listen_error = |source| Error::Listen { address: options.listen, source };
+        let listener = TcpListener::bind(options.listen).await.map_err(listen_error)?;
+        let address = listener.local_addr().map_err(listen_error)?;
+        let (health, health_service) = tonic_health::server::health_reporter();
+        for name in HEALTH_NAMES {
+            health.set_service_status(name, ServingStatus::Serving).await;
+        }
+        let router = router(&options, engine)?.add_service(health_service);
+        let stop = CancellationToken::new();
+        let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+        let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stop.clone().cancelled_owned()));
+        Ok(Self { address, health, stop, task })
+    }
+
+    /// Where the server listens.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// First phase of a drain: tells health checks NOT_SERVING, so that no new callers are sent here. Calls go on.
+    pub async fn set_draining(&self) {
+        for name in HEALTH_NAMES {
+            self.health.set_service_status(name, ServingStatus::NotServing).await;
+        }
+    }
+
+    /// Ends only when the server fails.
+    ///
+    /// # Errors
+    /// Why it failed.
+    pub async fn wait(&mut self) -> Result<(), Error> {
+        Ok((&mut self.task).await??)
+    }
+
+    /// Second phase of a drain, after the engine's: takes no more connections, lets calls end for up to `bound`, then
+    /// cuts them off.
+    ///
+    /// # Errors
+    /// Why the server failed before.
+    pub async fn shutdown(mut self, bound: Duration) -> Result<(), Error> {
+        self.set_draining().await;
+        self.stop.cancel();
+        match tokio::time::timeout(bound, &mut self.task).await {
+            Ok(ended) => Ok(ended??),
+            Err(_) => {
+                tracing::warn!(bound_seconds = bound.as_secs_f64(), "cutting off calls that outlast the drain");
+                Ok(())
+            }
+        }
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+/// Every service but health.
+fn router(options: &Options, engine: Engine) -> Result<Router<Stack<Meter, Identity>>, Error> {
+    let limits = options.limits.clone();
+    let max_bytes = options.max_message_bytes;
+    let calibration = Calibration::new(engine.clone(), limits.clone(), max_bytes, options.solve_grace);
+    let reflection = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+    macro_rules! with_limits {
+        ($service:expr) => {
+            $service.accept_compressed(Gzip).send_compressed(Gzip).max_decoding_message_size(max_bytes)
+        };
+    }
+    Ok(tonic::transport::Server::builder()
+        .layer(Meter)
+        .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
+        .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
+        .http2_keepalive_interval(Some(KEEPALIVE))
+        .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
+        .add_service(with_limits!(CalibrationServiceServer::new(calibration)))
+        .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits))))
+        .add_service(with_limits!(InputServiceServer::new(Inputs)))
+        // Older clients, grpcurl and Python's among them, still ask for v1alpha.
+        .add_service(reflection().build_v1()?)
+        .add_service(reflection().build_v1alpha()?))
+}

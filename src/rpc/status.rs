@@ -1,0 +1,153 @@
+//! The one place where errors become statuses (AIP-193): a code, a reason that programs can match, and what to do.
+//!
+//! | code | reason | when |
+//! |---|---|---|
+//! | `INVALID_ARGUMENT` | `INVALID_ARGUMENT` | a request breaks a rule; `BadRequest` names fields and indices |
+//! | `NOT_FOUND` | `JOB_NOT_FOUND` | no such job, or another tenant's |
+//! | `PERMISSION_DENIED` | `TENANT_FORBIDDEN` | a parent that is not the caller's tenant |
+//! | `ALREADY_EXISTS` | `ALREADY_EXISTS` | a job id is taken, or a request id came with another body |
+//! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused; `RetryInfo` says when to come back |
+//! | `FAILED_PRECONDITION` | `RESULT_NOT_READY` | there is no result, yet or for good |
+//! | `UNAVAILABLE` | `DRAINING` | the server is going down; `RetryInfo` |
+//! | `DEADLINE_EXCEEDED` | `INPUT_STALLED` | the chunks of a `Solve` stopped coming |
+//! | `UNIMPLEMENTED` | `NOT_IMPLEMENTED` | part of the API that is still to come |
+//! | `INTERNAL` | `INTERNAL` | our defect; what it was is in the log only |
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, FieldViolation, StatusExt};
+
+use crate::domain::job::{JobName, JobState};
+use crate::domain::{InvalidInput, Violation};
+use crate::engine;
+
+/// Domain of every `ErrorInfo`.
+pub const DOMAIN: &str = "scpsfm";
+
+/// Violations that the message spells out; all that were kept are in the details. Both travel in one HTTP/2 header
+/// block, of which common clients take 8 KiB.
+const SENTENCES_IN_MESSAGE: usize = 3;
+
+/// Pause that a caller of a draining server is told: about what a replacement needs to come up.
+const DRAINING_RETRY: Duration = Duration::from_secs(5);
+
+fn status(code: Code, reason: &str, message: impl Into<String>, mut details: ErrorDetails) -> Status {
+    details.set_error_info(reason, DOMAIN, HashMap::new());
+    Status::with_error_details(code, message, details)
+}
+
+/// A request that breaks rules.
+pub fn invalid(error: &InvalidInput) -> Status {
+    let violations = error.violations();
+    let listed = violations.len().min(SENTENCES_IN_MESSAGE);
+    let mut message = violations[..listed].iter().map(Violation::to_string).collect::<Vec<_>>().join("; ");
+    let unlisted = violations.len() - listed + error.unlisted();
+    if unlisted > 0 {
+        message.push_str(&format!("; and {unlisted} more"));
+    }
+    let fields = violations.iter().map(|violation| FieldViolation::new(violation.path(), &violation.description));
+    let details = ErrorDetails::with_bad_request(fields.collect::<Vec<_>>());
+    status(Code::InvalidArgument, "INVALID_ARGUMENT", message, details)
+}
+
+/// No such job, or another tenant's: a caller cannot tell them apart.
+pub fn job_not_found(name: &JobName) -> Status {
+    let mut details = ErrorDetails::new();
+    details.set_resource_info("scpsfm.v1.Job", name.to_string(), "", "there is no such job");
+    status(Code::NotFound, "JOB_NOT_FOUND", format!("there is no job {name}"), details)
+}
+
+/// A parent that is not the caller's tenant.
+pub fn tenant_forbidden(tenant: &str) -> Status {
+    let message = format!("tenants/{tenant} is not the caller's tenant");
+    status(Code::PermissionDenied, "TENANT_FORBIDDEN", message, ErrorDetails::new())
+}
+
+/// Part of the API that is still to come.
+pub fn not_implemented(what: &str) -> Status {
+    let message = format!("{what} is not implemented yet");
+    status(Code::Unimplemented, "NOT_IMPLEMENTED", message, ErrorDetails::new())
+}
+
+/// The chunks of a `Solve` stopped coming.
+pub fn input_stalled(patience: Duration) -> Status {
+    let message = format!("no message arrived for {} s and the input is not complete", patience.as_secs());
+    status(Code::DeadlineExceeded, "INPUT_STALLED", message, ErrorDetails::new())
+}
+
+/// A defect of ours. The caller gets no inside view; the log has it.
+pub fn internal(error: &dyn std::fmt::Display) -> Status {
+    tracing::error!(%error, "internal error");
+    status(Code::Internal, "INTERNAL", "internal error; the server's log has the cause", ErrorDetails::new())
+}
+
+/// What the engine refuses.
+pub fn from_engine(error: engine::Error) -> Status {
+    match error {
+        engine::Error::NotFound(name) => job_not_found(&name),
+        engine::Error::AlreadyExists(sentence) => {
+            status(Code::AlreadyExists, "ALREADY_EXISTS", sentence, ErrorDetails::new())
+        }
+        engine::Error::QueueFull { retry_after, message, .. } => {
+            let details = ErrorDetails::with_retry_info(Some(retry_after));
+            status(Code::ResourceExhausted, "QUEUE_FULL", message, details)
+        }
+        engine::Error::InvalidArgument(error) => invalid(&error),
+        engine::Error::NotReady(state) => {
+            let message = match state {
+                JobState::Queued | JobState::Running => format!("the job is {}; its result is not ready", state.name()),
+                _ => format!("the job is {}; it has no result", state.name()),
+            };
+            status(Code::FailedPrecondition, "RESULT_NOT_READY", message, ErrorDetails::new())
+        }
+        engine::Error::Draining => {
+            let details = ErrorDetails::with_retry_info(Some(DRAINING_RETRY));
+            status(Code::Unavailable, "DRAINING", "the server is draining; try another or come back", details)
+        }
+        engine::Error::Internal(error) => internal(&error),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::error::Violations;
+
+    #[test]
+    fn violations_are_all_in_the_details_and_some_in_the_message() {
+        let mut found = Violations::default();
+        for k in 0..30 {
+            found.push(Violation::at("track_set.x", k, "NaN is not a finite number"));
+        }
+        let status = invalid(&found.into_result().expect_err("30 violations"));
+        assert_eq!(status.code(), Code::InvalidArgument);
+        assert!(status.message().starts_with("track_set.x[0]: NaN is not a finite number; "), "{}", status.message());
+        assert!(status.message().ends_with("; and 27 more"), "{}", status.message());
+        let request = status.get_details_bad_request().expect("a BadRequest");
+        assert_eq!(request.field_violations.len(), InvalidInput::MAX_LISTED);
+        assert_eq!(request.field_violations[17].field, "track_set.x[17]");
+        let info = status.get_details_error_info().expect("an ErrorInfo");
+        assert_eq!((info.reason.as_str(), info.domain.as_str()), ("INVALID_ARGUMENT", DOMAIN));
+    }
+
+    #[test]
+    fn a_full_queue_says_when_to_come_back() {
+        let status = from_engine(engine::Error::QueueFull {
+            retry_after: Duration::from_secs(3),
+            reason: "queue_jobs",
+            message: "256 jobs wait already".into(),
+        });
+        assert_eq!(status.code(), Code::ResourceExhausted);
+        let retry = status.get_details_retry_info().expect("a RetryInfo");
+        assert_eq!(retry.retry_delay, Some(Duration::from_secs(3)));
+        assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "QUEUE_FULL");
+    }
+
+    #[test]
+    fn an_internal_error_keeps_its_cause_to_itself() {
+        let status = internal(&"password is hunter2");
+        assert!(!status.message().contains("hunter2"));
+    }
+}

@@ -1,0 +1,248 @@
+//! Which views and tracks are solved together: normalisation and the choice of complete blocks.
+
+use nalgebra::Vector2;
+
+use crate::domain::{ImageSize, Input, Warning, WarningCode};
+use crate::geometry::measurement::{CompleteBlock, Normalization};
+
+/// Tracks that a block should have: twice the eight that verification needs, for half of them may be wrong.
+const WANTED_TRACKS: usize = 16;
+/// Tracks below which no block is tried: verification needs eight inliers.
+pub const LEAST_TRACKS: usize = 8;
+/// Views below which a projective reconstruction carries no calibration worth searching for.
+pub const LEAST_VIEWS: usize = 3;
+/// Views that a block grows to. Real tracks are short: longer blocks hold few of them.
+const MOST_VIEWS: usize = 10;
+/// Views up to which tracks that are complete over all of them are solved as one block: bundle adjustment of a block
+/// is cubic in its views.
+const MOST_VIEWS_WHOLE: usize = 40;
+/// Tracks beyond which more of them do not make a block better.
+const ENOUGH_TRACKS: usize = 300;
+/// Blocks that are tried, best first, before the best result stands.
+const MOST_BLOCKS: usize = 4;
+
+/// A set of views with the tracks that are seen in all of them.
+#[derive(Debug, Clone)]
+pub struct Block {
+    /// Views of the input, increasing.
+    pub views: Vec<usize>,
+    /// Tracks of the input, increasing.
+    pub tracks: Vec<usize>,
+    /// Their points; view `i` and track `j` are `views[i]` and `tracks[j]` of the input.
+    pub complete: CompleteBlock,
+}
+
+/// Observation range of every track: `ranges[j]..ranges[j + 1]`.
+pub fn track_ranges(input: &Input) -> Vec<usize> {
+    let mut ends = vec![0; input.track_count() + 1];
+    for k in 0..input.observation_count() {
+        ends[input.track_of(k) + 1] += 1;
+    }
+    for track in 0..input.track_count() {
+        ends[track + 1] += ends[track];
+    }
+    ends
+}
+
+/// The transform from pixels that the whole solve uses: principal points assumed in the image centres, lengths in
+/// units of the largest image side.
+pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
+    let mut warnings = Vec::new();
+    let boxes = bounding_boxes(input);
+    let mut scale_px = 0.0f64;
+    let mut centres_px = Vec::with_capacity(input.view_count());
+    let mut unknown = 0usize;
+    for (view, bounds) in input.views().iter().zip(&boxes) {
+        let (centre, side) = match view.size {
+            Some(size) => (image_centre(size), f64::from(size.width_px.max(size.height_px))),
+            None => {
+                unknown += 1;
+                let [low, high] = bounds.unwrap_or([Vector2::zeros(), Vector2::repeat(1.0)]);
+                ((low + high) / 2.0, (high - low).amax())
+            }
+        };
+        centres_px.push(centre);
+        scale_px = scale_px.max(side);
+    }
+    if unknown > 0 {
+        warnings.push(Warning::new(
+            WarningCode::AssumedImageSize,
+            format!(
+                "{unknown} of {} views came without an image size; the extent of their points stood in, so the principal \
+                 point may be off",
+                input.view_count()
+            ),
+        ));
+    }
+    let groups: std::collections::BTreeSet<u32> = input.views().iter().map(|view| view.camera_group).collect();
+    let sizes: std::collections::BTreeSet<Option<(u32, u32)>> =
+        input.views().iter().map(|view| view.size.map(|size| (size.width_px, size.height_px))).collect();
+    if groups.len() > 1 || sizes.len() > 1 {
+        warnings.push(Warning::new(
+            WarningCode::CameraGroupsMerged,
+            format!(
+                "{} camera groups and {} image sizes were solved as one camera with one focal length",
+                groups.len(),
+                sizes.len()
+            ),
+        ));
+    }
+    // All points in one place: any scale will do.
+    let scale_px = if scale_px > 0.0 { scale_px } else { 1.0 };
+    (Normalization { centres_px, scale_px }, warnings)
+}
+
+/// Centre of an image whose top-left pixel's centre is (0, 0).
+fn image_centre(size: ImageSize) -> Vector2<f64> {
+    Vector2::new((f64::from(size.width_px) - 1.0) / 2.0, (f64::from(size.height_px) - 1.0) / 2.0)
+}
+
+fn bounding_boxes(input: &Input) -> Vec<Option<[Vector2<f64>; 2]>> {
+    let mut boxes: Vec<Option<[Vector2<f64>; 2]>> = vec![None; input.view_count()];
+    for k in 0..input.observation_count() {
+        let point = Vector2::from(input.point_px(k));
+        let bounds = boxes[input.view_of(k)].get_or_insert([point, point]);
+        bounds[0] = bounds[0].inf(&point);
+        bounds[1] = bounds[1].sup(&point);
+    }
+    boxes
+}
+
+/// Sets of views worth solving, best first; empty when no three views share enough tracks.
+pub fn candidate_views(input: &Input, ranges: &[usize]) -> Vec<Vec<usize>> {
+    let all: Vec<usize> = (0..input.view_count()).collect();
+    let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
+    let complete = ranges.windows(2).filter(|range| range[1] - range[0] == all.len()).count();
+    let whole = (LEAST_VIEWS..=MOST_VIEWS_WHOLE).contains(&all.len());
+    if whole && complete >= LEAST_TRACKS && 2 * complete >= observed {
+        return vec![all];
+    }
+    for least in [WANTED_TRACKS, LEAST_TRACKS] {
+        let found = greedy_views(input, ranges, least);
+        if !found.is_empty() {
+            return found;
+        }
+    }
+    Vec::new()
+}
+
+/// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on
+/// the way, keeps the one with most constraints.
+fn greedy_views(input: &Input, ranges: &[usize], least: usize) -> Vec<Vec<usize>> {
+    let mut tracks_of_view: Vec<Vec<usize>> = vec![Vec::new(); input.view_count()];
+    for k in 0..input.observation_count() {
+        tracks_of_view[input.view_of(k)].push(input.track_of(k));
+    }
+    let mut found: Vec<(usize, Vec<usize>)> = Vec::new();
+    for first in 0..input.view_count() {
+        let mut views = vec![first];
+        let mut tracks = tracks_of_view[first].clone();
+        let mut best: Option<(usize, Vec<usize>)> = None;
+        while views.len() < MOST_VIEWS {
+            let mut counts = vec![0usize; input.view_count()];
+            for &track in &tracks {
+                for k in ranges[track]..ranges[track + 1] {
+                    counts[input.view_of(k)] += 1;
+                }
+            }
+            for &view in &views {
+                counts[view] = 0;
+            }
+            // The first of equals, so that one input has one answer.
+            let Some((next, &count)) = counts.iter().enumerate().rev().max_by_key(|&(_, count)| count) else { break };
+            if count < least {
+                break;
+            }
+            views.push(next);
+            tracks.retain(|&track| (ranges[track]..ranges[track + 1]).any(|k| input.view_of(k) == next));
+            if views.len() >= LEAST_VIEWS {
+                let value = count.min(ENOUGH_TRACKS) * (views.len() - 2);
+                if best.as_ref().is_none_or(|(most, _)| value > *most) {
+                    let mut sorted = views.clone();
+                    sorted.sort_unstable();
+                    best = Some((value, sorted));
+                }
+            }
+        }
+        found.extend(best);
+    }
+    found.sort_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
+    let mut views: Vec<Vec<usize>> = found.into_iter().map(|(_, views)| views).collect();
+    views.dedup();
+    views.truncate(MOST_BLOCKS);
+    views
+}
+
+/// The block of these views: all tracks that are complete over them.
+pub fn extract(input: &Input, ranges: &[usize], normalization: &Normalization, views: &[usize]) -> Block {
+    let mut place = vec![None; input.view_count()];
+    for (i, &view) in views.iter().enumerate() {
+        place[view] = Some(i);
+    }
+    let mut tracks = Vec::new();
+    let mut points = Vec::new();
+    let mut depths = Vec::new();
+    for track in 0..input.track_count() {
+        // Observations of a track are sorted by view, and so are the views of a block.
+        let inside: Vec<usize> =
+            (ranges[track]..ranges[track + 1]).filter(|&k| place[input.view_of(k)].is_some()).collect();
+        if inside.len() == views.len() {
+            tracks.push(track);
+            for k in inside {
+                points.push(normalization.normalize(input.view_of(k), input.point_px(k)));
+                depths.extend(input.depth(k));
+            }
+        }
+    }
+    let depths = input.has_depths().then_some(depths);
+    let complete = CompleteBlock::new(views.len(), tracks.len(), &points, depths);
+    Block { views: views.to_vec(), tracks, complete }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::{Limits, RawInput, View};
+
+    /// Tracks given as lists of the views that see them.
+    fn input(views: usize, tracks: &[Vec<usize>]) -> Input {
+        let mut raw =
+            RawInput { views: vec![View::default(); views], track_count: tracks.len(), ..RawInput::default() };
+        for (track, seen) in tracks.iter().enumerate() {
+            for &view in seen {
+                raw.view.push(view as u32);
+                raw.track.push(track as u32);
+                raw.x.push((track * 7 % 13) as f64);
+                raw.y.push((track * 5 % 11) as f64);
+            }
+        }
+        Input::new(raw, &Limits::default(), "test").expect("valid")
+    }
+
+    #[test]
+    fn complete_tracks_are_one_block_of_all_views() {
+        let input = input(12, &vec![(0..12).collect(); 20]);
+        let ranges = track_ranges(&input);
+        assert_eq!(candidate_views(&input, &ranges), [(0..12).collect::<Vec<_>>()]);
+    }
+
+    #[test]
+    fn of_banded_tracks_the_densest_band_comes_first() {
+        let mut tracks = vec![(0..5).collect::<Vec<_>>(); 30];
+        tracks.extend(vec![(3..8).collect::<Vec<_>>(); 60]);
+        let input = input(8, &tracks);
+        let ranges = track_ranges(&input);
+        let candidates = candidate_views(&input, &ranges);
+        assert_eq!(candidates[0], [3, 4, 5, 6, 7]);
+        let (normalization, warnings) = normalization(&input);
+        let block = extract(&input, &ranges, &normalization, &candidates[0]);
+        assert_eq!((block.complete.views(), block.tracks.len()), (5, 60));
+        assert_eq!(warnings[0].code, WarningCode::AssumedImageSize);
+    }
+
+    #[test]
+    fn views_that_share_nothing_make_no_block() {
+        let input = input(4, &[vec![0, 1], vec![2, 3], vec![1, 2]]);
+        assert!(candidate_views(&input, &track_ranges(&input)).is_empty());
+    }
+}

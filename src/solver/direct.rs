@@ -1,0 +1,98 @@
+//! The methods without search: the paper's own thresholded weights, and plain projective factorisation.
+
+use super::grow::{self, Consensus, LEAST_SUPPORT};
+use super::recorder::Recorder;
+use crate::domain::{SolveSettings, StopToken};
+use crate::geometry::bundle::{self, projective};
+use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_residuals};
+use crate::geometry::measurement::{CompleteBlock, balance};
+use crate::geometry::triangulation;
+use crate::network::{NetworkSettings, PriorNetwork};
+
+use super::search::subspace;
+
+/// Weight above which the paper calls a track an inlier.
+const PAPER_THRESHOLD: f64 = 0.5;
+/// Residual (sine of the angle to the subspace) per unit of noise below which plain factorisation calls a track an
+/// inlier; the same scale as the search's tolerance.
+const PSFM_THRESHOLD_PER_NOISE: f64 = 4.0;
+/// Bundle adjustment iterations of a selection that nothing else will refine.
+const ADJUSTMENT_ITERATIONS: usize = 30;
+
+/// What a method without search decided.
+pub struct Decided {
+    pub inlier: Vec<bool>,
+    /// The method's own weights, one a track of the block.
+    pub weights: Vec<f64>,
+    pub network_weights: Vec<f64>,
+    pub iterations: u32,
+}
+
+/// PAPER: optimises the network to the end and thresholds its weights.
+///
+/// # Errors
+/// The network's own, which are defects: a block has more columns than it asks for.
+pub fn paper(
+    block: &CompleteBlock,
+    settings: &SolveSettings,
+    recorder: &mut Recorder,
+    scale_px: f64,
+    spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
+    stop: &StopToken,
+) -> Result<Decided, crate::network::Error> {
+    let matrix = balance(&block.measurement_matrix());
+    let mut network = PriorNetwork::new(&matrix, &NetworkSettings::from(settings))?;
+    while network.iteration() < settings.iterations && !stop.is_stopped() {
+        let step = network.step()?;
+        recorder.standing.iteration = step.iteration;
+        recorder.standing.losses = Some(step.losses);
+        recorder.standing.inliers = network.weights().iter().filter(|&&w| w > PAPER_THRESHOLD).count() as u32;
+        if settings.use_daq {
+            recorder.standing.focal_px = Some(network.focal() * scale_px);
+        }
+        recorder.tell(f64::from(step.iteration) / f64::from(settings.iterations));
+        if settings.weights_every > 0 && step.iteration.is_multiple_of(settings.weights_every) {
+            recorder.weights(&spread_weights(network.weights()));
+        }
+    }
+    let weights = network.weights().to_vec();
+    Ok(Decided {
+        inlier: weights.iter().map(|&weight| weight > PAPER_THRESHOLD).collect(),
+        network_weights: weights.clone(),
+        weights,
+        iterations: network.iteration(),
+    })
+}
+
+/// PSFM: the dominant subspace of all columns (Sturm & Triggs 1996), and the tracks that lie close to it.
+pub fn psfm(block: &CompleteBlock, noise: f64) -> Decided {
+    let matrix = balance(&block.measurement_matrix());
+    let residuals = dominant_subspace(&matrix, subspace::RANK)
+        .map_or_else(|| vec![1.0; block.tracks()], |basis| subspace_residuals(&matrix, &basis));
+    let threshold = PSFM_THRESHOLD_PER_NOISE * noise;
+    Decided {
+        inlier: residuals.iter().map(|&residual| residual < threshold).collect(),
+        weights: residuals.iter().map(|&residual| 1.0 / (1.0 + (residual / threshold).powi(2))).collect(),
+        network_weights: Vec::new(),
+        iterations: 0,
+    }
+}
+
+/// Cameras from a decided set of tracks, adjusted to their image points; the set itself stays as it was decided.
+///
+/// Returns `None` when the set is too small to determine cameras.
+pub fn reconstruct(block: &CompleteBlock, inlier: &[bool], noise: f64, stop: &StopToken) -> Option<Consensus> {
+    let support: Vec<usize> = (0..inlier.len()).filter(|&track| inlier[track]).collect();
+    if support.len() < LEAST_SUPPORT {
+        return None;
+    }
+    let matrix = balance(&block.measurement_matrix()).select_columns(&support);
+    let mut cameras = cameras_of(&dominant_subspace(&matrix, subspace::RANK)?);
+    let mut points: Vec<_> = support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();
+    let options =
+        bundle::Options { max_iterations: ADJUSTMENT_ITERATIONS, loss: grow::robust(noise), ..Default::default() };
+    projective::adjust(&mut cameras, &mut points, &grow::observations_of(block, &support), &options, stop);
+    let mut consensus = grow::judge(block, cameras, noise);
+    consensus.inlier = inlier.to_vec();
+    Some(consensus)
+}

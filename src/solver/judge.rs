@@ -1,0 +1,215 @@
+//! The last word on every track and observation, under the final geometry and noise.
+//!
+//! A right observation has a core of Gaussian noise and a tail of three times that width; a wrong one may be anywhere
+//! in the image. A track is judged by what it retains once observations that are more likely wrong than right are
+//! dropped, at a price for each.
+
+use crate::domain::Input;
+use crate::domain::result::{ObservationResults, TrackResults};
+use crate::geometry::measurement::{Normalization, Sighting};
+use crate::geometry::{Camera, Point, triangulation};
+
+/// Share of right observations in the tail, and its width in units of the core. Feature detectors have a core of .1
+/// to .3 px and tails that a Gaussian of that width would call impossible; together with the uniform outliers this
+/// puts the gate at 12 to 17 core deviations, where real sequences want it (15 to 20).
+const TAIL_SHARE: f64 = 0.05;
+const TAIL_WIDTH: f64 = 3.0;
+/// Prior probability that a single observation of a right track is wrong.
+const WRONG_OBSERVATION: f64 = 0.05;
+/// Observations that a track must retain, and the share of those it has in the registered views.
+const LEAST_RETAINED: usize = 3;
+const LEAST_RETAINED_SHARE: f64 = 0.6;
+/// Refinement steps of a point.
+const POINT_STEPS: usize = 10;
+
+/// The geometry to judge by.
+pub struct Geometry<'a> {
+    /// Projective camera of every view of the input, normalised; `None`: not registered.
+    pub cameras: &'a [Option<Camera>],
+    pub normalization: &'a Normalization,
+    /// Core noise, one standard deviation of a coordinate, normalised units.
+    pub noise: f64,
+    /// Density of a wrong coordinate: one over the width of the points' distribution, normalised units.
+    pub outlier_density: f64,
+    /// Prior probability that a track is right.
+    pub inlier_share: f64,
+}
+
+/// The verdict on one track.
+#[derive(Debug, Clone)]
+struct Verdict {
+    weight: f64,
+    inlier: bool,
+    point: Point,
+    /// One entry a sighting.
+    retained: Vec<bool>,
+}
+
+/// Every track and observation of the input, judged. Points stay homogeneous, projective and normalised.
+pub struct Judged {
+    pub tracks: TrackResults,
+    pub observations: ObservationResults,
+    /// Retained sightings of each inlier track, with views of the input.
+    pub retained: Vec<Vec<Sighting>>,
+    pub points: Vec<Option<Point>>,
+}
+
+/// Judges every track that has three observations in registered views or more; the others have weight 0 and no
+/// residuals.
+pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry) -> Judged {
+    let count = input.track_count();
+    let observation_count = input.observation_count();
+    let mut judged = Judged {
+        tracks: TrackResults {
+            weight: vec![0.0; count],
+            inlier: vec![false; count],
+            network_weight: Vec::new(),
+            point: vec![None; count],
+        },
+        observations: ObservationResults {
+            inlier: vec![false; observation_count],
+            residual_px: vec![None; observation_count],
+        },
+        retained: vec![Vec::new(); count],
+        points: vec![None; count],
+    };
+    // Triangulation wants a slice; unregistered views are never sighted.
+    let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+    for track in 0..count {
+        let seen: Vec<usize> =
+            (ranges[track]..ranges[track + 1]).filter(|&k| geometry.cameras[input.view_of(k)].is_some()).collect();
+        if seen.len() < LEAST_RETAINED {
+            continue;
+        }
+        let sightings: Vec<Sighting> = seen
+            .iter()
+            .map(|&k| {
+                let view = input.view_of(k);
+                Sighting { view, xy: geometry.normalization.normalize(view, input.point_px(k)) }
+            })
+            .collect();
+        let verdict = judge_track(&cameras, &sightings, geometry);
+        judged.tracks.weight[track] = verdict.weight as f32;
+        judged.tracks.inlier[track] = verdict.inlier;
+        for ((&k, sighting), &retained) in seen.iter().zip(&sightings).zip(&verdict.retained) {
+            let residual = triangulation::reprojection(&cameras[sighting.view], &verdict.point, &sighting.xy).norm();
+            let place = input.caller_index(k);
+            judged.observations.residual_px[place] =
+                Some(residual * geometry.normalization.scale_px).filter(|residual| residual.is_finite());
+            judged.observations.inlier[place] = verdict.inlier && retained;
+        }
+        if verdict.inlier {
+            let retained = sightings.iter().zip(&verdict.retained).filter(|(_, retained)| **retained);
+            judged.retained[track] = retained.map(|(sighting, _)| *sighting).collect();
+            judged.points[track] = Some(verdict.point);
+        }
+    }
+    judged
+}
+
+/// Drops the worst observation as long as it is more likely wrong than right, then weighs what remains.
+fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry) -> Verdict {
+    let gate = observation_gate(geometry.noise, geometry.outlier_density);
+    let mut retained: Vec<usize> = (0..sightings.len()).collect();
+    let (mut point, mut cost) = triangulate(cameras, sightings);
+    while retained.len() > LEAST_RETAINED {
+        let residual = |&k: &usize| {
+            triangulation::reprojection(&cameras[sightings[k].view], &point, &sightings[k].xy).norm_squared()
+        };
+        let Some((place, worst)) = retained.iter().map(residual).enumerate().max_by(|a, b| a.1.total_cmp(&b.1)) else {
+            break;
+        };
+        if worst <= gate {
+            break;
+        }
+        retained.remove(place);
+        let kept: Vec<Sighting> = retained.iter().map(|&k| sightings[k]).collect();
+        (point, cost) = triangulate(cameras, &kept);
+    }
+    let dropped = sightings.len() - retained.len();
+    let ln_odds = ln_odds(cost, retained.len(), dropped, geometry);
+    let enough = retained.len() as f64 >= LEAST_RETAINED_SHARE * sightings.len() as f64;
+    let weight = if enough { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
+    let mut flags = vec![false; sightings.len()];
+    for k in retained {
+        let residual =
+            triangulation::reprojection(&cameras[sightings[k].view], &point, &sightings[k].xy).norm_squared();
+        flags[k] = residual <= gate;
+    }
+    let whole = flags.iter().filter(|&&flag| flag).count() >= LEAST_RETAINED;
+    Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
+}
+
+fn triangulate(cameras: &[Camera], sightings: &[Sighting]) -> (Point, f64) {
+    triangulation::refine(cameras, sightings, triangulation::linear(cameras, sightings), POINT_STEPS)
+}
+
+/// Squared residual at which an observation is as likely wrong as right.
+fn observation_gate(noise: f64, outlier_density: f64) -> f64 {
+    let tail = (TAIL_WIDTH * noise).powi(2);
+    let right = (1.0 - WRONG_OBSERVATION) * TAIL_SHARE / (std::f64::consts::TAU * tail);
+    let wrong = WRONG_OBSERVATION * outlier_density.powi(2);
+    2.0 * tail * (right / wrong).ln().max(0.0)
+}
+
+/// Log of the odds that a track is right: prior, times the density of its residuals under core and tail, over that of
+/// coordinates anywhere, times the price of every dropped observation.
+fn ln_odds(cost: f64, retained: usize, dropped: usize, geometry: &Geometry) -> f64 {
+    let dof = (2 * retained) as f64 - 3.0;
+    let ln_density = |share: f64, width: f64| {
+        let variance = (width * geometry.noise).powi(2);
+        share.ln() - 0.5 * dof * (std::f64::consts::TAU * variance).ln() - 0.5 * cost / variance
+    };
+    let (core, tail) = (ln_density(1.0 - TAIL_SHARE, 1.0), ln_density(TAIL_SHARE, TAIL_WIDTH));
+    let ln_right = core.max(tail) + (-(core - tail).abs()).exp().ln_1p() + dropped as f64 * WRONG_OBSERVATION.ln();
+    let ln_wrong = dof * geometry.outlier_density.ln();
+    let prior = (geometry.inlier_share / (1.0 - geometry.inlier_share)).ln();
+    prior + ln_right - ln_wrong
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector2;
+
+    fn cameras(views: usize) -> Vec<Camera> {
+        (0..views)
+            .map(|view| {
+                let t = view as f64;
+                Camera::new(1.2, 0.0, 0.0, 0.5 * t, 0.0, 1.2, 0.0, 0.2 * t, 0.0, 0.0, 1.0, 3.0)
+            })
+            .collect()
+    }
+
+    fn geometry<'a>(normalization: &'a Normalization) -> Geometry<'a> {
+        Geometry { cameras: &[], normalization, noise: 0.001, outlier_density: 2.0, inlier_share: 0.3 }
+    }
+
+    fn sightings(cameras: &[Camera], shifts: &[f64]) -> Vec<Sighting> {
+        let point = Point::new(0.2, -0.1, 0.5, 1.0);
+        cameras
+            .iter()
+            .zip(shifts)
+            .enumerate()
+            .map(|(view, (camera, shift))| {
+                let image = camera * point;
+                Sighting { view, xy: image.xy() / image.z + Vector2::new(0.3 * shift, *shift) }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_right_track_a_track_with_one_wrong_observation_and_a_wrong_track() {
+        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
+        let geometry = geometry(&normalization);
+        let cameras = cameras(6);
+        let verdict = |shifts: [f64; 6]| judge_track(&cameras, &sightings(&cameras, &shifts), &geometry);
+        let right = verdict([0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001]);
+        assert!(right.inlier && right.weight > 0.999 && right.retained.iter().all(|&kept| kept));
+        let one_wrong = verdict([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]);
+        assert!(one_wrong.inlier);
+        assert_eq!(one_wrong.retained, [true, true, false, true, true, true]);
+        let wrong = verdict([0.1, -0.2, 0.15, -0.1, 0.3, -0.05]);
+        assert!(!wrong.inlier && wrong.weight < 0.01, "{}", wrong.weight);
+    }
+}

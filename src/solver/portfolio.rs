@@ -1,0 +1,348 @@
+//! The portfolio: priors propose, guided search verifies, the best consensus stands.
+//!
+//! The network is optimised a few iterations at a time; between, its ranking is verified by geometry, and so are the
+//! geometric priors and uniform sampling, which needs no prior to be right. Each prior's own time is kept, so that a
+//! result can say what each alone would have needed.
+
+use std::time::Instant;
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::grow::{self, Consensus, LEAST_SUPPORT};
+use super::priors;
+use super::recorder::Recorder;
+use super::search::{Sampler, Seed, Shortlist, affine, subspace};
+use crate::domain::result::PriorTime;
+use crate::domain::{Prior, SolveSettings, StopToken};
+use crate::geometry::measurement::{CompleteBlock, balance};
+use crate::network::{NetworkSettings, PriorNetwork};
+
+/// Network iterations between two verifications of its ranking.
+const ITERATIONS_PER_ROUND: u32 = 25;
+/// Network iterations that AUTO always spends, so that its losses and weights are always seen.
+pub const LEAST_ITERATIONS: u32 = 50;
+/// Rounds without a network: as many samples as the longest search with one.
+const ROUNDS_WITHOUT_NETWORK: u32 = 16;
+/// Samples a round and prior, without depths (a sample costs microseconds) and with.
+const AFFINE_SAMPLES: (usize, usize) = (2_000, 6_000);
+const SUBSPACE_SAMPLES: (usize, usize) = (250, 1_000);
+/// Hypotheses a round and prior that are grown.
+const SHORTLIST: usize = 2;
+/// Logarithm of the expected number of false alarms at which a consensus is decisive (e^-40: never by chance), and at
+/// which it may be accepted once the search has ended.
+const LN_DECISIVE: f64 = -40.0;
+const LN_ACCEPTABLE: f64 = -7.0;
+/// Inliers that geometry can verify: one more than determine the cameras.
+pub const LEAST_INLIERS: usize = LEAST_SUPPORT + 1;
+
+/// What the search found.
+pub struct Found {
+    pub consensus: Option<Consensus>,
+    pub winning_prior: Option<Prior>,
+    /// Network iterations spent.
+    pub iterations: u32,
+    /// The network's last weights, one a track of the block; empty without a network.
+    pub network_weights: Vec<f64>,
+    pub prior_times: Vec<PriorTime>,
+}
+
+enum Search {
+    Affine(affine::Search),
+    Subspace(subspace::Search),
+}
+
+/// One prior's account: what it proposed, what that cost.
+struct Account {
+    prior: Prior,
+    seconds: f64,
+    /// Network iterations, or samples.
+    work: u32,
+    /// Every consensus better than the prior's last: seconds and work spent by then, and how good it was.
+    records: Vec<(f64, u32, usize, f64)>,
+}
+
+impl Account {
+    fn best_score(&self) -> f64 {
+        self.records.last().map_or(f64::INFINITY, |record| record.3)
+    }
+}
+
+/// Searches one block.
+pub struct Portfolio<'a> {
+    block: &'a CompleteBlock,
+    settings: &'a SolveSettings,
+    stop: &'a StopToken,
+    search: Search,
+    noise: f64,
+    /// Standard deviation of the image points, the yardstick of the false alarms.
+    spread: f64,
+    rng: ChaCha8Rng,
+    accounts: Vec<Account>,
+    best: Option<(Consensus, Prior)>,
+}
+
+impl<'a> Portfolio<'a> {
+    /// * `noise`: noise that growing starts from, normalised units; rather too high than too low
+    pub fn new(block: &'a CompleteBlock, settings: &'a SolveSettings, noise: f64, stop: &'a StopToken) -> Self {
+        let search = if block.has_depths() {
+            Search::Subspace(subspace::Search::new(block, noise, settings.use_daq))
+        } else {
+            Search::Affine(affine::Search::new(block))
+        };
+        let account = |prior| Account { prior, seconds: 0.0, work: 0, records: Vec::new() };
+        Self {
+            block,
+            settings,
+            stop,
+            search,
+            noise,
+            spread: spread(block),
+            rng: ChaCha8Rng::seed_from_u64(settings.seed),
+            accounts: Prior::ALL.into_iter().map(account).collect(),
+            best: None,
+        }
+    }
+
+    /// Runs the search; `scale_px` turns the network's focal length into pixels and `weights` maps the block's weights
+    /// to the caller's tracks.
+    ///
+    /// # Errors
+    /// The network's own, which are defects: a block has more columns than it asks for.
+    pub fn run(
+        mut self,
+        recorder: &mut Recorder,
+        scale_px: f64,
+        spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
+    ) -> Result<Found, crate::network::Error> {
+        let mut network = if self.settings.method.uses_network() {
+            let matrix = match &self.search {
+                Search::Subspace(search) => search.balanced().clone(),
+                Search::Affine(_) => balance(&self.block.measurement_matrix()),
+            };
+            Some(PriorNetwork::new(&matrix, &NetworkSettings::from(self.settings))?)
+        } else {
+            None
+        };
+        let rounds = match network {
+            Some(_) => self.settings.iterations.div_ceil(ITERATIONS_PER_ROUND),
+            None => ROUNDS_WITHOUT_NETWORK,
+        };
+        for round in 0..rounds {
+            if let Some(network) = &mut network {
+                self.optimise(network, recorder, scale_px, spread_weights)?;
+                self.propose(Prior::Network, &priors::from_network(network.weights()));
+            }
+            if round == 0 {
+                self.propose_geometric();
+            }
+            self.propose(Prior::Uniform, &vec![1.0; self.block.tracks()]);
+            self.stand(recorder);
+            recorder.tell(f64::from(round + 1) / f64::from(rounds));
+            let seen_enough = network
+                .as_ref()
+                .is_none_or(|network| network.iteration() >= LEAST_ITERATIONS.min(self.settings.iterations));
+            if (seen_enough && self.is_decisive()) || self.stop.is_stopped() {
+                break;
+            }
+        }
+        Ok(self.finish(network))
+    }
+
+    /// One round of the network.
+    fn optimise(
+        &mut self,
+        network: &mut PriorNetwork,
+        recorder: &mut Recorder,
+        scale_px: f64,
+        spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
+    ) -> Result<(), crate::network::Error> {
+        let begun = Instant::now();
+        let iterations = self.settings.iterations;
+        let goal = (network.iteration() + ITERATIONS_PER_ROUND).min(iterations);
+        while network.iteration() < goal && !self.stop.is_stopped() {
+            let step = network.step()?;
+            recorder.standing.iteration = step.iteration;
+            recorder.standing.losses = Some(step.losses);
+            if self.settings.use_daq {
+                recorder.standing.focal_px = Some(network.focal() * scale_px);
+            }
+            recorder.tell(f64::from(step.iteration) / f64::from(iterations));
+            let every = self.settings.weights_every;
+            if every > 0 && step.iteration.is_multiple_of(every) {
+                recorder.weights(&spread_weights(network.weights()));
+            }
+        }
+        let account = self.account(Prior::Network);
+        account.seconds += begun.elapsed().as_secs_f64();
+        account.work = network.iteration();
+        Ok(())
+    }
+
+    /// The priors that need no optimisation, once.
+    fn propose_geometric(&mut self) {
+        let begun = Instant::now();
+        let (irls, consistency) = match &self.search {
+            Search::Affine(search) => (priors::affine_irls(search.centred()), priors::consistency(search.centred(), 2)),
+            Search::Subspace(search) => {
+                let centred = centred_rows(search.balanced());
+                (priors::irls(search.balanced(), subspace::RANK), priors::consistency(&centred, 3))
+            }
+        };
+        let seconds = begun.elapsed().as_secs_f64();
+        if let Some(prior) = irls {
+            self.account(Prior::Irls).seconds += seconds;
+            self.propose_ranking(Prior::Irls, &prior);
+            self.propose(Prior::Irls, &prior);
+        }
+        self.propose(Prior::Consistency, &consistency);
+    }
+
+    /// Searches under a prior and grows what it found.
+    fn propose(&mut self, prior: Prior, weights: &[f64]) {
+        if self.stop.is_stopped() {
+            return;
+        }
+        let begun = Instant::now();
+        let sampler = Sampler::new(weights);
+        let uniform = prior == Prior::Uniform;
+        let samples = |(guided, free): (usize, usize)| if uniform { free } else { guided };
+        let (seeds, drawn) = match &self.search {
+            Search::Affine(search) => {
+                let mut shortlist = Shortlist::new(SHORTLIST);
+                let drawn = samples(AFFINE_SAMPLES);
+                search.run(&sampler, drawn, &mut self.rng, &mut shortlist, self.stop);
+                let seeds: Vec<Seed> =
+                    shortlist.into_entries().flat_map(|hypothesis| search.seeds(self.block, &hypothesis)).collect();
+                (seeds, drawn)
+            }
+            Search::Subspace(search) => {
+                let mut shortlist = Shortlist::new(SHORTLIST);
+                let drawn = samples(SUBSPACE_SAMPLES);
+                search.run(&sampler, drawn, &mut self.rng, &mut shortlist, self.stop);
+                (shortlist.into_entries().map(|hypothesis| search.seed(self.block, &hypothesis)).collect(), drawn)
+            }
+        };
+        let account = self.account(prior);
+        account.seconds += begun.elapsed().as_secs_f64();
+        if prior != Prior::Network {
+            account.work += drawn as u32;
+        }
+        self.verify(prior, seeds);
+    }
+
+    /// Grows a prior's own best-ranked tracks, without sampling.
+    fn propose_ranking(&mut self, prior: Prior, weights: &[f64]) {
+        if matches!(self.search, Search::Affine(_)) {
+            let costs: Vec<f64> = weights.iter().map(|weight| -weight).collect();
+            self.verify(prior, affine::seeds_from_ranking(self.block, &costs));
+        }
+    }
+
+    /// Grows seeds until one is decisive, and keeps account.
+    fn verify(&mut self, prior: Prior, seeds: Vec<Seed>) {
+        for seed in seeds {
+            let begun = Instant::now();
+            let grown = grow::grow(self.block, seed.cameras, seed.points, seed.support, self.noise, self.stop);
+            let account = self.account(prior);
+            account.seconds += begun.elapsed().as_secs_f64();
+            let Some(consensus) = grown else { continue };
+            if consensus.score < account.best_score() {
+                let record = (account.seconds, account.work, consensus.inlier_count(), consensus.score);
+                account.records.push(record);
+            }
+            let decisive = self.decides(&consensus);
+            self.offer(consensus, prior);
+            if decisive || self.stop.is_stopped() {
+                break;
+            }
+        }
+    }
+
+    /// A consensus displaces the best one when it is better by more than half a track: the prior that came first wins.
+    fn offer(&mut self, consensus: Consensus, prior: Prior) {
+        let margin = 0.5 / self.block.tracks().max(1) as f64;
+        if self.best.as_ref().is_none_or(|(best, _)| consensus.score < best.score - margin) {
+            self.best = Some((consensus, prior));
+        }
+    }
+
+    fn decides(&self, consensus: &Consensus) -> bool {
+        consensus.inlier_count() >= LEAST_INLIERS && consensus.ln_false_alarms(self.spread) < LN_DECISIVE
+    }
+
+    fn is_decisive(&self) -> bool {
+        self.best.as_ref().is_some_and(|(best, _)| self.decides(best))
+    }
+
+    /// Writes the best consensus into the progress.
+    fn stand(&self, recorder: &mut Recorder) {
+        if let Some((best, _)) = &self.best {
+            recorder.standing.inliers = best.inlier_count() as u32;
+            recorder.standing.best_score = Some(best.score);
+        }
+    }
+
+    fn account(&mut self, prior: Prior) -> &mut Account {
+        let place = Prior::ALL.iter().position(|&other| other == prior).unwrap_or(0);
+        &mut self.accounts[place]
+    }
+
+    fn finish(self, network: Option<PriorNetwork>) -> Found {
+        let Self { best, accounts, spread, .. } = self;
+        let accepted = best
+            .filter(|(best, _)| best.inlier_count() >= LEAST_INLIERS && best.ln_false_alarms(spread) < LN_ACCEPTABLE);
+        let with_network = network.is_some();
+        let prior_times = accounts
+            .into_iter()
+            .filter(|account| with_network || account.prior != Prior::Network)
+            .map(|account| prior_time(&account, accepted.as_ref().map(|(best, _)| best)))
+            .collect();
+        let (consensus, winning_prior) = accepted.unzip();
+        Found {
+            consensus,
+            winning_prior,
+            iterations: network.as_ref().map_or(0, PriorNetwork::iteration),
+            network_weights: network.map_or_else(Vec::new, |network| network.weights().to_vec()),
+            prior_times,
+        }
+    }
+}
+
+/// Share of the accepted consensus's inliers that counts as having found it.
+const SUFFICIENT_SHARE: f64 = 0.95;
+
+fn prior_time(account: &Account, accepted: Option<&Consensus>) -> PriorTime {
+    let sufficient = accepted.and_then(|accepted| {
+        let enough = SUFFICIENT_SHARE * accepted.inlier_count() as f64;
+        account.records.iter().find(|record| record.2 as f64 >= enough)
+    });
+    PriorTime {
+        prior: account.prior,
+        seconds: sufficient.map(|record| record.0),
+        iterations: sufficient.map_or(account.work, |record| record.1),
+    }
+}
+
+/// Root mean squared deviation of the image points from their view's mean, one coordinate, normalised units.
+pub fn spread(block: &CompleteBlock) -> f64 {
+    let mut squared = 0.0;
+    for view in 0..block.views() {
+        let count = block.tracks().max(1) as f64;
+        let mean = (0..block.tracks()).map(|track| block.point(view, track)).sum::<nalgebra::Vector2<f64>>() / count;
+        let deviation: f64 = (0..block.tracks()).map(|track| (block.point(view, track) - mean).norm_squared()).sum();
+        squared += deviation / (2.0 * count);
+    }
+    (squared / block.views().max(1) as f64).sqrt().max(f64::MIN_POSITIVE)
+}
+
+/// Every row centred on its median.
+fn centred_rows(matrix: &nalgebra::DMatrix<f64>) -> nalgebra::DMatrix<f64> {
+    let mut centred = matrix.clone();
+    for mut row in centred.row_iter_mut() {
+        let mut values: Vec<f64> = row.iter().copied().collect();
+        let middle = crate::geometry::statistics::median(&mut values);
+        row.add_scalar_mut(-middle);
+    }
+    centred
+}

@@ -1,0 +1,159 @@
+//! Geometric priors: which tracks look right before any hypothesis stands.
+//!
+//! A prior is a non-negative weight per track, larger where the track is more likely right; only ratios matter.
+
+use nalgebra::DMatrix;
+
+use crate::geometry::factorization::{dominant_subspace, subspace_residuals};
+use crate::geometry::statistics::median;
+
+/// Power that turns the consistency of a track into a sampling weight.
+const CONSISTENCY_POWER: i32 = 4;
+/// Least weight, so that no track is excluded by a prior alone.
+const LEAST_WEIGHT: f64 = 1e-6;
+
+/// Consistency of the tracks' motion: `|mean_i z_ij|^2 / mean_i |z_ij|^2`, to the fourth power, with z the blocks of
+/// `rows_per_view` coordinates of a matrix whose views are centred.
+///
+/// 1 for a track at the same centred place in all views, about 1/n for one that jumps. Good for small rotations only:
+/// in an orbit right tracks wander too.
+pub fn consistency(centred: &DMatrix<f64>, rows_per_view: usize) -> Vec<f64> {
+    let views = centred.nrows() / rows_per_view;
+    centred
+        .column_iter()
+        .map(|column| {
+            let mean_squared: f64 = (0..rows_per_view)
+                .map(|row| {
+                    let mean = (0..views).map(|view| column[rows_per_view * view + row]).sum::<f64>() / views as f64;
+                    mean * mean
+                })
+                .sum();
+            let energy = column.norm_squared() / views as f64;
+            let share = if energy > f64::MIN_POSITIVE { mean_squared / energy } else { 0.0 };
+            share.powi(CONSISTENCY_POWER) + LEAST_WEIGHT
+        })
+        .collect()
+}
+
+/// Rounds of reweighting.
+const IRLS_ROUNDS: usize = 60;
+/// Floor of the residual scale at the start and at the end of the annealing (sines of angles).
+const IRLS_FLOORS: (f64, f64) = (0.3, 1e-3);
+/// Share of the rounds over which the floor is lowered.
+const IRLS_ANNEALING: f64 = 0.7;
+
+/// Iteratively reweighted least squares on the dominant subspace, least sum of unsquared residuals
+/// (Lerman & Maunu 2018, fast median subspace), with annealed floor: weights `1 / max(r, floor)`.
+///
+/// * `matrix`: d x m, columns of comparable norm
+/// * `rank`: dimension of the subspace
+///
+/// Returns the inverse squared residuals under the last subspace; `None` when a decomposition fails.
+pub fn irls(matrix: &DMatrix<f64>, rank: usize) -> Option<Vec<f64>> {
+    let mut weights = vec![1.0f64; matrix.ncols()];
+    let mut residuals = vec![1.0; matrix.ncols()];
+    for round in 0..IRLS_ROUNDS {
+        let mut weighted = matrix.clone();
+        for (mut column, weight) in weighted.column_iter_mut().zip(&weights) {
+            column *= weight.sqrt();
+        }
+        let basis = dominant_subspace(&weighted, rank)?;
+        residuals = subspace_residuals(matrix, &basis);
+        let annealed = round as f64 / (IRLS_ROUNDS as f64 * IRLS_ANNEALING);
+        let floor = (IRLS_FLOORS.0 * (IRLS_FLOORS.1 / IRLS_FLOORS.0).powf(annealed)).max(IRLS_FLOORS.1);
+        for (weight, residual) in weights.iter_mut().zip(&residuals) {
+            *weight = 1.0 / residual.max(floor);
+        }
+    }
+    Some(residuals.iter().map(|residual| 1.0 / residual.max(IRLS_FLOORS.1).powi(2)).collect())
+}
+
+/// Shrinking of the residual scale a round, and its floor, in units of a view's spread.
+const AFFINE_SHRINK: f64 = 0.88;
+const AFFINE_FLOOR: f64 = 0.08;
+
+/// The same idea for image points without depths: a rank-3 affine subspace of the centred coordinates (2n x m) under
+/// graduated Geman-McClure weights. The floor is wide: perspective makes right tracks deviate from affine.
+///
+/// Returns the weights of the last round; `None` when a decomposition fails.
+pub fn affine_irls(centred: &DMatrix<f64>) -> Option<Vec<f64>> {
+    let count = centred.ncols();
+    let mut weights = vec![1.0f64; count];
+    let mut scale = None;
+    for _ in 0..IRLS_ROUNDS {
+        let total: f64 = weights.iter().sum();
+        let mut mean = centred.column(0) * 0.0;
+        for (column, weight) in centred.column_iter().zip(&weights) {
+            mean += column * (weight / total);
+        }
+        let mut offset = centred.clone();
+        let mut weighted = centred.clone();
+        for j in 0..count {
+            let mut column = offset.column_mut(j);
+            column -= &mean;
+            weighted.set_column(j, &(&column * weights[j].sqrt()));
+        }
+        let basis = dominant_subspace(&weighted, 3)?;
+        let inside = basis.tr_mul(&offset);
+        let rows = centred.nrows() as f64;
+        let squared: Vec<f64> = offset
+            .column_iter()
+            .zip(inside.column_iter())
+            .map(|(column, inside)| (column.norm_squared() - inside.norm_squared()).max(0.0) / rows)
+            .collect();
+        let next: f64 = match scale {
+            None => median(&mut squared.clone()),
+            Some(scale) => AFFINE_FLOOR.powi(2).max(AFFINE_SHRINK * scale),
+        };
+        let next = next.max(f64::MIN_POSITIVE);
+        scale = Some(next);
+        for (weight, squared) in weights.iter_mut().zip(&squared) {
+            *weight = (next / (next + squared)).powi(2);
+        }
+    }
+    Some(weights.into_iter().map(|weight| weight + LEAST_WEIGHT).collect())
+}
+
+/// Floor of the network's weight as a prior: a track the network has given up is still drawn now and then.
+const NETWORK_FLOOR: f64 = 1e-3;
+
+/// The network's weights as a prior, `max(w, 1e-3)^2`.
+pub fn from_network(weights: &[f64]) -> Vec<f64> {
+    weights.iter().map(|weight| weight.max(NETWORK_FLOOR).powi(2)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 12 columns in a 3-dimensional subspace, 12 anywhere.
+    fn half_and_half() -> DMatrix<f64> {
+        let basis = DMatrix::from_fn(20, 3, |i, k| ((i * 5 + k * 11) as f64).sin());
+        let inside = &basis * DMatrix::from_fn(3, 12, |k, j| ((k + 2) as f64 * (j as f64 + 0.3)).cos());
+        let mut matrix = DMatrix::from_fn(20, 24, |i, j| ((i * 37 + j * 101) as f64).sin() * 1.5);
+        matrix.columns_mut(0, 12).copy_from(&inside);
+        matrix
+    }
+
+    fn separates(prior: &[f64]) {
+        let least_right = prior[..12].iter().copied().fold(f64::INFINITY, f64::min);
+        let most_wrong = prior[12..].iter().copied().fold(0.0, f64::max);
+        assert!(least_right > most_wrong, "{prior:?}");
+    }
+
+    #[test]
+    fn reweighting_separates_a_subspace_from_clutter() {
+        separates(&irls(&half_and_half(), 3).expect("finite"));
+        separates(&affine_irls(&half_and_half()).expect("finite"));
+    }
+
+    #[test]
+    fn a_track_that_stays_is_consistent_and_one_that_jumps_is_not() {
+        let matrix = DMatrix::from_columns(&[
+            nalgebra::DVector::from_vec(vec![1.0, 0.5, 1.0, 0.5, 1.0, 0.5]),
+            nalgebra::DVector::from_vec(vec![1.0, 0.0, -0.5, 0.9, -0.5, -0.9]),
+        ]);
+        let prior = consistency(&matrix, 2);
+        assert!(prior[0] > 0.99 && prior[1] < 0.01, "{prior:?}");
+    }
+}

@@ -1,0 +1,145 @@
+//! Guided search without depths: four tracks span an affine model of all others.
+//!
+//! Perspective makes right tracks deviate from affine by some tenths of a view's spread, hence the loose tolerance:
+//! the winner is no reconstruction, but its best-ranked tracks are right often enough to grow one from.
+
+use nalgebra::DMatrix;
+use rand_chacha::ChaCha8Rng;
+
+use super::{Sampler, Seed, Shortlist};
+use crate::domain::StopToken;
+use crate::geometry::factorization;
+use crate::geometry::measurement::CompleteBlock;
+
+/// Tolerance of the truncated score in units of a view's spread (1.5 median absolute deviations).
+const TOLERANCE: f64 = 0.2;
+/// Sizes of the supports that a hypothesis is factorised from. Eight keeps out the wrong tracks, twelve conditions
+/// the factorisation: each wins on some scenes.
+const SUPPORT_SIZES: [usize; 2] = [8, 12];
+/// Samples between two looks at the stop token; they take about a millisecond at 10 views and 200 tracks.
+const SAMPLES_PER_LOOK: usize = 256;
+/// Shortest direction that still spans, in units of a view's spread.
+const LEAST_DIRECTION: f64 = 1e-6;
+
+/// A minimal sample: the origin and an orthonormal basis of the three directions to the others.
+#[derive(Debug, Clone)]
+pub struct Hypothesis {
+    origin: usize,
+    basis: [Vec<f64>; 3],
+}
+
+/// The centred coordinates of a block, ready to be searched.
+#[derive(Debug, Clone)]
+pub struct Search {
+    /// 2n x m; columns are contiguous.
+    centred: DMatrix<f64>,
+}
+
+impl Search {
+    pub fn new(block: &CompleteBlock) -> Self {
+        Self { centred: block.centred_by_view() }
+    }
+
+    /// The centred coordinates, 2n x m, in units of each view's spread.
+    pub fn centred(&self) -> &DMatrix<f64> {
+        &self.centred
+    }
+
+    /// Draws `samples` samples and offers them to the shortlist.
+    pub fn run(
+        &self,
+        sampler: &Sampler,
+        samples: usize,
+        rng: &mut ChaCha8Rng,
+        shortlist: &mut Shortlist<Hypothesis>,
+        stop: &StopToken,
+    ) {
+        for k in 0..samples {
+            if k.is_multiple_of(SAMPLES_PER_LOOK) && stop.is_stopped() {
+                return;
+            }
+            let Some(hypothesis) = sampler.draw(rng).and_then(|sample| self.span(sample)) else { continue };
+            let cost = self.cost(&hypothesis, shortlist.bound());
+            shortlist.offer(cost, hypothesis);
+        }
+    }
+
+    /// Gram-Schmidt on the directions from the first track to the three others.
+    fn span(&self, sample: [usize; 4]) -> Option<Hypothesis> {
+        let origin = self.centred.column(sample[0]);
+        let mut basis: [Vec<f64>; 3] = Default::default();
+        for k in 0..3 {
+            let mut direction: Vec<f64> =
+                self.centred.column(sample[k + 1]).iter().zip(origin.iter()).map(|(a, b)| a - b).collect();
+            for earlier in &basis[..k] {
+                let along = dot(&direction, earlier);
+                for (entry, unit) in direction.iter_mut().zip(earlier) {
+                    *entry -= along * unit;
+                }
+            }
+            let norm = dot(&direction, &direction).sqrt();
+            if norm < LEAST_DIRECTION {
+                return None;
+            }
+            direction.iter_mut().for_each(|entry| *entry /= norm);
+            basis[k] = direction;
+        }
+        Some(Hypothesis { origin: sample[0], basis })
+    }
+
+    /// Truncated cost over all tracks; gives up above `bound`.
+    fn cost(&self, hypothesis: &Hypothesis, bound: f64) -> f64 {
+        let truncation = TOLERANCE * TOLERANCE * self.centred.nrows() as f64;
+        let mut cost = 0.0;
+        for track in 0..self.centred.ncols() {
+            cost += (self.squared(hypothesis, track) / truncation).min(1.0);
+            if cost >= bound {
+                break;
+            }
+        }
+        cost
+    }
+
+    /// Squared distance of a track from the model.
+    fn squared(&self, hypothesis: &Hypothesis, track: usize) -> f64 {
+        let rows = self.centred.nrows();
+        let column = &self.centred.as_slice()[track * rows..(track + 1) * rows];
+        let origin = &self.centred.as_slice()[hypothesis.origin * rows..(hypothesis.origin + 1) * rows];
+        let [first, second, third] = &hypothesis.basis;
+        let (mut energy, mut along) = (0.0, [0.0; 3]);
+        for row in 0..rows {
+            let offset = column[row] - origin[row];
+            energy += offset * offset;
+            along[0] += offset * first[row];
+            along[1] += offset * second[row];
+            along[2] += offset * third[row];
+        }
+        (energy - along.iter().map(|value| value * value).sum::<f64>()).max(0.0)
+    }
+
+    /// Affine factorisations of the hypothesis's best-ranked tracks.
+    pub fn seeds(&self, block: &CompleteBlock, hypothesis: &Hypothesis) -> Vec<Seed> {
+        let squared: Vec<f64> = (0..block.tracks()).map(|track| self.squared(hypothesis, track)).collect();
+        seeds_from_ranking(block, &squared)
+    }
+}
+
+/// Affine factorisations of the tracks of least cost, one for each support size.
+pub fn seeds_from_ranking(block: &CompleteBlock, costs: &[f64]) -> Vec<Seed> {
+    let mut ranked: Vec<usize> = (0..block.tracks()).collect();
+    ranked.sort_by(|&a, &b| costs[a].total_cmp(&costs[b]).then(a.cmp(&b)));
+    SUPPORT_SIZES
+        .iter()
+        .filter(|&&size| size <= ranked.len())
+        .filter_map(|&size| {
+            let mut support = ranked[..size].to_vec();
+            support.sort_unstable();
+            let (cameras, points) = factorization::affine(block, &support)?;
+            Some(Seed { cameras, points, support })
+        })
+        .collect()
+}
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}

@@ -1,0 +1,147 @@
+//! Guided search with depths: four columns of the balanced measurement matrix span the column space.
+
+use nalgebra::DMatrix;
+use rand_chacha::ChaCha8Rng;
+
+use super::{Sampler, Seed, Shortlist};
+use crate::domain::StopToken;
+use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_residuals};
+use crate::geometry::measurement::{CompleteBlock, balance};
+use crate::geometry::{daq, triangulation};
+
+/// Dimension of the column space of a measurement matrix with right depths.
+pub const RANK: usize = 4;
+/// Tolerance of the residual (sine of the angle to the subspace) in units of the noise, from the ratio of residual to
+/// noise of right columns with a margin of two.
+const TOLERANCE_PER_NOISE: f64 = 4.0;
+/// Bounds of that tolerance: below, numerics; above, everything is close to a 4-dimensional subspace.
+const TOLERANCE_BOUNDS: (f64, f64) = (1e-4, 0.25);
+/// Tolerances of the local optimisation, in units of the final one.
+const LOCAL_TOLERANCES: [f64; 3] = [2.0, 1.5, 1.0];
+/// Refits at each of these tolerances.
+const LOCAL_ROUNDS: usize = 4;
+/// Columns that the subspace is refitted to at least: one more than it needs.
+const LEAST_COLUMNS: usize = RANK + 1;
+/// Weight of the DAQ residual in a hypothesis's cost, in columns. The residual, not the count, tells a right set of
+/// four from a chance one: mean F1 .68 -> .975 at 98 % outliers.
+const DAQ_WEIGHT: f64 = 20.0;
+/// Samples between two looks at the stop token.
+const SAMPLES_PER_LOOK: usize = 64;
+
+/// A column space with its cost.
+#[derive(Debug, Clone)]
+pub struct Hypothesis {
+    basis: DMatrix<f64>,
+}
+
+/// The balanced measurement matrix of a block with depths, ready to be searched.
+#[derive(Debug, Clone)]
+pub struct Search {
+    balanced: DMatrix<f64>,
+    tolerance: f64,
+    use_daq: bool,
+}
+
+impl Search {
+    /// * `noise`: standard deviation of the image points in normalised units; depths are taken to be as good
+    pub fn new(block: &CompleteBlock, noise: f64, use_daq: bool) -> Self {
+        let tolerance = (TOLERANCE_PER_NOISE * noise).clamp(TOLERANCE_BOUNDS.0, TOLERANCE_BOUNDS.1);
+        Self { balanced: balance(&block.measurement_matrix()), tolerance, use_daq }
+    }
+
+    /// The balanced measurement matrix, 3n x m.
+    pub fn balanced(&self) -> &DMatrix<f64> {
+        &self.balanced
+    }
+
+    /// Draws `samples` samples; those that could enter the shortlist are optimised locally first.
+    pub fn run(
+        &self,
+        sampler: &Sampler,
+        samples: usize,
+        rng: &mut ChaCha8Rng,
+        shortlist: &mut Shortlist<Hypothesis>,
+        stop: &StopToken,
+    ) {
+        let mut best = f64::INFINITY;
+        for k in 0..samples {
+            if k.is_multiple_of(SAMPLES_PER_LOOK) && stop.is_stopped() {
+                return;
+            }
+            let Some(sample) = sampler.draw(rng) else { continue };
+            let columns = self.balanced.select_columns(&sample);
+            let basis = columns.qr().q();
+            if basis.ncols() < RANK {
+                continue;
+            }
+            let cost = self.truncated_cost(&basis);
+            // Only a sample that beats the best one so far is worth a local optimisation.
+            if cost < best {
+                best = cost;
+                let hypothesis = Hypothesis { basis: self.optimise_locally(basis) };
+                shortlist.offer(self.cost(&hypothesis), hypothesis);
+            }
+        }
+    }
+
+    fn truncated_cost(&self, basis: &DMatrix<f64>) -> f64 {
+        let truncation = self.tolerance * self.tolerance;
+        subspace_residuals(&self.balanced, basis)
+            .iter()
+            .map(|residual| (residual * residual / truncation).min(1.0))
+            .sum()
+    }
+
+    /// Truncated cost plus the weighted DAQ residual of the cameras in the subspace.
+    fn cost(&self, hypothesis: &Hypothesis) -> f64 {
+        let penalty =
+            if self.use_daq { DAQ_WEIGHT * daq::hypothesis_residual(&cameras_of(&hypothesis.basis)) } else { 0.0 };
+        self.truncated_cost(&hypothesis.basis) + penalty
+    }
+
+    /// Refits the subspace to the columns within a shrinking tolerance.
+    fn optimise_locally(&self, basis: DMatrix<f64>) -> DMatrix<f64> {
+        let (mut best, mut best_cost) = (basis.clone(), self.truncated_cost(&basis));
+        let mut current = basis;
+        for tolerance in LOCAL_TOLERANCES {
+            let mut kept: Vec<usize> = Vec::new();
+            for _ in 0..LOCAL_ROUNDS {
+                let residuals = subspace_residuals(&self.balanced, &current);
+                let near = nearest(&residuals, tolerance * self.tolerance);
+                if near == kept {
+                    break;
+                }
+                let Some(refitted) = dominant_subspace(&self.balanced.select_columns(&near), RANK) else { break };
+                (current, kept) = (refitted, near);
+                let cost = self.truncated_cost(&current);
+                if cost < best_cost {
+                    (best, best_cost) = (current.clone(), cost);
+                }
+            }
+        }
+        best
+    }
+
+    /// The seed of a hypothesis: the cameras in its basis, the columns within the tolerance.
+    pub fn seed(&self, block: &CompleteBlock, hypothesis: &Hypothesis) -> Seed {
+        self.seed_from_basis(block, &hypothesis.basis)
+    }
+
+    /// The seed of a column space given by an orthonormal basis (3n x 4).
+    pub fn seed_from_basis(&self, block: &CompleteBlock, basis: &DMatrix<f64>) -> Seed {
+        let support = nearest(&subspace_residuals(&self.balanced, basis), self.tolerance);
+        let cameras = cameras_of(basis);
+        let points = support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();
+        Seed { cameras, points, support }
+    }
+}
+
+/// Columns whose residual is below the tolerance, at least [`LEAST_COLUMNS`] of them, increasing.
+fn nearest(residuals: &[f64], tolerance: f64) -> Vec<usize> {
+    let mut ranked: Vec<usize> = (0..residuals.len()).collect();
+    ranked.sort_by(|&a, &b| residuals[a].total_cmp(&residuals[b]).then(a.cmp(&b)));
+    let within = ranked.iter().take_while(|&&track| residuals[track] < tolerance).count();
+    ranked.truncate(within.max(LEAST_COLUMNS.min(residuals.len())));
+    ranked.sort_unstable();
+    ranked
+}

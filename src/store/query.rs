@@ -1,0 +1,132 @@
+//! Listing jobs: the query, the page, and the token that leads to the next one.
+
+use std::collections::BTreeMap;
+
+use sha2::{Digest, Sha256};
+
+use super::Error;
+use crate::domain::job::{DEFAULT_TENANT, Job, JobState};
+
+/// Order of a listing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Order {
+    /// Newest first.
+    #[default]
+    CreateTimeDescending,
+    /// Oldest first.
+    CreateTimeAscending,
+}
+
+/// Which jobs of a tenant to list.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct JobQuery {
+    pub tenant: String,
+    /// Empty: every state.
+    pub states: Vec<JobState>,
+    /// All of them must be on the job.
+    pub labels: BTreeMap<String, String>,
+    pub order: Order,
+    /// 0: [`JobQuery::DEFAULT_PAGE_SIZE`]; above [`JobQuery::MAX_PAGE_SIZE`]: that (AIP-158).
+    pub page_size: u32,
+    /// `None` or empty: the first page.
+    pub page_token: Option<String>,
+}
+
+impl JobQuery {
+    /// A screen of jobs.
+    pub const DEFAULT_PAGE_SIZE: u32 = 50;
+    /// Keeps an answer well under the message limit.
+    pub const MAX_PAGE_SIZE: u32 = 1000;
+
+    /// The page size in force.
+    pub fn effective_page_size(&self) -> u32 {
+        match self.page_size {
+            0 => Self::DEFAULT_PAGE_SIZE,
+            size => size.min(Self::MAX_PAGE_SIZE),
+        }
+    }
+
+    /// Where the page begins; `None`: at the first job.
+    ///
+    /// # Errors
+    /// [`Error::PageToken`] for a token that was not made for this query (AIP-158: only the page size may change).
+    pub(super) fn cursor(&self) -> Result<Option<Cursor>, Error> {
+        match self.page_token.as_deref() {
+            None | Some("") => Ok(None),
+            Some(token) => Cursor::parse(token, self.digest()).map(Some).ok_or(Error::PageToken),
+        }
+    }
+
+    /// The token of the page that begins after `cursor`.
+    pub(super) fn token_after(&self, cursor: Cursor) -> String {
+        format!("{:016x}-{:x}-{:x}", self.digest(), cursor.create_micros, cursor.id)
+    }
+
+    /// Ties a token to its query; a slip is to be caught, nothing is to be kept secret, so 64 bits do.
+    fn digest(&self) -> u64 {
+        let mut hash = Sha256::new();
+        hash.update(format!("{:?}", (&self.tenant, &self.states, &self.labels, self.order)));
+        let digest = hash.finalize();
+        digest.iter().take(8).fold(0, |value, &byte| value << 8 | u64::from(byte))
+    }
+}
+
+impl Default for JobQuery {
+    fn default() -> Self {
+        Self {
+            tenant: DEFAULT_TENANT.into(),
+            states: Vec::new(),
+            labels: BTreeMap::new(),
+            order: Order::default(),
+            page_size: 0,
+            page_token: None,
+        }
+    }
+}
+
+/// One page of a listing.
+#[derive(Debug, Clone, PartialEq)]
+pub struct JobPage {
+    pub jobs: Vec<Job>,
+    /// `None` on the last page.
+    pub next_page_token: Option<String>,
+}
+
+/// The last job of a page; jobs of one microsecond are told apart by their row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Cursor {
+    pub create_micros: i64,
+    pub id: i64,
+}
+
+impl Cursor {
+    fn parse(token: &str, digest: u64) -> Option<Self> {
+        let rest = token.strip_prefix(&format!("{digest:016x}-"))?;
+        let mut parts = rest.split('-');
+        let mut number = || i64::from_str_radix(parts.next()?, 16).ok();
+        let cursor = Self { create_micros: number()?, id: number()? };
+        parts.next().is_none().then_some(cursor)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Cursor, JobQuery, Order};
+    use crate::store::Error;
+
+    #[test]
+    fn a_token_leads_back_into_its_own_query_only() {
+        let mut query = JobQuery::default();
+        let cursor = Cursor { create_micros: 1_700_000_000_000_001, id: 17 };
+        query.page_token = Some(query.token_after(cursor));
+        assert_eq!(query.cursor(), Ok(Some(cursor)));
+        query.page_size = 7;
+        assert_eq!(query.cursor(), Ok(Some(cursor)), "the page size may change between pages");
+        query.order = Order::CreateTimeAscending;
+        assert_eq!(query.cursor(), Err(Error::PageToken));
+        for bad in ["x", "-", "0-0-0", "0000000000000000-1-1"] {
+            query.page_token = Some(bad.into());
+            assert_eq!(query.cursor(), Err(Error::PageToken), "{bad}");
+        }
+    }
+}

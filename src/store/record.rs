@@ -1,0 +1,176 @@
+//! What goes into the store and what workers get from it.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::time::SystemTime;
+
+use crate::domain::SolveSettings;
+use crate::domain::job::{Failure, Job, JobName, Summary};
+use crate::domain::progress::Progress;
+
+/// A job to be stored.
+#[derive(Debug, Clone)]
+pub struct NewRecord {
+    pub name: JobName,
+    pub request: Option<Request>,
+    /// Encoded [`crate::domain::Input`], see [`super::payload`].
+    pub input: Vec<u8>,
+    pub view_count: u32,
+    pub track_count: u32,
+    pub observation_count: u32,
+    pub settings: SolveSettings,
+    pub deadline: Option<SystemTime>,
+    pub priority: i32,
+    pub labels: BTreeMap<String, String>,
+    /// W3C `traceparent` of the call that created the job, so that its trace goes on after a restart.
+    pub trace_parent: Option<String>,
+}
+
+/// A request id of the job's tenant, with the digest of the body that it stands for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Request {
+    pub id: String,
+    /// SHA-256.
+    pub digest: [u8; 32],
+}
+
+/// What a creation came to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Created {
+    pub job: Job,
+    /// `false`: an earlier call with the same request id had made it.
+    pub new: bool,
+}
+
+/// How much may wait at once.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct QueueBounds {
+    pub max_jobs: u64,
+    /// Encoded inputs.
+    pub max_bytes: u64,
+    pub max_observations: u64,
+}
+
+impl QueueBounds {
+    /// The first bound that one more job would break.
+    pub fn refuses(&self, load: &Load, bytes: u64, observations: u64) -> Option<Bound> {
+        if load.queued >= self.max_jobs {
+            return Some(Bound::Jobs { waiting: load.queued, max: self.max_jobs });
+        }
+        // A job alone in the queue always fits: what is too large for an empty queue is refused by the limits on inputs.
+        if load.queued == 0 {
+            None
+        } else if load.queued_bytes.saturating_add(bytes) > self.max_bytes {
+            Some(Bound::Bytes { waiting: load.queued_bytes, max: self.max_bytes })
+        } else if load.queued_observations.saturating_add(observations) > self.max_observations {
+            Some(Bound::Observations { waiting: load.queued_observations, max: self.max_observations })
+        } else {
+            None
+        }
+    }
+}
+
+/// The bound of the queue that refused a job.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Bound {
+    Jobs { waiting: u64, max: u64 },
+    Bytes { waiting: u64, max: u64 },
+    Observations { waiting: u64, max: u64 },
+}
+
+impl Bound {
+    /// The bound's name in metrics and error details.
+    pub fn name(self) -> &'static str {
+        match self {
+            Bound::Jobs { .. } => "queue_jobs",
+            Bound::Bytes { .. } => "queue_bytes",
+            Bound::Observations { .. } => "queue_observations",
+        }
+    }
+}
+
+impl fmt::Display for Bound {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Bound::Jobs { waiting, max } => write!(f, "the queue is full: {waiting} of at most {max} jobs wait"),
+            Bound::Bytes { waiting, max } => {
+                write!(f, "the queue is full: {waiting} of at most {max} bytes of input wait")
+            }
+            Bound::Observations { waiting, max } => {
+                write!(f, "the queue is full: {waiting} of at most {max} observations wait")
+            }
+        }
+    }
+}
+
+/// What waits and what runs.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Load {
+    pub queued: u64,
+    pub queued_bytes: u64,
+    pub queued_observations: u64,
+    pub running: u64,
+}
+
+/// The right to write to a running job. `attempt` is the fencing token: a later lease has a larger one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Lease {
+    pub name: JobName,
+    pub attempt: u32,
+}
+
+/// A job in a worker's hands.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Claimed {
+    pub job: Job,
+    pub lease: Lease,
+    pub trace_parent: Option<String>,
+    /// When the job last entered the queue.
+    pub queue_time: SystemTime,
+}
+
+/// What a heartbeat brings back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Heartbeat {
+    pub cancel_requested: bool,
+    pub deadline: Option<SystemTime>,
+}
+
+/// The end of an attempt and of its job.
+#[derive(Debug, Clone)]
+pub struct Ending {
+    pub outcome: Outcome,
+    /// The last progress, where it is newer than what was recorded; it goes into the job, not among the events.
+    pub progress: Option<Progress>,
+}
+
+/// How a job ended.
+#[derive(Debug, Clone)]
+pub enum Outcome {
+    /// With its encoded result.
+    Succeeded {
+        summary: Summary,
+        result: Vec<u8>,
+    },
+    Failed(Failure),
+    Cancelled,
+    Expired,
+}
+
+/// What asking for a cancel came to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CancelReply {
+    /// The job as it stands now.
+    pub job: Job,
+    /// Whether this call ended it.
+    pub ended_now: bool,
+}
+
+/// What a sweep changed; the jobs as they stand now.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Swept {
+    /// Their leases had run out: queued again, or ended.
+    pub lost: Vec<Job>,
+    /// They had waited past their deadline.
+    pub expired: Vec<Job>,
+}

@@ -1,0 +1,84 @@
+//! SQLite under the store's contract, and what is its own: the lock on the directory and its file.
+
+use tempfile::TempDir;
+
+use super::*;
+use crate::domain::job::JobState;
+use crate::store::contract;
+
+/// A store in a directory that lives as long as the test.
+struct Fixture {
+    store: Sqlite,
+    _directory: TempDir,
+}
+
+impl Fixture {
+    async fn open() -> Self {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        Self { store: Sqlite::open(directory.path()).await.expect("opens"), _directory: directory }
+    }
+}
+
+impl std::ops::Deref for Fixture {
+    type Target = Sqlite;
+
+    fn deref(&self) -> &Sqlite {
+        &self.store
+    }
+}
+
+contract::store_contract!(Fixture::open);
+
+#[tokio::test]
+async fn a_second_server_on_the_directory_is_refused_until_the_first_is_gone() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let first = Sqlite::open(directory.path()).await.expect("opens");
+    let error = Sqlite::open(directory.path()).await.expect_err("is held");
+    assert_eq!(error, Error::InUse(directory.path().to_path_buf()));
+    assert!(error.to_string().contains("in use by another server"), "{error}");
+    drop(first);
+    Sqlite::open(directory.path()).await.expect("the first let go");
+}
+
+#[tokio::test]
+async fn everything_is_there_after_a_reopen_and_every_lease_is_a_dead_one() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let now = contract::time(1);
+    let store = Sqlite::open(directory.path()).await.expect("opens");
+    store.create_job(contract::record("a"), &contract::ROOM, now).await.expect("created");
+    let claimed = store.claim("w", now, Duration::from_secs(3600)).await.expect("claims").expect("a job");
+    let events = store.events_after(&claimed.job.name, 0, 10).await.expect("events");
+    drop(store);
+
+    let store = Sqlite::open(directory.path()).await.expect("opens again");
+    assert_eq!(store.job(&claimed.job.name).await.expect("kept"), claimed.job);
+    assert_eq!(store.events_after(&claimed.job.name, 0, 10).await.expect("kept"), events);
+    let recovered = store.recover(now, 3).await.expect("recovers");
+    assert_eq!(recovered.len(), 1, "though the lease has an hour to go");
+    assert_eq!(recovered[0].state, JobState::Queued);
+}
+
+#[tokio::test]
+async fn a_database_of_a_newer_version_is_refused() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let store = Sqlite::open(directory.path()).await.expect("opens");
+    sqlx::query(
+        "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time) \
+         VALUES (9999, 'from the future', 1, x'00', 0)",
+    )
+    .execute(&store.writer)
+    .await
+    .expect("written");
+    store.close().await;
+    drop(store);
+    let error = Sqlite::open(directory.path()).await.expect_err("is newer");
+    assert!(matches!(error, Error::Corrupt(_)), "{error}");
+}
+
+#[tokio::test]
+async fn commits_are_synced_and_the_log_is_written_ahead() {
+    let fixture = Fixture::open().await;
+    let journal: String = sqlx::query_scalar("PRAGMA journal_mode").fetch_one(&fixture.writer).await.expect("reads");
+    let synchronous: i64 = sqlx::query_scalar("PRAGMA synchronous").fetch_one(&fixture.writer).await.expect("reads");
+    assert_eq!((journal.as_str(), synchronous), ("wal", 2));
+}

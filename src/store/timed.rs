@@ -1,0 +1,98 @@
+//! A store that tells the metrics how long each of its operations took, whatever implements it.
+
+use std::time::{Duration, SystemTime};
+
+use super::{
+    CancelReply, Claimed, Created, Ending, Error, Heartbeat, JobPage, JobQuery, Lease, Load, NewRecord, QueueBounds,
+    Store, Swept,
+};
+use crate::domain::job::{Job, JobEvent, JobName};
+use crate::domain::progress::Progress;
+use crate::telemetry::metrics::store_operation;
+
+/// Times every operation of the store inside. Failed operations count too: a slow failure is still slow.
+#[derive(Debug)]
+pub struct Timed<S>(pub S);
+
+#[async_trait::async_trait]
+impl<S: Store> Store for Timed<S> {
+    async fn create_job(&self, new: NewRecord, bounds: &QueueBounds, now: SystemTime) -> Result<Created, Error> {
+        let _timer = store_operation("create_job");
+        self.0.create_job(new, bounds, now).await
+    }
+
+    async fn job(&self, name: &JobName) -> Result<Job, Error> {
+        let _timer = store_operation("job");
+        self.0.job(name).await
+    }
+
+    async fn jobs(&self, query: &JobQuery) -> Result<JobPage, Error> {
+        let _timer = store_operation("jobs");
+        self.0.jobs(query).await
+    }
+
+    async fn events_after(&self, name: &JobName, after: u64, limit: u32) -> Result<Vec<JobEvent>, Error> {
+        let _timer = store_operation("events_after");
+        self.0.events_after(name, after, limit).await
+    }
+
+    async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error> {
+        let _timer = store_operation("claim");
+        self.0.claim(worker, now, lease_for).await
+    }
+
+    async fn input(&self, name: &JobName) -> Result<Vec<u8>, Error> {
+        let _timer = store_operation("input");
+        self.0.input(name).await
+    }
+
+    async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
+        let _timer = store_operation("heartbeat");
+        self.0.heartbeat(lease, now, lease_for).await
+    }
+
+    async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error> {
+        let _timer = store_operation("record");
+        self.0.record(lease, progress, now).await
+    }
+
+    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error> {
+        let _timer = store_operation("finish");
+        self.0.finish(lease, ending, now).await
+    }
+
+    async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
+        let _timer = store_operation("release");
+        self.0.release(lease, now).await
+    }
+
+    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error> {
+        let _timer = store_operation("request_cancel");
+        self.0.request_cancel(name, now).await
+    }
+
+    async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {
+        let _timer = store_operation("recover");
+        self.0.recover(now, max_attempts).await
+    }
+
+    async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
+        let _timer = store_operation("sweep");
+        self.0.sweep(now, max_attempts).await
+    }
+
+    async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
+        let _timer = store_operation("result");
+        self.0.result(name).await
+    }
+
+    async fn load(&self) -> Result<Load, Error> {
+        let _timer = store_operation("load");
+        self.0.load().await
+    }
+
+    async fn close(&self) {
+        let _timer = store_operation("close");
+        self.0.close().await;
+    }
+}

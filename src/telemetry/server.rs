@@ -1,0 +1,155 @@
+//! The scrape port: `/metrics`, `/healthz` and `/readyz`, apart from the gRPC port so that neither needs the other's
+//! exposure.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use axum::Router;
+use axum::http::{StatusCode, header};
+use axum::response::IntoResponse;
+use axum::routing::get;
+use metrics_exporter_prometheus::PrometheusHandle;
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+/// Prometheus' text format, as its exposition documentation names it.
+const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
+
+/// Between two drains of the histograms' samples: often enough that a server nobody scrapes stays small.
+const UPKEEP_INTERVAL: Duration = Duration::from_secs(5);
+
+/// Whether the service takes work: false until it does, and again while it drains. Clones share one latch.
+#[derive(Debug, Clone, Default)]
+pub struct Readiness(Arc<AtomicBool>);
+
+impl Readiness {
+    /// Says whether the service takes work.
+    pub fn set(&self, ready: bool) {
+        self.0.store(ready, Ordering::Relaxed);
+    }
+
+    fn get(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// What the scrape port needs.
+pub struct Options {
+    /// Address to listen on; port 0 takes a free one.
+    pub listen: SocketAddr,
+    pub scrape: PrometheusHandle,
+    pub ready: Readiness,
+}
+
+/// The running scrape port.
+#[must_use = "the port closes when this is dropped"]
+pub struct Server {
+    address: SocketAddr,
+    stop: CancellationToken,
+    served: JoinHandle<()>,
+}
+
+/// Binds the port and serves it in the background.
+///
+/// # Errors
+/// When the address cannot be bound.
+pub async fn bind(options: Options) -> std::io::Result<Server> {
+    let listener = TcpListener::bind(options.listen).await?;
+    let address = listener.local_addr()?;
+    let stop = CancellationToken::new();
+    let router = router(options.scrape.clone(), options.ready);
+    let stopped = stop.clone();
+    let upkeep = stop.clone();
+    let served = tokio::spawn(async move {
+        let serve = axum::serve(listener, router).with_graceful_shutdown(stopped.cancelled_owned());
+        let ((), served) = tokio::join!(keep_up(options.scrape, upkeep), serve);
+        if let Err(error) = served {
+            tracing::error!(%error, "the scrape port failed");
+        }
+    });
+    Ok(Server { address, stop, served })
+}
+
+impl Server {
+    /// The bound address.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Closes the port after the scrapes under way.
+    pub async fn shutdown(mut self) {
+        self.stop.cancel();
+        if let Err(error) = (&mut self.served).await {
+            tracing::error!(%error, "the scrape port's task failed");
+        }
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.stop.cancel();
+    }
+}
+
+fn router(scrape: PrometheusHandle, ready: Readiness) -> Router {
+    Router::new()
+        .route("/metrics", get(move || async move { ([(header::CONTENT_TYPE, TEXT_FORMAT)], scrape.render()) }))
+        .route("/healthz", get(|| async { "ok\n" }))
+        .route(
+            "/readyz",
+            get(move || async move {
+                match ready.get() {
+                    true => (StatusCode::OK, "ready\n").into_response(),
+                    false => (StatusCode::SERVICE_UNAVAILABLE, "not ready\n").into_response(),
+                }
+            }),
+        )
+}
+
+async fn keep_up(scrape: PrometheusHandle, stop: CancellationToken) {
+    let mut ticks = tokio::time::interval(UPKEEP_INTERVAL);
+    while stop.run_until_cancelled(ticks.tick()).await.is_some() {
+        scrape.run_upkeep();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpStream;
+
+    use super::{Options, Readiness, bind};
+    use crate::telemetry::metrics;
+
+    async fn get(address: std::net::SocketAddr, path: &str) -> String {
+        let mut stream = TcpStream::connect(address).await.expect("connect");
+        let request = format!("GET {path} HTTP/1.1\r\nhost: test\r\nconnection: close\r\n\r\n");
+        stream.write_all(request.as_bytes()).await.expect("send");
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).await.expect("receive");
+        answer
+    }
+
+    #[tokio::test]
+    async fn the_port_serves_metrics_and_follows_the_latch_until_it_is_shut() {
+        let ready = Readiness::default();
+        let scrape = metrics::install().expect("recorder");
+        let listen = "127.0.0.1:0".parse().expect("address");
+        let server = bind(Options { listen, scrape, ready: ready.clone() }).await.expect("bind");
+        let address = server.address();
+
+        assert!(get(address, "/healthz").await.starts_with("HTTP/1.1 200"));
+        assert!(get(address, "/readyz").await.starts_with("HTTP/1.1 503"));
+        ready.set(true);
+        assert!(get(address, "/readyz").await.starts_with("HTTP/1.1 200"));
+        let page = get(address, "/metrics").await;
+        assert!(page.contains("content-type: text/plain; version=0.0.4"), "{page}");
+        assert!(page.contains("\nscpsfm_queue_depth "), "{page}");
+
+        server.shutdown().await;
+        assert!(TcpStream::connect(address).await.is_err(), "the port is closed");
+    }
+}

@@ -1,0 +1,212 @@
+//! Logs and traces: how they are written, and every span's name and fields.
+//!
+//! A job is one trace: `submit`, `queue`, `attempt` (one or several) and the attempt's stages, all under the trace
+//! context that the caller sent. The job's record keeps the context as a W3C `traceparent`, so a restart, another
+//! replica or a second attempt continues the same trace.
+//!
+//! The spans have level ERROR: a log filter decides which lines are written, and must not take the job's name from
+//! the lines that remain.
+
+use std::collections::HashMap;
+use std::io::IsTerminal;
+use std::time::SystemTime;
+
+use opentelemetry::propagation::TextMapPropagator;
+use opentelemetry::trace::{Span as _, SpanKind, TraceContextExt, Tracer, TracerProvider};
+use opentelemetry::{Context, KeyValue, global};
+use opentelemetry_otlp::{SpanExporter, WithExportConfig};
+use opentelemetry_sdk::Resource;
+use opentelemetry_sdk::propagation::TraceContextPropagator;
+use opentelemetry_sdk::trace::SdkTracerProvider;
+use serde::{Deserialize, Serialize};
+use tracing::{Span, error_span, field};
+use tracing_opentelemetry::OpenTelemetrySpanExt;
+use tracing_subscriber::filter::{LevelFilter, Targets};
+use tracing_subscriber::fmt::MakeWriter;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::{EnvFilter, Layer, Registry};
+
+use crate::domain::Stage;
+use crate::domain::job::JobName;
+
+/// Target of every span of ours, and name of the instrumentation scope. Only this target is exported: spans of the
+/// transport would feed the exporter its own calls.
+const SCOPE: &str = "scpsfm";
+
+/// How log lines are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    /// For eyes.
+    #[default]
+    Human,
+    /// One JSON object a line, with the fields of the spans it stands in.
+    Json,
+}
+
+/// What to log and where to send traces.
+#[derive(Debug, Clone, Copy)]
+pub struct Options<'a> {
+    pub format: Format,
+    /// `tracing-subscriber`'s filter syntax: `info`, `info,scpsfm::engine=debug`.
+    pub filter: &'a str,
+    /// OTLP collector (gRPC), e.g. `http://127.0.0.1:4317`; `None` exports nothing.
+    pub otlp_endpoint: Option<&'a str>,
+    /// `service.name` of the traces.
+    pub service_name: &'static str,
+}
+
+/// Why logging or tracing could not begin.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("log.filter: {0}")]
+    Filter(#[from] tracing_subscriber::filter::ParseError),
+    #[error("otlp.endpoint: {0}")]
+    Exporter(#[from] opentelemetry_otlp::ExporterBuildError),
+    #[error("otlp.endpoint: export needs a tokio runtime, and none runs here")]
+    NoRuntime,
+    #[error("logging was already set up in this process")]
+    AlreadySet,
+}
+
+/// Ends the export: sends what is left when dropped, which may block for seconds. Drop it while the runtime, of more
+/// than one thread, still runs: the connection to the collector lives there.
+#[must_use = "traces are flushed when this is dropped"]
+#[derive(Debug)]
+pub struct Guard {
+    provider: Option<SdkTracerProvider>,
+}
+
+impl Drop for Guard {
+    fn drop(&mut self) {
+        if let Some(Err(error)) = self.provider.take().map(|provider| provider.shutdown()) {
+            tracing::warn!(%error, "the last traces were not exported");
+        }
+    }
+}
+
+/// Sets up logs (on stderr) and traces for the whole process.
+///
+/// # Errors
+/// See [`Error`]. With an `otlp_endpoint` it must be called inside a tokio runtime, which carries the export. A
+/// collector that cannot be reached is no error: traces are then dropped, with a log line.
+pub fn init(options: Options<'_>) -> Result<Guard, Error> {
+    let ansi = std::io::stderr().is_terminal();
+    let (subscriber, guard) = build(options, std::io::stderr, ansi)?;
+    tracing::subscriber::set_global_default(subscriber).map_err(|_| Error::AlreadySet)?;
+    Ok(guard)
+}
+
+/// The subscriber of [`init`], writing its lines to `writer`.
+fn build<W>(options: Options<'_>, writer: W, ansi: bool) -> Result<(impl tracing::Subscriber + use<W>, Guard), Error>
+where
+    W: for<'w> MakeWriter<'w> + Send + Sync + 'static,
+{
+    let lines = tracing_subscriber::fmt::layer().with_writer(writer).with_ansi(ansi);
+    let lines = match options.format {
+        Format::Human => lines.boxed(),
+        Format::Json => lines.json().flatten_event(true).boxed(),
+    };
+    let provider = options.otlp_endpoint.map(|endpoint| provider(endpoint, options.service_name)).transpose()?;
+    let export = provider.as_ref().map(|provider| {
+        global::set_tracer_provider(provider.clone());
+        tracing_opentelemetry::layer()
+            .with_tracer(provider.tracer(SCOPE))
+            .with_filter(Targets::new().with_target(SCOPE, LevelFilter::INFO))
+    });
+    let subscriber = Registry::default().with(export).with(lines.with_filter(EnvFilter::try_new(options.filter)?));
+    Ok((subscriber, Guard { provider }))
+}
+
+fn provider(endpoint: &str, service_name: &'static str) -> Result<SdkTracerProvider, Error> {
+    if tokio::runtime::Handle::try_current().is_err() {
+        return Err(Error::NoRuntime);
+    }
+    let exporter = SpanExporter::builder().with_tonic().with_endpoint(endpoint).build()?;
+    let resource = Resource::builder()
+        .with_service_name(service_name)
+        .with_attribute(KeyValue::new("service.version", env!("CARGO_PKG_VERSION")))
+        .build();
+    Ok(SdkTracerProvider::builder().with_batch_exporter(exporter).with_resource(resource).build())
+}
+
+/// The trace context that a `traceparent` header states; an empty one for none or a malformed one, as W3C asks.
+pub fn parent_context(traceparent: Option<&str>) -> Context {
+    let carrier: HashMap<String, String> =
+        traceparent.map(|value| ("traceparent".to_owned(), value.to_owned())).into_iter().collect();
+    // From an empty context, not the current one: a job's spans never hang under whatever runs it.
+    TraceContextPropagator::new().extract_with_context(&Context::new(), &carrier)
+}
+
+/// Puts a new span, not yet entered, under the trace that a `traceparent` states.
+pub fn set_parent(span: &Span, traceparent: Option<&str>) {
+    // The only failures are that nothing is exported or that a filter disabled the span: no trace to be part of.
+    let _ = span.set_parent(parent_context(traceparent));
+}
+
+/// The `traceparent` of a span; `None` where nothing is exported.
+pub fn traceparent_of(span: &Span) -> Option<String> {
+    traceparent(&span.context())
+}
+
+fn traceparent(context: &Context) -> Option<String> {
+    let span = context.span();
+    let span = span.span_context();
+    let sampled = u8::from(span.is_sampled());
+    span.is_valid().then(|| format!("00-{}-{}-{sampled:02x}", span.trace_id(), span.span_id()))
+}
+
+/// The `traceparent` to keep with a job: the submit span's, or the caller's own where this server exports nothing,
+/// so that one that does may continue the trace.
+pub fn traceparent_to_store(submit: &Span, caller: Option<&str>) -> Option<String> {
+    traceparent_of(submit).or_else(|| traceparent(&parent_context(caller)))
+}
+
+/// The call that creates a job, under the caller's trace. [`record_job`] tells its name once there is one.
+pub fn submit_span(method: &'static str, traceparent: Option<&str>) -> Span {
+    let span = error_span!(
+        target: SCOPE, parent: None, "submit",
+        otel.kind = "server", rpc.method = method, job = field::Empty
+    );
+    set_parent(&span, traceparent);
+    span
+}
+
+/// Tells a submit span the name of the job it created.
+pub fn record_job(submit: &Span, job: &JobName) {
+    submit.record("job", field::display(job));
+}
+
+/// Exports the wait in the queue, known only once it is over: nothing of it is lost when the server restarts.
+pub fn queue_span(job: &JobName, traceparent: Option<&str>, enqueued_at: SystemTime, claimed_at: SystemTime) {
+    let tracer = global::tracer(SCOPE);
+    let mut span = tracer
+        .span_builder("queue")
+        .with_kind(SpanKind::Internal)
+        .with_start_time(enqueued_at)
+        .with_attributes([KeyValue::new("job", job.to_string())])
+        .start_with_context(&tracer, &parent_context(traceparent));
+    span.end_with_timestamp(claimed_at);
+}
+
+/// One attempt at a job, under the trace that the job's record keeps.
+pub fn attempt_span(job: &JobName, attempt: u32, traceparent: Option<&str>) -> Span {
+    let span = error_span!(
+        target: SCOPE, parent: None, "attempt",
+        job = %job, attempt, outcome = field::Empty, otel.status_code = field::Empty
+    );
+    set_parent(&span, traceparent);
+    span
+}
+
+/// One stage of an attempt.
+pub fn stage_span(attempt: &Span, stage: Stage) -> Span {
+    error_span!(target: SCOPE, parent: attempt, "stage", otel.name = stage.name(), stage = stage.name())
+}
+
+#[cfg(test)]
+#[path = "../../tests/it/support/collector.rs"]
+mod collector;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,205 @@
+//! What bad input gets: a status that names field and index, before anything is stored.
+
+use scpsfm::domain::Limits;
+use scpsfm::rpc::proto::{self, create_job_request::Input, solve_request::Message};
+use scpsfm::rpc::server::Options;
+use tonic::{Code, Status};
+use tonic_types::StatusExt;
+
+use crate::support::server::{TestServer, one_worker};
+use crate::support::solvers::quick;
+use crate::support::wire::{all, create, create_tracks, matrix, solve_request, track_set};
+
+/// The fields that an `INVALID_ARGUMENT` names.
+fn fields(status: &Status) -> Vec<String> {
+    assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+    let info = status.get_details_error_info().expect("an ErrorInfo");
+    assert_eq!((info.reason.as_str(), info.domain.as_str()), ("INVALID_ARGUMENT", "scpsfm"));
+    let request = status.get_details_bad_request().expect("a BadRequest");
+    request.field_violations.into_iter().map(|violation| violation.field).collect()
+}
+
+fn tracks(change: impl FnOnce(&mut proto::TrackSet)) -> proto::CreateJobRequest {
+    let mut set = track_set();
+    change(&mut set);
+    create(Input::TrackSet(set))
+}
+
+fn matrices(change: impl FnOnce(&mut proto::MeasurementMatrix)) -> proto::CreateJobRequest {
+    let mut matrix = matrix();
+    change(&mut matrix);
+    create(Input::MeasurementMatrix(matrix))
+}
+
+fn described(change: impl FnOnce(&mut proto::Job)) -> proto::CreateJobRequest {
+    let mut job = proto::Job::default();
+    change(&mut job);
+    proto::CreateJobRequest { job: Some(job), ..create_tracks() }
+}
+
+fn set_up(change: impl FnOnce(&mut proto::SolveSettings)) -> proto::CreateJobRequest {
+    let mut settings = proto::SolveSettings::default();
+    change(&mut settings);
+    described(|job| job.settings = Some(settings))
+}
+
+/// Limits below every input of these tests but the smallest.
+const TIGHT: Limits = Limits { max_views: 4, max_tracks: 5, max_observations: 12 };
+
+#[tokio::test]
+async fn every_kind_is_refused_by_field_and_index_and_nothing_is_stored() {
+    let options = Options { limits: TIGHT, ..Options::default() };
+    let server = TestServer::start_with(quick(), options, one_worker()).await;
+    let mut jobs = server.jobs().await;
+    let cases = [
+        (tracks(|set| set.x[7] = f64::NAN), "track_set.x[7]"),
+        (tracks(|set| set.y[3] = f64::INFINITY), "track_set.y[3]"),
+        (tracks(|set| set.x[0] = 1e9), "track_set.x[0]"),
+        (tracks(|set| set.track[5] = 4), "track_set.track[5]"),
+        (tracks(|set| set.view[11] = 3), "track_set.view[11]"),
+        (tracks(|set| set.track[1] = 0), "track_set.track[1]"),
+        (tracks(|set| set.x.truncate(5)), "track_set.view"),
+        (tracks(|set| set.sigma = vec![0.0; 12]), "track_set.sigma[0]"),
+        (tracks(|set| set.depth = vec![1.0; 3]), "track_set.depth"),
+        (tracks(|set| set.views.clear()), "track_set.views"),
+        (tracks(|set| set.views.truncate(1)), "track_set.views"),
+        (tracks(|set| set.views[2].size = Some(proto::ImageSize { width_px: 10, height_px: 0 })), "track_set.views[2]"),
+        (tracks(|set| set.track_count = 0), "track_set.track_count"),
+        (tracks(|set| set.track_count = u32::MAX), "track_set.track_count"),
+        (tracks(|set| set.views = vec![proto::View::default(); 5]), "track_set.views"),
+        (tracks(|set| set.x = vec![0.0; 13]), "track_set.x"),
+        (create(Input::TrackSet(proto::TrackSet::default())), "track_set.views"),
+        (matrices(|matrix| matrix.values[4] = f64::NAN), "measurement_matrix.values[4]"),
+        (matrices(|matrix| matrix.values.truncate(17)), "measurement_matrix.values"),
+        (matrices(|matrix| matrix.visibility = vec![1; 5]), "measurement_matrix.visibility"),
+        (matrices(|matrix| matrix.view_count = u32::MAX), "measurement_matrix.view_count"),
+        (matrices(|matrix| (matrix.view_count, matrix.track_count) = (4, 4)), "measurement_matrix.track_count"),
+        (set_up(|settings| settings.method = 42), "settings.method"),
+        (set_up(|settings| settings.alpha = Some(f64::NAN)), "settings.alpha"),
+        (set_up(|settings| settings.iterations = Some(0)), "settings.iterations"),
+        (described(|job| job.priority = i32::MAX), "job.priority"),
+        (proto::CreateJobRequest { input: None, ..create_tracks() }, "input"),
+        (proto::CreateJobRequest { parent: "default".into(), ..create_tracks() }, "parent"),
+        (proto::CreateJobRequest { job_id: "-".into(), ..create_tracks() }, "job_id"),
+    ];
+    for (request, field) in cases {
+        let status = jobs.create_job(request).await.expect_err(field);
+        let named = fields(&status);
+        assert!(named.iter().any(|name| name == field), "{field} is not among {named:?}");
+        let path_and_text = format!("{}: ", named[0]);
+        assert!(status.message().starts_with(&path_and_text), "{}", status.message());
+    }
+    let listed = proto::ListJobsRequest { parent: "tenants/default".into(), ..Default::default() };
+    assert_eq!(jobs.list_jobs(listed).await.expect("a list").into_inner().jobs, []);
+    jobs.create_job(create_tracks()).await.expect("a good one still goes");
+}
+
+#[tokio::test]
+async fn a_stream_is_checked_as_it_arrives() {
+    let options = Options { limits: TIGHT, ..Options::default() };
+    let server = TestServer::start_with(quick(), options, one_worker()).await;
+    let mut calibration = server.calibration().await;
+    let config = || Message::Config(create_tracks());
+    let chunk = |y| Message::TrackSetChunk(proto::TrackSetChunk { y, ..Default::default() });
+    let mut refused = async |messages: Vec<Message>| {
+        let requests: Vec<_> = messages.into_iter().map(solve_request).collect();
+        let answer = calibration.solve(tokio_stream::iter(requests)).await;
+        fields(&answer.expect_err("a bad stream was taken"))
+    };
+    assert_eq!(refused(vec![]).await, ["config"]);
+    assert_eq!(refused(vec![chunk(vec![])]).await, ["config"]);
+    assert_eq!(refused(vec![config(), config()]).await, ["config"]);
+    assert_eq!(refused(vec![config(), chunk(vec![0.0])]).await, ["track_set.y"]);
+    let matrix_chunk = Message::MeasurementMatrixChunk(proto::MeasurementMatrixChunk::default());
+    assert_eq!(refused(vec![config(), matrix_chunk]).await, ["measurement_matrix_chunk"]);
+}
+
+#[tokio::test]
+async fn an_endless_stream_is_cut_off() {
+    let options = Options { limits: TIGHT, ..Options::default() };
+    let server = TestServer::start_with(quick(), options, one_worker()).await;
+    let chunk = proto::TrackSetChunk { x: vec![0.0; 10_000], ..Default::default() };
+    let endless = std::iter::once(Message::Config(create_tracks()))
+        .chain(std::iter::repeat(Message::TrackSetChunk(chunk)))
+        .map(solve_request);
+    let answer = server.calibration().await.solve(tokio_stream::iter(endless)).await;
+    assert_eq!(fields(&answer.expect_err("an endless stream")), ["track_set.x"]);
+}
+
+#[tokio::test]
+async fn a_message_above_the_limit_is_refused_and_the_server_goes_on() {
+    let options = Options { max_message_bytes: 2_000, ..Options::default() };
+    let server = TestServer::start_with(quick(), options, one_worker()).await;
+    let mut jobs = server.jobs().await;
+    let large = tracks(|set| set.x = vec![0.5; 1_000]);
+    let status = jobs.create_job(large).await.expect_err("8,000 bytes of 2,000");
+    assert_eq!(status.code(), Code::OutOfRange, "{status}");
+    jobs.create_job(create_tracks()).await.expect("a small one still goes");
+}
+
+#[tokio::test]
+async fn unknown_and_foreign_names_are_told_apart_from_malformed_ones() {
+    let server = TestServer::start(quick()).await;
+    let mut jobs = server.jobs().await;
+    let get = |name: &str| proto::GetJobRequest { name: name.into() };
+    for name in ["tenants/default/jobs/none", "tenants/other/jobs/none"] {
+        let status = jobs.get_job(get(name)).await.expect_err(name);
+        assert_eq!(status.code(), Code::NotFound);
+        assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "JOB_NOT_FOUND");
+    }
+    assert_eq!(fields(&jobs.get_job(get("none")).await.expect_err("malformed")), ["name"]);
+    let foreign = proto::CreateJobRequest { parent: "tenants/other".into(), ..create_tracks() };
+    let status = jobs.create_job(foreign).await.expect_err("another tenant");
+    assert_eq!(status.code(), Code::PermissionDenied);
+    let watch = proto::WatchJobRequest { name: "tenants/default/jobs/none".into(), after_sequence: 0 };
+    assert_eq!(jobs.watch_job(watch).await.expect_err("none").code(), Code::NotFound);
+}
+
+#[tokio::test]
+async fn what_is_still_to_come_says_so() {
+    let server = TestServer::start(quick()).await;
+    let mut jobs = server.jobs().await;
+    let mut inputs = proto::input_service_client::InputServiceClient::new(server.channel().await);
+    let uploaded = create(Input::InputName("tenants/default/inputs/a".into()));
+    let statuses = [
+        jobs.batch_create_jobs(proto::BatchCreateJobsRequest::default()).await.map(drop),
+        jobs.delete_job(proto::DeleteJobRequest::default()).await.map(drop),
+        jobs.create_job(uploaded).await.map(drop),
+        inputs.upload_input(tokio_stream::empty()).await.map(drop),
+        inputs.get_upload_status(proto::GetUploadStatusRequest::default()).await.map(drop),
+    ];
+    for status in statuses {
+        let status = status.expect_err("not implemented");
+        assert_eq!(status.code(), Code::Unimplemented, "{status}");
+        assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "NOT_IMPLEMENTED");
+    }
+}
+
+#[tokio::test]
+async fn bad_watches_and_reads_are_refused() {
+    let server = TestServer::start(quick()).await;
+    let mut jobs = server.jobs().await;
+    let name = jobs.create_job(create_tracks()).await.expect("a job").into_inner().name;
+    let watch = |after_sequence| proto::WatchJobRequest { name: name.clone(), after_sequence };
+    let (_, end) = all(jobs.watch_job(watch(0)).await.expect("a watch").into_inner()).await;
+    end.expect("watched to the end");
+    assert_eq!(fields(&jobs.watch_job(watch(1_000)).await.expect_err("beyond")), ["after_sequence"]);
+    for offset in [-1, i64::MAX] {
+        let read = proto::ReadJobResultRequest { name: name.clone(), offset };
+        assert_eq!(fields(&jobs.read_job_result(read).await.expect_err("outside")), ["offset"]);
+    }
+    let list = |change: &dyn Fn(&mut proto::ListJobsRequest)| {
+        let mut request = proto::ListJobsRequest { parent: "tenants/default".into(), ..Default::default() };
+        change(&mut request);
+        request
+    };
+    let cases = [
+        (list(&|list| list.page_size = -1), "page_size"),
+        (list(&|list| list.filter = "colour = red".into()), "filter"),
+        (list(&|list| list.order_by = "name".into()), "order_by"),
+        (list(&|list| list.page_token = "made up".into()), "page_token"),
+    ];
+    for (request, field) in cases {
+        assert_eq!(fields(&jobs.list_jobs(request).await.expect_err(field)), [field]);
+    }
+}

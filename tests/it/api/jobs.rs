@@ -1,0 +1,232 @@
+//! `JobService`: creation, watching, cancelling, listing, results.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use prost::Message;
+use scpsfm::domain::{Input, Limits, SolveSettings};
+use scpsfm::engine::{self, QueueBounds};
+use scpsfm::rpc::convert;
+use scpsfm::rpc::proto::job_service_client::JobServiceClient;
+use scpsfm::rpc::proto::{self, JobState, create_job_request};
+use scpsfm::rpc::server::Options;
+use tonic::Code;
+use tonic::transport::Channel;
+use tonic_types::StatusExt;
+
+use crate::support::server::{TestServer, one_worker, soon};
+use crate::support::solvers::{held, quick, solution};
+use crate::support::wire::{all, create, create_tracks, raw, state_of};
+
+async fn created(jobs: &mut JobServiceClient<Channel>, request: proto::CreateJobRequest) -> proto::Job {
+    jobs.create_job(request).await.expect("a job").into_inner()
+}
+
+async fn events(jobs: &mut JobServiceClient<Channel>, name: &str, after_sequence: u64) -> Vec<proto::JobEvent> {
+    let request = proto::WatchJobRequest { name: name.into(), after_sequence };
+    let (events, end) = soon(async { all(jobs.watch_job(request).await.expect("a watch").into_inner()).await }).await;
+    end.expect("the watch ends with the job");
+    events
+}
+
+/// Waits until a job runs.
+async fn running(jobs: &mut JobServiceClient<Channel>, name: &str) {
+    let request = proto::WatchJobRequest { name: name.into(), after_sequence: 0 };
+    let mut watch = jobs.watch_job(request).await.expect("a watch").into_inner();
+    while let Some(event) = soon(watch.message()).await.expect("an event") {
+        if state_of(&event) == Some(JobState::Running) {
+            return;
+        }
+    }
+    panic!("{name} ended without running");
+}
+
+#[tokio::test]
+async fn a_job_runs_to_its_result() {
+    let server = TestServer::start(quick()).await;
+    let mut jobs = server.jobs().await;
+    let mut request = create_tracks();
+    request.job = Some(proto::Job {
+        settings: Some(proto::SolveSettings { seed: 7, ..Default::default() }),
+        labels: BTreeMap::from([("site".into(), "north".into())]),
+        ..Default::default()
+    });
+    let job = created(&mut jobs, request).await;
+    assert!(job.name.starts_with("tenants/default/jobs/"), "{}", job.name);
+    assert_eq!((job.view_count, job.track_count, job.observation_count), (3, 4, 12));
+    assert_eq!(job.settings.expect("settings").alpha, Some(SolveSettings::DEFAULT_ALPHA), "defaults are written out");
+    let events = events(&mut jobs, &job.name, 0).await;
+    let states: Vec<_> = events.iter().filter_map(state_of).collect();
+    assert_eq!(states, [JobState::Queued, JobState::Running, JobState::Succeeded]);
+    let done = jobs.get_job(proto::GetJobRequest { name: job.name.clone() }).await.expect("a job").into_inner();
+    assert_eq!(done.state(), JobState::Succeeded);
+    assert_eq!(done.labels["site"], "north");
+    assert_eq!(done.attempt, 1);
+    assert_eq!(done.summary.expect("a summary").inlier_tracks, 2);
+    let request = proto::ReadJobResultRequest { name: job.name.clone(), offset: 0 };
+    let (chunks, end) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
+    end.expect("whole");
+    let result = proto::JobResult::decode(chunks[0].data.as_ref()).expect("a JobResult");
+    assert_eq!(result.job, job.name);
+    let input = Input::new(raw(3, 4), &Limits::default(), "").expect("valid");
+    let expected = solution(&input, &SolveSettings { seed: 7, ..SolveSettings::default() });
+    assert_eq!(convert::result::from_wire(result), Ok(expected));
+}
+
+#[tokio::test]
+async fn a_watch_replays_exactly_what_came_after() {
+    let server = TestServer::start(quick()).await;
+    let mut jobs = server.jobs().await;
+    let name = created(&mut jobs, create_tracks()).await.name;
+    let sequenced = |events: Vec<proto::JobEvent>| -> Vec<u64> {
+        events.iter().map(|event| event.sequence).filter(|&sequence| sequence > 0).collect()
+    };
+    let whole = sequenced(events(&mut jobs, &name, 0).await);
+    assert_eq!(whole, (1..=whole.len() as u64).collect::<Vec<_>>());
+    for after in 1..=whole.len() {
+        assert_eq!(sequenced(events(&mut jobs, &name, after as u64).await), whole[after..], "after {after}");
+    }
+}
+
+#[tokio::test]
+async fn dropping_a_watch_leaves_the_job_alone() {
+    let (solver, hold) = held();
+    let options = Options { solve_grace: Duration::ZERO, ..Options::default() };
+    let server = TestServer::start_with(solver, options, one_worker()).await;
+    let mut jobs = server.jobs().await;
+    let name = created(&mut jobs, create_tracks()).await.name;
+    running(&mut jobs, &name).await;
+    hold.let_go();
+    let states: Vec<_> = events(&mut jobs, &name, 0).await.iter().filter_map(state_of).collect();
+    assert_eq!(states.last(), Some(&JobState::Succeeded));
+}
+
+#[tokio::test]
+async fn cancel_reaches_running_queued_and_ended_jobs() {
+    let (solver, hold) = held();
+    let server = TestServer::start(solver).await;
+    let mut jobs = server.jobs().await;
+    let first = created(&mut jobs, create_tracks()).await.name;
+    let second = created(&mut jobs, create_tracks()).await.name;
+    running(&mut jobs, &first).await;
+    let cancel = |name: &str| proto::CancelJobRequest { name: name.into() };
+    let queued = jobs.cancel_job(cancel(&second)).await.expect("a cancel").into_inner();
+    assert_eq!(queued.state(), JobState::Cancelled);
+    let read = proto::ReadJobResultRequest { name: first.clone(), offset: 0 };
+    let status = jobs.read_job_result(read).await.expect_err("no result yet");
+    assert_eq!(status.code(), Code::FailedPrecondition);
+    assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "RESULT_NOT_READY");
+    jobs.cancel_job(cancel(&first)).await.expect("a cancel");
+    let states: Vec<_> = events(&mut jobs, &first, 0).await.iter().filter_map(state_of).collect();
+    assert_eq!(states.last(), Some(&JobState::Cancelled));
+    hold.let_go();
+    let again = jobs.cancel_job(cancel(&first)).await.expect("idempotent").into_inner();
+    assert_eq!(again.state(), JobState::Cancelled);
+}
+
+#[tokio::test]
+async fn a_full_queue_says_at_once_when_to_come_back() {
+    let (solver, hold) = held();
+    let engine = engine::Options {
+        queue: QueueBounds { max_jobs: 1, ..one_worker().queue },
+        retry_after: Duration::from_secs(7),
+        ..one_worker()
+    };
+    let server = TestServer::start_with(solver, Options::default(), engine).await;
+    let mut jobs = server.jobs().await;
+    let first = created(&mut jobs, create_tracks()).await.name;
+    running(&mut jobs, &first).await;
+    let second = created(&mut jobs, create_tracks()).await.name;
+    let status = jobs.create_job(create_tracks()).await.expect_err("a full queue");
+    assert_eq!(status.code(), Code::ResourceExhausted, "{status}");
+    let retry = status.get_details_retry_info().expect("a RetryInfo");
+    assert_eq!(retry.retry_delay, Some(Duration::from_secs(7)));
+    assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "QUEUE_FULL");
+    hold.let_go();
+    for name in [first, second] {
+        let states: Vec<_> = events(&mut jobs, &name, 0).await.iter().filter_map(state_of).collect();
+        assert_eq!(states.last(), Some(&JobState::Succeeded));
+    }
+}
+
+#[tokio::test]
+async fn a_request_id_stands_for_one_job() {
+    let server = TestServer::start(quick()).await;
+    let mut jobs = server.jobs().await;
+    let request = proto::CreateJobRequest { request_id: "r-1".into(), ..create_tracks() };
+    let first = created(&mut jobs, request.clone()).await;
+    let again = created(&mut jobs, request.clone()).await;
+    assert_eq!(first.name, again.name);
+    let other = create_job_request::Input::TrackSet(convert::input::to_wire(&raw(3, 5)));
+    let other = proto::CreateJobRequest { request_id: "r-1".into(), ..create(other) };
+    let status = jobs.create_job(other).await.expect_err("another body");
+    assert_eq!(status.code(), Code::AlreadyExists);
+    let named = proto::CreateJobRequest { job_id: "mine".into(), ..create_tracks() };
+    assert_eq!(created(&mut jobs, named.clone()).await.name, "tenants/default/jobs/mine");
+    assert_eq!(jobs.create_job(named).await.expect_err("taken").code(), Code::AlreadyExists);
+}
+
+#[tokio::test]
+async fn lists_are_filtered_ordered_and_paged() {
+    let server = TestServer::start(quick()).await;
+    let mut jobs = server.jobs().await;
+    let mut names = Vec::new();
+    for k in 0..5 {
+        let labels = BTreeMap::from([("parity".to_owned(), (k % 2).to_string())]);
+        let job = Some(proto::Job { labels, ..Default::default() });
+        let name = created(&mut jobs, proto::CreateJobRequest { job, ..create_tracks() }).await.name;
+        events(&mut jobs, &name, 0).await;
+        names.push(name);
+    }
+    let mut list = async |filter: &str, order_by: &str, page_size| {
+        let mut found = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let request = proto::ListJobsRequest {
+                parent: "tenants/default".into(),
+                page_size,
+                page_token,
+                filter: filter.into(),
+                order_by: order_by.into(),
+            };
+            let page = jobs.list_jobs(request).await.expect("a page").into_inner();
+            assert!(page_size == 0 || page.jobs.len() <= page_size as usize);
+            found.extend(page.jobs.into_iter().map(|job| job.name));
+            page_token = page.next_page_token;
+            if page_token.is_empty() {
+                return found;
+            }
+        }
+    };
+    let newest_first: Vec<_> = names.iter().rev().cloned().collect();
+    assert_eq!(list("", "", 0).await, newest_first);
+    assert_eq!(list("", "create_time", 2).await, names);
+    assert_eq!(list("labels.parity = 1", "create_time", 1).await, [names[1].clone(), names[3].clone()]);
+    assert_eq!(list("state = SUCCEEDED AND labels.parity = \"0\"", "", 0).await.len(), 3);
+    assert_eq!(list("state = QUEUED OR state = RUNNING", "", 0).await, [""; 0]);
+}
+
+#[tokio::test]
+async fn a_large_result_comes_in_chunks_from_any_offset() {
+    let server = TestServer::start(quick()).await;
+    let mut jobs = server.jobs().await;
+    let input = create_job_request::Input::TrackSet(convert::input::to_wire(&raw(2, 40_000)));
+    let name = created(&mut jobs, create(input)).await.name;
+    events(&mut jobs, &name, 0).await;
+    let mut read = async |offset| {
+        let request = proto::ReadJobResultRequest { name: name.clone(), offset };
+        let (chunks, end) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
+        end.expect("whole");
+        assert_eq!(chunks[0].offset, offset);
+        let total = chunks[0].total_size;
+        let bytes: Vec<u8> = chunks.iter().flat_map(|chunk| chunk.data.clone()).collect();
+        assert_eq!(bytes.len() as i64, total - offset);
+        (bytes, chunks.len())
+    };
+    let (whole, count) = read(0).await;
+    assert!(count > 2, "{count} chunks of {} bytes", whole.len());
+    let (rest, _) = read(300_000).await;
+    assert_eq!(rest, whole[300_000..]);
+    let result = proto::JobResult::decode(whole.as_slice()).expect("a JobResult");
+    assert_eq!(result.tracks.expect("tracks").weight.len(), 40_000);
+}

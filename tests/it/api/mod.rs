@@ -1,0 +1,7 @@
+//! The API over a real connection, with stand-ins for the solver.
+
+mod bad_input;
+mod client;
+mod discovery;
+mod jobs;
+mod solve;

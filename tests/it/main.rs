@@ -1,0 +1,4 @@
+//! Every integration test in one binary, so that everything links once. One concept a module.
+
+mod api;
+mod support;

@@ -1,0 +1,5 @@
+//! What tests share: a server on a free port with a store of its own, and stand-ins for the solver.
+
+pub mod server;
+pub mod solvers;
+pub mod wire;
