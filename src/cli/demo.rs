@@ -33,8 +33,8 @@ Examples:
   scpsfm demo --seed 3 --outliers 0.95 --tracks 400
   scpsfm demo --json | jq .f1
 
-Files: the result files of `scpsfm solve`, above all report.html, and the scene with its truth in scene/. Ends with code 1
-when the inliers found agree badly with the truth (F1 below 0.9).";
+Files: the result files of `scpsfm solve`, above all report.html, and the scene with its truth in scene/. Ends with \
+code 1 when the inliers found agree badly with the truth (F1 below 0.9).";
 
 /// Show the whole thing: make a scene, solve it through a real server, compare with the truth
 ///

@@ -1,18 +1,19 @@
 //! Showing how far a job is: a bar on a terminal, a few plain lines elsewhere. Always on stderr.
 
 use std::io::IsTerminal;
-use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::domain::{Observer, Progress, Stage};
+use crate::domain::{Observer, Progress};
 
 /// Steps of the bar: finer than any terminal is wide.
 const BAR_STEPS: u64 = 1_000;
 /// Plain lines appear at a change of stage, after this share of the work, ...
 const LINE_EVERY_SHARE: f64 = 0.1;
-/// ... or after this time, so that a log of an hour-long job shows that it lives.
-const LINE_EVERY: Duration = Duration::from_secs(10);
+/// ... or after this many seconds, ...
+const LINE_EVERY_SECONDS: f64 = 0.5;
+/// ... but not before this share of the time already spent: short jobs show that they live, hour-long ones fill no log.
+const LINE_EVERY_SPENT: f64 = 0.1;
 
 /// Shows progress; nothing when quiet.
 pub struct ProgressView {
@@ -22,7 +23,7 @@ pub struct ProgressView {
 enum Shown {
     Nothing,
     Bar(ProgressBar),
-    Lines { last: Option<(Stage, f64)>, last_time: Instant },
+    Lines { last: Option<Progress> },
 }
 
 impl ProgressView {
@@ -37,7 +38,7 @@ impl ProgressView {
             }
             Shown::Bar(bar)
         } else {
-            Shown::Lines { last: None, last_time: Instant::now() }
+            Shown::Lines { last: None }
         };
         Self { shown }
     }
@@ -60,13 +61,9 @@ impl ProgressView {
                 bar.set_position((progress.fraction.clamp(0.0, 1.0) * BAR_STEPS as f64) as u64);
                 bar.set_message(describe(progress));
             }
-            Shown::Lines { last, last_time } => {
-                let due = last.is_none_or(|(stage, fraction)| {
-                    stage != progress.stage || progress.fraction >= fraction + LINE_EVERY_SHARE
-                });
-                if due || last_time.elapsed() >= LINE_EVERY {
-                    *last = Some((progress.stage, progress.fraction));
-                    *last_time = Instant::now();
+            Shown::Lines { last } => {
+                if last.is_none_or(|last| is_line_due(&last, progress)) {
+                    *last = Some(*progress);
                     let percent = progress.fraction * 100.0;
                     eprintln!("{:>9} {percent:3.0}% {}", progress.stage.name(), describe(progress));
                 }
@@ -94,6 +91,14 @@ impl Observer for ProgressView {
     }
 }
 
+/// Whether enough has happened since the last line for another.
+fn is_line_due(last: &Progress, now: &Progress) -> bool {
+    let pause_seconds = LINE_EVERY_SECONDS.max(LINE_EVERY_SPENT * last.elapsed_seconds);
+    last.stage != now.stage
+        || now.fraction >= last.fraction + LINE_EVERY_SHARE
+        || now.elapsed_seconds >= last.elapsed_seconds + pause_seconds
+}
+
 /// What a progress record says, in a line.
 fn describe(progress: &Progress) -> String {
     let mut text = format!("{} inliers", progress.inliers);
@@ -116,7 +121,39 @@ fn describe(progress: &Progress) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::Losses;
+    use crate::domain::{Losses, Stage};
+
+    fn at(stage: Stage, fraction: f64, elapsed_seconds: f64) -> Progress {
+        Progress {
+            stage,
+            fraction,
+            iteration: 0,
+            losses: None,
+            inliers: 0,
+            focal_px: None,
+            best_score: None,
+            elapsed_seconds,
+        }
+    }
+
+    #[test]
+    fn lines_are_neither_too_many_nor_too_few() {
+        let last = at(Stage::Search, 0.2, 100.0);
+        assert!(!is_line_due(&last, &at(Stage::Search, 0.25, 101.0)));
+        assert!(is_line_due(&last, &at(Stage::Refine, 0.2, 100.0)));
+        assert!(is_line_due(&last, &at(Stage::Search, 0.31, 100.0)));
+        assert!(is_line_due(&last, &at(Stage::Search, 0.2, 110.0)));
+        assert!(is_line_due(&at(Stage::Search, 0.0, 0.0), &at(Stage::Search, 0.0, 0.5)));
+        let mut last = at(Stage::Search, 0.0, 0.0);
+        let mut lines = 0;
+        for second in 1..=3600 {
+            let now = at(Stage::Search, 0.0, f64::from(second));
+            if is_line_due(&last, &now) {
+                (last, lines) = (now, lines + 1);
+            }
+        }
+        assert!((20..100).contains(&lines), "{lines} lines an hour");
+    }
 
     #[test]
     fn a_line_holds_what_is_known_and_nothing_else() {

@@ -12,11 +12,11 @@ use crate::config::Config;
 use crate::telemetry;
 
 const HELP: &str = "\
-Configuration: defaults, then the file, then the environment, then flags; later ones win. Every key of the file may
-stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__WORKERS=4. --print-config shows all keys.
+Configuration: defaults, then the file, then the environment, then flags; later ones win. Every key of the file \
+may stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__WORKERS=4. --print-config shows all keys.
 
-When it serves, two lines on stdout say where: `grpc http://...` and `metrics http://...`. SIGTERM or Ctrl-C drains: new
-jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start.
+When it serves, two lines on stdout say where: `grpc http://...` and `metrics http://...`. SIGTERM or Ctrl-C drains: \
+new jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start.
 
 Examples:
   scpsfm serve

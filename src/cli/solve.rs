@@ -18,8 +18,8 @@ Examples:
   scpsfm solve observations.csv --out answer --json | jq .focal_px
   scpsfm solve observations.csv --out answer --server http://127.0.0.1:50051
 
-Files in the output directory: result.json (the summary), tracks.csv, observations.csv (every answer under the ids of
-the input), cameras.json, points.ply and report.html (open it in a browser).";
+Files in the output directory: result.json (the summary), tracks.csv, observations.csv (every answer under the ids \
+of the input), cameras.json, points.ply and report.html (open it in a browser).";
 
 /// Solve one input
 ///

@@ -32,7 +32,8 @@ pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) {
     let Claimed { job, lease, trace_parent, queue_time } = claimed;
     let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref(), queue_time);
     let span = attempt.span().clone();
-    Course::begin(inner, job, lease).run(worker, attempt).instrument(span).await;
+    // All of it inside the span, so that every line carries the job's name.
+    async { Course::begin(inner, job, lease).run(worker, attempt).await }.instrument(span).await;
 }
 
 /// An attempt under way.

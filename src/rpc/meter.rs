@@ -149,10 +149,76 @@ pub fn code_name(code: Code) -> &'static str {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::VecDeque;
+    use std::convert::Infallible;
+
+    use metrics_exporter_prometheus::PrometheusBuilder;
     use prost::Message;
+    use tonic::codegen::http::HeaderValue;
 
     use super::*;
     use crate::rpc::proto::FILE_DESCRIPTOR_SET;
+
+    /// A body of given frames.
+    struct Frames(VecDeque<Frame<Bytes>>);
+
+    impl HttpBody for Frames {
+        type Data = Bytes;
+        type Error = Status;
+
+        fn poll_frame(
+            mut self: Pin<&mut Self>,
+            _context: &mut Context<'_>,
+        ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+            Poll::Ready(self.0.pop_front().map(Ok))
+        }
+    }
+
+    fn with_status(code: &'static str) -> HeaderMap {
+        HeaderMap::from_iter([("grpc-status".parse().expect("a header"), HeaderValue::from_static(code))])
+    }
+
+    /// The code under which a call is counted whose answer has these headers and frames, `read` of which are read.
+    fn counted_as(headers: HeaderMap, frames: Vec<Frame<Bytes>>, read: usize) -> String {
+        let recorder = PrometheusBuilder::new().build_recorder();
+        metrics::with_local_recorder(&recorder, || {
+            let mut answer = Response::new(Body::new(Frames(frames.into())));
+            *answer.headers_mut() = headers;
+            let mut answer = Some(answer);
+            let inner = tower::service_fn(move |_: Request<()>| {
+                let answer = answer.take().expect("called once");
+                async { Ok::<_, Infallible>(answer) }
+            });
+            let request = Request::builder().uri("/scpsfm.v1.JobService/GetJob").body(()).expect("a request");
+            let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
+            runtime.block_on(async {
+                let Ok(answer) = Meter.layer(inner).call(request).await;
+                let mut body = answer.into_body();
+                for _ in 0..read {
+                    std::future::poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await;
+                }
+            });
+        });
+        let page = recorder.handle().render();
+        let counts: Vec<&str> = page.lines().filter(|line| line.starts_with("scpsfm_grpc_requests_total{")).collect();
+        let [count] = counts[..] else { panic!("not one count:\n{page}") };
+        assert!(count.contains("JobService/GetJob") && count.ends_with(" 1"), "{count}");
+        let (_, rest) = count.split_once("code=\"").expect("a code");
+        rest.split('"').next().expect("a value").to_owned()
+    }
+
+    #[test]
+    fn a_call_is_counted_once_by_how_it_ended() {
+        let data = || Frame::data(Bytes::from_static(b"message"));
+        assert_eq!(counted_as(with_status("5"), vec![], 0), "NOT_FOUND");
+        assert_eq!(counted_as(HeaderMap::new(), vec![data(), Frame::trailers(with_status("0"))], 2), "OK");
+        assert_eq!(
+            counted_as(HeaderMap::new(), vec![data(), Frame::trailers(with_status("8"))], 3),
+            "RESOURCE_EXHAUSTED"
+        );
+        assert_eq!(counted_as(HeaderMap::new(), vec![data()], 2), "UNKNOWN");
+        assert_eq!(counted_as(HeaderMap::new(), vec![data(), data()], 1), "CANCELLED");
+    }
 
     #[test]
     fn every_method_of_the_api_is_known() {

@@ -1,4 +1,7 @@
 //! Every integration test in one binary, so that everything links once. One concept a module.
 
 mod api;
+mod cli;
+mod readme;
 mod support;
+mod telemetry;

@@ -1,7 +1,7 @@
 //! The client side of the API: what every command that talks to a server shares.
 //!
-//! Calls that may be repeated are repeated when the connection breaks, for a bounded time: a watch goes on after its last
-//! event, a result after its last byte, a creation under its request id.
+//! Calls that may be repeated are repeated when the connection breaks, for a bounded time: a watch goes on after its
+//! last event, a result after its last byte, a creation under its request id.
 
 mod backoff;
 mod error;

@@ -9,6 +9,8 @@ use crate::geometry::bundle::{Observation, Options};
 /// Standard deviations of the log focal length that bound the grades.
 const METRIC_BELOW: f64 = 0.02;
 const WEAK_UP_TO: f64 = 0.1;
+/// Standard deviation of the log focal length, a factor of 2.7, beyond which the focal length counts as unobservable.
+const UNOBSERVABLE_ABOVE: f64 = 1.0;
 /// Gain in chi-square at which a richer model is taken: the .999 quantile for two degrees of freedom.
 const CHI_SQUARE_GAIN: f64 = 13.8;
 /// How much a richer model may raise the standard deviation of the log focal length and still be taken: beyond, it
@@ -94,7 +96,10 @@ pub(super) fn grade(
     let rival = rival(&simple, &minima);
     let mut best = richest(simple, problem, scale_px, &mut warnings, stop)?;
     Stopped::check(stop)?;
-    best.sigma = best.sigma.map(|sigma| profiled(sigma, &best, problem.observations, stop));
+    best.sigma = best
+        .sigma
+        .map(|sigma| profiled(sigma, &best, problem.observations, stop))
+        .filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
 
     let mut grade = match best.sigma {
         Some(sigma) if sigma < METRIC_BELOW => Grade::Metric,

@@ -118,7 +118,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     {
         let detail = format!(
             "homographies between the views miss by a median of {residual:.1} standard deviations of the noise \
-             ({:.2} px): the scene is planar or the camera only rotated, which carries no calibration",
+             ({:.2} px): the scene is planar, or the camera hardly did more than rotate, which carries no calibration",
             noise * scale_px
         );
         warnings.push(Warning::new(WarningCode::PlanarOrRotation, detail));

@@ -63,8 +63,8 @@ fn critical_motions_and_scenes_are_refused() {
         ("rotation", Motion::Rotation, false),
         ("plane", Motion::General, true),
     ] {
-        for tracks in [20, 60] {
-            for seed in 0..10 {
+        for (tracks, seeds) in [(20, 10), (60, 4)] {
+            for seed in 0..seeds {
                 let scene = testing::scene_of(seed, 10, tracks, NOISE, motion, planar);
                 let outcome = calibrated(&scene, seed, NOISE);
                 println!(
@@ -75,10 +75,10 @@ fn critical_motions_and_scenes_are_refused() {
                 );
                 assert_eq!(outcome.grade, Grade::ProjectiveOnly, "{name}, seed {seed}");
                 let expected = match motion {
-                    Motion::Translation | Motion::Forward => {
-                        [WarningCode::UnobservableFocal, WarningCode::SecondMinimum]
-                    }
-                    Motion::Rotation | Motion::General => [WarningCode::PlanarOrRotation; 2],
+                    // Along the axis, short baselines can be explained by homographies as well.
+                    Motion::Forward => vec![WarningCode::UnobservableFocal, WarningCode::PlanarOrRotation],
+                    Motion::Translation => vec![WarningCode::UnobservableFocal],
+                    Motion::Rotation | Motion::General => vec![WarningCode::PlanarOrRotation],
                 };
                 assert!(
                     outcome.warnings.iter().any(|warning| expected.contains(&warning.code)),

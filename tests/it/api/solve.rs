@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use scpsfm::rpc::convert;
+use scpsfm::rpc::follow::Followers;
 use scpsfm::rpc::proto::{self, JobState, create_job_request::Input, job_event::Body, solve_request::Message};
 use scpsfm::rpc::server::Options;
 use tonic::Streaming;
@@ -27,7 +28,8 @@ async fn states(server: &TestServer, name: &str) -> Vec<JobState> {
 
 #[tokio::test]
 async fn events_name_the_job_first_and_end_with_its_state() {
-    let server = TestServer::start(quick()).await;
+    let (solver, hold) = held();
+    let server = TestServer::start(solver).await;
     let whole = raw(3, 50);
     let head = Message::Config(create(Input::TrackSet(convert::input::head_to_wire(&whole))));
     let chunk = |range: std::ops::Range<usize>| {
@@ -39,14 +41,19 @@ async fn events_name_the_job_first_and_end_with_its_state() {
             ..Default::default()
         })
     };
-    let stream = solve(&server, vec![head, chunk(0..100), chunk(100..150)]).await;
-    let (events, end) = soon(all(stream)).await;
-    end.expect("a solve ends well");
+    let mut stream = solve(&server, vec![head, chunk(0..100), chunk(100..150)]).await;
+    let mut events = Vec::new();
+    while let Some(event) = soon(stream.message()).await.expect("a solve ends well") {
+        if let Some(Body::Progress(progress)) = &event.body {
+            assert_eq!((progress.iteration, progress.focal_px), (10, Some(1000.0)));
+            hold.let_go();
+        }
+        events.push(event);
+    }
     let first = &events[0];
     assert!(first.name.starts_with("tenants/default/jobs/"), "{}", first.name);
     assert_eq!((first.sequence, state_of(first)), (1, Some(JobState::Queued)));
     assert!(events.iter().all(|event| event.name == first.name));
-    assert!(events.iter().any(|event| matches!(event.body, Some(Body::Progress(_)))));
     let result = events.iter().position(|event| matches!(event.body, Some(Body::Result(_)))).expect("a result");
     assert!(result < events.len() - 1, "the final state follows the result");
     assert_eq!(state_of(events.last().expect("events")), Some(JobState::Succeeded));
@@ -78,22 +85,37 @@ async fn dropping_the_call_cancels_the_job_after_the_grace_period() {
 }
 
 #[tokio::test]
-async fn coming_back_with_the_same_request_id_keeps_the_job() {
+async fn two_calls_with_one_request_id_follow_one_job() {
     let (solver, hold) = held();
-    // Long enough for the second call to be there: what is tested is that it is counted, not how fast it comes.
-    let options = Options { solve_grace: Duration::from_secs(2), ..Options::default() };
+    let options = Options { solve_grace: Duration::ZERO, ..Options::default() };
     let server = TestServer::start_with(solver, options, one_worker()).await;
     let config = || Message::Config(proto::CreateJobRequest { request_id: "again".into(), ..create_tracks() });
-    let mut broken = solve(&server, vec![config()]).await;
-    let name = soon(broken.message()).await.expect("an event").expect("the first event").name;
-    drop(broken);
+    let mut first = solve(&server, vec![config()]).await;
+    let name = soon(first.message()).await.expect("an event").expect("the first event").name;
     let second = solve(&server, vec![config()]).await;
-    tokio::time::sleep(Duration::from_secs(3)).await;
+    drop(first);
     hold.let_go();
     let (events, end) = soon(all(second)).await;
     end.expect("a solve ends well");
     assert!(events.iter().all(|event| event.name == name));
     assert_eq!(state_of(events.last().expect("events")), Some(JobState::Succeeded));
+}
+
+#[tokio::test]
+async fn a_job_that_is_followed_again_within_the_grace_period_goes_on() {
+    const GRACE: Duration = Duration::from_millis(100);
+    let (solver, _hold) = held();
+    let server = TestServer::start(solver).await;
+    let created = server.jobs().await.create_job(create_tracks()).await.expect("a job").into_inner();
+    let name = convert::names::job(&created.name).expect("a name");
+    let followers = Followers::new(server.engine.clone(), GRACE);
+    drop(followers.follow(name.clone()));
+    let follower = followers.follow(name.clone());
+    tokio::time::sleep(3 * GRACE).await;
+    let job = server.engine.job(&name).await.expect("a job");
+    assert!(!job.state.is_terminal() && !job.cancel_requested, "{job:?}");
+    drop(follower);
+    assert_eq!(states(&server, &created.name).await.last(), Some(&JobState::Cancelled));
 }
 
 #[tokio::test]

@@ -1,0 +1,233 @@
+//! The program from the shell: exit codes, sentences, files.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+
+use rustix::process::Signal;
+use serde_json::Value;
+use tempfile::TempDir;
+
+use crate::support::program::{Running, Serving, program, run};
+
+/// An address where nothing listens: port 1 is reserved and privileged.
+const NOBODY: &str = "http://127.0.0.1:1";
+
+fn directory() -> TempDir {
+    tempfile::tempdir().expect("a temporary directory")
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("a path of ours")
+}
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_else(|error| panic!("{error} in {text}"))
+}
+
+/// A scene that is quickly solved.
+fn scene(directory: &Path) -> PathBuf {
+    let out = directory.join("scene");
+    let run = run(["synth", "--views", "6", "--tracks", "60", "--outliers", "0.5", "--seed", "5", "--out", text(&out)]);
+    assert_eq!(run.code, Some(0), "{run:?}");
+    out.join("observations.csv")
+}
+
+#[test]
+fn every_command_explains_itself() {
+    let commands = ["demo", "serve", "solve", "submit", "watch", "get", "list", "cancel", "result", "synth"].map(Some);
+    for command in commands.into_iter().chain([None]) {
+        let run = run(command.into_iter().chain(["--help"]));
+        assert_eq!(run.code, Some(0), "{run:?}");
+        assert!(run.stdout.contains(if command.is_some() { "Examples:" } else { "Exit codes:" }), "{}", run.stdout);
+    }
+    assert_eq!(run(["--version"]).stdout.trim(), concat!("scpsfm ", env!("CARGO_PKG_VERSION")));
+}
+
+#[test]
+fn wrong_usage_ends_with_2_and_does_nothing() {
+    let directory = directory();
+    let input = scene(directory.path());
+    let (input, out) = (text(&input), directory.path().join("out"));
+    let cases: [&[&str]; 7] = [
+        &["solve", input],
+        &["solve", input, "--out", text(&out), "--width", "100"],
+        &["solve", input, "--out", text(&out), "--width", "0", "--height", "9"],
+        &["solve", input, "--out", text(&out), "--iterations", "0"],
+        &["solve", input, "--out", text(&out), "--method", "magic"],
+        &["synth", "--views", "1", "--out", text(&out)],
+        &["frobnicate"],
+    ];
+    for arguments in cases {
+        let run = run(arguments);
+        assert_eq!(run.code, Some(2), "{arguments:?}: {run:?}");
+        assert!(run.stdout.is_empty() && run.stderr.contains("error"), "{run:?}");
+    }
+    assert!(!out.exists());
+}
+
+#[test]
+fn a_bad_input_ends_with_65_and_names_file_and_line() {
+    let directory = directory();
+    let good = fs::read_to_string(scene(directory.path())).expect("the scene");
+    let bad = directory.path().join("bad.csv");
+    let refused = |content: &[u8]| {
+        fs::write(&bad, content).expect("written");
+        let run = run(["solve", text(&bad), "--out", text(&directory.path().join("out"))]);
+        assert_eq!(run.code, Some(65), "{run:?}");
+        assert!(run.stdout.is_empty(), "{run:?}");
+        run.stderr
+    };
+    let mut lines: Vec<&str> = good.lines().collect();
+    lines[17] = "0,16,NaN,1";
+    assert_eq!(refused(lines.join("\n").as_bytes()), "error: bad.csv, line 18: x: NaN is not a finite number\n");
+    assert!(refused(&good.as_bytes()[..good.len() - 30]).contains("the file may be truncated"));
+    assert!(refused(b"").contains("bad.csv: is empty"));
+    assert!(refused(b"\x7fELF\x02\x01\x01\0\0\0\n").contains("bad.csv: is not a text file"));
+    assert!(refused(b"SQLite format 3\0").contains("not a supported format yet"));
+    let missing = run(["solve", "no/such.csv", "--out", text(directory.path())]);
+    assert_eq!(missing.code, Some(65), "{missing:?}");
+    assert!(missing.stderr.contains("such.csv: cannot be read"), "{missing:?}");
+    assert!(!directory.path().join("out").exists());
+}
+
+#[test]
+fn a_bad_configuration_ends_with_64_and_a_printed_one_reads_back() {
+    let directory = directory();
+    let file = directory.path().join("scpsfm.toml");
+    fs::write(&file, "[engine]\nwrokers = 3\n").expect("written");
+    let misspelt = run(["serve", "--config", text(&file)]);
+    assert_eq!(misspelt.code, Some(64), "{misspelt:?}");
+    assert!(misspelt.stderr.contains("wrokers"), "{misspelt:?}");
+    let nowhere = run(["serve", "--listen", "localhost"]);
+    assert_eq!(nowhere.code, Some(64), "{nowhere:?}");
+
+    let printed = run(["serve", "--print-config", "--workers", "3", "--backend", "ndarray"]);
+    assert_eq!(printed.code, Some(0), "{printed:?}");
+    fs::write(&file, &printed.stdout).expect("written");
+    assert_eq!(run(["serve", "--print-config", "--config", text(&file)]).stdout, printed.stdout);
+    assert!(printed.stdout.contains("workers = 3") && printed.stdout.contains("ndarray"), "{printed:?}");
+}
+
+#[test]
+fn without_a_server_commands_end_with_69() {
+    let directory = directory();
+    let input = scene(directory.path());
+    let out = directory.path().join("out");
+    let cases: [&[&str]; 4] = [
+        &["list", "--server", NOBODY],
+        &["get", "tenants/default/jobs/a", "--server", NOBODY],
+        &["submit", text(&input), "--server", NOBODY],
+        &["solve", text(&input), "--out", text(&out), "--server", NOBODY],
+    ];
+    for arguments in cases {
+        let run = run(arguments);
+        assert_eq!(run.code, Some(69), "{arguments:?}: {run:?}");
+        assert!(run.stderr.contains("127.0.0.1:1"), "{run:?}");
+    }
+}
+
+/// The files of a directory, times blanked.
+fn files_but_for_times(directory: &Path) -> BTreeMap<String, String> {
+    let entries = fs::read_dir(directory).expect("a directory");
+    let timeless = |line: &&str| !line.contains("seconds\":") && !line.contains("<dt>time</dt>");
+    entries
+        .map(|entry| entry.expect("an entry").path())
+        .map(|path| {
+            let content = fs::read_to_string(&path).expect("text");
+            let name = path.file_name().expect("a name").to_string_lossy().into_owned();
+            (name, content.lines().filter(timeless).collect::<Vec<_>>().join("\n"))
+        })
+        .collect()
+}
+
+#[test]
+fn a_server_gives_the_same_files_as_the_program_itself_and_drains_on_sigterm() {
+    let directory = directory();
+    let path = |name: &str| directory.path().join(name);
+    let input = scene(directory.path());
+    let solve = |out: &Path, more: &[&str]| {
+        let size = ["--width", "1000", "--height", "1000", "--json"];
+        let run = run(["solve", text(&input), "--out", text(out)].iter().chain(&size).chain(more));
+        assert_eq!(run.code, Some(0), "{run:?}");
+        json(&run.stdout)
+    };
+    let local = solve(&path("local"), &[]);
+    assert_eq!(local["status"], "SOLVED");
+    assert_eq!(local["inlier_tracks"], 30);
+    assert_eq!(json(&fs::read_to_string(path("local").join("result.json")).expect("result.json")), local);
+
+    let mut serving = Serving::start(&path("data"));
+    assert!(serving.page("/readyz").contains("200"));
+    solve(&path("remote"), &["--server", &serving.grpc]);
+    let (local, remote) = (files_but_for_times(&path("local")), files_but_for_times(&path("remote")));
+    assert_eq!(local.keys().collect::<Vec<_>>(), remote.keys().collect::<Vec<_>>());
+    for (name, content) in &local {
+        assert!(content == &remote[name], "{name} differs");
+    }
+
+    let listed = run(["list", "--server", &serving.grpc]);
+    assert_eq!(listed.code, Some(0), "{listed:?}");
+    assert!(listed.stdout.contains("SUCCEEDED"), "{listed:?}");
+    let name = listed.stdout.split_whitespace().find(|word| word.starts_with("tenants/")).expect("a job's name");
+    let result = run(["result", name, "--json", "--server", &serving.grpc]);
+    assert_eq!(json(&result.stdout)["inlier_tracks"], 30);
+    let unknown = run(["get", "tenants/default/jobs/unknown", "--server", &serving.grpc]);
+    assert_eq!(unknown.code, Some(65), "{unknown:?}");
+
+    serving.running.signal(Signal::TERM);
+    assert_eq!(serving.running.wait().code(), Some(0));
+}
+
+#[test]
+fn what_cannot_be_solved_ends_with_3_and_says_why() {
+    let directory = directory();
+    let (scene, out) = (directory.path().join("scene"), directory.path().join("out"));
+    run(["synth", "--views", "4", "--tracks", "20", "--outliers", "1", "--out", text(&scene)]);
+    let input = scene.join("observations.csv");
+    let run = run(["solve", text(&input), "--out", text(&out), "--json", "--method", "geometry"]);
+    assert_eq!(run.code, Some(3), "{run:?}");
+    let result = json(&run.stdout);
+    assert_eq!(result["status"], "NO_RECONSTRUCTION");
+    assert_ne!(result["warnings"], Value::Array(Vec::new()));
+    assert!(out.join("report.html").exists());
+}
+
+#[test]
+fn ctrl_c_ends_a_solve_with_130_and_leaves_no_result() {
+    let directory = directory();
+    let (input, out) = (scene(directory.path()), directory.path().join("out"));
+    // The paper's method runs all its iterations: some minutes, had it its way.
+    let mut child = program(["solve", text(&input), "--out", text(&out), "--method", "paper", "--iterations", "10000"])
+        .stdin(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    let mut stderr = BufReader::new(child.stderr.take().expect("piped"));
+    let mut running = Running(child);
+    let mut line = String::new();
+    stderr.read_line(&mut line).expect("progress");
+    assert!(line.contains('%'), "{line:?}");
+    running.signal(Signal::INT);
+    assert_eq!(running.wait().code(), Some(130));
+    assert!(!out.join("result.json").exists());
+}
+
+#[test]
+fn the_demo_finds_what_is_true() {
+    let directory = directory();
+    let out = directory.path().join("demo");
+    let run = run(["demo", "--out", text(&out), "--outliers", "0.8", "--tracks", "100", "--json"]);
+    assert_eq!(run.code, Some(0), "{run:?}");
+    let figures = json(&run.stdout);
+    assert!(figures["f1"].as_f64().is_some_and(|f1| f1 >= 0.95), "{figures}");
+    assert_eq!(figures["result"]["status"], "SOLVED");
+    for state in ["QUEUED", "RUNNING", "SUCCEEDED", "search"] {
+        assert!(run.stderr.contains(state), "{state} is not among {}", run.stderr);
+    }
+    for file in ["result.json", "report.html", "scene/observations.csv", "scene/truth.json"] {
+        assert!(out.join(file).exists(), "no {file}");
+    }
+}
