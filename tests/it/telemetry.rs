@@ -6,59 +6,21 @@ use std::time::Duration;
 
 use rustix::process::Signal;
 use scpsfm::domain::Stage;
-use scpsfm::rpc::convert;
-use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState, create_job_request::Input};
-use scpsfm::synthetic::{Scene, SceneOptions};
 use tonic::Code;
-use tonic::transport::Channel;
 
 use crate::support::collector::{Collector, attribute, hex, only};
+use crate::support::live::{connected, created, easy, lasting, reaches};
 use crate::support::program::Serving;
 use crate::support::scrape::Page;
 use crate::support::server::soon;
-use crate::support::wire::{create, state_of};
 
-/// A scene that is quickly solved.
-fn easy() -> proto::CreateJobRequest {
-    let options = SceneOptions { views: 6, tracks: 60, outliers: 0.3, seed: 1, ..SceneOptions::default() };
-    let scene = Scene::generate(&options).expect("a scene");
-    create(Input::TrackSet(convert::input::to_wire(&scene.input)))
-}
-
-/// A job that keeps a worker busy for minutes if it is let.
-fn endless() -> proto::CreateJobRequest {
-    let scene = Scene::generate(&SceneOptions { tracks: 1_000, ..SceneOptions::default() }).expect("a scene");
-    let settings =
-        proto::SolveSettings { method: proto::Method::Paper as i32, iterations: Some(10_000), ..Default::default() };
-    let mut request = create(Input::TrackSet(convert::input::to_wire(&scene.input)));
-    request.job = Some(proto::Job { settings: Some(settings), ..Default::default() });
-    request
-}
-
-async fn connected(server: &Serving) -> JobServiceClient<Channel> {
-    JobServiceClient::connect(server.grpc.clone()).await.expect("a connection")
-}
+/// Iterations that keep a worker busy for half a minute or more if they are let.
+const ENDLESS: u32 = 10_000;
 
 /// What `/metrics` shows now.
 fn scrape(server: &Serving) -> Page {
     Page::parse(&server.page("/metrics"))
-}
-
-async fn created(jobs: &mut JobServiceClient<Channel>, request: proto::CreateJobRequest) -> String {
-    jobs.create_job(request).await.expect("a job").into_inner().name
-}
-
-/// Follows a job until it enters one of these states, and returns which.
-async fn reaches(jobs: &mut JobServiceClient<Channel>, name: &str, states: &[JobState]) -> JobState {
-    let request = proto::WatchJobRequest { name: name.into(), after_sequence: 0 };
-    let mut watch = jobs.watch_job(request).await.expect("a watch").into_inner();
-    while let Some(event) = soon(watch.message()).await.expect("an event") {
-        if let Some(state) = state_of(&event).filter(|state| states.contains(state)) {
-            return state;
-        }
-    }
-    panic!("{name} ended in none of {states:?}");
 }
 
 /// The first page that shows `wanted`: metrics follow the commit that a watcher sees, so they may come a moment later.
@@ -108,7 +70,7 @@ async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
     assert_eq!(before.value("scpsfm_workers"), 1.0);
     assert_eq!(before.sum("scpsfm_build_info"), 1.0);
 
-    let name = created(&mut jobs, easy()).await;
+    let name = created(&mut jobs, easy(1)).await;
     assert_eq!(reaches(&mut jobs, &name, &[JobState::Succeeded, JobState::Failed]).await, JobState::Succeeded);
     let solved =
         scrape_until(&server, |page| page.value("scpsfm_jobs_total{state=\"SUCCEEDED\"}") > 0.0 && is_idle(page)).await;
@@ -136,7 +98,7 @@ async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
     }
     assert_idle(&solved);
 
-    let mut bad = easy();
+    let mut bad = easy(1);
     if let Some(Input::TrackSet(tracks)) = &mut bad.input {
         tracks.x[0] = f64::NAN;
     }
@@ -145,7 +107,7 @@ async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
     let invalid = "scpsfm_admission_refusals_total{reason=\"INVALID\"}";
     assert_growth(&solved, &refused, &[(invalid, 1.0), (CREATED_BAD, 1.0), ("scpsfm_jobs_created_total", 0.0)]);
 
-    let name = created(&mut jobs, endless()).await;
+    let name = created(&mut jobs, lasting(ENDLESS)).await;
     reaches(&mut jobs, &name, &[JobState::Running]).await;
     assert_eq!(scrape(&server).value("scpsfm_workers_busy"), 1.0);
     jobs.cancel_job(proto::CancelJobRequest { name: name.clone() }).await.expect("a cancel");
@@ -175,7 +137,7 @@ async fn a_job_that_takes_its_server_down_fails_and_is_counted_by_the_next() {
     let once = [("SCPSFM_ENGINE__MAX_ATTEMPTS", "1")];
     let server = Serving::start_with(&data_dir, &once, Stdio::null());
     let mut jobs = connected(&server).await;
-    let name = created(&mut jobs, endless()).await;
+    let name = created(&mut jobs, lasting(ENDLESS)).await;
     reaches(&mut jobs, &name, &[JobState::Running]).await;
     assert_eq!(scrape(&server).value("scpsfm_jobs_total{state=\"FAILED\"}"), 0.0);
     // Killed without a warning, as by a power cut.
@@ -206,7 +168,7 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
     let export = [("SCPSFM_OTLP__ENDPOINT", endpoint.as_str())];
     let mut server = Serving::start_with(&data_dir, &export, File::create(&log).expect("a log file"));
     let mut jobs = connected(&server).await;
-    let mut request = tonic::Request::new(easy());
+    let mut request = tonic::Request::new(easy(1));
     let traceparent = format!("00-{TRACE_ID}-{CALLER_SPAN}-01");
     request.metadata_mut().insert("traceparent", traceparent.parse().expect("ASCII"));
     let name = jobs.create_job(request).await.expect("a job").into_inner().name;

@@ -84,11 +84,21 @@ impl Serving {
 
     /// The same with these variables of the environment, logging to `stderr`.
     pub fn start_with(data_dir: &Path, variables: &[(&str, &str)], stderr: impl Into<Stdio>) -> Self {
+        Self::start_more(data_dir, &["--workers", "1"], variables, stderr)
+    }
+
+    /// The same with more arguments.
+    pub fn start_more(
+        data_dir: &Path,
+        arguments: &[&str],
+        variables: &[(&str, &str)],
+        stderr: impl Into<Stdio>,
+    ) -> Self {
         let mut child =
-            program(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--workers", "1"])
+            program(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--log-format", "json"])
                 .arg("--data-dir")
                 .arg(data_dir)
-                .args(["--log-format", "json"])
+                .args(arguments)
                 .stdin(Stdio::null())
                 .stdout(Stdio::piped())
                 .envs(variables.iter().copied())
