@@ -21,8 +21,8 @@
 //! * **Gradients of the losses are computed in f64, outside burn** ([`losses`]) and handed to it as a linear
 //!   surrogate: nothing differentiates an eigen-decomposition, and no loss is evaluated in f32.
 //! * **The global feature does not reach the segmentation head.** It would add the same vector `W_g g` to every
-//!   column, and the batch statistics of that very layer subtract it again, exactly; `pointnet.rs` has
-//!   the argument and a test.
+//!   column, and the batch statistics of that very layer subtract it again, exactly; the argument and a
+//!   test are in `pointnet.rs`.
 //!
 //! The weights rank tracks well and separate them badly: the paper's `t = 15` makes some fifteen to twenty kept
 //! tracks the optimum whatever the true number. The solver therefore takes them as a prior for guided search.

@@ -1,6 +1,6 @@
 //! From the geometry of a block to the solution that callers read.
 
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix4, Vector3};
+use nalgebra::{Matrix3, Matrix4};
 
 use super::attempt::Attempt;
 use super::judge::{self, Geometry, Judged};
@@ -8,6 +8,7 @@ use super::recorder::Recorder;
 use crate::domain::result::{ObservationResults, TrackResults, ViewResult};
 use crate::domain::{Calibration, Grade, Input, Method, Solution, SolveSettings, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::Reconstruction;
+use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::measurement::{Normalization, Sighting};
 use crate::geometry::{Camera, Point, triangulation};
 
@@ -73,8 +74,9 @@ pub fn solved(
     let Some(consensus) = &attempt.consensus else {
         return unsolved(input, settings, Some(&attempt), warnings, recorder);
     };
-    let frame = canonical_frame(&consensus.cameras);
-    let local: Vec<Camera> = consensus.cameras.iter().map(|camera| camera * frame).collect();
+    // Where the first camera has no rank 3 the frame stays as it is: there is nothing metric to be consistent with.
+    let local =
+        to_first_view_frame(&consensus.cameras, &[]).map_or_else(|| consensus.cameras.clone(), |frame| frame.cameras);
     let mut cameras = vec![None; input.view_count()];
     for (&view, camera) in attempt.block.views.iter().zip(&local) {
         cameras[view] = Some(*camera);
@@ -93,14 +95,15 @@ pub fn solved(
     let calibration = attempt.calibration.as_ref();
     let grade = calibration.map_or(Grade::ProjectiveOnly, |calibration| calibration.grade);
     let metric = calibration.and_then(|calibration| calibration.metric.as_ref());
+    let usable = metric.filter(|_| grade != Grade::ProjectiveOnly);
     warnings.extend(calibration.into_iter().flat_map(|calibration| calibration.warnings.iter().cloned()));
     warnings.extend(left_out(input, &attempt.block.views));
 
-    let plane = metric.and_then(|metric| plane_at_infinity(&local, metric));
+    let plane = calibration.and_then(|calibration| calibration.plane_at_infinity).filter(|_| usable.is_some());
     let first_px = normalization.to_pixels(attempt.block.views[0]);
-    let views = views(input, &attempt, &local, metric, normalization);
+    let views = views(input, &attempt, &local, usable, normalization);
     let Judged { mut tracks, observations, retained, points } = judged;
-    tracks.point = final_points(&attempt, metric, &retained, &points, &first_px);
+    tracks.point = final_points(&attempt, usable, &retained, &points, &first_px);
     own_verdicts(&attempt, settings.method, &mut tracks);
     let (rms, mean) = reprojection(&observations);
     let seconds = recorder.seconds();
@@ -151,61 +154,6 @@ fn own_verdicts(attempt: &Attempt, method: Method, tracks: &mut TrackResults) {
             tracks.inlier[track] = decided.inlier[j];
         }
     }
-}
-
-/// A 4x4 transform of space that brings the first camera to `[I|0]`: `P1 H = [I|0]`, the others' last columns of about
-/// the size of the rest.
-fn canonical_frame(cameras: &[Camera]) -> Matrix4<f64> {
-    let first = cameras[0];
-    let left = first.fixed_columns::<4>(0) * first.transpose();
-    let pseudo_inverse = left.try_inverse().map_or_else(|| first.transpose(), |inverse| first.transpose() * inverse);
-    let centre = camera_centre(&first);
-    let mut frame = Matrix4::identity();
-    frame.fixed_view_mut::<4, 3>(0, 0).copy_from(&pseudo_inverse);
-    frame.fixed_view_mut::<4, 1>(0, 3).copy_from(&centre);
-    frame
-}
-
-/// The null vector of a camera, as the 4-D cross product of its rows.
-fn camera_centre(camera: &Camera) -> Point {
-    let minor = |skip: usize| {
-        let columns: Vec<usize> = (0..4).filter(|&column| column != skip).collect();
-        Matrix3::from_fn(|row, k| camera[(row, columns[k])]).determinant()
-    };
-    let centre = Point::new(minor(0), -minor(1), minor(2), -minor(3));
-    let norm = centre.norm();
-    if norm > 0.0 { centre / norm } else { Point::new(0.0, 0.0, 0.0, 1.0) }
-}
-
-/// The plane at infinity `(n, 1)` in the frame of canonical projective cameras, from metric ones of the same views:
-/// least squares on `s_i K R_i R_1^T = (A_i - a_i n^T) K`, linear in `n` and the scales `s_i` (paper, eq. 4).
-///
-/// Returns `None` when the cameras do not determine it (no parallax).
-fn plane_at_infinity(cameras: &[Camera], metric: &Reconstruction) -> Option<Vector3<f64>> {
-    let k = metric.intrinsics.matrix();
-    let first = metric.poses[0].rotation.transpose();
-    let views = cameras.len();
-    let mut system = DMatrix::zeros(9 * views, 3 + views);
-    let mut right = DVector::zeros(9 * views);
-    for (view, camera) in cameras.iter().enumerate() {
-        let norm = camera.fixed_columns::<3>(0).norm();
-        let left = camera.fixed_columns::<3>(0) * k / norm;
-        let translation = camera.column(3) / norm;
-        let rotated = k * metric.poses[view].rotation * first;
-        for row in 0..3 {
-            for column in 0..3 {
-                let equation = 9 * view + 3 * row + column;
-                for axis in 0..3 {
-                    system[(equation, axis)] = translation[row] * k[(axis, column)];
-                }
-                system[(equation, 3 + view)] = rotated[(row, column)] / rotated.norm();
-                right[equation] = left[(row, column)];
-            }
-        }
-    }
-    let solution = system.svd(true, true).solve(&right, f64::EPSILON).ok()?;
-    let plane = Vector3::new(solution[0], solution[1], solution[2]);
-    plane.iter().all(|entry| entry.is_finite()).then_some(plane)
 }
 
 fn outlier_density(attempt: &Attempt) -> f64 {
@@ -274,15 +222,10 @@ fn final_points(
             .map(|point| point.and_then(|point| dehomogenise(&to_pixel_frame(&point, first_px))))
             .collect();
     };
-    let k = metric.intrinsics.matrix();
     let most = attempt.block.views.iter().copied().max().unwrap_or(0);
     let mut cameras = vec![Camera::zeros(); most + 1];
     for (i, &view) in attempt.block.views.iter().enumerate() {
-        let pose = &metric.poses[i];
-        let mut camera = Camera::zeros();
-        camera.fixed_columns_mut::<3>(0).copy_from(&(k * pose.rotation));
-        camera.set_column(3, &(k * pose.translation));
-        cameras[view] = camera;
+        cameras[view] = metric.poses[i].camera(&metric.intrinsics);
     }
     retained
         .iter()

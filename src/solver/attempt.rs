@@ -186,9 +186,7 @@ fn calibrate(block: &Block, consensus: &Consensus, scale_px: f64, stop: &StopTok
         observations: &observations,
         noise: consensus.noise,
     };
-    let outcome = calibration::calibrate(&problem, scale_px, stop);
-    stopped(stop)?;
-    outcome.map_err(|_| Error::Internal("calibration stopped without being asked to".into()))
+    Ok(calibration::calibrate(&problem, scale_px, stop)?)
 }
 
 /// All tracks, or a random choice of [`MOST_SEARCHED_TRACKS`], increasing.

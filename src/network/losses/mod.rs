@@ -4,8 +4,8 @@
 //!
 //! With `A = M diag(w)` and the eigen-decomposition `A Aᵀ = U Λ Uᵀ`:
 //! * `L_num = exp(t - Σ_j s(κ (w_j - 1/2)))`,
-//! * `L_proj = Σ_{k>=5} σ_k(A)`, [`spectrum`],
-//! * `L_DAQ = Σ_i | S_i/|S_i| - ω/|ω| |` over the views, [`daq`], in the cameras that [`gauge`] reads off the span of
+//! * `L_proj = Σ_{k>=5} σ_k(A)`, in `spectrum.rs`,
+//! * `L_DAQ = Σ_i | S_i/|S_i| - ω/|ω| |` over the views, in the cameras that `gauge.rs` reads off the span of
 //!   the first four eigenvectors.
 
 mod daq;
