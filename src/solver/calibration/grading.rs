@@ -231,7 +231,7 @@ fn misfits(best: &Candidate, fit: &ProjectiveFit) -> bool {
 /// by nine. Near critical motions the linearisation is optimistic: it is taken where the noise has moved the scene.
 fn profiled(sigma: f64, best: &Candidate, observations: &[Observation], stop: &StopToken) -> f64 {
     let shift = (PROFILE_DEVIATIONS * sigma).min(PROFILE_LONGEST);
-    if !(shift > 0.0) {
+    if shift <= 0.0 {
         return sigma;
     }
     let side = |shift: f64| {
