@@ -11,6 +11,7 @@ use crate::engine::{self, Engine};
 use crate::rpc::server::{self, Server};
 use crate::store::QueueBounds;
 use crate::store::sqlite::Sqlite;
+use crate::store::timed::Timed;
 
 /// How long calls may outlast the engine's drain: their streams end with it, so this is for the network only.
 const CALLS_BOUND: Duration = Duration::from_secs(5);
@@ -43,7 +44,7 @@ impl Service {
             max_attempts: config.engine.max_attempts,
             ..engine::Options::default()
         };
-        let engine = Engine::start(options, Arc::new(store), solver_on(config.compute.backend))
+        let engine = Engine::start(options, Arc::new(Timed(store)), solver_on(config.compute.backend))
             .await
             .map_err(|error| Failure::internal(format_args!("cannot start the engine: {error}")))?;
         let options = server::Options {

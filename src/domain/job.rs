@@ -125,7 +125,7 @@ pub struct Summary {
     pub winning_prior: Option<Prior>,
     pub iterations: u32,
     pub seconds: f64,
-    /// Size of the encoded result in bytes, as `ReadJobResult` streams it.
+    /// Size of the stored result in bytes; `ReadJobResult` streams about as much.
     pub result_bytes: u64,
 }
 

@@ -118,10 +118,18 @@ impl Warning {
 /// Intrinsics of one camera group, with their uncertainty.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
+    /// Horizontal focal length.
     pub focal_px: f64,
     /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable (infinite).
     pub sigma_log_focal: Option<f64>,
     pub principal_point_px: [f64; 2],
+    /// Vertical over horizontal focal length; 1 (square pixels) unless the data asked for more.
+    #[serde(default = "square_pixels")]
+    pub aspect: f64,
+}
+
+fn square_pixels() -> f64 {
+    1.0
 }
 
 /// One view of the result.

@@ -10,7 +10,7 @@ use tracing::Instrument;
 use super::observe::{self, Attempt, AttemptLost};
 use super::worker::{Assignment, Report, Verdict, Worker};
 use super::{Inner, locked};
-use crate::domain::job::{Failure, Job, JobName};
+use crate::domain::job::{Failure, Job};
 use crate::domain::{Progress, StopReason, StopToken};
 use crate::store::{self, Claimed, Ending, Lease, Outcome};
 
@@ -32,7 +32,8 @@ pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) {
     let Claimed { job, lease, trace_parent, queue_time } = claimed;
     let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref(), queue_time);
     let span = attempt.span().clone();
-    Course::begin(inner, job, lease).run(worker, attempt).instrument(span).await;
+    // All of it inside the span, so that every line carries the job's name.
+    async { Course::begin(inner, job, lease).run(worker, attempt).await }.instrument(span).await;
 }
 
 /// An attempt under way.
@@ -50,22 +51,22 @@ struct Course<'a> {
     _running: Running<'a>,
 }
 
-/// Lists a job among the running ones as long as it lives.
+/// Lists an attempt among the running ones as long as it lives.
 struct Running<'a> {
     inner: &'a Inner,
-    name: JobName,
+    lease: Lease,
 }
 
 impl<'a> Running<'a> {
-    fn list(inner: &'a Inner, name: &JobName, stop: &StopToken) -> Self {
-        locked(&inner.running).insert(name.clone(), stop.clone());
-        Self { inner, name: name.clone() }
+    fn list(inner: &'a Inner, lease: &Lease, stop: &StopToken) -> Self {
+        locked(&inner.running).insert(lease.clone(), stop.clone());
+        Self { inner, lease: lease.clone() }
     }
 }
 
 impl Drop for Running<'_> {
     fn drop(&mut self) {
-        locked(&self.inner.running).remove(&self.name);
+        locked(&self.inner.running).remove(&self.lease);
     }
 }
 
@@ -74,7 +75,7 @@ impl<'a> Course<'a> {
         let left = job.deadline.map(|deadline| deadline.duration_since(SystemTime::now()).unwrap_or_default());
         // A deadline beyond what the clock can express is none.
         let stop = StopToken::with_deadline(left.and_then(|left| std::time::Instant::now().checked_add(left)));
-        let running = Running::list(inner, &job.name, &stop);
+        let running = Running::list(inner, &lease, &stop);
         let leased_until = Instant::now() + inner.options.lease;
         inner.hub.wake(&job.name);
         tracing::info!("attempt begins");

@@ -30,7 +30,7 @@ pub use watch::Watch;
 use crate::domain::job::{Job, JobName, JobState};
 use crate::domain::{Input, Observer, Solution, SolveSettings, StopReason, StopToken};
 use crate::solver;
-use crate::store::{Store, payload};
+use crate::store::{Lease, Store, payload};
 
 /// What workers run; [`default_solver`] in earnest, a stand-in in tests.
 pub type Solver =
@@ -48,7 +48,8 @@ pub struct Options {
     pub workers: usize,
     /// What may wait at once.
     pub queue: QueueBounds,
-    /// How long a worker may be silent before its job is taken from it.
+    /// How long a worker may be silent before its job is taken from it; held to
+    /// [`Options::MIN_LEASE`]..=[`Options::MAX_LEASE`].
     pub lease: Duration,
     /// Attempts that may be lost before a job fails.
     pub max_attempts: u32,
@@ -69,6 +70,10 @@ impl Options {
     pub const DEFAULT_LEASE: Duration = Duration::from_secs(30);
     /// Twice is bad luck, three times is the job.
     pub const DEFAULT_MAX_ATTEMPTS: u32 = 3;
+    /// Shorter leases would be lost to a slow disk's commit, and keep it busy with heartbeats.
+    pub const MIN_LEASE: Duration = Duration::from_millis(100);
+    /// Longer ones would leave the job of a dead worker lying for good.
+    pub const MAX_LEASE: Duration = Duration::from_secs(24 * 60 * 60);
     /// About the time of one job.
     pub const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(3);
 }
@@ -114,8 +119,8 @@ struct Inner {
     options: Options,
     store: Arc<dyn Store>,
     hub: Arc<hub::Hub>,
-    /// Jobs that run in this process, for a cancel to reach them at once.
-    running: Mutex<HashMap<JobName, StopToken>>,
+    /// Attempts that run in this process, for a cancel to reach them at once.
+    running: Mutex<HashMap<Lease, StopToken>>,
     /// Counts the reasons to look for a job to claim; slots wait for a change.
     work: channel::Sender<u64>,
     /// Wakes the task that counts the queue.
@@ -130,7 +135,8 @@ impl Engine {
     ///
     /// # Errors
     /// [`Error::Internal`] when the store or a thread refuses.
-    pub async fn start(options: Options, store: Arc<dyn Store>, solver: Solver) -> Result<Self, Error> {
+    pub async fn start(mut options: Options, store: Arc<dyn Store>, solver: Solver) -> Result<Self, Error> {
+        options.lease = options.lease.clamp(Options::MIN_LEASE, Options::MAX_LEASE);
         let recovered = store.recover(SystemTime::now(), options.max_attempts).await?;
         let inner = Arc::new(Inner {
             store,
@@ -251,7 +257,8 @@ impl Inner {
 
     async fn cancel(&self, name: &JobName) -> Result<Job, Error> {
         let reply = self.store.request_cancel(name, SystemTime::now()).await?;
-        if let Some(stop) = locked(&self.running).get(name) {
+        // Of one job there may be two for a while: an attempt that lost its lease and does not know yet.
+        for (_, stop) in locked(&self.running).iter().filter(|(lease, _)| lease.name == *name) {
             stop.stop(StopReason::Cancelled);
         }
         if reply.ended_now {

@@ -96,7 +96,7 @@ fn infinity_is_null_and_said() {
 #[test]
 fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     let (mut input, mut solution) = fixture::solved();
-    let second = Calibration { focal_px: 77.0, sigma_log_focal: None, principal_point_px: [1.0, 2.0] };
+    let second = Calibration { focal_px: 77.0, sigma_log_focal: None, principal_point_px: [1.0, 2.0], aspect: 1.0 };
     solution.calibrations.push(second);
     input.raw.views[3].camera_group = 9;
     let result = json(&solution);

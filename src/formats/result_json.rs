@@ -181,7 +181,7 @@ fn camera_groups(solution: &Solution, input: Option<&LabelledInput>) -> Vec<usiz
 /// The calibration matrix `K`, row by row.
 fn intrinsics(calibration: &Calibration) -> [[f64; 3]; 3] {
     let [x, y] = calibration.principal_point_px;
-    [[calibration.focal_px, 0.0, x], [0.0, calibration.focal_px, y], [0.0, 0.0, 1.0]]
+    [[calibration.focal_px, 0.0, x], [0.0, calibration.focal_px * calibration.aspect, y], [0.0, 0.0, 1.0]]
 }
 
 /// The caller's id of view `index`, or the index where the input is not at hand.

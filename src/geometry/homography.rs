@@ -16,9 +16,10 @@ const CAUCHY_SCALE: f64 = 3.0;
 const QUANTILE: f64 = 0.75;
 const RAYLEIGH_QUANTILE: f64 = 1.665_109_222_315_395_5;
 
-/// Median over the views of how far homographies to the reference view miss, in units of the noise.
+/// Median over the views of how far homographies to a reference view miss, in units of the noise.
 ///
-/// The reference is the view with the most observations. About 1.4 (the noise of two views) for a planar scene or a
+/// First, last and most observed view take their turn as reference, and the largest median counts: along a sequence,
+/// neighbours alone have too little baseline to tell. About 1.4 (the noise of two views) for a planar scene or a
 /// camera that only rotates; tens where there is parallax. `noise` is the standard deviation of a coordinate.
 ///
 /// Returns `None` when no pair of views has enough points in common.
@@ -31,8 +32,16 @@ pub fn median_residual(observations: &[Observation], views: usize, noise: f64) -
         view.sort_by_key(|(point, _)| *point);
         view.dedup_by_key(|(point, _)| *point);
     }
-    let reference = (0..views).max_by_key(|&view| (by_view[view].len(), std::cmp::Reverse(view)))?;
-    let mut residuals: Vec<f64> = (0..views)
+    let most_observed = (0..views).max_by_key(|&view| (by_view[view].len(), std::cmp::Reverse(view)))?;
+    let mut references = vec![0, most_observed, views - 1];
+    references.sort_unstable();
+    references.dedup();
+    references.into_iter().filter_map(|reference| median_to(&by_view, reference, noise)).reduce(f64::max)
+}
+
+/// Median over the other views of how far homographies to this reference miss.
+fn median_to(by_view: &[Vec<(usize, Vector2<f64>)>], reference: usize, noise: f64) -> Option<f64> {
+    let mut residuals: Vec<f64> = (0..by_view.len())
         .filter(|&view| view != reference)
         .filter_map(|view| pair_residual(&common(&by_view[reference], &by_view[view]), noise))
         .collect();

@@ -266,6 +266,7 @@ fn pixel_calibration(
         focal_px: metric.intrinsics.focal * normalization.scale_px,
         sigma_log_focal,
         principal_point_px: (centre + offset).into(),
+        aspect: metric.intrinsics.aspect,
     }
 }
 

@@ -134,9 +134,9 @@ fn greedy_views(input: &Input, ranges: &[usize], least: usize) -> Vec<Vec<usize>
         tracks_of_view[input.view_of(k)].push(input.track_of(k));
     }
     let mut found: Vec<(usize, Vec<usize>)> = Vec::new();
-    for first in 0..input.view_count() {
+    for (first, seen) in tracks_of_view.into_iter().enumerate() {
         let mut views = vec![first];
-        let mut tracks = tracks_of_view[first].clone();
+        let mut tracks = seen;
         let mut best: Option<(usize, Vec<usize>)> = None;
         while views.len() < MOST_VIEWS {
             let mut counts = vec![0usize; input.view_count()];

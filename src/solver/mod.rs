@@ -17,6 +17,8 @@ mod portfolio;
 mod priors;
 mod recorder;
 mod search;
+#[cfg(test)]
+mod tests;
 
 use crate::domain::{Input, Observer, Solution, SolveSettings, StopReason, StopToken, Warning, WarningCode};
 use attempt::Attempt;

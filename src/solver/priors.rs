@@ -77,8 +77,7 @@ const AFFINE_FLOOR: f64 = 0.08;
 ///
 /// Returns the weights of the last round; `None` when a decomposition fails.
 pub fn affine_irls(centred: &DMatrix<f64>) -> Option<Vec<f64>> {
-    let count = centred.ncols();
-    let mut weights = vec![1.0f64; count];
+    let mut weights = vec![1.0f64; centred.ncols()];
     let mut scale = None;
     for _ in 0..IRLS_ROUNDS {
         let total: f64 = weights.iter().sum();
@@ -88,10 +87,10 @@ pub fn affine_irls(centred: &DMatrix<f64>) -> Option<Vec<f64>> {
         }
         let mut offset = centred.clone();
         let mut weighted = centred.clone();
-        for j in 0..count {
+        for (j, weight) in weights.iter().enumerate() {
             let mut column = offset.column_mut(j);
             column -= &mean;
-            weighted.set_column(j, &(&column * weights[j].sqrt()));
+            weighted.set_column(j, &(&column * weight.sqrt()));
         }
         let basis = dominant_subspace(&weighted, 3)?;
         let inside = basis.tr_mul(&offset);

@@ -113,7 +113,7 @@ pub struct Load {
 }
 
 /// The right to write to a running job. `attempt` is the fencing token: a later lease has a larger one.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Lease {
     pub name: JobName,
     pub attempt: u32,

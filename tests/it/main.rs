@@ -2,4 +2,8 @@
 
 mod api;
 mod cli;
+mod crash;
+mod load;
+mod readme;
 mod support;
+mod telemetry;

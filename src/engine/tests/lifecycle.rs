@@ -90,7 +90,7 @@ async fn a_cancel_reaches_a_queued_a_running_and_no_ended_job() {
 
 #[tokio::test]
 async fn a_cancel_that_another_process_stored_arrives_with_a_heartbeat() {
-    let options = Options { lease: Duration::from_millis(300), ..workers(1) };
+    let options = Options { lease: Duration::from_millis(300), max_attempts: u32::MAX, ..workers(1) };
     let bench = Bench::start(options).await;
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;

@@ -154,7 +154,7 @@ fn new_job(script: Script) -> NewJob {
 /// An engine over a store in a directory of its own.
 struct Bench {
     engine: Engine,
-    store: Arc<dyn Store>,
+    store: Arc<Sqlite>,
     gate: Arc<Gate>,
     directory: TempDir,
 }
@@ -177,10 +177,10 @@ impl Bench {
     }
 }
 
-async fn start(options: Options, directory: &TempDir, gate: &Arc<Gate>) -> (Engine, Arc<dyn Store>) {
+async fn start(options: Options, directory: &TempDir, gate: &Arc<Gate>) -> (Engine, Arc<Sqlite>) {
     // The engine before may still be letting go of the directory.
     let store = eventually(|| async { Sqlite::open(directory.path()).await.ok() }).await;
-    let store: Arc<dyn Store> = Arc::new(store);
+    let store = Arc::new(store);
     let engine = Engine::start(options, store.clone(), gate.solver()).await.expect("starts");
     (engine, store)
 }

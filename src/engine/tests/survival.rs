@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 use tokio::runtime::Runtime;
 
 use super::*;
-use crate::engine::{Drained, Error};
+use crate::engine::{Drained, Error, locked};
 
 #[tokio::test]
 async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
@@ -145,14 +145,67 @@ async fn a_worker_whose_lease_was_taken_over_changes_nothing() {
 
 #[tokio::test]
 async fn a_lost_lease_stops_the_work() {
-    let options = Options { lease: Duration::from_millis(300), ..workers(1) };
+    let options = Options { lease: Duration::from_millis(300), max_attempts: u32::MAX, ..workers(1) };
     let bench = Bench::start(options).await;
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let much_later = SystemTime::now() + Duration::from_secs(60);
-    bench.store.sweep(much_later, 10).await.expect("sweeps");
+    bench.store.sweep(much_later, u32::MAX).await.expect("sweeps");
     // The one worker can only take the job up again after the first attempt has stopped.
     bench.gate.until_waiting(2).await;
     bench.gate.open();
     assert_eq!(bench.ended(&name).await.state, JobState::Succeeded);
+}
+
+/// Statements after which no job can change its state, or none can be written at all, as with a full disk.
+const NO_ENDS: &str = "CREATE TRIGGER broken BEFORE UPDATE OF state ON jobs BEGIN SELECT RAISE(ABORT, 'broken'); END";
+const NO_WRITES: &str = "CREATE TRIGGER broken BEFORE UPDATE ON jobs BEGIN SELECT RAISE(ABORT, 'broken'); END";
+const MENDED: &str = "DROP TRIGGER broken";
+
+#[tokio::test]
+async fn a_result_waits_for_a_store_that_comes_back_in_time() {
+    let bench = Bench::start(workers(1)).await;
+    let name = bench.submit(Script::Wait).await;
+    bench.gate.until_waiting(1).await;
+    bench.store.execute(NO_ENDS).await;
+    bench.gate.open();
+    // Long enough to try in vain; were it not, the test would only show less.
+    tokio::time::sleep(Duration::from_millis(50)).await;
+    assert_eq!(bench.engine.job(&name).await.expect("reads work").state, JobState::Running);
+    bench.store.execute(MENDED).await;
+    let job = bench.ended(&name).await;
+    assert_eq!((job.state, job.attempt), (JobState::Succeeded, 1));
+    assert_eq!(bench.gate.calls.load(Ordering::SeqCst), 1);
+}
+
+#[tokio::test]
+async fn without_a_store_for_a_lease_the_work_stops_and_later_goes_on_by_itself() {
+    let options = Options { lease: Duration::from_millis(300), max_attempts: u32::MAX, ..workers(1) };
+    let bench = Bench::start(options).await;
+    let name = bench.submit(Script::Wait).await;
+    bench.gate.until_waiting(1).await;
+    bench.store.execute(NO_WRITES).await;
+    eventually(|| async { locked(&bench.engine.inner.running).is_empty().then_some(()) }).await;
+    assert_eq!(bench.engine.job(&name).await.expect("reads work").state, JobState::Running, "as far as is known");
+    assert!(matches!(bench.engine.submit(new_job(Script::Wait)).await, Err(Error::Internal(_))));
+    bench.store.execute(MENDED).await;
+    bench.gate.open();
+    let job = bench.ended(&name).await;
+    assert_eq!(job.state, JobState::Succeeded);
+    assert!(job.attempt > 1, "{}", job.attempt);
+    assert_contiguous(&rest(&mut bench.engine.watch(&name, 0).await.expect("exists")).await, 1);
+}
+
+#[tokio::test]
+async fn a_cancel_reaches_the_attempt_that_holds_the_lease_though_another_still_runs() {
+    let bench = Bench::start(Options { lease: Duration::from_secs(3000), ..workers(2) }).await;
+    let name = bench.submit(Script::Deaf).await;
+    bench.gate.until_waiting(1).await;
+    bench.store.sweep(SystemTime::now() + Duration::from_secs(4000), 3).await.expect("sweeps");
+    bench.gate.until_waiting(2).await;
+    bench.engine.cancel(&name).await.expect("exists");
+    let tokens: Vec<_> = locked(&bench.engine.inner.running).values().map(StopToken::is_stopped).collect();
+    assert_eq!(tokens, [true, true]);
+    bench.gate.open();
+    bench.ended(&name).await;
 }

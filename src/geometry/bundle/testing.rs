@@ -48,7 +48,19 @@ pub(crate) fn scene(seed: u64, views: usize, tracks: usize, noise: f64) -> TestS
 
 /// The same with another motion, or with the points on a plane.
 pub(crate) fn scene_of(seed: u64, views: usize, tracks: usize, noise: f64, motion: Motion, planar: bool) -> TestScene {
-    let options = SceneOptions { views, tracks, noise: 0.0, outliers: 0.0, seed, ..SceneOptions::default() };
+    let options = SceneOptions { views, tracks, seed, ..SceneOptions::default() };
+    from_options(&options, noise, motion, planar)
+}
+
+/// A scene in general motion whose cameras turn by at most this about each axis: little turning, little calibration.
+pub(crate) fn scene_turning(seed: u64, tracks: usize, noise: f64, max_rotation_rad: f64) -> TestScene {
+    let options = SceneOptions { tracks, max_rotation_rad, seed, ..SceneOptions::default() };
+    from_options(&options, noise, Motion::General, false)
+}
+
+fn from_options(options: &SceneOptions, noise: f64, motion: Motion, planar: bool) -> TestScene {
+    let (seed, views) = (options.seed, options.views);
+    let options = SceneOptions { noise: 0.0, outliers: 0.0, ..options.clone() };
     let truth = Scene::generate(&options).expect("valid options").truth;
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
     let mut points: Vec<Vector3<f64>> = truth.points.iter().map(|point| Vector3::from(*point)).collect();

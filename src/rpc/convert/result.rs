@@ -96,6 +96,7 @@ fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
         sigma_log_focal: calibration.sigma_log_focal,
         principal_point_x_px: calibration.principal_point_px[0],
         principal_point_y_px: calibration.principal_point_px[1],
+        aspect: calibration.aspect,
     }
 }
 
@@ -104,6 +105,7 @@ fn calibration_from_wire(calibration: &proto::Calibration) -> Calibration {
         focal_px: calibration.focal_px,
         sigma_log_focal: calibration.sigma_log_focal,
         principal_point_px: [calibration.principal_point_x_px, calibration.principal_point_y_px],
+        aspect: calibration.aspect,
     }
 }
 
@@ -227,8 +229,8 @@ mod tests {
             iterations: 150,
             seed: u64::MAX,
             calibrations: vec![
-                Calibration { focal_px: 1.0 / 3.0, sigma_log_focal: Some(0.05), principal_point_px: [499.5, 399.5] },
-                Calibration { focal_px: 900.0, sigma_log_focal: None, principal_point_px: [0.0, 0.0] },
+                Calibration { focal_px: 1.0 / 3.0, sigma_log_focal: Some(0.05), principal_point_px: [499.5, 399.5], aspect: 1.25 },
+                Calibration { focal_px: 900.0, sigma_log_focal: None, principal_point_px: [0.0, 0.0], aspect: 1.0 },
             ],
             plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),
             views: vec![

@@ -1,7 +1,7 @@
 //! Which model the data carry, how well the focal length is determined, and what to warn of.
 
 use super::search::Minimum;
-use super::{Outcome, Problem, Stopped};
+use super::{LEAST_NOISE, Outcome, Problem, Stopped};
 use crate::domain::{Grade, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{self, IntrinsicsModel, intrinsics_variance};
 use crate::geometry::bundle::{Observation, Options};
@@ -9,6 +9,8 @@ use crate::geometry::bundle::{Observation, Options};
 /// Standard deviations of the log focal length that bound the grades.
 const METRIC_BELOW: f64 = 0.02;
 const WEAK_UP_TO: f64 = 0.1;
+/// Standard deviation of the log focal length, a factor of 2.7, beyond which the focal length counts as unobservable.
+const UNOBSERVABLE_ABOVE: f64 = 1.0;
 /// Gain in chi-square at which a richer model is taken: the .999 quantile for two degrees of freedom.
 const CHI_SQUARE_GAIN: f64 = 13.8;
 /// How much a richer model may raise the standard deviation of the log focal length and still be taken: beyond, it
@@ -16,6 +18,8 @@ const CHI_SQUARE_GAIN: f64 = 13.8;
 const SIGMA_INFLATION: f64 = 3.0;
 /// Shift of the log focal length between models, in standard deviations, that speaks of a wrong model.
 const MODEL_SHIFT: f64 = 3.0;
+/// Degrees of freedom from which the posterior noise is believed; it is then known to 13 %.
+const ENOUGH_FREEDOM: usize = 30;
 /// Ratio of the metric to the projective posterior noise that speaks of a wrong model; the paper's synthetic scenes
 /// stay within 1.05.
 const RMS_RATIO_LIMIT: f64 = 1.15;
@@ -39,7 +43,7 @@ const PROFILE_LONGEST: f64 = 0.3;
 pub(super) struct ProjectiveFit {
     cost: f64,
     freedom: usize,
-    /// Posterior standard deviation of a coordinate.
+    /// Posterior standard deviation of a coordinate; not below the assumed one where there is little to judge from.
     pub noise: f64,
 }
 
@@ -47,12 +51,14 @@ impl ProjectiveFit {
     pub fn new(cost: f64, problem: &Problem, inliers: usize) -> Self {
         let unknowns = (11 * problem.cameras.len() + 3 * inliers).saturating_sub(15);
         let freedom = (2 * problem.observations.len()).saturating_sub(unknowns);
-        Self { cost, freedom, noise: posterior_noise(cost, freedom) }
+        let posterior = posterior_noise(cost, freedom);
+        let noise = if freedom < ENOUGH_FREEDOM { posterior.max(problem.noise) } else { posterior };
+        Self { cost, freedom, noise }
     }
 }
 
 fn posterior_noise(cost: f64, freedom: usize) -> f64 {
-    (cost / freedom.max(1) as f64).sqrt()
+    (cost / freedom.max(1) as f64).sqrt().max(LEAST_NOISE)
 }
 
 /// A metric reconstruction under one model, with what the model makes of the focal length.
@@ -94,7 +100,10 @@ pub(super) fn grade(
     let rival = rival(&simple, &minima);
     let mut best = richest(simple, problem, scale_px, &mut warnings, stop)?;
     Stopped::check(stop)?;
-    best.sigma = best.sigma.map(|sigma| profiled(sigma, &best, problem.observations, stop));
+    best.sigma = best
+        .sigma
+        .map(|sigma| profiled(sigma, &best, problem.observations, stop))
+        .filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
 
     let mut grade = match best.sigma {
         Some(sigma) if sigma < METRIC_BELOW => Grade::Metric,
@@ -110,13 +119,13 @@ pub(super) fn grade(
         cap(if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak });
         warnings.push(second_minimum(rival, &best, scale_px));
     }
-    let rms_ratio = if fit.cost > 0.0 { posterior_noise(best.minimum.cost, best.freedom) / fit.noise } else { 1.0 };
+    let rms_ratio = posterior_noise(best.minimum.cost, best.freedom) / fit.noise;
     if rms_ratio > RMS_RATIO_LIMIT && misfits(&best, fit) {
         cap(if rms_ratio > RMS_RATIO_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak });
         let detail = format!(
             "the metric reconstruction fits {rms_ratio:.2} times worse than the projective one ({:.2} px against \
              {:.2} px) with {} free: distortion, a zoom or wrong tracks",
-            best.noise * scale_px,
+            rms_ratio * fit.noise * scale_px,
             fit.noise * scale_px,
             best.model.name()
         );
@@ -222,7 +231,7 @@ fn misfits(best: &Candidate, fit: &ProjectiveFit) -> bool {
 /// by nine. Near critical motions the linearisation is optimistic: it is taken where the noise has moved the scene.
 fn profiled(sigma: f64, best: &Candidate, observations: &[Observation], stop: &StopToken) -> f64 {
     let shift = (PROFILE_DEVIATIONS * sigma).min(PROFILE_LONGEST);
-    if !(shift > 0.0) {
+    if shift <= 0.0 {
         return sigma;
     }
     let side = |shift: f64| {

@@ -22,6 +22,9 @@ const PROJECTIVE_ITERATIONS: usize = 10;
 /// Median homography residual, in units of the noise, below which the scene counts as planar or the camera as only
 /// rotating. Measured: 1.1 to 1.8 for those, above 11 for general motion.
 const HOMOGRAPHY_LIMIT: f64 = 3.0;
+/// Least noise that is believed, in image sides: a hundredth of a pixel in a 1000-pixel image. Exact input would make
+/// every deviation significant and every focal length certain, by its rounding alone.
+const LEAST_NOISE: f64 = 1e-5;
 /// Inlier tracks below which geometry cannot verify a consensus.
 const LEAST_INLIERS: usize = 8;
 /// Iterations that place the plane at infinity in the caller's frame.
@@ -100,6 +103,7 @@ impl From<Stopped> for super::Error {
 /// [`Stopped`] when `stop` fired; what stands by then is not worth returning.
 pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<Outcome, Stopped> {
     Stopped::check(stop)?;
+    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), ..*problem };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < LEAST_INLIERS {
@@ -112,14 +116,13 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     let adjusted = projective::adjust(&mut cameras, &mut points, problem.observations, &options, stop);
     Stopped::check(stop)?;
     let fit = grading::ProjectiveFit::new(adjusted.cost, problem, inliers);
-    let noise = fit.noise.max(problem.noise);
-    if let Some(residual) = homography::median_residual(problem.observations, cameras.len(), noise)
+    if let Some(residual) = homography::median_residual(problem.observations, cameras.len(), fit.noise)
         && residual < HOMOGRAPHY_LIMIT
     {
         let detail = format!(
             "homographies between the views miss by a median of {residual:.1} standard deviations of the noise \
-             ({:.2} px): the scene is planar or the camera only rotated, which carries no calibration",
-            noise * scale_px
+             ({:.2} px): the scene is planar, or the camera hardly did more than rotate, which carries no calibration",
+            fit.noise * scale_px
         );
         warnings.push(Warning::new(WarningCode::PlanarOrRotation, detail));
         return Ok(Outcome::refused(warnings));

@@ -63,8 +63,8 @@ fn critical_motions_and_scenes_are_refused() {
         ("rotation", Motion::Rotation, false),
         ("plane", Motion::General, true),
     ] {
-        for tracks in [20, 60] {
-            for seed in 0..10 {
+        for (tracks, seeds) in [(20, 10), (60, 4)] {
+            for seed in 0..seeds {
                 let scene = testing::scene_of(seed, 10, tracks, NOISE, motion, planar);
                 let outcome = calibrated(&scene, seed, NOISE);
                 println!(
@@ -75,10 +75,10 @@ fn critical_motions_and_scenes_are_refused() {
                 );
                 assert_eq!(outcome.grade, Grade::ProjectiveOnly, "{name}, seed {seed}");
                 let expected = match motion {
-                    Motion::Translation | Motion::Forward => {
-                        [WarningCode::UnobservableFocal, WarningCode::SecondMinimum]
-                    }
-                    Motion::Rotation | Motion::General => [WarningCode::PlanarOrRotation; 2],
+                    // Along the axis, short baselines can be explained by homographies as well.
+                    Motion::Forward => vec![WarningCode::UnobservableFocal, WarningCode::PlanarOrRotation],
+                    Motion::Translation => vec![WarningCode::UnobservableFocal],
+                    Motion::Rotation | Motion::General => vec![WarningCode::PlanarOrRotation],
                 };
                 assert!(
                     outcome.warnings.iter().any(|warning| expected.contains(&warning.code)),
@@ -86,6 +86,58 @@ fn critical_motions_and_scenes_are_refused() {
                     outcome.warnings
                 );
             }
+        }
+    }
+}
+
+#[test]
+fn little_turning_costs_certainty_not_honesty() {
+    for amplitude in [0.1, 0.02] {
+        for seed in 0..5 {
+            let scene = testing::scene_turning(seed, 40, 0.001, amplitude);
+            let outcome = calibrated(&scene, seed, 0.001);
+            let error = focal_error(&outcome, &scene);
+            println!(
+                "amplitude {amplitude}, seed {seed}: error {error:.4}, {:?} {:?} {:?}",
+                outcome.sigma_log_focal,
+                outcome.grade,
+                codes(&outcome)
+            );
+            let sigma = outcome.sigma_log_focal.expect("some turning");
+            assert!(error < 4.0 * sigma, "seed {seed}: {error} {sigma}");
+        }
+    }
+}
+
+#[test]
+fn exact_input_is_judged_like_any_other() {
+    for seed in 0..3 {
+        let general = testing::scene(seed, 10, 20, 0.0);
+        let outcome = calibrated(&general, seed, 0.0);
+        println!("seed {seed}: {:?} {:?} {}", outcome.grade, outcome.warnings, outcome.rms_ratio);
+        assert_eq!((outcome.grade, codes(&outcome)), (Grade::Metric, vec![]), "seed {seed}");
+        assert!(focal_error(&outcome, &general) < 1e-5, "seed {seed}");
+        for (motion, planar) in
+            [(Motion::Translation, false), (Motion::Forward, false), (Motion::Rotation, false), (Motion::General, true)]
+        {
+            let outcome = calibrated(&testing::scene_of(seed, 10, 20, 0.0, motion, planar), seed, 0.0);
+            println!("{motion:?}, planar {planar}, seed {seed}: {:?} {:?}", outcome.sigma_log_focal, outcome.warnings);
+            assert_eq!(outcome.grade, Grade::ProjectiveOnly, "{motion:?}, planar {planar}, seed {seed}");
+        }
+    }
+}
+
+#[test]
+fn a_wrong_assumption_about_the_noise_changes_neither_focal_length_nor_refusal() {
+    for assumed in [NOISE / 5.0, NOISE * 5.0] {
+        let scene = testing::scene(4, 10, 20, NOISE);
+        let outcome = calibrated(&scene, 4, assumed);
+        println!("assumed {assumed}: {:?} {:?} {:?}", outcome.grade, outcome.sigma_log_focal, codes(&outcome));
+        assert!(focal_error(&outcome, &scene) < 0.02);
+        assert_ne!(outcome.grade, Grade::ProjectiveOnly);
+        for (motion, planar) in [(Motion::Translation, false), (Motion::Rotation, false), (Motion::General, true)] {
+            let outcome = calibrated(&testing::scene_of(4, 10, 20, NOISE, motion, planar), 4, assumed);
+            assert_eq!(outcome.grade, Grade::ProjectiveOnly, "{motion:?}, planar {planar}, assumed {assumed}");
         }
     }
 }

@@ -72,6 +72,12 @@ impl Sqlite {
         Ok(Self { writer, readers, _lock: lock })
     }
 
+    /// Runs a statement as it is, for tests that need the database to misbehave.
+    #[cfg(test)]
+    pub(crate) async fn execute(&self, statement: &'static str) {
+        sqlx::query(statement).execute(&self.writer).await.expect("a valid statement");
+    }
+
     /// Begins a transaction that may write. It takes the write lock at once: one that began by reading could not be
     /// upgraded after another process wrote.
     async fn begin(&self) -> Result<Transaction<'static, Database>, Error> {

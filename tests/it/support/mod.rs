@@ -1,6 +1,9 @@
 //! What tests share: a server on a free port with a store of its own, and stand-ins for the solver.
 
+pub mod collector;
+pub mod live;
 pub mod program;
+pub mod scrape;
 pub mod server;
 pub mod solvers;
 pub mod wire;

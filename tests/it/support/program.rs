@@ -79,14 +79,30 @@ pub struct Serving {
 impl Serving {
     /// Starts it on a data directory and waits until it says where it listens.
     pub fn start(data_dir: &Path) -> Self {
+        Self::start_with(data_dir, &[], Stdio::null())
+    }
+
+    /// The same with these variables of the environment, logging to `stderr`.
+    pub fn start_with(data_dir: &Path, variables: &[(&str, &str)], stderr: impl Into<Stdio>) -> Self {
+        Self::start_more(data_dir, &["--workers", "1"], variables, stderr)
+    }
+
+    /// The same with more arguments.
+    pub fn start_more(
+        data_dir: &Path,
+        arguments: &[&str],
+        variables: &[(&str, &str)],
+        stderr: impl Into<Stdio>,
+    ) -> Self {
         let mut child =
-            program(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--workers", "1"])
+            program(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--log-format", "json"])
                 .arg("--data-dir")
                 .arg(data_dir)
-                .args(["--log-format", "json"])
+                .args(arguments)
                 .stdin(Stdio::null())
                 .stdout(Stdio::piped())
-                .stderr(Stdio::null())
+                .envs(variables.iter().copied())
+                .stderr(stderr)
                 .spawn()
                 .expect("the server starts");
         let mut stdout = BufReader::new(child.stdout.take().expect("piped"));

@@ -1,0 +1,257 @@
+//! Whole solves, from an input to a solution.
+
+use super::*;
+use crate::domain::{Backend, Grade, Limits, Method, Prior, Progress, RawInput, Silent, Stage, Status, View};
+use crate::synthetic::metrics::agreement;
+use crate::synthetic::{Scene, SceneOptions};
+
+fn scene(options: SceneOptions) -> (Input, Scene) {
+    let scene = Scene::generate(&options).expect("valid options");
+    (Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid scene"), scene)
+}
+
+fn solved(input: &Input, settings: &SolveSettings) -> Solution {
+    solve(input, settings, &mut Silent, &StopToken::default()).expect("a solution")
+}
+
+fn focal_error(solution: &Solution, scene: &Scene) -> f64 {
+    (solution.calibrations[0].focal_px / scene.truth.focal_px - 1.0).abs()
+}
+
+#[test]
+fn nine_in_ten_wrong_without_depths() {
+    let mut errors = Vec::new();
+    for seed in 0..3 {
+        let (input, scene) = scene(SceneOptions { seed, ..SceneOptions::default() });
+        let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+        assert_eq!((solution.status, solution.grade), (Status::Solved, Some(Grade::Metric)), "seed {seed}");
+        let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
+        assert!(f1 > 0.99, "seed {seed}: F1 {f1}");
+        assert!(solution.winning_prior.is_some() && solution.iterations >= portfolio::LEAST_ITERATIONS);
+        assert_eq!(solution.tracks.network_weight.len(), 200);
+        errors.push(focal_error(&solution, &scene));
+    }
+    assert!(errors.iter().all(|&error| error < 0.03), "focal errors {errors:?}");
+}
+
+#[test]
+fn nineteen_in_twenty_wrong_with_depths_on_an_arbitrary_scale() {
+    let (mut input, scene) = scene(SceneOptions { outliers: 0.95, with_depths: true, ..SceneOptions::default() });
+    // Depths are projective: their scale by view and by track means nothing.
+    let mut raw = input.to_raw();
+    for k in 0..raw.depth.len() {
+        raw.depth[k] *= (1.0 + f64::from(raw.view[k])) * (0.1 + f64::from(raw.track[k] % 7));
+    }
+    input = Input::new(raw, &Limits::default(), "scene").expect("valid scene");
+    let solution = solved(&input, &SolveSettings::default());
+    let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
+    assert!(f1 > 0.99, "F1 {f1}");
+}
+
+#[test]
+fn an_orbit_where_priors_on_small_motion_fail() {
+    let (input, scene) = scene(SceneOptions { max_rotation_rad: 3.1, seed: 5, ..SceneOptions::default() });
+    let solution = solved(&input, &SolveSettings { method: Method::Geometry, ..SolveSettings::default() });
+    let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
+    assert!(f1 > 0.99, "F1 {f1}");
+    assert_ne!(solution.winning_prior, Some(Prior::Consistency));
+    assert!(solution.tracks.network_weight.is_empty(), "GEOMETRY runs no network");
+}
+
+#[test]
+fn one_seed_one_answer() {
+    let (input, _) = scene(SceneOptions { tracks: 80, outliers: 0.7, ..SceneOptions::default() });
+    let timeless = || {
+        let mut solution = solved(&input, &SolveSettings::default());
+        solution.seconds = 0.0;
+        solution.stages.clear();
+        solution.prior_times.clear();
+        solution.history.clear();
+        solution
+    };
+    assert_eq!(timeless(), timeless());
+}
+
+#[test]
+fn both_backends_find_the_same_inliers() {
+    let (input, _) = scene(SceneOptions { tracks: 80, outliers: 0.8, seed: 2, ..SceneOptions::default() });
+    let inliers =
+        |backend| solved(&input, &SolveSettings { backend: Some(backend), ..SolveSettings::default() }).tracks.inlier;
+    assert_eq!(inliers(Backend::Flex), inliers(Backend::Ndarray));
+}
+
+#[test]
+fn the_projection_frame_and_the_plane_at_infinity_belong_together() {
+    let (input, scene) = scene(SceneOptions { outliers: 0.3, noise: 1e-4, ..SceneOptions::default() });
+    let solution = solved(&input, &SolveSettings::default());
+    let cameras: Vec<nalgebra::Matrix3x4<f64>> = solution
+        .views
+        .iter()
+        .map(|view| {
+            let rows = view.projection.expect("all views are registered");
+            nalgebra::Matrix3x4::from_fn(|row, column| rows[row][column])
+        })
+        .collect();
+    assert!((cameras[0] - nalgebra::Matrix3x4::identity()).norm() < 1e-9);
+    // P (x) Q (x) P^T of every view is the same DIAC, that of the true camera: K K^T (paper, eq. 6 and 7).
+    let [px, py] = scene.truth.principal_point_px;
+    let f = scene.truth.focal_px;
+    let k = nalgebra::Matrix3::new(f, 0.0, px, 0.0, f, py, 0.0, 0.0, 1.0);
+    let n = nalgebra::Vector3::from(solution.plane_at_infinity.expect("a plane"));
+    let mut upgrade = nalgebra::Matrix4x3::zeros();
+    upgrade.fixed_rows_mut::<3>(0).copy_from(&k);
+    upgrade.fixed_rows_mut::<1>(3).copy_from(&(-n.transpose() * k));
+    for camera in cameras {
+        // In units of the true camera the DIAC is the identity; pixels would drown it in the principal point.
+        let metric = k.try_inverse().expect("invertible") * camera * upgrade;
+        let diac = metric * metric.transpose();
+        let difference = (diac / diac.norm() - nalgebra::Matrix3::identity() / 3f64.sqrt()).norm();
+        assert!(difference < 0.05, "{difference}");
+    }
+    for (track, point) in solution.tracks.point.iter().enumerate() {
+        assert_eq!(point.is_some(), solution.tracks.inlier[track]);
+    }
+}
+
+#[test]
+fn paper_and_psfm_answer_with_their_own_verdicts() {
+    let (input, scene) =
+        scene(SceneOptions { tracks: 100, outliers: 0.5, with_depths: true, ..SceneOptions::default() });
+    let paper = SolveSettings { method: Method::Paper, iterations: 120, ..SolveSettings::default() };
+    let solution = solved(&input, &paper);
+    assert_eq!(solution.iterations, 120);
+    for (weight, inlier) in solution.tracks.weight.iter().zip(&solution.tracks.inlier) {
+        assert_eq!(*weight > 0.5, *inlier);
+    }
+    let chosen = agreement(&solution.tracks.inlier, &scene.truth.inlier);
+    assert!(chosen.precision > 0.9, "precision {}", chosen.precision);
+    // Nothing wrong: plain factorisation has nothing to be robust against.
+    let (clean, scene) = self::scene(SceneOptions { outliers: 0.0, with_depths: true, ..SceneOptions::default() });
+    let solution = solved(&clean, &SolveSettings { method: Method::Psfm, ..SolveSettings::default() });
+    assert!(agreement(&solution.tracks.inlier, &scene.truth.inlier).recall > 0.95);
+    assert!(focal_error(&solution, &scene) < 0.03);
+}
+
+#[test]
+fn of_incomplete_tracks_a_block_is_solved_and_the_views_left_out_are_named() {
+    let (input, scene) = scene(SceneOptions { views: 9, tracks: 120, outliers: 0.3, ..SceneOptions::default() });
+    let raw = input.to_raw();
+    // Views 0 to 5 see all tracks, views 6 to 8 every tenth.
+    let mut banded = RawInput { views: raw.views.clone(), track_count: raw.track_count, ..RawInput::default() };
+    for k in 0..raw.x.len() {
+        if raw.view[k] < 6 || raw.track[k].is_multiple_of(10) {
+            banded.view.push(raw.view[k]);
+            banded.track.push(raw.track[k]);
+            banded.x.push(raw.x[k]);
+            banded.y.push(raw.y[k]);
+        }
+    }
+    let input = Input::new(banded, &Limits::default(), "scene").expect("valid scene");
+    let solution = solved(&input, &SolveSettings::default());
+    assert_eq!(solution.registered_views(), [0, 1, 2, 3, 4, 5]);
+    let warning =
+        solution.warnings.iter().find(|warning| warning.code == WarningCode::ViewsLeftOut).expect("a warning");
+    assert!(warning.detail.ends_with("6, 7, 8"), "{}", warning.detail);
+    let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
+    assert!(f1 > 0.97, "F1 {f1}");
+}
+
+#[test]
+fn nothing_but_wrong_tracks_is_no_reconstruction() {
+    for seed in 0..2 {
+        let (input, _) = scene(SceneOptions { outliers: 1.0, tracks: 60, seed, ..SceneOptions::default() });
+        let settings = SolveSettings { iterations: 75, seed, ..SolveSettings::default() };
+        let solution = solved(&input, &settings);
+        assert_eq!((solution.status, solution.grade), (Status::NoReconstruction, None), "seed {seed}");
+        assert!(solution.tracks.inlier.iter().all(|&inlier| !inlier));
+        assert!(solution.calibrations.is_empty());
+        assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::NoConsensus));
+    }
+}
+
+#[test]
+fn two_views_and_tracks_that_share_nothing_are_refused_with_the_reason() {
+    let (input, _) = scene(SceneOptions { views: 2, tracks: 30, outliers: 0.0, ..SceneOptions::default() });
+    let solution = solved(&input, &SolveSettings::default());
+    assert_eq!(solution.status, Status::NoReconstruction);
+    assert!(solution.warnings[0].detail.contains("at least 3"), "{}", solution.warnings[0].detail);
+
+    let raw = RawInput {
+        views: vec![View::default(); 4],
+        track_count: 2,
+        view: vec![0, 1, 2, 3],
+        track: vec![0, 0, 1, 1],
+        x: vec![1.0, 2.0, 3.0, 4.0],
+        y: vec![1.0, 2.0, 3.0, 4.0],
+        depth: Vec::new(),
+    };
+    let sparse = Input::new(raw, &Limits::default(), "scene").expect("valid input");
+    let solution = solved(&sparse, &SolveSettings::default());
+    assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::FewInliers));
+}
+
+#[test]
+fn hostile_geometry_neither_panics_nor_succeeds_by_accident() {
+    let views = vec![View::default(); 4];
+    let grid = |point: &dyn Fn(usize, usize) -> (f64, f64)| {
+        let mut raw = RawInput { views: views.clone(), track_count: 20, ..RawInput::default() };
+        for track in 0..20 {
+            for view in 0..4 {
+                let (x, y) = point(track, view);
+                raw.view.push(view as u32);
+                raw.track.push(track as u32);
+                raw.x.push(x);
+                raw.y.push(y);
+            }
+        }
+        Input::new(raw, &Limits::default(), "scene").expect("valid input")
+    };
+    let settings = SolveSettings { iterations: 25, ..SolveSettings::default() };
+    let one_place = grid(&|_, _| (100.0, 100.0));
+    let standing_still = grid(&|track, _| (track as f64 * 37.0 % 100.0, track as f64 * 61.0 % 100.0));
+    let on_a_line = grid(&|track, view| (track as f64 + view as f64, 2.0 * track as f64 + view as f64));
+    let far_away = grid(&|track, view| (1e7 - track as f64 * 1e-3, -1e7 + (view * track) as f64 * 1e-3));
+    for (name, input) in
+        [("one place", one_place), ("standing still", standing_still), ("on a line", on_a_line), ("far away", far_away)]
+    {
+        let solution = solved(&input, &settings);
+        assert!(
+            matches!(solution.grade, None | Some(Grade::ProjectiveOnly)),
+            "{name}: graded {:?} with {:?}",
+            solution.grade,
+            solution.warnings
+        );
+    }
+}
+
+/// Stops the solve at its n-th report.
+struct StopAt {
+    token: StopToken,
+    reports: usize,
+    seen: Vec<Stage>,
+}
+
+impl Observer for StopAt {
+    fn stage(&mut self, stage: Stage) {
+        self.seen.push(stage);
+    }
+
+    fn progress(&mut self, _: &Progress) {
+        self.reports = self.reports.saturating_sub(1);
+        if self.reports == 0 {
+            self.token.stop(StopReason::Cancelled);
+        }
+    }
+}
+
+#[test]
+fn a_stop_ends_the_solve_wherever_it_is() {
+    let (input, _) = scene(SceneOptions { tracks: 60, outliers: 0.5, ..SceneOptions::default() });
+    for reports in [1, 5, 40] {
+        let token = StopToken::default();
+        let mut observer = StopAt { token: token.clone(), reports, seen: Vec::new() };
+        let outcome = solve(&input, &SolveSettings::default(), &mut observer, &token);
+        assert_eq!(outcome, Err(Error::Stopped(StopReason::Cancelled)), "stopped after {reports} reports");
+        assert!(!observer.seen.contains(&Stage::Judge));
+    }
+}

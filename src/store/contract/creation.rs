@@ -1,0 +1,110 @@
+//! Creating jobs: what is kept, what is the same, what is refused.
+
+use super::*;
+
+pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
+    let now = time(0) + Duration::from_micros(1);
+    let labels = BTreeMap::from([("scene".to_owned(), "door".to_owned()), ("é \"'".to_owned(), "%_".to_owned())]);
+    // More than two rows, and not a whole number of them.
+    let input: Vec<u8> = (0..2 * payload::CHUNK_BYTES + 17).map(|k| (k % 251) as u8).collect();
+    let new = NewRecord {
+        input: input.clone(),
+        labels: labels.clone(),
+        priority: -3,
+        deadline: Some(time(60)),
+        trace_parent: Some("00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01".into()),
+        ..record("a")
+    };
+    let created = store.create_job(new.clone(), &ROOM, now).await.expect("created");
+    assert!(created.new);
+    let expected = Job {
+        name: new.name.clone(),
+        state: JobState::Queued,
+        attempt: 0,
+        settings: new.settings,
+        view_count: 3,
+        track_count: 20,
+        observation_count: 60,
+        labels,
+        priority: -3,
+        create_time: now,
+        start_time: None,
+        end_time: None,
+        deadline: Some(time(60)),
+        progress: None,
+        last_sequence: 1,
+        summary: None,
+        failure: None,
+        cancel_requested: false,
+    };
+    assert_eq!(created.job, expected);
+    assert_eq!(store.job(&new.name).await, Ok(expected));
+    assert_eq!(store.input(&new.name).await, Ok(input));
+    assert_eq!(store.result(&new.name).await, Ok(None));
+    assert_eq!(story(store, &new.name).await, told(&[(1, 0, "QUEUED")]));
+    let claimed = claim(store, 1).await;
+    assert_eq!(claimed.trace_parent, new.trace_parent);
+    assert_eq!(claimed.queue_time, now);
+}
+
+pub(in crate::store) async fn a_request_id_stands_for_one_body_and_one_job(store: &dyn Store) {
+    let request = |byte| Some(Request { id: "r".into(), digest: [byte; 32] });
+    let first = create(store, NewRecord { request: request(1), ..record("a") }, 0).await;
+    claim(store, 1).await;
+    // Even where nothing more is admitted, and under another generated id.
+    let full = QueueBounds { max_jobs: 0, ..ROOM };
+    let again = NewRecord { request: request(1), ..record("b") };
+    let repeated = store.create_job(again, &full, time(2)).await.expect("known");
+    assert!(!repeated.new);
+    assert_eq!(repeated.job.name, first.name);
+    assert_eq!(repeated.job.state, JobState::Running, "the job as it stands now");
+    let other_body = NewRecord { request: request(2), ..record("c") };
+    let error = store.create_job(other_body, &ROOM, time(2)).await.expect_err("another body");
+    assert!(matches!(error, Error::AlreadyExists(_)), "{error}");
+    let mut other_tenant = NewRecord { request: request(2), ..record("a") };
+    other_tenant.name.tenant = "u".into();
+    let theirs = store.create_job(other_tenant, &ROOM, time(2)).await.expect("request ids are the tenant's");
+    assert!(theirs.new);
+}
+
+pub(in crate::store) async fn one_request_id_from_many_callers_is_one_job(store: &dyn Store) {
+    let call = |number: usize| {
+        let request = Some(Request { id: "r".into(), digest: [1; 32] });
+        store.create_job(NewRecord { request, ..record(&format!("job-{number}")) }, &ROOM, time(0))
+    };
+    let created = futures_util::future::join_all((0..50).map(call)).await;
+    let created: Vec<_> = created.into_iter().map(|created| created.expect("created or known")).collect();
+    assert_eq!(created.iter().filter(|created| created.new).count(), 1);
+    assert!(created.iter().all(|other| other.job.name == created[0].job.name));
+    assert_eq!(store.load().await.expect("counts").queued, 1);
+}
+
+pub(in crate::store) async fn a_taken_job_id_is_refused(store: &dyn Store) {
+    create(store, record("a"), 0).await;
+    let error = store.create_job(record("a"), &ROOM, time(1)).await.expect_err("taken");
+    assert_eq!(error, Error::AlreadyExists("tenants/t/jobs/a already exists".into()));
+}
+
+pub(in crate::store) async fn admission_bounds_what_waits(store: &dyn Store) {
+    let refused = |bounds: QueueBounds| async move {
+        match store.create_job(record("late"), &bounds, time(1)).await {
+            Err(Error::QueueFull(bound)) => bound,
+            other => panic!("{other:?}"),
+        }
+    };
+    let empty = QueueBounds { max_bytes: 0, max_observations: 0, ..ROOM };
+    store.create_job(record("a"), &empty, time(0)).await.expect("one job alone always fits");
+    create(store, record("b"), 0).await;
+    let load = store.load().await.expect("counts");
+    assert_eq!((load.queued, load.queued_bytes, load.queued_observations, load.running), (2, 200, 120, 0));
+    assert_eq!(refused(QueueBounds { max_jobs: 2, ..ROOM }).await, Bound::Jobs { waiting: 2, max: 2 });
+    assert_eq!(refused(QueueBounds { max_bytes: 299, ..ROOM }).await, Bound::Bytes { waiting: 200, max: 299 });
+    let bound = refused(QueueBounds { max_observations: 179, ..ROOM }).await;
+    assert_eq!(bound, Bound::Observations { waiting: 120, max: 179 });
+    assert!(matches!(store.job(&record("late").name).await, Err(Error::NotFound(_))), "nothing was stored");
+    claim(store, 2).await;
+    let load = store.load().await.expect("counts");
+    assert_eq!((load.queued, load.queued_bytes, load.queued_observations, load.running), (1, 100, 60, 1));
+    let exact = QueueBounds { max_jobs: 2, max_bytes: 200, max_observations: 120 };
+    store.create_job(record("c"), &exact, time(3)).await.expect("what runs does not wait");
+}

@@ -1,0 +1,142 @@
+//! What every store must do, as tests that each implementation runs through [`store_contract!`].
+
+pub(super) mod creation;
+pub(super) mod leases;
+pub(super) mod reading;
+
+use std::collections::BTreeMap;
+use std::time::{Duration, SystemTime};
+
+use crate::domain::job::{EventBody, Failure, Job, JobName, JobState, Summary};
+use crate::domain::{Progress, SolveSettings, Stage, Status};
+use crate::store::record::{Bound, NewRecord, QueueBounds, Request};
+use crate::store::{ATTEMPTS_EXHAUSTED, Claimed, Ending, Error, JobQuery, Lease, Order, Outcome, Store, payload};
+
+/// Runs the contract: `$open` is an async function without arguments whose result derefs to a store that is empty.
+macro_rules! store_contract {
+    ($open:path) => {
+        $crate::store::contract::store_contract!(@each $open;
+            creation::a_created_job_reads_back,
+            creation::a_request_id_stands_for_one_body_and_one_job,
+            creation::one_request_id_from_many_callers_is_one_job,
+            creation::a_taken_job_id_is_refused,
+            creation::admission_bounds_what_waits,
+            leases::claims_go_by_priority_then_age,
+            leases::no_job_is_claimed_twice,
+            leases::a_lease_that_was_taken_over_writes_nothing,
+            leases::a_success_stores_its_result_then_its_state,
+            leases::progress_is_an_event_and_stands_in_the_job,
+            leases::every_outcome_ends_in_its_state,
+            leases::giving_back_is_free_and_vanishing_is_not,
+            leases::a_cancel_ends_what_waits_and_flags_what_runs,
+            leases::deadlines_end_what_waits,
+            reading::listings_page_and_filter,
+            reading::events_come_in_order_and_in_portions,
+            reading::what_does_not_exist_is_not_found,
+        );
+    };
+    (@each $open:path; $($part:ident :: $test:ident,)*) => {
+        $(
+            #[tokio::test]
+            async fn $test() {
+                let fixture = $open().await;
+                $crate::store::contract::$part::$test(&*fixture).await;
+            }
+        )*
+    };
+}
+pub(super) use store_contract;
+
+/// Bounds that refuse nothing.
+pub(super) const ROOM: QueueBounds =
+    QueueBounds { max_jobs: u64::MAX, max_bytes: u64::MAX, max_observations: u64::MAX };
+
+const LEASE: Duration = Duration::from_secs(30);
+const MAX_ATTEMPTS: u32 = 3;
+
+/// A moment some seconds after a fixed one.
+pub(super) fn time(seconds: u64) -> SystemTime {
+    SystemTime::UNIX_EPOCH + Duration::from_secs(1_700_000_000 + seconds)
+}
+
+/// A small job of tenant `t`.
+pub(super) fn record(job: &str) -> NewRecord {
+    NewRecord {
+        name: JobName { tenant: "t".into(), job: job.into() },
+        request: None,
+        input: vec![7; 100],
+        view_count: 3,
+        track_count: 20,
+        observation_count: 60,
+        settings: SolveSettings { seed: 5, noise_px: Some(0.5), ..SolveSettings::default() },
+        deadline: None,
+        priority: 0,
+        labels: BTreeMap::new(),
+        trace_parent: None,
+    }
+}
+
+async fn create(store: &dyn Store, new: NewRecord, seconds: u64) -> Job {
+    store.create_job(new, &ROOM, time(seconds)).await.expect("created").job
+}
+
+async fn claim(store: &dyn Store, seconds: u64) -> Claimed {
+    store.claim("worker", time(seconds), LEASE).await.expect("claims").expect("a job waits")
+}
+
+fn progress(iteration: u32) -> Progress {
+    Progress {
+        stage: Stage::Search,
+        fraction: 0.5,
+        iteration,
+        losses: None,
+        inliers: 12,
+        focal_px: Some(1234.5),
+        best_score: Some(f64::INFINITY),
+        elapsed_seconds: 0.25,
+    }
+}
+
+fn summary() -> Summary {
+    Summary {
+        status: Status::NoReconstruction,
+        grade: None,
+        focal_px: None,
+        sigma_log_focal: None,
+        inlier_tracks: 0,
+        registered_views: 0,
+        reprojection_rms_px: None,
+        winning_prior: None,
+        iterations: 1,
+        seconds: 0.5,
+        result_bytes: 10,
+    }
+}
+
+fn success(result: Vec<u8>) -> Ending {
+    Ending { outcome: Outcome::Succeeded { summary: summary(), result }, progress: None }
+}
+
+/// The events of a job as `(sequence, attempt, what)`.
+async fn story(store: &dyn Store, name: &JobName) -> Vec<(u64, u32, String)> {
+    let events = store.events_after(name, 0, 1000).await.expect("events");
+    events
+        .into_iter()
+        .map(|event| {
+            assert_eq!(&event.name, name);
+            let what = match event.body {
+                EventBody::State { state, failure } => {
+                    failure.map_or(state.name().into(), |failure| format!("{}:{}", state.name(), failure.reason))
+                }
+                EventBody::Progress(progress) => format!("progress {}", progress.iteration),
+                EventBody::Result(_) => "result".into(),
+                EventBody::Weights { .. } => "weights".into(),
+            };
+            (event.sequence.expect("stored events are numbered"), event.attempt, what)
+        })
+        .collect()
+}
+
+fn told(story: &[(u64, u32, &str)]) -> Vec<(u64, u32, String)> {
+    story.iter().map(|&(sequence, attempt, what)| (sequence, attempt, what.to_owned())).collect()
+}

@@ -1,0 +1,97 @@
+//! A server that is killed in the middle of a job, and one that is sent away in the middle of one.
+
+use rustix::process::Signal;
+use scpsfm::rpc::proto::job_event::Body;
+use scpsfm::rpc::proto::job_service_client::JobServiceClient;
+use scpsfm::rpc::proto::{self, JobState};
+use tonic::Streaming;
+use tonic::transport::Channel;
+
+use crate::support::live::{connected, created, lasting};
+use crate::support::program::Serving;
+use crate::support::server::soon;
+use crate::support::wire::{all, state_of};
+
+async fn watch(jobs: &mut JobServiceClient<Channel>, name: &str, after_sequence: u64) -> Streaming<proto::JobEvent> {
+    jobs.watch_job(proto::WatchJobRequest { name: name.into(), after_sequence }).await.expect("a watch").into_inner()
+}
+
+/// The events of a watch up to the first progress in the middle of an optimisation, which is on disk before it is told.
+async fn until_optimising(mut events: Streaming<proto::JobEvent>) -> Vec<proto::JobEvent> {
+    let mut seen = Vec::new();
+    loop {
+        let event = soon(events.message()).await.expect("an event").expect("the job has not ended");
+        let optimising = matches!(&event.body, Some(Body::Progress(progress)) if progress.iteration > 0);
+        seen.push(event);
+        if optimising {
+            return seen;
+        }
+    }
+}
+
+fn sequences(events: &[proto::JobEvent]) -> Vec<u64> {
+    events.iter().map(|event| event.sequence).filter(|&sequence| sequence > 0).collect()
+}
+
+/// Asserts that a watcher who saw `before` and came back saw everything once, and that the job ended once.
+async fn assert_exactly_once(jobs: &mut JobServiceClient<Channel>, name: &str, before: Vec<proto::JobEvent>) {
+    let last = *sequences(&before).last().expect("sequenced events");
+    let (after, end) = soon(all(watch(jobs, name, last).await)).await;
+    end.expect("the watch ends with the job");
+    let mut seen = before;
+    seen.extend(after);
+    let numbers = sequences(&seen);
+    assert_eq!(numbers, (1..=numbers.len() as u64).collect::<Vec<_>>(), "nothing missed, nothing repeated");
+    let (replayed, _) = soon(all(watch(jobs, name, 0).await)).await;
+    assert_eq!(sequences(&replayed), numbers);
+    let sequenced: Vec<_> = seen.into_iter().filter(|event| event.sequence > 0).collect();
+    assert_eq!(replayed, sequenced, "what was seen live is what is kept");
+
+    let ends = sequenced.iter().filter_map(state_of).filter(|&state| state == JobState::Succeeded).count();
+    let results = sequenced.iter().filter(|event| matches!(event.body, Some(Body::Result(_)))).count();
+    assert_eq!((ends, results), (1, 1));
+    let job = jobs.get_job(proto::GetJobRequest { name: name.into() }).await.expect("the job").into_inner();
+    assert_eq!((job.state(), job.attempt), (JobState::Succeeded, 2));
+    assert_eq!(job.last_sequence, *numbers.last().expect("events"));
+    let request = proto::ReadJobResultRequest { name: name.into(), offset: 0 };
+    let (chunks, end) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
+    end.expect("a whole result");
+    let bytes: usize = chunks.iter().map(|chunk| chunk.data.len()).sum();
+    assert_eq!(bytes as i64, chunks[0].total_size);
+}
+
+/// Iterations that leave seconds between the first progress and the end, whatever the machine.
+const ITERATIONS: u32 = 600;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_whose_server_was_killed_is_finished_once_by_the_next() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let data_dir = directory.path().join("data");
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    let name = created(&mut jobs, lasting(ITERATIONS)).await;
+    let before = until_optimising(watch(&mut jobs, &name, 0).await).await;
+    // SIGKILL, as by a power cut.
+    drop(server);
+
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    assert_exactly_once(&mut jobs, &name, before).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_that_is_sent_away_gives_its_job_back_and_the_next_finishes_it() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let data_dir = directory.path().join("data");
+    let impatient = [("SCPSFM_ENGINE__DRAIN_SECONDS", "0")];
+    let mut server = Serving::start_with(&data_dir, &impatient, std::process::Stdio::null());
+    let mut jobs = connected(&server).await;
+    let name = created(&mut jobs, lasting(ITERATIONS)).await;
+    let before = until_optimising(watch(&mut jobs, &name, 0).await).await;
+    server.running.signal(Signal::TERM);
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success(), "a drain is a clean end");
+
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    assert_exactly_once(&mut jobs, &name, before).await;
+}

@@ -1,0 +1,204 @@
+//! Metrics, logs and traces of the real program: what a solved, a failed and a cancelled job change.
+
+use std::fs::File;
+use std::process::Stdio;
+use std::time::Duration;
+
+use rustix::process::Signal;
+use scpsfm::domain::Stage;
+use scpsfm::rpc::proto::{self, JobState, create_job_request::Input};
+use tonic::Code;
+
+use crate::support::collector::{Collector, attribute, hex, only};
+use crate::support::live::{connected, created, easy, lasting, reaches};
+use crate::support::program::Serving;
+use crate::support::scrape::Page;
+use crate::support::server::soon;
+
+/// Iterations that keep a worker busy for half a minute or more if they are let.
+const ENDLESS: u32 = 10_000;
+
+/// What `/metrics` shows now.
+fn scrape(server: &Serving) -> Page {
+    Page::parse(&server.page("/metrics"))
+}
+
+/// The first page that shows `wanted`: metrics follow the commit that a watcher sees, so they may come a moment later.
+async fn scrape_until(server: &Serving, wanted: impl Fn(&Page) -> bool) -> Page {
+    soon(async {
+        loop {
+            let page = scrape(server);
+            if wanted(&page) {
+                return page;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    })
+    .await
+}
+
+/// Asserts by how much each of these series grew.
+fn assert_growth(before: &Page, after: &Page, expected: &[(&str, f64)]) {
+    for (series, growth) in expected {
+        assert_eq!(after.value(series) - before.value(series), *growth, "{series}");
+    }
+}
+
+/// Asserts that nothing waits, runs or is watched.
+fn assert_idle(page: &Page) {
+    for gauge in ["scpsfm_queue_depth", "scpsfm_workers_busy", "scpsfm_watchers", "scpsfm_grpc_requests_in_flight"] {
+        assert_eq!(page.value(gauge), 0.0, "{gauge}");
+    }
+}
+
+fn is_idle(page: &Page) -> bool {
+    page.value("scpsfm_queue_depth") + page.value("scpsfm_watchers") + page.value("scpsfm_grpc_requests_in_flight")
+        == 0.0
+}
+
+const CREATED_OK: &str = "scpsfm_grpc_requests_total{method=\"scpsfm.v1.JobService/CreateJob\",code=\"OK\"}";
+const CREATED_BAD: &str =
+    "scpsfm_grpc_requests_total{method=\"scpsfm.v1.JobService/CreateJob\",code=\"INVALID_ARGUMENT\"}";
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let server = Serving::start(&directory.path().join("data"));
+    let mut jobs = connected(&server).await;
+    let before = scrape(&server);
+    assert_idle(&before);
+    assert_eq!(before.value("scpsfm_workers"), 1.0);
+    assert_eq!(before.sum("scpsfm_build_info"), 1.0);
+
+    let name = created(&mut jobs, easy(1)).await;
+    assert_eq!(reaches(&mut jobs, &name, &[JobState::Succeeded, JobState::Failed]).await, JobState::Succeeded);
+    let solved =
+        scrape_until(&server, |page| page.value("scpsfm_jobs_total{state=\"SUCCEEDED\"}") > 0.0 && is_idle(page)).await;
+    assert_growth(
+        &before,
+        &solved,
+        &[
+            ("scpsfm_jobs_created_total", 1.0),
+            ("scpsfm_jobs_total{state=\"SUCCEEDED\"}", 1.0),
+            ("scpsfm_jobs_total{state=\"FAILED\"}", 0.0),
+            ("scpsfm_job_duration_seconds_count{state=\"SUCCEEDED\"}", 1.0),
+            ("scpsfm_queue_wait_seconds_count", 1.0),
+            ("scpsfm_solve_iterations_count", 1.0),
+            ("scpsfm_inlier_ratio_count", 1.0),
+            ("scpsfm_store_operation_duration_seconds_count{operation=\"create_job\"}", 1.0),
+            ("scpsfm_store_operation_duration_seconds_count{operation=\"finish\"}", 1.0),
+            (CREATED_OK, 1.0),
+        ],
+    );
+    assert_eq!(solved.sum("scpsfm_results_total"), 1.0, "one grade");
+    assert_eq!(solved.sum("scpsfm_winning_prior_total"), 1.0, "one winner");
+    for stage in Stage::ALL.map(Stage::name) {
+        let series = format!("scpsfm_stage_duration_seconds_count{{stage=\"{stage}\",state=\"SUCCEEDED\"}}");
+        assert!(solved.value(&series) >= 1.0, "{series}");
+    }
+    assert_idle(&solved);
+
+    let mut bad = easy(1);
+    if let Some(Input::TrackSet(tracks)) = &mut bad.input {
+        tracks.x[0] = f64::NAN;
+    }
+    assert_eq!(jobs.create_job(bad).await.expect_err("not a number").code(), Code::InvalidArgument);
+    let refused = scrape_until(&server, |page| page.value(CREATED_BAD) > 0.0).await;
+    let invalid = "scpsfm_admission_refusals_total{reason=\"INVALID\"}";
+    assert_growth(&solved, &refused, &[(invalid, 1.0), (CREATED_BAD, 1.0), ("scpsfm_jobs_created_total", 0.0)]);
+
+    let name = created(&mut jobs, lasting(ENDLESS)).await;
+    reaches(&mut jobs, &name, &[JobState::Running]).await;
+    assert_eq!(scrape(&server).value("scpsfm_workers_busy"), 1.0);
+    jobs.cancel_job(proto::CancelJobRequest { name: name.clone() }).await.expect("a cancel");
+    reaches(&mut jobs, &name, &[JobState::Cancelled]).await;
+    let cancelled =
+        scrape_until(&server, |page| page.value("scpsfm_jobs_total{state=\"CANCELLED\"}") > 0.0 && is_idle(page)).await;
+    assert_growth(
+        &refused,
+        &cancelled,
+        &[
+            ("scpsfm_jobs_created_total", 1.0),
+            ("scpsfm_jobs_total{state=\"CANCELLED\"}", 1.0),
+            ("scpsfm_jobs_total{state=\"SUCCEEDED\"}", 0.0),
+            ("scpsfm_job_duration_seconds_count{state=\"CANCELLED\"}", 1.0),
+            ("scpsfm_queue_wait_seconds_count", 1.0),
+            ("scpsfm_solve_iterations_count", 0.0),
+        ],
+    );
+    assert_eq!(cancelled.sum("scpsfm_results_total"), 1.0, "a cancelled job has no grade");
+    assert_idle(&cancelled);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_that_takes_its_server_down_fails_and_is_counted_by_the_next() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let data_dir = directory.path().join("data");
+    let once = [("SCPSFM_ENGINE__MAX_ATTEMPTS", "1")];
+    let server = Serving::start_with(&data_dir, &once, Stdio::null());
+    let mut jobs = connected(&server).await;
+    let name = created(&mut jobs, lasting(ENDLESS)).await;
+    reaches(&mut jobs, &name, &[JobState::Running]).await;
+    assert_eq!(scrape(&server).value("scpsfm_jobs_total{state=\"FAILED\"}"), 0.0);
+    // Killed without a warning, as by a power cut.
+    drop(server);
+
+    let server = Serving::start_with(&data_dir, &once, Stdio::null());
+    let mut jobs = connected(&server).await;
+    reaches(&mut jobs, &name, &[JobState::Failed]).await;
+    // Counters begin at 0 with the process: what stands there is what this one did.
+    let page =
+        scrape_until(&server, |page| page.value("scpsfm_jobs_total{state=\"FAILED\"}") > 0.0 && is_idle(page)).await;
+    assert_eq!(page.value("scpsfm_jobs_total{state=\"FAILED\"}"), 1.0);
+    assert_eq!(page.value("scpsfm_attempts_lost_total{reason=\"LEASE_EXPIRED\"}"), 1.0);
+    assert_eq!(page.value("scpsfm_job_duration_seconds_count{state=\"FAILED\"}"), 1.0);
+    assert_eq!(page.sum("scpsfm_results_total"), 0.0, "a failed job has no grade");
+    assert_idle(&page);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_name() {
+    const TRACE_ID: &str = "4bf92f3577b34da6a3ce929d0e0e4736";
+    const CALLER_SPAN: &str = "00f067aa0ba902b7";
+    let (collector, address) = Collector::start().await;
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let data_dir = directory.path().join("data");
+    let log = directory.path().join("log");
+    let endpoint = format!("http://{address}");
+    let export = [("SCPSFM_OTLP__ENDPOINT", endpoint.as_str())];
+    let mut server = Serving::start_with(&data_dir, &export, File::create(&log).expect("a log file"));
+    let mut jobs = connected(&server).await;
+    let mut request = tonic::Request::new(easy(1));
+    let traceparent = format!("00-{TRACE_ID}-{CALLER_SPAN}-01");
+    request.metadata_mut().insert("traceparent", traceparent.parse().expect("ASCII"));
+    let name = jobs.create_job(request).await.expect("a job").into_inner().name;
+    reaches(&mut jobs, &name, &[JobState::Succeeded]).await;
+    // A server that drains sends what it has: nothing is waited for.
+    server.running.signal(Signal::TERM);
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success());
+
+    let mut spans = collector.spans();
+    spans.retain(|span| hex(&span.trace_id) == TRACE_ID);
+    let submit = only(&spans, "submit");
+    assert_eq!(hex(&submit.parent_span_id), CALLER_SPAN);
+    let attempt = only(&spans, "attempt");
+    for span in [submit, only(&spans, "queue"), attempt] {
+        assert_eq!(attribute(span, "job").as_ref(), Some(&name), "{}", span.name);
+    }
+    assert_eq!(only(&spans, "queue").parent_span_id, submit.span_id);
+    assert_eq!(attempt.parent_span_id, submit.span_id);
+    assert_eq!(attribute(attempt, "outcome").as_deref(), Some("SUCCEEDED"));
+    for stage in Stage::ALL.map(Stage::name) {
+        let mut of_stage = spans.iter().filter(|span| span.name == stage).peekable();
+        assert!(of_stage.peek().is_some(), "no span of {stage}");
+        assert!(of_stage.all(|span| span.parent_span_id == attempt.span_id), "{stage}");
+    }
+
+    let log = std::fs::read_to_string(&log).expect("a log");
+    let lines = log.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON"));
+    let of_attempt: Vec<_> = lines.filter(|line| line["target"] == "scpsfm::engine::attempt").collect();
+    assert!(of_attempt.len() >= 2, "an attempt's begin and end are logged:\n{log}");
+    for line in of_attempt {
+        assert_eq!(line["span"]["job"], name.as_str(), "{line}");
+    }
+}
