@@ -229,7 +229,12 @@ mod tests {
             iterations: 150,
             seed: u64::MAX,
             calibrations: vec![
-                Calibration { focal_px: 1.0 / 3.0, sigma_log_focal: Some(0.05), principal_point_px: [499.5, 399.5], aspect: 1.25 },
+                Calibration {
+                    focal_px: 1.0 / 3.0,
+                    sigma_log_focal: Some(0.05),
+                    principal_point_px: [499.5, 399.5],
+                    aspect: 1.25,
+                },
                 Calibration { focal_px: 900.0, sigma_log_focal: None, principal_point_px: [0.0, 0.0], aspect: 1.0 },
             ],
             plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),
