@@ -124,19 +124,24 @@ pub fn from_network(weights: &[f64]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
 
-    /// 12 columns in a 3-dimensional subspace, 12 anywhere.
+    /// Columns in a 3-dimensional subspace, then as many anywhere.
+    const HALF: usize = 40;
+
     fn half_and_half() -> DMatrix<f64> {
-        let basis = DMatrix::from_fn(20, 3, |i, k| ((i * 5 + k * 11) as f64).sin());
-        let inside = &basis * DMatrix::from_fn(3, 12, |k, j| ((k + 2) as f64 * (j as f64 + 0.3)).cos());
-        let mut matrix = DMatrix::from_fn(20, 24, |i, j| ((i * 37 + j * 101) as f64).sin() * 1.5);
-        matrix.columns_mut(0, 12).copy_from(&inside);
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut random = |rows, columns| DMatrix::from_fn(rows, columns, |_, _| rng.random_range(-1.0..1.0));
+        let inside = random(20, 3) * random(3, HALF);
+        let mut matrix = random(20, 2 * HALF);
+        matrix.columns_mut(0, HALF).copy_from(&inside);
         matrix
     }
 
     fn separates(prior: &[f64]) {
-        let least_right = prior[..12].iter().copied().fold(f64::INFINITY, f64::min);
-        let most_wrong = prior[12..].iter().copied().fold(0.0, f64::max);
+        let least_right = prior[..HALF].iter().copied().fold(f64::INFINITY, f64::min);
+        let most_wrong = prior[HALF..].iter().copied().fold(0.0, f64::max);
         assert!(least_right > most_wrong, "{prior:?}");
     }
 
