@@ -26,6 +26,17 @@ pub enum Grade {
     ProjectiveOnly,
 }
 
+impl Grade {
+    /// The one of the two that promises less.
+    pub fn worse(self, other: Self) -> Self {
+        match (self, other) {
+            (Grade::ProjectiveOnly, _) | (_, Grade::ProjectiveOnly) => Grade::ProjectiveOnly,
+            (Grade::Weak, _) | (_, Grade::Weak) => Grade::Weak,
+            _ => Grade::Metric,
+        }
+    }
+}
+
 /// What proposed the tracks that the accepted hypothesis was sampled from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]

@@ -6,7 +6,9 @@ use super::attempt::Attempt;
 use super::judge::{self, Geometry, Judged};
 use super::recorder::Recorder;
 use crate::domain::result::{ObservationResults, TrackResults, ViewResult};
-use crate::domain::{Calibration, Grade, Input, Method, Solution, SolveSettings, Stage, Status, Warning, WarningCode};
+use crate::domain::{
+    Calibration, Grade, Input, Method, Solution, SolveSettings, Stage, Status, StopToken, Warning, WarningCode,
+};
 use crate::geometry::bundle::metric::Reconstruction;
 use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::measurement::{Normalization, Sighting};
@@ -69,6 +71,7 @@ pub fn solved(
     attempt: Attempt,
     mut warnings: Vec<Warning>,
     mut recorder: Recorder,
+    stop: &StopToken,
 ) -> Solution {
     recorder.enter(Stage::Judge);
     let Some(consensus) = &attempt.consensus else {
@@ -91,6 +94,7 @@ pub fn solved(
             outlier_density: outlier_density(&attempt),
             inlier_share: (consensus.inlier_count() as f64 + 1.0) / (attempt.block.tracks.len() as f64 + 2.0),
         },
+        stop,
     );
     let calibration = attempt.calibration.as_ref();
     let grade = calibration.map_or(Grade::ProjectiveOnly, |calibration| calibration.grade);

@@ -130,12 +130,7 @@ fn search(
     }
     let Some(consensus) = found.consensus else { return Ok(()) };
     recorder.enter(Stage::Refine);
-    let whole = if searched.len() < complete.tracks() {
-        grow::polish(complete, grow::judge(complete, consensus.cameras, consensus.noise), stop)
-    } else {
-        consensus
-    };
-    let settled = grow::settle_noise(complete, whole, stop);
+    let settled = grow::refine(complete, &consensus, portfolio::spread(complete), stop);
     recorder.standing.inliers = settled.inlier_count() as u32;
     recorder.standing.best_score = Some(settled.score);
     recorder.tell(1.0);

@@ -167,10 +167,22 @@ fn greedy_views(input: &Input, ranges: &[usize], least: usize) -> Vec<Vec<usize>
         found.extend(best);
     }
     found.sort_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
-    let mut views: Vec<Vec<usize>> = found.into_iter().map(|(_, views)| views).collect();
-    views.dedup();
-    views.truncate(MOST_BLOCKS);
-    views
+    found.dedup();
+    diverse(found.into_iter().map(|(_, views)| views).collect())
+}
+
+/// At most [`MOST_BLOCKS`] of the ranked sets: those that share at most half of their views with every better one
+/// first, for a block that failed is not saved by changing one view.
+fn diverse(ranked: Vec<Vec<usize>>) -> Vec<Vec<usize>> {
+    let overlaps = |a: &[usize], b: &[usize]| 2 * a.iter().filter(|view| b.contains(view)).count() > a.len();
+    let (mut chosen, mut similar): (Vec<Vec<usize>>, Vec<Vec<usize>>) = (Vec::new(), Vec::new());
+    for views in ranked {
+        let list = if chosen.iter().any(|better| overlaps(&views, better)) { &mut similar } else { &mut chosen };
+        list.push(views);
+    }
+    chosen.append(&mut similar);
+    chosen.truncate(MOST_BLOCKS);
+    chosen
 }
 
 /// The block of these views: all tracks that are complete over them.

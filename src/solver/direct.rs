@@ -92,7 +92,7 @@ pub fn reconstruct(block: &CompleteBlock, inlier: &[bool], noise: f64, stop: &St
     let options =
         bundle::Options { max_iterations: ADJUSTMENT_ITERATIONS, loss: grow::robust(noise), ..Default::default() };
     projective::adjust(&mut cameras, &mut points, &grow::observations_of(block, &support), &options, stop);
-    let mut consensus = grow::judge(block, cameras, noise);
+    let mut consensus = grow::judge(block, cameras, noise, stop);
     consensus.inlier = inlier.to_vec();
     Some(consensus)
 }

@@ -28,6 +28,8 @@ const CAUCHY_SCALE: f64 = 3.0;
 const PLAIN_SUPPORT: usize = 8;
 /// Tracks whose linear residual is this many gates away are not refined: no refinement brings them back.
 const HOPELESS_GATES: f64 = 100.0;
+/// Tracks judged between two looks at the stop token: a few milliseconds at forty views.
+const TRACKS_PER_LOOK: usize = 64;
 /// Inflations of the gate while polishing.
 const POLISH_INFLATIONS: [f64; 6] = [8.0, 4.0, 2.0, 1.0, 1.0, 1.0];
 const POLISH_ROUNDS: usize = 2;
@@ -85,11 +87,18 @@ fn gate(views: usize) -> f64 {
 }
 
 /// Judges every track of a block by cameras.
-pub fn judge(block: &CompleteBlock, cameras: Vec<Camera>, noise: f64) -> Consensus {
+///
+/// Once `stop` fires the remaining tracks are outliers: nobody will look at the result.
+pub fn judge(block: &CompleteBlock, cameras: Vec<Camera>, noise: f64, stop: &StopToken) -> Consensus {
     let gate = gate(block.views()) * noise * noise;
     let mut points = Vec::with_capacity(block.tracks());
     let mut squared = Vec::with_capacity(block.tracks());
     for track in 0..block.tracks() {
+        if track.is_multiple_of(TRACKS_PER_LOOK) && stop.is_stopped() {
+            points.resize(block.tracks(), Point::new(0.0, 0.0, 0.0, 1.0));
+            squared.resize(block.tracks(), f64::MAX);
+            break;
+        }
         let sightings = block.track(track);
         let start = triangulation::linear(&cameras, sightings);
         let cost = triangulation::squared_residual(&cameras, &start, sightings);
@@ -156,7 +165,7 @@ pub fn grow(
         let loss = if support.len() > PLAIN_SUPPORT { robust(noise) } else { Loss::Squared };
         let iterations = if round < 3 { ADJUSTMENTS.0 } else { ADJUSTMENTS.1 };
         cameras = adjust(block, &cameras, points, &support, loss, iterations, stop);
-        let judged = judge(block, cameras.clone(), noise);
+        let judged = judge(block, cameras.clone(), noise, stop);
         let next = next_support(&judged, support.len(), block.views());
         points = next.iter().map(|&track| judged.points[track]).collect();
         if best.as_ref().is_none_or(|best| judged.score < best.score - 1e-12) {
@@ -217,7 +226,7 @@ pub fn polish(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> 
             let loss = if inflation > 1.0 { robust(noise) } else { Loss::Squared };
             let points = support.iter().map(|&track| current.points[track]).collect();
             let cameras = adjust(block, &current.cameras, points, &support, loss, ADJUSTMENTS.1, stop);
-            current = judge(block, cameras, noise);
+            current = judge(block, cameras, noise, stop);
             if current.score < best.score {
                 best = current.clone();
             }
@@ -242,7 +251,7 @@ const NOISE_BOUNDS: (f64, f64) = (1e-6, 0.1);
 /// The estimate is `median(r^2) / median of chi-square`, with the degrees of freedom that cameras and points leave to
 /// a track, so a few wrong tracks among the inliers do not move it. Starting high is safe, starting low is not: a gate
 /// that is too narrow loses the scene.
-pub fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> Consensus {
+fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> Consensus {
     let mut current = consensus;
     for _ in 0..NOISE_ROUNDS {
         let inliers = current.inliers();
@@ -253,7 +262,7 @@ pub fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToke
         let settled = (noise / current.noise - 1.0).abs() < NOISE_SETTLED;
         let points = inliers.iter().map(|&track| current.points[track]).collect();
         let cameras = adjust(block, &current.cameras, points, &inliers, robust(noise), ADJUSTMENTS.0, stop);
-        let refitted = polish(block, judge(block, cameras, noise), stop);
+        let refitted = polish(block, judge(block, cameras, noise, stop), stop);
         // A noise level at which the consensus falls apart was estimated from a fit too flexible to trust.
         if refitted.inlier_count() < LEAST_SUPPORT + 1 {
             break;
@@ -264,6 +273,31 @@ pub fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToke
         }
     }
     current
+}
+
+/// Higher noise levels, in units of the consensus's own, from which the noise settles too.
+const HIGHER_NOISE: [f64; 2] = [2.0, 4.0];
+
+/// The best of what settles from the consensus's noise and from higher ones.
+///
+/// A consensus found at a noise that is too low has lost its worse tracks, and an estimate from those that remain stays
+/// too low; seen from higher up they come back. Of the outcomes the one least likely to be chance stands.
+///
+/// * `spread`: see [`Consensus::ln_false_alarms`]
+pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> Consensus {
+    let settle = |factor: f64| {
+        let noise = (factor * consensus.noise).min(NOISE_BOUNDS.1);
+        let judged = judge(block, consensus.cameras.clone(), noise, stop);
+        settle_noise(block, polish(block, judged, stop), stop)
+    };
+    let mut best = settle(1.0);
+    for factor in HIGHER_NOISE {
+        let settled = settle(factor);
+        if settled.ln_false_alarms(spread) < best.ln_false_alarms(spread) {
+            best = settled;
+        }
+    }
+    best
 }
 
 fn estimate_noise(consensus: &Consensus, inliers: &[usize]) -> f64 {

@@ -4,8 +4,8 @@
 //! in the image. A track is judged by what it retains once observations that are more likely wrong than right are
 //! dropped, at a price for each.
 
-use crate::domain::Input;
 use crate::domain::result::{ObservationResults, TrackResults};
+use crate::domain::{Input, StopToken};
 use crate::geometry::measurement::{Normalization, Sighting};
 use crate::geometry::{Camera, Point, triangulation};
 
@@ -19,6 +19,8 @@ const WRONG_OBSERVATION: f64 = 0.05;
 /// Observations that a track must retain, and the share of those it has in the registered views.
 const LEAST_RETAINED: usize = 3;
 const LEAST_RETAINED_SHARE: f64 = 0.6;
+/// Tracks between two looks at the stop token: a few milliseconds.
+const TRACKS_PER_LOOK: usize = 64;
 /// Refinement steps of a point.
 const POINT_STEPS: usize = 10;
 
@@ -56,7 +58,9 @@ pub struct Judged {
 
 /// Judges every track that has three observations in registered views or more; the others have weight 0 and no
 /// residuals.
-pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry) -> Judged {
+///
+/// Once `stop` fires the rest stays unjudged: nobody will look at the result.
+pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry, stop: &StopToken) -> Judged {
     let count = input.track_count();
     let observation_count = input.observation_count();
     let mut judged = Judged {
@@ -76,6 +80,9 @@ pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry) -> Judged {
     // Triangulation wants a slice; unregistered views are never sighted.
     let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
     for track in 0..count {
+        if track.is_multiple_of(TRACKS_PER_LOOK) && stop.is_stopped() {
+            break;
+        }
         let seen: Vec<usize> =
             (ranges[track]..ranges[track + 1]).filter(|&k| geometry.cameras[input.view_of(k)].is_some()).collect();
         if seen.len() < LEAST_RETAINED {

@@ -6,6 +6,7 @@
 //! [`portfolio`] (priors, [`search`], [`grow`]) or [`direct`], and [`calibration`] upgrades it; [`judge`] has the last
 //! word on every track and observation; [`assemble`] writes it down.
 
+mod agreement;
 mod assemble;
 mod attempt;
 mod block;
@@ -41,7 +42,8 @@ pub enum Error {
 /// `observer` is told of every iteration; `stop` is asked at least every 50 ms or network iteration.
 ///
 /// Solves one block of views over which tracks are complete; views outside it are left out with a warning. Where a
-/// block's calibration does not hold, the next best block is tried and the best result returned.
+/// block's calibration does not hold, the next best block is tried and the best result returned; blocks that disagree
+/// raise its uncertainty.
 ///
 /// # Errors
 /// [`Error::Stopped`] when `stop` fired, [`Error::Internal`] for a defect.
@@ -56,22 +58,33 @@ pub fn solve(
     let (normalization, warnings) = block::normalization(input);
     let candidates = block::candidate_views(input, &ranges);
     let mut best: Option<Attempt> = None;
-    for views in &candidates {
+    let mut others = Vec::new();
+    for (k, views) in candidates.iter().enumerate() {
         stopped(stop)?;
+        recorder.begin_block(k, candidates.len());
         let block = block::extract(input, &ranges, &normalization, views);
         let attempt =
             attempt::solve_block(block, input.track_count(), settings, normalization.scale_px, &mut recorder, stop)?;
         if best.as_ref().is_none_or(|best| attempt.merit() > best.merit()) {
-            best = Some(attempt);
+            others.extend(best.replace(attempt));
+        } else {
+            others.push(attempt);
         }
-        if best.as_ref().is_some_and(Attempt::is_good) {
+        // A good block is still asked for a second opinion.
+        if k > 0 && best.as_ref().is_some_and(Attempt::is_good) {
             break;
         }
     }
     stopped(stop)?;
+    if let Some(best) = &mut best {
+        agreement::reconcile(best, &others);
+    }
     Ok(match best {
         Some(attempt) if attempt.consensus.is_some() => {
-            assemble::solved(input, settings, &ranges, &normalization, attempt, warnings, recorder)
+            let solution =
+                assemble::solved(input, settings, &ranges, &normalization, attempt, warnings, recorder, stop);
+            stopped(stop)?;
+            solution
         }
         best => {
             let mut warnings = warnings;

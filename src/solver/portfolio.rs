@@ -29,10 +29,15 @@ const AFFINE_SAMPLES: (usize, usize) = (2_000, 6_000);
 const SUBSPACE_SAMPLES: (usize, usize) = (250, 1_000);
 /// Hypotheses a round and prior that are grown.
 const SHORTLIST: usize = 2;
+/// Every other round grows at more noise than assumed, doubling up to sixteen times: a level that is twice too low
+/// loses the scene, and the caller may have given none.
+const NOISE_LADDER: [f64; 8] = [1.0, 2.0, 1.0, 4.0, 1.0, 8.0, 1.0, 16.0];
 /// Logarithm of the expected number of false alarms at which a consensus is decisive (e^-40: never by chance), and at
 /// which it may be accepted once the search has ended.
 const LN_DECISIVE: f64 = -40.0;
 const LN_ACCEPTABLE: f64 = -7.0;
+/// Gain in that logarithm below which two consensuses are the same: a single track more changes it by tens.
+const LN_MARGIN: f64 = 5.0;
 /// Inliers that geometry can verify: one more than determine the cameras.
 pub const LEAST_INLIERS: usize = LEAST_SUPPORT + 1;
 
@@ -58,13 +63,33 @@ struct Account {
     seconds: f64,
     /// Network iterations, or samples.
     work: u32,
-    /// Every consensus better than the prior's last: seconds and work spent by then, and how good it was.
-    records: Vec<(f64, u32, usize, f64)>,
+    /// Every consensus better than the prior's last.
+    records: Vec<Record>,
 }
 
-impl Account {
-    fn best_score(&self) -> f64 {
-        self.records.last().map_or(f64::INFINITY, |record| record.3)
+/// A consensus in a prior's account.
+struct Record {
+    /// Spent by then.
+    seconds: f64,
+    work: u32,
+    inliers: usize,
+    ln_false_alarms: f64,
+}
+
+/// The best consensus so far.
+struct Best {
+    consensus: Consensus,
+    prior: Prior,
+    ln_false_alarms: f64,
+}
+
+impl Best {
+    fn decides(&self) -> bool {
+        self.consensus.inlier_count() >= LEAST_INLIERS && self.ln_false_alarms < LN_DECISIVE
+    }
+
+    fn is_acceptable(&self) -> bool {
+        self.consensus.inlier_count() >= LEAST_INLIERS && self.ln_false_alarms < LN_ACCEPTABLE
     }
 }
 
@@ -74,12 +99,14 @@ pub struct Portfolio<'a> {
     settings: &'a SolveSettings,
     stop: &'a StopToken,
     search: Search,
+    /// Noise that the caller or a default assumes, and that of the current round.
+    assumed_noise: f64,
     noise: f64,
     /// Standard deviation of the image points, the yardstick of the false alarms.
     spread: f64,
     rng: ChaCha8Rng,
     accounts: Vec<Account>,
-    best: Option<(Consensus, Prior)>,
+    best: Option<Best>,
 }
 
 impl<'a> Portfolio<'a> {
@@ -96,6 +123,7 @@ impl<'a> Portfolio<'a> {
             settings,
             stop,
             search,
+            assumed_noise: noise,
             noise,
             spread: spread(block),
             rng: ChaCha8Rng::seed_from_u64(settings.seed),
@@ -129,6 +157,7 @@ impl<'a> Portfolio<'a> {
             None => ROUNDS_WITHOUT_NETWORK,
         };
         for round in 0..rounds {
+            self.set_noise(round);
             if let Some(network) = &mut network {
                 self.optimise(network, recorder, scale_px, spread_weights)?;
                 self.propose(Prior::Network, &priors::from_network(network.weights()));
@@ -147,6 +176,14 @@ impl<'a> Portfolio<'a> {
             }
         }
         Ok(self.finish(network))
+    }
+
+    /// The noise that a round searches and grows at.
+    fn set_noise(&mut self, round: u32) {
+        self.noise = self.assumed_noise * NOISE_LADDER[round as usize % NOISE_LADDER.len()];
+        if let Search::Subspace(search) = &mut self.search {
+            search.set_noise(self.noise);
+        }
     }
 
     /// One round of the network.
@@ -244,42 +281,42 @@ impl<'a> Portfolio<'a> {
         for seed in seeds {
             let begun = Instant::now();
             let grown = grow::grow(self.block, seed.cameras, seed.points, seed.support, self.noise, self.stop);
+            let spread = self.spread;
             let account = self.account(prior);
             account.seconds += begun.elapsed().as_secs_f64();
             let Some(consensus) = grown else { continue };
-            if consensus.score < account.best_score() {
-                let record = (account.seconds, account.work, consensus.inlier_count(), consensus.score);
-                account.records.push(record);
+            let ln_false_alarms = consensus.ln_false_alarms(spread);
+            if account.records.last().is_none_or(|last| ln_false_alarms < last.ln_false_alarms - LN_MARGIN) {
+                let (seconds, work) = (account.seconds, account.work);
+                account.records.push(Record { seconds, work, inliers: consensus.inlier_count(), ln_false_alarms });
             }
-            let decisive = self.decides(&consensus);
-            self.offer(consensus, prior);
+            let grown = Best { consensus, prior, ln_false_alarms };
+            let decisive = grown.decides();
+            self.offer(grown);
             if decisive || self.stop.is_stopped() {
                 break;
             }
         }
     }
 
-    /// A consensus displaces the best one when it is better by more than half a track: the prior that came first wins.
-    fn offer(&mut self, consensus: Consensus, prior: Prior) {
-        let margin = 0.5 / self.block.tracks().max(1) as f64;
-        if self.best.as_ref().is_none_or(|(best, _)| consensus.score < best.score - margin) {
-            self.best = Some((consensus, prior));
+    /// A consensus displaces the best one when it is clearly less likely to be chance: the prior that came first wins.
+    ///
+    /// Costs would not do to compare by: they depend on the noise that each was grown at.
+    fn offer(&mut self, grown: Best) {
+        if self.best.as_ref().is_none_or(|best| grown.ln_false_alarms < best.ln_false_alarms - LN_MARGIN) {
+            self.best = Some(grown);
         }
     }
 
-    fn decides(&self, consensus: &Consensus) -> bool {
-        consensus.inlier_count() >= LEAST_INLIERS && consensus.ln_false_alarms(self.spread) < LN_DECISIVE
-    }
-
     fn is_decisive(&self) -> bool {
-        self.best.as_ref().is_some_and(|(best, _)| self.decides(best))
+        self.best.as_ref().is_some_and(Best::decides)
     }
 
     /// Writes the best consensus into the progress.
     fn stand(&self, recorder: &mut Recorder) {
-        if let Some((best, _)) = &self.best {
-            recorder.standing.inliers = best.inlier_count() as u32;
-            recorder.standing.best_score = Some(best.score);
+        if let Some(best) = &self.best {
+            recorder.standing.inliers = best.consensus.inlier_count() as u32;
+            recorder.standing.best_score = Some(best.consensus.score);
         }
     }
 
@@ -289,16 +326,15 @@ impl<'a> Portfolio<'a> {
     }
 
     fn finish(self, network: Option<PriorNetwork>) -> Found {
-        let Self { best, accounts, spread, .. } = self;
-        let accepted = best
-            .filter(|(best, _)| best.inlier_count() >= LEAST_INLIERS && best.ln_false_alarms(spread) < LN_ACCEPTABLE);
+        let Self { best, accounts, .. } = self;
+        let accepted = best.filter(Best::is_acceptable);
         let with_network = network.is_some();
         let prior_times = accounts
             .into_iter()
             .filter(|account| with_network || account.prior != Prior::Network)
-            .map(|account| prior_time(&account, accepted.as_ref().map(|(best, _)| best)))
+            .map(|account| prior_time(&account, accepted.as_ref()))
             .collect();
-        let (consensus, winning_prior) = accepted.unzip();
+        let (consensus, winning_prior) = accepted.map(|best| (best.consensus, best.prior)).unzip();
         Found {
             consensus,
             winning_prior,
@@ -309,18 +345,20 @@ impl<'a> Portfolio<'a> {
     }
 }
 
-/// Share of the accepted consensus's inliers that counts as having found it.
+/// Share of the accepted consensus's inliers and certainty that counts as having found it.
 const SUFFICIENT_SHARE: f64 = 0.95;
 
-fn prior_time(account: &Account, accepted: Option<&Consensus>) -> PriorTime {
+fn prior_time(account: &Account, accepted: Option<&Best>) -> PriorTime {
     let sufficient = accepted.and_then(|accepted| {
-        let enough = SUFFICIENT_SHARE * accepted.inlier_count() as f64;
-        account.records.iter().find(|record| record.2 as f64 >= enough)
+        let inliers = SUFFICIENT_SHARE * accepted.consensus.inlier_count() as f64;
+        let certainty = SUFFICIENT_SHARE * accepted.ln_false_alarms;
+        let is_enough = |record: &&Record| record.inliers as f64 >= inliers && record.ln_false_alarms <= certainty;
+        account.records.iter().find(is_enough)
     });
     PriorTime {
         prior: account.prior,
-        seconds: sufficient.map(|record| record.0),
-        iterations: sufficient.map_or(account.work, |record| record.1),
+        seconds: sufficient.map(|record| record.seconds),
+        iterations: sufficient.map_or(account.work, |record| record.work),
     }
 }
 

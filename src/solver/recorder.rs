@@ -11,9 +11,9 @@ fn fraction_at(stage: Stage) -> f64 {
     match stage {
         Stage::Prepare => 0.0,
         Stage::Search => 0.02,
-        Stage::Refine => 0.75,
-        Stage::Calibrate => 0.85,
-        Stage::Judge => 0.97,
+        Stage::Refine => 0.85,
+        Stage::Calibrate => 0.93,
+        Stage::Judge => 0.98,
     }
 }
 
@@ -34,8 +34,12 @@ pub struct Recorder<'a> {
     stage: Stage,
     stage_started: Instant,
     stages: Vec<StageTime>,
-    /// Never decreases, also where a second block begins again at the search.
     fraction: f64,
+    /// The block that is solved, counted from 0, and how many may be: each has an equal share of the whole.
+    block: usize,
+    blocks: usize,
+    /// Network iterations of the blocks before.
+    earlier_iterations: u32,
     history: Vec<Progress>,
     /// Every so many records go into the history; doubled whenever it is full.
     stride: usize,
@@ -54,11 +58,22 @@ impl<'a> Recorder<'a> {
             stage_started: now,
             stages: Vec::new(),
             fraction: 0.0,
+            block: 0,
+            blocks: 1,
+            earlier_iterations: 0,
             history: Vec::new(),
             stride: 1,
             records: 0,
             standing: Standing::default(),
         }
+    }
+
+    /// Begins another block, `block` of at most `blocks`, counted from 0.
+    pub fn begin_block(&mut self, block: usize, blocks: usize) {
+        self.block = block;
+        self.blocks = blocks.max(1);
+        self.earlier_iterations += self.standing.iteration;
+        self.standing = Standing::default();
     }
 
     /// Enters a stage, ending the one before.
@@ -73,11 +88,12 @@ impl<'a> Recorder<'a> {
     pub fn tell(&mut self, within: f64) {
         let begin = fraction_at(self.stage);
         let end = Stage::ALL.into_iter().map(fraction_at).find(|&at| at > begin).unwrap_or(1.0);
-        self.fraction = self.fraction.max(begin + (end - begin) * within.clamp(0.0, 1.0));
+        let of_block = begin + (end - begin) * within.clamp(0.0, 1.0);
+        self.fraction = self.fraction.max((self.block as f64 + of_block) / self.blocks as f64);
         let progress = Progress {
             stage: self.stage,
             fraction: self.fraction,
-            iteration: self.standing.iteration,
+            iteration: self.iteration(),
             losses: self.standing.losses,
             inliers: self.standing.inliers,
             focal_px: self.standing.focal_px,
@@ -90,7 +106,12 @@ impl<'a> Recorder<'a> {
 
     /// Hands interim weights on.
     pub fn weights(&mut self, weights: &[f32]) {
-        self.observer.weights(self.standing.iteration, weights);
+        self.observer.weights(self.iteration(), weights);
+    }
+
+    /// Network iterations so far, over all blocks.
+    fn iteration(&self) -> u32 {
+        self.earlier_iterations + self.standing.iteration
     }
 
     /// Seconds since the solve began.
@@ -149,7 +170,8 @@ mod tests {
     fn fractions_never_decrease_and_history_is_bounded() {
         let mut seen = Fractions::default();
         let mut recorder = Recorder::new(&mut seen);
-        for _ in 0..2 {
+        for block in 0..2 {
+            recorder.begin_block(block, 2);
             for stage in [Stage::Search, Stage::Refine, Stage::Calibrate] {
                 recorder.enter(stage);
                 for step in 0..1000 {

@@ -105,12 +105,8 @@ pub(super) fn grade(
         .map(|sigma| profiled(sigma, &best, problem.observations, stop))
         .filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
 
-    let mut grade = match best.sigma {
-        Some(sigma) if sigma < METRIC_BELOW => Grade::Metric,
-        Some(sigma) if sigma <= WEAK_UP_TO => Grade::Weak,
-        _ => Grade::ProjectiveOnly,
-    };
-    let mut cap = |worst: Grade| grade = worse(grade, worst);
+    let mut grade = grade_of_sigma(best.sigma);
+    let mut cap = |worst: Grade| grade = grade.worse(worst);
     if best.sigma.is_none_or(|sigma| sigma > WEAK_UP_TO) {
         warnings.push(unobservable(&best));
     }
@@ -152,13 +148,13 @@ pub(super) fn grade(
     })
 }
 
-fn worse(a: Grade, b: Grade) -> Grade {
-    let rank = |grade| match grade {
-        Grade::Metric => 0,
-        Grade::Weak => 1,
-        Grade::ProjectiveOnly => 2,
-    };
-    if rank(a) >= rank(b) { a } else { b }
+/// The grade that a standard deviation of the log focal length alone would give; `None`: unobservable.
+pub fn grade_of_sigma(sigma: Option<f64>) -> Grade {
+    match sigma {
+        Some(sigma) if sigma < METRIC_BELOW => Grade::Metric,
+        Some(sigma) if sigma <= WEAK_UP_TO => Grade::Weak,
+        _ => Grade::ProjectiveOnly,
+    }
 }
 
 /// The cheapest minimum whose points are in front of the cameras, if the data do not tell it from the cheapest.

@@ -16,6 +16,8 @@ use crate::geometry::bundle::{Observation, Options, projective};
 use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
 use crate::geometry::homography;
 
+pub use grading::grade_of_sigma;
+
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
 /// caller has adjusted it before.
 const PROJECTIVE_ITERATIONS: usize = 10;

@@ -45,8 +45,14 @@ pub struct Search {
 impl Search {
     /// * `noise`: standard deviation of the image points in normalised units; depths are taken to be as good
     pub fn new(block: &CompleteBlock, noise: f64, use_daq: bool) -> Self {
-        let tolerance = (TOLERANCE_PER_NOISE * noise).clamp(TOLERANCE_BOUNDS.0, TOLERANCE_BOUNDS.1);
-        Self { balanced: balance(&block.measurement_matrix()), tolerance, use_daq }
+        let mut search = Self { balanced: balance(&block.measurement_matrix()), tolerance: 0.0, use_daq };
+        search.set_noise(noise);
+        search
+    }
+
+    /// Searches on at another noise.
+    pub fn set_noise(&mut self, noise: f64) {
+        self.tolerance = (TOLERANCE_PER_NOISE * noise).clamp(TOLERANCE_BOUNDS.0, TOLERANCE_BOUNDS.1);
     }
 
     /// The balanced measurement matrix, 3n x m.
