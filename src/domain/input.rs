@@ -74,6 +74,9 @@ impl Input {
     /// Coordinates beyond this many pixels are a unit mistake or a hostile file.
     pub const MAX_COORDINATE_PX: f64 = 1e7;
 
+    /// Sizes that a projective depth may have: its scale is free, and squares of these stay far from overflow.
+    pub const DEPTH_RANGE: (f64, f64) = (1e-30, 1e30);
+
     /// Checks a raw input and sorts its observations.
     ///
     /// # Errors
@@ -271,13 +274,14 @@ fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &m
                 ));
             }
         }
+        let (least, most) = Input::DEPTH_RANGE;
         if let Some(&depth) = raw.depth.get(k)
-            && !(depth.is_finite() && depth != 0.0)
+            && !(least..=most).contains(&depth.abs())
         {
             found.push(Violation::at(
                 field("depth"),
                 k,
-                format!("{depth} is not a finite number other than 0; leave an unobserved point out"),
+                format!("{depth} is not of a size within {least:e}..={most:e}; leave an unobserved point out"),
             ));
         }
     }

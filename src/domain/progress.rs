@@ -57,7 +57,7 @@ pub struct Progress {
     pub losses: Option<Losses>,
     /// Inlier tracks of the best hypothesis so far.
     pub inliers: u32,
-    /// Focal length of the best hypothesis so far, in pixels.
+    /// Current estimate of the focal length in pixels: the network's while it searches, then the calibrated one.
     pub focal_px: Option<f64>,
     /// Truncated cost of the best hypothesis so far, as a share of the cost of calling every track an outlier:
     /// 0 is a perfect consensus of all tracks, 1 is none.

@@ -90,7 +90,7 @@ pub enum WarningCode {
     AssumedImageSize,
     /// Views of several camera groups or sizes were treated as one camera.
     CameraGroupsMerged,
-    /// The deadline stopped the search; this is the best found by then.
+    /// The deadline stopped the search; this is the best found by then. Not given yet: such a job expires.
     StoppedEarly,
 }
 
@@ -157,11 +157,11 @@ pub struct ViewResult {
 /// What the geometry says of every track of the input (parallel arrays, one entry a track).
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrackResults {
-    /// AUTO, GEOMETRY, PSFM: probability that the track is an inlier; PAPER: the network's own weight. 0 for tracks
-    /// that were not judged.
+    /// AUTO, GEOMETRY: probability that the track is an inlier; PAPER: the network's own weight; PSFM: closeness to the
+    /// subspace. 0 for tracks that were not judged.
     pub weight: Vec<f32>,
     pub inlier: Vec<bool>,
-    /// The network's own weight; empty where no network ran.
+    /// The network's own weight, 0 for tracks that it was not shown; empty where no network ran.
     pub network_weight: Vec<f32>,
     /// Point of each track: metric where the result is metric, else in the projective frame (dehomogenised).
     /// `None` for tracks that are not inliers.

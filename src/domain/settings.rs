@@ -103,6 +103,9 @@ impl SolveSettings {
     /// Twice the original PointNet, beyond which memory grows and nothing was ever gained.
     pub const MAX_NETWORK_WIDTH: f64 = 2.0;
 
+    /// Adam moves every weight by about the rate at each step: above this nothing converges.
+    pub const MAX_LEARNING_RATE: f64 = 1.0;
+
     /// Checks every field.
     ///
     /// # Errors
@@ -132,6 +135,12 @@ impl SolveSettings {
             found.push(Violation::of(
                 "settings.network_width",
                 format!("{} is above the largest width {}", self.network_width, Self::MAX_NETWORK_WIDTH),
+            ));
+        }
+        if self.learning_rate > Self::MAX_LEARNING_RATE {
+            found.push(Violation::of(
+                "settings.learning_rate",
+                format!("{} is above the largest rate {}", self.learning_rate, Self::MAX_LEARNING_RATE),
             ));
         }
         if self.iterations == 0 || self.iterations > Self::MAX_ITERATIONS {

@@ -1,31 +1,29 @@
 //! From the geometry of a block to the solution that callers read.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{Matrix3, Matrix4};
 
+use super::Context;
 use super::attempt::Attempt;
+use super::direct::Decided;
+use super::grow::Consensus;
 use super::judge::{self, Geometry, Judged};
 use super::recorder::Recorder;
 use crate::domain::result::{ObservationResults, TrackResults, ViewResult};
-use crate::domain::{
-    Calibration, Grade, Input, Method, Solution, SolveSettings, Stage, Status, StopToken, Warning, WarningCode,
-};
+use crate::domain::{Calibration, Grade, Input, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::Reconstruction;
 use crate::geometry::daq::to_first_view_frame;
-use crate::geometry::measurement::{Normalization, Sighting};
+use crate::geometry::measurement::Sighting;
 use crate::geometry::{Camera, Point, triangulation};
 
 /// Views named one by one in a warning; past these they are only counted.
 const MOST_LISTED_VIEWS: usize = 20;
 
 /// The solution of a scene in which nothing could be reconstructed; the reason is among `warnings`.
-pub fn unsolved(
-    input: &Input,
-    settings: &SolveSettings,
-    attempt: Option<&Attempt>,
-    warnings: Vec<Warning>,
-    recorder: Recorder,
-) -> Solution {
-    let seconds = recorder.seconds();
+pub fn unsolved(context: &Context, attempt: Option<&Attempt>, warnings: Vec<Warning>, recorder: Recorder) -> Solution {
+    let (input, settings) = (context.input, context.settings);
+    let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
     let (stages, history) = recorder.finish();
     let mut tracks = TrackResults {
         weight: vec![0.0; input.track_count()],
@@ -34,14 +32,17 @@ pub fn unsolved(
         point: vec![None; input.track_count()],
     };
     if let Some(attempt) = attempt {
-        own_verdicts(attempt, settings.method, &mut tracks);
+        tracks.network_weight = network_weights(attempt, context);
+        if let Some(decided) = &attempt.decided {
+            own_verdicts(&attempt.block.tracks, decided, &mut tracks);
+        }
     }
     Solution {
         status: Status::NoReconstruction,
         grade: None,
         method: settings.method,
         winning_prior: None,
-        iterations: attempt.map_or(0, |attempt| attempt.iterations),
+        iterations,
         seed: settings.seed,
         calibrations: Vec::new(),
         plane_at_infinity: None,
@@ -63,99 +64,104 @@ pub fn unsolved(
 }
 
 /// The solution of a block that stands.
-pub fn solved(
-    input: &Input,
-    settings: &SolveSettings,
-    ranges: &[usize],
-    normalization: &Normalization,
-    attempt: Attempt,
-    mut warnings: Vec<Warning>,
-    mut recorder: Recorder,
-    stop: &StopToken,
-) -> Solution {
+///
+/// With grade PROJECTIVE_ONLY nothing metric is in it, the focal length included: a number that must not be used is
+/// not given.
+pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Solution {
     recorder.enter(Stage::Judge);
-    let Some(consensus) = &attempt.consensus else {
-        return unsolved(input, settings, Some(&attempt), warnings, recorder);
+    let (Some(consensus), Some(calibration)) = (&attempt.consensus, &attempt.calibration) else {
+        return unsolved(context, Some(attempt), warnings, recorder);
     };
     // Where the first camera has no rank 3 the frame stays as it is: there is nothing metric to be consistent with.
-    let local =
+    let cameras =
         to_first_view_frame(&consensus.cameras, &[]).map_or_else(|| consensus.cameras.clone(), |frame| frame.cameras);
-    let mut cameras = vec![None; input.view_count()];
-    for (&view, camera) in attempt.block.views.iter().zip(&local) {
-        cameras[view] = Some(*camera);
+    let mut judged = judged(context, attempt, consensus, &cameras);
+    if let Some(decided) = &attempt.decided {
+        mask(context, &attempt.block.tracks, decided, &mut judged);
     }
-    let judged = judge::judge(
-        input,
-        ranges,
-        &Geometry {
-            cameras: &cameras,
-            normalization,
-            noise: consensus.noise,
-            outlier_density: outlier_density(&attempt),
-            inlier_share: (consensus.inlier_count() as f64 + 1.0) / (attempt.block.tracks.len() as f64 + 2.0),
-        },
-        stop,
-    );
-    let calibration = attempt.calibration.as_ref();
-    let grade = calibration.map_or(Grade::ProjectiveOnly, |calibration| calibration.grade);
-    let metric = calibration.and_then(|calibration| calibration.metric.as_ref());
-    let usable = metric.filter(|_| grade != Grade::ProjectiveOnly);
-    warnings.extend(calibration.into_iter().flat_map(|calibration| calibration.warnings.iter().cloned()));
-    warnings.extend(left_out(input, &attempt.block.views));
+    let usable = calibration.metric.as_ref().filter(|_| calibration.grade != Grade::ProjectiveOnly);
+    warnings.extend(calibration.warnings.iter().cloned());
+    warnings.extend(left_out(context.input, &attempt.block.views));
 
-    let plane = calibration.and_then(|calibration| calibration.plane_at_infinity).filter(|_| usable.is_some());
-    let first_px = normalization.to_pixels(attempt.block.views[0]);
-    let views = views(input, &attempt, &local, usable, normalization);
-    let Judged { mut tracks, observations, retained, points } = judged;
-    tracks.point = final_points(&attempt, usable, &retained, &points, &first_px);
-    own_verdicts(&attempt, settings.method, &mut tracks);
-    let (rms, mean) = reprojection(&observations);
-    let seconds = recorder.seconds();
+    let first_px = context.normalization.to_pixels(attempt.block.views[0]);
+    judged.tracks.point = final_points(context, attempt, usable, &judged, &first_px);
+    judged.tracks.network_weight = network_weights(attempt, context);
+    let (rms, mean) = reprojection(&judged.observations);
+    let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
     let (stages, history) = recorder.finish();
     Solution {
         status: Status::Solved,
-        grade: Some(grade),
-        method: settings.method,
+        grade: Some(calibration.grade),
+        method: context.settings.method,
         winning_prior: attempt.winning_prior,
-        iterations: attempt.iterations,
-        seed: settings.seed,
-        calibrations: metric
-            .map(|metric| {
-                pixel_calibration(metric, calibration.and_then(|c| c.sigma_log_focal), normalization, &attempt)
-            })
-            .into_iter()
-            .collect(),
+        iterations,
+        seed: context.settings.seed,
+        calibrations: usable
+            .map(|metric| pixel_calibrations(metric, calibration.sigma_log_focal, context, attempt))
+            .unwrap_or_default(),
         // Planes transform by the inverse transpose of what moves points: from normalised to pixels that is T1^-T.
-        plane_at_infinity: plane
+        plane_at_infinity: calibration
+            .plane_at_infinity
+            .filter(|_| usable.is_some())
             .and_then(|plane| first_px.try_inverse().map(|inverse| (inverse.transpose() * plane).into())),
-        views,
-        tracks,
-        observations,
-        noise_px: Some(consensus.noise * normalization.scale_px),
+        views: views(context, attempt, &cameras, usable),
+        tracks: judged.tracks,
+        observations: judged.observations,
+        noise_px: Some(consensus.noise * context.scale_px),
         reprojection_rms_px: rms,
         reprojection_mean_px: mean,
         warnings,
         seconds,
         stages,
-        prior_times: attempt.prior_times,
+        prior_times: attempt.prior_times.clone(),
         history,
     }
 }
 
-/// Weights that the method or the network gave itself, in place of or beside the geometry's.
-fn own_verdicts(attempt: &Attempt, method: Method, tracks: &mut TrackResults) {
-    if method.uses_network() {
-        tracks.network_weight = vec![0.0; tracks.weight.len()];
-        for (&track, weight) in attempt.block.tracks.iter().zip(&attempt.network_weights) {
-            tracks.network_weight[track] = weight.unwrap_or(0.0) as f32;
-        }
+/// Every track and observation judged by the block's cameras.
+fn judged(context: &Context, attempt: &Attempt, consensus: &Consensus, local: &[Camera]) -> Judged {
+    let mut cameras = vec![None; context.input.view_count()];
+    for (&view, camera) in attempt.block.views.iter().zip(local) {
+        cameras[view] = Some(*camera);
     }
-    if let Some(decided) = &attempt.decided {
-        tracks.weight.fill(0.0);
-        tracks.inlier.fill(false);
-        for (j, &track) in attempt.block.tracks.iter().enumerate() {
-            tracks.weight[track] = decided.weights[j] as f32;
-            tracks.inlier[track] = decided.inlier[j];
+    let geometry = Geometry {
+        cameras: &cameras,
+        normalization: context.normalization,
+        noise: consensus.noise,
+        outlier_density: outlier_density(attempt),
+        inlier_share: (consensus.inlier_count() as f64 + 1.0) / (attempt.block.tracks.len() as f64 + 2.0),
+    };
+    judge::judge(context.input, context.ranges, &geometry, context.stop)
+}
+
+/// The network's own weight of every track; empty where none ran, 0 for tracks it did not see.
+fn network_weights(attempt: &Attempt, context: &Context) -> Vec<f32> {
+    if attempt.network_weights.is_empty() {
+        return Vec::new();
+    }
+    context.scatter(&attempt.network_weights, &attempt.block.tracks)
+}
+
+/// PAPER and PSFM: the method's own weights and verdicts in place of the geometry's.
+fn own_verdicts(block_tracks: &[usize], decided: &Decided, tracks: &mut TrackResults) {
+    tracks.weight.fill(0.0);
+    tracks.inlier.fill(false);
+    for (j, &track) in block_tracks.iter().enumerate() {
+        tracks.weight[track] = decided.weights[j] as f32;
+        tracks.inlier[track] = decided.inlier[j];
+    }
+}
+
+/// The same, with what follows from it: a track that the method rejects has neither observations nor a point.
+fn mask(context: &Context, block_tracks: &[usize], decided: &Decided, judged: &mut Judged) {
+    own_verdicts(block_tracks, decided, &mut judged.tracks);
+    for track in 0..context.input.track_count() {
+        if !judged.tracks.inlier[track] {
+            judged.retained[track].clear();
+            judged.points[track] = None;
+            for k in context.ranges[track]..context.ranges[track + 1] {
+                judged.observations.inlier[context.input.caller_index(k)] = false;
+            }
         }
     }
 }
@@ -177,7 +183,7 @@ fn left_out(input: &Input, registered: &[usize]) -> Option<Warning> {
     Some(Warning::new(
         WarningCode::ViewsLeftOut,
         format!(
-            "{} of {} views are outside the block of complete tracks that was solved and were left out: {}",
+            "{} of {} views are outside the block that was solved and were left out: {}",
             missing.len(),
             input.view_count(),
             names.join(", ")
@@ -185,22 +191,16 @@ fn left_out(input: &Input, registered: &[usize]) -> Option<Warning> {
     ))
 }
 
-fn views(
-    input: &Input,
-    attempt: &Attempt,
-    local: &[Camera],
-    metric: Option<&Reconstruction>,
-    normalization: &Normalization,
-) -> Vec<ViewResult> {
-    let mut views = vec![ViewResult::default(); input.view_count()];
+fn views(context: &Context, attempt: &Attempt, local: &[Camera], metric: Option<&Reconstruction>) -> Vec<ViewResult> {
+    let mut views = vec![ViewResult::default(); context.input.view_count()];
     let first = attempt.block.views[0];
     // In pixels the frame moves with the first view's pixel transform, so that its camera stays [I|0].
     let mut frame = Matrix4::identity();
-    if let Some(inverse) = normalization.to_pixels(first).try_inverse() {
+    if let Some(inverse) = context.normalization.to_pixels(first).try_inverse() {
         frame.fixed_view_mut::<3, 3>(0, 0).copy_from(&inverse);
     }
     for (i, &view) in attempt.block.views.iter().enumerate() {
-        let projection = normalization.camera_px(view, &local[i]) * frame;
+        let projection = context.normalization.camera_px(view, &local[i]) * frame;
         let pose = metric.map(|metric| &metric.poses[i]);
         views[view] = ViewResult {
             projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| projection[(row, column)]))),
@@ -214,33 +214,28 @@ fn views(
 
 /// Metric points where the result is metric, projective ones (pixel frame) elsewhere.
 fn final_points(
+    context: &Context,
     attempt: &Attempt,
     metric: Option<&Reconstruction>,
-    retained: &[Vec<Sighting>],
-    points: &[Option<Point>],
+    judged: &Judged,
     first_px: &Matrix3<f64>,
 ) -> Vec<Option<[f64; 3]>> {
     let Some(metric) = metric else {
-        return points
-            .iter()
-            .map(|point| point.and_then(|point| dehomogenise(&to_pixel_frame(&point, first_px))))
-            .collect();
+        let moved = |point: &Option<Point>| point.and_then(|point| dehomogenise(&to_pixel_frame(&point, first_px)));
+        return judged.points.iter().map(moved).collect();
     };
-    let most = attempt.block.views.iter().copied().max().unwrap_or(0);
-    let mut cameras = vec![Camera::zeros(); most + 1];
+    let mut cameras = vec![Camera::zeros(); context.input.view_count()];
     for (i, &view) in attempt.block.views.iter().enumerate() {
         cameras[view] = metric.poses[i].camera(&metric.intrinsics);
     }
-    retained
-        .iter()
-        .map(|sightings| {
-            if sightings.is_empty() {
-                return None;
-            }
-            let start = triangulation::linear(&cameras, sightings);
-            dehomogenise(&triangulation::refine(&cameras, sightings, start, POINT_STEPS).0)
-        })
-        .collect()
+    let triangulated = |sightings: &Vec<Sighting>| {
+        if sightings.is_empty() || context.stop.is_stopped() {
+            return None;
+        }
+        let start = triangulation::linear(&cameras, sightings);
+        dehomogenise(&triangulation::refine(&cameras, sightings, start, POINT_STEPS).0)
+    };
+    judged.retained.iter().map(triangulated).collect()
 }
 
 /// Refinement steps of a final point.
@@ -258,19 +253,29 @@ fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
     scaled.iter().all(|entry| entry.is_finite()).then(|| scaled.into())
 }
 
-fn pixel_calibration(
+/// The calibration in pixels: one for all views, or, where the input has several camera groups, one a group in rising
+/// order, their principal points about the image centre of the group's first view.
+fn pixel_calibrations(
     metric: &Reconstruction,
     sigma_log_focal: Option<f64>,
-    normalization: &Normalization,
+    context: &Context,
     attempt: &Attempt,
-) -> Calibration {
-    let centre = normalization.centres_px[attempt.block.views[0]];
-    let offset = metric.intrinsics.principal_point * normalization.scale_px;
-    Calibration {
-        focal_px: metric.intrinsics.focal * normalization.scale_px,
+) -> Vec<Calibration> {
+    let offset = metric.intrinsics.principal_point * context.scale_px;
+    let about = |view: usize| Calibration {
+        focal_px: metric.intrinsics.focal * context.scale_px,
         sigma_log_focal,
-        principal_point_px: (centre + offset).into(),
+        principal_point_px: (context.normalization.centres_px[view] + offset).into(),
         aspect: metric.intrinsics.aspect,
+    };
+    let mut first_of_group = BTreeMap::new();
+    for (view, description) in context.input.views().iter().enumerate() {
+        first_of_group.entry(description.camera_group).or_insert(view);
+    }
+    if first_of_group.len() > 1 {
+        first_of_group.into_values().map(about).collect()
+    } else {
+        vec![about(attempt.block.views[0])]
     }
 }
 

@@ -1,37 +1,37 @@
 //! One block of views solved from search to calibration.
 
-use rand::SeedableRng;
-use rand::seq::index;
-use rand_chacha::ChaCha8Rng;
-
 use super::block::Block;
 use super::calibration::{self, Outcome};
 use super::direct::{self, Decided};
-use super::grow::{self, Consensus};
+use super::grow::{self, Consensus, LEAST_INLIERS};
 use super::portfolio::{self, Portfolio};
 use super::recorder::Recorder;
-use super::{Error, stopped};
+use super::{Context, Error};
 use crate::domain::result::PriorTime;
-use crate::domain::{Grade, Method, Prior, SolveSettings, Stage, StopToken};
+use crate::domain::{Grade, Method, Prior, Stage};
 
 /// Noise that growing starts from when the caller gives none, as a share of the image side. High on purpose: twice too
 /// low loses the scene, ten times too high costs nothing.
 const INITIAL_NOISE: f64 = 0.005;
-/// Tracks that the search looks at; more of them do not make a consensus easier to find, and time grows with them.
-const MOST_SEARCHED_TRACKS: usize = 600;
+/// Tracks that a search looks at, at most and where there are many views: bundle adjustment costs their number times
+/// the square of the views, and more tracks make a consensus neither easier to find nor much more exact.
+const SEARCHED_TRACKS: (usize, usize) = (600, 200);
+/// Tracks times squared views that a search may hold between those two.
+const SEARCHED_WORK: usize = 60_000;
+/// Tracks that PAPER optimises weights for: the network holds some 40 kB a track at full width.
+const PAPER_TRACKS: usize = 5_000;
 
 /// What became of one block.
 pub struct Attempt {
     pub block: Block,
-    /// The consensus over all tracks of the block; `None` when nothing stands.
+    /// The consensus over the tracks of the block; `None` when nothing stands.
     pub consensus: Option<Consensus>,
     pub calibration: Option<Outcome>,
     pub winning_prior: Option<Prior>,
-    pub iterations: u32,
     /// The method's own verdicts where it searches nothing (PAPER, PSFM).
     pub decided: Option<Decided>,
-    /// The network's weights, one a track of the block; `None` for a track that the search left out.
-    pub network_weights: Vec<Option<f64>>,
+    /// The network's weights, one a track of the block; empty where none ran.
+    pub network_weights: Vec<f64>,
     pub prior_times: Vec<PriorTime>,
 }
 
@@ -49,129 +49,97 @@ impl Attempt {
 
     /// Whether no other block needs to be tried.
     pub fn is_good(&self) -> bool {
-        self.calibration
-            .as_ref()
-            .is_some_and(|calibration| calibration.grade == Grade::Metric && calibration.rms_ratio < MOST_MISFIT)
+        self.calibration.as_ref().is_some_and(|calibration| calibration.grade == Grade::Metric)
     }
 }
 
-/// Ratio of metric to projective residuals above which a block is distrusted and the next one tried: a consensus with
-/// one wrong track or a dominant plane fits projectively and not metrically.
-const MOST_MISFIT: f64 = 4.0;
-
-/// Solves a block.
-///
-/// * `track_count`: tracks of the input, for interim weights
+/// Solves a block, or as many of its tracks as its method can afford.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
-pub fn solve_block(
-    block: Block,
-    track_count: usize,
-    settings: &SolveSettings,
-    scale_px: f64,
-    recorder: &mut Recorder,
-    stop: &StopToken,
-) -> Result<Attempt, Error> {
-    let noise = settings.noise_px.map_or(INITIAL_NOISE, |noise_px| noise_px / scale_px);
+pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> Result<Attempt, Error> {
+    let most = match context.settings.method {
+        Method::Auto | Method::Geometry => {
+            let views = block.views.len().max(1);
+            (SEARCHED_WORK / (views * views)).clamp(SEARCHED_TRACKS.1, SEARCHED_TRACKS.0)
+        }
+        Method::Paper => PAPER_TRACKS,
+        Method::Psfm => usize::MAX,
+    };
     let mut attempt = Attempt {
-        block,
+        block: block.sample(most, context.settings.seed),
         consensus: None,
         calibration: None,
         winning_prior: None,
-        iterations: 0,
         decided: None,
         network_weights: Vec::new(),
         prior_times: Vec::new(),
     };
     recorder.enter(Stage::Search);
-    match settings.method {
-        Method::Auto | Method::Geometry => {
-            search(&mut attempt, track_count, settings, scale_px, noise, recorder, stop)?
-        }
-        Method::Paper | Method::Psfm => decide(&mut attempt, track_count, settings, scale_px, noise, recorder, stop)?,
+    match context.settings.method {
+        Method::Auto | Method::Geometry => search(&mut attempt, context, recorder)?,
+        Method::Paper | Method::Psfm => decide(&mut attempt, context, recorder)?,
     }
-    stopped(stop)?;
+    context.stopped()?;
     if let Some(consensus) = &attempt.consensus {
         recorder.enter(Stage::Calibrate);
-        attempt.calibration = Some(calibrate(&attempt.block, consensus, scale_px, stop)?);
+        attempt.calibration = Some(calibrate(&attempt.block, consensus, context)?);
         if let Some(metric) = attempt.calibration.as_ref().and_then(|outcome| outcome.metric.as_ref()) {
-            recorder.standing.focal_px = Some(metric.intrinsics.focal * scale_px);
+            recorder.standing.focal_px = Some(metric.intrinsics.focal * context.scale_px);
         }
         recorder.tell(1.0);
     }
     Ok(attempt)
 }
 
-/// AUTO and GEOMETRY: the portfolio on at most [`MOST_SEARCHED_TRACKS`] tracks, its consensus refined on all.
-fn search(
-    attempt: &mut Attempt,
-    track_count: usize,
-    settings: &SolveSettings,
-    scale_px: f64,
-    noise: f64,
-    recorder: &mut Recorder,
-    stop: &StopToken,
-) -> Result<(), Error> {
+/// The noise that a solve starts from, normalised units.
+fn initial_noise(context: &Context) -> f64 {
+    let noise = context.settings.noise_px.map_or(INITIAL_NOISE, |noise_px| noise_px / context.scale_px);
+    noise.clamp(grow::NOISE_BOUNDS.0, grow::NOISE_BOUNDS.1)
+}
+
+/// AUTO and GEOMETRY: the portfolio, its consensus refined.
+fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> Result<(), Error> {
     let complete = &attempt.block.complete;
-    let searched = searched_tracks(complete.tracks(), settings.seed);
-    let subset = complete.select(&searched);
-    let tracks: Vec<usize> = searched.iter().map(|&j| attempt.block.tracks[j]).collect();
-    let found = Portfolio::new(&subset, settings, noise, stop)
-        .run(recorder, scale_px, &|weights| scatter(weights, &tracks, track_count))
+    let tracks = &attempt.block.tracks;
+    let found = Portfolio::new(complete, context.settings, initial_noise(context), context.stop)
+        .run(recorder, context.scale_px, &|weights| context.scatter(weights, tracks))
         .map_err(|error| Error::Internal(error.to_string()))?;
-    stopped(stop)?;
+    context.stopped()?;
     attempt.winning_prior = found.winning_prior;
-    attempt.iterations = found.iterations;
     attempt.prior_times = found.prior_times;
-    attempt.network_weights = vec![None; complete.tracks()];
-    for (&track, &weight) in searched.iter().zip(&found.network_weights) {
-        attempt.network_weights[track] = Some(weight);
-    }
+    attempt.network_weights = found.network_weights;
     let Some(consensus) = found.consensus else { return Ok(()) };
     recorder.enter(Stage::Refine);
-    let settled = grow::refine(complete, &consensus, portfolio::spread(complete), stop);
-    recorder.standing.inliers = settled.inlier_count() as u32;
-    recorder.standing.best_score = Some(settled.score);
+    let refined = grow::refine(complete, &consensus, portfolio::spread(complete), context.stop);
+    recorder.standing.inliers = refined.inlier_count() as u32;
+    recorder.standing.best_score = Some(refined.score);
     recorder.tell(1.0);
-    if settled.inlier_count() >= portfolio::LEAST_INLIERS {
-        attempt.consensus = Some(settled);
+    if refined.inlier_count() >= LEAST_INLIERS {
+        attempt.consensus = Some(refined);
     }
     Ok(())
 }
 
 /// PAPER and PSFM: the method's own set of tracks, reconstructed as it is.
-fn decide(
-    attempt: &mut Attempt,
-    track_count: usize,
-    settings: &SolveSettings,
-    scale_px: f64,
-    noise: f64,
-    recorder: &mut Recorder,
-    stop: &StopToken,
-) -> Result<(), Error> {
+fn decide(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> Result<(), Error> {
     let complete = &attempt.block.complete;
-    let decided = match settings.method {
+    let noise = initial_noise(context);
+    let decided = match context.settings.method {
         Method::Psfm => direct::psfm(complete, noise),
-        _ => {
-            let tracks = &attempt.block.tracks;
-            let spread_weights = |weights: &[f64]| scatter(weights, tracks, track_count);
-            direct::paper(complete, settings, recorder, scale_px, &spread_weights, stop)
-                .map_err(|error| Error::Internal(error.to_string()))?
-        }
+        _ => direct::paper(&attempt.block, context, recorder).map_err(|error| Error::Internal(error.to_string()))?,
     };
-    stopped(stop)?;
+    context.stopped()?;
     recorder.enter(Stage::Refine);
-    attempt.iterations = decided.iterations;
-    attempt.network_weights = decided.network_weights.iter().map(|&weight| Some(weight)).collect();
-    attempt.consensus = direct::reconstruct(complete, &decided.inlier, noise, stop);
+    attempt.network_weights = decided.network_weights.clone();
+    attempt.consensus = direct::reconstruct(complete, &decided.inlier, noise, context.stop);
     attempt.decided = Some(decided);
     recorder.tell(1.0);
     Ok(())
 }
 
 /// Calibrates from the inliers of a consensus.
-fn calibrate(block: &Block, consensus: &Consensus, scale_px: f64, stop: &StopToken) -> Result<Outcome, Error> {
+fn calibrate(block: &Block, consensus: &Consensus, context: &Context) -> Result<Outcome, Error> {
     let inliers = consensus.inliers();
     let points: Vec<_> = inliers.iter().map(|&track| consensus.points[track]).collect();
     let observations = grow::observations_of(&block.complete, &inliers);
@@ -181,25 +149,5 @@ fn calibrate(block: &Block, consensus: &Consensus, scale_px: f64, stop: &StopTok
         observations: &observations,
         noise: consensus.noise,
     };
-    Ok(calibration::calibrate(&problem, scale_px, stop)?)
-}
-
-/// All tracks, or a random choice of [`MOST_SEARCHED_TRACKS`], increasing.
-fn searched_tracks(tracks: usize, seed: u64) -> Vec<usize> {
-    if tracks <= MOST_SEARCHED_TRACKS {
-        return (0..tracks).collect();
-    }
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut chosen = index::sample(&mut rng, tracks, MOST_SEARCHED_TRACKS).into_vec();
-    chosen.sort_unstable();
-    chosen
-}
-
-/// Weights of some tracks as weights of all, 0 elsewhere.
-fn scatter(weights: &[f64], tracks: &[usize], track_count: usize) -> Vec<f32> {
-    let mut all = vec![0.0; track_count];
-    for (&track, &weight) in tracks.iter().zip(weights) {
-        all[track] = weight as f32;
-    }
-    all
+    Ok(calibration::calibrate(&problem, context.scale_px, context.stop)?)
 }

@@ -1,8 +1,11 @@
 //! Which views and tracks are solved together: normalisation and the choice of complete blocks.
 
 use nalgebra::Vector2;
+use rand::SeedableRng;
+use rand::seq::index;
+use rand_chacha::ChaCha8Rng;
 
-use crate::domain::{ImageSize, Input, Warning, WarningCode};
+use crate::domain::{ImageSize, Input, StopToken, Warning, WarningCode};
 use crate::geometry::measurement::{CompleteBlock, Normalization};
 
 /// Tracks that a block should have: twice the eight that verification needs, for half of them may be wrong.
@@ -13,11 +16,13 @@ pub const LEAST_TRACKS: usize = 8;
 pub const LEAST_VIEWS: usize = 3;
 /// Views that a block grows to. Real tracks are short: longer blocks hold few of them.
 const MOST_VIEWS: usize = 10;
-/// Views up to which tracks that are complete over all of them are solved as one block: bundle adjustment of a block
-/// is cubic in its views.
+/// Views that are solved as one block where tracks are complete over all views; of more, these many evenly spread:
+/// bundle adjustment of a block is cubic in its views.
 const MOST_VIEWS_WHOLE: usize = 40;
 /// Tracks beyond which more of them do not make a block better.
 const ENOUGH_TRACKS: usize = 300;
+/// Views that blocks are begun from; of long sequences not every view needs its turn to find a few dense blocks.
+const MOST_FIRST_VIEWS: usize = 64;
 /// Blocks that are tried, best first, before the best result stands.
 const MOST_BLOCKS: usize = 4;
 
@@ -48,28 +53,25 @@ pub fn track_ranges(input: &Input) -> Vec<usize> {
 /// units of the largest image side.
 pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
     let mut warnings = Vec::new();
-    let boxes = bounding_boxes(input);
-    let mut scale_px = 0.0f64;
-    let mut centres_px = Vec::with_capacity(input.view_count());
-    let mut unknown = 0usize;
-    for (view, bounds) in input.views().iter().zip(&boxes) {
-        let (centre, side) = match view.size {
-            Some(size) => (image_centre(size), f64::from(size.width_px.max(size.height_px))),
-            None => {
-                unknown += 1;
-                let [low, high] = bounds.unwrap_or([Vector2::zeros(), Vector2::repeat(1.0)]);
-                ((low + high) / 2.0, (high - low).amax())
-            }
-        };
-        centres_px.push(centre);
-        scale_px = scale_px.max(side);
-    }
+    // One camera took the views of unknown size: one centre, or its principal point would move from view to view.
+    let [low, high] = extent_of_unsized(input);
+    let assumed = ((low + high) / 2.0, (high - low).amax());
+    let frames: Vec<(Vector2<f64>, f64)> = input
+        .views()
+        .iter()
+        .map(|view| {
+            view.size.map_or(assumed, |size| (image_centre(size), f64::from(size.width_px.max(size.height_px))))
+        })
+        .collect();
+    let scale_px = frames.iter().map(|(_, side)| *side).fold(0.0, f64::max);
+    let centres_px = frames.into_iter().map(|(centre, _)| centre).collect();
+    let unknown = input.views().iter().filter(|view| view.size.is_none()).count();
     if unknown > 0 {
         warnings.push(Warning::new(
             WarningCode::AssumedImageSize,
             format!(
                 "{unknown} of {} views came without an image size; the extent of their points stood in, so the principal \
-                 point may be off",
+                 point and with it the calibration may be off; give the size",
                 input.view_count()
             ),
         ));
@@ -97,28 +99,40 @@ fn image_centre(size: ImageSize) -> Vector2<f64> {
     Vector2::new((f64::from(size.width_px) - 1.0) / 2.0, (f64::from(size.height_px) - 1.0) / 2.0)
 }
 
-fn bounding_boxes(input: &Input) -> Vec<Option<[Vector2<f64>; 2]>> {
-    let mut boxes: Vec<Option<[Vector2<f64>; 2]>> = vec![None; input.view_count()];
-    for k in 0..input.observation_count() {
-        let point = Vector2::from(input.point_px(k));
-        let bounds = boxes[input.view_of(k)].get_or_insert([point, point]);
-        bounds[0] = bounds[0].inf(&point);
-        bounds[1] = bounds[1].sup(&point);
+/// Share of the points on either side that the extent leaves out: a few wild ones do not make an image.
+const EXTENT_TAIL: f64 = 0.02;
+
+/// Box around the points of all views without a size, but for a tail on every side; the unit square without points.
+fn extent_of_unsized(input: &Input) -> [Vector2<f64>; 2] {
+    let points: Vec<[f64; 2]> = (0..input.observation_count())
+        .filter(|&k| input.views()[input.view_of(k)].size.is_none())
+        .map(|k| input.point_px(k))
+        .collect();
+    if points.is_empty() {
+        return [Vector2::zeros(), Vector2::repeat(1.0)];
     }
-    boxes
+    let tail = (EXTENT_TAIL * points.len() as f64) as usize;
+    let bounds = [0, 1].map(|axis| {
+        let mut values: Vec<f64> = points.iter().map(|point| point[axis]).collect();
+        values.sort_by(f64::total_cmp);
+        [values[tail], values[values.len() - 1 - tail]]
+    });
+    [Vector2::new(bounds[0][0], bounds[1][0]), Vector2::new(bounds[0][1], bounds[1][1])]
 }
 
 /// Sets of views worth solving, best first; empty when no three views share enough tracks.
-pub fn candidate_views(input: &Input, ranges: &[usize]) -> Vec<Vec<usize>> {
+///
+/// Once `stop` fires the answer is whatever was found by then.
+pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec<Vec<usize>> {
     let all: Vec<usize> = (0..input.view_count()).collect();
     let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
     let complete = ranges.windows(2).filter(|range| range[1] - range[0] == all.len()).count();
-    let whole = (LEAST_VIEWS..=MOST_VIEWS_WHOLE).contains(&all.len());
-    if whole && complete >= LEAST_TRACKS && 2 * complete >= observed {
-        return vec![all];
+    if all.len() >= LEAST_VIEWS && complete >= LEAST_TRACKS && 2 * complete >= observed {
+        let count = all.len().min(MOST_VIEWS_WHOLE);
+        return vec![(0..count).map(|k| k * all.len() / count).collect()];
     }
     for least in [WANTED_TRACKS, LEAST_TRACKS] {
-        let found = greedy_views(input, ranges, least);
+        let found = greedy_views(input, ranges, least, stop);
         if !found.is_empty() {
             return found;
         }
@@ -128,13 +142,17 @@ pub fn candidate_views(input: &Input, ranges: &[usize]) -> Vec<Vec<usize>> {
 
 /// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on
 /// the way, keeps the one with most constraints.
-fn greedy_views(input: &Input, ranges: &[usize], least: usize) -> Vec<Vec<usize>> {
+fn greedy_views(input: &Input, ranges: &[usize], least: usize, stop: &StopToken) -> Vec<Vec<usize>> {
     let mut tracks_of_view: Vec<Vec<usize>> = vec![Vec::new(); input.view_count()];
     for k in 0..input.observation_count() {
         tracks_of_view[input.view_of(k)].push(input.track_of(k));
     }
     let mut found: Vec<(usize, Vec<usize>)> = Vec::new();
-    for (first, seen) in tracks_of_view.into_iter().enumerate() {
+    for first in first_views(&tracks_of_view) {
+        if stop.is_stopped() {
+            break;
+        }
+        let seen = tracks_of_view[first].clone();
         let mut views = vec![first];
         let mut tracks = seen;
         let mut best: Option<(usize, Vec<usize>)> = None;
@@ -171,6 +189,13 @@ fn greedy_views(input: &Input, ranges: &[usize], least: usize) -> Vec<Vec<usize>
     diverse(found.into_iter().map(|(_, views)| views).collect())
 }
 
+/// The views that blocks are begun from: all, or as many as are affordable, evenly along the sequence.
+fn first_views(tracks_of_view: &[Vec<usize>]) -> Vec<usize> {
+    let views = tracks_of_view.len();
+    let count = views.min(MOST_FIRST_VIEWS);
+    (0..count).map(|k| k * views / count).collect()
+}
+
 /// At most [`MOST_BLOCKS`] of the ranked sets: those that share at most half of their views with every better one
 /// first, for a block that failed is not saved by changing one view.
 fn diverse(ranked: Vec<Vec<usize>>) -> Vec<Vec<usize>> {
@@ -183,6 +208,20 @@ fn diverse(ranked: Vec<Vec<usize>>) -> Vec<Vec<usize>> {
     chosen.append(&mut similar);
     chosen.truncate(MOST_BLOCKS);
     chosen
+}
+
+impl Block {
+    /// The block of at most `most` of its tracks, chosen at random; `seed` decides which.
+    pub fn sample(self, most: usize, seed: u64) -> Self {
+        if self.tracks.len() <= most {
+            return self;
+        }
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut chosen = index::sample(&mut rng, self.tracks.len(), most).into_vec();
+        chosen.sort_unstable();
+        let complete = self.complete.select(&chosen);
+        Self { views: self.views, tracks: chosen.iter().map(|&j| self.tracks[j]).collect(), complete }
+    }
 }
 
 /// The block of these views: all tracks that are complete over them.
@@ -235,7 +274,10 @@ mod tests {
     fn complete_tracks_are_one_block_of_all_views() {
         let input = input(12, &vec![(0..12).collect(); 20]);
         let ranges = track_ranges(&input);
-        assert_eq!(candidate_views(&input, &ranges), [(0..12).collect::<Vec<_>>()]);
+        assert_eq!(candidate_views(&input, &ranges, &StopToken::default()), [(0..12).collect::<Vec<_>>()]);
+        let long = self::input(100, &vec![(0..100).collect(); 20]);
+        let views = &candidate_views(&long, &track_ranges(&long), &StopToken::default())[0];
+        assert_eq!((views.len(), views[0], views[39]), (MOST_VIEWS_WHOLE, 0, 97));
     }
 
     #[test]
@@ -244,17 +286,28 @@ mod tests {
         tracks.extend(vec![(3..8).collect::<Vec<_>>(); 60]);
         let input = input(8, &tracks);
         let ranges = track_ranges(&input);
-        let candidates = candidate_views(&input, &ranges);
+        let candidates = candidate_views(&input, &ranges, &StopToken::default());
         assert_eq!(candidates[0], [3, 4, 5, 6, 7]);
         let (normalization, warnings) = normalization(&input);
         let block = extract(&input, &ranges, &normalization, &candidates[0]);
         assert_eq!((block.complete.views(), block.tracks.len()), (5, 60));
         assert_eq!(warnings[0].code, WarningCode::AssumedImageSize);
+        let sampled = block.clone().sample(7, 1);
+        assert_eq!((sampled.tracks.len(), sampled.complete.tracks()), (7, 7));
+        let place = block.tracks.iter().position(|&track| track == sampled.tracks[3]).expect("a track of the block");
+        assert_eq!(sampled.complete.track(3), block.complete.track(place));
+    }
+
+    #[test]
+    fn views_of_unknown_size_share_one_centre() {
+        let input = input(3, &[vec![0, 1], vec![1, 2], vec![0, 2], vec![0, 1, 2]]);
+        let (normalization, _) = normalization(&input);
+        assert!(normalization.centres_px.iter().all(|centre| *centre == normalization.centres_px[0]));
     }
 
     #[test]
     fn views_that_share_nothing_make_no_block() {
         let input = input(4, &[vec![0, 1], vec![2, 3], vec![1, 2]]);
-        assert!(candidate_views(&input, &track_ranges(&input)).is_empty());
+        assert!(candidate_views(&input, &track_ranges(&input), &StopToken::default()).is_empty());
     }
 }

@@ -1,8 +1,10 @@
 //! The methods without search: the paper's own thresholded weights, and plain projective factorisation.
 
+use super::Context;
+use super::block::Block;
 use super::grow::{self, Consensus, LEAST_SUPPORT};
 use super::recorder::Recorder;
-use crate::domain::{SolveSettings, StopToken};
+use crate::domain::StopToken;
 use crate::geometry::bundle::{self, projective};
 use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_residuals};
 use crate::geometry::measurement::{CompleteBlock, balance};
@@ -25,34 +27,27 @@ pub struct Decided {
     /// The method's own weights, one a track of the block.
     pub weights: Vec<f64>,
     pub network_weights: Vec<f64>,
-    pub iterations: u32,
 }
 
 /// PAPER: optimises the network to the end and thresholds its weights.
 ///
 /// # Errors
 /// The network's own, which are defects: a block has more columns than it asks for.
-pub fn paper(
-    block: &CompleteBlock,
-    settings: &SolveSettings,
-    recorder: &mut Recorder,
-    scale_px: f64,
-    spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
-    stop: &StopToken,
-) -> Result<Decided, crate::network::Error> {
-    let matrix = balance(&block.measurement_matrix());
+pub fn paper(block: &Block, context: &Context, recorder: &mut Recorder) -> Result<Decided, crate::network::Error> {
+    let settings = context.settings;
+    let matrix = balance(&block.complete.measurement_matrix());
     let mut network = PriorNetwork::new(&matrix, &NetworkSettings::from(settings))?;
-    while network.iteration() < settings.iterations && !stop.is_stopped() {
+    while network.iteration() < settings.iterations && !context.stop.is_stopped() {
         let step = network.step()?;
         recorder.standing.iteration = step.iteration;
         recorder.standing.losses = Some(step.losses);
         recorder.standing.inliers = network.weights().iter().filter(|&&w| w > PAPER_THRESHOLD).count() as u32;
         if settings.use_daq {
-            recorder.standing.focal_px = Some(network.focal() * scale_px);
+            recorder.standing.focal_px = Some(network.focal() * context.scale_px);
         }
         recorder.tell(f64::from(step.iteration) / f64::from(settings.iterations));
         if settings.weights_every > 0 && step.iteration.is_multiple_of(settings.weights_every) {
-            recorder.weights(&spread_weights(network.weights()));
+            recorder.weights(&context.scatter(network.weights(), &block.tracks));
         }
     }
     let weights = network.weights().to_vec();
@@ -60,7 +55,6 @@ pub fn paper(
         inlier: weights.iter().map(|&weight| weight > PAPER_THRESHOLD).collect(),
         network_weights: weights.clone(),
         weights,
-        iterations: network.iteration(),
     })
 }
 
@@ -74,7 +68,6 @@ pub fn psfm(block: &CompleteBlock, noise: f64) -> Decided {
         inlier: residuals.iter().map(|&residual| residual < threshold).collect(),
         weights: residuals.iter().map(|&residual| 1.0 / (1.0 + (residual / threshold).powi(2))).collect(),
         network_weights: Vec::new(),
-        iterations: 0,
     }
 }
 
@@ -89,10 +82,17 @@ pub fn reconstruct(block: &CompleteBlock, inlier: &[bool], noise: f64, stop: &St
     let matrix = balance(&block.measurement_matrix()).select_columns(&support);
     let mut cameras = cameras_of(&dominant_subspace(&matrix, subspace::RANK)?);
     let mut points: Vec<_> = support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();
-    let options =
-        bundle::Options { max_iterations: ADJUSTMENT_ITERATIONS, loss: grow::robust(noise), ..Default::default() };
-    projective::adjust(&mut cameras, &mut points, &grow::observations_of(block, &support), &options, stop);
-    let mut consensus = grow::judge(block, cameras, noise, stop);
-    consensus.inlier = inlier.to_vec();
-    Some(consensus)
+    let observations = grow::observations_of(block, &support);
+    let mut consensus = None;
+    let mut noise = noise;
+    // Once at the noise assumed, once at that of the set itself.
+    for _ in 0..2 {
+        let options =
+            bundle::Options { max_iterations: ADJUSTMENT_ITERATIONS, loss: grow::robust(noise), ..Default::default() };
+        projective::adjust(&mut cameras, &mut points, &observations, &options, stop);
+        let judged = grow::judge(block, cameras.clone(), noise, stop);
+        noise = grow::estimate_noise(&judged, &support);
+        consensus = Some(Consensus { inlier: inlier.to_vec(), noise, ..judged });
+    }
+    consensus
 }

@@ -14,6 +14,8 @@ use crate::geometry::{Camera, Point, triangulation};
 /// Tracks below which projective cameras of three views or more are not determined by image points:
 /// `2nk > 11n + 3k - 15`.
 pub const LEAST_SUPPORT: usize = 7;
+/// Inliers that geometry can verify: one track more than determine the cameras.
+pub const LEAST_INLIERS: usize = LEAST_SUPPORT + 1;
 /// Rounds of growing; a true seed needs five to ten.
 const GROWING_ROUNDS: usize = 30;
 /// Rounds without a better consensus after which growing ends.
@@ -29,7 +31,7 @@ const PLAIN_SUPPORT: usize = 8;
 /// Tracks whose linear residual is this many gates away are not refined: no refinement brings them back.
 const HOPELESS_GATES: f64 = 100.0;
 /// Tracks judged between two looks at the stop token: a few milliseconds at forty views.
-const TRACKS_PER_LOOK: usize = 64;
+const TRACKS_PER_LOOK: usize = 16;
 /// Inflations of the gate while polishing.
 const POLISH_INFLATIONS: [f64; 6] = [8.0, 4.0, 2.0, 1.0, 1.0, 1.0];
 const POLISH_ROUNDS: usize = 2;
@@ -187,19 +189,28 @@ pub fn robust(noise: f64) -> Loss {
     Loss::Cauchy { scale: CAUCHY_SCALE * noise }
 }
 
+/// Growth of the support while the gate admits more tracks than it holds, and while it does not.
+const FAST_GROWTH: f64 = 1.5;
+const CAREFUL_GROWTH: f64 = 1.15;
+/// Share of the support that the gate must admit for the support to become what it admits.
+const CAUGHT_UP: f64 = 0.8;
+/// Gates within which the next track must lie for a support to grow that the gate does not confirm.
+const NEAR_GATES: f64 = 30.0;
+
 /// The tracks to fit next, increasing: by half more than now while the gate admits them, all admitted ones once the
 /// support has caught up, else carefully more as long as the next track is not far off.
 fn next_support(judged: &Consensus, size: usize, views: usize) -> Vec<usize> {
     let mut ranked: Vec<usize> = (0..judged.squared.len()).collect();
     ranked.sort_by(|&a, &b| judged.squared[a].total_cmp(&judged.squared[b]).then(a.cmp(&b)));
     let admitted = judged.inlier_count();
+    let grown = |factor: f64| (factor * size as f64) as usize;
     let wanted = if size < admitted {
-        (size + 1).max(admitted.min(size * 3 / 2))
-    } else if admitted * 5 >= size * 4 && admitted >= LEAST_SUPPORT {
+        (size + 1).max(admitted.min(grown(FAST_GROWTH)))
+    } else if admitted as f64 >= CAUGHT_UP * size as f64 && admitted >= LEAST_SUPPORT {
         admitted
     } else {
-        let more = size * 23 / 20;
-        let far = 30.0 * gate(views) * judged.noise * judged.noise;
+        let more = grown(CAREFUL_GROWTH);
+        let far = NEAR_GATES * gate(views) * judged.noise * judged.noise;
         let reaches = ranked.get(more.min(ranked.len() - 1)).is_some_and(|&track| judged.squared[track] < far);
         LEAST_SUPPORT.max(if reaches { more } else { size })
     };
@@ -238,13 +249,13 @@ pub fn polish(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> 
     best
 }
 
-/// Rounds of re-estimating the noise; each may lower it tenfold.
+/// Rounds of re-estimating the noise; from ten times too high two or three suffice.
 const NOISE_ROUNDS: usize = 6;
 /// Relative change of the noise below which it has settled.
 const NOISE_SETTLED: f64 = 0.05;
 /// Bounds of the noise estimate in normalised units: a hundredth of a pixel in a 10,000 px image, and a tenth of the
 /// image.
-const NOISE_BOUNDS: (f64, f64) = (1e-6, 0.1);
+pub const NOISE_BOUNDS: (f64, f64) = (1e-6, 0.1);
 
 /// Estimates the noise from the inliers and refits until both agree.
 ///
@@ -255,16 +266,16 @@ fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -
     let mut current = consensus;
     for _ in 0..NOISE_ROUNDS {
         let inliers = current.inliers();
-        if inliers.len() < LEAST_SUPPORT + 1 || stop.is_stopped() {
+        if inliers.len() < LEAST_INLIERS || stop.is_stopped() {
             break;
         }
-        let noise = estimate_noise(&current, &inliers).clamp(NOISE_BOUNDS.0, NOISE_BOUNDS.1);
+        let noise = estimate_noise(&current, &inliers);
         let settled = (noise / current.noise - 1.0).abs() < NOISE_SETTLED;
         let points = inliers.iter().map(|&track| current.points[track]).collect();
         let cameras = adjust(block, &current.cameras, points, &inliers, robust(noise), ADJUSTMENTS.0, stop);
         let refitted = polish(block, judge(block, cameras, noise, stop), stop);
         // A noise level at which the consensus falls apart was estimated from a fit too flexible to trust.
-        if refitted.inlier_count() < LEAST_SUPPORT + 1 {
+        if refitted.inlier_count() < LEAST_INLIERS {
             break;
         }
         current = refitted;
@@ -300,9 +311,10 @@ pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &
     best
 }
 
-fn estimate_noise(consensus: &Consensus, inliers: &[usize]) -> f64 {
+/// Noise of a consensus by the median of these tracks' residuals.
+pub fn estimate_noise(consensus: &Consensus, inliers: &[usize]) -> f64 {
     let views = consensus.cameras.len();
     let per_track = (constraint_count(views, inliers.len()) / inliers.len() as f64).max(0.5);
     let mut squared: Vec<f64> = inliers.iter().map(|&track| consensus.squared[track]).collect();
-    (median(&mut squared) / chi_square_median(per_track)).sqrt()
+    (median(&mut squared) / chi_square_median(per_track)).sqrt().clamp(NOISE_BOUNDS.0, NOISE_BOUNDS.1)
 }

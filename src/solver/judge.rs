@@ -20,7 +20,7 @@ const WRONG_OBSERVATION: f64 = 0.05;
 const LEAST_RETAINED: usize = 3;
 const LEAST_RETAINED_SHARE: f64 = 0.6;
 /// Tracks between two looks at the stop token: a few milliseconds.
-const TRACKS_PER_LOOK: usize = 64;
+const TRACKS_PER_LOOK: usize = 16;
 /// Refinement steps of a point.
 const POINT_STEPS: usize = 10;
 
@@ -119,7 +119,9 @@ fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry) 
     let gate = observation_gate(geometry.noise, geometry.outlier_density);
     let mut retained: Vec<usize> = (0..sightings.len()).collect();
     let (mut point, mut cost) = triangulate(cameras, sightings);
-    while retained.len() > LEAST_RETAINED {
+    let least = LEAST_RETAINED.max((LEAST_RETAINED_SHARE * sightings.len() as f64).ceil() as usize);
+    // A track that cannot retain enough is wrong already.
+    while retained.len() >= least && retained.len() > LEAST_RETAINED {
         let residual = |&k: &usize| {
             triangulation::reprojection(&cameras[sightings[k].view], &point, &sightings[k].xy).norm_squared()
         };
@@ -135,7 +137,7 @@ fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry) 
     }
     let dropped = sightings.len() - retained.len();
     let ln_odds = ln_odds(cost, retained.len(), dropped, geometry);
-    let enough = retained.len() as f64 >= LEAST_RETAINED_SHARE * sightings.len() as f64;
+    let enough = retained.len() >= least;
     let weight = if enough { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
     let mut flags = vec![false; sightings.len()];
     for k in retained {

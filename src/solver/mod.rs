@@ -22,6 +22,7 @@ mod search;
 mod tests;
 
 use crate::domain::{Input, Observer, Solution, SolveSettings, StopReason, StopToken, Warning, WarningCode};
+use crate::geometry::measurement::Normalization;
 use attempt::Attempt;
 use recorder::Recorder;
 
@@ -55,16 +56,17 @@ pub fn solve(
 ) -> Result<Solution, Error> {
     let mut recorder = Recorder::new(observer);
     let ranges = block::track_ranges(input);
-    let (normalization, warnings) = block::normalization(input);
-    let candidates = block::candidate_views(input, &ranges);
+    let (normalization, mut warnings) = block::normalization(input);
+    let scale_px = normalization.scale_px;
+    let context = Context { input, settings, ranges: &ranges, normalization: &normalization, scale_px, stop };
+    let candidates = block::candidate_views(input, &ranges, stop);
     let mut best: Option<Attempt> = None;
     let mut others = Vec::new();
     for (k, views) in candidates.iter().enumerate() {
-        stopped(stop)?;
+        context.stopped()?;
         recorder.begin_block(k, candidates.len());
         let block = block::extract(input, &ranges, &normalization, views);
-        let attempt =
-            attempt::solve_block(block, input.track_count(), settings, normalization.scale_px, &mut recorder, stop)?;
+        let attempt = attempt::solve_block(block, &context, &mut recorder)?;
         if best.as_ref().is_none_or(|best| attempt.merit() > best.merit()) {
             others.extend(best.replace(attempt));
         } else {
@@ -75,23 +77,48 @@ pub fn solve(
             break;
         }
     }
-    stopped(stop)?;
+    context.stopped()?;
     if let Some(best) = &mut best {
         agreement::reconcile(best, &others);
     }
-    Ok(match best {
-        Some(attempt) if attempt.consensus.is_some() => {
-            let solution =
-                assemble::solved(input, settings, &ranges, &normalization, attempt, warnings, recorder, stop);
-            stopped(stop)?;
-            solution
-        }
+    let solution = match &best {
+        Some(attempt) if attempt.consensus.is_some() => assemble::solved(&context, attempt, warnings, recorder),
         best => {
-            let mut warnings = warnings;
             warnings.push(why_unsolved(input, best.as_ref()));
-            assemble::unsolved(input, settings, best.as_ref(), warnings, recorder)
+            assemble::unsolved(&context, best.as_ref(), warnings, recorder)
         }
-    })
+    };
+    context.stopped()?;
+    Ok(solution)
+}
+
+/// What every part of one solve works on.
+#[derive(Clone, Copy)]
+struct Context<'a> {
+    input: &'a Input,
+    settings: &'a SolveSettings,
+    /// Observations of each track; see [`block::track_ranges`].
+    ranges: &'a [usize],
+    normalization: &'a Normalization,
+    /// Length of a normalised unit in pixels.
+    scale_px: f64,
+    stop: &'a StopToken,
+}
+
+impl Context<'_> {
+    /// `Err` once the token asks for a stop.
+    fn stopped(&self) -> Result<(), Error> {
+        self.stop.reason().map_or(Ok(()), |reason| Err(Error::Stopped(reason)))
+    }
+
+    /// Weights of some tracks as weights of all, 0 elsewhere.
+    fn scatter(&self, weights: &[f64], tracks: &[usize]) -> Vec<f32> {
+        let mut all = vec![0.0; self.input.track_count()];
+        for (&track, &weight) in tracks.iter().zip(weights) {
+            all[track] = weight as f32;
+        }
+        all
+    }
 }
 
 fn why_unsolved(input: &Input, best: Option<&Attempt>) -> Warning {
@@ -108,19 +135,22 @@ fn why_unsolved(input: &Input, best: Option<&Attempt>) -> Warning {
                 block::LEAST_TRACKS
             ),
         ),
+        Some(Attempt { decided: Some(decided), .. }) => Warning::new(
+            WarningCode::FewInliers,
+            format!(
+                "the method kept {} tracks; {} determine the cameras",
+                decided.inlier.iter().filter(|&&inlier| inlier).count(),
+                grow::LEAST_SUPPORT
+            ),
+        ),
         Some(attempt) => Warning::new(
             WarningCode::NoConsensus,
             format!(
                 "among the {} tracks complete over {} views no {} or more agree on one geometry more than by chance",
                 attempt.block.tracks.len(),
                 attempt.block.views.len(),
-                portfolio::LEAST_INLIERS
+                grow::LEAST_INLIERS
             ),
         ),
     }
-}
-
-/// `Err` once the token asks for a stop.
-fn stopped(stop: &StopToken) -> Result<(), Error> {
-    stop.reason().map_or(Ok(()), |reason| Err(Error::Stopped(reason)))
 }

@@ -9,13 +9,14 @@ use std::time::Instant;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::grow::{self, Consensus, LEAST_SUPPORT};
+use super::grow::{self, Consensus, LEAST_INLIERS};
 use super::priors;
 use super::recorder::Recorder;
 use super::search::{Sampler, Seed, Shortlist, affine, subspace};
 use crate::domain::result::PriorTime;
 use crate::domain::{Prior, SolveSettings, StopToken};
 use crate::geometry::measurement::{CompleteBlock, balance};
+use crate::geometry::statistics::median;
 use crate::network::{NetworkSettings, PriorNetwork};
 
 /// Network iterations between two verifications of its ranking.
@@ -38,15 +39,11 @@ const LN_DECISIVE: f64 = -40.0;
 const LN_ACCEPTABLE: f64 = -7.0;
 /// Gain in that logarithm below which two consensuses are the same: a single track more changes it by tens.
 const LN_MARGIN: f64 = 5.0;
-/// Inliers that geometry can verify: one more than determine the cameras.
-pub const LEAST_INLIERS: usize = LEAST_SUPPORT + 1;
 
 /// What the search found.
 pub struct Found {
     pub consensus: Option<Consensus>,
     pub winning_prior: Option<Prior>,
-    /// Network iterations spent.
-    pub iterations: u32,
     /// The network's last weights, one a track of the block; empty without a network.
     pub network_weights: Vec<f64>,
     pub prior_times: Vec<PriorTime>,
@@ -219,19 +216,21 @@ impl<'a> Portfolio<'a> {
     /// The priors that need no optimisation, once.
     fn propose_geometric(&mut self) {
         let begun = Instant::now();
-        let (irls, consistency) = match &self.search {
-            Search::Affine(search) => (priors::affine_irls(search.centred()), priors::consistency(search.centred(), 2)),
-            Search::Subspace(search) => {
-                let centred = centred_rows(search.balanced());
-                (priors::irls(search.balanced(), subspace::RANK), priors::consistency(&centred, 3))
-            }
+        let irls = match &self.search {
+            Search::Affine(search) => priors::affine_irls(search.centred(), self.stop),
+            Search::Subspace(search) => priors::irls(search.balanced(), subspace::RANK, self.stop),
         };
-        let seconds = begun.elapsed().as_secs_f64();
+        self.account(Prior::Irls).seconds += begun.elapsed().as_secs_f64();
         if let Some(prior) = irls {
-            self.account(Prior::Irls).seconds += seconds;
             self.propose_ranking(Prior::Irls, &prior);
             self.propose(Prior::Irls, &prior);
         }
+        let begun = Instant::now();
+        let consistency = match &self.search {
+            Search::Affine(search) => priors::consistency(search.centred(), 2),
+            Search::Subspace(search) => priors::consistency(&centred_rows(search.balanced()), 3),
+        };
+        self.account(Prior::Consistency).seconds += begun.elapsed().as_secs_f64();
         self.propose(Prior::Consistency, &consistency);
     }
 
@@ -338,7 +337,6 @@ impl<'a> Portfolio<'a> {
         Found {
             consensus,
             winning_prior,
-            iterations: network.as_ref().map_or(0, PriorNetwork::iteration),
             network_weights: network.map_or_else(Vec::new, |network| network.weights().to_vec()),
             prior_times,
         }
@@ -362,16 +360,26 @@ fn prior_time(account: &Account, accepted: Option<&Best>) -> PriorTime {
     }
 }
 
-/// Root mean squared deviation of the image points from their view's mean, one coordinate, normalised units.
+/// Normal consistency of the median absolute deviation.
+const DEVIATION_PER_MEDIAN: f64 = 1.4826;
+/// Largest spread that points of an image can have: half its side.
+const MOST_SPREAD: f64 = 0.5;
+
+/// Standard deviation of the image points from the middle of their view, one coordinate, normalised units: median
+/// over the views of a robust estimate, for a single far point must not make chance look small.
 pub fn spread(block: &CompleteBlock) -> f64 {
-    let mut squared = 0.0;
-    for view in 0..block.views() {
-        let count = block.tracks().max(1) as f64;
-        let mean = (0..block.tracks()).map(|track| block.point(view, track)).sum::<nalgebra::Vector2<f64>>() / count;
-        let deviation: f64 = (0..block.tracks()).map(|track| (block.point(view, track) - mean).norm_squared()).sum();
-        squared += deviation / (2.0 * count);
-    }
-    (squared / block.views().max(1) as f64).sqrt().max(f64::MIN_POSITIVE)
+    let mut spreads: Vec<f64> = (0..block.views())
+        .map(|view| {
+            let of_axis = |axis: usize| {
+                let mut values: Vec<f64> = (0..block.tracks()).map(|track| block.point(view, track)[axis]).collect();
+                let middle = median(&mut values);
+                values.iter_mut().for_each(|value| *value = (*value - middle).abs());
+                median(&mut values)
+            };
+            DEVIATION_PER_MEDIAN * (of_axis(0) + of_axis(1)) / 2.0
+        })
+        .collect();
+    median(&mut spreads).clamp(f64::MIN_POSITIVE, MOST_SPREAD)
 }
 
 /// Every row centred on its median.
@@ -379,7 +387,7 @@ fn centred_rows(matrix: &nalgebra::DMatrix<f64>) -> nalgebra::DMatrix<f64> {
     let mut centred = matrix.clone();
     for mut row in centred.row_iter_mut() {
         let mut values: Vec<f64> = row.iter().copied().collect();
-        let middle = crate::geometry::statistics::median(&mut values);
+        let middle = median(&mut values);
         row.add_scalar_mut(-middle);
     }
     centred

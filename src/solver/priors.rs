@@ -4,6 +4,7 @@
 
 use nalgebra::DMatrix;
 
+use crate::domain::StopToken;
 use crate::geometry::factorization::{dominant_subspace, subspace_residuals};
 use crate::geometry::statistics::median;
 
@@ -48,11 +49,14 @@ const IRLS_ANNEALING: f64 = 0.7;
 /// * `matrix`: d x m, columns of comparable norm
 /// * `rank`: dimension of the subspace
 ///
-/// Returns the inverse squared residuals under the last subspace; `None` when a decomposition fails.
-pub fn irls(matrix: &DMatrix<f64>, rank: usize) -> Option<Vec<f64>> {
+/// Returns the inverse squared residuals under the last subspace; `None` when a decomposition fails or `stop` fires.
+pub fn irls(matrix: &DMatrix<f64>, rank: usize, stop: &StopToken) -> Option<Vec<f64>> {
     let mut weights = vec![1.0f64; matrix.ncols()];
     let mut residuals = vec![1.0; matrix.ncols()];
     for round in 0..IRLS_ROUNDS {
+        if stop.is_stopped() {
+            return None;
+        }
         let mut weighted = matrix.clone();
         for (mut column, weight) in weighted.column_iter_mut().zip(&weights) {
             column *= weight.sqrt();
@@ -68,18 +72,22 @@ pub fn irls(matrix: &DMatrix<f64>, rank: usize) -> Option<Vec<f64>> {
     Some(residuals.iter().map(|residual| 1.0 / residual.max(IRLS_FLOORS.1).powi(2)).collect())
 }
 
-/// Shrinking of the residual scale a round, and its floor, in units of a view's spread.
+/// Shrinking of the residual scale a round: from a view's spread to the floor in the first half of the rounds.
 const AFFINE_SHRINK: f64 = 0.88;
+/// Floor of the residual, in units of a view's spread: what perspective adds to right tracks at moderate depths.
 const AFFINE_FLOOR: f64 = 0.08;
 
 /// The same idea for image points without depths: a rank-3 affine subspace of the centred coordinates (2n x m) under
 /// graduated Geman-McClure weights. The floor is wide: perspective makes right tracks deviate from affine.
 ///
-/// Returns the weights of the last round; `None` when a decomposition fails.
-pub fn affine_irls(centred: &DMatrix<f64>) -> Option<Vec<f64>> {
+/// Returns the weights of the last round; `None` when a decomposition fails or `stop` fires.
+pub fn affine_irls(centred: &DMatrix<f64>, stop: &StopToken) -> Option<Vec<f64>> {
     let mut weights = vec![1.0f64; centred.ncols()];
     let mut scale = None;
     for _ in 0..IRLS_ROUNDS {
+        if stop.is_stopped() {
+            return None;
+        }
         let total: f64 = weights.iter().sum();
         let mut mean = centred.column(0) * 0.0;
         for (column, weight) in centred.column_iter().zip(&weights) {
@@ -147,8 +155,8 @@ mod tests {
 
     #[test]
     fn reweighting_separates_a_subspace_from_clutter() {
-        separates(&irls(&half_and_half(), 3).expect("finite"));
-        separates(&affine_irls(&half_and_half()).expect("finite"));
+        separates(&irls(&half_and_half(), 3, &StopToken::default()).expect("finite"));
+        separates(&affine_irls(&half_and_half(), &StopToken::default()).expect("finite"));
     }
 
     #[test]

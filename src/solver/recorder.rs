@@ -110,7 +110,7 @@ impl<'a> Recorder<'a> {
     }
 
     /// Network iterations so far, over all blocks.
-    fn iteration(&self) -> u32 {
+    pub fn iteration(&self) -> u32 {
         self.earlier_iterations + self.standing.iteration
     }
 

@@ -123,6 +123,12 @@ fn paper_and_psfm_answer_with_their_own_verdicts() {
     for (weight, inlier) in solution.tracks.weight.iter().zip(&solution.tracks.inlier) {
         assert_eq!(*weight > 0.5, *inlier);
     }
+    for k in 0..input.observation_count() {
+        let inlier = solution.observations.inlier[input.caller_index(k)];
+        assert!(!inlier || solution.tracks.inlier[input.track_of(k)], "a rejected track has no inlier observation");
+    }
+    // 3 px were put in; the network's set is right but for a few tracks.
+    assert!(solution.noise_px.is_some_and(|noise| (1.0..9.0).contains(&noise)), "{:?}", solution.noise_px);
     let chosen = agreement(&solution.tracks.inlier, &scene.truth.inlier);
     assert!(chosen.precision > 0.9, "precision {}", chosen.precision);
     // Nothing wrong: plain factorisation has nothing to be robust against.
@@ -188,6 +194,55 @@ fn two_views_and_tracks_that_share_nothing_are_refused_with_the_reason() {
     let sparse = Input::new(raw, &Limits::default(), "scene").expect("valid input");
     let solution = solved(&sparse, &SolveSettings::default());
     assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::FewInliers));
+}
+
+#[test]
+fn one_point_far_away_does_not_make_chance_look_small() {
+    for seed in 0..2 {
+        let options = SceneOptions { views: 4, outliers: 1.0, tracks: 60, seed, ..SceneOptions::default() };
+        let mut raw = scene(options).0.to_raw();
+        raw.x[0] = 1e7;
+        let input = Input::new(raw, &Limits::default(), "scene").expect("valid input");
+        let settings = SolveSettings { method: Method::Geometry, seed, ..SolveSettings::default() };
+        assert_eq!(solved(&input, &settings).status, Status::NoReconstruction, "seed {seed}");
+    }
+}
+
+#[test]
+fn without_image_sizes_the_reported_cameras_still_reproject() {
+    let (sized, scene) = scene(SceneOptions { outliers: 0.5, seed: 3, ..SceneOptions::default() });
+    let mut raw = sized.to_raw();
+    raw.views = vec![View::default(); raw.views.len()];
+    let input = Input::new(raw.clone(), &Limits::default(), "scene").expect("valid input");
+    let solution = solved(&input, &SolveSettings::default());
+    let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
+    assert!(f1 > 0.98, "F1 {f1}");
+    let Some(calibration) = solution.calibrations.first() else { panic!("{:?}", solution.warnings) };
+    let ([px, py], f) = (calibration.principal_point_px, calibration.focal_px);
+    for k in 0..raw.x.len() {
+        let (view, track) = (raw.view[k] as usize, raw.track[k] as usize);
+        let Some(point) = solution.tracks.point[track].filter(|_| solution.observations.inlier[k]) else { continue };
+        let pose = &solution.views[view];
+        let rows = pose.rotation.expect("a metric pose");
+        let rotation = nalgebra::Matrix3::from_fn(|row, column| rows[row][column]);
+        let seen = rotation * nalgebra::Vector3::from(point)
+            + nalgebra::Vector3::from(pose.translation.expect("a metric pose"));
+        let residual =
+            (f * seen.x / seen.z + px - raw.x[k]).hypot(calibration.aspect * f * seen.y / seen.z + py - raw.y[k]);
+        // Noise of 3 px a coordinate, and what a principal point off by some pixels adds.
+        assert!(residual < 30.0, "view {view}, track {track}: {residual} px");
+    }
+}
+
+#[test]
+fn a_pure_translation_has_no_focal_length_to_give() {
+    let options =
+        SceneOptions { views: 6, tracks: 40, outliers: 0.0, max_rotation_rad: 0.0, ..SceneOptions::default() };
+    let solution = solved(&scene(options).0, &SolveSettings::default());
+    assert_eq!((solution.status, solution.grade), (Status::Solved, Some(Grade::ProjectiveOnly)));
+    assert!(solution.calibrations.is_empty() && solution.plane_at_infinity.is_none());
+    assert!(solution.views.iter().all(|view| view.projection.is_some() && view.rotation.is_none()));
+    assert!(solution.tracks.point.iter().filter(|point| point.is_some()).count() > 30);
 }
 
 #[test]

@@ -136,7 +136,7 @@ fn cost<const G: usize, const C: usize, const P: usize>(
 
 /// Minimises the loss over all unknowns, starting from and ending in `problem`.
 ///
-/// The cost never rises. `stop` is asked before every step; a stopped, stuck or degenerate problem keeps its last
+/// The cost never rises. `stop` is asked before every damped solve; a stopped, stuck or degenerate problem keeps its last
 /// good state.
 pub(super) fn minimise<const G: usize, const C: usize, const P: usize>(
     problem: &mut impl Problem<G, C, P>,
@@ -157,7 +157,7 @@ pub(super) fn minimise<const G: usize, const C: usize, const P: usize>(
     let mut damping = options.initial_damping.max(MIN_DAMPING);
     while report.iterations < options.max_iterations && report.cost > 0.0 && !stop.is_stopped() {
         linearisation.fill(problem, &layout, options.loss);
-        let accepted = (0..MAX_ATTEMPTS).find_map(|_| {
+        let accepted = (0..MAX_ATTEMPTS).take_while(|_| !stop.is_stopped()).find_map(|_| {
             let lowered = (reduced.solve(problem, &layout, &linearisation, damping, &mut step) && step.is_finite())
                 .then(|| {
                     trial.retract(problem, &step);

@@ -136,8 +136,10 @@ pub(super) fn grade(
     if warnings.iter().any(|warning| warning.code == WarningCode::FewInliers) {
         cap(Grade::Weak);
     }
+    // A sigma that the fit contradicts is not told: whatever lowered the grade is worth at least the grade's least.
+    let sigma = best.sigma.map(|sigma| if grade == Grade::Weak { sigma.max(METRIC_BELOW) } else { sigma });
     Ok(Outcome {
-        sigma_log_focal: best.sigma,
+        sigma_log_focal: sigma,
         grade,
         warnings,
         model: best.model,
@@ -223,7 +225,7 @@ fn misfits(best: &Candidate, fit: &ProjectiveFit) -> bool {
 
 /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
 ///
-/// The focal length is held three standard deviations away while everything else adjusts; the chi-square should rise
+/// The focal length is held three standard deviations away while poses and points adjust; the chi-square should rise
 /// by nine. Near critical motions the linearisation is optimistic: it is taken where the noise has moved the scene.
 fn profiled(sigma: f64, best: &Candidate, observations: &[Observation], stop: &StopToken) -> f64 {
     let shift = (PROFILE_DEVIATIONS * sigma).min(PROFILE_LONGEST);

@@ -26,7 +26,7 @@ const LEAST_COLUMNS: usize = RANK + 1;
 /// four from a chance one: mean F1 .68 -> .975 at 98 % outliers.
 const DAQ_WEIGHT: f64 = 20.0;
 /// Samples between two looks at the stop token.
-const SAMPLES_PER_LOOK: usize = 64;
+const SAMPLES_PER_LOOK: usize = 8;
 
 /// A column space with its cost.
 #[derive(Debug, Clone)]
