@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use crate::domain::{InvalidInput, Solution, Status};
 use crate::formats;
 
-/// The codes, as every `--help` shows them.
+/// The codes, as `scpsfm --help` shows them, and every command that solves or talks to a server.
 pub const HELP: &str = "\
 Exit codes:
     0  done; of a solve: solved (the grade may still be PROJECTIVE_ONLY: see result.json)
@@ -100,12 +100,6 @@ impl fmt::Display for Failure {
 impl From<std::io::Error> for Failure {
     fn from(error: std::io::Error) -> Self {
         Self::internal(error)
-    }
-}
-
-impl From<anyhow::Error> for Failure {
-    fn from(error: anyhow::Error) -> Self {
-        Self::internal(format_args!("{error:#}"))
     }
 }
 

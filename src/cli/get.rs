@@ -3,7 +3,7 @@
 use super::args::ServerArgs;
 use super::client::Client;
 use super::exit::{Exit, Failure};
-use super::{job_view, print};
+use super::job_view;
 use crate::domain::job::JobName;
 
 const EXAMPLES: &str = "\
@@ -32,6 +32,6 @@ pub struct Args {
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let job = Client::connect(&args.server.server).await?.get(&args.name).await?;
-    print(&if args.json { format!("{:#}", job_view::job_json(&job)) } else { job_view::job_line(&job) })?;
+    job_view::print_job(&job, args.json)?;
     Ok(Exit::Done)
 }

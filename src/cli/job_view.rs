@@ -35,14 +35,14 @@ fn summary_words(summary: &Summary) -> String {
     if summary.status == Status::NoReconstruction {
         return "no reconstruction".into();
     }
-    let grade = match summary.grade {
-        Some(Grade::Metric) => "METRIC",
-        Some(Grade::Weak) => "WEAK",
-        Some(Grade::ProjectiveOnly) => "PROJECTIVE_ONLY",
-        None => "solved",
-    };
+    let grade = summary.grade.map_or("solved", Grade::name);
     let focal = summary.focal_px.map(|focal_px| format!(", focal {focal_px:.1} px")).unwrap_or_default();
     format!("{grade}, {} inlier tracks{focal}, {:.1} s", summary.inlier_tracks, summary.seconds)
+}
+
+/// Prints a job: a line, or everything as JSON.
+pub fn print_job(job: &Job, json: bool) -> Result<(), Failure> {
+    print(&if json { format!("{:#}", job_json(job)) } else { job_line(job) })
 }
 
 /// A job for programs; times as RFC 3339.

@@ -11,6 +11,8 @@ pub fn text(solution: &Solution) -> String {
         for camera in rest {
             fact("", focal(camera.focal_px, camera.sigma_log_focal));
         }
+    } else if solution.is_focal_unobservable() {
+        fact("focal", "unobservable: none is given".into());
     }
     let tracks = solution.tracks.inlier.len();
     let observations = solution.observations.inlier.len();
@@ -47,10 +49,13 @@ fn headline(solution: &Solution) -> String {
     match (solution.status, solution.grade) {
         (Status::NoReconstruction, _) => "NO_RECONSTRUCTION".into(),
         (Status::Solved, None) => "SOLVED".into(),
-        (Status::Solved, Some(Grade::Metric)) => "SOLVED, METRIC".into(),
-        (Status::Solved, Some(Grade::Weak)) => "SOLVED, WEAK: the focal length is known to 2 to 10 %".into(),
-        (Status::Solved, Some(Grade::ProjectiveOnly)) => {
-            "SOLVED, PROJECTIVE_ONLY: the data carry no calibration to rely on".into()
+        (Status::Solved, Some(grade)) => {
+            let meaning = match grade {
+                Grade::Metric => "",
+                Grade::Weak => ": the focal length is known to 2 to 10 %",
+                Grade::ProjectiveOnly => ": the data carry no calibration to rely on",
+            };
+            format!("SOLVED, {}{meaning}", grade.name())
         }
     }
 }
@@ -79,5 +84,14 @@ mod tests {
         assert!(lines.contains("warning: FEW_INLIERS: "), "{lines}");
         solution.calibrations[0].sigma_log_focal = None;
         assert!(text(&solution).contains("unobservable"));
+    }
+
+    #[test]
+    fn a_projective_result_names_no_focal_length() {
+        let lines = text(&fixture::projective_only().1);
+        assert!(lines.starts_with("SOLVED, PROJECTIVE_ONLY: "), "{lines}");
+        let focal =
+            lines.lines().find(|line| line.trim_start().starts_with("focal")).expect("a line on the focal length");
+        assert!(focal.contains("unobservable") && !focal.contains("px"), "{focal}");
     }
 }

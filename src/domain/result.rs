@@ -27,6 +27,15 @@ pub enum Grade {
 }
 
 impl Grade {
+    /// The grade as it stands in files, metrics and words.
+    pub fn name(self) -> &'static str {
+        match self {
+            Grade::Metric => "METRIC",
+            Grade::Weak => "WEAK",
+            Grade::ProjectiveOnly => "PROJECTIVE_ONLY",
+        }
+    }
+
     /// The one of the two that promises less.
     pub fn worse(self, other: Self) -> Self {
         match (self, other) {
@@ -205,7 +214,7 @@ pub struct Solution {
     /// Network iterations spent.
     pub iterations: u32,
     pub seed: u64,
-    /// One entry a camera group; empty without a metric reconstruction.
+    /// One entry a camera group; empty without a metric reconstruction: see [`Solution::is_metric`].
     pub calibrations: Vec<Calibration>,
     /// Plane at infinity `(n, 1)` in pixels and in the frame `P1 = [I|0]` of the first registered view.
     pub plane_at_infinity: Option<[f64; 3]>,
@@ -228,6 +237,20 @@ pub struct Solution {
 }
 
 impl Solution {
+    /// Whether there is a metric reconstruction. Without one (above all under [`Grade::ProjectiveOnly`]) no calibration
+    /// and no pose is given, and the points are in the frame of the projective cameras.
+    pub fn is_metric(&self) -> bool {
+        !self.calibrations.is_empty()
+    }
+
+    /// Whether the scene was solved and yet says nothing of the focal length: its standard deviation is infinite.
+    pub fn is_focal_unobservable(&self) -> bool {
+        match self.calibrations.first() {
+            Some(calibration) => calibration.sigma_log_focal.is_none(),
+            None => self.grade == Some(Grade::ProjectiveOnly),
+        }
+    }
+
     /// Points of the curves in a report; more than a plot has pixels for is waste.
     pub const MAX_HISTORY: usize = 500;
 
@@ -242,5 +265,19 @@ impl Solution {
 
     pub fn inlier_observation_count(&self) -> usize {
         self.observations.inlier.iter().filter(|&&inlier| inlier).count()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_those_of_the_files() {
+        for grade in [Grade::Metric, Grade::Weak, Grade::ProjectiveOnly] {
+            assert_eq!(serde_json::to_value(grade).expect("serialisable"), grade.name());
+        }
+        let code = WarningCode::CameraGroupsMerged;
+        assert_eq!(serde_json::to_value(code).expect("serialisable"), code.name());
     }
 }

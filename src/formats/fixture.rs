@@ -1,6 +1,6 @@
 //! A hand-made solution for tests: the truth of a synthetic scene, dressed as an answer.
 
-use nalgebra::{Matrix3, Matrix3x4, Vector3};
+use nalgebra::{Matrix3, Matrix3x4, Matrix4, Vector3};
 use std::path::Path;
 
 use super::LabelledInput;
@@ -22,6 +22,33 @@ pub(crate) fn solved_with(options: &SceneOptions) -> (LabelledInput, Solution) {
     input.view_labels.iter_mut().for_each(|label| *label = 10 * *label + 3);
     input.track_labels.iter_mut().for_each(|label| *label = 2 * *label + 100);
     let solution = solution(&scene);
+    (input, solution)
+}
+
+/// The solved scene as the solver answers under [`Grade::ProjectiveOnly`]: no calibration, no plane at infinity, no
+/// poses, and cameras and points in the frame `P1 = [I|0]`.
+pub(crate) fn projective_only() -> (LabelledInput, Solution) {
+    let (input, mut solution) = solved();
+    let camera = |view: &ViewResult| {
+        let rows = view.projection.expect("every view of the fixture is registered");
+        Matrix3x4::from_fn(|row, column| rows[row][column])
+    };
+    let mut frame = Matrix4::identity();
+    frame.fixed_rows_mut::<3>(0).copy_from(&camera(&solution.views[0]));
+    let back = frame.try_inverse().expect("a finite camera");
+    for view in &mut solution.views {
+        let moved = camera(view) * back;
+        let projection = std::array::from_fn(|row| std::array::from_fn(|column| moved[(row, column)]));
+        *view = ViewResult { projection: Some(projection), rotation: None, translation: None };
+    }
+    for point in solution.tracks.point.iter_mut().flatten() {
+        let moved = frame * Vector3::from(*point).push(1.0);
+        *point = std::array::from_fn(|axis| moved[axis] / moved[3]);
+    }
+    solution.grade = Some(Grade::ProjectiveOnly);
+    solution.calibrations.clear();
+    solution.plane_at_infinity = None;
+    solution.warnings = vec![Warning::new(WarningCode::UnobservableFocal, "the camera only moved sideways")];
     (input, solution)
 }
 

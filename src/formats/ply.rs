@@ -8,12 +8,17 @@ use crate::domain::Solution;
 
 /// The points as an ASCII PLY: text, so that results can be compared line by line.
 ///
-/// A vertex has `x y z` (metric where the result is metric, else projective), a colour from orange (weight 0) to blue
+/// A vertex has `x y z` (metric where the result is metric, else dehomogenised in the frame of the projective cameras,
+/// which a comment tells), a colour from orange (weight 0) to blue
 /// (weight 1), the weight, and the caller's id of the track.
 pub fn points(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let vertices: Vec<(usize, [f64; 3])> =
         solution.tracks.point.iter().enumerate().filter_map(|(track, point)| Some((track, (*point)?))).collect();
-    let frame = if solution.calibrations.is_empty() { "projective" } else { "metric up to scale" };
+    let frame = if solution.is_metric() {
+        "metric up to scale"
+    } else {
+        "projective (pixels, frame P1 = [I|0] of the first registered view): no distances, no angles"
+    };
     let mut text = format!(
         "ply\nformat ascii 1.0\ncomment scpsfm points, {frame}, coloured by weight\nelement vertex {}\n\
          property double x\nproperty double y\nproperty double z\n\
@@ -58,6 +63,19 @@ mod tests {
         assert_eq!(first.len(), 8);
         assert_eq!(first[7], input.track_labels[track].to_string());
         assert_eq!(first[0], solution.tracks.point[track].expect("a point")[0].to_string());
+    }
+
+    #[test]
+    fn says_in_which_frame_the_points_are() {
+        let comment = |solution: &Solution| {
+            let text = points(solution, None);
+            text.lines().find(|line| line.starts_with("comment")).expect("a comment").to_owned()
+        };
+        assert!(comment(&fixture::solved().1).contains("metric up to scale"));
+        let (_, projective) = fixture::projective_only();
+        let comment = comment(&projective);
+        assert!(comment.contains("projective (pixels") && !comment.contains("metric"), "{comment}");
+        assert!(points(&projective, None).contains(&format!("element vertex {}\n", projective.inlier_track_count())));
     }
 
     #[test]

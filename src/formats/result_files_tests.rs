@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use super::*;
-use crate::domain::{Calibration, Grade, Status};
+use crate::domain::{Calibration, Status};
 use crate::formats::fixture;
 
 fn json(solution: &Solution) -> Value {
@@ -39,6 +39,7 @@ fn the_fields_of_result_json_are_a_contract() {
         "sigma_log_focal",
         "focal_unobservable",
         "principal_point_px",
+        "aspect",
         "plane_at_infinity",
         "inlier_tracks",
         "inlier_observations",
@@ -66,6 +67,7 @@ fn the_fields_of_result_json_are_a_contract() {
     assert_eq!(result["inlier_observations"], 100);
     assert_eq!(result["registered_views"], 5);
     assert_eq!(result["focal_unobservable"], false);
+    assert_eq!(result["aspect"], 1.0);
     assert_eq!(keys(&result["warnings"][0]), ["code", "detail"]);
     assert_eq!(result["warnings"][0]["code"], "FEW_INLIERS");
     assert_eq!(keys(&result["stages"][0]), ["name", "seconds"]);
@@ -86,30 +88,46 @@ fn infinity_is_null_and_said() {
     solution.grade = None;
     let result = json(&solution);
     assert_eq!(result["status"], "NO_RECONSTRUCTION");
-    for field in ["grade", "focal_px", "sigma_log_focal", "focal_unobservable", "principal_point_px"] {
+    for field in ["grade", "focal_px", "sigma_log_focal", "focal_unobservable", "principal_point_px", "aspect"] {
         assert_eq!(result[field], Value::Null, "{field}");
     }
-    solution.grade = Some(Grade::ProjectiveOnly);
-    assert_eq!(json(&solution)["grade"], "PROJECTIVE_ONLY");
+}
+
+#[test]
+fn a_projective_result_gives_no_calibration_and_says_why() {
+    let (input, solution) = fixture::projective_only();
+    let result = json(&solution);
+    assert_eq!((&result["status"], &result["grade"]), (&"SOLVED".into(), &"PROJECTIVE_ONLY".into()));
+    assert_eq!(result["focal_unobservable"], true);
+    for field in ["focal_px", "sigma_log_focal", "principal_point_px", "aspect", "plane_at_infinity"] {
+        assert_eq!(result[field], Value::Null, "{field}");
+    }
+    assert_eq!((&result["registered_views"], &result["inlier_tracks"]), (&5.into(), &20.into()));
+    for camera in CamerasJson::new(&solution, Some(&input)).views {
+        assert!(camera.registered && camera.P.is_some(), "view {}", camera.view);
+        assert!(camera.K.is_none() && camera.R.is_none() && camera.t.is_none(), "view {}", camera.view);
+    }
 }
 
 #[test]
 fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     let (mut input, mut solution) = fixture::solved();
-    let second = Calibration { focal_px: 77.0, sigma_log_focal: None, principal_point_px: [1.0, 2.0], aspect: 1.0 };
+    let second = Calibration { focal_px: 77.0, sigma_log_focal: None, principal_point_px: [1.0, 2.0], aspect: 1.25 };
     solution.calibrations.push(second);
     input.raw.views[3].camera_group = 9;
     let result = json(&solution);
     assert_eq!(result["cameras"].as_array().expect("a list").len(), 2);
     assert_eq!(
         keys(&result["cameras"][1]),
-        ["focal_px", "focal_unobservable", "principal_point_px", "sigma_log_focal"]
+        ["aspect", "focal_px", "focal_unobservable", "principal_point_px", "sigma_log_focal"]
     );
+    assert_eq!(result["cameras"][1]["aspect"], 1.25);
     assert_eq!(result["cameras"][1]["focal_unobservable"], true);
     let cameras = CamerasJson::new(&solution, Some(&input));
     let focal: Vec<f64> = cameras.views.iter().map(|view| view.K.expect("metric")[0][0]).collect();
     let first = solution.calibrations[0].focal_px;
     assert_eq!(focal, [first, first, first, 77.0, first]);
+    assert_eq!(cameras.views[3].K.expect("metric")[1][1], 77.0 * 1.25);
 }
 
 #[test]

@@ -10,7 +10,8 @@ use super::LabelledInput;
 /// The summary of a result.
 ///
 /// Infinity is not JSON: where the focal length is unobservable, `sigma_log_focal` is null and `focal_unobservable`
-/// is true. Without any calibration both are null.
+/// is true. That is so of every `PROJECTIVE_ONLY` result: it has no `focal_px`, no `principal_point_px`, no `aspect` and
+/// no `plane_at_infinity` either. Where nothing was calibrated for another reason, `focal_unobservable` is null too.
 #[derive(Debug, Clone, Serialize)]
 pub struct ResultJson {
     pub status: Status,
@@ -20,6 +21,8 @@ pub struct ResultJson {
     pub sigma_log_focal: Option<f64>,
     pub focal_unobservable: Option<bool>,
     pub principal_point_px: Option<[f64; 2]>,
+    /// Vertical over horizontal focal length.
+    pub aspect: Option<f64>,
     /// One entry a camera group; absent where all views share one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cameras: Option<Vec<CalibrationJson>>,
@@ -51,6 +54,7 @@ pub struct CalibrationJson {
     pub sigma_log_focal: Option<f64>,
     pub focal_unobservable: bool,
     pub principal_point_px: [f64; 2],
+    pub aspect: f64,
 }
 
 /// Seconds spent in a stage.
@@ -76,6 +80,7 @@ impl From<&Calibration> for CalibrationJson {
             sigma_log_focal: calibration.sigma_log_focal,
             focal_unobservable: calibration.sigma_log_focal.is_none(),
             principal_point_px: calibration.principal_point_px,
+            aspect: calibration.aspect,
         }
     }
 }
@@ -95,8 +100,10 @@ impl From<&Solution> for ResultJson {
             grade: solution.grade,
             focal_px: first.map(|camera| camera.focal_px),
             sigma_log_focal: first.and_then(|camera| camera.sigma_log_focal),
-            focal_unobservable: first.map(|camera| camera.focal_unobservable),
+            focal_unobservable: (solution.is_metric() || solution.is_focal_unobservable())
+                .then(|| solution.is_focal_unobservable()),
             principal_point_px: first.map(|camera| camera.principal_point_px),
+            aspect: first.map(|camera| camera.aspect),
             plane_at_infinity: solution.plane_at_infinity,
             inlier_tracks: solution.inlier_track_count(),
             inlier_observations: solution.inlier_observation_count(),

@@ -103,6 +103,16 @@ mod tests {
     }
 
     #[test]
+    fn a_projective_result_shows_no_focal_length_and_no_space() {
+        let (input, solution) = fixture::projective_only();
+        let page = page(&solution, Some(&input));
+        assert!(page.contains(">PROJECTIVE_ONLY<"));
+        assert!(page.contains("<dt>focal length</dt><dd>none</dd><p>unobservable</p>"));
+        assert!(page.contains("no metric reconstruction to show") && !page.contains("id=\"space-data\""));
+        assert!(page.contains("id=\"tracks-data\""));
+    }
+
+    #[test]
     fn a_large_input_makes_a_small_page() {
         let options = SceneOptions { views: 20, tracks: 20_000, outliers: 0.5, ..SceneOptions::default() };
         let (input, solution) = fixture::solved_with(&options);

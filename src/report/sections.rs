@@ -17,9 +17,7 @@ const FOCAL_CLIP: f64 = 2.5;
 pub fn headline(solution: &Solution) -> String {
     let (badge, tone) = match (solution.status, solution.grade) {
         (Status::NoReconstruction, _) => ("NO_RECONSTRUCTION", "bad"),
-        (_, Some(Grade::Metric)) => ("METRIC", "good"),
-        (_, Some(Grade::Weak)) => ("WEAK", "fair"),
-        (_, Some(Grade::ProjectiveOnly)) => ("PROJECTIVE_ONLY", "fair"),
+        (_, Some(grade)) => (grade.name(), if grade == Grade::Metric { "good" } else { "fair" }),
         (_, None) => ("SOLVED", "fair"),
     };
     let mut html = format!(
@@ -30,12 +28,14 @@ pub fn headline(solution: &Solution) -> String {
         let _ =
             writeln!(html, "<div><dt>{}</dt><dd>{}</dd><p>{}</p></div>", escape(name), escape(&figure), escape(&note));
     };
-    for calibration in solution.calibrations.iter().take(1) {
+    if let Some(calibration) = solution.calibrations.first() {
         let note = match calibration.sigma_log_focal {
             Some(sigma) => format!("\u{b1} {} % (one sigma)", short(sigma * 100.0)),
             None => "unobservable".into(),
         };
         card("focal length", format!("{:.1} px", calibration.focal_px), note);
+    } else if solution.is_focal_unobservable() {
+        card("focal length", "none".into(), "unobservable".into());
     }
     let observations = solution.observations.inlier.len();
     card(

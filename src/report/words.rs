@@ -6,10 +6,10 @@ use crate::domain::{Grade, Solution, Status, WarningCode};
 pub fn warning(code: WarningCode) -> &'static str {
     match code {
         WarningCode::PlanarOrRotation => {
-            "The points lie on one plane, or the camera only turned. Such views carry no calibration: do not use the focal length."
+            "The points lie on one plane, or the camera only turned. Such views carry no calibration."
         }
         WarningCode::UnobservableFocal => {
-            "The camera's motion leaves the focal length free. Whatever value is shown, others fit as well."
+            "The camera's motion leaves the focal length free: many values fit the tracks as well as any other."
         }
         WarningCode::SecondMinimum => "Another calibration explains the tracks about as well as the one shown.",
         WarningCode::ModelMismatch => {
@@ -38,7 +38,7 @@ pub fn outcome(solution: &Solution) -> &'static str {
             "The focal length is known to 2 to 10 % only; use the metric reconstruction with care."
         }
         (_, Some(Grade::ProjectiveOnly)) => {
-            "Which tracks are right is known, and the projective reconstruction stands; the data carry no focal length to rely on."
+            "Which tracks are right is known, and the projective reconstruction stands; the data carry no focal length to rely on, so none is given."
         }
         (_, None) => "Which tracks are right is known; nothing was calibrated.",
     }

@@ -367,11 +367,3 @@ pub async fn solve(
 ) -> Result<Solution, Error> {
     Client::connect(&server.server).await?.solve(input, settings, on_event, stop).await
 }
-
-/// Reads the result of a job on a server.
-///
-/// # Errors
-/// See [`Error`].
-pub async fn read_result(server: &ServerArgs, job: &JobName) -> Result<Solution, Error> {
-    Client::connect(&server.server).await?.read_result(job).await
-}
