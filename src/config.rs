@@ -246,6 +246,16 @@ impl Config {
         at_least_one("limits.max_views", self.limits.max_views as u64)?;
         at_least_one("limits.max_tracks", self.limits.max_tracks as u64)?;
         at_least_one("limits.max_observations", self.limits.max_observations as u64)?;
+        for (key, value) in [
+            ("limits.max_views", self.limits.max_views),
+            ("limits.max_tracks", self.limits.max_tracks),
+            ("limits.max_observations", self.limits.max_observations),
+        ] {
+            // Views, tracks and observations are counted in 32 bits.
+            if u32::try_from(value).is_err() {
+                return Err(Error::Value { key, found: value.to_string(), right: "a number below 4294967296" });
+            }
+        }
         if tracing_subscriber::EnvFilter::try_new(&self.log.filter).is_err() {
             return Err(Error::Value {
                 key: "log.filter",

@@ -7,17 +7,18 @@ use super::client::Client;
 use super::exit::{Exit, Failure};
 use super::{job_view, print, summary};
 use crate::domain::job::JobName;
-use crate::formats::result_files;
+use crate::domain::{Limits, Solution};
+use crate::formats::{self, LabelledInput, result_files};
 
 const EXAMPLES: &str = "\
 Examples:
-  scpsfm result tenants/default/jobs/a1b2 --out answer
+  scpsfm result tenants/default/jobs/a1b2 --out answer --input tracks.csv
   scpsfm result a1b2 --json | jq .focal_px";
 
 /// Read the result of a job
 ///
-/// Writes the files that `scpsfm solve` writes; views, tracks and observations have the numbers that they had in the
-/// job's input, counted from 0.
+/// With `--input`, writes the very files that `scpsfm solve` writes. Without it, observations.csv and the report's
+/// picture of the tracks are left out, and views and tracks are numbered from 0 as in the job's input.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
@@ -27,6 +28,10 @@ pub struct Args {
 
     #[command(flatten)]
     pub server: ServerArgs,
+
+    /// The file that the job was submitted with, for its ids and the files that need its points
+    #[arg(long, value_name = "FILE", requires = "out")]
+    pub input: Option<PathBuf>,
 
     /// Directory for the result files; created, files of these names in it are replaced
     #[arg(long, value_name = "DIR", required_unless_present = "json")]
@@ -39,9 +44,13 @@ pub struct Args {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let input = args.input.as_deref().map(|path| formats::read(path, &Limits::default(), None)).transpose()?;
     let solution = Client::connect(&args.server.server).await?.read_result(&args.name).await?;
+    if let Some(input) = &input {
+        belongs_together(input, &solution)?;
+    }
     if let Some(out) = &args.out {
-        result_files::write(out, &solution, None)?;
+        result_files::write(out, &solution, input.as_ref())?;
     }
     if args.json {
         print(result_files::result_json(&solution)?.trim_end())?;
@@ -52,4 +61,19 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         }
     }
     Ok(Exit::of(&solution))
+}
+
+/// Refuses a file of another shape than the job's input.
+fn belongs_together(input: &LabelledInput, solution: &Solution) -> Result<(), Failure> {
+    let of_file = (input.raw.views.len(), input.raw.track_count, input.raw.x.len());
+    let of_job = (solution.views.len(), solution.tracks.inlier.len(), solution.observations.inlier.len());
+    if of_file == of_job {
+        return Ok(());
+    }
+    let words =
+        |(views, tracks, observations)| format!("{views} views, {tracks} tracks and {observations} observations");
+    Err(Failure {
+        exit: Exit::BadInput,
+        message: format!("the file has {}, the job's input had {}", words(of_file), words(of_job)),
+    })
 }

@@ -129,7 +129,10 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     print(&format!("grpc http://{}", service.address()))?;
     print(&format!("metrics http://{}/metrics", metrics.address()))?;
     tokio::select! {
-        failed = service.wait() => failed?,
+        ended = service.wait() => {
+            ended?;
+            return Err(Failure::internal("the gRPC server ended without being asked to"));
+        }
         () = signals.next() => {}
     }
     ready.set(false);

@@ -6,7 +6,6 @@ use std::time::Duration;
 
 use super::exit::Failure;
 use crate::config::Config;
-use crate::domain::Backend;
 use crate::engine::{self, Engine};
 use crate::rpc::server::{self, Server};
 use crate::store::QueueBounds;
@@ -42,9 +41,10 @@ impl Service {
             },
             lease: Duration::from_secs(config.engine.lease_seconds),
             max_attempts: config.engine.max_attempts,
+            backend: config.compute.backend,
             ..engine::Options::default()
         };
-        let engine = Engine::start(options, Arc::new(Timed(store)), solver_on(config.compute.backend))
+        let engine = Engine::start(options, Arc::new(Timed(store)), engine::default_solver())
             .await
             .map_err(|error| Failure::internal(format_args!("cannot start the engine: {error}")))?;
         let options = server::Options {
@@ -80,14 +80,4 @@ impl Service {
         self.server.shutdown(CALLS_BOUND).await.map_err(Failure::internal)?;
         Ok(drained)
     }
-}
-
-/// The solver, on this backend where a job asks for none.
-fn solver_on(backend: Backend) -> engine::Solver {
-    let solve = engine::default_solver();
-    Arc::new(move |input, settings, observer, stop| {
-        let mut settings = settings.clone();
-        settings.backend.get_or_insert(backend);
-        solve(input, &settings, observer, stop)
-    })
 }

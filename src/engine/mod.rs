@@ -28,7 +28,7 @@ pub use submit::{Deadline, NewJob};
 pub use watch::Watch;
 
 use crate::domain::job::{Job, JobName, JobState};
-use crate::domain::{Input, Observer, Solution, SolveSettings, StopReason, StopToken};
+use crate::domain::{Backend, Input, Observer, Solution, SolveSettings, StopReason, StopToken};
 use crate::solver;
 use crate::store::{Lease, Store, payload};
 
@@ -57,6 +57,8 @@ pub struct Options {
     pub retry_after: Duration,
     /// Tells this process apart in the store.
     pub worker_name: String,
+    /// Backend of jobs that name none; stored with the job, so that a restart under another one changes nothing.
+    pub backend: Backend,
 }
 
 impl Options {
@@ -92,6 +94,7 @@ impl Default for Options {
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
             retry_after: Self::DEFAULT_RETRY_AFTER,
             worker_name: format!("process-{}", std::process::id()),
+            backend: Backend::default(),
         }
     }
 }

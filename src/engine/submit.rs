@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 use super::{Error, Inner, Phase, finished, observe};
 use crate::domain::error::{Violation, Violations};
 use crate::domain::job::{Job, JobName};
-use crate::domain::{Input, SolveSettings};
+use crate::domain::{Backend, Input, SolveSettings};
 use crate::store::{self, NewRecord, Request, payload};
 
 /// Longest request id: a UUID with room for a prefix.
@@ -75,7 +75,7 @@ impl NewJob {
     }
 
     /// What is stored. Encodes and, for a request id, hashes the whole input: not for an async thread.
-    fn into_record(self, now: SystemTime) -> Result<NewRecord, Error> {
+    fn into_record(self, now: SystemTime, backend: Backend) -> Result<NewRecord, Error> {
         let input = payload::encode(&self.input)?;
         let request = match &self.request_id {
             Some(id) => Some(Request { id: id.clone(), digest: self.digest(&input)? }),
@@ -97,7 +97,7 @@ impl NewJob {
             track_count: u32::try_from(self.input.track_count()).unwrap_or(u32::MAX),
             observation_count: u32::try_from(self.input.observation_count()).unwrap_or(u32::MAX),
             input,
-            settings: self.settings,
+            settings: SolveSettings { backend: Some(self.settings.backend.unwrap_or(backend)), ..self.settings },
             deadline,
             priority: self.priority,
             labels: self.labels,
@@ -130,7 +130,8 @@ impl Inner {
             return Err(Error::Draining);
         }
         let now = SystemTime::now();
-        let record = finished(tokio::task::spawn_blocking(move || new.into_record(now))).await?;
+        let backend = self.options.backend;
+        let record = finished(tokio::task::spawn_blocking(move || new.into_record(now, backend))).await?;
         // On its own task: a caller that goes away must not leave a stored job untold.
         finished(tokio::spawn(async move { self.store_job(record, now).await })).await
     }

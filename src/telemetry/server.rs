@@ -73,17 +73,22 @@ pub async fn bind(options: Options) -> std::io::Result<Server> {
     Ok(Server { address, stop, served })
 }
 
+/// A scrape takes milliseconds; a request that was begun and never ended must not hold up the end of the process.
+const SHUTDOWN_BOUND: Duration = Duration::from_secs(2);
+
 impl Server {
     /// The bound address.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Closes the port after the scrapes under way.
+    /// Closes the port after the scrapes under way, waiting [`SHUTDOWN_BOUND`] for them.
     pub async fn shutdown(mut self) {
         self.stop.cancel();
-        if let Err(error) = (&mut self.served).await {
-            tracing::error!(%error, "the scrape port's task failed");
+        match tokio::time::timeout(SHUTDOWN_BOUND, &mut self.served).await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => tracing::error!(%error, "the scrape port's task failed"),
+            Err(_) => self.served.abort(),
         }
     }
 }
