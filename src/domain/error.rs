@@ -39,6 +39,16 @@ impl fmt::Display for Violation {
     }
 }
 
+/// A caller's text as an error repeats it: quoted, and cut where it would fill the error.
+pub fn quoted(text: &str) -> String {
+    /// Long enough to be recognised; errors travel in headers that hold some thousand bytes.
+    const MOST_CHARACTERS: usize = 80;
+    match text.char_indices().nth(MOST_CHARACTERS) {
+        Some((end, _)) => format!("{:?}... ({} bytes)", &text[..end], text.len()),
+        None => format!("{text:?}"),
+    }
+}
+
 /// An input or a setting that no solver may see, with every violation found (at most [`InvalidInput::MAX_LISTED`]).
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", self.sentence())]
@@ -100,5 +110,15 @@ impl Violations {
 impl From<Violation> for InvalidInput {
     fn from(violation: Violation) -> Self {
         Self { violations: vec![violation], unlisted: 0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn long_texts_are_cut_at_a_character() {
+        assert_eq!(super::quoted("a\n"), "\"a\\n\"");
+        let long = super::quoted(&"\u{e9}".repeat(5000));
+        assert!(long.len() < 300 && long.ends_with("... (10000 bytes)"), "{long}");
     }
 }

@@ -11,7 +11,14 @@ use crate::domain::job::{JobEvent, JobName};
 /// Topics by job.
 #[derive(Debug, Default)]
 pub(super) struct Hub {
-    topics: Mutex<HashMap<JobName, Arc<Topic>>>,
+    topics: Mutex<HashMap<JobName, Held>>,
+}
+
+/// A topic with the number of its subscriptions, both only touched under the lock.
+#[derive(Debug)]
+struct Held {
+    topic: Arc<Topic>,
+    subscriptions: usize,
 }
 
 /// What those who follow a job listen to. Watchers read events from the store; a topic only says when to look.
@@ -35,17 +42,18 @@ impl Hub {
     /// Holds on to a job's topic.
     pub(super) fn subscribe(self: &Arc<Self>, name: &JobName) -> Subscription {
         let mut topics = locked(&self.topics);
-        let topic = topics
-            .entry(name.clone())
-            .or_insert_with(|| Arc::new(Topic { version: watch::Sender::new(0), weights: watch::Sender::new(None) }))
-            .clone();
-        Subscription { hub: self.clone(), name: name.clone(), topic }
+        let held = topics.entry(name.clone()).or_insert_with(|| {
+            let topic = Topic { version: watch::Sender::new(0), weights: watch::Sender::new(None) };
+            Held { topic: Arc::new(topic), subscriptions: 0 }
+        });
+        held.subscriptions += 1;
+        Subscription { hub: self.clone(), name: name.clone(), topic: held.topic.clone() }
     }
 
     /// Tells those who follow a job that something was committed.
     pub(super) fn wake(&self, name: &JobName) {
-        if let Some(topic) = locked(&self.topics).get(name) {
-            topic.version.send_modify(|version| *version = version.wrapping_add(1));
+        if let Some(held) = locked(&self.topics).get(name) {
+            held.topic.version.send_modify(|version| *version = version.wrapping_add(1));
         }
     }
 
@@ -64,10 +72,38 @@ impl Subscription {
 impl Drop for Subscription {
     fn drop(&mut self) {
         let mut topics = locked(&self.hub.topics);
-        // The map's and this one: topics are only handed out under the lock, so nobody can join in between.
-        const LAST: usize = 2;
-        if Arc::strong_count(&self.topic) == LAST {
-            topics.remove(&self.name);
+        if let Some(held) = topics.get_mut(&self.name) {
+            held.subscriptions -= 1;
+            if held.subscriptions == 0 {
+                topics.remove(&self.name);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Barrier;
+
+    use super::*;
+
+    #[test]
+    fn subscriptions_that_end_together_leave_no_topic_behind() {
+        const THREADS: usize = 8;
+        let hub = Arc::new(Hub::default());
+        let name = JobName { tenant: "default".into(), job: "a".into() };
+        for _ in 0..200 {
+            let together = Barrier::new(THREADS);
+            std::thread::scope(|scope| {
+                for _ in 0..THREADS {
+                    scope.spawn(|| {
+                        let subscription = hub.subscribe(&name);
+                        together.wait();
+                        drop(subscription);
+                    });
+                }
+            });
+            assert_eq!(hub.topic_count(), 0);
         }
     }
 }

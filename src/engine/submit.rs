@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime};
 use sha2::{Digest, Sha256};
 
 use super::{Error, Inner, Phase, finished, observe};
-use crate::domain::error::{Violation, Violations};
+use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::job::{Job, JobName};
 use crate::domain::{Backend, Input, SolveSettings};
 use crate::store::{self, NewRecord, Request, payload};
@@ -61,10 +61,10 @@ impl NewJob {
         let mut found = Violations::default();
         let id_rule = "1 to 63 of a-z, 0-9 and -, not beginning or ending with -";
         if !JobName::is_id(&self.tenant) {
-            found.push(Violation::of("tenant", format!("{:?} is not an id: {id_rule}", self.tenant)));
+            found.push(Violation::of("tenant", format!("{} is not an id: {id_rule}", quoted(&self.tenant))));
         }
         if let Some(id) = self.job_id.as_ref().filter(|id| !JobName::is_id(id)) {
-            found.push(Violation::of("job_id", format!("{id:?} is not an id: {id_rule}")));
+            found.push(Violation::of("job_id", format!("{} is not an id: {id_rule}", quoted(id))));
         }
         if let Some(id) = self.request_id.as_ref().filter(|id| id.is_empty() || id.len() > MAX_REQUEST_ID_BYTES) {
             let length = id.len();

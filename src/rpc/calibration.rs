@@ -101,8 +101,9 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
                 Ok(event) if matches!(event.body, EventBody::State { state, .. } if state.is_terminal()) => {
                     follower.release();
                 }
-                // The job goes back to the queue, for a caller that comes again with the same request id.
-                Err(engine::Error::Draining) => follower.release(),
+                // Ours to answer for, not the caller's: the job lives on, for a caller that comes again with the same
+                // request id.
+                Err(_) => follower.release(),
                 _ => {}
             }
             event.map(job::event_to_wire).map_err(status::from_engine)

@@ -18,11 +18,19 @@ pub struct Followers {
 struct Shared {
     engine: Engine,
     grace: Duration,
-    counts: Mutex<HashMap<JobName, usize>>,
+    counts: Mutex<HashMap<JobName, Count>>,
+}
+
+/// The followers of one job.
+#[derive(Default)]
+struct Count {
+    followers: usize,
+    /// How often the last follower has left: a grace period that began earlier than the latest is void.
+    departures: u64,
 }
 
 impl Shared {
-    fn counts(&self) -> MutexGuard<'_, HashMap<JobName, usize>> {
+    fn counts(&self) -> MutexGuard<'_, HashMap<JobName, Count>> {
         // A count is whole at every moment: a panic elsewhere under the lock leaves nothing half done.
         self.counts.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -36,7 +44,7 @@ impl Followers {
 
     /// Follows a job. Must be called within a tokio runtime.
     pub fn follow(&self, job: JobName) -> Follower {
-        *self.shared.counts().entry(job.clone()).or_default() += 1;
+        self.shared.counts().entry(job.clone()).or_default().followers += 1;
         Follower { shared: Arc::clone(&self.shared), job, released: false, runtime: Handle::current() }
     }
 }
@@ -64,21 +72,31 @@ impl Follower {
 impl Drop for Follower {
     fn drop(&mut self) {
         let mut counts = self.shared.counts();
-        let left = counts.get_mut(&self.job).map_or(0, |count| {
-            *count -= 1;
-            *count
-        });
-        if left == 0 {
-            counts.remove(&self.job);
-        }
-        drop(counts);
-        if self.released || left > 0 {
+        let Some(count) = counts.get_mut(&self.job) else { return };
+        count.followers = count.followers.saturating_sub(1);
+        if count.followers > 0 {
             return;
         }
+        if self.released {
+            counts.remove(&self.job);
+            return;
+        }
+        count.departures += 1;
+        let departure = count.departures;
+        drop(counts);
         let (shared, job) = (Arc::clone(&self.shared), self.job.clone());
         self.runtime.spawn(async move {
             tokio::time::sleep(shared.grace).await;
-            if shared.counts().contains_key(&job) {
+            let abandoned = {
+                let mut counts = shared.counts();
+                let abandoned =
+                    counts.get(&job).is_some_and(|count| count.followers == 0 && count.departures == departure);
+                if abandoned {
+                    counts.remove(&job);
+                }
+                abandoned
+            };
+            if !abandoned {
                 return;
             }
             tracing::info!(%job, "cancelling a job whose caller went away");

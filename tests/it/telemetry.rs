@@ -47,7 +47,7 @@ fn assert_growth(before: &Page, after: &Page, expected: &[(&str, f64)]) {
 /// Asserts that nothing waits, runs or is watched.
 fn assert_idle(page: &Page) {
     for gauge in ["scpsfm_queue_depth", "scpsfm_workers_busy", "scpsfm_watchers", "scpsfm_grpc_requests_in_flight"] {
-        assert_eq!(page.value(gauge), 0.0, "{gauge}");
+        assert_eq!(page.gauge(gauge), 0.0, "{gauge}");
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use crate::domain::error::quoted;
 use crate::domain::job::JobState;
 use crate::domain::{InvalidInput, Violation};
 use crate::engine::{JobQuery, Order};
@@ -9,6 +10,9 @@ use crate::rpc::proto;
 
 /// The largest page; larger wishes are cut to it (AIP-158).
 const MAX_PAGE_SIZE: i32 = 1_000;
+
+/// Longest filter: some two hundred terms, far from what a store can take in one query.
+const MAX_FILTER_BYTES: usize = 4_096;
 
 /// Which jobs a filter lets through.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -30,7 +34,7 @@ pub fn from_wire(tenant: String, request: proto::ListJobsRequest) -> Result<Opti
         [] | ["create_time", "desc"] => Order::CreateTimeDescending,
         ["create_time"] => Order::CreateTimeAscending,
         _ => {
-            let text = format!("{:?} is neither \"create_time\" nor \"create_time desc\"", request.order_by);
+            let text = format!("{} is neither \"create_time\" nor \"create_time desc\"", quoted(&request.order_by));
             return Err(Violation::of("order_by", text).into());
         }
     };
@@ -53,6 +57,9 @@ pub fn from_wire(tenant: String, request: proto::ListJobsRequest) -> Result<Opti
 /// # Errors
 /// A violation of `filter` that says which part was not understood.
 pub fn parse_filter(text: &str) -> Result<Filter, Violation> {
+    if text.len() > MAX_FILTER_BYTES {
+        return Err(Violation::of("filter", format!("{} bytes are above {MAX_FILTER_BYTES}", text.len())));
+    }
     let tokens = tokens(text)?;
     let mut filter = Filter::default();
     if tokens.is_empty() {
@@ -87,14 +94,15 @@ pub fn parse_filter(text: &str) -> Result<Filter, Violation> {
 fn state(name: &str) -> Result<JobState, Violation> {
     JobState::from_name(name).ok_or_else(|| {
         let known = JobState::ALL.map(JobState::name).join(", ");
-        Violation::of("filter", format!("{name:?} is not a state; states are {known}"))
+        Violation::of("filter", format!("{} is not a state; states are {known}", quoted(name)))
     })
 }
 
 fn add_label(filter: &mut Filter, key: &str, value: &str) -> Result<(), Violation> {
     match filter.labels.insert(key.to_owned(), value.to_owned()) {
         Some(other) if other != value => {
-            Err(Violation::of("filter", format!("labels.{key} cannot be both {other:?} and {value:?}")))
+            let (key, other, value) = (quoted(key), quoted(&other), quoted(value));
+            Err(Violation::of("filter", format!("the label {key} cannot be both {other} and {value}")))
         }
         _ => Ok(()),
     }
@@ -102,7 +110,7 @@ fn add_label(filter: &mut Filter, key: &str, value: &str) -> Result<(), Violatio
 
 fn not_understood(text: &str) -> Violation {
     let example = "state = QUEUED OR state = RUNNING AND labels.site = \"north 3\"";
-    Violation::of("filter", format!("{text:?} was not understood; an example: {example}"))
+    Violation::of("filter", format!("{} was not understood; an example: {example}", quoted(text)))
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,5 +1,6 @@
 //! Resource names in requests, against the tenant that calls.
 
+use crate::domain::error::quoted;
 use crate::domain::job::JobName;
 use crate::domain::{InvalidInput, Violation};
 
@@ -10,8 +11,11 @@ use crate::domain::{InvalidInput, Violation};
 pub fn tenant(parent: &str) -> Result<String, InvalidInput> {
     match parent.strip_prefix("tenants/") {
         Some(tenant) if JobName::is_id(tenant) => Ok(tenant.to_owned()),
-        _ => Err(Violation::of("parent", format!("{parent:?} is not of the form tenants/{{tenant}}: tenants/default"))
-            .into()),
+        _ => Err(Violation::of(
+            "parent",
+            format!("{} is not of the form tenants/{{tenant}}: tenants/default", quoted(parent)),
+        )
+        .into()),
     }
 }
 
@@ -21,7 +25,7 @@ pub fn tenant(parent: &str) -> Result<String, InvalidInput> {
 /// A violation of `name` where the name has another form.
 pub fn job(name: &str) -> Result<JobName, InvalidInput> {
     JobName::parse(name).ok_or_else(|| {
-        Violation::of("name", format!("{name:?} is not of the form tenants/{{tenant}}/jobs/{{job}}")).into()
+        Violation::of("name", format!("{} is not of the form tenants/{{tenant}}/jobs/{{job}}", quoted(name))).into()
     })
 }
 

@@ -22,6 +22,11 @@ impl Page {
         self.samples.get(series).copied().unwrap_or(0.0)
     }
 
+    /// Value of a series that exists from the first scrape on.
+    pub fn gauge(&self, series: &str) -> f64 {
+        *self.samples.get(series).unwrap_or_else(|| panic!("no series {series}"))
+    }
+
     /// Sum over every series of that name, whatever its labels.
     pub fn sum(&self, name: &str) -> f64 {
         let of_name =
