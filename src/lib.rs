@@ -10,6 +10,8 @@
 //! cli -> rpc -> engine -> { store, solver } -> { network, geometry } -> domain
 //! ```
 //!
+//! Beside them [`evaluation`] holds the methods against the truth of [`synthetic`] scenes.
+//!
 //! Only [`rpc`] (and the client side of [`cli`]) sees prost and tonic, only [`store`] sees SQL, only [`network`]
 //! sees burn; [`geometry`] is plain f64 linear algebra.
 
@@ -17,6 +19,7 @@ pub mod cli;
 pub mod config;
 pub mod domain;
 pub mod engine;
+pub mod evaluation;
 pub mod formats;
 pub mod geometry;
 pub mod network;

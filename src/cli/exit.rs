@@ -87,7 +87,12 @@ impl Failure {
     }
 
     pub fn interrupted() -> Self {
-        Self::new(Exit::Interrupted, "interrupted; no result was written")
+        Self::interrupted_with("interrupted; no result was written")
+    }
+
+    /// Interrupted, with what is left of the work.
+    pub fn interrupted_with(message: impl fmt::Display) -> Self {
+        Self::new(Exit::Interrupted, message)
     }
 }
 

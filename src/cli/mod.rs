@@ -6,6 +6,7 @@ pub mod args;
 pub mod cancel;
 pub mod client;
 pub mod demo;
+pub mod evaluate;
 pub mod exit;
 pub mod get;
 pub mod interrupt;
@@ -53,6 +54,7 @@ pub enum Command {
     Cancel(cancel::Args),
     Result(result::Args),
     Synth(synth::Args),
+    Evaluate(evaluate::Args),
 }
 
 /// Runs a parsed command line; an error is printed on stderr, once.
@@ -83,6 +85,7 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         Command::Cancel(args) => runtime.block_on(cancel::run(args)),
         Command::Result(args) => runtime.block_on(result::run(args)),
         Command::Synth(args) => synth::run(args),
+        Command::Evaluate(args) => runtime.block_on(evaluate::run(args)),
     }
 }
 

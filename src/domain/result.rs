@@ -56,13 +56,15 @@ pub enum Prior {
     Irls,
     /// Agreement of a track's motion over the views.
     Consistency,
+    /// Distances between tracks that stay the same in all views; where depths are given.
+    Rigidity,
     /// None: uniform sampling.
     Uniform,
 }
 
 impl Prior {
     /// Every prior.
-    pub const ALL: [Prior; 4] = [Prior::Network, Prior::Irls, Prior::Consistency, Prior::Uniform];
+    pub const ALL: [Prior; 5] = [Prior::Network, Prior::Irls, Prior::Consistency, Prior::Rigidity, Prior::Uniform];
 
     /// The prior's name in files, metrics and logs.
     pub fn name(self) -> &'static str {
@@ -70,6 +72,7 @@ impl Prior {
             Prior::Network => "network",
             Prior::Irls => "irls",
             Prior::Consistency => "consistency",
+            Prior::Rigidity => "rigidity",
             Prior::Uniform => "uniform",
         }
     }

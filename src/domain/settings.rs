@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::error::{InvalidInput, Violation, Violations};
+use super::result::Prior;
 
 /// Which tracks are right is decided by...
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
@@ -80,6 +81,8 @@ pub struct SolveSettings {
     pub weights_every: u32,
     /// Backend of the network; `None` takes the server's.
     pub backend: Option<Backend>,
+    /// Priors that AUTO and GEOMETRY leave out: for ablations, not for callers.
+    pub excluded_priors: Vec<Prior>,
 }
 
 impl SolveSettings {
@@ -169,6 +172,7 @@ impl Default for SolveSettings {
             noise_px: None,
             weights_every: 0,
             backend: None,
+            excluded_priors: Vec::new(),
         }
     }
 }

@@ -88,6 +88,11 @@ impl CompleteBlock {
         self.depths.is_some()
     }
 
+    /// The depths, `depths[track * views + view]`; `None` where none were given.
+    pub fn depths(&self) -> Option<&[f64]> {
+        self.depths.as_deref()
+    }
+
     /// The block restricted to some of its tracks.
     pub fn select(&self, tracks: &[usize]) -> Self {
         let points: Vec<Vector2<f64>> = tracks.iter().flat_map(|&j| self.track(j).iter().map(|s| s.xy)).collect();

@@ -9,6 +9,8 @@ pub mod factorization;
 pub mod homography;
 pub mod measurement;
 pub mod metric;
+pub mod procrustes;
+pub mod resection;
 pub mod statistics;
 pub mod triangulation;
 

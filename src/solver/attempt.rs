@@ -4,9 +4,10 @@ use super::block::Block;
 use super::calibration::{self, Outcome};
 use super::direct::{self, Decided};
 use super::grow::{self, Consensus, LEAST_INLIERS};
-use super::portfolio::{self, Portfolio};
+use super::portfolio::{self, Evidence, Portfolio};
 use super::recorder::Recorder;
 use super::{Context, Error};
+use super::{extend, few};
 use crate::domain::result::PriorTime;
 use crate::domain::{Grade, Method, Prior, Stage};
 
@@ -26,6 +27,8 @@ pub struct Attempt {
     pub block: Block,
     /// The consensus over the tracks of the block; `None` when nothing stands.
     pub consensus: Option<Consensus>,
+    /// What the consensus was verified by.
+    pub evidence: Evidence,
     pub calibration: Option<Outcome>,
     pub winning_prior: Option<Prior>,
     /// The method's own verdicts where it searches nothing (PAPER, PSFM).
@@ -69,6 +72,7 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
     let mut attempt = Attempt {
         block: block.sample(most, context.settings.seed),
         consensus: None,
+        evidence: Evidence::ImagePoints,
         calibration: None,
         winning_prior: None,
         decided: None,
@@ -83,7 +87,10 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
     context.stopped()?;
     if let Some(consensus) = &attempt.consensus {
         recorder.enter(Stage::Calibrate);
-        attempt.calibration = Some(calibrate(&attempt.block, consensus, context)?);
+        attempt.calibration = Some(match attempt.evidence {
+            Evidence::ImagePoints => calibrate(&attempt.block, consensus, context)?,
+            Evidence::Depths { focal } => few::calibrate(&attempt.block.complete, consensus, focal, context.stop),
+        });
         if let Some(metric) = attempt.calibration.as_ref().and_then(|outcome| outcome.metric.as_ref()) {
             recorder.standing.focal_px = Some(metric.intrinsics.focal * context.scale_px);
         }
@@ -111,14 +118,37 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     attempt.network_weights = found.network_weights;
     let Some(consensus) = found.consensus else { return Ok(()) };
     recorder.enter(Stage::Refine);
+    attempt.evidence = found.evidence;
+    if matches!(found.evidence, Evidence::Depths { .. }) {
+        attempt.consensus = Some(consensus);
+        return Ok(());
+    }
     let refined = grow::refine(complete, &consensus, portfolio::spread(complete), context.stop);
     recorder.standing.inliers = refined.inlier_count() as u32;
     recorder.standing.best_score = Some(refined.score);
     recorder.tell(1.0);
-    if refined.inlier_count() >= LEAST_INLIERS {
+    if refined.inlier_count() < LEAST_INLIERS {
+        return Ok(());
+    }
+    let extended = extend::extend(&attempt.block, &refined, context);
+    context.stopped()?;
+    if let Some((block, consensus)) = extended {
+        attempt.network_weights = carry_over(&attempt.network_weights, &attempt.block, &block);
+        recorder.standing.inliers = consensus.inlier_count() as u32;
+        (attempt.block, attempt.consensus) = (block, Some(consensus));
+    } else {
         attempt.consensus = Some(refined);
     }
     Ok(())
+}
+
+/// The network's weights of the searched tracks, for a larger block; 0 for tracks that it was not shown.
+fn carry_over(weights: &[f64], searched: &Block, block: &Block) -> Vec<f64> {
+    if weights.is_empty() {
+        return Vec::new();
+    }
+    let weight = |track: &usize| searched.tracks.binary_search(track).ok().map_or(0.0, |place| weights[place]);
+    block.tracks.iter().map(weight).collect()
 }
 
 /// PAPER and PSFM: the method's own set of tracks, reconstructed as it is.

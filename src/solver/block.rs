@@ -124,12 +124,9 @@ fn extent_of_unsized(input: &Input) -> [Vector2<f64>; 2] {
 ///
 /// Once `stop` fires the answer is whatever was found by then.
 pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec<Vec<usize>> {
-    let all: Vec<usize> = (0..input.view_count()).collect();
-    let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
-    let complete = ranges.windows(2).filter(|range| range[1] - range[0] == all.len()).count();
-    if all.len() >= LEAST_VIEWS && complete >= LEAST_TRACKS && 2 * complete >= observed {
-        let count = all.len().min(MOST_VIEWS_WHOLE);
-        return vec![(0..count).map(|k| k * all.len() / count).collect()];
+    if is_complete(input, ranges) {
+        let count = input.view_count().min(MOST_VIEWS_WHOLE);
+        return vec![(0..count).map(|k| k * input.view_count() / count).collect()];
     }
     for least in [WANTED_TRACKS, LEAST_TRACKS] {
         let found = greedy_views(input, ranges, least, stop);
@@ -138,6 +135,14 @@ pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec
         }
     }
     Vec::new()
+}
+
+/// Whether at least half of the tracks that are observed at all, and enough of them, are seen in all views.
+pub fn is_complete(input: &Input, ranges: &[usize]) -> bool {
+    let views = input.view_count();
+    let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
+    let complete = ranges.windows(2).filter(|range| range[1] - range[0] == views).count();
+    views >= LEAST_VIEWS && complete >= LEAST_TRACKS && 2 * complete >= observed
 }
 
 /// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on
@@ -213,12 +218,19 @@ fn diverse(ranked: Vec<Vec<usize>>) -> Vec<Vec<usize>> {
 impl Block {
     /// The block of at most `most` of its tracks, chosen at random; `seed` decides which.
     pub fn sample(self, most: usize, seed: u64) -> Self {
+        self.sample_with(most, seed, &[])
+    }
+
+    /// The same; tracks of the input that are among `kept` (increasing) stay in any case.
+    pub fn sample_with(self, most: usize, seed: u64, kept: &[usize]) -> Self {
         if self.tracks.len() <= most {
             return self;
         }
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut chosen = index::sample(&mut rng, self.tracks.len(), most).into_vec();
+        chosen.extend((0..self.tracks.len()).filter(|&j| kept.binary_search(&self.tracks[j]).is_ok()));
         chosen.sort_unstable();
+        chosen.dedup();
         let complete = self.complete.select(&chosen);
         Self { views: self.views, tracks: chosen.iter().map(|&j| self.tracks[j]).collect(), complete }
     }

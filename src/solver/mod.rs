@@ -3,7 +3,8 @@
 //! Depends on `network`, `geometry` and `domain`; knows nothing of jobs, transport or files.
 //!
 //! The way through: [`block`] chooses views whose tracks are complete; [`attempt`] solves one such block, by
-//! [`portfolio`] (priors, [`search`], [`grow`]) or [`direct`], and [`calibration`] upgrades it; [`judge`] has the last
+//! [`portfolio`] (priors, [`search`], [`grow`]; [`few`] where depths verify what image points cannot; [`extend`] to what a search leaves aside) or
+//! [`direct`], and [`calibration`] upgrades it; [`judge`] has the last
 //! word on every track and observation; [`assemble`] writes it down.
 
 mod agreement;
@@ -12,6 +13,8 @@ mod attempt;
 mod block;
 pub mod calibration;
 mod direct;
+mod extend;
+mod few;
 mod grow;
 mod judge;
 mod portfolio;

@@ -51,7 +51,7 @@ twins! {
     Stage = Stage { Prepare, Search, Refine, Calibrate, Judge }
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
-    Prior = Prior { Network, Irls, Consistency, Uniform }
+    Prior = Prior { Network, Irls, Consistency, Rigidity, Uniform }
     JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, Expired }
     WarningCode = WarningCode {
         PlanarOrRotation,

@@ -25,6 +25,8 @@ pub fn from_wire(settings: Option<proto::SolveSettings>) -> Result<SolveSettings
         noise_px: given.noise_px,
         weights_every: given.weights_every,
         backend: Backend::from_wire(given.backend, "settings.backend")?,
+        // Ablations are no service to callers.
+        excluded_priors: Vec::new(),
     };
     settings.validate()?;
     Ok(settings)

@@ -66,7 +66,8 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    fn refused(warnings: Vec<Warning>) -> Self {
+    /// An outcome without a calibration, for these reasons.
+    pub fn refused(warnings: Vec<Warning>) -> Self {
         Self {
             metric: None,
             sigma_log_focal: None,
@@ -109,8 +110,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < LEAST_INLIERS {
-        let detail = format!("{inliers} inlier tracks cannot be verified by geometry, which takes {LEAST_INLIERS}");
-        warnings.push(Warning::new(WarningCode::FewInliers, detail));
+        warnings.push(few_inliers(inliers));
     }
     let mut cameras = problem.cameras.to_vec();
     let mut points = problem.points.to_vec();
@@ -141,6 +141,13 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     let mut outcome = grading::grade(problem, &fit, minima, scale_px, warnings, stop)?;
     outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem, metric));
     Ok(outcome)
+}
+
+/// What is said of fewer inliers than image points alone can verify.
+pub fn few_inliers(inliers: usize) -> Warning {
+    let detail =
+        format!("{inliers} inlier tracks cannot be verified by image points alone, which takes {LEAST_INLIERS}");
+    Warning::new(WarningCode::FewInliers, detail)
 }
 
 /// Points with an observation.

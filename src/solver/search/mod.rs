@@ -1,6 +1,7 @@
 //! Hypothesis search: minimal samples, drawn under a prior, scored against all tracks.
 
 pub mod affine;
+pub mod rigid;
 pub mod subspace;
 
 use rand::Rng;

@@ -1,23 +1,30 @@
 //! The portfolio: priors propose, guided search verifies, the best consensus stands.
 //!
-//! The network is optimised a few iterations at a time; between, its ranking is verified by geometry, and so are the
-//! geometric priors and uniform sampling, which needs no prior to be right. Each prior's own time is kept, so that a
-//! result can say what each alone would have needed.
+//! What is cheap goes first: rigid distances where depths are given, reweighting, consistency. Then the network is
+//! optimised a few iterations at a time; between, its ranking is verified by geometry, and so is uniform sampling, which
+//! needs no prior to be right. A decisive consensus ends the search; the network still gets its least number of
+//! iterations, so that its losses and weights are always seen. Each prior's own time is kept.
+
+mod account;
+mod best;
 
 use std::time::Instant;
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::grow::{self, Consensus, LEAST_INLIERS};
-use super::priors;
+use super::grow::{self, Consensus};
 use super::recorder::Recorder;
-use super::search::{Sampler, Seed, Shortlist, affine, subspace};
+use super::search::{Sampler, Seed, Shortlist, affine, rigid, subspace};
+use super::{few, priors};
 use crate::domain::result::PriorTime;
 use crate::domain::{Prior, SolveSettings, StopToken};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::statistics::median;
 use crate::network::{NetworkSettings, PriorNetwork};
+use account::Account;
+use best::Best;
+pub use best::Evidence;
 
 /// Network iterations between two verifications of its ranking.
 const ITERATIONS_PER_ROUND: u32 = 25;
@@ -33,16 +40,12 @@ const SHORTLIST: usize = 2;
 /// Every other round grows at more noise than assumed, doubling up to sixteen times: a level that is twice too low
 /// loses the scene, and the caller may have given none.
 const NOISE_LADDER: [f64; 8] = [1.0, 2.0, 1.0, 4.0, 1.0, 8.0, 1.0, 16.0];
-/// Logarithm of the expected number of false alarms at which a consensus is decisive (e^-40: never by chance), and at
-/// which it may be accepted once the search has ended.
-const LN_DECISIVE: f64 = -40.0;
-const LN_ACCEPTABLE: f64 = -7.0;
-/// Gain in that logarithm below which two consensuses are the same: a single track more changes it by tens.
-const LN_MARGIN: f64 = 5.0;
 
 /// What the search found.
 pub struct Found {
     pub consensus: Option<Consensus>,
+    /// What the consensus was verified by.
+    pub evidence: Evidence,
     pub winning_prior: Option<Prior>,
     /// The network's last weights, one a track of the block; empty without a network.
     pub network_weights: Vec<f64>,
@@ -52,42 +55,6 @@ pub struct Found {
 enum Search {
     Affine(affine::Search),
     Subspace(subspace::Search),
-}
-
-/// One prior's account: what it proposed, what that cost.
-struct Account {
-    prior: Prior,
-    seconds: f64,
-    /// Network iterations, or samples.
-    work: u32,
-    /// Every consensus better than the prior's last.
-    records: Vec<Record>,
-}
-
-/// A consensus in a prior's account.
-struct Record {
-    /// Spent by then.
-    seconds: f64,
-    work: u32,
-    inliers: usize,
-    ln_false_alarms: f64,
-}
-
-/// The best consensus so far.
-struct Best {
-    consensus: Consensus,
-    prior: Prior,
-    ln_false_alarms: f64,
-}
-
-impl Best {
-    fn decides(&self) -> bool {
-        self.consensus.inlier_count() >= LEAST_INLIERS && self.ln_false_alarms < LN_DECISIVE
-    }
-
-    fn is_acceptable(&self) -> bool {
-        self.consensus.inlier_count() >= LEAST_INLIERS && self.ln_false_alarms < LN_ACCEPTABLE
-    }
 }
 
 /// Searches one block.
@@ -114,7 +81,6 @@ impl<'a> Portfolio<'a> {
         } else {
             Search::Affine(affine::Search::new(block))
         };
-        let account = |prior| Account { prior, seconds: 0.0, work: 0, records: Vec::new() };
         Self {
             block,
             settings,
@@ -124,7 +90,7 @@ impl<'a> Portfolio<'a> {
             noise,
             spread: spread(block),
             rng: ChaCha8Rng::seed_from_u64(settings.seed),
-            accounts: Prior::ALL.into_iter().map(account).collect(),
+            accounts: Prior::ALL.into_iter().map(Account::new).collect(),
             best: None,
         }
     }
@@ -155,12 +121,14 @@ impl<'a> Portfolio<'a> {
         };
         for round in 0..rounds {
             self.set_noise(round);
+            self.propose_rigid(round);
+            if round == 0 {
+                self.propose_geometric();
+            }
+            self.stand(recorder);
             if let Some(network) = &mut network {
                 self.optimise(network, recorder, scale_px, spread_weights)?;
                 self.propose(Prior::Network, &priors::from_network(network.weights()));
-            }
-            if round == 0 {
-                self.propose_geometric();
             }
             self.propose(Prior::Uniform, &vec![1.0; self.block.tracks()]);
             self.stand(recorder);
@@ -213,8 +181,50 @@ impl<'a> Portfolio<'a> {
         Ok(())
     }
 
+    /// Whether this prior has anything left to say.
+    fn is_wanted(&self, prior: Prior) -> bool {
+        !self.is_decisive() && !self.stop.is_stopped() && !self.settings.excluded_priors.contains(&prior)
+    }
+
+    /// Tracks whose distances stay the same, once a noise level: where depths are given and true up to one scale.
+    fn propose_rigid(&mut self, round: u32) {
+        let is_new = NOISE_LADDER.iter().position(|level| *level == NOISE_LADDER[round as usize % NOISE_LADDER.len()])
+            == Some(round as usize);
+        if !is_new || !self.is_wanted(Prior::Rigidity) {
+            return;
+        }
+        let Some(search) = rigid::Search::new(self.block, self.spread) else { return };
+        let begun = Instant::now();
+        let found = search.run(self.noise, self.stop);
+        let pairs = self.block.tracks() * (self.block.tracks() - 1) / 2;
+        let account = self.account(Prior::Rigidity);
+        account.seconds += begun.elapsed().as_secs_f64();
+        account.work += pairs as u32;
+        let Some(rigid) = found else { return };
+        self.verify(Prior::Rigidity, vec![few::seed(&rigid)]);
+        if !self.is_decisive() {
+            let found = Best {
+                ln_false_alarms: rigid.ln_false_alarms(search.spread()),
+                evidence: Evidence::Depths { focal: rigid.focal },
+                consensus: few::consensus(self.block, &rigid, self.noise),
+                prior: Prior::Rigidity,
+            };
+            self.account(Prior::Rigidity).record(&found);
+            self.offer(found);
+        }
+    }
+
     /// The priors that need no optimisation, once.
     fn propose_geometric(&mut self) {
+        if self.is_wanted(Prior::Irls) {
+            self.propose_irls();
+        }
+        if self.is_wanted(Prior::Consistency) {
+            self.propose_consistency();
+        }
+    }
+
+    fn propose_irls(&mut self) {
         let begun = Instant::now();
         let irls = match &self.search {
             Search::Affine(search) => priors::affine_irls(search.centred(), self.stop),
@@ -225,6 +235,9 @@ impl<'a> Portfolio<'a> {
             self.propose_ranking(Prior::Irls, &prior);
             self.propose(Prior::Irls, &prior);
         }
+    }
+
+    fn propose_consistency(&mut self) {
         let begun = Instant::now();
         let consistency = match &self.search {
             Search::Affine(search) => priors::consistency(search.centred(), 2),
@@ -236,7 +249,7 @@ impl<'a> Portfolio<'a> {
 
     /// Searches under a prior and grows what it found.
     fn propose(&mut self, prior: Prior, weights: &[f64]) {
-        if self.stop.is_stopped() {
+        if !self.is_wanted(prior) {
             return;
         }
         let begun = Instant::now();
@@ -285,11 +298,8 @@ impl<'a> Portfolio<'a> {
             account.seconds += begun.elapsed().as_secs_f64();
             let Some(consensus) = grown else { continue };
             let ln_false_alarms = consensus.ln_false_alarms(spread);
-            if account.records.last().is_none_or(|last| ln_false_alarms < last.ln_false_alarms - LN_MARGIN) {
-                let (seconds, work) = (account.seconds, account.work);
-                account.records.push(Record { seconds, work, inliers: consensus.inlier_count(), ln_false_alarms });
-            }
-            let grown = Best { consensus, prior, ln_false_alarms };
+            let grown = Best { consensus, prior, ln_false_alarms, evidence: Evidence::ImagePoints };
+            account.record(&grown);
             let decisive = grown.decides();
             self.offer(grown);
             if decisive || self.stop.is_stopped() {
@@ -298,11 +308,9 @@ impl<'a> Portfolio<'a> {
         }
     }
 
-    /// A consensus displaces the best one when it is clearly less likely to be chance: the prior that came first wins.
-    ///
-    /// Costs would not do to compare by: they depend on the noise that each was grown at.
+    /// Keeps the better one.
     fn offer(&mut self, grown: Best) {
-        if self.best.as_ref().is_none_or(|best| grown.ln_false_alarms < best.ln_false_alarms - LN_MARGIN) {
+        if self.best.as_ref().is_none_or(|best| grown.displaces(best)) {
             self.best = Some(grown);
         }
     }
@@ -325,38 +333,25 @@ impl<'a> Portfolio<'a> {
     }
 
     fn finish(self, network: Option<PriorNetwork>) -> Found {
+        let with_network = network.is_some();
+        let with_depths = self.block.has_depths();
         let Self { best, accounts, .. } = self;
         let accepted = best.filter(Best::is_acceptable);
-        let with_network = network.is_some();
         let prior_times = accounts
             .into_iter()
             .filter(|account| with_network || account.prior != Prior::Network)
-            .map(|account| prior_time(&account, accepted.as_ref()))
+            .filter(|account| with_depths || account.prior != Prior::Rigidity)
+            .map(|account| account.time(accepted.as_ref()))
             .collect();
+        let evidence = accepted.as_ref().map_or(Evidence::ImagePoints, |best| best.evidence);
         let (consensus, winning_prior) = accepted.map(|best| (best.consensus, best.prior)).unzip();
         Found {
             consensus,
+            evidence,
             winning_prior,
             network_weights: network.map_or_else(Vec::new, |network| network.weights().to_vec()),
             prior_times,
         }
-    }
-}
-
-/// Share of the accepted consensus's inliers and certainty that counts as having found it.
-const SUFFICIENT_SHARE: f64 = 0.95;
-
-fn prior_time(account: &Account, accepted: Option<&Best>) -> PriorTime {
-    let sufficient = accepted.and_then(|accepted| {
-        let inliers = SUFFICIENT_SHARE * accepted.consensus.inlier_count() as f64;
-        let certainty = SUFFICIENT_SHARE * accepted.ln_false_alarms;
-        let is_enough = |record: &&Record| record.inliers as f64 >= inliers && record.ln_false_alarms <= certainty;
-        account.records.iter().find(is_enough)
-    });
-    PriorTime {
-        prior: account.prior,
-        seconds: sufficient.map(|record| record.seconds),
-        iterations: sufficient.map_or(account.work, |record| record.work),
     }
 }
 

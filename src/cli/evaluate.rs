@@ -1,0 +1,303 @@
+//! `scpsfm evaluate`: the paper's evaluation, every method against the oracle.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use clap::ValueEnum;
+use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::json;
+use sha2::{Digest, Sha256};
+
+use super::exit::{Exit, Failure};
+use super::interrupt::Interrupt;
+use super::print;
+use crate::domain::{StopReason, StopToken};
+use crate::evaluation::plan::{Contestant, Depths, Plan, Sweep};
+use crate::evaluation::runner::{self, Records};
+use crate::evaluation::summary::{self, Cell};
+use crate::evaluation::{figures, page};
+use crate::formats::result_files::{create_directory, pretty, write_atomically};
+
+/// Seeds of a full evaluation and of a quick one.
+const SEEDS: u64 = 20;
+const QUICK_SEEDS: u64 = 4;
+
+const EXAMPLES: &str = "\
+Examples:
+  scpsfm evaluate --quick
+  scpsfm evaluate --out evaluation --seeds 20 --threads 2
+  scpsfm evaluate --sweeps outliers,orbit --depths none --methods oracle,auto,geometry
+
+Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
+figure-depths-*.svg (the paper's layout) and index.html, which shows all of it. Stopped by Ctrl-C, a crash or a power cut it goes on where it was when called again with the same directory.";
+
+/// Run the paper's evaluation: sweeps over points, outliers, noise and views, every method against the oracle
+///
+/// Scenes are made by the generator of `scpsfm synth`, with projective depths given (as the paper does) and without.
+/// The oracle knows the truth: its gate and its bundle adjustment are the best that anyone can do on the same scenes.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Args {
+    /// Directory for records and figures; created; runs that it already holds are not repeated
+    #[arg(long, value_name = "DIR", default_value = "scpsfm-evaluation")]
+    pub out: PathBuf,
+
+    /// Scenes a cell [default: 20, with --quick 4]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=10_000))]
+    pub seeds: Option<u64>,
+
+    /// A first impression: 4 seeds, and of the sweeps only cells that take less than a few seconds
+    #[arg(long)]
+    pub quick: bool,
+
+    /// Solves at a time, one thread each [default: one a core]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    pub threads: Option<u16>,
+
+    /// Sweeps to run [default: all]
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "SWEEP")]
+    pub sweeps: Vec<SweepArg>,
+
+    /// How projective depths are given [default: given and none]
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "DEPTHS")]
+    pub depths: Vec<DepthsArg>,
+
+    /// Methods to run [default: all]
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "METHOD")]
+    pub methods: Vec<ContestantArg>,
+
+    /// Print summary.json on stdout, instead of a table
+    #[arg(long)]
+    pub json: bool,
+
+    /// Show no progress
+    #[arg(long, short)]
+    pub quiet: bool,
+}
+
+/// [`Sweep`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
+pub enum SweepArg {
+    /// Tracks m, 50 to 1000 in 20 views
+    Points,
+    /// Share of outliers, .5 to .98
+    Outliers,
+    /// Noise, .1 to 2 % of the width
+    Noise,
+    /// Views n, 5 to 100 of 500 tracks
+    Views,
+    /// Noise, 3 to 11 % (the supplement)
+    StrongNoise,
+    /// Rotations to 3.1 rad, .5 to .95 outliers
+    Orbit,
+}
+
+/// [`Depths`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum DepthsArg {
+    /// True up to noise
+    Given,
+    /// Image points alone
+    None,
+}
+
+/// [`Contestant`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ContestantArg {
+    /// Knows the truth: the limit
+    Oracle,
+    /// The network's prior and geometry together
+    Auto,
+    /// Geometry alone
+    Geometry,
+    /// The paper's method
+    Paper,
+    /// The paper's method without its self-calibration term
+    PaperWithoutDaq,
+    /// Plain projective factorisation at its best threshold
+    Psfm,
+}
+
+impl From<DepthsArg> for Depths {
+    fn from(depths: DepthsArg) -> Self {
+        match depths {
+            DepthsArg::Given => Depths::Given,
+            DepthsArg::None => Depths::None,
+        }
+    }
+}
+
+impl From<ContestantArg> for Contestant {
+    fn from(contestant: ContestantArg) -> Self {
+        match contestant {
+            ContestantArg::Oracle => Contestant::Oracle,
+            ContestantArg::Auto => Contestant::Auto,
+            ContestantArg::Geometry => Contestant::Geometry,
+            ContestantArg::Paper => Contestant::Paper,
+            ContestantArg::PaperWithoutDaq => Contestant::PaperWithoutDaq,
+            ContestantArg::Psfm => Contestant::Psfm,
+        }
+    }
+}
+
+impl Args {
+    fn plan(&self) -> Plan {
+        let wanted: BTreeSet<String> = self
+            .sweeps
+            .iter()
+            .filter_map(|sweep| sweep.to_possible_value())
+            .map(|value| value.get_name().to_owned())
+            .collect();
+        let mut sweeps = Sweep::all();
+        sweeps.retain(|sweep| wanted.is_empty() || wanted.contains(sweep.name));
+        if self.quick {
+            sweeps.iter_mut().for_each(|sweep| sweep.cells.retain(|(_, scene)| is_quick(scene.views * scene.tracks)));
+        }
+        let unique = |mut list: Vec<Contestant>| {
+            list.sort_unstable();
+            list.dedup();
+            list
+        };
+        let contestants: Vec<Contestant> = self.methods.iter().map(|&method| method.into()).collect();
+        let mut depths: Vec<Depths> = self.depths.iter().map(|&depths| depths.into()).collect();
+        depths.sort_unstable();
+        depths.dedup();
+        Plan {
+            sweeps,
+            depths: if depths.is_empty() { Depths::ALL.to_vec() } else { depths },
+            contestants: if contestants.is_empty() { Contestant::ALL.to_vec() } else { unique(contestants) },
+            seeds: self.seeds.unwrap_or(if self.quick { QUICK_SEEDS } else { SEEDS }),
+        }
+    }
+}
+
+/// Observations of a scene up to which a quick evaluation solves it.
+fn is_quick(observations: usize) -> bool {
+    observations <= 5_000
+}
+
+/// Runs the command.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    create_directory(&args.out)?;
+    let plan = args.plan();
+    let runs = plan.runs();
+    let mut records = Records::open(&args.out, &build()?)?;
+    let missing = runs.iter().filter(|run| records.get(run).is_none()).count();
+    let bar = progress_bar(args.quiet, runs.len(), runs.len() - missing);
+    let threads = args.threads.map_or_else(cores, usize::from);
+    let stop = StopToken::default();
+    let interrupt = Interrupt::listen()?;
+    let (asked, token) = (stop.clone(), interrupt.token());
+    let relay = tokio::spawn(async move {
+        token.cancelled().await;
+        asked.stop(StopReason::Cancelled);
+    });
+    let outcome = tokio::task::block_in_place(|| {
+        runner::run(&runs, &mut records, threads, &stop, &mut |record| {
+            let scene = &record.run.scene;
+            bar.set_message(format!(
+                "{}: {} views, {} tracks, {} outliers, {} noise",
+                record.run.contestant.name(),
+                scene.views,
+                scene.tracks,
+                scene.outliers,
+                scene.noise
+            ));
+            bar.inc(1);
+        })
+    });
+    relay.abort();
+    bar.finish_and_clear();
+    outcome?;
+    let cells = summary::cells(&plan, &records);
+    let summary = write_summary(&args.out, &plan, &records, &cells)?;
+    print(if args.json { summary.trim_end().to_owned() } else { table(&cells) }.trim_end())?;
+    if stop.is_stopped() {
+        return Err(Failure::interrupted_with("interrupted; called again with the same --out it goes on"));
+    }
+    Ok(Exit::Done)
+}
+
+/// Writes the figures; returns the JSON.
+fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> Result<String, Failure> {
+    let coverage: Vec<_> = plan
+        .contestants
+        .iter()
+        .filter(|&&contestant| contestant != Contestant::Oracle)
+        .filter_map(|&contestant| summary::coverage(plan, records, contestant))
+        .collect();
+    let json = pretty(&json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "seeds": plan.seeds,
+        "cells": cells,
+        "coverage": coverage,
+    }))?;
+    write_atomically(out, "summary.json", json.as_bytes())?;
+    write_atomically(out, "summary.csv", summary::csv(cells).as_bytes())?;
+    for &depths in &plan.depths {
+        let name = format!("figure-depths-{}.svg", depths.name());
+        write_atomically(out, &name, figures::svg(plan, cells, depths).as_bytes())?;
+    }
+    write_atomically(out, "index.html", page::page(plan, cells, &coverage).as_bytes())?;
+    Ok(json)
+}
+
+/// Mean F1 and median focal error of every cell, in words.
+fn table(cells: &[Cell]) -> String {
+    let mut text = format!(
+        "{:<13}{:>7}  {:<7}{:<19}{:>6}{:>8}{:>8}{:>10}{:>10}{:>9}\n",
+        "sweep", "at", "depths", "method", "seeds", "F1", "min F1", "2D px", "focal %", "seconds"
+    );
+    let shown =
+        |value: Option<f64>, factor: f64| value.map_or_else(|| "-".into(), |value| format!("{:.2}", factor * value));
+    for cell in cells {
+        text.push_str(&format!(
+            "{:<13}{:>7}  {:<7}{:<19}{:>6}{:>8.3}{:>8.3}{:>10}{:>10}{:>9.2}\n",
+            cell.sweep,
+            cell.x,
+            cell.depths.name(),
+            cell.contestant.name(),
+            cell.seeds,
+            cell.mean_f1,
+            cell.least_f1,
+            shown(cell.error_2d_px, 1.0),
+            shown(cell.focal_error, 100.0),
+            cell.median_seconds
+        ));
+    }
+    text
+}
+
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, std::num::NonZeroUsize::get)
+}
+
+/// What tells this program from any other that might have written the records: its version and the digest of its file.
+fn build() -> Result<String, Failure> {
+    let program = std::fs::read(std::env::current_exe()?)?;
+    let digest = Sha256::digest(&program);
+    let short: String = digest.iter().take(8).map(|byte| format!("{byte:02x}")).collect();
+    Ok(format!("{} {short}", env!("CARGO_PKG_VERSION")))
+}
+
+fn progress_bar(quiet: bool, total: usize, done: usize) -> ProgressBar {
+    if quiet {
+        return ProgressBar::hidden();
+    }
+    let bar = ProgressBar::new(total as u64);
+    if let Ok(style) = ProgressStyle::with_template("[{bar:24}] {pos}/{len} runs, {eta} left  {wide_msg}") {
+        bar.set_style(style.progress_chars("=> "));
+    }
+    bar.set_position(done as u64);
+    bar.reset_eta();
+    bar
+}
+
+impl From<runner::Error> for Failure {
+    fn from(error: runner::Error) -> Self {
+        match error {
+            runner::Error::Io { .. } | runner::Error::Failed { .. } => Failure::internal(error),
+            runner::Error::OtherBuild { .. } | runner::Error::Malformed { .. } => Failure::bad_input(error),
+        }
+    }
+}

@@ -1,0 +1,220 @@
+//! The paper's measures of one answer, and where the paper is silent what was chosen.
+
+use nalgebra::{Matrix3, Vector2, Vector3};
+use serde::{Deserialize, Serialize};
+
+use crate::domain::{Grade, Method, Solution, Status, WarningCode};
+use crate::synthetic::metrics::{Agreement, agreement};
+use crate::synthetic::{Scene, Truth};
+
+/// How good one answer is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Measures {
+    pub f1: f64,
+    pub precision: f64,
+    pub recall: f64,
+    /// Root mean square distance, in pixels, between the reprojected points and the true image points, noise not
+    /// included, over the true inliers that the answer kept; `None`: nothing was reconstructed.
+    pub error_2d_px: Option<f64>,
+    /// Mean of `|X - X_true| / |X_true|` over the same tracks, after the similarity that fits them best (Umeyama 1991;
+    /// the paper names no alignment), origin as in the paper's generator: near the cameras. `None` without a metric
+    /// reconstruction.
+    pub error_3d: Option<f64>,
+    /// `ln(f / f_true)`; `None` where no focal length was given.
+    pub log_focal_error: Option<f64>,
+    /// One standard deviation that the answer claims for it; the Cramer-Rao bound for the oracle.
+    pub sigma_log_focal: Option<f64>,
+    pub grade: Option<Grade>,
+    pub warnings: Vec<WarningCode>,
+    pub seconds: f64,
+    /// Of AUTO and GEOMETRY: what stood first, by prior.
+    pub winning_prior: Option<crate::domain::Prior>,
+    /// Network iterations spent.
+    pub iterations: u32,
+}
+
+impl Measures {
+    /// Scores a solution.
+    pub fn of(scene: &Scene, solution: &Solution) -> Self {
+        let truth = &scene.truth;
+        let inliers = match solution.method {
+            Method::Psfm => best_threshold(&solution.tracks.weight, &truth.inlier),
+            _ => agreement(&solution.tracks.inlier, &truth.inlier),
+        };
+        let kept: Vec<usize> = (0..truth.inlier.len())
+            .filter(|&track| {
+                truth.inlier[track] && solution.tracks.inlier[track] && solution.tracks.point[track].is_some()
+            })
+            .collect();
+        let solved = solution.status == Status::Solved && !kept.is_empty();
+        Self {
+            f1: inliers.f1,
+            precision: inliers.precision,
+            recall: inliers.recall,
+            error_2d_px: if solved { error_2d_px(truth, solution, &kept) } else { None },
+            error_3d: if solved && solution.is_metric() {
+                let found: Vec<Vector3<f64>> =
+                    kept.iter().filter_map(|&track| solution.tracks.point[track]).map(Vector3::from).collect();
+                error_3d(&found, &true_points(truth, &kept))
+            } else {
+                None
+            },
+            log_focal_error: solution
+                .calibrations
+                .first()
+                .map(|calibration| (calibration.focal_px / truth.focal_px).ln())
+                .filter(|error| error.is_finite()),
+            sigma_log_focal: solution.calibrations.first().and_then(|calibration| calibration.sigma_log_focal),
+            grade: solution.grade,
+            warnings: solution.warnings.iter().map(|warning| warning.code).collect(),
+            seconds: solution.seconds,
+            winning_prior: solution.winning_prior,
+            iterations: solution.iterations,
+        }
+    }
+}
+
+/// The agreement at the weight threshold that suits the truth best: the most that a method which only ranks can reach.
+fn best_threshold(weights: &[f32], truth: &[bool]) -> Agreement {
+    let mut ranked: Vec<usize> = (0..weights.len()).collect();
+    ranked.sort_by(|&a, &b| weights[b].total_cmp(&weights[a]).then(a.cmp(&b)));
+    let mut found = vec![false; weights.len()];
+    let mut best = agreement(&found, truth);
+    for track in ranked {
+        found[track] = true;
+        let reached = agreement(&found, truth);
+        if reached.f1 > best.f1 {
+            best = reached;
+        }
+    }
+    best
+}
+
+/// The world points of some tracks.
+pub fn true_points(truth: &Truth, tracks: &[usize]) -> Vec<Vector3<f64>> {
+    tracks.iter().map(|&track| Vector3::from(truth.points[track])).collect()
+}
+
+/// The image point of a track, noise not included.
+pub fn true_image_px(truth: &Truth, view: usize, track: usize) -> Vector2<f64> {
+    let rotation = Matrix3::from_fn(|row, column| truth.rotations[view][row][column]);
+    let seen = rotation * Vector3::from(truth.points[track]) + Vector3::from(truth.translations[view]);
+    truth.focal_px * seen.xy() / seen.z + Vector2::from(truth.principal_point_px)
+}
+
+/// Root mean square distance of the reprojections from the true image points, over the registered views.
+fn error_2d_px(truth: &Truth, solution: &Solution, kept: &[usize]) -> Option<f64> {
+    let (mut sum, mut count) = (0.0, 0usize);
+    for (view, found) in solution.views.iter().enumerate() {
+        let Some(camera) = camera_of(solution, view) else { continue };
+        debug_assert!(found.projection.is_some());
+        for &track in kept {
+            let Some(point) = solution.tracks.point[track] else { continue };
+            let seen = camera * nalgebra::Vector4::new(point[0], point[1], point[2], 1.0);
+            let error = (seen.xy() / seen.z - true_image_px(truth, view, track)).norm_squared();
+            if error.is_finite() {
+                (sum, count) = (sum + error, count + 1);
+            }
+        }
+    }
+    (count > 0).then(|| (sum / count as f64).sqrt())
+}
+
+/// The pixel camera that goes with the solution's points: metric where they are metric.
+fn camera_of(solution: &Solution, view: usize) -> Option<nalgebra::Matrix3x4<f64>> {
+    let found = &solution.views[view];
+    let (Some(calibration), Some(rotation), Some(translation)) =
+        (solution.calibrations.first(), &found.rotation, &found.translation)
+    else {
+        return found.projection.map(|rows| nalgebra::Matrix3x4::from_fn(|row, column| rows[row][column]));
+    };
+    let [px, py] = calibration.principal_point_px;
+    let (fx, fy) = (calibration.focal_px, calibration.aspect * calibration.focal_px);
+    let intrinsics = Matrix3::new(fx, 0.0, px, 0.0, fy, py, 0.0, 0.0, 1.0);
+    let mut pose = nalgebra::Matrix3x4::zeros();
+    pose.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::from_fn(|row, column| rotation[row][column]));
+    pose.set_column(3, &Vector3::from(*translation));
+    Some(intrinsics * pose)
+}
+
+/// Mean relative distance of points from the true ones after the best similarity; `None` for fewer than three points
+/// or when nothing finite comes of it.
+pub fn error_3d(found: &[Vector3<f64>], truth: &[Vector3<f64>]) -> Option<f64> {
+    let aligned = aligned(found, truth)?;
+    let sum: f64 = aligned.iter().zip(truth).map(|(point, truth)| (point - truth).norm() / truth.norm()).sum();
+    let mean = sum / truth.len() as f64;
+    mean.is_finite().then_some(mean)
+}
+
+/// The points moved onto `truth` by the similarity of least squares (Umeyama 1991).
+fn aligned(points: &[Vector3<f64>], truth: &[Vector3<f64>]) -> Option<Vec<Vector3<f64>>> {
+    if points.len() < 3 || points.len() != truth.len() {
+        return None;
+    }
+    let count = points.len() as f64;
+    let centre = |list: &[Vector3<f64>]| list.iter().sum::<Vector3<f64>>() / count;
+    let (from, to) = (centre(points), centre(truth));
+    let mut covariance = Matrix3::zeros();
+    let mut variance = 0.0;
+    for (point, truth) in points.iter().zip(truth) {
+        covariance += (truth - to) * (point - from).transpose();
+        variance += (point - from).norm_squared();
+    }
+    if !(covariance.iter().all(|entry| entry.is_finite()) && variance > 0.0) {
+        return None;
+    }
+    let decomposition = covariance.svd(true, true);
+    let (left, right) = (decomposition.u?, decomposition.v_t?);
+    let mut signs = Vector3::repeat(1.0);
+    if (left * right).determinant() < 0.0 {
+        signs.z = -1.0;
+    }
+    let rotation = left * Matrix3::from_diagonal(&signs) * right;
+    let scale = decomposition.singular_values.dot(&signs) / variance;
+    Some(points.iter().map(|point| scale * rotation * (point - from) + to).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::{Input, Limits, Silent, SolveSettings, StopToken};
+    use crate::synthetic::SceneOptions;
+
+    #[test]
+    fn a_similarity_is_undone_exactly() {
+        let truth = [[0.0, 1.0, 3.0], [1.0, -0.5, 2.0], [-1.0, 0.2, 4.0], [0.3, 0.9, 2.5]].map(Vector3::from);
+        let turn = nalgebra::Rotation3::from_euler_angles(0.3, -1.0, 2.0);
+        let moved: Vec<Vector3<f64>> =
+            truth.iter().map(|point| 0.2 * (turn * point) + Vector3::new(5.0, -3.0, 1.0)).collect();
+        assert!(error_3d(&moved, &truth).expect("four points") < 1e-12);
+        let mut wrong = moved.clone();
+        wrong[0].x += 0.05;
+        let error = error_3d(&wrong, &truth).expect("four points");
+        assert!(error > 0.005 && error < 0.2, "{error}");
+        assert_eq!(error_3d(&moved[..2], &truth[..2]), None);
+        assert_eq!(error_3d(&[Vector3::repeat(f64::NAN); 4], &truth), None);
+    }
+
+    #[test]
+    fn the_best_threshold_is_between_right_and_wrong() {
+        let truth = [true, true, false, false];
+        assert_eq!(best_threshold(&[0.9, 0.4, 0.3, 0.1], &truth).f1, 1.0);
+        // One wrong track above a right one: two of three.
+        assert!((best_threshold(&[0.9, 0.4, 0.5, 0.1], &truth).f1 - 0.8).abs() < 1e-12);
+    }
+
+    #[test]
+    fn an_exact_scene_is_scored_as_exact() {
+        let options = SceneOptions { noise: 1e-6, outliers: 0.5, tracks: 60, views: 6, ..SceneOptions::default() };
+        let scene = Scene::generate(&options).expect("valid");
+        let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid");
+        let settings = SolveSettings { method: Method::Geometry, ..SolveSettings::default() };
+        let solution =
+            crate::solver::solve(&input, &settings, &mut Silent, &StopToken::default()).expect("nothing stops it");
+        let measures = Measures::of(&scene, &solution);
+        assert_eq!(measures.f1, 1.0, "{measures:?}");
+        assert!(measures.error_2d_px.expect("solved") < 0.01, "{measures:?}");
+        assert!(measures.error_3d.expect("metric") < 1e-4, "{measures:?}");
+        assert!(measures.log_focal_error.expect("metric").abs() < 1e-4, "{measures:?}");
+    }
+}

@@ -1,0 +1,224 @@
+//! What is run: sweeps of scenes, ways of giving depths, contestants.
+
+use serde::{Deserialize, Serialize};
+
+use crate::domain::{Method, SolveSettings};
+use crate::synthetic::SceneOptions;
+
+/// How projective depths come to the contestants.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Depths {
+    /// True up to noise, as in the paper's synthetic experiments.
+    Given,
+    /// None: image points alone, as real tracks come.
+    None,
+}
+
+impl Depths {
+    pub const ALL: [Depths; 2] = [Depths::Given, Depths::None];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Depths::Given => "given",
+            Depths::None => "none",
+        }
+    }
+}
+
+/// Who answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Contestant {
+    /// The truth classifies, metric bundle adjustment of the true inliers calibrates: the best anyone can do.
+    Oracle,
+    Auto,
+    Geometry,
+    /// The paper's method, with the DAQ loss.
+    Paper,
+    /// The same without it.
+    PaperWithoutDaq,
+    /// Plain projective factorisation (Sturm & Triggs 1996) at the threshold that suits the scene best.
+    Psfm,
+}
+
+impl Contestant {
+    pub const ALL: [Contestant; 6] = [
+        Contestant::Oracle,
+        Contestant::Auto,
+        Contestant::Geometry,
+        Contestant::Paper,
+        Contestant::PaperWithoutDaq,
+        Contestant::Psfm,
+    ];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Contestant::Oracle => "oracle",
+            Contestant::Auto => "auto",
+            Contestant::Geometry => "geometry",
+            Contestant::Paper => "paper",
+            Contestant::PaperWithoutDaq => "paper-without-daq",
+            Contestant::Psfm => "psfm",
+        }
+    }
+
+    /// The settings that it solves with; `None` for the oracle, which does not solve.
+    pub fn settings(self, seed: u64) -> Option<SolveSettings> {
+        let (method, use_daq) = match self {
+            Contestant::Oracle => return None,
+            Contestant::Auto => (Method::Auto, true),
+            Contestant::Geometry => (Method::Geometry, true),
+            Contestant::Paper => (Method::Paper, true),
+            Contestant::PaperWithoutDaq => (Method::Paper, false),
+            Contestant::Psfm => (Method::Psfm, true),
+        };
+        Some(SolveSettings { method, use_daq, seed, ..SolveSettings::default() })
+    }
+}
+
+/// One quantity varied, the others held.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sweep {
+    pub name: &'static str,
+    /// What is varied, for an axis.
+    pub label: &'static str,
+    /// Value on the axis, scene (seed 0, without depths).
+    pub cells: Vec<(f64, SceneOptions)>,
+}
+
+/// Noise of the sweeps over points and views (paper, Fig. 2; the value itself is not in its text: .6 % makes few views
+/// and few points hard and not hopeless).
+const SWEEP_NOISE: f64 = 0.006;
+/// Views of the sweep over points, points of the sweep over views.
+const POINTS_SWEEP_VIEWS: usize = 20;
+const VIEWS_SWEEP_TRACKS: usize = 500;
+/// Outlier share of all sweeps but the one over it.
+const SWEEP_OUTLIERS: f64 = 0.9;
+
+impl Sweep {
+    /// The four sweeps of the paper's Fig. 2, the supplement's noise to 11 %, and an orbit, which no prior that hopes
+    /// for small rotations survives.
+    pub fn all() -> Vec<Self> {
+        let base = SceneOptions { outliers: SWEEP_OUTLIERS, ..SceneOptions::default() };
+        let points = |tracks| SceneOptions { views: POINTS_SWEEP_VIEWS, tracks, noise: SWEEP_NOISE, ..base.clone() };
+        let views = |views| SceneOptions { views, tracks: VIEWS_SWEEP_TRACKS, noise: SWEEP_NOISE, ..base.clone() };
+        let noise = |noise| SceneOptions { noise, ..base.clone() };
+        let outliers = |outliers| SceneOptions { outliers, ..base.clone() };
+        let orbit = |outliers| SceneOptions { outliers, max_rotation_rad: 3.1, ..base.clone() };
+        let over_tracks = |list: &[usize]| list.iter().map(|&m| (m as f64, points(m))).collect();
+        let over_views = |list: &[usize]| list.iter().map(|&n| (n as f64, views(n))).collect();
+        let over = |list: &[f64], scene: &dyn Fn(f64) -> SceneOptions| list.iter().map(|&x| (x, scene(x))).collect();
+        vec![
+            Self { name: "points", label: "tracks m", cells: over_tracks(&[50, 100, 200, 500, 1000]) },
+            Self {
+                name: "outliers",
+                label: "share of outliers",
+                cells: over(&[0.5, 0.7, 0.8, 0.9, 0.95, 0.96, 0.97, 0.98], &outliers),
+            },
+            Self {
+                name: "noise",
+                label: "noise, share of the width",
+                cells: over(&[0.001, 0.003, 0.006, 0.01, 0.02], &noise),
+            },
+            Self { name: "views", label: "views n", cells: over_views(&[5, 10, 20, 50, 100]) },
+            Self {
+                name: "strong-noise",
+                label: "noise, share of the width",
+                cells: over(&[0.03, 0.05, 0.07, 0.09, 0.11], &noise),
+            },
+            Self { name: "orbit", label: "share of outliers", cells: over(&[0.5, 0.8, 0.9, 0.95], &orbit) },
+        ]
+    }
+}
+
+/// One scene given to one contestant.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Run {
+    /// The scene, its seed and whether depths are given included.
+    pub scene: SceneOptions,
+    pub contestant: Contestant,
+}
+
+impl Run {
+    /// What makes a run the same as another: its own text.
+    pub fn key(&self) -> String {
+        // Plain data: serialisation cannot fail.
+        serde_json::to_string(self).unwrap_or_default()
+    }
+}
+
+/// Which part of everything is run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    pub sweeps: Vec<Sweep>,
+    pub depths: Vec<Depths>,
+    pub contestants: Vec<Contestant>,
+    pub seeds: u64,
+}
+
+impl Plan {
+    /// Every run once, seed by seed, so that a stopped evaluation has all cells with fewer seeds.
+    pub fn runs(&self) -> Vec<Run> {
+        let mut seen = std::collections::HashSet::new();
+        let mut runs = Vec::new();
+        for seed in 0..self.seeds {
+            for sweep in &self.sweeps {
+                for &depths in &self.depths {
+                    for (_, scene) in &sweep.cells {
+                        for &contestant in &self.contestants {
+                            let run = Run { scene: cell_scene(scene, depths, seed), contestant };
+                            if seen.insert(run.key()) {
+                                runs.push(run);
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        runs
+    }
+}
+
+/// First seed of the evaluation's scenes: apart from the small ones that tests and demos use.
+const FIRST_SEED: u64 = 10_000;
+
+/// The scene of a cell with this number.
+pub fn cell_scene(scene: &SceneOptions, depths: Depths, number: u64) -> SceneOptions {
+    SceneOptions { with_depths: depths == Depths::Given, seed: FIRST_SEED + number, ..scene.clone() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_that_sweeps_share_are_run_once() {
+        let plan = Plan {
+            sweeps: Sweep::all(),
+            depths: Depths::ALL.to_vec(),
+            contestants: vec![Contestant::Oracle, Contestant::Auto],
+            seeds: 2,
+        };
+        let runs = plan.runs();
+        let cells: usize = plan.sweeps.iter().map(|sweep| sweep.cells.len()).sum();
+        // The centre of all sweeps (90 % outliers, .3 % noise) is in two.
+        assert_eq!(runs.len(), (cells - 1) * 2 * 2 * 2 - repeated_views(&plan));
+    }
+
+    /// Cells of the sweep over views that the sweep over points has too.
+    fn repeated_views(plan: &Plan) -> usize {
+        let of = |name: &str| plan.sweeps.iter().find(|sweep| sweep.name == name).expect("a sweep").cells.clone();
+        let (points, views) = (of("points"), of("views"));
+        8 * points.iter().filter(|(_, scene)| views.iter().any(|(_, other)| other == scene)).count()
+    }
+
+    #[test]
+    fn every_scene_of_the_plan_can_be_made() {
+        for sweep in Sweep::all() {
+            for (x, scene) in sweep.cells {
+                assert!(scene.validate().is_ok(), "{} at {x}", sweep.name);
+            }
+        }
+    }
+}

@@ -1,0 +1,260 @@
+//! Figures of a cell from its records, and what all of them together say of the grades.
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+
+use super::measures::Measures;
+use super::plan::{Contestant, Depths, Plan, Run, cell_scene};
+use super::runner::Records;
+use crate::domain::Grade;
+
+/// Resamples of a bootstrap interval, its seed, and the share on either side that it leaves out.
+const RESAMPLES: usize = 2_000;
+const BOOTSTRAP_SEED: u64 = 1;
+const TAIL: f64 = 0.025;
+/// Error of the focal length, as a logarithm, from which a METRIC answer is wrong.
+const WRONG_FOCAL: f64 = 0.05;
+
+/// One contestant on one cell.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Cell {
+    pub sweep: &'static str,
+    pub x: f64,
+    pub depths: Depths,
+    pub contestant: Contestant,
+    /// Seeds recorded.
+    pub seeds: usize,
+    pub mean_f1: f64,
+    pub least_f1: f64,
+    /// Share of the seeds in which something was reconstructed.
+    pub solved: f64,
+    /// Medians over the seeds that have a value; `None` where none has.
+    pub error_2d_px: Option<f64>,
+    pub error_3d: Option<f64>,
+    pub focal_error: Option<f64>,
+    /// Median focal error over the oracle's, on the seeds where this contestant gives one, with its bootstrap interval
+    /// (95 %, seeds resampled in pairs).
+    pub focal_ratio: Option<f64>,
+    pub focal_ratio_interval: Option<[f64; 2]>,
+    /// Shares of the seeds by grade.
+    pub metric: f64,
+    pub weak: f64,
+    pub projective_only: f64,
+    pub median_seconds: f64,
+}
+
+/// All cells of a plan that have records, in its order.
+pub fn cells(plan: &Plan, records: &Records) -> Vec<Cell> {
+    let mut cells = Vec::new();
+    for sweep in &plan.sweeps {
+        for &depths in &plan.depths {
+            for &contestant in &plan.contestants {
+                for (x, scene) in &sweep.cells {
+                    let of = |contestant: Contestant, seed: u64| {
+                        records.get(&Run { scene: cell_scene(scene, depths, seed), contestant })
+                    };
+                    let pairs: Vec<(&Measures, Option<&Measures>)> = (0..plan.seeds)
+                        .filter_map(|seed| Some((of(contestant, seed)?, of(Contestant::Oracle, seed))))
+                        .collect();
+                    if !pairs.is_empty() {
+                        cells.push(cell(sweep.name, *x, depths, contestant, &pairs));
+                    }
+                }
+            }
+        }
+    }
+    cells
+}
+
+fn cell(
+    sweep: &'static str,
+    x: f64,
+    depths: Depths,
+    contestant: Contestant,
+    pairs: &[(&Measures, Option<&Measures>)],
+) -> Cell {
+    let count = pairs.len() as f64;
+    let own = || pairs.iter().map(|(measures, _)| *measures);
+    let share = |grade: Grade| own().filter(|measures| measures.grade == Some(grade)).count() as f64 / count;
+    let focal_errors: Vec<(f64, f64)> = pairs
+        .iter()
+        .filter_map(|(measures, oracle)| {
+            Some((measures.log_focal_error?.abs(), oracle.as_ref()?.log_focal_error?.abs()))
+        })
+        .collect();
+    let with_oracle = contestant != Contestant::Oracle && !focal_errors.is_empty();
+    Cell {
+        sweep,
+        x,
+        depths,
+        contestant,
+        seeds: pairs.len(),
+        mean_f1: own().map(|measures| measures.f1).sum::<f64>() / count,
+        least_f1: own().map(|measures| measures.f1).fold(1.0, f64::min),
+        solved: own().filter(|measures| measures.error_2d_px.is_some()).count() as f64 / count,
+        error_2d_px: median(own().filter_map(|measures| measures.error_2d_px).collect()),
+        error_3d: median(own().filter_map(|measures| measures.error_3d).collect()),
+        focal_error: median(own().filter_map(|measures| measures.log_focal_error.map(f64::abs)).collect()),
+        focal_ratio: if with_oracle { ratio_of_medians(&focal_errors) } else { None },
+        focal_ratio_interval: if with_oracle { bootstrap(&focal_errors) } else { None },
+        metric: share(Grade::Metric),
+        weak: share(Grade::Weak),
+        projective_only: share(Grade::ProjectiveOnly),
+        median_seconds: median(own().map(|measures| measures.seconds).collect()).unwrap_or(0.0),
+    }
+}
+
+/// Median, the mean of the two middle ones for an even number; `None` without values.
+pub fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.sort_by(f64::total_cmp);
+    let middle = values.len() / 2;
+    match values.len() {
+        0 => None,
+        count if count % 2 == 1 => Some(values[middle]),
+        _ => Some((values[middle - 1] + values[middle]) / 2.0),
+    }
+}
+
+fn ratio_of_medians(pairs: &[(f64, f64)]) -> Option<f64> {
+    let own = median(pairs.iter().map(|pair| pair.0).collect())?;
+    let oracle = median(pairs.iter().map(|pair| pair.1).collect())?;
+    (oracle > 0.0).then_some(own / oracle)
+}
+
+fn bootstrap(pairs: &[(f64, f64)]) -> Option<[f64; 2]> {
+    let mut rng = ChaCha8Rng::seed_from_u64(BOOTSTRAP_SEED);
+    let mut ratios: Vec<f64> = (0..RESAMPLES)
+        .filter_map(|_| {
+            let resampled: Vec<(f64, f64)> =
+                (0..pairs.len()).map(|_| pairs[rng.random_range(0..pairs.len())]).collect();
+            ratio_of_medians(&resampled)
+        })
+        .collect();
+    ratios.sort_by(f64::total_cmp);
+    let last = ratios.len().checked_sub(1)? as f64;
+    let at = |share: f64| ratios[(share * last).round() as usize];
+    Some([at(TAIL), at(1.0 - TAIL)])
+}
+
+/// What METRIC is worth: claims against truth over all scenes of a plan.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Coverage {
+    pub contestant: Contestant,
+    pub scenes: usize,
+    pub metric: usize,
+    /// Shares of the METRIC answers within one and three of their own standard deviations.
+    pub within_one_sigma: f64,
+    pub within_three_sigma: f64,
+    /// METRIC answers wrong by more than 5 %.
+    pub metric_and_wrong: usize,
+    /// Scenes whose Cramer-Rao bound is below .01, and the share of them that ended METRIC.
+    pub determined: usize,
+    pub determined_metric: f64,
+}
+
+/// Standard deviation of the log focal length, by the Cramer-Rao bound, below which METRIC is expected.
+const DETERMINED: f64 = 0.01;
+
+/// Coverage of one contestant over all its records in the plan.
+pub fn coverage(plan: &Plan, records: &Records, contestant: Contestant) -> Option<Coverage> {
+    let runs: Vec<Run> = plan.runs().into_iter().filter(|run| run.contestant == contestant).collect();
+    let answers: Vec<(&Measures, Option<f64>)> = runs
+        .iter()
+        .filter_map(|run| {
+            let oracle = Run { contestant: Contestant::Oracle, scene: run.scene.clone() };
+            Some((records.get(run)?, records.get(&oracle).and_then(|oracle| oracle.sigma_log_focal)))
+        })
+        .collect();
+    let deviations: Vec<(f64, f64)> = answers
+        .iter()
+        .filter(|(measures, _)| measures.grade == Some(Grade::Metric))
+        .filter_map(|(measures, _)| Some((measures.log_focal_error?.abs(), measures.sigma_log_focal?)))
+        .collect();
+    let within = |sigmas: f64| {
+        deviations.iter().filter(|(error, sigma)| *error <= sigmas * sigma).count() as f64
+            / deviations.len().max(1) as f64
+    };
+    let determined: Vec<bool> = answers
+        .iter()
+        .filter(|(_, bound)| bound.is_some_and(|bound| bound < DETERMINED))
+        .map(|(measures, _)| measures.grade == Some(Grade::Metric))
+        .collect();
+    (!answers.is_empty()).then(|| Coverage {
+        contestant,
+        scenes: answers.len(),
+        metric: deviations.len(),
+        within_one_sigma: within(1.0),
+        within_three_sigma: within(3.0),
+        metric_and_wrong: deviations.iter().filter(|(error, _)| *error > WRONG_FOCAL).count(),
+        determined: determined.len(),
+        determined_metric: determined.iter().filter(|metric| **metric).count() as f64 / determined.len().max(1) as f64,
+    })
+}
+
+/// The cells as a table, one a line; empty where there is no value.
+pub fn csv(cells: &[Cell]) -> String {
+    let mut text = String::from(
+        "sweep,x,depths,contestant,seeds,mean_f1,least_f1,solved,error_2d_px,error_3d,focal_error,focal_ratio,\
+         focal_ratio_low,focal_ratio_high,metric,weak,projective_only,median_seconds\n",
+    );
+    let shown = |value: Option<f64>| value.map_or_else(String::new, |value| format!("{value:.6}"));
+    for cell in cells {
+        let [low, high] = cell.focal_ratio_interval.map_or([None; 2], |interval| interval.map(Some));
+        let values = [
+            Some(cell.mean_f1),
+            Some(cell.least_f1),
+            Some(cell.solved),
+            cell.error_2d_px,
+            cell.error_3d,
+            cell.focal_error,
+            cell.focal_ratio,
+            low,
+            high,
+            Some(cell.metric),
+            Some(cell.weak),
+            Some(cell.projective_only),
+            Some(cell.median_seconds),
+        ];
+        let values: Vec<String> = values.into_iter().map(shown).collect();
+        text.push_str(&format!(
+            "{},{},{},{},{},{}\n",
+            cell.sweep,
+            cell.x,
+            cell.depths.name(),
+            cell.contestant.name(),
+            cell.seeds,
+            values.join(",")
+        ));
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn medians_of_odd_even_and_none() {
+        assert_eq!(median(vec![3.0, 1.0, 2.0]), Some(2.0));
+        assert_eq!(median(vec![3.0, 1.0, 2.0, 10.0]), Some(2.5));
+        assert_eq!(median(Vec::new()), None);
+    }
+
+    #[test]
+    fn a_bootstrap_interval_holds_the_ratio_and_shrinks_with_more_seeds() {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let mut pairs = |count: usize| -> Vec<(f64, f64)> {
+            (0..count).map(|_| (rng.random_range(0.5..2.5), rng.random_range(0.5..1.5))).collect()
+        };
+        let (few, many) = (pairs(20), pairs(2000));
+        let width = |pairs: &[(f64, f64)]| {
+            let [low, high] = bootstrap(pairs).expect("values");
+            let ratio = ratio_of_medians(pairs).expect("values");
+            assert!(low <= ratio && ratio <= high, "{low} {ratio} {high}");
+            high - low
+        };
+        assert!(width(&many) < 0.3 * width(&few));
+        assert_eq!(bootstrap(&[]), None);
+    }
+}

@@ -1,0 +1,110 @@
+//! Fewer tracks than image points alone can verify, carried by their depths.
+//!
+//! Four complete tracks leave ten projective cameras undetermined; with depths and one focal length they leave fifty
+//! constraints over. What stands on them is never graded METRIC.
+
+use super::calibration::{Outcome, few_inliers, grade_of_sigma};
+use super::grow::Consensus;
+use super::search::Seed;
+use super::search::rigid::Rigid;
+use crate::domain::{Grade, StopToken};
+use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, Pose, Reconstruction, intrinsics_variance};
+use crate::geometry::bundle::{Observation, Options};
+use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::triangulation;
+
+/// Iterations of the metric adjustment, which starts within a few per cent.
+const ADJUSTMENT_ITERATIONS: usize = 60;
+const ADJUSTMENT_TOLERANCE: f64 = 1e-9;
+/// Directions that no observation sees: a similarity's.
+const SIMILARITY: usize = 7;
+/// Constraints beyond the unknowns from which a focal length is looked for: its variance is then known to 45 %.
+const LEAST_FREEDOM: usize = 10;
+/// Distance in log focal between what depths and what image points say from which they contradict each other: by
+/// itself, and in standard deviations.
+const MOST_STRAYED: f64 = 0.1;
+const STRAYED_SIGMAS: f64 = 4.0;
+/// Share of the observations that must lie in front of their cameras.
+const LEAST_CHEIRALITY: f64 = 0.9;
+
+/// The seed that a rigid consensus gives to growing without depths.
+pub fn seed(rigid: &Rigid) -> Seed {
+    let support: Vec<usize> = (0..rigid.inlier.len()).filter(|&track| rigid.inlier[track]).collect();
+    let points = rigid.homogeneous_points();
+    Seed { cameras: rigid.cameras(), points: support.iter().map(|&track| points[track]).collect(), support }
+}
+
+/// A rigid consensus as the rest of the solver knows one: inliers by image points and depths, residuals by image points.
+///
+/// * `noise`: that it was found at
+pub fn consensus(block: &CompleteBlock, rigid: &Rigid, noise: f64) -> Consensus {
+    let cameras = rigid.cameras();
+    let points = rigid.homogeneous_points();
+    let squared = (0..block.tracks())
+        .map(|track| triangulation::squared_residual(&cameras, &points[track], block.track(track)))
+        .map(|cost| if cost.is_finite() { cost } else { f64::MAX })
+        .collect();
+    Consensus {
+        cameras,
+        points,
+        squared,
+        inlier: rigid.inlier.clone(),
+        noise: rigid.noise().unwrap_or(noise),
+        score: rigid.cost / block.tracks().max(1) as f64,
+    }
+}
+
+/// Calibrates such a consensus by metric bundle adjustment of its image points from where it stands: the search over
+/// projective reconstructions has nothing to start from.
+///
+/// * `focal`: that of the consensus's cameras, `K [R|t]`
+pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop: &StopToken) -> Outcome {
+    let inliers = consensus.inliers();
+    let mut outcome = Outcome::refused(vec![few_inliers(inliers.len())]);
+    let observations: Vec<Observation> = super::grow::observations_of(block, &inliers);
+    let model = IntrinsicsModel::Focal;
+    let unknowns = 6 * block.views() + 3 * inliers.len() + model.freedom() - SIMILARITY;
+    let freedom = (2 * observations.len()).saturating_sub(unknowns);
+    if freedom < LEAST_FREEDOM {
+        return outcome;
+    }
+    let Some(mut found) = start(consensus, &inliers, focal) else { return outcome };
+    let options = Options {
+        max_iterations: ADJUSTMENT_ITERATIONS,
+        relative_tolerance: ADJUSTMENT_TOLERANCE,
+        ..Options::default()
+    };
+    let report = metric::adjust(&mut found, &observations, model, &options, stop);
+    let noise = consensus.noise.max((report.cost / freedom as f64).sqrt());
+    let sigma = intrinsics_variance(&found, &observations, model)
+        .log_focal
+        .map(|variance| variance.sqrt() * noise)
+        .filter(|sigma| sigma.is_finite());
+    let cheirality = crate::geometry::metric::cheirality(&found, &observations);
+    // Image points and depths tell one story, or there is none.
+    let strayed = (found.intrinsics.focal / focal).ln().abs() > MOST_STRAYED.max(STRAYED_SIGMAS * sigma.unwrap_or(0.0));
+    if strayed || cheirality < LEAST_CHEIRALITY || !found.intrinsics.focal.is_finite() {
+        return outcome;
+    }
+    outcome.grade = grade_of_sigma(sigma).worse(Grade::Weak);
+    outcome.sigma_log_focal = sigma;
+    outcome.cheirality = cheirality;
+    outcome.metric = Some(found);
+    outcome
+}
+
+/// The consensus as a metric reconstruction of its inliers.
+fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<Reconstruction> {
+    let intrinsics = Intrinsics::from_focal(focal);
+    let uncalibrate = intrinsics.matrix().try_inverse()?;
+    let poses = consensus
+        .cameras
+        .iter()
+        .map(|camera| {
+            let pose = uncalibrate * camera;
+            Pose { rotation: pose.fixed_columns::<3>(0).into_owned(), translation: pose.column(3).into_owned() }
+        })
+        .collect();
+    let points = inliers.iter().map(|&track| consensus.points[track].xyz()).collect();
+    Some(Reconstruction { intrinsics, poses, points })
+}

@@ -1,0 +1,60 @@
+//! What each prior proposed and what that cost, so that a result can say what each alone would have needed.
+
+use super::best::{Best, LN_MARGIN};
+use crate::domain::Prior;
+use crate::domain::result::PriorTime;
+
+/// One prior's account.
+pub struct Account {
+    pub prior: Prior,
+    pub seconds: f64,
+    /// Network iterations, or hypotheses.
+    pub work: u32,
+    /// Every consensus better than the prior's last.
+    records: Vec<Record>,
+}
+
+/// A consensus in a prior's account.
+struct Record {
+    /// Spent by then.
+    seconds: f64,
+    work: u32,
+    inliers: usize,
+    ln_false_alarms: f64,
+}
+
+/// Share of the accepted consensus's inliers and certainty that counts as having found it.
+const SUFFICIENT_SHARE: f64 = 0.95;
+
+impl Account {
+    pub fn new(prior: Prior) -> Self {
+        Self { prior, seconds: 0.0, work: 0, records: Vec::new() }
+    }
+
+    /// Enters a consensus, if it is better than the last.
+    pub fn record(&mut self, found: &Best) {
+        if self.records.last().is_none_or(|last| found.ln_false_alarms < last.ln_false_alarms - LN_MARGIN) {
+            self.records.push(Record {
+                seconds: self.seconds,
+                work: self.work,
+                inliers: found.consensus.inlier_count(),
+                ln_false_alarms: found.ln_false_alarms,
+            });
+        }
+    }
+
+    /// When this prior first stood at a consensus as good as the accepted one.
+    pub fn time(&self, accepted: Option<&Best>) -> PriorTime {
+        let sufficient = accepted.and_then(|accepted| {
+            let inliers = SUFFICIENT_SHARE * accepted.consensus.inlier_count() as f64;
+            let certainty = SUFFICIENT_SHARE * accepted.ln_false_alarms;
+            let is_enough = |record: &&Record| record.inliers as f64 >= inliers && record.ln_false_alarms <= certainty;
+            self.records.iter().find(is_enough)
+        });
+        PriorTime {
+            prior: self.prior,
+            seconds: sufficient.map(|record| record.seconds),
+            iterations: sufficient.map_or(self.work, |record| record.work),
+        }
+    }
+}

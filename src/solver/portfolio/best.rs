@@ -1,0 +1,61 @@
+//! The best consensus so far, and when it is good enough.
+
+use crate::domain::Prior;
+use crate::solver::grow::{Consensus, LEAST_INLIERS};
+
+/// Logarithm of the expected number of false alarms at which a consensus is decisive (e^-40: never by chance), and at
+/// which it may be accepted once the search has ended.
+const LN_DECISIVE: f64 = -40.0;
+const LN_ACCEPTABLE: f64 = -7.0;
+/// Gain in that logarithm below which two consensuses are the same: a single track more changes it by tens.
+pub const LN_MARGIN: f64 = 5.0;
+
+/// What a consensus was verified by.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Evidence {
+    /// Image points alone, under projective cameras.
+    ImagePoints,
+    /// Image points and depths, under one focal length and rigid motion.
+    Depths {
+        /// Of the calibrated cameras that the consensus has, normalised units.
+        focal: f64,
+    },
+}
+
+/// A consensus, where it came from and how likely it is to be chance.
+pub struct Best {
+    pub consensus: Consensus,
+    pub prior: Prior,
+    pub ln_false_alarms: f64,
+    pub evidence: Evidence,
+}
+
+impl Best {
+    pub fn decides(&self) -> bool {
+        self.is_verified() && self.ln_false_alarms < LN_DECISIVE
+    }
+
+    pub fn is_acceptable(&self) -> bool {
+        self.is_verified() && self.ln_false_alarms < LN_ACCEPTABLE
+    }
+
+    /// Whether there are enough inliers for its kind of evidence.
+    fn is_verified(&self) -> bool {
+        match self.evidence {
+            Evidence::ImagePoints => self.consensus.inlier_count() >= LEAST_INLIERS,
+            Evidence::Depths { .. } => true,
+        }
+    }
+
+    /// Whether it displaces another: clearly less likely to be chance, the prior that came first wins. Of different
+    /// evidence, what image points alone verify is better: it holds whatever the depths are worth.
+    ///
+    /// Costs would not do to compare by: they depend on the noise that each was grown at.
+    pub fn displaces(&self, other: &Self) -> bool {
+        match (self.evidence, other.evidence) {
+            (Evidence::ImagePoints, Evidence::Depths { .. }) => self.decides(),
+            (Evidence::Depths { .. }, Evidence::ImagePoints) => self.is_acceptable() && !other.decides(),
+            _ => self.ln_false_alarms < other.ln_false_alarms - LN_MARGIN,
+        }
+    }
+}

@@ -1,0 +1,476 @@
+//! Search with depths by rigidity: two right tracks are equally far apart in every view.
+//!
+//! Where the depths are true up to one common scale, track j of view i is the point `d_ij (x/f, y/f, 1)` of that
+//! camera's frame (principal point in the origin, square pixels, one focal length f), and the squared distance of two
+//! tracks is `g a_i + b_i` with `g = 1/f^2`. Ten views leave eight constraints to a *pair*, where the column space of
+//! the measurement matrix leaves none to four tracks: this search needs no sampling and finds four right tracks among
+//! two hundred. Depths from epipolar geometry are true only up to a scale a view and a track: there nothing is
+//! rigid, and the other searches remain.
+
+use nalgebra::Vector3;
+
+use crate::domain::StopToken;
+use crate::geometry::bundle::metric::{Intrinsics, Pose};
+use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::procrustes::{generalised, mean_position};
+use crate::geometry::statistics::{chi_square_gate, ln_choose, median};
+use crate::geometry::{Camera, Point};
+
+/// Focal lengths that are tried, in image sides: a grid whose steps of 9 % change a distance by less than a length
+/// tolerance allows.
+const FOCALS: usize = 33;
+const FOCAL_RANGE: (f64, f64) = (0.3, 5.0);
+/// Standard deviation of a distance over the views, in units of the noise times the depth, below which a pair is
+/// rigid: a distance has the noise of two points in up to three coordinates, and the grid adds to it.
+const PAIR_TOLERANCE: f64 = 3.0;
+/// The same as a share of the depth that the grid's steps leave to exact pairs.
+const GRID_TOLERANCE: f64 = 0.005;
+/// Distance in tolerances below which a pair says nothing: near points are near in every view, right or wrong.
+const LEAST_DISTANCE: f64 = 3.0;
+/// Best focal lengths and best-connected tracks of each that a consensus is grown from.
+const FOCALS_GROWN: usize = 3;
+const CORES_GROWN: usize = 4;
+/// Share of a core that a track must be rigid with to join it.
+const CORE_SHARE: f64 = 0.75;
+/// Tracks of a core at most; more do not make the poses better to start from.
+const MOST_CORE: usize = 30;
+/// Tracks that leave six unknowns a view determined, with one to verify.
+pub const LEAST_TRACKS: usize = 4;
+/// Rounds of re-estimating the noise, and the least that is believed: a hundredth of a pixel of a thousand.
+const NOISE_ROUNDS: usize = 3;
+const LEAST_NOISE: f64 = 1e-5;
+/// Inflations of the gate while a consensus grows.
+const GATES: [f64; 6] = [64.0, 16.0, 4.0, 1.0, 1.0, 1.0];
+/// Steps of the golden section on the log focal length, and its half width: two steps of the grid.
+const FOCAL_STEPS: usize = 12;
+const FOCAL_HALF_WIDTH: f64 = 0.18;
+
+/// A rigid shape with the tracks that belong to it.
+#[derive(Debug, Clone)]
+pub struct Rigid {
+    pub focal: f64,
+    pub poses: Vec<Pose>,
+    /// Position of every track of the block.
+    pub points: Vec<Vector3<f64>>,
+    /// Sum of squared residuals of every track: two image coordinates and the relative depth a view.
+    pub squared: Vec<f64>,
+    pub inlier: Vec<bool>,
+    /// Sum over the tracks of the squared residual over its gate, at most 1 each.
+    pub cost: f64,
+}
+
+impl Rigid {
+    pub fn inlier_count(&self) -> usize {
+        self.inlier.iter().filter(|&&inlier| inlier).count()
+    }
+
+    /// The cameras `K [R|t]`.
+    pub fn cameras(&self) -> Vec<Camera> {
+        let intrinsics = Intrinsics::from_focal(self.focal);
+        self.poses.iter().map(|pose| pose.camera(&intrinsics)).collect()
+    }
+
+    pub fn homogeneous_points(&self) -> Vec<Point> {
+        self.points.iter().map(|point| point.push(1.0)).collect()
+    }
+
+    /// Constraints that the inliers leave over: three coordinates a view and track, less poses, points and focal length.
+    fn constraints(&self) -> f64 {
+        let (views, inliers) = (self.poses.len(), self.inlier_count());
+        (3 * views * inliers) as f64 - (6 * views + 3 * inliers) as f64 + 5.0
+    }
+
+    fn inlier_cost(&self) -> f64 {
+        self.squared.iter().zip(&self.inlier).filter(|(_, inlier)| **inlier).map(|(cost, _)| cost).sum()
+    }
+
+    /// Noise by the inliers' residuals, one standard deviation of a coordinate; `None` without constraints.
+    pub fn noise(&self) -> Option<f64> {
+        let constraints = self.constraints();
+        (constraints > 0.0).then(|| (self.inlier_cost() / constraints).sqrt()).filter(|noise| noise.is_finite())
+    }
+
+    /// Natural logarithm of the expected number of false alarms; see `Consensus::ln_false_alarms`. Depths count as
+    /// third coordinates.
+    ///
+    /// * `spread`: standard deviation of unstructured coordinates, image points and relative depths together
+    pub fn ln_false_alarms(&self, spread: f64) -> f64 {
+        let (tracks, inliers, constraints) = (self.inlier.len(), self.inlier_count(), self.constraints());
+        let Some(rms) = self.noise() else { return f64::INFINITY };
+        let rms = rms.max(f64::MIN_POSITIVE);
+        ln_choose(tracks, inliers)
+            + (tracks as f64).ln()
+            + 0.5 * constraints * (1.0 + 2.0 * (rms / spread).ln()).min(0.0)
+    }
+}
+
+/// The image points and depths of a block, ready to be searched.
+pub struct Search<'a> {
+    block: &'a CompleteBlock,
+    /// `depths[track * views + view]`.
+    depths: &'a [f64],
+    median_depth: f64,
+    /// Standard deviation of image coordinates and relative depths: what unstructured data would leave.
+    spread: f64,
+}
+
+impl<'a> Search<'a> {
+    /// `None` where there are no depths, or too few tracks or views to be rigid.
+    ///
+    /// * `image_spread`: standard deviation of the image points, normalised units
+    pub fn new(block: &'a CompleteBlock, image_spread: f64) -> Option<Self> {
+        let depths = block.depths()?;
+        if block.views() < 3 || block.tracks() < LEAST_TRACKS {
+            return None;
+        }
+        let median_depth = median(&mut depths.to_vec());
+        if !(median_depth > 0.0 && median_depth.is_finite()) {
+            return None;
+        }
+        let mut deviations: Vec<f64> = depths.iter().map(|depth| (depth / median_depth - 1.0).abs()).collect();
+        let depth_spread = (1.4826 * median(&mut deviations)).clamp(1e-3, 0.5);
+        let spread = (image_spread.powi(2) * depth_spread).cbrt();
+        Some(Self { block, depths, median_depth, spread })
+    }
+
+    pub fn spread(&self) -> f64 {
+        self.spread
+    }
+
+    /// The best rigid consensus at this noise (normalised units); `None` where no four tracks are rigid.
+    pub fn run(&self, noise: f64, stop: &StopToken) -> Option<Rigid> {
+        let graph = self.rigid_pairs(noise, stop)?;
+        let mut best: Option<Rigid> = None;
+        for (focal, edges) in graph.best_focals(FOCALS_GROWN) {
+            let mut covered = vec![false; self.block.tracks()];
+            for _ in 0..CORES_GROWN {
+                if stop.is_stopped() {
+                    return best;
+                }
+                let core = edges.core(&covered);
+                if core.len() < LEAST_TRACKS {
+                    break;
+                }
+                core.iter().for_each(|&track| covered[track] = true);
+                let Some(grown) = self.grow(focal, core, noise) else { continue };
+                if best.as_ref().is_none_or(|best| grown.cost < best.cost) {
+                    best = Some(grown);
+                }
+            }
+        }
+        best.map(|best| self.settle(best, noise))
+    }
+
+    /// Refits at the noise that the inliers show, while that makes chance less likely.
+    fn settle(&self, found: Rigid, noise: f64) -> Rigid {
+        let mut best = found;
+        for _ in 0..NOISE_ROUNDS {
+            let settled = best.noise().unwrap_or(noise).max(LEAST_NOISE);
+            let support = (0..best.inlier.len()).filter(|&track| best.inlier[track]).collect();
+            match self.grow(best.focal, support, settled) {
+                Some(refitted) if refitted.ln_false_alarms(self.spread) < best.ln_false_alarms(self.spread) => {
+                    best = refitted;
+                }
+                _ => break,
+            }
+        }
+        best
+    }
+
+    /// A track in the frame of a view, at this focal length.
+    fn position(&self, view: usize, track: usize, focal: f64) -> Vector3<f64> {
+        let point = self.block.point(view, track);
+        self.depth(view, track) * Vector3::new(point.x / focal, point.y / focal, 1.0)
+    }
+
+    fn depth(&self, view: usize, track: usize) -> f64 {
+        self.depths[track * self.block.views() + view]
+    }
+
+    /// Statistics of all pairs over the views, and how many are rigid at each focal length.
+    fn rigid_pairs(&self, noise: f64, stop: &StopToken) -> Option<Graph> {
+        let (views, tracks) = (self.block.views(), self.block.tracks());
+        let tolerance = self.median_depth * (PAIR_TOLERANCE * noise + GRID_TOLERANCE);
+        let mut graph = Graph { tracks, tolerance, pairs: Vec::with_capacity(tracks * (tracks - 1) / 2) };
+        for a in 0..tracks {
+            if stop.is_stopped() {
+                return None;
+            }
+            for b in a + 1..tracks {
+                let mut pair = Pair::default();
+                for view in 0..views {
+                    let (first, second) = (self.block.point(view, a), self.block.point(view, b));
+                    let (near, far) = (self.depth(view, a), self.depth(view, b));
+                    pair.add((near * first - far * second).norm_squared(), (near - far).powi(2));
+                }
+                graph.pairs.push(pair.divided(views as f64));
+            }
+        }
+        Some(graph)
+    }
+
+    /// From a core to a consensus: fit and gate in turn, the gate tightening.
+    fn grow(&self, focal: f64, core: Vec<usize>, noise: f64) -> Option<Rigid> {
+        let (mut focal, mut support) = (focal, core);
+        let mut best: Option<Rigid> = None;
+        for (step, inflation) in GATES.into_iter().enumerate() {
+            if step < 2 || step + 1 == GATES.len() {
+                focal = self.best_focal(focal, &support);
+            }
+            let (poses, _) = self.fit(focal, &support)?;
+            let judged = self.judge(focal, poses, noise);
+            let gate = inflation * self.gate(noise);
+            let next: Vec<usize> = (0..self.block.tracks()).filter(|&track| judged.squared[track] < gate).collect();
+            if best.as_ref().is_none_or(|best| judged.cost < best.cost) {
+                best = Some(judged);
+            }
+            if next.len() < LEAST_TRACKS {
+                break;
+            }
+            support = next;
+        }
+        best.filter(|best| best.inlier_count() >= LEAST_TRACKS)
+    }
+
+    /// Gate of a track's squared residual.
+    fn gate(&self, noise: f64) -> f64 {
+        chi_square_gate((3 * self.block.views()) as f64 - 3.0) * noise * noise
+    }
+
+    /// Poses and positions of some tracks at a focal length.
+    fn fit(&self, focal: f64, support: &[usize]) -> Option<(Vec<Pose>, Vec<Vector3<f64>>)> {
+        let views = 0..self.block.views();
+        let seen: Vec<Vec<Vector3<f64>>> = views
+            .clone()
+            .map(|view| support.iter().map(|&track| self.position(view, track, focal)).collect())
+            .collect();
+        let weights: Vec<Vec<f64>> =
+            views.map(|view| support.iter().map(|&track| self.weight(view, track)).collect()).collect();
+        generalised(&seen, &weights)
+    }
+
+    /// The noise of a position grows with its depth.
+    fn weight(&self, view: usize, track: usize) -> f64 {
+        let depth = self.depth(view, track);
+        if depth.abs() > f64::MIN_POSITIVE { depth.powi(-2) } else { 0.0 }
+    }
+
+    /// The focal length near `focal` under which the support is most rigid.
+    fn best_focal(&self, focal: f64, support: &[usize]) -> f64 {
+        let cost = |log_focal: f64| {
+            let focal = log_focal.exp();
+            let Some((poses, shape)) = self.fit(focal, support) else { return f64::INFINITY };
+            let squared = |(k, &track): (usize, &usize)| self.squared(&poses, &shape[k], track, focal);
+            support.iter().enumerate().map(squared).sum()
+        };
+        golden_section(cost, focal.ln(), FOCAL_HALF_WIDTH, FOCAL_STEPS).exp()
+    }
+
+    /// Squared residual of a track at a position: image coordinates and relative depth, over all views.
+    fn squared(&self, poses: &[Pose], position: &Vector3<f64>, track: usize, focal: f64) -> f64 {
+        let residual = |(view, pose): (usize, &Pose)| {
+            let seen = pose.apply(position);
+            let image = focal * seen.xy() / seen.z - self.block.point(view, track);
+            image.norm_squared() + (seen.z / self.depth(view, track) - 1.0).powi(2)
+        };
+        let squared: f64 = poses.iter().enumerate().map(residual).sum();
+        if squared.is_finite() { squared } else { f64::MAX }
+    }
+
+    /// Every track of the block under these poses.
+    fn judge(&self, focal: f64, poses: Vec<Pose>, noise: f64) -> Rigid {
+        let views = self.block.views();
+        let gate = self.gate(noise);
+        let (mut points, mut squared) = (Vec::new(), Vec::new());
+        for track in 0..self.block.tracks() {
+            let seen: Vec<Vector3<f64>> = (0..views).map(|view| self.position(view, track, focal)).collect();
+            let position = mean_position(&poses, seen.iter(), (0..views).map(|view| self.weight(view, track)));
+            squared.push(self.squared(&poses, &position, track, focal));
+            points.push(position);
+        }
+        let inlier = squared.iter().map(|&squared| squared < gate).collect();
+        let cost = squared.iter().map(|&squared| (squared / gate).min(1.0)).sum();
+        Rigid { focal, poses, points, squared, inlier, cost }
+    }
+}
+
+/// Moments over the views of the two parts of a pair's squared distance: `a`, which the focal length scales, and `b`,
+/// the depths'.
+#[derive(Debug, Clone, Copy, Default)]
+struct Pair {
+    a: f64,
+    b: f64,
+    aa: f64,
+    ab: f64,
+    bb: f64,
+}
+
+impl Pair {
+    fn add(&mut self, a: f64, b: f64) {
+        self.a += a;
+        self.b += b;
+        self.aa += a * a;
+        self.ab += a * b;
+        self.bb += b * b;
+    }
+
+    fn divided(self, count: f64) -> Self {
+        let Self { a, b, aa, ab, bb } = self;
+        Self { a: a / count, b: b / count, aa: aa / count, ab: ab / count, bb: bb / count }
+    }
+
+    /// Whether the distance at `g = 1/f^2` deviates by less than `tolerance`, and is not near zero in its terms.
+    fn is_rigid(&self, g: f64, tolerance: f64) -> bool {
+        let squared_distance = g * self.a + self.b;
+        let second = g * g * self.aa + 2.0 * g * self.ab + self.bb;
+        let variance = (second - squared_distance * squared_distance).max(0.0);
+        // The deviation of a root is that of its square over twice the root.
+        squared_distance > (LEAST_DISTANCE * tolerance).powi(2)
+            && variance < 4.0 * squared_distance * tolerance * tolerance
+    }
+}
+
+/// Which pairs are rigid.
+struct Graph {
+    tracks: usize,
+    tolerance: f64,
+    /// Upper triangle, row by row.
+    pairs: Vec<Pair>,
+}
+
+impl Graph {
+    fn focal(k: usize) -> f64 {
+        FOCAL_RANGE.0 * (FOCAL_RANGE.1 / FOCAL_RANGE.0).powf(k as f64 / (FOCALS - 1) as f64)
+    }
+
+    /// The focal lengths with most rigid pairs, no two of them neighbours on the grid.
+    fn best_focals(&self, count: usize) -> Vec<(f64, Edges)> {
+        let mut totals = [0usize; FOCALS];
+        for pair in &self.pairs {
+            for (k, total) in totals.iter_mut().enumerate() {
+                *total += usize::from(pair.is_rigid(Self::focal(k).powi(-2), self.tolerance));
+            }
+        }
+        let mut ranked: Vec<usize> = (0..FOCALS).filter(|&k| totals[k] > 0).collect();
+        ranked.sort_by(|&a, &b| totals[b].cmp(&totals[a]).then(a.cmp(&b)));
+        let mut chosen: Vec<usize> = Vec::new();
+        for k in ranked {
+            if chosen.len() < count && chosen.iter().all(|&other| k.abs_diff(other) > 1) {
+                chosen.push(k);
+            }
+        }
+        chosen.into_iter().map(|k| (Self::focal(k), self.edges(Self::focal(k)))).collect()
+    }
+
+    fn edges(&self, focal: f64) -> Edges {
+        let mut adjacent = vec![vec![false; self.tracks]; self.tracks];
+        let mut pairs = self.pairs.iter();
+        for a in 0..self.tracks {
+            for b in a + 1..self.tracks {
+                let rigid = pairs.next().is_some_and(|pair| pair.is_rigid(focal.powi(-2), self.tolerance));
+                (adjacent[a][b], adjacent[b][a]) = (rigid, rigid);
+            }
+        }
+        let degree = adjacent.iter().map(|row| row.iter().filter(|&&edge| edge).count()).collect();
+        Edges { adjacent, degree }
+    }
+}
+
+/// The rigid pairs at one focal length.
+struct Edges {
+    adjacent: Vec<Vec<bool>>,
+    degree: Vec<usize>,
+}
+
+impl Edges {
+    /// A set of tracks nearly all of which are rigid with each other, begun from the best-connected one that no earlier
+    /// core covers.
+    fn core(&self, covered: &[bool]) -> Vec<usize> {
+        let tracks = self.degree.len();
+        let Some(first) =
+            (0..tracks).filter(|&track| !covered[track]).max_by_key(|&track| (self.degree[track], tracks - track))
+        else {
+            return Vec::new();
+        };
+        let mut candidates: Vec<usize> = (0..tracks).filter(|&track| self.adjacent[first][track]).collect();
+        candidates.sort_by(|&a, &b| self.degree[b].cmp(&self.degree[a]).then(a.cmp(&b)));
+        let mut core = vec![first];
+        for track in candidates {
+            let rigid = core.iter().filter(|&&member| self.adjacent[track][member]).count();
+            if rigid as f64 >= CORE_SHARE * core.len() as f64 && core.len() < MOST_CORE {
+                core.push(track);
+            }
+        }
+        core
+    }
+}
+
+/// Minimum of a function near `middle`, by golden section over `middle +- half_width`.
+fn golden_section(cost: impl Fn(f64) -> f64, middle: f64, half_width: f64, steps: usize) -> f64 {
+    let ratio = (5f64.sqrt() - 1.0) / 2.0;
+    let (mut low, mut high) = (middle - half_width, middle + half_width);
+    let (mut left, mut right) = (high - ratio * (high - low), low + ratio * (high - low));
+    let (mut cost_left, mut cost_right) = (cost(left), cost(right));
+    for _ in 0..steps {
+        if cost_left < cost_right {
+            (high, right, cost_right) = (right, left, cost_left);
+            left = high - ratio * (high - low);
+            cost_left = cost(left);
+        } else {
+            (low, left, cost_left) = (left, right, cost_right);
+            right = low + ratio * (high - low);
+            cost_right = cost(right);
+        }
+    }
+    (low + high) / 2.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::{Input, Limits};
+    use crate::solver::{block, portfolio};
+    use crate::synthetic::{Scene, SceneOptions};
+
+    fn found(options: &SceneOptions) -> (Scene, Option<Rigid>) {
+        let scene = Scene::generate(options).expect("valid options");
+        let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid scene");
+        let (normalization, _) = block::normalization(&input);
+        let ranges = block::track_ranges(&input);
+        let views: Vec<usize> = (0..options.views).collect();
+        let block = block::extract(&input, &ranges, &normalization, &views);
+        let spread = portfolio::spread(&block.complete);
+        let search = Search::new(&block.complete, spread).expect("depths");
+        let rigid = search.run(options.noise.max(0.001), &StopToken::default());
+        if let Some(rigid) = &rigid {
+            assert!(rigid.ln_false_alarms(search.spread()) < f64::INFINITY);
+        }
+        (scene, rigid)
+    }
+
+    #[test]
+    fn four_right_tracks_among_two_hundred_are_found() {
+        for seed in 0..5 {
+            let options = SceneOptions { outliers: 0.98, with_depths: true, seed, ..SceneOptions::default() };
+            let (scene, rigid) = found(&options);
+            let rigid = rigid.expect("four rigid tracks");
+            assert_eq!(rigid.inlier, scene.truth.inlier, "seed {seed}");
+            let error = (rigid.focal * 1000.0 / scene.truth.focal_px).ln().abs();
+            assert!(error < 0.1, "seed {seed}: {error}");
+        }
+    }
+
+    #[test]
+    fn where_nothing_is_rigid_nothing_is_certain() {
+        for seed in 0..5 {
+            let options = SceneOptions { outliers: 1.0, with_depths: true, seed, ..SceneOptions::default() };
+            assert!(found(&options).1.is_none_or(|rigid| rigid.ln_false_alarms(0.2) > -7.0), "seed {seed}");
+        }
+    }
+
+    #[test]
+    fn the_golden_section_finds_a_minimum() {
+        let found = golden_section(|x| (x - 0.3).powi(2), 0.2, 0.5, 30);
+        assert!((found - 0.3).abs() < 1e-5, "{found}");
+    }
+}
