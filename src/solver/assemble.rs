@@ -76,6 +76,9 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
     let cameras =
         to_first_view_frame(&consensus.cameras, &[]).map_or_else(|| consensus.cameras.clone(), |frame| frame.cameras);
     let mut judged = judged(context, attempt, consensus, &cameras);
+    if let Some(weights) = &attempt.weights_by_depths {
+        judge_by_depths(attempt, weights, &cameras, context, &mut judged);
+    }
     if let Some(decided) = &attempt.decided {
         mask(context, &attempt.block.tracks, decided, &mut judged);
     }
@@ -132,6 +135,31 @@ fn judged(context: &Context, attempt: &Attempt, consensus: &Consensus, local: &[
         inlier_share: (consensus.inlier_count() as f64 + 1.0) / (attempt.block.tracks.len() as f64 + 2.0),
     };
     judge::judge(context.input, context.ranges, &geometry, context.stop)
+}
+
+/// Tracks of the block by image points and depths together, in place of image points alone.
+fn judge_by_depths(attempt: &Attempt, weights: &[f64], local: &[Camera], context: &Context, judged: &mut Judged) {
+    let input = context.input;
+    for (j, &track) in attempt.block.tracks.iter().enumerate() {
+        judged.tracks.weight[track] = weights[j] as f32;
+        let inlier = weights[j] > 0.5;
+        if inlier == judged.tracks.inlier[track] {
+            continue;
+        }
+        judged.tracks.inlier[track] = inlier;
+        let sightings = attempt.block.complete.track(j);
+        let start = triangulation::linear(local, sightings);
+        judged.points[track] = inlier.then(|| triangulation::refine(local, sightings, start, POINT_STEPS).0);
+        judged.retained[track] = if inlier {
+            sightings.iter().map(|seen| Sighting { view: attempt.block.views[seen.view], xy: seen.xy }).collect()
+        } else {
+            Vec::new()
+        };
+        for k in context.ranges[track]..context.ranges[track + 1] {
+            judged.observations.inlier[input.caller_index(k)] =
+                inlier && attempt.block.views.binary_search(&input.view_of(k)).is_ok();
+        }
+    }
 }
 
 /// The network's own weight of every track; empty where none ran, 0 for tracks it did not see.

@@ -7,7 +7,7 @@ use super::grow::{self, Consensus, LEAST_INLIERS};
 use super::portfolio::{self, Evidence, Portfolio};
 use super::recorder::Recorder;
 use super::{Context, Error};
-use super::{extend, few};
+use super::{depths, extend};
 use crate::domain::result::PriorTime;
 use crate::domain::{Grade, Method, Prior, Stage};
 
@@ -31,6 +31,9 @@ pub struct Attempt {
     pub evidence: Evidence,
     pub calibration: Option<Outcome>,
     pub winning_prior: Option<Prior>,
+    /// Probability of each track of the block to be right by image points and depths together; `None` where depths
+    /// do not judge.
+    pub weights_by_depths: Option<Vec<f64>>,
     /// The method's own verdicts where it searches nothing (PAPER, PSFM).
     pub decided: Option<Decided>,
     /// The network's weights, one a track of the block; empty where none ran.
@@ -75,6 +78,7 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
         evidence: Evidence::ImagePoints,
         calibration: None,
         winning_prior: None,
+        weights_by_depths: None,
         decided: None,
         network_weights: Vec::new(),
         prior_times: Vec::new(),
@@ -89,7 +93,7 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
         recorder.enter(Stage::Calibrate);
         attempt.calibration = Some(match attempt.evidence {
             Evidence::ImagePoints => calibrate(&attempt.block, consensus, context)?,
-            Evidence::Depths { focal } => few::calibrate(&attempt.block.complete, consensus, focal, context.stop),
+            Evidence::Depths { focal } => depths::calibrate(&attempt.block.complete, consensus, focal, context.stop),
         });
         if let Some(metric) = attempt.calibration.as_ref().and_then(|outcome| outcome.metric.as_ref()) {
             recorder.standing.focal_px = Some(metric.intrinsics.focal * context.scale_px);
@@ -120,6 +124,8 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     recorder.enter(Stage::Refine);
     attempt.evidence = found.evidence;
     if matches!(found.evidence, Evidence::Depths { .. }) {
+        attempt.weights_by_depths =
+            found.rigid.and_then(|rigid| depths::weights(complete, &consensus, &rigid, portfolio::spread(complete)));
         attempt.consensus = Some(consensus);
         return Ok(());
     }
@@ -138,6 +144,10 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         (attempt.block, attempt.consensus) = (block, Some(consensus));
     } else {
         attempt.consensus = Some(refined);
+    }
+    let complete = &attempt.block.complete;
+    if let (Some(rigid), Some(consensus)) = (&found.rigid, &attempt.consensus) {
+        attempt.weights_by_depths = depths::weights(complete, consensus, rigid, portfolio::spread(complete));
     }
     Ok(())
 }

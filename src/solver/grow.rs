@@ -227,6 +227,7 @@ pub fn polish(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> 
     for _ in 0..POLISH_ROUNDS {
         let before = best.score;
         let mut current = best.clone();
+        let mut fitted = current.inliers();
         for inflation in POLISH_INFLATIONS {
             let support: Vec<usize> =
                 (0..block.tracks()).filter(|&track| current.squared[track] < inflation * gate).collect();
@@ -241,6 +242,11 @@ pub fn polish(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> 
             if current.score < best.score {
                 best = current.clone();
             }
+            // Fitted to what the gate admits, and the same again: the remaining steps would repeat it.
+            if inflation <= 1.0 && support == fitted {
+                break;
+            }
+            fitted = support;
         }
         if best.score > before - 1e-6 {
             break;
@@ -289,6 +295,9 @@ fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -
 /// Higher noise levels, in units of the consensus's own, from which the noise settles too.
 const HIGHER_NOISE: [f64; 2] = [2.0, 4.0];
 
+/// Settled noise, in units of that the consensus was found at, below which its gate was wide enough to lose nothing.
+const SURELY_HIGH: f64 = 0.75;
+
 /// The best of what settles from the consensus's noise and from higher ones.
 ///
 /// A consensus found at a noise that is too low has lost its worse tracks, and an estimate from those that remain stays
@@ -302,6 +311,9 @@ pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &
         settle_noise(block, polish(block, judged, stop), stop)
     };
     let mut best = settle(1.0);
+    if best.noise < SURELY_HIGH * consensus.noise {
+        return best;
+    }
     for factor in HIGHER_NOISE {
         let settled = settle(factor);
         if settled.ln_false_alarms(spread) < best.ln_false_alarms(spread) {

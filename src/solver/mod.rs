@@ -3,7 +3,7 @@
 //! Depends on `network`, `geometry` and `domain`; knows nothing of jobs, transport or files.
 //!
 //! The way through: [`block`] chooses views whose tracks are complete; [`attempt`] solves one such block, by
-//! [`portfolio`] (priors, [`search`], [`grow`]; [`few`] where depths verify what image points cannot; [`extend`] to what a search leaves aside) or
+//! [`portfolio`] (priors, [`search`], [`grow`]; [`depths`] where those verify what image points cannot; [`extend`] to what a search leaves aside) or
 //! [`direct`], and [`calibration`] upgrades it; [`judge`] has the last
 //! word on every track and observation; [`assemble`] writes it down.
 
@@ -12,9 +12,9 @@ mod assemble;
 mod attempt;
 mod block;
 pub mod calibration;
+mod depths;
 mod direct;
 mod extend;
-mod few;
 mod grow;
 mod judge;
 mod portfolio;

@@ -5,7 +5,7 @@ use crate::solver::grow::{Consensus, LEAST_INLIERS};
 
 /// Logarithm of the expected number of false alarms at which a consensus is decisive (e^-40: never by chance), and at
 /// which it may be accepted once the search has ended.
-const LN_DECISIVE: f64 = -40.0;
+pub const LN_DECISIVE: f64 = -40.0;
 const LN_ACCEPTABLE: f64 = -7.0;
 /// Gain in that logarithm below which two consensuses are the same: a single track more changes it by tens.
 pub const LN_MARGIN: f64 = 5.0;

@@ -15,8 +15,9 @@ use rand_chacha::ChaCha8Rng;
 
 use super::grow::{self, Consensus};
 use super::recorder::Recorder;
-use super::search::{Sampler, Seed, Shortlist, affine, rigid, subspace};
-use super::{few, priors};
+use super::search::rigid::{self, Rigid};
+use super::search::{Sampler, Seed, Shortlist, affine, subspace};
+use super::{depths, priors};
 use crate::domain::result::PriorTime;
 use crate::domain::{Prior, SolveSettings, StopToken};
 use crate::geometry::measurement::{CompleteBlock, balance};
@@ -46,6 +47,8 @@ pub struct Found {
     pub consensus: Option<Consensus>,
     /// What the consensus was verified by.
     pub evidence: Evidence,
+    /// The rigid consensus behind it or beside it, where depths were given and one is not chance.
+    pub rigid: Option<Rigid>,
     pub winning_prior: Option<Prior>,
     /// The network's last weights, one a track of the block; empty without a network.
     pub network_weights: Vec<f64>,
@@ -71,6 +74,7 @@ pub struct Portfolio<'a> {
     rng: ChaCha8Rng,
     accounts: Vec<Account>,
     best: Option<Best>,
+    rigid: Option<Rigid>,
 }
 
 impl<'a> Portfolio<'a> {
@@ -92,6 +96,7 @@ impl<'a> Portfolio<'a> {
             rng: ChaCha8Rng::seed_from_u64(settings.seed),
             accounts: Prior::ALL.into_iter().map(Account::new).collect(),
             best: None,
+            rigid: None,
         }
     }
 
@@ -201,16 +206,19 @@ impl<'a> Portfolio<'a> {
         account.seconds += begun.elapsed().as_secs_f64();
         account.work += pairs as u32;
         let Some(rigid) = found else { return };
-        self.verify(Prior::Rigidity, vec![few::seed(&rigid)]);
+        self.verify(Prior::Rigidity, vec![depths::seed(&rigid)]);
         if !self.is_decisive() {
             let found = Best {
                 ln_false_alarms: rigid.ln_false_alarms(search.spread()),
                 evidence: Evidence::Depths { focal: rigid.focal },
-                consensus: few::consensus(self.block, &rigid, self.noise),
+                consensus: depths::consensus(self.block, &rigid, self.noise),
                 prior: Prior::Rigidity,
             };
             self.account(Prior::Rigidity).record(&found);
             self.offer(found);
+        }
+        if rigid.ln_false_alarms(search.spread()) < best::LN_DECISIVE {
+            self.rigid = Some(rigid);
         }
     }
 
@@ -335,7 +343,7 @@ impl<'a> Portfolio<'a> {
     fn finish(self, network: Option<PriorNetwork>) -> Found {
         let with_network = network.is_some();
         let with_depths = self.block.has_depths();
-        let Self { best, accounts, .. } = self;
+        let Self { best, accounts, rigid, .. } = self;
         let accepted = best.filter(Best::is_acceptable);
         let prior_times = accounts
             .into_iter()
@@ -348,6 +356,7 @@ impl<'a> Portfolio<'a> {
         Found {
             consensus,
             evidence,
+            rigid,
             winning_prior,
             network_weights: network.map_or_else(Vec::new, |network| network.weights().to_vec()),
             prior_times,

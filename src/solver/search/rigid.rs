@@ -32,6 +32,11 @@ const FOCALS_GROWN: usize = 3;
 const CORES_GROWN: usize = 4;
 /// Share of a core that a track must be rigid with to join it.
 const CORE_SHARE: f64 = 0.75;
+/// Noise that a core is grown at, in units of that its pairs were rigid at: strict pairs keep chance out of a core, a
+/// wide gate lets the right tracks in.
+const GROWN_NOISE: [f64; 3] = [1.0, 2.0, 4.0];
+/// Logarithm of the expected number of false alarms at which the search ends.
+const LN_NEVER_CHANCE: f64 = -100.0;
 /// Tracks of a core at most; more do not make the poses better to start from.
 const MOST_CORE: usize = 30;
 /// Tracks that leave six unknowns a view determined, with one to verify.
@@ -42,7 +47,9 @@ const LEAST_NOISE: f64 = 1e-5;
 /// Inflations of the gate while a consensus grows.
 const GATES: [f64; 6] = [64.0, 16.0, 4.0, 1.0, 1.0, 1.0];
 /// Steps of the golden section on the log focal length, and its half width: two steps of the grid.
-const FOCAL_STEPS: usize = 12;
+const FOCAL_STEPS: usize = 10;
+/// Tracks that take part in it: their distances tell the focal length well enough to gate by.
+const FOCAL_TRACKS: usize = 12;
 const FOCAL_HALF_WIDTH: f64 = 0.18;
 
 /// A rigid shape with the tracks that belong to it.
@@ -137,35 +144,51 @@ impl<'a> Search<'a> {
         self.spread
     }
 
-    /// The best rigid consensus at this noise (normalised units); `None` where no four tracks are rigid.
+    /// The best rigid consensus with pairs rigid at this noise (normalised units); `None` where no four tracks are
+    /// rigid. Ends at the first that is never chance.
     pub fn run(&self, noise: f64, stop: &StopToken) -> Option<Rigid> {
         let graph = self.rigid_pairs(noise, stop)?;
         let mut best: Option<Rigid> = None;
         for (focal, edges) in graph.best_focals(FOCALS_GROWN) {
             let mut covered = vec![false; self.block.tracks()];
             for _ in 0..CORES_GROWN {
-                if stop.is_stopped() {
-                    return best;
-                }
                 let core = edges.core(&covered);
                 if core.len() < LEAST_TRACKS {
                     break;
                 }
                 core.iter().for_each(|&track| covered[track] = true);
-                let Some(grown) = self.grow(focal, core, noise) else { continue };
-                if best.as_ref().is_none_or(|best| grown.cost < best.cost) {
-                    best = Some(grown);
+                for factor in GROWN_NOISE {
+                    if stop.is_stopped() {
+                        return best;
+                    }
+                    let Some(grown) = self.grow(focal, core.clone(), factor * noise) else { continue };
+                    let settled = self.settle(grown);
+                    let certainty = settled.ln_false_alarms(self.spread);
+                    if best.as_ref().is_none_or(|best| certainty < best.ln_false_alarms(self.spread)) {
+                        best = Some(settled);
+                    }
+                    if certainty < LN_NEVER_CHANCE {
+                        return best;
+                    }
                 }
             }
         }
-        best.map(|best| self.settle(best, noise))
+        best
+    }
+
+    /// The consensus refitted on this block, which may have more tracks and views than the one it was found on.
+    ///
+    /// * `support`: tracks of this block to fit
+    pub fn refit(&self, found: &Rigid, support: &[usize]) -> Option<Rigid> {
+        let noise = found.noise()?.max(LEAST_NOISE);
+        self.grow(found.focal, support.to_vec(), noise).map(|grown| self.settle(grown))
     }
 
     /// Refits at the noise that the inliers show, while that makes chance less likely.
-    fn settle(&self, found: Rigid, noise: f64) -> Rigid {
+    fn settle(&self, found: Rigid) -> Rigid {
         let mut best = found;
         for _ in 0..NOISE_ROUNDS {
-            let settled = best.noise().unwrap_or(noise).max(LEAST_NOISE);
+            let Some(settled) = best.noise().map(|noise| noise.max(LEAST_NOISE)) else { break };
             let support = (0..best.inlier.len()).filter(|&track| best.inlier[track]).collect();
             match self.grow(best.focal, support, settled) {
                 Some(refitted) if refitted.ln_false_alarms(self.spread) < best.ln_false_alarms(self.spread) => {
@@ -214,7 +237,7 @@ impl<'a> Search<'a> {
         let (mut focal, mut support) = (focal, core);
         let mut best: Option<Rigid> = None;
         for (step, inflation) in GATES.into_iter().enumerate() {
-            if step < 2 || step + 1 == GATES.len() {
+            if step == 0 || step + 1 == GATES.len() {
                 focal = self.best_focal(focal, &support);
             }
             let (poses, _) = self.fit(focal, &support)?;
@@ -257,9 +280,11 @@ impl<'a> Search<'a> {
 
     /// The focal length near `focal` under which the support is most rigid.
     fn best_focal(&self, focal: f64, support: &[usize]) -> f64 {
+        let count = support.len().min(FOCAL_TRACKS);
+        let support: Vec<usize> = (0..count).map(|k| support[k * support.len() / count]).collect();
         let cost = |log_focal: f64| {
             let focal = log_focal.exp();
-            let Some((poses, shape)) = self.fit(focal, support) else { return f64::INFINITY };
+            let Some((poses, shape)) = self.fit(focal, &support) else { return f64::INFINITY };
             let squared = |(k, &track): (usize, &usize)| self.squared(&poses, &shape[k], track, focal);
             support.iter().enumerate().map(squared).sum()
         };

@@ -1,12 +1,12 @@
-//! Fewer tracks than image points alone can verify, carried by their depths.
+//! What depths say beyond image points: seeds, a consensus of few tracks, the last word on tracks in strong noise.
 //!
 //! Four complete tracks leave ten projective cameras undetermined; with depths and one focal length they leave fifty
-//! constraints over. What stands on them is never graded METRIC.
+//! constraints over. What stands on fewer tracks than image points can verify is never graded METRIC.
 
 use super::calibration::{Outcome, few_inliers, grade_of_sigma};
 use super::grow::Consensus;
 use super::search::Seed;
-use super::search::rigid::Rigid;
+use super::search::rigid::{Rigid, Search};
 use crate::domain::{Grade, StopToken};
 use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, Pose, Reconstruction, intrinsics_variance};
 use crate::geometry::bundle::{Observation, Options};
@@ -107,4 +107,34 @@ fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<Reconst
         .collect();
     let points = inliers.iter().map(|&track| consensus.points[track].xyz()).collect();
     Some(Reconstruction { intrinsics, poses, points })
+}
+
+/// Share of the consensus's inliers that must be rigid for depths to judge: else they are true to some other scale.
+const RIGID_SHARE: f64 = 0.8;
+
+/// Probability of each track of the block to be right by image points and depths together, under the rigid consensus
+/// refitted to the whole block; `None` where that does not hold for the consensus.
+///
+/// At a noise of a tenth of the image the image points alone lose right tracks; a third coordinate and fewer unknowns
+/// keep them.
+pub fn weights(block: &CompleteBlock, consensus: &Consensus, found: &Rigid, spread: f64) -> Option<Vec<f64>> {
+    let search = Search::new(block, spread)?;
+    let inliers = consensus.inliers();
+    let rigid = search.refit(found, &inliers)?;
+    let shared = inliers.iter().filter(|&&track| rigid.inlier[track]).count();
+    if (shared as f64) < RIGID_SHARE * inliers.len() as f64 {
+        return None;
+    }
+    let noise = rigid.noise()?.max(f64::MIN_POSITIVE);
+    let freedom = (3 * block.views()) as f64 - 3.0;
+    // A uniform distribution of that standard deviation is sqrt(12) times as wide.
+    let ln_wrong = -freedom * (12f64.sqrt() * search.spread()).ln();
+    let ln_core = -0.5 * freedom * (std::f64::consts::TAU * noise * noise).ln();
+    let share = (rigid.inlier_count() as f64 + 1.0) / (block.tracks() as f64 + 2.0);
+    let prior = (share / (1.0 - share)).ln();
+    let weight = |squared: &f64| {
+        let ln_odds = prior + ln_core - 0.5 * squared / (noise * noise) - ln_wrong;
+        1.0 / (1.0 + (-ln_odds).exp())
+    };
+    Some(rigid.squared.iter().map(weight).collect())
 }
