@@ -14,6 +14,7 @@ pub mod job_view;
 pub mod list;
 pub mod progress;
 pub mod result;
+pub mod scene_args;
 pub mod serve;
 pub mod service;
 pub mod solve;

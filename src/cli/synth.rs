@@ -4,6 +4,8 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use super::exit::{Exit, Failure};
+pub use super::scene_args::SceneArgs;
+use super::scene_args::{CameraArgs, GeometryArgs, OutlierArgs};
 use crate::domain::RawInput;
 use crate::formats::result_files::{OBSERVATIONS, create_directory, pretty, write_atomically};
 pub use crate::synthetic::scene::IMAGE_SIDE_PX;
@@ -16,12 +18,15 @@ const EXAMPLES: &str = "\
 Examples:
   scpsfm synth --out scene
   scpsfm synth --out scene --outliers 0.95 --tracks 400 --seed 3
+  scpsfm synth --out scene --motion pure-translation --outliers 0.3   # no method can calibrate this
+  scpsfm synth --out scene --wrong-views 2 --second-motion 0.3   # partly wrong tracks, two bodies
   scpsfm solve scene/observations.csv --width 1000 --height 1000 --out answer";
 
 /// Make a contaminated scene whose truth is known
 ///
 /// The generator of the paper's section 5.1: points in a box, cameras of one focal length around it, noise, and tracks
-/// whose image points are exchanged among each other. Writes observations.csv and truth.json; images are 1000 x 1000 px.
+/// whose image points are exchanged among each other; and departures from it, among them motions that no
+/// self-calibration survives. Writes observations.csv and truth.json; images are 1000 x 1000 px.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {
@@ -32,56 +37,24 @@ pub struct Args {
     #[command(flatten)]
     pub scene: SceneArgs,
 
+    #[command(flatten)]
+    pub geometry: GeometryArgs,
+
+    #[command(flatten)]
+    pub outliers: OutlierArgs,
+
+    #[command(flatten)]
+    pub camera: CameraArgs,
+
     /// Also write the projective depths, as a fifth column
-    #[arg(long)]
+    #[arg(long, help_heading = "The scene")]
     pub depths: bool,
 }
 
-/// The scene's measures; `demo` has them too.
-#[derive(Debug, Clone, clap::Args)]
-#[command(next_help_heading = "The scene")]
-pub struct SceneArgs {
-    /// Views (images)
-    #[arg(long, default_value_t = 10)]
-    pub views: usize,
-
-    /// Tracks; each is seen in every view
-    #[arg(long, default_value_t = 200)]
-    pub tracks: usize,
-
-    /// Standard deviation of the noise as a share of the image width
-    #[arg(long, value_name = "SHARE", default_value_t = 0.003)]
-    pub noise: f64,
-
-    /// Share of the tracks that are outliers
-    #[arg(long, value_name = "SHARE", default_value_t = 0.9)]
-    pub outliers: f64,
-
-    /// Largest rotation about each axis in radians; above 0.5 the cameras orbit the scene
-    #[arg(long, value_name = "RAD", default_value_t = 0.4)]
-    pub rotation: f64,
-
-    /// Seed of the scene: one seed, one scene
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
-}
-
-impl SceneArgs {
-    /// The scene itself.
-    ///
-    /// # Errors
-    /// A measure out of range, as wrong usage.
-    pub fn generate(&self, with_depths: bool) -> Result<Scene, Failure> {
-        let options = SceneOptions {
-            views: self.views,
-            tracks: self.tracks,
-            noise: self.noise,
-            outliers: self.outliers,
-            max_rotation_rad: self.rotation,
-            with_depths,
-            seed: self.seed,
-        };
-        Scene::generate(&options).map_err(Failure::usage)
+impl Args {
+    fn generate(&self) -> Result<Scene, Failure> {
+        let options = self.geometry.apply(self.scene.options(self.depths));
+        Scene::generate(&self.camera.apply(self.outliers.apply(options))).map_err(Failure::usage)
     }
 }
 
@@ -97,7 +70,7 @@ struct TruthJson<'a> {
 
 /// Runs the command.
 pub fn run(args: Args) -> Result<Exit, Failure> {
-    let scene = args.scene.generate(args.depths)?;
+    let scene = args.generate()?;
     write_scene(&args.out, &scene)?;
     eprintln!("{}: {}", describe(&scene), args.out.display());
     Ok(Exit::Done)
@@ -106,10 +79,11 @@ pub fn run(args: Args) -> Result<Exit, Failure> {
 /// The scene in a line.
 pub fn describe(scene: &Scene) -> String {
     let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
-    format!(
-        "{} views, {} tracks of which {right} are right, focal {:.1} px",
-        scene.options.views, scene.options.tracks, scene.truth.focal_px
-    )
+    let focal = match scene.options.zoom {
+        0.0 => format!("focal {:.1} px", scene.truth.focal_px),
+        zoom => format!("focal {:.1} px +- {:.0} %", scene.truth.focal_px, 100.0 * zoom),
+    };
+    format!("{} views, {} tracks of which {right} are right, {focal}", scene.options.views, scene.options.tracks)
 }
 
 /// Writes observations.csv and truth.json.
@@ -146,29 +120,42 @@ pub fn observations_csv(input: &RawInput) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::ffi::OsStr;
+
+    use clap::Parser;
+
     use super::*;
     use crate::domain::{ImageSize, Limits};
     use crate::formats;
+    use crate::synthetic::{Motion, NoiseKind, OutlierKind, Shape};
 
-    fn scene_args() -> SceneArgs {
-        SceneArgs { views: 4, tracks: 30, noise: 0.003, outliers: 0.5, rotation: 0.4, seed: 11 }
+    /// Parses the arguments of a small scene and these.
+    fn args(out: &Path, more: &[&str]) -> Args {
+        #[derive(clap::Parser)]
+        struct Command {
+            #[command(flatten)]
+            args: Args,
+        }
+        let small = ["synth", "--views", "4", "--tracks", "30", "--outliers", "0.5", "--seed", "11", "--out"];
+        let arguments = small.iter().map(OsStr::new).chain([out.as_os_str()]).chain(more.iter().map(OsStr::new));
+        Command::try_parse_from(arguments).unwrap_or_else(|error| panic!("{error}")).args
     }
 
     #[test]
     fn what_is_written_reads_back_exactly() {
-        for depths in [false, true] {
+        for more in [&[][..], &["--depths"]] {
             let directory = tempfile::tempdir().expect("a temporary directory");
             let out = directory.path().join("new/scene");
-            let args = Args { out: out.clone(), scene: scene_args(), depths };
+            let args = args(&out, more);
+            let scene = args.generate().expect("valid options");
             assert_eq!(run(args), Ok(Exit::Done));
             let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
             let read = formats::read(&out.join(OBSERVATIONS), &Limits::default(), Some(size)).expect("a valid file");
-            let scene = scene_args().generate(depths).expect("valid options");
             assert_eq!(read.raw.views, scene.input.views);
             assert_eq!((&read.raw.view, &read.raw.track), (&scene.input.view, &scene.input.track));
             assert_eq!((&read.raw.x, &read.raw.y), (&scene.input.x, &scene.input.y));
             assert_eq!(read.raw.depth, scene.input.depth);
-            assert_eq!(read.raw.depth.is_empty(), !depths);
+            assert_eq!(read.raw.depth.is_empty(), more.is_empty());
 
             let text = std::fs::read_to_string(out.join(TRUTH)).expect("truth.json");
             let truth: serde_json::Value = serde_json::from_str(&text).expect("JSON");
@@ -179,9 +166,36 @@ mod tests {
     }
 
     #[test]
+    fn without_more_arguments_the_scene_is_the_papers() {
+        let options = args(Path::new("out"), &[]).generate().expect("valid options").options;
+        let paper = SceneOptions { views: 4, tracks: 30, outliers: 0.5, seed: 11, ..SceneOptions::default() };
+        assert_eq!(options, paper);
+    }
+
+    #[test]
+    fn every_argument_reaches_its_option() {
+        let base = args(Path::new("out"), &[]).generate().expect("valid options").options;
+        let cases: [(&[&str], SceneOptions); 9] = [
+            (&["--shape", "plane"], SceneOptions { shape: Shape::Plane, ..base.clone() }),
+            (&["--motion", "pure-rotation"], SceneOptions { motion: Motion::PureRotation, ..base.clone() }),
+            (&["--outlier-kind", "slid"], SceneOptions { outlier_kind: OutlierKind::Slid, ..base.clone() }),
+            (&["--wrong-views", "2"], SceneOptions { wrong_views: 2, ..base.clone() }),
+            (&["--second-motion", "0.3"], SceneOptions { second_motion: 0.3, ..base.clone() }),
+            (&["--noise-kind", "heavy"], SceneOptions { noise_kind: NoiseKind::Heavy, ..base.clone() }),
+            (&["--principal-point", "-0.05,0.1"], SceneOptions { principal_point: [-0.05, 0.1], ..base.clone() }),
+            (&["--radial-k1", "-0.05"], SceneOptions { radial_k1: -0.05, ..base.clone() }),
+            (&["--zoom", "0.2"], SceneOptions { zoom: 0.2, ..base.clone() }),
+        ];
+        for (more, expected) in cases {
+            let options = args(Path::new("out"), more).generate().expect("valid options").options;
+            assert_eq!(options, expected, "{more:?}");
+        }
+    }
+
+    #[test]
     fn measures_out_of_range_are_wrong_usage() {
-        let failure = SceneArgs { views: 1, ..scene_args() }.generate(false).expect_err("one view");
+        let failure = args(Path::new("out"), &["--noise", "1.5"]).generate().expect_err("more noise than image");
         assert_eq!(failure.exit, Exit::Usage);
-        assert!(failure.message.contains("views"), "{failure}");
+        assert!(failure.message.contains("noise"), "{failure}");
     }
 }

@@ -1,8 +1,9 @@
-//! The paper's synthetic scenes (its section 5.1) and the metrics to judge answers on them.
+//! The paper's synthetic scenes (its section 5.1), scenes that depart from them, and the metrics to judge answers on
+//! both.
 //!
 //! May depend on `domain` only, plus linear algebra.
 
 pub mod metrics;
 pub mod scene;
 
-pub use scene::{Scene, SceneOptions, Truth};
+pub use scene::{Motion, NoiseKind, OutlierKind, Scene, SceneOptions, Shape, Truth};

@@ -1,0 +1,219 @@
+//! What a scene shall be, and which wishes make no scene.
+
+use serde::{Deserialize, Serialize};
+
+use super::contamination::OutlierKind;
+use super::motion::Motion;
+use super::noise::NoiseKind;
+use super::shape::Shape;
+use crate::domain::error::{InvalidInput, Violation, Violations};
+
+/// What to generate. The defaults are the paper's scenes (its section 5.1); a field that a file lacks has its default.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct SceneOptions {
+    pub views: usize,
+    pub tracks: usize,
+    /// Standard deviation of the noise as a share of the image width (of the depth, for depths).
+    pub noise: f64,
+    /// How the noise is distributed.
+    pub noise_kind: NoiseKind,
+    /// Share of the tracks that are outliers, those of the second body among them.
+    pub outliers: f64,
+    /// What the wrong observations of outliers are.
+    pub outlier_kind: OutlierKind,
+    /// In how many views an outlier track is wrong, random ones for each track; 0: in all that the kind can spoil (half
+    /// for [`OutlierKind::Repeated`]).
+    pub wrong_views: usize,
+    /// Share of all tracks that belong to a second rigid body, which in every view has a small random motion of its own
+    /// (up to 0.2 rad about each axis and 0.3 along it). They count among the outliers; the outliers that are left are
+    /// of the kind above.
+    pub second_motion: f64,
+    /// How the points lie.
+    pub shape: Shape,
+    /// How the cameras move.
+    pub motion: Motion,
+    /// Largest rotation about each axis that the motion turns about, in radians.
+    pub max_rotation_rad: f64,
+    /// Displacement of the principal point from the image's centre, right and down, as a share of the image width.
+    pub principal_point: [f64; 2],
+    /// Radial distortion, `x_d = x_n (1 + k1 r^2)` with `x_n` and its length `r` in normalised camera coordinates (focal
+    /// lengths from the principal point); negative: a barrel. Cameras for which the image of the scene would fold are
+    /// drawn again.
+    pub radial_k1: f64,
+    /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
+    pub zoom: f64,
+    /// Whether projective depths are part of the input.
+    pub with_depths: bool,
+    pub seed: u64,
+}
+
+impl Default for SceneOptions {
+    /// The paper's centre of all sweeps, without depths.
+    fn default() -> Self {
+        Self {
+            views: 10,
+            tracks: 200,
+            noise: 0.003,
+            noise_kind: NoiseKind::Gaussian,
+            outliers: 0.9,
+            outlier_kind: OutlierKind::Permuted,
+            wrong_views: 0,
+            second_motion: 0.0,
+            shape: Shape::Box,
+            motion: Motion::General,
+            max_rotation_rad: 0.4,
+            principal_point: [0.0, 0.0],
+            radial_k1: 0.0,
+            zoom: 0.0,
+            with_depths: false,
+            seed: 0,
+        }
+    }
+}
+
+impl SceneOptions {
+    /// Views and tracks that one scene may have, so that a slip of the finger does not fill the memory.
+    pub const MAX_VIEWS: usize = 1_000;
+    pub const MAX_TRACKS: usize = 100_000;
+    /// Farther from the centre the principal point would be outside the image.
+    pub const MAX_DISPLACEMENT: f64 = 0.5;
+    /// Stronger distortion is a fisheye's, which another model describes.
+    pub const MAX_RADIAL_K1: f64 = 0.5;
+    /// The longest focal length is then 19 times the shortest, as far as zooms go.
+    pub const MAX_ZOOM: f64 = 0.9;
+
+    /// Checks every option.
+    ///
+    /// # Errors
+    /// Each violation names its option.
+    pub fn validate(&self) -> Result<(), InvalidInput> {
+        let mut found = Violations::default();
+        if !(2..=Self::MAX_VIEWS).contains(&self.views) {
+            found.push(Violation::of("views", format!("{} is not in 2..={}", self.views, Self::MAX_VIEWS)));
+        }
+        if !(1..=Self::MAX_TRACKS).contains(&self.tracks) {
+            found.push(Violation::of("tracks", format!("{} is not in 1..={}", self.tracks, Self::MAX_TRACKS)));
+        }
+        if !(0.0..=1.0).contains(&self.noise) {
+            found.push(Violation::of("noise", format!("{} is not a share in 0..=1 of the width", self.noise)));
+        }
+        self.check_outliers(&mut found);
+        self.check_rotation(&mut found);
+        self.check_camera(&mut found);
+        found.into_result()
+    }
+
+    fn check_outliers(&self, found: &mut Violations) {
+        if !(0.0..=1.0).contains(&self.outliers) {
+            found.push(Violation::of("outliers", format!("{} is not a share in 0..=1", self.outliers)));
+        } else if !(0.0..=self.outliers).contains(&self.second_motion) {
+            let reason = format!("{} is not in 0..={}, the share of the outliers", self.second_motion, self.outliers);
+            found.push(Violation::of("second_motion", reason));
+        }
+        let (kind, most) = (self.outlier_kind.name(), self.outlier_kind.most_wrong_views(self.views));
+        if self.wrong_views > most {
+            let reason = format!("{} is above {most}, the most that {kind} outliers can have", self.wrong_views);
+            found.push(Violation::of("wrong_views", reason));
+        }
+        if self.wrong_views > 0 && self.outlier_kind == OutlierKind::Permuted && self.tracks == 1 {
+            found.push(Violation::of("wrong_views", "1 track has no other to exchange points with, give 2 tracks"));
+        }
+        if self.outlier_kind == OutlierKind::Slid {
+            if self.views == 2 {
+                found.push(Violation::of(
+                    "outlier_kind",
+                    "a slid track agrees with any two views, give 3 views or more",
+                ));
+            }
+            if self.motion == Motion::PureRotation {
+                let reason = format!("nothing slides where cameras do not move, as in {}", self.motion.name());
+                found.push(Violation::of("outlier_kind", reason));
+            }
+        }
+    }
+
+    fn check_rotation(&self, found: &mut Violations) {
+        if !(0.0..=std::f64::consts::PI).contains(&self.max_rotation_rad) {
+            found.push(Violation::of("rotation", format!("{} is not in 0..=pi", self.max_rotation_rad)));
+        }
+        if self.motion.needs_rotation() && self.max_rotation_rad == 0.0 {
+            let motion = self.motion.name();
+            found.push(Violation::of("rotation", format!("0 leaves nothing of the motion {motion}, give more than 0")));
+        }
+    }
+
+    fn check_camera(&self, found: &mut Violations) {
+        for (axis, displacement) in self.principal_point.into_iter().enumerate() {
+            let most = Self::MAX_DISPLACEMENT;
+            if !(-most..=most).contains(&displacement) {
+                let reason = format!("{displacement} is not a share in -{most}..={most} of the width");
+                found.push(Violation::at("principal_point", axis, reason));
+            }
+        }
+        let most = Self::MAX_RADIAL_K1;
+        if !(-most..=most).contains(&self.radial_k1) {
+            found.push(Violation::of("radial_k1", format!("{} is not in -{most}..={most}", self.radial_k1)));
+        }
+        if !(0.0..=Self::MAX_ZOOM).contains(&self.zoom) {
+            found.push(Violation::of("zoom", format!("{} is not a share in 0..={}", self.zoom, Self::MAX_ZOOM)));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_option_out_of_range_is_named() {
+        let default = SceneOptions::default;
+        let cases = [
+            ("views", SceneOptions { views: 1, ..default() }),
+            ("tracks", SceneOptions { tracks: 0, ..default() }),
+            ("noise", SceneOptions { noise: f64::NAN, ..default() }),
+            ("outliers", SceneOptions { outliers: 1.1, ..default() }),
+            ("second_motion", SceneOptions { second_motion: 0.31, outliers: 0.3, ..default() }),
+            ("second_motion", SceneOptions { second_motion: -0.1, ..default() }),
+            ("second_motion", SceneOptions { second_motion: f64::NAN, ..default() }),
+            ("wrong_views", SceneOptions { wrong_views: 11, ..default() }),
+            ("wrong_views", SceneOptions { wrong_views: 10, outlier_kind: OutlierKind::Slid, ..default() }),
+            ("wrong_views", SceneOptions { wrong_views: 1, tracks: 1, ..default() }),
+            ("outlier_kind", SceneOptions { views: 2, outlier_kind: OutlierKind::Slid, ..default() }),
+            (
+                "outlier_kind",
+                SceneOptions { motion: Motion::PureRotation, outlier_kind: OutlierKind::Slid, ..default() },
+            ),
+            ("rotation", SceneOptions { max_rotation_rad: 4.0, ..default() }),
+            ("rotation", SceneOptions { max_rotation_rad: 0.0, motion: Motion::Orbit, ..default() }),
+            ("rotation", SceneOptions { max_rotation_rad: 0.0, motion: Motion::PureRotation, ..default() }),
+            ("principal_point", SceneOptions { principal_point: [0.0, 0.6], ..default() }),
+            ("radial_k1", SceneOptions { radial_k1: f64::INFINITY, ..default() }),
+            ("zoom", SceneOptions { zoom: 1.0, ..default() }),
+        ];
+        for (name, options) in cases {
+            let error = options.validate().expect_err(name);
+            assert_eq!(error.violations().len(), 1, "{error}");
+            assert_eq!(error.violations()[0].field, name, "{error}");
+        }
+        assert_eq!(default().validate(), Ok(()));
+    }
+
+    #[test]
+    fn options_of_an_older_file_read_as_the_scene_they_made() {
+        let older = r#"{"views": 4, "tracks": 30, "noise": 0.01, "outliers": 0.5, "max_rotation_rad": 0.2,
+            "with_depths": true, "seed": 9}"#;
+        let read: SceneOptions = serde_json::from_str(older).expect("JSON");
+        let expected = SceneOptions {
+            views: 4,
+            tracks: 30,
+            noise: 0.01,
+            outliers: 0.5,
+            max_rotation_rad: 0.2,
+            with_depths: true,
+            seed: 9,
+            ..SceneOptions::default()
+        };
+        assert_eq!(read, expected);
+    }
+}
