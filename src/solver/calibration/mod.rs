@@ -18,6 +18,7 @@ use crate::geometry::bundle::metric::{IntrinsicsModel, Reconstruction};
 use crate::geometry::bundle::{Observation, Options, projective};
 use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
 
+use fit::Fit;
 pub use grading::grade_of_sigma;
 
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
@@ -113,12 +114,8 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
         let detail = format!("{inliers} inlier tracks cannot be verified by geometry, which takes {LEAST_INLIERS}");
         warnings.push(Warning::new(WarningCode::FewInliers, detail));
     }
-    let mut cameras = problem.cameras.to_vec();
-    let mut points = problem.points.to_vec();
-    let options = Options::squared(PROJECTIVE_ITERATIONS);
-    let adjusted = projective::adjust(&mut cameras, &mut points, problem.observations, &options, stop);
+    let (cameras, points, fit) = projectively_adjusted(problem, inliers, stop);
     Stopped::check(stop)?;
-    let fit = fit::Fit::projective(adjusted.cost, problem, inliers);
     let critical = critical::find(problem, &fit, scale_px, stop);
     Stopped::check(stop)?;
     let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);
@@ -142,6 +139,18 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     let mut outcome = grading::grade(problem, &fit, &prior, minima, scale_px, warnings, stop)?;
     outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem, metric));
     Ok(outcome)
+}
+
+/// The projective reconstruction at its minimum, and how well it fits.
+fn projectively_adjusted(
+    problem: &Problem,
+    inliers: usize,
+    stop: &StopToken,
+) -> (Vec<Matrix3x4<f64>>, Vec<Vector4<f64>>, Fit) {
+    let (mut cameras, mut points) = (problem.cameras.to_vec(), problem.points.to_vec());
+    let options = Options::squared(PROJECTIVE_ITERATIONS);
+    let report = projective::adjust(&mut cameras, &mut points, problem.observations, &options, stop);
+    (cameras, points, Fit::projective(report.cost, problem, inliers))
 }
 
 /// Points with an observation.
