@@ -82,8 +82,14 @@ impl Prior {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum WarningCode {
-    /// The points of the consensus lie on a plane, or the camera only rotated: a homography explains the views.
+    /// Homographies explain the views, and the data do not tell a planar scene from a camera that only rotated.
     PlanarOrRotation,
+    /// The points of the consensus lie on a plane.
+    PlanarScene,
+    /// The camera turned about its centre without moving.
+    PureRotation,
+    /// The camera moved without turning: every focal length fits. Forward motion is a case of it; the detail says so.
+    PureTranslation,
     /// The motion leaves the focal length (nearly) free.
     UnobservableFocal,
     /// Another calibration explains the data about as well.
@@ -92,10 +98,14 @@ pub enum WarningCode {
     ModelMismatch,
     /// Too few inlier tracks to verify or to calibrate.
     FewInliers,
+    /// The data do not determine the principal point; it was taken to be near the image centre.
+    PrincipalPointUnobservable,
     /// Points lie behind cameras.
     Cheirality,
     /// No consensus was found.
     NoConsensus,
+    /// Tracks outside the consensus agree on another rigid structure: a second motion. Not given yet.
+    SecondStructure,
     /// Views were left out; the detail lists them.
     ViewsLeftOut,
     /// No image size was given; the extent of the points stood in.
@@ -111,7 +121,12 @@ impl WarningCode {
     pub fn name(self) -> &'static str {
         match self {
             WarningCode::PlanarOrRotation => "PLANAR_OR_ROTATION",
+            WarningCode::PlanarScene => "PLANAR_SCENE",
+            WarningCode::PureRotation => "PURE_ROTATION",
+            WarningCode::PureTranslation => "PURE_TRANSLATION",
             WarningCode::UnobservableFocal => "UNOBSERVABLE_FOCAL",
+            WarningCode::PrincipalPointUnobservable => "PRINCIPAL_POINT_UNOBSERVABLE",
+            WarningCode::SecondStructure => "SECOND_STRUCTURE",
             WarningCode::SecondMinimum => "SECOND_MINIMUM",
             WarningCode::ModelMismatch => "MODEL_MISMATCH",
             WarningCode::FewInliers => "FEW_INLIERS",
@@ -149,6 +164,10 @@ pub struct Calibration {
     /// Vertical over horizontal focal length; 1 (square pixels) unless the data asked for more.
     #[serde(default = "square_pixels")]
     pub aspect: f64,
+    /// Radial distortion: a point at `(u, v, 1)` in camera coordinates is imaged at `x = f u s + px`,
+    /// `y = aspect f v s + py` with `s = 1 + k1 (u^2 + v^2)`. 0 (a pinhole) unless the data asked for more.
+    #[serde(default)]
+    pub radial_k1: f64,
 }
 
 fn square_pixels() -> f64 {

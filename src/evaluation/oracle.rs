@@ -6,7 +6,9 @@ use nalgebra::{Matrix3, Matrix4, Rotation3, Vector2, Vector3, Vector4};
 
 use super::measures::{Measures, error_3d, true_image_px, true_points};
 use crate::domain::StopToken;
-use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, Pose, Reconstruction, intrinsics_variance};
+use crate::geometry::bundle::metric::{
+    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
+};
 use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::measurement::Sighting;
 use crate::geometry::statistics::chi_square_gate;
@@ -149,13 +151,22 @@ impl<'a> World<'a> {
             poses: self.poses.clone(),
             points: points.clone(),
         };
-        let bound = intrinsics_variance(&found, &observations, IntrinsicsModel::Focal).log_focal;
+        let bound = Information::new(&found, &observations).and_then(|information| {
+            information.optimum(IntrinsicsModel::FOCAL, &IntrinsicsPrior::NONE).variance_of(Parameter::LogFocal)
+        });
         let options = Options {
             max_iterations: ADJUSTMENT_ITERATIONS,
             relative_tolerance: ADJUSTMENT_TOLERANCE,
             ..Options::default()
         };
-        metric::adjust(&mut found, &observations, IntrinsicsModel::Focal, &options, &StopToken::default());
+        metric::adjust(
+            &mut found,
+            &observations,
+            IntrinsicsModel::FOCAL,
+            &IntrinsicsPrior::NONE,
+            &options,
+            &StopToken::default(),
+        );
         let side = f64::from(IMAGE_SIDE_PX);
         let squared: f64 = observations
             .iter()

@@ -87,6 +87,7 @@ fn solution(scene: &Scene) -> Solution {
             sigma_log_focal: Some(0.004),
             principal_point_px: truth.principal_point_px,
             aspect: 1.0,
+            radial_k1: -0.02,
         }],
         plane_at_infinity: Some([1e-4, -2e-5, 0.03]),
         views: cameras

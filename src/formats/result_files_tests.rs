@@ -40,6 +40,7 @@ fn the_fields_of_result_json_are_a_contract() {
         "focal_unobservable",
         "principal_point_px",
         "aspect",
+        "radial_k1",
         "plane_at_infinity",
         "inlier_tracks",
         "inlier_observations",
@@ -68,6 +69,7 @@ fn the_fields_of_result_json_are_a_contract() {
     assert_eq!(result["registered_views"], 5);
     assert_eq!(result["focal_unobservable"], false);
     assert_eq!(result["aspect"], 1.0);
+    assert_eq!(result["radial_k1"], -0.02);
     assert_eq!(keys(&result["warnings"][0]), ["code", "detail"]);
     assert_eq!(result["warnings"][0]["code"], "FEW_INLIERS");
     assert_eq!(keys(&result["stages"][0]), ["name", "seconds"]);
@@ -99,27 +101,34 @@ fn a_projective_result_gives_no_calibration_and_says_why() {
     let result = json(&solution);
     assert_eq!((&result["status"], &result["grade"]), (&"SOLVED".into(), &"PROJECTIVE_ONLY".into()));
     assert_eq!(result["focal_unobservable"], true);
-    for field in ["focal_px", "sigma_log_focal", "principal_point_px", "aspect", "plane_at_infinity"] {
+    for field in ["focal_px", "sigma_log_focal", "principal_point_px", "aspect", "radial_k1", "plane_at_infinity"] {
         assert_eq!(result[field], Value::Null, "{field}");
     }
     assert_eq!((&result["registered_views"], &result["inlier_tracks"]), (&5.into(), &20.into()));
     for camera in CamerasJson::new(&solution, Some(&input)).views {
         assert!(camera.registered && camera.P.is_some(), "view {}", camera.view);
         assert!(camera.K.is_none() && camera.R.is_none() && camera.t.is_none(), "view {}", camera.view);
+        assert!(camera.radial_k1.is_none(), "view {}", camera.view);
     }
 }
 
 #[test]
 fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     let (mut input, mut solution) = fixture::solved();
-    let second = Calibration { focal_px: 77.0, sigma_log_focal: None, principal_point_px: [1.0, 2.0], aspect: 1.25 };
+    let second = Calibration {
+        focal_px: 77.0,
+        sigma_log_focal: None,
+        principal_point_px: [1.0, 2.0],
+        aspect: 1.25,
+        radial_k1: 0.01,
+    };
     solution.calibrations.push(second);
     input.raw.views[3].camera_group = 9;
     let result = json(&solution);
     assert_eq!(result["cameras"].as_array().expect("a list").len(), 2);
     assert_eq!(
         keys(&result["cameras"][1]),
-        ["aspect", "focal_px", "focal_unobservable", "principal_point_px", "sigma_log_focal"]
+        ["aspect", "focal_px", "focal_unobservable", "principal_point_px", "radial_k1", "sigma_log_focal"]
     );
     assert_eq!(result["cameras"][1]["aspect"], 1.25);
     assert_eq!(result["cameras"][1]["focal_unobservable"], true);
@@ -128,6 +137,7 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     let first = solution.calibrations[0].focal_px;
     assert_eq!(focal, [first, first, first, 77.0, first]);
     assert_eq!(cameras.views[3].K.expect("metric")[1][1], 77.0 * 1.25);
+    assert_eq!((cameras.views[0].radial_k1, cameras.views[3].radial_k1), (Some(-0.02), Some(0.01)));
 }
 
 #[test]

@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector2};
 use super::bundle::Observation;
 
 /// Common points that a pair of views needs: two more than the four that a homography always fits.
-const LEAST_COMMON: usize = 6;
+pub const LEAST_COMMON: usize = 6;
 /// Rounds of the reweighted direct linear transform; prototypes settle in three.
 const ROUNDS: usize = 5;
 /// Scale of the Cauchy weights in units of the noise of a transferred point.
@@ -24,50 +24,91 @@ const RAYLEIGH_QUANTILE: f64 = 1.665_109_222_315_395_5;
 ///
 /// Returns `None` when no pair of views has enough points in common.
 pub fn median_residual(observations: &[Observation], views: usize, noise: f64) -> Option<f64> {
-    let mut by_view: Vec<Vec<(usize, Vector2<f64>)>> = vec![Vec::new(); views];
-    for seen in observations.iter().filter(|seen| seen.camera < views && seen.xy.iter().all(|x| x.is_finite())) {
-        by_view[seen.camera].push((seen.point, seen.xy));
-    }
-    for view in &mut by_view {
-        view.sort_by_key(|(point, _)| *point);
-        view.dedup_by_key(|(point, _)| *point);
-    }
-    let most_observed = (0..views).max_by_key(|&view| (by_view[view].len(), std::cmp::Reverse(view)))?;
-    let mut references = vec![0, most_observed, views - 1];
+    let seen = Correspondences::new(observations, views);
+    let mut references = vec![0, seen.most_observed()?, views - 1];
     references.sort_unstable();
     references.dedup();
-    references.into_iter().filter_map(|reference| median_to(&by_view, reference, noise)).reduce(f64::max)
+    references.into_iter().filter_map(|reference| median_to(&seen, reference, noise)).reduce(f64::max)
 }
 
 /// Median over the other views of how far homographies to this reference miss.
-fn median_to(by_view: &[Vec<(usize, Vector2<f64>)>], reference: usize, noise: f64) -> Option<f64> {
-    let mut residuals: Vec<f64> = (0..by_view.len())
+fn median_to(seen: &Correspondences, reference: usize, noise: f64) -> Option<f64> {
+    let mut residuals: Vec<f64> = (0..seen.by_view.len())
         .filter(|&view| view != reference)
-        .filter_map(|view| pair_residual(&common(&by_view[reference], &by_view[view]), noise))
+        .filter_map(|view| pair_residual(&seen.common(reference, view), noise))
         .collect();
     residuals.sort_by(f64::total_cmp);
     residuals.get(residuals.len() / 2).copied()
 }
 
-/// Image points of the points that both views see; both lists sorted by point.
-fn common(first: &[(usize, Vector2<f64>)], second: &[(usize, Vector2<f64>)]) -> Vec<(Vector2<f64>, Vector2<f64>)> {
-    let found = first.iter().filter_map(|(point, xy)| {
-        let at = second.binary_search_by_key(point, |(point, _)| *point).ok()?;
-        Some((*xy, second[at].1))
-    });
-    found.collect()
+/// Image points by view, to find what two views have in common.
+#[derive(Debug, Clone)]
+pub struct Correspondences {
+    /// Point and position, sorted by point and without repetition.
+    by_view: Vec<Vec<(usize, Vector2<f64>)>>,
+}
+
+impl Correspondences {
+    /// Sorts the observations; views out of range and what is no number are left out.
+    pub fn new(observations: &[Observation], views: usize) -> Self {
+        let mut by_view: Vec<Vec<(usize, Vector2<f64>)>> = vec![Vec::new(); views];
+        for seen in observations.iter().filter(|seen| seen.camera < views && seen.xy.iter().all(|x| x.is_finite())) {
+            by_view[seen.camera].push((seen.point, seen.xy));
+        }
+        for view in &mut by_view {
+            view.sort_by_key(|(point, _)| *point);
+            view.dedup_by_key(|(point, _)| *point);
+        }
+        Self { by_view }
+    }
+
+    /// The view with the most points, the first of several; `None` without views.
+    pub fn most_observed(&self) -> Option<usize> {
+        (0..self.by_view.len()).max_by_key(|&view| (self.by_view[view].len(), std::cmp::Reverse(view)))
+    }
+
+    /// Positions in both views of the points that both see.
+    ///
+    /// # Panics
+    /// When a view is out of range.
+    pub fn common(&self, first: usize, second: usize) -> Vec<(Vector2<f64>, Vector2<f64>)> {
+        let second = &self.by_view[second];
+        let found = self.by_view[first].iter().filter_map(|(point, xy)| {
+            let at = second.binary_search_by_key(point, |(point, _)| *point).ok()?;
+            Some((*xy, second[at].1))
+        });
+        found.collect()
+    }
 }
 
 /// How far the best homography between two views misses, in units of the noise and corrected for its eight unknowns.
 fn pair_residual(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<f64> {
+    let noise = noise.max(f64::EPSILON);
+    let (_, mut errors) = robust(pairs, noise)?;
+    errors.sort_by(f64::total_cmp);
+    let quantile = errors[((pairs.len() as f64 * QUANTILE) as usize).min(pairs.len() - 1)];
+    let freedom = 1.0 - 4.0 / pairs.len() as f64;
+    let residual = quantile / (RAYLEIGH_QUANTILE * noise * freedom.sqrt());
+    residual.is_finite().then_some(residual)
+}
+
+/// The homography from the first to the second points of these pairs, by a reweighted direct linear transform.
+///
+/// Returns `None` for fewer than [`LEAST_COMMON`] pairs and for pairs that determine none.
+pub fn between(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<Matrix3<f64>> {
+    robust(pairs, noise.max(f64::EPSILON)).map(|(homography, _)| homography)
+}
+
+/// The same with the distance by which it misses each point.
+fn robust(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<(Matrix3<f64>, Vec<f64>)> {
     if pairs.len() < LEAST_COMMON {
         return None;
     }
-    let noise = noise.max(f64::EPSILON);
+    let mut homography = Matrix3::zeros();
     let mut weights = vec![1.0; pairs.len()];
     let mut errors = vec![f64::INFINITY; pairs.len()];
     for _ in 0..ROUNDS {
-        let homography = direct_linear_transform(pairs, &weights)?;
+        homography = direct_linear_transform(pairs, &weights)?;
         for ((error, weight), (from, to)) in errors.iter_mut().zip(&mut weights).zip(pairs) {
             let moved = homography * from.push(1.0);
             *error = (moved.xy() / moved.z - to).norm();
@@ -76,11 +117,7 @@ fn pair_residual(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<f
             *weight = if scale.is_finite() && scale > 0.0 { scale.recip() } else { 0.0 };
         }
     }
-    errors.sort_by(f64::total_cmp);
-    let quantile = errors[((pairs.len() as f64 * QUANTILE) as usize).min(pairs.len() - 1)];
-    let freedom = 1.0 - 4.0 / pairs.len() as f64;
-    let residual = quantile / (RAYLEIGH_QUANTILE * noise * freedom.sqrt());
-    residual.is_finite().then_some(residual)
+    Some((homography, errors))
 }
 
 /// The homography with the least weighted algebraic error, at unit norm.

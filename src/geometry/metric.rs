@@ -1,9 +1,10 @@
 //! From a projective to a metric reconstruction, given the DAQ.
 
-use nalgebra::{Matrix3, Matrix4, Vector3};
+use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
 use super::bundle::Observation;
-use super::bundle::metric::{Pose, Reconstruction};
+use super::bundle::critical::Translating;
+use super::bundle::metric::{Intrinsics, Pose, Reconstruction};
 use super::daq::{Daq, FirstViewFrame};
 
 /// Distance at which points are held, in median depths: beyond it the depth of a point moves no observation, while a
@@ -32,13 +33,39 @@ pub fn upgrade(frame: &FirstViewFrame, daq: &Daq, observations: &[Observation]) 
         let upgraded = uncalibrate * camera * homography;
         poses.push(pose(&upgraded.fixed_columns::<3>(0).into_owned(), &upgraded.column(3).into_owned())?);
     }
-    let points = frame.points.iter().map(|point| {
-        let moved = back * point;
-        let position = moved.xyz() / moved.w;
-        // Only the direction of a point at infinity is known.
-        if position.iter().all(|value| value.is_finite()) { position } else { moved.xyz() * f64::MAX.sqrt() }
-    });
-    let mut reconstruction = Reconstruction { intrinsics: daq.intrinsics, poses, points: points.collect() };
+    let points = frame.points.iter().map(|point| euclidean(&(back * point)));
+    let reconstruction = Reconstruction { intrinsics: daq.intrinsics, poses, points: points.collect() };
+    oriented(reconstruction, observations)
+}
+
+/// A camera that moved without turning as a metric reconstruction, were this its focal length: mirrored and scaled as
+/// [`upgrade`] does.
+///
+/// Returns `None` when the depth is not a number.
+pub fn upgrade_translation(
+    translation: &Translating,
+    focal: f64,
+    observations: &[Observation],
+) -> Option<Reconstruction> {
+    let back = Vector3::new(focal.recip(), focal.recip(), 1.0);
+    let pose = |moved: &Vector3<f64>| Pose { rotation: Matrix3::identity(), translation: moved.component_mul(&back) };
+    let point = |point: &Vector3<f64>| euclidean(&point.xy().push(1.0).component_mul(&back).push(point.z));
+    let reconstruction = Reconstruction {
+        intrinsics: Intrinsics::from_focal(focal),
+        poses: translation.translations.iter().map(pose).collect(),
+        points: translation.points.iter().map(point).collect(),
+    };
+    oriented(reconstruction, observations)
+}
+
+/// Coordinates of a homogeneous point; far out in its direction where it is at infinity.
+fn euclidean(point: &Vector4<f64>) -> Vector3<f64> {
+    let position = point.xyz() / point.w;
+    if position.iter().all(|value| value.is_finite()) { position } else { point.xyz() * f64::MAX.sqrt() }
+}
+
+/// Of the two mirror images the one with more observations in front of their cameras, at a median depth of 1.
+fn oriented(mut reconstruction: Reconstruction, observations: &[Observation]) -> Option<Reconstruction> {
     if cheirality(&reconstruction, observations) < 0.5 {
         reconstruction.poses.iter_mut().for_each(|pose| pose.translation.neg_mut());
         reconstruction.points.iter_mut().for_each(|point| point.neg_mut());

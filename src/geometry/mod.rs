@@ -4,6 +4,7 @@
 //! f64 throughout. May depend on `domain` (the stop token) and linear algebra; knows nothing of networks, jobs or I/O.
 
 pub mod bundle;
+pub mod critical;
 pub mod daq;
 pub mod factorization;
 pub mod homography;

@@ -34,6 +34,9 @@ pub fn headline(solution: &Solution) -> String {
             None => "unobservable".into(),
         };
         card("focal length", format!("{:.1} px", calibration.focal_px), note);
+        if calibration.radial_k1 != 0.0 {
+            card("radial distortion", format!("k1 {}", short(calibration.radial_k1)), "estimated".into());
+        }
     } else if solution.is_focal_unobservable() {
         card("focal length", "none".into(), "unobservable".into());
     }

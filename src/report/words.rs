@@ -8,6 +8,13 @@ pub fn warning(code: WarningCode) -> &'static str {
         WarningCode::PlanarOrRotation => {
             "The points lie on one plane, or the camera only turned. Such views carry no calibration."
         }
+        WarningCode::PlanarScene => "The points lie on one plane. Such views carry no calibration.",
+        WarningCode::PureRotation => {
+            "The camera only turned and did not move. Such views show no depth, and no calibration is taken from them."
+        }
+        WarningCode::PureTranslation => {
+            "The camera moved but did not turn. Such views carry no focal length: every value fits them alike."
+        }
         WarningCode::UnobservableFocal => {
             "The camera's motion leaves the focal length free: many values fit the tracks as well as any other."
         }
@@ -16,8 +23,12 @@ pub fn warning(code: WarningCode) -> &'static str {
             "One constant, distortion-free camera fits notably worse than free cameras do: expect lens distortion, a zoom or a displaced principal point."
         }
         WarningCode::FewInliers => "So few tracks agree that the result can hardly be verified.",
+        WarningCode::PrincipalPointUnobservable => {
+            "The tracks do not tell where the principal point is; it was taken to be near the image centre."
+        }
         WarningCode::Cheirality => "Some points come out behind the cameras that saw them.",
         WarningCode::NoConsensus => "No set of tracks was found that one rigid scene explains.",
+        WarningCode::SecondStructure => "Some of the tracks left out agree on a motion of their own.",
         WarningCode::ViewsLeftOut => "Not every view takes part in the result.",
         WarningCode::AssumedImageSize => {
             "No image size was given, so the extent of the points stood in; the principal point may be off."

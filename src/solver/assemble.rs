@@ -260,12 +260,20 @@ fn final_points(
         if sightings.is_empty() || context.stop.is_stopped() {
             return None;
         }
-        let start = triangulation::linear(&cameras, sightings);
-        dehomogenise(&triangulation::refine(&cameras, sightings, start, POINT_STEPS).0)
+        // These cameras know no distortion.
+        let undone = |seen: &Sighting| Some(Sighting { xy: metric.intrinsics.undistort(&seen.xy)?, ..*seen });
+        let sightings: Vec<Sighting> = sightings.iter().filter_map(undone).collect();
+        if sightings.len() < LEAST_SIGHTINGS {
+            return None;
+        }
+        let start = triangulation::linear(&cameras, &sightings);
+        dehomogenise(&triangulation::refine(&cameras, &sightings, start, POINT_STEPS).0)
     };
     judged.retained.iter().map(triangulated).collect()
 }
 
+/// Sightings that determine a point.
+const LEAST_SIGHTINGS: usize = 2;
 /// Refinement steps of a final point.
 const POINT_STEPS: usize = 10;
 
@@ -295,6 +303,7 @@ fn pixel_calibrations(
         sigma_log_focal,
         principal_point_px: (context.normalization.centres_px[view] + offset).into(),
         aspect: metric.intrinsics.aspect,
+        radial_k1: metric.intrinsics.radial,
     };
     let mut first_of_group = BTreeMap::new();
     for (view, description) in context.input.views().iter().enumerate() {

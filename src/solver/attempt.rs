@@ -9,7 +9,7 @@ use super::recorder::Recorder;
 use super::{Context, Error};
 use super::{depths, extend};
 use crate::domain::result::PriorTime;
-use crate::domain::{Grade, Method, Prior, Stage};
+use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View};
 
 /// Noise that growing starts from when the caller gives none, as a share of the image side. High on purpose: twice too
 /// low loses the scene, ten times too high costs nothing.
@@ -188,6 +188,51 @@ fn calibrate(block: &Block, consensus: &Consensus, context: &Context) -> Result<
         points: &points,
         observations: &observations,
         noise: consensus.noise,
+        focal_prior: focal_prior(block.views.iter().map(|&view| &context.input.views()[view])),
     };
     Ok(calibration::calibrate(&problem, context.scale_px, context.stop)?)
+}
+
+/// What is known beforehand of the one focal length of these views; `None` where nothing is.
+///
+/// The priors of one camera's views tell one piece of knowledge several times: their mean, weighted by information,
+/// has the standard deviation of one of them, not that of a mean. Where they differ, by so much more.
+fn focal_prior<'a>(views: impl Iterator<Item = &'a View>) -> Option<FocalPrior> {
+    let told: Vec<(f64, f64)> = views
+        .filter_map(|view| view.focal_prior)
+        .map(|prior| (prior.focal_px.ln(), prior.sigma_log.powi(-2)))
+        .collect();
+    let total: f64 = told.iter().map(|(_, information)| information).sum();
+    let mean = told.iter().map(|(log, information)| information * log).sum::<f64>() / total;
+    let spread = told.iter().map(|(log, information)| information * (log - mean).powi(2)).sum::<f64>() / total;
+    let sigma_log = (told.len() as f64 / total + spread).sqrt();
+    let usable = mean.is_finite() && sigma_log.is_finite() && sigma_log > 0.0;
+    usable.then(|| FocalPrior { focal_px: mean.exp(), sigma_log })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn prior(views: &[Option<(f64, f64)>]) -> Option<FocalPrior> {
+        let view = |prior: &Option<(f64, f64)>| View {
+            focal_prior: prior.map(|(focal_px, sigma_log)| FocalPrior { focal_px, sigma_log }),
+            ..View::default()
+        };
+        let views: Vec<View> = views.iter().map(view).collect();
+        focal_prior(views.iter())
+    }
+
+    #[test]
+    fn priors_of_several_views_are_one_piece_of_knowledge() {
+        assert_eq!(prior(&[]), None);
+        assert_eq!(prior(&[None, None]), None);
+        let told = prior(&[Some((800.0, 0.1)), None, Some((800.0, 0.1))]).expect("a prior");
+        assert!((told.focal_px - 800.0).abs() < 1e-9 && (told.sigma_log - 0.1).abs() < 1e-12, "{told:?}");
+        let vague = prior(&[Some((800.0, 0.01)), Some((1600.0, 1.0))]).expect("a prior");
+        assert!((vague.focal_px - 800.0).abs() < 1.0, "the vaguer one hardly counts: {vague:?}");
+        let torn = prior(&[Some((800.0, 0.01)), Some((1600.0, 0.01))]).expect("a prior");
+        assert!((torn.sigma_log - 0.5 * 2f64.ln()).abs() < 1e-3, "{torn:?}");
+        assert_eq!(prior(&[Some((800.0, f64::MAX))]), None, "nothing is known");
+    }
 }

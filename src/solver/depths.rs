@@ -8,7 +8,9 @@ use super::grow::Consensus;
 use super::search::Seed;
 use super::search::rigid::{Rigid, Search};
 use crate::domain::{Grade, StopToken};
-use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, Pose, Reconstruction, intrinsics_variance};
+use crate::geometry::bundle::metric::{
+    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
+};
 use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::triangulation;
@@ -62,8 +64,8 @@ pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop:
     let inliers = consensus.inliers();
     let mut outcome = Outcome::refused(vec![few_inliers(inliers.len())]);
     let observations: Vec<Observation> = super::grow::observations_of(block, &inliers);
-    let model = IntrinsicsModel::Focal;
-    let unknowns = 6 * block.views() + 3 * inliers.len() + model.freedom() - SIMILARITY;
+    let model = IntrinsicsModel::FOCAL;
+    let unknowns = 6 * block.views() + 3 * inliers.len() + model.parameters().len() - SIMILARITY;
     let freedom = (2 * observations.len()).saturating_sub(unknowns);
     if freedom < LEAST_FREEDOM {
         return outcome;
@@ -74,10 +76,10 @@ pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop:
         relative_tolerance: ADJUSTMENT_TOLERANCE,
         ..Options::default()
     };
-    let report = metric::adjust(&mut found, &observations, model, &options, stop);
+    let report = metric::adjust(&mut found, &observations, model, &IntrinsicsPrior::NONE, &options, stop);
     let noise = consensus.noise.max((report.cost / freedom as f64).sqrt());
-    let sigma = intrinsics_variance(&found, &observations, model)
-        .log_focal
+    let sigma = Information::new(&found, &observations)
+        .and_then(|information| information.optimum(model, &IntrinsicsPrior::NONE).variance_of(Parameter::LogFocal))
         .map(|variance| variance.sqrt() * noise)
         .filter(|sigma| sigma.is_finite());
     let cheirality = crate::geometry::metric::cheirality(&found, &observations);

@@ -1,13 +1,15 @@
 //! How well the intrinsics are determined, whatever the gauge.
 
 use faer::{MatRef, Side};
-use nalgebra::{DMatrix, SMatrix};
+use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
 use super::engine::Layout;
-use super::metric::{IntrinsicsModel, Metric, POINT, POSE, Reconstruction};
+use super::intrinsics::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter};
+use super::metric::{Metric, POINT, POSE, Reconstruction};
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation};
 
+const PARAMETERS: usize = Parameter::COUNT;
 /// Dimensions of a similarity: directions of the poses that no observation can see.
 const GAUGE: usize = 7;
 /// Eigenvalue of the poses' scaled information, relative to the largest, that counts as null beside the gauge:
@@ -16,73 +18,141 @@ const NULL_POSE: f64 = 1e-11;
 /// The same for the information on the intrinsics, scaled by what they would have with everything else known.
 const NULL_INTRINSICS: f64 = 1e-10;
 
-/// Variances of the intrinsics for observations with unit variance; multiply by the squared noise.
+/// What the observations say of all the intrinsics together, poses and points marginalised, at one reconstruction.
 ///
-/// `None`: the observations do not determine it (the variance is infinite). Fixed intrinsics have variance 0.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct IntrinsicsVariance {
-    /// Of the natural logarithm.
-    pub log_focal: Option<f64>,
-    pub principal_point: [Option<f64>; 2],
-    /// Of the natural logarithm.
-    pub log_aspect: Option<f64>,
+/// For observations with unit variance. From one linearisation it tells of every model at once where its minimum is,
+/// how low, and how well determined: a score test in place of an adjustment a model.
+#[derive(Debug, Clone, Copy)]
+pub struct Information {
+    intrinsics: Intrinsics,
+    matrix: SMatrix<f64, PARAMETERS, PARAMETERS>,
+    /// Half the downward gradient of the cost.
+    pull: SVector<f64, PARAMETERS>,
+    /// The matrix' diagonal were poses and points known.
+    known: [f64; PARAMETERS],
 }
 
-/// Variances of the free intrinsics with poses and points marginalised, at this reconstruction.
+/// The minimum of the cost over the intrinsics of one model, to second order; indexed by [`Parameter`].
 ///
-/// The seven directions of a similarity are projected out; a null direction of what remains makes every intrinsic
-/// that takes part in it infinite, rather than vanish in a pseudo-inverse.
-pub fn intrinsics_variance(
-    reconstruction: &Reconstruction,
-    observations: &[Observation],
-    model: IntrinsicsModel,
-) -> IntrinsicsVariance {
-    let [log_focal, px, py, log_aspect] = match model {
-        IntrinsicsModel::Fixed => [Some(0.0); 4],
-        IntrinsicsModel::Focal => variances::<1>(reconstruction, observations),
-        IntrinsicsModel::FocalPrincipalPoint => variances::<3>(reconstruction, observations),
-        IntrinsicsModel::FocalPrincipalPointAspect => variances::<4>(reconstruction, observations),
-    };
-    IntrinsicsVariance { log_focal, principal_point: [px, py], log_aspect }
+/// Parameters that the model does not free are where a pinhole has them, a focal length that it does not free stays.
+#[derive(Debug, Clone, Copy)]
+pub struct Optimum {
+    /// Value there minus value here.
+    pub shift: [f64; PARAMETERS],
+    /// Variances for observations with unit variance; multiply by the squared noise. `None`: the observations do not
+    /// determine it (the variance is infinite). What is not free has variance 0.
+    pub variance: [Option<f64>; PARAMETERS],
+    /// Cost there, prior included, minus the cost of the observations here.
+    pub rise: f64,
+    /// Natural logarithm of the determinant of the information on what is free. Null directions count as barely known.
+    pub log_determinant: f64,
 }
 
-/// Variance of each of the four intrinsics, the first `G` being free.
-fn variances<const G: usize>(reconstruction: &Reconstruction, observations: &[Observation]) -> [Option<f64>; 4] {
-    let free = information::<G>(reconstruction, observations).map(|(information, known)| invert(&information, &known));
-    std::array::from_fn(|k| if k < G { free.and_then(|free| free[k]) } else { Some(0.0) })
+impl Optimum {
+    /// Variance of one parameter.
+    pub fn variance_of(&self, parameter: Parameter) -> Option<f64> {
+        self.variance[parameter as usize]
+    }
 }
 
-/// Information on the intrinsics with poses and points marginalised, and its diagonal with both known.
-fn information<const G: usize>(
-    reconstruction: &Reconstruction,
-    observations: &[Observation],
-) -> Option<(SMatrix<f64, G, G>, [f64; G])> {
-    let poses = reconstruction.poses.len();
-    if poses == 0 {
-        return None;
+impl Information {
+    /// Linearises at this reconstruction.
+    ///
+    /// The seven directions of a similarity are projected out. Returns `None` without poses, or where the system
+    /// holds what is no number.
+    pub fn new(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
+        let poses = reconstruction.poses.len();
+        if poses == 0 {
+            return None;
+        }
+        let layout = Layout::new(observations, poses, reconstruction.points.len());
+        let problem =
+            Metric { reconstruction: reconstruction.clone(), free: Parameter::ALL, prior: IntrinsicsPrior::NONE };
+        let mut linearisation = Linearisation::<PARAMETERS, POSE, POINT>::new(&layout, poses);
+        linearisation.fill(&problem, &layout, Loss::Squared);
+        let known = std::array::from_fn(|k| linearisation.globals_diagonal()[k]);
+        let mut reduced = Reduced::new(&layout, poses);
+        if !reduced.build(&problem, &layout, &linearisation, 0.0) {
+            return None;
+        }
+        let (matrix, pull) = without_poses(&reduced.matrix, &reduced.vector, POSE * poses)?;
+        let finite = matrix.iter().chain(pull.iter()).all(|value| value.is_finite());
+        finite.then_some(Self { intrinsics: reconstruction.intrinsics, matrix, pull, known })
     }
-    let layout = Layout::new(observations, poses, reconstruction.points.len());
-    let problem = Metric::<G>(reconstruction.clone());
-    let mut linearisation = Linearisation::<G, POSE, POINT>::new(&layout, poses);
-    linearisation.fill(&problem, &layout, Loss::Squared);
-    let known = std::array::from_fn(|k| linearisation.globals_diagonal()[k]);
-    let mut reduced = Reduced::new(&layout, poses);
-    if !reduced.build(&problem, &layout, &linearisation, 0.0) {
-        return None;
+
+    /// Where the cost of a model is least, how low it is there, and how well that is determined.
+    ///
+    /// A null direction of the information makes every parameter that takes part in it infinitely uncertain, rather
+    /// than vanish in a pseudo-inverse.
+    pub fn optimum(&self, model: IntrinsicsModel, prior: &IntrinsicsPrior) -> Optimum {
+        let free: Vec<usize> = model.parameters().into_iter().map(|parameter| parameter as usize).collect();
+        let mut shift = SVector::<f64, PARAMETERS>::zeros();
+        for parameter in Parameter::ALL {
+            if parameter != Parameter::LogFocal && !free.contains(&(parameter as usize)) {
+                shift[parameter as usize] = -self.intrinsics.value(parameter);
+            }
+        }
+        let deviation = Parameter::ALL.map(|parameter| prior.deviation(parameter, &self.intrinsics));
+        let pull = self.pull - self.matrix * shift;
+        let scale: Vec<f64> = free.iter().map(|&k| scale_of(self.known[k] + prior.information[k])).collect();
+        let scaled = DMatrix::from_fn(free.len(), free.len(), |row, column| {
+            let (k, l) = (free[row], free[column]);
+            let believed = if k == l { prior.information[k] } else { 0.0 };
+            (self.matrix[(k, l)] + believed) * scale[row] * scale[column]
+        });
+        let target = DVector::from_fn(free.len(), |row, _| {
+            let k = free[row];
+            (pull[k] - prior.information[k] * deviation[k]) * scale[row]
+        });
+        let eigen = scaled.symmetric_eigen();
+        let mut variance = [Some(0.0); PARAMETERS];
+        let mut log_determinant = -2.0 * scale.iter().map(|scale| scale.ln()).sum::<f64>();
+        for (direction, &value) in eigen.eigenvalues.iter().enumerate() {
+            log_determinant += value.max(NULL_INTRINSICS).ln();
+            let vector = eigen.eigenvectors.column(direction);
+            let along = vector.dot(&target);
+            for (row, &k) in free.iter().enumerate() {
+                let share = vector[row].powi(2);
+                if value > NULL_INTRINSICS {
+                    shift[k] += scale[row] * vector[row] * along / value;
+                    variance[k] = variance[k].map(|sum| sum + share / value * scale[row].powi(2));
+                } else if share > NULL_INTRINSICS {
+                    variance[k] = None;
+                }
+            }
+        }
+        let believed: f64 = free.iter().map(|&k| prior.information[k] * (deviation[k] + shift[k]).powi(2)).sum();
+        let rise = shift.dot(&(self.matrix * shift)) - 2.0 * self.pull.dot(&shift) + believed;
+        Optimum { shift: shift.into(), variance, rise, log_determinant }
     }
-    let dimension = G + POSE * poses;
-    let full = DMatrix::from_column_slice(dimension, dimension, &reduced.matrix);
-    let mut information = SMatrix::<f64, G, G>::from_fn(|row, column| full[(row.max(column), row.min(column))]);
+}
+
+/// Unit information for a parameter of which something is known.
+fn scale_of(information: f64) -> f64 {
+    if information > 0.0 { information.sqrt().recip() } else { 1.0 }
+}
+
+/// Eliminates the poses from the reduced system, whose first unknowns are the intrinsics; its lower triangle is given.
+fn without_poses(
+    matrix: &[f64],
+    vector: &[f64],
+    n: usize,
+) -> Option<(SMatrix<f64, PARAMETERS, PARAMETERS>, SVector<f64, PARAMETERS>)> {
+    let dimension = PARAMETERS + n;
+    let full = DMatrix::from_column_slice(dimension, dimension, matrix);
+    let symmetric = |row: usize, column: usize| full[(row.max(column), row.min(column))];
+    let mut information = SMatrix::from_fn(symmetric);
+    let mut pull = SVector::from_fn(|row, _| vector[row]);
     // Unit diagonal, so that rotations and translations are compared alike.
-    let scale: Vec<f64> = (G..dimension).map(|k| full[(k, k)].max(f64::MIN_POSITIVE).sqrt().recip()).collect();
-    let scaled = DMatrix::from_fn(dimension - G, dimension - G, |row, column| {
-        full[(G + row.max(column), G + row.min(column))] * scale[row] * scale[column]
+    let scale: Vec<f64> = (PARAMETERS..dimension).map(|k| full[(k, k)].max(f64::MIN_POSITIVE).sqrt().recip()).collect();
+    let scaled = DMatrix::from_fn(n, n, |row, column| {
+        symmetric(PARAMETERS + row, PARAMETERS + column) * scale[row] * scale[column]
     });
     if scaled.iter().any(|value| !value.is_finite()) {
         return None;
     }
-    let coupling = DMatrix::from_fn(dimension - G, G, |row, column| full[(G + row, column)] * scale[row]);
-    let n = dimension - G;
+    let coupling = DMatrix::from_fn(n, PARAMETERS, |row, column| full[(PARAMETERS + row, column)] * scale[row]);
+    let gradient = DVector::from_fn(n, |row, _| vector[PARAMETERS + row] * scale[row]);
     let eigen = MatRef::from_column_major_slice(scaled.as_slice(), n, n).self_adjoint_eigen(Side::Lower).ok()?;
     // Eigenvalues come in ascending order.
     let largest = eigen.S()[n - 1];
@@ -91,42 +161,31 @@ fn information<const G: usize>(
         if value <= NULL_POSE * largest {
             continue;
         }
-        let direction = nalgebra::DVector::from_fn(n, |row, _| eigen.U()[(row, k)]);
-        let along = SMatrix::<f64, G, 1>::from_fn(|row, _| coupling.column(row).dot(&direction));
+        let direction = DVector::from_fn(n, |row, _| eigen.U()[(row, k)]);
+        let along = SVector::<f64, PARAMETERS>::from_fn(|row, _| coupling.column(row).dot(&direction));
         information -= along * along.transpose() / value;
+        pull -= along * (gradient.dot(&direction) / value);
     }
-    Some((information, known))
-}
-
-/// Diagonal of the inverse; `None` where a null direction takes part.
-fn invert<const G: usize>(information: &SMatrix<f64, G, G>, known: &[f64; G]) -> [Option<f64>; G] {
-    let scale: [f64; G] = std::array::from_fn(|k| if known[k] > 0.0 { known[k].sqrt().recip() } else { 0.0 });
-    let scaled = DMatrix::from_fn(G, G, |row, column| information[(row, column)] * scale[row] * scale[column]);
-    if scaled.iter().any(|value| !value.is_finite()) {
-        return [None; G];
-    }
-    let eigen = scaled.symmetric_eigen();
-    std::array::from_fn(|k| {
-        let mut variance = 0.0;
-        for (direction, &value) in eigen.eigenvalues.iter().enumerate() {
-            let share = eigen.eigenvectors[(k, direction)].powi(2);
-            if value > NULL_INTRINSICS {
-                variance += share / value;
-            } else if share > NULL_INTRINSICS {
-                return None;
-            }
-        }
-        (scale[k] > 0.0).then(|| variance * scale[k] * scale[k])
-    })
+    Some((information, pull))
 }
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector2;
+
+    use super::super::Options;
+    use super::super::metric::{Extension, adjust};
     use super::super::testing::{self, Motion, NOISE, TestScene};
     use super::*;
+    use crate::domain::StopToken;
 
-    fn reconstruction(scene: &TestScene) -> Reconstruction {
+    fn truth(scene: &TestScene) -> Reconstruction {
         Reconstruction { intrinsics: scene.intrinsics, poses: scene.poses.clone(), points: scene.points.clone() }
+    }
+
+    fn optimum(scene: &TestScene, model: IntrinsicsModel) -> Optimum {
+        let information = Information::new(&truth(scene), &scene.observations).expect("poses");
+        information.optimum(model, &IntrinsicsPrior::NONE)
     }
 
     #[test]
@@ -134,10 +193,9 @@ mod tests {
         for motion in [Motion::Translation, Motion::Forward] {
             for seed in 0..3 {
                 let scene = testing::scene_of(seed, 10, 20, 0.0, motion, false);
-                let variance =
-                    intrinsics_variance(&reconstruction(&scene), &scene.observations, IntrinsicsModel::Focal);
-                println!("{motion:?} seed {seed}: {variance:?}");
-                assert_eq!(variance.log_focal, None, "{motion:?} seed {seed}");
+                let optimum = optimum(&scene, IntrinsicsModel::FOCAL);
+                println!("{motion:?} seed {seed}: {optimum:?}");
+                assert_eq!(optimum.variance_of(Parameter::LogFocal), None, "{motion:?} seed {seed}");
             }
         }
     }
@@ -147,17 +205,61 @@ mod tests {
         for seed in 0..3 {
             let scene = testing::scene(seed, 10, 20, 0.0);
             let deviation = |model| {
-                let variance = intrinsics_variance(&reconstruction(&scene), &scene.observations, model);
-                assert!(variance.principal_point.iter().all(Option::is_some), "seed {seed}: {variance:?}");
-                variance.log_focal.expect("observable").sqrt() * NOISE
+                let optimum = optimum(&scene, model);
+                assert!(optimum.variance.iter().all(Option::is_some), "seed {seed}: {optimum:?}");
+                optimum.variance_of(Parameter::LogFocal).expect("observable").sqrt() * NOISE
             };
-            let alone = deviation(IntrinsicsModel::Focal);
-            let with_centre = deviation(IntrinsicsModel::FocalPrincipalPoint);
-            let with_aspect = deviation(IntrinsicsModel::FocalPrincipalPointAspect);
-            println!("seed {seed}: sigma of log f {alone:.5}, {with_centre:.5}, {with_aspect:.5}");
+            let model = IntrinsicsModel::FOCAL.with(Extension::PrincipalPoint);
+            let chain = [IntrinsicsModel::FOCAL, model, model.with(Extension::Aspect), IntrinsicsModel::FULL];
+            let sigmas = chain.map(deviation);
+            println!("seed {seed}: sigma of log f {sigmas:.5?}");
             // Cramer-Rao bound of this setting: median .5 % over scenes.
-            assert!((1e-4..0.02).contains(&alone), "seed {seed}: {alone}");
-            assert!(with_centre >= alone && with_aspect >= with_centre);
+            assert!((1e-4..0.02).contains(&sigmas[0]), "seed {seed}: {sigmas:?}");
+            assert!(sigmas.windows(2).all(|pair| pair[1] >= pair[0]), "seed {seed}: {sigmas:?}");
+        }
+    }
+
+    /// What one linearisation foretells of a richer model, an adjustment of that model finds.
+    #[test]
+    fn the_optimum_of_a_richer_model_is_foretold() {
+        for seed in 0..5 {
+            let mut scene = testing::scene(seed, 8, 40, 0.0);
+            scene.intrinsics.principal_point = Vector2::new(0.002, -0.001);
+            scene.intrinsics.radial = 0.001;
+            scene.observe(0.0005, &mut rand::SeedableRng::seed_from_u64(seed));
+            let adjusted = |start: &Reconstruction, model, prior: &IntrinsicsPrior| {
+                let mut start = start.clone();
+                let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
+                let stop = StopToken::default();
+                let report = adjust(&mut start, &scene.observations, model, prior, &options, &stop);
+                (start, report.cost)
+            };
+            let prior = IntrinsicsPrior::NONE.knowing(Parameter::PrincipalX, 0.001, 0.01, 0.0005);
+            let mut pinhole = truth(&scene);
+            pinhole.intrinsics = Intrinsics::from_focal(scene.intrinsics.focal);
+            let (simple, cost) = adjusted(&pinhole, IntrinsicsModel::FOCAL, &prior);
+            let information = Information::new(&simple, &scene.observations).expect("poses");
+            for model in IntrinsicsModel::all() {
+                let foretold = information.optimum(model, &prior);
+                let (found, found_cost) = adjusted(&simple, model, &prior);
+                let rise = found_cost - cost;
+                for parameter in Parameter::ALL {
+                    let shift = found.intrinsics.value(parameter) - simple.intrinsics.value(parameter);
+                    let sigma = foretold.variance_of(parameter).expect("observable").sqrt() * 0.0005;
+                    let error = (foretold.shift[parameter as usize] - shift).abs();
+                    assert!(error <= 0.1 * sigma + 1e-9, "seed {seed}, {}: {parameter:?} off by {error}", model.name());
+                }
+                let error = (foretold.rise - rise).abs() / (0.0005 * 0.0005);
+                println!("seed {seed}, {}: chi-square off by {error:.3}", model.name());
+                assert!(error < 0.2, "seed {seed}, {}: {error}", model.name());
+            }
+            // And back: from the richest model to the simple one.
+            let (rich, rich_cost) = adjusted(&simple, IntrinsicsModel::FULL, &prior);
+            let information = Information::new(&rich, &scene.observations).expect("poses");
+            let back = information.optimum(IntrinsicsModel::FOCAL, &prior);
+            let believed = prior.cost(IntrinsicsModel::FULL, &rich.intrinsics);
+            let error = (back.rise - (cost - rich_cost + believed)).abs() / (0.0005 * 0.0005);
+            assert!(error < 0.02 * (cost - rich_cost) / (0.0005 * 0.0005) + 0.2, "seed {seed}: {error}");
         }
     }
 }

@@ -58,6 +58,19 @@ impl<const G: usize, const C: usize, const P: usize> Step<G, C, P> {
     }
 }
 
+/// What is known of a global unknown beforehand.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Belief {
+    /// What a squared deviation costs.
+    pub information: f64,
+    /// Present minus expected value.
+    pub deviation: f64,
+}
+
+impl Belief {
+    pub const NONE: Self = Self { information: 0.0, deviation: 0.0 };
+}
+
 /// A bundle adjustment: `G` unknowns shared by all views, `C` a camera, `P` a point.
 pub(super) trait Problem<const G: usize, const C: usize, const P: usize>: Clone {
     fn camera_count(&self) -> usize;
@@ -66,6 +79,10 @@ pub(super) trait Problem<const G: usize, const C: usize, const P: usize>: Clone 
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, C, P>);
     /// Overwrites `self` with `from` moved by `step`; both have the same counts.
     fn retract(&mut self, from: &Self, step: &Step<G, C, P>);
+    /// What is known of the globals where they are.
+    fn global_beliefs(&self) -> [Belief; G] {
+        [Belief::NONE; G]
+    }
     /// Direction in which a homogeneous camera moves without changing any residual; zero where there is none.
     fn camera_gauge(&self, _camera: usize) -> SVector<f64, C> {
         SVector::zeros()
@@ -131,7 +148,8 @@ fn cost<const G: usize, const C: usize, const P: usize>(
     for seen in &layout.observations {
         problem.observe(seen, &mut total);
     }
-    total.sum
+    let beliefs = problem.global_beliefs();
+    total.sum + beliefs.iter().map(|belief| belief.information * belief.deviation.powi(2)).sum::<f64>()
 }
 
 /// Minimises the loss over all unknowns, starting from and ending in `problem`.

@@ -2,76 +2,15 @@
 
 use nalgebra::{Matrix3, Matrix3x4, Rotation3, SMatrix, Vector2, Vector3};
 
-pub use super::covariance::{IntrinsicsVariance, intrinsics_variance};
-use super::engine::{Jacobian, Problem, Sink, Step, minimise};
+pub use super::covariance::{Information, Optimum};
+use super::engine::{Belief, Jacobian, Problem, Sink, Step, minimise};
+pub use super::intrinsics::{Extension, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter};
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
 
 /// Unknowns of a pose (rotation vector, then translation) and of a point.
 pub(super) const POSE: usize = 6;
 pub(super) const POINT: usize = 3;
-
-/// Pinhole intrinsics in normalised image units, without skew: `x = f u + px`, `y = a f v + py` for a point at
-/// `(u, v, 1)` in front of the camera.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Intrinsics {
-    pub focal: f64,
-    /// Relative to the guessed principal point, which is the origin of normalised coordinates.
-    pub principal_point: Vector2<f64>,
-    /// Height of the pixels' scale over its width: 1 for square pixels.
-    pub aspect: f64,
-}
-
-impl Intrinsics {
-    /// Square pixels and the principal point where it was guessed.
-    pub fn from_focal(focal: f64) -> Self {
-        Self { focal, principal_point: Vector2::zeros(), aspect: 1.0 }
-    }
-
-    /// The calibration matrix `K`.
-    pub fn matrix(&self) -> Matrix3<f64> {
-        let [px, py] = [self.principal_point.x, self.principal_point.y];
-        Matrix3::new(self.focal, 0.0, px, 0.0, self.aspect * self.focal, py, 0.0, 0.0, 1.0)
-    }
-
-    /// Image of a point in camera coordinates; infinite or not a number at depth zero.
-    #[inline]
-    pub fn project(&self, seen: &Vector3<f64>) -> Vector2<f64> {
-        let (u, v) = (seen.x / seen.z, seen.y / seen.z);
-        Vector2::new(self.focal * u, self.aspect * self.focal * v) + self.principal_point
-    }
-}
-
-/// Which intrinsics are free; each model contains the one before it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum IntrinsicsModel {
-    Fixed,
-    Focal,
-    FocalPrincipalPoint,
-    FocalPrincipalPointAspect,
-}
-
-impl IntrinsicsModel {
-    /// Number of free intrinsics.
-    pub fn freedom(self) -> usize {
-        match self {
-            IntrinsicsModel::Fixed => 0,
-            IntrinsicsModel::Focal => 1,
-            IntrinsicsModel::FocalPrincipalPoint => 3,
-            IntrinsicsModel::FocalPrincipalPointAspect => 4,
-        }
-    }
-
-    /// What is free, in words.
-    pub fn name(self) -> &'static str {
-        match self {
-            IntrinsicsModel::Fixed => "nothing",
-            IntrinsicsModel::Focal => "focal length",
-            IntrinsicsModel::FocalPrincipalPoint => "focal length and principal point",
-            IntrinsicsModel::FocalPrincipalPointAspect => "focal length, principal point and aspect",
-        }
-    }
-}
 
 /// World to camera: `x = R X + t`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -114,67 +53,82 @@ impl Reconstruction {
     }
 }
 
-/// A reconstruction whose first `G` intrinsics are free, in the order log focal, principal point, log aspect.
-///
-/// Focal and aspect move by factors: they stay positive, and a variance is one of the logarithm.
+/// A reconstruction with these `G` intrinsics free.
 #[derive(Clone)]
-pub(super) struct Metric<const G: usize>(pub Reconstruction);
+pub(super) struct Metric<const G: usize> {
+    pub reconstruction: Reconstruction,
+    pub free: [Parameter; G],
+    pub prior: IntrinsicsPrior,
+}
 
 impl<const G: usize> Problem<G, POSE, POINT> for Metric<G> {
     fn camera_count(&self) -> usize {
-        self.0.poses.len()
+        self.reconstruction.poses.len()
     }
 
     fn point_count(&self) -> usize {
-        self.0.points.len()
+        self.reconstruction.points.len()
     }
 
     #[inline]
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, POSE, POINT>) {
-        let pose = &self.0.poses[observation.camera];
-        let turned = pose.rotation * self.0.points[observation.point];
+        let pose = &self.reconstruction.poses[observation.camera];
+        let turned = pose.rotation * self.reconstruction.points[observation.point];
         let seen = turned + pose.translation;
-        let intrinsics = &self.0.intrinsics;
+        let intrinsics = &self.reconstruction.intrinsics;
         sink.take(intrinsics.project(&seen) - observation.xy, || {
             let scale = seen.z.recip();
             let (u, v) = (seen.x * scale, seen.y * scale);
             let (fx, fy) = (intrinsics.focal, intrinsics.aspect * intrinsics.focal);
-            // Gradients of the two image coordinates with respect to the intrinsics and to the camera coordinates.
-            let by_intrinsics = [[fx * u, 1.0, 0.0, 0.0], [fy * v, 0.0, 1.0, fy * v]];
-            let by_seen =
-                [Vector3::new(fx * scale, 0.0, -fx * u * scale), Vector3::new(0.0, fy * scale, -fy * v * scale)];
+            let squared = u * u + v * v;
+            let radial = 1.0 + intrinsics.radial * squared;
+            let (x, y) = (fx * u * radial, fy * v * radial);
+            // Gradients of the two image coordinates with respect to the intrinsics, in the order of `Parameter`, and
+            // to u and v; by z the image moves as by -u and -v.
+            let by_intrinsics = [[x, 1.0, 0.0, 0.0, fx * u * squared], [y, 0.0, 1.0, y, fy * v * squared]];
+            let bend = 2.0 * intrinsics.radial;
+            let by_uv =
+                [[fx * (radial + bend * u * u), fx * bend * u * v], [fy * bend * u * v, fy * (radial + bend * v * v)]];
             let mut camera = SMatrix::<f64, POSE, 2>::zeros();
             let mut point = SMatrix::<f64, POINT, 2>::zeros();
-            for (component, by_seen) in by_seen.iter().enumerate() {
-                camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(by_seen));
-                camera.fixed_view_mut::<3, 1>(3, component).copy_from(by_seen);
-                point.set_column(component, &pose.rotation.tr_mul(by_seen));
+            for (component, [by_u, by_v]) in by_uv.into_iter().enumerate() {
+                let by_seen = Vector3::new(by_u, by_v, -by_u * u - by_v * v) * scale;
+                camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(&by_seen));
+                camera.fixed_view_mut::<3, 1>(3, component).copy_from(&by_seen);
+                point.set_column(component, &pose.rotation.tr_mul(&by_seen));
             }
-            let globals = SMatrix::from_fn(|parameter, component| by_intrinsics[component][parameter]);
+            let globals = SMatrix::from_fn(|k, component| by_intrinsics[component][self.free[k] as usize]);
             Jacobian { globals, camera, point }
         });
     }
 
     fn retract(&mut self, from: &Self, step: &Step<G, POSE, POINT>) {
-        let free = |parameter: usize| if parameter < G { step.globals[parameter] } else { 0.0 };
-        let intrinsics = &from.0.intrinsics;
-        self.0.intrinsics = Intrinsics {
-            focal: intrinsics.focal * free(0).exp(),
-            principal_point: intrinsics.principal_point + Vector2::new(free(1), free(2)),
-            aspect: intrinsics.aspect * free(3).exp(),
-        };
-        for ((pose, from), step) in self.0.poses.iter_mut().zip(&from.0.poses).zip(&step.cameras) {
+        let (moved, from) = (&mut self.reconstruction, &from.reconstruction);
+        moved.intrinsics = from.intrinsics;
+        for (parameter, by) in self.free.iter().zip(step.globals.iter()) {
+            moved.intrinsics.shift(*parameter, *by);
+        }
+        for ((pose, from), step) in moved.poses.iter_mut().zip(&from.poses).zip(&step.cameras) {
             let turn = Rotation3::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
             pose.rotation = turn * from.rotation;
             pose.translation = from.translation + step.fixed_rows::<3>(3);
         }
-        for ((point, from), step) in self.0.points.iter_mut().zip(&from.0.points).zip(&step.points) {
+        for ((point, from), step) in moved.points.iter_mut().zip(&from.points).zip(&step.points) {
             *point = from + step;
         }
     }
+
+    fn global_beliefs(&self) -> [Belief; G] {
+        self.free.map(|parameter| Belief {
+            information: self.prior.information[parameter as usize],
+            deviation: self.prior.deviation(parameter, &self.reconstruction.intrinsics),
+        })
+    }
 }
 
-/// Minimises the reprojection error over poses, points and the free intrinsics.
+/// Minimises the reprojection error over poses, points and the free intrinsics, of which `prior` knows something.
+///
+/// The cost contains what the prior adds.
 ///
 /// # Pitfall
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
@@ -182,27 +136,36 @@ pub fn adjust(
     reconstruction: &mut Reconstruction,
     observations: &[Observation],
     model: IntrinsicsModel,
+    prior: &IntrinsicsPrior,
     options: &Options,
     stop: &StopToken,
 ) -> Report {
-    match model {
-        IntrinsicsModel::Fixed => adjust_free::<0>(reconstruction, observations, options, stop),
-        IntrinsicsModel::Focal => adjust_free::<1>(reconstruction, observations, options, stop),
-        IntrinsicsModel::FocalPrincipalPoint => adjust_free::<3>(reconstruction, observations, options, stop),
-        IntrinsicsModel::FocalPrincipalPointAspect => adjust_free::<4>(reconstruction, observations, options, stop),
+    let run = Run { observations, prior, options, stop };
+    match model.parameters().as_slice() {
+        [] => run.with([], reconstruction),
+        &[a] => run.with([a], reconstruction),
+        &[a, b] => run.with([a, b], reconstruction),
+        &[a, b, c] => run.with([a, b, c], reconstruction),
+        &[a, b, c, d] => run.with([a, b, c, d], reconstruction),
+        _ => run.with(Parameter::ALL, reconstruction),
     }
 }
 
-fn adjust_free<const G: usize>(
-    reconstruction: &mut Reconstruction,
-    observations: &[Observation],
-    options: &Options,
-    stop: &StopToken,
-) -> Report {
-    let mut problem = Metric::<G>(reconstruction.clone());
-    let report = minimise(&mut problem, observations, options, stop);
-    *reconstruction = problem.0;
-    report
+/// What an adjustment works with, whatever is free.
+struct Run<'a> {
+    observations: &'a [Observation],
+    prior: &'a IntrinsicsPrior,
+    options: &'a Options,
+    stop: &'a StopToken,
+}
+
+impl Run<'_> {
+    fn with<const G: usize>(&self, free: [Parameter; G], reconstruction: &mut Reconstruction) -> Report {
+        let mut problem = Metric { reconstruction: reconstruction.clone(), free, prior: *self.prior };
+        let report = minimise(&mut problem, self.observations, self.options, self.stop);
+        *reconstruction = problem.reconstruction;
+        report
+    }
 }
 
 #[cfg(test)]
@@ -232,10 +195,17 @@ mod tests {
         let mut start = perturbed(&scene, 0.01, 1);
         start.intrinsics.principal_point = Vector2::new(0.03, -0.02);
         start.intrinsics.aspect = 1.1;
-        testing::check_jacobian(&Metric::<0>(start.clone()), &scene.observations);
-        testing::check_jacobian(&Metric::<1>(start.clone()), &scene.observations);
-        testing::check_jacobian(&Metric::<3>(start.clone()), &scene.observations);
-        testing::check_jacobian(&Metric::<4>(start), &scene.observations);
+        for radial in [0.0, -0.1] {
+            start.intrinsics.radial = radial;
+            let with = |reconstruction: &Reconstruction| (reconstruction.clone(), IntrinsicsPrior::NONE);
+            let (reconstruction, prior) = with(&start);
+            testing::check_jacobian(&Metric { reconstruction, free: [], prior }, &scene.observations);
+            let (reconstruction, prior) = with(&start);
+            let free = [Parameter::LogFocal, Parameter::Radial];
+            testing::check_jacobian(&Metric { reconstruction, free, prior }, &scene.observations);
+            let (reconstruction, prior) = with(&start);
+            testing::check_jacobian(&Metric { reconstruction, free: Parameter::ALL, prior }, &scene.observations);
+        }
     }
 
     #[test]
@@ -246,7 +216,8 @@ mod tests {
             let report = adjust(
                 &mut start,
                 &scene.observations,
-                IntrinsicsModel::Focal,
+                IntrinsicsModel::FOCAL,
+                &IntrinsicsPrior::NONE,
                 &Options { max_iterations: 60, ..Options::default() },
                 &StopToken::default(),
             );
@@ -265,12 +236,38 @@ mod tests {
     }
 
     #[test]
+    fn a_prior_moves_its_parameter_by_what_it_is_worth() {
+        let scene = testing::scene(4, 6, 20, NOISE);
+        let adjusted = |prior: &IntrinsicsPrior| {
+            let mut start = truth(&scene);
+            let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::default() };
+            let report =
+                adjust(&mut start, &scene.observations, IntrinsicsModel::FOCAL, prior, &options, &StopToken::default());
+            (start.intrinsics.focal.ln(), report.cost)
+        };
+        let (free, cost) = adjusted(&IntrinsicsPrior::NONE);
+        let mut reconstruction = truth(&scene);
+        reconstruction.intrinsics.focal = free.exp();
+        let information = Information::new(&reconstruction, &scene.observations).expect("poses");
+        let optimum = information.optimum(IntrinsicsModel::FOCAL, &IntrinsicsPrior::NONE);
+        let variance = optimum.variance_of(Parameter::LogFocal).expect("observable");
+        let sigma = variance.sqrt() * NOISE;
+        // As well known as the data say, one sigma away: it pulls half the way, and costs half a chi-square.
+        let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, free + sigma, sigma, NOISE);
+        let (pulled, dearer) = adjusted(&prior);
+        let (way, rise) = ((pulled - free) / sigma, (dearer - cost) / (NOISE * NOISE));
+        println!("way {way}, rise {rise}");
+        assert!((way - 0.5).abs() < 0.05 && (rise - 0.5).abs() < 0.05, "way {way}, rise {rise}");
+    }
+
+    #[test]
     fn fixed_intrinsics_stay_fixed() {
         let scene = testing::scene(2, 4, 12, NOISE);
         let mut start = perturbed(&scene, 0.01, 2);
         let before = start.intrinsics;
         let options = Options::default();
-        let report = adjust(&mut start, &scene.observations, IntrinsicsModel::Fixed, &options, &StopToken::default());
+        let (model, prior) = (IntrinsicsModel::FIXED, IntrinsicsPrior::NONE);
+        let report = adjust(&mut start, &scene.observations, model, &prior, &options, &StopToken::default());
         assert!(report.iterations > 0);
         assert_eq!(start.intrinsics, before);
     }
@@ -280,10 +277,13 @@ mod tests {
         let scene = testing::scene(3, 4, 8, NOISE);
         let run = |mut start: Reconstruction, observations: &[Observation]| {
             let options = Options::default();
-            for model in [IntrinsicsModel::Focal, IntrinsicsModel::FocalPrincipalPointAspect] {
-                let report = adjust(&mut start, observations, model, &options, &StopToken::default());
+            for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
+                let prior = IntrinsicsPrior::NONE;
+                let report = adjust(&mut start, observations, model, &prior, &options, &StopToken::default());
                 assert!(report.cost.is_finite() && report.cost <= report.initial_cost, "{report:?}");
-                intrinsics_variance(&start, observations, model);
+                if let Some(information) = Information::new(&start, observations) {
+                    information.optimum(model, &prior);
+                }
             }
             start
         };

@@ -7,7 +7,9 @@
 
 mod cholesky;
 mod covariance;
+pub mod critical;
 mod engine;
+mod intrinsics;
 pub mod metric;
 pub mod projective;
 mod reduced;

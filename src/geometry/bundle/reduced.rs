@@ -55,7 +55,7 @@ impl<const G: usize, const C: usize, const P: usize> Sink<G, C, P> for Entry<'_,
 }
 
 impl<const G: usize, const C: usize, const P: usize> Jacobian<G, C, P> {
-    fn zeros() -> Self {
+    pub fn zeros() -> Self {
         Self { globals: SMatrix::zeros(), camera: SMatrix::zeros(), point: SMatrix::zeros() }
     }
 }
@@ -79,7 +79,7 @@ impl<const G: usize, const C: usize, const P: usize> Linearisation<G, C, P> {
 
     /// Linearises at the state of `problem`.
     pub fn fill(&mut self, problem: &impl Problem<G, C, P>, layout: &Layout, loss: Loss) {
-        self.globals_diagonal.fill(0.0);
+        self.globals_diagonal = SVector::from(problem.global_beliefs().map(|belief| belief.information));
         self.camera_diagonals.fill(SVector::zeros());
         self.point_blocks.fill(SMatrix::zeros());
         for (k, seen) in layout.observations.iter().enumerate() {
@@ -157,6 +157,10 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     ) -> bool {
         self.matrix.fill(0.0);
         self.vector.fill(0.0);
+        for (k, belief) in problem.global_beliefs().iter().enumerate() {
+            self.matrix[k * (self.dimension + 1)] += belief.information;
+            self.vector[k] -= belief.information * belief.deviation;
+        }
         for point in 0..self.factors.len() {
             let range = layout.starts[point]..layout.starts[point + 1];
             let mut block = linearisation.point_blocks[point];

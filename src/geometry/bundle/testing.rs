@@ -118,9 +118,34 @@ impl TestScene {
         }
     }
 
+    /// Leaves what falls into the image, and of that what three views see; beyond where a barrel distortion folds the
+    /// image back, nothing is seen.
+    pub fn crop(&mut self) {
+        let (intrinsics, poses, points) = (self.intrinsics, &self.poses, &self.points);
+        self.observations.retain(|seen| {
+            let direction = poses[seen.camera].apply(&points[seen.point]);
+            let squared = (direction.xy() / direction.z).norm_squared();
+            seen.xy.amax() <= 0.5 && 1.0 + 3.0 * intrinsics.radial * squared > 0.1
+        });
+        let mut count = vec![0; self.points.len()];
+        self.observations.iter().for_each(|seen| count[seen.point] += 1);
+        self.observations.retain(|seen| count[seen.point] >= 3);
+    }
+
     /// The true cameras, `K [R|t]`.
     pub fn cameras(&self) -> Vec<Matrix3x4<f64>> {
         self.poses.iter().map(|pose| pose.camera(&self.intrinsics)).collect()
+    }
+}
+
+/// Moves the cameras onto a circle about the centre of the points, turning about one axis by at most so much.
+pub(crate) fn orbit(scene: &mut TestScene, max_angle_rad: f64) {
+    let count = scene.poses.len() as f64;
+    let centre = scene.points.iter().sum::<Vector3<f64>>() / scene.points.len() as f64;
+    for (k, pose) in scene.poses.iter_mut().enumerate() {
+        let angle = max_angle_rad * (2.0 * k as f64 / (count - 1.0) - 1.0);
+        let rotation = Rotation3::from_axis_angle(&Vector3::y_axis(), angle).into_inner();
+        *pose = Pose { rotation, translation: Vector3::new(0.0, 0.0, 3.0) - rotation * centre };
     }
 }
 

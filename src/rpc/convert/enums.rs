@@ -55,12 +55,17 @@ twins! {
     JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, Expired }
     WarningCode = WarningCode {
         PlanarOrRotation,
+        PlanarScene,
+        PureRotation,
+        PureTranslation,
         UnobservableFocal,
         SecondMinimum,
         ModelMismatch,
         FewInliers,
+        PrincipalPointUnobservable,
         Cheirality,
         NoConsensus,
+        SecondStructure,
         ViewsLeftOut,
         AssumedImageSize,
         CameraGroupsMerged,
@@ -93,7 +98,16 @@ mod tests {
 
     #[test]
     fn names_on_the_wire_are_the_domains_with_the_enums_prefix() {
-        for code in [WarningCode::PlanarOrRotation, WarningCode::StoppedEarly, WarningCode::CameraGroupsMerged] {
+        for code in [
+            WarningCode::PlanarOrRotation,
+            WarningCode::PlanarScene,
+            WarningCode::PureRotation,
+            WarningCode::PureTranslation,
+            WarningCode::PrincipalPointUnobservable,
+            WarningCode::SecondStructure,
+            WarningCode::StoppedEarly,
+            WarningCode::CameraGroupsMerged,
+        ] {
             let wire = proto::WarningCode::try_from(code.to_wire()).expect("known");
             assert_eq!(wire.as_str_name(), format!("WARNING_CODE_{}", code.name()));
         }

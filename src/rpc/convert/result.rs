@@ -97,6 +97,7 @@ fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
         principal_point_x_px: calibration.principal_point_px[0],
         principal_point_y_px: calibration.principal_point_px[1],
         aspect: calibration.aspect,
+        radial_k1: Some(calibration.radial_k1),
     }
 }
 
@@ -106,6 +107,7 @@ fn calibration_from_wire(calibration: &proto::Calibration) -> Calibration {
         sigma_log_focal: calibration.sigma_log_focal,
         principal_point_px: [calibration.principal_point_x_px, calibration.principal_point_y_px],
         aspect: calibration.aspect,
+        radial_k1: calibration.radial_k1.unwrap_or(0.0),
     }
 }
 
@@ -234,8 +236,15 @@ mod tests {
                     sigma_log_focal: Some(0.05),
                     principal_point_px: [499.5, 399.5],
                     aspect: 1.25,
+                    radial_k1: -0.05,
                 },
-                Calibration { focal_px: 900.0, sigma_log_focal: None, principal_point_px: [0.0, 0.0], aspect: 1.0 },
+                Calibration {
+                    focal_px: 900.0,
+                    sigma_log_focal: None,
+                    principal_point_px: [0.0, 0.0],
+                    aspect: 1.0,
+                    radial_k1: 0.0,
+                },
             ],
             plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),
             views: vec![

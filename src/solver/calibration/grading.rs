@@ -1,86 +1,50 @@
-//! Which model the data carry, how well the focal length is determined, and what to warn of.
+//! What a calibration is worth, and what to warn of.
 
+use super::fit::{Fit, MISFIT_DEVIATIONS, posterior_noise};
+use super::models::{CHI_SQUARE_GAIN, Candidate, Choice};
 use super::search::Minimum;
-use super::{LEAST_NOISE, Outcome, Problem, Stopped};
-use crate::domain::{Grade, StopToken, Warning, WarningCode};
-use crate::geometry::bundle::metric::{self, IntrinsicsModel, intrinsics_variance};
-use crate::geometry::bundle::{Observation, Options};
+use super::{Outcome, Problem, Stopped};
+use crate::domain::{FocalPrior, Grade, StopToken, Warning, WarningCode};
+use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 
 /// Standard deviations of the log focal length that bound the grades.
-const METRIC_BELOW: f64 = 0.02;
+pub(super) const METRIC_BELOW: f64 = 0.02;
 const WEAK_UP_TO: f64 = 0.1;
 /// Standard deviation of the log focal length, a factor of 2.7, beyond which the focal length counts as unobservable.
 const UNOBSERVABLE_ABOVE: f64 = 1.0;
-/// Gain in chi-square at which a richer model is taken: the .999 quantile for two degrees of freedom.
-const CHI_SQUARE_GAIN: f64 = 13.8;
-/// How much a richer model may raise the standard deviation of the log focal length and still be taken: beyond, it
-/// fits by giving up what was to be found.
-const SIGMA_INFLATION: f64 = 3.0;
-/// Shift of the log focal length between models, in standard deviations, that speaks of a wrong model.
-const MODEL_SHIFT: f64 = 3.0;
-/// Degrees of freedom from which the posterior noise is believed; it is then known to 13 %.
-const ENOUGH_FREEDOM: usize = 30;
 /// Ratio of the metric to the projective posterior noise that speaks of a wrong model; the paper's synthetic scenes
-/// stay within 1.05.
+/// stay within 1.05. With few degrees of freedom it exceeds its limit by chance: the loss of fit must also be more than
+/// [`MISFIT_DEVIATIONS`].
 const RMS_RATIO_LIMIT: f64 = 1.15;
 /// The same ratio from which the metric reconstruction is not to be used at all.
 const RMS_RATIO_REFUSAL: f64 = 3.0;
-/// With few degrees of freedom the ratio exceeds its limit by chance; the loss of fit must also be this many standard
-/// deviations of its F statistic.
-const MISFIT_DEVIATIONS: f64 = 4.0;
 /// Difference in log focal from which another minimum is another calibration.
 const OTHER_CALIBRATION: f64 = 0.02;
 /// Share of the observations that must lie in front of their cameras, and below which the reconstruction is refused.
 const CHEIRALITY_LIMIT: f64 = 0.99;
 const CHEIRALITY_REFUSAL: f64 = 0.9;
-/// Where the profile of the cost is sampled, in standard deviations to either side, and the iterations there.
-const PROFILE_DEVIATIONS: f64 = 3.0;
-const PROFILE_ITERATIONS: usize = 15;
-/// Largest step of the profile in log focal: a factor of 1.35.
-const PROFILE_LONGEST: f64 = 0.3;
+/// Standard deviation of a coordinate of the principal point, in image sides and from the observations alone, above
+/// which they do not determine it: no lens is worse centred than that.
+const PRINCIPAL_POINT_UNOBSERVABLE_ABOVE: f64 = 0.05;
+/// Difference between a prior and what the observations say, in standard deviations of the difference, that one of the
+/// two does not survive.
+const PRIOR_CONTRADICTED: f64 = 3.0;
 
-/// How well the projective reconstruction fits.
-pub(super) struct ProjectiveFit {
-    cost: f64,
-    freedom: usize,
-    /// Posterior standard deviation of a coordinate; not below the assumed one where there is little to judge from.
-    pub noise: f64,
+/// The grade with the warnings that led to it.
+struct Verdict {
+    grade: Grade,
+    warnings: Vec<Warning>,
 }
 
-impl ProjectiveFit {
-    pub fn new(cost: f64, problem: &Problem, inliers: usize) -> Self {
-        let unknowns = (11 * problem.cameras.len() + 3 * inliers).saturating_sub(15);
-        let freedom = (2 * problem.observations.len()).saturating_sub(unknowns);
-        let posterior = posterior_noise(cost, freedom);
-        let noise = if freedom < ENOUGH_FREEDOM { posterior.max(problem.noise) } else { posterior };
-        Self { cost, freedom, noise }
+impl Verdict {
+    /// Lowers the grade to this at most and says why.
+    fn cap(&mut self, worst: Grade, code: WarningCode, detail: String) {
+        self.grade = self.grade.worse(worst);
+        self.warnings.push(Warning::new(code, detail));
     }
-}
 
-fn posterior_noise(cost: f64, freedom: usize) -> f64 {
-    (cost / freedom.max(1) as f64).sqrt().max(LEAST_NOISE)
-}
-
-/// A metric reconstruction under one model, with what the model makes of the focal length.
-struct Candidate {
-    model: IntrinsicsModel,
-    minimum: Minimum,
-    freedom: usize,
-    noise: f64,
-    /// Standard deviation of the log focal length; `None`: unobservable.
-    sigma: Option<f64>,
-}
-
-impl Candidate {
-    fn new(minimum: Minimum, model: IntrinsicsModel, problem: &Problem) -> Self {
-        let Problem { observations, .. } = problem;
-        let inliers = super::observed_points(problem);
-        let unknowns = (6 * problem.cameras.len() + 3 * inliers + model.freedom()).saturating_sub(7);
-        let freedom = (2 * observations.len()).saturating_sub(unknowns);
-        let noise = posterior_noise(minimum.cost, freedom).max(problem.noise);
-        let variance = intrinsics_variance(&minimum.reconstruction, observations, model).log_focal;
-        let sigma = variance.map(|variance| variance.sqrt() * noise).filter(|sigma| sigma.is_finite());
-        Self { model, minimum, freedom, noise, sigma }
+    fn has(&self, code: WarningCode) -> bool {
+        self.warnings.iter().any(|warning| warning.code == code)
     }
 }
 
@@ -89,59 +53,53 @@ impl Candidate {
 /// * `minima`: not empty, cheapest first, with the focal length free
 pub(super) fn grade(
     problem: &Problem,
-    fit: &ProjectiveFit,
-    mut minima: Vec<Minimum>,
+    fit: &Fit,
+    prior: &IntrinsicsPrior,
+    minima: Vec<Minimum>,
     scale_px: f64,
     mut warnings: Vec<Warning>,
     stop: &StopToken,
 ) -> Result<Outcome, Stopped> {
-    let chosen = minima.remove(best_in_front(&minima, problem, fit));
-    let simple = Candidate::new(chosen, IntrinsicsModel::Focal, problem);
-    let rival = rival(&simple, &minima);
-    let mut best = richest(simple, problem, scale_px, &mut warnings, stop)?;
+    let choice = Choice { problem, prior, scale_px, stop };
+    let (best, others) = chosen(&choice, fit, minima, &mut warnings)?;
     Stopped::check(stop)?;
-    best.sigma = best
-        .sigma
-        .map(|sigma| profiled(sigma, &best, problem.observations, stop))
-        .filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
-
-    let mut grade = grade_of_sigma(best.sigma);
-    let mut cap = |worst: Grade| grade = grade.worse(worst);
-    if best.sigma.is_none_or(|sigma| sigma > WEAK_UP_TO) {
-        warnings.push(unobservable(&best));
+    let mut sigma = choice.sigma(&best).filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
+    let mut verdict = Verdict { grade: Grade::Metric, warnings };
+    if let Some(focal_prior) = problem.focal_prior {
+        weigh_prior(&mut verdict, &mut sigma, &choice, &best, focal_prior);
     }
-    if let Some(rival) = rival {
+    verdict.grade = verdict.grade.worse(grade_of_sigma(sigma));
+    if sigma.is_none_or(|sigma| sigma > WEAK_UP_TO) && !verdict.has(WarningCode::UnobservableFocal) {
+        verdict.warnings.push(unobservable(sigma));
+    }
+    if let Some(rival) = rival(&best, &others) {
         let shift = (rival.log_focal() - best.minimum.log_focal()).abs();
-        cap(if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak });
-        warnings.push(second_minimum(rival, &best, scale_px));
+        let worst = if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak };
+        verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, scale_px));
     }
-    let rms_ratio = posterior_noise(best.minimum.cost, best.freedom) / fit.noise;
-    if rms_ratio > RMS_RATIO_LIMIT && misfits(&best, fit) {
-        cap(if rms_ratio > RMS_RATIO_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak });
-        let detail = format!(
-            "the metric reconstruction fits {rms_ratio:.2} times worse than the projective one ({:.2} px against \
-             {:.2} px) with {} free: distortion, a zoom or wrong tracks",
-            rms_ratio * fit.noise * scale_px,
-            fit.noise * scale_px,
-            best.model.name()
-        );
-        warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
+    let rms_ratio = posterior_noise(best.fit.cost, best.fit.freedom) / fit.noise;
+    if rms_ratio > RMS_RATIO_LIMIT && fit.loss_deviations(best.fit.cost, best.fit.freedom) > MISFIT_DEVIATIONS {
+        let worst = if rms_ratio > RMS_RATIO_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
+        verdict.cap(worst, WarningCode::ModelMismatch, mismatch(rms_ratio, fit, best.model, scale_px));
     }
     let in_front = best.minimum.cheirality;
     if in_front < CHEIRALITY_LIMIT {
-        cap(if in_front < CHEIRALITY_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak });
+        let worst = if in_front < CHEIRALITY_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
         let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - in_front));
-        warnings.push(Warning::new(WarningCode::Cheirality, detail));
+        verdict.cap(worst, WarningCode::Cheirality, detail);
     }
-    if warnings.iter().any(|warning| warning.code == WarningCode::FewInliers) {
-        cap(Grade::Weak);
+    if verdict.has(WarningCode::FewInliers) {
+        verdict.grade = verdict.grade.worse(Grade::Weak);
+    }
+    if verdict.grade != Grade::ProjectiveOnly {
+        verdict.warnings.extend(principal_point(&best, prior, scale_px));
     }
     // A sigma that the fit contradicts is not told: whatever lowered the grade is worth at least the grade's least.
-    let sigma = best.sigma.map(|sigma| if grade == Grade::Weak { sigma.max(METRIC_BELOW) } else { sigma });
+    let sigma = sigma.map(|sigma| if verdict.grade == Grade::Weak { sigma.max(METRIC_BELOW) } else { sigma });
     Ok(Outcome {
         sigma_log_focal: sigma,
-        grade,
-        warnings,
+        grade: verdict.grade,
+        warnings: verdict.warnings,
         model: best.model,
         plane_at_infinity: None,
         cheirality: in_front,
@@ -159,8 +117,33 @@ pub fn grade_of_sigma(sigma: Option<f64>) -> Grade {
     }
 }
 
+/// The best minimum under the richest model that the data carry, and the others under the same model.
+fn chosen(
+    choice: &Choice,
+    fit: &Fit,
+    mut minima: Vec<Minimum>,
+    warnings: &mut Vec<Warning>,
+) -> Result<(Candidate, Vec<Minimum>), Stopped> {
+    let Choice { problem, prior, .. } = *choice;
+    let first = minima.remove(best_in_front(&minima, problem, fit));
+    let mut best = choice.richest(Candidate::new(first, IntrinsicsModel::FOCAL, prior, problem), warnings)?;
+    if best.model == IntrinsicsModel::FOCAL {
+        return Ok((best, minima));
+    }
+    for minimum in &mut minima {
+        Stopped::check(choice.stop)?;
+        *minimum = minimum.adjusted(problem.observations, best.model, prior, choice.stop);
+        // A model that is wrong may rank the minima wrongly.
+        if minimum.cost < best.minimum.cost && minimum.cheirality >= CHEIRALITY_LIMIT.min(best.minimum.cheirality) {
+            let better = Candidate::new(minimum.clone(), best.model, prior, problem);
+            *minimum = std::mem::replace(&mut best, better).minimum;
+        }
+    }
+    Ok((best, minima))
+}
+
 /// The cheapest minimum whose points are in front of the cameras, if the data do not tell it from the cheapest.
-fn best_in_front(minima: &[Minimum], problem: &Problem, fit: &ProjectiveFit) -> usize {
+fn best_in_front(minima: &[Minimum], problem: &Problem, fit: &Fit) -> usize {
     let unit = fit.noise.max(problem.noise).powi(2);
     let near = |minimum: &Minimum| minimum.cost - minima[0].cost < CHI_SQUARE_GAIN * unit;
     minima.iter().position(|minimum| minimum.cheirality >= CHEIRALITY_LIMIT && near(minimum)).unwrap_or(0)
@@ -171,80 +154,62 @@ fn rival<'a>(best: &Candidate, others: &'a [Minimum]) -> Option<&'a Minimum> {
     others.iter().find(|other| {
         (other.log_focal() - best.minimum.log_focal()).abs() > OTHER_CALIBRATION
             && other.cheirality >= CHEIRALITY_LIMIT.min(best.minimum.cheirality)
-            && other.cost - best.minimum.cost < CHI_SQUARE_GAIN * best.noise * best.noise
+            && other.cost - best.minimum.cost < CHI_SQUARE_GAIN * best.fit.noise.powi(2)
     })
 }
 
-/// Frees principal point, then aspect, as long as the data ask for it and still determine the focal length.
-fn richest(
-    simple: Candidate,
-    problem: &Problem,
-    scale_px: f64,
-    warnings: &mut Vec<Warning>,
-    stop: &StopToken,
-) -> Result<Candidate, Stopped> {
-    let mut best = simple;
-    for model in [IntrinsicsModel::FocalPrincipalPoint, IntrinsicsModel::FocalPrincipalPointAspect] {
-        Stopped::check(stop)?;
-        let minimum = best.minimum.adjusted(problem.observations, model, stop);
-        let richer = Candidate::new(minimum, model, problem);
-        let gain = (best.minimum.cost - richer.minimum.cost) / (richer.noise * richer.noise);
-        if gain <= CHI_SQUARE_GAIN {
-            continue;
-        }
-        let shift = (richer.minimum.log_focal() - best.minimum.log_focal()).abs();
-        if best.sigma.is_some_and(|sigma| shift > MODEL_SHIFT * sigma) {
-            let detail = format!(
-                "freeing {} moves the focal length from {:.1} to {:.1} px, {:.1} standard deviations",
-                model.name(),
-                best.minimum.reconstruction.intrinsics.focal * scale_px,
-                richer.minimum.reconstruction.intrinsics.focal * scale_px,
-                shift / best.sigma.unwrap_or(f64::INFINITY)
-            );
-            warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
-        }
-        let observable = match (best.sigma, richer.sigma) {
-            (Some(simple), Some(rich)) => rich <= METRIC_BELOW.max(SIGMA_INFLATION * simple),
-            (None, rich) => rich.is_some(),
-            (Some(_), None) => false,
-        };
-        if observable {
-            best = richer;
-        }
-    }
-    Ok(best)
-}
-
-/// Whether the metric reconstruction loses more fit than chance would explain (F test against the projective one).
-fn misfits(best: &Candidate, fit: &ProjectiveFit) -> bool {
-    let added = best.freedom.saturating_sub(fit.freedom).max(1) as f64;
-    let freedom = fit.freedom.max(1) as f64;
-    let statistic = (best.minimum.cost - fit.cost) / added / (fit.noise * fit.noise);
-    statistic > 1.0 + MISFIT_DEVIATIONS * (2.0 / added + 2.0 / freedom).sqrt()
-}
-
-/// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
+/// What a prior on the focal length may not do: contradict the observations unsaid, or make a calibration of nothing.
 ///
-/// The focal length is held three standard deviations away while poses and points adjust; the chi-square should rise
-/// by nine. Near critical motions the linearisation is optimistic: it is taken where the noise has moved the scene.
-fn profiled(sigma: f64, best: &Candidate, observations: &[Observation], stop: &StopToken) -> f64 {
-    let shift = (PROFILE_DEVIATIONS * sigma).min(PROFILE_LONGEST);
-    if shift <= 0.0 {
-        return sigma;
+/// Where it contradicts them, sigma grows by as many standard deviations (Birge's ratio of two values): one of the two
+/// is wrong, and which is not known.
+fn weigh_prior(
+    verdict: &mut Verdict,
+    sigma: &mut Option<f64>,
+    choice: &Choice,
+    best: &Candidate,
+    focal_prior: FocalPrior,
+) {
+    let alone = choice.prior.forgetting(Parameter::LogFocal);
+    let of_data = best.sigma(Parameter::LogFocal, best.model, &alone);
+    // It lifts the grade by one step at most.
+    if of_data.is_none_or(|of_data| of_data > WEAK_UP_TO) {
+        verdict.grade = verdict.grade.worse(Grade::Weak);
     }
-    let side = |shift: f64| {
-        let mut moved = best.minimum.reconstruction.clone();
-        moved.intrinsics.focal *= shift.exp();
-        let options = Options::squared(PROFILE_ITERATIONS);
-        let report = metric::adjust(&mut moved, observations, IntrinsicsModel::Fixed, &options, stop);
-        (report.cost - best.minimum.cost).max(0.0) / (best.noise * best.noise)
-    };
-    let rise = side(shift).min(side(-shift));
-    sigma.max(shift / rise.sqrt().max(f64::MIN_POSITIVE))
+    let (Some(of_data), Some(optimum)) = (of_data, best.optimum(best.model, &alone)) else { return };
+    let shift = optimum.shift[Parameter::LogFocal as usize];
+    let difference = choice.prior.deviation(Parameter::LogFocal, &best.minimum.reconstruction.intrinsics) + shift;
+    let deviations = difference.abs() / of_data.hypot(focal_prior.sigma_log);
+    if deviations > PRIOR_CONTRADICTED {
+        let detail = format!(
+            "the tracks alone give a focal length of {:.1} px, {deviations:.1} standard deviations from the {:.1} px \
+             known beforehand",
+            best.minimum.reconstruction.intrinsics.focal * shift.exp() * choice.scale_px,
+            focal_prior.focal_px
+        );
+        verdict.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
+        *sigma = sigma.map(|sigma| sigma * deviations);
+    }
 }
 
-fn unobservable(best: &Candidate) -> Warning {
-    let detail = match best.sigma {
+/// Says so where the observations do not determine the principal point.
+fn principal_point(best: &Candidate, prior: &IntrinsicsPrior, scale_px: f64) -> Option<Warning> {
+    let alone = prior.forgetting(Parameter::PrincipalX).forgetting(Parameter::PrincipalY);
+    let model = best.model.with(Extension::PrincipalPoint);
+    let names = [("x", Parameter::PrincipalX), ("y", Parameter::PrincipalY)];
+    let unknown: Vec<String> = names
+        .into_iter()
+        .filter_map(|(name, parameter)| match best.sigma(parameter, model, &alone) {
+            Some(sigma) if sigma <= PRINCIPAL_POINT_UNOBSERVABLE_ABOVE => None,
+            Some(sigma) => Some(format!("{name} only to {:.0} px", sigma * scale_px)),
+            None => Some(format!("{name} not at all")),
+        })
+        .collect();
+    let detail = format!("the tracks determine the principal point in {}", unknown.join(" and "));
+    (!unknown.is_empty()).then(|| Warning::new(WarningCode::PrincipalPointUnobservable, detail))
+}
+
+fn unobservable(sigma: Option<f64>) -> Warning {
+    let detail = match sigma {
         Some(sigma) => format!(
             "the motion determines the logarithm of the focal length only to {sigma:.2} (one standard deviation), \
              more than {WEAK_UP_TO}"
@@ -254,14 +219,23 @@ fn unobservable(best: &Candidate) -> Warning {
     Warning::new(WarningCode::UnobservableFocal, detail)
 }
 
-fn second_minimum(rival: &Minimum, best: &Candidate, scale_px: f64) -> Warning {
-    let detail = format!(
+fn second_minimum(rival: &Minimum, best: &Candidate, scale_px: f64) -> String {
+    format!(
         "a focal length of {:.1} px instead of {:.1} px explains the data about as well: chi-square larger by {:.1} \
          of {} degrees of freedom",
         rival.reconstruction.intrinsics.focal * scale_px,
         best.minimum.reconstruction.intrinsics.focal * scale_px,
-        ((rival.cost - best.minimum.cost) / (best.noise * best.noise)).max(0.0),
-        best.freedom
-    );
-    Warning::new(WarningCode::SecondMinimum, detail)
+        ((rival.cost - best.minimum.cost) / best.fit.noise.powi(2)).max(0.0),
+        best.fit.freedom
+    )
+}
+
+fn mismatch(rms_ratio: f64, fit: &Fit, model: IntrinsicsModel, scale_px: f64) -> String {
+    format!(
+        "the metric reconstruction fits {rms_ratio:.2} times worse than the projective one ({:.2} px against {:.2} px) \
+         with {} free: distortion, a zoom or wrong tracks",
+        rms_ratio * fit.noise * scale_px,
+        fit.noise * scale_px,
+        model.name()
+    )
 }

@@ -3,27 +3,27 @@
 //! The DAQ residual finds starts, metric bundle adjustment with one calibration for all views decides among them, and
 //! nothing is returned without a grade: a motion or scene that carries no calibration is said to.
 
+mod critical;
+mod fit;
 mod grading;
+mod models;
 mod search;
 #[cfg(test)]
 mod tests;
 
 use nalgebra::{Matrix3x4, Vector3, Vector4};
 
-use crate::domain::{Grade, StopReason, StopToken, Warning, WarningCode};
+use crate::domain::{FocalPrior, Grade, StopReason, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{IntrinsicsModel, Reconstruction};
 use crate::geometry::bundle::{Observation, Options, projective};
 use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
-use crate::geometry::homography;
 
+use fit::Fit;
 pub use grading::grade_of_sigma;
 
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
 /// caller has adjusted it before.
 const PROJECTIVE_ITERATIONS: usize = 10;
-/// Median homography residual, in units of the noise, below which the scene counts as planar or the camera as only
-/// rotating. Measured: 1.1 to 1.8 for those, above 11 for general motion.
-const HOMOGRAPHY_LIMIT: f64 = 3.0;
 /// Least noise that is believed, in image sides: a hundredth of a pixel in a 1000-pixel image. Exact input would make
 /// every deviation significant and every focal length certain, by its rounding alone.
 const LEAST_NOISE: f64 = 1e-5;
@@ -43,6 +43,8 @@ pub struct Problem<'a> {
     pub observations: &'a [Observation],
     /// Assumed standard deviation of a coordinate, in normalised units.
     pub noise: f64,
+    /// What is known of the focal length beforehand.
+    pub focal_prior: Option<FocalPrior>,
 }
 
 /// What came of it.
@@ -73,7 +75,7 @@ impl Outcome {
             sigma_log_focal: None,
             grade: Grade::ProjectiveOnly,
             warnings,
-            model: IntrinsicsModel::Focal,
+            model: IntrinsicsModel::FOCAL,
             plane_at_infinity: None,
             cheirality: 0.0,
             rms_ratio: 1.0,
@@ -112,33 +114,29 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     if inliers < LEAST_INLIERS {
         warnings.push(few_inliers(inliers));
     }
-    let mut cameras = problem.cameras.to_vec();
-    let mut points = problem.points.to_vec();
-    let options = Options::squared(PROJECTIVE_ITERATIONS);
-    let adjusted = projective::adjust(&mut cameras, &mut points, problem.observations, &options, stop);
+    let (cameras, points, fit) = projectively_adjusted(problem, inliers, stop);
     Stopped::check(stop)?;
-    let fit = grading::ProjectiveFit::new(adjusted.cost, problem, inliers);
-    if let Some(residual) = homography::median_residual(problem.observations, cameras.len(), fit.noise)
-        && residual < HOMOGRAPHY_LIMIT
-    {
-        let detail = format!(
-            "homographies between the views miss by a median of {residual:.1} standard deviations of the noise \
-             ({:.2} px): the scene is planar, or the camera hardly did more than rotate, which carries no calibration",
-            fit.noise * scale_px
-        );
-        warnings.push(Warning::new(WarningCode::PlanarOrRotation, detail));
-        return Ok(Outcome::refused(warnings));
-    }
-    let minima = match to_first_view_frame(&cameras, &points) {
-        Some(frame) => search::minima(&frame, problem, stop)?,
-        None => Vec::new(),
+    let critical = critical::find(problem, &fit, scale_px, stop);
+    Stopped::check(stop)?;
+    let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);
+    let refused = !critical.warnings.is_empty();
+    warnings.extend(critical.warnings);
+    let minima = match (critical.translation, problem.focal_prior) {
+        (Some(translation), Some(focal)) => {
+            search::known_focal(&translation, focal.focal_px / scale_px, problem, &prior, stop)
+        }
+        _ if refused => return Ok(Outcome::refused(warnings)),
+        _ => match to_first_view_frame(&cameras, &points) {
+            Some(frame) => search::minima(&frame, problem, &prior, stop)?,
+            None => Vec::new(),
+        },
     };
     if minima.is_empty() {
         let detail = "no start of the self-calibration led to a metric reconstruction";
         warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
         return Ok(Outcome::refused(warnings));
     }
-    let mut outcome = grading::grade(problem, &fit, minima, scale_px, warnings, stop)?;
+    let mut outcome = grading::grade(problem, &fit, &prior, minima, scale_px, warnings, stop)?;
     outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem, metric));
     Ok(outcome)
 }
@@ -148,6 +146,18 @@ pub fn few_inliers(inliers: usize) -> Warning {
     let detail =
         format!("{inliers} inlier tracks cannot be verified by image points alone, which takes {LEAST_INLIERS}");
     Warning::new(WarningCode::FewInliers, detail)
+}
+
+/// The projective reconstruction at its minimum, and how well it fits.
+fn projectively_adjusted(
+    problem: &Problem,
+    inliers: usize,
+    stop: &StopToken,
+) -> (Vec<Matrix3x4<f64>>, Vec<Vector4<f64>>, Fit) {
+    let (mut cameras, mut points) = (problem.cameras.to_vec(), problem.points.to_vec());
+    let options = Options::squared(PROJECTIVE_ITERATIONS);
+    let report = projective::adjust(&mut cameras, &mut points, problem.observations, &options, stop);
+    (cameras, points, Fit::projective(report.cost, problem, inliers))
 }
 
 /// Points with an observation.

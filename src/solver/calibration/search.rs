@@ -4,10 +4,11 @@ use nalgebra::{Matrix4, Vector3, Vector4};
 
 use super::{Problem, Stopped};
 use crate::domain::StopToken;
-use crate::geometry::bundle::metric::{self, IntrinsicsModel, Reconstruction};
+use crate::geometry::bundle::critical::Translating;
+use crate::geometry::bundle::metric::{self, IntrinsicsModel, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::daq::{self, Daq, FirstViewFrame, Free};
-use crate::geometry::metric::{cheirality, upgrade};
+use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
 
 /// The scan of focal lengths: 40 in the range, from the 4 widest views.
 const SCAN_FOCALS: usize = 40;
@@ -56,9 +57,15 @@ impl Minimum {
     }
 
     /// Adjusts to convergence from here with this model.
-    pub fn adjusted(&self, observations: &[Observation], model: IntrinsicsModel, stop: &StopToken) -> Self {
+    pub fn adjusted(
+        &self,
+        observations: &[Observation],
+        model: IntrinsicsModel,
+        prior: &IntrinsicsPrior,
+        stop: &StopToken,
+    ) -> Self {
         let mut reconstruction = self.reconstruction.clone();
-        let report = metric::adjust(&mut reconstruction, observations, model, &converge(), stop);
+        let report = metric::adjust(&mut reconstruction, observations, model, prior, &converge(), stop);
         let cheirality = cheirality(&reconstruction, observations);
         Self { reconstruction, cost: report.cost, cheirality }
     }
@@ -69,7 +76,13 @@ fn converge() -> Options {
 }
 
 /// Metric reconstructions with the focal length free that different starts converge to, cheapest first.
-pub(super) fn minima(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
+pub(super) fn minima(
+    frame: &FirstViewFrame,
+    problem: &Problem,
+    prior: &IntrinsicsPrior,
+    stop: &StopToken,
+) -> Result<Vec<Minimum>, Stopped> {
+    let model = IntrinsicsModel::FOCAL;
     let (subset, chosen) = subsample(frame, problem.observations);
     let observations = subset.as_deref().unwrap_or(problem.observations);
     let mut found: Vec<Minimum> = Vec::new();
@@ -78,21 +91,36 @@ pub(super) fn minima(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken
         let Some(mut reconstruction) = upgrade(frame, &start, observations) else { continue };
         let options =
             Options { max_iterations: FIRST_ITERATIONS, relative_tolerance: FIRST_TOLERANCE, ..Options::default() };
-        let report = metric::adjust(&mut reconstruction, observations, IntrinsicsModel::Focal, &options, stop);
+        let report = metric::adjust(&mut reconstruction, observations, model, prior, &options, stop);
         found.push(Minimum { cheirality: 0.0, cost: report.cost, reconstruction });
     }
     let mut found = distinct(found);
     found.truncate(CONVERGED);
     for minimum in &mut found {
         Stopped::check(stop)?;
-        *minimum = minimum.adjusted(observations, IntrinsicsModel::Focal, stop);
+        *minimum = minimum.adjusted(observations, model, prior, stop);
         if let Some(chosen) = &chosen {
             fill_points(minimum, chosen, problem.observations);
-            *minimum = minimum.adjusted(problem.observations, IntrinsicsModel::Focal, stop);
+            *minimum = minimum.adjusted(problem.observations, model, prior, stop);
         }
     }
     Stopped::check(stop)?;
     Ok(distinct(found))
+}
+
+/// The metric reconstruction of a camera that moved without turning, from a focal length that is known otherwise; empty
+/// where there is none.
+pub(super) fn known_focal(
+    translation: &Translating,
+    focal: f64,
+    problem: &Problem,
+    prior: &IntrinsicsPrior,
+    stop: &StopToken,
+) -> Vec<Minimum> {
+    let start = upgrade_translation(translation, focal, problem.observations);
+    let minimum = start.map(|reconstruction| Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 });
+    let adjusted = minimum.map(|start| start.adjusted(problem.observations, IntrinsicsModel::FOCAL, prior, stop));
+    distinct(adjusted.into_iter().collect())
 }
 
 /// Cheapest first, without those that repeat a cheaper one.

@@ -1,0 +1,209 @@
+//! Bundle adjustment of the motions and scenes that carry no metric reconstruction: models with fewer unknowns than
+//! projective cameras, to be tested against them.
+//!
+//! A point is `(x, y, 1)`, and `(x, y, 1, w)` where it has an inverse depth `w`, in the frame of the view in which the
+//! starts were taken: that keeps points at infinity apart from nothing.
+
+use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
+
+use super::engine::{Jacobian, Problem, Sink, Step, minimise};
+use super::metric::Intrinsics;
+use super::{Observation, Options, Report};
+use crate::domain::StopToken;
+
+/// Views of a plane, or of anything from one centre: `x ~ H (x, y, 1)`.
+#[derive(Debug, Clone)]
+pub struct Homographies {
+    /// One a view, any scale.
+    pub views: Vec<Matrix3<f64>>,
+    pub points: Vec<Vector2<f64>>,
+}
+
+/// A camera that turns about its centre: `x ~ K R (x, y, 1)`, with focal length and principal point of `K` free.
+#[derive(Debug, Clone)]
+pub struct Rotating {
+    pub intrinsics: Intrinsics,
+    pub rotations: Vec<Matrix3<f64>>,
+    pub points: Vec<Vector2<f64>>,
+}
+
+/// A camera that moves without turning: `x ~ (x, y, 1) + w t`.
+///
+/// `t` is `K` times the metric translation, and the point `K` times the metric one: every `K` explains the views alike.
+#[derive(Debug, Clone)]
+pub struct Translating {
+    pub translations: Vec<Vector3<f64>>,
+    /// `(x, y, w)`
+    pub points: Vec<Vector3<f64>>,
+}
+
+/// Unknowns that no observation determines: homographies of the plane; a rotation of everything; position and scale.
+pub const HOMOGRAPHIES_GAUGE: usize = 8;
+pub const ROTATING_GAUGE: usize = 3;
+pub const TRANSLATING_GAUGE: usize = 4;
+
+/// Image `seen.xy / seen.z`, and the gradients of its two coordinates with respect to `seen`.
+fn image(seen: &Vector3<f64>) -> (Vector2<f64>, [Vector3<f64>; 2]) {
+    let scale = seen.z.recip();
+    let image = Vector2::new(seen.x * scale, seen.y * scale);
+    (image, [Vector3::new(scale, 0.0, -image.x * scale), Vector3::new(0.0, scale, -image.y * scale)])
+}
+
+impl Problem<0, 9, 2> for Homographies {
+    fn camera_count(&self) -> usize {
+        self.views.len()
+    }
+
+    fn point_count(&self) -> usize {
+        self.points.len()
+    }
+
+    fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, 9, 2>) {
+        let homography = &self.views[observation.camera];
+        let point = self.points[observation.point].push(1.0);
+        let (image, by_seen) = image(&(homography * point));
+        sink.take(image - observation.xy, || {
+            let mut jacobian = Jacobian::<0, 9, 2>::zeros();
+            for (component, by_seen) in by_seen.iter().enumerate() {
+                let by_entry = SMatrix::<f64, 9, 1>::from_fn(|k, _| by_seen[k / 3] * point[k % 3]);
+                jacobian.camera.set_column(component, &by_entry);
+                jacobian.point.set_column(component, &homography.tr_mul(by_seen).xy());
+            }
+            jacobian
+        });
+    }
+
+    fn retract(&mut self, from: &Self, step: &Step<0, 9, 2>) {
+        for ((view, from), step) in self.views.iter_mut().zip(&from.views).zip(&step.cameras) {
+            let moved = from + Matrix3::from_row_slice(step.as_slice());
+            let norm = moved.norm();
+            *view = if norm > 0.0 && norm.is_finite() { moved / norm } else { moved };
+        }
+        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
+            *point = from + step;
+        }
+    }
+
+    fn camera_gauge(&self, camera: usize) -> SVector<f64, 9> {
+        SVector::from_column_slice(self.views[camera].transpose().as_slice())
+    }
+}
+
+impl Problem<3, 3, 2> for Rotating {
+    fn camera_count(&self) -> usize {
+        self.rotations.len()
+    }
+
+    fn point_count(&self) -> usize {
+        self.points.len()
+    }
+
+    fn observe(&self, observation: &Observation, sink: &mut impl Sink<3, 3, 2>) {
+        let rotation = &self.rotations[observation.camera];
+        let turned = rotation * self.points[observation.point].push(1.0);
+        let (direction, by_turned) = image(&turned);
+        let Intrinsics { focal, principal_point, .. } = self.intrinsics;
+        sink.take(direction * focal + principal_point - observation.xy, || {
+            let mut jacobian = Jacobian::<3, 3, 2>::zeros();
+            for (component, by_turned) in by_turned.iter().enumerate() {
+                let by_turned = by_turned * focal;
+                jacobian.globals[(0, component)] = focal * direction[component];
+                jacobian.globals[(1 + component, component)] = 1.0;
+                jacobian.camera.set_column(component, &turned.cross(&by_turned));
+                jacobian.point.set_column(component, &rotation.tr_mul(&by_turned).xy());
+            }
+            jacobian
+        });
+    }
+
+    fn retract(&mut self, from: &Self, step: &Step<3, 3, 2>) {
+        self.intrinsics.focal = from.intrinsics.focal * step.globals[0].exp();
+        self.intrinsics.principal_point =
+            from.intrinsics.principal_point + Vector2::new(step.globals[1], step.globals[2]);
+        for ((rotation, from), step) in self.rotations.iter_mut().zip(&from.rotations).zip(&step.cameras) {
+            *rotation = Rotation3::from_scaled_axis(*step) * from;
+        }
+        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
+            *point = from + step;
+        }
+    }
+}
+
+impl Problem<0, 3, 3> for Translating {
+    fn camera_count(&self) -> usize {
+        self.translations.len()
+    }
+
+    fn point_count(&self) -> usize {
+        self.points.len()
+    }
+
+    fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, 3, 3>) {
+        let translation = &self.translations[observation.camera];
+        let point = &self.points[observation.point];
+        let (image, by_seen) = image(&(point.xy().push(1.0) + translation * point.z));
+        sink.take(image - observation.xy, || {
+            let mut jacobian = Jacobian::<0, 3, 3>::zeros();
+            for (component, by_seen) in by_seen.iter().enumerate() {
+                jacobian.camera.set_column(component, &(by_seen * point.z));
+                jacobian.point.set_column(component, &by_seen.xy().push(by_seen.dot(translation)));
+            }
+            jacobian
+        });
+    }
+
+    fn retract(&mut self, from: &Self, step: &Step<0, 3, 3>) {
+        for ((translation, from), step) in self.translations.iter_mut().zip(&from.translations).zip(&step.cameras) {
+            *translation = from + step;
+        }
+        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
+            *point = from + step;
+        }
+    }
+}
+
+/// Minimises the reprojection error over all unknowns of one of these models.
+pub trait Adjust {
+    fn adjust(&mut self, observations: &[Observation], options: &Options, stop: &StopToken) -> Report;
+}
+
+macro_rules! adjust {
+    ($($model:ty),+) => {$(
+        impl Adjust for $model {
+            fn adjust(&mut self, observations: &[Observation], options: &Options, stop: &StopToken) -> Report {
+                minimise(self, observations, options, stop)
+            }
+        }
+    )+};
+}
+
+adjust!(Homographies, Rotating, Translating);
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{self, NOISE};
+    use super::*;
+
+    #[test]
+    fn jacobians_agree_with_finite_differences() {
+        let scene = testing::scene(1, 4, 8, NOISE);
+        let near = |seed: u64| 0.1 * testing::direction::<3>(seed);
+        let turned = |view: u64| Rotation3::from_scaled_axis(near(view)).into_inner();
+        let points: Vec<Vector2<f64>> = scene.observations[..8].iter().map(|seen| seen.xy).collect();
+        testing::check_jacobian(
+            &Homographies { views: (0..4).map(turned).collect(), points: points.clone() },
+            &scene.observations,
+        );
+        let mut intrinsics = Intrinsics::from_focal(1.2);
+        intrinsics.principal_point = Vector2::new(0.03, -0.02);
+        testing::check_jacobian(
+            &Rotating { intrinsics, rotations: (0..4).map(turned).collect(), points: points.clone() },
+            &scene.observations,
+        );
+        let with_depths = points.iter().enumerate().map(|(j, point)| point.push(0.2 + 0.05 * j as f64)).collect();
+        testing::check_jacobian(
+            &Translating { translations: (0..4).map(near).collect(), points: with_depths },
+            &scene.observations,
+        );
+    }
+}

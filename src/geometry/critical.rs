@@ -1,0 +1,296 @@
+//! Fits the motions and scenes that carry no calibration: a plane, a camera that only turns, one that only moves.
+//!
+//! Each fit is a maximum-likelihood one with its number of unknowns, so that it can be tested against projective
+//! cameras, of which it is a special case.
+
+use nalgebra::{Matrix3, SymmetricEigen, Vector2, Vector3};
+
+use super::bundle::critical::{
+    Adjust, HOMOGRAPHIES_GAUGE, Homographies, ROTATING_GAUGE, Rotating, TRANSLATING_GAUGE, Translating,
+};
+use super::bundle::metric::Intrinsics;
+use super::bundle::{Observation, Options};
+use super::homography::{self, Correspondences};
+use super::statistics::median;
+use crate::domain::StopToken;
+
+/// Focal lengths from which a rotation is looked for, in image sides; neighbours are a fifth apart.
+const FOCAL_RANGE: (f64, f64) = (0.3, 5.0);
+const FOCALS: usize = 16;
+/// Rounds of alternation for the depths of a translation's start; the adjustment does the rest.
+const DEPTH_ROUNDS: usize = 10;
+/// Iterations of each adjustment: they start near the minimum, or the model is wrong and its cost only has to show it.
+const ITERATIONS: usize = 30;
+
+/// A model at its minimum.
+#[derive(Debug, Clone)]
+pub struct Fit<M> {
+    pub model: M,
+    /// Sum of the squared residuals, normalised units.
+    pub cost: f64,
+    /// Unknowns that the observations could determine, the gauge taken off.
+    pub unknowns: usize,
+}
+
+/// Fits homographies and, with the same start, a camera that only turns.
+///
+/// Returns `None` when no view has enough points in common with every other: nothing ties the homographies together.
+pub fn fit_without_parallax(
+    observations: &[Observation],
+    views: usize,
+    points: usize,
+    noise: f64,
+    stop: &StopToken,
+) -> Option<(Fit<Homographies>, Fit<Rotating>)> {
+    let seen = Correspondences::new(observations, views);
+    let reference = seen.most_observed()?;
+    let homographies: Vec<Matrix3<f64>> = (0..views)
+        .map(|view| match view == reference {
+            true => Some(Matrix3::identity()),
+            false => homography::between(&seen.common(reference, view), noise),
+        })
+        .collect::<Option<_>>()?;
+    let inverses: Vec<Matrix3<f64>> =
+        homographies.iter().map(|homography| homography.try_inverse()).collect::<Option<_>>()?;
+    let mut positions = vec![None; points];
+    for seen in observations.iter().filter(|seen| seen.camera < views && seen.point < points) {
+        let slot = &mut positions[seen.point];
+        if slot.is_none() || seen.camera == reference {
+            let back = inverses[seen.camera] * seen.xy.push(1.0);
+            *slot = Some(back.xy() / back.z).filter(|position| position.iter().all(|value| value.is_finite()));
+        }
+    }
+    let observed = positions.iter().flatten().count();
+    let positions: Vec<Vector2<f64>> = positions.into_iter().map(Option::unwrap_or_default).collect();
+
+    let (intrinsics, rotations) = nearest_rotations(&homographies);
+    let back = |point: &Vector2<f64>| (point - intrinsics.principal_point) / intrinsics.focal;
+    let rotating = Rotating { intrinsics, rotations, points: positions.iter().map(back).collect() };
+    let plane = Homographies { views: homographies, points: positions };
+    Some((
+        adjusted(plane, 8 * views + 2 * observed, HOMOGRAPHIES_GAUGE, observations, stop),
+        adjusted(rotating, 3 * views + 3 + 2 * observed, ROTATING_GAUGE, observations, stop),
+    ))
+}
+
+fn adjusted<M: Adjust>(
+    mut model: M,
+    unknowns: usize,
+    gauge: usize,
+    observations: &[Observation],
+    stop: &StopToken,
+) -> Fit<M> {
+    let report = model.adjust(observations, &Options::squared(ITERATIONS), stop);
+    Fit { model, cost: report.cost, unknowns: unknowns.saturating_sub(gauge) }
+}
+
+/// The focal length, principal point in the centre, with which the homographies are nearest to rotations, and these.
+fn nearest_rotations(homographies: &[Matrix3<f64>]) -> (Intrinsics, Vec<Matrix3<f64>>) {
+    let ratio = (FOCAL_RANGE.1 / FOCAL_RANGE.0).ln() / (FOCALS - 1) as f64;
+    let candidates = (0..FOCALS).map(|k| {
+        let intrinsics = Intrinsics::from_focal(FOCAL_RANGE.0 * (ratio * k as f64).exp());
+        let forward = intrinsics.matrix();
+        let back = Matrix3::new(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, intrinsics.focal) / intrinsics.focal;
+        let (mut rotations, mut distance) = (Vec::with_capacity(homographies.len()), 0.0);
+        for homography in homographies {
+            let moved = back * homography * forward;
+            let moved = moved / moved.determinant().cbrt();
+            let rotation = nearest_rotation(&moved).unwrap_or_else(Matrix3::identity);
+            distance += (moved - rotation).norm_squared();
+            rotations.push(rotation);
+        }
+        (if distance.is_finite() { distance } else { f64::INFINITY }, intrinsics, rotations)
+    });
+    let best = candidates.min_by(|a, b| a.0.total_cmp(&b.0));
+    best.map_or_else(
+        || (Intrinsics::from_focal(1.0), vec![Matrix3::identity(); homographies.len()]),
+        |(_, intrinsics, rotations)| (intrinsics, rotations),
+    )
+}
+
+/// The rotation nearest to a matrix of positive determinant.
+fn nearest_rotation(matrix: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+    if matrix.iter().any(|value| !value.is_finite()) {
+        return None;
+    }
+    let decomposition = matrix.svd(true, true);
+    let rotation = decomposition.u? * decomposition.v_t?;
+    (rotation.determinant() > 0.0).then_some(rotation)
+}
+
+/// Fits a camera that moves without turning.
+///
+/// Without rotation the fundamental matrix of two views is `[e]x`, of their epipole (Hartley & Zisserman, section
+/// 9.3.1). Where these miss by a median of more than `limit` standard deviations, no adjustment is spent on the model.
+///
+/// Returns `None` then, and when no view has enough points in common with every other.
+pub fn fit_translation(
+    observations: &[Observation],
+    views: usize,
+    points: usize,
+    noise: f64,
+    limit: f64,
+    stop: &StopToken,
+) -> Option<Fit<Translating>> {
+    let seen = Correspondences::new(observations, views);
+    let reference = seen.most_observed()?;
+    let mut epipoles = vec![Vector3::zeros(); views];
+    let mut residuals = Vec::with_capacity(views);
+    for view in (0..views).filter(|&view| view != reference) {
+        let pairs = seen.common(reference, view);
+        epipoles[view] = epipole(&pairs)?;
+        residuals.push(epipolar_residual(&pairs, &epipoles[view]));
+    }
+    if median(&mut residuals) > limit * noise {
+        return None;
+    }
+    let mut positions = vec![Vector3::new(0.0, 0.0, 1.0); points];
+    let mut observed = vec![false; points];
+    let usable = |seen: &&Observation| {
+        seen.camera < views && seen.point < points && seen.xy.iter().all(|value| value.is_finite())
+    };
+    for seen in observations.iter().filter(usable) {
+        let slot = &mut positions[seen.point];
+        if !observed[seen.point] || seen.camera == reference {
+            (slot.x, slot.y) = (seen.xy.x, seen.xy.y);
+        }
+        observed[seen.point] = true;
+    }
+    let mut model = Translating { translations: epipoles, points: positions };
+    alternate(&mut model, observations, reference);
+    let observed = observed.iter().filter(|observed| **observed).count();
+    Some(adjusted(model, 3 * views + 3 * observed, TRANSLATING_GAUGE, observations, stop))
+}
+
+/// The common epipole of two views that are not turned to each other: it lies on the line through each point's images.
+fn epipole(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Option<Vector3<f64>> {
+    let mut normal = Matrix3::zeros();
+    for (from, to) in pairs {
+        let line = from.push(1.0).cross(&to.push(1.0));
+        normal += line * line.transpose();
+    }
+    if pairs.len() < homography::LEAST_COMMON || normal.iter().any(|value| !value.is_finite()) {
+        return None;
+    }
+    let eigen = SymmetricEigen::new(normal);
+    Some(eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned())
+}
+
+/// Median first-order distance from the epipolar constraint `to . (e x from) = 0` (Sampson).
+fn epipolar_residual(pairs: &[(Vector2<f64>, Vector2<f64>)], epipole: &Vector3<f64>) -> f64 {
+    let mut residuals: Vec<f64> = pairs
+        .iter()
+        .map(|(from, to)| {
+            let (line, back) = (epipole.cross(&from.push(1.0)), epipole.cross(&to.push(1.0)));
+            let gradient = (line.xy().norm_squared() + back.xy().norm_squared()).sqrt();
+            line.dot(&to.push(1.0)).abs() / gradient.max(f64::MIN_POSITIVE)
+        })
+        .collect();
+    median(&mut residuals)
+}
+
+/// Lengths of the translations and inverse depths that go with the epipoles, by alternating least squares on
+/// `x_i ~ x_0 + w_j s_i e_i`.
+fn alternate(model: &mut Translating, observations: &[Observation], reference: usize) {
+    let in_range = |seen: &&Observation| {
+        seen.camera < model.translations.len() && seen.point < model.points.len() && seen.camera != reference
+    };
+    // For each observation: view, point, w_j s_i and how well it is known.
+    let products: Vec<(usize, usize, f64, f64)> = observations
+        .iter()
+        .filter(in_range)
+        .filter_map(|seen| {
+            let here = seen.xy.push(1.0);
+            let along = here.cross(&model.translations[seen.camera]);
+            let weight = along.norm_squared();
+            let product = -here.cross(&model.points[seen.point].xy().push(1.0)).dot(&along) / weight;
+            product.is_finite().then_some((seen.camera, seen.point, product, weight))
+        })
+        .collect();
+    let mut lengths = vec![0.0; model.translations.len()];
+    let mut depths = vec![1.0; model.points.len()];
+    for _ in 0..DEPTH_ROUNDS {
+        let mut sums = vec![(0.0, 0.0); lengths.len()];
+        for &(view, point, product, weight) in &products {
+            sums[view].0 += weight * product * depths[point];
+            sums[view].1 += weight * depths[point] * depths[point];
+        }
+        lengths.iter_mut().zip(&sums).for_each(|(length, (above, below))| *length = ratio(*above, *below, 0.0));
+        let mut sums = vec![(0.0, 0.0); depths.len()];
+        for &(view, point, product, weight) in &products {
+            sums[point].0 += weight * product * lengths[view];
+            sums[point].1 += weight * lengths[view] * lengths[view];
+        }
+        depths.iter_mut().zip(&sums).for_each(|(depth, (above, below))| *depth = ratio(*above, *below, 1.0));
+    }
+    model.translations.iter_mut().zip(&lengths).for_each(|(translation, length)| *translation *= *length);
+    model.points.iter_mut().zip(&depths).for_each(|(point, depth)| point.z = *depth);
+}
+
+fn ratio(above: f64, below: f64, otherwise: f64) -> f64 {
+    let ratio = above / below;
+    if ratio.is_finite() { ratio } else { otherwise }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::bundle::testing::{self, Motion, NOISE, TestScene};
+    use super::*;
+
+    /// Chi-square over degrees of freedom of each model: homographies, rotation, translation.
+    fn ratios(scene: &TestScene, noise: f64) -> [f64; 3] {
+        let (views, points) = (scene.poses.len(), scene.points.len());
+        let stop = StopToken::default();
+        let reduced =
+            |cost: f64, unknowns: usize| cost / (noise * noise * (2 * scene.observations.len() - unknowns) as f64);
+        let (plane, turning) =
+            fit_without_parallax(&scene.observations, views, points, noise, &stop).expect("complete tracks");
+        let moving = fit_translation(&scene.observations, views, points, noise, f64::INFINITY, &stop);
+        let moving = moving.expect("complete tracks");
+        [
+            reduced(plane.cost, plane.unknowns),
+            reduced(turning.cost, turning.unknowns),
+            reduced(moving.cost, moving.unknowns),
+        ]
+    }
+
+    #[test]
+    fn each_model_fits_its_own_motion_to_the_noise_and_no_other() {
+        let fits = |ratio: f64| (0.6..1.4).contains(&ratio);
+        for seed in 0..10 {
+            for tracks in [20, 60] {
+                let of = |motion, planar| ratios(&testing::scene_of(seed, 10, tracks, NOISE, motion, planar), NOISE);
+                let plane = of(Motion::General, true);
+                let rotation = of(Motion::Rotation, false);
+                let translation = of(Motion::Translation, false);
+                let forward = of(Motion::Forward, false);
+                let general = of(Motion::General, false);
+                println!("seed {seed}, {tracks} tracks: plane {plane:.2?} rotation {rotation:.2?}");
+                println!("  translation {translation:.2?} forward {forward:.2?} general {general:.2?}");
+                assert!(fits(plane[0]) && plane[1] > 3.0 && plane[2] > 3.0, "seed {seed}: {plane:?}");
+                assert!(fits(rotation[0]) && fits(rotation[1]) && rotation[2] > 3.0, "seed {seed}: {rotation:?}");
+                assert!(fits(translation[2]) && translation[0] > 3.0, "seed {seed}: {translation:?}");
+                assert!(fits(forward[2]) && forward[0] > 2.0, "seed {seed}: {forward:?}");
+                assert!(general.iter().all(|&ratio| ratio > 3.0), "seed {seed}: {general:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn missing_observations_are_carried_and_hostile_ones_give_none() {
+        let mut scene = testing::scene_of(3, 8, 40, NOISE, Motion::Translation, false);
+        scene.observations.retain(|seen| (seen.camera + 3 * seen.point) % 4 != 0);
+        let fit = fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &StopToken::default()).expect("a fit");
+        let ratio = fit.cost / (NOISE * NOISE * (2 * scene.observations.len() - fit.unknowns) as f64);
+        assert!((0.6..1.4).contains(&ratio), "{ratio}");
+        let stop = StopToken::default();
+        assert!(fit_translation(&[], 0, 0, NOISE, 5.0, &stop).is_none());
+        assert!(fit_without_parallax(&[], 3, 0, NOISE, &stop).is_none());
+        scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(f64::NAN, 1e200));
+        assert!(fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop).is_none());
+        assert!(fit_without_parallax(&scene.observations, 8, 40, NOISE, &stop).is_none());
+        scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(0.25, 0.5));
+        fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop);
+        fit_without_parallax(&scene.observations, 8, 40, NOISE, &stop);
+    }
+}

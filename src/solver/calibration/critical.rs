@@ -1,0 +1,142 @@
+//! Motions and scenes that carry no calibration, and which of them it is.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::Problem;
+use super::fit::{Fit, MISFIT_DEVIATIONS};
+use crate::domain::{StopToken, Warning, WarningCode};
+use crate::geometry::bundle::critical::{Rotating, Translating};
+use crate::geometry::critical;
+use crate::geometry::homography;
+
+/// Median homography residual, in units of the noise, below which the scene counts as planar or the camera as only
+/// rotating. Measured: 1.1 to 1.8 for those, above 11 for general motion.
+const HOMOGRAPHY_LIMIT: f64 = 3.0;
+/// Median distance from the epipolar lines of a translation, in units of the noise, above which the motion is none and
+/// nothing is adjusted. A translation has about .7; the epipoles are only a start.
+const EPIPOLAR_LIMIT: f64 = 3.0;
+/// Loss of fit, in standard deviations of its statistic, from which a rotation is refuted in favour of a plane, and a
+/// plane in favour of depth. Up to [`MISFIT_DEVIATIONS`] a rotation stands, and between the two the data do not decide.
+/// Before a plane the projective model is singular and fits 3 to 5 deviations better than it should; depth, even with
+/// the short baselines of forward motion, has 50 and more.
+const PLANE_DEVIATIONS: f64 = 8.0;
+/// Spread of the camera's positions off the line that fits them best, relative to that along it, up to which the
+/// motion is along one line; noise leaves a few hundredths.
+const STRAIGHT: f64 = 0.2;
+/// Distance of the point that a straight motion heads for from the image centre, in image sides, up to which it is
+/// along the optical axis.
+const NEAR_AXIS: f64 = 0.1;
+
+/// What carries no calibration, as far as the views show.
+pub(super) struct Critical {
+    /// Empty where nothing speaks against a calibration.
+    pub warnings: Vec<Warning>,
+    /// The reconstruction of a camera that moved without turning, where its scene has depth: a focal length that is
+    /// known otherwise makes it metric.
+    pub translation: Option<Translating>,
+}
+
+/// Whether the views of this consensus carry no calibration, and why.
+///
+/// * `fit`: the projective cameras that every model is tested against
+pub(super) fn find(problem: &Problem, fit: &Fit, scale_px: f64, stop: &StopToken) -> Critical {
+    let (observations, views) = (problem.observations, problem.cameras.len());
+    let points = problem.points.len();
+    let translation = critical::fit_translation(observations, views, points, fit.noise, EPIPOLAR_LIMIT, stop)
+        .filter(|found| !fit.refutes(&Fit::new(found.cost, found.unknowns, problem)));
+    let flat = homography::median_residual(observations, views, fit.noise)
+        .filter(|residual| *residual < HOMOGRAPHY_LIMIT)
+        .and_then(|residual| without_parallax(problem, fit, residual, translation.is_some(), scale_px, stop));
+    if let Some(flat) = flat {
+        return Critical { warnings: vec![flat], translation: None };
+    }
+    let Some(translation) = translation else { return Critical { warnings: Vec::new(), translation: None } };
+    let detail = "a camera that does not turn leaves the focal length free";
+    let warnings = vec![pure_translation(&translation.model), Warning::new(WarningCode::UnobservableFocal, detail)];
+    Critical { warnings, translation: Some(translation.model) }
+}
+
+/// What is said where homographies nearly explain the views; `None` where the baselines are short but show depth.
+///
+/// * `translates`: whether a camera that does not turn explains the views
+fn without_parallax(
+    problem: &Problem,
+    fit: &Fit,
+    residual: f64,
+    translates: bool,
+    scale_px: f64,
+    stop: &StopToken,
+) -> Option<Warning> {
+    let missed = format!(
+        "homographies between the views miss by a median of {residual:.1} standard deviations of the noise ({:.2} px)",
+        fit.noise * scale_px
+    );
+    let (views, points) = (problem.cameras.len(), problem.points.len());
+    let fits = critical::fit_without_parallax(problem.observations, views, points, fit.noise, stop);
+    let Some((plane, turning)) = fits else {
+        let detail = format!("{missed}: the scene is planar, or the camera hardly did more than turn");
+        return Some(Warning::new(WarningCode::PlanarOrRotation, detail));
+    };
+    // The homographies themselves may miss by a little; what a rotation loses is counted from there.
+    let by_plane = Fit::new(plane.cost, plane.unknowns, problem);
+    let by_turning = Fit::new(turning.cost, turning.unknowns, problem);
+    let deviations = by_plane.loss_deviations(by_turning.cost, by_turning.freedom);
+    let turns = deviations < MISFIT_DEVIATIONS;
+    if translates && !turns && fit.loss_deviations(by_plane.cost, by_plane.freedom) > PLANE_DEVIATIONS {
+        return None;
+    }
+    let worse = format!("a camera that only turns fits worse than homographies by {deviations:.1} standard deviations");
+    let (code, because) = match (turns, translates) {
+        (true, true) => (
+            WarningCode::PlanarOrRotation,
+            "the camera hardly moved, and a turn explains the views as well as a shift".to_owned(),
+        ),
+        (true, false) => (WarningCode::PureRotation, rotation_in_words(&turning.model, scale_px)),
+        (false, _) if deviations < PLANE_DEVIATIONS => (
+            WarningCode::PlanarOrRotation,
+            format!("a planar scene is more likely than a camera that only turns; {worse}"),
+        ),
+        (false, _) => (WarningCode::PlanarScene, format!("the scene is planar; {worse}")),
+    };
+    Some(Warning::new(code, format!("{missed}: {because}")))
+}
+
+fn rotation_in_words(turning: &Rotating, scale_px: f64) -> String {
+    format!(
+        "a camera that only turns, with a focal length near {:.0} px, explains the views as well as any homographies do",
+        turning.intrinsics.focal * scale_px
+    )
+}
+
+fn pure_translation(translation: &Translating) -> Warning {
+    let direction = match direction(translation) {
+        Some(heading) if heading.z != 0.0 && heading.xy().norm() <= NEAR_AXIS * heading.z.abs() => {
+            ", along the optical axis"
+        }
+        Some(_) => ", along a line",
+        None => "",
+    };
+    let detail = format!(
+        "the camera moved without turning{direction}: cameras that are not turned to each other explain the views as well \
+         as free ones, and every focal length does so alike"
+    );
+    Warning::new(WarningCode::PureTranslation, detail)
+}
+
+/// Direction of the line along which the camera moved, times `K`; `None` where it left the line.
+fn direction(translation: &Translating) -> Option<Vector3<f64>> {
+    let positions = &translation.translations;
+    let mean = positions.iter().sum::<Vector3<f64>>() / positions.len().max(1) as f64;
+    let mut spread = Matrix3::zeros();
+    for position in positions {
+        spread += (position - mean) * (position - mean).transpose();
+    }
+    if spread.iter().any(|value| !value.is_finite()) {
+        return None;
+    }
+    let eigen = spread.symmetric_eigen();
+    let along = eigen.eigenvalues.imax();
+    let off: f64 = (0..3).filter(|&k| k != along).map(|k| eigen.eigenvalues[k].max(0.0)).sum();
+    let straight = off <= STRAIGHT * STRAIGHT * eigen.eigenvalues[along];
+    straight.then(|| eigen.eigenvectors.column(along).into_owned())
+}

@@ -1,0 +1,54 @@
+//! How well a model fits, and whether one that fits worse is refuted.
+
+use super::{LEAST_NOISE, Problem};
+
+/// Degrees of freedom from which the posterior noise is believed; it is then known to 13 %.
+const ENOUGH_FREEDOM: usize = 30;
+/// Loss of fit of a model with fewer unknowns, in standard deviations of its F statistic, that chance does not explain.
+pub(super) const MISFIT_DEVIATIONS: f64 = 4.0;
+
+/// The fit of a model that others are compared with.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Fit {
+    /// Sum of the squared residuals, normalised units.
+    pub cost: f64,
+    pub freedom: usize,
+    /// Posterior standard deviation of a coordinate; not below the assumed one where there is little to judge from.
+    pub noise: f64,
+}
+
+impl Fit {
+    /// * `unknowns`: those that the observations could determine, the gauge taken off
+    pub fn new(cost: f64, unknowns: usize, problem: &Problem) -> Self {
+        let freedom = (2 * problem.observations.len()).saturating_sub(unknowns);
+        let posterior = posterior_noise(cost, freedom);
+        let noise = if freedom < ENOUGH_FREEDOM { posterior.max(problem.noise) } else { posterior };
+        Self { cost, freedom, noise }
+    }
+
+    /// The fit of free projective cameras and points.
+    pub fn projective(cost: f64, problem: &Problem, inliers: usize) -> Self {
+        Self::new(cost, (11 * problem.cameras.len() + 3 * inliers).saturating_sub(15), problem)
+    }
+
+    /// How much worse a special case of this model fits than chance would have it, in standard deviations of the F
+    /// statistic. Not positive for one that fits as well as can be expected.
+    ///
+    /// * `freedom`: of the special case
+    pub fn loss_deviations(&self, cost: f64, freedom: usize) -> f64 {
+        let added = freedom.saturating_sub(self.freedom).max(1) as f64;
+        let statistic = (cost - self.cost) / added / (self.noise * self.noise);
+        (statistic - 1.0) / (2.0 / added + 2.0 / self.freedom.max(1) as f64).sqrt()
+    }
+
+    /// Whether a special case of this model fits worse than chance explains.
+    pub fn refutes(&self, other: &Fit) -> bool {
+        // Written so that a cost that is no number is refuted.
+        !(self.loss_deviations(other.cost, other.freedom) <= MISFIT_DEVIATIONS)
+    }
+}
+
+/// Standard deviation of a coordinate that goes with a sum of squares over so many degrees of freedom.
+pub(super) fn posterior_noise(cost: f64, freedom: usize) -> f64 {
+    (cost / freedom.max(1) as f64).sqrt().max(LEAST_NOISE)
+}

@@ -1,0 +1,260 @@
+//! Which intrinsics the data carry, and what not knowing that costs the focal length.
+
+use super::fit::Fit;
+use super::grading::METRIC_BELOW;
+use super::search::Minimum;
+use super::{Problem, Stopped};
+use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
+use crate::geometry::bundle::Options;
+use crate::geometry::bundle::metric::{
+    self, Extension, Information, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter,
+};
+
+/// How far the principal point of a lens may be expected from the image centre, one standard deviation of each
+/// coordinate in image sides: lenses are centred to a few hundredths, and only cropping takes it farther.
+const PRINCIPAL_POINT_SIGMA: f64 = 0.05;
+/// The same of the log aspect: digitised video has pixels up to a tenth off square.
+const LOG_ASPECT_SIGMA: f64 = 0.1;
+/// The same of `k1`: phones and cameras have a few hundredths, wide lenses -.3.
+const RADIAL_SIGMA: f64 = 0.2;
+/// Probability, before any observation, that a camera needs the extension. Principal points and distortion are as often
+/// in order (rectified, rendered) as not; pixels are square in all but old video.
+fn probability(extension: Extension) -> f64 {
+    match extension {
+        Extension::PrincipalPoint | Extension::Radial => 0.5,
+        Extension::Aspect => 0.05,
+    }
+}
+
+/// Gain in chi-square at which an extension is taken: the .999 quantile for its degrees of freedom.
+fn significant_gain(extension: Extension) -> f64 {
+    match extension.parameters().len() {
+        1 => 10.8,
+        _ => CHI_SQUARE_GAIN,
+    }
+}
+
+/// The .999 quantile of chi-square for two degrees of freedom.
+pub(super) const CHI_SQUARE_GAIN: f64 = 13.8;
+/// Share of the significant gain that a linearisation must foretell for an adjustment to be tried: it is off where the
+/// richer model is far.
+const WORTH_A_TRIAL: f64 = 0.5;
+/// How much a richer model may raise the standard deviation of the log focal length and still be taken: beyond, it
+/// fits by giving up what was to be found.
+const SIGMA_INFLATION: f64 = 3.0;
+/// Shift of the log focal length between models, in standard deviations, that speaks of a wrong model.
+const MODEL_SHIFT: f64 = 3.0;
+/// Weight of a model below which it has no say in whether the focal length is observable.
+const NEGLIGIBLE: f64 = 1e-3;
+/// Where the profile of the cost is sampled, in standard deviations to either side, and the iterations there.
+const PROFILE_DEVIATIONS: f64 = 3.0;
+const PROFILE_ITERATIONS: usize = 15;
+/// Largest step of the profile in log focal: a factor of 1.35.
+const PROFILE_LONGEST: f64 = 0.3;
+
+/// What is known of the intrinsics beforehand, at this noise: what lenses are like, and what the caller says.
+pub(super) fn knowledge(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> IntrinsicsPrior {
+    let lenses = IntrinsicsPrior::NONE
+        .knowing(Parameter::PrincipalX, 0.0, PRINCIPAL_POINT_SIGMA, noise)
+        .knowing(Parameter::PrincipalY, 0.0, PRINCIPAL_POINT_SIGMA, noise)
+        .knowing(Parameter::LogAspect, 0.0, LOG_ASPECT_SIGMA, noise)
+        .knowing(Parameter::Radial, 0.0, RADIAL_SIGMA, noise);
+    match focal {
+        Some(prior) => lenses.knowing(Parameter::LogFocal, (prior.focal_px / scale_px).ln(), prior.sigma_log, noise),
+        None => lenses,
+    }
+}
+
+/// A metric reconstruction under one model, with what the observations say of the intrinsics there.
+pub(super) struct Candidate {
+    pub model: IntrinsicsModel,
+    pub minimum: Minimum,
+    /// Of the observations alone, without what the prior costs.
+    pub fit: Fit,
+    information: Option<Information>,
+}
+
+impl Candidate {
+    pub fn new(minimum: Minimum, model: IntrinsicsModel, prior: &IntrinsicsPrior, problem: &Problem) -> Self {
+        let inliers = super::observed_points(problem);
+        let unknowns = 6 * problem.cameras.len() + 3 * inliers + model.parameters().len();
+        let believed = prior.cost(model, &minimum.reconstruction.intrinsics);
+        let fit = Fit::new(minimum.cost - believed, unknowns.saturating_sub(7), problem);
+        let information = Information::new(&minimum.reconstruction, problem.observations);
+        Self { model, minimum, fit, information }
+    }
+
+    /// What a model makes of the observations, to second order.
+    pub fn optimum(&self, model: IntrinsicsModel, prior: &IntrinsicsPrior) -> Option<Optimum> {
+        self.information.as_ref().map(|information| information.optimum(model, prior))
+    }
+
+    /// Standard deviation of a parameter under a model; `None`: unobservable.
+    pub fn sigma(&self, parameter: Parameter, model: IntrinsicsModel, prior: &IntrinsicsPrior) -> Option<f64> {
+        let variance = self.optimum(model, prior)?.variance_of(parameter)?;
+        Some(variance.sqrt() * self.fit.noise).filter(|sigma| sigma.is_finite())
+    }
+
+    /// Standard deviation of the log focal length if the model is right.
+    fn sigma_log_focal(&self, prior: &IntrinsicsPrior) -> Option<f64> {
+        self.sigma(Parameter::LogFocal, self.model, prior)
+    }
+}
+
+/// What the choice of a model works with.
+pub(super) struct Choice<'a> {
+    pub problem: &'a Problem<'a>,
+    pub prior: &'a IntrinsicsPrior,
+    pub scale_px: f64,
+    pub stop: &'a StopToken,
+}
+
+impl Choice<'_> {
+    /// Frees extension after extension, the most significant first, as long as the data ask for one and still determine
+    /// the focal length.
+    pub fn richest(&self, simple: Candidate, warnings: &mut Vec<Warning>) -> Result<Candidate, Stopped> {
+        let mut best = simple;
+        loop {
+            let mut taken = None;
+            for (extension, _) in self.promising(&best) {
+                Stopped::check(self.stop)?;
+                taken = self.extended(&best, extension, warnings);
+                if taken.is_some() {
+                    break;
+                }
+            }
+            match taken {
+                Some(richer) => best = richer,
+                None => return Ok(best),
+            }
+        }
+    }
+
+    /// Extensions that the linearisation foretells to be significant, with the gain beyond what is, largest first.
+    fn promising(&self, best: &Candidate) -> Vec<(Extension, f64)> {
+        let Some(here) = best.optimum(best.model, self.prior) else { return Vec::new() };
+        let beyond = |extension: Extension| {
+            let there = best.optimum(best.model.with(extension), self.prior)?;
+            let left = (best.fit.cost + there.rise).max(0.0) / best.fit.cost.max(f64::MIN_POSITIVE);
+            let gain = (here.rise - there.rise) / (best.fit.noise.powi(2) * left.max(f64::EPSILON));
+            let needed = significant_gain(extension);
+            (gain > WORTH_A_TRIAL * needed).then_some((extension, gain - needed))
+        };
+        let mut found: Vec<(Extension, f64)> = Extension::ALL
+            .into_iter()
+            .filter(|extension| !best.model.contains(*extension))
+            .filter_map(beyond)
+            .collect();
+        found.sort_by(|a, b| b.1.total_cmp(&a.1));
+        found
+    }
+
+    /// The candidate with this extension, if that is significant and leaves the focal length observable.
+    fn extended(&self, best: &Candidate, extension: Extension, warnings: &mut Vec<Warning>) -> Option<Candidate> {
+        let model = best.model.with(extension);
+        let minimum = best.minimum.adjusted(self.problem.observations, model, self.prior, self.stop);
+        let richer = Candidate::new(minimum, model, self.prior, self.problem);
+        let gain = (best.minimum.cost - richer.minimum.cost) / richer.fit.noise.powi(2);
+        if gain <= significant_gain(extension) {
+            return None;
+        }
+        let (simple_sigma, rich_sigma) = (best.sigma_log_focal(self.prior), richer.sigma_log_focal(self.prior));
+        let observable = match (simple_sigma, rich_sigma) {
+            (Some(simple), Some(rich)) => rich <= METRIC_BELOW.max(SIGMA_INFLATION * simple),
+            (None, rich) => rich.is_some(),
+            (Some(_), None) => false,
+        };
+        if observable {
+            return Some(richer);
+        }
+        let shift = (richer.minimum.log_focal() - best.minimum.log_focal()).abs();
+        if let Some(sigma) = simple_sigma.filter(|sigma| shift > MODEL_SHIFT * sigma) {
+            warnings.push(self.not_taken(best, &richer, extension, shift / sigma));
+        }
+        None
+    }
+
+    fn not_taken(&self, best: &Candidate, richer: &Candidate, extension: Extension, deviations: f64) -> Warning {
+        let focal_px = |candidate: &Candidate| candidate.minimum.reconstruction.intrinsics.focal * self.scale_px;
+        let detail = format!(
+            "the data ask for a free {}, which moves the focal length from {:.1} to {:.1} px, {deviations:.1} standard \
+             deviations, but leaves it too uncertain",
+            extension.name(),
+            focal_px(best),
+            focal_px(richer),
+        );
+        Warning::new(WarningCode::ModelMismatch, detail)
+    }
+
+    /// Standard deviation of the log focal length, the doubt about the model included; `None`: unobservable.
+    ///
+    /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
+    /// the expected squared error of the focal length reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights
+    /// from Laplace's approximation of each model's evidence under [`knowledge`]. An extension that the data can
+    /// neither confirm nor refute thus costs what it would move.
+    pub fn sigma(&self, best: &Candidate) -> Option<f64> {
+        let own = best.sigma_log_focal(self.prior)?;
+        let profiled = self.profiled(own, best);
+        let here = best.optimum(best.model, self.prior)?;
+        let unit = best.fit.noise.powi(2);
+        let models: Vec<(f64, Optimum)> = IntrinsicsModel::all()
+            .filter_map(|model| {
+                let there = best.optimum(model, self.prior)?;
+                Some((self.log_weight(model, &here, &there, unit), there))
+            })
+            .collect();
+        let highest = models.iter().map(|(weight, _)| *weight).fold(f64::NEG_INFINITY, f64::max);
+        let total: f64 = models.iter().map(|(weight, _)| (weight - highest).exp()).sum();
+        let mut squared = 0.0;
+        for (weight, there) in &models {
+            let weight = (weight - highest).exp() / total;
+            let index = Parameter::LogFocal as usize;
+            match there.variance[index] {
+                Some(variance) => {
+                    squared += weight * (variance * unit + (there.shift[index] - here.shift[index]).powi(2))
+                }
+                None if weight > NEGLIGIBLE => return None,
+                None => {}
+            }
+        }
+        // What the profile adds to the chosen model's own deviation, it adds to the whole.
+        Some(squared.sqrt() * profiled / own).filter(|sigma| sigma.is_finite())
+    }
+
+    /// Logarithm of prior probability times evidence, up to what all models share.
+    fn log_weight(&self, model: IntrinsicsModel, here: &Optimum, there: &Optimum, unit: f64) -> f64 {
+        let of = |extension: Extension| match model.contains(extension) {
+            true => {
+                let believed = |parameter: &Parameter| self.prior.information[*parameter as usize].ln();
+                probability(extension).ln() + 0.5 * extension.parameters().iter().map(believed).sum::<f64>()
+            }
+            false => (1.0 - probability(extension)).ln(),
+        };
+        let prior: f64 = Extension::ALL.into_iter().map(of).sum();
+        prior - 0.5 * (there.rise - here.rise) / unit - 0.5 * there.log_determinant
+    }
+
+    /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
+    ///
+    /// The focal length is held three standard deviations away while everything else adjusts; the chi-square should
+    /// rise by nine. Near critical motions the linearisation is optimistic: it is taken where the noise has moved the
+    /// scene.
+    fn profiled(&self, sigma: f64, best: &Candidate) -> f64 {
+        let shift = (PROFILE_DEVIATIONS * sigma).min(PROFILE_LONGEST);
+        if shift <= 0.0 {
+            return sigma;
+        }
+        let model = best.model.without_focal();
+        let side = |shift: f64| {
+            let mut moved = best.minimum.reconstruction.clone();
+            moved.intrinsics.focal *= shift.exp();
+            let options = Options::squared(PROFILE_ITERATIONS);
+            let report = metric::adjust(&mut moved, self.problem.observations, model, self.prior, &options, self.stop);
+            let deviation = self.prior.deviation(Parameter::LogFocal, &moved.intrinsics);
+            let believed = self.prior.information[Parameter::LogFocal as usize] * deviation.powi(2);
+            (report.cost + believed - best.minimum.cost).max(0.0) / best.fit.noise.powi(2)
+        };
+        let rise = side(shift).min(side(-shift));
+        sigma.max(shift / rise.sqrt().max(f64::MIN_POSITIVE))
+    }
+}

@@ -1,0 +1,131 @@
+//! Intrinsics beyond the focal length, and what is known of it beforehand.
+
+use nalgebra::Vector2;
+
+use super::*;
+use crate::geometry::bundle::metric::Extension;
+
+#[test]
+fn a_displaced_principal_point_is_found_and_a_central_one_is_left_alone() {
+    for seed in 0..4 {
+        let mut scene = testing::scene(seed, 10, 60, 0.0);
+        scene.intrinsics.principal_point = Vector2::new(0.05, -0.03);
+        let mut rng = rand::SeedableRng::seed_from_u64(seed);
+        scene.observe(0.001, &mut rng);
+        let outcome = calibrated(&scene, seed, 0.001);
+        let found = outcome.metric.as_ref().expect("a metric reconstruction").intrinsics;
+        println!("seed {seed}: {found:?}, true {:?}, {:?}", scene.intrinsics, codes(&outcome));
+        assert!(outcome.model.contains(Extension::PrincipalPoint), "seed {seed}");
+        assert!((found.principal_point - scene.intrinsics.principal_point).norm() < 0.01, "seed {seed}");
+        assert!(focal_error(&outcome, &scene) < 0.01, "seed {seed}");
+
+        let central = calibrated(&testing::scene(seed, 10, 60, 0.001), seed, 0.001);
+        assert_eq!(central.model, IntrinsicsModel::FOCAL, "seed {seed}");
+    }
+}
+
+/// Scenes seen through a distorting lens, only what falls into the image.
+fn through_a_lens(seed: u64, radial: f64, principal_point: Vector2<f64>, noise: f64) -> TestScene {
+    let mut scene = testing::scene(seed, 10, 80, 0.0);
+    scene.intrinsics.radial = radial;
+    scene.intrinsics.principal_point = principal_point;
+    scene.observe(noise, &mut rand::SeedableRng::seed_from_u64(seed));
+    scene.crop();
+    scene
+}
+
+#[test]
+fn radial_distortion_is_found_with_a_displaced_principal_point_too() {
+    for radial in [-0.05, -0.3] {
+        let mut beyond = 0;
+        for seed in 0..20 {
+            let displaced = testing::direction::<2>(seed).map(|value| (0.03 * value).clamp(-0.05, 0.05));
+            let scene = through_a_lens(seed, radial, displaced, 0.001);
+            let begun = std::time::Instant::now();
+            let outcome = calibrated(&scene, seed, 0.001);
+            let error = focal_error(&outcome, &scene);
+            let sigma = outcome.sigma_log_focal.unwrap_or(f64::INFINITY);
+            let found = outcome.metric.as_ref().expect("metric").intrinsics;
+            println!(
+                "k1 {radial}, seed {seed}: error {error:.5}, {:.1} sigma of {sigma:.5}, {:?}, k1 {:.4}, pp off by {:.4}, {} {:?} {:.2} in {:?}",
+                error / sigma,
+                outcome.grade,
+                found.radial,
+                (found.principal_point - displaced).norm(),
+                outcome.model.name(),
+                codes(&outcome),
+                outcome.rms_ratio,
+                begun.elapsed()
+            );
+            let warned = codes(&outcome).contains(&"MODEL_MISMATCH");
+            beyond += usize::from(error > 3.0 * sigma && !warned);
+        }
+        println!("k1 {radial}: {beyond} of 20 beyond three sigma and without a warning");
+        assert!(beyond <= 1, "k1 {radial}: {beyond} of 20");
+    }
+}
+
+#[test]
+fn a_lens_without_distortion_is_left_without() {
+    for seed in 0..10 {
+        let scene = through_a_lens(seed, 0.0, Vector2::zeros(), 0.001);
+        let outcome = calibrated(&scene, seed, 0.001);
+        let found = outcome.metric.as_ref().expect("metric").intrinsics;
+        println!("seed {seed}: {} {:?}", outcome.model.name(), codes(&outcome));
+        assert_eq!(found.radial, 0.0, "seed {seed}");
+    }
+}
+
+#[test]
+fn a_prior_makes_a_translation_weak_and_never_metric() {
+    for motion in [Motion::Translation, Motion::Forward] {
+        for seed in 0..10 {
+            let scene = testing::scene_of(seed, 10, 30, 0.001, motion, false);
+            let focal_px = scene.intrinsics.focal * SIDE_PX * 1.01;
+            for sigma_log in [0.02, 0.001] {
+                let outcome = calibrated_knowing(&scene, seed, 0.001, Some(FocalPrior { focal_px, sigma_log }));
+                println!(
+                    "{motion:?}, seed {seed}: {:?} {:?} {:?}",
+                    outcome.grade, outcome.sigma_log_focal, outcome.warnings
+                );
+                assert_eq!(outcome.grade, Grade::Weak, "{motion:?}, seed {seed}");
+                assert_eq!(outcome.cheirality, 1.0, "{motion:?}, seed {seed}");
+                let sigma = outcome.sigma_log_focal.expect("known beforehand");
+                assert!((0.02..0.03).contains(&sigma), "{motion:?}, seed {seed}: {sigma}");
+                assert!(codes(&outcome).contains(&"PURE_TRANSLATION"), "{motion:?}, seed {seed}");
+                assert!(focal_error(&outcome, &scene) < 0.02, "{motion:?}, seed {seed}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_prior_helps_where_the_motion_says_little_and_is_contradicted_where_it_says_much() {
+    for seed in 0..5 {
+        let weak = testing::scene_turning(seed, 40, 0.001, 0.05);
+        let focal_px = weak.intrinsics.focal * SIDE_PX;
+        let alone = calibrated(&weak, seed, 0.001).sigma_log_focal.unwrap_or(f64::INFINITY);
+        let helped = calibrated_knowing(&weak, seed, 0.001, Some(FocalPrior { focal_px, sigma_log: 0.05 }));
+        println!("seed {seed}: sigma {alone} alone, {:?} with a prior", helped.sigma_log_focal);
+        assert!(helped.sigma_log_focal.expect("known") < 0.051_f64.max(1.1 * alone), "seed {seed}");
+
+        let strong = testing::scene(seed, 10, 60, 0.001);
+        let off = strong.intrinsics.focal * SIDE_PX * 1.3;
+        let outcome = calibrated_knowing(&strong, seed, 0.001, Some(FocalPrior { focal_px: off, sigma_log: 0.02 }));
+        println!("seed {seed}: {:?} {:?} {:?}", outcome.grade, outcome.sigma_log_focal, outcome.warnings);
+        assert!(codes(&outcome).contains(&"MODEL_MISMATCH"), "seed {seed}: {:?}", outcome.warnings);
+        assert!(focal_error(&outcome, &strong) < 3.0 * outcome.sigma_log_focal.expect("observable"), "seed {seed}");
+    }
+}
+
+#[test]
+fn an_orbit_about_one_axis_leaves_the_principal_point_open() {
+    for seed in 0..5 {
+        let mut scene = testing::scene(seed, 10, 40, 0.0);
+        testing::orbit(&mut scene, 0.8);
+        scene.observe(0.001, &mut rand::SeedableRng::seed_from_u64(seed));
+        let outcome = calibrated(&scene, seed, 0.001);
+        println!("seed {seed}: {:?} {:?} {:?}", outcome.grade, outcome.sigma_log_focal, outcome.warnings);
+        assert!(codes(&outcome).contains(&"PRINCIPAL_POINT_UNOBSERVABLE"), "seed {seed}: {:?}", outcome.warnings);
+    }
+}
