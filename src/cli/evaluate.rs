@@ -12,10 +12,10 @@ use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
 use crate::domain::{StopReason, StopToken};
-use crate::evaluation::plan::{Contestant, Depths, Plan, Sweep};
+use crate::evaluation::plan::{Contestant, Depths, Plan};
 use crate::evaluation::runner::{self, Records};
 use crate::evaluation::summary::{self, Cell};
-use crate::evaluation::{figures, page};
+use crate::evaluation::{Sweep, figures, page};
 use crate::formats::result_files::{create_directory, pretty, write_atomically};
 
 /// Seeds of a full evaluation and of a quick one.
@@ -27,6 +27,8 @@ Examples:
   scpsfm evaluate --quick
   scpsfm evaluate --out evaluation --seeds 20 --threads 2
   scpsfm evaluate --sweeps outliers,orbit --depths none --methods oracle,auto,geometry
+  scpsfm evaluate --beyond --methods oracle,auto --depths none
+  scpsfm evaluate --ablation --sweeps outliers,orbit --out ablation
 
 Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
 figure-depths-*.svg (the paper's layout) and index.html, which shows all of it. Stopped by Ctrl-C, a crash or a power cut it goes on where it was when called again with the same directory.";
@@ -54,9 +56,17 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
 
-    /// Sweeps to run [default: all]
+    /// Sweeps to run [default: those of the paper, strong noise and the orbit]
     #[arg(long, value_enum, value_delimiter = ',', value_name = "SWEEP")]
     pub sweeps: Vec<SweepArg>,
+
+    /// All sweeps, those that the paper leaves out included: structured outliers, critical motions, lens terms
+    #[arg(long, conflicts_with = "sweeps")]
+    pub beyond: bool,
+
+    /// AUTO without one of its parts at a time, instead of all methods
+    #[arg(long, conflicts_with = "methods")]
+    pub ablation: bool,
 
     /// How projective depths are given [default: given and none]
     #[arg(long, value_enum, value_delimiter = ',', value_name = "DEPTHS")]
@@ -90,6 +100,16 @@ pub enum SweepArg {
     StrongNoise,
     /// Rotations to 3.1 rad, .5 to .95 outliers
     Orbit,
+    /// Uniform, slid, repeated outliers, a second motion
+    Structured,
+    /// Outliers that are wrong in 1, 2, 5 of 10 views
+    Partial,
+    /// Noise that is not Gaussian
+    NoiseKind,
+    /// Critical motions and a planar scene
+    Motion,
+    /// Displaced principal points, distortion, zooms
+    Lens,
 }
 
 /// [`Depths`] on the command line.
@@ -148,8 +168,8 @@ impl Args {
             .filter_map(|sweep| sweep.to_possible_value())
             .map(|value| value.get_name().to_owned())
             .collect();
-        let mut sweeps = Sweep::all();
-        sweeps.retain(|sweep| wanted.is_empty() || wanted.contains(sweep.name));
+        let mut sweeps = if wanted.is_empty() && !self.beyond { Sweep::paper() } else { Sweep::all() };
+        sweeps.retain(|sweep| self.beyond || wanted.is_empty() || wanted.contains(sweep.name));
         if self.quick {
             sweeps.iter_mut().for_each(|sweep| sweep.cells.retain(|(_, scene)| is_quick(scene.views * scene.tracks)));
         }
@@ -165,7 +185,11 @@ impl Args {
         Plan {
             sweeps,
             depths: if depths.is_empty() { Depths::ALL.to_vec() } else { depths },
-            contestants: if contestants.is_empty() { Contestant::ALL.to_vec() } else { unique(contestants) },
+            contestants: match contestants.is_empty() {
+                true if self.ablation => Contestant::ABLATION.to_vec(),
+                true => Contestant::ALL.to_vec(),
+                false => unique(contestants),
+            },
             seeds: self.seeds.unwrap_or(if self.quick { QUICK_SEEDS } else { SEEDS }),
         }
     }
@@ -245,16 +269,16 @@ fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> 
 /// Mean F1 and median focal error of every cell, in words.
 fn table(cells: &[Cell]) -> String {
     let mut text = format!(
-        "{:<13}{:>7}  {:<7}{:<19}{:>6}{:>8}{:>8}{:>10}{:>10}{:>9}\n",
+        "{:<13}{:<19}{:<7}{:<25}{:>6}{:>8}{:>8}{:>10}{:>10}{:>9}\n",
         "sweep", "at", "depths", "method", "seeds", "F1", "min F1", "2D px", "focal %", "seconds"
     );
     let shown =
         |value: Option<f64>, factor: f64| value.map_or_else(|| "-".into(), |value| format!("{:.2}", factor * value));
     for cell in cells {
         text.push_str(&format!(
-            "{:<13}{:>7}  {:<7}{:<19}{:>6}{:>8.3}{:>8.3}{:>10}{:>10}{:>9.2}\n",
+            "{:<13}{:<19}{:<7}{:<25}{:>6}{:>8.3}{:>8.3}{:>10}{:>10}{:>9.2}\n",
             cell.sweep,
-            cell.x,
+            cell.place,
             cell.depths.name(),
             cell.contestant.name(),
             cell.seeds,

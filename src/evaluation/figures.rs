@@ -10,6 +10,8 @@ use crate::report::html::escape;
 const PANEL: (f64, f64) = (210.0, 120.0);
 const GAP: (f64, f64) = (62.0, 46.0);
 const MARGIN: (f64, f64) = (66.0, 58.0);
+/// Columns that there is always room for, so that the legend fits.
+const LEAST_COLUMNS: usize = 3;
 /// Ratio of the largest to the smallest value on the horizontal axis from which it is logarithmic.
 const LOGARITHMIC_FROM: f64 = 8.0;
 /// Decades that a vertical axis shows below its largest value.
@@ -39,12 +41,21 @@ fn stroke(contestant: Contestant) -> (&'static str, &'static str) {
         Contestant::Paper => ("#009e73", ""),
         Contestant::PaperWithoutDaq => ("#009e73", "5 3"),
         Contestant::Psfm => ("#cc79a7", ""),
+        Contestant::AutoWithoutDaq => ("#d55e00", "8 3"),
+        Contestant::AutoWithoutIrls => ("#56b4e9", ""),
+        Contestant::AutoWithoutConsistency => ("#56b4e9", "5 3"),
+        Contestant::AutoWithoutRigidity => ("#e69f00", ""),
+        Contestant::AutoWithoutUniform => ("#e69f00", "5 3"),
+        Contestant::NetworkAlone => ("#009e73", "2 2"),
     }
 }
 
 /// The figure of one way of giving depths.
+///
+/// Sweeps whose cells have names instead of values are left to the tables.
 pub fn svg(plan: &Plan, cells: &[Cell], depths: Depths) -> String {
-    let width = MARGIN.0 + plan.sweeps.len() as f64 * (PANEL.0 + GAP.0);
+    let sweeps: Vec<_> = plan.sweeps.iter().filter(|sweep| sweep.names.is_empty()).collect();
+    let width = MARGIN.0 + sweeps.len().max(LEAST_COLUMNS) as f64 * (PANEL.0 + GAP.0);
     let height = MARGIN.1 + MEASURES.len() as f64 * (PANEL.1 + GAP.1);
     let mut out = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width:.0} {height:.0}\" role=\"img\" \
@@ -53,7 +64,7 @@ pub fn svg(plan: &Plan, cells: &[Cell], depths: Depths) -> String {
         depths.name()
     );
     legend(&mut out, plan);
-    for (column, sweep) in plan.sweeps.iter().enumerate() {
+    for (column, sweep) in sweeps.into_iter().enumerate() {
         let left = MARGIN.0 + column as f64 * (PANEL.0 + GAP.0);
         text(&mut out, (left + PANEL.0 / 2.0, MARGIN.1 - 12.0), "middle", "#000", &sweep.name.replace('-', " "));
         let x = Axis::horizontal(sweep.cells.iter().map(|(x, _)| *x), left);
@@ -119,7 +130,10 @@ fn panel(out: &mut String, x: &Axis, top: f64, measure: &Measure, cells: &[&Cell
         text(out, (at, top + PANEL.1 + 15.0), "middle", "#555", &number(tick));
     }
     frame(out, x, top);
-    for contestant in Contestant::ALL {
+    let mut contestants: Vec<Contestant> = cells.iter().map(|cell| cell.contestant).collect();
+    contestants.sort_unstable();
+    contestants.dedup();
+    for contestant in contestants {
         let points: Vec<(f64, f64)> = cells
             .iter()
             .filter(|cell| cell.contestant == contestant)
@@ -251,17 +265,21 @@ impl Axis {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evaluation::plan::Sweep;
+    use crate::evaluation::sweeps::Sweep;
 
     fn cell(x: f64, contestant: Contestant, error: Option<f64>) -> Cell {
         Cell {
             sweep: "outliers",
             x,
+            place: x.to_string(),
             depths: Depths::None,
             contestant,
             seeds: 1,
             mean_f1: x,
             least_f1: x,
+            observation_f1: x,
+            reached: 1.0,
+            seconds_to_reach: None,
             solved: 1.0,
             error_2d_px: error,
             error_3d: error,
@@ -278,7 +296,7 @@ mod tests {
     #[test]
     fn every_value_is_a_point_and_nothing_else() {
         let plan = Plan {
-            sweeps: Sweep::all(),
+            sweeps: Sweep::paper(),
             depths: vec![Depths::None],
             contestants: vec![Contestant::Oracle, Contestant::Auto],
             seeds: 1,

@@ -13,6 +13,8 @@ pub struct Measures {
     pub f1: f64,
     pub precision: f64,
     pub recall: f64,
+    /// The same by observation; the only fair count where a wrong track is wrong in a few views.
+    pub observations: Observations,
     /// Root mean square distance, in pixels, between the reprojected points and the true image points, noise not
     /// included, over the true inliers that the answer kept; `None`: nothing was reconstructed.
     pub error_2d_px: Option<f64>,
@@ -20,7 +22,7 @@ pub struct Measures {
     /// the paper names no alignment), origin as in the paper's generator: near the cameras. `None` without a metric
     /// reconstruction.
     pub error_3d: Option<f64>,
-    /// `ln(f / f_true)`; `None` where no focal length was given.
+    /// `ln(f / f_true)`; `None` where no focal length was given, or the truth has several.
     pub log_focal_error: Option<f64>,
     /// One standard deviation that the answer claims for it; the Cramer-Rao bound for the oracle.
     pub sigma_log_focal: Option<f64>,
@@ -31,6 +33,20 @@ pub struct Measures {
     pub winning_prior: Option<crate::domain::Prior>,
     /// Network iterations spent.
     pub iterations: u32,
+}
+
+/// Agreement by observation.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Observations {
+    pub f1: f64,
+    pub precision: f64,
+    pub recall: f64,
+}
+
+impl From<Agreement> for Observations {
+    fn from(Agreement { precision, recall, f1 }: Agreement) -> Self {
+        Self { f1, precision, recall }
+    }
 }
 
 impl Measures {
@@ -46,11 +62,14 @@ impl Measures {
                 truth.inlier[track] && solution.tracks.inlier[track] && solution.tracks.point[track].is_some()
             })
             .collect();
-        let solved = solution.status == Status::Solved && !kept.is_empty();
+        // The reprojection of a scene with lens terms depends on what the answer calls its pinhole: it is not compared.
+        let pinhole = scene.options.radial_k1 == 0.0 && scene.options.zoom == 0.0;
+        let solved = solution.status == Status::Solved && !kept.is_empty() && pinhole;
         Self {
             f1: inliers.f1,
             precision: inliers.precision,
             recall: inliers.recall,
+            observations: agreement(&solution.observations.inlier, &truth.observation_right).into(),
             error_2d_px: if solved { error_2d_px(truth, solution, &kept) } else { None },
             error_3d: if solved && solution.is_metric() {
                 let found: Vec<Vector3<f64>> =
@@ -62,6 +81,7 @@ impl Measures {
             log_focal_error: solution
                 .calibrations
                 .first()
+                .filter(|_| scene.options.zoom == 0.0)
                 .map(|calibration| (calibration.focal_px / truth.focal_px).ln())
                 .filter(|error| error.is_finite()),
             sigma_log_focal: solution.calibrations.first().and_then(|calibration| calibration.sigma_log_focal),

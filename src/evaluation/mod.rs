@@ -1,6 +1,6 @@
 //! The paper's evaluation, and what goes beyond it: every method on the same scenes, against the oracle.
 //!
-//! [`plan`] says which scenes and which contestants, [`runner`] runs and records them one by one (and goes on where it
+//! [`sweeps`] are the scenes, [`plan`] says which contestants solve them, [`runner`] runs and records them one by one (and goes on where it
 //! was stopped), [`measures`] scores an answer, [`oracle`] does what the best could do who knows the truth, and
 //! [`summary`] makes numbers of the records, [`figures`] and [`page`] show them. May depend on `solver`, `synthetic`,
 //! `geometry`, `report` and `domain`; knows nothing of jobs or transport.
@@ -12,6 +12,8 @@ pub mod page;
 pub mod plan;
 pub mod runner;
 pub mod summary;
+pub mod sweeps;
 
 pub use measures::Measures;
-pub use plan::{Contestant, Depths, Run, Sweep};
+pub use plan::{Contestant, Depths, Run};
+pub use sweeps::Sweep;

@@ -27,6 +27,8 @@ const LEAST_NOISE: f64 = 1e-9;
 
 /// Scores the oracle on a scene whose tracks are complete: the true cameras and the true noise gate every track, metric bundle
 /// adjustment of the true inliers, started at the truth, gives the rest.
+///
+/// Knows pinholes only: scenes with distortion or a zoom have no oracle.
 pub fn measure(scene: &Scene) -> Measures {
     let begun = Instant::now();
     let world = World::new(scene);
@@ -37,6 +39,7 @@ pub fn measure(scene: &Scene) -> Measures {
         f1: inliers.f1,
         precision: inliers.precision,
         recall: inliers.recall,
+        observations: Default::default(),
         error_2d_px: calibrated.as_ref().map(|calibrated| calibrated.error_2d_px),
         error_3d: calibrated.as_ref().and_then(|calibrated| calibrated.error_3d),
         log_focal_error: calibrated.as_ref().map(|calibrated| calibrated.log_focal_error),

@@ -61,7 +61,7 @@ fn coverage_table(coverage: &[Coverage]) -> String {
 fn cell_table(cells: &[Cell]) -> String {
     let mut table = String::from(
         "<h2>Every cell</h2>\n<table>\n<tr><th>sweep</th><th>at</th><th>depths</th><th>method</th><th>seeds</th><th>F1</th>\
-         <th>least F1</th><th>2D px</th><th>3D</th><th>focal %</th><th>of the oracle's</th><th>METRIC</th><th>WEAK</th>\
+         <th>least F1</th><th>by observation</th><th>2D px</th><th>3D</th><th>focal %</th><th>of the oracle's</th><th>METRIC</th><th>WEAK</th>\
          <th>PROJECTIVE</th><th>seconds</th></tr>\n",
     );
     let shown = |value: Option<f64>, factor: f64, digits: usize| {
@@ -72,15 +72,16 @@ fn cell_table(cells: &[Cell]) -> String {
             cell.focal_ratio_interval.map_or_else(String::new, |[low, high]| format!(" ({low:.2} to {high:.2})"));
         let _ = writeln!(
             table,
-            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{:.3}</td><td>{:.3}</td><td>{}</td><td>{}</td>\
+            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{:.3}</td><td>{:.3}</td><td>{:.3}</td><td>{}</td><td>{}</td>\
              <td>{}</td><td>{}{}</td><td>{:.2}</td><td>{:.2}</td><td>{:.2}</td><td>{:.2}</td></tr>",
             escape(cell.sweep),
-            cell.x,
+            escape(&cell.place),
             cell.depths.name(),
             cell.contestant.name(),
             cell.seeds,
             cell.mean_f1,
             cell.least_f1,
+            cell.observation_f1,
             shown(cell.error_2d_px, 1.0, 2),
             shown(cell.error_3d, 1.0, 4),
             shown(cell.focal_error, 100.0, 2),

@@ -1,8 +1,9 @@
-//! What is run: sweeps of scenes, ways of giving depths, contestants.
+//! What is run: ways of giving depths, contestants, and which of them on which sweeps.
 
 use serde::{Deserialize, Serialize};
 
-use crate::domain::{Method, SolveSettings};
+use super::sweeps::Sweep;
+use crate::domain::{Method, Prior, SolveSettings};
 use crate::synthetic::SceneOptions;
 
 /// How projective depths come to the contestants.
@@ -40,9 +41,29 @@ pub enum Contestant {
     PaperWithoutDaq,
     /// Plain projective factorisation (Sturm & Triggs 1996) at the threshold that suits the scene best.
     Psfm,
+    /// AUTO with the DAQ residual in neither losses nor scores.
+    AutoWithoutDaq,
+    AutoWithoutIrls,
+    AutoWithoutConsistency,
+    AutoWithoutRigidity,
+    AutoWithoutUniform,
+    /// AUTO with the network's prior and no other.
+    NetworkAlone,
 }
 
 impl Contestant {
+    /// AUTO and what is left of it: without the network it is GEOMETRY.
+    pub const ABLATION: [Contestant; 8] = [
+        Contestant::Auto,
+        Contestant::Geometry,
+        Contestant::AutoWithoutDaq,
+        Contestant::AutoWithoutIrls,
+        Contestant::AutoWithoutConsistency,
+        Contestant::AutoWithoutRigidity,
+        Contestant::AutoWithoutUniform,
+        Contestant::NetworkAlone,
+    ];
+    /// The contestants of the paper's figure.
     pub const ALL: [Contestant; 6] = [
         Contestant::Oracle,
         Contestant::Auto,
@@ -60,6 +81,34 @@ impl Contestant {
             Contestant::Paper => "paper",
             Contestant::PaperWithoutDaq => "paper-without-daq",
             Contestant::Psfm => "psfm",
+            Contestant::AutoWithoutDaq => "auto-without-daq",
+            Contestant::AutoWithoutIrls => "auto-without-irls",
+            Contestant::AutoWithoutConsistency => "auto-without-consistency",
+            Contestant::AutoWithoutRigidity => "auto-without-rigidity",
+            Contestant::AutoWithoutUniform => "auto-without-uniform",
+            Contestant::NetworkAlone => "network-alone",
+        }
+    }
+
+    /// Whether this contestant has anything to say of such a scene: the oracle knows pinholes only, and rigidity needs
+    /// depths.
+    pub fn takes_part(self, scene: &SceneOptions, depths: Depths) -> bool {
+        match self {
+            Contestant::Oracle => scene.radial_k1 == 0.0 && scene.zoom == 0.0,
+            Contestant::AutoWithoutRigidity => depths == Depths::Given,
+            _ => true,
+        }
+    }
+
+    /// Priors that this contestant does without.
+    fn excluded_priors(self) -> Vec<Prior> {
+        match self {
+            Contestant::AutoWithoutIrls => vec![Prior::Irls],
+            Contestant::AutoWithoutConsistency => vec![Prior::Consistency],
+            Contestant::AutoWithoutRigidity => vec![Prior::Rigidity],
+            Contestant::AutoWithoutUniform => vec![Prior::Uniform],
+            Contestant::NetworkAlone => Prior::ALL.into_iter().filter(|&prior| prior != Prior::Network).collect(),
+            _ => Vec::new(),
         }
     }
 
@@ -72,63 +121,15 @@ impl Contestant {
             Contestant::Paper => (Method::Paper, true),
             Contestant::PaperWithoutDaq => (Method::Paper, false),
             Contestant::Psfm => (Method::Psfm, true),
+            Contestant::AutoWithoutDaq => (Method::Auto, false),
+            Contestant::AutoWithoutIrls
+            | Contestant::AutoWithoutConsistency
+            | Contestant::AutoWithoutRigidity
+            | Contestant::AutoWithoutUniform
+            | Contestant::NetworkAlone => (Method::Auto, true),
         };
-        Some(SolveSettings { method, use_daq, seed, ..SolveSettings::default() })
-    }
-}
-
-/// One quantity varied, the others held.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Sweep {
-    pub name: &'static str,
-    /// What is varied, for an axis.
-    pub label: &'static str,
-    /// Value on the axis, scene (seed 0, without depths).
-    pub cells: Vec<(f64, SceneOptions)>,
-}
-
-/// Noise of the sweeps over points and views (paper, Fig. 2; the value itself is not in its text: .6 % makes few views
-/// and few points hard and not hopeless).
-const SWEEP_NOISE: f64 = 0.006;
-/// Views of the sweep over points, points of the sweep over views.
-const POINTS_SWEEP_VIEWS: usize = 20;
-const VIEWS_SWEEP_TRACKS: usize = 500;
-/// Outlier share of all sweeps but the one over it.
-const SWEEP_OUTLIERS: f64 = 0.9;
-
-impl Sweep {
-    /// The four sweeps of the paper's Fig. 2, the supplement's noise to 11 %, and an orbit, which no prior that hopes
-    /// for small rotations survives.
-    pub fn all() -> Vec<Self> {
-        let base = SceneOptions { outliers: SWEEP_OUTLIERS, ..SceneOptions::default() };
-        let points = |tracks| SceneOptions { views: POINTS_SWEEP_VIEWS, tracks, noise: SWEEP_NOISE, ..base.clone() };
-        let views = |views| SceneOptions { views, tracks: VIEWS_SWEEP_TRACKS, noise: SWEEP_NOISE, ..base.clone() };
-        let noise = |noise| SceneOptions { noise, ..base.clone() };
-        let outliers = |outliers| SceneOptions { outliers, ..base.clone() };
-        let orbit = |outliers| SceneOptions { outliers, max_rotation_rad: 3.1, ..base.clone() };
-        let over_tracks = |list: &[usize]| list.iter().map(|&m| (m as f64, points(m))).collect();
-        let over_views = |list: &[usize]| list.iter().map(|&n| (n as f64, views(n))).collect();
-        let over = |list: &[f64], scene: &dyn Fn(f64) -> SceneOptions| list.iter().map(|&x| (x, scene(x))).collect();
-        vec![
-            Self { name: "points", label: "tracks m", cells: over_tracks(&[50, 100, 200, 500, 1000]) },
-            Self {
-                name: "outliers",
-                label: "share of outliers",
-                cells: over(&[0.5, 0.7, 0.8, 0.9, 0.95, 0.96, 0.97, 0.98], &outliers),
-            },
-            Self {
-                name: "noise",
-                label: "noise, share of the width",
-                cells: over(&[0.001, 0.003, 0.006, 0.01, 0.02], &noise),
-            },
-            Self { name: "views", label: "views n", cells: over_views(&[5, 10, 20, 50, 100]) },
-            Self {
-                name: "strong-noise",
-                label: "noise, share of the width",
-                cells: over(&[0.03, 0.05, 0.07, 0.09, 0.11], &noise),
-            },
-            Self { name: "orbit", label: "share of outliers", cells: over(&[0.5, 0.8, 0.9, 0.95], &orbit) },
-        ]
+        let excluded_priors = self.excluded_priors();
+        Some(SolveSettings { method, use_daq, seed, excluded_priors, ..SolveSettings::default() })
     }
 }
 
@@ -167,6 +168,9 @@ impl Plan {
                 for &depths in &self.depths {
                     for (_, scene) in &sweep.cells {
                         for &contestant in &self.contestants {
+                            if !contestant.takes_part(scene, depths) {
+                                continue;
+                            }
                             let run = Run { scene: cell_scene(scene, depths, seed), contestant };
                             if seen.insert(run.key()) {
                                 runs.push(run);
@@ -195,7 +199,7 @@ mod tests {
     #[test]
     fn cells_that_sweeps_share_are_run_once() {
         let plan = Plan {
-            sweeps: Sweep::all(),
+            sweeps: Sweep::paper(),
             depths: Depths::ALL.to_vec(),
             contestants: vec![Contestant::Oracle, Contestant::Auto],
             seeds: 2,
@@ -211,14 +215,5 @@ mod tests {
         let of = |name: &str| plan.sweeps.iter().find(|sweep| sweep.name == name).expect("a sweep").cells.clone();
         let (points, views) = (of("points"), of("views"));
         8 * points.iter().filter(|(_, scene)| views.iter().any(|(_, other)| other == scene)).count()
-    }
-
-    #[test]
-    fn every_scene_of_the_plan_can_be_made() {
-        for sweep in Sweep::all() {
-            for (x, scene) in sweep.cells {
-                assert!(scene.validate().is_ok(), "{} at {x}", sweep.name);
-            }
-        }
     }
 }

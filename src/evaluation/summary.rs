@@ -8,6 +8,7 @@ use super::measures::Measures;
 use super::plan::{Contestant, Depths, Plan, Run, cell_scene};
 use super::runner::Records;
 use crate::domain::Grade;
+use crate::synthetic::{Motion, SceneOptions, Shape};
 
 /// Resamples of a bootstrap interval, its seed, and the share on either side that it leaves out.
 const RESAMPLES: usize = 2_000;
@@ -16,17 +17,27 @@ const TAIL: f64 = 0.025;
 /// Error of the focal length, as a logarithm, from which a METRIC answer is wrong.
 const WRONG_FOCAL: f64 = 0.05;
 
+/// F1 from which a scene counts as solved in an ablation.
+const REACHED_F1: f64 = 0.98;
+
 /// One contestant on one cell.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Cell {
     pub sweep: &'static str,
     pub x: f64,
+    /// The same, as it is shown.
+    pub place: String,
     pub depths: Depths,
     pub contestant: Contestant,
     /// Seeds recorded.
     pub seeds: usize,
     pub mean_f1: f64,
     pub least_f1: f64,
+    /// Mean over the seeds, by observation.
+    pub observation_f1: f64,
+    /// Share of the seeds with an F1 of .98 or more, and the median seconds of those solves.
+    pub reached: f64,
+    pub seconds_to_reach: Option<f64>,
     /// Share of the seeds in which something was reconstructed.
     pub solved: f64,
     /// Medians over the seeds that have a value; `None` where none has.
@@ -50,7 +61,7 @@ pub fn cells(plan: &Plan, records: &Records) -> Vec<Cell> {
     for sweep in &plan.sweeps {
         for &depths in &plan.depths {
             for &contestant in &plan.contestants {
-                for (x, scene) in &sweep.cells {
+                for (index, (x, scene)) in sweep.cells.iter().enumerate() {
                     let of = |contestant: Contestant, seed: u64| {
                         records.get(&Run { scene: cell_scene(scene, depths, seed), contestant })
                     };
@@ -58,7 +69,7 @@ pub fn cells(plan: &Plan, records: &Records) -> Vec<Cell> {
                         .filter_map(|seed| Some((of(contestant, seed)?, of(Contestant::Oracle, seed))))
                         .collect();
                     if !pairs.is_empty() {
-                        cells.push(cell(sweep.name, *x, depths, contestant, &pairs));
+                        cells.push(cell((sweep.name, *x, sweep.place(index)), depths, contestant, &pairs));
                     }
                 }
             }
@@ -68,8 +79,7 @@ pub fn cells(plan: &Plan, records: &Records) -> Vec<Cell> {
 }
 
 fn cell(
-    sweep: &'static str,
-    x: f64,
+    (sweep, x, place): (&'static str, f64, String),
     depths: Depths,
     contestant: Contestant,
     pairs: &[(&Measures, Option<&Measures>)],
@@ -87,11 +97,17 @@ fn cell(
     Cell {
         sweep,
         x,
+        place,
         depths,
         contestant,
         seeds: pairs.len(),
         mean_f1: own().map(|measures| measures.f1).sum::<f64>() / count,
         least_f1: own().map(|measures| measures.f1).fold(1.0, f64::min),
+        observation_f1: own().map(|measures| measures.observations.f1).sum::<f64>() / count,
+        reached: own().filter(|measures| measures.f1 >= REACHED_F1).count() as f64 / count,
+        seconds_to_reach: median(
+            own().filter(|measures| measures.f1 >= REACHED_F1).map(|measures| measures.seconds).collect(),
+        ),
         solved: own().filter(|measures| measures.error_2d_px.is_some()).count() as f64 / count,
         error_2d_px: median(own().filter_map(|measures| measures.error_2d_px).collect()),
         error_3d: median(own().filter_map(|measures| measures.error_3d).collect()),
@@ -156,6 +172,11 @@ pub struct Coverage {
 /// Standard deviation of the log focal length, by the Cramer-Rao bound, below which METRIC is expected.
 const DETERMINED: f64 = 0.01;
 
+/// Whether a scene has nothing that forbids a calibration.
+fn is_general(scene: &SceneOptions) -> bool {
+    matches!(scene.motion, Motion::General | Motion::Orbit) && scene.shape == Shape::Box
+}
+
 /// Coverage of one contestant over all its records in the plan.
 pub fn coverage(plan: &Plan, records: &Records, contestant: Contestant) -> Option<Coverage> {
     let runs: Vec<Run> = plan.runs().into_iter().filter(|run| run.contestant == contestant).collect();
@@ -163,7 +184,8 @@ pub fn coverage(plan: &Plan, records: &Records, contestant: Contestant) -> Optio
         .iter()
         .filter_map(|run| {
             let oracle = Run { contestant: Contestant::Oracle, scene: run.scene.clone() };
-            Some((records.get(run)?, records.get(&oracle).and_then(|oracle| oracle.sigma_log_focal)))
+            let bound = records.get(&oracle).and_then(|oracle| oracle.sigma_log_focal);
+            Some((records.get(run)?, bound.filter(|_| is_general(&run.scene))))
         })
         .collect();
     let deviations: Vec<(f64, f64)> = answers
@@ -195,7 +217,7 @@ pub fn coverage(plan: &Plan, records: &Records, contestant: Contestant) -> Optio
 /// The cells as a table, one a line; empty where there is no value.
 pub fn csv(cells: &[Cell]) -> String {
     let mut text = String::from(
-        "sweep,x,depths,contestant,seeds,mean_f1,least_f1,solved,error_2d_px,error_3d,focal_error,focal_ratio,\
+        "sweep,x,place,depths,contestant,seeds,mean_f1,least_f1,observation_f1,reached,seconds_to_reach,solved,error_2d_px,error_3d,focal_error,focal_ratio,\
          focal_ratio_low,focal_ratio_high,metric,weak,projective_only,median_seconds\n",
     );
     let shown = |value: Option<f64>| value.map_or_else(String::new, |value| format!("{value:.6}"));
@@ -204,6 +226,9 @@ pub fn csv(cells: &[Cell]) -> String {
         let values = [
             Some(cell.mean_f1),
             Some(cell.least_f1),
+            Some(cell.observation_f1),
+            Some(cell.reached),
+            cell.seconds_to_reach,
             Some(cell.solved),
             cell.error_2d_px,
             cell.error_3d,
@@ -218,9 +243,10 @@ pub fn csv(cells: &[Cell]) -> String {
         ];
         let values: Vec<String> = values.into_iter().map(shown).collect();
         text.push_str(&format!(
-            "{},{},{},{},{},{}\n",
+            "{},{},{},{},{},{},{}\n",
             cell.sweep,
             cell.x,
+            cell.place,
             cell.depths.name(),
             cell.contestant.name(),
             cell.seeds,
