@@ -84,6 +84,7 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
     }
     let usable = calibration.metric.as_ref().filter(|_| calibration.grade != Grade::ProjectiveOnly);
     warnings.extend(calibration.warnings.iter().cloned());
+    warnings.extend(attempt.second_structure.clone());
     warnings.extend(left_out(context.input, &attempt.block.views));
 
     let first_px = context.normalization.to_pixels(attempt.block.views[0]);

@@ -7,9 +7,9 @@ use super::grow::{self, Consensus, LEAST_INLIERS};
 use super::portfolio::{self, Evidence, Portfolio};
 use super::recorder::Recorder;
 use super::{Context, Error};
-use super::{depths, extend};
+use super::{depths, extend, second};
 use crate::domain::result::PriorTime;
-use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View};
+use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View, Warning};
 
 /// Noise that growing starts from when the caller gives none, as a share of the image side. High on purpose: twice too
 /// low loses the scene, ten times too high costs nothing.
@@ -31,6 +31,8 @@ pub struct Attempt {
     pub evidence: Evidence,
     pub calibration: Option<Outcome>,
     pub winning_prior: Option<Prior>,
+    /// That the tracks left out agree on a motion of their own.
+    pub second_structure: Option<Warning>,
     /// Probability of each track of the block to be right by image points and depths together; `None` where depths
     /// do not judge.
     pub weights_by_depths: Option<Vec<f64>>,
@@ -78,6 +80,7 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
         evidence: Evidence::ImagePoints,
         calibration: None,
         winning_prior: None,
+        second_structure: None,
         weights_by_depths: None,
         decided: None,
         network_weights: Vec::new(),
@@ -136,6 +139,8 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     if refined.inlier_count() < LEAST_INLIERS {
         return Ok(());
     }
+    attempt.second_structure = second::structure(complete, &refined, context.settings, context.stop)?;
+    context.stopped()?;
     let extended = extend::extend(&attempt.block, &refined, context);
     context.stopped()?;
     if let Some((block, consensus)) = extended {

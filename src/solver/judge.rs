@@ -9,11 +9,16 @@ use crate::domain::{Input, StopToken};
 use crate::geometry::measurement::{Normalization, Sighting};
 use crate::geometry::{Camera, Point, triangulation};
 
-/// Share of right observations in the tail, and its width in units of the core. Feature detectors have a core of .1
-/// to .3 px and tails that a Gaussian of that width would call impossible; together with the uniform outliers this
-/// puts the gate at 12 to 17 core deviations, where real sequences want it (15 to 20).
+/// Share of right observations in the tail, before it is known, and the tail's width in units of the core. Feature
+/// detectors have a core of .1 to .3 px and tails that a Gaussian of that width would call impossible; together with the
+/// uniform outliers this puts the gate at 12 to 17 core deviations, where real sequences want it (15 to 20).
 const TAIL_SHARE: f64 = 0.05;
 const TAIL_WIDTH: f64 = 3.0;
+/// Bounds of the share that is estimated: noise without a tail still has a rare blunder that is no wrong match.
+const TAIL_BOUNDS: (f64, f64) = (0.001, 0.2);
+/// Observations from which the share is estimated, and rounds of the estimation; it converges in five.
+const TAIL_OBSERVATIONS: usize = 100;
+const TAIL_ROUNDS: usize = 10;
 /// Prior probability that a single observation of a right track is wrong.
 const WRONG_OBSERVATION: f64 = 0.05;
 /// Observations that a track must retain, and the share of those it has in the registered views.
@@ -35,6 +40,14 @@ pub struct Geometry<'a> {
     pub outlier_density: f64,
     /// Prior probability that a track is right.
     pub inlier_share: f64,
+}
+
+/// How the residuals of right observations are distributed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct NoiseModel {
+    /// Core, one standard deviation of a coordinate.
+    core: f64,
+    tail_share: f64,
 }
 
 /// The verdict on one track.
@@ -59,8 +72,44 @@ pub struct Judged {
 /// Judges every track that has three observations in registered views or more; the others have weight 0 and no
 /// residuals.
 ///
+/// Twice: with a wide tail first, then with the tail that the tracks show which are right in all their observations.
+/// Where there is none, a wrong observation is told from a right one at seven core deviations instead of twelve.
+///
 /// Once `stop` fires the rest stays unjudged: nobody will look at the result.
 pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry, stop: &StopToken) -> Judged {
+    let mut noise = NoiseModel { core: geometry.noise, tail_share: TAIL_SHARE };
+    let judged = judge_under(input, ranges, geometry, &noise, stop);
+    let Some(share) = tail_share(input, ranges, geometry, &judged) else { return judged };
+    noise.tail_share = share;
+    judge_under(input, ranges, geometry, &noise, stop)
+}
+
+/// The share of the tail by expectation and maximisation over the residuals of tracks that are right as a whole: a track
+/// with a dropped observation may be wrong in others. `None` for too few of them.
+fn tail_share(input: &Input, ranges: &[usize], geometry: &Geometry, judged: &Judged) -> Option<f64> {
+    let squared: Vec<f64> = (0..input.track_count())
+        .filter(|&track| judged.tracks.inlier[track])
+        .filter(|&track| judged.retained[track].len() == ranges[track + 1] - ranges[track])
+        .flat_map(|track| ranges[track]..ranges[track + 1])
+        .filter_map(|k| judged.observations.residual_px[input.caller_index(k)])
+        .map(|residual| (residual / geometry.normalization.scale_px / geometry.noise).powi(2))
+        .collect();
+    if squared.len() < TAIL_OBSERVATIONS {
+        return None;
+    }
+    let mut share = TAIL_SHARE;
+    for _ in 0..TAIL_ROUNDS {
+        let of_tail = |squared: &f64| {
+            let core = (1.0 - share) * (-0.5 * squared).exp();
+            let tail = share * (-0.5 * squared / TAIL_WIDTH.powi(2)).exp() / TAIL_WIDTH.powi(2);
+            tail / (core + tail).max(f64::MIN_POSITIVE)
+        };
+        share = squared.iter().map(of_tail).sum::<f64>() / squared.len() as f64;
+    }
+    Some(share.clamp(TAIL_BOUNDS.0, TAIL_BOUNDS.1))
+}
+
+fn judge_under(input: &Input, ranges: &[usize], geometry: &Geometry, noise: &NoiseModel, stop: &StopToken) -> Judged {
     let count = input.track_count();
     let observation_count = input.observation_count();
     let mut judged = Judged {
@@ -95,7 +144,7 @@ pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry, stop: &StopTo
                 Sighting { view, xy: geometry.normalization.normalize(view, input.point_px(k)) }
             })
             .collect();
-        let verdict = judge_track(&cameras, &sightings, geometry);
+        let verdict = judge_track(&cameras, &sightings, geometry, noise);
         judged.tracks.weight[track] = verdict.weight as f32;
         judged.tracks.inlier[track] = verdict.inlier;
         for ((&k, sighting), &retained) in seen.iter().zip(&sightings).zip(&verdict.retained) {
@@ -115,8 +164,8 @@ pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry, stop: &StopTo
 }
 
 /// Drops the worst observation as long as it is more likely wrong than right, then weighs what remains.
-fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry) -> Verdict {
-    let gate = observation_gate(geometry.noise, geometry.outlier_density);
+fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry, noise: &NoiseModel) -> Verdict {
+    let gate = observation_gate(noise, geometry.outlier_density);
     let mut retained: Vec<usize> = (0..sightings.len()).collect();
     let (mut point, mut cost) = triangulate(cameras, sightings);
     let least = LEAST_RETAINED.max((LEAST_RETAINED_SHARE * sightings.len() as f64).ceil() as usize);
@@ -136,7 +185,7 @@ fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry) 
         (point, cost) = triangulate(cameras, &kept);
     }
     let dropped = sightings.len() - retained.len();
-    let ln_odds = ln_odds(cost, retained.len(), dropped, geometry);
+    let ln_odds = ln_odds(cost, retained.len(), dropped, geometry, noise);
     let enough = retained.len() >= least;
     let weight = if enough { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
     let mut flags = vec![false; sightings.len()];
@@ -154,22 +203,22 @@ fn triangulate(cameras: &[Camera], sightings: &[Sighting]) -> (Point, f64) {
 }
 
 /// Squared residual at which an observation is as likely wrong as right.
-fn observation_gate(noise: f64, outlier_density: f64) -> f64 {
-    let tail = (TAIL_WIDTH * noise).powi(2);
-    let right = (1.0 - WRONG_OBSERVATION) * TAIL_SHARE / (std::f64::consts::TAU * tail);
+fn observation_gate(noise: &NoiseModel, outlier_density: f64) -> f64 {
+    let tail = (TAIL_WIDTH * noise.core).powi(2);
+    let right = (1.0 - WRONG_OBSERVATION) * noise.tail_share / (std::f64::consts::TAU * tail);
     let wrong = WRONG_OBSERVATION * outlier_density.powi(2);
     2.0 * tail * (right / wrong).ln().max(0.0)
 }
 
 /// Log of the odds that a track is right: prior, times the density of its residuals under core and tail, over that of
 /// coordinates anywhere, times the price of every dropped observation.
-fn ln_odds(cost: f64, retained: usize, dropped: usize, geometry: &Geometry) -> f64 {
+fn ln_odds(cost: f64, retained: usize, dropped: usize, geometry: &Geometry, noise: &NoiseModel) -> f64 {
     let dof = (2 * retained) as f64 - 3.0;
     let ln_density = |share: f64, width: f64| {
-        let variance = (width * geometry.noise).powi(2);
+        let variance = (width * noise.core).powi(2);
         share.ln() - 0.5 * dof * (std::f64::consts::TAU * variance).ln() - 0.5 * cost / variance
     };
-    let (core, tail) = (ln_density(1.0 - TAIL_SHARE, 1.0), ln_density(TAIL_SHARE, TAIL_WIDTH));
+    let (core, tail) = (ln_density(1.0 - noise.tail_share, 1.0), ln_density(noise.tail_share, TAIL_WIDTH));
     let ln_right = core.max(tail) + (-(core - tail).abs()).exp().ln_1p() + dropped as f64 * WRONG_OBSERVATION.ln();
     let ln_wrong = dof * geometry.outlier_density.ln();
     let prior = (geometry.inlier_share / (1.0 - geometry.inlier_share)).ln();
@@ -212,7 +261,8 @@ mod tests {
         let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
         let geometry = geometry(&normalization);
         let cameras = cameras(6);
-        let verdict = |shifts: [f64; 6]| judge_track(&cameras, &sightings(&cameras, &shifts), &geometry);
+        let noise = NoiseModel { core: geometry.noise, tail_share: TAIL_SHARE };
+        let verdict = |shifts: [f64; 6]| judge_track(&cameras, &sightings(&cameras, &shifts), &geometry, &noise);
         let right = verdict([0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001]);
         assert!(right.inlier && right.weight > 0.999 && right.retained.iter().all(|&kept| kept));
         let one_wrong = verdict([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]);

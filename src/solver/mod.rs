@@ -21,6 +21,7 @@ mod portfolio;
 mod priors;
 mod recorder;
 mod search;
+mod second;
 #[cfg(test)]
 mod tests;
 
