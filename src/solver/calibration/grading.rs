@@ -4,7 +4,7 @@ use super::fit::{Fit, MISFIT_DEVIATIONS, posterior_noise};
 use super::models::{CHI_SQUARE_GAIN, Candidate, Choice};
 use super::search::Minimum;
 use super::{Outcome, Problem, Stopped};
-use crate::domain::{FocalPrior, Grade, StopToken, Warning, WarningCode};
+use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 
 /// Standard deviations of the log focal length that bound the grades.
@@ -50,49 +50,29 @@ impl Verdict {
 
 /// Chooses among the minima and models, and says what the choice is worth.
 ///
+/// * `fit`: of the projective cameras
 /// * `minima`: not empty, cheapest first, with the focal length free
 pub(super) fn grade(
-    problem: &Problem,
+    choice: &Choice,
     fit: &Fit,
-    prior: &IntrinsicsPrior,
     minima: Vec<Minimum>,
-    scale_px: f64,
     mut warnings: Vec<Warning>,
-    stop: &StopToken,
 ) -> Result<Outcome, Stopped> {
-    let choice = Choice { problem, prior, scale_px, stop };
-    let (best, others) = chosen(&choice, fit, minima, &mut warnings)?;
-    Stopped::check(stop)?;
+    let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
+    Stopped::check(choice.stop)?;
     let mut sigma = choice.sigma(&best).filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
     let mut verdict = Verdict { grade: Grade::Metric, warnings };
-    if let Some(focal_prior) = problem.focal_prior {
-        weigh_prior(&mut verdict, &mut sigma, &choice, &best, focal_prior);
+    if let Some(focal_prior) = choice.problem.focal_prior {
+        weigh_prior(&mut verdict, &mut sigma, choice, &best, focal_prior);
     }
     verdict.grade = verdict.grade.worse(grade_of_sigma(sigma));
     if sigma.is_none_or(|sigma| sigma > WEAK_UP_TO) && !verdict.has(WarningCode::UnobservableFocal) {
         verdict.warnings.push(unobservable(sigma));
     }
-    if let Some(rival) = rival(&best, &others) {
-        let shift = (rival.log_focal() - best.minimum.log_focal()).abs();
-        let worst = if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak };
-        verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, scale_px));
-    }
     let rms_ratio = posterior_noise(best.fit.cost, best.fit.freedom) / fit.noise;
-    if rms_ratio > RMS_RATIO_LIMIT && fit.loss_deviations(best.fit.cost, best.fit.freedom) > MISFIT_DEVIATIONS {
-        let worst = if rms_ratio > RMS_RATIO_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
-        verdict.cap(worst, WarningCode::ModelMismatch, mismatch(rms_ratio, fit, best.model, scale_px));
-    }
-    let in_front = best.minimum.cheirality;
-    if in_front < CHEIRALITY_LIMIT {
-        let worst = if in_front < CHEIRALITY_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
-        let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - in_front));
-        verdict.cap(worst, WarningCode::Cheirality, detail);
-    }
-    if verdict.has(WarningCode::FewInliers) {
-        verdict.grade = verdict.grade.worse(Grade::Weak);
-    }
+    object(&mut verdict, &best, &others, fit, rms_ratio, choice.scale_px);
     if verdict.grade != Grade::ProjectiveOnly {
-        verdict.warnings.extend(principal_point(&best, prior, scale_px));
+        verdict.warnings.extend(principal_point(&best, choice.prior, choice.scale_px));
     }
     // A sigma that the fit contradicts is not told: whatever lowered the grade is worth at least the grade's least.
     let sigma = sigma.map(|sigma| if verdict.grade == Grade::Weak { sigma.max(METRIC_BELOW) } else { sigma });
@@ -102,10 +82,32 @@ pub(super) fn grade(
         warnings: verdict.warnings,
         model: best.model,
         plane_at_infinity: None,
-        cheirality: in_front,
+        cheirality: best.minimum.cheirality,
         rms_ratio,
         metric: Some(best.minimum.reconstruction),
     })
+}
+
+/// What a small sigma does not see: another minimum, a misfit, points behind cameras, too few tracks.
+fn object(verdict: &mut Verdict, best: &Candidate, others: &[Minimum], fit: &Fit, rms_ratio: f64, scale_px: f64) {
+    let weak_unless = |refused: bool| if refused { Grade::ProjectiveOnly } else { Grade::Weak };
+    if let Some(rival) = rival(best, others) {
+        let shift = (rival.log_focal() - best.minimum.log_focal()).abs();
+        let detail = second_minimum(rival, best, scale_px);
+        verdict.cap(weak_unless(shift > WEAK_UP_TO), WarningCode::SecondMinimum, detail);
+    }
+    if rms_ratio > RMS_RATIO_LIMIT && fit.loss_deviations(best.fit.cost, best.fit.freedom) > MISFIT_DEVIATIONS {
+        let detail = mismatch(rms_ratio, fit, best.model, scale_px);
+        verdict.cap(weak_unless(rms_ratio > RMS_RATIO_REFUSAL), WarningCode::ModelMismatch, detail);
+    }
+    let in_front = best.minimum.cheirality;
+    if in_front < CHEIRALITY_LIMIT {
+        let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - in_front));
+        verdict.cap(weak_unless(in_front < CHEIRALITY_REFUSAL), WarningCode::Cheirality, detail);
+    }
+    if verdict.has(WarningCode::FewInliers) {
+        verdict.grade = verdict.grade.worse(Grade::Weak);
+    }
 }
 
 /// The grade that a standard deviation of the log focal length alone would give; `None`: unobservable.

@@ -136,7 +136,8 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
         warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
         return Ok(Outcome::refused(warnings));
     }
-    let mut outcome = grading::grade(problem, &fit, &prior, minima, scale_px, warnings, stop)?;
+    let choice = models::Choice { problem, prior: &prior, scale_px, stop };
+    let mut outcome = grading::grade(&choice, &fit, minima, warnings)?;
     outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem, metric));
     Ok(outcome)
 }
