@@ -71,6 +71,10 @@ pub struct SettingsArgs {
     #[arg(long, value_name = "PX")]
     pub noise_px: Option<f64>,
 
+    /// A focal length a view (a zoom) instead of one for all
+    #[arg(long)]
+    pub focal_per_view: bool,
+
     /// Tensor backend of the network [default: flex, or what the server is configured with]
     #[arg(long, value_enum)]
     pub backend: Option<BackendArg>,
@@ -118,6 +122,7 @@ impl SettingsArgs {
             network_width: self.network_width,
             seed: self.seed,
             noise_px: self.noise_px,
+            focal_per_view: self.focal_per_view,
             backend: self.backend.map(Backend::from),
             ..SolveSettings::default()
         };

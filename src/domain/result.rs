@@ -156,9 +156,10 @@ impl Warning {
 /// Intrinsics of one camera group, with their uncertainty.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
-    /// Horizontal focal length.
+    /// Horizontal focal length; the geometric mean where every view has its own, see [`ViewResult::focal_px`].
     pub focal_px: f64,
-    /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable (infinite).
+    /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable (infinite). Where every
+    /// view has its own, the root mean square over the views.
     pub sigma_log_focal: Option<f64>,
     pub principal_point_px: [f64; 2],
     /// Vertical over horizontal focal length; 1 (square pixels) unless the data asked for more.
@@ -183,6 +184,9 @@ pub struct ViewResult {
     /// Metric pose: `x ~ K (R X + t)`; row by row. `None` where there is no metric reconstruction.
     pub rotation: Option<[[f64; 3]; 3]>,
     pub translation: Option<[f64; 3]>,
+    /// The view's own focal length; `None` where that of the calibration is every view's.
+    #[serde(default)]
+    pub focal_px: Option<f64>,
 }
 
 /// What the geometry says of every track of the input (parallel arrays, one entry a track).

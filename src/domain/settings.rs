@@ -77,6 +77,9 @@ pub struct SolveSettings {
     /// What the caller believes the observation noise to be, one standard deviation in pixels. A start, not a
     /// verdict: the noise is estimated from the data.
     pub noise_px: Option<f64>,
+    /// Whether every view has a focal length of its own (a zoom), instead of one constant calibration for all. The DAQ
+    /// residual, which asks for constancy, takes no part then, nor do focal priors.
+    pub focal_per_view: bool,
     /// Interim weights every so many network iterations; 0: never.
     pub weights_every: u32,
     /// Backend of the network; `None` takes the server's.
@@ -170,6 +173,7 @@ impl Default for SolveSettings {
             network_width: Self::DEFAULT_NETWORK_WIDTH,
             seed: 0,
             noise_px: None,
+            focal_per_view: false,
             weights_every: 0,
             backend: None,
             excluded_priors: Vec::new(),

@@ -39,7 +39,7 @@ pub(crate) fn projective_only() -> (LabelledInput, Solution) {
     for view in &mut solution.views {
         let moved = camera(view) * back;
         let projection = std::array::from_fn(|row| std::array::from_fn(|column| moved[(row, column)]));
-        *view = ViewResult { projection: Some(projection), rotation: None, translation: None };
+        *view = ViewResult { projection: Some(projection), ..ViewResult::default() };
     }
     for point in solution.tracks.point.iter_mut().flatten() {
         let moved = frame * Vector3::from(*point).push(1.0);
@@ -97,6 +97,7 @@ fn solution(scene: &Scene) -> Solution {
                 projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| camera[(row, column)]))),
                 rotation: Some(truth.rotations[view]),
                 translation: Some(truth.translations[view]),
+                focal_px: None,
             })
             .collect(),
         tracks: TrackResults {

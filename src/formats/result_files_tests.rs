@@ -137,6 +137,8 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     let first = solution.calibrations[0].focal_px;
     assert_eq!(focal, [first, first, first, 77.0, first]);
     assert_eq!(cameras.views[3].K.expect("metric")[1][1], 77.0 * 1.25);
+    solution.views[3].focal_px = Some(80.0);
+    assert_eq!(CamerasJson::new(&solution, Some(&input)).views[3].K.expect("metric")[0][0], 80.0);
     assert_eq!((cameras.views[0].radial_k1, cameras.views[3].radial_k1), (Some(-0.02), Some(0.01)));
 }
 

@@ -168,7 +168,7 @@ impl CamerasJson {
                 view: view_label(input, index),
                 registered: view.projection.is_some(),
                 P: view.projection,
-                K: calibration.filter(|_| is_metric).map(intrinsics),
+                K: calibration.filter(|_| is_metric).map(|shared| intrinsics(shared, view.focal_px)),
                 R: view.rotation.filter(|_| is_metric),
                 t: view.translation.filter(|_| is_metric),
                 radial_k1: calibration.filter(|_| is_metric).map(|calibration| calibration.radial_k1),
@@ -193,10 +193,11 @@ fn camera_groups(solution: &Solution, input: Option<&LabelledInput>) -> Vec<usiz
     }
 }
 
-/// The calibration matrix `K`, row by row.
-fn intrinsics(calibration: &Calibration) -> [[f64; 3]; 3] {
+/// The calibration matrix `K`, row by row; `own`: the view's own focal length.
+fn intrinsics(calibration: &Calibration, own: Option<f64>) -> [[f64; 3]; 3] {
     let [x, y] = calibration.principal_point_px;
-    [[calibration.focal_px, 0.0, x], [0.0, calibration.focal_px * calibration.aspect, y], [0.0, 0.0, 1.0]]
+    let focal_px = own.unwrap_or(calibration.focal_px);
+    [[focal_px, 0.0, x], [0.0, focal_px * calibration.aspect, y], [0.0, 0.0, 1.0]]
 }
 
 /// The caller's id of view `index`, or the index where the input is not at hand.

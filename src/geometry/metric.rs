@@ -5,7 +5,8 @@ use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 use super::bundle::Observation;
 use super::bundle::critical::Translating;
 use super::bundle::metric::{Intrinsics, Pose, Reconstruction};
-use super::daq::{Daq, FirstViewFrame};
+use super::bundle::zoom::Zooming;
+use super::daq::{Daq, FirstViewFrame, zoomed};
 
 /// Distance at which points are held, in median depths: beyond it the depth of a point moves no observation, while a
 /// point at infinity would have no coordinates.
@@ -36,6 +37,27 @@ pub fn upgrade(frame: &FirstViewFrame, daq: &Daq, observations: &[Observation]) 
     let points = frame.points.iter().map(|point| euclidean(&(back * point)));
     let reconstruction = Reconstruction { intrinsics: daq.intrinsics, poses, points: points.collect() };
     oriented(reconstruction, observations)
+}
+
+/// The same for a camera that zooms: the quadric gives every view a focal length of its own.
+///
+/// Returns `None` also where the quadric gives a view no focal length.
+pub fn upgrade_zooming(frame: &FirstViewFrame, daq: &Daq, observations: &[Observation]) -> Option<Zooming> {
+    let homography = upgrading_homography(daq);
+    let back = homography.try_inverse()?;
+    let mut focals = Vec::with_capacity(frame.cameras.len());
+    let mut poses = Vec::with_capacity(frame.cameras.len());
+    for camera in &frame.cameras {
+        let (focal, _) = zoomed(camera, daq)?;
+        let uncalibrate = Matrix3::from_diagonal(&Vector3::new(focal.recip(), focal.recip(), 1.0));
+        let upgraded = uncalibrate * camera * homography;
+        poses.push(pose(&upgraded.fixed_columns::<3>(0).into_owned(), &upgraded.column(3).into_owned())?);
+        focals.push(focal);
+    }
+    let points = frame.points.iter().map(|point| euclidean(&(back * point)));
+    let reconstruction = Reconstruction { intrinsics: daq.intrinsics, poses, points: points.collect() };
+    let Reconstruction { poses, points, .. } = oriented(reconstruction, observations)?;
+    Some(Zooming { focals, poses, points })
 }
 
 /// A camera that moved without turning as a metric reconstruction, were this its focal length: mirrored and scaled as

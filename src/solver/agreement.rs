@@ -20,7 +20,8 @@ struct Estimate {
 impl Estimate {
     /// The estimate of a block that claims one, i.e. is graded METRIC or WEAK.
     fn of(attempt: &Attempt) -> Option<Self> {
-        let calibration = attempt.calibration.as_ref()?;
+        // Blocks of a zoom hold other views, and their focal lengths differ as they may.
+        let calibration = attempt.calibration.as_ref().filter(|calibration| calibration.focals.is_none())?;
         let focal = calibration.metric.as_ref()?.intrinsics.focal;
         let sigma = calibration.sigma_log_focal?;
         let claims = calibration.grade != Grade::ProjectiveOnly && focal > 0.0;

@@ -12,7 +12,7 @@ use super::judge::{self, Geometry, Judged};
 use super::recorder::Recorder;
 use crate::domain::result::{ObservationResults, TrackResults, ViewResult};
 use crate::domain::{Calibration, Grade, Input, Solution, Stage, Status, Warning, WarningCode};
-use crate::geometry::bundle::metric::Reconstruction;
+use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::measurement::Sighting;
 use crate::geometry::{Camera, Point, triangulation};
@@ -236,9 +236,15 @@ fn views(context: &Context, attempt: &Attempt, local: &[Camera], metric: Option<
             rotation: pose
                 .map(|pose| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
             translation: pose.map(|pose| pose.translation.into()),
+            focal_px: pose.and_then(|_| own_focal(attempt, i)).map(|focal| focal * context.scale_px),
         };
     }
     views
+}
+
+/// Normalised focal length of the `i`-th view of the block, where every view has its own.
+fn own_focal(attempt: &Attempt, i: usize) -> Option<f64> {
+    attempt.calibration.as_ref()?.focals.as_ref()?.get(i).copied()
 }
 
 /// Metric points where the result is metric, projective ones (pixel frame) elsewhere.
@@ -255,7 +261,8 @@ fn final_points(
     };
     let mut cameras = vec![Camera::zeros(); context.input.view_count()];
     for (i, &view) in attempt.block.views.iter().enumerate() {
-        cameras[view] = metric.poses[i].camera(&metric.intrinsics);
+        let focal = own_focal(attempt, i).unwrap_or(metric.intrinsics.focal);
+        cameras[view] = metric.poses[i].camera(&Intrinsics { focal, ..metric.intrinsics });
     }
     let triangulated = |sightings: &Vec<Sighting>| {
         if sightings.is_empty() || context.stop.is_stopped() {

@@ -193,6 +193,7 @@ fn calibrate(block: &Block, consensus: &Consensus, context: &Context) -> Result<
         points: &points,
         observations: &observations,
         noise: consensus.noise,
+        focal_per_view: context.settings.focal_per_view,
         focal_prior: focal_prior(block.views.iter().map(|&view| &context.input.views()[view])),
     };
     Ok(calibration::calibrate(&problem, context.scale_px, context.stop)?)

@@ -58,6 +58,8 @@ pub fn solve(
     observer: &mut dyn Observer,
     stop: &StopToken,
 ) -> Result<Solution, Error> {
+    // A zoom has no constant calibration for the DAQ to ask for.
+    let settings = &SolveSettings { use_daq: settings.use_daq && !settings.focal_per_view, ..settings.clone() };
     let mut recorder = Recorder::new(observer);
     let ranges = block::track_ranges(input);
     let (normalization, mut warnings) = block::normalization(input);

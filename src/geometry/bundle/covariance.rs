@@ -11,10 +11,10 @@ use super::{Loss, Observation};
 
 const PARAMETERS: usize = Parameter::COUNT;
 /// Dimensions of a similarity: directions of the poses that no observation can see.
-const GAUGE: usize = 7;
+pub(super) const GAUGE: usize = 7;
 /// Eigenvalue of the poses' scaled information, relative to the largest, that counts as null beside the gauge:
 /// above what rounding leaves (1e-15 times the dimension), far below what weak but real parallax gives (1e-7).
-const NULL_POSE: f64 = 1e-11;
+pub(super) const NULL_POSE: f64 = 1e-11;
 /// The same for the information on the intrinsics, scaled by what they would have with everything else known.
 const NULL_INTRINSICS: f64 = 1e-10;
 

@@ -15,6 +15,7 @@ pub mod projective;
 mod reduced;
 #[cfg(test)]
 pub(crate) mod testing;
+pub mod zoom;
 
 use nalgebra::Vector2;
 

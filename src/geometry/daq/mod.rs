@@ -5,11 +5,13 @@
 
 mod frame;
 mod starts;
+mod zoom;
 
 use nalgebra::{Matrix3, Matrix3x4, Matrix4, SMatrix, SVector, Vector3};
 
 pub use self::frame::{FirstViewFrame, to_first_view_frame};
 pub use self::starts::{linear, plane_from_second_view, scan, widest_views};
+pub use self::zoom::{zoom_starts, zoomed};
 use super::bundle::metric::Intrinsics;
 
 /// Unknowns of the refinement: log focal and the plane at infinity.

@@ -6,7 +6,7 @@ use super::{Daq, residual};
 
 /// Focal lengths of the scan, in image sides: from wider than any rectilinear lens (118 degrees) to a telephoto of
 /// 11 degrees.
-const SCAN_RANGE: (f64, f64) = (0.3, 5.0);
+pub(super) const SCAN_RANGE: (f64, f64) = (0.3, 5.0);
 /// Distinct entries of a symmetric 4x4 matrix.
 const ENTRIES: usize = 10;
 /// Deviations of the constraints of the linear DAQ after Pollefeys, Van Gool et al. 2004 (table 2): focal length
@@ -110,9 +110,14 @@ fn nearest_of_rank_three(quadric: &Matrix4<f64>) -> Matrix4<f64> {
 ///
 /// Two planes, one for each sign of the camera; none when the views share their centre.
 pub fn plane_from_second_view(camera: &Matrix3x4<f64>, focal: f64) -> Option<[Vector3<f64>; 2]> {
-    let calibration = Matrix3::from_diagonal(&Vector3::new(focal, focal, 1.0));
-    let inverse = Matrix3::from_diagonal(&Vector3::new(focal.recip(), focal.recip(), 1.0));
-    let translation = inverse * camera.column(3);
+    plane_from_zoomed_view(camera, focal, focal)
+}
+
+/// The same with a focal length of its own for each of the two views.
+pub(super) fn plane_from_zoomed_view(camera: &Matrix3x4<f64>, first: f64, second: f64) -> Option<[Vector3<f64>; 2]> {
+    let calibration = Matrix3::from_diagonal(&Vector3::new(first, first, 1.0));
+    let uncalibrate = |focal: f64| Matrix3::from_diagonal(&Vector3::new(focal.recip(), focal.recip(), 1.0));
+    let translation = uncalibrate(second) * camera.column(3);
     let length = translation.norm();
     if !(length > 1e-9 && length.is_finite()) {
         return None;
@@ -121,11 +126,12 @@ pub fn plane_from_second_view(camera: &Matrix3x4<f64>, focal: f64) -> Option<[Ve
     let along = translation / length;
     let across = along.cross(&Vector3::ith(along.iamin(), 1.0)).normalize();
     let turn = Matrix3::from_rows(&[along.transpose(), across.transpose(), along.cross(&across).transpose()]);
-    let rows = turn * inverse * camera.fixed_columns::<3>(0) * calibration;
+    let rows = turn * uncalibrate(second) * camera.fixed_columns::<3>(0) * calibration;
+    let back = uncalibrate(first);
     let plane = |sign: f64| {
         let [first, second, third] = [0, 1, 2].map(|row| sign * rows.row(row).transpose());
         let direction = (second.cross(&third) / third.norm() - first) / length;
-        -sign * inverse * direction
+        -sign * back * direction
     };
     Some([plane(1.0), plane(-1.0)])
 }

@@ -23,6 +23,7 @@ pub fn from_wire(settings: Option<proto::SolveSettings>) -> Result<SolveSettings
         network_width: given.network_width.unwrap_or(default.network_width),
         seed: given.seed,
         noise_px: given.noise_px,
+        focal_per_view: given.focal_per_view,
         weights_every: given.weights_every,
         backend: Backend::from_wire(given.backend, "settings.backend")?,
         // Ablations are no service to callers.
@@ -46,6 +47,7 @@ pub fn to_wire(settings: &SolveSettings) -> proto::SolveSettings {
         network_width: Some(settings.network_width),
         seed: settings.seed,
         noise_px: settings.noise_px,
+        focal_per_view: settings.focal_per_view,
         weights_every: settings.weights_every,
         backend: optional_to_wire(settings.backend),
     }
@@ -64,6 +66,7 @@ mod tests {
             beta: 0.0,
             seed: u64::MAX,
             noise_px: Some(0.5),
+            focal_per_view: true,
             weights_every: 10,
             backend: Some(Backend::Ndarray),
             ..SolveSettings::default()

@@ -92,6 +92,10 @@ fn without_parallax(
             "the camera hardly moved, and a turn explains the views as well as a shift".to_owned(),
         ),
         (true, false) => (WarningCode::PureRotation, rotation_in_words(&turning.model, scale_px)),
+        (false, _) if problem.focal_per_view => (
+            WarningCode::PlanarOrRotation,
+            "with a focal length a view, a planar scene and a camera that only turns are not told apart".to_owned(),
+        ),
         (false, _) if deviations < PLANE_DEVIATIONS => (
             WarningCode::PlanarOrRotation,
             format!("a planar scene is more likely than a camera that only turns; {worse}"),

@@ -43,8 +43,8 @@ impl Fit {
 
     /// Whether a special case of this model fits worse than chance explains.
     pub fn refutes(&self, other: &Fit) -> bool {
-        // Written so that a cost that is no number is refuted.
-        !(self.loss_deviations(other.cost, other.freedom) <= MISFIT_DEVIATIONS)
+        let loss = self.loss_deviations(other.cost, other.freedom);
+        loss > MISFIT_DEVIATIONS || loss.is_nan()
     }
 }
 

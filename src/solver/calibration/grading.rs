@@ -1,28 +1,15 @@
 //! What a calibration is worth, and what to warn of.
 
-use super::fit::{Fit, MISFIT_DEVIATIONS, posterior_noise};
+use super::fit::Fit;
 use super::models::{CHI_SQUARE_GAIN, Candidate, Choice};
 use super::search::Minimum;
+use super::verdict::{CHEIRALITY_LIMIT, UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO};
 use super::{Outcome, Problem, Stopped};
-use crate::domain::{FocalPrior, Grade, StopToken, Warning, WarningCode};
+use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 
-/// Standard deviations of the log focal length that bound the grades.
-pub(super) const METRIC_BELOW: f64 = 0.02;
-const WEAK_UP_TO: f64 = 0.1;
-/// Standard deviation of the log focal length, a factor of 2.7, beyond which the focal length counts as unobservable.
-const UNOBSERVABLE_ABOVE: f64 = 1.0;
-/// Ratio of the metric to the projective posterior noise that speaks of a wrong model; the paper's synthetic scenes
-/// stay within 1.05. With few degrees of freedom it exceeds its limit by chance: the loss of fit must also be more than
-/// [`MISFIT_DEVIATIONS`].
-const RMS_RATIO_LIMIT: f64 = 1.15;
-/// The same ratio from which the metric reconstruction is not to be used at all.
-const RMS_RATIO_REFUSAL: f64 = 3.0;
 /// Difference in log focal from which another minimum is another calibration.
 const OTHER_CALIBRATION: f64 = 0.02;
-/// Share of the observations that must lie in front of their cameras, and below which the reconstruction is refused.
-const CHEIRALITY_LIMIT: f64 = 0.99;
-const CHEIRALITY_REFUSAL: f64 = 0.9;
 /// Standard deviation of a coordinate of the principal point, in image sides and from the observations alone, above
 /// which they do not determine it: no lens is worse centred than that.
 const PRINCIPAL_POINT_UNOBSERVABLE_ABOVE: f64 = 0.05;
@@ -30,91 +17,45 @@ const PRINCIPAL_POINT_UNOBSERVABLE_ABOVE: f64 = 0.05;
 /// two does not survive.
 const PRIOR_CONTRADICTED: f64 = 3.0;
 
-/// The grade with the warnings that led to it.
-struct Verdict {
-    grade: Grade,
-    warnings: Vec<Warning>,
-}
-
-impl Verdict {
-    /// Lowers the grade to this at most and says why.
-    fn cap(&mut self, worst: Grade, code: WarningCode, detail: String) {
-        self.grade = self.grade.worse(worst);
-        self.warnings.push(Warning::new(code, detail));
-    }
-
-    fn has(&self, code: WarningCode) -> bool {
-        self.warnings.iter().any(|warning| warning.code == code)
-    }
-}
-
 /// Chooses among the minima and models, and says what the choice is worth.
 ///
+/// * `fit`: of the projective cameras
 /// * `minima`: not empty, cheapest first, with the focal length free
 pub(super) fn grade(
-    problem: &Problem,
+    choice: &Choice,
     fit: &Fit,
-    prior: &IntrinsicsPrior,
     minima: Vec<Minimum>,
-    scale_px: f64,
     mut warnings: Vec<Warning>,
-    stop: &StopToken,
 ) -> Result<Outcome, Stopped> {
-    let choice = Choice { problem, prior, scale_px, stop };
-    let (best, others) = chosen(&choice, fit, minima, &mut warnings)?;
-    Stopped::check(stop)?;
+    let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
+    Stopped::check(choice.stop)?;
     let mut sigma = choice.sigma(&best).filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
     let mut verdict = Verdict { grade: Grade::Metric, warnings };
-    if let Some(focal_prior) = problem.focal_prior {
-        weigh_prior(&mut verdict, &mut sigma, &choice, &best, focal_prior);
+    if let Some(focal_prior) = choice.problem.focal_prior {
+        weigh_prior(&mut verdict, &mut sigma, choice, &best, focal_prior);
     }
-    verdict.grade = verdict.grade.worse(grade_of_sigma(sigma));
-    if sigma.is_none_or(|sigma| sigma > WEAK_UP_TO) && !verdict.has(WarningCode::UnobservableFocal) {
-        verdict.warnings.push(unobservable(sigma));
-    }
+    verdict.judge_sigma(sigma);
     if let Some(rival) = rival(&best, &others) {
         let shift = (rival.log_focal() - best.minimum.log_focal()).abs();
         let worst = if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak };
-        verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, scale_px));
+        verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, choice.scale_px));
     }
-    let rms_ratio = posterior_noise(best.fit.cost, best.fit.freedom) / fit.noise;
-    if rms_ratio > RMS_RATIO_LIMIT && fit.loss_deviations(best.fit.cost, best.fit.freedom) > MISFIT_DEVIATIONS {
-        let worst = if rms_ratio > RMS_RATIO_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
-        verdict.cap(worst, WarningCode::ModelMismatch, mismatch(rms_ratio, fit, best.model, scale_px));
-    }
-    let in_front = best.minimum.cheirality;
-    if in_front < CHEIRALITY_LIMIT {
-        let worst = if in_front < CHEIRALITY_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
-        let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - in_front));
-        verdict.cap(worst, WarningCode::Cheirality, detail);
-    }
-    if verdict.has(WarningCode::FewInliers) {
-        verdict.grade = verdict.grade.worse(Grade::Weak);
-    }
+    let rms_ratio = verdict.judge_fit(fit, &best.fit, &best.model.name(), choice.scale_px);
+    verdict.judge_cheirality(best.minimum.cheirality);
     if verdict.grade != Grade::ProjectiveOnly {
-        verdict.warnings.extend(principal_point(&best, prior, scale_px));
+        verdict.warnings.extend(principal_point(&best, choice.prior, choice.scale_px));
     }
-    // A sigma that the fit contradicts is not told: whatever lowered the grade is worth at least the grade's least.
-    let sigma = sigma.map(|sigma| if verdict.grade == Grade::Weak { sigma.max(METRIC_BELOW) } else { sigma });
     Ok(Outcome {
-        sigma_log_focal: sigma,
+        sigma_log_focal: verdict.told(sigma),
         grade: verdict.grade,
         warnings: verdict.warnings,
         model: best.model,
         plane_at_infinity: None,
-        cheirality: in_front,
+        cheirality: best.minimum.cheirality,
         rms_ratio,
         metric: Some(best.minimum.reconstruction),
+        focals: None,
     })
-}
-
-/// The grade that a standard deviation of the log focal length alone would give; `None`: unobservable.
-pub fn grade_of_sigma(sigma: Option<f64>) -> Grade {
-    match sigma {
-        Some(sigma) if sigma < METRIC_BELOW => Grade::Metric,
-        Some(sigma) if sigma <= WEAK_UP_TO => Grade::Weak,
-        _ => Grade::ProjectiveOnly,
-    }
 }
 
 /// The best minimum under the richest model that the data carry, and the others under the same model.
@@ -208,17 +149,6 @@ fn principal_point(best: &Candidate, prior: &IntrinsicsPrior, scale_px: f64) -> 
     (!unknown.is_empty()).then(|| Warning::new(WarningCode::PrincipalPointUnobservable, detail))
 }
 
-fn unobservable(sigma: Option<f64>) -> Warning {
-    let detail = match sigma {
-        Some(sigma) => format!(
-            "the motion determines the logarithm of the focal length only to {sigma:.2} (one standard deviation), \
-             more than {WEAK_UP_TO}"
-        ),
-        None => "the motion does not determine the focal length".to_owned(),
-    };
-    Warning::new(WarningCode::UnobservableFocal, detail)
-}
-
 fn second_minimum(rival: &Minimum, best: &Candidate, scale_px: f64) -> String {
     format!(
         "a focal length of {:.1} px instead of {:.1} px explains the data about as well: chi-square larger by {:.1} \
@@ -227,15 +157,5 @@ fn second_minimum(rival: &Minimum, best: &Candidate, scale_px: f64) -> String {
         best.minimum.reconstruction.intrinsics.focal * scale_px,
         ((rival.cost - best.minimum.cost) / best.fit.noise.powi(2)).max(0.0),
         best.fit.freedom
-    )
-}
-
-fn mismatch(rms_ratio: f64, fit: &Fit, model: IntrinsicsModel, scale_px: f64) -> String {
-    format!(
-        "the metric reconstruction fits {rms_ratio:.2} times worse than the projective one ({:.2} px against {:.2} px) \
-         with {} free: distortion, a zoom or wrong tracks",
-        rms_ratio * fit.noise * scale_px,
-        fit.noise * scale_px,
-        model.name()
     )
 }

@@ -10,6 +10,8 @@ mod models;
 mod search;
 #[cfg(test)]
 mod tests;
+mod verdict;
+mod zoom;
 
 use nalgebra::{Matrix3x4, Vector3, Vector4};
 
@@ -19,7 +21,7 @@ use crate::geometry::bundle::{Observation, Options, projective};
 use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
 
 use fit::Fit;
-pub use grading::grade_of_sigma;
+pub use verdict::grade_of_sigma;
 
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
 /// caller has adjusted it before.
@@ -45,6 +47,8 @@ pub struct Problem<'a> {
     pub noise: f64,
     /// What is known of the focal length beforehand.
     pub focal_prior: Option<FocalPrior>,
+    /// Whether every view has a focal length of its own.
+    pub focal_per_view: bool,
 }
 
 /// What came of it.
@@ -53,6 +57,8 @@ pub struct Outcome {
     /// `None` when no metric reconstruction was found or looked for. With grade PROJECTIVE_ONLY it may stand but is
     /// not to be used as metric.
     pub metric: Option<Reconstruction>,
+    /// With a focal length a view: these, normalised; `metric` has their geometric mean.
+    pub focals: Option<Vec<f64>>,
     /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable.
     pub sigma_log_focal: Option<f64>,
     pub grade: Grade,
@@ -72,6 +78,7 @@ impl Outcome {
     pub fn refused(warnings: Vec<Warning>) -> Self {
         Self {
             metric: None,
+            focals: None,
             sigma_log_focal: None,
             grade: Grade::ProjectiveOnly,
             warnings,
@@ -108,7 +115,9 @@ impl From<Stopped> for super::Error {
 /// [`Stopped`] when `stop` fired; what stands by then is not worth returning.
 pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<Outcome, Stopped> {
     Stopped::check(stop)?;
-    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), ..*problem };
+    // What is known of one focal length says nothing of a zoom.
+    let focal_prior = problem.focal_prior.filter(|_| !problem.focal_per_view);
+    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_prior, ..*problem };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < LEAST_INLIERS {
@@ -118,25 +127,24 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     Stopped::check(stop)?;
     let critical = critical::find(problem, &fit, scale_px, stop);
     Stopped::check(stop)?;
-    let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);
     let refused = !critical.warnings.is_empty();
     warnings.extend(critical.warnings);
-    let minima = match (critical.translation, problem.focal_prior) {
-        (Some(translation), Some(focal)) => {
-            search::known_focal(&translation, focal.focal_px / scale_px, problem, &prior, stop)
-        }
+    let prior = models::knowledge(fit.noise, focal_prior, scale_px);
+    let choice = models::Choice { problem, prior: &prior, scale_px, stop };
+    let minima = match (critical.translation, focal_prior) {
+        (Some(translation), Some(focal)) => search::known_focal(&translation, focal.focal_px / scale_px, &choice),
         _ if refused => return Ok(Outcome::refused(warnings)),
         _ => match to_first_view_frame(&cameras, &points) {
+            Some(frame) if problem.focal_per_view => return zoom::calibrate(&frame, &choice, &fit, warnings),
             Some(frame) => search::minima(&frame, problem, &prior, stop)?,
             None => Vec::new(),
         },
     };
     if minima.is_empty() {
-        let detail = "no start of the self-calibration led to a metric reconstruction";
-        warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
+        warnings.push(no_start());
         return Ok(Outcome::refused(warnings));
     }
-    let mut outcome = grading::grade(problem, &fit, &prior, minima, scale_px, warnings, stop)?;
+    let mut outcome = grading::grade(&choice, &fit, minima, warnings)?;
     outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem, metric));
     Ok(outcome)
 }
@@ -146,6 +154,11 @@ pub fn few_inliers(inliers: usize) -> Warning {
     let detail =
         format!("{inliers} inlier tracks cannot be verified by image points alone, which takes {LEAST_INLIERS}");
     Warning::new(WarningCode::FewInliers, detail)
+}
+
+fn no_start() -> Warning {
+    let detail = "no start of the self-calibration led to a metric reconstruction";
+    Warning::new(WarningCode::UnobservableFocal, detail)
 }
 
 /// The projective reconstruction at its minimum, and how well it fits.

@@ -1,8 +1,8 @@
 //! Which intrinsics the data carry, and what not knowing that costs the focal length.
 
 use super::fit::Fit;
-use super::grading::METRIC_BELOW;
 use super::search::Minimum;
+use super::verdict::METRIC_BELOW;
 use super::{Problem, Stopped};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::Options;

@@ -2,6 +2,7 @@
 
 use nalgebra::{Matrix4, Vector3, Vector4};
 
+use super::models::Choice;
 use super::{Problem, Stopped};
 use crate::domain::StopToken;
 use crate::geometry::bundle::critical::Translating;
@@ -29,10 +30,10 @@ const WINDOW_HALF_WIDTH: f64 = 0.15;
 /// Difference in log focal below which refined starts are the same.
 const SAME_START: f64 = 0.02;
 /// Iterations and tolerance of the first adjustment, which only has to rank the starts.
-const FIRST_ITERATIONS: usize = 12;
-const FIRST_TOLERANCE: f64 = 1e-4;
+pub(super) const FIRST_ITERATIONS: usize = 12;
+pub(super) const FIRST_TOLERANCE: f64 = 1e-4;
 /// Starts that are adjusted to convergence, and the iterations allowed.
-const CONVERGED: usize = 3;
+pub(super) const CONVERGED: usize = 3;
 const FINAL_ITERATIONS: usize = 60;
 const FINAL_TOLERANCE: f64 = 1e-9;
 /// Adjusted starts this near in log focal, and within this share in cost, are the same minimum.
@@ -71,7 +72,7 @@ impl Minimum {
     }
 }
 
-fn converge() -> Options {
+pub(super) fn converge() -> Options {
     Options { max_iterations: FINAL_ITERATIONS, relative_tolerance: FINAL_TOLERANCE, ..Options::default() }
 }
 
@@ -110,16 +111,11 @@ pub(super) fn minima(
 
 /// The metric reconstruction of a camera that moved without turning, from a focal length that is known otherwise; empty
 /// where there is none.
-pub(super) fn known_focal(
-    translation: &Translating,
-    focal: f64,
-    problem: &Problem,
-    prior: &IntrinsicsPrior,
-    stop: &StopToken,
-) -> Vec<Minimum> {
-    let start = upgrade_translation(translation, focal, problem.observations);
+pub(super) fn known_focal(translation: &Translating, focal: f64, choice: &Choice) -> Vec<Minimum> {
+    let observations = choice.problem.observations;
+    let start = upgrade_translation(translation, focal, observations);
     let minimum = start.map(|reconstruction| Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 });
-    let adjusted = minimum.map(|start| start.adjusted(problem.observations, IntrinsicsModel::FOCAL, prior, stop));
+    let adjusted = minimum.map(|start| start.adjusted(observations, IntrinsicsModel::FOCAL, choice.prior, choice.stop));
     distinct(adjusted.into_iter().collect())
 }
 

@@ -3,6 +3,7 @@
 mod coverage;
 mod critical;
 mod models;
+mod zoom;
 
 use super::*;
 use crate::geometry::bundle::testing::{self, Motion, NOISE, TestScene};
@@ -22,7 +23,14 @@ fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
 
 fn calibrated_knowing(scene: &TestScene, seed: u64, noise: f64, focal_prior: Option<FocalPrior>) -> Outcome {
     let (cameras, points) = projective_problem(scene, seed);
-    let problem = Problem { cameras: &cameras, points: &points, observations: &scene.observations, noise, focal_prior };
+    let problem = Problem {
+        cameras: &cameras,
+        points: &points,
+        observations: &scene.observations,
+        noise,
+        focal_prior,
+        focal_per_view: false,
+    };
     calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
 }
 
@@ -143,6 +151,7 @@ fn the_plane_at_infinity_fits_the_callers_frame() {
         observations: &scene.observations,
         noise: 1e-5,
         focal_prior: None,
+        focal_per_view: false,
     };
     let outcome = calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it");
     let plane = outcome.plane_at_infinity.expect("a plane");
@@ -169,7 +178,7 @@ fn hostile_input_is_refused_without_panic() {
     let scene = testing::scene(1, 4, 12, NOISE);
     let (cameras, points) = projective_problem(&scene, 1);
     let run = |cameras: &[Matrix3x4<f64>], points: &[Vector4<f64>], observations: &[Observation], noise| {
-        let problem = Problem { cameras, points, observations, noise, focal_prior: None };
+        let problem = Problem { cameras, points, observations, noise, focal_prior: None, focal_per_view: false };
         calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
     };
     let nothing = run(&[], &[], &[], NOISE);
@@ -196,6 +205,7 @@ fn a_stopped_token_ends_it() {
         observations: &scene.observations,
         noise: NOISE,
         focal_prior: None,
+        focal_per_view: false,
     };
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);

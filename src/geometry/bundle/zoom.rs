@@ -1,0 +1,180 @@
+//! Metric bundle adjustment of a camera that zooms: a focal length a view, else a pinhole with square pixels and the
+//! principal point where it was guessed.
+
+use faer::{MatRef, Side};
+use nalgebra::{DMatrix, Rotation3, Vector2, Vector3};
+
+use super::covariance::{GAUGE, NULL_POSE};
+use super::engine::{Jacobian, Layout, Problem, Sink, Step, minimise};
+use super::metric::{Intrinsics, POINT, Pose, Reconstruction};
+use super::reduced::{Linearisation, Reduced};
+use super::{Loss, Observation, Options, Report};
+use crate::domain::StopToken;
+
+/// Unknowns of a view: rotation vector, translation, log focal length.
+const VIEW: usize = 7;
+/// Share of a log focal length in a null direction from which it counts as undetermined.
+const TAKES_PART: f64 = 1e-8;
+
+/// A metric reconstruction with a focal length a view, up to a similarity.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Zooming {
+    /// In image sides.
+    pub focals: Vec<f64>,
+    pub poses: Vec<Pose>,
+    pub points: Vec<Vector3<f64>>,
+}
+
+impl From<&Reconstruction> for Zooming {
+    /// The same focal length in every view.
+    fn from(constant: &Reconstruction) -> Self {
+        Self {
+            focals: vec![constant.intrinsics.focal; constant.poses.len()],
+            poses: constant.poses.clone(),
+            points: constant.points.clone(),
+        }
+    }
+}
+
+impl Problem<0, VIEW, POINT> for Zooming {
+    fn camera_count(&self) -> usize {
+        self.poses.len()
+    }
+
+    fn point_count(&self) -> usize {
+        self.points.len()
+    }
+
+    fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, VIEW, POINT>) {
+        let (pose, focal) = (&self.poses[observation.camera], self.focals[observation.camera]);
+        let turned = pose.rotation * self.points[observation.point];
+        let seen = turned + pose.translation;
+        let scale = focal / seen.z;
+        let image = Vector2::new(seen.x * scale, seen.y * scale);
+        sink.take(image - observation.xy, || {
+            let by_seen = [Vector3::new(scale, 0.0, -image.x / seen.z), Vector3::new(0.0, scale, -image.y / seen.z)];
+            let mut jacobian = Jacobian::<0, VIEW, POINT>::zeros();
+            for (component, by_seen) in by_seen.iter().enumerate() {
+                jacobian.camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(by_seen));
+                jacobian.camera.fixed_view_mut::<3, 1>(3, component).copy_from(by_seen);
+                jacobian.camera[(6, component)] = image[component];
+                jacobian.point.set_column(component, &pose.rotation.tr_mul(by_seen));
+            }
+            jacobian
+        });
+    }
+
+    fn retract(&mut self, from: &Self, step: &Step<0, VIEW, POINT>) {
+        for (view, step) in step.cameras.iter().enumerate() {
+            let turn = Rotation3::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
+            self.poses[view].rotation = turn * from.poses[view].rotation;
+            self.poses[view].translation = from.poses[view].translation + step.fixed_rows::<3>(3);
+            self.focals[view] = from.focals[view] * step[6].exp();
+        }
+        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
+            *point = from + step;
+        }
+    }
+}
+
+impl Zooming {
+    /// Minimises the reprojection error over focal lengths, poses and points.
+    pub fn adjust(&mut self, observations: &[Observation], options: &Options, stop: &StopToken) -> Report {
+        minimise(self, observations, options, stop)
+    }
+
+    /// With one focal length for all views, their geometric mean: for what only asks for poses and points.
+    pub fn at_mean_focal(&self) -> Reconstruction {
+        let mean = self.focals.iter().map(|focal| focal.ln()).sum::<f64>() / self.focals.len().max(1) as f64;
+        Reconstruction {
+            intrinsics: Intrinsics::from_focal(mean.exp()),
+            poses: self.poses.clone(),
+            points: self.points.clone(),
+        }
+    }
+
+    /// Variances of the log focal lengths, everything else marginalised, for observations with unit variance: multiply
+    /// by the squared noise. `None` for a view whose focal length the observations do not determine.
+    pub fn log_focal_variances(&self, observations: &[Observation]) -> Vec<Option<f64>> {
+        self.variances(observations).unwrap_or_else(|| vec![None; self.focals.len()])
+    }
+
+    fn variances(&self, observations: &[Observation]) -> Option<Vec<Option<f64>>> {
+        let views = self.poses.len();
+        let n = VIEW * views;
+        let layout = Layout::new(observations, views, self.points.len());
+        let mut linearisation = Linearisation::<0, VIEW, POINT>::new(&layout, views);
+        linearisation.fill(self, &layout, Loss::Squared);
+        let mut reduced = Reduced::new(&layout, views);
+        if n == 0 || !reduced.build(self, &layout, &linearisation, 0.0) {
+            return None;
+        }
+        let full = DMatrix::from_column_slice(n, n, &reduced.matrix);
+        // Unit diagonal, so that rotations, translations and focal lengths are compared alike.
+        let scale: Vec<f64> = (0..n).map(|k| full[(k, k)].max(f64::MIN_POSITIVE).sqrt().recip()).collect();
+        let scaled =
+            DMatrix::from_fn(n, n, |row, column| full[(row.max(column), row.min(column))] * scale[row] * scale[column]);
+        if scaled.iter().any(|value| !value.is_finite()) {
+            return None;
+        }
+        let eigen = MatRef::from_column_major_slice(scaled.as_slice(), n, n).self_adjoint_eigen(Side::Lower).ok()?;
+        let largest = eigen.S()[n - 1];
+        let variance = |view: usize| {
+            let row = VIEW * view + VIEW - 1;
+            let mut sum = 0.0;
+            // Eigenvalues ascend; the first are the similarity's, which no focal length takes part in.
+            for k in GAUGE.min(n)..n {
+                let (value, share) = (eigen.S()[k], eigen.U()[(row, k)].powi(2));
+                if value > NULL_POSE * largest {
+                    sum += share / value;
+                } else if share > TAKES_PART {
+                    return None;
+                }
+            }
+            Some(sum * scale[row] * scale[row])
+        };
+        Some((0..views).map(variance).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::metric::Information;
+    use super::super::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter};
+    use super::super::testing::{self, Motion, NOISE};
+    use super::*;
+
+    fn truth(scene: &testing::TestScene) -> Reconstruction {
+        Reconstruction { intrinsics: scene.intrinsics, poses: scene.poses.clone(), points: scene.points.clone() }
+    }
+
+    #[test]
+    fn jacobian_agrees_with_finite_differences() {
+        let scene = testing::scene(1, 4, 8, NOISE);
+        let mut zooming = Zooming::from(&truth(&scene));
+        zooming.focals = vec![0.9, 1.0, 1.2, 1.5];
+        testing::check_jacobian(&zooming, &scene.observations);
+    }
+
+    #[test]
+    fn a_focal_length_a_view_is_less_certain_than_one_for_all() {
+        for seed in 0..3 {
+            let scene = testing::scene(seed, 10, 40, 0.0);
+            let constant = Information::new(&truth(&scene), &scene.observations)
+                .map(|information| information.optimum(IntrinsicsModel::FOCAL, &IntrinsicsPrior::NONE))
+                .and_then(|optimum| optimum.variance_of(Parameter::LogFocal))
+                .expect("observable");
+            let variances = Zooming::from(&truth(&scene)).log_focal_variances(&scene.observations);
+            println!("seed {seed}: {constant:.3} for all, {variances:.2?}");
+            assert_eq!(variances.len(), 10);
+            for variance in variances {
+                assert!(variance.expect("observable") > constant, "seed {seed}");
+            }
+        }
+        let scene = testing::scene_of(1, 10, 40, 0.0, Motion::Translation, false);
+        let variances = Zooming::from(&truth(&scene)).log_focal_variances(&scene.observations);
+        // Null but for rounding: a sigma of several e-folds.
+        let free = |variance: &Option<f64>| variance.is_none_or(|variance| variance.sqrt() * NOISE > 1.0);
+        assert!(variances.iter().all(free), "{variances:?}");
+    }
+}

@@ -1,0 +1,99 @@
+//! A focal length a view.
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::*;
+use crate::geometry::bundle::metric::Intrinsics;
+
+/// A scene whose focal length changes from view to view by factors of up to `exp(range)` either way, and these focal
+/// lengths.
+fn zooming(seed: u64, tracks: usize, noise: f64, range: f64) -> (TestScene, Vec<f64>) {
+    let mut scene = testing::scene(seed, 10, tracks, 0.0);
+    let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x2003);
+    let focals: Vec<f64> = (0..10)
+        .map(|_| {
+            let zoom = if range > 0.0 { rand::Rng::random_range(&mut rng, -range..range) } else { 0.0 };
+            scene.intrinsics.focal * f64::exp(zoom)
+        })
+        .collect();
+    for seen in &mut scene.observations {
+        let intrinsics = Intrinsics::from_focal(focals[seen.camera]);
+        let image = intrinsics.project(&scene.poses[seen.camera].apply(&scene.points[seen.point]));
+        let mut noisy = || noise * testing::normal(&mut rng);
+        seen.xy = image + nalgebra::Vector2::new(noisy(), noisy());
+    }
+    (scene, focals)
+}
+
+fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
+    // Any projective frame of any cameras near the truth is adjusted to the observations.
+    let (cameras, points) = projective_problem(scene, seed);
+    let observations = &scene.observations;
+    let problem =
+        Problem { cameras: &cameras, points: &points, observations, noise, focal_prior: None, focal_per_view: true };
+    calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
+}
+
+#[test]
+fn every_view_gets_its_focal_length() {
+    for range in [0.0, 0.3, 0.7] {
+        let (mut calibrated_well, mut deviations) = (0, Vec::new());
+        for seed in 0..20 {
+            let (scene, focals) = zooming(seed, 60, 0.001, range);
+            let begun = std::time::Instant::now();
+            let outcome = calibrated(&scene, seed, 0.001);
+            let found = outcome.focals.as_deref().unwrap_or_default();
+            let errors: Vec<f64> = found.iter().zip(&focals).map(|(found, focal)| (found / focal).ln()).collect();
+            let rms = (errors.iter().map(|error| error * error).sum::<f64>() / errors.len() as f64).sqrt();
+            let sigma = outcome.sigma_log_focal.unwrap_or(f64::INFINITY);
+            println!(
+                "range {range}, seed {seed}: {:?}, errors {rms:.4} rms, sigma {sigma:.4}, rms ratio {:.2}, {:?} in {:?}",
+                outcome.grade,
+                outcome.rms_ratio,
+                codes(&outcome),
+                begun.elapsed()
+            );
+            calibrated_well += usize::from(outcome.grade == Grade::Metric && rms < 0.02);
+            if outcome.grade == Grade::Metric {
+                deviations.push(rms / sigma);
+            }
+        }
+        let beyond = deviations.iter().filter(|deviation| **deviation > 3.0).count();
+        println!("range {range}: {calibrated_well} of 20 well, {beyond} of {} beyond three sigma", deviations.len());
+        assert!(calibrated_well >= 16 && beyond <= 1, "range {range}");
+    }
+}
+
+#[test]
+fn critical_motions_are_refused_with_a_focal_length_a_view_too() {
+    for (motion, planar) in
+        [(Motion::Translation, false), (Motion::Forward, false), (Motion::Rotation, false), (Motion::General, true)]
+    {
+        for seed in 0..5 {
+            let scene = testing::scene_of(seed, 10, 40, NOISE, motion, planar);
+            let outcome = calibrated(&scene, seed, NOISE);
+            println!("{motion:?}, planar {planar}, seed {seed}: {:?}", codes(&outcome));
+            assert_eq!(outcome.grade, Grade::ProjectiveOnly, "{motion:?}, planar {planar}, seed {seed}");
+        }
+    }
+}
+
+#[test]
+fn the_plane_at_infinity_goes_with_the_zoom() {
+    let (scene, _) = zooming(3, 60, 1e-5, 0.3);
+    let (cameras, points) = projective_problem(&scene, 3);
+    let observations = &scene.observations;
+    let noise = 1e-5;
+    let problem =
+        Problem { cameras: &cameras, points: &points, observations, noise, focal_prior: None, focal_per_view: true };
+    let outcome = calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it");
+    let plane_at_infinity = outcome.plane_at_infinity.expect("a plane");
+    let focals = outcome.focals.expect("a focal length a view");
+    let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
+    let daq = Daq::new(focals[0], plane_at_infinity);
+    for (camera, focal) in frame.cameras.iter().zip(&focals) {
+        let (found, cost) = daq::zoomed(camera, &daq).expect("a focal length");
+        assert!((found / focal - 1.0).abs() < 1e-3 && cost < 1e-5, "{found} {focal} {cost}");
+    }
+}

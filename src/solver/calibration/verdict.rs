@@ -1,0 +1,98 @@
+//! The grade, and the warnings that lower it.
+
+use super::fit::{Fit, MISFIT_DEVIATIONS, posterior_noise};
+use crate::domain::{Grade, Warning, WarningCode};
+
+/// Standard deviations of the log focal length that bound the grades.
+pub(super) const METRIC_BELOW: f64 = 0.02;
+pub(super) const WEAK_UP_TO: f64 = 0.1;
+/// Standard deviation of the log focal length, a factor of 2.7, beyond which the focal length counts as unobservable.
+pub(super) const UNOBSERVABLE_ABOVE: f64 = 1.0;
+/// Ratio of the metric to the projective posterior noise that speaks of a wrong model; the paper's synthetic scenes
+/// stay within 1.05. With few degrees of freedom it exceeds its limit by chance: the loss of fit must also be more than
+/// [`MISFIT_DEVIATIONS`].
+const RMS_RATIO_LIMIT: f64 = 1.15;
+/// The same ratio from which the metric reconstruction is not to be used at all.
+const RMS_RATIO_REFUSAL: f64 = 3.0;
+/// Share of the observations that must lie in front of their cameras, and below which the reconstruction is refused.
+pub(super) const CHEIRALITY_LIMIT: f64 = 0.99;
+const CHEIRALITY_REFUSAL: f64 = 0.9;
+
+/// The grade with the warnings that led to it.
+pub(super) struct Verdict {
+    pub grade: Grade,
+    pub warnings: Vec<Warning>,
+}
+
+impl Verdict {
+    /// Lowers the grade to this at most and says why.
+    pub fn cap(&mut self, worst: Grade, code: WarningCode, detail: String) {
+        self.grade = self.grade.worse(worst);
+        self.warnings.push(Warning::new(code, detail));
+    }
+
+    pub fn has(&self, code: WarningCode) -> bool {
+        self.warnings.iter().any(|warning| warning.code == code)
+    }
+
+    /// Grades by the standard deviation of the log focal length; `None`: unobservable.
+    pub fn judge_sigma(&mut self, sigma: Option<f64>) {
+        self.grade = self.grade.worse(grade_of_sigma(sigma));
+        if grade_of_sigma(sigma) != Grade::ProjectiveOnly || self.has(WarningCode::UnobservableFocal) {
+            return;
+        }
+        let detail = match sigma {
+            Some(sigma) => format!(
+                "the motion determines the logarithm of the focal length only to {sigma:.2} (one standard deviation), \
+                 more than {WEAK_UP_TO}"
+            ),
+            None => "the motion does not determine the focal length".to_owned(),
+        };
+        self.warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
+    }
+
+    /// Asks whether the metric reconstruction fits as well as the projective one; returns the ratio of their noises.
+    ///
+    /// * `free`: what the metric one leaves free, in words
+    pub fn judge_fit(&mut self, projective: &Fit, metric: &Fit, free: &str, scale_px: f64) -> f64 {
+        let ratio = posterior_noise(metric.cost, metric.freedom) / projective.noise;
+        if ratio > RMS_RATIO_LIMIT && projective.loss_deviations(metric.cost, metric.freedom) > MISFIT_DEVIATIONS {
+            let worst = if ratio > RMS_RATIO_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
+            let detail = format!(
+                "the metric reconstruction fits {ratio:.2} times worse than the projective one ({:.2} px against \
+                 {:.2} px) with {free} free: distortion, a zoom or wrong tracks",
+                ratio * projective.noise * scale_px,
+                projective.noise * scale_px,
+            );
+            self.cap(worst, WarningCode::ModelMismatch, detail);
+        }
+        ratio
+    }
+
+    /// Asks for the observations in front of their cameras, and for enough tracks.
+    pub fn judge_cheirality(&mut self, in_front: f64) {
+        if in_front < CHEIRALITY_LIMIT {
+            let worst = if in_front < CHEIRALITY_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
+            let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - in_front));
+            self.cap(worst, WarningCode::Cheirality, detail);
+        }
+        if self.has(WarningCode::FewInliers) {
+            self.grade = self.grade.worse(Grade::Weak);
+        }
+    }
+
+    /// The sigma that is told: not one that the fit contradicts. Whatever lowered the grade is worth at least the grade's
+    /// least.
+    pub fn told(&self, sigma: Option<f64>) -> Option<f64> {
+        sigma.map(|sigma| if self.grade == Grade::Weak { sigma.max(METRIC_BELOW) } else { sigma })
+    }
+}
+
+/// The grade that a standard deviation of the log focal length alone would give; `None`: unobservable.
+pub fn grade_of_sigma(sigma: Option<f64>) -> Grade {
+    match sigma {
+        Some(sigma) if sigma < METRIC_BELOW => Grade::Metric,
+        Some(sigma) if sigma <= WEAK_UP_TO => Grade::Weak,
+        _ => Grade::ProjectiveOnly,
+    }
+}

@@ -1,0 +1,156 @@
+//! Self-calibration with a focal length a view.
+
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+
+use super::fit::Fit;
+use super::models::{CHI_SQUARE_GAIN, Choice};
+use super::search::{self, CONVERGED, FIRST_ITERATIONS, FIRST_TOLERANCE, converge};
+use super::verdict::{UNOBSERVABLE_ABOVE, Verdict};
+use super::{Outcome, Problem, Stopped, no_start};
+use crate::domain::{Grade, StopToken, Warning, WarningCode};
+use crate::geometry::bundle::Options;
+use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior};
+use crate::geometry::bundle::zoom::Zooming;
+use crate::geometry::daq::{self, FirstViewFrame, to_first_view_frame};
+use crate::geometry::metric::{cheirality, upgrade_zooming};
+
+/// Best quadrics that are adjusted, beside the reconstructions with a constant focal length.
+const STARTS: usize = 8;
+/// Difference in the mean log focal length, and share of the cost, within which minima are the same.
+const SAME_MINIMUM: f64 = 0.01;
+const SAME_COST: f64 = 0.01;
+
+/// A converged reconstruction.
+#[derive(Debug, Clone)]
+struct Minimum {
+    zooming: Zooming,
+    cost: f64,
+}
+
+impl Minimum {
+    fn adjusted(mut zooming: Zooming, problem: &Problem, options: &Options, stop: &StopToken) -> Self {
+        let report = zooming.adjust(problem.observations, options, stop);
+        Self { zooming, cost: report.cost }
+    }
+
+    fn mean_log_focal(&self) -> f64 {
+        self.zooming.focals.iter().map(|focal| focal.ln()).sum::<f64>() / self.zooming.focals.len().max(1) as f64
+    }
+}
+
+/// Calibrates with a focal length a view and grades the result; principal point in the centre, square pixels, no
+/// distortion, and priors on the focal length are not looked at.
+///
+/// Sigma is the root mean square over the views of the standard deviations of their log focal lengths.
+///
+/// * `fit`: of the projective cameras
+pub(super) fn calibrate(
+    frame: &FirstViewFrame,
+    choice: &Choice,
+    fit: &Fit,
+    mut warnings: Vec<Warning>,
+) -> Result<Outcome, Stopped> {
+    let Choice { problem, scale_px, stop, .. } = *choice;
+    let minima = minima(frame, problem, stop)?;
+    let Some((best, others)) = minima.split_first() else {
+        warnings.push(no_start());
+        return Ok(Outcome::refused(warnings));
+    };
+    let inliers = super::observed_points(problem);
+    let unknowns = 7 * problem.cameras.len() + 3 * inliers;
+    let own = Fit::new(best.cost, unknowns.saturating_sub(7), problem);
+    let variances = best.zooming.log_focal_variances(problem.observations);
+    let sum: Option<f64> = variances.iter().copied().sum();
+    let sigma = sum.map(|sum| (sum / variances.len().max(1) as f64).sqrt() * own.noise);
+    let sigma = sigma.filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
+
+    let mut verdict = Verdict { grade: Grade::Metric, warnings };
+    verdict.judge_sigma(sigma);
+    let close = |other: &&Minimum| other.cost - best.cost < CHI_SQUARE_GAIN * own.noise.powi(2);
+    if let Some(rival) = others.iter().find(close) {
+        let detail = format!(
+            "focal lengths around {:.1} px instead of {:.1} px explain the data about as well",
+            rival.mean_log_focal().exp() * scale_px,
+            best.mean_log_focal().exp() * scale_px
+        );
+        verdict.cap(Grade::ProjectiveOnly, WarningCode::SecondMinimum, detail);
+    }
+    let metric = best.zooming.at_mean_focal();
+    let in_front = cheirality(&metric, problem.observations);
+    let rms_ratio = verdict.judge_fit(fit, &own, "a focal length a view", scale_px);
+    verdict.judge_cheirality(in_front);
+    Ok(Outcome {
+        sigma_log_focal: verdict.told(sigma),
+        grade: verdict.grade,
+        warnings: verdict.warnings,
+        model: IntrinsicsModel::FOCAL,
+        plane_at_infinity: plane_at_infinity(problem, &best.zooming),
+        cheirality: in_front,
+        rms_ratio,
+        metric: Some(metric),
+        focals: Some(best.zooming.focals.clone()),
+    })
+}
+
+/// The plane at infinity of the caller's cameras that goes best with the reconstruction, in the frame that
+/// [`to_first_view_frame`] gives them: `A - a n' ~ K R K1^-1` for every `P = [A|a]`, linear in `n` and the scales.
+fn plane_at_infinity(problem: &Problem, zooming: &Zooming) -> Option<Vector3<f64>> {
+    let frame = to_first_view_frame(problem.cameras, &[])?;
+    let calibration = |focal: f64| Matrix3::from_diagonal(&Vector3::new(focal, focal, 1.0));
+    let back = zooming.poses.first()?.rotation.transpose() * calibration(*zooming.focals.first()?).try_inverse()?;
+    let (mut normal, mut target) = (Matrix3::zeros(), Vector3::zeros());
+    for ((camera, pose), focal) in frame.cameras.iter().zip(&zooming.poses).zip(&zooming.focals) {
+        let infinite = calibration(*focal) * pose.rotation * back;
+        let infinite = SVector::<f64, 9>::from_column_slice((infinite / infinite.norm()).as_slice());
+        // Entry (row, column) of `A` is at 3 column + row, and `a_row n_column` beside it.
+        let by_plane =
+            SMatrix::<f64, 9, 3>::from_fn(|k, column| if k / 3 == column { camera[(k % 3, 3)] } else { 0.0 });
+        let without_scale = by_plane - infinite * (infinite.transpose() * by_plane);
+        let left = SVector::<f64, 9>::from_column_slice(camera.fixed_columns::<3>(0).into_owned().as_slice());
+        normal += without_scale.transpose() * by_plane;
+        target += without_scale.transpose() * left;
+    }
+    let plane = normal.try_inverse()? * target;
+    plane.iter().all(|value| value.is_finite()).then_some(plane)
+}
+
+/// Reconstructions that different starts converge to, cheapest first.
+fn minima(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
+    let mut starts: Vec<Zooming> = daq::zoom_starts(&frame.cameras)
+        .into_iter()
+        .take(STARTS)
+        .filter_map(|(daq, _)| upgrade_zooming(frame, &daq, problem.observations))
+        .collect();
+    let constant = search::minima(frame, problem, &IntrinsicsPrior::NONE, stop)?;
+    starts.extend(constant.iter().map(|minimum| Zooming::from(&minimum.reconstruction)));
+    let first = Options { max_iterations: FIRST_ITERATIONS, relative_tolerance: FIRST_TOLERANCE, ..Options::default() };
+    let mut found = Vec::with_capacity(starts.len());
+    for start in starts {
+        Stopped::check(stop)?;
+        found.push(Minimum::adjusted(start, problem, &first, stop));
+    }
+    let mut found = distinct(found);
+    found.truncate(CONVERGED);
+    for minimum in &mut found {
+        Stopped::check(stop)?;
+        *minimum = Minimum::adjusted(minimum.zooming.clone(), problem, &converge(), stop);
+    }
+    Ok(distinct(found))
+}
+
+/// Cheapest first, without those that repeat a cheaper one.
+fn distinct(mut found: Vec<Minimum>) -> Vec<Minimum> {
+    found.retain(|minimum| minimum.cost.is_finite() && minimum.mean_log_focal().is_finite());
+    found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+    let mut kept: Vec<Minimum> = Vec::with_capacity(found.len());
+    for candidate in found {
+        let repeats = kept.iter().any(|minimum| {
+            (candidate.mean_log_focal() - minimum.mean_log_focal()).abs() < SAME_MINIMUM
+                && candidate.cost < (1.0 + SAME_COST) * minimum.cost
+        });
+        if !repeats {
+            kept.push(candidate);
+        }
+    }
+    kept
+}
