@@ -37,9 +37,9 @@ fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
 
 #[test]
 fn every_view_gets_its_focal_length() {
-    for range in [0.0, 0.3, 0.7] {
+    for range in [0.0, 0.5] {
         let (mut calibrated_well, mut deviations) = (0, Vec::new());
-        for seed in 0..20 {
+        for seed in 0..10 {
             let (scene, focals) = zooming(seed, 60, 0.001, range);
             let begun = std::time::Instant::now();
             let outcome = calibrated(&scene, seed, 0.001);
@@ -60,8 +60,8 @@ fn every_view_gets_its_focal_length() {
             }
         }
         let beyond = deviations.iter().filter(|deviation| **deviation > 3.0).count();
-        println!("range {range}: {calibrated_well} of 20 well, {beyond} of {} beyond three sigma", deviations.len());
-        assert!(calibrated_well >= 16 && beyond <= 1, "range {range}");
+        println!("range {range}: {calibrated_well} of 10 well, {beyond} of {} beyond three sigma", deviations.len());
+        assert!(calibrated_well >= 9 && beyond <= 1, "range {range}");
     }
 }
 
@@ -70,7 +70,7 @@ fn critical_motions_are_refused_with_a_focal_length_a_view_too() {
     for (motion, planar) in
         [(Motion::Translation, false), (Motion::Forward, false), (Motion::Rotation, false), (Motion::General, true)]
     {
-        for seed in 0..5 {
+        for seed in 0..3 {
             let scene = testing::scene_of(seed, 10, 40, NOISE, motion, planar);
             let outcome = calibrated(&scene, seed, NOISE);
             println!("{motion:?}, planar {planar}, seed {seed}: {:?}", codes(&outcome));
