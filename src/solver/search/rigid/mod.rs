@@ -7,7 +7,13 @@
 //! two hundred. Depths from epipolar geometry are true only up to a scale a view and a track: there nothing is
 //! rigid, and the other searches remain.
 
+mod golden;
+mod graph;
+
 use nalgebra::Vector3;
+
+use golden::golden_section;
+use graph::{Graph, Pair};
 
 use crate::domain::StopToken;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
@@ -16,29 +22,19 @@ use crate::geometry::procrustes::{generalised, mean_position};
 use crate::geometry::statistics::{chi_square_gate, ln_choose, median};
 use crate::geometry::{Camera, Point};
 
-/// Focal lengths that are tried, in image sides: a grid whose steps of 9 % change a distance by less than a length
-/// tolerance allows.
-const FOCALS: usize = 33;
-const FOCAL_RANGE: (f64, f64) = (0.3, 5.0);
 /// Standard deviation of a distance over the views, in units of the noise times the depth, below which a pair is
 /// rigid: a distance has the noise of two points in up to three coordinates, and the grid adds to it.
 const PAIR_TOLERANCE: f64 = 3.0;
 /// The same as a share of the depth that the grid's steps leave to exact pairs.
 const GRID_TOLERANCE: f64 = 0.005;
-/// Distance in tolerances below which a pair says nothing: near points are near in every view, right or wrong.
-const LEAST_DISTANCE: f64 = 3.0;
 /// Best focal lengths and best-connected tracks of each that a consensus is grown from.
 const FOCALS_GROWN: usize = 3;
 const CORES_GROWN: usize = 4;
-/// Share of a core that a track must be rigid with to join it.
-const CORE_SHARE: f64 = 0.75;
 /// Noise that a core is grown at, in units of that its pairs were rigid at: strict pairs keep chance out of a core, a
 /// wide gate lets the right tracks in.
 const GROWN_NOISE: [f64; 3] = [1.0, 2.0, 4.0];
 /// Logarithm of the expected number of false alarms at which the search ends.
 const LN_NEVER_CHANCE: f64 = -100.0;
-/// Tracks of a core at most; more do not make the poses better to start from.
-const MOST_CORE: usize = 30;
 /// Tracks that leave six unknowns a view determined, with one to verify.
 pub const LEAST_TRACKS: usize = 4;
 /// Rounds of re-estimating the noise, and the least that is believed: a hundredth of a pixel of a thousand.
@@ -48,9 +44,9 @@ const LEAST_NOISE: f64 = 1e-5;
 const GATES: [f64; 6] = [64.0, 16.0, 4.0, 1.0, 1.0, 1.0];
 /// Steps of the golden section on the log focal length, and its half width: two steps of the grid.
 const FOCAL_STEPS: usize = 10;
+const FOCAL_HALF_WIDTH: f64 = 0.18;
 /// Tracks that take part in it: their distances tell the focal length well enough to gate by.
 const FOCAL_TRACKS: usize = 12;
-const FOCAL_HALF_WIDTH: f64 = 0.18;
 
 /// A rigid shape with the tracks that belong to it.
 #[derive(Debug, Clone)]
@@ -319,137 +315,6 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Moments over the views of the two parts of a pair's squared distance: `a`, which the focal length scales, and `b`,
-/// the depths'.
-#[derive(Debug, Clone, Copy, Default)]
-struct Pair {
-    a: f64,
-    b: f64,
-    aa: f64,
-    ab: f64,
-    bb: f64,
-}
-
-impl Pair {
-    fn add(&mut self, a: f64, b: f64) {
-        self.a += a;
-        self.b += b;
-        self.aa += a * a;
-        self.ab += a * b;
-        self.bb += b * b;
-    }
-
-    fn divided(self, count: f64) -> Self {
-        let Self { a, b, aa, ab, bb } = self;
-        Self { a: a / count, b: b / count, aa: aa / count, ab: ab / count, bb: bb / count }
-    }
-
-    /// Whether the distance at `g = 1/f^2` deviates by less than `tolerance`, and is not near zero in its terms.
-    fn is_rigid(&self, g: f64, tolerance: f64) -> bool {
-        let squared_distance = g * self.a + self.b;
-        let second = g * g * self.aa + 2.0 * g * self.ab + self.bb;
-        let variance = (second - squared_distance * squared_distance).max(0.0);
-        // The deviation of a root is that of its square over twice the root.
-        squared_distance > (LEAST_DISTANCE * tolerance).powi(2)
-            && variance < 4.0 * squared_distance * tolerance * tolerance
-    }
-}
-
-/// Which pairs are rigid.
-struct Graph {
-    tracks: usize,
-    tolerance: f64,
-    /// Upper triangle, row by row.
-    pairs: Vec<Pair>,
-}
-
-impl Graph {
-    fn focal(k: usize) -> f64 {
-        FOCAL_RANGE.0 * (FOCAL_RANGE.1 / FOCAL_RANGE.0).powf(k as f64 / (FOCALS - 1) as f64)
-    }
-
-    /// The focal lengths with most rigid pairs, no two of them neighbours on the grid.
-    fn best_focals(&self, count: usize) -> Vec<(f64, Edges)> {
-        let mut totals = [0usize; FOCALS];
-        for pair in &self.pairs {
-            for (k, total) in totals.iter_mut().enumerate() {
-                *total += usize::from(pair.is_rigid(Self::focal(k).powi(-2), self.tolerance));
-            }
-        }
-        let mut ranked: Vec<usize> = (0..FOCALS).filter(|&k| totals[k] > 0).collect();
-        ranked.sort_by(|&a, &b| totals[b].cmp(&totals[a]).then(a.cmp(&b)));
-        let mut chosen: Vec<usize> = Vec::new();
-        for k in ranked {
-            if chosen.len() < count && chosen.iter().all(|&other| k.abs_diff(other) > 1) {
-                chosen.push(k);
-            }
-        }
-        chosen.into_iter().map(|k| (Self::focal(k), self.edges(Self::focal(k)))).collect()
-    }
-
-    fn edges(&self, focal: f64) -> Edges {
-        let mut adjacent = vec![vec![false; self.tracks]; self.tracks];
-        let mut pairs = self.pairs.iter();
-        for a in 0..self.tracks {
-            for b in a + 1..self.tracks {
-                let rigid = pairs.next().is_some_and(|pair| pair.is_rigid(focal.powi(-2), self.tolerance));
-                (adjacent[a][b], adjacent[b][a]) = (rigid, rigid);
-            }
-        }
-        let degree = adjacent.iter().map(|row| row.iter().filter(|&&edge| edge).count()).collect();
-        Edges { adjacent, degree }
-    }
-}
-
-/// The rigid pairs at one focal length.
-struct Edges {
-    adjacent: Vec<Vec<bool>>,
-    degree: Vec<usize>,
-}
-
-impl Edges {
-    /// A set of tracks nearly all of which are rigid with each other, begun from the best-connected one that no earlier
-    /// core covers.
-    fn core(&self, covered: &[bool]) -> Vec<usize> {
-        let tracks = self.degree.len();
-        let Some(first) =
-            (0..tracks).filter(|&track| !covered[track]).max_by_key(|&track| (self.degree[track], tracks - track))
-        else {
-            return Vec::new();
-        };
-        let mut candidates: Vec<usize> = (0..tracks).filter(|&track| self.adjacent[first][track]).collect();
-        candidates.sort_by(|&a, &b| self.degree[b].cmp(&self.degree[a]).then(a.cmp(&b)));
-        let mut core = vec![first];
-        for track in candidates {
-            let rigid = core.iter().filter(|&&member| self.adjacent[track][member]).count();
-            if rigid as f64 >= CORE_SHARE * core.len() as f64 && core.len() < MOST_CORE {
-                core.push(track);
-            }
-        }
-        core
-    }
-}
-
-/// Minimum of a function near `middle`, by golden section over `middle +- half_width`.
-fn golden_section(cost: impl Fn(f64) -> f64, middle: f64, half_width: f64, steps: usize) -> f64 {
-    let ratio = (5f64.sqrt() - 1.0) / 2.0;
-    let (mut low, mut high) = (middle - half_width, middle + half_width);
-    let (mut left, mut right) = (high - ratio * (high - low), low + ratio * (high - low));
-    let (mut cost_left, mut cost_right) = (cost(left), cost(right));
-    for _ in 0..steps {
-        if cost_left < cost_right {
-            (high, right, cost_right) = (right, left, cost_left);
-            left = high - ratio * (high - low);
-            cost_left = cost(left);
-        } else {
-            (low, left, cost_left) = (left, right, cost_right);
-            right = low + ratio * (high - low);
-            cost_right = cost(right);
-        }
-    }
-    (low + high) / 2.0
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -491,11 +356,5 @@ mod tests {
             let options = SceneOptions { outliers: 1.0, with_depths: true, seed, ..SceneOptions::default() };
             assert!(found(&options).1.is_none_or(|rigid| rigid.ln_false_alarms(0.2) > -7.0), "seed {seed}");
         }
-    }
-
-    #[test]
-    fn the_golden_section_finds_a_minimum() {
-        let found = golden_section(|x| (x - 0.3).powi(2), 0.2, 0.5, 30);
-        assert!((found - 0.3).abs() < 1e-5, "{found}");
     }
 }

@@ -1,0 +1,124 @@
+//! Which pairs of tracks are rigid at which focal length, and the sets that are rigid together.
+
+/// Focal lengths that are tried, in image sides: a grid whose steps of 9 % change a distance by less than a length
+/// tolerance allows.
+const FOCALS: usize = 33;
+const FOCAL_RANGE: (f64, f64) = (0.3, 5.0);
+/// Distance in tolerances below which a pair says nothing: near points are near in every view, right or wrong.
+const LEAST_DISTANCE: f64 = 3.0;
+/// Share of a core that a track must be rigid with to join it.
+const CORE_SHARE: f64 = 0.75;
+/// Tracks of a core at most; more do not make the poses better to start from.
+const MOST_CORE: usize = 30;
+
+/// Moments over the views of the two parts of a pair's squared distance: `a`, which the focal length scales, and `b`,
+/// the depths'.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Pair {
+    a: f64,
+    b: f64,
+    aa: f64,
+    ab: f64,
+    bb: f64,
+}
+
+impl Pair {
+    pub fn add(&mut self, a: f64, b: f64) {
+        self.a += a;
+        self.b += b;
+        self.aa += a * a;
+        self.ab += a * b;
+        self.bb += b * b;
+    }
+
+    pub fn divided(self, count: f64) -> Self {
+        let Self { a, b, aa, ab, bb } = self;
+        Self { a: a / count, b: b / count, aa: aa / count, ab: ab / count, bb: bb / count }
+    }
+
+    /// Whether the distance at `g = 1/f^2` deviates by less than `tolerance`, and is not near zero in its terms.
+    fn is_rigid(&self, g: f64, tolerance: f64) -> bool {
+        let squared_distance = g * self.a + self.b;
+        let second = g * g * self.aa + 2.0 * g * self.ab + self.bb;
+        let variance = (second - squared_distance * squared_distance).max(0.0);
+        // The deviation of a root is that of its square over twice the root.
+        squared_distance > (LEAST_DISTANCE * tolerance).powi(2)
+            && variance < 4.0 * squared_distance * tolerance * tolerance
+    }
+}
+
+/// Which pairs are rigid.
+pub struct Graph {
+    pub tracks: usize,
+    /// Standard deviation of a distance below which a pair is rigid.
+    pub tolerance: f64,
+    /// Upper triangle, row by row.
+    pub pairs: Vec<Pair>,
+}
+
+impl Graph {
+    fn focal(k: usize) -> f64 {
+        FOCAL_RANGE.0 * (FOCAL_RANGE.1 / FOCAL_RANGE.0).powf(k as f64 / (FOCALS - 1) as f64)
+    }
+
+    /// The focal lengths with most rigid pairs, no two of them neighbours on the grid.
+    pub fn best_focals(&self, count: usize) -> Vec<(f64, Edges)> {
+        let mut totals = [0usize; FOCALS];
+        for pair in &self.pairs {
+            for (k, total) in totals.iter_mut().enumerate() {
+                *total += usize::from(pair.is_rigid(Self::focal(k).powi(-2), self.tolerance));
+            }
+        }
+        let mut ranked: Vec<usize> = (0..FOCALS).filter(|&k| totals[k] > 0).collect();
+        ranked.sort_by(|&a, &b| totals[b].cmp(&totals[a]).then(a.cmp(&b)));
+        let mut chosen: Vec<usize> = Vec::new();
+        for k in ranked {
+            if chosen.len() < count && chosen.iter().all(|&other| k.abs_diff(other) > 1) {
+                chosen.push(k);
+            }
+        }
+        chosen.into_iter().map(|k| (Self::focal(k), self.edges(Self::focal(k)))).collect()
+    }
+
+    fn edges(&self, focal: f64) -> Edges {
+        let mut adjacent = vec![vec![false; self.tracks]; self.tracks];
+        let mut pairs = self.pairs.iter();
+        for a in 0..self.tracks {
+            for b in a + 1..self.tracks {
+                let rigid = pairs.next().is_some_and(|pair| pair.is_rigid(focal.powi(-2), self.tolerance));
+                (adjacent[a][b], adjacent[b][a]) = (rigid, rigid);
+            }
+        }
+        let degree = adjacent.iter().map(|row| row.iter().filter(|&&edge| edge).count()).collect();
+        Edges { adjacent, degree }
+    }
+}
+
+/// The rigid pairs at one focal length.
+pub struct Edges {
+    adjacent: Vec<Vec<bool>>,
+    degree: Vec<usize>,
+}
+
+impl Edges {
+    /// A set of tracks nearly all of which are rigid with each other, begun from the best-connected one that no earlier
+    /// core covers.
+    pub fn core(&self, covered: &[bool]) -> Vec<usize> {
+        let tracks = self.degree.len();
+        let Some(first) =
+            (0..tracks).filter(|&track| !covered[track]).max_by_key(|&track| (self.degree[track], tracks - track))
+        else {
+            return Vec::new();
+        };
+        let mut candidates: Vec<usize> = (0..tracks).filter(|&track| self.adjacent[first][track]).collect();
+        candidates.sort_by(|&a, &b| self.degree[b].cmp(&self.degree[a]).then(a.cmp(&b)));
+        let mut core = vec![first];
+        for track in candidates {
+            let rigid = core.iter().filter(|&&member| self.adjacent[track][member]).count();
+            if rigid as f64 >= CORE_SHARE * core.len() as f64 && core.len() < MOST_CORE {
+                core.push(track);
+            }
+        }
+        core
+    }
+}
