@@ -201,7 +201,8 @@ fn outlier_density(attempt: &Attempt) -> f64 {
 }
 
 fn left_out(input: &Input, registered: &[usize]) -> Option<Warning> {
-    let missing: Vec<usize> = (0..input.view_count()).filter(|view| !registered.contains(view)).collect();
+    let observed = super::block::observed_views(input);
+    let missing: Vec<usize> = observed.iter().copied().filter(|view| !registered.contains(view)).collect();
     if missing.is_empty() {
         return None;
     }
@@ -214,7 +215,7 @@ fn left_out(input: &Input, registered: &[usize]) -> Option<Warning> {
         format!(
             "{} of {} views are outside the block that was solved and were left out: {}",
             missing.len(),
-            input.view_count(),
+            observed.len(),
             names.join(", ")
         ),
     ))

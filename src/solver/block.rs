@@ -124,9 +124,9 @@ fn extent_of_unsized(input: &Input) -> [Vector2<f64>; 2] {
 ///
 /// Once `stop` fires the answer is whatever was found by then.
 pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec<Vec<usize>> {
-    if is_complete(input, ranges) {
-        let count = input.view_count().min(MOST_VIEWS_WHOLE);
-        return vec![(0..count).map(|k| k * input.view_count() / count).collect()];
+    if let Some(views) = complete_views(input, ranges) {
+        let count = views.len().min(MOST_VIEWS_WHOLE);
+        return vec![(0..count).map(|k| views[k * views.len() / count]).collect()];
     }
     for least in [WANTED_TRACKS, LEAST_TRACKS] {
         let found = greedy_views(input, ranges, least, stop);
@@ -137,12 +137,20 @@ pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec
     Vec::new()
 }
 
-/// Whether at least half of the tracks that are observed at all, and enough of them, are seen in all views.
-pub fn is_complete(input: &Input, ranges: &[usize]) -> bool {
-    let views = input.view_count();
+/// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of them,
+/// are seen in all of these. Padding, views and tracks without observations, changes nothing.
+pub fn complete_views(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
+    let views = observed_views(input);
     let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
-    let complete = ranges.windows(2).filter(|range| range[1] - range[0] == views).count();
-    views >= LEAST_VIEWS && complete >= LEAST_TRACKS && 2 * complete >= observed
+    let complete = ranges.windows(2).filter(|range| range[1] - range[0] == views.len()).count();
+    (views.len() >= LEAST_VIEWS && complete >= LEAST_TRACKS && 2 * complete >= observed).then_some(views)
+}
+
+/// The views in which anything is observed, increasing.
+pub fn observed_views(input: &Input) -> Vec<usize> {
+    let mut seen = vec![false; input.view_count()];
+    (0..input.observation_count()).for_each(|k| seen[input.view_of(k)] = true);
+    (0..seen.len()).filter(|&view| seen[view]).collect()
 }
 
 /// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on

@@ -31,11 +31,7 @@ const REGISTRATION_GATES: f64 = 9.0;
 /// The block and its consensus with the tracks and views that the search left aside; `None` where there are none, or
 /// where what was found does not carry over.
 pub fn extend(block: &Block, consensus: &Consensus, context: &Context) -> Option<(Block, Consensus)> {
-    let others: Vec<usize> = if block::is_complete(context.input, context.ranges) {
-        (0..context.input.view_count()).collect()
-    } else {
-        Vec::new()
-    };
+    let others = block::complete_views(context.input, context.ranges).unwrap_or_default();
     let wanted = with_others(&block.views, &others);
     if wanted.len() > block.views.len()
         && let Some(extended) = extend_to(block, consensus, &wanted, context)

@@ -37,7 +37,8 @@ fn scene(directory: &Path) -> PathBuf {
 
 #[test]
 fn every_command_explains_itself() {
-    let commands = ["demo", "serve", "solve", "submit", "watch", "get", "list", "cancel", "result", "synth"].map(Some);
+    let commands =
+        ["demo", "serve", "solve", "submit", "watch", "get", "list", "cancel", "result", "synth", "evaluate"].map(Some);
     for command in commands.into_iter().chain([None]) {
         let run = run(command.into_iter().chain(["--help"]));
         assert_eq!(run.code, Some(0), "{run:?}");
@@ -47,17 +48,59 @@ fn every_command_explains_itself() {
 }
 
 #[test]
+fn an_evaluation_scores_methods_against_the_oracle_and_goes_on_where_it_was() {
+    let directory = directory();
+    let out = directory.path().join("evaluation");
+    let evaluate = |seeds: &'static str| {
+        let run = run([
+            "evaluate",
+            "--sweeps",
+            "orbit",
+            "--depths",
+            "given",
+            "--methods",
+            "oracle,psfm",
+            "--seeds",
+            seeds,
+            "--json",
+            "--quiet",
+            "--out",
+            text(&out),
+        ]);
+        assert_eq!(run.code, Some(0), "{run:?}");
+        json(&run.stdout)
+    };
+    let summary = evaluate("1");
+    let cells = summary["cells"].as_array().expect("cells");
+    assert_eq!(cells.len(), 8, "four shares of outliers, two methods");
+    let oracle = cells.iter().filter(|cell| cell["contestant"] == "oracle");
+    assert!(oracle.clone().count() == 4 && oracle.clone().all(|cell| cell["mean_f1"].as_f64() > Some(0.95)));
+    for file in ["runs.jsonl", "summary.json", "summary.csv", "figure-depths-given.svg", "index.html"] {
+        assert!(out.join(file).metadata().is_ok_and(|metadata| metadata.len() > 0), "{file}");
+    }
+    let records = || fs::read_to_string(out.join("runs.jsonl")).expect("records");
+    let first = records();
+    assert_eq!(first.lines().count(), 1 + 8);
+    evaluate("2");
+    assert!(records().starts_with(&first), "what was recorded stays");
+    assert_eq!(records().lines().count(), 1 + 16);
+}
+
+#[test]
 fn wrong_usage_ends_with_2_and_does_nothing() {
     let directory = directory();
     let input = scene(directory.path());
     let (input, out) = (text(&input), directory.path().join("out"));
-    let cases: [&[&str]; 7] = [
+    let cases: [&[&str]; 10] = [
         &["solve", input],
         &["solve", input, "--out", text(&out), "--width", "100"],
         &["solve", input, "--out", text(&out), "--width", "0", "--height", "9"],
         &["solve", input, "--out", text(&out), "--iterations", "0"],
         &["solve", input, "--out", text(&out), "--method", "magic"],
         &["synth", "--views", "1", "--out", text(&out)],
+        &["evaluate", "--sweeps", "magic", "--out", text(&out)],
+        &["evaluate", "--seeds", "0", "--out", text(&out)],
+        &["evaluate", "--ablation", "--methods", "auto", "--out", text(&out)],
         &["frobnicate"],
     ];
     for arguments in cases {

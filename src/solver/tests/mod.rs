@@ -75,6 +75,27 @@ fn one_seed_one_answer() {
 }
 
 #[test]
+fn padding_changes_nothing() {
+    // The paper pads its matrices to 300 x 1000.
+    for with_depths in [false, true] {
+        let (input, _) = scene(SceneOptions { tracks: 80, outliers: 0.7, with_depths, ..SceneOptions::default() });
+        let mut raw = input.to_raw();
+        raw.track_count = 1000;
+        raw.views.resize(100, raw.views[0].clone());
+        let padded = Input::new(raw, &Limits::default(), "padded").expect("valid");
+        let (plain, padded) = (solved(&input, &SolveSettings::default()), solved(&padded, &SolveSettings::default()));
+        assert_eq!(plain.tracks.inlier, padded.tracks.inlier[..80]);
+        assert_eq!(plain.tracks.weight, padded.tracks.weight[..80]);
+        assert_eq!(plain.tracks.point, padded.tracks.point[..80]);
+        assert!(padded.tracks.inlier[80..].iter().all(|&inlier| !inlier));
+        assert_eq!(plain.views, padded.views[..10]);
+        assert_eq!(plain.calibrations, padded.calibrations);
+        assert_eq!(plain.observations, padded.observations);
+        assert_eq!(plain.warnings, padded.warnings);
+    }
+}
+
+#[test]
 fn both_backends_find_the_same_inliers() {
     let (input, _) = scene(SceneOptions { tracks: 80, outliers: 0.8, seed: 2, ..SceneOptions::default() });
     let inliers =
