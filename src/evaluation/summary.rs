@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
 use super::measures::Measures;
-use super::plan::{Contestant, Depths, Plan, Run, cell_scene};
+use super::plan::{Contestant, Depths, Plan, Run};
 use super::runner::Records;
 use crate::domain::Grade;
 
@@ -49,13 +49,13 @@ pub fn cells(plan: &Plan, records: &Records) -> Vec<Cell> {
     let mut cells = Vec::new();
     for sweep in &plan.sweeps {
         for &depths in &plan.depths {
-            for &contestant in &plan.contestants {
+            for contestant in plan.contestants_with(depths) {
                 for (x, scene) in &sweep.cells {
-                    let of = |contestant: Contestant, seed: u64| {
-                        records.get(&Run { scene: cell_scene(scene, depths, seed), contestant })
-                    };
                     let pairs: Vec<(&Measures, Option<&Measures>)> = (0..plan.seeds)
-                        .filter_map(|seed| Some((of(contestant, seed)?, of(Contestant::Oracle, seed))))
+                        .filter_map(|seed| {
+                            let own = plan.run(scene, depths, seed, contestant);
+                            Some((records.get(&own)?, records.get(&Run::oracle(own.scene))))
+                        })
                         .collect();
                     if !pairs.is_empty() {
                         cells.push(cell(sweep.name, *x, depths, contestant, &pairs));
@@ -162,7 +162,7 @@ pub fn coverage(plan: &Plan, records: &Records, contestant: Contestant) -> Optio
     let answers: Vec<(&Measures, Option<f64>)> = runs
         .iter()
         .filter_map(|run| {
-            let oracle = Run { contestant: Contestant::Oracle, scene: run.scene.clone() };
+            let oracle = Run::oracle(run.scene.clone());
             Some((records.get(run)?, records.get(&oracle).and_then(|oracle| oracle.sigma_log_focal)))
         })
         .collect();
