@@ -67,6 +67,11 @@ pub struct SettingsArgs {
     #[arg(long)]
     pub no_daq: bool,
 
+    /// With `paper` and `psfm`, for an input without depths: estimate projective depths from fundamental matrices and
+    /// epipoles, instead of taking them as 1; needs about half of the tracks to be right
+    #[arg(long)]
+    pub epipolar_depths: bool,
+
     /// Noise of the observations in pixels, one standard deviation, where known: a start, the noise is estimated
     #[arg(long, value_name = "PX")]
     pub noise_px: Option<f64>,
@@ -120,6 +125,7 @@ impl SettingsArgs {
             learning_rate: self.learning_rate,
             iterations: self.iterations,
             network_width: self.network_width,
+            epipolar_depths: self.epipolar_depths,
             seed: self.seed,
             noise_px: self.noise_px,
             focal_per_view: self.focal_per_view,

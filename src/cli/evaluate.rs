@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
-use crate::domain::{StopReason, StopToken};
+use crate::domain::{SolveSettings, StopReason, StopToken};
 use crate::evaluation::plan::{Contestant, Depths, Plan};
 use crate::evaluation::runner::{self, Records};
 use crate::evaluation::summary::{self, Cell};
@@ -29,6 +29,7 @@ Examples:
   scpsfm evaluate --sweeps outliers,orbit --depths none --methods oracle,auto,geometry
   scpsfm evaluate --beyond --methods oracle,auto --depths none
   scpsfm evaluate --ablation --sweeps outliers,orbit --out ablation
+  scpsfm evaluate --sweeps outliers --depths given,epipolar --methods paper,psfm --paper-width 1
 
 Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
 figure-depths-*.svg (the paper's layout) and index.html, which shows all of it. Stopped by Ctrl-C, a crash or a power cut it goes on where it was when called again with the same directory.";
@@ -68,13 +69,17 @@ pub struct Args {
     #[arg(long, conflicts_with = "methods")]
     pub ablation: bool,
 
-    /// How projective depths are given [default: given and none]
+    /// How projective depths are given [default: all]; `epipolar` runs paper and psfm only
     #[arg(long, value_enum, value_delimiter = ',', value_name = "DEPTHS")]
     pub depths: Vec<DepthsArg>,
 
     /// Methods to run [default: all]
     #[arg(long, value_enum, value_delimiter = ',', value_name = "METHOD")]
     pub methods: Vec<ContestantArg>,
+
+    /// Width of the network in `paper` and `paper-without-daq`, as a share of the original PointNet; 1 is the paper's
+    #[arg(long, value_name = "SHARE", value_parser = width, default_value_t = SolveSettings::DEFAULT_NETWORK_WIDTH)]
+    pub paper_width: f64,
 
     /// Print summary.json on stdout, instead of a table
     #[arg(long)]
@@ -83,6 +88,14 @@ pub struct Args {
     /// Show no progress
     #[arg(long, short)]
     pub quiet: bool,
+}
+
+/// A width that the solver accepts.
+fn width(text: &str) -> Result<f64, String> {
+    let width = text.parse().map_err(|_| "not a number".to_owned())?;
+    let settings = SolveSettings { network_width: width, ..SolveSettings::default() };
+    settings.validate().map_err(|error| error.to_string())?;
+    Ok(width)
 }
 
 /// [`Sweep`] on the command line.
@@ -119,6 +132,8 @@ pub enum DepthsArg {
     Given,
     /// Image points alone
     None,
+    /// Estimated from fundamental matrices and epipoles
+    Epipolar,
 }
 
 /// [`Contestant`] on the command line.
@@ -143,6 +158,7 @@ impl From<DepthsArg> for Depths {
         match depths {
             DepthsArg::Given => Depths::Given,
             DepthsArg::None => Depths::None,
+            DepthsArg::Epipolar => Depths::Epipolar,
         }
     }
 }
@@ -191,6 +207,7 @@ impl Args {
                 false => unique(contestants),
             },
             seeds: self.seeds.unwrap_or(if self.quick { QUICK_SEEDS } else { SEEDS }),
+            paper_width: self.paper_width,
         }
     }
 }
@@ -253,6 +270,7 @@ fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> 
     let json = pretty(&json!({
         "version": env!("CARGO_PKG_VERSION"),
         "seeds": plan.seeds,
+        "paper_width": plan.paper_width,
         "cells": cells,
         "coverage": coverage,
     }))?;
@@ -269,14 +287,14 @@ fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> 
 /// Mean F1 and median focal error of every cell, in words.
 fn table(cells: &[Cell]) -> String {
     let mut text = format!(
-        "{:<13}{:<19}{:<7}{:<25}{:>6}{:>8}{:>8}{:>10}{:>10}{:>9}\n",
+        "{:<13}{:<19}{:<10}{:<25}{:>6}{:>8}{:>8}{:>10}{:>10}{:>9}\n",
         "sweep", "at", "depths", "method", "seeds", "F1", "min F1", "2D px", "focal %", "seconds"
     );
     let shown =
         |value: Option<f64>, factor: f64| value.map_or_else(|| "-".into(), |value| format!("{:.2}", factor * value));
     for cell in cells {
         text.push_str(&format!(
-            "{:<13}{:<19}{:<7}{:<25}{:>6}{:>8.3}{:>8.3}{:>10}{:>10}{:>9.2}\n",
+            "{:<13}{:<19}{:<10}{:<25}{:>6}{:>8.3}{:>8.3}{:>10}{:>10}{:>9.2}\n",
             cell.sweep,
             cell.place,
             cell.depths.name(),

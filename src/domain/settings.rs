@@ -72,6 +72,10 @@ pub struct SolveSettings {
     pub iterations: u32,
     /// Width of the PointNet as a share of the original (64-64-64-128-1024).
     pub network_width: f64,
+    /// Whether PAPER and PSFM estimate projective depths from fundamental matrices and epipoles where the input brings
+    /// none, as the paper does on real tracks; otherwise such depths are 1. The other methods need none, and an input's
+    /// own depths are never replaced: there it changes nothing.
+    pub epipolar_depths: bool,
     /// Seed of every random choice: one seed, one answer.
     pub seed: u64,
     /// What the caller believes the observation noise to be, one standard deviation in pixels. A start, not a
@@ -171,6 +175,8 @@ impl Default for SolveSettings {
             learning_rate: Self::DEFAULT_LEARNING_RATE,
             iterations: Self::DEFAULT_ITERATIONS,
             network_width: Self::DEFAULT_NETWORK_WIDTH,
+            // Half of the matches must be right for it to work, and depths of 1 need no such thing.
+            epipolar_depths: false,
             seed: 0,
             noise_px: None,
             focal_per_view: false,

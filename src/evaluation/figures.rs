@@ -5,6 +5,7 @@ use std::fmt::Write;
 use super::plan::{Contestant, Depths, Plan};
 use super::summary::Cell;
 use crate::report::html::escape;
+use crate::synthetic::SceneOptions;
 
 /// Size of one panel's plot and the room around it, in the units of the `viewBox`.
 const PANEL: (f64, f64) = (210.0, 120.0);
@@ -63,7 +64,7 @@ pub fn svg(plan: &Plan, cells: &[Cell], depths: Depths) -> String {
          <rect width=\"100%\" height=\"100%\" fill=\"#fff\"/>",
         depths.name()
     );
-    legend(&mut out, plan);
+    legend(&mut out, plan, depths);
     for (column, sweep) in sweeps.into_iter().enumerate() {
         let left = MARGIN.0 + column as f64 * (PANEL.0 + GAP.0);
         text(&mut out, (left + PANEL.0 / 2.0, MARGIN.1 - 12.0), "middle", "#000", &sweep.name.replace('-', " "));
@@ -88,9 +89,10 @@ pub fn svg(plan: &Plan, cells: &[Cell], depths: Depths) -> String {
     out
 }
 
-fn legend(out: &mut String, plan: &Plan) {
+fn legend(out: &mut String, plan: &Plan, depths: Depths) {
     let mut left = MARGIN.0;
-    for &contestant in &plan.contestants {
+    let scene = SceneOptions::default();
+    for contestant in plan.contestants_with(&scene, depths) {
         let (colour, dash) = stroke(contestant);
         let _ = write!(
             out,
@@ -298,8 +300,9 @@ mod tests {
         let plan = Plan {
             sweeps: Sweep::paper(),
             depths: vec![Depths::None],
-            contestants: vec![Contestant::Oracle, Contestant::Auto],
+            contestants: vec![Contestant::Oracle, Contestant::Auto, Contestant::Psfm],
             seeds: 1,
+            paper_width: 0.25,
         };
         let cells = [
             cell(0.5, Contestant::Auto, Some(1.0)),
@@ -314,6 +317,9 @@ mod tests {
         assert!(svg.contains("nothing reconstructed"), "the other sweeps have no cells");
         // Another way of giving depths has no cells at all.
         assert!(!super::svg(&plan, &cells, Depths::Given).contains("<circle"));
+        // The legend names who took part.
+        let epipolar = super::svg(&plan, &cells, Depths::Epipolar);
+        assert!(svg.contains(">oracle<") && !epipolar.contains(">oracle<") && epipolar.contains(">psfm<"));
     }
 
     #[test]

@@ -18,12 +18,14 @@ pub fn page(plan: &Plan, cells: &[Cell], coverage: &[Coverage]) -> String {
         "<h1>Evaluation</h1>\n<p>Every method on the same scenes, against an oracle that knows the truth. F1 is a mean \
          over the seeds; errors are medians over the seeds that have one. 2D error: root mean square distance of the \
          reprojections from the true image points. 3D error: mean relative distance after the best similarity. Focal \
-         error: |ln(f / f true)|. Of psfm, F1 is that of the best threshold.</p>\n",
+         error: |ln(f / f true)|. Of psfm, F1 is that of the best threshold.",
     );
+    let _ = writeln!(body, " The network of paper has {} of the original's width.</p>", plan.paper_width);
     for &depths in &plan.depths {
         let what = match depths {
             Depths::Given => "Depths given",
             Depths::None => "No depths: image points alone",
+            Depths::Epipolar => "No depths given: estimated from fundamental matrices and epipoles, by paper and psfm",
         };
         let _ = write!(body, "<h2>{what}</h2>\n<figure>{}</figure>\n", figures::svg(plan, cells, depths));
     }

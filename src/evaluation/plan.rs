@@ -14,15 +14,19 @@ pub enum Depths {
     Given,
     /// None: image points alone, as real tracks come.
     None,
+    /// None given; the contestants estimate them from fundamental matrices and epipoles (Sturm & Triggs 1996), as the
+    /// paper does on real tracks. The scenes are those of [`Depths::None`].
+    Epipolar,
 }
 
 impl Depths {
-    pub const ALL: [Depths; 2] = [Depths::Given, Depths::None];
+    pub const ALL: [Depths; 3] = [Depths::Given, Depths::None, Depths::Epipolar];
 
     pub fn name(self) -> &'static str {
         match self {
             Depths::Given => "given",
             Depths::None => "none",
+            Depths::Epipolar => "epipolar",
         }
     }
 }
@@ -90,9 +94,12 @@ impl Contestant {
         }
     }
 
-    /// Whether this contestant has anything to say of such a scene: the oracle knows pinholes only, and rigidity needs
-    /// depths.
+    /// Whether this contestant has anything to say of such a scene: the oracle knows pinholes only, rigidity needs
+    /// depths, and epipolar ones are made use of by PAPER and PSFM alone.
     pub fn takes_part(self, scene: &SceneOptions, depths: Depths) -> bool {
+        if depths == Depths::Epipolar && !self.is_paper() && self != Contestant::Psfm {
+            return false;
+        }
         match self {
             Contestant::Oracle => scene.radial_k1 == 0.0 && scene.zoom == 0.0,
             Contestant::AutoWithoutRigidity => depths == Depths::Given,
@@ -112,9 +119,35 @@ impl Contestant {
         }
     }
 
-    /// The settings that it solves with; `None` for the oracle, which does not solve.
-    pub fn settings(self, seed: u64) -> Option<SolveSettings> {
-        let (method, use_daq) = match self {
+    /// Whether its answer is that of the paper's network, whose width is the evaluation's to choose.
+    fn is_paper(self) -> bool {
+        matches!(self, Contestant::Paper | Contestant::PaperWithoutDaq)
+    }
+}
+
+/// One scene given to one contestant.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Run {
+    /// The scene, its seed and whether depths are given included.
+    pub scene: SceneOptions,
+    pub contestant: Contestant,
+    /// Whether it estimates depths from epipolar geometry.
+    #[serde(default)]
+    pub epipolar_depths: bool,
+    /// Width of the network of the PAPER contestants, as a share of the original; `None` for the others.
+    #[serde(default)]
+    pub paper_width: Option<f64>,
+}
+
+impl Run {
+    /// The oracle on a scene.
+    pub fn oracle(scene: SceneOptions) -> Self {
+        Self { scene, contestant: Contestant::Oracle, epipolar_depths: false, paper_width: None }
+    }
+
+    /// The settings that the contestant solves with; `None` for the oracle, which does not solve.
+    pub fn settings(&self) -> Option<SolveSettings> {
+        let (method, use_daq) = match self.contestant {
             Contestant::Oracle => return None,
             Contestant::Auto => (Method::Auto, true),
             Contestant::Geometry => (Method::Geometry, true),
@@ -128,20 +161,17 @@ impl Contestant {
             | Contestant::AutoWithoutUniform
             | Contestant::NetworkAlone => (Method::Auto, true),
         };
-        let excluded_priors = self.excluded_priors();
-        Some(SolveSettings { method, use_daq, seed, excluded_priors, ..SolveSettings::default() })
+        Some(SolveSettings {
+            method,
+            excluded_priors: self.contestant.excluded_priors(),
+            use_daq,
+            seed: self.scene.seed,
+            epipolar_depths: self.epipolar_depths,
+            network_width: self.paper_width.unwrap_or(SolveSettings::DEFAULT_NETWORK_WIDTH),
+            ..SolveSettings::default()
+        })
     }
-}
 
-/// One scene given to one contestant.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Run {
-    /// The scene, its seed and whether depths are given included.
-    pub scene: SceneOptions,
-    pub contestant: Contestant,
-}
-
-impl Run {
     /// What makes a run the same as another: its own text.
     pub fn key(&self) -> String {
         // Plain data: serialisation cannot fail.
@@ -156,9 +186,27 @@ pub struct Plan {
     pub depths: Vec<Depths>,
     pub contestants: Vec<Contestant>,
     pub seeds: u64,
+    /// Width of the network of the PAPER contestants, as a share of the original.
+    pub paper_width: f64,
 }
 
 impl Plan {
+    /// The contestants that take part on a scene with depths of this kind.
+    pub fn contestants_with(&self, scene: &SceneOptions, depths: Depths) -> impl Iterator<Item = Contestant> {
+        let part = |contestant: &&Contestant| contestant.takes_part(scene, depths);
+        self.contestants.iter().filter(part).copied().collect::<Vec<_>>().into_iter()
+    }
+
+    /// The run of a contestant on the scene of a cell with this number.
+    pub fn run(&self, scene: &SceneOptions, depths: Depths, number: u64, contestant: Contestant) -> Run {
+        Run {
+            scene: cell_scene(scene, depths, number),
+            contestant,
+            epipolar_depths: depths == Depths::Epipolar,
+            paper_width: contestant.is_paper().then_some(self.paper_width),
+        }
+    }
+
     /// Every run once, seed by seed, so that a stopped evaluation has all cells with fewer seeds.
     pub fn runs(&self) -> Vec<Run> {
         let mut seen = std::collections::HashSet::new();
@@ -167,11 +215,8 @@ impl Plan {
             for sweep in &self.sweeps {
                 for &depths in &self.depths {
                     for (_, scene) in &sweep.cells {
-                        for &contestant in &self.contestants {
-                            if !contestant.takes_part(scene, depths) {
-                                continue;
-                            }
-                            let run = Run { scene: cell_scene(scene, depths, seed), contestant };
+                        for contestant in self.contestants_with(scene, depths) {
+                            let run = self.run(scene, depths, seed, contestant);
                             if seen.insert(run.key()) {
                                 runs.push(run);
                             }
@@ -203,10 +248,11 @@ mod tests {
             depths: Depths::ALL.to_vec(),
             contestants: vec![Contestant::Oracle, Contestant::Auto],
             seeds: 2,
+            paper_width: SolveSettings::DEFAULT_NETWORK_WIDTH,
         };
         let runs = plan.runs();
         let cells: usize = plan.sweeps.iter().map(|sweep| sweep.cells.len()).sum();
-        // The centre of all sweeps (90 % outliers, .3 % noise) is in two.
+        // The centre of all sweeps (90 % outliers, .3 % noise) is in two. Neither contestant asks for epipolar depths.
         assert_eq!(runs.len(), (cells - 1) * 2 * 2 * 2 - repeated_views(&plan));
     }
 
@@ -215,5 +261,46 @@ mod tests {
         let of = |name: &str| plan.sweeps.iter().find(|sweep| sweep.name == name).expect("a sweep").cells.clone();
         let (points, views) = (of("points"), of("views"));
         8 * points.iter().filter(|(_, scene)| views.iter().any(|(_, other)| other == scene)).count()
+    }
+
+    #[test]
+    fn epipolar_depths_are_for_paper_and_psfm_on_the_scenes_without_depths() {
+        let plan = |depths: &[Depths]| Plan {
+            sweeps: Sweep::paper().into_iter().filter(|sweep| sweep.name == "outliers").collect(),
+            depths: depths.to_vec(),
+            contestants: Contestant::ALL.to_vec(),
+            seeds: 1,
+            paper_width: 1.0,
+        };
+        let (none, epipolar) = (plan(&[Depths::None]).runs(), plan(&[Depths::Epipolar]).runs());
+        assert_eq!((none.len(), epipolar.len()), (8 * 6, 8 * 3));
+        for run in &epipolar {
+            let settings = run.settings().expect("no oracle");
+            assert!(settings.epipolar_depths && matches!(settings.method, Method::Paper | Method::Psfm));
+            assert!(none.iter().any(|other| other.scene == run.scene && other.contestant == run.contestant));
+        }
+        assert!(none.iter().filter_map(Run::settings).all(|settings| !settings.epipolar_depths));
+        assert_eq!(plan(&[Depths::None, Depths::Epipolar]).runs().len(), none.len() + epipolar.len());
+    }
+
+    #[test]
+    fn a_width_is_part_of_the_key_of_paper_and_of_nothing_else() {
+        let scene = SceneOptions::default();
+        let plan = |paper_width| Plan {
+            sweeps: Vec::new(),
+            depths: Vec::new(),
+            contestants: Vec::new(),
+            seeds: 1,
+            paper_width,
+        };
+        for contestant in Contestant::ALL {
+            let [quarter, whole] = [0.25, 1.0].map(|width| plan(width).run(&scene, Depths::Given, 0, contestant));
+            assert_eq!(quarter.key() != whole.key(), contestant.is_paper(), "{}", contestant.name());
+            let width = |run: &Run| run.settings().map(|settings| settings.network_width);
+            let expected = if contestant.is_paper() { 1.0 } else { SolveSettings::DEFAULT_NETWORK_WIDTH };
+            assert!(width(&whole).is_none_or(|width| width == expected), "{}", contestant.name());
+            let read: Run = serde_json::from_str(&whole.key()).expect("its own text");
+            assert_eq!(read, whole);
+        }
     }
 }

@@ -192,7 +192,7 @@ pub fn run(
 fn measure(run: &Run, stop: &StopToken) -> Result<Option<Record>, Error> {
     let failed = |what: String| Error::Failed { run: run.key(), what };
     let scene = Scene::generate(&run.scene).map_err(|error| failed(error.to_string()))?;
-    let measures = match run.contestant.settings(run.scene.seed) {
+    let measures = match run.settings() {
         None => oracle::measure(&scene),
         Some(settings) => {
             let input = Input::new(scene.input.clone(), &Limits::default(), "scene")
@@ -218,7 +218,8 @@ mod tests {
             .flat_map(|seed| {
                 let scene =
                     SceneOptions { views: 5, tracks: 40, outliers: 0.3, with_depths: true, seed, ..Default::default() };
-                [Contestant::Oracle, Contestant::Psfm].map(|contestant| Run { scene: scene.clone(), contestant })
+                let oracle = Run::oracle(scene);
+                [oracle.clone(), Run { contestant: Contestant::Psfm, ..oracle }]
             })
             .collect()
     }

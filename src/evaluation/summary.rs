@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
 use super::measures::Measures;
-use super::plan::{Contestant, Depths, Plan, Run, cell_scene};
+use super::plan::{Contestant, Depths, Plan, Run};
 use super::runner::Records;
 use crate::domain::Grade;
 use crate::synthetic::{Motion, SceneOptions, Shape};
@@ -62,11 +62,14 @@ pub fn cells(plan: &Plan, records: &Records) -> Vec<Cell> {
         for &depths in &plan.depths {
             for &contestant in &plan.contestants {
                 for (index, (x, scene)) in sweep.cells.iter().enumerate() {
-                    let of = |contestant: Contestant, seed: u64| {
-                        records.get(&Run { scene: cell_scene(scene, depths, seed), contestant })
-                    };
+                    if !contestant.takes_part(scene, depths) {
+                        continue;
+                    }
                     let pairs: Vec<(&Measures, Option<&Measures>)> = (0..plan.seeds)
-                        .filter_map(|seed| Some((of(contestant, seed)?, of(Contestant::Oracle, seed))))
+                        .filter_map(|seed| {
+                            let own = plan.run(scene, depths, seed, contestant);
+                            Some((records.get(&own)?, records.get(&Run::oracle(own.scene))))
+                        })
                         .collect();
                     if !pairs.is_empty() {
                         cells.push(cell((sweep.name, *x, sweep.place(index)), depths, contestant, &pairs));
@@ -183,8 +186,7 @@ pub fn coverage(plan: &Plan, records: &Records, contestant: Contestant) -> Optio
     let answers: Vec<(&Measures, Option<f64>)> = runs
         .iter()
         .filter_map(|run| {
-            let oracle = Run { contestant: Contestant::Oracle, scene: run.scene.clone() };
-            let bound = records.get(&oracle).and_then(|oracle| oracle.sigma_log_focal);
+            let bound = records.get(&Run::oracle(run.scene.clone())).and_then(|oracle| oracle.sigma_log_focal);
             Some((records.get(run)?, bound.filter(|_| is_general(&run.scene))))
         })
         .collect();

@@ -93,6 +93,15 @@ impl CompleteBlock {
         self.depths.as_deref()
     }
 
+    /// The same points with these depths, `depths[track * views + view]`.
+    ///
+    /// # Panics
+    /// When the number of depths is not that of the points: a defect of the caller.
+    pub fn with_depths(&self, depths: Vec<f64>) -> Self {
+        assert_eq!(depths.len(), self.sightings.len(), "one depth a point");
+        Self { depths: Some(depths), ..self.clone() }
+    }
+
     /// The block restricted to some of its tracks.
     pub fn select(&self, tracks: &[usize]) -> Self {
         let points: Vec<Vector2<f64>> = tracks.iter().flat_map(|&j| self.track(j).iter().map(|s| s.xy)).collect();

@@ -1,12 +1,14 @@
-//! Multi-view geometry as pure functions and types: cameras, measurements, factorisation, triangulation, the dual
-//! absolute quadric, bundle adjustment, degeneracy.
+//! Multi-view geometry as pure functions and types: cameras, measurements, epipolar geometry, factorisation,
+//! triangulation, the dual absolute quadric, bundle adjustment, degeneracy.
 //!
 //! f64 throughout. May depend on `domain` (the stop token) and linear algebra; knows nothing of networks, jobs or I/O.
 
 pub mod bundle;
 pub mod critical;
 pub mod daq;
+pub mod epipolar_depths;
 pub mod factorization;
+pub mod fundamental;
 pub mod homography;
 pub mod measurement;
 pub mod metric;

@@ -168,11 +168,14 @@ fn carry_over(weights: &[f64], searched: &Block, block: &Block) -> Vec<f64> {
 
 /// PAPER and PSFM: the method's own set of tracks, reconstructed as it is.
 fn decide(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> Result<(), Error> {
-    let complete = &attempt.block.complete;
     let noise = initial_noise(context);
+    let completed = direct::with_epipolar_depths(&attempt.block.complete, context, noise);
+    context.stopped()?;
+    let complete = completed.as_ref().unwrap_or(&attempt.block.complete);
     let decided = match context.settings.method {
         Method::Psfm => direct::psfm(complete, noise),
-        _ => direct::paper(&attempt.block, context, recorder).map_err(|error| Error::Internal(error.to_string()))?,
+        _ => direct::paper(complete, &attempt.block.tracks, context, recorder)
+            .map_err(|error| Error::Internal(error.to_string()))?,
     };
     context.stopped()?;
     recorder.enter(Stage::Refine);

@@ -1,11 +1,13 @@
 //! The methods without search: the paper's own thresholded weights, and plain projective factorisation.
+//!
+//! Where PAPER departs from the paper, and on what evidence, is listed in [`crate::network`].
 
 use super::Context;
-use super::block::Block;
 use super::grow::{self, Consensus, LEAST_SUPPORT};
 use super::recorder::Recorder;
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, projective};
+use crate::geometry::epipolar_depths::epipolar_depths;
 use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_residuals};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::triangulation;
@@ -29,13 +31,33 @@ pub struct Decided {
     pub network_weights: Vec<f64>,
 }
 
+/// The block completed with depths from epipolar geometry, where the settings ask for them and the input has none: what
+/// the paper does on real tracks.
+///
+/// Returns `None` where the block stays as it is: not asked for, depths given, or no fundamental matrix to be found, in
+/// which case depths of 1 are what is left.
+pub fn with_epipolar_depths(block: &CompleteBlock, context: &Context, noise: f64) -> Option<CompleteBlock> {
+    let settings = context.settings;
+    if !settings.epipolar_depths || block.has_depths() {
+        return None;
+    }
+    epipolar_depths(block, noise, settings.seed, context.stop).map(|depths| block.with_depths(depths))
+}
+
 /// PAPER: optimises the network to the end and thresholds its weights.
+///
+/// * `tracks`: those of the input that the block's are
 ///
 /// # Errors
 /// The network's own, which are defects: a block has more columns than it asks for.
-pub fn paper(block: &Block, context: &Context, recorder: &mut Recorder) -> Result<Decided, crate::network::Error> {
+pub fn paper(
+    block: &CompleteBlock,
+    tracks: &[usize],
+    context: &Context,
+    recorder: &mut Recorder,
+) -> Result<Decided, crate::network::Error> {
     let settings = context.settings;
-    let matrix = balance(&block.complete.measurement_matrix());
+    let matrix = balance(&block.measurement_matrix());
     let mut network = PriorNetwork::new(&matrix, &NetworkSettings::from(settings))?;
     while network.iteration() < settings.iterations && !context.stop.is_stopped() {
         let step = network.step()?;
@@ -47,7 +69,7 @@ pub fn paper(block: &Block, context: &Context, recorder: &mut Recorder) -> Resul
         }
         recorder.tell(f64::from(step.iteration) / f64::from(settings.iterations));
         if settings.weights_every > 0 && step.iteration.is_multiple_of(settings.weights_every) {
-            recorder.weights(&context.scatter(network.weights(), &block.tracks));
+            recorder.weights(&context.scatter(network.weights(), tracks));
         }
     }
     let weights = network.weights().to_vec();

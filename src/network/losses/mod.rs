@@ -10,6 +10,8 @@
 
 mod daq;
 mod gauge;
+#[cfg(test)]
+mod reference_tests;
 mod spectrum;
 #[cfg(test)]
 mod tests;

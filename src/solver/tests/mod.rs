@@ -161,6 +161,24 @@ fn paper_and_psfm_answer_with_their_own_verdicts() {
     assert!(focal_error(&solution, &scene) < 0.03);
 }
 
+/// With depths of 1, plain factorisation takes perspective for outliers; epipolar geometry tells them apart.
+#[test]
+fn epipolar_depths_complete_what_the_input_lacks_and_replace_nothing() {
+    let psfm = |epipolar_depths| SolveSettings {
+        method: Method::Psfm,
+        noise_px: Some(1.0),
+        epipolar_depths,
+        ..SolveSettings::default()
+    };
+    let options = SceneOptions { views: 6, tracks: 100, outliers: 0.0, noise: 0.001, ..SceneOptions::default() };
+    let (bare, truth) = scene(options.clone());
+    let recall = |epipolar| agreement(&solved(&bare, &psfm(epipolar)).tracks.inlier, &truth.truth.inlier).recall;
+    let (without, with) = (recall(false), recall(true));
+    assert!(with > 0.9 && without < 0.5, "recall {without} without, {with} with epipolar depths");
+    let (given, _) = scene(SceneOptions { with_depths: true, ..options });
+    assert_eq!(solved(&given, &psfm(true)).tracks.weight, solved(&given, &psfm(false)).tracks.weight);
+}
+
 #[test]
 fn of_incomplete_tracks_a_block_is_solved_and_the_views_left_out_are_named() {
     let (input, scene) = scene(SceneOptions { views: 9, tracks: 120, outliers: 0.3, ..SceneOptions::default() });

@@ -1,0 +1,254 @@
+//! The fundamental matrix of two views: from correspondences, robustly, with its epipole and the depths it implies.
+//!
+//! One convention throughout: `x_toᵀ F x_from = 0`, and the epipole `e` is that of the view `to`, `eᵀ F = 0`: the image
+//! of the centre of the camera `from`.
+
+use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
+use rand::seq::index;
+use rand_chacha::ChaCha8Rng;
+
+use crate::domain::StopToken;
+
+/// Correspondences that determine a fundamental matrix linearly.
+pub const LEAST_MATCHES: usize = 8;
+/// Samples of the robust estimate at most: enough where 43 % of the matches are right. At ninety per cent outliers
+/// 10⁸ would be, which nobody waits for.
+const MOST_SAMPLES: usize = 4_000;
+/// Probability with which one sample without outliers is to be among those drawn.
+const CONFIDENCE: f64 = 0.99;
+/// Chi-square quantile of .95 for one degree of freedom, which is what a Sampson distance has.
+const GATE: f64 = 3.841_459;
+/// Gates of the local optimisation, as multiples of the gate: eight noisy matches make a noisier matrix than many.
+const LOCAL_GATES: [f64; 4] = [4.0, 2.0, 1.0, 1.0];
+/// Rounds of the same at the end, while they help.
+const FINAL_ROUNDS: usize = 5;
+/// Spread of points, as a share of their distance from the origin, below which they coincide but for rounding.
+const COINCIDENT: f64 = 1e-12;
+/// Samples between two looks at the stop token: well below 50 ms.
+const STOP_EVERY: usize = 128;
+/// Least squared sine of the angle between an image point and the epipole: at the epipole itself every depth fits.
+const LEAST_SQUARED_SINE: f64 = 1e-12;
+
+/// A point seen in two views, normalised coordinates.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Match {
+    pub from: Vector2<f64>,
+    pub to: Vector2<f64>,
+}
+
+/// A fundamental matrix of rank 2 and unit norm, with its epipole in the view `to`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Fundamental {
+    matrix: Matrix3<f64>,
+    /// Unit norm; the sign is arbitrary, as is the matrix's.
+    epipole: Vector3<f64>,
+}
+
+impl Fundamental {
+    /// `F` of `x_toᵀ F x_from = 0`, unit norm.
+    pub fn matrix(&self) -> &Matrix3<f64> {
+        &self.matrix
+    }
+
+    /// The epipole in the view `to`, homogeneous, unit norm.
+    pub fn epipole(&self) -> &Vector3<f64> {
+        &self.epipole
+    }
+
+    /// Squared Sampson distance of a match (Hartley & Zisserman, eq. 11.9): to first order its squared distance in the
+    /// units of the coordinates from the nearest match that fits exactly.
+    pub fn sampson_squared(&self, seen: &Match) -> f64 {
+        let (error, gradient_squared) = self.algebraic(seen);
+        if gradient_squared > f64::MIN_POSITIVE { error * error / gradient_squared } else { f64::INFINITY }
+    }
+
+    /// `x_toᵀ F x_from` and the squared norm of its gradient by the four coordinates.
+    fn algebraic(&self, seen: &Match) -> (f64, f64) {
+        let (from, to) = (seen.from.push(1.0), seen.to.push(1.0));
+        let line = self.matrix * from;
+        let back = self.matrix.tr_mul(&to);
+        (to.dot(&line), line.xy().norm_squared() + back.xy().norm_squared())
+    }
+
+    /// Projective depth of a match in the view `to` per unit of its depth in the view `from` (Sturm & Triggs 1996,
+    /// eq. 3): `((e × x_to) · (F x_from)) / |e × x_to|²`.
+    ///
+    /// From `λ_to x_to = P_to X`, `λ_from x_from = P_from X` and `F = [e]ₓ P_to P_from⁺` follows
+    /// `λ_to (e × x_to) = λ_from F x_from`, whose least-squares solution this is. Scale and sign of F and e are
+    /// arbitrary, so that one factor, which may be negative, is common to all matches of a pair of views.
+    ///
+    /// Returns `None` at the epipole, where every depth fits, and for what is no finite number.
+    pub fn depth_ratio(&self, seen: &Match) -> Option<f64> {
+        let to = seen.to.push(1.0);
+        let across = self.epipole.cross(&to);
+        let squared = across.norm_squared();
+        let ratio = across.dot(&(self.matrix * seen.from.push(1.0))) / squared;
+        (squared > LEAST_SQUARED_SINE * to.norm_squared() && ratio.is_finite()).then_some(ratio)
+    }
+
+    /// Whether all of some matches lie on the same side of both cameras (Chum, Werner & Matas 2004): a sample with
+    /// outliers rarely does, and one look spares scoring it.
+    fn is_oriented(&self, sample: &[Match]) -> bool {
+        let in_front = sample.iter().filter(|seen| self.depth_ratio(seen).is_some_and(|ratio| ratio > 0.0)).count();
+        in_front == 0 || in_front == sample.len()
+    }
+}
+
+/// The fundamental matrix of least algebraic error in Hartley's normalised coordinates (Hartley 1997), of rank 2.
+///
+/// * `weights`: one a match, not negative
+///
+/// Returns `None` for fewer than [`LEAST_MATCHES`] matches, points that all coincide, or what is no finite number.
+///
+/// # Pitfall
+/// Points on a plane, or views from one place, have a family of such matrices; one of it is returned.
+pub fn eight_point(matches: &[Match], weights: &[f64]) -> Option<Fundamental> {
+    if matches.len() < LEAST_MATCHES || weights.len() != matches.len() {
+        return None;
+    }
+    let total: f64 = weights.iter().sum();
+    let from = hartley(matches.iter().map(|seen| seen.from).zip(weights.iter().copied()), total)?;
+    let to = hartley(matches.iter().map(|seen| seen.to).zip(weights.iter().copied()), total)?;
+    let mut normal = SMatrix::<f64, 9, 9>::zeros();
+    for (seen, weight) in matches.iter().zip(weights) {
+        let (a, b) = (from * seen.from.push(1.0), to * seen.to.push(1.0));
+        // Entry (row, column) of F is unknown 3 row + column.
+        let equation = SVector::<f64, 9>::from_fn(|k, _| b[k / 3] * a[k % 3]);
+        normal.syger(*weight, &equation, &equation, 1.0);
+    }
+    normal.fill_upper_triangle_with_lower_triangle();
+    // Before the decomposition, which would not end on what is no number.
+    let trace = normal.trace();
+    if !(trace > 0.0 && trace.is_finite()) || normal.iter().any(|entry| !entry.is_finite()) {
+        return None;
+    }
+    let eigen = (normal / trace).symmetric_eigen();
+    let solution = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+    let svd = Matrix3::from_row_slice(solution.as_slice()).svd(true, true);
+    let (u, vt, mut singular) = (svd.u?, svd.v_t?, svd.singular_values);
+    let smallest = singular.imin();
+    singular[smallest] = 0.0;
+    let normalised = u * Matrix3::from_diagonal(&singular) * vt;
+    let matrix = (to.transpose() * normalised * from).try_normalize(f64::MIN_POSITIVE)?;
+    let epipole = (to.try_inverse()? * u.column(smallest)).try_normalize(f64::MIN_POSITIVE)?;
+    let finite = matrix.iter().chain(epipole.iter()).all(|entry| entry.is_finite());
+    finite.then_some(Fundamental { matrix, epipole })
+}
+
+/// The similarity that brings weighted points to mean 0 and root mean square distance `sqrt 2`.
+fn hartley(points: impl Iterator<Item = (Vector2<f64>, f64)> + Clone, total: f64) -> Option<Matrix3<f64>> {
+    let mean = points.clone().map(|(point, weight)| point * weight).sum::<Vector2<f64>>() / total;
+    let spread = (points.map(|(point, weight)| weight * (point - mean).norm_squared()).sum::<f64>() / total).sqrt();
+    let scale = std::f64::consts::SQRT_2 / spread;
+    let usable = spread.is_finite() && scale.is_finite() && spread > COINCIDENT * mean.norm();
+    usable.then(|| Matrix3::new(scale, 0.0, -scale * mean.x, 0.0, scale, -scale * mean.y, 0.0, 0.0, 1.0))
+}
+
+/// Squared Sampson distance within which 95 % of the right matches lie.
+pub fn squared_gate(noise: f64) -> f64 {
+    GATE * noise * noise
+}
+
+/// What most matches of two views agree on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Robust {
+    pub fundamental: Fundamental,
+    /// One a match: whether its Sampson distance is within the gate.
+    pub inlier: Vec<bool>,
+    /// Mean over the matches of the squared distance in units of the gate, 1 at most.
+    pub cost: f64,
+}
+
+/// LO-RANSAC (Chum, Matas & Kittler 2003): samples of eight, truncated squared Sampson distances, every new best
+/// refitted to the matches it explains.
+///
+/// * `noise`: standard deviation of a coordinate, in the units of the matches
+///
+/// Draws until [`CONFIDENCE`] is reached for the share of inliers found, [`MOST_SAMPLES`] at most: reliable down to
+/// 43 % inliers. Once `stop` fires, the best so far.
+///
+/// Returns `None` for too few matches, no usable noise, or when no sample gives a matrix.
+pub fn robust(matches: &[Match], noise: f64, rng: &mut ChaCha8Rng, stop: &StopToken) -> Option<Robust> {
+    let gate = squared_gate(noise);
+    if matches.len() < LEAST_MATCHES || !(gate > 0.0 && gate.is_finite()) {
+        return None;
+    }
+    let mut best: Option<(Fundamental, f64)> = None;
+    let (mut drawn, mut wanted) = (0, MOST_SAMPLES);
+    while drawn < wanted && !(drawn % STOP_EVERY == 0 && stop.is_stopped()) {
+        drawn += 1;
+        let sample: Vec<Match> =
+            index::sample(rng, matches.len(), LEAST_MATCHES).into_iter().map(|k| matches[k]).collect();
+        let Some(found) = eight_point(&sample, &[1.0; LEAST_MATCHES]) else { continue };
+        if !found.is_oriented(&sample) {
+            continue;
+        }
+        let to_beat = best.map_or(f64::INFINITY, |(_, cost)| cost);
+        if let Some(cost) = cost_below(&found, matches, gate, to_beat) {
+            let improved = optimise(found, cost, matches, gate);
+            wanted = samples_wanted(inlier_share(&improved.0, matches, gate)).min(MOST_SAMPLES);
+            best = Some(improved);
+        }
+    }
+    let (mut fundamental, mut cost) = best?;
+    for _ in 0..FINAL_ROUNDS {
+        let (refitted, lower) = optimise(fundamental, cost, matches, gate);
+        if lower >= cost {
+            break;
+        }
+        (fundamental, cost) = (refitted, lower);
+    }
+    let inlier = matches.iter().map(|seen| fundamental.sampson_squared(seen) < gate).collect();
+    Some(Robust { fundamental, inlier, cost: cost / matches.len() as f64 })
+}
+
+/// Sum of the truncated squared distances in units of the gate; `None` as soon as it is not below `to_beat`.
+fn cost_below(fundamental: &Fundamental, matches: &[Match], gate: f64, to_beat: f64) -> Option<f64> {
+    let mut cost = 0.0;
+    for seen in matches {
+        // NaN counts as an outlier.
+        cost += (fundamental.sampson_squared(seen) / gate).min(1.0);
+        if cost >= to_beat {
+            return None;
+        }
+    }
+    Some(cost)
+}
+
+/// Refits to the matches within shrinking gates, each weighted so that its algebraic error is its Sampson distance.
+fn optimise(start: Fundamental, cost: f64, matches: &[Match], gate: f64) -> (Fundamental, f64) {
+    let (mut current, mut best) = (start, (start, cost));
+    for wide in LOCAL_GATES {
+        let weights: Vec<f64> = matches
+            .iter()
+            .map(|seen| {
+                let gradient_squared = current.algebraic(seen).1;
+                if current.sampson_squared(seen) < wide * gate { gradient_squared.recip() } else { 0.0 }
+            })
+            .collect();
+        if weights.iter().filter(|&&weight| weight > 0.0).count() < LEAST_MATCHES {
+            break;
+        }
+        let Some(refitted) = eight_point(matches, &weights) else { break };
+        current = refitted;
+        if let Some(cost) = cost_below(&current, matches, gate, best.1) {
+            best = (current, cost);
+        }
+    }
+    best
+}
+
+fn inlier_share(fundamental: &Fundamental, matches: &[Match], gate: f64) -> f64 {
+    let inliers = matches.iter().filter(|seen| fundamental.sampson_squared(seen) < gate).count();
+    inliers as f64 / matches.len() as f64
+}
+
+/// Samples after which one without outliers was drawn with [`CONFIDENCE`].
+fn samples_wanted(inlier_share: f64) -> usize {
+    let right = inlier_share.powi(LEAST_MATCHES as i32).clamp(f64::EPSILON, 1.0 - f64::EPSILON);
+    ((1.0 - CONFIDENCE).ln() / (1.0 - right).ln()).ceil() as usize
+}
+
+#[cfg(test)]
+#[path = "fundamental_tests.rs"]
+mod tests;
