@@ -202,12 +202,16 @@ fn triangulate(cameras: &[Camera], sightings: &[Sighting]) -> (Point, f64) {
     triangulation::refine(cameras, sightings, triangulation::linear(cameras, sightings), POINT_STEPS)
 }
 
-/// Squared residual at which an observation is as likely wrong as right.
+/// Squared residual at which an observation is as likely wrong as right: by its core or by its tail, whichever reaches
+/// farther. Strong noise has a core that reaches farther than a rare tail.
 fn observation_gate(noise: &NoiseModel, outlier_density: f64) -> f64 {
-    let tail = (TAIL_WIDTH * noise.core).powi(2);
-    let right = (1.0 - WRONG_OBSERVATION) * noise.tail_share / (std::f64::consts::TAU * tail);
     let wrong = WRONG_OBSERVATION * outlier_density.powi(2);
-    2.0 * tail * (right / wrong).ln().max(0.0)
+    let reach = |share: f64, width: f64| {
+        let variance = (width * noise.core).powi(2);
+        let right = (1.0 - WRONG_OBSERVATION) * share / (std::f64::consts::TAU * variance);
+        2.0 * variance * (right / wrong).ln().max(0.0)
+    };
+    reach(1.0 - noise.tail_share, 1.0).max(reach(noise.tail_share, TAIL_WIDTH))
 }
 
 /// Log of the odds that a track is right: prior, times the density of its residuals under core and tail, over that of
@@ -254,6 +258,16 @@ mod tests {
                 Sighting { view, xy: image.xy() / image.z + Vector2::new(0.3 * shift, *shift) }
             })
             .collect()
+    }
+
+    #[test]
+    fn the_gate_lets_the_core_of_any_noise_through() {
+        for core in [1e-4, 0.003, 0.02, 0.05] {
+            for tail_share in [TAIL_BOUNDS.0, TAIL_SHARE, TAIL_BOUNDS.1] {
+                let gate = observation_gate(&NoiseModel { core, tail_share }, 1.0).sqrt() / core;
+                assert!((2.5..25.0).contains(&gate), "noise {core}, tail {tail_share}: {gate} deviations");
+            }
+        }
     }
 
     #[test]
