@@ -343,3 +343,30 @@ impl From<runner::Error> for Failure {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    fn parse(arguments: &[&str]) -> Result<Plan, clap::Error> {
+        #[derive(clap::Parser)]
+        struct Command {
+            #[command(flatten)]
+            args: Args,
+        }
+        Command::try_parse_from([&["evaluate"], arguments].concat()).map(|command| command.args.plan())
+    }
+
+    #[test]
+    fn the_papers_width_and_the_depths_reach_the_plan() {
+        let plan = parse(&[]).expect("defaults");
+        assert_eq!((plan.paper_width, plan.depths), (SolveSettings::DEFAULT_NETWORK_WIDTH, Depths::ALL.to_vec()));
+        let plan = parse(&["--paper-width", "1", "--depths", "epipolar"]).expect("valid");
+        assert_eq!((plan.paper_width, plan.depths), (1.0, vec![Depths::Epipolar]));
+        for wrong in ["0", "-1", "3", "NaN", "wide"] {
+            assert!(parse(&["--paper-width", wrong]).is_err(), "{wrong}");
+        }
+    }
+}

@@ -175,7 +175,8 @@ impl Default for SolveSettings {
             learning_rate: Self::DEFAULT_LEARNING_RATE,
             iterations: Self::DEFAULT_ITERATIONS,
             network_width: Self::DEFAULT_NETWORK_WIDTH,
-            // Half of the matches must be right for it to work, and depths of 1 need no such thing.
+            // Half of the tracks must be right: mean F1 of PAPER over four scenes (10 views, 200 tracks) is .42 for .00
+            // with depths of 1 at 30 % outliers, .55 for .05 at 50 %, .30 for .24 at 70 %, but .31 for .99 at 90 %.
             epipolar_depths: false,
             seed: 0,
             noise_px: None,

@@ -29,6 +29,10 @@ const MOST_RELATIVE_DEPTH: f64 = 100.0;
 ///
 /// Returns `None` for fewer than two views, fewer than eight tracks, a pair of views without a fundamental matrix, or
 /// once `stop` fires.
+///
+/// # Pitfall
+/// Where fewer than about half of the tracks are right the matrices are those of outliers, and so are the depths: worse
+/// than depths of 1.
 pub fn epipolar_depths(block: &CompleteBlock, noise: f64, seed: u64, stop: &StopToken) -> Option<Vec<f64>> {
     let views = block.views();
     if views < 2 {

@@ -125,7 +125,7 @@ fn refine(start: Camera, points: &[Point], images: &[Vector2<f64>], gate: f64) -
         let moved = camera - Camera::from_fn(|row, column| step[4 * row + column]);
         let moved = moved / moved.norm();
         let reached = cost(&moved);
-        if !(reached < least) {
+        if reached >= least || reached.is_nan() {
             break;
         }
         (camera, least) = (moved, reached);

@@ -26,7 +26,7 @@
 //! | initial weights | not said | near 1/2 | the scores neither saturate nor prefer a track | - |
 //! | Adam | PyTorch's: .9, .999, 1e-8 | the same, written out | burn's own default of 1e-5 hardly moves small gradients | - |
 //! | iterations | not said | 400 | weights settle within 300 to 500 | `iterations` |
-//! | frame of the plane at infinity | `P₁ = [I&#124;0]` | the same, and the one freedom that leaves is fixed | n_inf has a meaning from one iteration to the next only so ([`losses`]) | - |
+//! | frame of the plane at infinity | `P₁ = [I\|0]` | the same, and the one freedom that leaves is fixed | n_inf has a meaning from one iteration to the next only so ([`losses`]) | - |
 //! | training | one network a data set | one a request | nothing to train on is asked of a caller | - |
 //! | precision | not said | losses and gradients f64, network f32 | nothing differentiates an eigen-decomposition; finite differences agree (tests) | - |
 //!

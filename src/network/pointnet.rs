@@ -181,15 +181,14 @@ impl PointNet<Tensor<2>> {
         }
         let logits = self.logit.affine(features);
 
-        let mut features = local;
-        for (index, layer) in self.trunk.iter().enumerate().skip(LOCAL_LAYER + 1) {
-            let input = if index == LOCAL_LAYER + 1 { features } else { centre(features) };
-            features = layer.normalised(input);
-        }
-        let mut global = features.max_dim(1);
-        if plane_apart {
-            global = global.detach();
-        }
+        let upper = &self.trunk[LOCAL_LAYER + 1..];
+        let mut global = if plane_apart {
+            // Off the graph, which would only keep what no gradient asks for.
+            let upper: Vec<_> = upper.iter().map(Layer::untracked).collect();
+            Tensor::from_inner(global_feature(&upper, local.inner()))
+        } else {
+            global_feature(upper, local)
+        };
         for layer in &self.classification {
             global = relu(layer.affine(global));
         }
@@ -197,7 +196,23 @@ impl PointNet<Tensor<2>> {
     }
 }
 
+/// The largest response of every feature of the trunk's upper layers to a cloud whose rows have mean 0.
+fn global_feature(layers: &[Layer<Tensor<2>>], local: Tensor<2>) -> Tensor<2> {
+    let mut features = local;
+    for (index, layer) in layers.iter().enumerate() {
+        let input = if index == 0 { features } else { centre(features) };
+        features = layer.normalised(input);
+    }
+    features.max_dim(1)
+}
+
 impl Layer<Tensor<2>> {
+    /// The same values outside the graph.
+    fn untracked(&self) -> Self {
+        let inner = |tensor: &Tensor<2>| tensor.clone().inner();
+        Self { weight: inner(&self.weight), gain: self.gain.as_ref().map(inner), bias: inner(&self.bias) }
+    }
+
     /// `W X + b`.
     fn affine(&self, input: Tensor<2>) -> Tensor<2> {
         self.weight.clone().matmul(input) + self.bias.clone()

@@ -49,7 +49,8 @@ impl Spectrum {
         let (ascending, vectors) = (eigen.S().column_vector(), eigen.U());
         let values = (0..rows).map(|k| largest * ascending[rows - 1 - k].max(0.0)).collect();
         let vectors = DMatrix::from_fn(rows, rows, |row, k| vectors[(row, rows - 1 - k)]);
-        let coordinates = vectors.tr_mul(balanced);
+        // Not `tr_mul`: nalgebra takes that one by scalar products, three and a half times as long.
+        let coordinates = vectors.transpose() * balanced;
         Ok(Self { values, vectors, coordinates })
     }
 
