@@ -145,8 +145,8 @@ mod tests {
         let (cameras, points) = testing::projectively_transformed(&scene, seed);
         let mut images: Vec<Vector2<f64>> =
             scene.observations.iter().filter(|seen| seen.camera == 2).map(|seen| seen.xy).collect();
-        for k in 0..wrong {
-            images[k] += Vector2::new(0.1 + 0.01 * k as f64, -0.2);
+        for (k, image) in images.iter_mut().take(wrong).enumerate() {
+            *image += Vector2::new(0.1 + 0.01 * k as f64, -0.2);
         }
         (cameras[2], points, images)
     }

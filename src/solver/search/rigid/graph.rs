@@ -82,12 +82,10 @@ impl Graph {
 
     fn edges(&self, focal: f64) -> Edges {
         let mut adjacent = vec![vec![false; self.tracks]; self.tracks];
-        let mut pairs = self.pairs.iter();
-        for a in 0..self.tracks {
-            for b in a + 1..self.tracks {
-                let rigid = pairs.next().is_some_and(|pair| pair.is_rigid(focal.powi(-2), self.tolerance));
-                (adjacent[a][b], adjacent[b][a]) = (rigid, rigid);
-            }
+        let order = (0..self.tracks).flat_map(|a| (a + 1..self.tracks).map(move |b| (a, b)));
+        for ((a, b), pair) in order.zip(&self.pairs) {
+            let rigid = pair.is_rigid(focal.powi(-2), self.tolerance);
+            (adjacent[a][b], adjacent[b][a]) = (rigid, rigid);
         }
         let degree = adjacent.iter().map(|row| row.iter().filter(|&&edge| edge).count()).collect();
         Edges { adjacent, degree }
