@@ -337,8 +337,11 @@ fn parent() -> String {
 }
 
 fn create_request(input: proto::TrackSet, settings: &SolveSettings, options: JobOptions) -> proto::CreateJobRequest {
-    // A limit beyond what a duration holds is no limit.
-    let time_limit = options.time_limit.and_then(|limit| prost_types::Duration::try_from(limit).ok());
+    // What the wire cannot say is far above what a server takes: it says so.
+    let time_limit = options.time_limit.map(|limit| prost_types::Duration {
+        seconds: i64::try_from(limit.as_secs()).unwrap_or(i64::MAX),
+        nanos: limit.subsec_nanos() as i32,
+    });
     proto::CreateJobRequest {
         parent: parent(),
         job_id: options.job_id.unwrap_or_default(),

@@ -1,7 +1,7 @@
 //! What bad input gets: a status that names field and index, before anything is stored.
 
 use scpsfm::domain::Limits;
-use scpsfm::rpc::proto::{self, create_job_request::Input, solve_request::Message};
+use scpsfm::rpc::proto::{self, create_job_request::Input, job::Deadline, solve_request::Message};
 use scpsfm::rpc::server::Options;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
@@ -43,6 +43,14 @@ fn set_up(change: impl FnOnce(&mut proto::SolveSettings)) -> proto::CreateJobReq
     described(|job| job.settings = Some(settings))
 }
 
+fn deadline_time(seconds: i64, nanos: i32) -> Option<Deadline> {
+    Some(Deadline::DeadlineTime(prost_types::Timestamp { seconds, nanos }))
+}
+
+fn time_limit(seconds: i64, nanos: i32) -> Option<Deadline> {
+    Some(Deadline::TimeLimit(prost_types::Duration { seconds, nanos }))
+}
+
 /// Limits below every input of these tests but the smallest.
 const TIGHT: Limits = Limits { max_views: 4, max_tracks: 5, max_observations: 12 };
 
@@ -78,6 +86,10 @@ async fn every_kind_is_refused_by_field_and_index_and_nothing_is_stored() {
         (set_up(|settings| settings.alpha = Some(f64::NAN)), "settings.alpha"),
         (set_up(|settings| settings.iterations = Some(0)), "settings.iterations"),
         (described(|job| job.priority = i32::MAX), "job.priority"),
+        (described(|job| job.deadline = deadline_time(1_800_000_000, 1_000_000_000)), "job.deadline_time"),
+        (described(|job| job.deadline = deadline_time(i64::MAX, 0)), "job.deadline_time"),
+        (described(|job| job.deadline = time_limit(-1, 2_000_000_000)), "job.time_limit"),
+        (described(|job| job.deadline = time_limit(i64::MAX, 0)), "job.time_limit"),
         (proto::CreateJobRequest { input: None, ..create_tracks() }, "input"),
         (proto::CreateJobRequest { parent: "default".into(), ..create_tracks() }, "parent"),
         (proto::CreateJobRequest { job_id: "-".into(), ..create_tracks() }, "job_id"),
