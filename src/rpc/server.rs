@@ -13,6 +13,7 @@ use tonic_health::server::HealthReporter;
 use tower::layer::util::{Identity, Stack};
 
 use super::calibration::Calibration;
+use super::explain::Explain;
 use super::inputs::Inputs;
 use super::jobs::Jobs;
 use super::meter::Meter;
@@ -160,7 +161,7 @@ impl Drop for Server {
 }
 
 /// Every service but health.
-fn router(options: &Options, engine: Engine) -> Result<Router<Stack<Meter, Identity>>, Error> {
+fn router(options: &Options, engine: Engine) -> Result<Router<Stack<Explain, Stack<Meter, Identity>>>, Error> {
     let limits = options.limits.clone();
     let max_bytes = options.max_message_bytes;
     let calibration = Calibration::new(engine.clone(), limits.clone(), max_bytes, options.solve_grace);
@@ -176,6 +177,7 @@ fn router(options: &Options, engine: Engine) -> Result<Router<Stack<Meter, Ident
     }
     Ok(tonic::transport::Server::builder()
         .layer(Meter)
+        .layer(Explain)
         .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
         .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
         .http2_keepalive_interval(Some(KEEPALIVE))
