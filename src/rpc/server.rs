@@ -160,8 +160,11 @@ impl Drop for Server {
     }
 }
 
+/// What goes around every service; the last of them is outermost.
+type Layers = Stack<Explain, Stack<Meter, Identity>>;
+
 /// Every service but health.
-fn router(options: &Options, engine: Engine) -> Result<Router<Stack<Explain, Stack<Meter, Identity>>>, Error> {
+fn router(options: &Options, engine: Engine) -> Result<Router<Layers>, Error> {
     let limits = options.limits.clone();
     let max_bytes = options.max_message_bytes;
     let calibration = Calibration::new(engine.clone(), limits.clone(), max_bytes, options.solve_grace);
