@@ -12,6 +12,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::domain::{Backend, Limits};
 use crate::telemetry::tracing::Format;
+use crate::{engine, rpc};
 
 /// Everything that the server can be told.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -43,8 +44,7 @@ impl Default for Server {
         Self {
             // Loopback: whoever opens the service to a network should have meant to. 50051 is gRPC's customary port.
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 50051),
-            // Two million observations of at most 33 bytes fit into one message; larger inputs come in chunks.
-            max_message_bytes: 64 << 20,
+            max_message_bytes: rpc::server::Options::MAX_MESSAGE_BYTES,
         }
     }
 }
@@ -101,23 +101,19 @@ pub struct Engine {
 }
 
 impl Default for Engine {
+    /// What [`engine::Options`] has by default, with its reasons.
     fn default() -> Self {
+        use engine::Options;
         Self {
             // A job is single-threaded numerics: more workers than cores only lengthen every job.
             workers: 0,
-            // At about 3 s a job, what a 4-core server works off in some three minutes; beyond, a caller does better
-            // to come back than to wait.
-            queue_capacity: 256,
-            // Ten of the largest inputs, on a disk that should not fill up unseen.
-            queue_bytes: 1 << 30,
-            // Four of the largest inputs: what a server can work off before its callers give up.
-            queue_observations: 16_000_000,
-            // Several missed heartbeats, so that a busy disk loses no lease, and still a short wait after a crash.
-            lease_seconds: 15,
+            queue_capacity: Options::DEFAULT_MAX_JOBS as usize,
+            queue_bytes: Options::DEFAULT_MAX_BYTES,
+            queue_observations: Options::DEFAULT_MAX_OBSERVATIONS,
+            lease_seconds: Options::DEFAULT_LEASE.as_secs(),
             // Kubernetes kills 30 s after it asks; this leaves a third of it for the rest of the exit.
             drain_seconds: 20,
-            // One crash may be the machine's fault, two a coincidence; three are the job's.
-            max_attempts: 3,
+            max_attempts: Options::DEFAULT_MAX_ATTEMPTS,
         }
     }
 }

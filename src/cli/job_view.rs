@@ -103,7 +103,8 @@ pub fn show_event(view: &mut ProgressView, event: &JobEvent) {
     }
 }
 
-/// Follows a job to its end and tells how it ended; with `json` one event a line on stdout.
+/// Follows a job to its end and ends as it did; with `json` one event a line on stdout. Where nothing came after `after`
+/// any more, it says so.
 pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json: bool) -> Result<Exit, Failure> {
     let mut view = ProgressView::new(json);
     let mut status = None;
@@ -121,8 +122,19 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
     let last = client.watch(name, after, &mut on_event).await?;
     view.finish();
     unprinted?;
-    client::ended(&last)?;
-    Ok(status.map_or(Exit::Done, Exit::of_status))
+    if let Some(last) = &last {
+        client::ended(last)?;
+        if let Some(status) = status {
+            return Ok(Exit::of_status(status));
+        }
+    }
+    // The event that tells the result, or the end, came before.
+    let job = client.get(name).await?;
+    if last.is_none() {
+        eprintln!("nothing comes after event {after}: {} is {}", job.name, job.state.name());
+    }
+    client::ended_as(&job.name, job.state, job.failure.as_ref())?;
+    Ok(job.summary.map_or(Exit::Done, |summary| Exit::of_status(summary.status)))
 }
 
 #[cfg(test)]

@@ -32,28 +32,10 @@ impl Service {
         let store = Sqlite::open(directory).await.map_err(|error| {
             Failure::internal(format_args!("cannot open the data directory {}: {error}", directory.display()))
         })?;
-        let options = engine::Options {
-            workers: config.engine.worker_count(),
-            queue: QueueBounds {
-                max_jobs: config.engine.queue_capacity as u64,
-                max_bytes: config.engine.queue_bytes,
-                max_observations: config.engine.queue_observations,
-            },
-            lease: Duration::from_secs(config.engine.lease_seconds),
-            max_attempts: config.engine.max_attempts,
-            backend: config.compute.backend,
-            ..engine::Options::default()
-        };
-        let engine = Engine::start(options, Arc::new(Timed(store)), engine::default_solver())
+        let engine = Engine::start(engine_options(config), Arc::new(Timed(store)), engine::default_solver())
             .await
             .map_err(|error| Failure::internal(format_args!("cannot start the engine: {error}")))?;
-        let options = server::Options {
-            listen: config.server.listen,
-            limits: config.limits.clone(),
-            max_message_bytes: config.server.max_message_bytes,
-            ..server::Options::default()
-        };
-        let server = Server::bind(options, engine.clone()).await.map_err(Failure::internal)?;
+        let server = Server::bind(server_options(config), engine.clone()).await.map_err(Failure::internal)?;
         Ok(Self { engine, server, drain_bound: Duration::from_secs(config.engine.drain_seconds) })
     }
 
@@ -79,5 +61,45 @@ impl Service {
         let drained = self.engine.drain(self.drain_bound).await;
         self.server.shutdown(CALLS_BOUND).await.map_err(Failure::internal)?;
         Ok(drained)
+    }
+}
+
+fn engine_options(config: &Config) -> engine::Options {
+    engine::Options {
+        workers: config.engine.worker_count(),
+        queue: QueueBounds {
+            max_jobs: config.engine.queue_capacity as u64,
+            max_bytes: config.engine.queue_bytes,
+            max_observations: config.engine.queue_observations,
+        },
+        lease: Duration::from_secs(config.engine.lease_seconds),
+        max_attempts: config.engine.max_attempts,
+        backend: config.compute.backend,
+        ..engine::Options::default()
+    }
+}
+
+fn server_options(config: &Config) -> server::Options {
+    server::Options {
+        listen: config.server.listen,
+        limits: config.limits.clone(),
+        max_message_bytes: config.server.max_message_bytes,
+        ..server::Options::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_configuration_of_defaults_is_the_default_of_engine_and_server() {
+        let config = Config::default();
+        let of = |options: engine::Options| {
+            (options.workers, options.queue, options.lease, options.max_attempts, options.backend)
+        };
+        assert_eq!(of(engine_options(&config)), of(engine::Options::default()));
+        let of = |options: server::Options| (options.limits, options.max_message_bytes, options.solve_grace);
+        assert_eq!(of(server_options(&config)), of(server::Options::default()));
     }
 }

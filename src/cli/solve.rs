@@ -100,14 +100,8 @@ async fn on_server(
     let mut on_event = |event: &JobEvent| job_view::show_event(progress, event);
     let outcome = client::solve(&server, &input.raw, settings, &mut on_event, interrupt.token()).await;
     outcome.map_err(|error| match error {
-        // The server speaks of fields and indices; the user has lines.
-        client::Error::Invalid(violations, _)
-            if violations.iter().any(|violation| !violation.field.starts_with("settings")) =>
-        {
-            input.explain_all(&violations, 0).into()
-        }
         client::Error::Cancelled if interrupt.token().is_cancelled() => Failure::interrupted(),
-        error => error.into(),
+        error => error.at_lines(input),
     })
 }
 

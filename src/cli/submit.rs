@@ -3,10 +3,9 @@
 use std::time::Duration;
 
 use super::args::{InputArgs, ServerArgs, SettingsArgs};
-use super::client::{self, Client, JobOptions};
+use super::client::{Client, JobOptions};
 use super::exit::{Exit, Failure};
 use super::{job_view, print};
-use crate::formats::LabelledInput;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -66,17 +65,9 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         priority: args.priority,
         time_limit: args.time_limit,
     };
-    let job = client.create(&input.raw, &settings, options).await.map_err(|error| at_lines(error, &input))?;
+    let job = client.create(&input.raw, &settings, options).await.map_err(|error| error.at_lines(&input))?;
     print(&job.name.to_string())?;
     if args.watch { job_view::watch_to_end(&mut client, &job.name, 0, false).await } else { Ok(Exit::Done) }
-}
-
-/// Tells violations by file and line.
-fn at_lines(error: client::Error, input: &LabelledInput) -> Failure {
-    match &error {
-        client::Error::Invalid(violations, _) if !violations.is_empty() => input.explain_all(violations, 0).into(),
-        _ => error.into(),
-    }
 }
 
 fn parse_label(text: &str) -> Result<(String, String), String> {

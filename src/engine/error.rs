@@ -14,9 +14,9 @@ pub enum Error {
     /// The job id is taken, or the request id stands for another body.
     #[error("{0}")]
     AlreadyExists(String),
-    /// Too much waits already; `reason` names the bound for programs.
+    /// Too much waits already; `bound` names for programs what there is too much of.
     #[error("{message}; try again in {} s", .retry_after.as_secs_f64())]
-    QueueFull { retry_after: Duration, reason: &'static str, message: String },
+    QueueFull { retry_after: Duration, bound: &'static str, message: String },
     #[error(transparent)]
     InvalidArgument(#[from] InvalidInput),
     /// There is no result in this state.
@@ -38,7 +38,7 @@ impl From<store::Error> for Error {
             store::Error::PageToken => Error::InvalidArgument(Violation::of("page_token", error.to_string()).into()),
             store::Error::QueueFull(bound) => Error::QueueFull {
                 retry_after: super::Options::DEFAULT_RETRY_AFTER,
-                reason: bound.name(),
+                bound: bound.name(),
                 message: bound.to_string(),
             },
             store::Error::Fenced(_)

@@ -62,15 +62,16 @@ pub struct Options {
 }
 
 impl Options {
-    /// Jobs that may wait: at some 3 s a job and one worker, about a quarter of an hour.
+    /// Jobs that may wait: at about 3 s a job, what a 4-core server works off in some three minutes; beyond, a caller
+    /// does better to come back than to wait.
     pub const DEFAULT_MAX_JOBS: u64 = 256;
-    /// Encoded inputs that may wait: ten of the largest inputs that the limits allow.
-    pub const DEFAULT_MAX_BYTES: u64 = 2 << 30;
-    /// Observations that may wait: ten of the largest inputs that the limits allow.
-    pub const DEFAULT_MAX_OBSERVATIONS: u64 = 40_000_000;
-    /// Survives a stalled disk or a paused virtual machine, and still frees a dead worker's job within a minute.
-    pub const DEFAULT_LEASE: Duration = Duration::from_secs(30);
-    /// Twice is bad luck, three times is the job.
+    /// Encoded inputs that may wait: ten of the largest, on a disk that should not fill up unseen.
+    pub const DEFAULT_MAX_BYTES: u64 = 1 << 30;
+    /// Observations that may wait: four of the largest inputs, what a server can work off before its callers give up.
+    pub const DEFAULT_MAX_OBSERVATIONS: u64 = 16_000_000;
+    /// Several missed heartbeats, so that a busy disk loses no lease, and still a short wait after a crash.
+    pub const DEFAULT_LEASE: Duration = Duration::from_secs(15);
+    /// One crash may be the machine's fault, two a coincidence; three are the job's.
     pub const DEFAULT_MAX_ATTEMPTS: u32 = 3;
     /// Shorter leases would be lost to a slow disk's commit, and keep it busy with heartbeats.
     pub const MIN_LEASE: Duration = Duration::from_millis(100);

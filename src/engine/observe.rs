@@ -1,6 +1,30 @@
 //! What the engine tells metrics and traces: the one place where they meet.
 
+use crate::store::Bound;
 pub(super) use crate::telemetry::Attempt;
 pub(super) use crate::telemetry::metrics::{
     AttemptLost, Refusal, attempt_lost, engine_size, job_created, job_finished as job_ended, queue_depth, refused,
 };
+
+/// The refusal by a bound of the queue.
+pub(super) fn by(bound: Bound) -> Refusal {
+    match bound {
+        Bound::Jobs { .. } => Refusal::QueueJobs,
+        Bound::Bytes { .. } => Refusal::QueueBytes,
+        Bound::Observations { .. } => Refusal::QueueObservations,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn metrics_and_error_details_name_a_bound_alike() {
+        let (waiting, max) = (1, 1);
+        for bound in [Bound::Jobs { waiting, max }, Bound::Bytes { waiting, max }, Bound::Observations { waiting, max }]
+        {
+            assert_eq!(by(bound).bound(), bound.name());
+        }
+    }
+}

@@ -147,9 +147,9 @@ impl Inner {
                 Ok(created.job)
             }
             Err(store::Error::QueueFull(bound)) => {
-                observe::refused(observe::Refusal::QueueFull);
+                observe::refused(observe::by(bound));
                 let retry_after = self.options.retry_after;
-                Err(Error::QueueFull { retry_after, reason: bound.name(), message: bound.to_string() })
+                Err(Error::QueueFull { retry_after, bound: bound.name(), message: bound.to_string() })
             }
             Err(error) => Err(error.into()),
         }

@@ -93,7 +93,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             Ok::<_, Status>(follower)
         };
         let mut follower = accepted.instrument(span.clone()).await?;
-        let watch = self.engine.watch(follower.job(), 0).await.map_err(status::from_engine)?;
+        let watch = follower.watch().await.map_err(status::from_engine)?;
         let watching = telemetry::metrics::watcher();
         let events = watch.into_stream().map(move |event| {
             let _ = &watching;

@@ -5,6 +5,7 @@
 pub mod calibration;
 pub mod caller;
 pub mod convert;
+pub mod explain;
 pub mod follow;
 pub mod inputs;
 pub mod jobs;

@@ -13,6 +13,7 @@ use tonic_health::server::HealthReporter;
 use tower::layer::util::{Identity, Stack};
 
 use super::calibration::Calibration;
+use super::explain::Explain;
 use super::inputs::Inputs;
 use super::jobs::Jobs;
 use super::meter::Meter;
@@ -159,8 +160,11 @@ impl Drop for Server {
     }
 }
 
+/// What goes around every service; the last of them is outermost.
+type Layers = Stack<Explain, Stack<Meter, Identity>>;
+
 /// Every service but health.
-fn router(options: &Options, engine: Engine) -> Result<Router<Stack<Meter, Identity>>, Error> {
+fn router(options: &Options, engine: Engine) -> Result<Router<Layers>, Error> {
     let limits = options.limits.clone();
     let max_bytes = options.max_message_bytes;
     let calibration = Calibration::new(engine.clone(), limits.clone(), max_bytes, options.solve_grace);
@@ -176,6 +180,7 @@ fn router(options: &Options, engine: Engine) -> Result<Router<Stack<Meter, Ident
     }
     Ok(tonic::transport::Server::builder()
         .layer(Meter)
+        .layer(Explain)
         .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
         .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
         .http2_keepalive_interval(Some(KEEPALIVE))

@@ -6,7 +6,9 @@
 //! | `NOT_FOUND` | `JOB_NOT_FOUND` | no such job, or another tenant's |
 //! | `PERMISSION_DENIED` | `TENANT_FORBIDDEN` | a parent that is not the caller's tenant |
 //! | `ALREADY_EXISTS` | `ALREADY_EXISTS` | a job id is taken, or a request id came with another body |
-//! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused; `RetryInfo` says when to come back |
+//! | `INVALID_ARGUMENT` | `MALFORMED_MESSAGE` | a message that cannot be decoded |
+//! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.limits.max_message_bytes`, packed or not |
+//! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes` or `observations`; `RetryInfo` says when to come back |
 //! | `FAILED_PRECONDITION` | `RESULT_NOT_READY` | there is no result, yet or for good |
 //! | `UNAVAILABLE` | `DRAINING` | the server is going down; `RetryInfo` |
 //! | `DEADLINE_EXCEEDED` | `INPUT_STALLED` | the chunks of a `Solve` stopped coming |
@@ -33,8 +35,19 @@ const SENTENCES_IN_MESSAGE: usize = 3;
 /// Pause that a caller of a draining server is told: about what a replacement needs to come up.
 const DRAINING_RETRY: Duration = Duration::from_secs(5);
 
-fn status(code: Code, reason: &str, message: impl Into<String>, mut details: ErrorDetails) -> Status {
-    details.set_error_info(reason, DOMAIN, HashMap::new());
+fn status(code: Code, reason: &str, message: impl Into<String>, details: ErrorDetails) -> Status {
+    status_with(code, reason, HashMap::new(), message, details)
+}
+
+/// The same with metadata of the `ErrorInfo`, for programs.
+fn status_with(
+    code: Code,
+    reason: &str,
+    metadata: HashMap<String, String>,
+    message: impl Into<String>,
+    mut details: ErrorDetails,
+) -> Status {
+    details.set_error_info(reason, DOMAIN, metadata);
     Status::with_error_details(code, message, details)
 }
 
@@ -77,6 +90,19 @@ pub fn input_stalled(patience: Duration) -> Status {
     status(Code::DeadlineExceeded, "INPUT_STALLED", message, ErrorDetails::new())
 }
 
+/// What the transport says of a message that it did not take, with a reason; `None` for any other status.
+///
+/// tonic has one code for a message that is too large as it comes and another for one that unpacks to too much, which
+/// is the same to a caller; and it calls internal what the caller's bytes are to blame for.
+pub fn from_transport(found: &Status) -> Option<Status> {
+    let (code, reason) = match found.code() {
+        Code::OutOfRange | Code::ResourceExhausted => (Code::OutOfRange, "MESSAGE_TOO_LARGE"),
+        Code::Internal => (Code::InvalidArgument, "MALFORMED_MESSAGE"),
+        _ => return None,
+    };
+    Some(status(code, reason, found.message(), ErrorDetails::new()))
+}
+
 /// A defect of ours. The caller gets no inside view; the log has it.
 pub fn internal(error: &dyn std::fmt::Display) -> Status {
     tracing::error!(%error, "internal error");
@@ -90,9 +116,10 @@ pub fn from_engine(error: engine::Error) -> Status {
         engine::Error::AlreadyExists(sentence) => {
             status(Code::AlreadyExists, "ALREADY_EXISTS", sentence, ErrorDetails::new())
         }
-        engine::Error::QueueFull { retry_after, message, .. } => {
+        engine::Error::QueueFull { retry_after, bound, message } => {
+            let metadata = HashMap::from([("bound".to_owned(), bound.to_owned())]);
             let details = ErrorDetails::with_retry_info(Some(retry_after));
-            status(Code::ResourceExhausted, "QUEUE_FULL", message, details)
+            status_with(Code::ResourceExhausted, "QUEUE_FULL", metadata, message, details)
         }
         engine::Error::InvalidArgument(error) => invalid(&error),
         engine::Error::NotReady(state) => {
@@ -136,13 +163,14 @@ mod tests {
     fn a_full_queue_says_when_to_come_back() {
         let status = from_engine(engine::Error::QueueFull {
             retry_after: Duration::from_secs(3),
-            reason: "queue_jobs",
+            bound: "jobs",
             message: "256 jobs wait already".into(),
         });
         assert_eq!(status.code(), Code::ResourceExhausted);
         let retry = status.get_details_retry_info().expect("a RetryInfo");
         assert_eq!(retry.retry_delay, Some(Duration::from_secs(3)));
-        assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "QUEUE_FULL");
+        let info = status.get_details_error_info().expect("an ErrorInfo");
+        assert_eq!((info.reason.as_str(), info.metadata["bound"].as_str()), ("QUEUE_FULL", "jobs"));
     }
 
     #[test]

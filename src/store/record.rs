@@ -82,9 +82,9 @@ impl Bound {
     /// The bound's name in metrics and error details.
     pub fn name(self) -> &'static str {
         match self {
-            Bound::Jobs { .. } => "queue_jobs",
-            Bound::Bytes { .. } => "queue_bytes",
-            Bound::Observations { .. } => "queue_observations",
+            Bound::Jobs { .. } => "jobs",
+            Bound::Bytes { .. } => "bytes",
+            Bound::Observations { .. } => "observations",
         }
     }
 }

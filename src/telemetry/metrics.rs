@@ -139,8 +139,8 @@ pub const WINNING_PRIOR: Metric = Metric {
 pub const REFUSALS: Metric = Metric {
     name: "scpsfm_admission_refusals_total",
     kind: Kind::Counter,
-    labels: &["reason"],
-    help: "Jobs refused before anything was stored, by reason.",
+    labels: &["reason", "bound"],
+    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL, by the bound that was hit.",
 };
 pub const RPC_REQUESTS: Metric = Metric {
     name: "scpsfm_grpc_requests_total",
@@ -202,7 +202,11 @@ pub const ALL: [Metric; 21] = [
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refusal {
     /// The queue holds as many jobs as it may.
-    QueueFull,
+    QueueJobs,
+    /// The queue holds as many bytes of inputs as it may.
+    QueueBytes,
+    /// The queue holds as many observations as it may.
+    QueueObservations,
     /// Input or settings broke a rule.
     Invalid,
     /// The input is above the advertised limits.
@@ -212,14 +216,31 @@ pub enum Refusal {
 }
 
 impl Refusal {
-    const ALL: [Refusal; 4] = [Refusal::QueueFull, Refusal::Invalid, Refusal::TooLarge, Refusal::Draining];
+    const ALL: [Refusal; 6] = [
+        Refusal::QueueJobs,
+        Refusal::QueueBytes,
+        Refusal::QueueObservations,
+        Refusal::Invalid,
+        Refusal::TooLarge,
+        Refusal::Draining,
+    ];
 
-    fn name(self) -> &'static str {
+    fn reason(self) -> &'static str {
         match self {
-            Refusal::QueueFull => "QUEUE_FULL",
+            Refusal::QueueJobs | Refusal::QueueBytes | Refusal::QueueObservations => "QUEUE_FULL",
             Refusal::Invalid => "INVALID",
             Refusal::TooLarge => "TOO_LARGE",
             Refusal::Draining => "DRAINING",
+        }
+    }
+
+    /// The bound of the queue that was hit; `NONE` where it was no bound.
+    pub fn bound(self) -> &'static str {
+        match self {
+            Refusal::QueueJobs => "jobs",
+            Refusal::QueueBytes => "bytes",
+            Refusal::QueueObservations => "observations",
+            Refusal::Invalid | Refusal::TooLarge | Refusal::Draining => NONE,
         }
     }
 }
@@ -247,7 +268,7 @@ impl AttemptLost {
     }
 }
 
-/// Label of a succeeded job without a reconstruction, and of an attempt that ended no job.
+/// Label of a succeeded job without a reconstruction, of an attempt that ended no job, and of a refusal by no bound.
 const NONE: &str = "NONE";
 
 /// Installs the process-wide recorder, once; later calls return the same handle.
@@ -323,8 +344,8 @@ fn create_known_series() {
     for prior in Prior::ALL {
         counter!(WINNING_PRIOR.name, "prior" => prior.name()).absolute(0);
     }
-    for reason in Refusal::ALL {
-        counter!(REFUSALS.name, "reason" => reason.name()).absolute(0);
+    for refusal in Refusal::ALL {
+        counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
     }
     for reason in AttemptLost::ALL {
         counter!(ATTEMPTS_LOST.name, "reason" => reason.name()).absolute(0);
@@ -367,8 +388,8 @@ pub fn job_created() {
 }
 
 /// A job was refused.
-pub fn refused(reason: Refusal) {
-    counter!(REFUSALS.name, "reason" => reason.name()).increment(1);
+pub fn refused(refusal: Refusal) {
+    counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).increment(1);
 }
 
 /// A job reached a terminal state, `job.state`; once a job, by whoever committed it.

@@ -5,12 +5,14 @@ use std::fs;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
+use std::time::Instant;
 
 use rustix::process::Signal;
 use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::support::program::{Running, Serving, program, run};
+use crate::support::server::PATIENCE;
 
 /// An address where nothing listens: port 1 is reserved and privileged.
 const NOBODY: &str = "http://127.0.0.1:1";
@@ -276,4 +278,102 @@ fn the_demo_finds_what_is_true() {
     for file in ["result.json", "report.html", "scene/observations.csv", "scene/truth.json"] {
         assert!(out.join(file).exists(), "no {file}");
     }
+}
+
+#[test]
+fn flags_that_only_a_server_can_refuse_are_wrong_usage() {
+    let directory = directory();
+    let (input, bad) = (scene(directory.path()), directory.path().join("bad.csv"));
+    let input = text(&input);
+    let serving = Serving::start(&directory.path().join("data"));
+    let long_key = format!("{}=x", "k".repeat(64));
+    let cases: [(&[&str], &str); 8] = [
+        (&["submit", input, "--priority", "99999"], "job.priority"),
+        (&["submit", input, "--label", &long_key], "job.labels"),
+        (&["submit", input, "--job-id", "A"], "job_id"),
+        (&["submit", input, "--request-id", "a b"], "request_id"),
+        (&["submit", input, "--time-limit", "1e15"], "job.time_limit"),
+        (&["list", "--filter", "colour = red"], "filter"),
+        (&["list", "--page-token", "made-up"], "page_token"),
+        (&["list", "--server", "localhost:1"], "http://HOST:PORT"),
+    ];
+    for (arguments, names) in cases {
+        // A later --server is none: clap takes one.
+        let server: &[&str] = if arguments.contains(&"--server") { &[] } else { &["--server", &serving.grpc] };
+        let run = run(arguments.iter().chain(server));
+        assert_eq!(run.code, Some(2), "{arguments:?}: {run:?}");
+        assert!(run.stdout.is_empty() && run.stderr.contains(names), "{run:?}");
+        assert!(!run.stderr.contains(".csv"), "the file is not to blame: {run:?}");
+    }
+    // What the file is to blame for stays bad input, told by its lines, though only the server looks for it.
+    let twice = "view,track,x,y\n0,0,1,1\n1,0,1,1\n0,0,2,2\n1,1,3,3\n";
+    fs::write(&bad, twice).expect("written");
+    let run = run(["submit", text(&bad), "--server", &serving.grpc]);
+    assert_eq!(run.code, Some(65), "{run:?}");
+    assert!(run.stderr.contains("bad.csv"), "{run:?}");
+}
+
+#[test]
+fn a_watch_after_the_last_event_says_so_and_ends_as_the_job_did() {
+    let directory = directory();
+    let (good, hopeless) = (scene(directory.path()), directory.path().join("hopeless"));
+    run(["synth", "--views", "4", "--tracks", "20", "--outliers", "1", "--out", text(&hopeless)]);
+    let serving = Serving::start(&directory.path().join("data"));
+    let server = ["--server", serving.grpc.as_str()];
+    for (input, code) in [(good, 0), (hopeless.join("observations.csv"), 3)] {
+        let submitted = run(["submit", text(&input), "--method", "geometry"].iter().chain(&server));
+        assert_eq!(submitted.code, Some(0), "{submitted:?}");
+        let name = submitted.stdout.trim();
+        assert_eq!(run(["watch", name].iter().chain(&server)).code, Some(code));
+        let job = json(&run(["get", name, "--json"].iter().chain(&server)).stdout);
+        let last = job["last_sequence"].as_u64().expect("a number");
+        let after = |after: u64| run(["watch", name, "--after", &after.to_string(), "--json"].iter().chain(&server));
+        let nothing = after(last);
+        assert_eq!((nothing.code, nothing.stdout.as_str()), (Some(code), ""), "{nothing:?}");
+        let words = format!("nothing comes after event {last}: {name} is SUCCEEDED\n");
+        assert_eq!(nothing.stderr, words);
+        // The final state alone, after the event that tells the result.
+        let end = after(last - 1);
+        assert_eq!((end.code, end.stdout.lines().count(), end.stderr.as_str()), (Some(code), 1, ""), "{end:?}");
+        assert_eq!(after(last + 1).code, Some(2));
+    }
+}
+
+#[test]
+fn submit_says_that_it_waits_for_a_server_that_drains_and_why() {
+    let directory = directory();
+    let input = scene(directory.path());
+    // Longer than the test takes: the long job ends with the server, killed at the end.
+    let drain = [("SCPSFM_ENGINE__DRAIN_SECONDS", "600")];
+    let serving = Serving::start_with(&directory.path().join("data"), &drain, Stdio::null());
+    let submit = |more: &[&str]| {
+        let submit = ["submit", text(&input), "--server", &serving.grpc];
+        let mut command = program(submit.iter().chain(more));
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("the program starts");
+        let mut stderr = BufReader::new(child.stderr.take().expect("piped"));
+        let running = Running(child);
+        let mut line = String::new();
+        stderr.read_line(&mut line).expect("a line or the end");
+        drop(running);
+        line
+    };
+    assert_eq!(submit(&["--method", "paper", "--iterations", "10000"]), "");
+    let running = || run(["list", "--state", "running", "--json", "--server", &serving.grpc]);
+    let begin = Instant::now();
+    while running().stdout.is_empty() {
+        assert!(begin.elapsed() < PATIENCE, "the job does not run");
+    }
+    serving.running.signal(Signal::TERM);
+    // The signal takes a moment to arrive; until then jobs are taken in silence.
+    let told = loop {
+        let line = submit(&[]);
+        if !line.is_empty() {
+            break line;
+        }
+        assert!(begin.elapsed() < PATIENCE, "the server does not drain");
+    };
+    assert_eq!(
+        told,
+        format!("waiting up to 15 s: {}: the server is draining; try another or come back\n", serving.grpc)
+    );
 }

@@ -48,6 +48,6 @@ async fn a_hundred_jobs_of_twenty_clients_all_end_and_the_queue_is_empty() {
     let listed = jobs.list_jobs(request).await.expect("a page").into_inner();
     assert_eq!(listed.jobs.len(), names.len());
     let page = Page::parse(&server.page("/metrics"));
-    assert_eq!(page.gauge("scpsfm_queue_depth"), 0.0);
-    assert_eq!(page.gauge("scpsfm_workers"), 2.0);
+    assert_eq!(page.value("scpsfm_queue_depth"), 0.0);
+    assert_eq!(page.value("scpsfm_workers"), 2.0);
 }

@@ -40,14 +40,14 @@ async fn scrape_until(server: &Serving, wanted: impl Fn(&Page) -> bool) -> Page 
 /// Asserts by how much each of these series grew.
 fn assert_growth(before: &Page, after: &Page, expected: &[(&str, f64)]) {
     for (series, growth) in expected {
-        assert_eq!(after.value(series) - before.value(series), *growth, "{series}");
+        assert_eq!(after.value(series) - before.value_so_far(series), *growth, "{series}");
     }
 }
 
 /// Asserts that nothing waits, runs or is watched.
 fn assert_idle(page: &Page) {
     for gauge in ["scpsfm_queue_depth", "scpsfm_workers_busy", "scpsfm_watchers", "scpsfm_grpc_requests_in_flight"] {
-        assert_eq!(page.gauge(gauge), 0.0, "{gauge}");
+        assert_eq!(page.value(gauge), 0.0, "{gauge}");
     }
 }
 
@@ -103,8 +103,8 @@ async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
         tracks.x[0] = f64::NAN;
     }
     assert_eq!(jobs.create_job(bad).await.expect_err("not a number").code(), Code::InvalidArgument);
-    let refused = scrape_until(&server, |page| page.value(CREATED_BAD) > 0.0).await;
-    let invalid = "scpsfm_admission_refusals_total{reason=\"INVALID\"}";
+    let refused = scrape_until(&server, |page| page.value_so_far(CREATED_BAD) > 0.0).await;
+    let invalid = "scpsfm_admission_refusals_total{reason=\"INVALID\",bound=\"NONE\"}";
     assert_growth(&solved, &refused, &[(invalid, 1.0), (CREATED_BAD, 1.0), ("scpsfm_jobs_created_total", 0.0)]);
 
     let name = created(&mut jobs, lasting(ENDLESS)).await;

@@ -13,6 +13,14 @@ pub struct Backoff {
 }
 
 impl Backoff {
+    /// All pauses together.
+    pub const TOTAL: Duration = Duration::from_millis(total_ms());
+
+    /// Whether no try has come to nothing yet.
+    pub fn is_first_try(&self) -> bool {
+        self.tries == 0
+    }
+
     /// Something arrived: the next trouble is a new one.
     pub fn reset(&mut self) {
         self.tries = 0;
@@ -25,4 +33,13 @@ impl Backoff {
         tokio::time::sleep(Duration::from_millis(pause_ms)).await;
         true
     }
+}
+
+const fn total_ms() -> u64 {
+    let (mut total, mut k) = (0, 0);
+    while k < PAUSES_MS.len() {
+        total += PAUSES_MS[k];
+        k += 1;
+    }
+    total
 }

@@ -7,6 +7,7 @@ use tonic_types::StatusExt;
 
 use crate::cli::exit::{Exit, Failure};
 use crate::domain::{InvalidInput, Violation};
+use crate::formats::LabelledInput;
 
 /// Why a call came to nothing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -14,9 +15,12 @@ pub enum Error {
     /// No server answers, it is going down, or its queue is full: another try may help.
     #[error("{0}")]
     Unavailable(String),
-    /// The server found fault with the input; the fields are those of the API.
+    /// The server found fault with the input or with what was asked; the fields are those of the API.
     #[error("{1}")]
     Invalid(Vec<Violation>, String),
+    /// What was asked makes no sense for any server.
+    #[error("{0}")]
+    Usage(String),
     /// The server will not do it: no such job, no result yet, an id that is taken.
     #[error("{0}")]
     Refused(String),
@@ -27,7 +31,26 @@ pub enum Error {
     Failed(String),
 }
 
+/// First parts of the fields that come from a file of tracks. All others come from flags.
+const INPUT_FIELDS: [&str; 3] = ["track_set", "measurement_matrix", "input"];
+
 impl Error {
+    /// The violations that are the input's; empty for any other error.
+    fn of_input(&self) -> &[Violation] {
+        match self {
+            Error::Invalid(violations, _) if violations.iter().any(is_of_input) => violations,
+            _ => &[],
+        }
+    }
+
+    /// Tells what is wrong with the input by file and line: the server speaks of fields and indices, the user has lines.
+    pub fn at_lines(self, input: &LabelledInput) -> Failure {
+        match self.of_input() {
+            [] => self.into(),
+            violations => input.explain_all(violations, 0).into(),
+        }
+    }
+
     /// From the status of a call to `server`.
     pub(super) fn from_status(server: &str, status: &Status) -> Self {
         if status.source().is_some() && status.get_details_error_info().is_none() {
@@ -83,6 +106,12 @@ fn violations(status: &Status) -> Vec<Violation> {
     fields.into_iter().map(|found| violation(&found.field, found.description)).collect()
 }
 
+/// Whether the fault is the input's. Every other field is one that a flag set.
+fn is_of_input(violation: &Violation) -> bool {
+    let first = violation.field.split('.').next().unwrap_or_default();
+    INPUT_FIELDS.contains(&first)
+}
+
 /// Reads `track_set.x[17]` back into field and index.
 fn violation(path: &str, description: String) -> Violation {
     let indexed = path.strip_suffix(']').and_then(|path| path.rsplit_once('['));
@@ -110,6 +139,8 @@ impl From<Error> for Failure {
     fn from(error: Error) -> Self {
         let exit = match &error {
             Error::Unavailable(_) => Exit::Unavailable,
+            Error::Invalid(violations, _) if violations.iter().any(|violation| !is_of_input(violation)) => Exit::Usage,
+            Error::Usage(_) => Exit::Usage,
             Error::Invalid(..) | Error::Refused(_) => Exit::BadInput,
             Error::Cancelled => Exit::Interrupted,
             Error::Failed(_) => Exit::Internal,
@@ -134,5 +165,23 @@ mod tests {
         assert_eq!(message, "track_set.x[17]: NaN is not a finite number");
         let whole = violation("settings.alpha", "is wrong".into());
         assert_eq!(whole, Violation::of("settings.alpha", "is wrong"));
+    }
+
+    #[test]
+    fn fields_that_flags_set_are_wrong_usage_and_the_inputs_are_bad_input() {
+        let exit = |field: &str| {
+            let status = status::invalid(&Violation::of(field, "is wrong").into());
+            Failure::from(Error::from_status("http://a", &status)).exit
+        };
+        for flag in
+            ["settings.alpha", "settings.backend", "job.labels", "job.time_limit", "job_id", "filter", "after_sequence"]
+        {
+            assert_eq!(exit(flag), Exit::Usage, "{flag}");
+        }
+        for input in ["track_set.x", "track_set.views", "measurement_matrix.values", "input"] {
+            assert_eq!(exit(input), Exit::BadInput, "{input}");
+        }
+        let unnamed = Error::Invalid(Vec::new(), "a malformed message".into());
+        assert_eq!(Failure::from(unnamed).exit, Exit::BadInput);
     }
 }

@@ -20,7 +20,7 @@ pub use error::Error;
 
 use self::backoff::Backoff;
 use super::args::ServerArgs;
-use crate::domain::job::{DEFAULT_TENANT, EventBody, Job, JobEvent, JobName, JobState};
+use crate::domain::job::{DEFAULT_TENANT, EventBody, Failure, Job, JobEvent, JobName, JobState};
 use crate::domain::{RawInput, Solution, SolveSettings};
 use crate::rpc::convert;
 use crate::rpc::proto::{self, calibration_service_client as calibration, job_service_client as jobs};
@@ -65,13 +65,14 @@ impl Client {
     /// Connects.
     ///
     /// # Errors
-    /// [`Error::Unavailable`] where no server answers, [`Error::Refused`] for what is not a URL.
+    /// [`Error::Unavailable`] where no server answers, [`Error::Usage`] for what is not a URL.
     pub async fn connect(server: &str) -> Result<Self, Error> {
+        let no_url = || Error::Usage(format!("{server:?} is not a URL of the form http://HOST:PORT"));
         if !server.starts_with("http://") {
-            return Err(Error::Refused(format!("{server:?} is not a URL of the form http://HOST:PORT")));
+            return Err(no_url());
         }
         let endpoint = Endpoint::from_shared(server.to_owned())
-            .map_err(|_| Error::Refused(format!("{server:?} is not a URL of the form http://HOST:PORT")))?
+            .map_err(|_| no_url())?
             .connect_timeout(CONNECT_TIMEOUT)
             .tcp_nodelay(true)
             .http2_keep_alive_interval(KEEPALIVE);
@@ -146,14 +147,17 @@ impl Client {
 
     /// Tells a job's events after a sequence number until its end, over broken connections and restarts of the server.
     ///
+    /// How the job ended is in the event that is returned, its last; `None` where the job has ended and nothing came
+    /// after that number.
+    ///
     /// # Errors
-    /// What went wrong with the watch. How the job ended is in the event that is returned, its last.
+    /// What went wrong with the watch.
     pub async fn watch(
         &mut self,
         name: &JobName,
         after_sequence: u64,
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
-    ) -> Result<JobEvent, Error> {
+    ) -> Result<Option<JobEvent>, Error> {
         let mut told = Told { last_sequence: after_sequence, on_event };
         let mut backoff = Backoff::default();
         loop {
@@ -163,9 +167,7 @@ impl Client {
                 Err(status) => Err(status),
             };
             match outcome {
-                Ok(Some(last)) => return Ok(last),
-                // The job had ended before `after_sequence`, so that there is nothing to tell.
-                Ok(None) => return Err(Error::Refused(format!("there are no events after {after_sequence}"))),
+                Ok(last) => return Ok(last),
                 Err(status) => self.pause(&mut backoff, status).await?,
             }
         }
@@ -276,9 +278,15 @@ impl Client {
         }
     }
 
-    /// Waits before another try, or gives up: for good reason, or after too many.
+    /// Waits before another try, or gives up: for good reason, or after too many. Says so once each trouble, on stderr:
+    /// a quarter of a minute of silence looks like a hang.
     async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
-        if error::is_transient(&status) && backoff.pause().await { Ok(()) } else { Err(self.error(status)) }
+        let transient = error::is_transient(&status);
+        let error = self.error(status);
+        if transient && backoff.is_first_try() {
+            eprintln!("waiting up to {} s: {error}", Backoff::TOTAL.as_secs());
+        }
+        if transient && backoff.pause().await { Ok(()) } else { Err(error) }
     }
 }
 
@@ -320,15 +328,24 @@ impl Told<'_> {
 /// [`Error::Cancelled`], or [`Error::Failed`] with the reason.
 pub fn ended(last: &JobEvent) -> Result<(), Error> {
     match &last.body {
-        EventBody::State { state: JobState::Succeeded, .. } => Ok(()),
-        EventBody::State { state: JobState::Cancelled, .. } => Err(Error::Cancelled),
-        EventBody::State { state: JobState::Expired, .. } => {
-            Err(Error::Failed(format!("{} expired: its deadline passed before a result stood", last.name)))
-        }
-        EventBody::State { failure: Some(failure), .. } => {
-            Err(Error::Failed(format!("{} failed: {} ({})", last.name, failure.message, failure.reason)))
-        }
+        EventBody::State { state, failure } => ended_as(&last.name, *state, failure.as_ref()),
         _ => Err(Error::Failed(format!("{} did not succeed", last.name))),
+    }
+}
+
+/// The same of a job's state.
+///
+/// # Errors
+/// See [`ended`].
+pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> Result<(), Error> {
+    match (state, failure) {
+        (JobState::Succeeded, _) => Ok(()),
+        (JobState::Cancelled, _) => Err(Error::Cancelled),
+        (JobState::Expired, _) => {
+            Err(Error::Failed(format!("{name} expired: its deadline passed before a result stood")))
+        }
+        (_, Some(failure)) => Err(Error::Failed(format!("{name} failed: {} ({})", failure.message, failure.reason))),
+        _ => Err(Error::Failed(format!("{name} did not succeed"))),
     }
 }
 
@@ -337,8 +354,11 @@ fn parent() -> String {
 }
 
 fn create_request(input: proto::TrackSet, settings: &SolveSettings, options: JobOptions) -> proto::CreateJobRequest {
-    // A limit beyond what a duration holds is no limit.
-    let time_limit = options.time_limit.and_then(|limit| prost_types::Duration::try_from(limit).ok());
+    // What the wire cannot say is far above what a server takes: it says so.
+    let time_limit = options.time_limit.map(|limit| prost_types::Duration {
+        seconds: i64::try_from(limit.as_secs()).unwrap_or(i64::MAX),
+        nanos: limit.subsec_nanos() as i32,
+    });
     proto::CreateJobRequest {
         parent: parent(),
         job_id: options.job_id.unwrap_or_default(),

@@ -13,8 +13,8 @@ async fn a_full_queue_refuses_at_once_and_takes_on_again() {
     bench.gate.until_waiting(1).await;
     let waiting = bench.submit(Script::Wait).await;
     match bench.engine.submit(new_job(Script::Wait)).await {
-        Err(Error::QueueFull { retry_after, reason, message }) => {
-            assert_eq!((retry_after, reason), (Duration::from_secs(17), "queue_jobs"));
+        Err(Error::QueueFull { retry_after, bound, message }) => {
+            assert_eq!((retry_after, bound), (Duration::from_secs(17), "jobs"));
             assert_eq!(message, "the queue is full: 1 of at most 1 jobs wait");
         }
         other => panic!("{other:?}"),

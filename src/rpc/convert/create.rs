@@ -1,9 +1,8 @@
 //! What a caller says of a job beside its input.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
 
-use super::{settings, time_from_wire};
+use super::{positive_duration, settings, time_from_wire};
 use crate::domain::error::Violations;
 use crate::domain::{InvalidInput, SolveSettings, Violation};
 use crate::engine::Deadline;
@@ -85,15 +84,14 @@ fn shortened(key: &str) -> String {
 fn deadline_from_wire(deadline: WireDeadline) -> Result<Deadline, Violation> {
     match deadline {
         WireDeadline::DeadlineTime(time) => Ok(Deadline::At(time_from_wire(time, "job.deadline_time")?)),
-        WireDeadline::TimeLimit(limit) => match Duration::try_from(limit) {
-            Ok(limit) if limit > Duration::ZERO => Ok(Deadline::After(limit)),
-            _ => Err(Violation::of("job.time_limit", "is not a positive duration")),
-        },
+        WireDeadline::TimeLimit(limit) => Ok(Deadline::After(positive_duration(limit, "job.time_limit")?)),
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
     fn described(job: proto::Job) -> Result<Description, Vec<String>> {
@@ -128,6 +126,10 @@ mod tests {
         assert_eq!(wrong(proto::Job { priority: 1001, ..Default::default() }), ["job.priority"]);
         assert_eq!(wrong(proto::Job { deadline: limit(0), ..Default::default() }), ["job.time_limit"]);
         assert_eq!(wrong(proto::Job { deadline: limit(-5), ..Default::default() }), ["job.time_limit"]);
+        assert_eq!(wrong(proto::Job { deadline: limit(i64::MAX), ..Default::default() }), ["job.time_limit"]);
+        let time = prost_types::Timestamp { seconds: 1_800_000_000, nanos: -1 };
+        let deadline = Some(WireDeadline::DeadlineTime(time));
+        assert_eq!(wrong(proto::Job { deadline, ..Default::default() }), ["job.deadline_time"]);
         let labels = BTreeMap::from([("k".repeat(64), String::new()), ("v".into(), "x".repeat(256))]);
         assert_eq!(wrong(proto::Job { labels, ..Default::default() }), ["job.labels", "job.labels"]);
         let many = (0..65).map(|k| (k.to_string(), String::new())).collect();

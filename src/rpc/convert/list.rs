@@ -8,9 +8,6 @@ use crate::domain::{InvalidInput, Violation};
 use crate::engine::{JobQuery, Order};
 use crate::rpc::proto;
 
-/// The largest page; larger wishes are cut to it (AIP-158).
-const MAX_PAGE_SIZE: i32 = 1_000;
-
 /// Longest filter: some two hundred terms, far from what a store can take in one query.
 const MAX_FILTER_BYTES: usize = 4_096;
 
@@ -47,7 +44,8 @@ pub fn from_wire(tenant: String, request: proto::ListJobsRequest) -> Result<Opti
         states: states.unwrap_or_default(),
         labels,
         order,
-        page_size: request.page_size.min(MAX_PAGE_SIZE).unsigned_abs(),
+        // Larger wishes are cut (AIP-158).
+        page_size: request.page_size.unsigned_abs().min(JobQuery::MAX_PAGE_SIZE),
         page_token: (!request.page_token.is_empty()).then_some(request.page_token),
     }))
 }
@@ -70,7 +68,11 @@ pub fn parse_filter(text: &str) -> Result<Filter, Violation> {
         for comparison in term.split(|token| *token == Token::Word("OR")) {
             match *comparison {
                 [Token::Word("state"), Token::Equals, Token::Word(name) | Token::Quoted(name)] => {
-                    states.push(state(name)?);
+                    // Once each: a repeated state says nothing more, and a filter has room for hundreds.
+                    let state = state(name)?;
+                    if !states.contains(&state) {
+                        states.push(state);
+                    }
                 }
                 [Token::Word(field), Token::Equals, Token::Word(value) | Token::Quoted(value)]
                     if field.starts_with("labels.") && !term.contains(&Token::Word("OR")) =>
@@ -164,6 +166,8 @@ mod tests {
             ("labels.site = \"north = 3\"", filter(None, &[("site", "north = 3")])),
             ("labels.a=b AND state = QUEUED OR state = RUNNING", filter(Some(&[Queued, Running]), &[("a", "b")])),
             ("state = QUEUED AND state = RUNNING", filter(Some(&[]), &[])),
+            ("state = RUNNING OR state = QUEUED OR state = RUNNING", filter(Some(&[Running, Queued]), &[])),
+            ("state = QUEUED OR state = QUEUED AND state = QUEUED", filter(Some(&[Queued]), &[])),
             ("labels.a = \"\"", filter(None, &[("a", "")])),
         ];
         for (text, expected) in cases {
@@ -188,6 +192,35 @@ mod tests {
         ] {
             assert_eq!(parse_filter(text).map_err(|violation| violation.field), Err("filter".to_owned()), "{text}");
         }
+    }
+
+    #[test]
+    fn a_filter_is_bounded_and_however_long_asks_for_each_state_once() {
+        let term = "state = QUEUED OR ";
+        let longest = format!("{}state = RUNNING", term.repeat((MAX_FILTER_BYTES - 15) / term.len()));
+        assert!(longest.len() <= MAX_FILTER_BYTES, "{}", longest.len());
+        assert_eq!(parse_filter(&longest), Ok(filter(Some(&[JobState::Queued, JobState::Running]), &[])));
+        let padded = |bytes: usize| format!("state = QUEUED{}", " ".repeat(bytes - "state = QUEUED".len()));
+        assert!(parse_filter(&padded(MAX_FILTER_BYTES)).is_ok());
+        let error = parse_filter(&padded(MAX_FILTER_BYTES + 1)).expect_err("one byte too many");
+        assert_eq!(error.to_string(), "filter: 4097 bytes are above 4096");
+    }
+
+    #[test]
+    fn page_sizes_and_tokens_reach_the_query() {
+        let list = |page_size, page_token: &str| {
+            let request = proto::ListJobsRequest { page_size, page_token: page_token.into(), ..Default::default() };
+            let query = from_wire("default".into(), request).expect("valid").expect("some");
+            (query.page_size, query.page_token)
+        };
+        // 0 is the store's default, AIP-158.
+        for (asked, given) in [(0, 0), (1, 1), (999, 999), (1_000, 1_000), (1_001, 1_000), (i32::MAX, 1_000)] {
+            assert_eq!(list(asked, ""), (given, None), "{asked}");
+        }
+        assert_eq!(list(1, "t"), (1, Some("t".into())));
+        let request = proto::ListJobsRequest { page_size: i32::MIN, ..Default::default() };
+        let error = from_wire("default".into(), request).expect_err("negative");
+        assert_eq!(error.to_string(), "page_size: -2147483648 is negative");
     }
 
     #[test]

@@ -14,24 +14,13 @@ pub mod names;
 pub mod progress;
 pub mod result;
 pub mod settings;
+mod time;
 
-use std::time::SystemTime;
-
-use prost_types::Timestamp;
+pub(crate) use time::{optional_time, positive_duration, time_from_wire};
 
 use crate::domain::Violation;
 
 /// The field's value, or the violation that it is not set.
 pub(crate) fn required<T>(value: Option<T>, field: &str) -> Result<T, Violation> {
     value.ok_or_else(|| Violation::of(field, "is not set"))
-}
-
-/// A time from the wire.
-pub(crate) fn time_from_wire(time: Timestamp, field: &str) -> Result<SystemTime, Violation> {
-    SystemTime::try_from(time).map_err(|_| Violation::of(field, "is not a time that this system can represent"))
-}
-
-/// An optional time from the wire.
-pub(crate) fn optional_time(time: Option<Timestamp>, field: &str) -> Result<Option<SystemTime>, Violation> {
-    time.map(|time| time_from_wire(time, field)).transpose()
 }

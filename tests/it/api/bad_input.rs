@@ -1,8 +1,9 @@
 //! What bad input gets: a status that names field and index, before anything is stored.
 
 use scpsfm::domain::Limits;
-use scpsfm::rpc::proto::{self, create_job_request::Input, solve_request::Message};
+use scpsfm::rpc::proto::{self, create_job_request::Input, job::Deadline, solve_request::Message};
 use scpsfm::rpc::server::Options;
+use tonic::codec::CompressionEncoding::Gzip;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
@@ -17,6 +18,13 @@ fn fields(status: &Status) -> Vec<String> {
     assert_eq!((info.reason.as_str(), info.domain.as_str()), ("INVALID_ARGUMENT", "scpsfm"));
     let request = status.get_details_bad_request().expect("a BadRequest");
     request.field_violations.into_iter().map(|violation| violation.field).collect()
+}
+
+/// The reason that a status gives for programs.
+fn reason(status: &Status) -> String {
+    let info = status.get_details_error_info().expect("an ErrorInfo");
+    assert_eq!(info.domain, "scpsfm");
+    info.reason
 }
 
 fn tracks(change: impl FnOnce(&mut proto::TrackSet)) -> proto::CreateJobRequest {
@@ -41,6 +49,14 @@ fn set_up(change: impl FnOnce(&mut proto::SolveSettings)) -> proto::CreateJobReq
     let mut settings = proto::SolveSettings::default();
     change(&mut settings);
     described(|job| job.settings = Some(settings))
+}
+
+fn deadline_time(seconds: i64, nanos: i32) -> Option<Deadline> {
+    Some(Deadline::DeadlineTime(prost_types::Timestamp { seconds, nanos }))
+}
+
+fn time_limit(seconds: i64, nanos: i32) -> Option<Deadline> {
+    Some(Deadline::TimeLimit(prost_types::Duration { seconds, nanos }))
 }
 
 /// Limits below every input of these tests but the smallest.
@@ -78,6 +94,10 @@ async fn every_kind_is_refused_by_field_and_index_and_nothing_is_stored() {
         (set_up(|settings| settings.alpha = Some(f64::NAN)), "settings.alpha"),
         (set_up(|settings| settings.iterations = Some(0)), "settings.iterations"),
         (described(|job| job.priority = i32::MAX), "job.priority"),
+        (described(|job| job.deadline = deadline_time(1_800_000_000, 1_000_000_000)), "job.deadline_time"),
+        (described(|job| job.deadline = deadline_time(i64::MAX, 0)), "job.deadline_time"),
+        (described(|job| job.deadline = time_limit(-1, 2_000_000_000)), "job.time_limit"),
+        (described(|job| job.deadline = time_limit(i64::MAX, 0)), "job.time_limit"),
         (proto::CreateJobRequest { input: None, ..create_tracks() }, "input"),
         (proto::CreateJobRequest { parent: "default".into(), ..create_tracks() }, "parent"),
         (proto::CreateJobRequest { job_id: "-".into(), ..create_tracks() }, "job_id"),
@@ -131,10 +151,36 @@ async fn a_message_above_the_limit_is_refused_and_the_server_goes_on() {
     let options = Options { max_message_bytes: 2_000, ..Options::default() };
     let server = TestServer::start_with(quick(), options, one_worker()).await;
     let mut jobs = server.jobs().await;
-    let large = tracks(|set| set.x = vec![0.5; 1_000]);
-    let status = jobs.create_job(large).await.expect_err("8,000 bytes of 2,000");
-    assert_eq!(status.code(), Code::OutOfRange, "{status}");
+    let large = || tracks(|set| set.x = vec![0.5; 1_000]);
+    let plain = jobs.create_job(large()).await.expect_err("8,000 bytes of 2,000");
+    // A few dozen bytes on the wire.
+    let packed = jobs.clone().send_compressed(Gzip).create_job(large()).await.expect_err("8,000 bytes of 2,000");
+    let messages = tokio_stream::iter([solve_request(Message::Config(large()))]);
+    let streamed = server.calibration().await.solve(messages).await.expect_err("8,000 bytes of 2,000");
+    for status in [plain, packed, streamed] {
+        assert_eq!(status.code(), Code::OutOfRange, "{status}");
+        assert_eq!(reason(&status), "MESSAGE_TOO_LARGE");
+        assert!(status.message().contains("2000 bytes"), "{status}");
+    }
     jobs.create_job(create_tracks()).await.expect("a small one still goes");
+}
+
+#[tokio::test]
+async fn a_message_that_cannot_be_decoded_is_the_callers_fault_and_says_so() {
+    let server = TestServer::start(quick()).await;
+    let mut grpc = tonic::client::Grpc::new(server.channel().await);
+    // Field 1 of these bytes: no UTF-8, as the name of GetJobRequest and the parent of CreateJobRequest have to be, and
+    // a truncated message where SolveRequest has its config.
+    let bad = vec![0xff, 0xfe];
+    for method in ["JobService/GetJob", "JobService/CreateJob", "CalibrationService/Solve"] {
+        grpc.ready().await.expect("a connection");
+        let path = format!("/scpsfm.v1.{method}").parse().expect("a path");
+        let codec = tonic_prost::ProstCodec::<Vec<u8>, proto::Job>::default();
+        let sent = tonic::Request::new(tokio_stream::iter([bad.clone()]));
+        let status = grpc.streaming(sent, path, codec).await.map(drop).expect_err(method);
+        assert_eq!(status.code(), Code::InvalidArgument, "{method}: {status}");
+        assert_eq!(reason(&status), "MALFORMED_MESSAGE", "{method}");
+    }
 }
 
 #[tokio::test]
@@ -201,5 +247,21 @@ async fn bad_watches_and_reads_are_refused() {
     ];
     for (request, field) in cases {
         assert_eq!(fields(&jobs.list_jobs(request).await.expect_err(field)), [field]);
+    }
+    jobs.create_job(create_tracks()).await.expect("a second job");
+    let first = jobs.list_jobs(list(&|list| list.page_size = 1)).await.expect("a page").into_inner();
+    let token = first.next_page_token;
+    let second = jobs.list_jobs(list(&|list| list.page_token = token.clone())).await.expect("the next page");
+    assert_eq!(second.into_inner().jobs.len(), 1, "the page size may change");
+    let cases = [
+        list(&|list| (list.page_token, list.order_by) = (token.clone(), "create_time".into())),
+        list(&|list| (list.page_token, list.filter) = (token.clone(), "state = SUCCEEDED".into())),
+        list(&|list| list.page_token = format!("{token}0-0")),
+        list(&|list| list.page_token = token[..token.len() / 2].into()),
+        list(&|list| list.page_token = "f".repeat(100_000)),
+    ];
+    for request in cases {
+        let status = jobs.list_jobs(request).await.expect_err("a token of another query, or of none");
+        assert_eq!(fields(&status), ["page_token"]);
     }
 }

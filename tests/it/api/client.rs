@@ -46,8 +46,11 @@ async fn stopping_a_solve_cancels_its_job() {
     let outcome = soon(client.solve(&raw(3, 4), &settings(), &mut on_event, stop)).await;
     assert_eq!(outcome, Err(Error::Cancelled));
     let name = name.expect("the job ran");
-    let last = soon(client.watch(&name, 0, &mut |_| ())).await.expect("watched to the end");
+    let last = soon(client.watch(&name, 0, &mut |_| ())).await.expect("watched to the end").expect("an event");
     assert_eq!(ended(&last), Err(Error::Cancelled));
+    let after = last.sequence.expect("a numbered event");
+    let nothing = soon(client.watch(&name, after, &mut |event| panic!("{event:?}"))).await;
+    assert_eq!(nothing, Ok(None), "a watch after the last event ends at once");
 }
 
 #[tokio::test]
@@ -73,7 +76,7 @@ async fn a_watch_goes_on_over_a_restart_without_gap_or_repeat() {
     soon(runs).await.expect("the job runs");
     let server = server.restart(quick()).await;
     let (last, sequences) = soon(watching).await.expect("the watch does not panic");
-    ended(&last.expect("watched to the end")).expect("solved after the restart");
+    ended(&last.expect("watched to the end").expect("an event")).expect("solved after the restart");
     assert_eq!(sequences, (1..=sequences.len() as u64).collect::<Vec<_>>());
     drop(server);
 }
@@ -91,7 +94,7 @@ async fn errors_are_sentences() {
     let name = scpsfm::domain::job::JobName::parse("tenants/default/jobs/none").expect("a name");
     assert!(matches!(client.get(&name).await, Err(Error::Refused(_))));
     assert!(matches!(client.read_result(&name).await, Err(Error::Refused(_))));
-    assert!(matches!(Client::connect("localhost:1").await, Err(Error::Refused(_))));
+    assert!(matches!(Client::connect("localhost:1").await, Err(Error::Usage(_))));
     let url = server.url();
     drop(server);
     let error = Client::connect(&url).await.expect_err("nobody listens");

@@ -1,14 +1,15 @@
 //! `JobService`: creation, watching, cancelling, listing, results.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
-use prost::Message;
+use prost::Message as _;
 use scpsfm::domain::{Input, Limits, SolveSettings};
 use scpsfm::engine::{self, QueueBounds};
 use scpsfm::rpc::convert;
+use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
-use scpsfm::rpc::proto::{self, JobState, create_job_request};
+use scpsfm::rpc::proto::{self, JobState, create_job_request, solve_request::Message};
 use scpsfm::rpc::server::Options;
 use tonic::Code;
 use tonic::transport::Channel;
@@ -16,7 +17,7 @@ use tonic_types::StatusExt;
 
 use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::{held, quick, solution};
-use crate::support::wire::{all, create, create_tracks, raw, state_of};
+use crate::support::wire::{all, create, create_tracks, raw, solve_request, state_of};
 
 async fn created(jobs: &mut JobServiceClient<Channel>, request: proto::CreateJobRequest) -> proto::Job {
     jobs.create_job(request).await.expect("a job").into_inner()
@@ -91,11 +92,23 @@ async fn a_watch_replays_exactly_what_came_after() {
 #[tokio::test]
 async fn dropping_a_watch_leaves_the_job_alone() {
     let (solver, hold) = held();
-    let options = Options { solve_grace: Duration::ZERO, ..Options::default() };
+    let options = Options { solve_grace: Duration::from_millis(1), ..Options::default() };
     let server = TestServer::start_with(solver, options, one_worker()).await;
-    let mut jobs = server.jobs().await;
+    let channel = server.channel().await;
+    let mut jobs = JobServiceClient::new(channel.clone());
     let name = created(&mut jobs, create_tracks()).await.name;
     running(&mut jobs, &name).await;
+    // A Solve that is dropped on the same connection after the watch: once its job is cancelled, the grace period of
+    // whatever was dropped before is over too.
+    let request = solve_request(Message::Config(create_tracks()));
+    let mut solve = CalibrationServiceClient::new(channel);
+    let mut stream = solve.solve(tokio_stream::iter([request])).await.expect("a solve").into_inner();
+    let solved = soon(stream.message()).await.expect("an event").expect("the first event").name;
+    drop(stream);
+    let states: Vec<_> = events(&mut jobs, &solved, 0).await.iter().filter_map(state_of).collect();
+    assert_eq!(states.last(), Some(&JobState::Cancelled));
+    let job = jobs.get_job(proto::GetJobRequest { name: name.clone() }).await.expect("a job").into_inner();
+    assert_eq!((job.state(), job.cancel_requested), (JobState::Running, false));
     hold.let_go();
     let states: Vec<_> = events(&mut jobs, &name, 0).await.iter().filter_map(state_of).collect();
     assert_eq!(states.last(), Some(&JobState::Succeeded));
@@ -125,13 +138,22 @@ async fn cancel_reaches_running_queued_and_ended_jobs() {
 }
 
 #[tokio::test]
-async fn a_full_queue_says_at_once_when_to_come_back() {
+async fn a_full_queue_says_at_once_when_to_come_back_and_which_bound_was_hit() {
+    let room = one_worker().queue;
+    // The second job waits alone, which always fits; the third finds 12 observations waiting.
+    for (queue, bound) in [
+        (QueueBounds { max_jobs: 1, ..room.clone() }, "jobs"),
+        (QueueBounds { max_bytes: 1, ..room.clone() }, "bytes"),
+        (QueueBounds { max_observations: 23, ..room }, "observations"),
+    ] {
+        fills_up(queue, bound).await;
+    }
+}
+
+/// Fills a queue of these bounds until it refuses, by `bound`.
+async fn fills_up(queue: QueueBounds, bound: &str) {
     let (solver, hold) = held();
-    let engine = engine::Options {
-        queue: QueueBounds { max_jobs: 1, ..one_worker().queue },
-        retry_after: Duration::from_secs(7),
-        ..one_worker()
-    };
+    let engine = engine::Options { queue, retry_after: Duration::from_secs(7), ..one_worker() };
     let server = TestServer::start_with(solver, Options::default(), engine).await;
     let mut jobs = server.jobs().await;
     let first = created(&mut jobs, create_tracks()).await.name;
@@ -141,7 +163,9 @@ async fn a_full_queue_says_at_once_when_to_come_back() {
     assert_eq!(status.code(), Code::ResourceExhausted, "{status}");
     let retry = status.get_details_retry_info().expect("a RetryInfo");
     assert_eq!(retry.retry_delay, Some(Duration::from_secs(7)));
-    assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "QUEUE_FULL");
+    let info = status.get_details_error_info().expect("an ErrorInfo");
+    assert_eq!(info.reason, "QUEUE_FULL");
+    assert_eq!(info.metadata, HashMap::from([("bound".to_owned(), bound.to_owned())]));
     hold.let_go();
     for name in [first, second] {
         let states: Vec<_> = events(&mut jobs, &name, 0).await.iter().filter_map(state_of).collect();
@@ -199,6 +223,8 @@ async fn lists_are_filtered_ordered_and_paged() {
         }
     };
     let newest_first: Vec<_> = names.iter().rev().cloned().collect();
+    let twice = "state = SUCCEEDED OR state = SUCCEEDED";
+    assert_eq!(list(twice, "", 2).await, newest_first, "a repeated state repeats no job and keeps its pages");
     assert_eq!(list("", "", 0).await, newest_first);
     assert_eq!(list("", "create_time", 2).await, names);
     assert_eq!(list("labels.parity = 1", "create_time", 1).await, [names[1].clone(), names[3].clone()]);

@@ -17,20 +17,23 @@ impl Page {
         Self { samples: samples.collect() }
     }
 
-    /// Value of one series; 0 where it does not exist yet.
+    /// Value of one series. One that does not exist fails the test: a misspelt name must not pass for an idle server.
     pub fn value(&self, series: &str) -> f64 {
-        self.samples.get(series).copied().unwrap_or(0.0)
-    }
-
-    /// Value of a series that exists from the first scrape on.
-    pub fn gauge(&self, series: &str) -> f64 {
         *self.samples.get(series).unwrap_or_else(|| panic!("no series {series}"))
     }
 
-    /// Sum over every series of that name, whatever its labels.
+    /// Value of a series that appears with its first sample; 0 before. Only for what is to be waited for or compared
+    /// with a later [`Page::value`], which tells whether the name is right.
+    pub fn value_so_far(&self, series: &str) -> f64 {
+        self.samples.get(series).copied().unwrap_or(0.0)
+    }
+
+    /// Sum over every series of that name, whatever its labels; there must be one.
     pub fn sum(&self, name: &str) -> f64 {
         let of_name =
             |series: &str| series.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('{'));
-        self.samples.iter().filter(|(series, _)| of_name(series)).map(|(_, value)| value).sum()
+        let mut values = self.samples.iter().filter(|(series, _)| of_name(series)).map(|(_, value)| value).peekable();
+        assert!(values.peek().is_some(), "no series of {name}");
+        values.sum()
     }
 }
