@@ -139,7 +139,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     if refined.inlier_count() < LEAST_INLIERS {
         return Ok(());
     }
-    attempt.second_structure = second::structure(complete, &refined, context.settings, context.stop)?;
+    attempt.second_structure = second::structure(complete, &refined, context.stop);
     context.stopped()?;
     let extended = extend::extend(&attempt.block, &refined, context);
     context.stopped()?;

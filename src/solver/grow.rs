@@ -157,6 +157,18 @@ pub fn grow(
     noise: f64,
     stop: &StopToken,
 ) -> Option<Consensus> {
+    grow_roughly(block, cameras, points, support, noise, stop).map(|consensus| polish(block, consensus, stop))
+}
+
+/// The same without the polish.
+pub fn grow_roughly(
+    block: &CompleteBlock,
+    cameras: Vec<Camera>,
+    points: Vec<Point>,
+    support: Vec<usize>,
+    noise: f64,
+    stop: &StopToken,
+) -> Option<Consensus> {
     if support.len() < LEAST_SUPPORT || block.views() < 2 {
         return None;
     }
@@ -181,7 +193,7 @@ pub fn grow(
         }
         support = next;
     }
-    best.map(|consensus| polish(block, consensus, stop))
+    best
 }
 
 /// Robust loss at a noise level.

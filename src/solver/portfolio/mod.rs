@@ -25,7 +25,7 @@ use crate::geometry::statistics::median;
 use crate::network::{NetworkSettings, PriorNetwork};
 use account::Account;
 use best::Best;
-pub use best::Evidence;
+pub use best::{Evidence, LN_DECISIVE};
 
 /// Network iterations between two verifications of its ranking.
 const ITERATIONS_PER_ROUND: u32 = 25;
@@ -45,8 +45,6 @@ const NOISE_LADDER: [f64; 8] = [1.0, 2.0, 1.0, 4.0, 1.0, 8.0, 1.0, 16.0];
 /// What the search found.
 pub struct Found {
     pub consensus: Option<Consensus>,
-    /// Whether the consensus is never chance; else it is the best of a search that came to its end.
-    pub decisive: bool,
     /// What the consensus was verified by.
     pub evidence: Evidence,
     /// The rigid consensus behind it or beside it, where depths were given and one is not chance.
@@ -77,8 +75,6 @@ pub struct Portfolio<'a> {
     accounts: Vec<Account>,
     best: Option<Best>,
     rigid: Option<Rigid>,
-    /// Rounds without a network.
-    rounds: u32,
 }
 
 impl<'a> Portfolio<'a> {
@@ -101,13 +97,7 @@ impl<'a> Portfolio<'a> {
             accounts: Prior::ALL.into_iter().map(Account::new).collect(),
             best: None,
             rigid: None,
-            rounds: ROUNDS_WITHOUT_NETWORK,
         }
-    }
-
-    /// The same with fewer rounds, where no network runs.
-    pub fn with_rounds(self, rounds: u32) -> Self {
-        Self { rounds, ..self }
     }
 
     /// Runs the search; `scale_px` turns the network's focal length into pixels and `weights` maps the block's weights
@@ -132,7 +122,7 @@ impl<'a> Portfolio<'a> {
         };
         let rounds = match network {
             Some(_) => self.settings.iterations.div_ceil(ITERATIONS_PER_ROUND),
-            None => self.rounds,
+            None => ROUNDS_WITHOUT_NETWORK,
         };
         for round in 0..rounds {
             self.set_noise(round);
@@ -227,7 +217,7 @@ impl<'a> Portfolio<'a> {
             self.account(Prior::Rigidity).record(&found);
             self.offer(found);
         }
-        if rigid.ln_false_alarms(search.spread()) < best::LN_DECISIVE {
+        if rigid.ln_false_alarms(search.spread()) < LN_DECISIVE {
             self.rigid = Some(rigid);
         }
     }
@@ -361,12 +351,10 @@ impl<'a> Portfolio<'a> {
             .filter(|account| with_depths || account.prior != Prior::Rigidity)
             .map(|account| account.time(accepted.as_ref()))
             .collect();
-        let decisive = accepted.as_ref().is_some_and(Best::decides);
         let evidence = accepted.as_ref().map_or(Evidence::ImagePoints, |best| best.evidence);
         let (consensus, winning_prior) = accepted.map(|best| (best.consensus, best.prior)).unzip();
         Found {
             consensus,
-            decisive,
             evidence,
             rigid,
             winning_prior,
