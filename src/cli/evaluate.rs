@@ -21,6 +21,8 @@ use crate::formats::result_files::{create_directory, pretty, write_atomically};
 /// Seeds of a full evaluation and of a quick one.
 const SEEDS: u64 = 20;
 const QUICK_SEEDS: u64 = 4;
+/// Observations of a scene up to which a quick evaluation solves it: a second or two each, with the paper's network too.
+const QUICK_OBSERVATIONS: usize = 5_000;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -214,7 +216,7 @@ impl Args {
 
 /// Observations of a scene up to which a quick evaluation solves it.
 fn is_quick(observations: usize) -> bool {
-    observations <= 5_000
+    observations <= QUICK_OBSERVATIONS
 }
 
 /// Runs the command.

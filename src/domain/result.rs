@@ -104,7 +104,7 @@ pub enum WarningCode {
     Cheirality,
     /// No consensus was found.
     NoConsensus,
-    /// Tracks outside the consensus agree on another rigid structure: a second motion. Not given yet.
+    /// Tracks outside the consensus agree on another rigid structure: a second motion.
     SecondStructure,
     /// Views were left out; the detail lists them.
     ViewsLeftOut,

@@ -206,7 +206,8 @@ impl Axis {
     fn vertical(values: impl Iterator<Item = f64>, top: f64, bounds: Option<(f64, f64)>) -> Option<Self> {
         let (from, to) = (top + PANEL.1, top);
         if let Some((low, high)) = bounds {
-            return Some(Self { low, high, from, to, logarithmic: false, marks: Vec::new() }.padded());
+            let marks = [0.0, 0.25, 0.5, 0.75, 1.0].map(|share| low + share * (high - low)).to_vec();
+            return Some(Self { low, high, from, to, logarithmic: false, marks }.padded());
         }
         let positive: Vec<f64> = values.filter(|value| *value > 0.0).collect();
         let high = positive.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -243,9 +244,6 @@ impl Axis {
             }
             return kept;
         }
-        if !self.logarithmic {
-            return [0.0, 0.25, 0.5, 0.75, 1.0].map(|share| self.round_at(share)).to_vec();
-        }
         let decades = (self.low.log10().ceil() as i32)..=(self.high.log10().floor() as i32);
         let tens: Vec<f64> = decades.map(|decade| 10f64.powi(decade)).collect();
         if tens.len() > 1 {
@@ -256,11 +254,6 @@ impl Axis {
             .flat_map(|decade| [1.0, 2.0, 5.0].map(|digit| digit * 10f64.powi(decade)))
             .filter(|value| (self.low..=self.high).contains(value))
             .collect()
-    }
-
-    fn round_at(&self, share: f64) -> f64 {
-        let value = self.low + share * (self.high - self.low);
-        (value * 20.0).round() / 20.0
     }
 }
 
@@ -279,7 +272,7 @@ mod tests {
             seeds: 1,
             mean_f1: x,
             least_f1: x,
-            observation_f1: x,
+            observation_f1: Some(x),
             reached: 1.0,
             seconds_to_reach: None,
             solved: 1.0,
@@ -320,6 +313,12 @@ mod tests {
         // The legend names who took part.
         let epipolar = super::svg(&plan, &cells, Depths::Epipolar);
         assert!(svg.contains(">oracle<") && !epipolar.contains(">oracle<") && epipolar.contains(">psfm<"));
+    }
+
+    #[test]
+    fn an_axis_of_shares_has_its_ticks_from_0_to_1() {
+        let axis = Axis::vertical(std::iter::empty(), 0.0, Some((0.0, 1.0))).expect("bounds");
+        assert_eq!(axis.ticks(), [0.0, 0.25, 0.5, 0.75, 1.0]);
     }
 
     #[test]

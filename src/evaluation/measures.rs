@@ -14,7 +14,10 @@ pub struct Measures {
     pub precision: f64,
     pub recall: f64,
     /// The same by observation; the only fair count where a wrong track is wrong in a few views.
-    pub observations: Observations,
+    /// `None` for the oracle, which judges tracks. PSFM counts here at its own threshold.
+    pub observations: Option<Observations>,
+    /// Whether anything was reconstructed.
+    pub solved: bool,
     /// Root mean square distance, in pixels, between the reprojected points and the true image points, noise not
     /// included, over the true inliers that the answer kept; `None`: nothing was reconstructed.
     pub error_2d_px: Option<f64>,
@@ -69,7 +72,8 @@ impl Measures {
             f1: inliers.f1,
             precision: inliers.precision,
             recall: inliers.recall,
-            observations: agreement(&solution.observations.inlier, &truth.observation_right).into(),
+            observations: Some(agreement(&solution.observations.inlier, &truth.observation_right).into()),
+            solved: solution.status == Status::Solved,
             error_2d_px: if solved { error_2d_px(truth, solution, &kept) } else { None },
             error_3d: if solved && solution.is_metric() {
                 let found: Vec<Vector3<f64>> =

@@ -74,7 +74,7 @@ fn cell_table(cells: &[Cell]) -> String {
             cell.focal_ratio_interval.map_or_else(String::new, |[low, high]| format!(" ({low:.2} to {high:.2})"));
         let _ = writeln!(
             table,
-            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{:.3}</td><td>{:.3}</td><td>{:.3}</td><td>{}</td><td>{}</td>\
+            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{:.3}</td><td>{:.3}</td><td>{}</td><td>{}</td><td>{}</td>\
              <td>{}</td><td>{}{}</td><td>{:.2}</td><td>{:.2}</td><td>{:.2}</td><td>{:.2}</td></tr>",
             escape(cell.sweep),
             escape(&cell.place),
@@ -83,7 +83,7 @@ fn cell_table(cells: &[Cell]) -> String {
             cell.seeds,
             cell.mean_f1,
             cell.least_f1,
-            cell.observation_f1,
+            shown(cell.observation_f1, 1.0, 3),
             shown(cell.error_2d_px, 1.0, 2),
             shown(cell.error_3d, 1.0, 4),
             shown(cell.focal_error, 100.0, 2),

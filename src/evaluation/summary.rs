@@ -34,7 +34,7 @@ pub struct Cell {
     pub mean_f1: f64,
     pub least_f1: f64,
     /// Mean over the seeds, by observation.
-    pub observation_f1: f64,
+    pub observation_f1: Option<f64>,
     /// Share of the seeds with an F1 of .98 or more, and the median seconds of those solves.
     pub reached: f64,
     pub seconds_to_reach: Option<f64>,
@@ -106,12 +106,14 @@ fn cell(
         seeds: pairs.len(),
         mean_f1: own().map(|measures| measures.f1).sum::<f64>() / count,
         least_f1: own().map(|measures| measures.f1).fold(1.0, f64::min),
-        observation_f1: own().map(|measures| measures.observations.f1).sum::<f64>() / count,
+        observation_f1: mean(
+            own().filter_map(|measures| measures.observations).map(|observations| observations.f1).collect(),
+        ),
         reached: own().filter(|measures| measures.f1 >= REACHED_F1).count() as f64 / count,
         seconds_to_reach: median(
             own().filter(|measures| measures.f1 >= REACHED_F1).map(|measures| measures.seconds).collect(),
         ),
-        solved: own().filter(|measures| measures.error_2d_px.is_some()).count() as f64 / count,
+        solved: own().filter(|measures| measures.solved).count() as f64 / count,
         error_2d_px: median(own().filter_map(|measures| measures.error_2d_px).collect()),
         error_3d: median(own().filter_map(|measures| measures.error_3d).collect()),
         focal_error: median(own().filter_map(|measures| measures.log_focal_error.map(f64::abs)).collect()),
@@ -122,6 +124,11 @@ fn cell(
         projective_only: share(Grade::ProjectiveOnly),
         median_seconds: median(own().map(|measures| measures.seconds).collect()).unwrap_or(0.0),
     }
+}
+
+/// `None` without values.
+fn mean(values: Vec<f64>) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 /// Median, the mean of the two middle ones for an even number; `None` without values.
@@ -182,7 +189,9 @@ fn is_general(scene: &SceneOptions) -> bool {
 
 /// Coverage of one contestant over all its records in the plan.
 pub fn coverage(plan: &Plan, records: &Records, contestant: Contestant) -> Option<Coverage> {
-    let runs: Vec<Run> = plan.runs().into_iter().filter(|run| run.contestant == contestant).collect();
+    // A zoom has no one focal length to compare with.
+    let has_one_focal = |run: &Run| run.contestant == contestant && run.scene.zoom == 0.0;
+    let runs: Vec<Run> = plan.runs().into_iter().filter(has_one_focal).collect();
     let answers: Vec<(&Measures, Option<f64>)> = runs
         .iter()
         .filter_map(|run| {
@@ -228,7 +237,7 @@ pub fn csv(cells: &[Cell]) -> String {
         let values = [
             Some(cell.mean_f1),
             Some(cell.least_f1),
-            Some(cell.observation_f1),
+            cell.observation_f1,
             Some(cell.reached),
             cell.seconds_to_reach,
             Some(cell.solved),

@@ -42,7 +42,7 @@ const ROUNDS: usize = 5;
 /// * `seen[i][j]`: point j in the frame of view i
 /// * `weights[i][j]`: inverse variance of that point
 ///
-/// Returns the poses (shape to view) and the shape, in the frame of the first view; `None` as
+/// Returns the poses (shape to view) and the shape, in a frame of their own near the first view's; `None` as
 /// [`absolute_orientation`] does.
 pub fn generalised(seen: &[Vec<Vector3<f64>>], weights: &[Vec<f64>]) -> Option<(Vec<Pose>, Vec<Vector3<f64>>)> {
     let mut shape = seen.first()?.clone();

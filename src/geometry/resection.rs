@@ -15,7 +15,7 @@ const SAMPLES: usize = 300;
 const SAMPLE_GATES: f64 = 25.0;
 /// Steps of the refinement.
 const REFINE_STEPS: usize = 10;
-/// Damping of the refinement, relative to the diagonal: the scale of a camera is free.
+/// Damping of the refinement, relative to the trace: the scale of a camera is free.
 const DAMPING: f64 = 1e-6;
 
 /// The camera of least algebraic error (Hartley & Zisserman, section 7.1), unit Frobenius norm.

@@ -3,6 +3,9 @@
 /// Standard normal quantile of .999, the level of every inlier gate: one right track in a thousand is lost.
 pub const GATE_QUANTILE: f64 = 3.090_232;
 
+/// Normal consistency of the median absolute deviation.
+pub const DEVIATION_PER_MEDIAN: f64 = 1.4826;
+
 /// Chi-square quantile at the level of [`GATE_QUANTILE`] for `dof` degrees of freedom.
 ///
 /// Wilson & Hilferty's approximation (1931); within 2 % for `dof` >= 3.

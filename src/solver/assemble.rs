@@ -148,17 +148,25 @@ fn judge_by_depths(attempt: &Attempt, weights: &[f64], local: &[Camera], context
             continue;
         }
         judged.tracks.inlier[track] = inlier;
+        if context.stop.is_stopped() {
+            return;
+        }
         let sightings = attempt.block.complete.track(j);
         let start = triangulation::linear(local, sightings);
-        judged.points[track] = inlier.then(|| triangulation::refine(local, sightings, start, POINT_STEPS).0);
+        let point = triangulation::refine(local, sightings, start, POINT_STEPS).0;
+        judged.points[track] = inlier.then_some(point);
         judged.retained[track] = if inlier {
             sightings.iter().map(|seen| Sighting { view: attempt.block.views[seen.view], xy: seen.xy }).collect()
         } else {
             Vec::new()
         };
         for k in context.ranges[track]..context.ranges[track + 1] {
-            judged.observations.inlier[input.caller_index(k)] =
-                inlier && attempt.block.views.binary_search(&input.view_of(k)).is_ok();
+            let Ok(view) = attempt.block.views.binary_search(&input.view_of(k)) else { continue };
+            let place = input.caller_index(k);
+            let residual = triangulation::reprojection(&local[view], &point, &sightings[view].xy).norm();
+            judged.observations.inlier[place] = inlier;
+            judged.observations.residual_px[place] =
+                Some(residual * context.scale_px).filter(|residual| residual.is_finite());
         }
     }
 }

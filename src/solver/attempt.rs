@@ -19,6 +19,10 @@ const INITIAL_NOISE: f64 = 0.005;
 const SEARCHED_TRACKS: (usize, usize) = (600, 200);
 /// Tracks times squared views that a search may hold between those two.
 const SEARCHED_WORK: usize = 60_000;
+/// Inlier tracks, and observations of them, that a calibration is made from: beyond, it takes minutes, and other errors
+/// than noise bound what it gives.
+const MOST_CALIBRATED: usize = 600;
+const CALIBRATED_OBSERVATIONS: usize = 20_000;
 /// Tracks that PAPER optimises weights for: the network holds some 40 kB a track at full width.
 const PAPER_TRACKS: usize = 5_000;
 
@@ -127,8 +131,9 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     recorder.enter(Stage::Refine);
     attempt.evidence = found.evidence;
     if matches!(found.evidence, Evidence::Depths { .. }) {
-        attempt.weights_by_depths =
-            found.rigid.and_then(|rigid| depths::weights(complete, &consensus, &rigid, portfolio::spread(complete)));
+        attempt.weights_by_depths = found
+            .rigid
+            .and_then(|rigid| depths::weights(complete, &consensus, &rigid, portfolio::spread(complete), context.stop));
         attempt.consensus = Some(consensus);
         return Ok(());
     }
@@ -152,7 +157,8 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     }
     let complete = &attempt.block.complete;
     if let (Some(rigid), Some(consensus)) = (&found.rigid, &attempt.consensus) {
-        attempt.weights_by_depths = depths::weights(complete, consensus, rigid, portfolio::spread(complete));
+        attempt.weights_by_depths =
+            depths::weights(complete, consensus, rigid, portfolio::spread(complete), context.stop);
     }
     Ok(())
 }
@@ -188,7 +194,8 @@ fn decide(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
 
 /// Calibrates from the inliers of a consensus.
 fn calibrate(block: &Block, consensus: &Consensus, context: &Context) -> Result<Outcome, Error> {
-    let inliers = consensus.inliers();
+    let most = MOST_CALIBRATED.min(CALIBRATED_OBSERVATIONS / block.views.len().max(1));
+    let inliers = extend::evenly(&consensus.inliers(), most);
     let points: Vec<_> = inliers.iter().map(|&track| consensus.points[track]).collect();
     let observations = grow::observations_of(&block.complete, &inliers);
     let problem = calibration::Problem {

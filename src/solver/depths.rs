@@ -3,11 +3,11 @@
 //! Four complete tracks leave ten projective cameras undetermined; with depths and one focal length they leave fifty
 //! constraints over. What stands on fewer tracks than image points can verify is never graded METRIC.
 
-use super::calibration::{Outcome, few_inliers, grade_of_sigma};
-use super::grow::Consensus;
+use super::calibration::{CHEIRALITY_LIMIT, Outcome, few_inliers, grade_of_sigma, plane_at_infinity};
+use super::grow::{Consensus, LEAST_INLIERS, NOISE_BOUNDS};
 use super::search::Seed;
 use super::search::rigid::{Rigid, Search};
-use crate::domain::{Grade, StopToken};
+use crate::domain::{Grade, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
 };
@@ -23,11 +23,9 @@ const SIMILARITY: usize = 7;
 /// Constraints beyond the unknowns from which a focal length is looked for: its variance is then known to 45 %.
 const LEAST_FREEDOM: usize = 10;
 /// Distance in log focal between what depths and what image points say from which they contradict each other: by
-/// itself, and in standard deviations.
+/// itself (depths alone are off by some per cent in strong noise), and in standard deviations of the latter.
 const MOST_STRAYED: f64 = 0.1;
 const STRAYED_SIGMAS: f64 = 4.0;
-/// Share of the observations that must lie in front of their cameras.
-const LEAST_CHEIRALITY: f64 = 0.9;
 
 /// The seed that a rigid consensus gives to growing without depths.
 pub fn seed(rigid: &Rigid) -> Seed {
@@ -51,7 +49,7 @@ pub fn consensus(block: &CompleteBlock, rigid: &Rigid, noise: f64) -> Consensus 
         points,
         squared,
         inlier: rigid.inlier.clone(),
-        noise: rigid.noise().unwrap_or(noise),
+        noise: rigid.noise().unwrap_or(noise).clamp(NOISE_BOUNDS.0, NOISE_BOUNDS.1),
         score: rigid.cost / block.tracks().max(1) as f64,
     }
 }
@@ -62,13 +60,21 @@ pub fn consensus(block: &CompleteBlock, rigid: &Rigid, noise: f64) -> Consensus 
 /// * `focal`: that of the consensus's cameras, `K [R|t]`
 pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop: &StopToken) -> Outcome {
     let inliers = consensus.inliers();
-    let mut outcome = Outcome::refused(vec![few_inliers(inliers.len())]);
+    let mut outcome = Outcome::refused(Vec::new());
+    if inliers.len() < LEAST_INLIERS {
+        outcome.warnings.push(few_inliers(inliers.len()));
+    }
+    let refused = |mut outcome: Outcome, code: WarningCode, detail: String| {
+        outcome.warnings.push(Warning::new(code, detail));
+        outcome
+    };
     let observations: Vec<Observation> = super::grow::observations_of(block, &inliers);
     let model = IntrinsicsModel::FOCAL;
     let unknowns = 6 * block.views() + 3 * inliers.len() + model.parameters().len() - SIMILARITY;
     let freedom = (2 * observations.len()).saturating_sub(unknowns);
     if freedom < LEAST_FREEDOM {
-        return outcome;
+        let detail = format!("{} tracks leave {freedom} constraints for a focal length, too few", inliers.len());
+        return refused(outcome, WarningCode::UnobservableFocal, detail);
     }
     let Some(mut found) = start(consensus, &inliers, focal) else { return outcome };
     let options = Options {
@@ -84,10 +90,16 @@ pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop:
         .filter(|sigma| sigma.is_finite());
     let cheirality = crate::geometry::metric::cheirality(&found, &observations);
     // Image points and depths tell one story, or there is none.
-    let strayed = (found.intrinsics.focal / focal).ln().abs() > MOST_STRAYED.max(STRAYED_SIGMAS * sigma.unwrap_or(0.0));
-    if strayed || cheirality < LEAST_CHEIRALITY || !found.intrinsics.focal.is_finite() {
-        return outcome;
+    let strayed = (found.intrinsics.focal / focal).ln().abs();
+    if strayed.is_nan() || strayed > MOST_STRAYED.max(STRAYED_SIGMAS * sigma.unwrap_or(0.0)) {
+        let detail = format!("image points alone give a focal length that differs by a factor of {:.2}", strayed.exp());
+        return refused(outcome, WarningCode::ModelMismatch, detail);
     }
+    if cheirality < CHEIRALITY_LIMIT {
+        let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - cheirality));
+        return refused(outcome, WarningCode::Cheirality, detail);
+    }
+    outcome.plane_at_infinity = plane_at_infinity(&consensus.cameras, &found);
     outcome.grade = grade_of_sigma(sigma).worse(Grade::Weak);
     outcome.sigma_log_focal = sigma;
     outcome.cheirality = cheirality;
@@ -111,7 +123,8 @@ fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<Reconst
     Some(Reconstruction { intrinsics, poses, points })
 }
 
-/// Share of the consensus's inliers that must be rigid for depths to judge: else they are true to some other scale.
+/// Share of the consensus's inliers that must be rigid for depths to judge: of depths that are not true to one scale
+/// next to none are.
 const RIGID_SHARE: f64 = 0.8;
 
 /// Probability of each track of the block to be right by image points and depths together, under the rigid consensus
@@ -119,15 +132,21 @@ const RIGID_SHARE: f64 = 0.8;
 ///
 /// At a noise of a tenth of the image the image points alone lose right tracks; a third coordinate and fewer unknowns
 /// keep them.
-pub fn weights(block: &CompleteBlock, consensus: &Consensus, found: &Rigid, spread: f64) -> Option<Vec<f64>> {
-    let search = Search::new(block, spread)?;
+pub fn weights(
+    block: &CompleteBlock,
+    consensus: &Consensus,
+    found: &Rigid,
+    spread: f64,
+    stop: &StopToken,
+) -> Option<Vec<f64>> {
+    let search = Search::new(block, spread, stop)?;
     let inliers = consensus.inliers();
     let rigid = search.refit(found, &inliers)?;
     let shared = inliers.iter().filter(|&&track| rigid.inlier[track]).count();
     if (shared as f64) < RIGID_SHARE * inliers.len() as f64 {
         return None;
     }
-    let noise = rigid.noise()?.max(f64::MIN_POSITIVE);
+    let noise = rigid.noise()?.clamp(NOISE_BOUNDS.0, NOISE_BOUNDS.1);
     let freedom = (3 * block.views()) as f64 - 3.0;
     // A uniform distribution of that standard deviation is sqrt(12) times as wide.
     let ln_wrong = -freedom * (12f64.sqrt() * search.spread()).ln();

@@ -84,7 +84,7 @@ fn with_others(own: &[usize], all: &[usize]) -> Vec<usize> {
 }
 
 /// At most `most` of the items, evenly spread.
-fn evenly(items: &[usize], most: usize) -> Vec<usize> {
+pub fn evenly(items: &[usize], most: usize) -> Vec<usize> {
     let count = items.len().min(most);
     (0..count).map(|k| items[k * items.len() / count]).collect()
 }

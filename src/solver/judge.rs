@@ -73,7 +73,7 @@ pub struct Judged {
 /// residuals.
 ///
 /// Twice: with a wide tail first, then with the tail that the tracks show which are right in all their observations.
-/// Where there is none, a wrong observation is told from a right one at seven core deviations instead of twelve.
+/// Where there is none, a wrong observation is told from a right one nearer by: at 8 to 9 core deviations instead of 12 at .3 % noise.
 ///
 /// Once `stop` fires the rest stays unjudged: nobody will look at the result.
 pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry, stop: &StopToken) -> Judged {

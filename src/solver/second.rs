@@ -42,8 +42,8 @@ pub fn structure(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken)
 
 /// Tracks of another rigid shape, where depths are given.
 fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize> {
-    let search = rigid::Search::new(rest, portfolio::spread(rest))?;
-    let found = search.run(noise, stop)?;
+    let search = rigid::Search::new(rest, portfolio::spread(rest), stop)?;
+    let found = search.run(noise)?;
     (found.ln_false_alarms(search.spread()) < LN_DECISIVE).then(|| found.inlier_count())
 }
 

@@ -21,7 +21,7 @@ use crate::geometry::bundle::{Observation, Options, projective};
 use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
 
 use fit::Fit;
-pub use verdict::grade_of_sigma;
+pub use verdict::{CHEIRALITY_LIMIT, grade_of_sigma};
 
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
 /// caller has adjusted it before.
@@ -145,7 +145,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
         return Ok(Outcome::refused(warnings));
     }
     let mut outcome = grading::grade(&choice, &fit, minima, warnings)?;
-    outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem, metric));
+    outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem.cameras, metric));
     Ok(outcome)
 }
 
@@ -185,8 +185,8 @@ fn observed_points(problem: &Problem) -> usize {
 }
 
 /// The plane at infinity of the caller's cameras that goes best with the calibration found.
-fn plane_at_infinity(problem: &Problem, metric: &Reconstruction) -> Option<Vector3<f64>> {
-    let frame = to_first_view_frame(problem.cameras, &[])?;
+pub fn plane_at_infinity(cameras: &[Matrix3x4<f64>], metric: &Reconstruction) -> Option<Vector3<f64>> {
+    let frame = to_first_view_frame(cameras, &[])?;
     let starts = daq::widest_views(&frame.cameras)
         .into_iter()
         .take(4)

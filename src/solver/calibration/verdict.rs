@@ -16,7 +16,7 @@ const RMS_RATIO_LIMIT: f64 = 1.15;
 const RMS_RATIO_REFUSAL: f64 = 3.0;
 /// Share of the observations that must lie in front of their cameras, or the reconstruction is not to be used: what was
 /// seen was not behind the camera. A forward-moving car gave 2.9 % behind, with a focal length of a quarter of the true.
-pub(super) const CHEIRALITY_LIMIT: f64 = 0.99;
+pub const CHEIRALITY_LIMIT: f64 = 0.99;
 
 /// The grade with the warnings that led to it.
 pub(super) struct Verdict {

@@ -7,6 +7,7 @@
 
 mod account;
 mod best;
+mod spread;
 
 use std::time::Instant;
 
@@ -26,6 +27,7 @@ use crate::network::{NetworkSettings, PriorNetwork};
 use account::Account;
 use best::Best;
 pub use best::{Evidence, LN_DECISIVE};
+pub use spread::spread;
 
 /// Network iterations between two verifications of its ranking.
 const ITERATIONS_PER_ROUND: u32 = 25;
@@ -195,12 +197,13 @@ impl<'a> Portfolio<'a> {
     fn propose_rigid(&mut self, round: u32) {
         let is_new = NOISE_LADDER.iter().position(|level| *level == NOISE_LADDER[round as usize % NOISE_LADDER.len()])
             == Some(round as usize);
-        if !is_new || !self.is_wanted(Prior::Rigidity) {
+        // A zoom moves distances with the focal length.
+        if !is_new || self.settings.focal_per_view || !self.is_wanted(Prior::Rigidity) {
             return;
         }
-        let Some(search) = rigid::Search::new(self.block, self.spread) else { return };
+        let Some(search) = rigid::Search::new(self.block, self.spread, self.stop) else { return };
         let begun = Instant::now();
-        let found = search.run(self.noise, self.stop);
+        let found = search.run(self.noise);
         let pairs = self.block.tracks() * (self.block.tracks() - 1) / 2;
         let account = self.account(Prior::Rigidity);
         account.seconds += begun.elapsed().as_secs_f64();
@@ -217,7 +220,9 @@ impl<'a> Portfolio<'a> {
             self.account(Prior::Rigidity).record(&found);
             self.offer(found);
         }
-        if rigid.ln_false_alarms(search.spread()) < LN_DECISIVE {
+        let certainty = |rigid: &Rigid| rigid.ln_false_alarms(search.spread());
+        let least = self.rigid.as_ref().map_or(LN_DECISIVE, certainty);
+        if certainty(&rigid) < least {
             self.rigid = Some(rigid);
         }
     }
@@ -362,28 +367,6 @@ impl<'a> Portfolio<'a> {
             prior_times,
         }
     }
-}
-
-/// Normal consistency of the median absolute deviation.
-const DEVIATION_PER_MEDIAN: f64 = 1.4826;
-/// Largest spread that points of an image can have: half its side.
-const MOST_SPREAD: f64 = 0.5;
-
-/// Standard deviation of the image points from the middle of their view, one coordinate, normalised units: median
-/// over the views of a robust estimate, for a single far point must not make chance look small.
-pub fn spread(block: &CompleteBlock) -> f64 {
-    let mut spreads: Vec<f64> = (0..block.views())
-        .map(|view| {
-            let of_axis = |axis: usize| {
-                let mut values: Vec<f64> = (0..block.tracks()).map(|track| block.point(view, track)[axis]).collect();
-                let middle = median(&mut values);
-                values.iter_mut().for_each(|value| *value = (*value - middle).abs());
-                median(&mut values)
-            };
-            DEVIATION_PER_MEDIAN * (of_axis(0) + of_axis(1)) / 2.0
-        })
-        .collect();
-    median(&mut spreads).clamp(f64::MIN_POSITIVE, MOST_SPREAD)
 }
 
 /// Every row centred on its median.

@@ -75,6 +75,53 @@ fn one_seed_one_answer() {
 }
 
 #[test]
+fn four_tracks_with_depths_are_found_and_never_metric() {
+    for seed in 0..4 {
+        let (input, scene) = scene(SceneOptions { outliers: 0.98, with_depths: true, seed, ..SceneOptions::default() });
+        let solution = solved(&input, &SolveSettings { method: Method::Geometry, ..SolveSettings::default() });
+        assert_eq!(solution.tracks.inlier, scene.truth.inlier, "seed {seed}");
+        assert_eq!(solution.winning_prior, Some(Prior::Rigidity), "seed {seed}");
+        assert!(matches!(solution.grade, Some(Grade::Weak | Grade::ProjectiveOnly)), "seed {seed}");
+        assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::FewInliers), "seed {seed}");
+        assert_eq!(solution.plane_at_infinity.is_some(), solution.is_metric(), "seed {seed}");
+        let residuals = solution.observations.residual_px.iter().zip(&solution.observations.inlier);
+        let worst = residuals.filter_map(|(residual, inlier)| residual.filter(|_| *inlier)).fold(0.0, f64::max);
+        assert!(worst < 30.0, "seed {seed}: {worst} px at 3 px noise");
+    }
+}
+
+#[test]
+fn strong_noise_is_judged_by_depths_too() {
+    let (mut by_image, mut by_depths) = (0.0, 0.0);
+    for seed in 0..4 {
+        for with_depths in [false, true] {
+            let (input, scene) = scene(SceneOptions { noise: 0.08, with_depths, seed, ..SceneOptions::default() });
+            let solution = solved(&input, &SolveSettings { method: Method::Geometry, ..SolveSettings::default() });
+            let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
+            *(if with_depths { &mut by_depths } else { &mut by_image }) += f1 / 4.0;
+        }
+    }
+    assert!(by_depths > 0.9 && by_depths > by_image, "mean F1 {by_depths} with depths, {by_image} without");
+}
+
+#[test]
+fn a_second_motion_is_told_and_nothing_else_is() {
+    for with_depths in [false, true] {
+        for seed in 0..3 {
+            for second_motion in [0.0, 0.3] {
+                let options =
+                    SceneOptions { outliers: 0.5, second_motion, with_depths, seed, ..SceneOptions::default() };
+                let (input, scene) = scene(options);
+                let solution = solved(&input, &SolveSettings { method: Method::Geometry, ..SolveSettings::default() });
+                let told = solution.warnings.iter().any(|warning| warning.code == WarningCode::SecondStructure);
+                assert_eq!(told, second_motion > 0.0, "seed {seed}, depths {with_depths}: {:?}", solution.warnings);
+                assert!(agreement(&solution.tracks.inlier, &scene.truth.inlier).f1 > 0.98, "no blend, seed {seed}");
+            }
+        }
+    }
+}
+
+#[test]
 fn padding_changes_nothing() {
     // The paper pads its matrices to 300 x 1000.
     for with_depths in [false, true] {

@@ -6,7 +6,7 @@ const FOCALS: usize = 33;
 const FOCAL_RANGE: (f64, f64) = (0.3, 5.0);
 /// Distance in tolerances below which a pair says nothing: near points are near in every view, right or wrong.
 const LEAST_DISTANCE: f64 = 3.0;
-/// Share of a core that a track must be rigid with to join it.
+/// Share of a core that a track must be rigid with to join it: at the gate's width a right pair is missed now and then.
 const CORE_SHARE: f64 = 0.75;
 /// Tracks of a core at most; more do not make the poses better to start from.
 const MOST_CORE: usize = 30;
@@ -63,10 +63,11 @@ impl Graph {
 
     /// The focal lengths with most rigid pairs, no two of them neighbours on the grid.
     pub fn best_focals(&self, count: usize) -> Vec<(f64, Edges)> {
+        let scales: [f64; FOCALS] = std::array::from_fn(|k| Self::focal(k).powi(-2));
         let mut totals = [0usize; FOCALS];
         for pair in &self.pairs {
-            for (k, total) in totals.iter_mut().enumerate() {
-                *total += usize::from(pair.is_rigid(Self::focal(k).powi(-2), self.tolerance));
+            for (total, g) in totals.iter_mut().zip(scales) {
+                *total += usize::from(pair.is_rigid(g, self.tolerance));
             }
         }
         let mut ranked: Vec<usize> = (0..FOCALS).filter(|&k| totals[k] > 0).collect();
@@ -83,8 +84,9 @@ impl Graph {
     fn edges(&self, focal: f64) -> Edges {
         let mut adjacent = vec![vec![false; self.tracks]; self.tracks];
         let order = (0..self.tracks).flat_map(|a| (a + 1..self.tracks).map(move |b| (a, b)));
+        let g = focal.powi(-2);
         for ((a, b), pair) in order.zip(&self.pairs) {
-            let rigid = pair.is_rigid(focal.powi(-2), self.tolerance);
+            let rigid = pair.is_rigid(g, self.tolerance);
             (adjacent[a][b], adjacent[b][a]) = (rigid, rigid);
         }
         let degree = adjacent.iter().map(|row| row.iter().filter(|&&edge| edge).count()).collect();
