@@ -221,9 +221,12 @@ fn is_quick(observations: usize) -> bool {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
-    create_directory(&args.out)?;
     let plan = args.plan();
     let runs = plan.runs();
+    if runs.is_empty() {
+        return Err(Failure::usage("no method has anything to say of these sweeps and depths: give others"));
+    }
+    create_directory(&args.out)?;
     let mut records = Records::open(&args.out, &build()?)?;
     let missing = runs.iter().filter(|run| records.get(run).is_none()).count();
     let bar = progress_bar(args.quiet, runs.len(), runs.len() - missing);
@@ -278,7 +281,9 @@ fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> 
     }))?;
     write_atomically(out, "summary.json", json.as_bytes())?;
     write_atomically(out, "summary.csv", summary::csv(cells).as_bytes())?;
-    for &depths in &plan.depths {
+    // Cells with names instead of values are in the tables.
+    let has_figure = plan.sweeps.iter().any(|sweep| sweep.names.is_empty());
+    for &depths in plan.depths.iter().filter(|_| has_figure) {
         let name = format!("figure-depths-{}.svg", depths.name());
         write_atomically(out, &name, figures::svg(plan, cells, depths).as_bytes())?;
     }

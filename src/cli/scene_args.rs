@@ -121,7 +121,7 @@ pub struct CameraArgs {
     pub principal_point: [f64; 2],
 
     /// Radial distortion: x (1 + K1 r^2), with x and its length r in focal lengths from the principal point
-    #[arg(long, value_name = "K1", default_value_t = 0.0, allow_negative_numbers = true)]
+    #[arg(long, value_name = "K1", default_value_t = 0.0, allow_hyphen_values = true)]
     pub radial_k1: f64,
 
     /// The focal length of each view is random in f (1 +- SHARE)

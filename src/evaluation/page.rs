@@ -21,7 +21,8 @@ pub fn page(plan: &Plan, cells: &[Cell], coverage: &[Coverage]) -> String {
          error: |ln(f / f true)|. Of psfm, F1 is that of the best threshold.",
     );
     let _ = writeln!(body, " The network of paper has {} of the original's width.</p>", plan.paper_width);
-    for &depths in &plan.depths {
+    let has_figure = plan.sweeps.iter().any(|sweep| sweep.names.is_empty());
+    for &depths in plan.depths.iter().filter(|_| has_figure) {
         let what = match depths {
             Depths::Given => "Depths given",
             Depths::None => "No depths: image points alone",

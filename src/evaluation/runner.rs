@@ -30,7 +30,7 @@ pub enum Error {
         path.display()
     )]
     OtherBuild { path: PathBuf, recorded: String, current: String },
-    #[error("{} line {line}: {what}", path.display())]
+    #[error("{} line {line}: {what}; remove the file, or give another directory", path.display())]
     Malformed { path: PathBuf, line: usize, what: String },
     /// A scene that cannot be made, or a defect of the solver; the run is named.
     #[error("{run}: {what}")]

@@ -32,10 +32,8 @@ pub fn structure(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken)
     Some(Warning::new(
         WarningCode::SecondStructure,
         format!(
-            "{count} of the {} tracks that were left out agree on another rigid motion: a second moving body, or a \
-                 repeated structure; the result is that of the {} tracks that stand, not of both",
-            left.len(),
-            consensus.inlier_count()
+            "about {count} tracks that the search left out agree on another rigid motion: a second moving body, or a \
+             repeated structure; the result is that of the larger set, not of both"
         ),
     ))
 }

@@ -30,7 +30,7 @@ pub(super) fn grade(
     let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
     Stopped::check(choice.stop)?;
     let mut sigma = choice.sigma(&best).filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
-    let mut verdict = Verdict { grade: Grade::Metric, warnings };
+    let mut verdict = Verdict::new(warnings);
     if let Some(focal_prior) = choice.problem.focal_prior {
         weigh_prior(&mut verdict, &mut sigma, choice, &best, focal_prior);
     }

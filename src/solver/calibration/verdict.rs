@@ -22,9 +22,16 @@ pub const CHEIRALITY_LIMIT: f64 = 0.99;
 pub(super) struct Verdict {
     pub grade: Grade,
     pub warnings: Vec<Warning>,
+    /// Whether the metric model does not fit: its sigma says nothing then.
+    misfit: bool,
 }
 
 impl Verdict {
+    /// Nothing speaks against it yet but these warnings.
+    pub fn new(warnings: Vec<Warning>) -> Self {
+        Self { grade: Grade::Metric, warnings, misfit: false }
+    }
+
     /// Lowers the grade to this at most and says why.
     pub fn cap(&mut self, worst: Grade, code: WarningCode, detail: String) {
         self.grade = self.grade.worse(worst);
@@ -65,6 +72,7 @@ impl Verdict {
                 projective.noise * scale_px,
             );
             self.cap(worst, WarningCode::ModelMismatch, detail);
+            self.misfit = true;
         }
         ratio
     }
@@ -81,9 +89,14 @@ impl Verdict {
     }
 
     /// The sigma that is told: not one that the fit contradicts. Whatever lowered the grade is worth at least the grade's
-    /// least.
+    /// least, and a model that does not fit its most: wrong minima behind a distorting lens were off by 20 to 30 %.
     pub fn told(&self, sigma: Option<f64>) -> Option<f64> {
-        sigma.map(|sigma| if self.grade == Grade::Weak { sigma.max(METRIC_BELOW) } else { sigma })
+        let least = match (self.grade, self.misfit) {
+            (Grade::Weak, true) => WEAK_UP_TO,
+            (Grade::Weak, false) => METRIC_BELOW,
+            _ => 0.0,
+        };
+        sigma.map(|sigma| sigma.max(least))
     }
 }
 

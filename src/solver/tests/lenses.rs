@@ -86,7 +86,7 @@ fn a_zoom_gets_a_focal_length_a_view() {
     }
     let input = Input::new(raw, &Limits::default(), "scene").expect("valid input");
     let solution = solved(&input, &SolveSettings { focal_per_view: true, ..SolveSettings::default() });
-    assert_eq!(solution.grade, Some(Grade::Metric), "{:?}", solution.warnings);
+    assert_eq!(solution.grade, Some(Grade::Weak), "{:?}", solution.warnings);
     for (view, result) in solution.views.iter().enumerate() {
         let error = result.focal_px.expect("metric") / (zoom(view as u32) * scene.truth.focal_px) - 1.0;
         println!("view {view}: focal length off by {error:.4}");
