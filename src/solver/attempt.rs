@@ -156,7 +156,9 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         attempt.consensus = Some(refined);
     }
     let complete = &attempt.block.complete;
-    if let (Some(rigid), Some(consensus)) = (&found.rigid, &attempt.consensus) {
+    if let (Some(rigid), Some(consensus)) = (&found.rigid, &attempt.consensus)
+        && consensus.noise > depths::STRONG_NOISE
+    {
         attempt.weights_by_depths =
             depths::weights(complete, consensus, rigid, portfolio::spread(complete), context.stop);
     }
