@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
-use crate::domain::{SolveSettings, StopReason, StopToken};
+use crate::domain::{SolveSettings, StopToken};
 use crate::evaluation::plan::{Contestant, Depths, Plan};
 use crate::evaluation::runner::{self, Records};
 use crate::evaluation::summary::{self, Cell};
@@ -233,11 +233,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let threads = args.threads.map_or_else(cores, usize::from);
     let stop = StopToken::default();
     let interrupt = Interrupt::listen()?;
-    let (asked, token) = (stop.clone(), interrupt.token());
-    let relay = tokio::spawn(async move {
-        token.cancelled().await;
-        asked.stop(StopReason::Cancelled);
-    });
+    let relay = interrupt.stops(&stop);
     let outcome = tokio::task::block_in_place(|| {
         runner::run(&runs, &mut records, threads, &stop, &mut |record| {
             let scene = &record.run.scene;

@@ -7,6 +7,7 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use super::exit::{Exit, Failure};
+use crate::domain::{StopReason, StopToken};
 
 /// Signals within this time of the first are the same request: `timeout` and some supervisors signal a process and its
 /// group, so that it arrives twice.
@@ -40,6 +41,15 @@ impl Interrupt {
     /// Cancelled by the first signal.
     pub fn token(&self) -> CancellationToken {
         self.token.clone()
+    }
+
+    /// From now on until the task is aborted, the first signal stops blocking work that asks this token.
+    pub fn stops(&self, stop: &StopToken) -> JoinHandle<()> {
+        let (stop, token) = (stop.clone(), self.token());
+        tokio::spawn(async move {
+            token.cancelled().await;
+            stop.stop(StopReason::Cancelled);
+        })
     }
 }
 

@@ -8,7 +8,7 @@ use super::interrupt::Interrupt;
 use super::progress::ProgressView;
 use super::{client, job_view, print, summary};
 use crate::domain::job::JobEvent;
-use crate::domain::{Limits, Solution, SolveSettings, StopReason, StopToken};
+use crate::domain::{Limits, Solution, SolveSettings, StopToken};
 use crate::formats::{LabelledInput, result_files};
 use crate::solver;
 
@@ -75,11 +75,7 @@ fn in_process(
     let checked = input.check(&Limits::default())?;
     let stop = StopToken::default();
     let interrupt = Interrupt::listen()?;
-    let (asked, token) = (stop.clone(), interrupt.token());
-    let relay = tokio::spawn(async move {
-        token.cancelled().await;
-        asked.stop(StopReason::Cancelled);
-    });
+    let relay = interrupt.stops(&stop);
     let outcome = tokio::task::block_in_place(|| solver::solve(&checked, settings, progress, &stop));
     relay.abort();
     outcome.map_err(|error| match error {

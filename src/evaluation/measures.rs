@@ -4,6 +4,7 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::domain::{Grade, Method, Solution, Status, WarningCode};
+use crate::geometry::procrustes::absolute_orientation;
 use crate::synthetic::metrics::{Agreement, agreement};
 use crate::synthetic::{Scene, Truth};
 
@@ -129,9 +130,8 @@ pub fn true_image_px(truth: &Truth, view: usize, track: usize) -> Vector2<f64> {
 /// Root mean square distance of the reprojections from the true image points, over the registered views.
 fn error_2d_px(truth: &Truth, solution: &Solution, kept: &[usize]) -> Option<f64> {
     let (mut sum, mut count) = (0.0, 0usize);
-    for (view, found) in solution.views.iter().enumerate() {
+    for view in 0..solution.views.len() {
         let Some(camera) = camera_of(solution, view) else { continue };
-        debug_assert!(found.projection.is_some());
         for &track in kept {
             let Some(point) = solution.tracks.point[track] else { continue };
             let seen = camera * nalgebra::Vector4::new(point[0], point[1], point[2], 1.0);
@@ -175,27 +175,14 @@ fn aligned(points: &[Vector3<f64>], truth: &[Vector3<f64>]) -> Option<Vec<Vector
     if points.len() < 3 || points.len() != truth.len() {
         return None;
     }
-    let count = points.len() as f64;
-    let centre = |list: &[Vector3<f64>]| list.iter().sum::<Vector3<f64>>() / count;
+    // The rotation of least squares is the same with and without a scale.
+    let pose = absolute_orientation(points, truth, &vec![1.0; points.len()])?;
+    let centre = |list: &[Vector3<f64>]| list.iter().sum::<Vector3<f64>>() / list.len() as f64;
     let (from, to) = (centre(points), centre(truth));
-    let mut covariance = Matrix3::zeros();
-    let mut variance = 0.0;
-    for (point, truth) in points.iter().zip(truth) {
-        covariance += (truth - to) * (point - from).transpose();
-        variance += (point - from).norm_squared();
-    }
-    if !(covariance.iter().all(|entry| entry.is_finite()) && variance > 0.0) {
-        return None;
-    }
-    let decomposition = covariance.svd(true, true);
-    let (left, right) = (decomposition.u?, decomposition.v_t?);
-    let mut signs = Vector3::repeat(1.0);
-    if (left * right).determinant() < 0.0 {
-        signs.z = -1.0;
-    }
-    let rotation = left * Matrix3::from_diagonal(&signs) * right;
-    let scale = decomposition.singular_values.dot(&signs) / variance;
-    Some(points.iter().map(|point| scale * rotation * (point - from) + to).collect())
+    let turned: Vec<Vector3<f64>> = points.iter().map(|point| pose.rotation * (point - from)).collect();
+    let variance: f64 = turned.iter().map(Vector3::norm_squared).sum();
+    let scale = turned.iter().zip(truth).map(|(turned, truth)| turned.dot(&(truth - to))).sum::<f64>() / variance;
+    scale.is_finite().then(|| turned.iter().map(|turned| scale * turned + to).collect())
 }
 
 #[cfg(test)]

@@ -123,8 +123,8 @@ fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<Reconst
     Some(Reconstruction { intrinsics, poses, points })
 }
 
-/// Noise from which depths judge what image points have verified, normalised units: below, image points alone lose no track (F1 1.000 up to 2 %), and the
-/// time is saved.
+/// Noise from which depths judge what image points have verified, normalised units: below, image points alone lose next to
+/// no track (mean F1 1.000 at 1 %, .997 at 2 %: `scpsfm evaluate --sweeps noise --depths none`), and the time is saved.
 pub const STRONG_NOISE: f64 = 0.015;
 /// Share of the consensus's inliers that must be rigid for depths to judge: of depths that are not true to one scale
 /// next to none are.
