@@ -14,13 +14,16 @@ pub enum Stage {
     Refine,
     /// Self-calibration, metric bundle adjustment, covariance and grade.
     Calibrate,
+    /// Registering the other views of a sequence against the block that was solved.
+    Extend,
     /// Judging every track and observation under the final geometry.
     Judge,
 }
 
 impl Stage {
     /// Every stage in the order in which a solve passes them.
-    pub const ALL: [Stage; 5] = [Stage::Prepare, Stage::Search, Stage::Refine, Stage::Calibrate, Stage::Judge];
+    pub const ALL: [Stage; 6] =
+        [Stage::Prepare, Stage::Search, Stage::Refine, Stage::Calibrate, Stage::Extend, Stage::Judge];
 
     /// The stage's name in files, metrics and logs.
     pub fn name(self) -> &'static str {
@@ -29,6 +32,7 @@ impl Stage {
             Stage::Search => "search",
             Stage::Refine => "refine",
             Stage::Calibrate => "calibrate",
+            Stage::Extend => "extend",
             Stage::Judge => "judge",
         }
     }

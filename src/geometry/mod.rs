@@ -12,6 +12,7 @@ pub mod fundamental;
 pub mod homography;
 pub mod measurement;
 pub mod metric;
+pub mod pose;
 pub mod procrustes;
 pub mod resection;
 pub mod statistics;

@@ -101,7 +101,7 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
         iterations,
         seed: context.settings.seed,
         calibrations: usable
-            .map(|metric| pixel_calibrations(metric, calibration.sigma_log_focal, context, attempt))
+            .map(|metric| pixel_calibrations(metric, calibration.sigma_log_focal, context, attempt.block.views[0]))
             .unwrap_or_default(),
         // Planes transform by the inverse transpose of what moves points: from normalised to pixels that is T1^-T.
         plane_at_infinity: calibration
@@ -131,6 +131,7 @@ fn judged(context: &Context, attempt: &Attempt, consensus: &Consensus, local: &[
     let geometry = Geometry {
         cameras: &cameras,
         normalization: context.normalization,
+        lens: None,
         noise: consensus.noise,
         outlier_density: outlier_density(attempt),
         inlier_share: (consensus.inlier_count() as f64 + 1.0) / (attempt.block.tracks.len() as f64 + 2.0),
@@ -172,7 +173,7 @@ fn judge_by_depths(attempt: &Attempt, weights: &[f64], local: &[Camera], context
 }
 
 /// The network's own weight of every track; empty where none ran, 0 for tracks it did not see.
-fn network_weights(attempt: &Attempt, context: &Context) -> Vec<f32> {
+pub fn network_weights(attempt: &Attempt, context: &Context) -> Vec<f32> {
     if attempt.network_weights.is_empty() {
         return Vec::new();
     }
@@ -208,7 +209,7 @@ fn outlier_density(attempt: &Attempt) -> f64 {
     1.0 / (12.0f64.sqrt() * super::portfolio::spread(&attempt.block.complete))
 }
 
-fn left_out(input: &Input, registered: &[usize]) -> Option<Warning> {
+pub fn left_out(input: &Input, registered: &[usize]) -> Option<Warning> {
     let observed = super::block::observed_views(input);
     let missing: Vec<usize> = observed.iter().copied().filter(|view| !registered.contains(view)).collect();
     if missing.is_empty() {
@@ -301,18 +302,18 @@ fn to_pixel_frame(point: &Point, first_px: &Matrix3<f64>) -> Point {
 }
 
 /// `None` for points at infinity.
-fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
+pub fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
     let scaled = point.xyz() / point.w;
     scaled.iter().all(|entry| entry.is_finite()).then(|| scaled.into())
 }
 
 /// The calibration in pixels: one for all views, or, where the input has several camera groups, one a group in rising
 /// order, their principal points about the image centre of the group's first view.
-fn pixel_calibrations(
+pub fn pixel_calibrations(
     metric: &Reconstruction,
     sigma_log_focal: Option<f64>,
     context: &Context,
-    attempt: &Attempt,
+    first_view: usize,
 ) -> Vec<Calibration> {
     let offset = metric.intrinsics.principal_point * context.scale_px;
     let about = |view: usize| Calibration {
@@ -329,12 +330,12 @@ fn pixel_calibrations(
     if first_of_group.len() > 1 {
         first_of_group.into_values().map(about).collect()
     } else {
-        vec![about(attempt.block.views[0])]
+        vec![about(first_view)]
     }
 }
 
 /// Root mean square and mean of the inlier observations' residuals.
-fn reprojection(observations: &ObservationResults) -> (Option<f64>, Option<f64>) {
+pub fn reprojection(observations: &ObservationResults) -> (Option<f64>, Option<f64>) {
     let residuals: Vec<f64> = observations
         .inlier
         .iter()

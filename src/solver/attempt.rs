@@ -215,7 +215,7 @@ fn calibrate(block: &Block, consensus: &Consensus, context: &Context) -> Result<
 ///
 /// The priors of one camera's views tell one piece of knowledge several times: their mean, weighted by information,
 /// has the standard deviation of one of them, not that of a mean. Where they differ, by so much more.
-fn focal_prior<'a>(views: impl Iterator<Item = &'a View>) -> Option<FocalPrior> {
+pub fn focal_prior<'a>(views: impl Iterator<Item = &'a View>) -> Option<FocalPrior> {
     let told: Vec<(f64, f64)> = views
         .filter_map(|view| view.focal_prior)
         .map(|prior| (prior.focal_px.ln(), prior.sigma_log.powi(-2)))

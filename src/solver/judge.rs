@@ -4,8 +4,11 @@
 //! in the image. A track is judged by what it retains once observations that are more likely wrong than right are
 //! dropped, at a price for each.
 
+use nalgebra::Vector2;
+
 use crate::domain::result::{ObservationResults, TrackResults};
 use crate::domain::{Input, StopToken};
+use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::{Normalization, Sighting};
 use crate::geometry::{Camera, Point, triangulation};
 
@@ -34,12 +37,37 @@ pub struct Geometry<'a> {
     /// Projective camera of every view of the input, normalised; `None`: not registered.
     pub cameras: &'a [Option<Camera>],
     pub normalization: &'a Normalization,
+    /// The lens whose distortion is undone before the cameras, pinholes, are asked; `None`: a pinhole.
+    pub lens: Option<&'a Intrinsics>,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
     /// Density of a wrong coordinate: one over the width of the points' distribution, normalised units.
     pub outlier_density: f64,
     /// Prior probability that a track is right.
     pub inlier_share: f64,
+}
+
+impl Geometry<'_> {
+    /// Where a pinhole would see observation `k`; what a lens images nowhere stays where it is, far from any point.
+    fn point(&self, input: &Input, k: usize) -> Vector2<f64> {
+        let xy = self.normalization.normalize(input.view_of(k), input.point_px(k));
+        self.lens.and_then(|lens| lens.undistort(&xy)).unwrap_or(xy)
+    }
+}
+
+/// Density of a wrong coordinate among points that are spread like these: one over the width of a uniform distribution
+/// of their standard deviation.
+pub fn outlier_density(points: &[Vector2<f64>]) -> f64 {
+    let count = points.len().max(1) as f64;
+    let mean = points.iter().sum::<Vector2<f64>>() / count;
+    let variance = points.iter().map(|point| (point - mean).norm_squared()).sum::<f64>() / (2.0 * count);
+    let spread = variance.sqrt().clamp(f64::MIN_POSITIVE, super::portfolio::MOST_SPREAD);
+    1.0 / (12.0f64.sqrt() * spread)
+}
+
+/// Squared residual within which an observation is more likely right than wrong while nothing is known of the noise's tail.
+pub fn working_gate(noise: f64, outlier_density: f64) -> f64 {
+    observation_gate(&NoiseModel { core: noise, tail_share: TAIL_SHARE }, outlier_density)
 }
 
 /// How the residuals of right observations are distributed.
@@ -139,10 +167,7 @@ fn judge_under(input: &Input, ranges: &[usize], geometry: &Geometry, noise: &Noi
         }
         let sightings: Vec<Sighting> = seen
             .iter()
-            .map(|&k| {
-                let view = input.view_of(k);
-                Sighting { view, xy: geometry.normalization.normalize(view, input.point_px(k)) }
-            })
+            .map(|&k| Sighting { view: input.view_of(k), xy: geometry.point(input, k) })
             .collect();
         let verdict = judge_track(&cameras, &sightings, geometry, noise);
         judged.tracks.weight[track] = verdict.weight as f32;
@@ -232,7 +257,6 @@ fn ln_odds(cost: f64, retained: usize, dropped: usize, geometry: &Geometry, nois
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::Vector2;
 
     fn cameras(views: usize) -> Vec<Camera> {
         (0..views)
@@ -244,7 +268,7 @@ mod tests {
     }
 
     fn geometry<'a>(normalization: &'a Normalization) -> Geometry<'a> {
-        Geometry { cameras: &[], normalization, noise: 0.001, outlier_density: 2.0, inlier_share: 0.3 }
+        Geometry { cameras: &[], normalization, lens: None, noise: 0.001, outlier_density: 2.0, inlier_share: 0.3 }
     }
 
     fn sightings(cameras: &[Camera], shifts: &[f64]) -> Vec<Sighting> {

@@ -4,7 +4,8 @@
 //!
 //! The way through: [`block`] chooses views whose tracks are complete; [`attempt`] solves one such block, by
 //! [`portfolio`] (priors, [`search`], [`grow`]; [`depths`] where those verify what image points cannot; [`extend`] to what a search leaves aside) or
-//! [`direct`], and [`calibration`] upgrades it; [`judge`] has the last
+//! [`direct`], and [`calibration`] upgrades it; where tracks are not complete, [`sequence`] extends the best block to the
+//! other views; [`judge`] has the last
 //! word on every track and observation; [`assemble`] writes it down.
 
 mod agreement;
@@ -22,6 +23,7 @@ mod priors;
 mod recorder;
 mod search;
 mod second;
+mod sequence;
 #[cfg(test)]
 mod tests;
 
@@ -66,6 +68,10 @@ pub fn solve(
     let scale_px = normalization.scale_px;
     let context = Context { input, settings, ranges: &ranges, normalization: &normalization, scale_px, stop };
     let candidates = block::candidate_views(input, &ranges, stop);
+    let extends = sequence::applies(&context);
+    if extends {
+        recorder.expect_extension();
+    }
     let mut best: Option<Attempt> = None;
     let mut others = Vec::new();
     for (k, views) in candidates.iter().enumerate() {
@@ -86,6 +92,16 @@ pub fn solve(
     context.stopped()?;
     if let Some(best) = &mut best {
         agreement::reconcile(best, &others);
+    }
+    if extends && let Some(seed) = &best {
+        recorder.begin_extension();
+        if let Some(extended) = sequence::extend(seed, &context, &mut recorder)?
+            && extended.improves_on(seed)
+        {
+            let solution = sequence::solved(extended, seed, warnings, recorder);
+            context.stopped()?;
+            return Ok(solution);
+        }
     }
     let solution = match &best {
         Some(attempt) if attempt.consensus.is_some() => assemble::solved(&context, attempt, warnings, recorder),

@@ -13,7 +13,20 @@ fn fraction_at(stage: Stage) -> f64 {
         Stage::Search => 0.02,
         Stage::Refine => 0.85,
         Stage::Calibrate => 0.93,
+        Stage::Extend => 0.97,
         Stage::Judge => 0.98,
+    }
+}
+
+/// Share of a sequence's solve that its blocks take; the rest is their extension.
+const BLOCKS_OF_SEQUENCE: f64 = 0.4;
+
+/// The same as [`fraction_at`] for an extension.
+fn fraction_of_extension_at(stage: Stage) -> f64 {
+    match stage {
+        Stage::Prepare | Stage::Search | Stage::Refine | Stage::Extend => 0.0,
+        Stage::Calibrate => 0.85,
+        Stage::Judge => 0.95,
     }
 }
 
@@ -38,6 +51,9 @@ pub struct Recorder<'a> {
     /// The block that is solved, counted from 0, and how many may be: each has an equal share of the whole.
     block: usize,
     blocks: usize,
+    /// Share of the whole that the blocks have: all, or what an extension leaves them.
+    share_of_blocks: f64,
+    extending: bool,
     /// Network iterations of the blocks before.
     earlier_iterations: u32,
     history: Vec<Progress>,
@@ -60,6 +76,8 @@ impl<'a> Recorder<'a> {
             fraction: 0.0,
             block: 0,
             blocks: 1,
+            share_of_blocks: 1.0,
+            extending: false,
             earlier_iterations: 0,
             history: Vec::new(),
             stride: 1,
@@ -76,6 +94,16 @@ impl<'a> Recorder<'a> {
         self.standing = Standing::default();
     }
 
+    /// Says beforehand that the best block will be extended.
+    pub fn expect_extension(&mut self) {
+        self.share_of_blocks = BLOCKS_OF_SEQUENCE;
+    }
+
+    /// Begins the extension of a block.
+    pub fn begin_extension(&mut self) {
+        self.extending = true;
+    }
+
     /// Enters a stage, ending the one before.
     pub fn enter(&mut self, stage: Stage) {
         self.close_stage();
@@ -86,10 +114,7 @@ impl<'a> Recorder<'a> {
 
     /// Tells the observer the current standing; `within` is the share of the stage that is done.
     pub fn tell(&mut self, within: f64) {
-        let begin = fraction_at(self.stage);
-        let end = Stage::ALL.into_iter().map(fraction_at).find(|&at| at > begin).unwrap_or(1.0);
-        let of_block = begin + (end - begin) * within.clamp(0.0, 1.0);
-        self.fraction = self.fraction.max((self.block as f64 + of_block) / self.blocks as f64);
+        self.fraction = self.fraction.max(self.fraction_done(within.clamp(0.0, 1.0)));
         let progress = Progress {
             stage: self.stage,
             fraction: self.fraction,
@@ -102,6 +127,18 @@ impl<'a> Recorder<'a> {
         };
         self.observer.progress(&progress);
         self.keep(progress);
+    }
+
+    fn fraction_done(&self, within: f64) -> f64 {
+        let at = if self.extending { fraction_of_extension_at } else { fraction_at };
+        let begin = at(self.stage);
+        let end = Stage::ALL.into_iter().map(at).find(|&at| at > begin).unwrap_or(1.0);
+        let done = begin + (end - begin) * within;
+        if self.extending {
+            self.share_of_blocks + (1.0 - self.share_of_blocks) * done
+        } else {
+            self.share_of_blocks * (self.block as f64 + done) / self.blocks as f64
+        }
     }
 
     /// Hands interim weights on.

@@ -48,7 +48,7 @@ macro_rules! twins {
 twins! {
     Method = Method { Auto, Paper, Geometry, Psfm }
     Backend = Backend { Flex, Ndarray }
-    Stage = Stage { Prepare, Search, Refine, Calibrate, Judge }
+    Stage = Stage { Prepare, Search, Refine, Calibrate, Extend, Judge }
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
     Prior = Prior { Network, Irls, Consistency, Rigidity, Uniform }

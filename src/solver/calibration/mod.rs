@@ -21,6 +21,7 @@ use crate::geometry::bundle::{Observation, Options, projective};
 use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
 
 use fit::Fit;
+pub use models::knowledge;
 pub use verdict::{CHEIRALITY_LIMIT, grade_of_sigma};
 
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
@@ -146,6 +147,42 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     }
     let mut outcome = grading::grade(&choice, &fit, minima, warnings)?;
     outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem.cameras, metric));
+    Ok(outcome)
+}
+
+/// Calibrates a reconstruction that is metric already, as a sequence is that grew from a calibrated block: its focal
+/// length is known to be near a minimum, and others are looked for only where this one is not certain.
+///
+/// * `problem`: the projective cameras and points of `metric`
+///
+/// # Errors
+/// As [`calibrate`].
+pub fn from_metric(
+    problem: &Problem,
+    metric: &Reconstruction,
+    scale_px: f64,
+    stop: &StopToken,
+) -> Result<Outcome, Stopped> {
+    Stopped::check(stop)?;
+    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), ..*problem };
+    let mut warnings = Vec::new();
+    let inliers = observed_points(problem);
+    if inliers < LEAST_INLIERS {
+        warnings.push(few_inliers(inliers));
+    }
+    let (_, _, fit) = projectively_adjusted(problem, inliers, stop);
+    Stopped::check(stop)?;
+    let critical = critical::find(problem, &fit, scale_px, stop);
+    Stopped::check(stop)?;
+    if !critical.warnings.is_empty() {
+        warnings.extend(critical.warnings);
+        return Ok(Outcome::refused(warnings));
+    }
+    let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);
+    let choice = models::Choice { problem, prior: &prior, scale_px, stop };
+    let minima = search::minima_near(metric, problem, &prior, stop)?;
+    let mut outcome = grading::grade(&choice, &fit, minima, warnings)?;
+    outcome.plane_at_infinity = None;
     Ok(outcome)
 }
 

@@ -53,7 +53,7 @@ const PROFILE_ITERATIONS: usize = 15;
 const PROFILE_LONGEST: f64 = 0.3;
 
 /// What is known of the intrinsics beforehand, at this noise: what lenses are like, and what the caller says.
-pub(super) fn knowledge(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> IntrinsicsPrior {
+pub fn knowledge(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> IntrinsicsPrior {
     let lenses = IntrinsicsPrior::NONE
         .knowing(Parameter::PrincipalX, 0.0, PRINCIPAL_POINT_SIGMA, noise)
         .knowing(Parameter::PrincipalY, 0.0, PRINCIPAL_POINT_SIGMA, noise)

@@ -6,7 +6,7 @@ use super::models::Choice;
 use super::{Problem, Stopped};
 use crate::domain::StopToken;
 use crate::geometry::bundle::critical::Translating;
-use crate::geometry::bundle::metric::{self, IntrinsicsModel, IntrinsicsPrior, Reconstruction};
+use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::daq::{self, Daq, FirstViewFrame, Free};
 use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
@@ -74,6 +74,43 @@ impl Minimum {
 
 pub(super) fn converge() -> Options {
     Options { max_iterations: FINAL_ITERATIONS, relative_tolerance: FINAL_TOLERANCE, ..Options::default() }
+}
+
+/// Factors on the focal length of a reconstruction from which other minima are looked for: a forward motion has them
+/// half or twice as far.
+const OTHER_FOCALS: [f64; 4] = [0.5, 0.75, 1.33, 2.0];
+/// Iterations in which poses and points follow a focal length that is held.
+const FOLLOWING: usize = 12;
+
+/// Minima from a reconstruction that is metric already: its own, and those that other focal lengths lead to; cheapest
+/// first.
+pub(super) fn minima_near(
+    metric: &Reconstruction,
+    problem: &Problem,
+    prior: &IntrinsicsPrior,
+    stop: &StopToken,
+) -> Result<Vec<Minimum>, Stopped> {
+    let mut found = Vec::new();
+    for factor in std::iter::once(1.0).chain(OTHER_FOCALS) {
+        Stopped::check(stop)?;
+        let mut reconstruction = metric.clone();
+        reconstruction.intrinsics = Intrinsics::from_focal(factor * metric.intrinsics.focal);
+        if factor != 1.0 {
+            let options = Options { max_iterations: FOLLOWING, ..Options::default() };
+            metric::adjust(
+                &mut reconstruction,
+                problem.observations,
+                IntrinsicsModel::FIXED,
+                prior,
+                &options,
+                stop,
+            );
+        }
+        let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
+        found.push(start.adjusted(problem.observations, IntrinsicsModel::FOCAL, prior, stop));
+    }
+    Stopped::check(stop)?;
+    Ok(distinct(found))
 }
 
 /// Metric reconstructions with the focal length free that different starts converge to, cheapest first.

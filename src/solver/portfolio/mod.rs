@@ -27,7 +27,7 @@ use crate::network::{NetworkSettings, PriorNetwork};
 use account::Account;
 use best::Best;
 pub use best::{Evidence, LN_DECISIVE};
-pub use spread::spread;
+pub use spread::{MOST_SPREAD, spread};
 
 /// Network iterations between two verifications of its ranking.
 const ITERATIONS_PER_ROUND: u32 = 25;

@@ -4,7 +4,7 @@ use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::statistics::{DEVIATION_PER_MEDIAN, median};
 
 /// Largest spread that points of an image can have: half its side.
-const MOST_SPREAD: f64 = 0.5;
+pub const MOST_SPREAD: f64 = 0.5;
 
 /// Standard deviation of the image points from the middle of their view, one coordinate, normalised units: median
 /// over the views of a robust estimate, for a single far point must not make chance look small.

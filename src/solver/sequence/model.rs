@@ -1,0 +1,129 @@
+//! The state of an extension: what is known of the views, the points and the noise.
+
+use nalgebra::{Vector2, Vector3};
+
+use crate::domain::StopToken;
+use crate::geometry::Camera;
+use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
+use crate::geometry::measurement::Sighting;
+use crate::solver::Context;
+use crate::solver::judge;
+
+/// An input as the extension sees it; observations keep the input's sorted order (track, view).
+pub struct Scene<'a> {
+    pub context: Context<'a>,
+    /// Normalised image points, one an observation.
+    pub xy: Vec<Vector2<f64>>,
+    /// Observations of each view.
+    pub of_view: Vec<Vec<u32>>,
+    /// Density of a wrong coordinate; see [`judge::Geometry::outlier_density`].
+    pub outlier_density: f64,
+}
+
+impl<'a> Scene<'a> {
+    pub fn new(context: &Context<'a>) -> Self {
+        let input = context.input;
+        let mut of_view = vec![Vec::new(); input.view_count()];
+        let mut xy = Vec::with_capacity(input.observation_count());
+        for k in 0..input.observation_count() {
+            let view = input.view_of(k);
+            of_view[view].push(k as u32);
+            xy.push(context.normalization.normalize(view, input.point_px(k)));
+        }
+        let outlier_density = judge::outlier_density(&xy);
+        Self { context: *context, xy, of_view, outlier_density }
+    }
+
+    pub fn stop(&self) -> &'a StopToken {
+        self.context.stop
+    }
+
+    pub fn tracks(&self) -> usize {
+        self.context.input.track_count()
+    }
+
+    pub fn view_of(&self, k: usize) -> usize {
+        self.context.input.view_of(k)
+    }
+
+    pub fn track_of(&self, k: usize) -> usize {
+        self.context.input.track_of(k)
+    }
+
+    /// Observations of a track.
+    pub fn of_track(&self, track: usize) -> std::ops::Range<usize> {
+        self.context.ranges[track]..self.context.ranges[track + 1]
+    }
+}
+
+/// A point of the reconstruction.
+#[derive(Debug, Clone, Copy)]
+pub struct Landmark {
+    pub position: Vector3<f64>,
+    /// Largest angle between the rays that see it, radians.
+    pub angle: f64,
+    /// Observations that agree with it.
+    pub support: usize,
+}
+
+/// A metric reconstruction under way.
+#[derive(Debug, Clone)]
+pub struct Model {
+    pub intrinsics: Intrinsics,
+    /// Which intrinsics adjustments leave free.
+    pub free: IntrinsicsModel,
+    /// One a view of the input.
+    pub poses: Vec<Option<Pose>>,
+    /// One a track of the input.
+    pub landmarks: Vec<Option<Landmark>>,
+    /// One an observation: whether it agrees with its landmark.
+    pub kept: Vec<bool>,
+    /// Core noise, one standard deviation of a coordinate, normalised units.
+    pub noise: f64,
+}
+
+impl Model {
+    pub fn new(scene: &Scene, views: &[usize], metric: &Reconstruction, noise: f64) -> Self {
+        let mut poses = vec![None; scene.context.input.view_count()];
+        for (&view, pose) in views.iter().zip(&metric.poses) {
+            poses[view] = Some(*pose);
+        }
+        Self {
+            intrinsics: metric.intrinsics,
+            free: IntrinsicsModel::FOCAL,
+            poses,
+            landmarks: vec![None; scene.tracks()],
+            kept: vec![false; scene.xy.len()],
+            noise,
+        }
+    }
+
+    /// Registered views, increasing.
+    pub fn registered(&self) -> Vec<usize> {
+        (0..self.poses.len()).filter(|&view| self.poses[view].is_some()).collect()
+    }
+
+    /// Pinhole cameras of all views, zero for those that are not registered.
+    pub fn cameras(&self) -> Vec<Camera> {
+        let camera = |pose: &Option<Pose>| pose.map_or_else(Camera::zeros, |pose| pose.camera(&self.intrinsics));
+        self.poses.iter().map(camera).collect()
+    }
+
+    /// Where the pinhole cameras see an observation; `None` where the view is not registered or the lens images nothing.
+    pub fn sighting(&self, scene: &Scene, k: usize) -> Option<Sighting> {
+        let view = scene.view_of(k);
+        self.poses[view]?;
+        Some(Sighting { view, xy: self.intrinsics.undistort(&scene.xy[k])? })
+    }
+
+    /// The direction `(u, v)` at unit depth in which an observation is seen.
+    pub fn ray(&self, scene: &Scene, k: usize) -> Option<Vector2<f64>> {
+        let offset = self.intrinsics.undistort(&scene.xy[k])? - self.intrinsics.principal_point;
+        Some(Vector2::new(offset.x / self.intrinsics.focal, offset.y / (self.intrinsics.aspect * self.intrinsics.focal)))
+    }
+
+    /// Squared residual, normalised units, within which an observation agrees with its landmark.
+    pub fn gate(&self, scene: &Scene) -> f64 {
+        judge::working_gate(self.noise, scene.outlier_density)
+    }
+}
