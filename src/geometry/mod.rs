@@ -15,6 +15,7 @@ pub mod metric;
 pub mod pose;
 pub mod procrustes;
 pub mod resection;
+pub mod robust_triangulation;
 pub mod statistics;
 pub mod triangulation;
 

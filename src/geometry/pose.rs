@@ -53,9 +53,7 @@ pub fn three_points(points: &[Vector3<f64>; SAMPLE], seen: &[Vector2<f64>; SAMPL
     let quartic = [
         (1.0 + q).powi(2) - 4.0 * a / b * gamma * gamma,
         4.0 * (-q * (1.0 + q) * beta + 2.0 * a / b * gamma * gamma * beta - (1.0 - w) * alpha * gamma),
-        2.0 * (q * q - 1.0
-            + 2.0 * q * q * beta * beta
-            + 2.0 * (b - c) / b * alpha * alpha
+        2.0 * (q * q - 1.0 + 2.0 * q * q * beta * beta + 2.0 * (b - c) / b * alpha * alpha
             - 4.0 * w * alpha * beta * gamma
             + 2.0 * (b - a) / b * gamma * gamma),
         4.0 * (q * (1.0 - q) * beta - (1.0 - w) * alpha * gamma + 2.0 * c / b * alpha * alpha * beta),
@@ -76,10 +74,22 @@ pub fn three_points(points: &[Vector3<f64>; SAMPLE], seen: &[Vector2<f64>; SAMPL
 fn positive_roots(quartic: &[f64; 5]) -> Vec<f64> {
     let [c0, c1, c2, c3, c4] = *quartic;
     let companion = Matrix4::new(
-        -c3 / c4, -c2 / c4, -c1 / c4, -c0 / c4, //
-        1.0, 0.0, 0.0, 0.0, //
-        0.0, 1.0, 0.0, 0.0, //
-        0.0, 0.0, 1.0, 0.0,
+        -c3 / c4,
+        -c2 / c4,
+        -c1 / c4,
+        -c0 / c4, //
+        1.0,
+        0.0,
+        0.0,
+        0.0, //
+        0.0,
+        1.0,
+        0.0,
+        0.0, //
+        0.0,
+        0.0,
+        1.0,
+        0.0,
     );
     if companion.iter().any(|entry| !entry.is_finite()) {
         return Vec::new();
@@ -105,12 +115,7 @@ fn positive_roots(quartic: &[f64; 5]) -> Vec<f64> {
 ///
 /// Draws until [`CONFIDENCE`] is reached, [`MOST_SAMPLES`] at most. Returns `None` for fewer than three correspondences or
 /// when no sample gives a pose.
-pub fn robust(
-    points: &[Vector3<f64>],
-    seen: &[Vector2<f64>],
-    gate: f64,
-    rng: &mut ChaCha8Rng,
-) -> Option<Robust> {
+pub fn robust(points: &[Vector3<f64>], seen: &[Vector2<f64>], gate: f64, rng: &mut ChaCha8Rng) -> Option<Robust> {
     if points.len() < SAMPLE || points.len() != seen.len() || !(gate > 0.0) {
         return None;
     }

@@ -132,6 +132,7 @@ fn judged(context: &Context, attempt: &Attempt, consensus: &Consensus, local: &[
         cameras: &cameras,
         normalization: context.normalization,
         lens: None,
+        linked: false,
         noise: consensus.noise,
         outlier_density: outlier_density(attempt),
         inlier_share: (consensus.inlier_count() as f64 + 1.0) / (attempt.block.tracks.len() as f64 + 2.0),
@@ -327,11 +328,7 @@ pub fn pixel_calibrations(
     for (view, description) in context.input.views().iter().enumerate() {
         first_of_group.entry(description.camera_group).or_insert(view);
     }
-    if first_of_group.len() > 1 {
-        first_of_group.into_values().map(about).collect()
-    } else {
-        vec![about(first_view)]
-    }
+    if first_of_group.len() > 1 { first_of_group.into_values().map(about).collect() } else { vec![about(first_view)] }
 }
 
 /// Root mean square and mean of the inlier observations' residuals.

@@ -10,7 +10,7 @@ use crate::domain::result::{ObservationResults, TrackResults};
 use crate::domain::{Input, StopToken};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::{Normalization, Sighting};
-use crate::geometry::{Camera, Point, triangulation};
+use crate::geometry::{Camera, Point, robust_triangulation, triangulation};
 
 /// Share of right observations in the tail, before it is known, and the tail's width in units of the core. Feature
 /// detectors have a core of .1 to .3 px and tails that a Gaussian of that width would call impossible; together with the
@@ -39,6 +39,10 @@ pub struct Geometry<'a> {
     pub normalization: &'a Normalization,
     /// The lens whose distortion is undone before the cameras, pinholes, are asked; `None`: a pinhole.
     pub lens: Option<&'a Intrinsics>,
+    /// Whether tracks were linked from view to view, so that one wrong link joins two points: the observations that
+    /// agree on one are looked for then, however few they are beside the others. The cameras must be metric. Otherwise
+    /// a track is right in most of its observations or wrong.
+    pub linked: bool,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
     /// Density of a wrong coordinate: one over the width of the points' distribution, normalised units.
@@ -165,10 +169,8 @@ fn judge_under(input: &Input, ranges: &[usize], geometry: &Geometry, noise: &Noi
         if seen.len() < LEAST_RETAINED {
             continue;
         }
-        let sightings: Vec<Sighting> = seen
-            .iter()
-            .map(|&k| Sighting { view: input.view_of(k), xy: geometry.point(input, k) })
-            .collect();
+        let sightings: Vec<Sighting> =
+            seen.iter().map(|&k| Sighting { view: input.view_of(k), xy: geometry.point(input, k) }).collect();
         let verdict = judge_track(&cameras, &sightings, geometry, noise);
         judged.tracks.weight[track] = verdict.weight as f32;
         judged.tracks.inlier[track] = verdict.inlier;
@@ -191,9 +193,10 @@ fn judge_under(input: &Input, ranges: &[usize], geometry: &Geometry, noise: &Noi
 /// Drops the worst observation as long as it is more likely wrong than right, then weighs what remains.
 fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry, noise: &NoiseModel) -> Verdict {
     let gate = observation_gate(noise, geometry.outlier_density);
-    let mut retained: Vec<usize> = (0..sightings.len()).collect();
-    let (mut point, mut cost) = triangulate(cameras, sightings);
-    let least = LEAST_RETAINED.max((LEAST_RETAINED_SHARE * sightings.len() as f64).ceil() as usize);
+    let mut retained = retained_at_first(cameras, sightings, geometry, gate);
+    let (mut point, mut cost) = triangulate(cameras, &chosen(sightings, &retained));
+    let share = if geometry.linked { 0.0 } else { LEAST_RETAINED_SHARE };
+    let least = LEAST_RETAINED.max((share * sightings.len() as f64).ceil() as usize);
     // A track that cannot retain enough is wrong already.
     while retained.len() >= least && retained.len() > LEAST_RETAINED {
         let residual = |&k: &usize| {
@@ -206,8 +209,7 @@ fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry, 
             break;
         }
         retained.remove(place);
-        let kept: Vec<Sighting> = retained.iter().map(|&k| sightings[k]).collect();
-        (point, cost) = triangulate(cameras, &kept);
+        (point, cost) = triangulate(cameras, &chosen(sightings, &retained));
     }
     let dropped = sightings.len() - retained.len();
     let ln_odds = ln_odds(cost, retained.len(), dropped, geometry, noise);
@@ -221,6 +223,19 @@ fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry, 
     }
     let whole = flags.iter().filter(|&&flag| flag).count() >= LEAST_RETAINED;
     Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
+}
+
+/// The sightings that a verdict begins with: all, or those that agree where links may be wrong.
+fn retained_at_first(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry, gate: f64) -> Vec<usize> {
+    let agreeing = geometry.linked.then(|| robust_triangulation::robust(cameras, sightings, gate)).flatten();
+    match agreeing {
+        Some(found) => (0..sightings.len()).filter(|&k| found.agrees[k]).collect(),
+        None => (0..sightings.len()).collect(),
+    }
+}
+
+fn chosen(sightings: &[Sighting], which: &[usize]) -> Vec<Sighting> {
+    which.iter().map(|&k| sightings[k]).collect()
 }
 
 fn triangulate(cameras: &[Camera], sightings: &[Sighting]) -> (Point, f64) {
@@ -268,7 +283,15 @@ mod tests {
     }
 
     fn geometry<'a>(normalization: &'a Normalization) -> Geometry<'a> {
-        Geometry { cameras: &[], normalization, lens: None, noise: 0.001, outlier_density: 2.0, inlier_share: 0.3 }
+        Geometry {
+            cameras: &[],
+            normalization,
+            lens: None,
+            linked: false,
+            noise: 0.001,
+            outlier_density: 2.0,
+            inlier_share: 0.3,
+        }
     }
 
     fn sightings(cameras: &[Camera], shifts: &[f64]) -> Vec<Sighting> {

@@ -16,7 +16,7 @@ mod zoom;
 use nalgebra::{Matrix3x4, Vector3, Vector4};
 
 use crate::domain::{FocalPrior, Grade, StopReason, StopToken, Warning, WarningCode};
-use crate::geometry::bundle::metric::{IntrinsicsModel, Reconstruction};
+use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
 use crate::geometry::bundle::{Observation, Options, projective};
 use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
 
@@ -184,6 +184,24 @@ pub fn from_metric(
     let mut outcome = grading::grade(&choice, &fit, minima, warnings)?;
     outcome.plane_at_infinity = None;
     Ok(outcome)
+}
+
+/// The log focal length that a metric reconstruction has by these observations alone, the rest of the lens held, and its
+/// standard deviation; `None` where that is not finite.
+pub fn focal_alone(
+    problem: &Problem,
+    metric: &Reconstruction,
+    prior: &IntrinsicsPrior,
+    stop: &StopToken,
+) -> Option<(f64, f64)> {
+    let start = search::Minimum { reconstruction: metric.clone(), cost: f64::INFINITY, cheirality: 0.0 };
+    let prior = prior.forgetting(Parameter::LogFocal);
+    let model = IntrinsicsModel::FOCAL;
+    let candidate =
+        models::Candidate::new(start.adjusted(problem.observations, model, &prior, stop), model, &prior, problem);
+    let sigma = candidate.sigma(Parameter::LogFocal, model, &prior)?;
+    let log_focal = candidate.minimum.log_focal();
+    (log_focal.is_finite() && sigma > 0.0).then_some((log_focal, sigma))
 }
 
 /// What is said of fewer inliers than image points alone can verify.

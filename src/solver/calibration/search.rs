@@ -97,14 +97,7 @@ pub(super) fn minima_near(
         reconstruction.intrinsics = Intrinsics::from_focal(factor * metric.intrinsics.focal);
         if factor != 1.0 {
             let options = Options { max_iterations: FOLLOWING, ..Options::default() };
-            metric::adjust(
-                &mut reconstruction,
-                problem.observations,
-                IntrinsicsModel::FIXED,
-                prior,
-                &options,
-                stop,
-            );
+            metric::adjust(&mut reconstruction, problem.observations, IntrinsicsModel::FIXED, prior, &options, stop);
         }
         let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
         found.push(start.adjusted(problem.observations, IntrinsicsModel::FOCAL, prior, stop));

@@ -27,8 +27,6 @@ pub struct Part {
     pub tracks: Vec<usize>,
     pub reconstruction: Reconstruction,
     pub observations: Vec<Observation>,
-    /// Observation of the input of each.
-    pub sources: Vec<usize>,
 }
 
 impl Part {
@@ -47,14 +45,12 @@ impl Part {
             tracks: Vec::with_capacity(tracks.len()),
             reconstruction: Reconstruction { intrinsics: model.intrinsics, poses, points: Vec::new() },
             observations: Vec::new(),
-            sources: Vec::new(),
         };
         for &track in tracks {
             let Some(landmark) = model.landmarks[track] else { continue };
             let point = part.tracks.len();
             for k in scene.of_track(track).filter(|&k| model.kept[k] && place[scene.view_of(k)] != usize::MAX) {
                 part.observations.push(Observation { camera: place[scene.view_of(k)], point, xy: scene.xy[k] });
-                part.sources.push(k);
             }
             part.tracks.push(track);
             part.reconstruction.points.push(landmark.position);
@@ -106,7 +102,7 @@ pub fn knowledge(scene: &Scene, noise: f64) -> IntrinsicsPrior {
 /// Adjusts all registered views with the landmarks that hold them best, while more are to come.
 pub fn while_growing(scene: &Scene, model: &mut Model) {
     let views = model.registered();
-    let tracks = covering(scene, model, OF_VIEW_WHILE_GROWING);
+    let tracks = covering(scene, model, &views, OF_VIEW_WHILE_GROWING);
     let mut part = Part::new(scene, model, &views, &tracks);
     part.adjust(scene, model, model.free, ITERATIONS_WHILE_GROWING);
     finish(scene, model, &part);
@@ -141,15 +137,24 @@ pub fn verified(model: &Model) -> Vec<usize> {
     (0..model.landmarks.len()).filter(is_verified).collect()
 }
 
-/// The longest of the verified tracks until every view has `of_view` observations, or all that it has.
-pub fn covering(scene: &Scene, model: &Model, of_view: usize) -> Vec<usize> {
-    let mut tracks = verified(model);
+/// The longest of the verified tracks until every one of these views has `of_view` observations, or all that it has.
+pub fn covering(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -> Vec<usize> {
+    let mut wanted = vec![0usize; model.poses.len()];
+    views.iter().for_each(|&view| wanted[view] = of_view);
+    let mut seen: Vec<usize> =
+        views.iter().flat_map(|&view| &scene.of_view[view]).map(|&k| scene.track_of(k as usize)).collect();
+    seen.sort_unstable();
+    seen.dedup();
+    let mut tracks: Vec<usize> = seen
+        .into_iter()
+        .filter(|&track| model.landmarks[track].is_some_and(|landmark| landmark.is_verified()))
+        .collect();
     let support = |track: usize| model.landmarks[track].map_or(0, |landmark| landmark.support);
     tracks.sort_by_key(|&track| (std::cmp::Reverse(support(track)), track));
     let mut observed = vec![0usize; model.poses.len()];
     tracks.retain(|&track| {
         let kept = || scene.of_track(track).filter(|&k| model.kept[k]).map(|k| scene.view_of(k));
-        let needed = kept().any(|view| observed[view] < of_view);
+        let needed = kept().any(|view| observed[view] < wanted[view]);
         if needed {
             kept().for_each(|view| observed[view] += 1);
         }

@@ -77,6 +77,7 @@ fn judged(scene: &Scene, model: &Model) -> Judged {
         cameras: &cameras,
         normalization: context.normalization,
         lens: Some(&model.intrinsics).filter(|intrinsics| intrinsics.radial != 0.0),
+        linked: true,
         noise: model.noise,
         outlier_density: scene.outlier_density,
         inlier_share: (verified as f64 + 1.0) / (tried.max(verified) as f64 + 2.0),

@@ -3,7 +3,7 @@
 //! Tracks of real sequences live a few views: no block of complete tracks holds them all. A block that was solved is the
 //! seed; view after view is resected against the points that stand ([`register`]), its tracks are triangulated
 //! ([`structure`]), and bundle adjustment with the calibration free keeps the whole straight ([`adjust`]). What the
-//! whole says of the calibration is graded anew ([`calibrate`]), and every track and observation is judged by it
+//! whole says of the calibration is graded anew ([`calibrate`]) and checked between its [`windows`], and every track and observation is judged by it
 //! ([`assemble`]).
 
 mod adjust;
@@ -12,6 +12,7 @@ mod calibrate;
 mod model;
 mod register;
 mod structure;
+mod windows;
 
 pub use assemble::solved;
 

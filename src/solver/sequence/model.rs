@@ -119,7 +119,10 @@ impl Model {
     /// The direction `(u, v)` at unit depth in which an observation is seen.
     pub fn ray(&self, scene: &Scene, k: usize) -> Option<Vector2<f64>> {
         let offset = self.intrinsics.undistort(&scene.xy[k])? - self.intrinsics.principal_point;
-        Some(Vector2::new(offset.x / self.intrinsics.focal, offset.y / (self.intrinsics.aspect * self.intrinsics.focal)))
+        Some(Vector2::new(
+            offset.x / self.intrinsics.focal,
+            offset.y / (self.intrinsics.aspect * self.intrinsics.focal),
+        ))
     }
 
     /// Squared residual, normalised units, within which an observation agrees with its landmark.

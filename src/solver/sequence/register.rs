@@ -69,7 +69,8 @@ pub fn all(scene: &Scene, model: &mut Model, recorder: &mut Recorder) -> Result<
             settle(scene, model);
             adjusted_at = registered;
         }
-        recorder.standing.inliers = model.landmarks.iter().flatten().filter(|landmark| landmark.is_verified()).count() as u32;
+        recorder.standing.inliers =
+            model.landmarks.iter().flatten().filter(|landmark| landmark.is_verified()).count() as u32;
         recorder.standing.focal_px = Some(model.intrinsics.focal * scene.context.scale_px);
         recorder.tell(registered as f64 / views.len().max(1) as f64);
     }
@@ -112,10 +113,8 @@ fn register(scene: &Scene, model: &mut Model, view: usize, seen: &[usize], rng: 
     let step = seen.len().div_ceil(MOST_POINTS);
     let pairs: Vec<(usize, nalgebra::Vector2<f64>)> =
         seen.iter().step_by(step).filter_map(|&k| Some((k, model.ray(scene, k)?))).collect();
-    let points: Vec<_> = pairs
-        .iter()
-        .filter_map(|(k, _)| Some(model.landmarks[scene.track_of(*k)]?.position))
-        .collect();
+    let points: Vec<_> =
+        pairs.iter().filter_map(|(k, _)| Some(model.landmarks[scene.track_of(*k)]?.position)).collect();
     let rays: Vec<_> = pairs.iter().map(|(_, ray)| *ray).collect();
     let gate = model.gate(scene) / model.intrinsics.focal.powi(2);
     let Some(found) = pose::robust(&points, &rays, gate, rng) else { return 0 };

@@ -1,18 +1,11 @@
-//! Points from tracks of which some observations are wrong.
+//! The points of a reconstruction, triangulated from tracks with wrong links.
 
 use nalgebra::Vector3;
 
 use super::model::{Landmark, Model, Scene};
 use crate::geometry::measurement::Sighting;
-use crate::geometry::{Camera, Point, triangulation};
+use crate::geometry::{Point, robust_triangulation};
 
-/// Sightings that a hypothesis is made of: links of a track are made between neighbouring views, so that a wrong one
-/// parts it into runs that are right each.
-const RUNS: [usize; 2] = [3, 2];
-/// Sightings beyond which the hypotheses of a track are thinned: its rest decides as well.
-const MOST_HYPOTHESES: usize = 30;
-/// Refinement steps of a point.
-const POINT_STEPS: usize = 8;
 /// Observations that two views and one that verifies them make.
 const VERIFIED: usize = 3;
 /// Angle between the rays from which the depth of a point is known well enough to support a pose, radians: .3 degrees
@@ -45,18 +38,19 @@ pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
             continue;
         }
         let sightings: Vec<Sighting> = seen.iter().map(|(_, sighting)| *sighting).collect();
-        let Some((position, agrees)) = consensus(&cameras, &sightings, gate) else { continue };
-        let rays = seen.iter().zip(&agrees).filter(|(_, agrees)| **agrees).filter_map(|((_, sighting), _)| {
+        let Some(found) = robust_triangulation::robust(&cameras, &sightings, gate) else { continue };
+        let Some(position) = euclidean(&found.point) else { continue };
+        let rays = seen.iter().zip(&found.agrees).filter(|(_, agrees)| **agrees).filter_map(|((_, sighting), _)| {
             let pose = model.poses[sighting.view]?;
             Some((position + pose.rotation.tr_mul(&pose.translation)).normalize())
         });
         let landmark = Landmark {
             position,
             angle: widest_angle(&rays.collect::<Vec<_>>()),
-            support: agrees.iter().filter(|&&agrees| agrees).count(),
+            support: found.agrees.iter().filter(|&&agrees| agrees).count(),
         };
         model.landmarks[track] = Some(landmark);
-        for ((k, _), agrees) in seen.iter().zip(agrees) {
+        for ((k, _), agrees) in seen.iter().zip(found.agrees) {
             model.kept[*k] = agrees;
         }
     }
@@ -72,71 +66,6 @@ impl Landmark {
     pub fn is_verified(&self) -> bool {
         self.support >= VERIFIED && self.angle > LEAST_ANGLE
     }
-}
-
-/// The point that most sightings agree with, in front of their cameras, and which do; `None` where no two do.
-fn consensus(cameras: &[Camera], sightings: &[Sighting], gate: f64) -> Option<(Vector3<f64>, Vec<bool>)> {
-    let all = triangulation::linear(cameras, sightings);
-    let (all, _) = triangulation::refine(cameras, sightings, all, POINT_STEPS);
-    let agrees = agreeing(cameras, sightings, &all, gate);
-    if agrees.iter().all(|&agrees| agrees) {
-        return Some((euclidean(&all)?, agrees));
-    }
-    let mut best: Option<(Point, f64)> = None;
-    let mut offer = |point: Point| {
-        let cost = truncated(cameras, sightings, &point, gate);
-        if best.is_none_or(|(_, least)| cost < least) {
-            best = Some((point, cost));
-        }
-    };
-    offer(all);
-    for run in RUNS {
-        let starts = (sightings.len() + 1).saturating_sub(run);
-        for start in (0..starts).step_by(starts.div_ceil(MOST_HYPOTHESES).max(1)) {
-            offer(triangulation::linear(cameras, &sightings[start..start + run]));
-        }
-    }
-    // The widest pair of a track whose neighbours are all too near.
-    if let [first, .., last] = sightings {
-        offer(triangulation::linear(cameras, &[*first, *last]));
-    }
-    let (point, _) = best?;
-    let mut agrees = agreeing(cameras, sightings, &point, gate);
-    let right = chosen(sightings, &agrees);
-    if right.len() < 2 {
-        return None;
-    }
-    let (point, _) = triangulation::refine(cameras, &right, point, POINT_STEPS);
-    let refined = agreeing(cameras, sightings, &point, gate);
-    let count = |flags: &[bool]| flags.iter().filter(|&&flag| flag).count();
-    if count(&refined) < count(&agrees).min(2) {
-        return None;
-    }
-    agrees = refined;
-    (count(&agrees) >= 2).then_some((euclidean(&point)?, agrees))
-}
-
-fn chosen(sightings: &[Sighting], which: &[bool]) -> Vec<Sighting> {
-    sightings.iter().zip(which).filter(|(_, chosen)| **chosen).map(|(sighting, _)| *sighting).collect()
-}
-
-/// Whether each sighting is within the gate of the point, and the point in front of its camera.
-fn agreeing(cameras: &[Camera], sightings: &[Sighting], point: &Point, gate: f64) -> Vec<bool> {
-    sightings.iter().map(|sighting| squared(cameras, sighting, point) < gate).collect()
-}
-
-/// Squared residual, infinite behind the camera.
-fn squared(cameras: &[Camera], sighting: &Sighting, point: &Point) -> f64 {
-    let camera = &cameras[sighting.view];
-    let depth = (camera.row(2) * point).x * point.w.signum();
-    if depth <= 0.0 {
-        return f64::INFINITY;
-    }
-    triangulation::reprojection(camera, point, &sighting.xy).norm_squared()
-}
-
-fn truncated(cameras: &[Camera], sightings: &[Sighting], point: &Point, gate: f64) -> f64 {
-    sightings.iter().map(|sighting| squared(cameras, sighting, point).min(gate)).sum()
 }
 
 /// `None` at infinity.

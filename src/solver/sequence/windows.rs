@@ -1,0 +1,157 @@
+//! What windows of a sequence say of each other's focal length.
+//!
+//! The formal uncertainty of one adjustment knows noise and nothing else; distortion beyond the model, a wrong track or a
+//! motion that hardly turns moves windows apart by more than it admits. They are fused by information weight, with a
+//! common misfit that makes their chi-square what it should be (DerSimonian & Laird 1986).
+
+use super::adjust::{self, Part};
+use super::calibrate;
+use super::model::{Model, Scene};
+use crate::domain::{Warning, WarningCode};
+use crate::solver::calibration::{self, Outcome, grade_of_sigma};
+use crate::solver::{Context, Error};
+
+/// Views of a window where there are many, and of the shortest one: below, a window says little of a focal length.
+const VIEWS: usize = 10;
+const LEAST_VIEWS: usize = 5;
+/// Windows at most, evenly spread over the sequence: the misfit is known to a tenth then.
+const MOST_WINDOWS: usize = 50;
+/// Observations of a view that a window holds.
+const OF_VIEW: usize = 150;
+/// Growth of sigma from which a warning says why.
+const WORTH_A_WARNING: f64 = 3.0;
+
+/// Log focal length and its standard deviation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    pub log_focal: f64,
+    pub sigma: f64,
+}
+
+/// Several estimates as one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Fused {
+    pub sigma: f64,
+    /// Standard deviation of what each has beside its own sigma.
+    pub misfit: f64,
+    /// Chi-square per degree of freedom without it.
+    pub chi_square: f64,
+}
+
+/// Raises the sigma of a sequence's calibration to what its windows admit, grades it anew and says so.
+pub fn reconcile(scene: &Scene, model: &Model, context: &Context, outcome: &mut Outcome) -> Result<(), Error> {
+    let Some(own) = outcome.sigma_log_focal else { return Ok(()) };
+    let estimates = estimates(scene, model, context)?;
+    let Some(fused) = fuse(&estimates) else { return Ok(()) };
+    let sigma = own.max(fused.sigma);
+    outcome.sigma_log_focal = Some(sigma);
+    outcome.grade = outcome.grade.worse(grade_of_sigma(Some(sigma)));
+    if sigma > WORTH_A_WARNING * own {
+        outcome.warnings.push(Warning::new(
+            WarningCode::ModelMismatch,
+            format!(
+                "{} windows of the sequence differ in focal length by {:.2} % (one standard deviation beside their own), \
+                 chi-square {:.1} a degree of freedom; sigma was raised from {:.3} to {:.3} %",
+                estimates.len(),
+                100.0 * fused.misfit,
+                fused.chi_square,
+                100.0 * own,
+                100.0 * sigma
+            ),
+        ));
+    }
+    Ok(())
+}
+
+/// What each window says by itself, the lens as the whole has it.
+fn estimates(scene: &Scene, model: &Model, context: &Context) -> Result<Vec<Estimate>, Error> {
+    let mut found = Vec::new();
+    for views in windows(&model.registered()) {
+        context.stopped()?;
+        let part = calibrate::core(scene, model, &views, OF_VIEW);
+        found.extend(estimate(scene, model, &part, context));
+    }
+    Ok(found)
+}
+
+fn estimate(scene: &Scene, model: &Model, part: &Part, context: &Context) -> Option<Estimate> {
+    let metric = &part.reconstruction;
+    let (cameras, points) = calibrate::projective(metric);
+    let problem = calibration::Problem {
+        cameras: &cameras,
+        points: &points,
+        observations: &part.observations,
+        noise: model.noise,
+        focal_prior: None,
+        focal_per_view: false,
+    };
+    let prior = adjust::knowledge(scene, model.noise);
+    let (log_focal, sigma) = calibration::focal_alone(&problem, metric, &prior, context.stop)?;
+    Some(Estimate { log_focal, sigma })
+}
+
+/// Runs of consecutive registered views, not overlapping; none where there are fewer than two.
+fn windows(views: &[usize]) -> Vec<Vec<usize>> {
+    let count = (views.len() / VIEWS).max(2);
+    if views.len() < 2 * LEAST_VIEWS {
+        return Vec::new();
+    }
+    let all = (0..count).map(|k| views[k * views.len() / count..(k + 1) * views.len() / count].to_vec());
+    let step = count.div_ceil(MOST_WINDOWS);
+    all.step_by(step).collect()
+}
+
+/// `None` for fewer than two.
+pub fn fuse(estimates: &[Estimate]) -> Option<Fused> {
+    if estimates.len() < 2 {
+        return None;
+    }
+    let weights = |misfit: f64| -> Vec<f64> {
+        estimates.iter().map(|estimate| (estimate.sigma.powi(2) + misfit * misfit).recip()).collect()
+    };
+    let weight = weights(0.0);
+    let total: f64 = weight.iter().sum();
+    let mean = weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.log_focal).sum::<f64>() / total;
+    let statistic: f64 =
+        weight.iter().zip(estimates).map(|(weight, estimate)| weight * (estimate.log_focal - mean).powi(2)).sum();
+    let freedom = (estimates.len() - 1) as f64;
+    let scale = total - weight.iter().map(|weight| weight * weight).sum::<f64>() / total;
+    let misfit = ((statistic - freedom).max(0.0) / scale).sqrt();
+    let sigma = weights(misfit).iter().sum::<f64>().sqrt().recip();
+    (sigma.is_finite() && misfit.is_finite()).then_some(Fused { sigma, misfit, chi_square: statistic / freedom })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn estimates(values: &[(f64, f64)]) -> Vec<Estimate> {
+        values.iter().map(|&(log_focal, sigma)| Estimate { log_focal, sigma }).collect()
+    }
+
+    #[test]
+    fn estimates_that_agree_fuse_by_information() {
+        let fused = fuse(&estimates(&[(0.0, 0.01), (0.005, 0.01), (-0.003, 0.01), (0.002, 0.01)])).expect("four");
+        assert_eq!(fused.misfit, 0.0);
+        assert!((fused.sigma - 0.005).abs() < 1e-12, "{fused:?}");
+        assert_eq!(fuse(&estimates(&[(0.0, 0.01)])), None);
+    }
+
+    #[test]
+    fn estimates_that_differ_by_more_than_they_admit_raise_sigma() {
+        let fused = fuse(&estimates(&[(0.1, 0.001), (-0.1, 0.001), (0.1, 0.001), (-0.1, 0.001)])).expect("four");
+        // Four values of standard deviation .115: their mean is known to half of that.
+        assert!((fused.misfit - 0.1155).abs() < 1e-3 && (fused.sigma - 0.0577).abs() < 1e-3, "{fused:?}");
+        // One that knows nothing refutes nothing.
+        let fused = fuse(&estimates(&[(0.0, 0.001), (0.5, 0.6)])).expect("two");
+        assert_eq!(fused.misfit, 0.0);
+    }
+
+    #[test]
+    fn windows_are_runs_of_about_ten() {
+        assert!(windows(&(0..9).collect::<Vec<_>>()).is_empty());
+        assert_eq!(windows(&(0..11).collect::<Vec<_>>()).iter().map(Vec::len).collect::<Vec<_>>(), [5, 6]);
+        assert_eq!(windows(&(0..40).collect::<Vec<_>>()).iter().map(Vec::len).collect::<Vec<_>>(), [10; 4]);
+        assert_eq!(windows(&(0..1000).collect::<Vec<_>>()).len(), MOST_WINDOWS);
+    }
+}
