@@ -178,8 +178,8 @@ fn square_pixels() -> f64 {
 /// One view of the result.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ViewResult {
-    /// 3x4 projective camera in pixels, row by row, in the frame `P1 = [I|0]` of the first registered view.
-    /// `None`: the view is not registered.
+    /// 3x4 projective camera in pixels, row by row, in the frame `P1 = [I|0]` of the first registered view of
+    /// its part. `None`: the view is not registered.
     pub projection: Option<[[f64; 4]; 3]>,
     /// Metric pose: `x ~ K (R X + t)`; row by row. `None` where there is no metric reconstruction.
     pub rotation: Option<[[f64; 3]; 3]>,
@@ -187,6 +187,10 @@ pub struct ViewResult {
     /// The view's own focal length; `None` where that of the calibration is every view's.
     #[serde(default)]
     pub focal_px: Option<f64>,
+    /// Which reconstruction the view belongs to, the largest first: views that share no tracks have frames and scales of
+    /// their own. 0 where there is one, and for views that are not registered.
+    #[serde(default)]
+    pub part: u32,
 }
 
 /// What the geometry says of every track of the input (parallel arrays, one entry a track).

@@ -150,6 +150,8 @@ pub struct CameraJson {
     /// The caller's id of the view.
     pub view: u64,
     pub registered: bool,
+    /// Reconstruction that a registered view belongs to; each has a frame and a scale of its own.
+    pub part: Option<u32>,
     pub P: Option<[[f64; 4]; 3]>,
     pub K: Option<[[f64; 3]; 3]>,
     pub R: Option<[[f64; 3]; 3]>,
@@ -167,6 +169,7 @@ impl CamerasJson {
             CameraJson {
                 view: view_label(input, index),
                 registered: view.projection.is_some(),
+                part: view.projection.map(|_| view.part),
                 P: view.projection,
                 K: calibration.filter(|_| is_metric).map(|shared| intrinsics(shared, view.focal_px)),
                 R: view.rotation.filter(|_| is_metric),

@@ -130,6 +130,7 @@ fn judged(context: &Context, attempt: &Attempt, consensus: &Consensus, local: &[
     }
     let geometry = Geometry {
         cameras: &cameras,
+        parts: None,
         normalization: context.normalization,
         lens: None,
         linked: false,
@@ -248,6 +249,7 @@ fn views(context: &Context, attempt: &Attempt, local: &[Camera], metric: Option<
                 .map(|pose| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
             translation: pose.map(|pose| pose.translation.into()),
             focal_px: pose.and_then(|_| own_focal(attempt, i)).map(|focal| focal * context.scale_px),
+            part: 0,
         };
     }
     views

@@ -71,6 +71,7 @@ impl Attempt {
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let most = match context.settings.method {
+        Method::Auto | Method::Geometry if context.seeding => SEARCHED_TRACKS.1,
         Method::Auto | Method::Geometry => {
             let views = block.views.len().max(1);
             (SEARCHED_WORK / (views * views)).clamp(SEARCHED_TRACKS.1, SEARCHED_TRACKS.0)
@@ -146,6 +147,10 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     }
     attempt.second_structure = second::structure(complete, &refined, context.stop);
     context.stopped()?;
+    if context.seeding {
+        attempt.consensus = Some(refined);
+        return Ok(());
+    }
     let extended = extend::extend(&attempt.block, &refined, context);
     context.stopped()?;
     if let Some((block, consensus)) = extended {
@@ -206,7 +211,9 @@ fn calibrate(block: &Block, consensus: &Consensus, context: &Context) -> Result<
         observations: &observations,
         noise: consensus.noise,
         focal_per_view: context.settings.focal_per_view,
-        focal_prior: focal_prior(block.views.iter().map(|&view| &context.input.views()[view])),
+        focal_prior: context
+            .focal_prior
+            .or_else(|| focal_prior(block.views.iter().map(|&view| &context.input.views()[view]))),
     };
     Ok(calibration::calibrate(&problem, context.scale_px, context.stop)?)
 }

@@ -128,8 +128,13 @@ pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec
         let count = views.len().min(MOST_VIEWS_WHOLE);
         return vec![(0..count).map(|k| views[k * views.len() / count]).collect()];
     }
+    candidate_views_among(input, ranges, &vec![true; input.view_count()], stop)
+}
+
+/// The same of incomplete tracks, only of views that are `open` (one entry a view).
+pub fn candidate_views_among(input: &Input, ranges: &[usize], open: &[bool], stop: &StopToken) -> Vec<Vec<usize>> {
     for least in [WANTED_TRACKS, LEAST_TRACKS] {
-        let found = greedy_views(input, ranges, least, stop);
+        let found = greedy_views(input, ranges, open, least, stop);
         if !found.is_empty() {
             return found;
         }
@@ -155,9 +160,9 @@ pub fn observed_views(input: &Input) -> Vec<usize> {
 
 /// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on
 /// the way, keeps the one with most constraints.
-fn greedy_views(input: &Input, ranges: &[usize], least: usize, stop: &StopToken) -> Vec<Vec<usize>> {
+fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, stop: &StopToken) -> Vec<Vec<usize>> {
     let mut tracks_of_view: Vec<Vec<usize>> = vec![Vec::new(); input.view_count()];
-    for k in 0..input.observation_count() {
+    for k in (0..input.observation_count()).filter(|&k| open[input.view_of(k)]) {
         tracks_of_view[input.view_of(k)].push(input.track_of(k));
     }
     let mut found: Vec<(usize, Vec<usize>)> = Vec::new();
@@ -172,7 +177,7 @@ fn greedy_views(input: &Input, ranges: &[usize], least: usize, stop: &StopToken)
         while views.len() < MOST_VIEWS {
             let mut counts = vec![0usize; input.view_count()];
             for &track in &tracks {
-                for k in ranges[track]..ranges[track + 1] {
+                for k in (ranges[track]..ranges[track + 1]).filter(|&k| open[input.view_of(k)]) {
                     counts[input.view_of(k)] += 1;
                 }
             }
@@ -202,11 +207,10 @@ fn greedy_views(input: &Input, ranges: &[usize], least: usize, stop: &StopToken)
     diverse(found.into_iter().map(|(_, views)| views).collect())
 }
 
-/// The views that blocks are begun from: all, or as many as are affordable, evenly along the sequence.
+/// The views that blocks are begun from: all that see something, or as many as are affordable, evenly along the sequence.
 fn first_views(tracks_of_view: &[Vec<usize>]) -> Vec<usize> {
-    let views = tracks_of_view.len();
-    let count = views.min(MOST_FIRST_VIEWS);
-    (0..count).map(|k| k * views / count).collect()
+    let seeing: Vec<usize> = (0..tracks_of_view.len()).filter(|&view| !tracks_of_view[view].is_empty()).collect();
+    super::extend::evenly(&seeing, MOST_FIRST_VIEWS)
 }
 
 /// At most [`MOST_BLOCKS`] of the ranked sets: those that share at most half of their views with every better one

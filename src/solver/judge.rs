@@ -36,6 +36,8 @@ const POINT_STEPS: usize = 10;
 pub struct Geometry<'a> {
     /// Projective camera of every view of the input, normalised; `None`: not registered.
     pub cameras: &'a [Option<Camera>],
+    /// Where views are in several frames: the frame of each view and the one that each track is judged in.
+    pub parts: Option<(&'a [u32], &'a [u32])>,
     pub normalization: &'a Normalization,
     /// The lens whose distortion is undone before the cameras, pinholes, are asked; `None`: a pinhole.
     pub lens: Option<&'a Intrinsics>,
@@ -52,6 +54,11 @@ pub struct Geometry<'a> {
 }
 
 impl Geometry<'_> {
+    /// Whether a track is judged by what a view saw of it.
+    fn judges(&self, track: usize, view: usize) -> bool {
+        self.cameras[view].is_some() && self.parts.is_none_or(|(of_view, of_track)| of_view[view] == of_track[track])
+    }
+
     /// Where a pinhole would see observation `k`; what a lens images nowhere stays where it is, far from any point.
     fn point(&self, input: &Input, k: usize) -> Vector2<f64> {
         let xy = self.normalization.normalize(input.view_of(k), input.point_px(k));
@@ -165,7 +172,7 @@ fn judge_under(input: &Input, ranges: &[usize], geometry: &Geometry, noise: &Noi
             break;
         }
         let seen: Vec<usize> =
-            (ranges[track]..ranges[track + 1]).filter(|&k| geometry.cameras[input.view_of(k)].is_some()).collect();
+            (ranges[track]..ranges[track + 1]).filter(|&k| geometry.judges(track, input.view_of(k))).collect();
         if seen.len() < LEAST_RETAINED {
             continue;
         }
@@ -285,6 +292,7 @@ mod tests {
     fn geometry<'a>(normalization: &'a Normalization) -> Geometry<'a> {
         Geometry {
             cameras: &[],
+            parts: None,
             normalization,
             lens: None,
             linked: false,

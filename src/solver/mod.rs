@@ -27,7 +27,9 @@ mod sequence;
 #[cfg(test)]
 mod tests;
 
-use crate::domain::{Input, Observer, Solution, SolveSettings, StopReason, StopToken, Warning, WarningCode};
+use crate::domain::{
+    FocalPrior, Input, Observer, Solution, SolveSettings, StopReason, StopToken, Warning, WarningCode,
+};
 use crate::geometry::measurement::Normalization;
 use attempt::Attempt;
 use recorder::Recorder;
@@ -64,13 +66,21 @@ pub fn solve(
     let settings = &SolveSettings { use_daq: settings.use_daq && !settings.focal_per_view, ..settings.clone() };
     let mut recorder = Recorder::new(observer);
     let ranges = block::track_ranges(input);
-    let (normalization, mut warnings) = block::normalization(input);
+    let (normalization, warnings) = block::normalization(input);
     let scale_px = normalization.scale_px;
-    let context = Context { input, settings, ranges: &ranges, normalization: &normalization, scale_px, stop };
+    let context = Context {
+        input,
+        settings,
+        ranges: &ranges,
+        normalization: &normalization,
+        scale_px,
+        seeding: false,
+        focal_prior: None,
+        stop,
+    };
     let candidates = block::candidate_views(input, &ranges, stop);
-    let extends = sequence::applies(&context);
-    if extends {
-        recorder.expect_extension();
+    if sequence::applies(&context) {
+        return solve_sequence(&candidates, &context, warnings, recorder);
     }
     let mut best: Option<Attempt> = None;
     let mut others = Vec::new();
@@ -93,21 +103,38 @@ pub fn solve(
     if let Some(best) = &mut best {
         agreement::reconcile(best, &others);
     }
-    if extends && let Some(seed) = &best {
-        recorder.begin_extension();
-        if let Some(extended) = sequence::extend(seed, &context, &mut recorder)?
-            && extended.improves_on(seed)
-        {
-            let solution = sequence::solved(extended, seed, warnings, recorder);
+    of_block(best.as_ref(), &context, warnings, recorder)
+}
+
+/// Solves an input whose tracks live a few views.
+fn solve_sequence(
+    candidates: &[Vec<usize>],
+    context: &Context,
+    warnings: Vec<Warning>,
+    mut recorder: Recorder,
+) -> Result<Solution, Error> {
+    match sequence::solve(candidates, context, &mut recorder)? {
+        sequence::Ended::Extended(extended) => {
+            let solution = sequence::solved(*extended, warnings, recorder);
             context.stopped()?;
-            return Ok(solution);
+            Ok(solution)
         }
+        sequence::Ended::Block(best) => of_block(best.as_ref(), context, warnings, recorder),
     }
-    let solution = match &best {
-        Some(attempt) if attempt.consensus.is_some() => assemble::solved(&context, attempt, warnings, recorder),
+}
+
+/// The solution that the best block gives.
+fn of_block(
+    best: Option<&Attempt>,
+    context: &Context,
+    mut warnings: Vec<Warning>,
+    recorder: Recorder,
+) -> Result<Solution, Error> {
+    let solution = match best {
+        Some(attempt) if attempt.consensus.is_some() => assemble::solved(context, attempt, warnings, recorder),
         best => {
-            warnings.push(why_unsolved(input, best.as_ref()));
-            assemble::unsolved(&context, best.as_ref(), warnings, recorder)
+            warnings.push(why_unsolved(context.input, best));
+            assemble::unsolved(context, best, warnings, recorder)
         }
     };
     context.stopped()?;
@@ -124,6 +151,10 @@ struct Context<'a> {
     normalization: &'a Normalization,
     /// Length of a normalised unit in pixels.
     scale_px: f64,
+    /// The block is the seed of a sequence: as much of it is solved as carries a calibration, and no more.
+    seeding: bool,
+    /// What is known of the focal length beside what the views bring: what another part of the input said.
+    focal_prior: Option<FocalPrior>,
     stop: &'a StopToken,
 }
 

@@ -89,6 +89,7 @@ impl<'a> Recorder<'a> {
     /// Begins another block, `block` of at most `blocks`, counted from 0.
     pub fn begin_block(&mut self, block: usize, blocks: usize) {
         self.block = block;
+        self.extending = false;
         self.blocks = blocks.max(1);
         self.earlier_iterations += self.standing.iteration;
         self.standing = Standing::default();

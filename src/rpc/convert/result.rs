@@ -117,6 +117,7 @@ fn view_to_wire(view: &ViewResult) -> proto::ViewResult {
         rotation: view.rotation.iter().flatten().flatten().copied().collect(),
         translation: view.translation.iter().flatten().copied().collect(),
         focal_px: view.focal_px,
+        part: view.part,
     }
 }
 
@@ -133,6 +134,7 @@ fn view_from_wire((index, view): (usize, &proto::ViewResult)) -> Result<ViewResu
             other => return Err(wrong("translation", 3, other)),
         },
         focal_px: view.focal_px,
+        part: view.part,
     })
 }
 
@@ -250,7 +252,13 @@ mod tests {
             ],
             plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),
             views: vec![
-                ViewResult { projection, rotation, translation: Some([0.0, -1.0, 2.0]), focal_px: Some(987.5) },
+                ViewResult {
+                    projection,
+                    rotation,
+                    translation: Some([0.0, -1.0, 2.0]),
+                    focal_px: Some(987.5),
+                    part: 1,
+                },
                 ViewResult { projection, ..ViewResult::default() },
                 ViewResult::default(),
             ],

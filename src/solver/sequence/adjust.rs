@@ -1,8 +1,7 @@
 //! Bundle adjustment of a sequence: of what stands, with the calibration free.
 
-use nalgebra::Vector3;
-
 use super::model::{Model, Scene};
+use super::parts::FIRST;
 use crate::geometry::bundle::metric::{self, IntrinsicsModel, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::{Loss, Observation, Options};
 use crate::geometry::statistics::median;
@@ -99,12 +98,14 @@ pub fn knowledge(scene: &Scene, noise: f64) -> IntrinsicsPrior {
     crate::solver::calibration::knowledge(noise, crate::solver::attempt::focal_prior(views), context.scale_px)
 }
 
-/// Adjusts all registered views with the landmarks that hold them best, while more are to come.
-pub fn while_growing(scene: &Scene, model: &mut Model) {
-    let views = model.registered();
+/// Adjusts the views of a part with the landmarks that hold them best, while more are to come. The calibration is the
+/// first part's: the others are held to it until all are adjusted together.
+pub fn while_growing(scene: &Scene, model: &mut Model, part: u32) {
+    let views = model.of_part(part);
+    let free = if part == FIRST { model.free } else { IntrinsicsModel::FIXED };
     let tracks = covering(scene, model, &views, OF_VIEW_WHILE_GROWING);
     let mut part = Part::new(scene, model, &views, &tracks);
-    part.adjust(scene, model, model.free, ITERATIONS_WHILE_GROWING);
+    part.adjust(scene, model, free, ITERATIONS_WHILE_GROWING);
     finish(scene, model, &part);
 }
 
@@ -164,15 +165,15 @@ pub fn covering(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -
     tracks
 }
 
-/// Moves a model so that its registered views stay as they are but for scale: the median depth becomes 1.
+/// Scales a part so that its median depth becomes 1.
 ///
 /// Scale is free, and adjustments damp best near unit lengths.
-pub fn rescale(scene: &Scene, model: &mut Model) {
+pub fn rescale(scene: &Scene, model: &mut Model, part: u32) {
     let mut depths: Vec<f64> = (0..scene.xy.len())
         .filter(|&k| model.kept[k])
         .filter_map(|k| {
             let pose = model.poses[scene.view_of(k)]?;
-            let landmark = model.landmarks[scene.track_of(k)]?;
+            let landmark = model.landmarks[scene.track_of(k)].filter(|landmark| landmark.part == part)?;
             Some(pose.apply(&landmark.position).z)
         })
         .collect();
@@ -180,7 +181,11 @@ pub fn rescale(scene: &Scene, model: &mut Model) {
     if !(scale.is_finite() && scale > 0.0) {
         return;
     }
-    model.poses.iter_mut().flatten().for_each(|pose| pose.translation *= scale);
-    let scaled = |position: &mut Vector3<f64>| *position *= scale;
-    model.landmarks.iter_mut().flatten().for_each(|landmark| scaled(&mut landmark.position));
+    for view in model.of_part(part) {
+        if let Some(pose) = &mut model.poses[view] {
+            pose.translation *= scale;
+        }
+    }
+    let landmarks = model.landmarks.iter_mut().flatten().filter(|landmark| landmark.part == part);
+    landmarks.for_each(|landmark| landmark.position *= scale);
 }

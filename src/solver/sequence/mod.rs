@@ -1,39 +1,51 @@
-//! From a calibrated block of views to the whole sequence.
+//! From a calibrated block to the whole sequence.
 //!
 //! Tracks of real sequences live a few views: no block of complete tracks holds them all. A block that was solved is the
 //! seed; view after view is resected against the points that stand ([`register`]), its tracks are triangulated
-//! ([`structure`]), and bundle adjustment with the calibration free keeps the whole straight ([`adjust`]). What the
-//! whole says of the calibration is graded anew ([`calibrate`]) and checked between its [`windows`], and every track and observation is judged by it
-//! ([`assemble`]).
+//! ([`structure`]), and bundle adjustment with the calibration free keeps the whole straight ([`adjust`]). Views that
+//! share no tracks with it become [`parts`] of their own under the same calibration. What the whole says of the
+//! calibration is graded anew ([`calibrate`]) and checked between its [`windows`], and every track and observation is
+//! judged by it ([`assemble`]).
 
 mod adjust;
 mod assemble;
 mod calibrate;
 mod model;
+mod parts;
 mod register;
 mod structure;
 mod windows;
 
 pub use assemble::solved;
 
-use super::attempt::Attempt;
+use super::attempt::{self, Attempt};
 use super::calibration::Outcome;
 use super::recorder::Recorder;
-use super::{Context, Error};
+use super::{Context, Error, block};
 use crate::domain::{Grade, Method, Stage};
 use model::{Model, Scene};
 
 /// Rounds of adjusting everything and triangulating it anew that end an extension; the third moves nothing that a
 /// gate would see.
 const FINAL_ROUNDS: usize = 3;
+/// Share of the views that an extension must register for no other seed to be tried.
+const ENOUGH_REGISTERED: f64 = 0.5;
 
-/// A sequence that stands.
+/// A sequence that stands, with the block that it grew from.
 pub struct Extended<'a> {
+    seed: Attempt,
     scene: Scene<'a>,
     model: Model,
-    pub calibration: Outcome,
+    calibration: Outcome,
     /// Views that could not be registered, with the reason.
     unregistered: Vec<register::Unregistered>,
+}
+
+/// What came of a sequence.
+pub enum Ended<'a> {
+    Extended(Box<Extended<'a>>),
+    /// Nothing stands beyond a block, if that: the best one that was tried.
+    Block(Option<Attempt>),
 }
 
 /// Whether an input is one that is extended beyond a block.
@@ -41,28 +53,64 @@ pub fn applies(context: &Context) -> bool {
     matches!(context.settings.method, Method::Auto | Method::Geometry)
         && !context.settings.focal_per_view
         && !context.input.has_depths()
-        && super::block::complete_views(context.input, context.ranges).is_none()
+        && block::complete_views(context.input, context.ranges).is_none()
 }
 
-/// Extends a block to every view that can be registered; `None` where the block is not metric or nothing stands beyond
-/// it.
+/// Solves block after block until one carries an extension over most of the views; the best extension otherwise.
 ///
 /// # Errors
-/// [`Error::Stopped`].
-pub fn extend<'a>(
-    seed: &Attempt,
+/// [`Error::Stopped`]; [`Error::Internal`] for defects.
+pub fn solve<'a>(
+    candidates: &[Vec<usize>],
     context: &Context<'a>,
     recorder: &mut Recorder,
-) -> Result<Option<Extended<'a>>, Error> {
-    let Some(metric) = seed.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref()) else {
-        return Ok(None);
-    };
-    let Some(consensus) = &seed.consensus else { return Ok(None) };
+) -> Result<Ended<'a>, Error> {
+    let seeding = Context { seeding: true, ..*context };
+    let mut best: Option<Extended> = None;
+    let mut unextended: Option<Attempt> = None;
+    recorder.expect_extension();
+    for (k, views) in candidates.iter().enumerate() {
+        context.stopped()?;
+        recorder.begin_block(k, candidates.len());
+        let block = block::extract(context.input, context.ranges, context.normalization, views);
+        let attempt = attempt::solve_block(block, &seeding, recorder)?;
+        if attempt.is_good() {
+            let extended = extend(attempt, &seeding, recorder)?;
+            let enough = extended.is_firm();
+            if best.as_ref().is_none_or(|best| extended.merit() > best.merit()) {
+                best = Some(extended);
+            }
+            if enough {
+                break;
+            }
+        } else if unextended.as_ref().is_none_or(|best| attempt.merit() > best.merit()) {
+            unextended = Some(attempt);
+        }
+    }
+    if let Some(best) = best {
+        return Ok(Ended::Extended(Box::new(best)));
+    }
+    match unextended {
+        Some(seed) if seed.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some()) => {
+            let extended = extend(seed, &seeding, recorder)?;
+            match extended.calibration.metric {
+                Some(_) => Ok(Ended::Extended(Box::new(extended))),
+                None => Ok(Ended::Block(Some(extended.seed))),
+            }
+        }
+        unextended => Ok(Ended::Block(unextended)),
+    }
+}
+
+/// Extends a block, which must be metric, to every view that can be registered.
+fn extend<'a>(seed: Attempt, context: &Context<'a>, recorder: &mut Recorder) -> Result<Extended<'a>, Error> {
+    recorder.begin_extension();
     recorder.enter(Stage::Extend);
     let scene = Scene::new(context);
-    let mut model = Model::new(&scene, &seed.block.views, metric, consensus.noise);
-    structure::triangulate(&scene, &mut model);
-    let unregistered = register::all(&scene, &mut model, recorder)?;
+    let mut model = parts::first(&scene, &seed);
+    let mut trials = vec![register::Trial::default(); context.input.view_count()];
+    register::join(&scene, &mut model, parts::FIRST, &mut trials, recorder)?;
+    parts::others(&scene, &mut model, &seed, &mut trials, recorder)?;
     for _ in 0..FINAL_ROUNDS {
         context.stopped()?;
         adjust::all(&scene, &mut model);
@@ -72,15 +120,21 @@ pub fn extend<'a>(
     recorder.enter(Stage::Calibrate);
     let calibration = calibrate::calibrate(&scene, &mut model, context)?;
     context.stopped()?;
-    let stands = model.registered().len() >= seed.block.views.len() && calibration.metric.is_some();
-    Ok(stands.then_some(Extended { scene, model, calibration, unregistered }))
+    parts::largest_first(&mut model);
+    let unregistered = register::left(&scene, &model, &trials);
+    Ok(Extended { seed, scene, model, calibration, unregistered })
 }
 
 impl Extended<'_> {
-    /// Whether this says more than the block that it began from.
-    pub fn improves_on(&self, seed: &Attempt) -> bool {
-        let usable = |grade: Grade| grade != Grade::ProjectiveOnly;
-        let seed_usable = seed.calibration.as_ref().is_some_and(|calibration| usable(calibration.grade));
-        self.model.registered().len() > seed.block.views.len() || usable(self.calibration.grade) || !seed_usable
+    /// Larger is better: a calibration before none, then the number of views.
+    fn merit(&self) -> (bool, usize) {
+        (self.calibration.grade != Grade::ProjectiveOnly, self.model.registered().len())
+    }
+
+    /// Whether no other seed needs to be tried.
+    fn is_firm(&self) -> bool {
+        let (calibrated, registered) = self.merit();
+        let views = registered + self.unregistered.len();
+        calibrated && registered as f64 >= ENOUGH_REGISTERED * views as f64
     }
 }

@@ -64,6 +64,8 @@ pub struct Landmark {
     pub angle: f64,
     /// Observations that agree with it.
     pub support: usize,
+    /// Part that it was triangulated in.
+    pub part: u32,
 }
 
 /// A metric reconstruction under way.
@@ -74,6 +76,8 @@ pub struct Model {
     pub free: IntrinsicsModel,
     /// One a view of the input.
     pub poses: Vec<Option<Pose>>,
+    /// Part of each registered view: views that share no tracks are reconstructions of their own, under one calibration.
+    pub part_of: Vec<u32>,
     /// One a track of the input.
     pub landmarks: Vec<Option<Landmark>>,
     /// One an observation: whether it agrees with its landmark.
@@ -83,24 +87,44 @@ pub struct Model {
 }
 
 impl Model {
-    pub fn new(scene: &Scene, views: &[usize], metric: &Reconstruction, noise: f64) -> Self {
-        let mut poses = vec![None; scene.context.input.view_count()];
-        for (&view, pose) in views.iter().zip(&metric.poses) {
-            poses[view] = Some(*pose);
-        }
+    /// A model of nothing yet, with this camera and noise.
+    pub fn new(scene: &Scene, intrinsics: Intrinsics, noise: f64) -> Self {
+        let views = scene.context.input.view_count();
         Self {
-            intrinsics: metric.intrinsics,
+            intrinsics,
             free: IntrinsicsModel::FOCAL,
-            poses,
+            poses: vec![None; views],
+            part_of: vec![0; views],
             landmarks: vec![None; scene.tracks()],
             kept: vec![false; scene.xy.len()],
             noise,
         }
     }
 
+    /// Adds the views of a metric block as a part.
+    pub fn add_part(&mut self, part: u32, views: &[usize], metric: &Reconstruction) {
+        for (&view, pose) in views.iter().zip(&metric.poses) {
+            self.poses[view] = Some(*pose);
+            self.part_of[view] = part;
+        }
+    }
+
+    /// Takes a part back.
+    pub fn remove_part(&mut self, part: u32) {
+        for view in self.of_part(part) {
+            self.poses[view] = None;
+            self.part_of[view] = 0;
+        }
+    }
+
     /// Registered views, increasing.
     pub fn registered(&self) -> Vec<usize> {
         (0..self.poses.len()).filter(|&view| self.poses[view].is_some()).collect()
+    }
+
+    /// Registered views of a part, increasing.
+    pub fn of_part(&self, part: u32) -> Vec<usize> {
+        (0..self.poses.len()).filter(|&view| self.poses[view].is_some() && self.part_of[view] == part).collect()
     }
 
     /// Pinhole cameras of all views, zero for those that are not registered.

@@ -7,12 +7,12 @@ use super::adjust;
 use super::model::{Model, Scene};
 use super::structure;
 use crate::geometry::pose;
-use crate::solver::Error;
 use crate::solver::recorder::Recorder;
+use crate::solver::{Error, block};
 
 /// Points that a view must see before it is tried, and that must agree with its pose: three determine it, and each of
 /// the other five agrees with a wrong one by chance in one case of a hundred.
-const LEAST_POINTS: usize = 8;
+pub const LEAST_POINTS: usize = 8;
 /// Share of the points seen that must agree.
 const LEAST_SHARE: f64 = 0.1;
 /// Points of a view beyond which a pose is not made better.
@@ -34,73 +34,91 @@ pub struct Unregistered {
     pub agreeing: usize,
 }
 
+/// What came of the trials of a view.
 #[derive(Debug, Clone, Copy, Default)]
-struct Trial {
+pub struct Trial {
     count: usize,
+    /// Points that it saw at the last, and how many agreed.
     points: usize,
     agreeing: usize,
 }
 
-/// Registers every view that can be, those that see most points first; returns those that cannot.
+/// Joins to a part every view that can be, those that see most of its points first.
 ///
 /// # Errors
 /// [`Error::Stopped`].
-pub fn all(scene: &Scene, model: &mut Model, recorder: &mut Recorder) -> Result<Vec<Unregistered>, Error> {
-    let views = super::super::block::observed_views(scene.context.input);
+pub fn join(
+    scene: &Scene,
+    model: &mut Model,
+    part: u32,
+    trials: &mut [Trial],
+    recorder: &mut Recorder,
+) -> Result<(), Error> {
+    let views = block::observed_views(scene.context.input).len().max(1) as f64;
     let mut rng = ChaCha8Rng::seed_from_u64(scene.context.settings.seed);
-    let mut trials = vec![Trial::default(); model.poses.len()];
-    settle(scene, model);
-    let mut adjusted_at = model.registered().len();
+    // Views that another part could not take may fit this one.
+    trials.iter_mut().for_each(|trial| trial.count = 0);
+    settle(scene, model, part);
+    let mut adjusted_at = model.of_part(part).len();
     loop {
         scene.context.stopped()?;
-        let Some((view, seen)) = next(scene, model, &trials) else {
+        let Some((view, seen)) = next(scene, model, part, trials) else {
             // What a last adjustment moves may let a view fit that did not.
-            if model.registered().len() == adjusted_at {
+            if model.of_part(part).len() == adjusted_at {
                 break;
             }
-            settle(scene, model);
-            adjusted_at = model.registered().len();
+            settle(scene, model, part);
+            adjusted_at = model.of_part(part).len();
             continue;
         };
-        let agreeing = register(scene, model, view, &seen, &mut rng);
-        trials[view] = Trial { count: trials[view].count + 1, points: seen.len(), agreeing };
-        let registered = model.registered().len();
-        if registered as f64 >= ADJUST_GROWTH * adjusted_at as f64 {
-            settle(scene, model);
-            adjusted_at = registered;
+        let agreeing = register(scene, model, part, view, &seen, &mut rng);
+        let trial = &mut trials[view];
+        *trial = Trial { count: trial.count + 1, points: seen.len(), agreeing };
+        let grown = model.of_part(part).len();
+        if grown as f64 >= ADJUST_GROWTH * adjusted_at as f64 {
+            settle(scene, model, part);
+            adjusted_at = grown;
         }
         recorder.standing.inliers =
             model.landmarks.iter().flatten().filter(|landmark| landmark.is_verified()).count() as u32;
         recorder.standing.focal_px = Some(model.intrinsics.focal * scene.context.scale_px);
-        recorder.tell(registered as f64 / views.len().max(1) as f64);
+        recorder.tell(model.registered().len() as f64 / views);
     }
-    let left = views.into_iter().filter(|&view| model.poses[view].is_none());
-    Ok(left
-        .map(|view| Unregistered { view, points: supported(scene, model, view).len(), agreeing: trials[view].agreeing })
-        .collect())
+    Ok(())
 }
 
-/// Adjusts what stands and triangulates it anew.
-fn settle(scene: &Scene, model: &mut Model) {
-    adjust::while_growing(scene, model);
-    adjust::rescale(scene, model);
+/// The views that were not registered, with what came of the best trial of each.
+pub fn left(scene: &Scene, model: &Model, trials: &[Trial]) -> Vec<Unregistered> {
+    let views = block::observed_views(scene.context.input).into_iter();
+    views
+        .filter(|&view| model.poses[view].is_none())
+        .map(|view| Unregistered { view, points: trials[view].points, agreeing: trials[view].agreeing })
+        .collect()
+}
+
+/// Adjusts a part and triangulates it anew.
+fn settle(scene: &Scene, model: &mut Model, part: u32) {
+    adjust::while_growing(scene, model, part);
+    adjust::rescale(scene, model, part);
     structure::triangulate(scene, model);
 }
 
-/// Observations of a view whose track has a point that may support a pose.
-fn supported(scene: &Scene, model: &Model, view: usize) -> Vec<usize> {
-    let supports = |k: &usize| model.landmarks[scene.track_of(*k)].is_some_and(|landmark| landmark.supports());
+/// Observations of a view whose track has a point of the part that may support a pose.
+fn supported(scene: &Scene, model: &Model, part: u32, view: usize) -> Vec<usize> {
+    let supports = |k: &usize| {
+        model.landmarks[scene.track_of(*k)].is_some_and(|landmark| landmark.part == part && landmark.supports())
+    };
     scene.of_view[view].iter().map(|&k| k as usize).filter(supports).collect()
 }
 
 /// The view to try next, the one that sees most points, with these observations.
-fn next(scene: &Scene, model: &Model, trials: &[Trial]) -> Option<(usize, Vec<usize>)> {
+fn next(scene: &Scene, model: &Model, part: u32, trials: &[Trial]) -> Option<(usize, Vec<usize>)> {
     let open = (0..model.poses.len()).filter(|&view| model.poses[view].is_none()).filter_map(|view| {
         let trial = trials[view];
         if trial.count >= MOST_TRIALS {
             return None;
         }
-        let seen = supported(scene, model, view);
+        let seen = supported(scene, model, part, view);
         let worth = trial.count == 0 || seen.len() as f64 >= RETRY_GROWTH * trial.points as f64;
         (seen.len() >= LEAST_POINTS && worth).then_some((view, seen))
     });
@@ -109,7 +127,7 @@ fn next(scene: &Scene, model: &Model, trials: &[Trial]) -> Option<(usize, Vec<us
 }
 
 /// Registers a view if enough of the points it sees agree; returns how many do.
-fn register(scene: &Scene, model: &mut Model, view: usize, seen: &[usize], rng: &mut ChaCha8Rng) -> usize {
+fn register(scene: &Scene, model: &mut Model, part: u32, view: usize, seen: &[usize], rng: &mut ChaCha8Rng) -> usize {
     let step = seen.len().div_ceil(MOST_POINTS);
     let pairs: Vec<(usize, nalgebra::Vector2<f64>)> =
         seen.iter().step_by(step).filter_map(|&k| Some((k, model.ray(scene, k)?))).collect();
@@ -121,6 +139,7 @@ fn register(scene: &Scene, model: &mut Model, view: usize, seen: &[usize], rng: 
     let agreeing = found.inlier.iter().filter(|&&inlier| inlier).count();
     if agreeing >= LEAST_POINTS && agreeing as f64 >= LEAST_SHARE * points.len() as f64 {
         model.poses[view] = Some(found.pose);
+        model.part_of[view] = part;
         let tracks: Vec<usize> = scene.of_view[view].iter().map(|&k| scene.track_of(k as usize)).collect();
         structure::triangulate_some(scene, model, &tracks);
     }

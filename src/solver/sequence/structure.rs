@@ -30,10 +30,14 @@ pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
         if place.is_multiple_of(TRACKS_PER_LOOK) && scene.stop().is_stopped() {
             return;
         }
-        let seen: Vec<(usize, Sighting)> =
-            scene.of_track(track).filter_map(|k| Some((k, model.sighting(scene, k)?))).collect();
         scene.of_track(track).for_each(|k| model.kept[k] = false);
         model.landmarks[track] = None;
+        let Some(part) = part_of_track(scene, model, track) else { continue };
+        let seen: Vec<(usize, Sighting)> = scene
+            .of_track(track)
+            .filter(|&k| model.part_of[scene.view_of(k)] == part)
+            .filter_map(|k| Some((k, model.sighting(scene, k)?)))
+            .collect();
         if seen.len() < 2 {
             continue;
         }
@@ -47,6 +51,7 @@ pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
         let landmark = Landmark {
             position,
             angle: widest_angle(&rays.collect::<Vec<_>>()),
+            part,
             support: found.agrees.iter().filter(|&&agrees| agrees).count(),
         };
         model.landmarks[track] = Some(landmark);
@@ -54,6 +59,23 @@ pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
             model.kept[*k] = agrees;
         }
     }
+}
+
+/// The part in whose views a track has most observations, the first of equals; `None`: in none.
+fn part_of_track(scene: &Scene, model: &Model, track: usize) -> Option<u32> {
+    let mut counts: Vec<(u32, usize)> = Vec::new();
+    for k in scene.of_track(track) {
+        let view = scene.view_of(k);
+        if model.poses[view].is_none() {
+            continue;
+        }
+        let part = model.part_of[view];
+        match counts.iter_mut().find(|(known, _)| *known == part) {
+            Some((_, count)) => *count += 1,
+            None => counts.push((part, 1)),
+        }
+    }
+    counts.into_iter().max_by(|a, b| a.1.cmp(&b.1).then(b.0.cmp(&a.0))).map(|(part, _)| part)
 }
 
 impl Landmark {

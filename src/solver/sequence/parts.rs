@@ -1,0 +1,108 @@
+//! Reconstructions of an input that share no tracks, or too few: each with a frame and a scale of its own, all with one
+//! calibration.
+
+use super::model::{Model, Scene};
+use super::register::{self, Trial};
+use super::structure;
+use crate::domain::{FocalPrior, Grade};
+use crate::geometry::bundle::metric::Intrinsics;
+use crate::solver::attempt::{self, Attempt};
+use crate::solver::recorder::Recorder;
+use crate::solver::{Context, Error, block};
+
+/// The part that the calibration comes from.
+pub const FIRST: u32 = 0;
+/// Parts of one input at most: more of them is an input without overlap.
+const MOST_PARTS: u32 = 100;
+/// Deviation of the log focal length that other parts are told of, at least, where the first has one: parts differ by
+/// more than each admits. And where the first has none: it only keeps them from running away.
+const PRIOR_SIGMA: f64 = 0.02;
+const VAGUE_SIGMA: f64 = 0.5;
+
+/// The model that a block begins.
+pub fn first(scene: &Scene, seed: &Attempt) -> Model {
+    let metric = seed.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref());
+    let noise = seed.consensus.as_ref().map_or(0.0, |consensus| consensus.noise);
+    let intrinsics = metric.map_or_else(|| Intrinsics::from_focal(1.0), |metric| metric.intrinsics);
+    let mut model = Model::new(scene, intrinsics, noise);
+    if let Some(metric) = metric {
+        model.add_part(FIRST, &seed.block.views, metric);
+    }
+    structure::triangulate(scene, &mut model);
+    model
+}
+
+/// Solves and extends block after block of the views that are left, as long as there are any.
+///
+/// # Errors
+/// [`Error::Stopped`]; [`Error::Internal`] for defects.
+pub fn others(
+    scene: &Scene,
+    model: &mut Model,
+    seed: &Attempt,
+    trials: &mut [Trial],
+    recorder: &mut Recorder,
+) -> Result<(), Error> {
+    let context = Context { focal_prior: prior_of(seed, model, &scene.context), ..scene.context };
+    let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
+    for part in FIRST + 1..MOST_PARTS {
+        context.stopped()?;
+        let candidates = block::candidate_views_among(context.input, context.ranges, &open, context.stop);
+        let Some(views) = candidates.first() else { break };
+        let block = block::extract(context.input, context.ranges, context.normalization, views);
+        let attempt = attempt::solve_block(block, &context, recorder)?;
+        recorder.enter(crate::domain::Stage::Extend);
+        // Whatever comes of it, a block is tried once.
+        views.iter().for_each(|&view| open[view] = false);
+        let Some(metric) = attempt.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref()) else {
+            continue;
+        };
+        model.add_part(part, &attempt.block.views, metric);
+        structure::triangulate(scene, model);
+        register::join(scene, model, part, trials, recorder)?;
+        if !stands(scene, model, part) {
+            model.remove_part(part);
+            structure::triangulate(scene, model);
+        }
+        for (open, pose) in open.iter_mut().zip(&model.poses) {
+            *open &= pose.is_none();
+        }
+    }
+    Ok(())
+}
+
+/// What the first part says of the focal length of the others.
+fn prior_of(seed: &Attempt, model: &Model, context: &Context) -> Option<FocalPrior> {
+    let calibration = seed.calibration.as_ref()?;
+    let sigma = calibration.sigma_log_focal.filter(|_| calibration.grade != Grade::ProjectiveOnly);
+    let focal_px = model.intrinsics.focal * context.scale_px;
+    Some(FocalPrior { focal_px, sigma_log: sigma.map_or(VAGUE_SIGMA, |sigma| sigma.max(PRIOR_SIGMA)) })
+}
+
+/// Whether each view of a part sees enough of its points to have been registered by them.
+fn stands(scene: &Scene, model: &Model, part: u32) -> bool {
+    let views = model.of_part(part);
+    let supported = |&view: &usize| {
+        let kept = scene.of_view[view].iter().filter(|&&k| {
+            let k = k as usize;
+            model.kept[k] && model.landmarks[scene.track_of(k)].is_some_and(|landmark| landmark.is_verified())
+        });
+        kept.count() >= register::LEAST_POINTS
+    };
+    views.len() >= block::LEAST_VIEWS && views.iter().all(supported)
+}
+
+/// Numbers the parts anew, the one with most views first; of equals the one found first.
+pub fn largest_first(model: &mut Model) {
+    let most = model.part_of.iter().copied().max().unwrap_or(0);
+    let mut parts: Vec<(usize, u32)> = (0..=most).map(|part| (model.of_part(part).len(), part)).collect();
+    parts.sort_by_key(|&(views, part)| (std::cmp::Reverse(views), part));
+    let mut number = vec![0; parts.len()];
+    for (rank, &(_, part)) in parts.iter().enumerate() {
+        number[part as usize] = rank as u32;
+    }
+    for (part, pose) in model.part_of.iter_mut().zip(&model.poses) {
+        *part = if pose.is_some() { number[*part as usize] } else { 0 };
+    }
+    model.landmarks.iter_mut().flatten().for_each(|landmark| landmark.part = number[landmark.part as usize]);
+}
