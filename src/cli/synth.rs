@@ -7,9 +7,10 @@ use super::exit::{Exit, Failure};
 pub use super::scene_args::SceneArgs;
 use super::scene_args::{CameraArgs, GeometryArgs, OutlierArgs};
 use crate::domain::RawInput;
+use crate::domain::error::quoted;
 use crate::formats::result_files::{OBSERVATIONS, create_directory, pretty, write_atomically};
 pub use crate::synthetic::scene::IMAGE_SIDE_PX;
-use crate::synthetic::{Scene, SceneOptions, Truth};
+use crate::synthetic::{Scene, Sequence, SequenceOptions};
 
 /// Name of the file that holds what the scene was made of.
 pub const TRUTH: &str = "truth.json";
@@ -20,6 +21,7 @@ Examples:
   scpsfm synth --out scene --outliers 0.95 --tracks 400 --seed 3
   scpsfm synth --out scene --motion pure-translation --outliers 0.3   # no method can calibrate this
   scpsfm synth --out scene --wrong-views 2 --second-motion 0.3   # partly wrong tracks, two bodies
+  scpsfm synth --out walk --sequence --views 100 --tracks 5000 --noise 0.0005 --outliers 0.5   # tracks of 3 to 10 views
   scpsfm solve scene/observations.csv --width 1000 --height 1000 --out answer";
 
 /// Make a contaminated scene whose truth is known
@@ -49,6 +51,35 @@ pub struct Args {
     /// Also write the projective depths, as a fifth column
     #[arg(long, help_heading = "The scene")]
     pub depths: bool,
+
+    #[command(flatten)]
+    pub sequence: SequenceArgs,
+}
+
+/// A camera that travels, instead of the paper's scene.
+#[derive(Debug, Clone, clap::Args)]
+#[command(next_help_heading = "A sequence")]
+pub struct SequenceArgs {
+    /// A camera that travels, whose tracks live a few views each; of the scene's options, --views, --tracks, --noise,
+    /// --outliers, --radial-k1 and --seed apply
+    #[arg(long, conflicts_with_all = ["depths", "shape", "motion", "outlier_kind", "wrong_views", "second_motion",
+        "noise_kind", "principal_point", "zoom", "rotation"])]
+    pub sequence: bool,
+
+    /// Views that a track lives, at least and at most
+    #[arg(long, value_name = "LEAST,MOST", default_value = "3,10", value_parser = lifetime, requires = "sequence")]
+    pub lifetime: (usize, usize),
+
+    /// Share of the observations of right tracks that are wrong
+    #[arg(long, value_name = "SHARE", default_value_t = 0.05, requires = "sequence")]
+    pub wrong_observations: f64,
+}
+
+/// Reads two counts with a comma between them.
+fn lifetime(text: &str) -> Result<(usize, usize), String> {
+    let number = |text: &str| text.trim().parse::<usize>().map_err(|error| format!("{error} in {}", quoted(text)));
+    let (least, most) = text.split_once(',').ok_or("two numbers with a comma between them are expected")?;
+    Ok((number(least)?, number(most)?))
 }
 
 impl Args {
@@ -56,20 +87,48 @@ impl Args {
         let options = self.geometry.apply(self.scene.options(self.depths));
         Scene::generate(&self.camera.apply(self.outliers.apply(options))).map_err(Failure::usage)
     }
+
+    fn generate_sequence(&self) -> Result<Sequence, Failure> {
+        let options = SequenceOptions {
+            views: self.scene.views,
+            tracks: self.scene.tracks,
+            lifetime: self.sequence.lifetime,
+            noise: self.scene.noise,
+            outliers: self.scene.outliers,
+            wrong_observations: self.sequence.wrong_observations,
+            radial_k1: self.camera.radial_k1,
+            seed: self.scene.seed,
+        };
+        Sequence::generate(&options).map_err(Failure::usage)
+    }
 }
 
 /// What truth.json holds.
 #[derive(serde::Serialize)]
-struct TruthJson<'a> {
-    options: &'a SceneOptions,
+struct TruthJson<'a, O, T> {
+    options: &'a O,
     image_width_px: u32,
     image_height_px: u32,
     #[serde(flatten)]
-    truth: &'a Truth,
+    truth: &'a T,
 }
 
 /// Runs the command.
 pub fn run(args: Args) -> Result<Exit, Failure> {
+    if args.sequence.sequence {
+        let sequence = args.generate_sequence()?;
+        write(&args.out, &sequence.input, &sequence.options, &sequence.truth)?;
+        let right = sequence.truth.inlier.iter().filter(|&&inlier| inlier).count();
+        eprintln!(
+            "{} views, {} observations, {} tracks of which {right} are right, focal {:.1} px: {}",
+            args.scene.views,
+            sequence.input.x.len(),
+            args.scene.tracks,
+            sequence.truth.focal_px,
+            args.out.display()
+        );
+        return Ok(Exit::Done);
+    }
     let scene = args.generate()?;
     write_scene(&args.out, &scene)?;
     eprintln!("{}: {}", describe(&scene), args.out.display());
@@ -91,14 +150,18 @@ pub fn describe(scene: &Scene) -> String {
 /// # Errors
 /// The file that cannot be written.
 pub fn write_scene(directory: &Path, scene: &Scene) -> Result<(), Failure> {
+    write(directory, &scene.input, &scene.options, &scene.truth)
+}
+
+fn write<O: serde::Serialize, T: serde::Serialize>(
+    directory: &Path,
+    input: &RawInput,
+    options: &O,
+    truth: &T,
+) -> Result<(), Failure> {
     create_directory(directory)?;
-    write_atomically(directory, OBSERVATIONS, observations_csv(&scene.input).as_bytes())?;
-    let truth = TruthJson {
-        options: &scene.options,
-        image_width_px: IMAGE_SIDE_PX,
-        image_height_px: IMAGE_SIDE_PX,
-        truth: &scene.truth,
-    };
+    write_atomically(directory, OBSERVATIONS, observations_csv(input).as_bytes())?;
+    let truth = TruthJson { options, image_width_px: IMAGE_SIDE_PX, image_height_px: IMAGE_SIDE_PX, truth };
     write_atomically(directory, TRUTH, pretty(&truth)?.as_bytes())?;
     Ok(())
 }

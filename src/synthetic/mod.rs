@@ -5,5 +5,7 @@
 
 pub mod metrics;
 pub mod scene;
+pub mod sequence;
 
 pub use scene::{Motion, NoiseKind, OutlierKind, Scene, SceneOptions, Shape, Truth};
+pub use sequence::{Sequence, SequenceOptions, SequenceTruth};

@@ -1,6 +1,7 @@
 //! Whole solves, from an input to a solution.
 
 mod lenses;
+mod sequences;
 
 use super::*;
 use crate::domain::{Backend, Grade, Limits, Method, Prior, Progress, RawInput, Silent, Stage, Status, View};
@@ -224,30 +225,6 @@ fn epipolar_depths_complete_what_the_input_lacks_and_replace_nothing() {
     assert!(with > 0.9 && without < 0.5, "recall {without} without, {with} with epipolar depths");
     let (given, _) = scene(SceneOptions { with_depths: true, ..options });
     assert_eq!(solved(&given, &psfm(true)).tracks.weight, solved(&given, &psfm(false)).tracks.weight);
-}
-
-#[test]
-fn of_incomplete_tracks_a_block_is_solved_and_the_views_left_out_are_named() {
-    let (input, scene) = scene(SceneOptions { views: 9, tracks: 120, outliers: 0.3, ..SceneOptions::default() });
-    let raw = input.to_raw();
-    // Views 0 to 5 see all tracks, views 6 to 8 every tenth.
-    let mut banded = RawInput { views: raw.views.clone(), track_count: raw.track_count, ..RawInput::default() };
-    for k in 0..raw.x.len() {
-        if raw.view[k] < 6 || raw.track[k].is_multiple_of(10) {
-            banded.view.push(raw.view[k]);
-            banded.track.push(raw.track[k]);
-            banded.x.push(raw.x[k]);
-            banded.y.push(raw.y[k]);
-        }
-    }
-    let input = Input::new(banded, &Limits::default(), "scene").expect("valid scene");
-    let solution = solved(&input, &SolveSettings::default());
-    assert_eq!(solution.registered_views(), [0, 1, 2, 3, 4, 5]);
-    let warning =
-        solution.warnings.iter().find(|warning| warning.code == WarningCode::ViewsLeftOut).expect("a warning");
-    assert!(warning.detail.ends_with("6, 7, 8"), "{}", warning.detail);
-    let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
-    assert!(f1 > 0.97, "F1 {f1}");
 }
 
 #[test]

@@ -1,0 +1,87 @@
+//! Inputs whose tracks live a few views.
+
+use super::*;
+use crate::synthetic::{Sequence, SequenceOptions};
+
+fn input_of(sequence: &Sequence) -> Input {
+    Input::new(sequence.input.clone(), &Limits::default(), "sequence").expect("valid sequence")
+}
+
+/// The observations that `keep` wants, of all tracks.
+fn thinned(sequence: &Sequence, keep: impl Fn(usize) -> bool) -> RawInput {
+    let from = &sequence.input;
+    let mut raw = RawInput { views: from.views.clone(), track_count: from.track_count, ..RawInput::default() };
+    for k in (0..from.x.len()).filter(|&k| keep(k)) {
+        raw.view.push(from.view[k]);
+        raw.track.push(from.track[k]);
+        raw.x.push(from.x[k]);
+        raw.y.push(from.y[k]);
+    }
+    raw
+}
+
+#[test]
+fn every_view_is_registered_and_every_observation_judged() {
+    for (seed, outliers, radial_k1) in [(0, 0.3, 0.0), (1, 0.5, -0.1)] {
+        let options = SequenceOptions { tracks: 800, outliers, radial_k1, seed, ..SequenceOptions::default() };
+        let sequence = Sequence::generate(&options).expect("valid");
+        let solution = solved(&input_of(&sequence), &SolveSettings { seed, ..SolveSettings::default() });
+        assert_eq!(solution.registered_views().len(), 20, "seed {seed}: {:?}", solution.warnings);
+        assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}: {:?}", solution.warnings);
+        let tracks = agreement(&solution.tracks.inlier, &sequence.truth.inlier);
+        let observations = agreement(&solution.observations.inlier, &sequence.truth.observation_right);
+        let focal = solution.calibrations[0].focal_px / sequence.truth.focal_px - 1.0;
+        println!("seed {seed}: tracks {tracks:?}, observations {observations:?}, focal off by {focal:.5}");
+        assert!(tracks.f1 > 0.97 && observations.precision > 0.99 && observations.recall > 0.95, "seed {seed}");
+        assert!(focal.abs() < 0.01, "seed {seed}: focal length off by {focal}");
+        assert!((solution.calibrations[0].radial_k1 - radial_k1).abs() < 0.01, "{:?}", solution.calibrations[0]);
+    }
+}
+
+#[test]
+fn what_shares_no_tracks_is_in_parts_of_one_calibration() {
+    let options = SequenceOptions { views: 24, tracks: 1_000, seed: 2, ..SequenceOptions::default() };
+    let sequence = Sequence::generate(&options).expect("valid");
+    // Tracks that cross from view 13 to 14 end there.
+    let first: Vec<u32> = {
+        let mut first = vec![u32::MAX; options.tracks];
+        for k in 0..sequence.input.x.len() {
+            let first = &mut first[sequence.input.track[k] as usize];
+            *first = (*first).min(sequence.input.view[k]);
+        }
+        first
+    };
+    let raw = thinned(&sequence, |k| first[sequence.input.track[k] as usize] >= 14 || sequence.input.view[k] < 14);
+    let solution =
+        solved(&Input::new(raw, &Limits::default(), "sequence").expect("valid sequence"), &SolveSettings::default());
+    let parts: Vec<u32> = solution.views.iter().map(|view| view.part).collect();
+    assert_eq!(solution.registered_views().len(), 24, "{:?}", solution.warnings);
+    assert_eq!(parts, [vec![0; 14], vec![1; 10]].concat());
+    assert_eq!((solution.calibrations.len(), solution.grade), (1, Some(Grade::Metric)), "{:?}", solution.warnings);
+    for first in [0, 14] {
+        let projection = solution.views[first].projection.expect("registered");
+        let off = (0..3).flat_map(|row| (0..4).map(move |column| (row, column)));
+        let worst = off.map(|(row, column)| (projection[row][column] - f64::from(u8::from(row == column))).abs());
+        assert!(worst.fold(0.0, f64::max) < 1e-9, "the first view of a part is [I|0]: {projection:?}");
+    }
+}
+
+#[test]
+fn a_view_of_nothing_but_wrong_observations_is_left_out_with_the_reason() {
+    let options = SequenceOptions { tracks: 800, outliers: 0.2, seed: 3, ..SequenceOptions::default() };
+    let mut sequence = Sequence::generate(&options).expect("valid");
+    let in_view: Vec<usize> = (0..sequence.input.x.len()).filter(|&k| sequence.input.view[k] == 11).collect();
+    // Each gets the point of another.
+    let points: Vec<(f64, f64)> = in_view.iter().map(|&k| (sequence.input.x[k], sequence.input.y[k])).collect();
+    for (place, &k) in in_view.iter().enumerate() {
+        (sequence.input.x[k], sequence.input.y[k]) = points[(place + points.len() / 2) % points.len()];
+    }
+    let solution = solved(&input_of(&sequence), &SolveSettings::default());
+    let others: Vec<usize> = (0..20).filter(|&view| view != 11).collect();
+    assert_eq!(solution.registered_views(), others);
+    let left_out = solution.warnings.iter().find(|warning| warning.code == WarningCode::ViewsLeftOut);
+    let detail = &left_out.expect("a warning").detail;
+    assert!(detail.starts_with("1 of 20 views") && detail.contains("11 (") && detail.contains("agree"), "{detail}");
+    let wrong = in_view.iter().filter(|&&k| solution.observations.inlier[k]).count();
+    assert_eq!(wrong, 0, "observations of a view that has no camera");
+}

@@ -1,0 +1,278 @@
+//! Sequences: a camera that travels, and tracks that live a few views each, as real ones do.
+
+use std::f64::consts::TAU;
+
+use nalgebra::{Matrix3, Rotation3, Vector2, Vector3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::scene::{FOCAL_RANGE_PX, IMAGE_SIDE_PX, SceneOptions};
+use crate::domain::error::{InvalidInput, Violation, Violations};
+use crate::domain::{ImageSize, RawInput, View};
+
+/// Way from view to view, in the units of the depths below: over ten views the nearest points cross a third of the image.
+const STEP: f64 = 0.15;
+/// Depths of the points, in the frame of the middle one of the views that see them.
+const DEPTH: (f64, f64) = (3.0, 9.0);
+/// Swings of the camera about x, y and z, in radians, and their periods in views: without a common divisor, so that no
+/// two stretches look alike.
+const SWING_RAD: [f64; 3] = [0.2, 0.35, 0.3];
+const PERIOD_VIEWS: [f64; 3] = [17.0, 23.0, 31.0];
+/// Swing of the path across its direction.
+const WEAVE: f64 = 0.3;
+/// Draws of one point before its views are called impossible.
+const MOST_DRAWS: usize = 1_000;
+
+/// What to generate.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct SequenceOptions {
+    pub views: usize,
+    pub tracks: usize,
+    /// Views that a track lives, uniform between the two.
+    pub lifetime: (usize, usize),
+    /// Standard deviation of the noise as a share of the image width.
+    pub noise: f64,
+    /// Share of the tracks that are wrong: each observation is anywhere in its image.
+    pub outliers: f64,
+    /// Share of the observations of the other tracks that are anywhere in their image.
+    pub wrong_observations: f64,
+    /// Radial distortion, as in [`SceneOptions::radial_k1`].
+    pub radial_k1: f64,
+    pub seed: u64,
+}
+
+impl Default for SequenceOptions {
+    /// A short walk: tracks and noise as feature matching gives them.
+    fn default() -> Self {
+        Self {
+            views: 20,
+            tracks: 1_000,
+            lifetime: (3, 10),
+            noise: 0.0005,
+            outliers: 0.3,
+            wrong_observations: 0.05,
+            radial_k1: 0.0,
+            seed: 0,
+        }
+    }
+}
+
+impl SequenceOptions {
+    /// Tracks that one sequence may have: some 10^7 observations.
+    pub const MAX_TRACKS: usize = 2_000_000;
+
+    /// Checks every option.
+    ///
+    /// # Errors
+    /// Each violation names its option.
+    pub fn validate(&self) -> Result<(), InvalidInput> {
+        let mut found = Violations::default();
+        if !(2..=SceneOptions::MAX_VIEWS).contains(&self.views) {
+            found.push(Violation::of("views", format!("{} is not in 2..={}", self.views, SceneOptions::MAX_VIEWS)));
+        }
+        if !(1..=Self::MAX_TRACKS).contains(&self.tracks) {
+            found.push(Violation::of("tracks", format!("{} is not in 1..={}", self.tracks, Self::MAX_TRACKS)));
+        }
+        let (least, most) = self.lifetime;
+        if least < 2 || most < least || most > self.views {
+            let reason = format!("{least} to {most} is not a range within 2..={}, the views", self.views);
+            found.push(Violation::of("lifetime", reason));
+        }
+        let shares =
+            [("noise", self.noise), ("outliers", self.outliers), ("wrong_observations", self.wrong_observations)];
+        for (name, share) in shares {
+            if !(0.0..=1.0).contains(&share) {
+                found.push(Violation::of(name, format!("{share} is not a share in 0..=1")));
+            }
+        }
+        let limit = SceneOptions::MAX_RADIAL_K1;
+        if !(-limit..=limit).contains(&self.radial_k1) {
+            found.push(Violation::of("radial_k1", format!("{} is not in -{limit}..={limit}", self.radial_k1)));
+        }
+        found.into_result()
+    }
+}
+
+/// What a sequence was made of.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SequenceTruth {
+    pub focal_px: f64,
+    pub principal_point_px: [f64; 2],
+    /// Whether a track is of one point, but for single wrong observations; one entry a track.
+    pub inlier: Vec<bool>,
+    /// Whether an observation is that of its track's point; one entry an observation, in the input's order.
+    pub observation_right: Vec<bool>,
+    pub points: Vec<[f64; 3]>,
+    /// World-to-camera rotations (row by row) and translations, one a view.
+    pub rotations: Vec<[[f64; 3]; 3]>,
+    pub translations: Vec<[f64; 3]>,
+}
+
+/// A generated sequence.
+#[derive(Debug, Clone)]
+pub struct Sequence {
+    pub options: SequenceOptions,
+    pub input: RawInput,
+    pub truth: SequenceTruth,
+}
+
+struct Pose {
+    rotation: Matrix3<f64>,
+    centre: Vector3<f64>,
+}
+
+impl Sequence {
+    /// Generates the sequence of these options; the same options give the same sequence.
+    ///
+    /// # Errors
+    /// Options out of range.
+    pub fn generate(options: &SequenceOptions) -> Result<Self, InvalidInput> {
+        options.validate()?;
+        let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
+        let focal_px = rng.random_range(FOCAL_RANGE_PX.0..FOCAL_RANGE_PX.1);
+        let poses: Vec<Pose> = (0..options.views).map(|view| pose(view, rng.random_range(-0.05..0.05))).collect();
+        let centre_px = (f64::from(IMAGE_SIDE_PX) - 1.0) / 2.0;
+        let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
+        let mut input = RawInput {
+            views: vec![View { size: Some(size), ..View::default() }; options.views],
+            track_count: options.tracks,
+            ..RawInput::default()
+        };
+        let mut truth = SequenceTruth {
+            focal_px,
+            principal_point_px: [centre_px; 2],
+            inlier: Vec::with_capacity(options.tracks),
+            observation_right: Vec::new(),
+            points: Vec::with_capacity(options.tracks),
+            rotations: poses.iter().map(|pose| rows(&pose.rotation)).collect(),
+            translations: poses.iter().map(|pose| (-(pose.rotation * pose.centre)).into()).collect(),
+        };
+        let focal = focal_px / f64::from(IMAGE_SIDE_PX);
+        for track in 0..options.tracks {
+            let (point, first, images) = draw_track(options, &poses, focal, &mut rng)?;
+            let inlier = rng.random::<f64>() >= options.outliers;
+            truth.inlier.push(inlier);
+            truth.points.push(point.into());
+            for (k, image) in images.iter().enumerate() {
+                let right = inlier && rng.random::<f64>() >= options.wrong_observations;
+                let seen = if right { image + options.noise * normals(&mut rng) } else { anywhere(&mut rng) };
+                let [x, y] = (seen * f64::from(IMAGE_SIDE_PX)).into();
+                input.view.push((first + k) as u32);
+                input.track.push(track as u32);
+                input.x.push(x + centre_px);
+                input.y.push(y + centre_px);
+                truth.observation_right.push(right);
+            }
+        }
+        Ok(Self { options: options.clone(), input, truth })
+    }
+}
+
+fn pose(view: usize, jitter: f64) -> Pose {
+    let at = |k: usize| SWING_RAD[k] * (TAU * view as f64 / PERIOD_VIEWS[k]).sin();
+    let rotation = Rotation3::from_euler_angles(at(0), at(1) + jitter, at(2));
+    let along = view as f64;
+    let weave = |k: usize| WEAVE * (TAU * along / PERIOD_VIEWS[k]).cos();
+    Pose { rotation: *rotation.matrix(), centre: Vector3::new(STEP * along, weave(0), weave(1)) }
+}
+
+/// A point, the first view of its track and its exact images there and in the next ones, in image sides about the centre.
+fn draw_track(
+    options: &SequenceOptions,
+    poses: &[Pose],
+    focal: f64,
+    rng: &mut ChaCha8Rng,
+) -> Result<(Vector3<f64>, usize, Vec<Vector2<f64>>), InvalidInput> {
+    for _ in 0..MOST_DRAWS {
+        let length = rng.random_range(options.lifetime.0..=options.lifetime.1);
+        let first = rng.random_range(0..=poses.len() - length);
+        let middle = &poses[first + length / 2];
+        let uv = anywhere(rng) / focal;
+        let point = middle.centre + middle.rotation.tr_mul(&(uv.push(1.0) * rng.random_range(DEPTH.0..DEPTH.1)));
+        let image = |pose: &Pose| {
+            let seen = pose.rotation * (point - pose.centre);
+            let uv = seen.xy() / seen.z;
+            let image = focal * uv * (1.0 + options.radial_k1 * uv.norm_squared());
+            (seen.z > DEPTH.0 / 2.0 && image.amax() < 0.5).then_some(image)
+        };
+        let images: Option<Vec<Vector2<f64>>> = poses[first..first + length].iter().map(image).collect();
+        if let Some(images) = images {
+            return Ok((point, first, images));
+        }
+    }
+    Err(Violation::of("lifetime", format!("no point stays in view for {} views", options.lifetime.1)).into())
+}
+
+/// Uniform over the image, in image sides about its centre.
+fn anywhere(rng: &mut ChaCha8Rng) -> Vector2<f64> {
+    Vector2::new(rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5))
+}
+
+/// Two independent standard normal numbers (Box & Muller).
+fn normals(rng: &mut ChaCha8Rng) -> Vector2<f64> {
+    let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
+    let angle = TAU * rng.random::<f64>();
+    Vector2::new(radius * angle.cos(), radius * angle.sin())
+}
+
+fn rows(matrix: &Matrix3<f64>) -> [[f64; 3]; 3] {
+    std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::{Input, Limits};
+
+    #[test]
+    fn tracks_live_as_long_as_asked_and_right_ones_reproject() {
+        let options =
+            SequenceOptions { views: 60, tracks: 500, radial_k1: -0.1, seed: 4, ..SequenceOptions::default() };
+        let Sequence { input, truth, .. } = Sequence::generate(&options).expect("valid");
+        assert_eq!(Sequence::generate(&options).expect("valid").input.x, input.x, "one seed, one sequence");
+        let mut lengths = vec![0; 500];
+        let (mut right, mut squared) = (0.0, 0.0);
+        for k in 0..input.x.len() {
+            let (view, track) = (input.view[k] as usize, input.track[k] as usize);
+            lengths[track] += 1;
+            if !truth.observation_right[k] {
+                continue;
+            }
+            let rotation = Matrix3::from_fn(|row, column| truth.rotations[view][row][column]);
+            let seen = rotation * Vector3::from(truth.points[track]) + Vector3::from(truth.translations[view]);
+            let uv = seen.xy() / seen.z;
+            let image = truth.focal_px * uv * (1.0 + options.radial_k1 * uv.norm_squared())
+                + Vector2::from(truth.principal_point_px);
+            right += 1.0;
+            squared += (image - Vector2::new(input.x[k], input.y[k])).norm_squared();
+        }
+        let rms: f64 = (squared / right / 2.0f64).sqrt();
+        assert!((rms - 0.5).abs() < 0.02, "noise of {rms} px instead of .5");
+        assert!(lengths.iter().all(|length| (3..=10).contains(length)));
+        let inliers = truth.inlier.iter().filter(|&&inlier| inlier).count();
+        assert!((320..=380).contains(&inliers), "{inliers} of 500 for a share of .7");
+        assert!(Input::new(input, &Limits::default(), "sequence").is_ok());
+    }
+
+    #[test]
+    fn every_option_out_of_range_is_named() {
+        let default = SequenceOptions::default;
+        let cases = [
+            ("views", SequenceOptions { views: 1, lifetime: (2, 1), ..default() }),
+            ("tracks", SequenceOptions { tracks: 0, ..default() }),
+            ("lifetime", SequenceOptions { lifetime: (1, 3), ..default() }),
+            ("lifetime", SequenceOptions { lifetime: (3, 30), ..default() }),
+            ("noise", SequenceOptions { noise: f64::NAN, ..default() }),
+            ("outliers", SequenceOptions { outliers: 1.1, ..default() }),
+            ("wrong_observations", SequenceOptions { wrong_observations: -0.1, ..default() }),
+            ("radial_k1", SequenceOptions { radial_k1: 2.0, ..default() }),
+        ];
+        for (name, options) in cases {
+            let error = options.validate().expect_err(name);
+            assert_eq!(error.violations()[0].field, name, "{error}");
+        }
+        assert_eq!(default().validate(), Ok(()));
+    }
+}
