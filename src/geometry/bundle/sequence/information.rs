@@ -45,9 +45,10 @@ pub fn information(
     if let Some(own) = priors.get_mut(group) {
         *own = IntrinsicsPrior::NONE;
     }
-    let layout = Layout::new(sequence, sightings, &Free { models: &models, ..*free }, Some(group));
-    let whole = pattern(sequence, &layout);
     let mut pace = Pace::new(stop);
+    let free = Free { models: &models, ..*free };
+    let layout = Layout::new(sequence, sightings, &free, Some(group), &mut pace)?;
+    let whole = pattern(sequence, &layout, &mut pace)?;
     let mut normal = Normal::new(&layout, &whole, sequence);
     let mut reduced = Reduced::new(&layout, whole);
     let built = normal.fill(sequence, &layout, &priors, Loss::Squared, &mut pace)

@@ -6,7 +6,7 @@ use nalgebra::Vector2;
 
 use super::super::intrinsics::Parameter;
 use super::super::metric::{POINT, POSE};
-use super::{Free, Sequence, Sighting};
+use super::{Free, Pace, Sequence, Sighting};
 
 /// The unknowns of views and groups, in blocks: the poses of the free views that see something, then the groups with
 /// free intrinsics.
@@ -103,12 +103,23 @@ impl Layout {
     /// is not positive are left out.
     ///
     /// * `last_group`: the group whose block is to be the last
-    pub fn new(sequence: &Sequence, sightings: &[Sighting], free: &Free, last_group: Option<usize>) -> Self {
+    ///
+    /// Returns `None` when it was stopped.
+    pub fn new(
+        sequence: &Sequence,
+        sightings: &[Sighting],
+        free: &Free,
+        last_group: Option<usize>,
+        pace: &mut Pace,
+    ) -> Option<Self> {
         let points = sequence.points.len();
         let usable = || sightings.iter().filter(|sighting| sequence.holds(sighting));
         let mut seen_starts = vec![0; points + 1];
         let mut sees = vec![false; sequence.poses.len()];
         for sighting in usable() {
+            if !pace.go_on(1) {
+                return None;
+            }
             seen_starts[sighting.point + 1] += 1;
             sees[sighting.view] = true;
         }
@@ -117,6 +128,9 @@ impl Layout {
         let mut seen = vec![nothing; seen_starts[points]];
         let mut next = seen_starts.clone();
         for sighting in usable() {
+            if !pace.go_on(1) {
+                return None;
+            }
             let Sighting { view, point, xy, weight } = *sighting;
             seen[next[point]] = Seen { view, xy, weight, ..nothing };
             next[point] += 1;
@@ -130,17 +144,20 @@ impl Layout {
             coupling_starts: vec![0],
             free_points: (0..points).map(|point| is_free(free.points, point)).collect(),
         };
-        layout.couple(sequence);
-        layout
+        layout.couple(sequence, pace).then_some(layout)
     }
 
-    /// Finds the blocks that each free point touches and gives them their places among the couplings.
-    fn couple(&mut self, sequence: &Sequence) {
+    /// Finds the blocks that each free point touches and gives them their places among the couplings; `false` when it was
+    /// stopped.
+    fn couple(&mut self, sequence: &Sequence, pace: &mut Pace) -> bool {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
         let mut couplings = 0;
         for point in 0..self.free_points.len() {
             let seen = &mut self.seen[self.seen_starts[point]..self.seen_starts[point + 1]];
+            if !pace.go_on(seen.len()) {
+                return false;
+            }
             seen.sort_by_key(|seen| seen.view);
             if self.free_points[point] {
                 let first = self.touches.len();
@@ -170,6 +187,7 @@ impl Layout {
             self.touch_starts.push(self.touches.len());
             self.coupling_starts.push(couplings);
         }
+        true
     }
 
     pub fn point_count(&self) -> usize {

@@ -18,6 +18,10 @@ use crate::domain::StopToken;
 /// with more.
 const MIN_DAMPING: f64 = 1e-14;
 
+/// Factor on the damping's factor with each rejected step: the attempts span 5e15, from the least damping to one that
+/// allows but a small step downhill.
+const GROWTH_UP: f64 = 2.0;
+
 /// Minimises the reprojection error over what is free.
 ///
 /// * `priors`: what is known of the intrinsics, one a group; nothing of a group beyond the slice
@@ -26,7 +30,7 @@ const MIN_DAMPING: f64 = 1e-14;
 /// to the bit. One iteration costs time linear in the observations times the length of their tracks, and what the
 /// factorisation takes: linear in the views where each is connected with a bounded number of others. `stop` is asked
 /// every few milliseconds but not within a factorisation; a stopped, stuck or degenerate problem keeps its last good
-/// state.
+/// state. The costs of one that was stopped before they were known are infinite.
 ///
 /// # Pitfall
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
@@ -38,15 +42,15 @@ pub fn adjust(
     options: &Options,
     stop: &StopToken,
 ) -> Report {
-    let layout = Layout::new(sequence, sightings, free, None);
-    // Without a cost there is nothing to report: this once the token is not asked.
-    let initial_cost = cost(sequence, &layout, priors, options.loss, &mut Pace::new(&StopToken::default()));
-    let initial_cost = initial_cost.unwrap_or(f64::INFINITY);
+    let mut pace = Pace::new(stop);
+    let unknown = Report { initial_cost: f64::INFINITY, cost: f64::INFINITY, iterations: 0 };
+    let Some(layout) = Layout::new(sequence, sightings, free, None, &mut pace) else { return unknown };
+    let Some(initial_cost) = cost(sequence, &layout, priors, options.loss, &mut pace) else { return unknown };
     let mut report = Report { initial_cost, cost: initial_cost, iterations: 0 };
     if layout.is_empty() || stop.is_stopped() {
         return report;
     }
-    let Some(mut descent) = Descent::new(sequence, &layout, priors, options, stop) else { return report };
+    let Some(mut descent) = Descent::new(sequence, &layout, priors, options, pace) else { return report };
     let mut trial = sequence.clone();
     while report.iterations < options.max_iterations && report.cost > 0.0 {
         let Some(cost) = descent.step(sequence, &mut trial, report.cost) else { break };
@@ -61,11 +65,11 @@ pub fn adjust(
     report
 }
 
-/// Pattern of the reduced system of a layout.
-pub(super) fn pattern(sequence: &Sequence, layout: &Layout) -> Pattern {
+/// Pattern of the reduced system of a layout; `None` when it was stopped.
+pub(super) fn pattern(sequence: &Sequence, layout: &Layout, pace: &mut Pace) -> Option<Pattern> {
     let unknowns = &layout.unknowns;
     let pair = |view: usize| unknowns.pose_block[view].zip(unknowns.group_block_of_view(sequence, view));
-    Pattern::new(layout, (0..sequence.poses.len()).filter_map(pair))
+    Pattern::new(layout, (0..sequence.poses.len()).filter_map(pair), pace)
 }
 
 /// Sum of the loss over the observations and of what the priors add; `None` when it was stopped.
@@ -108,9 +112,9 @@ impl<'a> Descent<'a> {
         layout: &'a Layout,
         priors: &'a [IntrinsicsPrior],
         options: &Options,
-        stop: &'a StopToken,
+        mut pace: Pace<'a>,
     ) -> Option<Self> {
-        let pattern = pattern(sequence, layout);
+        let pattern = pattern(sequence, layout, &mut pace)?;
         Some(Self {
             layout,
             priors,
@@ -119,7 +123,7 @@ impl<'a> Descent<'a> {
             normal: Normal::new(layout, &pattern, sequence),
             reduced: Reduced::new(layout, pattern),
             damping: options.initial_damping.max(MIN_DAMPING),
-            pace: Pace::new(stop),
+            pace,
         })
     }
 
@@ -128,6 +132,7 @@ impl<'a> Descent<'a> {
         if !self.normal.fill(sequence, self.layout, self.priors, self.loss, &mut self.pace) {
             return None;
         }
+        let mut growth = DAMPING_UP;
         for _ in 0..MAX_ATTEMPTS {
             if self.pace.stop.is_stopped() {
                 return None;
@@ -136,7 +141,8 @@ impl<'a> Descent<'a> {
                 self.damping = (self.damping / DAMPING_DOWN).max(MIN_DAMPING);
                 return Some(cost);
             }
-            self.damping *= DAMPING_UP;
+            self.damping *= growth;
+            growth *= GROWTH_UP;
         }
         None
     }
@@ -159,6 +165,9 @@ impl<'a> Descent<'a> {
 }
 
 /// Moves poses and intrinsics from where they are in `from`.
+///
+/// Cameras turn about their own centres, `x -> dR x + dt` in camera coordinates: about the origin of the world, a camera
+/// far from it could turn only against the damping of its lever, and shift.
 pub(super) fn retract(moved: &mut Sequence, from: &Sequence, layout: &Layout, step: &[f64]) {
     let unknowns = &layout.unknowns;
     for (group, block) in unknowns.group_block.iter().enumerate() {
@@ -173,7 +182,7 @@ pub(super) fn retract(moved: &mut Sequence, from: &Sequence, layout: &Layout, st
         if let &[a, b, c, x, y, z] = &step[unknowns.range(*block)] {
             let turn = Rotation3::from_scaled_axis([a, b, c].into());
             moved.poses[view].rotation = turn * from.poses[view].rotation;
-            moved.poses[view].translation = from.poses[view].translation + Vector3::new(x, y, z);
+            moved.poses[view].translation = turn * from.poses[view].translation + Vector3::new(x, y, z);
         }
     }
 }

@@ -36,15 +36,14 @@ impl Weighted {
     fn new(sequence: &Sequence, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
         let pose = &sequence.poses[seen.view];
         let intrinsics = &sequence.intrinsics[sequence.group_of[seen.view]];
-        let turned = pose.rotation * point;
-        let at = turned + pose.translation;
+        let at = pose.apply(point);
         let residual = intrinsics.project(&at) - seen.xy;
         let squared = usable_squared_norm(&residual)? * seen.weight;
         let root = seen.weight.sqrt() * loss.root_weight(squared);
         let gradients = intrinsics.gradients(&at);
         let by_seen = gradients.by_seen.map(|gradient| gradient * root);
         let pose_row = |by_seen: &Vector3<f64>| {
-            let turn = turned.cross(by_seen);
+            let turn = at.cross(by_seen);
             [turn.x, turn.y, turn.z, by_seen.x, by_seen.y, by_seen.z]
         };
         Some(Self {

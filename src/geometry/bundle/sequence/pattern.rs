@@ -1,5 +1,6 @@
 //! Where the blocks of the reduced system are that are not zero.
 
+use super::Pace;
 use super::layout::Layout;
 
 /// The lower triangle of a symmetric matrix of blocks, by block columns.
@@ -28,10 +29,10 @@ pub(super) struct Place {
 }
 
 impl Pattern {
-    /// Blocks that a point touches together, and the pose of every view with the intrinsics of its group.
+    /// Blocks that a point touches together, and the pose of every view with the intrinsics of its group. `None` when it was stopped.
     ///
     /// * `pairs`: pose block and group block of the views where both are free
-    pub fn new(layout: &Layout, pairs: impl Iterator<Item = (usize, usize)>) -> Self {
+    pub fn new(layout: &Layout, pairs: impl Iterator<Item = (usize, usize)>, pace: &mut Pace) -> Option<Self> {
         let blocks = layout.unknowns.block_count();
         let mut group_of = vec![None; blocks];
         pairs.for_each(|(pose, group)| group_of[pose] = Some(group));
@@ -50,12 +51,17 @@ impl Pattern {
             list(column);
             group_of[column].into_iter().for_each(&mut list);
             for &point in &points[starts[column]..starts[column + 1]] {
-                layout.touches(point as usize).iter().for_each(|touch| list(touch.block as usize));
+                let touches = layout.touches(point as usize);
+                // A look at a block costs a small part of what an observation's linearisation does.
+                if !pace.go_on(touches.len().div_ceil(8)) {
+                    return None;
+                }
+                touches.iter().for_each(|touch| list(touch.block as usize));
             }
             rows[first..].sort_unstable();
             column_starts.push(rows.len());
         }
-        Self::from_rows(layout.unknowns.offsets.clone(), column_starts, rows)
+        Some(Self::from_rows(layout.unknowns.offsets.clone(), column_starts, rows))
     }
 
     fn from_rows(offsets: Vec<usize>, column_starts: Vec<usize>, rows: Vec<u32>) -> Self {

@@ -59,8 +59,10 @@ fn differentiate(sequence: &Sequence, sightings: &[Sighting], layout: &Layout) -
 fn normal_equations_agree_with_finite_differences() {
     let (sequence, sightings, models, views, points) = mixed();
     let free = Free { models: &models, views: Some(&views), points: Some(&points) };
-    let layout = Layout::new(&sequence, &sightings, &free, None);
-    let pattern = pattern(&sequence, &layout);
+    let going = StopToken::default();
+    let mut pace = Pace::new(&going);
+    let layout = Layout::new(&sequence, &sightings, &free, None, &mut pace).expect("goes on");
+    let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let cameras = pattern.dimension();
     assert_eq!(cameras, 6 * 6 + 5 + 3, "six free views, five and three intrinsics");
     let mut normal = Normal::new(&layout, &pattern, &sequence);
@@ -109,8 +111,10 @@ fn normal_equations_agree_with_finite_differences() {
 fn what_is_known_beforehand_takes_part() {
     let (sequence, sightings, models, ..) = mixed();
     let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, 0.2, 0.1, 0.01);
-    let layout = Layout::new(&sequence, &sightings, &Free::all(&models), None);
-    let pattern = pattern(&sequence, &layout);
+    let going = StopToken::default();
+    let mut pace = Pace::new(&going);
+    let layout = Layout::new(&sequence, &sightings, &Free::all(&models), None, &mut pace).expect("goes on");
+    let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let with = |priors: &[IntrinsicsPrior]| {
         let mut normal = Normal::new(&layout, &pattern, &sequence);
         assert!(normal.fill(&sequence, &layout, priors, Loss::Squared, &mut Pace::new(&StopToken::default())));
@@ -129,8 +133,10 @@ fn what_is_known_beforehand_takes_part() {
 fn a_stop_is_seen_within_one_linearisation() {
     let (sequence, sightings) = chain(2, 10, 1 + WORK_BETWEEN_QUESTIONS / 20, 5, 0.001);
     let free = Free::all(&[IntrinsicsModel::FOCAL]);
-    let layout = Layout::new(&sequence, &sightings, &free, None);
-    let pattern = pattern(&sequence, &layout);
+    let going = StopToken::default();
+    let mut pace = Pace::new(&going);
+    let layout = Layout::new(&sequence, &sightings, &free, None, &mut pace).expect("goes on");
+    let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);
