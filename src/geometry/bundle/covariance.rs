@@ -76,8 +76,18 @@ impl Information {
             return None;
         }
         let (matrix, pull) = without_poses(&reduced.matrix, &reduced.vector, POSE * poses)?;
+        Self::assembled(reconstruction.intrinsics, matrix, pull, known)
+    }
+
+    /// From what is left when everything else is eliminated; `None` where it holds what is no number.
+    pub(super) fn assembled(
+        intrinsics: Intrinsics,
+        matrix: SMatrix<f64, PARAMETERS, PARAMETERS>,
+        pull: SVector<f64, PARAMETERS>,
+        known: [f64; PARAMETERS],
+    ) -> Option<Self> {
         let finite = matrix.iter().chain(pull.iter()).all(|value| value.is_finite());
-        finite.then_some(Self { intrinsics: reconstruction.intrinsics, matrix, pull, known })
+        finite.then_some(Self { intrinsics, matrix, pull, known })
     }
 
     /// Where the cost of a model is least, how low it is there, and how well that is determined.
@@ -104,12 +114,14 @@ impl Information {
             let k = free[row];
             (pull[k] - prior.information[k] * deviation[k]) * scale[row]
         });
-        let eigen = scaled.symmetric_eigen();
+        // Of nothing there is no decomposition.
+        let eigen = (!free.is_empty()).then(|| scaled.symmetric_eigen());
         let mut variance = [Some(0.0); PARAMETERS];
         let mut log_determinant = -2.0 * scale.iter().map(|scale| scale.ln()).sum::<f64>();
-        for (direction, &value) in eigen.eigenvalues.iter().enumerate() {
+        for (&value, vector) in
+            eigen.iter().flat_map(|eigen| eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()))
+        {
             log_determinant += value.max(NULL_INTRINSICS).ln();
-            let vector = eigen.eigenvectors.column(direction);
             let along = vector.dot(&target);
             for (row, &k) in free.iter().enumerate() {
                 let share = vector[row].powi(2);

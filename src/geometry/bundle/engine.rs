@@ -8,12 +8,12 @@ use crate::domain::StopToken;
 
 /// Squared residual at which an observation counts as undefined (depth zero or nearly so, not a number): a million
 /// image sides. It then costs just this and pulls at nothing, so that costs stay finite and comparable.
-const UNDEFINED_SQUARED: f64 = 1e12;
+pub(super) const UNDEFINED_SQUARED: f64 = 1e12;
 /// Dampings tried for one step before the state is declared a minimum; they span 8^8 = 1.7e7.
-const MAX_ATTEMPTS: usize = 8;
+pub(super) const MAX_ATTEMPTS: usize = 8;
 /// Factor on the damping after a rejected step, and its divisor after an accepted one.
-const DAMPING_UP: f64 = 8.0;
-const DAMPING_DOWN: f64 = 5.0;
+pub(super) const DAMPING_UP: f64 = 8.0;
+pub(super) const DAMPING_DOWN: f64 = 5.0;
 /// Least damping: below it, rounding in the gauge directions would be amplified into the step.
 const MIN_DAMPING: f64 = 1e-10;
 

@@ -39,6 +39,24 @@ impl Intrinsics {
         Vector2::new(scale * u, self.aspect * scale * v) + self.principal_point
     }
 
+    /// Derivatives of [`Self::project`]; infinite or not a number at depth zero.
+    #[inline]
+    pub(super) fn gradients(&self, seen: &Vector3<f64>) -> ImageGradients {
+        let scale = seen.z.recip();
+        let (u, v) = (seen.x * scale, seen.y * scale);
+        let (fx, fy) = (self.focal, self.aspect * self.focal);
+        let squared = u * u + v * v;
+        let radial = 1.0 + self.radial * squared;
+        let (x, y) = (fx * u * radial, fy * v * radial);
+        let by_parameter = [[x, 1.0, 0.0, 0.0, fx * u * squared], [y, 0.0, 1.0, y, fy * v * squared]];
+        let bend = 2.0 * self.radial;
+        // Of the two image coordinates by u and v; by z the image moves as by -u and -v.
+        let by_uv =
+            [[fx * (radial + bend * u * u), fx * bend * u * v], [fy * bend * u * v, fy * (radial + bend * v * v)]];
+        let by_seen = by_uv.map(|[by_u, by_v]| Vector3::new(by_u, by_v, -by_u * u - by_v * v) * scale);
+        ImageGradients { by_parameter, by_seen }
+    }
+
     /// Where a pinhole with this `K` would see what the lens images at `xy`.
     ///
     /// Returns `None` where nothing is imaged: beyond the circle at which a barrel distortion folds the image back.
@@ -91,6 +109,14 @@ impl Intrinsics {
             Parameter::Radial => self.radial += by,
         }
     }
+}
+
+/// Gradients of the two coordinates of an image point.
+pub(super) struct ImageGradients {
+    /// With respect to the intrinsics, in the order of [`Parameter`].
+    pub by_parameter: [[f64; Parameter::COUNT]; 2],
+    /// With respect to the point in camera coordinates.
+    pub by_seen: [Vector3<f64>; 2],
 }
 
 /// An intrinsic as it is adjusted.

@@ -4,6 +4,7 @@ use nalgebra::{Matrix3, Matrix3x4, Rotation3, SMatrix, Vector2, Vector3};
 
 pub use super::covariance::{Information, Optimum};
 use super::engine::{Belief, Jacobian, Problem, Sink, Step, minimise};
+use super::intrinsics::ImageGradients;
 pub use super::intrinsics::{Extension, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter};
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
@@ -77,27 +78,15 @@ impl<const G: usize> Problem<G, POSE, POINT> for Metric<G> {
         let seen = turned + pose.translation;
         let intrinsics = &self.reconstruction.intrinsics;
         sink.take(intrinsics.project(&seen) - observation.xy, || {
-            let scale = seen.z.recip();
-            let (u, v) = (seen.x * scale, seen.y * scale);
-            let (fx, fy) = (intrinsics.focal, intrinsics.aspect * intrinsics.focal);
-            let squared = u * u + v * v;
-            let radial = 1.0 + intrinsics.radial * squared;
-            let (x, y) = (fx * u * radial, fy * v * radial);
-            // Gradients of the two image coordinates with respect to the intrinsics, in the order of `Parameter`, and
-            // to u and v; by z the image moves as by -u and -v.
-            let by_intrinsics = [[x, 1.0, 0.0, 0.0, fx * u * squared], [y, 0.0, 1.0, y, fy * v * squared]];
-            let bend = 2.0 * intrinsics.radial;
-            let by_uv =
-                [[fx * (radial + bend * u * u), fx * bend * u * v], [fy * bend * u * v, fy * (radial + bend * v * v)]];
+            let ImageGradients { by_parameter, by_seen } = intrinsics.gradients(&seen);
             let mut camera = SMatrix::<f64, POSE, 2>::zeros();
             let mut point = SMatrix::<f64, POINT, 2>::zeros();
-            for (component, [by_u, by_v]) in by_uv.into_iter().enumerate() {
-                let by_seen = Vector3::new(by_u, by_v, -by_u * u - by_v * v) * scale;
-                camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(&by_seen));
-                camera.fixed_view_mut::<3, 1>(3, component).copy_from(&by_seen);
-                point.set_column(component, &pose.rotation.tr_mul(&by_seen));
+            for (component, by_seen) in by_seen.iter().enumerate() {
+                camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(by_seen));
+                camera.fixed_view_mut::<3, 1>(3, component).copy_from(by_seen);
+                point.set_column(component, &pose.rotation.tr_mul(by_seen));
             }
-            let globals = SMatrix::from_fn(|k, component| by_intrinsics[component][self.free[k] as usize]);
+            let globals = SMatrix::from_fn(|k, component| by_parameter[component][self.free[k] as usize]);
             Jacobian { globals, camera, point }
         });
     }

@@ -13,6 +13,7 @@ mod intrinsics;
 pub mod metric;
 pub mod projective;
 mod reduced;
+pub mod sequence;
 #[cfg(test)]
 pub(crate) mod testing;
 pub mod zoom;

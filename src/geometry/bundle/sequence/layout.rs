@@ -1,0 +1,246 @@
+//! Which unknowns there are, and the observations point by point.
+
+use std::ops::Range;
+
+use nalgebra::Vector2;
+
+use super::super::intrinsics::Parameter;
+use super::super::metric::{POINT, POSE};
+use super::{Free, Pace, Sequence, Sighting};
+
+/// The unknowns of views and groups, in blocks: the poses of the free views that see something, then the groups with
+/// free intrinsics.
+#[derive(Debug)]
+pub(super) struct Unknowns {
+    /// Block of a view's pose; `None` where it is held or sees nothing.
+    pub pose_block: Vec<Option<usize>>,
+    /// Block of a group's intrinsics; `None` where all are held.
+    pub group_block: Vec<Option<usize>>,
+    /// Free intrinsics of a group, in the order of its block.
+    pub parameters: Vec<Vec<Parameter>>,
+    /// First unknown of a block, and at the end the number of unknowns.
+    pub offsets: Vec<usize>,
+}
+
+impl Unknowns {
+    fn new(sequence: &Sequence, free: &Free, sees: &[bool], last_group: Option<usize>) -> Self {
+        let mut offsets = vec![0];
+        let mut append = |size: usize| {
+            let block = offsets.len() - 1;
+            offsets.push(offsets[block] + size);
+            block
+        };
+        let pose_block = (0..sequence.poses.len())
+            .map(|view| (sees[view] && is_free(free.views, view)).then(|| append(POSE)))
+            .collect();
+        let groups = sequence.intrinsics.len();
+        let parameters: Vec<Vec<Parameter>> = (0..groups)
+            .map(|group| free.models.get(group).map(|model| model.parameters()).unwrap_or_default())
+            .collect();
+        let mut group_block = vec![None; groups];
+        let ordered = (0..groups).filter(|group| Some(*group) != last_group).chain(last_group);
+        for group in ordered.filter(|group| *group < groups) {
+            group_block[group] = (!parameters[group].is_empty()).then(|| append(parameters[group].len()));
+        }
+        Self { pose_block, group_block, parameters, offsets }
+    }
+
+    /// Block of the intrinsics of a view.
+    pub fn group_block_of_view(&self, sequence: &Sequence, view: usize) -> Option<usize> {
+        *self.group_block.get(*sequence.group_of.get(view)?)?
+    }
+
+    pub fn block_count(&self) -> usize {
+        self.offsets.len() - 1
+    }
+
+    /// The unknowns of a block.
+    pub fn range(&self, block: usize) -> Range<usize> {
+        self.offsets[block]..self.offsets[block + 1]
+    }
+}
+
+/// A mask frees what it says `true` of; none frees all.
+pub(super) fn is_free(mask: Option<&[bool]>, index: usize) -> bool {
+    mask.is_none_or(|mask| mask.get(index).copied().unwrap_or(false))
+}
+
+/// One observation of a point.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Seen {
+    pub view: usize,
+    pub xy: Vector2<f64>,
+    pub weight: f64,
+    /// Where the couplings of the view's pose and of its group's intrinsics with the point start; `None` where either
+    /// is held.
+    pub pose_coupling: Option<u32>,
+    pub group_coupling: Option<u32>,
+}
+
+/// A block of unknowns that a point is coupled with.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Touch {
+    pub block: u32,
+    /// Start of its rows x 3 matrix among the point's couplings, column after column.
+    pub coupling: u32,
+}
+
+/// The observations sorted by point, then view, and the blocks each point touches.
+#[derive(Debug)]
+pub(super) struct Layout {
+    pub unknowns: Unknowns,
+    seen: Vec<Seen>,
+    seen_starts: Vec<usize>,
+    touches: Vec<Touch>,
+    touch_starts: Vec<usize>,
+    /// Start of a point's couplings.
+    coupling_starts: Vec<usize>,
+    pub free_points: Vec<bool>,
+}
+
+impl Layout {
+    /// Sorts in linear time. Observations with an index out of range, a coordinate that is not finite or a weight that
+    /// is not positive are left out.
+    ///
+    /// * `last_group`: the group whose block is to be the last
+    ///
+    /// Returns `None` when it was stopped.
+    pub fn new(
+        sequence: &Sequence,
+        sightings: &[Sighting],
+        free: &Free,
+        last_group: Option<usize>,
+        pace: &mut Pace,
+    ) -> Option<Self> {
+        let points = sequence.points.len();
+        let usable = || sightings.iter().filter(|sighting| sequence.holds(sighting));
+        let mut seen_starts = vec![0; points + 1];
+        let mut sees = vec![false; sequence.poses.len()];
+        for sighting in usable() {
+            if !pace.go_on(1) {
+                return None;
+            }
+            seen_starts[sighting.point + 1] += 1;
+            sees[sighting.view] = true;
+        }
+        accumulate(&mut seen_starts);
+        let nothing = Seen { view: 0, xy: Vector2::zeros(), weight: 0.0, pose_coupling: None, group_coupling: None };
+        let mut seen = vec![nothing; seen_starts[points]];
+        let mut next = seen_starts.clone();
+        for sighting in usable() {
+            if !pace.go_on(1) {
+                return None;
+            }
+            let Sighting { view, point, xy, weight } = *sighting;
+            seen[next[point]] = Seen { view, xy, weight, ..nothing };
+            next[point] += 1;
+        }
+        let mut layout = Self {
+            unknowns: Unknowns::new(sequence, free, &sees, last_group),
+            seen,
+            seen_starts,
+            touches: Vec::new(),
+            touch_starts: vec![0],
+            coupling_starts: vec![0],
+            free_points: (0..points).map(|point| is_free(free.points, point)).collect(),
+        };
+        layout.couple(sequence, pace).then_some(layout)
+    }
+
+    /// Finds the blocks that each free point touches and gives them their places among the couplings; `false` when it was
+    /// stopped.
+    fn couple(&mut self, sequence: &Sequence, pace: &mut Pace) -> bool {
+        let unknowns = &self.unknowns;
+        let mut blocks: Vec<usize> = Vec::new();
+        let mut couplings = 0;
+        for point in 0..self.free_points.len() {
+            let seen = &mut self.seen[self.seen_starts[point]..self.seen_starts[point + 1]];
+            if !pace.go_on(seen.len()) {
+                return false;
+            }
+            seen.sort_by_key(|seen| seen.view);
+            if self.free_points[point] {
+                let first = self.touches.len();
+                let pose = |seen: &Seen| unknowns.pose_block[seen.view];
+                let group = |seen: &Seen| unknowns.group_block_of_view(sequence, seen.view);
+                blocks.clear();
+                blocks.extend(seen.iter().filter_map(pose));
+                blocks.extend(seen.iter().filter_map(group));
+                blocks.sort_unstable();
+                blocks.dedup();
+                let mut size = 0;
+                for &block in &blocks {
+                    self.touches.push(Touch { block: block as u32, coupling: size as u32 });
+                    size += POINT * unknowns.range(block).len();
+                }
+                let touches = &self.touches[first..];
+                let place = |block: Option<usize>| {
+                    let at = touches.binary_search_by_key(&(block? as u32), |touch| touch.block).ok()?;
+                    Some(touches[at].coupling)
+                };
+                for seen in seen {
+                    seen.pose_coupling = place(pose(seen));
+                    seen.group_coupling = place(group(seen));
+                }
+                couplings += size;
+            }
+            self.touch_starts.push(self.touches.len());
+            self.coupling_starts.push(couplings);
+        }
+        true
+    }
+
+    pub fn point_count(&self) -> usize {
+        self.free_points.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.seen.is_empty()
+    }
+
+    /// Observations of a point.
+    pub fn seen(&self, point: usize) -> &[Seen] {
+        &self.seen[self.seen_starts[point]..self.seen_starts[point + 1]]
+    }
+
+    /// Blocks that a point touches, ascending; none for a point that is held.
+    pub fn touches(&self, point: usize) -> &[Touch] {
+        &self.touches[self.touch_starts[point]..self.touch_starts[point + 1]]
+    }
+
+    /// Where the couplings of a point are.
+    pub fn couplings(&self, point: usize) -> Range<usize> {
+        self.coupling_starts[point]..self.coupling_starts[point + 1]
+    }
+
+    /// Values of all couplings.
+    pub fn coupling_count(&self) -> usize {
+        self.coupling_starts[self.point_count()]
+    }
+
+    /// Points that touch each block, ascending: their starts and, one block after the other, the points.
+    pub fn points_by_block(&self) -> (Vec<usize>, Vec<u32>) {
+        let mut starts = vec![0; self.unknowns.block_count() + 1];
+        for touch in &self.touches {
+            starts[touch.block as usize + 1] += 1;
+        }
+        accumulate(&mut starts);
+        let mut next = starts.clone();
+        let mut points = vec![0; self.touches.len()];
+        for point in 0..self.point_count() {
+            for touch in self.touches(point) {
+                let slot = &mut next[touch.block as usize];
+                points[*slot] = point as u32;
+                *slot += 1;
+            }
+        }
+        (starts, points)
+    }
+}
+
+/// Counts, each one place late, to starts.
+fn accumulate(counts: &mut [usize]) {
+    for k in 1..counts.len() {
+        counts[k] += counts[k - 1];
+    }
+}

@@ -1,0 +1,145 @@
+//! Metric bundle adjustment of whole sequences, cameras in groups of one calibration: cost and memory linear in the
+//! observations, by a sparse Cholesky factorisation of the Schur complement of the points (Triggs et al. 2000, "Bundle
+//! adjustment - a modern synthesis", section 6).
+//!
+//! Shares residuals, loss and damping with the dense adjustment of one block, `bundle::metric`. May depend on nothing
+//! of `geometry` but `bundle` and linear algebra.
+
+mod information;
+mod layout;
+mod minimise;
+mod normal;
+mod pattern;
+mod point;
+mod reduced;
+mod solver;
+#[cfg(test)]
+mod tests;
+
+use nalgebra::{Vector2, Vector3};
+
+pub use self::information::information;
+pub use self::minimise::adjust;
+use super::Observation;
+use super::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
+use crate::domain::StopToken;
+
+/// A metric reconstruction, up to a similarity, whose views share intrinsics in groups.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sequence {
+    /// One a group.
+    pub intrinsics: Vec<Intrinsics>,
+    /// Group of each view.
+    pub group_of: Vec<usize>,
+    pub poses: Vec<Pose>,
+    pub points: Vec<Vector3<f64>>,
+}
+
+/// One image point.
+///
+/// Sightings with an index out of range, a coordinate that is not finite or a weight that is not finite and positive
+/// are ignored.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sighting {
+    pub view: usize,
+    pub point: usize,
+    /// Normalised image coordinates.
+    pub xy: Vector2<f64>,
+    /// Factor on the squared residual, before the loss: `(sigma / own sigma)^2`, 1 for an observation as noisy as most.
+    pub weight: f64,
+}
+
+/// What may move. What a mask is too short for is held.
+#[derive(Debug, Clone, Copy)]
+pub struct Free<'a> {
+    /// Free intrinsics, one a group; none are free of a group that is beyond the slice.
+    pub models: &'a [IntrinsicsModel],
+    /// Views whose poses are free; `None`: all.
+    pub views: Option<&'a [bool]>,
+    /// Points that are free; `None`: all.
+    pub points: Option<&'a [bool]>,
+}
+
+impl<'a> Free<'a> {
+    /// All poses and points, and these intrinsics.
+    pub fn all(models: &'a [IntrinsicsModel]) -> Self {
+        Self { models, views: None, points: None }
+    }
+}
+
+impl From<&Reconstruction> for Sequence {
+    /// All views in one group.
+    fn from(constant: &Reconstruction) -> Self {
+        Self {
+            intrinsics: vec![constant.intrinsics],
+            group_of: vec![0; constant.poses.len()],
+            poses: constant.poses.clone(),
+            points: constant.points.clone(),
+        }
+    }
+}
+
+impl From<&Observation> for Sighting {
+    /// As noisy as most.
+    fn from(seen: &Observation) -> Self {
+        Self { view: seen.camera, point: seen.point, xy: seen.xy, weight: 1.0 }
+    }
+}
+
+impl Sequence {
+    /// Intrinsics of a view.
+    ///
+    /// # Panics
+    /// When the view or its group is out of range.
+    pub fn intrinsics_of(&self, view: usize) -> &Intrinsics {
+        &self.intrinsics[self.group_of[view]]
+    }
+
+    /// Predicted minus observed image point, unweighted; infinite or not a number at depth zero.
+    ///
+    /// # Panics
+    /// When an index is out of range.
+    pub fn residual(&self, seen: &Sighting) -> Vector2<f64> {
+        self.intrinsics_of(seen.view).project(&self.poses[seen.view].apply(&self.points[seen.point])) - seen.xy
+    }
+
+    /// Whether a sighting can be used.
+    fn holds(&self, seen: &Sighting) -> bool {
+        seen.view < self.poses.len()
+            && self.group_of.get(seen.view).is_some_and(|group| *group < self.intrinsics.len())
+            && seen.point < self.points.len()
+            && seen.xy.iter().all(|x| x.is_finite())
+            && seen.weight > 0.0
+            && seen.weight.is_finite()
+    }
+}
+
+/// Observations' worth of work after which the stop token is asked: some milliseconds, 20 in builds for tests.
+const WORK_BETWEEN_QUESTIONS: usize = 1 << 14;
+
+/// Asks the stop token now and then.
+struct Pace<'a> {
+    stop: &'a StopToken,
+    left: usize,
+}
+
+impl<'a> Pace<'a> {
+    fn new(stop: &'a StopToken) -> Self {
+        Self { stop, left: WORK_BETWEEN_QUESTIONS }
+    }
+
+    /// Whether to go on after so much work.
+    #[inline]
+    fn go_on(&mut self, work: usize) -> bool {
+        match self.left.checked_sub(work) {
+            Some(left) => {
+                self.left = left;
+                true
+            }
+            None => {
+                self.left = WORK_BETWEEN_QUESTIONS;
+                !self.stop.is_stopped()
+            }
+        }
+    }
+}

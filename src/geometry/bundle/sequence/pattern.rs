@@ -1,0 +1,185 @@
+//! Where the blocks of the reduced system are that are not zero.
+
+use super::Pace;
+use super::layout::Layout;
+
+/// The lower triangle of a symmetric matrix of blocks, by block columns.
+///
+/// The blocks of one column are a dense panel, column-major, the diagonal block (held in full) on top: the values are
+/// those of a compressed sparse column matrix whose row indices are the same all over a panel.
+#[derive(Debug)]
+pub(super) struct Pattern {
+    /// First unknown of a block, and at the end their number.
+    pub offsets: Vec<usize>,
+    /// Where a block column starts in `rows`.
+    pub column_starts: Vec<usize>,
+    /// Row blocks of the columns, ascending, first the diagonal.
+    pub rows: Vec<u32>,
+    /// Where a row block starts in the panel of its column.
+    heights: Vec<u32>,
+    /// Where the panel of a block column starts among the values.
+    panel_starts: Vec<usize>,
+}
+
+/// A block among the values: its first, and the distance between its columns.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place {
+    pub start: usize,
+    pub stride: usize,
+}
+
+impl Pattern {
+    /// Blocks that a point touches together, and the pose of every view with the intrinsics of its group. `None` when it was stopped.
+    ///
+    /// * `pairs`: pose block and group block of the views where both are free
+    pub fn new(layout: &Layout, pairs: impl Iterator<Item = (usize, usize)>, pace: &mut Pace) -> Option<Self> {
+        let blocks = layout.unknowns.block_count();
+        let mut group_of = vec![None; blocks];
+        pairs.for_each(|(pose, group)| group_of[pose] = Some(group));
+        let (starts, points) = layout.points_by_block();
+        let (mut column_starts, mut rows) = (vec![0], Vec::new());
+        // Column for which a row was listed last.
+        let mut listed_for = vec![usize::MAX; blocks];
+        for column in 0..blocks {
+            let first = rows.len();
+            let mut list = |row: usize| {
+                if row >= column && listed_for[row] != column {
+                    listed_for[row] = column;
+                    rows.push(row as u32);
+                }
+            };
+            list(column);
+            group_of[column].into_iter().for_each(&mut list);
+            for &point in &points[starts[column]..starts[column + 1]] {
+                let touches = layout.touches(point as usize);
+                // A look at a block costs a small part of what an observation's linearisation does.
+                if !pace.go_on(touches.len().div_ceil(8)) {
+                    return None;
+                }
+                touches.iter().for_each(|touch| list(touch.block as usize));
+            }
+            rows[first..].sort_unstable();
+            column_starts.push(rows.len());
+        }
+        Some(Self::from_rows(layout.unknowns.offsets.clone(), column_starts, rows))
+    }
+
+    fn from_rows(offsets: Vec<usize>, column_starts: Vec<usize>, rows: Vec<u32>) -> Self {
+        let mut heights = Vec::with_capacity(rows.len());
+        let mut panel_starts = vec![0];
+        let mut values = 0;
+        for column in 0..column_starts.len() - 1 {
+            let mut height = 0;
+            for &row in &rows[column_starts[column]..column_starts[column + 1]] {
+                heights.push(height as u32);
+                height += offsets[row as usize + 1] - offsets[row as usize];
+            }
+            values += height * (offsets[column + 1] - offsets[column]);
+            panel_starts.push(values);
+        }
+        Self { offsets, column_starts, rows, heights, panel_starts }
+    }
+
+    pub fn block_count(&self) -> usize {
+        self.offsets.len() - 1
+    }
+
+    pub fn dimension(&self) -> usize {
+        self.offsets[self.block_count()]
+    }
+
+    pub fn value_count(&self) -> usize {
+        self.panel_starts[self.block_count()]
+    }
+
+    /// Unknowns of a block.
+    pub fn size(&self, block: usize) -> usize {
+        self.offsets[block + 1] - self.offsets[block]
+    }
+
+    /// Rows of the panel of a block column.
+    pub fn stride(&self, column: usize) -> usize {
+        let last = self.column_starts[column + 1] - 1;
+        self.heights[last] as usize + self.size(self.rows[last] as usize)
+    }
+
+    /// Where panel and list of rows of a block column start.
+    pub fn column(&self, column: usize) -> Column<'_> {
+        let range = self.column_starts[column]..self.column_starts[column + 1];
+        Column {
+            rows: &self.rows[range.clone()],
+            heights: &self.heights[range],
+            start: self.panel_starts[column],
+            at: 0,
+        }
+    }
+
+    /// Where a block is; `None` where it is zero.
+    pub fn place(&self, row: usize, column: usize) -> Option<Place> {
+        let start = self.column(column).start_of(row as u32)?;
+        Some(Place { start, stride: self.stride(column) })
+    }
+
+    /// Calls `take` with row, column and index of every value, those of the diagonal blocks' upper triangles too.
+    pub fn for_each(&self, mut take: impl FnMut(usize, usize, usize)) {
+        for block in 0..self.block_count() {
+            let mut index = self.panel_starts[block];
+            for column in self.offsets[block]..self.offsets[block + 1] {
+                for &row in &self.rows[self.column_starts[block]..self.column_starts[block + 1]] {
+                    for row in self.offsets[row as usize]..self.offsets[row as usize + 1] {
+                        take(row, column, index);
+                        index += 1;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Where the diagonal is among the values, unknown after unknown.
+    pub fn diagonal(&self) -> Vec<usize> {
+        let of_block = |block: usize| {
+            let (start, stride) = (self.panel_starts[block], self.stride(block));
+            (0..self.size(block)).map(move |k| start + k * (stride + 1))
+        };
+        (0..self.block_count()).flat_map(of_block).collect()
+    }
+
+    /// The same without the last block.
+    pub fn without_last(&self) -> Self {
+        let blocks = self.block_count().saturating_sub(1);
+        let (mut column_starts, mut rows) = (vec![0], Vec::new());
+        for column in 0..blocks {
+            let kept = self.column(column).rows.iter().filter(|row| (**row as usize) < blocks);
+            rows.extend(kept);
+            column_starts.push(rows.len());
+        }
+        Self::from_rows(self.offsets[..=blocks].to_vec(), column_starts, rows)
+    }
+}
+
+/// A block column whose rows are looked up in ascending order.
+pub(super) struct Column<'a> {
+    rows: &'a [u32],
+    heights: &'a [u32],
+    start: usize,
+    at: usize,
+}
+
+impl<'a> Column<'a> {
+    pub fn rows(&self) -> &'a [u32] {
+        self.rows
+    }
+
+    /// Where a row block starts among the values; rows must be asked for in ascending order.
+    #[inline]
+    pub fn start_of(&mut self, row: u32) -> Option<usize> {
+        // Neighbours in a track are mostly neighbours in the list; else it is searched.
+        if self.rows.get(self.at) != Some(&row) {
+            self.at += 1;
+            if self.rows.get(self.at) != Some(&row) {
+                self.at = self.rows.binary_search(&row).ok()?;
+            }
+        }
+        Some(self.start + self.heights[self.at] as usize)
+    }
+}

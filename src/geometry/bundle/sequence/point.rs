@@ -1,0 +1,84 @@
+//! A point's block of the normal equations, and its elimination.
+
+use nalgebra::Vector3;
+
+use super::super::metric::POINT;
+
+/// Least diagonal of a point's block as a share of its trace, for points whose position nothing determines.
+const POINT_DAMPING: f64 = 1e-12;
+
+/// Information on a point and half the gradient of the cost by it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PointBlock {
+    /// Lower triangle, column after column.
+    matrix: [f64; 6],
+    pub gradient: Vector3<f64>,
+}
+
+/// `L` of a point's damped block `L L'`, lower triangle by columns, with the diagonal inverted.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PointFactor([f64; 6]);
+
+impl PointBlock {
+    pub const ZERO: Self = Self { matrix: [0.0; 6], gradient: Vector3::new(0.0, 0.0, 0.0) };
+
+    #[inline]
+    pub fn add(&mut self, rows: &[Vector3<f64>; 2], residual: [f64; 2]) {
+        let [a, b] = rows;
+        let entry = |i: usize, j: usize| a[i] * a[j] + b[i] * b[j];
+        let added = [entry(0, 0), entry(1, 0), entry(2, 0), entry(1, 1), entry(2, 1), entry(2, 2)];
+        self.matrix.iter_mut().zip(added).for_each(|(sum, value)| *sum += value);
+        self.gradient += a * residual[0] + b * residual[1];
+    }
+
+    /// Factors the block with Marquardt's damping; `None` when it is not positive definite.
+    #[inline]
+    pub fn factor(&self, damping: f64) -> Option<PointFactor> {
+        let [m00, m10, m20, m11, m21, m22] = self.matrix;
+        let least = POINT_DAMPING * (m00 + m11 + m22) + f64::MIN_POSITIVE;
+        let inverse_root = |value: f64| (value > 0.0 && value.is_finite()).then(|| value.sqrt().recip());
+        let l00 = inverse_root(m00 + damping * m00 + least)?;
+        let (l10, l20) = (m10 * l00, m20 * l00);
+        let l11 = inverse_root(m11 + damping * m11 + least - l10 * l10)?;
+        let l21 = (m21 - l20 * l10) * l11;
+        let l22 = inverse_root(m22 + damping * m22 + least - l20 * l20 - l21 * l21)?;
+        Some(PointFactor([l00, l10, l20, l11, l21, l22]))
+    }
+}
+
+impl PointFactor {
+    /// `L^-1 x`
+    #[inline]
+    pub fn whiten(&self, x: &Vector3<f64>) -> Vector3<f64> {
+        let [l00, l10, l20, l11, l21, l22] = self.0;
+        let first = x[0] * l00;
+        let second = (x[1] - l10 * first) * l11;
+        Vector3::new(first, second, (x[2] - l20 * first - l21 * second) * l22)
+    }
+
+    /// `L'^-1 x`
+    #[inline]
+    pub fn unwhiten(&self, x: &Vector3<f64>) -> Vector3<f64> {
+        let [l00, l10, l20, l11, l21, l22] = self.0;
+        let third = x[2] * l22;
+        let second = (x[1] - l21 * third) * l11;
+        Vector3::new((x[0] - l10 * second - l20 * third) * l00, second, third)
+    }
+
+    /// `W L'^-1` for a coupling `W`, `rows x 3`, column-major.
+    #[inline]
+    pub fn whiten_coupling(&self, coupling: &[f64], whitened: &mut [f64]) {
+        let [l00, l10, l20, l11, l21, l22] = self.0;
+        let rows = coupling.len() / POINT;
+        let (coupling, whitened) = (&coupling[..POINT * rows], &mut whitened[..POINT * rows]);
+        let mut k = 0;
+        while k < rows {
+            let first = coupling[k] * l00;
+            let second = (coupling[rows + k] - l10 * first) * l11;
+            whitened[k] = first;
+            whitened[rows + k] = second;
+            whitened[2 * rows + k] = (coupling[2 * rows + k] - l20 * first - l21 * second) * l22;
+            k += 1;
+        }
+    }
+}

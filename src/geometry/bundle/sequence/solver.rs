@@ -1,0 +1,134 @@
+//! Cholesky factorisation of a system with a block pattern: dense where it is small, else sparse.
+
+use faer::dyn_stack::{MemBuffer, MemStack, StackReq};
+use faer::perm::Perm;
+use faer::sparse::linalg::amd;
+use faer::sparse::linalg::cholesky::{LltRef, SymbolicCholesky, SymmetricOrdering, factorize_symbolic_cholesky};
+use faer::sparse::{SparseColMatRef, SymbolicSparseColMat, SymbolicSparseColMatRef};
+use faer::{Conj, MatMut, Par, Side};
+
+use super::super::cholesky::CholeskySolver;
+use super::pattern::Pattern;
+
+/// Unknowns up to which the dense factorisation is used, about forty views: its plain loop needs no analysis.
+const DENSE_LIMIT: usize = 256;
+
+/// Solves systems of one pattern.
+pub(super) enum Solver {
+    Dense { solver: CholeskySolver, matrix: Vec<f64> },
+    Sparse(SparseCholesky),
+}
+
+impl Solver {
+    /// `None` when the analysis runs out of memory.
+    pub fn new(pattern: &Pattern) -> Option<Self> {
+        let n = pattern.dimension();
+        if n <= DENSE_LIMIT {
+            return Some(Self::Dense { solver: CholeskySolver::new(n), matrix: vec![0.0; n * n] });
+        }
+        SparseCholesky::new(pattern, 1).map(Self::Sparse)
+    }
+
+    /// Solves in place of `vector`; `false` when the matrix is not positive definite.
+    pub fn solve(&mut self, pattern: &Pattern, values: &[f64], vector: &mut [f64]) -> bool {
+        match self {
+            Self::Dense { solver, matrix } => {
+                let n = vector.len();
+                matrix.fill(0.0);
+                // The blocks' upper triangles land above the diagonal, where nothing looks.
+                pattern.for_each(|row, column, index| matrix[column * n + row] = values[index]);
+                solver.solve(matrix, vector)
+            }
+            Self::Sparse(cholesky) => {
+                cholesky.factor(values) && {
+                    cholesky.solve(vector);
+                    true
+                }
+            }
+        }
+    }
+}
+
+/// Sparse Cholesky factorisation, supernodal where it pays, in an order of approximately minimum degree.
+pub(super) struct SparseCholesky {
+    structure: SymbolicSparseColMat<usize>,
+    symbolic: SymbolicCholesky<usize>,
+    factor: Vec<f64>,
+    memory: MemBuffer,
+}
+
+impl SparseCholesky {
+    /// Orders and analyses; `None` without unknowns, or without the memory for it.
+    ///
+    /// * `columns`: right-hand sides at most
+    pub fn new(pattern: &Pattern, columns: usize) -> Option<Self> {
+        let n = pattern.dimension();
+        if n == 0 {
+            return None;
+        }
+        let structure = structure(pattern);
+        let (forward, inverse) = order(pattern)?;
+        let order = Perm::new_checked(forward.into(), inverse.into(), n);
+        let ordering = SymmetricOrdering::Custom(order.as_ref());
+        let symbolic =
+            factorize_symbolic_cholesky(structure.as_ref(), Side::Lower, ordering, Default::default()).ok()?;
+        let scratch = StackReq::any_of(&[
+            symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default()),
+            symbolic.solve_in_place_scratch::<f64>(columns, Par::Seq),
+        ]);
+        let memory = MemBuffer::try_new(scratch).ok()?;
+        Some(Self { factor: vec![0.0; symbolic.len_val()], structure, symbolic, memory })
+    }
+
+    /// Factors the matrix with these values; `false` when it is not positive definite.
+    pub fn factor(&mut self, values: &[f64]) -> bool {
+        let stack = MemStack::new(&mut self.memory);
+        let matrix = SparseColMatRef::new(self.structure.as_ref(), values);
+        let factor = &mut self.factor;
+        let (par, regularisation, parameters) = (Par::Seq, Default::default(), Default::default());
+        self.symbolic.factorize_numeric_llt(factor, matrix, Side::Lower, regularisation, par, stack, parameters).is_ok()
+    }
+
+    /// Solves in place with the latest factor.
+    ///
+    /// * `vectors`: right-hand sides, one after the other
+    pub fn solve(&mut self, vectors: &mut [f64]) {
+        let n = self.structure.nrows();
+        let columns = vectors.len() / n;
+        let factor = LltRef::new(&self.symbolic, &self.factor);
+        let vectors = MatMut::from_column_major_slice_mut(vectors, n, columns);
+        factor.solve_in_place_with_conj(Conj::No, vectors, Par::Seq, MemStack::new(&mut self.memory));
+    }
+}
+
+/// The pattern, unknown by unknown. What it holds above the diagonal is ignored in the factorisation.
+fn structure(pattern: &Pattern) -> SymbolicSparseColMat<usize> {
+    let n = pattern.dimension();
+    let (mut starts, mut rows) = (vec![0], Vec::with_capacity(pattern.value_count()));
+    for block in 0..pattern.block_count() {
+        for _ in 0..pattern.size(block) {
+            for &row in pattern.column(block).rows() {
+                rows.extend(pattern.offsets[row as usize]..pattern.offsets[row as usize + 1]);
+            }
+            starts.push(rows.len());
+        }
+    }
+    SymbolicSparseColMat::new_checked(n, n, starts, None, rows)
+}
+
+/// An order of the unknowns that keeps the factor sparse, found on the blocks: which unknown comes when, and when each
+/// comes.
+fn order(pattern: &Pattern) -> Option<(Vec<usize>, Vec<usize>)> {
+    let blocks = pattern.block_count();
+    let rows: Vec<usize> = pattern.rows.iter().map(|row| *row as usize).collect();
+    let graph = SymbolicSparseColMatRef::new_checked(blocks, blocks, &pattern.column_starts, None, &rows);
+    let (mut order, mut inverse) = (vec![0; blocks], vec![0; blocks]);
+    let mut memory = MemBuffer::try_new(amd::order_scratch::<usize>(blocks, rows.len())).ok()?;
+    let stack = MemStack::new(&mut memory);
+    amd::order(&mut order, &mut inverse, graph, Default::default(), stack).ok()?;
+    let forward: Vec<usize> =
+        order.iter().flat_map(|&block| pattern.offsets[block]..pattern.offsets[block + 1]).collect();
+    let mut inverse = vec![0; forward.len()];
+    forward.iter().enumerate().for_each(|(place, &unknown)| inverse[unknown] = place);
+    Some((forward, inverse))
+}

@@ -1,0 +1,178 @@
+//! Where adjustments end.
+
+use super::*;
+use crate::geometry::bundle::metric::{self, Extension, Parameter};
+use crate::geometry::bundle::testing::{self, NOISE};
+use crate::geometry::bundle::zoom::Zooming;
+
+/// Small systems go dense, large ones sparse: both end where the adjustment of one block does.
+#[test]
+fn one_group_ends_where_a_block_does() {
+    for (seed, views, tracks) in [(1, 8, 40), (2, 10, 60), (3, 48, 30)] {
+        let scene = testing::scene(seed, views, tracks, NOISE);
+        let (truth, sightings) = sequence_of(&scene);
+        let start = perturbed(&truth, 0.01, seed);
+        let model = IntrinsicsModel::FOCAL.with(Extension::Radial);
+        let prior = IntrinsicsPrior::NONE.knowing(Parameter::Radial, 0.0, 0.05, NOISE);
+        for options in [thorough(), Options { loss: Options::cauchy(NOISE, 1).loss, ..thorough() }] {
+            let mut block = Reconstruction {
+                intrinsics: start.intrinsics[0],
+                poses: start.poses.clone(),
+                points: start.points.clone(),
+            };
+            let stop = StopToken::default();
+            let dense = metric::adjust(&mut block, &scene.observations, model, &prior, &options, &stop);
+            let mut sequence = start.clone();
+            let sparse = adjust(&mut sequence, &sightings, &Free::all(&[model]), &[prior], &options, &stop);
+            println!("seed {seed}, {views} views: {dense:?}, {sparse:?}");
+            assert!((sparse.initial_cost / dense.initial_cost - 1.0).abs() < 1e-12, "seed {seed}");
+            assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
+            for parameter in [Parameter::LogFocal, Parameter::Radial] {
+                let error = sequence.intrinsics[0].value(parameter) - block.intrinsics.value(parameter);
+                assert!(error.abs() < 1e-5, "seed {seed}: {parameter:?} off by {error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn two_groups_are_recovered() {
+    for seed in 0..3 {
+        let (mut truth, mut sightings) = chain(seed, 16, 12, 6, 0.0);
+        truth.group_of = (0..16).map(|view| view % 2).collect();
+        truth.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.8)];
+        truth.intrinsics[1].radial = -0.08;
+        observe(&truth, &mut sightings, 0.0, seed);
+        let mut start = perturbed(&truth, 0.01, seed);
+        start.intrinsics[1].radial = 0.0;
+        let models = [IntrinsicsModel::FOCAL, IntrinsicsModel::FOCAL.with(Extension::Radial)];
+        let report = adjusted(&mut start, &sightings, &models, &thorough());
+        println!("seed {seed}: {report:?} {:?}", start.intrinsics);
+        for (found, expected) in start.intrinsics.iter().zip(&truth.intrinsics) {
+            for parameter in Parameter::ALL {
+                let error = found.value(parameter) - expected.value(parameter);
+                assert!(error.abs() < 1e-6, "seed {seed}: {parameter:?} off by {error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_focal_length_a_view_ends_where_a_zooming_block_does() {
+    for seed in 0..3 {
+        let scene = testing::scene(seed, 12, 40, NOISE);
+        let (mut start, sightings) = sequence_of(&scene);
+        start.intrinsics = vec![start.intrinsics[0]; 12];
+        start.group_of = (0..12).collect();
+        let mut zooming = Zooming::from(&reconstruction_of(&scene));
+        let dense = zooming.adjust(&scene.observations, &thorough(), &StopToken::default());
+        let sparse = adjusted(&mut start, &sightings, &[IntrinsicsModel::FOCAL; 12], &thorough());
+        println!("seed {seed}: {dense:?} {sparse:?}");
+        assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
+        for (intrinsics, focal) in start.intrinsics.iter().zip(&zooming.focals) {
+            assert!((intrinsics.focal / focal - 1.0).abs() < 1e-5, "seed {seed}: {} {focal}", intrinsics.focal);
+        }
+    }
+}
+
+#[test]
+fn a_chain_converges_to_the_noise_floor() {
+    for seed in 0..3 {
+        let (truth, sightings) = chain(seed, 60, 8, 5, 0.001);
+        let mut start = perturbed(&truth, 0.02, seed);
+        let report = adjusted(&mut start, &sightings, &[IntrinsicsModel::FOCAL], &thorough());
+        let freedom = 2 * sightings.len() - (6 * 60 + 3 * truth.points.len() - 7 + 1);
+        let ratio = report.cost / (freedom as f64 * 0.001 * 0.001);
+        let focal_error = start.intrinsics[0].focal / truth.intrinsics[0].focal - 1.0;
+        println!("seed {seed}: {report:?}, chi2 per degree of freedom {ratio:.3}, focal off by {focal_error:.5}");
+        assert!((0.85..1.15).contains(&ratio), "seed {seed}: {ratio}");
+        assert!(focal_error.abs() < 0.01, "seed {seed}: {focal_error}");
+    }
+}
+
+#[test]
+fn disconnected_chains_converge_together() {
+    let (mut truth, mut sightings) = chain(5, 30, 8, 5, 0.0);
+    // A second copy far away, which shares nothing but the intrinsics.
+    let (views, points) = (truth.poses.len(), truth.points.len());
+    let shift = Vector3::new(0.0, 100.0, 0.0);
+    for view in 0..views {
+        let pose = truth.poses[view];
+        truth.poses.push(Pose { translation: pose.translation - pose.rotation * shift, ..pose });
+        truth.group_of.push(0);
+    }
+    truth.points.extend_from_within(..);
+    truth.points[points..].iter_mut().for_each(|point| *point += shift);
+    let second = |seen: &Sighting| Sighting { view: seen.view + views, point: seen.point + points, ..*seen };
+    sightings.extend(sightings.clone().iter().map(second));
+    observe(&truth, &mut sightings, 0.0, 5);
+    let mut start = perturbed(&truth, 0.01, 5);
+    let report = adjusted(&mut start, &sightings, &[IntrinsicsModel::FOCAL], &thorough());
+    println!("{report:?}");
+    assert!(report.cost < 1e-18 * sightings.len() as f64, "{report:?}");
+    assert!((start.intrinsics[0].focal / truth.intrinsics[0].focal - 1.0).abs() < 1e-6);
+}
+
+#[test]
+fn what_is_held_stays_to_the_bit() {
+    for views in [16, 60] {
+        let (truth, sightings) = chain(6, views, 6, 5, 0.001);
+        let start = perturbed(&truth, 0.005, 6);
+        let free_views: Vec<bool> = (0..views).map(|view| view % 3 == 1).collect();
+        let free_points: Vec<bool> = (0..start.points.len()).map(|point| point % 4 != 0).collect();
+        let free = Free { models: &[IntrinsicsModel::FIXED], views: Some(&free_views), points: Some(&free_points) };
+        let mut sequence = start.clone();
+        let report = adjust(&mut sequence, &sightings, &free, &[], &thorough(), &StopToken::default());
+        assert!(report.cost < 0.9 * report.initial_cost, "{report:?}");
+        assert_eq!(sequence.intrinsics, start.intrinsics);
+        for view in 0..views {
+            assert_eq!(sequence.poses[view] != start.poses[view], free_views[view], "view {view}");
+        }
+        for point in 0..start.points.len() {
+            assert_eq!(sequence.points[point] != start.points[point], free_points[point], "point {point}");
+        }
+        // Points alone, which no system of cameras connects.
+        let free = Free { models: &[], views: Some(&[]), points: None };
+        let report = adjust(&mut sequence, &sightings, &free, &[], &thorough(), &StopToken::default());
+        assert!(report.cost < report.initial_cost && report.iterations > 0, "{report:?}");
+    }
+}
+
+/// A local adjustment agrees with one in which all that is held is taken as it is: what moves is at a minimum.
+#[test]
+fn free_views_among_held_ones_find_the_truth() {
+    let (truth, sightings) = chain(7, 20, 8, 5, 0.0);
+    let free_views: Vec<bool> = (0..20).map(|view| (8..12).contains(&view)).collect();
+    let free = Free { models: &[IntrinsicsModel::FIXED], views: Some(&free_views), points: None };
+    let mut start = perturbed(&truth, 0.01, 7);
+    start.intrinsics = truth.intrinsics.clone();
+    for view in (0..20).filter(|view| !free_views[*view]) {
+        start.poses[view] = truth.poses[view];
+    }
+    adjust(&mut start, &sightings, &free, &[], &thorough(), &StopToken::default());
+    for (found, expected) in start.poses.iter().zip(&truth.poses) {
+        let error = (found.rotation - expected.rotation).norm() + (found.translation - expected.translation).norm();
+        assert!(error < 1e-8, "{error}");
+    }
+}
+
+#[test]
+fn a_weight_counts_like_so_many_observations() {
+    let (truth, sightings) = chain(8, 10, 6, 5, 0.002);
+    let start = perturbed(&truth, 0.005, 8);
+    let twice = |seen: &Sighting| seen.point % 3 == 0;
+    let weighted: Vec<Sighting> =
+        sightings.iter().map(|seen| Sighting { weight: if twice(seen) { 2.0 } else { 1.0 }, ..*seen }).collect();
+    let repeated: Vec<Sighting> =
+        sightings.iter().chain(sightings.iter().filter(|seen| twice(seen))).copied().collect();
+    let run = |sightings: &[Sighting]| {
+        let mut sequence = start.clone();
+        let report = adjusted(&mut sequence, sightings, &[IntrinsicsModel::FOCAL], &thorough());
+        (report.cost, sequence.intrinsics[0].focal)
+    };
+    let ((cost, focal), (same_cost, same_focal)) = (run(&weighted), run(&repeated));
+    assert!((cost / same_cost - 1.0).abs() < 1e-10, "{cost} {same_cost}");
+    assert!((focal / same_focal - 1.0).abs() < 1e-6, "{focal} {same_focal}");
+    let (unweighted, _) = run(&sightings);
+    assert!(cost > 1.1 * unweighted, "{cost} {unweighted}");
+}

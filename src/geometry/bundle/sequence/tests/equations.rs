@@ -1,0 +1,149 @@
+//! The normal equations against finite differences, and the places of the blocks.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::super::layout::Layout;
+use super::super::minimise::{pattern, retract};
+use super::super::normal::Normal;
+use super::super::{Pace, WORK_BETWEEN_QUESTIONS};
+use super::*;
+use crate::domain::StopReason;
+use crate::geometry::bundle::Loss;
+use crate::geometry::bundle::metric::{Extension, Parameter};
+
+/// Three groups, one of them held, a held view and a held point, unequal weights.
+fn mixed() -> (Sequence, Vec<Sighting>, Vec<IntrinsicsModel>, Vec<bool>, Vec<bool>) {
+    let (mut sequence, mut sightings) = chain(1, 7, 3, 4, 0.003);
+    sequence.group_of = vec![0, 0, 1, 1, 2, 2, 0];
+    sequence.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.9), Intrinsics::from_focal(1.3)];
+    sequence.intrinsics[0].radial = -0.1;
+    sequence.intrinsics[0].aspect = 1.1;
+    observe(&sequence, &mut sightings, 0.003, 1);
+    sightings.iter_mut().enumerate().for_each(|(k, seen)| seen.weight = 0.5 + 0.1 * (k % 7) as f64);
+    // The same point a second time in one view.
+    sightings.push(sightings[5]);
+    let models =
+        vec![IntrinsicsModel::FULL, IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL.with(Extension::PrincipalPoint)];
+    let views = (0..7).map(|view| view != 3).collect();
+    let points = (0..sequence.points.len()).map(|point| point != 4).collect();
+    (sequence, sightings, models, views, points)
+}
+
+/// Weighted residuals and their derivatives by central differences through the retraction: unknowns of the cameras,
+/// then of the free points.
+fn differentiate(sequence: &Sequence, sightings: &[Sighting], layout: &Layout) -> (DVector<f64>, DMatrix<f64>) {
+    const WIDTH: f64 = 1e-6;
+    let cameras = layout.unknowns.offsets[layout.unknowns.block_count()];
+    let residuals = |sequence: &Sequence| {
+        let weighted = |seen: &Sighting| sequence.residual(seen) * seen.weight.sqrt();
+        DVector::from_iterator(2 * sightings.len(), sightings.iter().flat_map(|seen| <[f64; 2]>::from(weighted(seen))))
+    };
+    let moved = |unknown: usize, by: f64| {
+        let mut moved = sequence.clone();
+        let mut step = vec![0.0; cameras];
+        if unknown < cameras {
+            step[unknown] = by;
+            retract(&mut moved, sequence, layout, &step);
+        } else {
+            moved.points[(unknown - cameras) / 3][(unknown - cameras) % 3] += by;
+        }
+        residuals(&moved)
+    };
+    let columns: Vec<_> = (0..cameras + 3 * sequence.points.len())
+        .map(|unknown| (moved(unknown, WIDTH) - moved(unknown, -WIDTH)) / (2.0 * WIDTH))
+        .collect();
+    (residuals(sequence), DMatrix::from_columns(&columns))
+}
+
+#[test]
+fn normal_equations_agree_with_finite_differences() {
+    let (sequence, sightings, models, views, points) = mixed();
+    let free = Free { models: &models, views: Some(&views), points: Some(&points) };
+    let going = StopToken::default();
+    let mut pace = Pace::new(&going);
+    let layout = Layout::new(&sequence, &sightings, &free, None, &mut pace).expect("goes on");
+    let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
+    let cameras = pattern.dimension();
+    assert_eq!(cameras, 6 * 6 + 5 + 3, "six free views, five and three intrinsics");
+    let mut normal = Normal::new(&layout, &pattern, &sequence);
+    let stop = StopToken::default();
+    assert!(normal.fill(&sequence, &layout, &[], Loss::Squared, &mut Pace::new(&stop)));
+    let (residuals, jacobian) = differentiate(&sequence, &sightings, &layout);
+    let information = jacobian.transpose() * &jacobian;
+    let gradient = jacobian.transpose() * residuals;
+    let close = |found: f64, expected: f64, what: &str| {
+        let error = (found - expected).abs();
+        assert!(error < 1e-6 * (1.0 + information.amax()), "{what}: {found} instead of {expected}");
+    };
+    let mut among = DMatrix::zeros(cameras, cameras);
+    pattern.for_each(|row, column, index| among[(row.max(column), row.min(column))] = normal.cameras.values[index]);
+    for column in 0..cameras {
+        close(normal.cameras.gradient[column], gradient[column], "gradient");
+        for row in column..cameras {
+            close(among[(row, column)], information[(row, column)], "cameras");
+        }
+    }
+    let mut compared = 0;
+    for (point, block) in normal.points.iter().enumerate() {
+        let first = cameras + 3 * point;
+        let mut coupling = DMatrix::zeros(cameras, 3);
+        for touch in layout.touches(point) {
+            let range = layout.unknowns.range(touch.block as usize);
+            let values = &normal.couplings[layout.couplings(point)][touch.coupling as usize..];
+            for (k, unknown) in range.clone().enumerate() {
+                (0..3).for_each(|column| coupling[(unknown, column)] = values[column * range.len() + k]);
+            }
+        }
+        if points[point] {
+            (0..3).for_each(|k| close(block.gradient[k], gradient[first + k], "gradient of a point"));
+            for (row, value) in coupling.column_iter().enumerate() {
+                (0..cameras).for_each(|unknown| close(value[unknown], information[(unknown, first + row)], "coupling"));
+            }
+            compared += 1;
+        } else {
+            assert!(layout.touches(point).is_empty());
+        }
+    }
+    assert_eq!(compared, sequence.points.len() - 1);
+}
+
+#[test]
+fn what_is_known_beforehand_takes_part() {
+    let (sequence, sightings, models, ..) = mixed();
+    let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, 0.2, 0.1, 0.01);
+    let going = StopToken::default();
+    let mut pace = Pace::new(&going);
+    let layout = Layout::new(&sequence, &sightings, &Free::all(&models), None, &mut pace).expect("goes on");
+    let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
+    let with = |priors: &[IntrinsicsPrior]| {
+        let mut normal = Normal::new(&layout, &pattern, &sequence);
+        assert!(normal.fill(&sequence, &layout, priors, Loss::Squared, &mut Pace::new(&StopToken::default())));
+        let block = layout.unknowns.group_block[2].expect("free");
+        let unknown = layout.unknowns.range(block).start;
+        (normal.cameras.values[normal.cameras.diagonal[unknown]], normal.cameras.gradient[unknown])
+    };
+    let (information, gradient) = with(&[]);
+    let (informed, pulled) = with(&[prior, prior, prior]);
+    let deviation = 1.3f64.ln() - 0.2;
+    assert!((informed - information - 0.01).abs() < 1e-9 && (pulled - gradient - 0.01 * deviation).abs() < 1e-9);
+}
+
+/// A stop is seen within the work that may pass between two questions, in the middle of a linearisation.
+#[test]
+fn a_stop_is_seen_within_one_linearisation() {
+    let (sequence, sightings) = chain(2, 10, 1 + WORK_BETWEEN_QUESTIONS / 20, 5, 0.001);
+    let free = Free::all(&[IntrinsicsModel::FOCAL]);
+    let going = StopToken::default();
+    let mut pace = Pace::new(&going);
+    let layout = Layout::new(&sequence, &sightings, &free, None, &mut pace).expect("goes on");
+    let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
+    let mut normal = Normal::new(&layout, &pattern, &sequence);
+    let stop = StopToken::default();
+    stop.stop(StopReason::Cancelled);
+    assert!(sightings.len() > WORK_BETWEEN_QUESTIONS);
+    assert!(!normal.fill(&sequence, &layout, &[], Loss::Squared, &mut Pace::new(&stop)));
+    let mut start = sequence.clone();
+    let report = adjust(&mut start, &sightings, &free, &[], &Options::default(), &stop);
+    assert_eq!((report.iterations, report.cost), (0, report.initial_cost));
+    assert_eq!(start, sequence);
+}

@@ -1,0 +1,139 @@
+//! Time of an iteration, against the number of observations and against a block's adjustment; run by hand:
+//! `cargo test --lib sequence::tests::measure -- --ignored --nocapture --test-threads 1`.
+
+use std::time::Instant;
+
+use super::super::Pace;
+use super::super::layout::Layout;
+use super::super::minimise::pattern;
+use super::super::solver::Solver;
+use super::*;
+use crate::geometry::bundle::metric;
+use crate::geometry::bundle::testing::{self, NOISE};
+
+/// Steps of a measurement, after which its time is divided.
+const STEPS: usize = 5;
+
+fn options() -> Options {
+    Options { relative_tolerance: 0.0, ..Options::squared(STEPS) }
+}
+
+/// Seconds and what was found.
+fn timed<T>(run: impl FnOnce() -> T) -> (f64, T) {
+    let begun = Instant::now();
+    let found = run();
+    (begun.elapsed().as_secs_f64(), found)
+}
+
+#[test]
+#[ignore = "prints a measurement"]
+fn time_against_observations() {
+    let mut logs = Vec::new();
+    for (views, tracks) in [(20, 2_000), (200, 20_000), (1000, 200_000)] {
+        for each_its_own in [false, true] {
+            let (mut truth, sightings) = chain(1, views, tracks / (views - 4), 5, 0.001);
+            if each_its_own {
+                truth.intrinsics = vec![truth.intrinsics[0]; views];
+                truth.group_of = (0..views).collect();
+            }
+            let mut start = perturbed(&truth, 0.002, 1);
+            let models = vec![IntrinsicsModel::FOCAL; truth.intrinsics.len()];
+            let stop = StopToken::default();
+            let mut pace = Pace::new(&stop);
+            let (layout_seconds, layout) =
+                timed(|| Layout::new(&truth, &sightings, &Free::all(&models), None, &mut pace).expect("goes on"));
+            let (analysis_seconds, _) = timed(|| {
+                let pattern = pattern(&truth, &layout, &mut pace).expect("goes on");
+                Solver::new(&pattern).expect("memory")
+            });
+            drop(layout);
+            let (seconds, report) = timed(|| adjusted(&mut start, &sightings, &models, &options()));
+            let (seconds, n) = (seconds / report.iterations as f64, sightings.len());
+            let (groups, each) = (models.len(), 1e6 * seconds / n as f64);
+            println!("{n} observations, {views} views, {groups} groups: layout {layout_seconds:.3} s, analysis");
+            println!("    {analysis_seconds:.3} s, iteration {seconds:.4} s, {each:.2} us an observation; {report:?}");
+            if !each_its_own {
+                logs.push(((n as f64).ln(), seconds.ln()));
+            }
+        }
+    }
+    println!("log-log slope {:.3}", (logs[2].1 - logs[0].1) / (logs[2].0 - logs[0].0));
+}
+
+#[test]
+#[ignore = "prints a measurement"]
+fn time_against_a_block() {
+    const REPEATS: u64 = 20;
+    let (mut block_seconds, mut sequence_seconds) = (0.0, 0.0);
+    for seed in 0..REPEATS {
+        let scene = testing::scene(seed, 10, 200, NOISE);
+        let (truth, sightings) = sequence_of(&scene);
+        let mut start = perturbed(&truth, 0.01, seed);
+        let mut block = Reconstruction {
+            intrinsics: start.intrinsics[0],
+            poses: start.poses.clone(),
+            points: start.points.clone(),
+        };
+        let (model, prior, stop) = (IntrinsicsModel::FOCAL, IntrinsicsPrior::NONE, StopToken::default());
+        let (seconds, dense) =
+            timed(|| metric::adjust(&mut block, &scene.observations, model, &prior, &options(), &stop));
+        block_seconds += seconds / dense.iterations as f64;
+        let (seconds, sparse) = timed(|| adjusted(&mut start, &sightings, &[model], &options()));
+        sequence_seconds += seconds / sparse.iterations as f64;
+    }
+    let [block, sequence] = [block_seconds, sequence_seconds].map(|seconds| 1e3 * seconds / REPEATS as f64);
+    println!("10 views, 200 tracks: block {block:.2} ms, sequence {sequence:.2} ms an iteration");
+}
+
+/// Views that drifted as in a growing reconstruction: many steps would mean that weak directions are damped too much.
+#[test]
+#[ignore = "prints a measurement"]
+fn steps_after_drift() {
+    for (views, noise) in [(100, 0.001), (300, 0.001)] {
+        for closed in [false, true] {
+            let (mut truth, mut sightings) = chain(1, views, 20, 5, noise);
+            if closed {
+                // The first views see some points of the end, as when a loop closes.
+                let last = truth.points.len() - 20;
+                for point in last..truth.points.len() {
+                    let view = views - 1 - point % 5;
+                    truth.poses.push(truth.poses[view]);
+                    truth.group_of.push(0);
+                    let near = |seen: &&Sighting| seen.view == view;
+                    let copies: Vec<_> = sightings.iter().filter(near).copied().collect();
+                    let view = truth.poses.len() - 1;
+                    sightings.extend(copies.iter().map(|seen| Sighting { view, ..*seen }));
+                }
+            }
+            let mut start = truth.clone();
+            // A bend that grows along the chain: every view turned by a little more, and points with their views.
+            for (view, pose) in start.poses.iter_mut().enumerate() {
+                let bend = bend(views, -(pose.rotation.tr_mul(&pose.translation)).x);
+                let centre = -pose.rotation.tr_mul(&pose.translation);
+                let moved = bend.0 * centre + bend.1;
+                pose.rotation = pose.rotation * bend.0.transpose();
+                pose.translation = -pose.rotation * moved;
+                let _ = view;
+            }
+            for point in &mut start.points {
+                let bend = bend(views, point.x);
+                *point = bend.0 * *point + bend.1;
+            }
+            let goal = adjusted(&mut truth.clone(), &sightings, &[IntrinsicsModel::FOCAL], &thorough());
+            let mut cut = start.clone();
+            let usual = adjusted(&mut cut, &sightings, &[IntrinsicsModel::FOCAL], &Options::default());
+            let long = adjusted(&mut start, &sightings, &[IntrinsicsModel::FOCAL], &thorough());
+            println!("{views} views, closed {closed}: goal {:.8}, usual {usual:?}, thorough {long:?}", goal.cost);
+        }
+    }
+}
+
+/// Arc in place of the line: rotation and shift at so much along it.
+fn bend(views: usize, along: f64) -> (nalgebra::Matrix3<f64>, Vector3<f64>) {
+    let length = BASELINE * views as f64;
+    let angle = 0.5 * along / length;
+    let radius = length / 0.5;
+    let rotation = Rotation3::from_axis_angle(&Vector3::y_axis(), angle).into_inner();
+    let on_arc = Vector3::new(radius * angle.sin(), 0.0, radius * (angle.cos() - 1.0));
+    (rotation, on_arc - rotation * Vector3::new(along, 0.0, 0.0))
+}

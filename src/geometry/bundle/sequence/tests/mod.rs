@@ -1,0 +1,88 @@
+//! What the tests of sequences share: chains of views with short tracks, and perturbed starts.
+
+mod adjust;
+mod degenerate;
+mod equations;
+mod information;
+mod measure;
+
+use nalgebra::{Rotation3, Vector2, Vector3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::super::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Pose, Reconstruction};
+use super::super::testing::{TestScene, normal, perturb};
+use super::super::{Options, Report};
+use super::{Free, Sequence, Sighting, adjust};
+use crate::domain::StopToken;
+
+/// Distance between the views of a chain, as a share of the depth of what they see about a tenth.
+const BASELINE: f64 = 0.4;
+
+/// Views on a line that sways and turns, each track seen by `length` neighbours, `tracks_a_view` beginning in each.
+fn chain(seed: u64, views: usize, tracks_a_view: usize, length: usize, noise: f64) -> (Sequence, Vec<Sighting>) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut uniform = |range: f64| rng.random_range(-range..range);
+    let poses: Vec<Pose> = (0..views)
+        .map(|view| {
+            let centre = Vector3::new(BASELINE * view as f64, uniform(0.3), uniform(0.3));
+            let rotation = Rotation3::from_euler_angles(uniform(0.25), uniform(0.25), uniform(0.5)).into_inner();
+            Pose { rotation, translation: -rotation * centre }
+        })
+        .collect();
+    let mut sequence =
+        Sequence { intrinsics: vec![Intrinsics::from_focal(1.1)], group_of: vec![0; views], poses, points: vec![] };
+    let mut sightings = Vec::new();
+    for first in 0..=views - length {
+        for _ in 0..tracks_a_view {
+            let middle = BASELINE * (first as f64 + 0.5 * (length as f64 - 1.0));
+            let point = sequence.points.len();
+            sequence.points.push(Vector3::new(middle + uniform(1.0), uniform(1.0), 4.0 + uniform(1.5)));
+            let see = |view| Sighting { view, point, xy: Vector2::zeros(), weight: 1.0 };
+            sightings.extend((first..first + length).map(see));
+        }
+    }
+    observe(&sequence, &mut sightings, noise, seed);
+    (sequence, sightings)
+}
+
+/// Draws the image points anew.
+fn observe(sequence: &Sequence, sightings: &mut [Sighting], noise: f64, seed: u64) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
+    for seen in sightings {
+        seen.xy = Vector2::zeros();
+        seen.xy = sequence.residual(seen) + noise * Vector2::new(normal(&mut rng), normal(&mut rng));
+    }
+}
+
+fn sequence_of(scene: &TestScene) -> (Sequence, Vec<Sighting>) {
+    (Sequence::from(&reconstruction_of(scene)), scene.observations.iter().map(Sighting::from).collect())
+}
+
+fn reconstruction_of(scene: &TestScene) -> Reconstruction {
+    Reconstruction { intrinsics: scene.intrinsics, poses: scene.poses.clone(), points: scene.points.clone() }
+}
+
+/// Moves points and poses by so much, focal lengths by ten times as much.
+fn perturbed(truth: &Sequence, deviation: f64, seed: u64) -> Sequence {
+    let mut start = truth.clone();
+    perturb(start.intrinsics.iter_mut().map(|intrinsics| &mut intrinsics.focal), 10.0 * deviation, seed);
+    perturb(start.points.iter_mut().flat_map(|point| point.iter_mut()), deviation, seed + 1);
+    perturb(start.poses.iter_mut().flat_map(|pose| pose.translation.iter_mut()), deviation, seed + 2);
+    let mut turns = vec![Vector3::zeros(); start.poses.len()];
+    perturb(turns.iter_mut().flat_map(|turn: &mut Vector3<f64>| turn.iter_mut()), deviation, seed + 3);
+    for (pose, turn) in start.poses.iter_mut().zip(turns) {
+        pose.rotation = Rotation3::from_scaled_axis(turn) * pose.rotation;
+    }
+    start
+}
+
+/// To the last digit.
+fn thorough() -> Options {
+    Options { max_iterations: 100, relative_tolerance: 1e-14, ..Options::default() }
+}
+
+fn adjusted(sequence: &mut Sequence, sightings: &[Sighting], models: &[IntrinsicsModel], options: &Options) -> Report {
+    let priors = vec![IntrinsicsPrior::NONE; models.len()];
+    adjust(sequence, sightings, &Free::all(models), &priors, options, &StopToken::default())
+}
