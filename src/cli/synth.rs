@@ -190,7 +190,7 @@ mod tests {
     use super::*;
     use crate::domain::{ImageSize, Limits};
     use crate::formats;
-    use crate::synthetic::{Motion, NoiseKind, OutlierKind, Shape};
+    use crate::synthetic::{Motion, NoiseKind, OutlierKind, SceneOptions, Shape};
 
     /// Parses the arguments of a small scene and these.
     fn args(out: &Path, more: &[&str]) -> Args {

@@ -98,6 +98,7 @@ fn solution(scene: &Scene) -> Solution {
                 rotation: Some(truth.rotations[view]),
                 translation: Some(truth.translations[view]),
                 focal_px: None,
+                part: 0,
             })
             .collect(),
         tracks: TrackResults {
