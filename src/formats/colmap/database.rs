@@ -123,10 +123,11 @@ async fn contents(path: &Path, limits: &Limits, matches: Option<Matches>) -> Res
         .disable_statement_logging();
     let mut connection =
         options.connect().await.map_err(|error| Problem::of_file(format!("cannot be opened: {error}")))?;
-    let found = read_tables(&mut connection, limits, matches).await;
+    // After an error the connection is dropped as it is: its thread may be gone, and to wait for it without end.
+    let found = read_tables(&mut connection, limits, matches).await?;
     // Read-only: nothing is lost with a close that fails.
     let _ = connection.close().await;
-    found
+    Ok(found)
 }
 
 async fn read_tables(
@@ -134,7 +135,12 @@ async fn read_tables(
     limits: &Limits,
     matches: Option<Matches>,
 ) -> Result<Contents, Problem> {
-    rows::require_tables(connection, &["cameras", "images", "keypoints"]).await?;
+    let tables = rows::tables(connection).await?;
+    let require = |table: &str| match tables.contains(table) {
+        true => Ok(()),
+        false => Err(Problem::of_file(format!("is no COLMAP database: it has no table `{table}`"))),
+    };
+    ["cameras", "images", "keypoints"].into_iter().try_for_each(require)?;
     let mut images = Images::default();
     rows::cameras(connection, &mut images).await?;
     rows::images(connection, limits.max_views, &mut images).await?;
@@ -145,7 +151,7 @@ async fn read_tables(
         None => &[Matches::Verified, Matches::Raw],
     };
     for &kind in kinds {
-        rows::require_tables(connection, &[rows::table(kind)]).await?;
+        require(rows::table(kind))?;
         let (matches, pairs) = rows::matches(connection, kind, &images, &keypoints).await?;
         if !matches.is_empty() {
             return Ok(Contents { images, keypoints, matches, pairs, kind });

@@ -1,8 +1,10 @@
 //! The tables of a COLMAP database, row by row, every blob measured against what its row announces.
 
+use std::collections::BTreeSet;
+
 use futures_util::TryStreamExt;
-use sqlx::Row;
 use sqlx::sqlite::{SqliteConnection, SqliteRow};
+use sqlx::{Either, Executor, Row};
 
 use super::super::cameras::{Camera, Model};
 use super::super::images::Images;
@@ -29,49 +31,72 @@ fn damaged(error: sqlx::Error) -> Problem {
     Problem::of_file(format!("cannot be read as a COLMAP database: {error}"))
 }
 
-/// Refuses a database without these tables. Views and virtual tables are none: a query of one runs its maker's program.
-pub(super) async fn require_tables(connection: &mut SqliteConnection, tables: &[&str]) -> Result<(), Problem> {
-    const TABLES: &str =
-        "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%' AND name = ?";
-    for table in tables {
-        let found = sqlx::query(TABLES).bind(*table).fetch_optional(&mut *connection).await.map_err(damaged)?;
-        if found.is_none() {
-            return Err(Problem::of_file(format!("is no COLMAP database: it has no table `{table}`")));
+/// Gives every row of a query to `each`.
+///
+/// # Pitfall
+/// Queries select expressions, `+column AS column`: sqlx asks SQLite for the declared types and names of plain columns,
+/// and its thread panics where a damaged schema has such that are not UTF-8. A stream of rows then just ends, and who asks
+/// that connection for more may wait for ever. So a stream that ends without its summary is an error, after which the
+/// connection must not be used.
+async fn for_each_row(
+    connection: &mut SqliteConnection,
+    query: &'static str,
+    mut each: impl FnMut(&SqliteRow) -> Result<(), Problem>,
+) -> Result<(), Problem> {
+    let mut steps = connection.fetch_many(sqlx::query(query));
+    let mut is_whole = false;
+    while let Some(step) = steps.try_next().await.map_err(damaged)? {
+        match step {
+            Either::Left(_summary) => is_whole = true,
+            Either::Right(row) => each(&row)?,
         }
     }
-    Ok(())
+    if is_whole { Ok(()) } else { Err(Problem::of_file("cannot be read as a COLMAP database: reading broke off")) }
+}
+
+/// The tables that a query may go to. Views and virtual tables are none: a query of one runs its maker's program.
+pub(super) async fn tables(connection: &mut SqliteConnection) -> Result<BTreeSet<String>, Problem> {
+    let query = "SELECT +name AS name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'";
+    let mut tables = BTreeSet::new();
+    for_each_row(connection, query, |row| {
+        // One whose name is no text is none of COLMAP's.
+        tables.extend(row.try_get::<String, _>("name"));
+        Ok(())
+    })
+    .await?;
+    Ok(tables)
 }
 
 pub(super) async fn cameras(connection: &mut SqliteConnection, images: &mut Images) -> Result<(), Problem> {
-    let query = "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras ORDER BY camera_id";
-    let mut found = sqlx::query(query).fetch(connection);
-    while let Some(row) = found.try_next().await.map_err(damaged)? {
-        let id: u32 = integer(&row, "cameras", "camera_id", 0)?;
-        let wrong = |what: String| Problem::of_record(format!("table cameras, camera_id {id}"), what);
-        let model: i64 = integer(&row, "cameras", "model", id.into())?;
-        let (width, height) =
-            (integer(&row, "cameras", "width", id.into())?, integer(&row, "cameras", "height", id.into())?);
-        let camera = Camera::new(Model::of_id(model), width, height).map_err(wrong)?;
-        let is_known = integer::<i64>(&row, "cameras", "prior_focal_length", id.into())? != 0;
-        let first = blob(&row, "cameras", "params", id.into())?.first_chunk().copied().map(f64::from_le_bytes);
-        images.add_camera(id, camera.knowing(first.filter(|_| is_known))).map_err(wrong)?;
-    }
-    Ok(())
+    let query =
+        "SELECT +camera_id AS camera_id, +model AS model, +width AS width, +height AS height, +params AS params,
+        +prior_focal_length AS prior_focal_length FROM cameras ORDER BY cameras.camera_id";
+    for_each_row(connection, query, |row| {
+        let id: u32 = integer(row, "cameras", "camera_id", 0)?;
+        let value = |column: &str| integer::<i64>(row, "cameras", column, id.into());
+        let side = |column: &str| integer::<u64>(row, "cameras", column, id.into());
+        let model = Model::of_id(value("model")?);
+        let (width, height, is_known) = (side("width")?, side("height")?, value("prior_focal_length")? != 0);
+        let first = blob(row, "cameras", "params", id.into())?.first_chunk().copied().map(f64::from_le_bytes);
+        Camera::new(model, width, height)
+            .and_then(|camera| images.add_camera(id, camera.knowing(first.filter(|_| is_known))))
+            .map_err(|what| Problem::of_record(format!("table cameras, row {id}"), what))
+    })
+    .await
 }
 
 pub(super) async fn images(connection: &mut SqliteConnection, most: usize, images: &mut Images) -> Result<(), Problem> {
-    let mut found = sqlx::query("SELECT image_id, camera_id, name FROM images ORDER BY image_id").fetch(connection);
-    while let Some(row) = found.try_next().await.map_err(damaged)? {
-        let id: u32 = integer(&row, "images", "image_id", 0)?;
-        let wrong = |what: String| Problem::of_record(format!("table images, image_id {id}"), what);
-        let camera = integer(&row, "images", "camera_id", id.into())?;
+    let query = "SELECT +image_id AS image_id, +camera_id AS camera_id, +name AS name FROM images
+        ORDER BY images.image_id";
+    for_each_row(connection, query, |row| {
+        let id: u32 = integer(row, "images", "image_id", 0)?;
+        let wrong = |what: String| Problem::of_record(format!("table images, row {id}"), what);
+        let camera = integer(row, "images", "camera_id", id.into())?;
         let name: &str = row.try_get("name").map_err(|error| wrong(format!("name: {}", unwrapped(error))))?;
         images.add_image(id, name, camera).map_err(wrong)?;
-        if images.len() > most {
-            return Err(wrong(format!("more images than the limit of {most}")));
-        }
-    }
-    Ok(())
+        if images.len() > most { Err(wrong(format!("more images than the limit of {most}"))) } else { Ok(()) }
+    })
+    .await
 }
 
 /// Keypoints of all images, numbered image after image.
@@ -103,24 +128,21 @@ impl Keypoints {
 pub(super) async fn keypoints(connection: &mut SqliteConnection, images: &Images) -> Result<Keypoints, Problem> {
     let mut of_image: Vec<Vec<[f32; 2]>> = vec![Vec::new(); images.len()];
     let mut count = 0;
-    let query = "SELECT image_id, rows, cols, data FROM keypoints ORDER BY image_id";
-    let mut found = sqlx::query(query).fetch(connection);
-    while let Some(row) = found.try_next().await.map_err(damaged)? {
-        let id: u32 = integer(&row, "keypoints", "image_id", 0)?;
-        let wrong = |what: String| Problem::of_record(format!("table keypoints, image_id {id}"), what);
-        let image = images.position(id).ok_or_else(|| wrong("is not among the images".into()))?;
-        let (columns, data) = matrix(&row, "keypoints", id.into(), 2)?;
+    let query = "SELECT +image_id AS image_id, +rows AS rows, +cols AS cols, +data AS data FROM keypoints
+        ORDER BY keypoints.image_id";
+    for_each_row(connection, query, |row| {
+        let id: u32 = integer(row, "keypoints", "image_id", 0)?;
+        let wrong = |what: &str| Problem::of_record(format!("table keypoints, row {id}"), what);
+        let image = images.position(id).ok_or_else(|| wrong("is of no image of the table images"))?;
+        let (columns, data) = matrix(row, "keypoints", id.into())?;
         // x, y, and scale and orientation or an affine shape, which are not needed.
-        let points = data.chunks_exact(4 * columns).map(|row| {
-            let coordinate = |at: usize| f32::from_le_bytes([row[at], row[at + 1], row[at + 2], row[at + 3]]);
-            [coordinate(0), coordinate(4)]
-        });
+        let points = data.chunks_exact(4 * columns).map(|row| pair(row).map(f32::from_le_bytes));
         of_image[image as usize] = points.collect();
         count += of_image[image as usize].len();
-        if count > MAX_KEYPOINTS {
-            return Err(wrong(format!("more keypoints than {MAX_KEYPOINTS} in all")));
-        }
-    }
+        let fits = count <= MAX_KEYPOINTS;
+        if fits { Ok(()) } else { Err(wrong(&format!("more keypoints than {MAX_KEYPOINTS} in all"))) }
+    })
+    .await?;
     let mut starts = vec![0];
     let mut points = Vec::with_capacity(count);
     for of_image in of_image {
@@ -139,47 +161,61 @@ pub(super) async fn matches(
 ) -> Result<(Vec<Match>, usize), Problem> {
     let query = match kind {
         Matches::Verified => {
-            "SELECT pair_id, rows, cols, data FROM two_view_geometries WHERE rows <> 0 ORDER BY pair_id"
+            "SELECT +pair_id AS pair_id, +rows AS rows, +cols AS cols, +data AS data FROM two_view_geometries AS pairs
+             WHERE pairs.rows <> 0 ORDER BY pairs.pair_id"
         }
-        Matches::Raw => "SELECT pair_id, rows, cols, data FROM matches WHERE rows <> 0 ORDER BY pair_id",
+        Matches::Raw => {
+            "SELECT +pair_id AS pair_id, +rows AS rows, +cols AS cols, +data AS data FROM matches AS pairs
+             WHERE pairs.rows <> 0 ORDER BY pairs.pair_id"
+        }
     };
-    let table = table(kind);
     let mut matches = Vec::new();
     let mut pairs = 0;
-    let mut found = sqlx::query(query).fetch(connection);
-    while let Some(row) = found.try_next().await.map_err(damaged)? {
-        let pair: u64 = integer(&row, table, "pair_id", 0)?;
-        let wrong = |what: String| Problem::of_record(format!("table {table}, pair_id {pair}"), what);
-        let ids = [pair / MAX_IMAGES, pair % MAX_IMAGES];
-        let position = |id: u64| u32::try_from(id).ok().and_then(|id| images.position(id));
-        let (Some(first), Some(second)) = (position(ids[0]), position(ids[1])) else {
-            return Err(wrong(format!(
-                "is of the images {} and {}, which are not both among the images",
-                ids[0], ids[1]
-            )));
-        };
-        if first == second {
-            return Err(wrong(format!("matches image {} with itself", ids[0])));
-        }
-        let (columns, data) = matrix(&row, table, pair, 2)?;
-        let rows = data.chunks_exact(4 * columns);
-        let pair_size = rows.len() as u32;
-        for (k, row) in rows.enumerate() {
-            let index = |at: usize| u32::from_le_bytes([row[at], row[at + 1], row[at + 2], row[at + 3]]);
-            let ends = [(first, index(0)), (second, index(4))].map(|(image, index)| keypoints.number(image, index));
-            let [Some(a), Some(b)] = ends else {
-                let what =
-                    format!("match {k} joins keypoints {} and {}, of which one is not there", index(0), index(4));
-                return Err(wrong(what));
-            };
-            matches.push(Match { a, b, pair_size });
-        }
-        if matches.len() > MAX_MATCHES {
-            return Err(wrong(format!("more matches than {MAX_MATCHES} in all")));
-        }
+    for_each_row(connection, query, |row| {
         pairs += 1;
-    }
+        of_pair(row, table(kind), images, keypoints, &mut matches)
+    })
+    .await?;
     Ok((matches, pairs))
+}
+
+/// Takes the matches of one image pair.
+fn of_pair(
+    row: &SqliteRow,
+    table: &str,
+    images: &Images,
+    keypoints: &Keypoints,
+    matches: &mut Vec<Match>,
+) -> Result<(), Problem> {
+    let pair_id: u64 = integer(row, table, "pair_id", 0)?;
+    let wrong = |what: String| Problem::of_record(format!("table {table}, row {pair_id}"), what);
+    let [first_id, second_id] = [pair_id / MAX_IMAGES, pair_id % MAX_IMAGES];
+    let position = |id: u64| u32::try_from(id).ok().and_then(|id| images.position(id));
+    let (Some(first), Some(second)) = (position(first_id), position(second_id)) else {
+        return Err(wrong(format!(
+            "is of the images {first_id} and {second_id}, which the table images does not have"
+        )));
+    };
+    if first == second {
+        return Err(wrong(format!("matches image {first_id} with itself")));
+    }
+    let (columns, data) = matrix(row, table, pair_id)?;
+    let rows = data.chunks_exact(4 * columns);
+    // A blob of SQLite has less than 2^31 bytes.
+    let pair_size = rows.len() as u32;
+    for (k, row) in rows.enumerate() {
+        let [in_first, in_second] = pair(row).map(u32::from_le_bytes);
+        let (Some(a), Some(b)) = (keypoints.number(first, in_first), keypoints.number(second, in_second)) else {
+            return Err(wrong(format!("match {k} joins keypoints {in_first} and {in_second}; one is not there")));
+        };
+        matches.push(Match { a, b, pair_size });
+    }
+    if matches.len() > MAX_MATCHES { Err(wrong(format!("more matches than {MAX_MATCHES} in all"))) } else { Ok(()) }
+}
+
+/// The first two four-byte numbers of a row of a matrix, which has at least [`LEAST_COLUMNS`].
+fn pair(row: &[u8]) -> [[u8; 4]; 2] {
+    [[row[0], row[1], row[2], row[3]], [row[4], row[5], row[6], row[7]]]
 }
 
 /// An integer of a row. `id` names the row in errors.
@@ -197,19 +233,23 @@ fn blob<'r>(row: &'r SqliteRow, table: &str, column: &str, id: u64) -> Result<&'
     Ok(value.unwrap_or_default())
 }
 
-/// The columns and the bytes of a matrix of four-byte numbers with at least `least` columns.
-fn matrix<'r>(row: &'r SqliteRow, table: &str, id: u64, least: usize) -> Result<(usize, &'r [u8]), Problem> {
+/// Columns of keypoints (x, y) and of matches (a keypoint of either image) that there must be.
+const LEAST_COLUMNS: usize = 2;
+
+/// The columns and the bytes of a matrix of four-byte numbers.
+fn matrix<'r>(row: &'r SqliteRow, table: &str, id: u64) -> Result<(usize, &'r [u8]), Problem> {
     let (rows, columns): (u64, usize) = (integer(row, table, "rows", id)?, integer(row, table, "cols", id)?);
     let data = blob(row, table, "data", id)?;
     let wrong = |what: String| Problem::of_record(format!("table {table}, row {id}: data"), what);
-    if rows > 0 && columns < least {
-        return Err(wrong(format!("has {columns} columns, at least {least} are needed")));
+    if rows > 0 && columns < LEAST_COLUMNS {
+        return Err(wrong(format!("has {columns} columns, at least {LEAST_COLUMNS} are needed")));
     }
     let announced = rows.checked_mul(columns as u64).and_then(|numbers| numbers.checked_mul(4));
     if announced != Some(data.len() as u64) {
         return Err(wrong(format!("has {} bytes, {rows} x {columns} numbers of 4 are announced", data.len())));
     }
-    Ok((columns.max(least), data))
+    // An empty matrix may have none.
+    Ok((columns.max(LEAST_COLUMNS), data))
 }
 
 /// What went wrong with a column, without sqlx's words around it.
