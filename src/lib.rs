@@ -12,8 +12,9 @@
 //!
 //! Beside them [`evaluation`] holds the methods against the truth of [`synthetic`] scenes.
 //!
-//! Only [`rpc`] (and the client side of [`cli`]) sees prost and tonic, only [`store`] sees SQL, only [`network`]
-//! sees burn; [`geometry`] is plain f64 linear algebra.
+//! Only [`rpc`] (and the client side of [`cli`]) sees prost and tonic, only [`store`] sees SQL
+//! (but for [`formats`], which reads COLMAP's databases), only [`network`] sees burn; [`geometry`] is plain f64 linear
+//! algebra.
 
 pub mod cli;
 pub mod config;

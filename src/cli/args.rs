@@ -1,12 +1,12 @@
 //! Arguments that several commands share.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 
 use super::exit::Failure;
-use crate::domain::{Backend, ImageSize, Limits, Method, SolveSettings};
-use crate::formats::{self, LabelledInput};
+use crate::domain::{Backend, ImageSize, Limits, Method, Solution, SolveSettings};
+use crate::formats::{self, Export, Format, LabelledInput, Matches, Reading};
 
 /// Where the server listens by default; `serve --listen` has the same port.
 pub const DEFAULT_SERVER: &str = "http://127.0.0.1:50051";
@@ -22,18 +22,20 @@ pub struct ServerArgs {
 /// Which tracks to solve.
 #[derive(Debug, Clone, Args)]
 pub struct InputArgs {
-    /// Tracks as observations.csv: a header `view,track,x,y[,depth]`, then one observation a line, in pixels; the centre
-    /// of the top-left pixel is (0, 0). Ids are any whole numbers; other columns are ignored
+    /// Tracks: a CSV with a header `view,track,x,y[,depth]`, OpenSfM's tracks.csv, COLMAP's database.db, or the directory
+    /// of a COLMAP sparse model (.bin or .txt)
+    ///
+    /// The kind is told from the name and the first bytes; --format overrides.
+    ///
+    /// In the CSV, a line is an observation, in pixels; the centre of the top-left pixel is (0, 0). Ids are any whole
+    /// numbers, other columns are ignored. OpenSfM's coordinates are relative to the image size, which --width and
+    /// --height must give. Of a database, matches are joined into tracks; a match that would put two keypoints of one
+    /// image into one track is cut. A model gives its tracks; its poses, points and calibration are not used.
     #[arg(value_name = "INPUT")]
     pub input: PathBuf,
 
-    /// Width of the images in pixels; without it the extent of the points stands in, with a warning
-    #[arg(long, value_name = "PX", requires = "height", value_parser = clap::value_parser!(u32).range(1..))]
-    pub width: Option<u32>,
-
-    /// Height of the images in pixels
-    #[arg(long, value_name = "PX", requires = "width", value_parser = clap::value_parser!(u32).range(1..))]
-    pub height: Option<u32>,
+    #[command(flatten)]
+    pub reading: ReadingArgs,
 }
 
 impl InputArgs {
@@ -42,8 +44,78 @@ impl InputArgs {
     /// # Errors
     /// What is wrong with it, by line ([`Exit::BadInput`](super::exit::Exit::BadInput)).
     pub fn read(&self) -> Result<LabelledInput, Failure> {
-        let size = self.width.zip(self.height).map(|(width_px, height_px)| ImageSize { width_px, height_px });
-        Ok(formats::read(&self.input, &Limits::default(), size)?)
+        self.reading.read(&self.input)
+    }
+}
+
+/// How to read a file of tracks.
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = "How to read INPUT")]
+pub struct ReadingArgs {
+    /// Width of the images in pixels; without it the extent of the points stands in, with a warning. COLMAP's files
+    /// carry their own sizes
+    #[arg(long, value_name = "PX", requires = "height", value_parser = clap::value_parser!(u32).range(1..))]
+    pub width: Option<u32>,
+
+    /// Height of the images in pixels
+    #[arg(long, value_name = "PX", requires = "width", value_parser = clap::value_parser!(u32).range(1..))]
+    pub height: Option<u32>,
+
+    /// What kind of file INPUT is [default: told from its name and content]
+    #[arg(long, value_enum)]
+    pub format: Option<FormatArg>,
+
+    /// Which matches of a COLMAP database to join into tracks [default: verified, or raw where none is]
+    #[arg(long, value_enum)]
+    pub matches: Option<MatchesArg>,
+}
+
+impl ReadingArgs {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// What is wrong with it, by line ([`Exit::BadInput`](super::exit::Exit::BadInput)).
+    pub fn read(&self, path: &Path) -> Result<LabelledInput, Failure> {
+        let reading = Reading {
+            format: self.format.map(Format::from),
+            size: self.width.zip(self.height).map(|(width_px, height_px)| ImageSize { width_px, height_px }),
+            matches: self.matches.map(Matches::from),
+        };
+        Ok(formats::read(path, &Limits::default(), &reading)?)
+    }
+}
+
+/// Tells on stderr what reading changed or left out.
+pub fn tell_notes(input: &LabelledInput) {
+    for note in &input.notes {
+        eprintln!("{}: {note}", input.file_name());
+    }
+}
+
+/// Files for other programs.
+#[derive(Debug, Clone, Args)]
+pub struct ExportArgs {
+    /// Also write a metric result for these programs, below the output directory: colmap/ and colmap-text/ hold a sparse
+    /// model, opensfm/ a reconstruction.json
+    #[arg(long, value_name = "KIND", value_enum, value_delimiter = ',')]
+    pub export: Vec<ExportArg>,
+}
+
+impl ExportArgs {
+    /// Writes what is asked for. A result that is not metric is no failure: it is told on stderr.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn write(&self, directory: &Path, solution: &Solution, input: &LabelledInput) -> Result<(), Failure> {
+        if self.export.is_empty() {
+            return Ok(());
+        }
+        let exports: Vec<Export> = self.export.iter().copied().map(Export::from).collect();
+        match formats::export::write(directory, &exports, solution, input) {
+            Err(error @ formats::export::Error::NotMetric(_)) => eprintln!("warning: {error}"),
+            outcome => outcome.map_err(Failure::internal)?,
+        }
+        Ok(())
     }
 }
 
@@ -175,6 +247,69 @@ impl From<BackendArg> for Backend {
         match backend {
             BackendArg::Flex => Backend::Flex,
             BackendArg::Ndarray => Backend::Ndarray,
+        }
+    }
+}
+
+/// [`Format`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum FormatArg {
+    /// A table `view,track,x,y[,depth]`
+    Csv,
+    /// OpenSfM's tracks.csv, any version
+    Opensfm,
+    /// COLMAP's database.db
+    ColmapDatabase,
+    /// The directory of a COLMAP sparse model
+    ColmapModel,
+}
+
+impl From<FormatArg> for Format {
+    fn from(format: FormatArg) -> Self {
+        match format {
+            FormatArg::Csv => Format::Observations,
+            FormatArg::Opensfm => Format::OpenSfm,
+            FormatArg::ColmapDatabase => Format::ColmapDatabase,
+            FormatArg::ColmapModel => Format::ColmapModel,
+        }
+    }
+}
+
+/// [`Matches`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum MatchesArg {
+    /// Those that COLMAP's geometric verification kept
+    Verified,
+    /// Those of the descriptors
+    Raw,
+}
+
+impl From<MatchesArg> for Matches {
+    fn from(matches: MatchesArg) -> Self {
+        match matches {
+            MatchesArg::Verified => Matches::Verified,
+            MatchesArg::Raw => Matches::Raw,
+        }
+    }
+}
+
+/// [`Export`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ExportArg {
+    /// A COLMAP sparse model, binary
+    Colmap,
+    /// A COLMAP sparse model, text
+    ColmapText,
+    /// OpenSfM's reconstruction.json
+    Opensfm,
+}
+
+impl From<ExportArg> for Export {
+    fn from(export: ExportArg) -> Self {
+        match export {
+            ExportArg::Colmap => Export::Colmap,
+            ExportArg::ColmapText => Export::ColmapText,
+            ExportArg::Opensfm => Export::OpenSfm,
         }
     }
 }

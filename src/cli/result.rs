@@ -2,13 +2,13 @@
 
 use std::path::PathBuf;
 
-use super::args::ServerArgs;
+use super::args::{ExportArgs, ReadingArgs, ServerArgs};
 use super::client::Client;
 use super::exit::{Exit, Failure};
 use super::{job_view, print, summary};
+use crate::domain::Solution;
 use crate::domain::job::JobName;
-use crate::domain::{Limits, Solution};
-use crate::formats::{self, LabelledInput, result_files};
+use crate::formats::{LabelledInput, result_files};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -30,8 +30,14 @@ pub struct Args {
     pub server: ServerArgs,
 
     /// The file that the job was submitted with, for its ids and the files that need its points
-    #[arg(long, value_name = "FILE", requires = "out")]
+    #[arg(long, value_name = "INPUT", requires = "out")]
     pub input: Option<PathBuf>,
+
+    #[command(flatten)]
+    pub reading: ReadingArgs,
+
+    #[command(flatten)]
+    pub export: ExportArgs,
 
     /// Directory for the result files; created, files of these names in it are replaced
     #[arg(long, value_name = "DIR", required_unless_present = "json")]
@@ -44,12 +50,18 @@ pub struct Args {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
-    let input = args.input.as_deref().map(|path| formats::read(path, &Limits::default(), None)).transpose()?;
+    let input = args.input.as_deref().map(|path| args.reading.read(path)).transpose()?;
+    if input.is_none() && !args.export.export.is_empty() {
+        return Err(Failure::usage("--export needs --input, whose points and names it writes"));
+    }
     let solution = Client::connect(&args.server.server).await?.read_result(&args.name).await?;
     if let Some(input) = &input {
         belongs_together(input, &solution)?;
     }
     if let Some(out) = &args.out {
+        if let Some(input) = &input {
+            args.export.write(out, &solution, input)?;
+        }
         result_files::write(out, &solution, input.as_ref())?;
     }
     if args.json {

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use super::args::{InputArgs, ServerArgs, SettingsArgs};
+use super::args::{ExportArgs, InputArgs, ServerArgs, SettingsArgs, tell_notes};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::progress::ProgressView;
@@ -17,6 +17,8 @@ Examples:
   scpsfm solve observations.csv --width 3072 --height 2048 --out answer
   scpsfm solve observations.csv --out answer --json | jq .focal_px
   scpsfm solve observations.csv --out answer --server http://127.0.0.1:50051
+  scpsfm solve database.db --out answer --export colmap,opensfm
+  scpsfm solve tracks.csv --width 3072 --height 2048 --out answer
 
 Files in the output directory: result.json (the summary), tracks.csv, observations.csv (every answer under the ids \
 of the input), cameras.json, points.ply and report.html (open it in a browser).";
@@ -48,6 +50,9 @@ pub struct Args {
     pub quiet: bool,
 
     #[command(flatten)]
+    pub export: ExportArgs,
+
+    #[command(flatten)]
     pub settings: SettingsArgs,
 }
 
@@ -55,6 +60,9 @@ pub struct Args {
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let settings = args.settings.settings()?;
     let input = args.input.read()?;
+    if !args.quiet {
+        tell_notes(&input);
+    }
     // Found out now rather than after the work.
     result_files::create_directory(&args.out)?;
     let mut progress = ProgressView::new(args.quiet);
@@ -103,6 +111,8 @@ async fn on_server(
 
 /// Writes the files and tells what they hold.
 fn deliver(args: &Args, solution: &Solution, input: &LabelledInput) -> Result<Exit, Failure> {
+    // First: whoever waits for result.json, the last file, finds them.
+    args.export.write(&args.out, solution, input)?;
     result_files::write(&args.out, solution, Some(input))?;
     if args.json {
         print(result_files::result_json(solution)?.trim_end())?;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::args::{InputArgs, ServerArgs, SettingsArgs};
+use super::args::{InputArgs, ServerArgs, SettingsArgs, tell_notes};
 use super::client::{Client, JobOptions};
 use super::exit::{Exit, Failure};
 use super::{job_view, print};
@@ -57,6 +57,7 @@ pub struct Args {
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let settings = args.settings.settings()?;
     let input = args.input.read()?;
+    tell_notes(&input);
     let mut client = Client::connect(&args.server.server).await?;
     let options = JobOptions {
         job_id: args.job_id,

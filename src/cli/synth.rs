@@ -189,7 +189,7 @@ mod tests {
 
     use super::*;
     use crate::domain::{ImageSize, Limits};
-    use crate::formats;
+    use crate::formats::{self, Reading};
     use crate::synthetic::{Motion, NoiseKind, OutlierKind, SceneOptions, Shape};
 
     /// Parses the arguments of a small scene and these.
@@ -213,7 +213,8 @@ mod tests {
             let scene = args.generate().expect("valid options");
             assert_eq!(run(args), Ok(Exit::Done));
             let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
-            let read = formats::read(&out.join(OBSERVATIONS), &Limits::default(), Some(size)).expect("a valid file");
+            let reading = Reading { size: Some(size), ..Reading::default() };
+            let read = formats::read(&out.join(OBSERVATIONS), &Limits::default(), &reading).expect("a valid file");
             assert_eq!(read.raw.views, scene.input.views);
             assert_eq!((&read.raw.view, &read.raw.track), (&scene.input.view, &scene.input.track));
             assert_eq!((&read.raw.x, &read.raw.y), (&scene.input.x, &scene.input.y));

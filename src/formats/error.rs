@@ -1,15 +1,25 @@
-//! What is wrong with an input file, by line.
+//! What is wrong with an input file, by line or byte.
 
 use std::fmt;
 
 use crate::domain::InvalidInput;
 
+/// Where in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Place {
+    /// The file as a whole.
+    File,
+    /// Line of a text, counted from 1.
+    Line(u64),
+    /// Bytes before the place in a binary file.
+    Byte(u64),
+}
+
 /// One thing wrong with a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
-    /// Line, counted from 1; `None` where the file as a whole is meant.
-    pub line: Option<u64>,
-    /// Column of the file (`x`), or empty.
+    pub place: Place,
+    /// Column (`x`), record (`camera 3`) or row of a table (`table keypoints, image_id 3`) of the file, or empty.
     pub column: String,
     pub description: String,
 }
@@ -17,12 +27,22 @@ pub struct Problem {
 impl Problem {
     /// A problem of the file as a whole.
     pub fn of_file(description: impl Into<String>) -> Self {
-        Self { line: None, column: String::new(), description: description.into() }
+        Self { place: Place::File, column: String::new(), description: description.into() }
     }
 
     /// A problem of one line.
     pub fn at_line(line: u64, column: &str, description: impl Into<String>) -> Self {
-        Self { line: Some(line), column: column.into(), description: description.into() }
+        Self { place: Place::Line(line), column: column.into(), description: description.into() }
+    }
+
+    /// A problem of a binary file, found at this offset.
+    pub fn at_byte(offset: u64, record: &str, description: impl Into<String>) -> Self {
+        Self { place: Place::Byte(offset), column: record.into(), description: description.into() }
+    }
+
+    /// A problem of a record that has no line, such as a row of a database.
+    pub fn of_record(record: impl Into<String>, description: impl Into<String>) -> Self {
+        Self { place: Place::File, column: record.into(), description: description.into() }
     }
 }
 
@@ -61,8 +81,10 @@ impl fmt::Display for Error {
                 writeln!(f)?;
             }
             f.write_str(&self.file)?;
-            if let Some(line) = problem.line {
-                write!(f, ", line {line}")?;
+            match problem.place {
+                Place::File => {}
+                Place::Line(line) => write!(f, ", line {line}")?,
+                Place::Byte(offset) => write!(f, ", byte {offset}")?,
             }
             if !problem.column.is_empty() {
                 write!(f, ": {}", problem.column)?;

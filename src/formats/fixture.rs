@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Matrix3x4, Matrix4, Vector3};
 use std::path::Path;
 
-use super::LabelledInput;
+use super::{Label, LabelledInput};
 use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, ViewResult};
 use crate::domain::{
     Calibration, Grade, Losses, Method, Prior, Progress, Solution, Stage, Status, Warning, WarningCode,
@@ -19,8 +19,8 @@ pub(crate) fn solved() -> (LabelledInput, Solution) {
 pub(crate) fn solved_with(options: &SceneOptions) -> (LabelledInput, Solution) {
     let scene = Scene::generate(options).expect("valid options");
     let mut input = LabelledInput::unlabelled(scene.input.clone(), Path::new("observations.csv"));
-    input.view_labels.iter_mut().for_each(|label| *label = 10 * *label + 3);
-    input.track_labels.iter_mut().for_each(|label| *label = 2 * *label + 100);
+    input.view_labels = (0..input.raw.views.len() as u64).map(|view| Label::Number(10 * view + 3)).collect();
+    input.track_labels = (0..input.raw.track_count as u64).map(|track| Label::Number(2 * track + 100)).collect();
     let solution = solution(&scene);
     (input, solution)
 }

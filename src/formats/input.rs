@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use super::error::{Error, Problem, Problems};
+use super::error::{Error, Place, Problem, Problems};
+use super::label::Label;
 use crate::domain::{Input, InvalidInput, Limits, RawInput, Violation};
 
 /// What a file says: dense indices for the solver, the file's own ids for the answers.
@@ -10,11 +11,15 @@ use crate::domain::{Input, InvalidInput, Limits, RawInput, Violation};
 pub struct LabelledInput {
     pub raw: RawInput,
     /// The file's id of each view, ascending.
-    pub view_labels: Vec<u64>,
+    pub view_labels: Vec<Label>,
     /// The file's id of each track, ascending.
-    pub track_labels: Vec<u64>,
-    /// Line of each observation, counted from 1.
+    pub track_labels: Vec<Label>,
+    /// Line of each observation, counted from 1; empty where the file has no lines.
     pub lines: Vec<u64>,
+    /// COLMAP's id of each view's image, kept for what is exported to COLMAP; empty for other files.
+    pub image_ids: Vec<u32>,
+    /// What reading changed or left out, a sentence each.
+    pub notes: Vec<String>,
     pub path: PathBuf,
 }
 
@@ -22,11 +27,12 @@ impl LabelledInput {
     /// The input that a program made rather than read: indices stand as labels, observation `k` on line `k + 2`.
     pub fn unlabelled(raw: RawInput, path: &Path) -> Self {
         Self {
-            view_labels: (0..raw.views.len() as u64).collect(),
-            track_labels: (0..raw.track_count as u64).collect(),
+            view_labels: (0..raw.views.len() as u64).map(Label::Number).collect(),
+            track_labels: (0..raw.track_count as u64).map(Label::Number).collect(),
             lines: (0..raw.x.len() as u64).map(|k| k + 2).collect(),
             path: path.into(),
             raw,
+            ..Self::default()
         }
     }
 
@@ -65,17 +71,54 @@ impl LabelledInput {
     fn problem(&self, violation: &Violation) -> Problem {
         let column = violation.field.rsplit('.').next().unwrap_or_default();
         let place = violation.index.and_then(|index| match column {
-            "view" | "track" | "x" | "y" | "depth" => self.lines.get(index).map(|&line| (Some(line), column.into())),
-            "views" => self.view_labels.get(index).map(|label| (None, format!("view {label}"))),
+            "view" | "track" | "x" | "y" | "depth" => self.place(index, column),
+            "views" => self.view_labels.get(index).map(|label| (Place::File, format!("view {label}"))),
             _ => None,
         });
-        let (line, column) = place.unwrap_or_else(|| match violation.index {
-            Some(_) => (None, violation.path()),
+        let (place, column) = place.unwrap_or_else(|| match violation.index {
+            Some(_) => (Place::File, violation.path()),
             // The file has no column of these names: the sentence alone says it best.
-            None if matches!(column, "x" | "views" | "track_count") => (None, String::new()),
-            None => (None, column.into()),
+            None if matches!(column, "x" | "views" | "track_count") => (Place::File, String::new()),
+            None => (Place::File, column.into()),
         });
-        Problem { line, column, description: violation.description.clone() }
+        Problem { place, column, description: violation.description.clone() }
+    }
+
+    /// Where an observation stands: its line, or its view and track where the file has no lines.
+    fn place(&self, observation: usize, column: &str) -> Option<(Place, String)> {
+        if !self.lines.is_empty() {
+            return self.lines.get(observation).map(|&line| (Place::Line(line), column.into()));
+        }
+        let label = |labels: &[Label], indices: &[u32]| {
+            let index = *indices.get(observation)? as usize;
+            labels.get(index).cloned()
+        };
+        let view = label(&self.view_labels, &self.raw.view)?;
+        let track = label(&self.track_labels, &self.raw.track)?;
+        Some((Place::File, format!("view {view}, track {track}: {column}")))
+    }
+
+    /// Refuses a second observation of a track in a view. The domain does too, but by index; here both lines can be
+    /// named.
+    pub(super) fn refuse_duplicates(&self) -> Result<(), Error> {
+        let (view, track) = (&self.raw.view, &self.raw.track);
+        let mut order: Vec<usize> = (0..self.lines.len()).collect();
+        order.sort_unstable_by_key(|&k| (track[k], view[k], k));
+        let mut duplicates: Vec<(usize, usize)> = order
+            .windows(2)
+            .map(|pair| (pair[1], pair[0]))
+            .filter(|&(later, first)| (track[later], view[later]) == (track[first], view[first]))
+            .collect();
+        duplicates.sort_unstable();
+        let mut problems = Problems::default();
+        for (later, first) in duplicates {
+            let what = format!(
+                "track {} is observed a second time in view {} (first on line {})",
+                self.track_labels[track[later] as usize], self.view_labels[view[later] as usize], self.lines[first]
+            );
+            problems.push(Problem::at_line(self.lines[later], "track", what));
+        }
+        problems.into_result(&self.file_name())
     }
 }
 

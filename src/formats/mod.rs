@@ -1,17 +1,29 @@
-//! Files in and out: observations as CSV, and the result files, whose fields are a contract.
+//! Files in and out: tables of observations, OpenSfM's and COLMAP's files, and the result files, whose fields are a
+//! contract.
 //!
 //! May depend on `domain`, and on `report` for the page among the result files; knows nothing of transport.
 
+pub mod colmap;
 pub mod error;
+pub mod export;
 pub mod input;
+pub mod label;
+pub mod metric;
 pub mod observations;
+pub mod opensfm;
 pub mod ply;
 pub mod result_files;
 pub mod result_json;
+pub mod source;
+mod text;
 
 #[cfg(test)]
 pub(crate) mod fixture;
+#[cfg(test)]
+pub(crate) mod mutation;
 
 pub use error::Error;
+pub use export::Export;
 pub use input::LabelledInput;
-pub use observations::read;
+pub use label::Label;
+pub use source::{Format, Matches, Reading, read};

@@ -10,7 +10,7 @@ use crate::domain::Solution;
 ///
 /// A vertex has `x y z` (metric where the result is metric, else dehomogenised in the frame of the projective cameras,
 /// which a comment tells), a colour from orange (weight 0) to blue
-/// (weight 1), the weight, and the caller's id of the track.
+/// (weight 1), the weight, and the caller's id of the track, or where that is no number its place among the tracks.
 pub fn points(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let vertices: Vec<(usize, [f64; 3])> =
         solution.tracks.point.iter().enumerate().filter_map(|(track, point)| Some((track, (*point)?))).collect();
@@ -29,7 +29,7 @@ pub fn points(solution: &Solution, input: Option<&LabelledInput>) -> String {
     for (track, [x, y, z]) in vertices {
         let weight = solution.tracks.weight.get(track).copied().unwrap_or(0.0);
         let [red, green, blue] = colour(weight);
-        let label = track_label(input, track);
+        let label = track_label(input, track).number().unwrap_or(track as u64);
         // Writing to a String cannot fail.
         let _ = writeln!(text, "{x} {y} {z} {red} {green} {blue} {weight} {label}");
     }

@@ -102,7 +102,7 @@ fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let mut text = String::from("track,weight,inlier");
     text.push_str(if has_network { ",network_weight\n" } else { "\n" });
     for (track, (weight, &inlier)) in tracks.weight.iter().zip(&tracks.inlier).enumerate() {
-        text.push_str(&format!("{},{weight},{}", track_label(input, track), u8::from(inlier)));
+        text.push_str(&format!("{},{weight},{}", track_label(input, track).csv(), u8::from(inlier)));
         if has_network {
             text.push_str(&format!(",{}", tracks.network_weight.get(track).copied().unwrap_or(0.0)));
         }
@@ -121,8 +121,8 @@ fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {
         let residual = judged.residual_px.get(k).copied().flatten();
         text.push_str(&format!(
             "{},{},{},{}\n",
-            view_label(Some(input), view as usize),
-            track_label(Some(input), track as usize),
+            view_label(Some(input), view as usize).csv(),
+            track_label(Some(input), track as usize).csv(),
             u8::from(inlier),
             residual.map_or_else(String::new, |px| px.to_string()),
         ));

@@ -5,7 +5,7 @@ use serde::Serialize;
 use crate::domain::result::{PriorTime, ViewResult};
 use crate::domain::{Calibration, Grade, Method, Solution, Status, Warning};
 
-use super::LabelledInput;
+use super::{Label, LabelledInput};
 
 /// The summary of a result.
 ///
@@ -147,8 +147,8 @@ pub struct CamerasJson {
 #[derive(Debug, Clone, Serialize)]
 #[allow(non_snake_case, reason = "the field's names for these matrices are capitals")]
 pub struct CameraJson {
-    /// The caller's id of the view.
-    pub view: u64,
+    /// The caller's id of the view: a number, or a text where the input has names.
+    pub view: Label,
     pub registered: bool,
     /// Reconstruction that a registered view belongs to; each has a frame and a scale of its own.
     pub part: Option<u32>,
@@ -183,7 +183,7 @@ impl CamerasJson {
 
 /// Position of each view's camera group among the calibrations. Groups are numbered in ascending order of their ids;
 /// a single calibration is everyone's.
-fn camera_groups(solution: &Solution, input: Option<&LabelledInput>) -> Vec<usize> {
+pub(super) fn camera_groups(solution: &Solution, input: Option<&LabelledInput>) -> Vec<usize> {
     match input {
         Some(input) if solution.calibrations.len() > 1 => {
             let mut ids: Vec<u32> = input.raw.views.iter().map(|view| view.camera_group).collect();
@@ -204,11 +204,11 @@ fn intrinsics(calibration: &Calibration, own: Option<f64>) -> [[f64; 3]; 3] {
 }
 
 /// The caller's id of view `index`, or the index where the input is not at hand.
-pub fn view_label(input: Option<&LabelledInput>, index: usize) -> u64 {
-    input.and_then(|input| input.view_labels.get(index).copied()).unwrap_or(index as u64)
+pub fn view_label(input: Option<&LabelledInput>, index: usize) -> Label {
+    input.and_then(|input| input.view_labels.get(index).cloned()).unwrap_or(Label::Number(index as u64))
 }
 
 /// The caller's id of track `index`, or the index where the input is not at hand.
-pub fn track_label(input: Option<&LabelledInput>, index: usize) -> u64 {
-    input.and_then(|input| input.track_labels.get(index).copied()).unwrap_or(index as u64)
+pub fn track_label(input: Option<&LabelledInput>, index: usize) -> Label {
+    input.and_then(|input| input.track_labels.get(index).cloned()).unwrap_or(Label::Number(index as u64))
 }

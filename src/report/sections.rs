@@ -278,7 +278,7 @@ pub fn views(solution: &Solution, input: Option<&LabelledInput>) -> String {
         let _ = writeln!(
             html,
             "<tr><td>{}</td><td>{registered}</td><td>{}</td><td>{}</td><td>{rms}</td></tr>",
-            view_label(input, index),
+            escape(&view_label(input, index).to_string()),
             count.observations,
             count.inliers
         );

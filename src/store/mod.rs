@@ -1,7 +1,7 @@
 //! The state that outlives the process: jobs, inputs, events, results, leases and request ids, behind one trait.
 //!
-//! Only this module sees SQL. Depends on `domain` and `telemetry`; the state machine's rules are the domain's, what is
-//! written in one transaction is decided here.
+//! Only this module sees SQL, but for `formats`, which reads COLMAP's databases. Depends on `domain` and `telemetry`;
+//! the state machine's rules are the domain's, what is written in one transaction is decided here.
 
 pub mod payload;
 pub mod query;

@@ -131,7 +131,7 @@ fn a_bad_input_ends_with_65_and_names_file_and_line() {
     assert!(refused(&good.as_bytes()[..good.len() - 30]).contains("the file may be truncated"));
     assert!(refused(b"").contains("bad.csv: is empty"));
     assert!(refused(b"\x7fELF\x02\x01\x01\0\0\0\n").contains("bad.csv: is not a text file"));
-    assert!(refused(b"SQLite format 3\0").contains("not a supported format yet"));
+    assert!(refused(b"SQLite format 3\0").contains("bad.csv: cannot be"));
     let missing = run(["solve", "no/such.csv", "--out", text(directory.path())]);
     assert_eq!(missing.code, Some(65), "{missing:?}");
     assert!(missing.stderr.contains("such.csv: cannot be read"), "{missing:?}");

@@ -3,6 +3,7 @@
 mod api;
 mod cli;
 mod crash;
+mod formats;
 mod load;
 mod readme;
 mod support;

@@ -1,11 +1,11 @@
 //! The README's own client, run as it stands there.
 
 use std::fs;
-use std::io::Write;
 use std::path::Path;
 use std::process::Command;
 
 use crate::support::program::{Serving, run};
+use crate::support::python::{python, succeeds};
 
 const README: &str = include_str!("../../README.md");
 
@@ -14,30 +14,6 @@ fn block(language: &str) -> &'static str {
     let fence = format!("```{language}\n");
     let (_, rest) = README.split_once(&fence).expect("the README has such a block");
     rest.split_once("```").expect("the block ends").0
-}
-
-/// An interpreter that has grpcio and grpcio-tools. Without one the test is skipped, loudly, unless
-/// `SCPSFM_REQUIRE_PYTHON` forbids it.
-fn python() -> Option<String> {
-    let python = std::env::var("SCPSFM_PYTHON").unwrap_or_else(|_| "python3".into());
-    let found = Command::new(&python).args(["-c", "import grpc, grpc_tools"]).output();
-    if found.is_ok_and(|output| output.status.success()) {
-        return Some(python);
-    }
-    let missing = format!("{python} with grpcio and grpcio-tools is missing (SCPSFM_PYTHON names an interpreter)");
-    assert!(std::env::var_os("SCPSFM_REQUIRE_PYTHON").is_none(), "{missing}");
-    // Past the capture of a passing test's output.
-    writeln!(std::io::stderr(), "SKIPPED the Python client: {missing}").expect("stderr");
-    None
-}
-
-/// Runs the interpreter to its end; returns what it printed.
-fn succeeds(command: &mut Command) -> String {
-    let output = command.output().expect("the interpreter runs");
-    let text = |bytes| String::from_utf8(bytes).expect("UTF-8");
-    let (stdout, stderr) = (text(output.stdout), text(output.stderr));
-    assert!(output.status.success(), "{command:?}\n{stdout}\n{stderr}");
-    stdout
 }
 
 fn generate_stubs(python: &str, into: &Path) {
@@ -50,7 +26,7 @@ fn generate_stubs(python: &str, into: &Path) {
 
 #[test]
 fn the_python_client_submits_watches_and_reads_the_result() {
-    let Some(python) = python() else { return };
+    let Some(python) = python("the Python client", "grpc, grpc_tools") else { return };
     let directory = tempfile::tempdir().expect("a temporary directory");
     let path = |name: &str| directory.path().join(name);
     let scene = path("scene");

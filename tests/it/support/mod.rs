@@ -3,6 +3,7 @@
 pub mod collector;
 pub mod live;
 pub mod program;
+pub mod python;
 pub mod scrape;
 pub mod server;
 pub mod solvers;

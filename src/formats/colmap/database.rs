@@ -1,0 +1,170 @@
+//! Reading a COLMAP database (SQLite): keypoints, and matches joined into tracks.
+//!
+//! The only SQL outside `store`, and of another kind: it reads a file of someone else's, and never writes.
+
+mod rows;
+
+use std::path::{Path, PathBuf};
+
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
+use sqlx::{ConnectOptions, Connection};
+
+use self::rows::Keypoints;
+use super::images::{Images, Observation};
+use super::tracks::{self, Match};
+use crate::domain::Limits;
+use crate::formats::error::{Error, Problem};
+use crate::formats::input::{LabelledInput, display_name};
+use crate::formats::source::Matches;
+
+/// Reads the tracks of a database. Views are image names; tracks are numbered from 0, COLMAP has none yet.
+///
+/// * `matches`: which to join; `None`: the verified where there are any, else the raw
+///
+/// A note tells how many matches made the tracks, and how many were cut because they would have put two keypoints of one
+/// image into one track.
+///
+/// # Errors
+/// A file that is no such database, is being written to, is damaged (by table and row) or above `limits`.
+pub fn read(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<LabelledInput, Error> {
+    let file = display_name(path);
+    refuse_unfinished(path).map_err(|what| Error::one(&file, Problem::of_file(what)))?;
+    let contents = on_a_runtime_of_its_own(path, limits, matches).map_err(|problem| Error::one(&file, problem))?;
+    let labelled = contents.into_labelled(path, limits).map_err(|problem| Error::one(&file, problem))?;
+    labelled.check(limits)?;
+    Ok(labelled)
+}
+
+/// What a database holds of use here.
+struct Contents {
+    images: Images,
+    /// Keypoints of each image, in the order of the images.
+    keypoints: Keypoints,
+    matches: Vec<Match>,
+    pairs: usize,
+    kind: Matches,
+}
+
+impl Contents {
+    fn into_labelled(self, path: &Path, limits: &Limits) -> Result<LabelledInput, Problem> {
+        let count = self.matches.len();
+        let keypoints = self.keypoints;
+        let joined = tracks::join(self.matches, |keypoint| keypoints.image_of(keypoint));
+        if joined.observations.len() > limits.max_observations {
+            let what = format!(
+                "{} observations are above the limit of {}",
+                joined.observations.len(),
+                limits.max_observations
+            );
+            return Err(Problem::of_file(what));
+        }
+        let note = format!(
+            "{} tracks were joined from {count} {} matches of {} image pairs; {} matches were cut, which would have put two \
+             keypoints of one image into one track",
+            joined.tracks,
+            kind_name(self.kind),
+            self.pairs,
+            joined.cut
+        );
+        let observation = |&(keypoint, track): &(u32, u32)| {
+            let [x, y] = keypoints.point(keypoint);
+            Observation { image: keypoints.image_of(keypoint), track: u64::from(track), x, y, line: 0 }
+        };
+        let observations = joined.observations.iter().map(observation).collect();
+        Ok(self.images.into_labelled(observations, path, vec![note]))
+    }
+}
+
+fn kind_name(kind: Matches) -> &'static str {
+    match kind {
+        Matches::Verified => "verified",
+        Matches::Raw => "raw",
+    }
+}
+
+/// Refuses a database with a write-ahead log: what stands in there alone would be missed.
+fn refuse_unfinished(path: &Path) -> Result<(), String> {
+    let mut log = path.as_os_str().to_owned();
+    log.push("-wal");
+    let log = PathBuf::from(log);
+    match std::fs::metadata(&log) {
+        Ok(metadata) if metadata.len() > 0 => Err(format!(
+            "{} beside it holds changes that are not in the file yet: let COLMAP end, or fold them in with \
+             `sqlite3 {} 'pragma wal_checkpoint(truncate)'`",
+            display_name(&log),
+            display_name(path)
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Runs the queries on a thread and a runtime of their own: this module is synchronous, its callers may be on a runtime,
+/// which must not be blocked on from within.
+fn on_a_runtime_of_its_own(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<Contents, Problem> {
+    let work = || {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_time()
+            .build()
+            .map_err(|error| Problem::of_file(format!("cannot be read: no runtime: {error}")))?;
+        runtime.block_on(contents(path, limits, matches))
+    };
+    std::thread::scope(|scope| scope.spawn(work).join())
+        .unwrap_or_else(|_| Err(Problem::of_file("cannot be read: reading it failed within this program")))
+}
+
+async fn contents(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<Contents, Problem> {
+    let options = SqliteConnectOptions::new()
+        .filename(path)
+        .read_only(true)
+        // Nobody else writes while this reads, so no lock and no shared memory file beside it is needed.
+        .immutable(true)
+        // A schema is a program too; this one is a stranger's.
+        .pragma("trusted_schema", "0")
+        .disable_statement_logging();
+    let mut connection =
+        options.connect().await.map_err(|error| Problem::of_file(format!("cannot be opened: {error}")))?;
+    // After an error the connection is dropped as it is: its thread may be gone, and to wait for it without end.
+    let found = read_tables(&mut connection, limits, matches).await?;
+    // Read-only: nothing is lost with a close that fails.
+    let _ = connection.close().await;
+    Ok(found)
+}
+
+async fn read_tables(
+    connection: &mut SqliteConnection,
+    limits: &Limits,
+    matches: Option<Matches>,
+) -> Result<Contents, Problem> {
+    let tables = rows::tables(connection).await?;
+    let require = |table: &str| match tables.contains(table) {
+        true => Ok(()),
+        false => Err(Problem::of_file(format!("is no COLMAP database: it has no table `{table}`"))),
+    };
+    ["cameras", "images", "keypoints"].into_iter().try_for_each(require)?;
+    let mut images = Images::default();
+    rows::cameras(connection, &mut images).await?;
+    rows::images(connection, limits.max_views, &mut images).await?;
+    let keypoints = rows::keypoints(connection, &images).await?;
+    let kinds: &[Matches] = match matches {
+        Some(Matches::Verified) => &[Matches::Verified],
+        Some(Matches::Raw) => &[Matches::Raw],
+        None => &[Matches::Verified, Matches::Raw],
+    };
+    for &kind in kinds {
+        require(rows::table(kind))?;
+        let (matches, pairs) = rows::matches(connection, kind, &images, &keypoints).await?;
+        if !matches.is_empty() {
+            return Ok(Contents { images, keypoints, matches, pairs, kind });
+        }
+    }
+    Err(Problem::of_file(match matches {
+        Some(Matches::Verified) => {
+            "holds no verified matches; let COLMAP verify them, or take the others with --matches raw"
+        }
+        _ => "holds no matches; let COLMAP match its images first",
+    }))
+}
+
+#[cfg(test)]
+#[path = "database_tests.rs"]
+mod tests;

@@ -1,0 +1,261 @@
+//! The tables of a COLMAP database, row by row, every blob measured against what its row announces.
+
+use std::collections::BTreeSet;
+
+use futures_util::TryStreamExt;
+use sqlx::sqlite::{SqliteConnection, SqliteRow};
+use sqlx::{Either, Executor, Row};
+
+use super::super::cameras::{Camera, Model};
+use super::super::images::Images;
+use super::super::tracks::Match;
+use crate::formats::error::Problem;
+use crate::formats::source::Matches;
+
+/// COLMAP's numbering of pairs: `first * MAX_IMAGES + second`, first < second (`kMaxNumImages`, `types.h`).
+const MAX_IMAGES: u64 = 2_147_483_647;
+/// Keypoints in all: 2,000 images of 25,000, twice what COLMAP extracts at most by default. 8 bytes each are held.
+const MAX_KEYPOINTS: usize = 50_000_000;
+/// Matches in all: 2,000 images, each matched with 20 others, 800 matches a pair. Some 50 bytes each are held.
+const MAX_MATCHES: usize = 32_000_000;
+
+/// The table with the matches of a kind.
+pub(super) fn table(kind: Matches) -> &'static str {
+    match kind {
+        Matches::Verified => "two_view_geometries",
+        Matches::Raw => "matches",
+    }
+}
+
+fn damaged(error: sqlx::Error) -> Problem {
+    Problem::of_file(format!("cannot be read as a COLMAP database: {error}"))
+}
+
+/// Gives every row of a query to `each`.
+///
+/// # Pitfall
+/// Queries select expressions, `+column AS column`: sqlx asks SQLite for the declared types and names of plain columns,
+/// and its thread panics where a damaged schema has such that are not UTF-8. A stream of rows then just ends, and who asks
+/// that connection for more may wait for ever. So a stream that ends without its summary is an error, after which the
+/// connection must not be used.
+async fn for_each_row(
+    connection: &mut SqliteConnection,
+    query: &'static str,
+    mut each: impl FnMut(&SqliteRow) -> Result<(), Problem>,
+) -> Result<(), Problem> {
+    let mut steps = connection.fetch_many(sqlx::query(query));
+    let mut is_whole = false;
+    while let Some(step) = steps.try_next().await.map_err(damaged)? {
+        match step {
+            Either::Left(_summary) => is_whole = true,
+            Either::Right(row) => each(&row)?,
+        }
+    }
+    if is_whole { Ok(()) } else { Err(Problem::of_file("cannot be read as a COLMAP database: reading broke off")) }
+}
+
+/// The tables that a query may go to. Views and virtual tables are none: a query of one runs its maker's program.
+pub(super) async fn tables(connection: &mut SqliteConnection) -> Result<BTreeSet<String>, Problem> {
+    let query = "SELECT +name AS name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'";
+    let mut tables = BTreeSet::new();
+    for_each_row(connection, query, |row| {
+        // One whose name is no text is none of COLMAP's.
+        tables.extend(row.try_get::<String, _>("name"));
+        Ok(())
+    })
+    .await?;
+    Ok(tables)
+}
+
+pub(super) async fn cameras(connection: &mut SqliteConnection, images: &mut Images) -> Result<(), Problem> {
+    let query =
+        "SELECT +camera_id AS camera_id, +model AS model, +width AS width, +height AS height, +params AS params,
+        +prior_focal_length AS prior_focal_length FROM cameras ORDER BY cameras.camera_id";
+    for_each_row(connection, query, |row| {
+        let id: u32 = integer(row, "cameras", "camera_id", 0)?;
+        let value = |column: &str| integer::<i64>(row, "cameras", column, id.into());
+        let side = |column: &str| integer::<u64>(row, "cameras", column, id.into());
+        let model = Model::of_id(value("model")?);
+        let (width, height, is_known) = (side("width")?, side("height")?, value("prior_focal_length")? != 0);
+        let first = blob(row, "cameras", "params", id.into())?.first_chunk().copied().map(f64::from_le_bytes);
+        Camera::new(model, width, height)
+            .and_then(|camera| images.add_camera(id, camera.knowing(first.filter(|_| is_known))))
+            .map_err(|what| Problem::of_record(format!("table cameras, row {id}"), what))
+    })
+    .await
+}
+
+pub(super) async fn images(connection: &mut SqliteConnection, most: usize, images: &mut Images) -> Result<(), Problem> {
+    let query = "SELECT +image_id AS image_id, +camera_id AS camera_id, +name AS name FROM images
+        ORDER BY images.image_id";
+    for_each_row(connection, query, |row| {
+        let id: u32 = integer(row, "images", "image_id", 0)?;
+        let wrong = |what: String| Problem::of_record(format!("table images, row {id}"), what);
+        let camera = integer(row, "images", "camera_id", id.into())?;
+        let name: &str = row.try_get("name").map_err(|error| wrong(format!("name: {}", unwrapped(error))))?;
+        images.add_image(id, name, camera).map_err(wrong)?;
+        if images.len() > most { Err(wrong(format!("more images than the limit of {most}"))) } else { Ok(()) }
+    })
+    .await
+}
+
+/// Keypoints of all images, numbered image after image.
+#[derive(Debug)]
+pub(super) struct Keypoints {
+    /// Number of the first keypoint of each image, and their number in all.
+    starts: Vec<u32>,
+    /// In COLMAP's pixels.
+    points: Vec<[f32; 2]>,
+}
+
+impl Keypoints {
+    /// Position of the image that a keypoint is of.
+    pub fn image_of(&self, keypoint: u32) -> u32 {
+        (self.starts.partition_point(|&start| start <= keypoint) - 1) as u32
+    }
+
+    pub fn point(&self, keypoint: u32) -> [f64; 2] {
+        self.points[keypoint as usize].map(f64::from)
+    }
+
+    /// Number of keypoint `index` of an image, if it has so many.
+    fn number(&self, image: u32, index: u32) -> Option<u32> {
+        let [start, end] = *self.starts.get(image as usize..)?.first_chunk()?;
+        start.checked_add(index).filter(|&keypoint| keypoint < end)
+    }
+}
+
+pub(super) async fn keypoints(connection: &mut SqliteConnection, images: &Images) -> Result<Keypoints, Problem> {
+    let mut of_image: Vec<Vec<[f32; 2]>> = vec![Vec::new(); images.len()];
+    let mut count = 0;
+    let query = "SELECT +image_id AS image_id, +rows AS rows, +cols AS cols, +data AS data FROM keypoints
+        ORDER BY keypoints.image_id";
+    for_each_row(connection, query, |row| {
+        let id: u32 = integer(row, "keypoints", "image_id", 0)?;
+        let wrong = |what: &str| Problem::of_record(format!("table keypoints, row {id}"), what);
+        let image = images.position(id).ok_or_else(|| wrong("is of no image of the table images"))?;
+        let (columns, data) = matrix(row, "keypoints", id.into())?;
+        // x, y, and scale and orientation or an affine shape, which are not needed.
+        let points = data.chunks_exact(4 * columns).map(|row| pair(row).map(f32::from_le_bytes));
+        of_image[image as usize] = points.collect();
+        count += of_image[image as usize].len();
+        let fits = count <= MAX_KEYPOINTS;
+        if fits { Ok(()) } else { Err(wrong(&format!("more keypoints than {MAX_KEYPOINTS} in all"))) }
+    })
+    .await?;
+    let mut starts = vec![0];
+    let mut points = Vec::with_capacity(count);
+    for of_image in of_image {
+        points.extend(of_image);
+        starts.push(points.len() as u32);
+    }
+    Ok(Keypoints { starts, points })
+}
+
+/// The matches of a kind, and the number of image pairs that have some.
+pub(super) async fn matches(
+    connection: &mut SqliteConnection,
+    kind: Matches,
+    images: &Images,
+    keypoints: &Keypoints,
+) -> Result<(Vec<Match>, usize), Problem> {
+    let query = match kind {
+        Matches::Verified => {
+            "SELECT +pair_id AS pair_id, +rows AS rows, +cols AS cols, +data AS data FROM two_view_geometries AS pairs
+             WHERE pairs.rows <> 0 ORDER BY pairs.pair_id"
+        }
+        Matches::Raw => {
+            "SELECT +pair_id AS pair_id, +rows AS rows, +cols AS cols, +data AS data FROM matches AS pairs
+             WHERE pairs.rows <> 0 ORDER BY pairs.pair_id"
+        }
+    };
+    let mut matches = Vec::new();
+    let mut pairs = 0;
+    for_each_row(connection, query, |row| {
+        pairs += 1;
+        of_pair(row, table(kind), images, keypoints, &mut matches)
+    })
+    .await?;
+    Ok((matches, pairs))
+}
+
+/// Takes the matches of one image pair.
+fn of_pair(
+    row: &SqliteRow,
+    table: &str,
+    images: &Images,
+    keypoints: &Keypoints,
+    matches: &mut Vec<Match>,
+) -> Result<(), Problem> {
+    let pair_id: u64 = integer(row, table, "pair_id", 0)?;
+    let wrong = |what: String| Problem::of_record(format!("table {table}, row {pair_id}"), what);
+    let [first_id, second_id] = [pair_id / MAX_IMAGES, pair_id % MAX_IMAGES];
+    let position = |id: u64| u32::try_from(id).ok().and_then(|id| images.position(id));
+    let (Some(first), Some(second)) = (position(first_id), position(second_id)) else {
+        return Err(wrong(format!(
+            "is of the images {first_id} and {second_id}, which the table images does not have"
+        )));
+    };
+    if first == second {
+        return Err(wrong(format!("matches image {first_id} with itself")));
+    }
+    let (columns, data) = matrix(row, table, pair_id)?;
+    let rows = data.chunks_exact(4 * columns);
+    // A blob of SQLite has less than 2^31 bytes.
+    let pair_size = rows.len() as u32;
+    for (k, row) in rows.enumerate() {
+        let [in_first, in_second] = pair(row).map(u32::from_le_bytes);
+        let (Some(a), Some(b)) = (keypoints.number(first, in_first), keypoints.number(second, in_second)) else {
+            return Err(wrong(format!("match {k} joins keypoints {in_first} and {in_second}; one is not there")));
+        };
+        matches.push(Match { a, b, pair_size });
+    }
+    if matches.len() > MAX_MATCHES { Err(wrong(format!("more matches than {MAX_MATCHES} in all"))) } else { Ok(()) }
+}
+
+/// The first two four-byte numbers of a row of a matrix, which has at least [`LEAST_COLUMNS`].
+fn pair(row: &[u8]) -> [[u8; 4]; 2] {
+    [[row[0], row[1], row[2], row[3]], [row[4], row[5], row[6], row[7]]]
+}
+
+/// An integer of a row. `id` names the row in errors.
+fn integer<T: TryFrom<i64>>(row: &SqliteRow, table: &str, column: &str, id: u64) -> Result<T, Problem> {
+    let wrong = |what: String| Problem::of_record(format!("table {table}, row {id}: {column}"), what);
+    let value: i64 = row.try_get(column).map_err(|error| wrong(unwrapped(error)))?;
+    T::try_from(value).map_err(|_| wrong(format!("{value} is out of range")))
+}
+
+/// A blob of a row; NULL is an empty one.
+fn blob<'r>(row: &'r SqliteRow, table: &str, column: &str, id: u64) -> Result<&'r [u8], Problem> {
+    let value: Option<&[u8]> = row
+        .try_get(column)
+        .map_err(|error| Problem::of_record(format!("table {table}, row {id}: {column}"), unwrapped(error)))?;
+    Ok(value.unwrap_or_default())
+}
+
+/// Columns of keypoints (x, y) and of matches (a keypoint of either image) that there must be.
+const LEAST_COLUMNS: usize = 2;
+
+/// The columns and the bytes of a matrix of four-byte numbers.
+fn matrix<'r>(row: &'r SqliteRow, table: &str, id: u64) -> Result<(usize, &'r [u8]), Problem> {
+    let (rows, columns): (u64, usize) = (integer(row, table, "rows", id)?, integer(row, table, "cols", id)?);
+    let data = blob(row, table, "data", id)?;
+    let wrong = |what: String| Problem::of_record(format!("table {table}, row {id}: data"), what);
+    if rows > 0 && columns < LEAST_COLUMNS {
+        return Err(wrong(format!("has {columns} columns, at least {LEAST_COLUMNS} are needed")));
+    }
+    let announced = rows.checked_mul(columns as u64).and_then(|numbers| numbers.checked_mul(4));
+    if announced != Some(data.len() as u64) {
+        return Err(wrong(format!("has {} bytes, {rows} x {columns} numbers of 4 are announced", data.len())));
+    }
+    // An empty matrix may have none.
+    Ok((columns.max(LEAST_COLUMNS), data))
+}
+
+/// What went wrong with a column, without sqlx's words around it.
+fn unwrapped(error: sqlx::Error) -> String {
+    match error {
+        sqlx::Error::ColumnDecode { source, .. } => source.to_string(),
+        error => error.to_string(),
+    }
+}

@@ -1,0 +1,187 @@
+//! Cameras and images as COLMAP's files list them, and the input that they make together with tracks.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::path::Path;
+
+use super::FIRST_PIXEL;
+use super::cameras::Camera;
+use crate::domain::{RawInput, View};
+use crate::formats::input::LabelledInput;
+use crate::formats::label::{Label, dense};
+
+/// Cameras by id, and images in the order of the file.
+#[derive(Debug, Default)]
+pub(super) struct Images {
+    cameras: BTreeMap<u32, Camera>,
+    images: Vec<Image>,
+    by_id: HashMap<u32, u32>,
+    names: HashSet<Label>,
+}
+
+#[derive(Debug)]
+struct Image {
+    id: u32,
+    name: Label,
+    camera: u32,
+}
+
+/// One keypoint of a track.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Observation {
+    /// Position of the image in the file.
+    pub image: u32,
+    pub track: u64,
+    /// In COLMAP's pixels.
+    pub x: f64,
+    pub y: f64,
+    /// Line of the file; 0 where it has none.
+    pub line: u64,
+}
+
+impl Images {
+    pub fn add_camera(&mut self, id: u32, camera: Camera) -> Result<(), String> {
+        match self.cameras.insert(id, camera) {
+            None => Ok(()),
+            Some(_) => Err("is there a second time".into()),
+        }
+    }
+
+    /// Adds an image; returns its position.
+    pub fn add_image(&mut self, id: u32, name: &str, camera: u32) -> Result<u32, String> {
+        let name = Label::name(name)?;
+        if !self.cameras.contains_key(&camera) {
+            return Err(format!("is of camera {camera}, which is not among the cameras"));
+        }
+        if !self.names.insert(name.clone()) {
+            return Err(format!("the name {name} is there a second time"));
+        }
+        // An image takes some bytes of a file, more than 2^32 of them no file.
+        let position = self.images.len() as u32;
+        if self.by_id.insert(id, position).is_some() {
+            return Err("is there a second time".into());
+        }
+        self.images.push(Image { id, name, camera });
+        Ok(position)
+    }
+
+    pub fn len(&self) -> usize {
+        self.images.len()
+    }
+
+    /// Position of the image of this id.
+    pub fn position(&self, id: u32) -> Option<u32> {
+        self.by_id.get(&id).copied()
+    }
+
+    /// The input; its views are the images in the order of their names, each with its camera as group.
+    ///
+    /// A track keeps one observation of each image, the one that comes first; a note counts the others.
+    pub fn into_labelled(self, mut observations: Vec<Observation>, path: &Path, notes: Vec<String>) -> LabelledInput {
+        let mut notes = notes;
+        let repeated = drop_repeated(&mut observations);
+        if repeated > 0 {
+            notes.push(format!("{repeated} observations were left out, each the second of a track in one image"));
+        }
+        notes.extend(self.foreign_cameras());
+        let names: Vec<Label> = self.images.iter().map(|image| image.name.clone()).collect();
+        let (view_labels, view_of) = dense(&names);
+        let mut order: Vec<usize> = (0..self.images.len()).collect();
+        order.sort_unstable_by_key(|&image| view_of[image]);
+        let track_ids: Vec<u64> = observations.iter().map(|observation| observation.track).collect();
+        let (track_labels, track) = dense(&track_ids);
+        let has_lines = observations.iter().any(|observation| observation.line > 0);
+        LabelledInput {
+            raw: RawInput {
+                views: order.iter().map(|&image| self.view(image)).collect(),
+                track_count: track_labels.len(),
+                view: observations.iter().map(|observation| view_of[observation.image as usize]).collect(),
+                track,
+                x: observations.iter().map(|observation| observation.x - FIRST_PIXEL).collect(),
+                y: observations.iter().map(|observation| observation.y - FIRST_PIXEL).collect(),
+                depth: Vec::new(),
+            },
+            view_labels,
+            track_labels: track_labels.into_iter().map(Label::Number).collect(),
+            lines: if has_lines {
+                observations.iter().map(|observation| observation.line).collect()
+            } else {
+                Vec::new()
+            },
+            image_ids: order.iter().map(|&image| self.images[image].id).collect(),
+            notes,
+            path: path.into(),
+        }
+    }
+
+    fn view(&self, image: usize) -> View {
+        let id = self.images[image].camera;
+        // Checked when the image was added.
+        let camera = self.cameras.get(&id);
+        View {
+            size: camera.map(|camera| camera.size),
+            camera_group: id,
+            focal_prior: camera.and_then(|camera| camera.focal_prior),
+        }
+    }
+
+    /// A note on cameras that are no pinholes.
+    fn foreign_cameras(&self) -> Option<String> {
+        let used: HashSet<u32> = self.images.iter().map(|image| image.camera).collect();
+        let foreign = self.cameras.iter().find(|(id, camera)| used.contains(id) && camera.is_foreign())?;
+        let name = foreign.1.model.map_or("an unknown model", |model| model.name);
+        Some(format!(
+            "camera {} is of COLMAP's model {name}; its images are solved as those of a pinhole with at most one term \
+             of radial distortion",
+            foreign.0
+        ))
+    }
+}
+
+/// Keeps the first observation of each track in each image; returns how many were dropped.
+fn drop_repeated(observations: &mut Vec<Observation>) -> usize {
+    let mut order: Vec<u32> = (0..observations.len() as u32).collect();
+    let key = |k: u32| (observations[k as usize].track, observations[k as usize].image);
+    order.sort_unstable_by_key(|&k| (key(k), k));
+    let mut repeated = vec![false; observations.len()];
+    for pair in order.windows(2) {
+        repeated[pair[1] as usize] = key(pair[0]) == key(pair[1]);
+    }
+    let mut place = 0;
+    observations.retain(|_| {
+        place += 1;
+        !repeated[place - 1]
+    });
+    repeated.iter().filter(|&&repeated| repeated).count()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::Limits;
+    use crate::formats::colmap::cameras::Model;
+
+    #[test]
+    fn views_are_images_by_name_with_the_size_and_group_of_their_cameras() {
+        let mut images = Images::default();
+        for (id, width) in [(4, 640), (2, 320)] {
+            let camera = Camera::new(Model::of_name("PINHOLE"), width, 200).expect("a size").knowing(Some(500.0));
+            images.add_camera(id, camera).expect("new");
+        }
+        assert_eq!(images.add_image(7, "b", 4), Ok(0));
+        assert_eq!(images.add_image(3, "a", 2), Ok(1));
+        assert!(images.add_image(3, "c", 2).is_err() && images.add_image(9, "a", 2).is_err());
+        assert!(images.add_image(9, "d", 1).expect_err("no camera 1").contains("camera 1"));
+        let at = |image, track, x| Observation { image, track, x, y: 1.5, line: 0 };
+        let seen = vec![at(0, 11, 1.0), at(1, 11, 2.0), at(0, 11, 3.0), at(0, 5, 4.0)];
+        let input = images.into_labelled(seen, Path::new("m"), Vec::new());
+        assert_eq!(input.view_labels, [Label::Name("a".into()), Label::Name("b".into())]);
+        assert_eq!((&input.image_ids[..], &input.raw.view[..]), (&[3, 7][..], &[1, 0, 1][..]));
+        assert_eq!((&input.raw.x[..], input.raw.y[0]), (&[0.5, 1.5, 3.5][..], 1.0));
+        let view = &input.raw.views[0];
+        assert_eq!((view.camera_group, view.size.map(|size| size.width_px)), (2, Some(320)));
+        assert_eq!(view.focal_prior.map(|prior| prior.focal_px), Some(500.0));
+        assert_eq!(input.notes.len(), 1, "{:?}", input.notes);
+        assert!(input.notes[0].starts_with("1 observations were left out"));
+        input.check(&Limits::default()).expect("valid");
+    }
+}

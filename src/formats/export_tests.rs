@@ -1,0 +1,166 @@
+use std::fs;
+
+use nalgebra::{Rotation3, Vector3};
+use serde_json::Value;
+
+use super::*;
+use crate::domain::{Calibration, ImageSize};
+use crate::formats::{Label, fixture};
+
+const ALL: [Export; 3] = [Export::Colmap, Export::ColmapText, Export::OpenSfm];
+
+#[test]
+fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let directory = directory.path();
+    let (input, solution) = fixture::solved();
+    write(directory, &ALL, &solution, &input).expect("written");
+    let paths: Vec<_> = ALL
+        .iter()
+        .flat_map(|export| export.files().1.iter().map(|file| directory.join(export.files().0).join(file)))
+        .collect();
+    assert_eq!(paths.len(), 7);
+    assert!(paths.iter().all(|path| path.metadata().is_ok_and(|metadata| metadata.len() > 0)));
+    let mine = directory.join("colmap/mine.txt");
+    fs::write(&mine, "x").expect("written");
+    let (input, projective) = fixture::projective_only();
+    let error = write(directory, &ALL, &projective, &input).expect_err("not metric");
+    assert!(matches!(error, Error::NotMetric(_)) && error.to_string().contains("not metric"), "{error}");
+    assert!(paths.iter().all(|path| !path.exists()) && mine.exists());
+}
+
+/// Where OpenSfM's formulas put every point of the file in every shot, against the observations (its `perspective` and
+/// `brown` models, doc/source/geometry.rst).
+fn worst_of_opensfm(json: &Value, input: &LabelledInput, solution: &Solution) -> f64 {
+    let number = |value: &Value| value.as_f64().expect("a number");
+    let three = |value: &Value| Vector3::from_fn(|axis, _| number(&value[axis]));
+    let mut worst = 0.0f64;
+    let mut seen = 0;
+    for k in (0..input.raw.x.len()).filter(|&k| solution.observations.inlier[k]) {
+        let shot = &json[0]["shots"][input.view_labels[input.raw.view[k] as usize].to_string()];
+        let camera = &json[0]["cameras"][shot["camera"].as_str().expect("a name")];
+        let point = &json[0]["points"][input.track_labels[input.raw.track[k] as usize].to_string()];
+        let rotation = Rotation3::from_scaled_axis(three(&shot["rotation"]));
+        let seen_at = rotation * three(&point["coordinates"]) + three(&shot["translation"]);
+        let (x, y) = (seen_at.x / seen_at.z, seen_at.y / seen_at.z);
+        let d = 1.0 + number(&camera["k1"]) * (x * x + y * y);
+        let (u, v) = match camera["projection_type"].as_str() {
+            Some("perspective") => (number(&camera["focal"]) * d * x, number(&camera["focal"]) * d * y),
+            Some("brown") => (
+                number(&camera["focal_x"]) * d * x + number(&camera["c_x"]),
+                number(&camera["focal_y"]) * d * y + number(&camera["c_y"]),
+            ),
+            other => panic!("{other:?} is not a type of ours"),
+        };
+        let (w, h) = (number(&camera["width"]), number(&camera["height"]));
+        let px = [u * w.max(h) - 0.5 + w / 2.0, v * w.max(h) - 0.5 + h / 2.0];
+        worst = worst.max((px[0] - input.raw.x[k]).hypot(px[1] - input.raw.y[k]));
+        seen += 1;
+    }
+    assert!(seen > 50);
+    worst
+}
+
+/// The solved scene of the fixture under another lens: the observations are exactly those of the result.
+fn scene_of(calibration: Calibration, size: ImageSize) -> (LabelledInput, Solution) {
+    let (mut input, mut solution) = fixture::solved();
+    solution.calibrations = vec![calibration];
+    input.raw.views.iter_mut().for_each(|view| view.size = Some(size));
+    for k in (0..input.raw.x.len()).filter(|&k| solution.observations.inlier[k]) {
+        let view = &solution.views[input.raw.view[k] as usize];
+        let point = solution.tracks.point[input.raw.track[k] as usize].expect("an inlier");
+        let (rotation, translation) = (view.rotation.expect("a pose"), view.translation.expect("a pose"));
+        let seen: [f64; 3] = std::array::from_fn(|row| {
+            (0..3).map(|axis| rotation[row][axis] * point[axis]).sum::<f64>() + translation[row]
+        });
+        let (u, v) = (seen[0] / seen[2], seen[1] / seen[2]);
+        let s = 1.0 + calibration.radial_k1 * (u * u + v * v);
+        let [px, py] = calibration.principal_point_px;
+        input.raw.x[k] = calibration.focal_px * u * s + px;
+        input.raw.y[k] = calibration.aspect * calibration.focal_px * v * s + py;
+    }
+    (input, solution)
+}
+
+fn lens(aspect: f64, radial_k1: f64, principal_point_px: [f64; 2]) -> Calibration {
+    Calibration { focal_px: 900.0, sigma_log_focal: Some(0.01), principal_point_px, aspect, radial_k1 }
+}
+
+#[test]
+fn opensfm_sees_the_points_where_they_were_observed() {
+    let size = ImageSize { width_px: 900, height_px: 1200 };
+    let middle = [449.5, 599.5];
+    for (calibration, kind) in [
+        (lens(1.0, -0.05, middle), "perspective"),
+        (lens(1.0, 0.0, [440.0, 610.0]), "brown"),
+        (lens(1.1, -0.05, [440.0, 610.0]), "brown"),
+    ] {
+        let (input, solution) = scene_of(calibration, size);
+        let json = opensfm::reconstruction::json(&Model::new(&solution, &input).expect("metric"));
+        let cameras = json[0]["cameras"].as_object().expect("cameras");
+        let kinds: Vec<&Value> = cameras.values().map(|camera| &camera["projection_type"]).collect();
+        assert_eq!(kinds, [kind]);
+        assert_eq!(json[0]["points"].as_object().expect("points").len(), solution.inlier_track_count());
+        let worst = worst_of_opensfm(&json, &input, &solution);
+        assert!(worst < 1e-6, "{worst} px off under {calibration:?}");
+    }
+}
+
+#[test]
+fn colmap_gets_the_simplest_camera_that_says_the_same_half_a_pixel_on() {
+    let size = ImageSize { width_px: 900, height_px: 1200 };
+    for (calibration, line) in [
+        (lens(1.0, 0.0, [449.5, 599.5]), "1 SIMPLE_PINHOLE 900 1200 900 450 600"),
+        (lens(1.25, 0.0, [449.5, 599.5]), "1 PINHOLE 900 1200 900 1125 450 600"),
+        (lens(1.0, 0.5, [449.5, 599.5]), "1 SIMPLE_RADIAL 900 1200 900 450 600 0.5"),
+        (lens(1.25, 0.5, [449.5, 599.5]), "1 OPENCV 900 1200 900 1125 450 600 0.5 0 0 0"),
+    ] {
+        let (input, solution) = scene_of(calibration, size);
+        let [cameras, ..] = colmap::write::text(&Model::new(&solution, &input).expect("metric"));
+        assert_eq!(cameras.lines().nth(1), Some(line));
+        assert_eq!(cameras.lines().count(), 2);
+    }
+}
+
+#[test]
+fn cameras_are_apart_where_sizes_groups_or_focal_lengths_are() {
+    let (mut input, mut solution) = fixture::solved();
+    let ids = |input: &LabelledInput, solution: &Solution| {
+        let model = Model::new(solution, input).expect("metric");
+        model.images.iter().map(|image| model.cameras[image.camera].id).collect::<Vec<u32>>()
+    };
+    assert_eq!(ids(&input, &solution), [1, 1, 1, 1, 1]);
+    input.raw.views[3].camera_group = 9;
+    input.raw.views[4].size = Some(ImageSize { width_px: 10, height_px: 10 });
+    assert_eq!(ids(&input, &solution), [1, 1, 1, 2, 3]);
+    solution.views.iter_mut().enumerate().for_each(|(view, result)| result.focal_px = Some(500.0 + view as f64));
+    assert_eq!(ids(&input, &solution), [1, 2, 3, 4, 5]);
+    let (mut input, solution) = fixture::solved();
+    input.image_ids = vec![11, 12, 13, 14, 15];
+    input.raw.views.iter_mut().enumerate().for_each(|(view, of)| of.camera_group = 20 + view as u32 / 3);
+    assert_eq!(ids(&input, &solution), [20, 20, 20, 21, 21]);
+}
+
+#[test]
+fn views_without_a_pose_and_points_that_one_image_sees_are_left_out() {
+    let (mut input, mut solution) = fixture::solved();
+    solution.views[1] = Default::default();
+    let track = solution.tracks.inlier.iter().position(|&inlier| inlier).expect("an inlier");
+    let of_track: Vec<usize> = (0..input.raw.x.len()).filter(|&k| input.raw.track[k] as usize == track).collect();
+    of_track[..4].iter().for_each(|&k| solution.observations.inlier[k] = false);
+    let model = Model::new(&solution, &input).expect("metric");
+    assert_eq!((model.images.len(), model.points.len()), (4, solution.inlier_track_count() - 1));
+    for (position, point) in model.points.iter().enumerate() {
+        assert_eq!(point.seen.len(), 4);
+        for &(image, keypoint) in &point.seen {
+            assert_eq!(model.images[image].keypoints[keypoint].point, Some(position));
+        }
+    }
+    assert_eq!(model.points[0].id, model.points[0].label.number().expect("a number"));
+    input.track_labels.iter_mut().for_each(|label| *label = Label::Name(format!("t{label}").into()));
+    let named = Model::new(&solution, &input).expect("metric");
+    let ids: Vec<u64> = named.points.iter().map(|point| point.id).collect();
+    assert_eq!(ids, (1..=ids.len() as u64).collect::<Vec<_>>());
+    solution.views.iter_mut().for_each(|view| *view = Default::default());
+    assert_eq!(Model::new(&solution, &input).expect_err("no poses"), metric::Error::NoPose);
+}

@@ -1,0 +1,208 @@
+//! A metric result as other programs' files need it: cameras, posed images, points with the keypoints that see them.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
+
+use super::LabelledInput;
+use super::label::Label;
+use super::ply::colour;
+use super::result_json::{camera_groups, view_label};
+use crate::domain::result::ViewResult;
+use crate::domain::{Calibration, ImageSize, Solution};
+
+/// Why a result cannot be exported.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum Error {
+    #[error(
+        "the result is not metric: it has no focal length, no poses and no distances, which these files are made of"
+    )]
+    NotMetric,
+    #[error("no view of the result has a pose")]
+    NoPose,
+}
+
+/// Cameras, images and points, in the pixels and the metric frame of the result.
+#[derive(Debug)]
+pub struct Model {
+    pub cameras: Vec<Camera>,
+    pub images: Vec<Image>,
+    pub points: Vec<Point>,
+}
+
+/// Intrinsics: `x = f u s + px`, `y = aspect f v s + py` with `s = 1 + radial_k1 (u^2 + v^2)`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Camera {
+    pub id: u32,
+    pub size: ImageSize,
+    pub intrinsics: Calibration,
+}
+
+/// A view with a pose, `x ~ K (R X + t)`.
+#[derive(Debug)]
+pub struct Image {
+    pub id: u32,
+    pub name: Label,
+    /// Position among the cameras.
+    pub camera: usize,
+    pub rotation: UnitQuaternion<f64>,
+    pub translation: [f64; 3],
+    /// Every observation of the view in the order of the input, with the position of its point where it is right.
+    pub keypoints: Vec<Keypoint>,
+}
+
+/// An observation: pixels, and the position of its point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Keypoint {
+    pub x: f64,
+    pub y: f64,
+    pub point: Option<usize>,
+}
+
+/// A point that two images see or more.
+#[derive(Debug)]
+pub struct Point {
+    pub id: u64,
+    pub label: Label,
+    pub position: [f64; 3],
+    pub colour: [u8; 3],
+    /// Mean reprojection error over its keypoints.
+    pub error_px: f64,
+    /// Positions of the image and, in that, of the keypoint.
+    pub seen: Vec<(usize, usize)>,
+}
+
+impl Model {
+    /// The model of a metric result.
+    ///
+    /// # Errors
+    /// The result is not metric, or has no poses.
+    pub fn new(solution: &Solution, input: &LabelledInput) -> Result<Self, Error> {
+        if !solution.is_metric() {
+            return Err(Error::NotMetric);
+        }
+        let (cameras, mut images, image_of_view) = images(solution, input);
+        if images.is_empty() {
+            return Err(Error::NoPose);
+        }
+        let points = points(solution, input, &image_of_view, &mut images);
+        Ok(Self { cameras, images, points })
+    }
+}
+
+/// What sets cameras apart: group, size, and the view that has its own focal length.
+type CameraKey = (usize, u32, ImageKey, Option<usize>);
+type ImageKey = Option<(u32, u32)>;
+
+/// Cameras, images without keypoints, and the image of each view.
+fn images(solution: &Solution, input: &LabelledInput) -> (Vec<Camera>, Vec<Image>, Vec<Option<usize>>) {
+    let groups = camera_groups(solution, Some(input));
+    let mut cameras = Vec::new();
+    let mut known: BTreeMap<CameraKey, usize> = BTreeMap::new();
+    let mut images: Vec<Image> = Vec::new();
+    let mut image_of_view = vec![None; solution.views.len()];
+    let mut own_groups = Vec::new();
+    for (view, result) in solution.views.iter().enumerate() {
+        let calibration = groups.get(view).and_then(|&group| Some((group, solution.calibrations.get(group)?)));
+        let (Some(rotation), Some(translation), Some((group, calibration))) =
+            (result.rotation, result.translation, calibration)
+        else {
+            continue;
+        };
+        let size = input.raw.views.get(view).and_then(|view| view.size);
+        let own_group = input.raw.views.get(view).map_or(0, |view| view.camera_group);
+        let sides = size.map(|size| (size.width_px, size.height_px));
+        let key = (group, own_group, sides, result.focal_px.map(|_| view));
+        let camera = *known.entry(key).or_insert_with(|| {
+            cameras.push(camera(cameras.len(), size, calibration, result));
+            own_groups.push(own_group);
+            cameras.len() - 1
+        });
+        image_of_view[view] = Some(images.len());
+        images.push(Image {
+            // Without ids of its own, an input's views are numbered from 1, as COLMAP does.
+            id: input.image_ids.get(view).copied().unwrap_or(view as u32 + 1),
+            name: view_label(Some(input), view),
+            camera,
+            rotation: quaternion(rotation),
+            translation,
+            keypoints: Vec::new(),
+        });
+    }
+    let distinct: BTreeSet<u32> = own_groups.iter().copied().collect();
+    // What came from COLMAP goes back under its own ids, unless a camera became several.
+    if !input.image_ids.is_empty() && distinct.len() == cameras.len() {
+        cameras.iter_mut().zip(own_groups).for_each(|(camera, group)| camera.id = group);
+    }
+    (cameras, images, image_of_view)
+}
+
+/// Camera `position`; without a size, the principal point is taken as the middle.
+fn camera(position: usize, size: Option<ImageSize>, calibration: &Calibration, view: &ViewResult) -> Camera {
+    // A cast of a float saturates; an image has a pixel at least.
+    let side = |principal: f64| ((2.0 * principal).round() as u32).saturating_add(1).max(1);
+    let [x, y] = calibration.principal_point_px;
+    Camera {
+        id: position as u32 + 1,
+        size: size.unwrap_or(ImageSize { width_px: side(x), height_px: side(y) }),
+        intrinsics: Calibration { focal_px: view.focal_px.unwrap_or(calibration.focal_px), ..*calibration },
+    }
+}
+
+/// The rotation as a unit quaternion with a scalar part that is not negative.
+fn quaternion(rows: [[f64; 3]; 3]) -> UnitQuaternion<f64> {
+    let matrix = Matrix3::from_fn(|row, column| rows[row][column]);
+    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(matrix));
+    if rotation.w < 0.0 { UnitQuaternion::new_unchecked(-rotation.into_inner()) } else { rotation }
+}
+
+/// The points that two images see or more; hangs every observation on its image.
+fn points(
+    solution: &Solution,
+    input: &LabelledInput,
+    image_of_view: &[Option<usize>],
+    images: &mut [Image],
+) -> Vec<Point> {
+    let raw = &input.raw;
+    let point_of = |track: usize| solution.tracks.point.get(track).copied().flatten();
+    let image_of = |k: usize| image_of_view.get(raw.view[k] as usize).copied().flatten();
+    let is_right = |k: usize| solution.observations.inlier.get(k) == Some(&true);
+    let mut seen_by = vec![0u32; raw.track_count];
+    for k in (0..raw.x.len()).filter(|&k| is_right(k) && image_of(k).is_some()) {
+        seen_by[raw.track[k] as usize] += 1;
+    }
+    let mut position_of = vec![None; raw.track_count];
+    let mut points = Vec::new();
+    for track in (0..raw.track_count).filter(|&track| seen_by[track] >= 2) {
+        let Some(position) = point_of(track) else { continue };
+        position_of[track] = Some(points.len());
+        let weight = solution.tracks.weight.get(track).copied().unwrap_or(0.0);
+        let label = input.track_labels.get(track).cloned().unwrap_or(Label::Number(track as u64));
+        let (colour, error_px, seen) = (colour(weight), 0.0, Vec::new());
+        points.push(Point { id: 0, label, position, colour, error_px, seen });
+    }
+    for k in 0..raw.x.len() {
+        let Some(image) = image_of(k) else { continue };
+        let point = position_of[raw.track[k] as usize].filter(|_| is_right(k));
+        if let Some(point) = point {
+            points[point].error_px += solution.observations.residual_px.get(k).copied().flatten().unwrap_or(0.0);
+            points[point].seen.push((image, images[image].keypoints.len()));
+        }
+        images[image].keypoints.push(Keypoint { x: raw.x[k], y: raw.y[k], point });
+    }
+    for point in &mut points {
+        point.error_px /= point.seen.len() as f64;
+    }
+    number(&mut points);
+    points
+}
+
+/// Ids of points: those of the tracks where all are numbers that COLMAP takes, else their positions from 1.
+fn number(points: &mut [Point]) {
+    // COLMAP reads ids of text files as signed.
+    const MOST: u64 = i64::MAX as u64;
+    let own = points.iter().all(|point| point.label.number().is_some_and(|number| number <= MOST));
+    for (position, point) in points.iter_mut().enumerate() {
+        point.id = point.label.number().filter(|_| own).unwrap_or(position as u64 + 1);
+    }
+}

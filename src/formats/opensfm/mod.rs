@@ -1,0 +1,16 @@
+//! OpenSfM's files: tracks in, reconstructions out.
+//!
+//! Coordinates are normalised there: the origin in the middle of the image, its larger side 1 (mapillary/OpenSfM,
+//! `doc/source/geometry.rst` and `opensfm/features.py`).
+
+pub mod reconstruction;
+pub mod tracks;
+
+use crate::domain::ImageSize;
+
+/// Position of the middle of the image, and the length that is 1, in our pixels, where the centre of the top-left pixel
+/// is (0, 0), as it is in OpenSfM's own: `x_normalised = (x_px - middle) / side`, `middle = (width - 1) / 2`.
+fn frame(size: ImageSize) -> ([f64; 2], f64) {
+    let sides = [size.width_px, size.height_px].map(f64::from);
+    (sides.map(|side| (side - 1.0) / 2.0), sides[0].max(sides[1]))
+}

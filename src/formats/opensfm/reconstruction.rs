@@ -1,0 +1,64 @@
+//! Writing OpenSfM's reconstruction.json (mapillary/OpenSfM, `doc/source/dataset.rst`, `opensfm/io.py`).
+
+use serde_json::{Map, Value, json};
+
+use super::frame;
+use crate::formats::metric::{Camera, Image, Model, Point};
+
+/// Distance of a principal point from the middle of the image below which it is the middle, in pixels: what is left of
+/// a half when a middle is computed.
+const MIDDLE_PX: f64 = 1e-6;
+
+/// A list of one reconstruction: cameras, shots and points.
+///
+/// Lengths of cameras are in units of the larger image side, the origin is the middle of the image; a shot's rotation is
+/// an angle-axis vector, world to camera.
+pub fn json(model: &Model) -> Value {
+    let cameras: Map<String, Value> =
+        model.cameras.iter().map(|camera| (camera_name(camera), self::camera(camera))).collect();
+    let shots: Map<String, Value> =
+        model.images.iter().map(|image| (image.name.to_string(), shot(image, model))).collect();
+    let points: Map<String, Value> =
+        model.points.iter().map(|point| (point.label.to_string(), self::point(point))).collect();
+    json!([{ "cameras": cameras, "shots": shots, "points": points }])
+}
+
+fn camera_name(camera: &Camera) -> String {
+    format!("scpsfm camera {}", camera.id)
+}
+
+/// `perspective` where the principal point is the middle and pixels are square, else `brown`.
+fn camera(camera: &Camera) -> Value {
+    let intrinsics = &camera.intrinsics;
+    let (middle_px, side_px) = frame(camera.size);
+    let focal = intrinsics.focal_px / side_px;
+    let [x, y] = intrinsics.principal_point_px;
+    let offset_px = [x - middle_px[0], y - middle_px[1]];
+    let is_middle = offset_px.iter().all(|offset| offset.abs() < MIDDLE_PX);
+    let (width, height) = (camera.size.width_px, camera.size.height_px);
+    if is_middle && intrinsics.aspect == 1.0 {
+        return json!({
+            "projection_type": "perspective", "width": width, "height": height,
+            "focal": focal, "k1": intrinsics.radial_k1, "k2": 0.0,
+        });
+    }
+    json!({
+        "projection_type": "brown", "width": width, "height": height,
+        "focal_x": focal, "focal_y": focal * intrinsics.aspect,
+        "c_x": offset_px[0] / side_px, "c_y": offset_px[1] / side_px,
+        "k1": intrinsics.radial_k1, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0,
+    })
+}
+
+fn shot(image: &Image, model: &Model) -> Value {
+    let rotation: [f64; 3] = image.rotation.scaled_axis().into();
+    json!({
+        "camera": camera_name(&model.cameras[image.camera]),
+        "rotation": rotation,
+        "translation": image.translation,
+    })
+}
+
+fn point(point: &Point) -> Value {
+    json!({ "coordinates": point.position, "color": point.colour })
+}

@@ -1,0 +1,179 @@
+//! What kind of input a path holds, and reading it.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use super::error::{Error, Problem};
+use super::input::{LabelledInput, display_name};
+use super::{colmap, observations, opensfm};
+use crate::domain::{ImageSize, Limits};
+
+/// How SQLite files, and so COLMAP databases, begin.
+pub(super) const SQLITE_MAGIC: &[u8] = b"SQLite format 3\0";
+/// How OpenSfM's tracks.csv begins, from its version 1 on.
+pub(super) const OPENSFM_TRACKS: &[u8] = b"OPENSFM_TRACKS_VERSION";
+const UTF8_BOM: &[u8] = b"\xEF\xBB\xBF";
+/// Bytes that a kind is told from: the first line of a table, its image's name at its longest.
+const BEGINNING_BYTES: u64 = 8192;
+/// Tabs of the shortest line of OpenSfM's tracks.csv.
+const OPENSFM_TABS: usize = 7;
+
+/// A kind of input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// A CSV with a header `view,track,x,y[,depth]`.
+    Observations,
+    /// OpenSfM's tracks.csv.
+    OpenSfm,
+    /// COLMAP's database.db: keypoints and matches.
+    ColmapDatabase,
+    /// A directory with a COLMAP sparse model, text or binary.
+    ColmapModel,
+}
+
+/// Which matches of a COLMAP database are joined into tracks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Matches {
+    /// Those that COLMAP's geometric verification kept.
+    Verified,
+    /// Those of the descriptors.
+    Raw,
+}
+
+/// How to read an input. The default asks the file itself.
+#[derive(Debug, Clone, Default)]
+pub struct Reading {
+    /// `None`: told from the file.
+    pub format: Option<Format>,
+    /// Size of every image, for files that carry none.
+    pub size: Option<ImageSize>,
+    /// `None`: verified where there are any, else raw.
+    pub matches: Option<Matches>,
+}
+
+/// Reads an input of any kind; an `Ok` is an input the solver takes.
+///
+/// # Errors
+/// What is wrong with the file, by line, byte or row; a flag that the file needs or contradicts.
+pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledInput, Error> {
+    let whole = |description: String| Error::one(&display_name(path), Problem::of_file(description));
+    let format = match reading.format {
+        Some(format) => format,
+        None => detect(path).map_err(whole)?,
+    };
+    if matches!(format, Format::ColmapDatabase | Format::ColmapModel) && reading.size.is_some() {
+        return Err(whole("carries the sizes of its images; leave out --width and --height".into()));
+    }
+    if reading.matches.is_some() && format != Format::ColmapDatabase {
+        return Err(whole("is no COLMAP database; leave out --matches".into()));
+    }
+    match format {
+        Format::Observations => observations::read(path, limits, reading.size),
+        Format::OpenSfm => {
+            let size = reading.size.ok_or_else(|| {
+                whole("OpenSfM's coordinates are relative to the image size; give it with --width and --height".into())
+            })?;
+            opensfm::tracks::read(path, limits, size)
+        }
+        Format::ColmapDatabase => colmap::database::read(path, limits, reading.matches),
+        Format::ColmapModel => colmap::model::read(path, limits),
+    }
+}
+
+/// Tells a kind from names and first bytes; what is nothing else is taken for a table of observations, whose reader
+/// says best what is wrong with it. Of a pipe nothing is read, it could not be read again.
+fn detect(path: &Path) -> Result<Format, String> {
+    let cannot_read = |error: std::io::Error| format!("cannot be read: {error}");
+    let metadata = std::fs::metadata(path).map_err(cannot_read)?;
+    if metadata.is_dir() {
+        return if colmap::model::is_model(path) { Ok(Format::ColmapModel) } else { Err(what_a_directory_lacks(path)) };
+    }
+    let name = display_name(path).to_lowercase();
+    if colmap::model::is_part(&name) {
+        return Err("is one file of a COLMAP model; give the directory that holds it".into());
+    }
+    if !metadata.is_file() {
+        return Ok(Format::Observations);
+    }
+    let mut beginning = Vec::new();
+    File::open(path).and_then(|file| file.take(BEGINNING_BYTES).read_to_end(&mut beginning)).map_err(cannot_read)?;
+    let text = beginning.strip_prefix(UTF8_BOM).unwrap_or(&beginning);
+    let first_line = text.split(|&byte| byte == b'\n').next().unwrap_or_default();
+    let tabs = first_line.iter().filter(|&&byte| byte == b'\t').count();
+    Ok(if beginning.starts_with(SQLITE_MAGIC) || name.ends_with(".db") {
+        Format::ColmapDatabase
+    } else if text.starts_with(OPENSFM_TRACKS) || tabs >= OPENSFM_TABS {
+        Format::OpenSfm
+    } else {
+        Format::Observations
+    })
+}
+
+/// What to give instead of this directory.
+fn what_a_directory_lacks(path: &Path) -> String {
+    let below = ["database.db", "tracks.csv", "observations.csv", "sparse/0", "sparse"];
+    match below.into_iter().find(|name| path.join(name).exists()) {
+        Some(name) => format!("is a directory without a COLMAP model; give its {name}"),
+        None => "is a directory without a COLMAP model (cameras and images, .bin or .txt)".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    fn detected(name: &str, content: &[u8]) -> Result<Format, String> {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join(name);
+        fs::write(&path, content).expect("written");
+        detect(&path)
+    }
+
+    #[test]
+    fn a_kind_is_told_from_name_and_content() {
+        assert_eq!(detected("o.csv", b"view,track,x,y\n"), Ok(Format::Observations));
+        assert_eq!(detected("o.csv", b""), Ok(Format::Observations));
+        assert_eq!(detected("tracks.csv", b"OPENSFM_TRACKS_VERSION_v2\n"), Ok(Format::OpenSfm));
+        assert_eq!(detected("tracks.csv", b"\xEF\xBB\xBFOPENSFM_TRACKS_VERSION_v1\n"), Ok(Format::OpenSfm));
+        assert_eq!(detected("tracks.csv", b"a,b.jpg\t0\t1\t0.1\t0.2\t1\t2\t3\n"), Ok(Format::OpenSfm));
+        assert_eq!(detected("any", b"SQLite format 3\0..."), Ok(Format::ColmapDatabase));
+        assert_eq!(detected("empty.db", b""), Ok(Format::ColmapDatabase));
+        let part = detected("images.bin", b"\x01").expect_err("a part of a model");
+        assert!(part.contains("give the directory"), "{part}");
+    }
+
+    #[test]
+    fn a_directory_is_a_model_or_says_what_to_give() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let refused = || detect(directory.path()).expect_err("no model");
+        assert!(refused().contains("without a COLMAP model (cameras"), "{}", refused());
+        fs::write(directory.path().join("database.db"), "").expect("written");
+        assert!(refused().ends_with("give its database.db"), "{}", refused());
+        for name in ["cameras.txt", "images.txt"] {
+            fs::write(directory.path().join(name), "").expect("written");
+        }
+        assert_eq!(detect(directory.path()), Ok(Format::ColmapModel));
+    }
+
+    #[test]
+    fn flags_that_do_not_fit_the_file_are_named() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("tracks.csv");
+        let refused = |reading: Reading| {
+            read(&path, &Limits::default(), &reading).expect_err("flags that do not fit").to_string()
+        };
+        fs::write(&path, "OPENSFM_TRACKS_VERSION_v2\n").expect("written");
+        let words = refused(Reading::default());
+        assert!(words.starts_with("tracks.csv: ") && words.contains("--width and --height"), "{words}");
+        let matches = Some(Matches::Raw);
+        assert!(refused(Reading { matches, ..Reading::default() }).contains("leave out --matches"));
+        let size = Some(ImageSize { width_px: 4, height_px: 3 });
+        let database = Reading { size, format: Some(Format::ColmapDatabase), matches: None };
+        assert!(refused(database).contains("leave out --width and --height"));
+        let table = Reading { format: Some(Format::Observations), ..Reading::default() };
+        assert!(refused(table).contains("is an OpenSfM tracks.csv"));
+    }
+}

@@ -1,0 +1,122 @@
+//! Files of other programs, in and out through the command line.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use serde_json::Value;
+
+use crate::support::program::{Run, Serving, run};
+use crate::support::python::{python, succeeds};
+
+/// Side of a synthetic image.
+const SIDE_PX: f64 = 1000.0;
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("a path of ours")
+}
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_else(|error| panic!("{error} in {text}"))
+}
+
+/// Solves by geometry, which is quick; the answer is in `out`.
+fn solve(input: &Path, out: &Path, more: &[&str]) -> Run {
+    let fixed = ["solve", text(input), "--out", text(out), "--method", "geometry", "--json"];
+    run(fixed.iter().chain(more))
+}
+
+/// A scene with 30 right tracks of 60 as OpenSfM would write it: names instead of numbers, coordinates in parts of the
+/// image's side.
+fn opensfm_tracks(directory: &Path) -> PathBuf {
+    let scene = directory.join("scene");
+    let made =
+        run(["synth", "--views", "6", "--tracks", "60", "--outliers", "0.5", "--seed", "5", "--out", text(&scene)]);
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let table = fs::read_to_string(scene.join("observations.csv")).expect("the scene");
+    let mut tracks = String::from("OPENSFM_TRACKS_VERSION_v2\n");
+    for line in table.lines().skip(1) {
+        let fields: Vec<f64> = line.split(',').map(|field| field.parse().expect("a number")).collect();
+        let normalised = |px: f64| (px + 0.5 - SIDE_PX / 2.0) / SIDE_PX;
+        let (x, y) = (normalised(fields[2]), normalised(fields[3]));
+        let (view, track) = (fields[0], fields[1]);
+        tracks.push_str(&format!("{view}, west.jpg\t{track}\t0\t{x}\t{y}\t0.01\t9\t9\t9\t-1\t-1\n"));
+    }
+    let path = directory.join("tracks.csv");
+    fs::write(&path, tracks).expect("written");
+    path
+}
+
+/// OpenSfM's tracks in, here and through a server; COLMAP's model out, and that model in again.
+#[test]
+fn opensfm_tracks_become_a_colmap_model_that_is_read_again() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let path = |name: &str| directory.path().join(name);
+    let tracks = opensfm_tracks(directory.path());
+    let nothing = solve(&tracks, &path("nothing"), &[]);
+    assert_eq!(nothing.code, Some(65), "{nothing:?}");
+    assert!(nothing.stderr.contains("--width and --height"), "{nothing:?}");
+
+    let size = ["--width", "1000", "--height", "1000"];
+    let export = ["--export", "colmap,colmap-text", "--export", "opensfm"];
+    let flags = [&size[..], &export[..]].concat();
+    let solved = solve(&tracks, &path("local"), &flags);
+    assert_eq!(solved.code, Some(0), "{solved:?}");
+    assert_eq!(json(&solved.stdout)["inlier_tracks"], 30);
+    let observations = fs::read_to_string(path("local/observations.csv")).expect("observations.csv");
+    assert!(observations.lines().any(|line| line.starts_with("\"0, west.jpg\",0,")), "{observations}");
+    let cameras = json(&fs::read_to_string(path("local/cameras.json")).expect("cameras.json"));
+    assert_eq!(cameras["views"][0]["view"], "0, west.jpg");
+    let reconstruction =
+        json(&fs::read_to_string(path("local/opensfm/reconstruction.json")).expect("a reconstruction"));
+    assert_eq!(reconstruction[0]["points"].as_object().map(serde_json::Map::len), Some(30));
+
+    let serving = Serving::start(&path("data"));
+    let remote = solve(&tracks, &path("remote"), &[&flags[..], &["--server", &serving.grpc]].concat());
+    assert_eq!(remote.code, Some(0), "{remote:?}");
+    for file in ["observations.csv", "cameras.json", "opensfm/reconstruction.json", "colmap/points3D.bin"] {
+        let content = |side: &str| fs::read(path(side).join(file)).expect("a file");
+        assert!(content("local") == content("remote"), "{file} differs");
+    }
+
+    for model in ["colmap", "colmap-text"] {
+        let again = solve(&path("local").join(model), &path("again"), &[]);
+        assert_eq!(again.code, Some(0), "{again:?}");
+        let result = json(&again.stdout);
+        assert_eq!((&result["inlier_tracks"], &result["registered_views"]), (&30.into(), &6.into()), "{model}");
+    }
+}
+
+/// COLMAP's own reader opens what is exported, and puts the points where they were observed.
+#[test]
+fn pycolmap_opens_the_exported_models() {
+    let Some(python) = python("COLMAP's reader", "pycolmap") else { return };
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let out = directory.path().join("out");
+    let tracks = opensfm_tracks(directory.path());
+    let flags = ["--width", "1000", "--height", "1000", "--export", "colmap,colmap-text"];
+    let solved = solve(&tracks, &out, &flags);
+    assert_eq!(solved.code, Some(0), "{solved:?}");
+    let script = r#"
+import sys, numpy, pycolmap
+for path in sys.argv[1:]:
+    model = pycolmap.Reconstruction(path)
+    errors = []
+    for point in model.points3D.values():
+        for seen in point.track.elements:
+            image = model.images[seen.image_id]
+            px = image.project_point(point.xyz)
+            errors.append(numpy.linalg.norm(px - image.points2D[seen.point2D_idx].xy))
+    print(model.num_reg_images(), model.num_points3D(), numpy.sqrt(numpy.mean(numpy.square(errors))))
+"#;
+    let models = ["colmap", "colmap-text"].map(|name| out.join(name));
+    let printed = succeeds(Command::new(python).args(["-c", script]).args(&models));
+    let rms_px = json(&solved.stdout)["reprojection_rms_px"].as_f64().expect("a number");
+    assert_eq!(printed.lines().count(), 2, "{printed}");
+    for line in printed.lines() {
+        let fields: Vec<f64> = line.split(' ').map(|field| field.parse().expect("a number")).collect();
+        assert_eq!(fields[..2], [6.0, 30.0], "{printed}");
+        // The very residuals of result.json, by another program's projection.
+        assert!((fields[2] / rms_px - 1.0).abs() < 1e-3, "{} px instead of {rms_px}", fields[2]);
+    }
+}
