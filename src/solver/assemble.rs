@@ -1,7 +1,5 @@
 //! From the geometry of a block to the solution that callers read.
 
-use std::collections::BTreeMap;
-
 use nalgebra::{Matrix3, Matrix4};
 
 use super::Context;
@@ -132,7 +130,7 @@ fn judged(context: &Context, attempt: &Attempt, consensus: &Consensus, local: &[
         cameras: &cameras,
         parts: None,
         normalization: context.normalization,
-        lens: None,
+        lenses: &[],
         linked: false,
         noise: consensus.noise,
         outlier_density: outlier_density(attempt),
@@ -312,25 +310,35 @@ pub fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
 
 /// The calibration in pixels: one for all views, or, where the input has several camera groups, one a group in rising
 /// order, their principal points about the image centre of the group's first view.
-pub fn pixel_calibrations(
+fn pixel_calibrations(
     metric: &Reconstruction,
     sigma_log_focal: Option<f64>,
     context: &Context,
     first_view: usize,
 ) -> Vec<Calibration> {
-    let offset = metric.intrinsics.principal_point * context.scale_px;
-    let about = |view: usize| Calibration {
-        focal_px: metric.intrinsics.focal * context.scale_px,
+    let about = |view: usize| pixel_calibration(&metric.intrinsics, sigma_log_focal, context, view);
+    let (group_of, groups) = super::block::camera_groups(context.input);
+    match groups {
+        1 => vec![about(first_view)],
+        _ => (0..groups).filter_map(|group| group_of.iter().position(|of| *of == group)).map(about).collect(),
+    }
+}
+
+/// One calibration in pixels, its principal point about the image centre of this view.
+pub fn pixel_calibration(
+    intrinsics: &Intrinsics,
+    sigma_log_focal: Option<f64>,
+    context: &Context,
+    view: usize,
+) -> Calibration {
+    let offset = intrinsics.principal_point * context.scale_px;
+    Calibration {
+        focal_px: intrinsics.focal * context.scale_px,
         sigma_log_focal,
         principal_point_px: (context.normalization.centres_px[view] + offset).into(),
-        aspect: metric.intrinsics.aspect,
-        radial_k1: metric.intrinsics.radial,
-    };
-    let mut first_of_group = BTreeMap::new();
-    for (view, description) in context.input.views().iter().enumerate() {
-        first_of_group.entry(description.camera_group).or_insert(view);
+        aspect: intrinsics.aspect,
+        radial_k1: intrinsics.radial,
     }
-    if first_of_group.len() > 1 { first_of_group.into_values().map(about).collect() } else { vec![about(first_view)] }
 }
 
 /// Root mean square and mean of the inlier observations' residuals.

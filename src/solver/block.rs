@@ -1,11 +1,13 @@
 //! Which views and tracks are solved together: normalisation and the choice of complete blocks.
 
+use std::collections::BTreeSet;
+
 use nalgebra::Vector2;
 use rand::SeedableRng;
 use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 
-use crate::domain::{ImageSize, Input, StopToken, Warning, WarningCode};
+use crate::domain::{ImageSize, Input, StopToken, View, Warning, WarningCode};
 use crate::geometry::measurement::{CompleteBlock, Normalization};
 
 /// Tracks that a block should have: twice the eight that verification needs, for half of them may be wrong.
@@ -76,22 +78,40 @@ pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
             ),
         ));
     }
-    let groups: std::collections::BTreeSet<u32> = input.views().iter().map(|view| view.camera_group).collect();
-    let sizes: std::collections::BTreeSet<Option<(u32, u32)>> =
-        input.views().iter().map(|view| view.size.map(|size| (size.width_px, size.height_px))).collect();
-    if groups.len() > 1 || sizes.len() > 1 {
-        warnings.push(Warning::new(
-            WarningCode::CameraGroupsMerged,
-            format!(
-                "{} camera groups and {} image sizes were solved as one camera with one focal length",
-                groups.len(),
-                sizes.len()
-            ),
-        ));
-    }
     // All points in one place: any scale will do.
     let scale_px = if scale_px > 0.0 { scale_px } else { 1.0 };
     (Normalization { centres_px, scale_px }, warnings)
+}
+
+/// Says so where the views of one solve come from several cameras or have several sizes; `cameras`: where each group has
+/// a calibration of its own, sizes alone matter, within a group.
+pub fn merged_cameras(input: &Input, cameras: bool) -> Option<Warning> {
+    let (group_of, groups) = camera_groups(input);
+    let size = |view: &View| view.size.map(|size| (size.width_px, size.height_px));
+    let kinds: BTreeSet<_> =
+        input.views().iter().zip(&group_of).map(|(view, group)| (cameras.then_some(*group), size(view))).collect();
+    let distinct = if cameras { groups } else { 1 };
+    if kinds.len() <= distinct && (cameras || groups == 1) {
+        return None;
+    }
+    let detail = if cameras {
+        "views of one camera group have several image sizes; they were solved with one focal length in pixels"
+            .to_owned()
+    } else {
+        format!(
+            "{groups} camera groups and {} image sizes were solved as one camera with one focal length",
+            kinds.len()
+        )
+    };
+    Some(Warning::new(WarningCode::CameraGroupsMerged, detail))
+}
+
+/// Camera group of each view, counted from 0 in rising order of the input's numbers, and how many there are.
+pub fn camera_groups(input: &Input) -> (Vec<usize>, usize) {
+    let numbers: BTreeSet<u32> = input.views().iter().map(|view| view.camera_group).collect();
+    let numbers: Vec<u32> = numbers.into_iter().collect();
+    let of = |view: &View| numbers.partition_point(|number| *number < view.camera_group);
+    (input.views().iter().map(of).collect(), numbers.len())
 }
 
 /// Centre of an image whose top-left pixel's centre is (0, 0).
@@ -129,6 +149,22 @@ pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec
         return vec![(0..count).map(|k| views[k * views.len() / count]).collect()];
     }
     candidate_views_among(input, ranges, &vec![true; input.view_count()], stop)
+}
+
+/// The same of incomplete tracks, each set of one camera group: those of the group with most observations first.
+pub fn candidate_views_of_one_camera(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec<Vec<usize>> {
+    let (group_of, groups) = camera_groups(input);
+    let mut observed = vec![0usize; groups];
+    (0..input.observation_count()).for_each(|k| observed[group_of[input.view_of(k)]] += 1);
+    let mut order: Vec<usize> = (0..groups).collect();
+    order.sort_by_key(|&group| (std::cmp::Reverse(observed[group]), group));
+    let of_group = |group: usize| {
+        let open: Vec<bool> = group_of.iter().map(|of| *of == group).collect();
+        candidate_views_among(input, ranges, &open, stop)
+    };
+    let mut found: Vec<Vec<usize>> = order.into_iter().flat_map(of_group).collect();
+    found.truncate(MOST_BLOCKS);
+    found
 }
 
 /// The same of incomplete tracks, only of views that are `open` (one entry a view).
@@ -277,7 +313,7 @@ pub fn extract(input: &Input, ranges: &[usize], normalization: &Normalization, v
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{Limits, RawInput, View};
+    use crate::domain::{Limits, RawInput};
 
     /// Tracks given as lists of the views that see them.
     fn input(views: usize, tracks: &[Vec<usize>]) -> Input {

@@ -39,8 +39,8 @@ pub struct Geometry<'a> {
     /// Where views are in several frames: the frame of each view and the one that each track is judged in.
     pub parts: Option<(&'a [u32], &'a [u32])>,
     pub normalization: &'a Normalization,
-    /// The lens whose distortion is undone before the cameras, pinholes, are asked; `None`: a pinhole.
-    pub lens: Option<&'a Intrinsics>,
+    /// The lens of each view, whose distortion is undone before the cameras, pinholes, are asked; empty: all are pinholes.
+    pub lenses: &'a [Intrinsics],
     /// Whether tracks were linked from view to view, so that one wrong link joins two points: the observations that
     /// agree on one are looked for then, however few they are beside the others. The cameras must be metric. Otherwise
     /// a track is right in most of its observations or wrong.
@@ -62,7 +62,7 @@ impl Geometry<'_> {
     /// Where a pinhole would see observation `k`; what a lens images nowhere stays where it is, far from any point.
     fn point(&self, input: &Input, k: usize) -> Vector2<f64> {
         let xy = self.normalization.normalize(input.view_of(k), input.point_px(k));
-        self.lens.and_then(|lens| lens.undistort(&xy)).unwrap_or(xy)
+        self.lenses.get(input.view_of(k)).and_then(|lens| lens.undistort(&xy)).unwrap_or(xy)
     }
 }
 
@@ -294,7 +294,7 @@ mod tests {
             cameras: &[],
             parts: None,
             normalization,
-            lens: None,
+            lenses: &[],
             linked: false,
             noise: 0.001,
             outlier_density: 2.0,

@@ -66,7 +66,7 @@ pub fn solve(
     let settings = &SolveSettings { use_daq: settings.use_daq && !settings.focal_per_view, ..settings.clone() };
     let mut recorder = Recorder::new(observer);
     let ranges = block::track_ranges(input);
-    let (normalization, warnings) = block::normalization(input);
+    let (normalization, mut warnings) = block::normalization(input);
     let scale_px = normalization.scale_px;
     let context = Context {
         input,
@@ -78,10 +78,12 @@ pub fn solve(
         focal_prior: None,
         stop,
     };
-    let candidates = block::candidate_views(input, &ranges, stop);
-    if sequence::applies(&context) {
-        return solve_sequence(&candidates, &context, warnings, recorder);
+    let sequence = sequence::applies(&context);
+    warnings.extend(block::merged_cameras(input, sequence));
+    if sequence {
+        return solve_sequence(&context, warnings, recorder);
     }
+    let candidates = block::candidate_views(input, &ranges, stop);
     let mut best: Option<Attempt> = None;
     let mut others = Vec::new();
     for (k, views) in candidates.iter().enumerate() {
@@ -107,13 +109,9 @@ pub fn solve(
 }
 
 /// Solves an input whose tracks live a few views.
-fn solve_sequence(
-    candidates: &[Vec<usize>],
-    context: &Context,
-    warnings: Vec<Warning>,
-    mut recorder: Recorder,
-) -> Result<Solution, Error> {
-    match sequence::solve(candidates, context, &mut recorder)? {
+fn solve_sequence(context: &Context, warnings: Vec<Warning>, mut recorder: Recorder) -> Result<Solution, Error> {
+    let candidates = block::candidate_views_of_one_camera(context.input, context.ranges, context.stop);
+    match sequence::solve(&candidates, context, &mut recorder)? {
         sequence::Ended::Extended(extended) => {
             let solution = sequence::solved(*extended, warnings, recorder);
             context.stopped()?;

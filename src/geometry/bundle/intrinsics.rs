@@ -87,6 +87,12 @@ impl Intrinsics {
         undone.iter().all(|value| value.is_finite()).then_some(undone)
     }
 
+    /// The direction `(u, v)` at unit depth that is imaged at `xy`; `None` where the lens images nothing.
+    pub fn ray(&self, xy: &Vector2<f64>) -> Option<Vector2<f64>> {
+        let offset = self.undistort(xy)? - self.principal_point;
+        Some(Vector2::new(offset.x / self.focal, offset.y / (self.aspect * self.focal)))
+    }
+
     /// One parameter, in the form in which it is adjusted.
     pub fn value(&self, parameter: Parameter) -> f64 {
         match parameter {

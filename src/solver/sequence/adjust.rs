@@ -2,156 +2,227 @@
 
 use super::model::{Model, Scene};
 use super::parts::FIRST;
-use crate::geometry::bundle::metric::{self, IntrinsicsModel, IntrinsicsPrior, Reconstruction};
+use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
+use crate::geometry::bundle::sequence::{self, Free, Sequence, Sighting};
 use crate::geometry::bundle::{Loss, Observation, Options};
 use crate::geometry::statistics::median;
+use crate::solver::{attempt, calibration};
 
 /// Scale of the Cauchy loss in units of the core noise: detectors have tails that a wider one would follow.
 const CAUCHY_SCALE: f64 = 2.0;
-/// Iterations while views are added, which start at what was adjusted before, and at the end.
+/// Iterations around a new view, while views are added, which start at what was adjusted before, and at the end.
+const ITERATIONS_AROUND: usize = 3;
 const ITERATIONS_WHILE_GROWING: usize = 6;
 const ITERATIONS: usize = 20;
 /// Cost gained by a step, as a share, below which an adjustment that will be repeated ends.
 const TOLERANCE: f64 = 1e-4;
 /// Observations of a view that an adjustment while growing holds.
 const OF_VIEW_WHILE_GROWING: usize = 100;
+/// Views that are free in the adjustment around a new one: those that share most points with it.
+const VIEWS_AROUND: usize = 6;
 /// Median of the norm of two independent normal coordinates (Rayleigh) in standard deviations.
 const RAYLEIGH_MEDIAN: f64 = 1.177_41;
 /// Least share of the observations' freedom that is left to the residuals, however few landmarks there are.
 const LEAST_FREEDOM: f64 = 0.2;
+/// Least noise that is believed, pixels: exact input would close every gate.
+const LEAST_NOISE_PX: f64 = 0.01;
 
 /// The part of a model that is adjusted together.
-pub struct Part {
+pub struct Extract {
+    /// Views and tracks of the input, in the order of the sequence's poses and points.
     pub views: Vec<usize>,
     pub tracks: Vec<usize>,
-    pub reconstruction: Reconstruction,
-    pub observations: Vec<Observation>,
+    pub sequence: Sequence,
+    pub sightings: Vec<Sighting>,
 }
 
-impl Part {
-    /// The registered views among `views` with these tracks' kept observations in them.
+impl Extract {
+    /// These views, all registered, with the kept observations that these tracks have in them.
     pub fn new(scene: &Scene, model: &Model, views: &[usize], tracks: &[usize]) -> Self {
         let mut place = vec![usize::MAX; model.poses.len()];
-        let mut poses = Vec::with_capacity(views.len());
-        for (i, &view) in views.iter().enumerate() {
+        let mut extract = Self {
+            views: Vec::with_capacity(views.len()),
+            tracks: Vec::with_capacity(tracks.len()),
+            sequence: Sequence {
+                intrinsics: model.lenses.iter().map(|lens| lens.intrinsics).collect(),
+                group_of: Vec::with_capacity(views.len()),
+                poses: Vec::with_capacity(views.len()),
+                points: Vec::with_capacity(tracks.len()),
+            },
+            sightings: Vec::new(),
+        };
+        for &view in views {
             if let Some(pose) = model.poses[view] {
-                place[view] = i;
-                poses.push(pose);
+                place[view] = extract.views.len();
+                extract.views.push(view);
+                extract.sequence.poses.push(pose);
+                extract.sequence.group_of.push(scene.group_of[view]);
             }
         }
-        let mut part = Self {
-            views: views.to_vec(),
-            tracks: Vec::with_capacity(tracks.len()),
-            reconstruction: Reconstruction { intrinsics: model.intrinsics, poses, points: Vec::new() },
-            observations: Vec::new(),
-        };
         for &track in tracks {
             let Some(landmark) = model.landmarks[track] else { continue };
-            let point = part.tracks.len();
+            let point = extract.tracks.len();
             for k in scene.of_track(track).filter(|&k| model.kept[k] && place[scene.view_of(k)] != usize::MAX) {
-                part.observations.push(Observation { camera: place[scene.view_of(k)], point, xy: scene.xy[k] });
+                let view = place[scene.view_of(k)];
+                extract.sightings.push(Sighting { view, point, xy: scene.xy[k], weight: 1.0 });
             }
-            part.tracks.push(track);
-            part.reconstruction.points.push(landmark.position);
+            extract.tracks.push(track);
+            extract.sequence.points.push(landmark.position);
         }
-        part
+        extract
     }
 
     /// Takes the reconstruction back into the model.
     pub fn write_back(&self, model: &mut Model) {
-        model.intrinsics = self.reconstruction.intrinsics;
-        for (&view, pose) in self.views.iter().zip(&self.reconstruction.poses) {
+        for (lens, intrinsics) in model.lenses.iter_mut().zip(&self.sequence.intrinsics) {
+            lens.intrinsics = *intrinsics;
+        }
+        for (&view, pose) in self.views.iter().zip(&self.sequence.poses) {
             model.poses[view] = Some(*pose);
         }
-        for (&track, position) in self.tracks.iter().zip(&self.reconstruction.points) {
+        for (&track, position) in self.tracks.iter().zip(&self.sequence.points) {
             if let Some(landmark) = &mut model.landmarks[track] {
                 landmark.position = *position;
             }
         }
     }
 
-    fn adjust(&mut self, scene: &Scene, model: &Model, free: IntrinsicsModel, iterations: usize) {
+    /// The views as if all were of one camera, the first one's.
+    pub fn constant(&self) -> (Reconstruction, Vec<Observation>) {
+        let group = self.sequence.group_of.first().copied().unwrap_or(0);
+        let reconstruction = Reconstruction {
+            intrinsics: self.sequence.intrinsics[group],
+            poses: self.sequence.poses.clone(),
+            points: self.sequence.points.clone(),
+        };
+        let observation = |seen: &Sighting| Observation { camera: seen.view, point: seen.point, xy: seen.xy };
+        (reconstruction, self.sightings.iter().map(observation).collect())
+    }
+
+    fn adjust(&mut self, scene: &Scene, model: &Model, free: &Free, iterations: usize) {
         let options = Options {
             max_iterations: iterations,
             relative_tolerance: TOLERANCE,
             loss: Loss::Cauchy { scale: CAUCHY_SCALE * model.noise },
             ..Options::default()
         };
-        let prior = knowledge(scene, model.noise);
-        metric::adjust(&mut self.reconstruction, &self.observations, free, &prior, &options, scene.stop());
+        let priors: Vec<IntrinsicsPrior> =
+            (0..scene.groups).map(|group| knowledge(scene, group, model.noise)).collect();
+        sequence::adjust(&mut self.sequence, &self.sightings, free, &priors, &options, scene.stop());
     }
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise(&self) -> f64 {
-        let mut norms: Vec<f64> =
-            self.observations.iter().map(|seen| self.reconstruction.residual(seen).norm()).collect();
+        let mut norms: Vec<f64> = self.sightings.iter().map(|seen| self.sequence.residual(seen).norm()).collect();
         let unknowns = 6 * self.views.len() + 3 * self.tracks.len();
-        let freedom = 1.0 - unknowns as f64 / (2 * self.observations.len()).max(1) as f64;
+        let freedom = 1.0 - unknowns as f64 / (2 * self.sightings.len()).max(1) as f64;
         median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(LEAST_FREEDOM).sqrt()
     }
 }
 
-/// What is known of the intrinsics before any observation.
-pub fn knowledge(scene: &Scene, noise: f64) -> IntrinsicsPrior {
+/// What is known of the intrinsics of a camera group before any observation.
+pub fn knowledge(scene: &Scene, group: usize, noise: f64) -> IntrinsicsPrior {
     let context = &scene.context;
-    let views = context.input.views().iter();
-    crate::solver::calibration::knowledge(noise, crate::solver::attempt::focal_prior(views), context.scale_px)
+    let views = context.input.views().iter().zip(&scene.group_of).filter(|(_, of)| **of == group);
+    calibration::knowledge(noise, attempt::focal_prior(views.map(|(view, _)| view)), context.scale_px)
 }
 
-/// Adjusts the views of a part with the landmarks that hold them best, while more are to come. The calibration is the
-/// first part's: the others are held to it until all are adjusted together.
+/// Adjusts the views of a part with the landmarks that hold them best, while more are to come. The calibration of groups
+/// that the first part has is the first part's: the others are held to it until all are adjusted together.
 pub fn while_growing(scene: &Scene, model: &mut Model, part: u32) {
     let views = model.of_part(part);
-    let free = if part == FIRST { model.free } else { IntrinsicsModel::FIXED };
     let tracks = covering(scene, model, &views, OF_VIEW_WHILE_GROWING);
-    let mut part = Part::new(scene, model, &views, &tracks);
-    part.adjust(scene, model, free, ITERATIONS_WHILE_GROWING);
-    finish(scene, model, &part);
+    let mut extract = Extract::new(scene, model, &views, &tracks);
+    let held = |group: usize| part != FIRST && model.of_part(FIRST).iter().any(|&view| scene.group_of[view] == group);
+    let models: Vec<IntrinsicsModel> = model
+        .lenses
+        .iter()
+        .enumerate()
+        .map(|(group, lens)| if held(group) { IntrinsicsModel::FIXED } else { lens.free })
+        .collect();
+    extract.adjust(scene, model, &Free::all(&models), ITERATIONS_WHILE_GROWING);
+    finish(scene, model, &extract);
+}
+
+/// Adjusts a new view and those that share most landmarks with it, all others held, and the calibration too unless the
+/// camera is new.
+pub fn around(scene: &Scene, model: &mut Model, view: usize, is_new_camera: bool) {
+    let near = neighbours(scene, model, view);
+    let tracks = covering(scene, model, &near, OF_VIEW_WHILE_GROWING);
+    let mut views: Vec<usize> = tracks
+        .iter()
+        .flat_map(|&track| scene.of_track(track))
+        .filter(|&k| model.kept[k])
+        .map(|k| scene.view_of(k))
+        .collect();
+    views.sort_unstable();
+    views.dedup();
+    let mut extract = Extract::new(scene, model, &views, &tracks);
+    let moves: Vec<bool> = extract.views.iter().map(|view| near.contains(view)).collect();
+    let mut models = vec![IntrinsicsModel::FIXED; scene.groups];
+    if is_new_camera {
+        models[scene.group_of[view]] = IntrinsicsModel::FOCAL;
+    }
+    let free = Free { models: &models, views: Some(&moves), points: None };
+    extract.adjust(scene, model, &free, ITERATIONS_AROUND);
+    if !scene.stop().is_stopped() {
+        extract.write_back(model);
+    }
+}
+
+/// A view and those that share most kept landmarks with it.
+fn neighbours(scene: &Scene, model: &Model, view: usize) -> Vec<usize> {
+    let mut shared = vec![0usize; model.poses.len()];
+    for &k in scene.of_view[view].iter().filter(|&&k| model.kept[k as usize]) {
+        for other in scene.of_track(scene.track_of(k as usize)).filter(|&other| model.kept[other]) {
+            shared[scene.view_of(other)] += 1;
+        }
+    }
+    let mut views: Vec<usize> = (0..shared.len()).filter(|&view| shared[view] > 0).collect();
+    views.sort_by_key(|&other| (other != view, std::cmp::Reverse(shared[other]), other));
+    views.truncate(VIEWS_AROUND);
+    views
 }
 
 /// Adjusts all registered views and verified landmarks.
 pub fn all(scene: &Scene, model: &mut Model) {
     let views = model.registered();
     let tracks = verified(model);
-    let mut part = Part::new(scene, model, &views, &tracks);
-    part.adjust(scene, model, model.free, ITERATIONS);
-    finish(scene, model, &part);
+    let mut extract = Extract::new(scene, model, &views, &tracks);
+    let models: Vec<IntrinsicsModel> = model.lenses.iter().map(|lens| lens.free).collect();
+    extract.adjust(scene, model, &Free::all(&models), ITERATIONS);
+    finish(scene, model, &extract);
 }
 
-fn finish(scene: &Scene, model: &mut Model, part: &Part) {
-    if scene.stop().is_stopped() || part.observations.is_empty() {
+fn finish(scene: &Scene, model: &mut Model, extract: &Extract) {
+    if scene.stop().is_stopped() || extract.sightings.is_empty() {
         return;
     }
-    part.write_back(model);
-    let noise = part.noise();
+    extract.write_back(model);
+    let noise = extract.noise();
     if noise.is_finite() {
         model.noise = noise.max(LEAST_NOISE_PX / scene.context.scale_px);
     }
 }
 
-/// Least noise that is believed, pixels: exact input would close every gate.
-const LEAST_NOISE_PX: f64 = 0.01;
-
 /// Tracks with a verified landmark, increasing.
 pub fn verified(model: &Model) -> Vec<usize> {
-    let is_verified = |track: &usize| model.landmarks[*track].is_some_and(|landmark| landmark.is_verified());
-    (0..model.landmarks.len()).filter(is_verified).collect()
+    (0..model.landmarks.len()).filter(|&track| is_verified(model, track)).collect()
+}
+
+fn is_verified(model: &Model, track: usize) -> bool {
+    model.landmarks[track].is_some_and(|landmark| landmark.is_verified())
 }
 
 /// The longest of the verified tracks until every one of these views has `of_view` observations, or all that it has.
 pub fn covering(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -> Vec<usize> {
     let mut wanted = vec![0usize; model.poses.len()];
     views.iter().for_each(|&view| wanted[view] = of_view);
-    let mut seen: Vec<usize> =
-        views.iter().flat_map(|&view| &scene.of_view[view]).map(|&k| scene.track_of(k as usize)).collect();
-    seen.sort_unstable();
-    seen.dedup();
-    let mut tracks: Vec<usize> = seen
-        .into_iter()
-        .filter(|&track| model.landmarks[track].is_some_and(|landmark| landmark.is_verified()))
-        .collect();
+    let seen = views.iter().flat_map(|&view| &scene.of_view[view]).map(|&k| scene.track_of(k as usize));
+    let mut tracks: Vec<usize> = seen.filter(|&track| is_verified(model, track)).collect();
     let support = |track: usize| model.landmarks[track].map_or(0, |landmark| landmark.support);
-    tracks.sort_by_key(|&track| (std::cmp::Reverse(support(track)), track));
+    tracks.sort_unstable_by_key(|&track| (std::cmp::Reverse(support(track)), track));
+    tracks.dedup();
     let mut observed = vec![0usize; model.poses.len()];
     tracks.retain(|&track| {
         let kept = || scene.of_track(track).filter(|&k| model.kept[k]).map(|k| scene.view_of(k));
@@ -165,9 +236,7 @@ pub fn covering(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -
     tracks
 }
 
-/// Scales a part so that its median depth becomes 1.
-///
-/// Scale is free, and adjustments damp best near unit lengths.
+/// Scales a part so that its median depth becomes 1: scale is free, and adjustments damp best near unit lengths.
 pub fn rescale(scene: &Scene, model: &mut Model, part: u32) {
     let mut depths: Vec<f64> = (0..scene.xy.len())
         .filter(|&k| model.kept[k])

@@ -6,10 +6,11 @@ use super::Extended;
 use super::model::{Landmark, Model, Scene};
 use super::register::Unregistered;
 use crate::domain::result::ViewResult;
-use crate::domain::{Grade, Solution, Stage, Status, Warning, WarningCode};
-use crate::geometry::bundle::metric::Pose;
-use crate::geometry::{Camera, Point};
-use crate::solver::assemble::{dehomogenise, network_weights, pixel_calibrations, reprojection};
+use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
+use crate::geometry::Point;
+use crate::geometry::bundle::metric::{Intrinsics, Pose};
+use crate::solver::assemble::{dehomogenise, network_weights, pixel_calibration, reprojection};
+use crate::solver::calibration::Outcome;
 use crate::solver::judge::{self, Geometry, Judged};
 use crate::solver::recorder::Recorder;
 
@@ -21,34 +22,29 @@ const MOST_LISTED_VIEWS: usize = 20;
 /// With grade PROJECTIVE_ONLY nothing metric is in it: points are then in the frame of the projective cameras.
 pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Solution {
     recorder.enter(Stage::Judge);
-    let Extended { seed, scene, model, calibration, unregistered } = extended;
+    let grade = extended.grade();
+    let Extended { seed, scene, model, calibrations, unregistered } = extended;
     let context = &scene.context;
     let mut judged = judged(&scene, &model);
-    let metric = calibration.grade != Grade::ProjectiveOnly;
-    warnings.extend(calibration.warnings.iter().cloned());
+    let metric = grade != Grade::ProjectiveOnly;
+    warnings.extend(told(&calibrations));
     warnings.extend(seed.second_structure.clone());
     warnings.extend(left_out(&unregistered, super::super::block::observed_views(context.input).len()));
-    let registered = model.registered();
     let frames = frames(&scene, &model);
     judged.tracks.point = points(&judged, &model, &frames, metric);
     judged.tracks.network_weight = network_weights(&seed, context);
     let (rms, mean) = reprojection(&judged.observations);
-    let reconstruction = calibration.metric.as_ref().filter(|_| metric);
-    let calibrations = reconstruction.map(|metric| {
-        let metric = crate::geometry::bundle::metric::Reconstruction { intrinsics: model.intrinsics, ..metric.clone() };
-        pixel_calibrations(&metric, calibration.sigma_log_focal, context, registered[0])
-    });
     let views = views(&scene, &model, &frames, metric);
     let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
     let (stages, history) = recorder.finish();
     Solution {
         status: Status::Solved,
-        grade: Some(calibration.grade),
+        grade: Some(grade),
         method: context.settings.method,
         winning_prior: seed.winning_prior,
         iterations,
         seed: context.settings.seed,
-        calibrations: calibrations.unwrap_or_default(),
+        calibrations: if metric { in_pixels(&scene, &model, &calibrations) } else { Vec::new() },
         // The frame is affine to the metric one: its plane at infinity is (0, 0, 0, 1).
         plane_at_infinity: metric.then_some([0.0; 3]),
         views,
@@ -65,11 +61,33 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
     }
 }
 
+/// What is to be said of the calibrations, each group's named where there are several.
+fn told(calibrations: &[Outcome]) -> Vec<Warning> {
+    let of_group = |(group, outcome): (usize, &Outcome)| -> Vec<Warning> {
+        let named = |warning: &Warning| match calibrations.len() {
+            1 => warning.clone(),
+            _ => Warning::new(warning.code, format!("camera group {group}: {}", warning.detail)),
+        };
+        outcome.warnings.iter().map(named).collect()
+    };
+    calibrations.iter().enumerate().flat_map(of_group).collect()
+}
+
+/// The calibration of each group in pixels, its principal point about the image centre of the group's first view.
+fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Calibration> {
+    let of_group = |(group, outcome): (usize, &Outcome)| {
+        let intrinsics = &model.lenses[group].intrinsics;
+        let view = scene.group_of.iter().position(|of| *of == group).unwrap_or(0);
+        pixel_calibration(intrinsics, outcome.sigma_log_focal, &scene.context, view)
+    };
+    calibrations.iter().enumerate().map(of_group).collect()
+}
+
 /// Every track and observation judged by all registered views.
 fn judged(scene: &Scene, model: &Model) -> Judged {
     let context = &scene.context;
-    let camera = |pose: &Option<Pose>| pose.map(|pose| pose.camera(&model.intrinsics));
-    let cameras: Vec<Option<Camera>> = model.poses.iter().map(camera).collect();
+    let cameras = model.cameras(scene);
+    let lenses: Vec<Intrinsics> = (0..cameras.len()).map(|view| *model.intrinsics_of(scene, view)).collect();
     let tried = model.landmarks.iter().flatten().count();
     let verified = super::adjust::verified(model).len();
     let of_track: Vec<u32> =
@@ -78,7 +96,7 @@ fn judged(scene: &Scene, model: &Model) -> Judged {
         cameras: &cameras,
         parts: Some((&model.part_of, &of_track)),
         normalization: context.normalization,
-        lens: Some(&model.intrinsics).filter(|intrinsics| intrinsics.radial != 0.0),
+        lenses: &lenses,
         linked: true,
         noise: model.noise,
         outlier_density: scene.outlier_density,
@@ -98,7 +116,7 @@ fn frames(scene: &Scene, model: &Model) -> Vec<Option<Matrix4<f64>>> {
 fn first_view_frame(scene: &Scene, model: &Model, view: usize) -> Option<Matrix4<f64>> {
     let pose = model.poses[view]?;
     let to_pixels = scene.context.normalization.to_pixels(view);
-    let inverse = (to_pixels * model.intrinsics.matrix() * pose.rotation).try_inverse()?;
+    let inverse = (to_pixels * model.intrinsics_of(scene, view).matrix() * pose.rotation).try_inverse()?;
     let centre = -(pose.rotation.tr_mul(&pose.translation));
     let mut frame = Matrix4::identity();
     frame.fixed_view_mut::<3, 3>(0, 0).copy_from(&inverse);
@@ -110,7 +128,8 @@ fn views(scene: &Scene, model: &Model, frames: &[Option<Matrix4<f64>>], metric: 
     let result = |(view, pose): (usize, &Option<Pose>)| {
         let frame = frames[model.part_of[view] as usize].as_ref();
         let (Some(pose), Some(frame)) = (pose, frame) else { return ViewResult::default() };
-        let camera = scene.context.normalization.camera_px(view, &pose.camera(&model.intrinsics)) * frame;
+        let camera =
+            scene.context.normalization.camera_px(view, &pose.camera(model.intrinsics_of(scene, view))) * frame;
         ViewResult {
             projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| camera[(row, column)]))),
             rotation: metric

@@ -1,15 +1,19 @@
-//! What the whole sequence says of the calibration.
+//! What the whole sequence says of the calibration of each camera group.
 
 use nalgebra::Vector4;
 
-use super::adjust::{self, Part};
+use super::adjust::{self, Extract};
 use super::model::{Model, Scene};
 use super::windows;
+use crate::domain::{Warning, WarningCode};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::Reconstruction;
 use crate::solver::calibration::{self, Outcome};
-use crate::solver::{Context, Error, attempt};
+use crate::solver::{Context, Error, attempt, block};
 
+/// Views that a calibration is made from at most: the projective adjustment that it is compared with is cubic in them.
+/// Of more, the stretch with most observations; the others speak through their windows.
+const MOST_VIEWS: usize = 40;
 /// Observations that a calibration is made from, and of one view at least and at most: other errors than noise bound
 /// what more of them would give.
 const OBSERVATIONS: usize = 6_000;
@@ -20,31 +24,69 @@ const CORE_SQUARED: f64 = 13.8;
 /// Observations that a track must keep to take part.
 const LEAST_KEPT: usize = 3;
 
-/// Calibrates from the landmarks and observations that fit best, takes the calibration over into the model, adjusts
-/// everything under it and asks the windows.
-pub fn calibrate(scene: &Scene, model: &mut Model, context: &Context) -> Result<Outcome, Error> {
-    let views = model.registered();
-    let of_view = (OBSERVATIONS / views.len().max(1)).clamp(OF_VIEW.0, OF_VIEW.1);
-    let part = core(scene, model, &views, of_view);
-    let (cameras, points) = projective(&part.reconstruction);
+/// Calibrates each group from the landmarks and observations that fit best, takes the models over, adjusts everything
+/// under them and asks the windows; one outcome a group.
+///
+/// # Errors
+/// [`Error::Stopped`].
+pub fn calibrate(scene: &Scene, model: &mut Model, context: &Context) -> Result<Vec<Outcome>, Error> {
+    let mut outcomes = Vec::with_capacity(scene.groups);
+    for group in 0..scene.groups {
+        outcomes.push(of_group(scene, model, group, context)?);
+    }
+    super::structure::triangulate(scene, model);
+    adjust::all(scene, model);
+    for (group, outcome) in outcomes.iter_mut().enumerate() {
+        windows::reconcile(scene, model, group, context, outcome)?;
+    }
+    Ok(outcomes)
+}
+
+fn of_group(scene: &Scene, model: &mut Model, group: usize, context: &Context) -> Result<Outcome, Error> {
+    let registered = model.registered();
+    let views: Vec<usize> = registered.iter().copied().filter(|&view| scene.group_of[view] == group).collect();
+    if views.len() < block::LEAST_VIEWS {
+        let detail = format!(
+            "{} views of camera group {group} are registered; a calibration needs {}",
+            views.len(),
+            block::LEAST_VIEWS
+        );
+        return Ok(Outcome::refused(vec![Warning::new(WarningCode::UnobservableFocal, detail)]));
+    }
+    let views = densest(scene, model, &views);
+    let of_view = (OBSERVATIONS / views.len()).clamp(OF_VIEW.0, OF_VIEW.1);
+    let mut extract = core(scene, model, &views, of_view);
+    let (metric, observations) = extract.constant();
+    let (cameras, points) = projective(&metric);
     let problem = calibration::Problem {
         cameras: &cameras,
         points: &points,
-        observations: &part.observations,
+        observations: &observations,
         noise: model.noise,
         focal_prior: attempt::focal_prior(views.iter().map(|&view| &context.input.views()[view])),
         focal_per_view: false,
     };
-    let mut outcome = calibration::from_metric(&problem, &part.reconstruction, context.scale_px, context.stop)?;
+    let outcome = calibration::from_metric(&problem, &metric, context.scale_px, context.stop)?;
     if let Some(metric) = &outcome.metric {
-        let found = Part { reconstruction: metric.clone(), ..part };
-        found.write_back(model);
-        model.free = outcome.model;
-        super::structure::triangulate(scene, model);
-        adjust::all(scene, model);
-        windows::reconcile(scene, model, context, &mut outcome)?;
+        model.lenses[group].free = outcome.model;
+        // Some of the views alone would leave the frame of the others.
+        if extract.views.len() == registered.len() {
+            extract.sequence.intrinsics[group] = metric.intrinsics;
+            (extract.sequence.poses, extract.sequence.points) = (metric.poses.clone(), metric.points.clone());
+            extract.write_back(model);
+        }
     }
     Ok(outcome)
+}
+
+/// The run of at most [`MOST_VIEWS`] of these views that keeps most observations.
+fn densest(scene: &Scene, model: &Model, views: &[usize]) -> Vec<usize> {
+    let kept = |view: &usize| scene.of_view[*view].iter().filter(|&&k| model.kept[k as usize]).count();
+    let counts: Vec<usize> = views.iter().map(kept).collect();
+    let runs = views.windows(MOST_VIEWS.min(views.len())).zip(counts.windows(MOST_VIEWS.min(views.len())));
+    let densest =
+        runs.enumerate().max_by_key(|(start, (_, counts))| (counts.iter().sum::<usize>(), std::cmp::Reverse(*start)));
+    densest.map_or_else(Vec::new, |(_, (run, _))| run.to_vec())
 }
 
 /// The cameras and points of a metric reconstruction without what makes it metric.
@@ -55,17 +97,17 @@ pub fn projective(metric: &Reconstruction) -> (Vec<Camera>, Vec<Vector4<f64>>) {
 
 /// Landmarks that give every one of these registered views `of_view` observations, with the observations that the core
 /// of the noise explains.
-pub fn core(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -> Part {
+pub fn core(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -> Extract {
     let tracks = adjust::covering(scene, model, views, of_view);
-    let mut part = Part::new(scene, model, views, &tracks);
+    let mut extract = Extract::new(scene, model, views, &tracks);
     let limit = CORE_SQUARED * model.noise * model.noise;
     let fits: Vec<bool> =
-        part.observations.iter().map(|seen| part.reconstruction.residual(seen).norm_squared() < limit).collect();
-    let mut kept = vec![0usize; part.tracks.len()];
-    for (seen, fits) in part.observations.iter().zip(&fits) {
+        extract.sightings.iter().map(|seen| extract.sequence.residual(seen).norm_squared() < limit).collect();
+    let mut kept = vec![0usize; extract.tracks.len()];
+    for (seen, fits) in extract.sightings.iter().zip(&fits) {
         kept[seen.point] += usize::from(*fits);
     }
     let mut fits = fits.into_iter();
-    part.observations.retain(|seen| fits.next().unwrap_or(false) && kept[seen.point] >= LEAST_KEPT);
-    part
+    extract.sightings.retain(|seen| fits.next().unwrap_or(false) && kept[seen.point] >= LEAST_KEPT);
+    extract
 }

@@ -36,7 +36,8 @@ pub struct Extended<'a> {
     seed: Attempt,
     scene: Scene<'a>,
     model: Model,
-    calibration: Outcome,
+    /// One a camera group.
+    calibrations: Vec<Outcome>,
     /// Views that could not be registered, with the reason.
     unregistered: Vec<register::Unregistered>,
 }
@@ -93,10 +94,8 @@ pub fn solve<'a>(
     match unextended {
         Some(seed) if seed.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some()) => {
             let extended = extend(seed, &seeding, recorder)?;
-            match extended.calibration.metric {
-                Some(_) => Ok(Ended::Extended(Box::new(extended))),
-                None => Ok(Ended::Block(Some(extended.seed))),
-            }
+            let stands = extended.calibrations.iter().any(|outcome| outcome.metric.is_some());
+            Ok(if stands { Ended::Extended(Box::new(extended)) } else { Ended::Block(Some(extended.seed)) })
         }
         unextended => Ok(Ended::Block(unextended)),
     }
@@ -118,17 +117,24 @@ fn extend<'a>(seed: Attempt, context: &Context<'a>, recorder: &mut Recorder) -> 
     }
     context.stopped()?;
     recorder.enter(Stage::Calibrate);
-    let calibration = calibrate::calibrate(&scene, &mut model, context)?;
+    let calibrations = calibrate::calibrate(&scene, &mut model, context)?;
     context.stopped()?;
     parts::largest_first(&mut model);
     let unregistered = register::left(&scene, &model, &trials);
-    Ok(Extended { seed, scene, model, calibration, unregistered })
+    Ok(Extended { seed, scene, model, calibrations, unregistered })
 }
 
 impl Extended<'_> {
+    /// The worst of the cameras that have registered views.
+    fn grade(&self) -> Grade {
+        let has_views = |group: usize| self.model.lenses[group].is_known;
+        let grades = self.calibrations.iter().enumerate().filter(|(group, _)| has_views(*group));
+        grades.map(|(_, outcome)| outcome.grade).reduce(Grade::worse).unwrap_or(Grade::ProjectiveOnly)
+    }
+
     /// Larger is better: a calibration before none, then the number of views.
     fn merit(&self) -> (bool, usize) {
-        (self.calibration.grade != Grade::ProjectiveOnly, self.model.registered().len())
+        (self.grade() != Grade::ProjectiveOnly, self.model.registered().len())
     }
 
     /// Whether no other seed needs to be tried.

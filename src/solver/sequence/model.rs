@@ -1,4 +1,4 @@
-//! The state of an extension: what is known of the views, the points and the noise.
+//! The state of an extension: what is known of the cameras, the views, the points and the noise.
 
 use nalgebra::{Vector2, Vector3};
 
@@ -16,6 +16,9 @@ pub struct Scene<'a> {
     pub xy: Vec<Vector2<f64>>,
     /// Observations of each view.
     pub of_view: Vec<Vec<u32>>,
+    /// Camera group of each view, counted from 0 in rising order of the input's numbers.
+    pub group_of: Vec<usize>,
+    pub groups: usize,
     /// Density of a wrong coordinate; see [`judge::Geometry::outlier_density`].
     pub outlier_density: f64,
 }
@@ -31,7 +34,8 @@ impl<'a> Scene<'a> {
             xy.push(context.normalization.normalize(view, input.point_px(k)));
         }
         let outlier_density = judge::outlier_density(&xy);
-        Self { context: *context, xy, of_view, outlier_density }
+        let (group_of, groups) = crate::solver::block::camera_groups(input);
+        Self { context: *context, xy, of_view, group_of, groups, outlier_density }
     }
 
     pub fn stop(&self) -> &'a StopToken {
@@ -68,12 +72,21 @@ pub struct Landmark {
     pub part: u32,
 }
 
-/// A metric reconstruction under way.
-#[derive(Debug, Clone)]
-pub struct Model {
+/// The camera of a group.
+#[derive(Debug, Clone, Copy)]
+pub struct Lens {
     pub intrinsics: Intrinsics,
     /// Which intrinsics adjustments leave free.
     pub free: IntrinsicsModel,
+    /// Whether a registered view has it; until then its focal length is a guess.
+    pub is_known: bool,
+}
+
+/// A metric reconstruction under way.
+#[derive(Debug, Clone)]
+pub struct Model {
+    /// One a camera group.
+    pub lenses: Vec<Lens>,
     /// One a view of the input.
     pub poses: Vec<Option<Pose>>,
     /// Part of each registered view: views that share no tracks are reconstructions of their own, under one calibration.
@@ -82,31 +95,39 @@ pub struct Model {
     pub landmarks: Vec<Option<Landmark>>,
     /// One an observation: whether it agrees with its landmark.
     pub kept: Vec<bool>,
+    /// Landmarks among the tracks of each view that may support a pose.
+    pub supported: Vec<usize>,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
 }
 
 impl Model {
-    /// A model of nothing yet, with this camera and noise.
+    /// A model of nothing yet, with this noise, all cameras like this one.
     pub fn new(scene: &Scene, intrinsics: Intrinsics, noise: f64) -> Self {
         let views = scene.context.input.view_count();
+        let lens = Lens { intrinsics, free: IntrinsicsModel::FOCAL, is_known: false };
         Self {
-            intrinsics,
-            free: IntrinsicsModel::FOCAL,
+            lenses: vec![lens; scene.groups],
             poses: vec![None; views],
             part_of: vec![0; views],
             landmarks: vec![None; scene.tracks()],
             kept: vec![false; scene.xy.len()],
+            supported: vec![0; views],
             noise,
         }
     }
 
     /// Adds the views of a metric block as a part.
-    pub fn add_part(&mut self, part: u32, views: &[usize], metric: &Reconstruction) {
+    pub fn add_part(&mut self, scene: &Scene, part: u32, views: &[usize], metric: &Reconstruction) {
         for (&view, pose) in views.iter().zip(&metric.poses) {
-            self.poses[view] = Some(*pose);
-            self.part_of[view] = part;
+            self.register(scene, view, part, *pose);
         }
+    }
+
+    pub fn register(&mut self, scene: &Scene, view: usize, part: u32, pose: Pose) {
+        self.poses[view] = Some(pose);
+        self.part_of[view] = part;
+        self.lenses[scene.group_of[view]].is_known = true;
     }
 
     /// Takes a part back.
@@ -127,26 +148,22 @@ impl Model {
         (0..self.poses.len()).filter(|&view| self.poses[view].is_some() && self.part_of[view] == part).collect()
     }
 
-    /// Pinhole cameras of all views, zero for those that are not registered.
-    pub fn cameras(&self) -> Vec<Camera> {
-        let camera = |pose: &Option<Pose>| pose.map_or_else(Camera::zeros, |pose| pose.camera(&self.intrinsics));
-        self.poses.iter().map(camera).collect()
+    pub fn intrinsics_of(&self, scene: &Scene, view: usize) -> &Intrinsics {
+        &self.lenses[scene.group_of[view]].intrinsics
+    }
+
+    /// Pinhole cameras of all views; `None` for those that are not registered.
+    pub fn cameras(&self, scene: &Scene) -> Vec<Option<Camera>> {
+        let camera =
+            |(view, pose): (usize, &Option<Pose>)| pose.map(|pose| pose.camera(self.intrinsics_of(scene, view)));
+        self.poses.iter().enumerate().map(camera).collect()
     }
 
     /// Where the pinhole cameras see an observation; `None` where the view is not registered or the lens images nothing.
     pub fn sighting(&self, scene: &Scene, k: usize) -> Option<Sighting> {
         let view = scene.view_of(k);
         self.poses[view]?;
-        Some(Sighting { view, xy: self.intrinsics.undistort(&scene.xy[k])? })
-    }
-
-    /// The direction `(u, v)` at unit depth in which an observation is seen.
-    pub fn ray(&self, scene: &Scene, k: usize) -> Option<Vector2<f64>> {
-        let offset = self.intrinsics.undistort(&scene.xy[k])? - self.intrinsics.principal_point;
-        Some(Vector2::new(
-            offset.x / self.intrinsics.focal,
-            offset.y / (self.intrinsics.aspect * self.intrinsics.focal),
-        ))
+        Some(Sighting { view, xy: self.intrinsics_of(scene, view).undistort(&scene.xy[k])? })
     }
 
     /// Squared residual, normalised units, within which an observation agrees with its landmark.

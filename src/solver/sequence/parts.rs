@@ -26,7 +26,7 @@ pub fn first(scene: &Scene, seed: &Attempt) -> Model {
     let intrinsics = metric.map_or_else(|| Intrinsics::from_focal(1.0), |metric| metric.intrinsics);
     let mut model = Model::new(scene, intrinsics, noise);
     if let Some(metric) = metric {
-        model.add_part(FIRST, &seed.block.views, metric);
+        model.add_part(scene, FIRST, &seed.block.views, metric);
     }
     structure::triangulate(scene, &mut model);
     model
@@ -43,13 +43,15 @@ pub fn others(
     trials: &mut [Trial],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
-    let context = Context { focal_prior: prior_of(seed, model, &scene.context), ..scene.context };
+    let first_group = seed.block.views.first().map_or(0, |&view| scene.group_of[view]);
+    let prior = prior_of(seed, model, first_group, &scene.context);
     let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
     for part in FIRST + 1..MOST_PARTS {
-        context.stopped()?;
-        let candidates = block::candidate_views_among(context.input, context.ranges, &open, context.stop);
-        let Some(views) = candidates.first() else { break };
-        let block = block::extract(context.input, context.ranges, context.normalization, views);
+        scene.context.stopped()?;
+        let Some(views) = next_block(scene, &open) else { break };
+        let told = prior.filter(|_| scene.group_of[views[0]] == first_group);
+        let context = Context { focal_prior: told, ..scene.context };
+        let block = block::extract(context.input, context.ranges, context.normalization, &views);
         let attempt = attempt::solve_block(block, &context, recorder)?;
         recorder.enter(crate::domain::Stage::Extend);
         // Whatever comes of it, a block is tried once.
@@ -57,7 +59,7 @@ pub fn others(
         let Some(metric) = attempt.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref()) else {
             continue;
         };
-        model.add_part(part, &attempt.block.views, metric);
+        model.add_part(scene, part, &attempt.block.views, metric);
         structure::triangulate(scene, model);
         register::join(scene, model, part, trials, recorder)?;
         if !stands(scene, model, part) {
@@ -71,11 +73,21 @@ pub fn others(
     Ok(())
 }
 
+/// The best block of open views of one camera group.
+fn next_block(scene: &Scene, open: &[bool]) -> Option<Vec<usize>> {
+    let context = &scene.context;
+    (0..scene.groups).find_map(|group| {
+        let of_group: Vec<bool> = open.iter().zip(&scene.group_of).map(|(open, of)| *open && *of == group).collect();
+        let found = block::candidate_views_among(context.input, context.ranges, &of_group, context.stop);
+        found.into_iter().next()
+    })
+}
+
 /// What the first part says of the focal length of the others.
-fn prior_of(seed: &Attempt, model: &Model, context: &Context) -> Option<FocalPrior> {
+fn prior_of(seed: &Attempt, model: &Model, group: usize, context: &Context) -> Option<FocalPrior> {
     let calibration = seed.calibration.as_ref()?;
     let sigma = calibration.sigma_log_focal.filter(|_| calibration.grade != Grade::ProjectiveOnly);
-    let focal_px = model.intrinsics.focal * context.scale_px;
+    let focal_px = model.lenses[group].intrinsics.focal * context.scale_px;
     Some(FocalPrior { focal_px, sigma_log: sigma.map_or(VAGUE_SIGMA, |sigma| sigma.max(PRIOR_SIGMA)) })
 }
 

@@ -6,6 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::adjust;
 use super::model::{Model, Scene};
 use super::structure;
+use crate::geometry::bundle::metric::{Intrinsics, Pose};
 use crate::geometry::pose;
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, block};
@@ -21,8 +22,12 @@ const MOST_POINTS: usize = 2_000;
 const RETRY_GROWTH: f64 = 1.2;
 /// Trials of a view.
 const MOST_TRIALS: usize = 4;
-/// Growth of the registered views after which all are adjusted.
-const ADJUST_GROWTH: f64 = 1.1;
+/// Growth of the registered views after which all are adjusted; in between, only what is around each new one.
+const ADJUST_GROWTH: f64 = 1.2;
+/// Focal lengths that a view of a camera that is not known yet is tried with, as factors on the first camera's: a
+/// quarter of an octave apart, from a third to three times.
+const OTHER_FOCALS: std::ops::RangeInclusive<i32> = -6..=6;
+const FOCALS_PER_OCTAVE: f64 = 4.0;
 
 /// A view left out, and why.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -78,10 +83,10 @@ pub fn join(
         if grown as f64 >= ADJUST_GROWTH * adjusted_at as f64 {
             settle(scene, model, part);
             adjusted_at = grown;
+            recorder.standing.inliers = adjust::verified(model).len() as u32;
         }
-        recorder.standing.inliers =
-            model.landmarks.iter().flatten().filter(|landmark| landmark.is_verified()).count() as u32;
-        recorder.standing.focal_px = Some(model.intrinsics.focal * scene.context.scale_px);
+        let focal = model.intrinsics_of(scene, view).focal;
+        recorder.standing.focal_px = Some(focal * scene.context.scale_px);
         recorder.tell(model.registered().len() as f64 / views);
     }
     Ok(())
@@ -113,35 +118,70 @@ fn supported(scene: &Scene, model: &Model, part: u32, view: usize) -> Vec<usize>
 
 /// The view to try next, the one that sees most points, with these observations.
 fn next(scene: &Scene, model: &Model, part: u32, trials: &[Trial]) -> Option<(usize, Vec<usize>)> {
-    let open = (0..model.poses.len()).filter(|&view| model.poses[view].is_none()).filter_map(|view| {
+    let is_open = |&view: &usize| {
         let trial = trials[view];
-        if trial.count >= MOST_TRIALS {
-            return None;
-        }
-        let seen = supported(scene, model, part, view);
-        let worth = trial.count == 0 || seen.len() as f64 >= RETRY_GROWTH * trial.points as f64;
-        (seen.len() >= LEAST_POINTS && worth).then_some((view, seen))
-    });
+        let worth = trial.count == 0 || model.supported[view] as f64 >= RETRY_GROWTH * trial.points as f64;
+        model.poses[view].is_none() && trial.count < MOST_TRIALS && worth && model.supported[view] >= LEAST_POINTS
+    };
+    let mut open: Vec<usize> = (0..model.poses.len()).filter(is_open).collect();
     // The first of equals, so that one input has one answer.
-    open.max_by(|a, b| a.1.len().cmp(&b.1.len()).then(b.0.cmp(&a.0)))
+    open.sort_by_key(|&view| (std::cmp::Reverse(model.supported[view]), view));
+    open.into_iter().find_map(|view| {
+        let seen = supported(scene, model, part, view);
+        let worth = trials[view].count == 0 || seen.len() as f64 >= RETRY_GROWTH * trials[view].points as f64;
+        (seen.len() >= LEAST_POINTS && worth).then_some((view, seen))
+    })
 }
 
 /// Registers a view if enough of the points it sees agree; returns how many do.
 fn register(scene: &Scene, model: &mut Model, part: u32, view: usize, seen: &[usize], rng: &mut ChaCha8Rng) -> usize {
-    let step = seen.len().div_ceil(MOST_POINTS);
-    let pairs: Vec<(usize, nalgebra::Vector2<f64>)> =
-        seen.iter().step_by(step).filter_map(|&k| Some((k, model.ray(scene, k)?))).collect();
-    let points: Vec<_> =
-        pairs.iter().filter_map(|(k, _)| Some(model.landmarks[scene.track_of(*k)]?.position)).collect();
-    let rays: Vec<_> = pairs.iter().map(|(_, ray)| *ray).collect();
-    let gate = model.gate(scene) / model.intrinsics.focal.powi(2);
-    let Some(found) = pose::robust(&points, &rays, gate, rng) else { return 0 };
-    let agreeing = found.inlier.iter().filter(|&&inlier| inlier).count();
-    if agreeing >= LEAST_POINTS && agreeing as f64 >= LEAST_SHARE * points.len() as f64 {
-        model.poses[view] = Some(found.pose);
-        model.part_of[view] = part;
-        let tracks: Vec<usize> = scene.of_view[view].iter().map(|&k| scene.track_of(k as usize)).collect();
-        structure::triangulate_some(scene, model, &tracks);
+    let is_new_camera = !model.lenses[scene.group_of[view]].is_known;
+    let found = focals(scene, model, view)
+        .into_iter()
+        .filter_map(|focal| {
+            let intrinsics = Intrinsics { focal, ..*model.intrinsics_of(scene, view) };
+            Some((intrinsics, robust_pose(scene, model, &intrinsics, seen, rng)?))
+        })
+        // The first of equals.
+        .rev()
+        .max_by_key(|(_, (_, agreeing))| *agreeing);
+    let Some((intrinsics, (pose, agreeing))) = found else { return 0 };
+    if agreeing < LEAST_POINTS || (agreeing as f64) < LEAST_SHARE * seen.len().min(MOST_POINTS) as f64 {
+        return agreeing;
     }
+    model.lenses[scene.group_of[view]].intrinsics = intrinsics;
+    model.register(scene, view, part, pose);
+    let tracks: Vec<usize> = scene.of_view[view].iter().map(|&k| scene.track_of(k as usize)).collect();
+    structure::triangulate_some(scene, model, &tracks);
+    adjust::around(scene, model, view, is_new_camera);
+    structure::triangulate_some(scene, model, &tracks);
     agreeing
+}
+
+/// Focal lengths to try a view with: its camera's own, or, of one that is not known yet, what the input says or a scan.
+fn focals(scene: &Scene, model: &Model, view: usize) -> Vec<f64> {
+    let lens = &model.lenses[scene.group_of[view]];
+    if lens.is_known {
+        return vec![lens.intrinsics.focal];
+    }
+    if let Some(prior) = scene.context.input.views()[view].focal_prior {
+        return vec![prior.focal_px / scene.context.scale_px];
+    }
+    OTHER_FOCALS.map(|step| lens.intrinsics.focal * (f64::from(step) / FOCALS_PER_OCTAVE).exp2()).collect()
+}
+
+/// The pose that most of these observations agree with, and how many do.
+fn robust_pose(
+    scene: &Scene,
+    model: &Model,
+    intrinsics: &Intrinsics,
+    seen: &[usize],
+    rng: &mut ChaCha8Rng,
+) -> Option<(Pose, usize)> {
+    let step = seen.len().div_ceil(MOST_POINTS).max(1);
+    let pair = |&k: &usize| Some((model.landmarks[scene.track_of(k)]?.position, intrinsics.ray(&scene.xy[k])?));
+    let (points, rays): (Vec<_>, Vec<_>) = seen.iter().step_by(step).filter_map(pair).unzip();
+    let gate = model.gate(scene) / intrinsics.focal.powi(2);
+    let found = pose::robust(&points, &rays, gate, rng)?;
+    Some((found.pose, found.inlier.iter().filter(|&&inlier| inlier).count()))
 }

@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::model::{Landmark, Model, Scene};
 use crate::geometry::measurement::Sighting;
-use crate::geometry::{Point, robust_triangulation};
+use crate::geometry::{Camera, Point, robust_triangulation};
 
 /// Observations that two views and one that verifies them make.
 const VERIFIED: usize = 3;
@@ -24,14 +24,14 @@ pub fn triangulate(scene: &Scene, model: &mut Model) {
 
 /// Triangulates these tracks anew from the registered views.
 pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
-    let cameras = model.cameras();
+    let cameras: Vec<Camera> =
+        model.cameras(scene).into_iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
     let gate = model.gate(scene);
     for (place, &track) in tracks.iter().enumerate() {
         if place.is_multiple_of(TRACKS_PER_LOOK) && scene.stop().is_stopped() {
             return;
         }
-        scene.of_track(track).for_each(|k| model.kept[k] = false);
-        model.landmarks[track] = None;
+        forget(scene, model, track);
         let Some(part) = part_of_track(scene, model, track) else { continue };
         let seen: Vec<(usize, Sighting)> = scene
             .of_track(track)
@@ -54,11 +54,22 @@ pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
             part,
             support: found.agrees.iter().filter(|&&agrees| agrees).count(),
         };
+        if landmark.supports() {
+            scene.of_track(track).for_each(|k| model.supported[scene.view_of(k)] += 1);
+        }
         model.landmarks[track] = Some(landmark);
         for ((k, _), agrees) in seen.iter().zip(found.agrees) {
             model.kept[*k] = agrees;
         }
     }
+}
+
+/// Takes the point of a track away.
+fn forget(scene: &Scene, model: &mut Model, track: usize) {
+    if model.landmarks[track].take().is_some_and(|landmark| landmark.supports()) {
+        scene.of_track(track).for_each(|k| model.supported[scene.view_of(k)] -= 1);
+    }
+    scene.of_track(track).for_each(|k| model.kept[k] = false);
 }
 
 /// The part in whose views a track has most observations, the first of equals; `None`: in none.

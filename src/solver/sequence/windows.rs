@@ -4,7 +4,7 @@
 //! motion that hardly turns moves windows apart by more than it admits. They are fused by information weight, with a
 //! common misfit that makes their chi-square what it should be (DerSimonian & Laird 1986).
 
-use super::adjust::{self, Part};
+use super::adjust::{self, Extract};
 use super::calibrate;
 use super::model::{Model, Scene};
 use crate::domain::{Warning, WarningCode};
@@ -39,9 +39,15 @@ pub struct Fused {
 }
 
 /// Raises the sigma of a sequence's calibration to what its windows admit, grades it anew and says so.
-pub fn reconcile(scene: &Scene, model: &Model, context: &Context, outcome: &mut Outcome) -> Result<(), Error> {
+pub fn reconcile(
+    scene: &Scene,
+    model: &Model,
+    group: usize,
+    context: &Context,
+    outcome: &mut Outcome,
+) -> Result<(), Error> {
     let Some(own) = outcome.sigma_log_focal else { return Ok(()) };
-    let estimates = estimates(scene, model, context)?;
+    let estimates = estimates(scene, model, group, context)?;
     let Some(fused) = fuse(&estimates) else { return Ok(()) };
     let sigma = own.max(fused.sigma);
     outcome.sigma_log_focal = Some(sigma);
@@ -64,29 +70,30 @@ pub fn reconcile(scene: &Scene, model: &Model, context: &Context, outcome: &mut 
 }
 
 /// What each window says by itself, the lens as the whole has it.
-fn estimates(scene: &Scene, model: &Model, context: &Context) -> Result<Vec<Estimate>, Error> {
+fn estimates(scene: &Scene, model: &Model, group: usize, context: &Context) -> Result<Vec<Estimate>, Error> {
     let mut found = Vec::new();
-    for views in windows(&model.registered()) {
+    let views: Vec<usize> = model.registered().into_iter().filter(|&view| scene.group_of[view] == group).collect();
+    for views in windows(&views) {
         context.stopped()?;
-        let part = calibrate::core(scene, model, &views, OF_VIEW);
-        found.extend(estimate(scene, model, &part, context));
+        let extract = calibrate::core(scene, model, &views, OF_VIEW);
+        found.extend(estimate(scene, model, group, &extract, context));
     }
     Ok(found)
 }
 
-fn estimate(scene: &Scene, model: &Model, part: &Part, context: &Context) -> Option<Estimate> {
-    let metric = &part.reconstruction;
-    let (cameras, points) = calibrate::projective(metric);
+fn estimate(scene: &Scene, model: &Model, group: usize, extract: &Extract, context: &Context) -> Option<Estimate> {
+    let (metric, observations) = extract.constant();
+    let (cameras, points) = calibrate::projective(&metric);
     let problem = calibration::Problem {
         cameras: &cameras,
         points: &points,
-        observations: &part.observations,
+        observations: &observations,
         noise: model.noise,
         focal_prior: None,
         focal_per_view: false,
     };
-    let prior = adjust::knowledge(scene, model.noise);
-    let (log_focal, sigma) = calibration::focal_alone(&problem, metric, &prior, context.stop)?;
+    let prior = adjust::knowledge(scene, group, model.noise);
+    let (log_focal, sigma) = calibration::focal_alone(&problem, &metric, &prior, context.stop)?;
     Some(Estimate { log_focal, sigma })
 }
 
