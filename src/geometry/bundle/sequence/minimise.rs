@@ -5,10 +5,11 @@ use nalgebra::{Rotation3, Vector3};
 use super::super::engine::{DAMPING_DOWN, DAMPING_UP, MAX_ATTEMPTS, UNDEFINED_SQUARED, usable_squared_norm};
 use super::super::metric::IntrinsicsPrior;
 use super::super::{Loss, Options, Report};
-use super::layout::Layout;
+use super::layout::{Layout, Seen};
 use super::normal::Normal;
 use super::pattern::Pattern;
 use super::reduced::{Reduced, substitute};
+use super::settle::settle_points;
 use super::solver::Solver;
 use super::{Free, Pace, Sequence, Sighting};
 use crate::domain::StopToken;
@@ -85,13 +86,20 @@ fn cost(sequence: &Sequence, layout: &Layout, priors: &[IntrinsicsPrior], loss: 
         if !pace.go_on(seen.len()) {
             return None;
         }
-        for seen in seen {
-            let at = sequence.poses[seen.view].apply(position);
-            let residual = sequence.intrinsics_of(seen.view).project(&at) - seen.xy;
-            sum += loss.cost(seen.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
-        }
+        sum += cost_of_point(sequence, seen, position, loss);
     }
     Some(sum)
+}
+
+/// Sum of the loss over the observations of one point, were it at this position.
+pub(super) fn cost_of_point(sequence: &Sequence, seen: &[Seen], position: &Vector3<f64>, loss: Loss) -> f64 {
+    let mut sum = 0.0;
+    for seen in seen {
+        let at = sequence.poses[seen.view].apply(position);
+        let residual = sequence.intrinsics_of(seen.view).project(&at) - seen.xy;
+        sum += loss.cost(seen.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
+    }
+    sum
 }
 
 /// What the steps need from one to the next.
@@ -137,9 +145,10 @@ impl<'a> Descent<'a> {
             if self.pace.stop.is_stopped() {
                 return None;
             }
-            if let Some(cost) = self.attempt(sequence, trial).filter(|cost| *cost < present) {
+            let lowered = self.attempt(sequence, trial, present);
+            if lowered.is_some() {
                 self.damping = (self.damping / DAMPING_DOWN).max(MIN_DAMPING);
-                return Some(cost);
+                return lowered;
             }
             self.damping *= growth;
             growth *= GROWTH_UP;
@@ -147,8 +156,8 @@ impl<'a> Descent<'a> {
         None
     }
 
-    /// Moves `trial` to where the damped step leads from `sequence`; its cost.
-    fn attempt(&mut self, sequence: &Sequence, trial: &mut Sequence) -> Option<f64> {
+    /// Moves `trial` to where the damped step leads from `sequence`; its cost where that is less than `present`.
+    fn attempt(&mut self, sequence: &Sequence, trial: &mut Sequence, present: f64) -> Option<f64> {
         let Self { layout, normal, reduced, pace, .. } = self;
         if !reduced.build(layout, normal, self.damping, pace) {
             return None;
@@ -159,8 +168,16 @@ impl<'a> Descent<'a> {
         }
         let step = &reduced.vector;
         retract(trial, sequence, layout, step);
-        substitute(trial, sequence, layout, normal, self.damping, step, pace)
-            .then(|| cost(trial, layout, self.priors, self.loss, pace))?
+        if !substitute(trial, sequence, layout, normal, self.damping, step, pace) {
+            return None;
+        }
+        let cost = cost(trial, layout, self.priors, self.loss, pace)?;
+        if cost < present {
+            return Some(cost);
+        }
+        // Cheaper than another system: most of what a long step spoils is the points' part of its curvature.
+        let cost = cost - settle_points(trial, layout, self.loss, pace)?;
+        (cost < present).then_some(cost)
     }
 }
 

@@ -90,6 +90,22 @@ fn a_chain_converges_to_the_noise_floor() {
     }
 }
 
+/// What bends at next to no cost is straightened with the usual options: where points only follow the tangent, thirty
+/// steps leave the cost .6 % above the minimum.
+#[test]
+fn drift_is_undone_in_few_steps() {
+    for seed in 1..3 {
+        let (truth, sightings) = chain(seed, 100, 20, 5, 0.001);
+        let models = [IntrinsicsModel::FOCAL];
+        let best = adjusted(&mut truth.clone(), &sightings, &models, &thorough());
+        let mut start = bent(&truth, 0.5);
+        let report = adjusted(&mut start, &sightings, &models, &Options::default());
+        println!("seed {seed}: least {best:?}, from a bend {report:?}");
+        assert!(report.initial_cost > 50.0 * best.cost, "seed {seed}: {report:?}");
+        assert!(report.cost / best.cost - 1.0 < 1e-6, "seed {seed}: {report:?} {best:?}");
+    }
+}
+
 #[test]
 fn disconnected_chains_converge_together() {
     let (mut truth, mut sightings) = chain(5, 30, 8, 5, 0.0);
