@@ -1,5 +1,5 @@
 //! Points after a long step of the cameras: each to its own minimum (embedded point iterations; Jeong, Nister, Steedly,
-//! Szeliski, Kweon 2012, "Pushing the envelope of modern methods for bundle adjustment", section 3.3).
+//! Szeliski, Kweon 2012, "Pushing the envelope of modern methods for bundle adjustment").
 //!
 //! Long chains of views bend at next to no cost. Cameras and points that follow a bend along its tangent are stretched
 //! across its axis and not along it, which costs by the square of the angle; points that are put where the moved cameras
@@ -40,8 +40,8 @@ pub(super) fn settle_points(sequence: &mut Sequence, layout: &Layout, loss: Loss
             let Some(factor) = block.factor(0.0) else { break };
             let moved = position - factor.unwhiten(&factor.whiten(&block.gradient));
             let moved_cost = cost_of_point(sequence, seen, &moved, loss);
-            // Written so that NaN fails.
-            if !(moved_cost < cost) || !moved.iter().all(|value| value.is_finite()) {
+            let lower = moved_cost < cost && moved.iter().all(|value| value.is_finite());
+            if !lower {
                 break;
             }
             let gain = cost - moved_cost;
