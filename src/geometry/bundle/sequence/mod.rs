@@ -12,6 +12,7 @@ mod normal;
 mod pattern;
 mod point;
 mod reduced;
+mod settle;
 mod solver;
 #[cfg(test)]
 mod tests;

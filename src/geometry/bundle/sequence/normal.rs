@@ -23,17 +23,17 @@ struct ViewPlaces {
 }
 
 /// One observation's weighted residual and Jacobian, by rows.
-struct Weighted {
-    residual: [f64; 2],
+pub(super) struct Weighted {
+    pub residual: [f64; 2],
     pose: [[f64; POSE]; 2],
-    point: [Vector3<f64>; 2],
+    pub point: [Vector3<f64>; 2],
     by_parameter: [[f64; Parameter::COUNT]; 2],
 }
 
 impl Weighted {
     /// `None` where the observation is undefined.
     #[inline]
-    fn new(sequence: &Sequence, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
+    pub fn new(sequence: &Sequence, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
         let pose = &sequence.poses[seen.view];
         let intrinsics = &sequence.intrinsics[sequence.group_of[seen.view]];
         let at = pose.apply(point);

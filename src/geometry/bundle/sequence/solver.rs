@@ -16,7 +16,7 @@ const DENSE_LIMIT: usize = 256;
 /// Solves systems of one pattern.
 pub(super) enum Solver {
     Dense { solver: CholeskySolver, matrix: Vec<f64> },
-    Sparse(SparseCholesky),
+    Sparse(Box<SparseCholesky>),
 }
 
 impl Solver {
@@ -26,7 +26,7 @@ impl Solver {
         if n <= DENSE_LIMIT {
             return Some(Self::Dense { solver: CholeskySolver::new(n), matrix: vec![0.0; n * n] });
         }
-        SparseCholesky::new(pattern, 1).map(Self::Sparse)
+        SparseCholesky::new(pattern, 1).map(|cholesky| Self::Sparse(Box::new(cholesky)))
     }
 
     /// Solves in place of `vector`; `false` when the matrix is not positive definite.

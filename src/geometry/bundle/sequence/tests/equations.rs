@@ -43,7 +43,7 @@ fn differentiate(sequence: &Sequence, sightings: &[Sighting], layout: &Layout) -
         let mut step = vec![0.0; cameras];
         if unknown < cameras {
             step[unknown] = by;
-            retract(&mut moved, sequence, layout, &step);
+            assert!(retract(&mut moved, sequence, layout, &step));
         } else {
             moved.points[(unknown - cameras) / 3][(unknown - cameras) % 3] += by;
         }

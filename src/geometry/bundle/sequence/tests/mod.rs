@@ -77,6 +77,31 @@ fn perturbed(truth: &Sequence, deviation: f64, seed: u64) -> Sequence {
     start
 }
 
+/// The chain bent to an arc of so many radians, as a reconstruction drifts that grows view by view.
+fn bent(straight: &Sequence, angle: f64) -> Sequence {
+    let length = BASELINE * straight.poses.len() as f64;
+    let radius = length / angle;
+    // Rotation and shift of what is so far along the line.
+    let bend = |along: f64| {
+        let angle = along / radius;
+        let rotation = Rotation3::from_axis_angle(&Vector3::y_axis(), angle).into_inner();
+        let on_arc = radius * Vector3::new(angle.sin(), 0.0, angle.cos() - 1.0);
+        (rotation, on_arc - rotation * Vector3::new(along, 0.0, 0.0))
+    };
+    let mut bent = straight.clone();
+    for pose in &mut bent.poses {
+        let centre = -pose.rotation.tr_mul(&pose.translation);
+        let (rotation, shift) = bend(centre.x);
+        pose.rotation *= rotation.transpose();
+        pose.translation = -pose.rotation * (rotation * centre + shift);
+    }
+    for point in &mut bent.points {
+        let (rotation, shift) = bend(point.x);
+        *point = rotation * *point + shift;
+    }
+    bent
+}
+
 /// To the last digit.
 fn thorough() -> Options {
     Options { max_iterations: 100, relative_tolerance: 1e-14, ..Options::default() }
