@@ -48,25 +48,27 @@ impl InputArgs {
     }
 }
 
+/// Heading of the flags that say how. Given flag by flag: set for the whole, it would go on to flags of the command.
+const READING: &str = "How to read INPUT";
+
 /// How to read a file of tracks.
 #[derive(Debug, Clone, Args)]
-#[command(next_help_heading = "How to read INPUT")]
 pub struct ReadingArgs {
     /// Width of the images in pixels; without it the extent of the points stands in, with a warning. COLMAP's files
     /// carry their own sizes
-    #[arg(long, value_name = "PX", requires = "height", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, help_heading = READING, value_name = "PX", requires = "height", value_parser = clap::value_parser!(u32).range(1..))]
     pub width: Option<u32>,
 
     /// Height of the images in pixels
-    #[arg(long, value_name = "PX", requires = "width", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, help_heading = READING, value_name = "PX", requires = "width", value_parser = clap::value_parser!(u32).range(1..))]
     pub height: Option<u32>,
 
     /// What kind of file INPUT is [default: told from its name and content]
-    #[arg(long, value_enum)]
+    #[arg(long, help_heading = READING, value_enum)]
     pub format: Option<FormatArg>,
 
     /// Which matches of a COLMAP database to join into tracks [default: verified, or raw where none is]
-    #[arg(long, value_enum)]
+    #[arg(long, help_heading = READING, value_enum)]
     pub matches: Option<MatchesArg>,
 }
 

@@ -101,6 +101,9 @@ fn opensfm_sees_the_points_where_they_were_observed() {
         let kinds: Vec<&Value> = cameras.values().map(|camera| &camera["projection_type"]).collect();
         assert_eq!(kinds, [kind]);
         assert_eq!(json[0]["points"].as_object().expect("points").len(), solution.inlier_track_count());
+        let error_px = |point: &metric::Point| point.error_px;
+        let model = Model::new(&solution, &input).expect("metric");
+        assert!(model.points.iter().map(error_px).fold(0.0, f64::max) < 1e-6);
         let worst = worst_of_opensfm(&json, &input, &solution);
         assert!(worst < 1e-6, "{worst} px off under {calibration:?}");
     }

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use super::LabelledInput;
 use super::label::Label;
@@ -66,7 +66,7 @@ pub struct Point {
     pub label: Label,
     pub position: [f64; 3],
     pub colour: [u8; 3],
-    /// Mean reprojection error over its keypoints.
+    /// Mean reprojection error over its keypoints, a distance.
     pub error_px: f64,
     /// Positions of the image and, in that, of the keypoint.
     pub seen: Vec<(usize, usize)>,
@@ -86,7 +86,34 @@ impl Model {
             return Err(Error::NoPose);
         }
         let points = points(solution, input, &image_of_view, &mut images);
-        Ok(Self { cameras, images, points })
+        let mut model = Self { cameras, images, points };
+        model.measure();
+        Ok(model)
+    }
+
+    /// Gives every point its error under these cameras. The residuals of the result are those of the projective
+    /// reconstruction, which has more freedom and fits a little better.
+    fn measure(&mut self) {
+        for point in &mut self.points {
+            let distance = |&(image, keypoint): &(usize, usize)| {
+                let image = &self.images[image];
+                let [x, y] = image.project(&self.cameras[image.camera], point.position);
+                let seen = &image.keypoints[keypoint];
+                (x - seen.x).hypot(y - seen.y)
+            };
+            point.error_px = point.seen.iter().map(distance).sum::<f64>() / point.seen.len() as f64;
+        }
+    }
+}
+
+impl Image {
+    /// Where a point is imaged, in pixels.
+    fn project(&self, camera: &Camera, position: [f64; 3]) -> [f64; 2] {
+        let seen = self.rotation * Vector3::from(position) + Vector3::from(self.translation);
+        let (u, v) = (seen.x / seen.z, seen.y / seen.z);
+        let Calibration { focal_px, principal_point_px: [px, py], aspect, radial_k1, .. } = camera.intrinsics;
+        let s = 1.0 + radial_k1 * (u * u + v * v);
+        [focal_px * u * s + px, aspect * focal_px * v * s + py]
     }
 }
 
@@ -185,13 +212,9 @@ fn points(
         let Some(image) = image_of(k) else { continue };
         let point = position_of[raw.track[k] as usize].filter(|_| is_right(k));
         if let Some(point) = point {
-            points[point].error_px += solution.observations.residual_px.get(k).copied().flatten().unwrap_or(0.0);
             points[point].seen.push((image, images[image].keypoints.len()));
         }
         images[image].keypoints.push(Keypoint { x: raw.x[k], y: raw.y[k], point });
-    }
-    for point in &mut points {
-        point.error_px /= point.seen.len() as f64;
     }
     number(&mut points);
     points

@@ -4,7 +4,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// Inputs of a reader in a normal run; `SCPSFM_MUTATIONS` says another number.
-const DEFAULT_COUNT: u64 = 3_000;
+const DEFAULT_COUNT: u64 = 2_000;
 /// Mutations of one input at most: the first wrong byte often hides what comes after it.
 const MOST_CHANGES: u32 = 4;
 

@@ -46,13 +46,15 @@ pub fn page(solution: &Solution, input: Option<&LabelledInput>) -> String {
 mod tests {
     use super::*;
     use crate::domain::{Status, Warning, WarningCode};
-    use crate::formats::fixture;
+    use crate::formats::{Label, fixture};
     use crate::synthetic::SceneOptions;
 
     #[test]
     fn fetches_nothing_and_escapes_everything() {
-        let (input, mut solution) = fixture::solved();
+        let (mut input, mut solution) = fixture::solved();
         let hostile = "</script><script>alert(1)</script><img src=x onerror='a'>";
+        // Image names come from files of others.
+        input.view_labels[1] = Label::Name(hostile.into());
         solution.warnings.push(Warning::new(WarningCode::ViewsLeftOut, hostile));
         let page = page(&solution, Some(&input));
         for forbidden in ["http://", "https://", "//cdn", "<link", "@import", "url(", "<img", "fetch(", hostile] {

@@ -82,20 +82,22 @@ fn kind_name(kind: Matches) -> &'static str {
     }
 }
 
-/// Refuses a database with a write-ahead log: what stands in there alone would be missed.
+/// Refuses a database with a journal: what stands in there alone would be missed, or half a change be read.
 fn refuse_unfinished(path: &Path) -> Result<(), String> {
-    let mut log = path.as_os_str().to_owned();
-    log.push("-wal");
-    let log = PathBuf::from(log);
-    match std::fs::metadata(&log) {
-        Ok(metadata) if metadata.len() > 0 => Err(format!(
-            "{} beside it holds changes that are not in the file yet: let COLMAP end, or fold them in with \
-             `sqlite3 {} 'pragma wal_checkpoint(truncate)'`",
-            display_name(&log),
-            display_name(path)
-        )),
-        _ => Ok(()),
+    for suffix in ["-wal", "-journal"] {
+        let mut journal = path.as_os_str().to_owned();
+        journal.push(suffix);
+        let journal = PathBuf::from(journal);
+        if std::fs::metadata(&journal).is_ok_and(|metadata| metadata.len() > 0) {
+            return Err(format!(
+                "{} beside it says that a change is under way or was broken off: let COLMAP end, or run \
+                 `sqlite3 {} 'pragma wal_checkpoint(truncate)'`",
+                display_name(&journal),
+                display_name(path)
+            ));
+        }
     }
+    Ok(())
 }
 
 /// Runs the queries on a thread and a runtime of their own: this module is synchronous, its callers may be on a runtime,

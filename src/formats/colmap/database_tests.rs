@@ -196,8 +196,11 @@ fn what_is_wrong_is_named_by_table_and_row() {
 #[test]
 fn files_that_are_no_finished_database_say_so() {
     let (directory, path) = with_matches("matches", &CHAIN);
-    fs::write(directory.path().join("database.db-wal"), "x").expect("written");
-    assert!(refusal(&path, None).contains("database.db-wal beside it holds changes"));
+    for journal in ["database.db-wal", "database.db-journal"] {
+        fs::write(directory.path().join(journal), "x").expect("written");
+        assert!(refusal(&path, None).contains(&format!("{journal} beside it says that a change")));
+        fs::remove_file(directory.path().join(journal)).expect("removed");
+    }
     let other = directory.path().join("other.db");
     fs::write(&other, "no database, but long enough to be taken for the header of one, if nobody looked: ".repeat(9))
         .expect("written");
@@ -207,7 +210,6 @@ fn files_that_are_no_finished_database_say_so() {
     assert!(refusal(&other, None).contains("cannot be read as a COLMAP database"), "{}", refusal(&other, None));
     assert!(refusal(&directory.path().join("none.db"), None).contains("cannot be opened"));
     let tiny = Limits { max_observations: 3, ..Limits::default() };
-    fs::remove_file(directory.path().join("database.db-wal")).expect("removed");
     let refused = read(&path, &tiny, None).expect_err("above the limits").to_string();
     assert!(refused.contains("6 observations are above the limit of 3"), "{refused}");
     let tiny = Limits { max_views: 2, ..Limits::default() };

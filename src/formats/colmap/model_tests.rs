@@ -110,7 +110,7 @@ fn what_is_wrong_with_text_is_named_by_line() {
 fn what_is_wrong_with_bytes_is_named_by_offset() {
     let (_, [cameras, images, _], _) = exported();
     let bad = |cameras: &[u8], images: &[u8]| parsed("bin", [cameras, images]).expect_err("bad files");
-    assert_eq!(bad(&cameras[..30], &images), "cameras.bin, byte 24: camera 4: the file ends here; it may be truncated");
+    assert_eq!(bad(&cameras[..40], &images), "cameras.bin, byte 40: camera 4: the file ends here; it may be truncated");
     assert!(bad(&[], &images).starts_with("cameras.bin, byte 0: the count of cameras: the file ends here"));
     let mut model = cameras.clone();
     model[12] = 99;
