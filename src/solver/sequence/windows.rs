@@ -72,8 +72,11 @@ pub fn reconcile(
 /// What each window says by itself, the lens as the whole has it.
 fn estimates(scene: &Scene, model: &Model, group: usize, context: &Context) -> Result<Vec<Estimate>, Error> {
     let mut found = Vec::new();
-    let views: Vec<usize> = model.registered().into_iter().filter(|&view| scene.group_of[view] == group).collect();
-    for views in windows(&views) {
+    let parts = model.part_of.iter().copied().max().unwrap_or(0);
+    let of_group = |part: u32| -> Vec<usize> {
+        model.of_part(part).into_iter().filter(|&view| scene.group_of[view] == group).collect()
+    };
+    for views in windows(&(0..=parts).map(of_group).collect::<Vec<_>>()) {
         context.stopped()?;
         let extract = calibrate::core(scene, model, &views, OF_VIEW);
         found.extend(estimate(scene, model, group, &extract, context));
@@ -97,15 +100,19 @@ fn estimate(scene: &Scene, model: &Model, group: usize, extract: &Extract, conte
     Some(Estimate { log_focal, sigma })
 }
 
-/// Runs of consecutive registered views, not overlapping; none where there are fewer than two.
-fn windows(views: &[usize]) -> Vec<Vec<usize>> {
-    let count = (views.len() / VIEWS).max(2);
-    if views.len() < 2 * LEAST_VIEWS {
-        return Vec::new();
-    }
-    let all = (0..count).map(|k| views[k * views.len() / count..(k + 1) * views.len() / count].to_vec());
-    let step = count.div_ceil(MOST_WINDOWS);
-    all.step_by(step).collect()
+/// Runs of consecutive views of one part, not overlapping; one or none says nothing.
+fn windows(parts: &[Vec<usize>]) -> Vec<Vec<usize>> {
+    let long: Vec<&Vec<usize>> = parts.iter().filter(|views| views.len() >= LEAST_VIEWS).collect();
+    // One part is halved, so that there is something to compare.
+    let least = if long.len() == 1 { 2 } else { 1 };
+    let of_part = |views: &Vec<usize>| -> Vec<Vec<usize>> {
+        let count = (views.len() / VIEWS).max(least);
+        let run = |k: usize| views[k * views.len() / count..(k + 1) * views.len() / count].to_vec();
+        (0..count).map(run).filter(|run| run.len() >= LEAST_VIEWS).collect()
+    };
+    let all: Vec<Vec<usize>> = long.into_iter().flat_map(of_part).collect();
+    let step = all.len().div_ceil(MOST_WINDOWS).max(1);
+    all.into_iter().step_by(step).collect()
 }
 
 /// `None` for fewer than two.
@@ -156,9 +163,14 @@ mod tests {
 
     #[test]
     fn windows_are_runs_of_about_ten() {
-        assert!(windows(&(0..9).collect::<Vec<_>>()).is_empty());
-        assert_eq!(windows(&(0..11).collect::<Vec<_>>()).iter().map(Vec::len).collect::<Vec<_>>(), [5, 6]);
-        assert_eq!(windows(&(0..40).collect::<Vec<_>>()).iter().map(Vec::len).collect::<Vec<_>>(), [10; 4]);
-        assert_eq!(windows(&(0..1000).collect::<Vec<_>>()).len(), MOST_WINDOWS);
+        let lengths = |parts: &[std::ops::Range<usize>]| -> Vec<usize> {
+            let parts: Vec<Vec<usize>> = parts.iter().map(|part| part.clone().collect()).collect();
+            windows(&parts).iter().map(Vec::len).collect()
+        };
+        assert!(lengths(&[0..9]).len() < 2);
+        assert_eq!(lengths(&[0..11]), [5, 6]);
+        assert_eq!(lengths(&[0..40]), [10; 4]);
+        assert_eq!(lengths(&[0..11, 11..21, 21..24]), [11, 10]);
+        assert_eq!(lengths(&[0..1000]).len(), MOST_WINDOWS);
     }
 }
