@@ -116,7 +116,7 @@ fn positive_roots(quartic: &[f64; 5]) -> Vec<f64> {
 /// Draws until [`CONFIDENCE`] is reached, [`MOST_SAMPLES`] at most. Returns `None` for fewer than three correspondences or
 /// when no sample gives a pose.
 pub fn robust(points: &[Vector3<f64>], seen: &[Vector2<f64>], gate: f64, rng: &mut ChaCha8Rng) -> Option<Robust> {
-    if points.len() < SAMPLE || points.len() != seen.len() || !(gate > 0.0) {
+    if points.len() < SAMPLE || points.len() != seen.len() || gate.is_nan() || gate <= 0.0 {
         return None;
     }
     let wide = SAMPLE_GATES * gate;

@@ -117,7 +117,7 @@ fn solve_sequence(context: &Context, warnings: Vec<Warning>, mut recorder: Recor
             context.stopped()?;
             Ok(solution)
         }
-        sequence::Ended::Block(best) => of_block(best.as_ref(), context, warnings, recorder),
+        sequence::Ended::Block(best) => of_block(best.as_deref(), context, warnings, recorder),
     }
 }
 

@@ -118,6 +118,13 @@ pub struct Sequence {
     pub truth: SequenceTruth,
 }
 
+/// A point, the first view of its track and its exact images there and in the next ones, in image sides about the centre.
+struct Track {
+    point: Vector3<f64>,
+    first: usize,
+    images: Vec<Vector2<f64>>,
+}
+
 struct Pose {
     rotation: Matrix3<f64>,
     centre: Vector3<f64>,
@@ -151,7 +158,7 @@ impl Sequence {
         };
         let focal = focal_px / f64::from(IMAGE_SIDE_PX);
         for track in 0..options.tracks {
-            let (point, first, images) = draw_track(options, &poses, focal, &mut rng)?;
+            let Track { point, first, images } = draw_track(options, &poses, focal, &mut rng)?;
             let inlier = rng.random::<f64>() >= options.outliers;
             truth.inlier.push(inlier);
             truth.points.push(point.into());
@@ -178,13 +185,12 @@ fn pose(view: usize, jitter: f64) -> Pose {
     Pose { rotation: *rotation.matrix(), centre: Vector3::new(STEP * along, weave(0), weave(1)) }
 }
 
-/// A point, the first view of its track and its exact images there and in the next ones, in image sides about the centre.
 fn draw_track(
     options: &SequenceOptions,
     poses: &[Pose],
     focal: f64,
     rng: &mut ChaCha8Rng,
-) -> Result<(Vector3<f64>, usize, Vec<Vector2<f64>>), InvalidInput> {
+) -> Result<Track, InvalidInput> {
     for _ in 0..MOST_DRAWS {
         let length = rng.random_range(options.lifetime.0..=options.lifetime.1);
         let first = rng.random_range(0..=poses.len() - length);
@@ -199,7 +205,7 @@ fn draw_track(
         };
         let images: Option<Vec<Vector2<f64>>> = poses[first..first + length].iter().map(image).collect();
         if let Some(images) = images {
-            return Ok((point, first, images));
+            return Ok(Track { point, first, images });
         }
     }
     Err(Violation::of("lifetime", format!("no point stays in view for {} views", options.lifetime.1)).into())

@@ -73,13 +73,16 @@ async fn open(path: &Path) -> SqlitePool {
 }
 
 /// The same with matches in a table: `(first, second, [(keypoint, keypoint)])`.
-fn with_matches(table: &str, pairs: &[(i64, i64, &[(u32, u32)])]) -> (TempDir, PathBuf) {
+/// Two image ids and the matches of their keypoints.
+type Pair<'a> = (i64, i64, &'a [(u32, u32)]);
+
+fn with_matches(table: &str, pairs: &[Pair]) -> (TempDir, PathBuf) {
     let (directory, path) = database(&[]);
     add_matches(&path, table, pairs);
     (directory, path)
 }
 
-fn add_matches(path: &Path, table: &str, pairs: &[(i64, i64, &[(u32, u32)])]) {
+fn add_matches(path: &Path, table: &str, pairs: &[Pair]) {
     run(async {
         let pool = open(path).await;
         for (first, second, found) in pairs {
@@ -104,7 +107,7 @@ fn refusal(path: &Path, matches: Option<Matches>) -> String {
     read(path, &Limits::default(), matches).expect_err("a bad database was accepted").to_string()
 }
 
-const CHAIN: [(i64, i64, &[(u32, u32)]); 2] = [(1, 2, &[(0, 1), (2, 2)]), (2, 5, &[(1, 0), (2, 1)])];
+const CHAIN: [Pair; 2] = [(1, 2, &[(0, 1), (2, 2)]), (2, 5, &[(1, 0), (2, 1)])];
 
 #[test]
 fn matches_become_tracks_of_images_by_name_in_our_pixels() {
@@ -146,8 +149,7 @@ fn verified_matches_come_first_and_a_flag_asks_for_either() {
 
 #[test]
 fn a_wrong_match_is_cut_and_counted() {
-    let wrong: [(i64, i64, &[(u32, u32)]); 3] =
-        [CHAIN[0], (1, 5, &[(0, 0), (2, 1)]), (2, 5, &[(1, 0), (2, 1), (1, 1)])];
+    let wrong: [Pair; 3] = [CHAIN[0], (1, 5, &[(0, 0), (2, 1)]), (2, 5, &[(1, 0), (2, 1), (1, 1)])];
     let (_directory, path) = with_matches("matches", &wrong);
     let input = read(&path, &Limits::default(), None).expect("valid");
     assert_eq!(input.raw.track, [0, 0, 0, 1, 1, 1]);

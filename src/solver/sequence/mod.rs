@@ -46,7 +46,7 @@ pub struct Extended<'a> {
 pub enum Ended<'a> {
     Extended(Box<Extended<'a>>),
     /// Nothing stands beyond a block, if that: the best one that was tried.
-    Block(Option<Attempt>),
+    Block(Option<Box<Attempt>>),
 }
 
 /// Whether an input is one that is extended beyond a block.
@@ -95,9 +95,9 @@ pub fn solve<'a>(
         Some(seed) if seed.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some()) => {
             let extended = extend(seed, &seeding, recorder)?;
             let stands = extended.calibrations.iter().any(|outcome| outcome.metric.is_some());
-            Ok(if stands { Ended::Extended(Box::new(extended)) } else { Ended::Block(Some(extended.seed)) })
+            Ok(if stands { Ended::Extended(Box::new(extended)) } else { Ended::Block(Some(Box::new(extended.seed))) })
         }
-        unextended => Ok(Ended::Block(unextended)),
+        unextended => Ok(Ended::Block(unextended.map(Box::new))),
     }
 }
 

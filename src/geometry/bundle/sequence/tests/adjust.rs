@@ -178,7 +178,7 @@ fn free_views_among_held_ones_find_the_truth() {
 fn a_weight_counts_like_so_many_observations() {
     let (truth, sightings) = chain(8, 10, 6, 5, 0.002);
     let start = perturbed(&truth, 0.005, 8);
-    let twice = |seen: &Sighting| seen.point % 3 == 0;
+    let twice = |seen: &Sighting| seen.point.is_multiple_of(3);
     let weighted: Vec<Sighting> =
         sightings.iter().map(|seen| Sighting { weight: if twice(seen) { 2.0 } else { 1.0 }, ..*seen }).collect();
     let repeated: Vec<Sighting> =
