@@ -211,7 +211,7 @@ pub struct TrackResults {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ObservationResults {
     pub inlier: Vec<bool>,
-    /// Reprojection error in pixels; `None` where the observation was not judged.
+    /// Reprojection error in pixels, a lens's distortion undone; `None` where the observation was not judged.
     pub residual_px: Vec<Option<f64>>,
 }
 

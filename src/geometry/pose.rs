@@ -6,6 +6,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::bundle::metric::Pose;
 use super::procrustes;
+use crate::domain::StopToken;
 
 /// Correspondences that determine a pose up to four solutions.
 const SAMPLE: usize = 3;
@@ -27,6 +28,8 @@ const TOLERANCE: f64 = 1e-6;
 const REAL: f64 = 1e-4;
 /// Iterations of the eigenvalue solver; four eigenvalues take a dozen.
 const MOST_EIGEN_ITERATIONS: usize = 200;
+/// Samples between two looks at the stop token: some milliseconds.
+const STOP_EVERY: usize = 32;
 /// Newton steps that polish a root.
 const POLISH: usize = 2;
 
@@ -113,16 +116,22 @@ fn positive_roots(quartic: &[f64; 5]) -> Vec<f64> {
 /// * `seen`: images `(u, v)` at unit depth, distortion undone
 /// * `gate`: squared distance, in the same units, within which an image agrees
 ///
-/// Draws until [`CONFIDENCE`] is reached, [`MOST_SAMPLES`] at most. Returns `None` for fewer than three correspondences or
+/// Draws until [`CONFIDENCE`] is reached, [`MOST_SAMPLES`] at most; once `stop` fires, the best so far. Returns `None` for fewer than three correspondences or
 /// when no sample gives a pose.
-pub fn robust(points: &[Vector3<f64>], seen: &[Vector2<f64>], gate: f64, rng: &mut ChaCha8Rng) -> Option<Robust> {
+pub fn robust(
+    points: &[Vector3<f64>],
+    seen: &[Vector2<f64>],
+    gate: f64,
+    rng: &mut ChaCha8Rng,
+    stop: &StopToken,
+) -> Option<Robust> {
     if points.len() < SAMPLE || points.len() != seen.len() || gate.is_nan() || gate <= 0.0 {
         return None;
     }
     let wide = SAMPLE_GATES * gate;
     let mut best: Option<(Pose, f64)> = None;
     let (mut drawn, mut wanted) = (0, MOST_SAMPLES);
-    while drawn < wanted {
+    while drawn < wanted && !(drawn % STOP_EVERY == 0 && stop.is_stopped()) {
         drawn += 1;
         let sample = index::sample(rng, points.len(), SAMPLE);
         let some: [Vector3<f64>; SAMPLE] = std::array::from_fn(|k| points[sample.index(k)]);
@@ -282,9 +291,10 @@ mod tests {
         let nan = Vector3::from_element(f64::NAN);
         assert!(three_points(&[nan, same, same * 2.0], &[Vector2::zeros(); 3]).is_empty());
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        assert_eq!(robust(&[same; 2], &[Vector2::zeros(); 2], 1e-4, &mut rng), None);
-        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], 1e-4, &mut rng), None);
-        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], f64::NAN, &mut rng), None);
+        let stop = StopToken::default();
+        assert_eq!(robust(&[same; 2], &[Vector2::zeros(); 2], 1e-4, &mut rng, &stop), None);
+        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], 1e-4, &mut rng, &stop), None);
+        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], f64::NAN, &mut rng, &stop), None);
     }
 
     #[test]
@@ -300,7 +310,7 @@ mod tests {
                     *image = Vector2::new(rng.random_range(-0.4..0.4), rng.random_range(-0.4..0.4));
                 }
             }
-            let found = robust(&points, &seen, 13.8 * NOISE * NOISE, &mut rng).expect("a pose");
+            let found = robust(&points, &seen, 13.8 * NOISE * NOISE, &mut rng, &StopToken::default()).expect("a pose");
             let right = found.inlier.iter().enumerate().filter(|(k, inlier)| (k % 3 == 0) == **inlier).count();
             let away = distance(&found.pose, &scene.poses[2]);
             println!("seed {seed}: {right} of 90 verdicts right, pose off by {away}");

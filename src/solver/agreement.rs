@@ -12,9 +12,9 @@ const WORTH_A_WARNING: f64 = 2.0;
 
 /// Log focal length and its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Estimate {
-    log_focal: f64,
-    sigma: f64,
+pub struct Estimate {
+    pub log_focal: f64,
+    pub sigma: f64,
 }
 
 impl Estimate {

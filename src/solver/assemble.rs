@@ -209,23 +209,30 @@ fn outlier_density(attempt: &Attempt) -> f64 {
     1.0 / (12.0f64.sqrt() * super::portfolio::spread(&attempt.block.complete))
 }
 
-pub fn left_out(input: &Input, registered: &[usize]) -> Option<Warning> {
+/// The names with commas between them, past the first few only counted.
+pub fn listed(names: impl ExactSizeIterator<Item = String>) -> String {
+    let count = names.len();
+    let mut listed: Vec<String> = names.take(MOST_LISTED_VIEWS).collect();
+    if count > listed.len() {
+        listed.push(format!("and {} more", count - listed.len()));
+    }
+    listed.join(", ")
+}
+
+fn left_out(input: &Input, registered: &[usize]) -> Option<Warning> {
     let observed = super::block::observed_views(input);
     let missing: Vec<usize> = observed.iter().copied().filter(|view| !registered.contains(view)).collect();
     if missing.is_empty() {
         return None;
     }
-    let mut names: Vec<String> = missing.iter().take(MOST_LISTED_VIEWS).map(usize::to_string).collect();
-    if missing.len() > MOST_LISTED_VIEWS {
-        names.push(format!("and {} more", missing.len() - MOST_LISTED_VIEWS));
-    }
+    let names = listed(missing.iter().map(usize::to_string));
     Some(Warning::new(
         WarningCode::ViewsLeftOut,
         format!(
             "{} of {} views are outside the block that was solved and were left out: {}",
             missing.len(),
             observed.len(),
-            names.join(", ")
+            names
         ),
     ))
 }

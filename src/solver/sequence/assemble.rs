@@ -9,13 +9,10 @@ use crate::domain::result::ViewResult;
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::Point;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
-use crate::solver::assemble::{dehomogenise, network_weights, pixel_calibration, reprojection};
+use crate::solver::assemble::{dehomogenise, listed, network_weights, pixel_calibration, reprojection};
 use crate::solver::calibration::Outcome;
 use crate::solver::judge::{self, Geometry, Judged};
 use crate::solver::recorder::Recorder;
-
-/// Views named one by one in a warning; past these they are only counted.
-const MOST_LISTED_VIEWS: usize = 20;
 
 /// The solution of a sequence.
 ///
@@ -157,16 +154,13 @@ fn left_out(unregistered: &[Unregistered], observed: usize) -> Option<Warning> {
     if unregistered.is_empty() {
         return None;
     }
-    let named = unregistered.iter().take(MOST_LISTED_VIEWS).map(|left| match left.agreeing {
-        0 if left.points == 0 => format!("{} (sees no point of the reconstruction)", left.view),
-        agreeing => format!("{} ({agreeing} of the {} points it sees agree on a pose)", left.view, left.points),
+    let named = unregistered.iter().map(|left| match left.points {
+        0 => format!("{} (sees too few points of the reconstruction)", left.view),
+        points => format!("{} ({} of the {points} points it sees agree on a pose)", left.view, left.agreeing),
     });
-    let mut names: Vec<String> = named.collect();
-    if unregistered.len() > MOST_LISTED_VIEWS {
-        names.push(format!("and {} more", unregistered.len() - MOST_LISTED_VIEWS));
-    }
+    let names = listed(named);
     Some(Warning::new(
         WarningCode::ViewsLeftOut,
-        format!("{} of {observed} views could not be registered: {}", unregistered.len(), names.join(", ")),
+        format!("{} of {observed} views could not be registered: {}", unregistered.len(), names),
     ))
 }

@@ -182,6 +182,6 @@ fn robust_pose(
     let pair = |&k: &usize| Some((model.landmarks[scene.track_of(k)]?.position, intrinsics.ray(&scene.xy[k])?));
     let (points, rays): (Vec<_>, Vec<_>) = seen.iter().step_by(step).filter_map(pair).unzip();
     let gate = model.gate(scene) / intrinsics.focal.powi(2);
-    let found = pose::robust(&points, &rays, gate, rng)?;
+    let found = pose::robust(&points, &rays, gate, rng, scene.stop())?;
     Some((found.pose, found.inlier.iter().filter(|&&inlier| inlier).count()))
 }

@@ -8,6 +8,7 @@ use super::adjust::{self, Extract};
 use super::calibrate;
 use super::model::{Model, Scene};
 use crate::domain::{Warning, WarningCode};
+use crate::solver::agreement::Estimate;
 use crate::solver::calibration::{self, Outcome, grade_of_sigma};
 use crate::solver::{Context, Error};
 
@@ -20,13 +21,6 @@ const MOST_WINDOWS: usize = 50;
 const OF_VIEW: usize = 150;
 /// Growth of sigma from which a warning says why.
 const WORTH_A_WARNING: f64 = 3.0;
-
-/// Log focal length and its standard deviation.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Estimate {
-    pub log_focal: f64,
-    pub sigma: f64,
-}
 
 /// Several estimates as one.
 #[derive(Debug, Clone, Copy, PartialEq)]
