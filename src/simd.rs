@@ -1,4 +1,4 @@
-//! The processor's widest vectors for loops that carry the time.
+//! The processor's widest vectors, for loops that carry the time. Depends on nothing of ours.
 
 use faer::traits::ComplexField;
 
