@@ -2,14 +2,14 @@
 //!
 //! With `V = Jp' Jp` damped and factored as `L L'`, and `Q = L^-1 Jp'`, the reduced system is
 //! `Jc' (I - Q' Q) Jc`: every pair of observations of a point adds `Jc_a' (d_ab I - Q_a' Q_b) Jc_b`, a product through
-//! 2x2 blocks. That costs half of what the product of the 12x4 blocks `Jc' Jp` costs and is linear in the points.
+//! 2x2 blocks. That costs half of what the product of the 12x4 blocks `Jc' Jp` costs and is linear in the points. Where
+//! most cameras see a point, that product (`Jc' Q'` times its transpose, see [`Panel`]) is nevertheless three times as fast.
 
-use faer::linalg::matmul::triangular::{self, BlockStructure};
-use faer::{Accum, MatMut, MatRef, Par};
 use nalgebra::{Cholesky, Matrix2, SMatrix, SVector, Vector2};
 
 use super::cholesky::CholeskySolver;
 use super::engine::{Jacobian, Layout, Problem, Sink, Step, usable_squared_norm};
+use super::panel::Panel;
 use super::{Loss, Observation};
 use crate::simd::vectorised;
 
@@ -18,13 +18,6 @@ use crate::simd::vectorised;
 const GAUGE_DAMPING: f64 = 1e-9;
 /// Least diagonal of a point's block as a share of its trace, for points whose position nothing determines.
 const POINT_DAMPING: f64 = 1e-12;
-
-/// Share of all pairs of point and camera that must be observed for the points to be eliminated by [`Panel`]s, which
-/// calculate with zeros for the others: a product of panels takes about a third of the time of its pairs, whose number
-/// falls with the square of the share.
-const PANEL_SHARE: f64 = 0.6;
-/// Points of a panel: enough for the product to run at full speed, few enough for a second-level cache.
-const PANEL_POINTS: usize = 64;
 
 /// Residuals and Jacobians at one state, with their robust weights, and the diagonal blocks of `J' J`.
 pub(super) struct Linearisation<const G: usize, const C: usize, const P: usize> {
@@ -374,77 +367,38 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     }
 }
 
-/// `Jc' Q'` of some points side by side, `C` rows a camera and `P` columns a point: times its own transpose it is what
-/// eliminating the points takes off the camera blocks, by one product that runs at the processor's full speed.
-struct Panel<const C: usize, const P: usize> {
-    /// Rows: `C` times the cameras.
-    rows: usize,
-    /// Column-major.
-    values: Vec<f64>,
-}
+#[cfg(test)]
+mod tests {
+    use super::super::projective::Projective;
+    use super::super::testing;
+    use super::*;
 
-impl<const C: usize, const P: usize> Panel<C, P> {
-    /// Whether enough of the pairs of point and camera are observed.
-    fn is_worth_it(layout: &Layout, cameras: usize) -> bool {
-        let pairs = cameras * (layout.starts.len() - 1);
-        layout.observations.len() as f64 >= PANEL_SHARE * pairs as f64
-    }
-
-    fn new(cameras: usize) -> Self {
-        let rows = C * cameras;
-        Self { rows, values: Vec::with_capacity(rows * P * PANEL_POINTS) }
-    }
-
-    fn is_full(&self) -> bool {
-        self.values.len() >= self.rows * P * PANEL_POINTS
-    }
-
-    /// Appends a point's columns.
-    #[inline(always)]
-    fn push<const G: usize>(
-        &mut self,
-        observations: &[Observation],
-        jacobians: &[Jacobian<G, C, P>],
-        whitened: &[SMatrix<f64, P, 2>],
-    ) {
-        let first = self.values.len();
-        self.values.resize(first + self.rows * P, 0.0);
-        for ((seen, jacobian), whitened) in observations.iter().zip(jacobians).zip(whitened) {
-            let [u, v] = &jacobian.camera.data.0;
-            let mut k = 0;
-            while k < P {
-                let (x, y) = (whitened[(k, 0)], whitened[(k, 1)]);
-                let start = first + k * self.rows + C * seen.camera;
-                if let Some(slots) = self.values[start..].first_chunk_mut::<C>() {
-                    let mut r = 0;
-                    while r < C {
-                        slots[r] += u[r] * x + v[r] * y;
-                        r += 1;
-                    }
-                }
-                k += 1;
+    /// More points than a panel holds, some of them missing in some views and one seen twice in the same.
+    #[test]
+    fn panels_and_pairs_build_the_same_system() {
+        let scene = testing::scene(1, 5, 150, testing::NOISE);
+        let mut seen: Vec<Observation> =
+            scene.observations.iter().copied().filter(|seen| (seen.point + seen.camera) % 7 != 0).collect();
+        seen.push(Observation { xy: seen[0].xy + Vector2::new(0.01, 0.0), ..seen[0] });
+        let cameras = scene.poses.iter().map(|pose| pose.camera(&scene.intrinsics)).collect();
+        let problem = Projective { cameras, points: scene.points.iter().map(|point| point.push(1.0)).collect() };
+        let layout = Layout::new(&seen, 5, 150);
+        let mut linearisation = Linearisation::new(&layout, 5);
+        linearisation.fill(&problem, &layout, Loss::Squared);
+        let build = |by_panels: bool| {
+            let mut reduced = Reduced::new(&layout, 5);
+            reduced.panel = by_panels.then(|| Panel::new(5));
+            assert!(reduced.build(&problem, &layout, &linearisation, 1e-3));
+            (reduced.matrix, reduced.vector)
+        };
+        let ((panels, right), (pairs, expected)) = (build(true), build(false));
+        assert_eq!(right, expected);
+        let largest = pairs.iter().fold(0.0f64, |largest, value| largest.max(value.abs()));
+        for column in 0..60 {
+            for row in column..60 {
+                let (a, b) = (panels[60 * column + row], pairs[60 * column + row]);
+                assert!((a - b).abs() < 1e-12 * largest, "row {row}, column {column}: {a} and {b}");
             }
         }
-    }
-
-    /// Subtracts the product with its transpose from the lower triangle of `matrix` below and right of `offset`, and
-    /// empties the panel.
-    fn subtract(&mut self, matrix: &mut [f64], offset: usize) {
-        let dimension = offset + self.rows;
-        let panel = MatRef::from_column_major_slice(&self.values, self.rows, self.values.len() / self.rows.max(1));
-        let cameras = MatMut::from_column_major_slice_mut(matrix, dimension, dimension)
-            .submatrix_mut(offset, offset, self.rows, self.rows);
-        triangular::matmul(
-            cameras,
-            BlockStructure::TriangularLower,
-            Accum::Add,
-            panel,
-            BlockStructure::Rectangular,
-            panel.transpose(),
-            BlockStructure::Rectangular,
-            -1.0,
-            Par::Seq,
-        );
-        self.values.clear();
     }
 }
