@@ -26,6 +26,7 @@ pub mod geometry;
 pub mod network;
 pub mod report;
 pub mod rpc;
+mod simd;
 pub mod solver;
 pub mod store;
 pub mod synthetic;

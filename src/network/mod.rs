@@ -1,6 +1,6 @@
 //! The paper's network, optimised on each request's own measurement matrix: PointNet on burn, its three losses, Adam.
 //!
-//! May depend on `domain` only (and, in tests, on `synthetic`); nothing else of ours sees burn. Everything in here
+//! May depend on `domain` and `simd` only (and, in tests, on `synthetic`); nothing else of ours sees burn. Everything in here
 //! runs on the calling thread: burn is built without its thread pool.
 //!
 //! # Where this departs from the paper, and why
@@ -35,8 +35,11 @@
 
 pub mod losses;
 mod parameter;
+mod pass;
 mod pointnet;
 mod prior;
+#[cfg(test)]
+mod reference;
 mod settings;
 #[cfg(test)]
 mod tests;

@@ -43,9 +43,14 @@ impl Parameter {
         &self.values
     }
 
-    /// The array as a leaf of a new autodiff graph.
-    pub fn leaf(&self, device: &Device) -> Tensor<2> {
-        Tensor::from_data(TensorData::new(self.values.clone(), self.shape), device).require_grad()
+    /// Rows and columns.
+    pub fn shape(&self) -> [usize; 2] {
+        self.shape
+    }
+
+    /// The array on a device.
+    pub fn tensor(&self, device: &Device) -> Tensor<2> {
+        Tensor::from_data(TensorData::new(self.values.clone(), self.shape), device)
     }
 
     /// One Adam step. Entries of the gradient that are not finite count as 0; returns how many there were.

@@ -15,7 +15,6 @@
 //! Subtracting the mean commutes with `W`: `W X - mean(W X) = W (X - mean X)`. The layers here centre their input,
 //! which is the narrower side.
 
-use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -26,7 +25,7 @@ use super::parameter::Parameter;
 /// Features of the trunk at full width; the local feature is what leaves layer [`LOCAL_LAYER`].
 const TRUNK: [usize; 5] = [64, 64, 64, 128, 1024];
 /// Layer of the trunk, counted from 0, after which the local feature is taken.
-const LOCAL_LAYER: usize = 1;
+pub const LOCAL_LAYER: usize = 1;
 /// Hidden features of the segmentation head at full width.
 const SEGMENTATION: [usize; 3] = [512, 256, 128];
 /// Hidden features of the classification head at full width.
@@ -35,7 +34,7 @@ const CLASSIFICATION: [usize; 2] = [512, 256];
 const MIN_FEATURES: usize = 8;
 /// Added to a variance before it divides. Small next to the variances of the first layers (about 1), large enough to
 /// leave a feature that hardly varies alone.
-const VARIANCE_FLOOR: f64 = 1e-3;
+pub const VARIANCE_FLOOR: f32 = 1e-3;
 /// He et al. 2015: variance of a weight times its fan-in, for layers that rectify.
 const RECTIFIED_GAIN: f64 = 2.0;
 /// The same for the logits: small, so that all weights start near 1/2.
@@ -54,22 +53,14 @@ pub struct Layer<T> {
     pub bias: T,
 }
 
-/// The network's arrays: as [`Parameter`]s between iterations, as tensors of one graph within one.
+/// The network's arrays, or something for each of them.
 #[derive(Debug, Clone)]
 pub struct PointNet<T> {
-    trunk: Vec<Layer<T>>,
-    segmentation: Vec<Layer<T>>,
-    logit: Layer<T>,
-    classification: Vec<Layer<T>>,
-    plane: Layer<T>,
-}
-
-/// What the network says of a cloud of m columns.
-pub struct Output {
-    /// Logits of the weights, 1 x m.
-    pub logits: Tensor<2>,
-    /// Plane at infinity, 3 x 1.
-    pub plane: Tensor<2>,
+    pub trunk: Vec<Layer<T>>,
+    pub segmentation: Vec<Layer<T>>,
+    pub logit: Layer<T>,
+    pub classification: Vec<Layer<T>>,
+    pub plane: Layer<T>,
 }
 
 /// Logarithm of the focal length, the one parameter outside the PointNet.
@@ -114,23 +105,6 @@ impl PointNet<Parameter> {
         let plane = Layer::new([3, last], last, PLANE_GAIN, false, &mut rng);
         Self { trunk, segmentation: segmentation_layers, logit, classification: classification_layers, plane }
     }
-
-    /// The arrays as leaves of a new graph.
-    pub fn leaves(&self, device: &Device) -> PointNet<Tensor<2>> {
-        let layer = |layer: &Layer<Parameter>| Layer {
-            weight: layer.weight.leaf(device),
-            gain: layer.gain.as_ref().map(|gain| gain.leaf(device)),
-            bias: layer.bias.leaf(device),
-        };
-        let layers = |layers: &[Layer<Parameter>]| layers.iter().map(layer).collect();
-        PointNet {
-            trunk: layers(&self.trunk),
-            segmentation: layers(&self.segmentation),
-            logit: layer(&self.logit),
-            classification: layers(&self.classification),
-            plane: layer(&self.plane),
-        }
-    }
 }
 
 impl Layer<Parameter> {
@@ -147,8 +121,10 @@ impl Layer<Parameter> {
 
 impl<T> PointNet<T> {
     /// Every array, in a fixed order that [`Self::arrays_mut`] shares.
-    pub fn arrays(&self) -> impl Iterator<Item = &T> {
-        self.layers().flat_map(|layer| [Some(&layer.weight), layer.gain.as_ref(), Some(&layer.bias)]).flatten()
+    pub fn into_arrays(self) -> impl Iterator<Item = T> {
+        let Self { trunk, segmentation, logit, classification, plane } = self;
+        let layers = trunk.into_iter().chain(segmentation).chain([logit]).chain(classification).chain([plane]);
+        layers.flat_map(|layer| [Some(layer.weight), layer.gain, Some(layer.bias)]).flatten()
     }
 
     /// Every array, to be changed.
@@ -157,86 +133,6 @@ impl<T> PointNet<T> {
         let layers = trunk.iter_mut().chain(segmentation).chain([logit]).chain(classification).chain([plane]);
         layers.flat_map(|layer| [Some(&mut layer.weight), layer.gain.as_mut(), Some(&mut layer.bias)]).flatten()
     }
-
-    fn layers(&self) -> impl Iterator<Item = &Layer<T>> {
-        let heads = self.segmentation.iter().chain([&self.logit]).chain(&self.classification).chain([&self.plane]);
-        self.trunk.iter().chain(heads)
-    }
-}
-
-impl PointNet<Tensor<2>> {
-    /// Runs the network on a cloud (rows x m) whose rows have mean 0.
-    ///
-    /// With `plane_apart` no gradient of the plane reaches the trunk, only the classification head.
-    pub fn forward(&self, centred: Tensor<2>, plane_apart: bool) -> Output {
-        let mut features = self.trunk[0].normalised(centred);
-        for layer in &self.trunk[1..=LOCAL_LAYER] {
-            features = layer.normalised(centre(features));
-        }
-        let local = centre(features);
-
-        let mut features = self.segmentation[0].normalised(local.clone());
-        for layer in &self.segmentation[1..] {
-            features = layer.normalised(centre(features));
-        }
-        let logits = self.logit.affine(features);
-
-        let upper = &self.trunk[LOCAL_LAYER + 1..];
-        let mut global = if plane_apart {
-            // Off the graph, which would only keep what no gradient asks for.
-            let upper: Vec<_> = upper.iter().map(Layer::untracked).collect();
-            Tensor::from_inner(global_feature(&upper, local.inner()))
-        } else {
-            global_feature(upper, local)
-        };
-        for layer in &self.classification {
-            global = relu(layer.affine(global));
-        }
-        Output { logits, plane: self.plane.affine(global) }
-    }
-}
-
-/// The largest response of every feature of the trunk's upper layers to a cloud whose rows have mean 0.
-fn global_feature(layers: &[Layer<Tensor<2>>], local: Tensor<2>) -> Tensor<2> {
-    let mut features = local;
-    for (index, layer) in layers.iter().enumerate() {
-        let input = if index == 0 { features } else { centre(features) };
-        features = layer.normalised(input);
-    }
-    features.max_dim(1)
-}
-
-impl Layer<Tensor<2>> {
-    /// The same values outside the graph.
-    fn untracked(&self) -> Self {
-        let inner = |tensor: &Tensor<2>| tensor.clone().inner();
-        Self { weight: inner(&self.weight), gain: self.gain.as_ref().map(inner), bias: inner(&self.bias) }
-    }
-
-    /// `W X + b`.
-    fn affine(&self, input: Tensor<2>) -> Tensor<2> {
-        self.weight.clone().matmul(input) + self.bias.clone()
-    }
-
-    /// `max(0, gain · W X / sqrt(var(W X) + ε) + b)` for an X whose rows have mean 0, so that those of W X have, too.
-    fn normalised(&self, centred: Tensor<2>) -> Tensor<2> {
-        let response = self.weight.clone().matmul(centred);
-        let columns = response.dims()[1] as f64;
-        let variance = (response.clone() * response.clone()).sum_dim(1).div_scalar(columns);
-        let deviation = variance.add_scalar(VARIANCE_FLOOR).sqrt();
-        let scale = match &self.gain {
-            Some(gain) => gain.clone() / deviation,
-            None => deviation.recip(),
-        };
-        relu(response * scale + self.bias.clone())
-    }
-}
-
-/// Subtracts the mean over the columns from every row.
-fn centre(features: Tensor<2>) -> Tensor<2> {
-    let columns = features.dims()[1] as f64;
-    let mean = features.clone().sum_dim(1).div_scalar(columns);
-    features - mean
 }
 
 /// A constant `rows` x `columns` tensor from values row by row.
@@ -253,7 +149,7 @@ pub fn values_of(tensor: Tensor<2>) -> Result<Vec<f32>, Error> {
 }
 
 /// Box-Muller; one of the pair is enough here.
-fn standard_normal(rng: &mut ChaCha8Rng) -> f64 {
+pub fn standard_normal(rng: &mut ChaCha8Rng) -> f64 {
     let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
     radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
 }
@@ -261,30 +157,6 @@ fn standard_normal(rng: &mut ChaCha8Rng) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// The first segmentation layer on [local | global], as PointNet has it, says the same whatever the global feature.
-    #[test]
-    fn the_global_feature_cancels_in_the_segmentation_head() {
-        const COLUMNS: usize = 40;
-        let device = Device::flex();
-        let mut rng = ChaCha8Rng::seed_from_u64(5);
-        let mut draw = |count: usize| (0..count).map(|_| standard_normal(&mut rng) as f32).collect::<Vec<f32>>();
-        let tensor = |values: Vec<f32>, shape| constant(values, shape, &device);
-        let (local, global) = (tensor(draw(6 * COLUMNS), [6, COLUMNS]), tensor(draw(9), [9, 1]));
-        let (on_local, on_global) = (tensor(draw(12 * 6), [12, 6]), tensor(draw(12 * 9), [12, 9]));
-        let bias = tensor(draw(12), [12, 1]);
-        let layer = |weight| Layer { weight, gain: None, bias: bias.clone() };
-
-        let every_column = global.repeat_dim(1, COLUMNS);
-        let concatenated = layer(Tensor::cat(vec![on_local.clone(), on_global], 1))
-            .normalised(centre(Tensor::cat(vec![local.clone(), every_column], 0)));
-        let alone = layer(on_local).normalised(centre(local));
-        let pair = values_of(concatenated).expect("f32").into_iter().zip(values_of(alone).expect("f32"));
-        assert!(pair.clone().any(|(a, _)| a > 1.0));
-        for (a, b) in pair {
-            assert!((a - b).abs() < 1e-5, "{a} and {b}");
-        }
-    }
 
     #[test]
     fn widths_are_shares_of_the_original() {

@@ -5,6 +5,7 @@ use nalgebra::DMatrix;
 
 use super::losses::{self, Evaluation, LossSettings};
 use super::parameter::Parameter;
+use super::pass::Pass;
 use super::pointnet::{self, PointNet};
 use super::{Error, NetworkSettings};
 use crate::domain::{Backend, Losses};
@@ -145,13 +146,12 @@ impl PriorNetwork {
 
     /// Forward, losses, backward; changes nothing but what the network was last seen to say.
     ///
-    /// The backward pass starts from the surrogate `Σ_j g_j z_j + g_n · n`, linear in the network's outputs, whose
-    /// derivatives at this point are those of the loss. The focal length is no output; its derivative is passed on.
+    /// The backward pass starts from the derivatives with respect to the network's outputs. The focal length is no output;
+    /// its derivative is passed on.
     pub(super) fn differentiate(&mut self) -> Result<Slope, Error> {
         let daq_on_weights = self.daq_acts_on_weights();
-        let leaves = self.network.leaves(&self.device);
-        let output = leaves.forward(self.cloud.clone(), !daq_on_weights);
-        self.read(&output)?;
+        let pass = self.network.forward(&self.cloud, !daq_on_weights, &self.device)?;
+        self.read(&pass)?;
         let evaluation = losses::evaluate(
             &self.balanced,
             &self.weights,
@@ -161,27 +161,18 @@ impl PriorNetwork {
         )?;
         let gradients = self.gradients(&evaluation, daq_on_weights);
 
-        let columns = gradients.logits.len();
-        let on_logits = pointnet::constant(gradients.logits, [1, columns], &self.device);
-        let mut surrogate = (output.logits * on_logits).sum();
-        if self.settings.use_daq {
-            let on_plane = pointnet::constant(gradients.plane.to_vec(), [3, 1], &self.device);
-            surrogate = surrogate + (output.plane * on_plane).sum();
-        }
-        let mut reached = surrogate.backward();
-        let arrays = leaves.arrays().map(|leaf| leaf.grad_remove(&mut reached).map(pointnet::values_of).transpose());
+        let on_plane = self.settings.use_daq.then_some(gradients.plane);
+        let gradient = pass.backward(gradients.logits, on_plane)?;
         Ok(Slope {
             losses: evaluation.losses,
-            arrays: arrays.collect::<Result<_, _>>()?,
+            arrays: gradient.into_arrays().collect(),
             log_focal: gradients.log_focal,
         })
     }
 
     /// Takes weights and plane from the network's output.
-    fn read(&mut self, output: &pointnet::Output) -> Result<(), Error> {
-        let logits = pointnet::values_of(output.logits.clone().inner())?;
-        let plane = pointnet::values_of(output.plane.clone().inner())?;
-        if logits.iter().chain(&plane).any(|value| !value.is_finite()) {
+    fn read(&mut self, Pass { logits, plane, .. }: &Pass) -> Result<(), Error> {
+        if logits.iter().chain(plane).any(|value| !value.is_finite()) {
             return Err(Error::Diverged { iteration: self.iteration + 1 });
         }
         self.weights = logits.iter().map(|&logit| sigmoid(f64::from(logit))).collect();
@@ -224,7 +215,6 @@ fn device(backend: Backend) -> Device {
         Backend::Flex => Device::flex(),
         Backend::Ndarray => Device::ndarray(),
     }
-    .autodiff()
 }
 
 fn check(balanced: &DMatrix<f64>) -> Result<(), Error> {

@@ -117,22 +117,62 @@ pub fn judge(block: &CompleteBlock, cameras: Vec<Camera>, noise: f64, stop: &Sto
     Consensus { cameras, points, squared, inlier, noise, score }
 }
 
-/// Adjusts cameras to a support of tracks, starting from the points of `consensus`.
-fn adjust(
-    block: &CompleteBlock,
-    cameras: &[Camera],
-    points: Vec<Point>,
-    support: &[usize],
+/// Fits at one noise level, and where those ended that converged: the same support under the same loss ends there again,
+/// so that it is looked up instead.
+///
+/// Growing and polishing come back to a support that stands still several times each: with 100 right tracks in 11 views,
+/// 37 adjustments become 11.
+struct Fits<'a> {
+    block: &'a CompleteBlock,
+    noise: f64,
+    stop: &'a StopToken,
+    converged: Vec<Converged>,
+}
+
+/// A fit that more iterations would not change.
+struct Converged {
+    support: Vec<usize>,
     loss: Loss,
-    iterations: usize,
-    stop: &StopToken,
-) -> Vec<Camera> {
-    let mut cameras = cameras.to_vec();
-    let mut points = points;
-    let observations = observations_of(block, support);
-    let options = bundle::Options { max_iterations: iterations, loss, ..bundle::Options::default() };
-    projective::adjust(&mut cameras, &mut points, &observations, &options, stop);
-    cameras
+    judged: Consensus,
+}
+
+impl<'a> Fits<'a> {
+    fn new(block: &'a CompleteBlock, noise: f64, stop: &'a StopToken) -> Self {
+        Self { block, noise, stop, converged: Vec::new() }
+    }
+
+    /// Every track judged by the cameras that fit a support, found from a start near by; whether more iterations could
+    /// change them.
+    ///
+    /// * `points`: of the support, in its order
+    fn fit(
+        &mut self,
+        cameras: &[Camera],
+        points: Vec<Point>,
+        support: &[usize],
+        loss: Loss,
+        iterations: usize,
+    ) -> (Consensus, bool) {
+        if let Some(known) = self.converged.iter().find(|known| known.loss == loss && known.support == support) {
+            return (known.judged.clone(), true);
+        }
+        let (mut cameras, mut points) = (cameras.to_vec(), points);
+        let observations = observations_of(self.block, support);
+        let options = bundle::Options { max_iterations: iterations, loss, ..bundle::Options::default() };
+        let report = projective::adjust(&mut cameras, &mut points, &observations, &options, self.stop);
+        let judged = judge(self.block, cameras, self.noise, self.stop);
+        let converged = report.iterations < iterations && !self.stop.is_stopped();
+        if converged {
+            self.converged.push(Converged { support: support.to_vec(), loss, judged: judged.clone() });
+        }
+        (judged, converged)
+    }
+
+    /// The same from where a consensus stands.
+    fn refit(&mut self, from: &Consensus, support: &[usize], loss: Loss, iterations: usize) -> Consensus {
+        let points = support.iter().map(|&track| from.points[track]).collect();
+        self.fit(&from.cameras, points, support, loss, iterations).0
+    }
 }
 
 /// The sightings of some tracks as observations; point `k` is `support[k]`.
@@ -157,7 +197,8 @@ pub fn grow(
     noise: f64,
     stop: &StopToken,
 ) -> Option<Consensus> {
-    grow_roughly(block, cameras, points, support, noise, stop).map(|consensus| polish(block, consensus, stop))
+    let mut fits = Fits::new(block, noise, stop);
+    grow_with(&mut fits, cameras, points, support).map(|consensus| polish_with(&mut fits, consensus))
 }
 
 /// The same without the polish.
@@ -169,6 +210,11 @@ pub fn grow_roughly(
     noise: f64,
     stop: &StopToken,
 ) -> Option<Consensus> {
+    grow_with(&mut Fits::new(block, noise, stop), cameras, points, support)
+}
+
+fn grow_with(fits: &mut Fits, cameras: Vec<Camera>, points: Vec<Point>, support: Vec<usize>) -> Option<Consensus> {
+    let (block, noise) = (fits.block, fits.noise);
     if support.len() < LEAST_SUPPORT || block.views() < 2 {
         return None;
     }
@@ -178,8 +224,8 @@ pub fn grow_roughly(
     for round in 0..GROWING_ROUNDS {
         let loss = if support.len() > PLAIN_SUPPORT { robust(noise) } else { Loss::Squared };
         let iterations = if round < 3 { ADJUSTMENTS.0 } else { ADJUSTMENTS.1 };
-        cameras = adjust(block, &cameras, points, &support, loss, iterations, stop);
-        let judged = judge(block, cameras.clone(), noise, stop);
+        let (judged, converged) = fits.fit(&cameras, points, &support, loss, iterations);
+        cameras = judged.cameras.clone();
         let next = next_support(&judged, support.len(), block.views());
         points = next.iter().map(|&track| judged.points[track]).collect();
         if best.as_ref().is_none_or(|best| judged.score < best.score - 1e-12) {
@@ -188,7 +234,8 @@ pub fn grow_roughly(
         } else {
             idle += 1;
         }
-        if idle >= PATIENCE || (round > 1 && next == support) || stop.is_stopped() {
+        let stands_still = next == support && (converged || round > 1);
+        if idle >= PATIENCE || stands_still || fits.stop.is_stopped() {
             break;
         }
         support = next;
@@ -233,7 +280,11 @@ fn next_support(judged: &Consensus, size: usize, views: usize) -> Vec<usize> {
 
 /// Inflates the gate and tightens it again, keeping what gets better.
 pub fn polish(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> Consensus {
-    let noise = consensus.noise;
+    polish_with(&mut Fits::new(block, consensus.noise, stop), consensus)
+}
+
+fn polish_with(fits: &mut Fits, consensus: Consensus) -> Consensus {
+    let (block, noise) = (fits.block, fits.noise);
     let gate = gate(block.views()) * noise * noise;
     let mut best = consensus;
     for _ in 0..POLISH_ROUNDS {
@@ -244,13 +295,11 @@ pub fn polish(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> 
             let support: Vec<usize> =
                 (0..block.tracks()).filter(|&track| current.squared[track] < inflation * gate).collect();
             let too_many = inflation > 1.0 && support.len() > 3 * best.inlier_count().max(LEAST_SUPPORT);
-            if support.len() < LEAST_SUPPORT || too_many || stop.is_stopped() {
+            if support.len() < LEAST_SUPPORT || too_many || fits.stop.is_stopped() {
                 continue;
             }
             let loss = if inflation > 1.0 { robust(noise) } else { Loss::Squared };
-            let points = support.iter().map(|&track| current.points[track]).collect();
-            let cameras = adjust(block, &current.cameras, points, &support, loss, ADJUSTMENTS.1, stop);
-            current = judge(block, cameras, noise, stop);
+            current = fits.refit(&current, &support, loss, ADJUSTMENTS.1);
             if current.score < best.score {
                 best = current.clone();
             }
@@ -289,9 +338,9 @@ fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -
         }
         let noise = estimate_noise(&current, &inliers);
         let settled = (noise / current.noise - 1.0).abs() < NOISE_SETTLED;
-        let points = inliers.iter().map(|&track| current.points[track]).collect();
-        let cameras = adjust(block, &current.cameras, points, &inliers, robust(noise), ADJUSTMENTS.0, stop);
-        let refitted = polish(block, judge(block, cameras, noise, stop), stop);
+        let mut fits = Fits::new(block, noise, stop);
+        let fitted = fits.refit(&current, &inliers, robust(noise), ADJUSTMENTS.0);
+        let refitted = polish_with(&mut fits, fitted);
         // A noise level at which the consensus falls apart was estimated from a fit too flexible to trust.
         if refitted.inlier_count() < LEAST_INLIERS {
             break;

@@ -1,7 +1,7 @@
 //! Bundle adjustment by Levenberg-Marquardt on the Schur complement of the points, projective and metric.
 //!
 //! One engine serves both problems; what they share (observations, robust loss, options, report) lives here. May
-//! depend on nothing of `geometry` but linear algebra.
+//! depend on nothing of `geometry`, only on linear algebra.
 //!
 //! Image coordinates are normalised throughout: pixels minus the guessed principal point, over the larger image side.
 
@@ -11,6 +11,7 @@ pub mod critical;
 mod engine;
 mod intrinsics;
 pub mod metric;
+mod panel;
 pub mod projective;
 mod reduced;
 pub mod sequence;
