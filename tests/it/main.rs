@@ -6,5 +6,6 @@ mod crash;
 mod formats;
 mod load;
 mod readme;
+mod sequence;
 mod support;
 mod telemetry;

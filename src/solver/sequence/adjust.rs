@@ -24,8 +24,6 @@ const VIEWS_AROUND: usize = 6;
 const RAYLEIGH_MEDIAN: f64 = 1.177_41;
 /// Least share of the observations' freedom that is left to the residuals, however few landmarks there are.
 const LEAST_FREEDOM: f64 = 0.2;
-/// Least noise that is believed, pixels: exact input would close every gate.
-const LEAST_NOISE_PX: f64 = 0.01;
 
 /// The part of a model that is adjusted together.
 pub struct Extract {
@@ -199,10 +197,7 @@ fn finish(scene: &Scene, model: &mut Model, extract: &Extract) {
         return;
     }
     extract.write_back(model);
-    let noise = extract.noise();
-    if noise.is_finite() {
-        model.noise = noise.max(LEAST_NOISE_PX / scene.context.scale_px);
-    }
+    model.set_noise(scene, extract.noise());
 }
 
 /// Tracks with a verified landmark, increasing.

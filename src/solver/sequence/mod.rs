@@ -22,7 +22,7 @@ use super::attempt::{self, Attempt};
 use super::calibration::Outcome;
 use super::recorder::Recorder;
 use super::{Context, Error, block};
-use crate::domain::{Grade, Method, Stage};
+use crate::domain::{Grade, Method, Stage, Warning, WarningCode};
 use model::{Model, Scene};
 
 /// Rounds of adjusting everything and triangulating it anew that end an extension; the third moves nothing that a
@@ -117,11 +117,24 @@ fn extend<'a>(seed: Attempt, context: &Context<'a>, recorder: &mut Recorder) -> 
     }
     context.stopped()?;
     recorder.enter(Stage::Calibrate);
-    let calibrations = calibrate::calibrate(&scene, &mut model, context)?;
+    let mut calibrations = calibrate::calibrate(&scene, &mut model, context)?;
+    if model.is_strained {
+        calibrations.iter_mut().for_each(|outcome| refuse(outcome, &model, context));
+    }
     context.stopped()?;
     parts::largest_first(&mut model);
     let unregistered = register::left(&scene, &model, &trials);
     Ok(Extended { seed, scene, model, calibrations, unregistered })
+}
+
+/// Takes back a calibration under which the sequence does not hold together.
+fn refuse(outcome: &mut Outcome, model: &Model, context: &Context) {
+    let detail = format!(
+        "the views together fit much worse than the block that they were registered against: more than {:.2} px",
+        model.noise * context.scale_px
+    );
+    outcome.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
+    outcome.grade = Grade::ProjectiveOnly;
 }
 
 impl Extended<'_> {

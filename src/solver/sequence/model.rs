@@ -99,7 +99,17 @@ pub struct Model {
     pub supported: Vec<usize>,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
+    /// Noise of the seed, whose gates found it.
+    seed_noise: f64,
+    /// Whether the residuals would have asked for more noise than [`NOISE_GROWTH`] allows.
+    pub is_strained: bool,
 }
+
+/// Noise that a sequence may have, in that of its seed: the seed's is measured without a calibration, and a metric
+/// reconstruction that fits four times worse is wrong. Without a bound wrong observations widen their own gates.
+const NOISE_GROWTH: f64 = 4.0;
+/// Least noise that is believed, pixels: exact input would close every gate.
+const LEAST_NOISE_PX: f64 = 0.01;
 
 impl Model {
     /// A model of nothing yet, with this noise, all cameras like this one.
@@ -114,6 +124,18 @@ impl Model {
             kept: vec![false; scene.xy.len()],
             supported: vec![0; views],
             noise,
+            seed_noise: noise,
+            is_strained: false,
+        }
+    }
+
+    /// Takes the noise that the residuals show, within bounds.
+    pub fn set_noise(&mut self, scene: &Scene, noise: f64) {
+        let least = LEAST_NOISE_PX / scene.context.scale_px;
+        let most = NOISE_GROWTH * self.seed_noise.max(least);
+        if noise.is_finite() {
+            self.is_strained = noise > most;
+            self.noise = noise.clamp(least, most);
         }
     }
 
