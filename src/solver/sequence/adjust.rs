@@ -233,7 +233,11 @@ pub fn covering(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -
 
 /// Scales a part so that its median depth becomes 1: scale is free, and adjustments damp best near unit lengths.
 pub fn rescale(scene: &Scene, model: &mut Model, part: u32) {
-    let mut depths: Vec<f64> = (0..scene.xy.len())
+    let views = model.of_part(part);
+    let mut depths: Vec<f64> = views
+        .iter()
+        .flat_map(|&view| &scene.of_view[view])
+        .map(|&k| k as usize)
         .filter(|&k| model.kept[k])
         .filter_map(|k| {
             let pose = model.poses[scene.view_of(k)]?;
@@ -245,7 +249,7 @@ pub fn rescale(scene: &Scene, model: &mut Model, part: u32) {
     if !(scale.is_finite() && scale > 0.0) {
         return;
     }
-    for view in model.of_part(part) {
+    for view in views {
         if let Some(pose) = &mut model.poses[view] {
             pose.translation *= scale;
         }

@@ -60,11 +60,12 @@ pub fn others(
             continue;
         };
         model.add_part(scene, part, &attempt.block.views, metric);
-        structure::triangulate(scene, model);
+        structure::triangulate_seen(scene, model, &attempt.block.views);
         register::join(scene, model, part, trials, recorder)?;
         if !stands(scene, model, part) {
+            let views = model.of_part(part);
             model.remove_part(part);
-            structure::triangulate(scene, model);
+            structure::triangulate_seen(scene, model, &views);
         }
         for (open, pose) in open.iter_mut().zip(&model.poses) {
             *open &= pose.is_none();

@@ -105,7 +105,7 @@ pub fn left(scene: &Scene, model: &Model, trials: &[Trial]) -> Vec<Unregistered>
 fn settle(scene: &Scene, model: &mut Model, part: u32) {
     adjust::while_growing(scene, model, part);
     adjust::rescale(scene, model, part);
-    structure::triangulate(scene, model);
+    structure::triangulate_seen(scene, model, &model.of_part(part));
 }
 
 /// Observations of a view whose track has a point of the part that may support a pose.
@@ -151,10 +151,9 @@ fn register(scene: &Scene, model: &mut Model, part: u32, view: usize, seen: &[us
     }
     model.lenses[scene.group_of[view]].intrinsics = intrinsics;
     model.register(scene, view, part, pose);
-    let tracks: Vec<usize> = scene.of_view[view].iter().map(|&k| scene.track_of(k as usize)).collect();
-    structure::triangulate_some(scene, model, &tracks);
+    structure::triangulate_seen(scene, model, &[view]);
     adjust::around(scene, model, view, is_new_camera);
-    structure::triangulate_some(scene, model, &tracks);
+    structure::triangulate_seen(scene, model, &[view]);
     agreeing
 }
 

@@ -22,6 +22,15 @@ pub fn triangulate(scene: &Scene, model: &mut Model) {
     triangulate_some(scene, model, &tracks);
 }
 
+/// Triangulates every track that these views see anew.
+pub fn triangulate_seen(scene: &Scene, model: &mut Model, views: &[usize]) {
+    let seen = views.iter().flat_map(|&view| &scene.of_view[view]).map(|&k| scene.track_of(k as usize));
+    let mut tracks: Vec<usize> = seen.collect();
+    tracks.sort_unstable();
+    tracks.dedup();
+    triangulate_some(scene, model, &tracks);
+}
+
 /// Triangulates these tracks anew from the registered views.
 pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
     let cameras: Vec<Camera> =

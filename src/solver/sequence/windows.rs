@@ -19,8 +19,9 @@ const LEAST_VIEWS: usize = 5;
 const MOST_WINDOWS: usize = 50;
 /// Observations of a view that a window holds.
 const OF_VIEW: usize = 150;
-/// Growth of sigma from which a warning says why.
+/// Growth of sigma from which a warning says why, and the sigma from which anyone minds: a quarter of a METRIC one.
 const WORTH_A_WARNING: f64 = 3.0;
+const WORTH_MINDING: f64 = 0.005;
 
 /// Several estimates as one.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -46,7 +47,7 @@ pub fn reconcile(
     let sigma = own.max(fused.sigma);
     outcome.sigma_log_focal = Some(sigma);
     outcome.grade = outcome.grade.worse(grade_of_sigma(Some(sigma)));
-    if sigma > WORTH_A_WARNING * own {
+    if sigma > WORTH_A_WARNING * own && sigma > WORTH_MINDING {
         outcome.warnings.push(Warning::new(
             WarningCode::ModelMismatch,
             format!(
