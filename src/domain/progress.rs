@@ -21,7 +21,7 @@ pub enum Stage {
 }
 
 impl Stage {
-    /// Every stage in the order in which a solve passes them.
+    /// Every stage in the order in which a solve passes them first; an extension is calibrated once more.
     pub const ALL: [Stage; 6] =
         [Stage::Prepare, Stage::Search, Stage::Refine, Stage::Calibrate, Stage::Extend, Stage::Judge];
 

@@ -275,9 +275,9 @@ impl Solution {
 
     /// Whether the scene was solved and yet says nothing of the focal length: its standard deviation is infinite.
     pub fn is_focal_unobservable(&self) -> bool {
-        match self.calibrations.first() {
-            Some(calibration) => calibration.sigma_log_focal.is_none(),
-            None => self.grade == Some(Grade::ProjectiveOnly),
+        match self.calibrations.as_slice() {
+            [] => self.grade == Some(Grade::ProjectiveOnly),
+            calibrations => calibrations.iter().all(|calibration| calibration.sigma_log_focal.is_none()),
         }
     }
 

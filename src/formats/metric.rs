@@ -129,7 +129,9 @@ fn images(solution: &Solution, input: &LabelledInput) -> (Vec<Camera>, Vec<Image
     let mut images: Vec<Image> = Vec::new();
     let mut image_of_view = vec![None; solution.views.len()];
     let mut own_groups = Vec::new();
-    for (view, result) in solution.views.iter().enumerate() {
+    // Other parts have frames of their own, which these files have no word for.
+    let largest = solution.views.iter().enumerate().filter(|(_, result)| result.part == 0);
+    for (view, result) in largest {
         let calibration = groups.get(view).and_then(|&group| Some((group, solution.calibrations.get(group)?)));
         let (Some(rotation), Some(translation), Some((group, calibration))) =
             (result.rotation, result.translation, calibration)

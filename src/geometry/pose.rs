@@ -138,9 +138,12 @@ pub fn robust(
         let uv: [Vector2<f64>; SAMPLE] = std::array::from_fn(|k| seen[sample.index(k)]);
         for pose in three_points(&some, &uv) {
             let to_beat = best.map_or(f64::INFINITY, |(_, cost)| cost);
-            if truncated(&pose, points, seen, wide, to_beat) < to_beat {
-                let better = refine(pose, points, seen, wide);
-                let cost = truncated(&better, points, seen, wide, f64::INFINITY);
+            let cost = truncated(&pose, points, seen, wide, to_beat);
+            if cost < to_beat {
+                // The refinement minimises another cost, and may do this one no good.
+                let refined = refine(pose, points, seen, wide);
+                let refined_cost = truncated(&refined, points, seen, wide, cost);
+                let (better, cost) = if refined_cost < cost { (refined, refined_cost) } else { (pose, cost) };
                 let share = inliers(&better, points, seen, wide).iter().filter(|&&inlier| inlier).count() as f64
                     / points.len() as f64;
                 wanted = samples_wanted(share);

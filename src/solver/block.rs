@@ -158,11 +158,14 @@ pub fn candidate_views_of_one_camera(input: &Input, ranges: &[usize], stop: &Sto
     (0..input.observation_count()).for_each(|k| observed[group_of[input.view_of(k)]] += 1);
     let mut order: Vec<usize> = (0..groups).collect();
     order.sort_by_key(|&group| (std::cmp::Reverse(observed[group]), group));
-    let of_group = |group: usize| {
+    let mut found: Vec<Vec<usize>> = Vec::new();
+    for group in order {
         let open: Vec<bool> = group_of.iter().map(|of| *of == group).collect();
-        candidate_views_among(input, ranges, &open, stop)
-    };
-    let mut found: Vec<Vec<usize>> = order.into_iter().flat_map(of_group).collect();
+        let enough = open.iter().filter(|&&open| open).count() >= LEAST_VIEWS;
+        if enough && found.len() < MOST_BLOCKS && !stop.is_stopped() {
+            found.extend(candidate_views_among(input, ranges, &open, stop));
+        }
+    }
     found.truncate(MOST_BLOCKS);
     found
 }

@@ -200,7 +200,8 @@ fn judge_under(input: &Input, ranges: &[usize], geometry: &Geometry, noise: &Noi
 /// Drops the worst observation as long as it is more likely wrong than right, then weighs what remains.
 fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry, noise: &NoiseModel) -> Verdict {
     let gate = observation_gate(noise, geometry.outlier_density);
-    let mut retained = retained_at_first(cameras, sightings, geometry, gate);
+    let retained = retained_at_first(cameras, sightings, geometry, gate);
+    let Some(mut retained) = retained else { return Verdict::wrong(cameras, sightings) };
     let (mut point, mut cost) = triangulate(cameras, &chosen(sightings, &retained));
     let share = if geometry.linked { 0.0 } else { LEAST_RETAINED_SHARE };
     let least = LEAST_RETAINED.max((share * sightings.len() as f64).ceil() as usize);
@@ -232,13 +233,21 @@ fn judge_track(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry, 
     Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
 }
 
-/// The sightings that a verdict begins with: all, or those that agree where links may be wrong.
-fn retained_at_first(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry, gate: f64) -> Vec<usize> {
-    let agreeing = geometry.linked.then(|| robust_triangulation::robust(cameras, sightings, gate)).flatten();
-    match agreeing {
-        Some(found) => (0..sightings.len()).filter(|&k| found.agrees[k]).collect(),
-        None => (0..sightings.len()).collect(),
+impl Verdict {
+    /// On a track of which no two observations agree on a point in front of their cameras.
+    fn wrong(cameras: &[Camera], sightings: &[Sighting]) -> Self {
+        let (point, _) = triangulate(cameras, sightings);
+        Self { weight: 0.0, inlier: false, point, retained: vec![false; sightings.len()] }
     }
+}
+
+/// The sightings that a verdict begins with: all, or those that agree where links may be wrong; `None` where none do.
+fn retained_at_first(cameras: &[Camera], sightings: &[Sighting], geometry: &Geometry, gate: f64) -> Option<Vec<usize>> {
+    if !geometry.linked {
+        return Some((0..sightings.len()).collect());
+    }
+    let found = robust_triangulation::robust(cameras, sightings, gate)?;
+    Some((0..sightings.len()).filter(|&k| found.agrees[k]).collect())
 }
 
 fn chosen(sightings: &[Sighting], which: &[usize]) -> Vec<Sighting> {
@@ -339,5 +348,20 @@ mod tests {
         assert_eq!(one_wrong.retained, [true, true, false, true, true, true]);
         let wrong = verdict([0.1, -0.2, 0.15, -0.1, 0.3, -0.05]);
         assert!(!wrong.inlier && wrong.weight < 0.01, "{}", wrong.weight);
+    }
+
+    #[test]
+    fn of_a_linked_track_the_right_run_is_kept_and_nothing_behind_the_cameras() {
+        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
+        let geometry = Geometry { linked: true, ..geometry(&normalization) };
+        let cameras = cameras(6);
+        let noise = NoiseModel { core: geometry.noise, tail_share: TAIL_SHARE };
+        let joined = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.2, -0.15, 0.31]);
+        let verdict = judge_track(&cameras, &joined, &geometry, &noise);
+        assert!(verdict.inlier, "{}", verdict.weight);
+        assert_eq!(verdict.retained, [true, true, true, false, false, false]);
+        let behind: Vec<Camera> = cameras.iter().map(|camera| -camera).collect();
+        let verdict = judge_track(&behind, &sightings(&cameras, &[0.0; 6]), &geometry, &noise);
+        assert!(!verdict.inlier && verdict.weight == 0.0, "{}", verdict.weight);
     }
 }

@@ -50,9 +50,9 @@ pub enum Error {
 /// Single-threaded and deterministic: the same input, settings and build give the same solution, but for times.
 /// `observer` is told of every iteration; `stop` is asked at least every 50 ms or network iteration.
 ///
-/// Solves one block of views over which tracks are complete; views outside it are left out with a warning. Where a
-/// block's calibration does not hold, the next best block is tried and the best result returned; blocks that disagree
-/// raise its uncertainty.
+/// Where tracks are complete over all views these are one block; of other inputs AUTO and GEOMETRY extend a block to every
+/// view that can be registered. Where neither applies, the best block is solved, views outside it are left out with a
+/// warning, and blocks that disagree raise its uncertainty.
 ///
 /// # Errors
 /// [`Error::Stopped`] when `stop` fired, [`Error::Internal`] for a defect.
@@ -75,14 +75,15 @@ pub fn solve(
         normalization: &normalization,
         scale_px,
         seeding: false,
+        merges_cameras: false,
         focal_prior: None,
         stop,
     };
     let sequence = sequence::applies(&context);
-    warnings.extend(block::merged_cameras(input, sequence));
     if sequence {
         return solve_sequence(&context, warnings, recorder);
     }
+    warnings.extend(block::merged_cameras(input, false));
     let candidates = block::candidate_views(input, &ranges, stop);
     let mut best: Option<Attempt> = None;
     let mut others = Vec::new();
@@ -109,15 +110,33 @@ pub fn solve(
 }
 
 /// Solves an input whose tracks live a few views.
-fn solve_sequence(context: &Context, warnings: Vec<Warning>, mut recorder: Recorder) -> Result<Solution, Error> {
-    let candidates = block::candidate_views_of_one_camera(context.input, context.ranges, context.stop);
+fn solve_sequence(context: &Context, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Result<Solution, Error> {
+    let of_one = block::candidate_views_of_one_camera(context.input, context.ranges, context.stop);
+    // A group an image, say: what one camera alone cannot carry, all together may.
+    let merges_cameras = of_one.is_empty();
+    let candidates =
+        if merges_cameras { block::candidate_views(context.input, context.ranges, context.stop) } else { of_one };
+    let context = &Context { merges_cameras, ..*context };
     match sequence::solve(&candidates, context, &mut recorder)? {
         sequence::Ended::Extended(extended) => {
+            warnings.extend(block::merged_cameras(context.input, !merges_cameras));
             let solution = sequence::solved(*extended, warnings, recorder);
             context.stopped()?;
             Ok(solution)
         }
-        sequence::Ended::Block(best) => of_block(best.as_deref(), context, warnings, recorder),
+        sequence::Ended::Block(best) => {
+            warnings.extend(block::merged_cameras(context.input, false));
+            // A seed is less than its block can give.
+            let best = match best {
+                Some(seed) if seed.consensus.is_some() => {
+                    let views = &seed.block.views;
+                    let block = block::extract(context.input, context.ranges, context.normalization, views);
+                    Some(Box::new(attempt::solve_block(block, context, &mut recorder)?))
+                }
+                best => best,
+            };
+            of_block(best.as_deref(), context, warnings, recorder)
+        }
     }
 }
 
@@ -151,6 +170,8 @@ struct Context<'a> {
     scale_px: f64,
     /// The block is the seed of a sequence: as much of it is solved as carries a calibration, and no more.
     seeding: bool,
+    /// Whether all views are taken to be of one camera, whatever their groups.
+    merges_cameras: bool,
     /// What is known of the focal length beside what the views bring: what another part of the input said.
     focal_prior: Option<FocalPrior>,
     stop: &'a StopToken,

@@ -54,6 +54,8 @@ pub struct Recorder<'a> {
     /// Share of the whole that the blocks have: all, or what an extension leaves them.
     share_of_blocks: f64,
     extending: bool,
+    /// Standing before the block of a further part, while that is solved.
+    before_part: Option<Standing>,
     /// Network iterations of the blocks before.
     earlier_iterations: u32,
     history: Vec<Progress>,
@@ -78,6 +80,7 @@ impl<'a> Recorder<'a> {
             blocks: 1,
             share_of_blocks: 1.0,
             extending: false,
+            before_part: None,
             earlier_iterations: 0,
             history: Vec::new(),
             stride: 1,
@@ -103,6 +106,21 @@ impl<'a> Recorder<'a> {
     /// Begins the extension of a block.
     pub fn begin_extension(&mut self) {
         self.extending = true;
+    }
+
+    /// Begins the block of a further part: its course counts as work, and moves the share done no further.
+    pub fn begin_part(&mut self) {
+        self.earlier_iterations += self.standing.iteration;
+        self.before_part = Some(std::mem::take(&mut self.standing));
+    }
+
+    /// Ends it: what stands is again what stood before.
+    pub fn end_part(&mut self) {
+        self.earlier_iterations += self.standing.iteration;
+        if let Some(before) = self.before_part.take() {
+            self.standing = Standing { iteration: 0, ..before };
+        }
+        self.enter(Stage::Extend);
     }
 
     /// Enters a stage, ending the one before.
@@ -131,6 +149,9 @@ impl<'a> Recorder<'a> {
     }
 
     fn fraction_done(&self, within: f64) -> f64 {
+        if self.before_part.is_some() {
+            return self.fraction;
+        }
         let at = if self.extending { fraction_of_extension_at } else { fraction_at };
         let begin = at(self.stage);
         let end = Stage::ALL.into_iter().map(at).find(|&at| at > begin).unwrap_or(1.0);

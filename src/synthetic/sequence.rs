@@ -201,7 +201,9 @@ fn draw_track(
             let seen = pose.rotation * (point - pose.centre);
             let uv = seen.xy() / seen.z;
             let image = focal * uv * (1.0 + options.radial_k1 * uv.norm_squared());
-            (seen.z > DEPTH.0 / 2.0 && image.amax() < 0.5).then_some(image)
+            // Beyond the fold a lens images two points in one place.
+            let one_to_one = 1.0 + 3.0 * options.radial_k1 * uv.norm_squared() > 0.0;
+            (seen.z > DEPTH.0 / 2.0 && image.amax() < 0.5 && one_to_one).then_some(image)
         };
         let images: Option<Vec<Vector2<f64>>> = poses[first..first + length].iter().map(image).collect();
         if let Some(images) = images {

@@ -181,9 +181,11 @@ pub fn from_metric(
     let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);
     let choice = models::Choice { problem, prior: &prior, scale_px, stop };
     let minima = search::minima_near(metric, problem, &prior, stop)?;
-    let mut outcome = grading::grade(&choice, &fit, minima, warnings)?;
-    outcome.plane_at_infinity = None;
-    Ok(outcome)
+    if minima.is_empty() {
+        warnings.push(no_start());
+        return Ok(Outcome::refused(warnings));
+    }
+    grading::grade(&choice, &fit, minima, warnings)
 }
 
 /// The log focal length that a metric reconstruction has by these observations alone, the rest of the lens held, and its

@@ -6,7 +6,7 @@ use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstr
 use crate::geometry::bundle::sequence::{self, Free, Sequence, Sighting};
 use crate::geometry::bundle::{Loss, Observation, Options};
 use crate::geometry::statistics::median;
-use crate::solver::{attempt, calibration};
+use crate::solver::calibration;
 
 /// Scale of the Cauchy loss in units of the core noise: detectors have tails that a wider one would follow.
 const CAUCHY_SCALE: f64 = 2.0;
@@ -25,7 +25,7 @@ const RAYLEIGH_MEDIAN: f64 = 1.177_41;
 /// Least share of the observations' freedom that is left to the residuals, however few landmarks there are.
 const LEAST_FREEDOM: f64 = 0.2;
 
-/// The part of a model that is adjusted together.
+/// What of a model is adjusted together.
 pub struct Extract {
     /// Views and tracks of the input, in the order of the sequence's poses and points.
     pub views: Vec<usize>,
@@ -120,9 +120,7 @@ impl Extract {
 
 /// What is known of the intrinsics of a camera group before any observation.
 pub fn knowledge(scene: &Scene, group: usize, noise: f64) -> IntrinsicsPrior {
-    let context = &scene.context;
-    let views = context.input.views().iter().zip(&scene.group_of).filter(|(_, of)| **of == group);
-    calibration::knowledge(noise, attempt::focal_prior(views.map(|(view, _)| view)), context.scale_px)
+    calibration::knowledge(noise, scene.focal_priors[group], scene.context.scale_px)
 }
 
 /// Adjusts the views of a part with the landmarks that hold them best, while more are to come. The calibration of groups

@@ -77,6 +77,11 @@ fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Cali
         let view = scene.group_of.iter().position(|of| *of == group).unwrap_or(0);
         pixel_calibration(intrinsics, outcome.sigma_log_focal, &scene.context, view)
     };
+    if scene.context.merges_cameras {
+        // One calibration, told for each of the groups.
+        let (_, groups) = crate::solver::block::camera_groups(scene.context.input);
+        return calibrations.first().map_or_else(Vec::new, |outcome| vec![of_group((0, outcome)); groups]);
+    }
     calibrations.iter().enumerate().map(of_group).collect()
 }
 

@@ -7,9 +7,9 @@ use super::model::{Model, Scene};
 use super::windows;
 use crate::domain::{Warning, WarningCode};
 use crate::geometry::Camera;
-use crate::geometry::bundle::metric::Reconstruction;
+use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::solver::calibration::{self, Outcome};
-use crate::solver::{Context, Error, attempt, block};
+use crate::solver::{Context, Error, block};
 
 /// Views that a calibration is made from at most: the projective adjustment that it is compared with is cubic in them.
 /// Of more, the stretch with most observations; the others speak through their windows.
@@ -37,6 +37,7 @@ pub fn calibrate(scene: &Scene, model: &mut Model, context: &Context) -> Result<
     super::structure::triangulate(scene, model);
     adjust::all(scene, model);
     for (group, outcome) in outcomes.iter_mut().enumerate() {
+        admit_difference(model, group, outcome);
         windows::reconcile(scene, model, group, context, outcome)?;
     }
     Ok(outcomes)
@@ -63,12 +64,15 @@ fn of_group(scene: &Scene, model: &mut Model, group: usize, context: &Context) -
         points: &points,
         observations: &observations,
         noise: model.noise,
-        focal_prior: attempt::focal_prior(views.iter().map(|&view| &context.input.views()[view])),
+        focal_prior: scene.focal_priors[group],
         focal_per_view: false,
     };
     let outcome = calibration::from_metric(&problem, &metric, context.scale_px, context.stop)?;
     if let Some(metric) = &outcome.metric {
-        model.lenses[group].free = outcome.model;
+        let lens = &mut model.lenses[group];
+        lens.free = outcome.model;
+        // What the model holds is as the calibration has it, not as the seed had it.
+        lens.intrinsics = Intrinsics { focal: lens.intrinsics.focal, ..metric.intrinsics };
         // Some of the views alone would leave the frame of the others.
         if extract.views.len() == registered.len() {
             extract.sequence.intrinsics[group] = metric.intrinsics;
@@ -77,6 +81,16 @@ fn of_group(scene: &Scene, model: &mut Model, group: usize, context: &Context) -
         }
     }
     Ok(outcome)
+}
+
+/// Raises sigma to what lies between the focal length that was graded and the one that all observations led to.
+fn admit_difference(model: &Model, group: usize, outcome: &mut Outcome) {
+    let (Some(metric), Some(sigma)) = (&outcome.metric, outcome.sigma_log_focal) else { return };
+    let difference = (model.lenses[group].intrinsics.focal / metric.intrinsics.focal).ln().abs();
+    if difference > sigma {
+        outcome.sigma_log_focal = Some(difference);
+        outcome.grade = outcome.grade.worse(calibration::grade_of_sigma(Some(difference)));
+    }
 }
 
 /// The run of at most [`MOST_VIEWS`] of these views that keeps most observations.

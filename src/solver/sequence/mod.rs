@@ -114,6 +114,9 @@ fn extend<'a>(seed: Attempt, context: &Context<'a>, recorder: &mut Recorder) -> 
         context.stopped()?;
         adjust::all(&scene, &mut model);
         structure::triangulate(&scene, &mut model);
+        for part in 0..=model.part_of.iter().copied().max().unwrap_or(parts::FIRST) {
+            parts::drop_unsupported(&scene, &mut model, part);
+        }
     }
     context.stopped()?;
     recorder.enter(Stage::Calibrate);
@@ -138,10 +141,14 @@ fn refuse(outcome: &mut Outcome, model: &Model, context: &Context) {
 }
 
 impl Extended<'_> {
-    /// The worst of the cameras that have registered views.
+    /// The worst of the cameras that have enough registered views to be calibrated: a few photographs of another camera
+    /// take nothing from the rest.
     fn grade(&self) -> Grade {
-        let has_views = |group: usize| self.model.lenses[group].is_known;
-        let grades = self.calibrations.iter().enumerate().filter(|(group, _)| has_views(*group));
+        let views = |group: usize| {
+            let registered = self.model.registered();
+            registered.into_iter().filter(|&view| self.scene.group_of[view] == group).count()
+        };
+        let grades = self.calibrations.iter().enumerate().filter(|(group, _)| views(*group) >= block::LEAST_VIEWS);
         grades.map(|(_, outcome)| outcome.grade).reduce(Grade::worse).unwrap_or(Grade::ProjectiveOnly)
     }
 

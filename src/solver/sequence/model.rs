@@ -2,12 +2,11 @@
 
 use nalgebra::{Vector2, Vector3};
 
-use crate::domain::StopToken;
+use crate::domain::{FocalPrior, StopToken};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
 use crate::geometry::measurement::Sighting;
-use crate::solver::Context;
-use crate::solver::judge;
+use crate::solver::{Context, attempt, block, judge};
 
 /// An input as the extension sees it; observations keep the input's sorted order (track, view).
 pub struct Scene<'a> {
@@ -19,6 +18,8 @@ pub struct Scene<'a> {
     /// Camera group of each view, counted from 0 in rising order of the input's numbers.
     pub group_of: Vec<usize>,
     pub groups: usize,
+    /// What is known of the focal length of each group beforehand.
+    pub focal_priors: Vec<Option<FocalPrior>>,
     /// Density of a wrong coordinate; see [`judge::Geometry::outlier_density`].
     pub outlier_density: f64,
 }
@@ -34,8 +35,16 @@ impl<'a> Scene<'a> {
             xy.push(context.normalization.normalize(view, input.point_px(k)));
         }
         let outlier_density = judge::outlier_density(&xy);
-        let (group_of, groups) = crate::solver::block::camera_groups(input);
-        Self { context: *context, xy, of_view, group_of, groups, outlier_density }
+        let (group_of, groups) = match context.merges_cameras {
+            true => (vec![0; input.view_count()], 1),
+            false => block::camera_groups(input),
+        };
+        let of_group = |group: usize| {
+            let views = input.views().iter().zip(&group_of).filter(|(_, of)| **of == group);
+            attempt::focal_prior(views.map(|(view, _)| view))
+        };
+        let focal_priors = (0..groups).map(of_group).collect();
+        Self { context: *context, xy, of_view, group_of, groups, focal_priors, outlier_density }
     }
 
     pub fn stop(&self) -> &'a StopToken {
@@ -95,7 +104,9 @@ pub struct Model {
     pub landmarks: Vec<Option<Landmark>>,
     /// One an observation: whether it agrees with its landmark.
     pub kept: Vec<bool>,
-    /// Landmarks among the tracks of each view that may support a pose.
+    /// The part that grows.
+    current: u32,
+    /// Landmarks of that part among the tracks of each view that may support a pose.
     pub supported: Vec<usize>,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
@@ -122,6 +133,7 @@ impl Model {
             part_of: vec![0; views],
             landmarks: vec![None; scene.tracks()],
             kept: vec![false; scene.xy.len()],
+            current: 0,
             supported: vec![0; views],
             noise,
             seed_noise: noise,
@@ -139,8 +151,40 @@ impl Model {
         }
     }
 
-    /// Adds the views of a metric block as a part.
+    /// Turns to the part that grows next.
+    pub fn turn_to(&mut self, scene: &Scene, part: u32) {
+        self.current = part;
+        self.supported.fill(0);
+        for track in 0..self.landmarks.len() {
+            self.count_support(scene, track, 1);
+        }
+    }
+
+    /// Sets the landmark of a track.
+    pub fn set_landmark(&mut self, scene: &Scene, track: usize, landmark: Option<Landmark>) {
+        self.count_support(scene, track, -1);
+        self.landmarks[track] = landmark;
+        self.count_support(scene, track, 1);
+    }
+
+    fn count_support(&mut self, scene: &Scene, track: usize, by: isize) {
+        let counts = |landmark: &Landmark| landmark.part == self.current && landmark.supports();
+        if self.landmarks[track].as_ref().is_some_and(counts) {
+            for k in scene.of_track(track) {
+                let count = &mut self.supported[scene.view_of(k)];
+                *count = count.saturating_add_signed(by);
+            }
+        }
+    }
+
+    /// Adds the views of a metric block, all of one camera group, as a part; a camera that is not known yet is the block's.
     pub fn add_part(&mut self, scene: &Scene, part: u32, views: &[usize], metric: &Reconstruction) {
+        if let Some(&view) = views.first() {
+            let lens = &mut self.lenses[scene.group_of[view]];
+            if !lens.is_known {
+                lens.intrinsics = metric.intrinsics;
+            }
+        }
         for (&view, pose) in views.iter().zip(&metric.poses) {
             self.register(scene, view, part, *pose);
         }
@@ -152,11 +196,15 @@ impl Model {
         self.lenses[scene.group_of[view]].is_known = true;
     }
 
-    /// Takes a part back.
-    pub fn remove_part(&mut self, part: u32) {
-        for view in self.of_part(part) {
+    /// Takes views back.
+    pub fn unregister(&mut self, scene: &Scene, views: &[usize]) {
+        for &view in views {
             self.poses[view] = None;
             self.part_of[view] = 0;
+        }
+        for (group, lens) in self.lenses.iter_mut().enumerate() {
+            let has_view = |(pose, of): (&Option<Pose>, &usize)| pose.is_some() && *of == group;
+            lens.is_known = self.poses.iter().zip(&scene.group_of).any(has_view);
         }
     }
 

@@ -12,8 +12,10 @@ use crate::solver::{Context, Error, block};
 
 /// The part that the calibration comes from.
 pub const FIRST: u32 = 0;
-/// Parts of one input at most: more of them is an input without overlap.
+/// Blocks that are tried for parts at most, and how many may fail one after the other: the best come first, and an input
+/// without overlap has any number of hopeless ones.
 const MOST_PARTS: u32 = 100;
+const MOST_FAILURES: usize = 3;
 /// Deviation of the log focal length that other parts are told of, at least, where the first has one: parts differ by
 /// more than each admits. And where the first has none: it only keeps them from running away.
 const PRIOR_SIGMA: f64 = 0.02;
@@ -46,27 +48,30 @@ pub fn others(
     let first_group = seed.block.views.first().map_or(0, |&view| scene.group_of[view]);
     let prior = prior_of(seed, model, first_group, &scene.context);
     let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
+    let mut failures = 0;
     for part in FIRST + 1..MOST_PARTS {
         scene.context.stopped()?;
+        if failures == MOST_FAILURES {
+            break;
+        }
         let Some(views) = next_block(scene, &open) else { break };
         let told = prior.filter(|_| scene.group_of[views[0]] == first_group);
         let context = Context { focal_prior: told, ..scene.context };
         let block = block::extract(context.input, context.ranges, context.normalization, &views);
+        recorder.begin_part();
         let attempt = attempt::solve_block(block, &context, recorder)?;
-        recorder.enter(crate::domain::Stage::Extend);
+        recorder.end_part();
         // Whatever comes of it, a block is tried once.
         views.iter().for_each(|&view| open[view] = false);
         let Some(metric) = attempt.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref()) else {
+            failures += 1;
             continue;
         };
         model.add_part(scene, part, &attempt.block.views, metric);
         structure::triangulate_seen(scene, model, &attempt.block.views);
         register::join(scene, model, part, trials, recorder)?;
-        if !stands(scene, model, part) {
-            let views = model.of_part(part);
-            model.remove_part(part);
-            structure::triangulate_seen(scene, model, &views);
-        }
+        drop_unsupported(scene, model, part);
+        failures = if model.of_part(part).is_empty() { failures + 1 } else { 0 };
         for (open, pose) in open.iter_mut().zip(&model.poses) {
             *open &= pose.is_none();
         }
@@ -79,6 +84,9 @@ fn next_block(scene: &Scene, open: &[bool]) -> Option<Vec<usize>> {
     let context = &scene.context;
     (0..scene.groups).find_map(|group| {
         let of_group: Vec<bool> = open.iter().zip(&scene.group_of).map(|(open, of)| *open && *of == group).collect();
+        if of_group.iter().filter(|&&open| open).count() < block::LEAST_VIEWS || context.stop.is_stopped() {
+            return None;
+        }
         let found = block::candidate_views_among(context.input, context.ranges, &of_group, context.stop);
         found.into_iter().next()
     })
@@ -92,17 +100,23 @@ fn prior_of(seed: &Attempt, model: &Model, group: usize, context: &Context) -> O
     Some(FocalPrior { focal_px, sigma_log: sigma.map_or(VAGUE_SIGMA, |sigma| sigma.max(PRIOR_SIGMA)) })
 }
 
-/// Whether each view of a part sees enough of its points to have been registered by them.
-fn stands(scene: &Scene, model: &Model, part: u32) -> bool {
-    let views = model.of_part(part);
-    let supported = |&view: &usize| {
+/// Takes back the views of a part that see too few of its points to be held by them, and the whole part if too few are
+/// left.
+pub fn drop_unsupported(scene: &Scene, model: &mut Model, part: u32) {
+    let unsupported = |&view: &usize| {
         let kept = scene.of_view[view].iter().filter(|&&k| {
             let k = k as usize;
             model.kept[k] && model.landmarks[scene.track_of(k)].is_some_and(|landmark| landmark.is_verified())
         });
-        kept.count() >= register::LEAST_POINTS
+        kept.count() < register::LEAST_POINTS
     };
-    views.len() >= block::LEAST_VIEWS && views.iter().all(supported)
+    let views = model.of_part(part);
+    let mut dropped: Vec<usize> = views.iter().copied().filter(unsupported).collect();
+    if views.len() - dropped.len() < block::LEAST_VIEWS {
+        dropped.clone_from(&views);
+    }
+    model.unregister(scene, &dropped);
+    structure::triangulate_seen(scene, model, &dropped);
 }
 
 /// Numbers the parts anew, the one with most views first; of equals the one found first.

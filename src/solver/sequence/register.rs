@@ -35,7 +35,7 @@ pub struct Unregistered {
     pub view: usize,
     /// Points of the reconstruction that it sees.
     pub points: usize,
-    /// How many of these agreed with its best pose.
+    /// How many of these agreed with a pose.
     pub agreeing: usize,
 }
 
@@ -43,7 +43,8 @@ pub struct Unregistered {
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Trial {
     count: usize,
-    /// Points that it saw at the last, and how many agreed.
+    /// Points that it saw at the last, how many of them were asked, and how many agreed.
+    seen: usize,
     points: usize,
     agreeing: usize,
 }
@@ -63,6 +64,7 @@ pub fn join(
     let mut rng = ChaCha8Rng::seed_from_u64(scene.context.settings.seed);
     // Views that another part could not take may fit this one.
     trials.iter_mut().for_each(|trial| trial.count = 0);
+    model.turn_to(scene, part);
     settle(scene, model, part);
     let mut adjusted_at = model.of_part(part).len();
     loop {
@@ -76,9 +78,9 @@ pub fn join(
             adjusted_at = model.of_part(part).len();
             continue;
         };
-        let agreeing = register(scene, model, part, view, &seen, &mut rng);
+        let (points, agreeing) = register(scene, model, part, view, &seen, &mut rng);
         let trial = &mut trials[view];
-        *trial = Trial { count: trial.count + 1, points: seen.len(), agreeing };
+        *trial = Trial { count: trial.count + 1, seen: seen.len(), points, agreeing };
         let grown = model.of_part(part).len();
         if grown as f64 >= ADJUST_GROWTH * adjusted_at as f64 {
             settle(scene, model, part);
@@ -92,7 +94,7 @@ pub fn join(
     Ok(())
 }
 
-/// The views that were not registered, with what came of the best trial of each.
+/// The views that were not registered, with what came of the last trial of each.
 pub fn left(scene: &Scene, model: &Model, trials: &[Trial]) -> Vec<Unregistered> {
     let views = block::observed_views(scene.context.input).into_iter();
     views
@@ -120,7 +122,7 @@ fn supported(scene: &Scene, model: &Model, part: u32, view: usize) -> Vec<usize>
 fn next(scene: &Scene, model: &Model, part: u32, trials: &[Trial]) -> Option<(usize, Vec<usize>)> {
     let is_open = |&view: &usize| {
         let trial = trials[view];
-        let worth = trial.count == 0 || model.supported[view] as f64 >= RETRY_GROWTH * trial.points as f64;
+        let worth = trial.count == 0 || model.supported[view] as f64 >= RETRY_GROWTH * trial.seen as f64;
         model.poses[view].is_none() && trial.count < MOST_TRIALS && worth && model.supported[view] >= LEAST_POINTS
     };
     let mut open: Vec<usize> = (0..model.poses.len()).filter(is_open).collect();
@@ -128,45 +130,54 @@ fn next(scene: &Scene, model: &Model, part: u32, trials: &[Trial]) -> Option<(us
     open.sort_by_key(|&view| (std::cmp::Reverse(model.supported[view]), view));
     open.into_iter().find_map(|view| {
         let seen = supported(scene, model, part, view);
-        let worth = trials[view].count == 0 || seen.len() as f64 >= RETRY_GROWTH * trials[view].points as f64;
+        let worth = trials[view].count == 0 || seen.len() as f64 >= RETRY_GROWTH * trials[view].seen as f64;
         (seen.len() >= LEAST_POINTS && worth).then_some((view, seen))
     })
 }
 
-/// Registers a view if enough of the points it sees agree; returns how many do.
-fn register(scene: &Scene, model: &mut Model, part: u32, view: usize, seen: &[usize], rng: &mut ChaCha8Rng) -> usize {
+/// Registers a view if enough of the points it sees agree; returns how many were asked and how many do.
+fn register(
+    scene: &Scene,
+    model: &mut Model,
+    part: u32,
+    view: usize,
+    seen: &[usize],
+    rng: &mut ChaCha8Rng,
+) -> (usize, usize) {
     let is_new_camera = !model.lenses[scene.group_of[view]].is_known;
-    let found = focals(scene, model, view)
+    let step = seen.len().div_ceil(MOST_POINTS).max(1);
+    let seen: Vec<usize> = seen.iter().copied().step_by(step).collect();
+    let found = guesses(scene, model, view)
         .into_iter()
-        .filter_map(|focal| {
-            let intrinsics = Intrinsics { focal, ..*model.intrinsics_of(scene, view) };
-            Some((intrinsics, robust_pose(scene, model, &intrinsics, seen, rng)?))
-        })
+        .filter_map(|intrinsics| Some((intrinsics, robust_pose(scene, model, &intrinsics, &seen, rng)?)))
         // The first of equals.
         .rev()
         .max_by_key(|(_, (_, agreeing))| *agreeing);
-    let Some((intrinsics, (pose, agreeing))) = found else { return 0 };
-    if agreeing < LEAST_POINTS || (agreeing as f64) < LEAST_SHARE * seen.len().min(MOST_POINTS) as f64 {
-        return agreeing;
+    let Some((intrinsics, (pose, agreeing))) = found else { return (seen.len(), 0) };
+    if agreeing < LEAST_POINTS || (agreeing as f64) < LEAST_SHARE * seen.len() as f64 {
+        return (seen.len(), agreeing);
     }
     model.lenses[scene.group_of[view]].intrinsics = intrinsics;
     model.register(scene, view, part, pose);
     structure::triangulate_seen(scene, model, &[view]);
     adjust::around(scene, model, view, is_new_camera);
     structure::triangulate_seen(scene, model, &[view]);
-    agreeing
+    (seen.len(), agreeing)
 }
 
-/// Focal lengths to try a view with: its camera's own, or, of one that is not known yet, what the input says or a scan.
-fn focals(scene: &Scene, model: &Model, view: usize) -> Vec<f64> {
+/// Lenses to try a view with: its camera's own, or, of one that is not known yet, pinholes of what the input says, give or
+/// take its deviation, or of a scan.
+fn guesses(scene: &Scene, model: &Model, view: usize) -> Vec<Intrinsics> {
     let lens = &model.lenses[scene.group_of[view]];
     if lens.is_known {
-        return vec![lens.intrinsics.focal];
+        return vec![lens.intrinsics];
     }
     if let Some(prior) = scene.context.input.views()[view].focal_prior {
-        return vec![prior.focal_px / scene.context.scale_px];
+        let focal = prior.focal_px / scene.context.scale_px;
+        return [0.0, -1.0, 1.0].map(|by| Intrinsics::from_focal(focal * (by * prior.sigma_log).exp())).to_vec();
     }
-    OTHER_FOCALS.map(|step| lens.intrinsics.focal * (f64::from(step) / FOCALS_PER_OCTAVE).exp2()).collect()
+    let focal = |step: i32| lens.intrinsics.focal * (f64::from(step) / FOCALS_PER_OCTAVE).exp2();
+    OTHER_FOCALS.map(|step| Intrinsics::from_focal(focal(step))).collect()
 }
 
 /// The pose that most of these observations agree with, and how many do.
@@ -177,9 +188,8 @@ fn robust_pose(
     seen: &[usize],
     rng: &mut ChaCha8Rng,
 ) -> Option<(Pose, usize)> {
-    let step = seen.len().div_ceil(MOST_POINTS).max(1);
     let pair = |&k: &usize| Some((model.landmarks[scene.track_of(k)]?.position, intrinsics.ray(&scene.xy[k])?));
-    let (points, rays): (Vec<_>, Vec<_>) = seen.iter().step_by(step).filter_map(pair).unzip();
+    let (points, rays): (Vec<_>, Vec<_>) = seen.iter().filter_map(pair).unzip();
     let gate = model.gate(scene) / intrinsics.focal.powi(2);
     let found = pose::robust(&points, &rays, gate, rng, scene.stop())?;
     Some((found.pose, found.inlier.iter().filter(|&&inlier| inlier).count()))

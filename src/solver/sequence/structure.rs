@@ -63,10 +63,7 @@ pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
             part,
             support: found.agrees.iter().filter(|&&agrees| agrees).count(),
         };
-        if landmark.supports() {
-            scene.of_track(track).for_each(|k| model.supported[scene.view_of(k)] += 1);
-        }
-        model.landmarks[track] = Some(landmark);
+        model.set_landmark(scene, track, Some(landmark));
         for ((k, _), agrees) in seen.iter().zip(found.agrees) {
             model.kept[*k] = agrees;
         }
@@ -75,9 +72,7 @@ pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
 
 /// Takes the point of a track away.
 fn forget(scene: &Scene, model: &mut Model, track: usize) {
-    if model.landmarks[track].take().is_some_and(|landmark| landmark.supports()) {
-        scene.of_track(track).for_each(|k| model.supported[scene.view_of(k)] -= 1);
-    }
+    model.set_landmark(scene, track, None);
     scene.of_track(track).for_each(|k| model.kept[k] = false);
 }
 
@@ -116,8 +111,12 @@ fn euclidean(point: &Point) -> Option<Vector3<f64>> {
     position.iter().all(|value| value.is_finite()).then_some(position)
 }
 
-/// Largest angle between two of the unit rays: from their mean, twice the largest, so that long tracks cost no more.
+/// About the largest angle between two of the unit rays, never more: that between the one farthest from their mean and
+/// the one farthest from that, so that long tracks cost no more than short ones.
 fn widest_angle(rays: &[Vector3<f64>]) -> f64 {
-    let Some(mean) = rays.iter().sum::<Vector3<f64>>().try_normalize(f64::MIN_POSITIVE) else { return 0.0 };
-    2.0 * rays.iter().map(|ray| ray.dot(&mean).clamp(-1.0, 1.0).acos()).fold(0.0, f64::max)
+    let farthest = |from: &Vector3<f64>| rays.iter().min_by(|a, b| a.dot(from).total_cmp(&b.dot(from)));
+    let mean: Vector3<f64> = rays.iter().sum();
+    let ends = farthest(&mean).and_then(|end| Some((end, farthest(end)?)));
+    // By the cross product: the arc cosine of a small angle is mostly rounding.
+    ends.map_or(0.0, |(a, b)| a.cross(b).norm().atan2(a.dot(b)))
 }

@@ -14,8 +14,8 @@ use crate::solver::{Context, Error};
 
 /// Views of a window where there are many, and of the shortest one: below, a window says little of a focal length.
 const VIEWS: usize = 10;
-const LEAST_VIEWS: usize = 5;
-/// Windows at most, evenly spread over the sequence: the misfit is known to a tenth then.
+const LEAST_VIEWS: usize = 4;
+/// Windows at most, evenly spread over the sequence: a variance of 50 values is known to a fifth.
 const MOST_WINDOWS: usize = 50;
 /// Observations of a view that a window holds.
 const OF_VIEW: usize = 150;
@@ -26,6 +26,7 @@ const WORTH_MINDING: f64 = 0.005;
 /// Several estimates as one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fused {
+    pub log_focal: f64,
     pub sigma: f64,
     /// Standard deviation of what each has beside its own sigma.
     pub misfit: f64,
@@ -44,7 +45,8 @@ pub fn reconcile(
     let Some(own) = outcome.sigma_log_focal else { return Ok(()) };
     let estimates = estimates(scene, model, group, context)?;
     let Some(fused) = fuse(&estimates) else { return Ok(()) };
-    let sigma = own.max(fused.sigma);
+    let apart = (fused.log_focal - model.lenses[group].intrinsics.focal.ln()).abs();
+    let sigma = own.max(fused.sigma).max(apart);
     outcome.sigma_log_focal = Some(sigma);
     outcome.grade = outcome.grade.worse(grade_of_sigma(Some(sigma)));
     if sigma > WORTH_A_WARNING * own && sigma > WORTH_MINDING {
@@ -98,7 +100,12 @@ fn estimate(scene: &Scene, model: &Model, group: usize, extract: &Extract, conte
 /// Runs of consecutive views of one part, not overlapping; one or none says nothing.
 fn windows(parts: &[Vec<usize>]) -> Vec<Vec<usize>> {
     let long: Vec<&Vec<usize>> = parts.iter().filter(|views| views.len() >= LEAST_VIEWS).collect();
-    // One part is halved, so that there is something to compare.
+    // One part is halved, so that there is something to compare; the halves of a short one overlap.
+    if let [views] = long.as_slice()
+        && views.len() < 2 * LEAST_VIEWS
+    {
+        return [&views[..LEAST_VIEWS], &views[views.len() - LEAST_VIEWS..]].map(<[usize]>::to_vec).to_vec();
+    }
     let least = if long.len() == 1 { 2 } else { 1 };
     let of_part = |views: &Vec<usize>| -> Vec<Vec<usize>> {
         let count = (views.len() / VIEWS).max(least);
@@ -126,8 +133,13 @@ pub fn fuse(estimates: &[Estimate]) -> Option<Fused> {
     let freedom = (estimates.len() - 1) as f64;
     let scale = total - weight.iter().map(|weight| weight * weight).sum::<f64>() / total;
     let misfit = ((statistic - freedom).max(0.0) / scale).sqrt();
-    let sigma = weights(misfit).iter().sum::<f64>().sqrt().recip();
-    (sigma.is_finite() && misfit.is_finite()).then_some(Fused { sigma, misfit, chi_square: statistic / freedom })
+    let weight = weights(misfit);
+    let total: f64 = weight.iter().sum();
+    let log_focal =
+        weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.log_focal).sum::<f64>() / total;
+    let sigma = total.sqrt().recip();
+    let usable = sigma.is_finite() && misfit.is_finite() && log_focal.is_finite();
+    usable.then_some(Fused { log_focal, sigma, misfit, chi_square: statistic / freedom })
 }
 
 #[cfg(test)]
@@ -164,7 +176,9 @@ mod tests {
             let parts: Vec<Vec<usize>> = parts.iter().map(|&count| views.by_ref().take(count).collect()).collect();
             windows(&parts).iter().map(Vec::len).collect()
         };
-        assert!(lengths(&[9]).len() < 2);
+        assert!(lengths(&[3]).is_empty());
+        assert_eq!(lengths(&[6]), [4, 4]);
+        assert_eq!(lengths(&[9]), [4, 5]);
         assert_eq!(lengths(&[11]), [5, 6]);
         assert_eq!(lengths(&[40]), [10; 4]);
         assert_eq!(lengths(&[11, 10, 3]), [11, 10]);

@@ -85,3 +85,40 @@ fn a_view_of_nothing_but_wrong_observations_is_left_out_with_the_reason() {
     let wrong = in_view.iter().filter(|&&k| solution.observations.inlier[k]).count();
     assert_eq!(wrong, 0, "observations of a view that has no camera");
 }
+
+#[test]
+fn camera_groups_have_focal_lengths_of_their_own_unless_each_is_too_small() {
+    let options = SequenceOptions { views: 16, tracks: 800, seed: 5, ..SequenceOptions::default() };
+    let sequence = Sequence::generate(&options).expect("valid");
+    let centre = sequence.truth.principal_point_px;
+    // The last views are of a camera with another focal length.
+    let grouped = |group_of: &dyn Fn(usize) -> u32| {
+        let mut raw = sequence.input.clone();
+        raw.views.iter_mut().enumerate().for_each(|(view, of)| of.camera_group = group_of(view));
+        for k in 0..raw.x.len() {
+            if raw.views[raw.view[k] as usize].camera_group == 7 {
+                raw.x[k] = centre[0] + 0.8 * (raw.x[k] - centre[0]);
+                raw.y[k] = centre[1] + 0.8 * (raw.y[k] - centre[1]);
+            }
+        }
+        Input::new(raw, &Limits::default(), "sequence").expect("valid sequence")
+    };
+    let solution = solved(&grouped(&|view| if view < 10 { 3 } else { 7 }), &SolveSettings::default());
+    assert_eq!(solution.registered_views().len(), 16, "{:?}", solution.warnings);
+    assert_eq!(solution.grade, Some(Grade::Metric), "{:?}", solution.warnings);
+    let focals: Vec<f64> = solution.calibrations.iter().map(|calibration| calibration.focal_px).collect();
+    let expected = [sequence.truth.focal_px, 0.8 * sequence.truth.focal_px];
+    assert!(focals.iter().zip(expected).all(|(found, true_px)| (found / true_px - 1.0).abs() < 0.02), "{focals:?}");
+    assert!(!solution.warnings.iter().any(|warning| warning.code == WarningCode::CameraGroupsMerged));
+
+    // Two photographs of another camera take nothing from the rest.
+    let solution = solved(&grouped(&|view| if view < 14 { 3 } else { 7 }), &SolveSettings::default());
+    assert_eq!(solution.grade, Some(Grade::Metric), "{:?}", solution.warnings);
+    assert_eq!(solution.calibrations[1].sigma_log_focal, None);
+    assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::UnobservableFocal));
+
+    // A group an image: all are solved as one.
+    let solution = solved(&grouped(&|view| 100 + view as u32), &SolveSettings::default());
+    assert_eq!((solution.registered_views().len(), solution.calibrations.len()), (16, 16), "{:?}", solution.warnings);
+    assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::CameraGroupsMerged));
+}

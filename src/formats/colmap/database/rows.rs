@@ -248,8 +248,8 @@ fn matrix<'r>(row: &'r SqliteRow, table: &str, id: u64) -> Result<(usize, &'r [u
     if announced != Some(data.len() as u64) {
         return Err(wrong(format!("has {} bytes, {rows} x {columns} numbers of 4 are announced", data.len())));
     }
-    // An empty matrix may have none.
-    Ok((columns.max(LEAST_COLUMNS), data))
+    // An empty matrix may have any number of columns.
+    Ok((if data.is_empty() { LEAST_COLUMNS } else { columns }, data))
 }
 
 /// What went wrong with a column, without sqlx's words around it.
