@@ -6,5 +6,6 @@ mod crash;
 mod formats;
 mod load;
 mod readme;
+mod real;
 mod support;
 mod telemetry;
