@@ -18,14 +18,14 @@ const TICK: Duration = Duration::from_millis(200);
 
 /// What the files of a sequence must hold.
 pub const FORMAT: &str = "\
-A sequence folder of --real holds
-  observations.csv  view,track,x,y: whole numbers from 0 as ids, pixels
-  meta.json         width and height (or image_width and image_height, or image_size: [width, height]); K: the known
-                    calibration in pixels, 3x3 row by row, or a list of such, one a view
-  labels.csv        view,track,inlier (0 or 1), one line an observation; other columns are ignored
-  cameras.json      if there is one: P, a list of 3x4 matrices, one a view, null where none is known; estimated: true
-                    where they were found from these tracks
-and real.json, real.csv and real.html are written to --out.
+A sequence folder of --real holds, with pixels as unit and (0, 0) the centre of the top-left one:
+  observations.csv: view,track,x,y with whole numbers from 0 as ids
+  meta.json: the image size as width and height (or image_width and image_height, or image_size: [width, height]) and \
+K, the known calibration, 3x3 row by row or a list of such, one a view
+  labels.csv: view,track,inlier (0 or 1), one line an observation; other columns are ignored
+  cameras.json, where known: P, a list of 3x4 matrices, one a view, null where none is known; estimated, true where they \
+were found from these tracks
+Written to --out: real.json, real.csv and real.html.
 
 A peer is called as COMMAND observations.csv WIDTH HEIGHT -o FILE and writes a JSON object: views (how many it \
 registered), focal (pixels or null), inlier (0 or 1 for each track id from 0 on) or observation_inlier (the same for each \
