@@ -15,7 +15,10 @@ const LEAST_CENTRES: usize = 3;
 /// What either side says, in its own words.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Answer {
+    /// Views, in all parts together.
     pub registered: usize,
+    /// Reconstructions, each with a frame of its own.
+    pub parts: usize,
     pub grade: Option<String>,
     pub focal_px: Option<f64>,
     /// Standard deviation of log f.
@@ -54,7 +57,10 @@ impl Verdicts {
 /// An answer against what is known.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Scores {
+    /// Views, in all parts together.
     pub registered: usize,
+    /// Reconstructions, each with a frame of its own.
+    pub parts: usize,
     pub grade: Option<String>,
     pub focal_px: Option<f64>,
     /// `100 (f / f_known - 1)`.
@@ -89,6 +95,7 @@ impl Scores {
         let finite = |value: Option<f64>| value.filter(|value| value.is_finite());
         Self {
             registered: answer.registered,
+            parts: answer.parts,
             grade: answer.grade.clone(),
             focal_px: answer.focal_px,
             focal_error_percent: finite(ratio.map(|ratio| 100.0 * (ratio - 1.0))),

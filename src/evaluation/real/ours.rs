@@ -1,6 +1,6 @@
 //! This program's side: `solve` in a process of its own, and the files that it writes.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -80,6 +80,7 @@ pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint
     }
     Ok(Answer {
         registered: result.registered_views,
+        parts: cameras.views.iter().filter_map(|camera| camera.part).collect::<BTreeSet<_>>().len(),
         grade: Some(result.grade.unwrap_or(result.status)),
         focal_px: result.focal_px,
         sigma_log_focal: result.sigma_log_focal,

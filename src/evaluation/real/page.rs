@@ -31,7 +31,8 @@ pub fn page(rows: &[Row], peer: &[String]) -> String {
     };
     format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<title>scpsfm on real sequences</title>\n\
-         <style>{STYLE}</style>\n</head>\n<body>\n<h1>Real sequences</h1>\n{peer}<p>Focal %: deviation from the known focal \
+         <style>{STYLE}</style>\n</head>\n<body>\n<h1>Real sequences</h1>\n{peer}<p>Views: how many are registered, of how many, and in how many parts where \
+         there are several. Focal %: deviation from the known focal \
          length. Precision, recall and F1: over all observations against the labels, by the side's verdicts on \
          observations or on tracks. Mean and rms px: reprojection errors over what the side itself kept. Centres %: root \
          mean square error of the camera centres of the largest part after the best similarity, as a share of the known \

@@ -1,6 +1,6 @@
 //! The other program's side. It is called as `COMMAND observations.csv WIDTH HEIGHT -o FILE` and writes a JSON object:
 //!
-//! * `views`: how many it registered
+//! * `views`: how many it registered, in one reconstruction
 //! * `focal`: in pixels, or null
 //! * `inlier`: 0 or 1 for each track id from 0 on; or `observation_inlier`: the same for each line of its input
 //! * where it has them: `sigma_log_focal`, `k1`, `reproj` (mean) and `rms` in pixels, `grade`, `warnings` (texts), `centres`
@@ -95,6 +95,7 @@ pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint
     let centres = said.centres.unwrap_or_default().into_iter().zip(0u64..);
     Ok(Answer {
         registered: said.views,
+        parts: usize::from(said.views > 0),
         grade: said.grade,
         focal_px: said.focal.filter(|&focal| focal > 0.0),
         sigma_log_focal: said.sigma_log_focal.filter(|&sigma| sigma > 0.0),

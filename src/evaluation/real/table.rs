@@ -33,8 +33,10 @@ const fn figure(heading: &'static str, cell: fn(&Row) -> String) -> Column {
 const COLUMNS: [Column; 19] = [
     words("sequence", |row| row.sequence.clone()),
     words("side", |row| row.side.name().into()),
-    figure("views", |row| {
-        row.scores.as_ref().map_or_else(|| "-".into(), |scores| format!("{}/{}", scores.registered, row.views))
+    figure("views", |row| match &row.scores {
+        None => "-".into(),
+        Some(scores) if scores.parts > 1 => format!("{}/{} in {}", scores.registered, row.views, scores.parts),
+        Some(scores) => format!("{}/{}", scores.registered, row.views),
     }),
     words("grade", |row| row.scores.as_ref().and_then(|scores| scores.grade.clone()).unwrap_or_else(|| "-".into())),
     figure("focal %", |row| number(row, 2, |scores| scores.focal_error_percent)),
@@ -102,7 +104,7 @@ pub fn text(rows: &[Row]) -> String {
 /// One line a row, every number in full; an empty field is one that there is not.
 pub fn csv(rows: &[Row]) -> String {
     let mut text = String::from(
-        "sequence,side,views,observations,registered,grade,focal_px,focal_error_percent,sigma_log_focal,\
+        "sequence,side,views,observations,registered,parts,grade,focal_px,focal_error_percent,sigma_log_focal,\
          focal_error_sigmas,radial_k1,precision,recall,f1,verdicts,mean_px,rms_px,centre_error_percent,centres,\
          cameras_estimated,cpu_seconds,wall_seconds,peak_memory_mb,warnings,failure\n",
     );
@@ -116,6 +118,7 @@ pub fn csv(rows: &[Row]) -> String {
             row.views.to_string(),
             row.observations.to_string(),
             scores.map_or_else(String::new, |scores| scores.registered.to_string()),
+            scores.map_or_else(String::new, |scores| scores.parts.to_string()),
             scores.and_then(|scores| scores.grade.as_deref()).map_or_else(String::new, quoted),
             of(|scores| scores.focal_px),
             of(|scores| scores.focal_error_percent),
