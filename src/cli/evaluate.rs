@@ -1,4 +1,4 @@
-//! `scpsfm evaluate`: the paper's evaluation, every method against the oracle.
+//! `scpsfm evaluate`: the paper's evaluation, every method against the oracle; real sequences are in [`evaluate_real`].
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -8,6 +8,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
+use super::evaluate_real::{self, RealArgs};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
@@ -32,6 +33,7 @@ Examples:
   scpsfm evaluate --beyond --methods oracle,auto --depths none
   scpsfm evaluate --ablation --sweeps outliers,orbit --out ablation
   scpsfm evaluate --sweeps outliers --depths given,epipolar --methods paper,psfm --paper-width 1
+  scpsfm evaluate --real sequences --peer 'python peer.py' --out side-by-side
 
 Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
 figure-depths-*.svg (the paper's layout) and index.html, which shows all of it. Stopped by Ctrl-C, a crash or a power cut it goes on where it was when called again with the same directory.";
@@ -41,7 +43,7 @@ figure-depths-*.svg (the paper's layout) and index.html, which shows all of it. 
 /// Scenes are made by the generator of `scpsfm synth`, with projective depths given (as the paper does) and without.
 /// The oracle knows the truth: its gate and its bundle adjustment are the best that anyone can do on the same scenes.
 #[derive(Debug, clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", evaluate_real::FORMAT))]
 pub struct Args {
     /// Directory for records and figures; created; runs that it already holds are not repeated
     #[arg(long, value_name = "DIR", default_value = "scpsfm-evaluation")]
@@ -83,13 +85,16 @@ pub struct Args {
     #[arg(long, value_name = "SHARE", value_parser = width, default_value_t = SolveSettings::DEFAULT_NETWORK_WIDTH)]
     pub paper_width: f64,
 
-    /// Print summary.json on stdout, instead of a table
+    /// Print summary.json (with --real, real.json) on stdout, instead of a table
     #[arg(long)]
     pub json: bool,
 
     /// Show no progress
     #[arg(long, short)]
     pub quiet: bool,
+
+    #[command(flatten)]
+    pub real: RealArgs,
 }
 
 /// A width that the solver accepts.
@@ -221,6 +226,9 @@ fn is_quick(observations: usize) -> bool {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
+    if !args.real.real.is_empty() {
+        return evaluate_real::run(&args.real, &args.out, args.json, args.quiet).await;
+    }
     let plan = args.plan();
     let runs = plan.runs();
     if runs.is_empty() {

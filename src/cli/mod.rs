@@ -7,6 +7,7 @@ pub mod cancel;
 pub mod client;
 pub mod demo;
 pub mod evaluate;
+pub mod evaluate_real;
 pub mod exit;
 pub mod get;
 pub mod interrupt;

@@ -6,6 +6,7 @@ mod crash;
 mod formats;
 mod load;
 mod readme;
+mod real;
 mod sequence;
 mod support;
 mod telemetry;
