@@ -31,6 +31,10 @@ pub fn headline(solution: &Solution) -> String {
             Some(sigma) => format!("\u{b1} {} % (one sigma)", short(sigma * 100.0)),
             None => "unobservable".into(),
         };
+        let note = match solution.calibrations.len() {
+            1 => note,
+            several => format!("{note}; the first of {several} camera groups"),
+        };
         card("focal length", format!("{:.1} px", calibration.focal_px), note);
         if calibration.radial_k1 != 0.0 {
             card("radial distortion", format!("k1 {}", short(calibration.radial_k1)), "estimated".into());

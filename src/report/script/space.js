@@ -33,7 +33,7 @@ const space = () => {
     centres.forEach((c, k) => { centres[k] = along(c, -1, focus); });
     // Cameras as large as their distance along the path allows.
     const steps = centres.slice(1).map((c, k) => Math.hypot(...along(c, -1, centres[k])));
-    const depth = Math.min(0.12 * radius, Math.max(0.02 * radius, 1.2 * quantile(steps, 0.5)));
+    const depth = Math.min(0.12 * radius, Math.max(0.03 * radius, 1.2 * quantile(steps, 0.5)));
     const frusta = cameras.map(([, , R, [left, right, top, bottom]], k) => {
       const rows = [0, 1, 2].map((row) => turned(R.slice(3 * row, 3 * row + 3)));
       return [[left, top], [right, top], [right, bottom], [left, bottom]].map(([x, y]) =>
@@ -50,7 +50,7 @@ const space = () => {
     const { points, weights, count, radius, centres, frusta, names, part } = scene;
     const [context, width, height] = fit(canvas, 0.6);
     const [cy, sy, cp, sp] = [Math.cos(look.yaw), Math.sin(look.yaw), Math.cos(look.pitch), Math.sin(look.pitch)];
-    const unitPx = look.zoom * 0.5 * Math.min(width, height) / radius, reach = 3.5 * radius / Math.sqrt(look.zoom);
+    const unitPx = look.zoom * 0.62 * Math.min(width, height) / radius, reach = 3.5 * radius / Math.sqrt(look.zoom);
     // To the screen: a turn about the vertical, a tilt, and the perspective of an eye `reach` away; null behind the eye.
     const place = (x, y, z) => {
       const right = cy * x + sy * z, ahead = cy * z - sy * x, below = cp * y - sp * ahead, depth = cp * ahead + sp * y;
@@ -86,8 +86,8 @@ const space = () => {
     });
     context.stroke();
     context.fillStyle = theme("ink"); context.font = "11px system-ui, sans-serif";
-    // Some thirty names, the first and the last among them.
-    const every = Math.ceil(names.length / 30);
+    // Some fifteen names, the first and the last among them.
+    const every = Math.ceil(names.length / 15);
     names.forEach((name, k) => {
       if (apexes[k] && (k % every === 0 || k === names.length - 1)) context.fillText(name, apexes[k][0] + 6, apexes[k][1] - 6);
     });
