@@ -8,7 +8,7 @@ use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResul
 use crate::domain::{
     Calibration, Grade, Losses, Method, Prior, Progress, Solution, Stage, Status, Warning, WarningCode,
 };
-use crate::synthetic::{Scene, SceneOptions};
+use crate::synthetic::{Scene, SceneOptions, Sequence, SequenceOptions};
 
 /// A solved scene of 5 views and 40 tracks, labels 10 x view + 3 and 2 x track + 100.
 pub(crate) fn solved() -> (LabelledInput, Solution) {
@@ -23,6 +23,53 @@ pub(crate) fn solved_with(options: &SceneOptions) -> (LabelledInput, Solution) {
     input.track_labels = (0..input.raw.track_count as u64).map(|track| Label::Number(2 * track + 100)).collect();
     let solution = solution(&scene);
     (input, solution)
+}
+
+/// The truth of a synthetic sequence as the solver answers it; of the fixture of a scene what is no sequence's.
+pub(crate) fn solved_sequence(options: &SequenceOptions) -> (LabelledInput, Solution) {
+    let sequence = Sequence::generate(options).expect("valid options");
+    let (truth, raw) = (&sequence.truth, &sequence.input);
+    let (_, base) = solved();
+    let [cx, cy] = truth.principal_point_px;
+    let k = Matrix3::new(truth.focal_px, 0.0, cx, 0.0, truth.focal_px, cy, 0.0, 0.0, 1.0);
+    let pose = |view: usize| {
+        let mut pose = Matrix3x4::zeros();
+        let rotation = truth.rotations[view];
+        pose.fixed_columns_mut::<3>(0).copy_from(&Matrix3::from_fn(|row, column| rotation[row][column]));
+        pose.set_column(3, &Vector3::from(truth.translations[view]));
+        k * pose
+    };
+    let cameras: Vec<Matrix3x4<f64>> = (0..options.views).map(pose).collect();
+    let residual = |n: usize| {
+        let seen = cameras[raw.view[n] as usize] * Vector3::from(truth.points[raw.track[n] as usize]).push(1.0);
+        (seen.x / seen.z - raw.x[n]).hypot(seen.y / seen.z - raw.y[n])
+    };
+    let view = |(view, camera): (usize, &Matrix3x4<f64>)| ViewResult {
+        projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| camera[(row, column)]))),
+        rotation: Some(truth.rotations[view]),
+        translation: Some(truth.translations[view]),
+        ..ViewResult::default()
+    };
+    let solution = Solution {
+        calibrations: vec![Calibration {
+            focal_px: truth.focal_px,
+            radial_k1: options.radial_k1,
+            ..base.calibrations[0]
+        }],
+        views: cameras.iter().enumerate().map(view).collect(),
+        tracks: TrackResults {
+            weight: truth.inlier.iter().map(|&yes| if yes { 0.97 } else { 0.02 }).collect(),
+            inlier: truth.inlier.clone(),
+            network_weight: Vec::new(),
+            point: truth.inlier.iter().zip(&truth.points).map(|(&yes, &point)| yes.then_some(point)).collect(),
+        },
+        observations: ObservationResults {
+            inlier: truth.observation_right.clone(),
+            residual_px: (0..raw.x.len()).map(|n| Some(residual(n))).collect(),
+        },
+        ..base
+    };
+    (LabelledInput::unlabelled(raw.clone(), Path::new("observations.csv")), solution)
 }
 
 /// The solved scene as the solver answers under [`Grade::ProjectiveOnly`]: no calibration, no plane at infinity, no

@@ -3,12 +3,10 @@
 use std::fmt::Write;
 
 use super::chart::{self, LineChart, Series};
-use super::html::{escape, script_json, short};
-use super::{scene, words};
+use super::html::{escape, short};
+use super::words;
 use crate::domain::result::PriorTime;
 use crate::domain::{Grade, Losses, Progress, Solution, Status};
-use crate::formats::LabelledInput;
-use crate::formats::result_json::view_label;
 
 /// A focal length beyond this factor of the final one is drawn at the edge of its chart.
 const FOCAL_CLIP: f64 = 2.5;
@@ -32,6 +30,10 @@ pub fn headline(solution: &Solution) -> String {
         let note = match calibration.sigma_log_focal {
             Some(sigma) => format!("\u{b1} {} % (one sigma)", short(sigma * 100.0)),
             None => "unobservable".into(),
+        };
+        let note = match solution.calibrations.len() {
+            1 => note,
+            several => format!("{note}; the first of {several} camera groups"),
         };
         card("focal length", format!("{:.1} px", calibration.focal_px), note);
         if calibration.radial_k1 != 0.0 {
@@ -196,94 +198,6 @@ pub fn weights(solution: &Solution) -> String {
         html.push_str(&draw("The network's own weights", &tracks.network_weight));
     }
     html.push_str("</div>\n<p class=\"note\">Heights are square roots of the counts, so that small bars stay visible.</p>\n</section>\n");
-    html
-}
-
-/// The tracks in the images.
-pub fn images(solution: &Solution, input: Option<&LabelledInput>) -> String {
-    let mut html = String::from("<section id=\"images\">\n<h2>Tracks in the images</h2>\n");
-    let Some(input) = input else {
-        html.push_str(
-            "<p class=\"note\">This page was made without the input: there are no points to draw.</p>\n</section>\n",
-        );
-        return html;
-    };
-    let tracks = scene::tracks(solution, input);
-    let _ = write!(
-        html,
-        "<p class=\"tools\"><label>View <select id=\"view\"></select></label>\n\
-         <label>Colour by <select id=\"colour\"><option value=\"inlier\">inlier</option><option value=\"weight\">weight</option></select></label>\n\
-         <label><input type=\"checkbox\" id=\"outliers\" checked> outliers</label>\n\
-         <label><input type=\"checkbox\" id=\"flow\" checked> flow to the next view</label></p>\n\
-         <canvas id=\"image\" role=\"img\" aria-label=\"tracks of the chosen view\"></canvas>\n\
-         <p class=\"note\" id=\"hover\">Blue: inlier. Orange: outlier track. Red: an observation left out of an inlier track. \
-         Point at one to see its track.</p>\n<p class=\"note\">{} of {} tracks are drawn.</p>\n\
-         <script type=\"application/json\" id=\"tracks-data\">{}</script>\n</section>\n",
-        tracks.shown,
-        tracks.all,
-        script_json(&tracks.json)
-    );
-    html
-}
-
-/// Cameras and points.
-pub fn space(solution: &Solution, input: Option<&LabelledInput>) -> String {
-    let mut html = String::from("<section id=\"space\">\n<h2>Cameras and points</h2>\n");
-    match scene::space(solution, input) {
-        Some(json) => {
-            let _ = write!(
-                html,
-                "<canvas id=\"solid\" role=\"img\" aria-label=\"cameras and points in space\"></canvas>\n\
-                 <p class=\"note\">Drag to turn, wheel to zoom. Points are coloured by weight.</p>\n\
-                 <script type=\"application/json\" id=\"space-data\">{}</script>\n",
-                script_json(&json)
-            );
-        }
-        None => html.push_str("<p class=\"note\">There is no metric reconstruction to show.</p>\n"),
-    }
-    html.push_str("</section>\n");
-    html
-}
-
-/// What one view contributes.
-#[derive(Default, Clone)]
-struct ViewCount {
-    observations: usize,
-    inliers: usize,
-    squares: f64,
-    judged: usize,
-}
-
-/// A table of the views.
-pub fn views(solution: &Solution, input: Option<&LabelledInput>) -> String {
-    let mut counts = vec![ViewCount::default(); solution.views.len()];
-    for (k, &view) in input.map_or(&[][..], |input| &input.raw.view).iter().enumerate() {
-        let Some(count) = counts.get_mut(view as usize) else { continue };
-        count.observations += 1;
-        if solution.observations.inlier.get(k) == Some(&true) {
-            count.inliers += 1;
-            if let Some(px) = solution.observations.residual_px.get(k).copied().flatten() {
-                count.squares += px * px;
-                count.judged += 1;
-            }
-        }
-    }
-    let mut html = String::from(
-        "<section id=\"views\">\n<h2>Views</h2>\n<div class=\"table\"><table>\n<tr><th>view</th><th>registered</th>\
-         <th>observations</th><th>inliers</th><th>RMS (px)</th></tr>\n",
-    );
-    for (index, (view, count)) in solution.views.iter().zip(&counts).enumerate() {
-        let rms = if count.judged > 0 { short((count.squares / count.judged as f64).sqrt()) } else { "-".into() };
-        let registered = if view.projection.is_some() { "yes" } else { "no" };
-        let _ = writeln!(
-            html,
-            "<tr><td>{}</td><td>{registered}</td><td>{}</td><td>{}</td><td>{rms}</td></tr>",
-            escape(&view_label(input, index).to_string()),
-            count.observations,
-            count.inliers
-        );
-    }
-    html.push_str("</table></div>\n</section>\n");
     html
 }
 

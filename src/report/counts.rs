@@ -1,0 +1,150 @@
+//! What each view, and each part, contributes to a result.
+
+use std::collections::BTreeMap;
+
+use crate::domain::Solution;
+use crate::formats::LabelledInput;
+
+/// Worst observations kept a view: enough to see whether they have something in common.
+const WORST: usize = 5;
+
+/// One view's share of the observations. Residuals are over its inlier observations.
+#[derive(Debug, Default, Clone)]
+pub struct ViewCount {
+    pub observations: usize,
+    pub inliers: usize,
+    judged: usize,
+    sum_px: f64,
+    sum_px2: f64,
+    /// The inlier observations of the largest residuals (px), largest first, each with its track.
+    pub worst: Vec<(f64, usize)>,
+}
+
+impl ViewCount {
+    pub fn mean_px(&self) -> Option<f64> {
+        (self.judged > 0).then(|| self.sum_px / self.judged as f64)
+    }
+
+    pub fn rms_px(&self) -> Option<f64> {
+        (self.judged > 0).then(|| (self.sum_px2 / self.judged as f64).sqrt())
+    }
+
+    fn add_residual(&mut self, px: f64, track: usize) {
+        self.judged += 1;
+        self.sum_px += px;
+        self.sum_px2 += px * px;
+        let place = self.worst.partition_point(|&(worse, _)| worse >= px);
+        if place < WORST {
+            self.worst.insert(place, (px, track));
+            self.worst.truncate(WORST);
+        }
+    }
+}
+
+/// One entry a view of the solution; nothing but zeros without the input.
+pub fn of_views(solution: &Solution, input: Option<&LabelledInput>) -> Vec<ViewCount> {
+    let mut counts = vec![ViewCount::default(); solution.views.len()];
+    let Some(raw) = input.map(|input| &input.raw) else { return counts };
+    for (k, (&view, &track)) in raw.view.iter().zip(&raw.track).enumerate() {
+        let Some(count) = counts.get_mut(view as usize) else { continue };
+        count.observations += 1;
+        if solution.observations.inlier.get(k) == Some(&true) {
+            count.inliers += 1;
+            let residual = solution.observations.residual_px.get(k).copied().flatten();
+            if let Some(px) = residual.filter(|px| px.is_finite()) {
+                count.add_residual(px, track as usize);
+            }
+        }
+    }
+    counts
+}
+
+/// The registered views of each part, in the input's order.
+pub fn parts(solution: &Solution) -> BTreeMap<u32, Vec<usize>> {
+    let mut parts: BTreeMap<u32, Vec<usize>> = BTreeMap::new();
+    for view in solution.registered_views() {
+        parts.entry(solution.views[view].part).or_default().push(view);
+    }
+    parts
+}
+
+/// The part that each inlier track is reconstructed in: that of the first registered view with an inlier observation of
+/// it. Where there is one part, its tracks need no input to tell.
+pub fn parts_of_tracks(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Option<u32>> {
+    let all = parts(solution);
+    let tracks = &solution.tracks.inlier;
+    if all.len() < 2 {
+        let only = all.keys().next().copied();
+        return tracks.iter().map(|&inlier| only.filter(|_| inlier)).collect();
+    }
+    let mut of_track = vec![None; tracks.len()];
+    let Some(raw) = input.map(|input| &input.raw) else { return of_track };
+    for (k, (&view, &track)) in raw.view.iter().zip(&raw.track).enumerate() {
+        let registered = solution.views.get(view as usize).filter(|view| view.projection.is_some());
+        let inlier = solution.observations.inlier.get(k) == Some(&true);
+        if let (Some(view), true, Some(part @ None)) = (registered, inlier, of_track.get_mut(track as usize)) {
+            *part = Some(view.part);
+        }
+    }
+    of_track
+}
+
+/// The views of each track's inlier observations, ascending, each once.
+pub fn inlier_views(solution: &Solution, input: &LabelledInput) -> Vec<Vec<u32>> {
+    let mut views: Vec<Vec<u32>> = vec![Vec::new(); solution.tracks.inlier.len()];
+    for (k, (&view, &track)) in input.raw.view.iter().zip(&input.raw.track).enumerate() {
+        if solution.observations.inlier.get(k) == Some(&true) && (view as usize) < solution.views.len() {
+            if let Some(views) = views.get_mut(track as usize) {
+                views.push(view);
+            }
+        }
+    }
+    for views in &mut views {
+        views.sort_unstable();
+        views.dedup();
+    }
+    views
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::formats::fixture;
+
+    #[test]
+    fn a_view_counts_what_it_sees() {
+        let (input, mut solution) = fixture::solved();
+        let of_view: Vec<usize> = (0..input.raw.view.len()).filter(|&k| input.raw.view[k] == 2).collect();
+        let inliers: Vec<usize> = of_view.iter().copied().filter(|&k| solution.observations.inlier[k]).collect();
+        for (rank, &k) in inliers.iter().enumerate() {
+            solution.observations.residual_px[k] = Some(rank as f64);
+        }
+        let count = &of_views(&solution, Some(&input))[2];
+        let n = inliers.len() as f64;
+        assert_eq!((count.observations, count.inliers), (of_view.len(), inliers.len()));
+        assert_eq!(count.mean_px(), Some((n - 1.0) / 2.0));
+        assert!((count.rms_px().expect("judged") - ((n - 1.0) * (2.0 * n - 1.0) / 6.0).sqrt()).abs() < 1e-9);
+        let worst: Vec<f64> = count.worst.iter().map(|worst| worst.0).collect();
+        assert_eq!(worst, (1..=WORST).map(|k| n - k as f64).collect::<Vec<_>>());
+        assert_eq!(count.worst[0].1, input.raw.track[inliers[inliers.len() - 1]] as usize);
+    }
+
+    #[test]
+    fn tracks_belong_to_the_part_that_sees_them() {
+        let (input, mut solution) = fixture::solved();
+        assert_eq!(parts(&solution).len(), 1);
+        let inlier = solution.tracks.inlier.iter().position(|&inlier| inlier).expect("an inlier");
+        assert_eq!(parts_of_tracks(&solution, None)[inlier], Some(0), "one part needs no input");
+        solution.views.iter_mut().skip(3).for_each(|view| view.part = 1);
+        for k in 0..input.raw.view.len() {
+            // This track is seen by the second part only.
+            if input.raw.track[k] as usize == inlier && input.raw.view[k] < 3 {
+                solution.observations.inlier[k] = false;
+            }
+        }
+        assert_eq!(parts(&solution)[&1], [3, 4]);
+        assert_eq!(parts_of_tracks(&solution, Some(&input))[inlier], Some(1));
+        assert_eq!(parts_of_tracks(&solution, None)[inlier], None, "nothing tells without the input");
+        assert_eq!(inlier_views(&solution, &input)[inlier], [3, 4]);
+    }
+}

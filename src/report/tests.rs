@@ -1,0 +1,112 @@
+//! The page as a whole.
+
+use super::*;
+use crate::domain::{Status, Warning, WarningCode};
+use crate::formats::{Label, fixture};
+use crate::synthetic::{SceneOptions, SequenceOptions};
+
+#[test]
+fn fetches_nothing_and_escapes_everything() {
+    let (mut input, mut solution) = fixture::solved();
+    let hostile = "</script><script>alert(1)</script><img src=x onerror='a'>";
+    // Image names come from files of others.
+    input.view_labels[1] = Label::Name(hostile.into());
+    solution.warnings.push(Warning::new(WarningCode::ViewsLeftOut, hostile));
+    let page = page(&solution, Some(&input));
+    for forbidden in ["http://", "https://", "//cdn", "<link", "@import", "url(", "<img", "fetch(", hostile] {
+        assert!(!page.contains(forbidden), "the page holds {forbidden}");
+    }
+    assert!(page.contains("&lt;/script&gt;&lt;script&gt;alert(1)"));
+    assert_eq!(page.matches("</script>").count(), page.matches("<script").count());
+}
+
+#[test]
+fn shows_every_part() {
+    let (input, solution) = fixture::solved();
+    let page = page(&solution, Some(&input));
+    for part in [
+        "id=\"headline\"",
+        "id=\"warnings\"",
+        "id=\"convergence\"",
+        "id=\"weights\"",
+        "id=\"images\"",
+        "id=\"space\"",
+        "id=\"views\"",
+        "id=\"calibration\"",
+        "id=\"parts\"",
+        "id=\"covisibility\"",
+    ] {
+        assert!(page.contains(part), "no {part}");
+    }
+    let focal = format!("{:.1}", solution.calibrations[0].focal_px);
+    assert!(page.contains(&focal));
+    for curve in ["L_num", "L_proj", "L_DAQ"] {
+        assert!(page.contains(curve), "no curve {curve}");
+    }
+}
+
+#[test]
+fn an_unsolved_scene_and_an_absent_input_make_a_page_too() {
+    let (input, mut solution) = fixture::solved();
+    solution.status = Status::NoReconstruction;
+    solution.grade = None;
+    solution.calibrations.clear();
+    solution.views.iter_mut().for_each(|view| *view = Default::default());
+    solution.tracks.inlier.iter_mut().for_each(|inlier| *inlier = false);
+    solution.tracks.point.iter_mut().for_each(|point| *point = None);
+    solution.history.clear();
+    solution.tracks.network_weight.clear();
+    let with = page(&solution, Some(&input));
+    assert!(with.contains("NO_RECONSTRUCTION") && with.contains("nothing recorded"));
+    let without = page(&solution, None);
+    assert!(without.contains("without the input"));
+    assert!(!without.contains("id=\"tracks-data\""));
+}
+
+#[test]
+fn a_projective_result_shows_no_focal_length_and_no_space() {
+    let (input, solution) = fixture::projective_only();
+    let page = page(&solution, Some(&input));
+    assert!(page.contains(">PROJECTIVE_ONLY<"));
+    assert!(page.contains("<dt>focal length</dt><dd>none</dd><p>unobservable</p>"));
+    assert!(page.contains("known up to a projective transformation only") && page.contains("no calibration to show"));
+    assert!(page.contains("no metric reconstruction to show") && !page.contains("id=\"space-data\""));
+    assert!(page.contains("id=\"tracks-data\""));
+}
+
+#[test]
+fn a_large_input_makes_a_small_page() {
+    let options = SceneOptions { views: 20, tracks: 20_000, outliers: 0.5, ..SceneOptions::default() };
+    let (input, solution) = fixture::solved_with(&options);
+    let page = page(&solution, Some(&input));
+    assert!(page.len() < 5 * 1024 * 1024, "{} bytes", page.len());
+    assert!(page.contains("of 20000 tracks are drawn"));
+}
+
+#[test]
+fn a_long_sequence_makes_a_small_page() {
+    let options = SequenceOptions { views: 1000, tracks: 200_000, ..SequenceOptions::default() };
+    let (mut input, mut solution) = fixture::solved_sequence(&options);
+    // Names as long as files may have, of characters that grow when escaped.
+    input.view_labels = (0..1000).map(|view| Label::Name(format!("{}{view}.jpg", "<".repeat(4000)).into())).collect();
+    input.track_labels = (0..200_000).map(|track| Label::Name(format!("{track}{}", "<".repeat(200)).into())).collect();
+    solution.views.iter_mut().skip(700).for_each(|view| view.part = 1);
+    let page = page(&solution, Some(&input));
+    assert!(page.len() < 5 * 1024 * 1024, "{} bytes", page.len());
+    assert!(page.contains("of 200000 tracks are drawn") && page.contains("form 2 parts"));
+}
+
+#[test]
+fn the_same_result_makes_the_same_page_but_for_two_lines() {
+    let options = SequenceOptions { views: 30, tracks: 500, ..SequenceOptions::default() };
+    let (input, mut solution) = fixture::solved_sequence(&options);
+    let first = page(&solution, Some(&input));
+    assert_eq!(first, page(&solution, Some(&input)));
+    solution.seconds *= 3.0;
+    solution.stages.iter_mut().for_each(|stage| stage.seconds += 1.0);
+    solution.prior_times.iter_mut().for_each(|time| time.seconds = Some(0.25));
+    solution.history.iter_mut().for_each(|record| record.elapsed_seconds += 1.0);
+    let second = page(&solution, Some(&input));
+    let differing = first.lines().zip(second.lines()).filter(|(a, b)| a != b).count();
+    assert_eq!((first.lines().count(), differing), (second.lines().count(), 2));
+}
