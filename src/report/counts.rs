@@ -93,10 +93,11 @@ pub fn parts_of_tracks(solution: &Solution, input: Option<&LabelledInput>) -> Ve
 pub fn inlier_views(solution: &Solution, input: &LabelledInput) -> Vec<Vec<u32>> {
     let mut views: Vec<Vec<u32>> = vec![Vec::new(); solution.tracks.inlier.len()];
     for (k, (&view, &track)) in input.raw.view.iter().zip(&input.raw.track).enumerate() {
-        if solution.observations.inlier.get(k) == Some(&true) && (view as usize) < solution.views.len() {
-            if let Some(views) = views.get_mut(track as usize) {
-                views.push(view);
-            }
+        if solution.observations.inlier.get(k) == Some(&true)
+            && (view as usize) < solution.views.len()
+            && let Some(views) = views.get_mut(track as usize)
+        {
+            views.push(view);
         }
     }
     for views in &mut views {

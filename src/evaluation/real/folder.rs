@@ -233,8 +233,11 @@ fn labels(file: &Path) -> Result<HashMap<(u64, u64), bool>, Error> {
     Ok(said)
 }
 
+/// Centre of each view's camera, where the file has one.
+type Centres = Vec<Option<Vector3<f64>>>;
+
 /// Camera centres, and whether they were estimated from the tracks; none where there is no such file.
-fn cameras(file: &Path) -> Result<(Vec<Option<Vector3<f64>>>, bool), Error> {
+fn cameras(file: &Path) -> Result<(Centres, bool), Error> {
     if !file.exists() {
         return Ok((Vec::new(), false));
     }
