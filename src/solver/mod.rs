@@ -27,8 +27,9 @@ mod sequence;
 #[cfg(test)]
 mod tests;
 
+use crate::domain::result::ViewResult;
 use crate::domain::{
-    FocalPrior, Input, Observer, Solution, SolveSettings, StopReason, StopToken, Warning, WarningCode,
+    FocalPrior, Input, Observer, Solution, SolveSettings, Status, StopReason, StopToken, Warning, WarningCode,
 };
 use crate::geometry::measurement::Normalization;
 use attempt::Attempt;
@@ -122,7 +123,7 @@ fn solve_sequence(context: &Context, mut warnings: Vec<Warning>, mut recorder: R
             warnings.extend(block::merged_cameras(context.input, !merges_cameras));
             let solution = sequence::solved(*extended, warnings, recorder);
             context.stopped()?;
-            Ok(solution)
+            Ok(verified(solution))
         }
         sequence::Ended::Block(best) => {
             warnings.extend(block::merged_cameras(context.input, false));
@@ -138,6 +139,28 @@ fn solve_sequence(context: &Context, mut warnings: Vec<Warning>, mut recorder: R
             of_block(best.as_deref(), context, warnings, recorder)
         }
     }
+}
+
+/// The solution, or none where judging leaves fewer tracks than geometry can verify.
+fn verified(mut solution: Solution) -> Solution {
+    let inliers = solution.inlier_track_count();
+    if inliers >= grow::LEAST_INLIERS {
+        return solution;
+    }
+    solution.status = Status::NoReconstruction;
+    solution.grade = None;
+    solution.calibrations.clear();
+    solution.plane_at_infinity = None;
+    solution.views.fill(ViewResult::default());
+    solution.tracks.weight.fill(0.0);
+    solution.tracks.inlier.fill(false);
+    solution.tracks.point.fill(None);
+    solution.observations.inlier.fill(false);
+    solution.observations.residual_px.fill(None);
+    (solution.noise_px, solution.reprojection_rms_px, solution.reprojection_mean_px) = (None, None, None);
+    let detail = format!("{inliers} tracks hold under the final geometry; {} can be verified", grow::LEAST_INLIERS);
+    solution.warnings.push(Warning::new(WarningCode::FewInliers, detail));
+    solution
 }
 
 /// The solution that the best block gives.

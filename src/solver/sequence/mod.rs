@@ -20,6 +20,7 @@ pub use assemble::solved;
 
 use super::attempt::{self, Attempt};
 use super::calibration::Outcome;
+use super::grow::LEAST_INLIERS;
 use super::recorder::Recorder;
 use super::{Context, Error, block};
 use crate::domain::{Grade, Method, Stage, Warning, WarningCode};
@@ -77,6 +78,10 @@ pub fn solve<'a>(
         let attempt = attempt::solve_block(block, &seeding, recorder)?;
         if attempt.is_good() {
             let extended = extend(attempt, &seeding, recorder)?;
+            if !extended.stands() {
+                unextended = better(unextended, extended.seed);
+                continue;
+            }
             let enough = extended.is_firm();
             if best.as_ref().is_none_or(|best| extended.merit() > best.merit()) {
                 best = Some(extended);
@@ -84,8 +89,8 @@ pub fn solve<'a>(
             if enough {
                 break;
             }
-        } else if unextended.as_ref().is_none_or(|best| attempt.merit() > best.merit()) {
-            unextended = Some(attempt);
+        } else {
+            unextended = better(unextended, attempt);
         }
     }
     if let Some(best) = best {
@@ -94,10 +99,21 @@ pub fn solve<'a>(
     match unextended {
         Some(seed) if seed.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some()) => {
             let extended = extend(seed, &seeding, recorder)?;
-            let stands = extended.calibrations.iter().any(|outcome| outcome.metric.is_some());
-            Ok(if stands { Ended::Extended(Box::new(extended)) } else { Ended::Block(Some(Box::new(extended.seed))) })
+            Ok(if extended.stands() {
+                Ended::Extended(Box::new(extended))
+            } else {
+                Ended::Block(Some(Box::new(extended.seed)))
+            })
         }
         unextended => Ok(Ended::Block(unextended.map(Box::new))),
+    }
+}
+
+/// The one of the two that has more merit, the first of equals.
+fn better(best: Option<Attempt>, attempt: Attempt) -> Option<Attempt> {
+    match best {
+        Some(best) if best.merit() >= attempt.merit() => Some(best),
+        _ => Some(attempt),
     }
 }
 
@@ -155,6 +171,13 @@ impl Extended<'_> {
     /// Larger is better: a calibration before none, then the number of views.
     fn merit(&self) -> (bool, usize) {
         (self.grade() != Grade::ProjectiveOnly, self.model.registered().len())
+    }
+
+    /// Whether there is anything that geometry verifies: views that points hold, and enough points.
+    fn stands(&self) -> bool {
+        self.model.registered().len() >= block::LEAST_VIEWS
+            && adjust::verified(&self.model).len() >= LEAST_INLIERS
+            && self.calibrations.iter().any(|outcome| outcome.metric.is_some())
     }
 
     /// Whether no other seed needs to be tried.
