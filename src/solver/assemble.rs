@@ -133,7 +133,7 @@ fn judged(context: &Context, attempt: &Attempt, consensus: &Consensus, local: &[
         lenses: &[],
         linked: false,
         noise: consensus.noise,
-        outlier_density: outlier_density(attempt),
+        outlier_density: judge::density_of_spread(super::portfolio::spread(&attempt.block.complete)),
         inlier_share: (consensus.inlier_count() as f64 + 1.0) / (attempt.block.tracks.len() as f64 + 2.0),
     };
     judge::judge(context.input, context.ranges, &geometry, context.stop)
@@ -202,11 +202,6 @@ fn mask(context: &Context, block_tracks: &[usize], decided: &Decided, judged: &m
             }
         }
     }
-}
-
-fn outlier_density(attempt: &Attempt) -> f64 {
-    // A uniform distribution of that standard deviation is sqrt(12) times as wide.
-    1.0 / (12.0f64.sqrt() * super::portfolio::spread(&attempt.block.complete))
 }
 
 /// The names with commas between them, past the first few only counted.

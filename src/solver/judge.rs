@@ -72,7 +72,11 @@ pub fn outlier_density(points: &[Vector2<f64>]) -> f64 {
     let count = points.len().max(1) as f64;
     let mean = points.iter().sum::<Vector2<f64>>() / count;
     let variance = points.iter().map(|point| (point - mean).norm_squared()).sum::<f64>() / (2.0 * count);
-    let spread = variance.sqrt().clamp(f64::MIN_POSITIVE, super::portfolio::MOST_SPREAD);
+    density_of_spread(variance.sqrt().clamp(f64::MIN_POSITIVE, super::portfolio::MOST_SPREAD))
+}
+
+/// The same from the standard deviation of a coordinate: a uniform distribution is `sqrt(12)` times as wide.
+pub fn density_of_spread(spread: f64) -> f64 {
     1.0 / (12.0f64.sqrt() * spread)
 }
 

@@ -7,7 +7,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::scene::{FOCAL_RANGE_PX, IMAGE_SIDE_PX, SceneOptions};
+use super::scene::{FOCAL_RANGE_PX, IMAGE_SIDE_PX, SceneOptions, normal, rows};
 use crate::domain::error::{InvalidInput, Violation, Violations};
 use crate::domain::{ImageSize, RawInput, View};
 
@@ -218,15 +218,11 @@ fn anywhere(rng: &mut ChaCha8Rng) -> Vector2<f64> {
     Vector2::new(rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5))
 }
 
-/// Two independent standard normal numbers (Box & Muller).
+/// Two independent standard normal numbers.
 fn normals(rng: &mut ChaCha8Rng) -> Vector2<f64> {
-    let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
-    let angle = TAU * rng.random::<f64>();
-    Vector2::new(radius * angle.cos(), radius * angle.sin())
-}
-
-fn rows(matrix: &Matrix3<f64>) -> [[f64; 3]; 3] {
-    std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]))
+    let (radius, angle) = (rng.random(), rng.random::<f64>());
+    // Box-Muller's pair: the cosine of an angle, and its sine as the cosine a quarter of a turn back.
+    Vector2::new(normal(radius, angle), normal(radius, angle - 0.25))
 }
 
 #[cfg(test)]

@@ -76,18 +76,8 @@ impl Information {
             return None;
         }
         let (matrix, pull) = without_poses(&reduced.matrix, &reduced.vector, POSE * poses)?;
-        Self::assembled(reconstruction.intrinsics, matrix, pull, known)
-    }
-
-    /// From what is left when everything else is eliminated; `None` where it holds what is no number.
-    pub(super) fn assembled(
-        intrinsics: Intrinsics,
-        matrix: SMatrix<f64, PARAMETERS, PARAMETERS>,
-        pull: SVector<f64, PARAMETERS>,
-        known: [f64; PARAMETERS],
-    ) -> Option<Self> {
         let finite = matrix.iter().chain(pull.iter()).all(|value| value.is_finite());
-        finite.then_some(Self { intrinsics, matrix, pull, known })
+        finite.then_some(Self { intrinsics: reconstruction.intrinsics, matrix, pull, known })
     }
 
     /// Where the cost of a model is least, how low it is there, and how well that is determined.

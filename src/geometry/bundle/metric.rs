@@ -266,7 +266,7 @@ mod tests {
         let scene = testing::scene(3, 4, 8, NOISE);
         let run = |mut start: Reconstruction, observations: &[Observation]| {
             let options = Options::default();
-            for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
+            for model in [IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
                 let prior = IntrinsicsPrior::NONE;
                 let report = adjust(&mut start, observations, model, &prior, &options, &StopToken::default());
                 assert!(report.cost.is_finite() && report.cost <= report.initial_cost, "{report:?}");

@@ -17,7 +17,7 @@ use crate::simd::vectorised;
 /// of a projective, 7 of a metric reconstruction) at a thousandth of what observed directions weigh at worst.
 const GAUGE_DAMPING: f64 = 1e-9;
 /// Least diagonal of a point's block as a share of its trace, for points whose position nothing determines.
-const POINT_DAMPING: f64 = 1e-12;
+pub(super) const POINT_DAMPING: f64 = 1e-12;
 
 /// Residuals and Jacobians at one state, with their robust weights, and the diagonal blocks of `J' J`.
 pub(super) struct Linearisation<const G: usize, const C: usize, const P: usize> {

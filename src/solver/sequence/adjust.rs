@@ -1,6 +1,6 @@
 //! Bundle adjustment of a sequence: of what stands, with the calibration free.
 
-use super::model::{Model, Scene};
+use super::model::{Lens, Model, Scene};
 use super::parts::FIRST;
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::sequence::{self, Free, Sequence, Sighting};
@@ -129,13 +129,12 @@ pub fn while_growing(scene: &Scene, model: &mut Model, part: u32) {
     let views = model.of_part(part);
     let tracks = covering(scene, model, &views, OF_VIEW_WHILE_GROWING);
     let mut extract = Extract::new(scene, model, &views, &tracks);
-    let held = |group: usize| part != FIRST && model.of_part(FIRST).iter().any(|&view| scene.group_of[view] == group);
-    let models: Vec<IntrinsicsModel> = model
-        .lenses
-        .iter()
-        .enumerate()
-        .map(|(group, lens)| if held(group) { IntrinsicsModel::FIXED } else { lens.free })
-        .collect();
+    let mut is_held = vec![false; scene.groups];
+    if part != FIRST {
+        model.of_part(FIRST).into_iter().for_each(|view| is_held[scene.group_of[view]] = true);
+    }
+    let free = |(lens, held): (&Lens, &bool)| if *held { IntrinsicsModel::FIXED } else { lens.free };
+    let models: Vec<IntrinsicsModel> = model.lenses.iter().zip(&is_held).map(free).collect();
     extract.adjust(scene, model, &Free::all(&models), ITERATIONS_WHILE_GROWING);
     finish(scene, model, &extract);
 }

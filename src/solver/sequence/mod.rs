@@ -29,7 +29,8 @@ use model::{Model, Scene};
 /// Rounds of adjusting everything and triangulating it anew that end an extension; the third moves nothing that a
 /// gate would see.
 const FINAL_ROUNDS: usize = 3;
-/// Share of the views that an extension must register for no other seed to be tried.
+/// Share of the views that an extension must register for no other seed to be tried: one that carries most of them is a
+/// part of whatever another would lead to.
 const ENOUGH_REGISTERED: f64 = 0.5;
 
 /// A sequence that stands, with the block that it grew from.
@@ -160,12 +161,10 @@ impl Extended<'_> {
     /// The worst of the cameras that have enough registered views to be calibrated: a few photographs of another camera
     /// take nothing from the rest.
     fn grade(&self) -> Grade {
-        let views = |group: usize| {
-            let registered = self.model.registered();
-            registered.into_iter().filter(|&view| self.scene.group_of[view] == group).count()
-        };
-        let grades = self.calibrations.iter().enumerate().filter(|(group, _)| views(*group) >= block::LEAST_VIEWS);
-        grades.map(|(_, outcome)| outcome.grade).reduce(Grade::worse).unwrap_or(Grade::ProjectiveOnly)
+        let mut views = vec![0; self.scene.groups];
+        self.model.registered().into_iter().for_each(|view| views[self.scene.group_of[view]] += 1);
+        let grades = self.calibrations.iter().zip(views).filter(|(_, views)| *views >= block::LEAST_VIEWS);
+        grades.map(|(outcome, _)| outcome.grade).reduce(Grade::worse).unwrap_or(Grade::ProjectiveOnly)
     }
 
     /// Larger is better: a calibration before none, then the number of views.

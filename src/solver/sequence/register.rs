@@ -14,15 +14,16 @@ use crate::solver::{Error, block};
 /// Points that a view must see before it is tried, and that must agree with its pose: three determine it, and each of
 /// the other five agrees with a wrong one by chance in one case of a hundred.
 pub const LEAST_POINTS: usize = 8;
-/// Share of the points seen that must agree.
+/// Share of the points seen that must agree: below, the robust pose's samples do not suffice.
 const LEAST_SHARE: f64 = 0.1;
 /// Points of a view beyond which a pose is not made better.
 const MOST_POINTS: usize = 2_000;
-/// Growth of the points that a view sees after which a failed one is tried again.
+/// Growth of the points that a view sees after which a failed one is tried again: fewer new ones hardly change its odds.
 const RETRY_GROWTH: f64 = 1.2;
-/// Trials of a view.
+/// Trials of a view a part: by the last it sees some 1.7 times the points of the first.
 const MOST_TRIALS: usize = 4;
-/// Growth of the registered views after which all are adjusted; in between, only what is around each new one.
+/// Growth of the registered views after which all are adjusted; in between, only what is around each new one. A geometric
+/// growth keeps the cost of all adjustments together at six times that of the last.
 const ADJUST_GROWTH: f64 = 1.2;
 /// Focal lengths that a view of a camera that is not known yet is tried with, as factors on the first camera's: a
 /// quarter of an octave apart, from a third to three times.

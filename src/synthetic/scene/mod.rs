@@ -18,12 +18,14 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use self::camera::{Camera, Lens, rows};
+pub(super) use self::camera::rows;
+use self::camera::{Camera, Lens};
 use self::contamination::Contamination;
 pub use self::contamination::OutlierKind;
 pub use self::motion::Motion;
 pub use self::noise::NoiseKind;
 use self::noise::Observation;
+pub(super) use self::noise::normal;
 pub use self::options::SceneOptions;
 pub use self::shape::Shape;
 use self::stream::Stream;

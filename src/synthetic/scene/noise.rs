@@ -45,7 +45,7 @@ impl NoiseKind {
 }
 
 /// Box-Muller, of two numbers uniform in `[0, 1)`; one of the pair is enough here.
-fn normal(first: f64, second: f64) -> f64 {
+pub fn normal(first: f64, second: f64) -> f64 {
     let radius = (-2.0 * (1.0 - first).ln()).sqrt();
     radius * (TAU * second).cos()
 }

@@ -23,7 +23,7 @@ pub(super) struct Unknowns {
 }
 
 impl Unknowns {
-    fn new(sequence: &Sequence, free: &Free, sees: &[bool], last_group: Option<usize>) -> Self {
+    fn new(sequence: &Sequence, free: &Free, sees: &[bool]) -> Self {
         let mut offsets = vec![0];
         let mut append = |size: usize| {
             let block = offsets.len() - 1;
@@ -37,11 +37,7 @@ impl Unknowns {
         let parameters: Vec<Vec<Parameter>> = (0..groups)
             .map(|group| free.models.get(group).map(|model| model.parameters()).unwrap_or_default())
             .collect();
-        let mut group_block = vec![None; groups];
-        let ordered = (0..groups).filter(|group| Some(*group) != last_group).chain(last_group);
-        for group in ordered.filter(|group| *group < groups) {
-            group_block[group] = (!parameters[group].is_empty()).then(|| append(parameters[group].len()));
-        }
+        let group_block = parameters.iter().map(|free| (!free.is_empty()).then(|| append(free.len()))).collect();
         Self { pose_block, group_block, parameters, offsets }
     }
 
@@ -102,16 +98,8 @@ impl Layout {
     /// Sorts in linear time. Observations with an index out of range, a coordinate that is not finite or a weight that
     /// is not positive are left out.
     ///
-    /// * `last_group`: the group whose block is to be the last
-    ///
     /// Returns `None` when it was stopped.
-    pub fn new(
-        sequence: &Sequence,
-        sightings: &[Sighting],
-        free: &Free,
-        last_group: Option<usize>,
-        pace: &mut Pace,
-    ) -> Option<Self> {
+    pub fn new(sequence: &Sequence, sightings: &[Sighting], free: &Free, pace: &mut Pace) -> Option<Self> {
         let points = sequence.points.len();
         let usable = || sightings.iter().filter(|sighting| sequence.holds(sighting));
         let mut seen_starts = vec![0; points + 1];
@@ -136,7 +124,7 @@ impl Layout {
             next[point] += 1;
         }
         let mut layout = Self {
-            unknowns: Unknowns::new(sequence, free, &sees, last_group),
+            unknowns: Unknowns::new(sequence, free, &sees),
             seen,
             seen_starts,
             touches: Vec::new(),

@@ -50,7 +50,7 @@ pub fn adjust(
 ) -> Report {
     let mut pace = Pace::new(stop);
     let unknown = Report { initial_cost: f64::INFINITY, cost: f64::INFINITY, iterations: 0 };
-    let Some(layout) = Layout::new(sequence, sightings, free, None, &mut pace) else { return unknown };
+    let Some(layout) = Layout::new(sequence, sightings, free, &mut pace) else { return unknown };
     let Some(initial_cost) = cost(sequence, &layout, priors, options.loss, &mut pace) else { return unknown };
     let mut report = Report { initial_cost, cost: initial_cost, iterations: 0 };
     if layout.is_empty() || stop.is_stopped() {

@@ -5,7 +5,6 @@
 //! Shares residuals, loss and damping with the dense adjustment of one block, `bundle::metric`. May depend on nothing
 //! of `geometry` but `bundle` and linear algebra.
 
-mod information;
 mod layout;
 mod minimise;
 mod normal;
@@ -19,7 +18,6 @@ mod tests;
 
 use nalgebra::{Vector2, Vector3};
 
-pub use self::information::information;
 pub use self::minimise::adjust;
 use super::Observation;
 use super::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};

@@ -143,18 +143,6 @@ impl Pattern {
         };
         (0..self.block_count()).flat_map(of_block).collect()
     }
-
-    /// The same without the last block.
-    pub fn without_last(&self) -> Self {
-        let blocks = self.block_count().saturating_sub(1);
-        let (mut column_starts, mut rows) = (vec![0], Vec::new());
-        for column in 0..blocks {
-            let kept = self.column(column).rows.iter().filter(|row| (**row as usize) < blocks);
-            rows.extend(kept);
-            column_starts.push(rows.len());
-        }
-        Self::from_rows(self.offsets[..=blocks].to_vec(), column_starts, rows)
-    }
 }
 
 /// A block column whose rows are looked up in ascending order.

@@ -3,9 +3,7 @@
 use nalgebra::Vector3;
 
 use super::super::metric::POINT;
-
-/// Least diagonal of a point's block as a share of its trace, for points whose position nothing determines.
-const POINT_DAMPING: f64 = 1e-12;
+use super::super::reduced::POINT_DAMPING;
 
 /// Information on a point and half the gradient of the cost by it.
 #[derive(Debug, Clone, Copy)]

@@ -26,7 +26,7 @@ impl Solver {
         if n <= DENSE_LIMIT {
             return Some(Self::Dense { solver: CholeskySolver::new(n), matrix: vec![0.0; n * n] });
         }
-        SparseCholesky::new(pattern, 1).map(|cholesky| Self::Sparse(Box::new(cholesky)))
+        SparseCholesky::new(pattern).map(|cholesky| Self::Sparse(Box::new(cholesky)))
     }
 
     /// Solves in place of `vector`; `false` when the matrix is not positive definite.
@@ -59,9 +59,7 @@ pub(super) struct SparseCholesky {
 
 impl SparseCholesky {
     /// Orders and analyses; `None` without unknowns, or without the memory for it.
-    ///
-    /// * `columns`: right-hand sides at most
-    pub fn new(pattern: &Pattern, columns: usize) -> Option<Self> {
+    pub fn new(pattern: &Pattern) -> Option<Self> {
         let n = pattern.dimension();
         if n == 0 {
             return None;
@@ -74,7 +72,7 @@ impl SparseCholesky {
             factorize_symbolic_cholesky(structure.as_ref(), Side::Lower, ordering, Default::default()).ok()?;
         let scratch = StackReq::any_of(&[
             symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default()),
-            symbolic.solve_in_place_scratch::<f64>(columns, Par::Seq),
+            symbolic.solve_in_place_scratch::<f64>(1, Par::Seq),
         ]);
         let memory = MemBuffer::try_new(scratch).ok()?;
         Some(Self { factor: vec![0.0; symbolic.len_val()], structure, symbolic, memory })
@@ -90,14 +88,10 @@ impl SparseCholesky {
     }
 
     /// Solves in place with the latest factor.
-    ///
-    /// * `vectors`: right-hand sides, one after the other
-    pub fn solve(&mut self, vectors: &mut [f64]) {
-        let n = self.structure.nrows();
-        let columns = vectors.len() / n;
+    pub fn solve(&mut self, vector: &mut [f64]) {
         let factor = LltRef::new(&self.symbolic, &self.factor);
-        let vectors = MatMut::from_column_major_slice_mut(vectors, n, columns);
-        factor.solve_in_place_with_conj(Conj::No, vectors, Par::Seq, MemStack::new(&mut self.memory));
+        let vector = MatMut::from_column_major_slice_mut(vector, self.structure.nrows(), 1);
+        factor.solve_in_place_with_conj(Conj::No, vector, Par::Seq, MemStack::new(&mut self.memory));
     }
 }
 

@@ -1,6 +1,5 @@
 //! Input that determines little or nothing, or is no number.
 
-use super::super::information;
 use super::*;
 use crate::geometry::bundle::Loss;
 
@@ -11,12 +10,6 @@ fn run(mut sequence: Sequence, sightings: &[Sighting]) -> Sequence {
             let options = Options { loss, ..Options::default() };
             let report = adjusted(&mut sequence, sightings, &models, &options);
             assert!(report.cost.is_finite() && report.cost <= report.initial_cost, "{report:?}");
-            for group in 0..sequence.intrinsics.len() {
-                let free = Free::all(&models);
-                if let Some(found) = information(&sequence, sightings, group, &free, &[], &StopToken::default()) {
-                    found.optimum(model, &IntrinsicsPrior::NONE);
-                }
-            }
         }
     }
     sequence

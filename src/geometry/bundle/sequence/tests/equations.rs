@@ -61,7 +61,7 @@ fn normal_equations_agree_with_finite_differences() {
     let free = Free { models: &models, views: Some(&views), points: Some(&points) };
     let going = StopToken::default();
     let mut pace = Pace::new(&going);
-    let layout = Layout::new(&sequence, &sightings, &free, None, &mut pace).expect("goes on");
+    let layout = Layout::new(&sequence, &sightings, &free, &mut pace).expect("goes on");
     let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let cameras = pattern.dimension();
     assert_eq!(cameras, 6 * 6 + 5 + 3, "six free views, five and three intrinsics");
@@ -113,7 +113,7 @@ fn what_is_known_beforehand_takes_part() {
     let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, 0.2, 0.1, 0.01);
     let going = StopToken::default();
     let mut pace = Pace::new(&going);
-    let layout = Layout::new(&sequence, &sightings, &Free::all(&models), None, &mut pace).expect("goes on");
+    let layout = Layout::new(&sequence, &sightings, &Free::all(&models), &mut pace).expect("goes on");
     let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let with = |priors: &[IntrinsicsPrior]| {
         let mut normal = Normal::new(&layout, &pattern, &sequence);
@@ -135,7 +135,7 @@ fn a_stop_is_seen_within_one_linearisation() {
     let free = Free::all(&[IntrinsicsModel::FOCAL]);
     let going = StopToken::default();
     let mut pace = Pace::new(&going);
-    let layout = Layout::new(&sequence, &sightings, &free, None, &mut pace).expect("goes on");
+    let layout = Layout::new(&sequence, &sightings, &free, &mut pace).expect("goes on");
     let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();

@@ -41,7 +41,7 @@ fn time_against_observations() {
             let stop = StopToken::default();
             let mut pace = Pace::new(&stop);
             let (layout_seconds, layout) =
-                timed(|| Layout::new(&truth, &sightings, &Free::all(&models), None, &mut pace).expect("goes on"));
+                timed(|| Layout::new(&truth, &sightings, &Free::all(&models), &mut pace).expect("goes on"));
             let (analysis_seconds, _) = timed(|| {
                 let pattern = pattern(&truth, &layout, &mut pace).expect("goes on");
                 Solver::new(&pattern).expect("memory")

@@ -3,7 +3,6 @@
 mod adjust;
 mod degenerate;
 mod equations;
-mod information;
 mod measure;
 
 use nalgebra::{Rotation3, Vector2, Vector3};

@@ -1,0 +1,187 @@
+//! Every metric's name, help, labels and buckets.
+
+/// How a metric's values are read.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Kind {
+    /// Only grows; 0 at the start of the process.
+    Counter,
+    /// Goes up and down.
+    Gauge,
+    /// Counts below each of these upper bounds.
+    Histogram(&'static [f64]),
+}
+
+/// One metric, as it stands on `/metrics`.
+#[derive(Debug, Clone, Copy)]
+pub struct Metric {
+    /// Name in Prometheus' convention: base units, counters end in `_total`.
+    pub name: &'static str,
+    pub kind: Kind,
+    /// Names of its labels.
+    pub labels: &'static [&'static str],
+    pub help: &'static str,
+}
+
+/// Seconds a job waits or runs: from 50 ms (a queue that is empty) to ten minutes (a deadline some will set).
+const JOB_SECONDS: Kind =
+    Kind::Histogram(&[0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 13.0, 30.0, 60.0, 120.0, 300.0, 600.0]);
+
+/// Seconds of one stage: `prepare` and `judge` take milliseconds, `search` most of a job.
+const STAGE_SECONDS: Kind =
+    Kind::Histogram(&[0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0, 30.0, 60.0, 300.0]);
+
+/// Seconds of a call: a point read takes about 1 ms, a watch lives as long as its job.
+const RPC_SECONDS: Kind = Kind::Histogram(&[0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0]);
+
+/// Seconds of a store operation: a synced commit takes 1 to 20 ms on ordinary disks; a second is trouble.
+const STORE_SECONDS: Kind = Kind::Histogram(&[0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0]);
+
+/// Share of the tracks that are inliers, in tenths; below a tenth the search is hard, so it is cut once more.
+const RATIO: Kind = Kind::Histogram(&[0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]);
+
+/// Network iterations: the floor of 50, the default of 400, the cap of 10,000.
+const ITERATIONS: Kind = Kind::Histogram(&[0.0, 50.0, 100.0, 150.0, 200.0, 300.0, 400.0, 800.0, 2_000.0, 10_000.0]);
+
+pub const BUILD_INFO: Metric = Metric {
+    name: "scpsfm_build_info",
+    kind: Kind::Gauge,
+    labels: &["version", "backend"],
+    help: "Always 1; the labels tell the build's version and the server's compute backend.",
+};
+pub const QUEUE_DEPTH: Metric = Metric {
+    name: "scpsfm_queue_depth",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Jobs that are stored and wait for a worker.",
+};
+pub const QUEUE_CAPACITY: Metric = Metric {
+    name: "scpsfm_queue_capacity",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Waiting jobs at which new ones are refused.",
+};
+pub const QUEUE_WAIT: Metric = Metric {
+    name: "scpsfm_queue_wait_seconds",
+    kind: JOB_SECONDS,
+    labels: &[],
+    help: "Seconds from a job's entry into the queue to the claim of a worker.",
+};
+pub const WORKERS: Metric =
+    Metric { name: "scpsfm_workers", kind: Kind::Gauge, labels: &[], help: "Worker threads of this process." };
+pub const WORKERS_BUSY: Metric =
+    Metric { name: "scpsfm_workers_busy", kind: Kind::Gauge, labels: &[], help: "Worker threads that run a job." };
+pub const JOBS: Metric = Metric {
+    name: "scpsfm_jobs_total",
+    kind: Kind::Counter,
+    labels: &["state"],
+    help: "Jobs that ended, by terminal state.",
+};
+pub const JOBS_CREATED: Metric = Metric {
+    name: "scpsfm_jobs_created_total",
+    kind: Kind::Counter,
+    labels: &[],
+    help: "Jobs that were admitted and stored.",
+};
+pub const JOB_DURATION: Metric = Metric {
+    name: "scpsfm_job_duration_seconds",
+    kind: JOB_SECONDS,
+    labels: &["state"],
+    help: "Seconds from the start of a job's first attempt to its end, by terminal state.",
+};
+pub const STAGE_DURATION: Metric = Metric {
+    name: "scpsfm_stage_duration_seconds",
+    kind: STAGE_SECONDS,
+    labels: &["stage", "state"],
+    help: "Seconds that an attempt spent in a stage of the solver, by how the attempt ended.",
+};
+pub const ATTEMPTS_LOST: Metric = Metric {
+    name: "scpsfm_attempts_lost_total",
+    kind: Kind::Counter,
+    labels: &["reason"],
+    help: "Attempts that ended without ending their job: given back at a drain, lease lost, or crashed.",
+};
+pub const GRADES: Metric = Metric {
+    name: "scpsfm_results_total",
+    kind: Kind::Counter,
+    labels: &["grade"],
+    help: "Results of succeeded jobs by grade; NONE is a result without a reconstruction.",
+};
+pub const INLIER_RATIO: Metric = Metric {
+    name: "scpsfm_inlier_ratio",
+    kind: RATIO,
+    labels: &[],
+    help: "Inlier tracks as a share of all tracks, one sample a solved job.",
+};
+pub const SOLVE_ITERATIONS: Metric = Metric {
+    name: "scpsfm_solve_iterations",
+    kind: ITERATIONS,
+    labels: &[],
+    help: "Network iterations spent, one sample a succeeded job.",
+};
+pub const WINNING_PRIOR: Metric = Metric {
+    name: "scpsfm_winning_prior_total",
+    kind: Kind::Counter,
+    labels: &["prior"],
+    help: "Solved jobs by the prior whose sample led to the accepted consensus.",
+};
+pub const REFUSALS: Metric = Metric {
+    name: "scpsfm_admission_refusals_total",
+    kind: Kind::Counter,
+    labels: &["reason", "bound"],
+    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL, by the bound that was hit.",
+};
+pub const RPC_REQUESTS: Metric = Metric {
+    name: "scpsfm_grpc_requests_total",
+    kind: Kind::Counter,
+    labels: &["method", "code"],
+    help: "gRPC calls that ended, by method and status code.",
+};
+pub const RPC_DURATION: Metric = Metric {
+    name: "scpsfm_grpc_request_duration_seconds",
+    kind: RPC_SECONDS,
+    labels: &["method", "code"],
+    help: "Seconds from a gRPC call's first byte to its status, by method and status code.",
+};
+pub const RPC_IN_FLIGHT: Metric = Metric {
+    name: "scpsfm_grpc_requests_in_flight",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "gRPC calls that have begun and not ended.",
+};
+pub const STORE_DURATION: Metric = Metric {
+    name: "scpsfm_store_operation_duration_seconds",
+    kind: STORE_SECONDS,
+    labels: &["operation"],
+    help: "Seconds of a store operation, by operation.",
+};
+pub const WATCHERS: Metric = Metric {
+    name: "scpsfm_watchers",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Streams that follow a job (WatchJob and Solve).",
+};
+
+/// Every metric that this program exposes.
+pub const ALL: [Metric; 21] = [
+    BUILD_INFO,
+    QUEUE_DEPTH,
+    QUEUE_CAPACITY,
+    QUEUE_WAIT,
+    WORKERS,
+    WORKERS_BUSY,
+    JOBS,
+    JOBS_CREATED,
+    JOB_DURATION,
+    STAGE_DURATION,
+    ATTEMPTS_LOST,
+    GRADES,
+    INLIER_RATIO,
+    SOLVE_ITERATIONS,
+    WINNING_PRIOR,
+    REFUSALS,
+    RPC_REQUESTS,
+    RPC_DURATION,
+    RPC_IN_FLIGHT,
+    STORE_DURATION,
+    WATCHERS,
+];
