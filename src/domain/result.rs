@@ -166,9 +166,21 @@ pub struct Calibration {
     #[serde(default = "square_pixels")]
     pub aspect: f64,
     /// Radial distortion: a point at `(u, v, 1)` in camera coordinates is imaged at `x = f u s + px`,
-    /// `y = aspect f v s + py` with `s = 1 + k1 (u^2 + v^2)`. 0 (a pinhole) unless the data asked for more.
+    /// `y = aspect f v s + py` with `s = 1 + k1 r^2 + k2 r^4`, `r^2 = u^2 + v^2`. 0 (a pinhole) unless the data asked for
+    /// more.
     #[serde(default)]
     pub radial_k1: f64,
+    /// The second coefficient, `k2`.
+    #[serde(default)]
+    pub radial_k2: f64,
+}
+
+impl Calibration {
+    /// What the lens makes of a point at this squared tangent of the angle from the optical axis: the scale `s` of
+    /// [`Self::radial_k1`].
+    pub fn radial_scale(&self, squared: f64) -> f64 {
+        1.0 + squared * (self.radial_k1 + squared * self.radial_k2)
+    }
 }
 
 fn square_pixels() -> f64 {

@@ -43,7 +43,8 @@ fn worst_of_opensfm(json: &Value, input: &LabelledInput, solution: &Solution) ->
         let rotation = Rotation3::from_scaled_axis(three(&shot["rotation"]));
         let seen_at = rotation * three(&point["coordinates"]) + three(&shot["translation"]);
         let (x, y) = (seen_at.x / seen_at.z, seen_at.y / seen_at.z);
-        let d = 1.0 + number(&camera["k1"]) * (x * x + y * y);
+        let squared = x * x + y * y;
+        let d = 1.0 + number(&camera["k1"]) * squared + number(&camera["k2"]) * squared * squared;
         let (u, v) = match camera["projection_type"].as_str() {
             Some("perspective") => (number(&camera["focal"]) * d * x, number(&camera["focal"]) * d * y),
             Some("brown") => (
@@ -74,7 +75,7 @@ fn scene_of(calibration: Calibration, size: ImageSize) -> (LabelledInput, Soluti
             (0..3).map(|axis| rotation[row][axis] * point[axis]).sum::<f64>() + translation[row]
         });
         let (u, v) = (seen[0] / seen[2], seen[1] / seen[2]);
-        let s = 1.0 + calibration.radial_k1 * (u * u + v * v);
+        let s = calibration.radial_scale(u * u + v * v);
         let [px, py] = calibration.principal_point_px;
         input.raw.x[k] = calibration.focal_px * u * s + px;
         input.raw.y[k] = calibration.aspect * calibration.focal_px * v * s + py;
@@ -82,8 +83,8 @@ fn scene_of(calibration: Calibration, size: ImageSize) -> (LabelledInput, Soluti
     (input, solution)
 }
 
-fn lens(aspect: f64, radial_k1: f64, principal_point_px: [f64; 2]) -> Calibration {
-    Calibration { focal_px: 900.0, sigma_log_focal: Some(0.01), principal_point_px, aspect, radial_k1 }
+fn lens(aspect: f64, [radial_k1, radial_k2]: [f64; 2], principal_point_px: [f64; 2]) -> Calibration {
+    Calibration { focal_px: 900.0, sigma_log_focal: Some(0.01), principal_point_px, aspect, radial_k1, radial_k2 }
 }
 
 #[test]
@@ -91,9 +92,9 @@ fn opensfm_sees_the_points_where_they_were_observed() {
     let size = ImageSize { width_px: 900, height_px: 1200 };
     let middle = [449.5, 599.5];
     for (calibration, kind) in [
-        (lens(1.0, -0.05, middle), "perspective"),
-        (lens(1.0, 0.0, [440.0, 610.0]), "brown"),
-        (lens(1.1, -0.05, [440.0, 610.0]), "brown"),
+        (lens(1.0, [-0.05, 0.01], middle), "perspective"),
+        (lens(1.0, [0.0, 0.0], [440.0, 610.0]), "brown"),
+        (lens(1.1, [-0.05, 0.01], [440.0, 610.0]), "brown"),
     ] {
         let (input, solution) = scene_of(calibration, size);
         let json = opensfm::reconstruction::json(&Model::new(&solution, &input).expect("metric"));
@@ -113,10 +114,11 @@ fn opensfm_sees_the_points_where_they_were_observed() {
 fn colmap_gets_the_simplest_camera_that_says_the_same_half_a_pixel_on() {
     let size = ImageSize { width_px: 900, height_px: 1200 };
     for (calibration, line) in [
-        (lens(1.0, 0.0, [449.5, 599.5]), "1 SIMPLE_PINHOLE 900 1200 900 450 600"),
-        (lens(1.25, 0.0, [449.5, 599.5]), "1 PINHOLE 900 1200 900 1125 450 600"),
-        (lens(1.0, 0.5, [449.5, 599.5]), "1 SIMPLE_RADIAL 900 1200 900 450 600 0.5"),
-        (lens(1.25, 0.5, [449.5, 599.5]), "1 OPENCV 900 1200 900 1125 450 600 0.5 0 0 0"),
+        (lens(1.0, [0.0, 0.0], [449.5, 599.5]), "1 SIMPLE_PINHOLE 900 1200 900 450 600"),
+        (lens(1.25, [0.0, 0.0], [449.5, 599.5]), "1 PINHOLE 900 1200 900 1125 450 600"),
+        (lens(1.0, [0.5, 0.0], [449.5, 599.5]), "1 SIMPLE_RADIAL 900 1200 900 450 600 0.5"),
+        (lens(1.0, [0.5, -0.25], [449.5, 599.5]), "1 RADIAL 900 1200 900 450 600 0.5 -0.25"),
+        (lens(1.25, [0.5, 0.25], [449.5, 599.5]), "1 OPENCV 900 1200 900 1125 450 600 0.5 0.25 0 0"),
     ] {
         let (input, solution) = scene_of(calibration, size);
         let [cameras, ..] = colmap::write::text(&Model::new(&solution, &input).expect("metric"));

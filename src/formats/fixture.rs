@@ -135,6 +135,7 @@ fn solution(scene: &Scene) -> Solution {
             principal_point_px: truth.principal_point_px,
             aspect: 1.0,
             radial_k1: -0.02,
+            radial_k2: 0.0,
         }],
         plane_at_infinity: Some([1e-4, -2e-5, 0.03]),
         views: cameras

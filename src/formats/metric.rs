@@ -30,7 +30,7 @@ pub struct Model {
     pub points: Vec<Point>,
 }
 
-/// Intrinsics: `x = f u s + px`, `y = aspect f v s + py` with `s = 1 + radial_k1 (u^2 + v^2)`.
+/// Intrinsics: `x = f u s + px`, `y = aspect f v s + py` with `s` its radial scale.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Camera {
     pub id: u32,
@@ -111,8 +111,8 @@ impl Image {
     fn project(&self, camera: &Camera, position: [f64; 3]) -> [f64; 2] {
         let seen = self.rotation * Vector3::from(position) + Vector3::from(self.translation);
         let (u, v) = (seen.x / seen.z, seen.y / seen.z);
-        let Calibration { focal_px, principal_point_px: [px, py], aspect, radial_k1, .. } = camera.intrinsics;
-        let s = 1.0 + radial_k1 * (u * u + v * v);
+        let Calibration { focal_px, principal_point_px: [px, py], aspect, .. } = camera.intrinsics;
+        let s = camera.intrinsics.radial_scale(u * u + v * v);
         [focal_px * u * s + px, aspect * focal_px * v * s + py]
     }
 }

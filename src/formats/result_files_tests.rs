@@ -41,6 +41,7 @@ fn the_fields_of_result_json_are_a_contract() {
         "principal_point_px",
         "aspect",
         "radial_k1",
+        "radial_k2",
         "plane_at_infinity",
         "inlier_tracks",
         "inlier_observations",
@@ -101,7 +102,9 @@ fn a_projective_result_gives_no_calibration_and_says_why() {
     let result = json(&solution);
     assert_eq!((&result["status"], &result["grade"]), (&"SOLVED".into(), &"PROJECTIVE_ONLY".into()));
     assert_eq!(result["focal_unobservable"], true);
-    for field in ["focal_px", "sigma_log_focal", "principal_point_px", "aspect", "radial_k1", "plane_at_infinity"] {
+    for field in
+        ["focal_px", "sigma_log_focal", "principal_point_px", "aspect", "radial_k1", "radial_k2", "plane_at_infinity"]
+    {
         assert_eq!(result[field], Value::Null, "{field}");
     }
     assert_eq!((&result["registered_views"], &result["inlier_tracks"]), (&5.into(), &20.into()));
@@ -121,6 +124,7 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
         principal_point_px: [1.0, 2.0],
         aspect: 1.25,
         radial_k1: 0.01,
+        radial_k2: 0.002,
     };
     solution.calibrations.push(second);
     input.raw.views[3].camera_group = 9;
@@ -128,7 +132,7 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     assert_eq!(result["cameras"].as_array().expect("a list").len(), 2);
     assert_eq!(
         keys(&result["cameras"][1]),
-        ["aspect", "focal_px", "focal_unobservable", "principal_point_px", "radial_k1", "sigma_log_focal"]
+        ["aspect", "focal_px", "focal_unobservable", "principal_point_px", "radial_k1", "radial_k2", "sigma_log_focal"]
     );
     assert_eq!(result["cameras"][1]["aspect"], 1.25);
     assert_eq!(result["cameras"][1]["focal_unobservable"], true);

@@ -11,7 +11,7 @@ use super::{Label, LabelledInput};
 ///
 /// Infinity is not JSON: where the focal length is unobservable, `sigma_log_focal` is null and `focal_unobservable`
 /// is true. That is so of every `PROJECTIVE_ONLY` result: it has no `focal_px`, no `principal_point_px`, no `aspect`, no
-/// `radial_k1` and no `plane_at_infinity` either. Where nothing was calibrated for another reason, `focal_unobservable` is null too.
+/// radial distortion and no `plane_at_infinity` either. Where nothing was calibrated for another reason, `focal_unobservable` is null too.
 #[derive(Debug, Clone, Serialize)]
 pub struct ResultJson {
     pub status: Status,
@@ -23,8 +23,10 @@ pub struct ResultJson {
     pub principal_point_px: Option<[f64; 2]>,
     /// Vertical over horizontal focal length.
     pub aspect: Option<f64>,
-    /// `x = f u s + px`, `y = aspect f v s + py` with `s = 1 + radial_k1 (u^2 + v^2)`, for a point at `(u, v, 1)`.
+    /// `x = f u s + px`, `y = aspect f v s + py` with `s = 1 + radial_k1 r^2 + radial_k2 r^4`, `r^2 = u^2 + v^2`, for a
+    /// point at `(u, v, 1)`.
     pub radial_k1: Option<f64>,
+    pub radial_k2: Option<f64>,
     /// One entry a camera group; absent where all views share one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cameras: Option<Vec<CalibrationJson>>,
@@ -58,6 +60,7 @@ pub struct CalibrationJson {
     pub principal_point_px: [f64; 2],
     pub aspect: f64,
     pub radial_k1: f64,
+    pub radial_k2: f64,
 }
 
 /// Seconds spent in a stage.
@@ -85,6 +88,7 @@ impl From<&Calibration> for CalibrationJson {
             principal_point_px: calibration.principal_point_px,
             aspect: calibration.aspect,
             radial_k1: calibration.radial_k1,
+            radial_k2: calibration.radial_k2,
         }
     }
 }
@@ -109,6 +113,7 @@ impl From<&Solution> for ResultJson {
             principal_point_px: first.map(|camera| camera.principal_point_px),
             aspect: first.map(|camera| camera.aspect),
             radial_k1: first.map(|camera| camera.radial_k1),
+            radial_k2: first.map(|camera| camera.radial_k2),
             plane_at_infinity: solution.plane_at_infinity,
             inlier_tracks: solution.inlier_track_count(),
             inlier_observations: solution.inlier_observation_count(),
@@ -142,7 +147,7 @@ pub struct CamerasJson {
 }
 
 /// One view: `x ~ P X` in pixels, in the frame `P1 = [I|0]` of the first registered view; `x ~ K (R X + t)` where the
-/// result is metric, before the radial distortion [`ResultJson::radial_k1`]. Matrices row by row; null where there is
+/// result is metric, before the radial distortion of [`ResultJson::radial_k1`]. Matrices row by row; null where there is
 /// none.
 #[derive(Debug, Clone, Serialize)]
 #[allow(non_snake_case, reason = "the field's names for these matrices are capitals")]
@@ -157,6 +162,7 @@ pub struct CameraJson {
     pub R: Option<[[f64; 3]; 3]>,
     pub t: Option<[f64; 3]>,
     pub radial_k1: Option<f64>,
+    pub radial_k2: Option<f64>,
 }
 
 impl CamerasJson {
@@ -175,6 +181,7 @@ impl CamerasJson {
                 R: view.rotation.filter(|_| is_metric),
                 t: view.translation.filter(|_| is_metric),
                 radial_k1: calibration.filter(|_| is_metric).map(|calibration| calibration.radial_k1),
+                radial_k2: calibration.filter(|_| is_metric).map(|calibration| calibration.radial_k2),
             }
         };
         Self { views: solution.views.iter().enumerate().map(camera).collect() }

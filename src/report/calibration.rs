@@ -50,7 +50,7 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
     }
     html.push_str(
         "<div class=\"table\"><table>\n<tr><th>camera group</th><th>views</th><th>focal length (px)</th>\
-         <th>principal point (px)</th><th>aspect</th><th>k1</th></tr>\n",
+         <th>principal point (px)</th><th>aspect</th><th>k1</th><th>k2</th></tr>\n",
     );
     for (index, group) in groups.iter().take(MAX_GROUPS).enumerate() {
         html.push_str(&row(index, group));
@@ -62,7 +62,7 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let _ = writeln!(html, "<figure>{}</figure>", bars(&groups[..groups.len().min(MAX_GROUPS)]));
     html.push_str(
         "<p class=\"note\">Errors are one standard deviation of the focal length; none is estimated for the rest. \
-         Aspect is vertical over horizontal focal length; k1 is the radial distortion, 0 for a pinhole.</p>\n",
+         Aspect is vertical over horizontal focal length; k1 and k2 are the radial distortion, 0 for a pinhole.</p>\n",
     );
     html.push_str(&own_focals(solution));
     html.push_str("</section>\n");
@@ -74,19 +74,21 @@ fn name(index: usize, group: &Group) -> String {
 }
 
 fn row(index: usize, group: &Group) -> String {
-    let Calibration { focal_px, sigma_log_focal, principal_point_px: [x, y], aspect, radial_k1 } = *group.calibration;
+    let Calibration { focal_px, sigma_log_focal, principal_point_px: [x, y], aspect, radial_k1, radial_k2 } =
+        *group.calibration;
     let error = match sigma_log_focal {
         // A small deviation of the logarithm is one of the ratio.
         Some(sigma) => format!("\u{b1} {} ({} %)", short(sigma * focal_px), short(sigma * 100.0)),
         None => "(unobservable)".into(),
     };
     format!(
-        "<tr><td>{}</td><td>{} of {}</td><td>{focal_px:.1} {error}</td><td>{x:.1}, {y:.1}</td><td>{}</td><td>{}</td></tr>\n",
+        "<tr><td>{}</td><td>{} of {}</td><td>{focal_px:.1} {error}</td><td>{x:.1}, {y:.1}</td><td>{}</td><td>{}</td><td>{}</td></tr>\n",
         name(index, group),
         group.registered,
         group.views,
         short(aspect),
-        short(radial_k1)
+        short(radial_k1),
+        short(radial_k2)
     )
 }
 
@@ -188,6 +190,7 @@ mod tests {
             principal_point_px: [640.0, 480.5],
             aspect: 1.002,
             radial_k1: -0.125,
+            radial_k2: 0.25,
         };
         solution.calibrations.push(second);
         solution.views[4].projection = None;
@@ -195,7 +198,7 @@ mod tests {
         let html = section(&solution, Some(&input));
         let sigma = format!("{:.1} \u{b1} {} (0.4 %)", first.focal_px, short(first.focal_px * 0.004));
         assert!(html.contains(&format!("<tr><td>4</td><td>2 of 2</td><td>{sigma}</td>")), "{html}");
-        let row = "<tr><td>9</td><td>2 of 3</td><td>2000.0 \u{b1} 20 (1 %)</td><td>640.0, 480.5</td><td>1.002</td><td>-0.125</td></tr>";
+        let row = "<tr><td>9</td><td>2 of 3</td><td>2000.0 \u{b1} 20 (1 %)</td><td>640.0, 480.5</td><td>1.002</td><td>-0.125</td><td>0.25</td></tr>";
         assert!(html.contains(row), "{html}");
         assert_eq!(html.matches("<circle").count(), 2);
         let without = section(&solution, None);

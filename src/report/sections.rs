@@ -37,7 +37,11 @@ pub fn headline(solution: &Solution) -> String {
         };
         card("focal length", format!("{:.1} px", calibration.focal_px), note);
         if calibration.radial_k1 != 0.0 {
-            card("radial distortion", format!("k1 {}", short(calibration.radial_k1)), "estimated".into());
+            let second = match calibration.radial_k2 {
+                0.0 => String::new(),
+                k2 => format!(", k2 {}", short(k2)),
+            };
+            card("radial distortion", format!("k1 {}{second}", short(calibration.radial_k1)), "estimated".into());
         }
     } else if solution.is_focal_unobservable() {
         card("focal length", "none".into(), "unobservable".into());

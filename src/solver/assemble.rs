@@ -340,6 +340,7 @@ pub fn pixel_calibration(
         principal_point_px: (context.normalization.centres_px[view] + offset).into(),
         aspect: intrinsics.aspect,
         radial_k1: intrinsics.radial,
+        radial_k2: intrinsics.second_radial,
     }
 }
 

@@ -95,13 +95,15 @@ pub fn text(model: &Model) -> [String; 3] {
 /// our model.
 fn parameters(camera: &Camera) -> (&'static str, Vec<f64>) {
     let intrinsics = &camera.intrinsics;
-    let (f, k) = (intrinsics.focal_px, intrinsics.radial_k1);
+    let (f, k1, k2) = (intrinsics.focal_px, intrinsics.radial_k1, intrinsics.radial_k2);
     let [cx, cy] = intrinsics.principal_point_px.map(|centre| centre + FIRST_PIXEL);
-    match (intrinsics.aspect == 1.0, k == 0.0) {
-        (true, true) => ("SIMPLE_PINHOLE", vec![f, cx, cy]),
-        (false, true) => ("PINHOLE", vec![f, f * intrinsics.aspect, cx, cy]),
-        (true, false) => ("SIMPLE_RADIAL", vec![f, cx, cy, k]),
-        (false, false) => ("OPENCV", vec![f, f * intrinsics.aspect, cx, cy, k, 0.0, 0.0, 0.0]),
+    let (is_pinhole, has_one_term) = (k1 == 0.0 && k2 == 0.0, k2 == 0.0);
+    match intrinsics.aspect == 1.0 {
+        true if is_pinhole => ("SIMPLE_PINHOLE", vec![f, cx, cy]),
+        true if has_one_term => ("SIMPLE_RADIAL", vec![f, cx, cy, k1]),
+        true => ("RADIAL", vec![f, cx, cy, k1, k2]),
+        false if is_pinhole => ("PINHOLE", vec![f, f * intrinsics.aspect, cx, cy]),
+        false => ("OPENCV", vec![f, f * intrinsics.aspect, cx, cy, k1, k2, 0.0, 0.0]),
     }
 }
 

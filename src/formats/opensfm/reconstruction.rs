@@ -39,14 +39,14 @@ fn camera(camera: &Camera) -> Value {
     if is_middle && intrinsics.aspect == 1.0 {
         return json!({
             "projection_type": "perspective", "width": width, "height": height,
-            "focal": focal, "k1": intrinsics.radial_k1, "k2": 0.0,
+            "focal": focal, "k1": intrinsics.radial_k1, "k2": intrinsics.radial_k2,
         });
     }
     json!({
         "projection_type": "brown", "width": width, "height": height,
         "focal_x": focal, "focal_y": focal * intrinsics.aspect,
         "c_x": offset_px[0] / side_px, "c_y": offset_px[1] / side_px,
-        "k1": intrinsics.radial_k1, "k2": 0.0, "k3": 0.0, "p1": 0.0, "p2": 0.0,
+        "k1": intrinsics.radial_k1, "k2": intrinsics.radial_k2, "k3": 0.0, "p1": 0.0, "p2": 0.0,
     })
 }
 

@@ -4,7 +4,8 @@ use faer::{MatRef, Side};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
 use super::engine::Layout;
-use super::intrinsics::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter};
+use super::intrinsics::Intrinsics;
+use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior, Parameter};
 use super::metric::{Metric, POINT, POSE, Reconstruction};
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation};

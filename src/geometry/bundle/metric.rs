@@ -5,7 +5,8 @@ use nalgebra::{Matrix3, Matrix3x4, Rotation3, SMatrix, Vector2, Vector3};
 pub use super::covariance::{Information, Optimum};
 use super::engine::{Belief, Jacobian, Problem, Sink, Step, minimise};
 use super::intrinsics::ImageGradients;
-pub use super::intrinsics::{Extension, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter};
+pub use super::intrinsics::Intrinsics;
+pub use super::intrinsics_model::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
 
@@ -136,6 +137,8 @@ pub fn adjust(
         &[a, b] => run.with([a, b], reconstruction),
         &[a, b, c] => run.with([a, b, c], reconstruction),
         &[a, b, c, d] => run.with([a, b, c, d], reconstruction),
+        &[a, b, c, d, e] => run.with([a, b, c, d, e], reconstruction),
+        // The only model left is the one that frees them all.
         _ => run.with(Parameter::ALL, reconstruction),
     }
 }
@@ -184,8 +187,8 @@ mod tests {
         let mut start = perturbed(&scene, 0.01, 1);
         start.intrinsics.principal_point = Vector2::new(0.03, -0.02);
         start.intrinsics.aspect = 1.1;
-        for radial in [0.0, -0.1] {
-            start.intrinsics.radial = radial;
+        for (radial, second_radial) in [(0.0, 0.0), (-0.1, 0.0), (-0.1, 0.07)] {
+            (start.intrinsics.radial, start.intrinsics.second_radial) = (radial, second_radial);
             let with = |reconstruction: &Reconstruction| (reconstruction.clone(), IntrinsicsPrior::NONE);
             let (reconstruction, prior) = with(&start);
             testing::check_jacobian(&Metric { reconstruction, free: [], prior }, &scene.observations);

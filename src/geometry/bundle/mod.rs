@@ -10,6 +10,7 @@ mod covariance;
 pub mod critical;
 mod engine;
 mod intrinsics;
+mod intrinsics_model;
 pub mod metric;
 mod panel;
 pub mod projective;

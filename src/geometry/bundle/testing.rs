@@ -118,14 +118,15 @@ impl TestScene {
         }
     }
 
-    /// Leaves what falls into the image, and of that what three views see; beyond where a barrel distortion folds the
+    /// Leaves what falls into the image, and of that what three views see; beyond where the distortion folds the
     /// image back, nothing is seen.
     pub fn crop(&mut self) {
         let (intrinsics, poses, points) = (self.intrinsics, &self.poses, &self.points);
         self.observations.retain(|seen| {
             let direction = poses[seen.camera].apply(&points[seen.point]);
             let squared = (direction.xy() / direction.z).norm_squared();
-            seen.xy.amax() <= 0.5 && 1.0 + 3.0 * intrinsics.radial * squared > 0.1
+            let slope = 1.0 + squared * (3.0 * intrinsics.radial + 5.0 * squared * intrinsics.second_radial);
+            seen.xy.amax() <= 0.5 && intrinsics.images(squared) && slope > 0.1
         });
         let mut count = vec![0; self.points.len()];
         self.observations.iter().for_each(|seen| count[seen.point] += 1);

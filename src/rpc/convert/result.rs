@@ -98,6 +98,7 @@ fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
         principal_point_y_px: calibration.principal_point_px[1],
         aspect: calibration.aspect,
         radial_k1: Some(calibration.radial_k1),
+        radial_k2: Some(calibration.radial_k2),
     }
 }
 
@@ -108,6 +109,7 @@ fn calibration_from_wire(calibration: &proto::Calibration) -> Calibration {
         principal_point_px: [calibration.principal_point_x_px, calibration.principal_point_y_px],
         aspect: calibration.aspect,
         radial_k1: calibration.radial_k1.unwrap_or(0.0),
+        radial_k2: calibration.radial_k2.unwrap_or(0.0),
     }
 }
 
@@ -241,6 +243,7 @@ mod tests {
                     principal_point_px: [499.5, 399.5],
                     aspect: 1.25,
                     radial_k1: -0.05,
+                    radial_k2: 0.01,
                 },
                 Calibration {
                     focal_px: 900.0,
@@ -248,6 +251,7 @@ mod tests {
                     principal_point_px: [0.0, 0.0],
                     aspect: 1.0,
                     radial_k1: 0.0,
+                    radial_k2: 0.0,
                 },
             ],
             plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),

@@ -17,11 +17,14 @@ const PRINCIPAL_POINT_SIGMA: f64 = 0.05;
 const LOG_ASPECT_SIGMA: f64 = 0.1;
 /// The same of `k1`: phones and cameras have a few hundredths, wide lenses -.3.
 const RADIAL_SIGMA: f64 = 0.2;
+/// The same of `k2`: calibrations on boards give it the size of `k1`, with either sign.
+const SECOND_RADIAL_SIGMA: f64 = 0.2;
 /// Probability, before any observation, that a camera needs the extension. Principal points and distortion are as often
-/// in order (rectified, rendered) as not; pixels are square in all but old video.
+/// in order (rectified, rendered) as not; pixels are square in all but old video. That of the second radial term is where
+/// there is a first.
 fn probability(extension: Extension) -> f64 {
     match extension {
-        Extension::PrincipalPoint | Extension::Radial => 0.5,
+        Extension::PrincipalPoint | Extension::Radial | Extension::SecondRadial => 0.5,
         Extension::Aspect => 0.05,
     }
 }
@@ -58,7 +61,8 @@ pub fn knowledge(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> Intrin
         .knowing(Parameter::PrincipalX, 0.0, PRINCIPAL_POINT_SIGMA, noise)
         .knowing(Parameter::PrincipalY, 0.0, PRINCIPAL_POINT_SIGMA, noise)
         .knowing(Parameter::LogAspect, 0.0, LOG_ASPECT_SIGMA, noise)
-        .knowing(Parameter::Radial, 0.0, RADIAL_SIGMA, noise);
+        .knowing(Parameter::Radial, 0.0, RADIAL_SIGMA, noise)
+        .knowing(Parameter::SecondRadial, 0.0, SECOND_RADIAL_SIGMA, noise);
     match focal {
         Some(prior) => lenses.knowing(Parameter::LogFocal, (prior.focal_px / scale_px).ln(), prior.sigma_log, noise),
         None => lenses,
@@ -142,7 +146,7 @@ impl Choice<'_> {
         };
         let mut found: Vec<(Extension, f64)> = Extension::ALL
             .into_iter()
-            .filter(|extension| !best.model.contains(*extension))
+            .filter(|extension| !best.model.contains(*extension) && best.model.admits(*extension))
             .filter_map(beyond)
             .collect();
         found.sort_by(|a, b| b.1.total_cmp(&a.1));
@@ -228,7 +232,8 @@ impl Choice<'_> {
                 let believed = |parameter: &Parameter| self.prior.information[*parameter as usize].ln();
                 probability(extension).ln() + 0.5 * extension.parameters().iter().map(believed).sum::<f64>()
             }
-            false => (1.0 - probability(extension)).ln(),
+            false if model.admits(extension) => (1.0 - probability(extension)).ln(),
+            false => 0.0,
         };
         let prior: f64 = Extension::ALL.into_iter().map(of).sum();
         prior - 0.5 * (there.rise - here.rise) / unit - 0.5 * there.log_determinant

@@ -63,7 +63,7 @@ fn a_distorting_lens_is_estimated_and_everything_reprojects_through_it() {
             let seen = rotation * nalgebra::Vector3::from(point)
                 + nalgebra::Vector3::from(pose.translation.expect("a metric pose"));
             let (u, v) = (seen.x / seen.z, seen.y / seen.z);
-            let scale = f * (1.0 + calibration.radial_k1 * (u * u + v * v));
+            let scale = f * calibration.radial_scale(u * u + v * v);
             residuals.push((scale * u + px - raw.x[k]).hypot(calibration.aspect * scale * v + py - raw.y[k]));
         }
         residuals.sort_by(f64::total_cmp);

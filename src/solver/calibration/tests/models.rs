@@ -66,6 +66,41 @@ fn radial_distortion_is_found_with_a_displaced_principal_point_too() {
 }
 
 #[test]
+fn a_second_radial_term_is_taken_where_the_lens_has_one_and_only_there() {
+    let (mut taken, mut taken_in_vain, mut beyond) = (0, 0, 0);
+    for seed in 0..20 {
+        for second_radial in [0.2, 0.0] {
+            let mut scene = testing::scene(seed, 10, 200, 0.0);
+            (scene.intrinsics.radial, scene.intrinsics.second_radial) = (-0.25, second_radial);
+            scene.observe(0.0005, &mut rand::SeedableRng::seed_from_u64(seed));
+            scene.crop();
+            let outcome = calibrated(&scene, seed, 0.0005);
+            let (error, sigma) = (focal_error(&outcome, &scene), outcome.sigma_log_focal.unwrap_or(f64::INFINITY));
+            let found = outcome.metric.as_ref().expect("metric").intrinsics;
+            println!(
+                "seed {seed}, k2 {second_radial}: {} k1 {:.4} k2 {:.4}, error {error:.5}, {:.1} sigma, {:?}",
+                outcome.model.name(),
+                found.radial,
+                found.second_radial,
+                error / sigma,
+                codes(&outcome)
+            );
+            let is_taken = outcome.model.contains(Extension::SecondRadial);
+            assert!(!is_taken || outcome.model.contains(Extension::Radial), "seed {seed}");
+            match second_radial == 0.0 {
+                true => taken_in_vain += usize::from(is_taken),
+                false => taken += usize::from(is_taken),
+            }
+            beyond += usize::from(error > 3.0 * sigma);
+        }
+    }
+    println!(
+        "taken in {taken} of 20 lenses that have it and {taken_in_vain} of 20 that have not, {beyond} beyond 3 sigma"
+    );
+    assert!(taken >= 15 && taken_in_vain <= 1 && beyond <= 1, "{taken} {taken_in_vain} {beyond}");
+}
+
+#[test]
 fn a_lens_without_distortion_is_left_without() {
     for seed in 0..10 {
         let scene = through_a_lens(seed, 0.0, Vector2::zeros(), 0.001);

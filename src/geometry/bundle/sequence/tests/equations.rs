@@ -17,6 +17,7 @@ fn mixed() -> (Sequence, Vec<Sighting>, Vec<IntrinsicsModel>, Vec<bool>, Vec<boo
     sequence.group_of = vec![0, 0, 1, 1, 2, 2, 0];
     sequence.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.9), Intrinsics::from_focal(1.3)];
     sequence.intrinsics[0].radial = -0.1;
+    sequence.intrinsics[0].second_radial = 0.05;
     sequence.intrinsics[0].aspect = 1.1;
     observe(&sequence, &mut sightings, 0.003, 1);
     sightings.iter_mut().enumerate().for_each(|(k, seen)| seen.weight = 0.5 + 0.1 * (k % 7) as f64);
@@ -64,7 +65,7 @@ fn normal_equations_agree_with_finite_differences() {
     let layout = Layout::new(&sequence, &sightings, &free, &mut pace).expect("goes on");
     let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let cameras = pattern.dimension();
-    assert_eq!(cameras, 6 * 6 + 5 + 3, "six free views, five and three intrinsics");
+    assert_eq!(cameras, 6 * 6 + 6 + 3, "six free views, six and three intrinsics");
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();
     assert!(normal.fill(&sequence, &layout, &[], Loss::Squared, &mut Pace::new(&stop)));
