@@ -73,6 +73,10 @@ pub struct SequenceArgs {
     /// Share of the observations of right tracks that are wrong
     #[arg(long, value_name = "SHARE", default_value_t = 0.05, requires = "sequence")]
     pub wrong_observations: f64,
+
+    /// Share of the right tracks of six views or more that go over to another point on their way
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0, requires = "sequence")]
+    pub joined: f64,
 }
 
 /// Reads two counts with a comma between them.
@@ -96,6 +100,7 @@ impl Args {
             noise: self.scene.noise,
             outliers: self.scene.outliers,
             wrong_observations: self.sequence.wrong_observations,
+            joined: self.sequence.joined,
             radial_k1: self.camera.radial_k1,
             seed: self.scene.seed,
         };

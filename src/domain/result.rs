@@ -225,6 +225,40 @@ pub struct ObservationResults {
     pub inlier: Vec<bool>,
     /// Reprojection error in pixels, a lens's distortion undone; `None` where the observation was not judged.
     pub residual_px: Vec<Option<f64>>,
+    /// Probability that the observation shows its track's point, if the track is right: times the track's weight, that
+    /// it is right. 0 where it was not judged.
+    #[serde(default)]
+    pub weight: Vec<f32>,
+    /// 0, or which of the other points that its track joins the observation shows: see [`TrackSplit::number`]. Such an
+    /// observation is no inlier of its track.
+    #[serde(default)]
+    pub split: Vec<u32>,
+}
+
+impl ObservationResults {
+    /// Nothing judged of this many observations.
+    pub fn unjudged(count: usize) -> Self {
+        Self {
+            inlier: vec![false; count],
+            residual_px: vec![None; count],
+            weight: vec![0.0; count],
+            split: vec![0; count],
+        }
+    }
+}
+
+/// A point beside its own that a track shows, where a wrong link joined two: at least three of its observations agree on
+/// it and on nothing else.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TrackSplit {
+    /// Index of the track.
+    pub track: u32,
+    /// From 1 within a track.
+    pub number: u32,
+    /// Probability that the point is right.
+    pub weight: f32,
+    /// In the frame of [`TrackResults::point`]; `None`: at infinity.
+    pub point: Option<[f64; 3]>,
 }
 
 /// Seconds spent in a stage.
@@ -264,6 +298,9 @@ pub struct Solution {
     pub views: Vec<ViewResult>,
     pub tracks: TrackResults,
     pub observations: ObservationResults,
+    /// The other points of tracks that join several, by track and number.
+    #[serde(default)]
+    pub splits: Vec<TrackSplit>,
     /// Estimated observation noise, one standard deviation of a coordinate, in pixels.
     pub noise_px: Option<f64>,
     /// Root mean square and mean of the reprojection errors (distances) over the inlier observations, in pixels.

@@ -66,6 +66,7 @@ pub(crate) fn solved_sequence(options: &SequenceOptions) -> (LabelledInput, Solu
         observations: ObservationResults {
             inlier: truth.observation_right.clone(),
             residual_px: (0..raw.x.len()).map(|n| Some(residual(n))).collect(),
+            ..ObservationResults::unjudged(raw.x.len())
         },
         ..base
     };
@@ -158,7 +159,9 @@ fn solution(scene: &Scene) -> Solution {
         observations: ObservationResults {
             inlier: (0..count).map(inlier_of).collect(),
             residual_px: (0..count).map(|n| inlier_of(n).then(|| residual(n))).collect(),
+            ..ObservationResults::unjudged(count)
         },
+        splits: Vec::new(),
         noise_px: Some(3.1),
         reprojection_rms_px: Some((kept.iter().map(|r| r * r).sum::<f64>() / kept.len() as f64).sqrt()),
         reprojection_mean_px: Some(kept.iter().sum::<f64>() / kept.len() as f64),

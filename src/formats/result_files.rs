@@ -111,20 +111,23 @@ fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
     text
 }
 
-/// `view,track,inlier,residual_px` in the order of the caller's file; an observation that was not judged has an empty
-/// residual.
+/// `view,track,inlier,residual_px,weight,split` in the order of the caller's file; an observation that was not judged has
+/// an empty residual, one that shows no other point of its track an empty split.
 fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {
     let judged = &solution.observations;
-    let mut text = String::from("view,track,inlier,residual_px\n");
+    let mut text = String::from("view,track,inlier,residual_px,weight,split\n");
     for (k, (&view, &track)) in input.raw.view.iter().zip(&input.raw.track).enumerate() {
         let inlier = judged.inlier.get(k).copied().unwrap_or(false);
         let residual = judged.residual_px.get(k).copied().flatten();
+        let split = judged.split.get(k).copied().unwrap_or(0);
         text.push_str(&format!(
-            "{},{},{},{}\n",
+            "{},{},{},{},{},{}\n",
             view_label(Some(input), view as usize).csv(),
             track_label(Some(input), track as usize).csv(),
             u8::from(inlier),
             residual.map_or_else(String::new, |px| px.to_string()),
+            judged.weight.get(k).copied().unwrap_or(0.0),
+            if split > 0 { split.to_string() } else { String::new() },
         ));
     }
     text

@@ -166,7 +166,8 @@ fn a_view_without_a_pose_has_no_matrices() {
 
 #[test]
 fn answers_carry_the_callers_ids_in_the_callers_order() {
-    let (mut input, solution) = fixture::solved();
+    let (mut input, mut solution) = fixture::solved();
+    (solution.observations.weight[3], solution.observations.split[3]) = (0.25, 2);
     input.raw.view.swap(0, 1);
     input.raw.track.swap(0, 1);
     let directory = tempfile::tempdir().expect("a temporary directory");
@@ -180,11 +181,12 @@ fn answers_carry_the_callers_ids_in_the_callers_order() {
     let expected = if solution.tracks.inlier[1] { "102,0.98,1,0.8" } else { "102,0.03,0,0.2" };
     assert_eq!(tracks[2], expected);
     let observations: Vec<&str> = files[OBSERVATIONS].lines().collect();
-    assert_eq!(observations[0], "view,track,inlier,residual_px");
+    assert_eq!(observations[0], "view,track,inlier,residual_px,weight,split");
     assert_eq!(observations.len(), 201);
     assert!(observations[1].starts_with("3,102,"), "{}", observations[1]);
+    assert!(observations[4].ends_with(",0.25,2"), "{}", observations[4]);
     let outlier = solution.observations.inlier.iter().position(|&inlier| !inlier).expect("an outlier");
-    assert!(observations[outlier + 1].ends_with(",0,"), "{}", observations[outlier + 1]);
+    assert!(observations[outlier + 1].ends_with(",0,,0,"), "{}", observations[outlier + 1]);
 }
 
 #[test]

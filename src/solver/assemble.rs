@@ -46,10 +46,8 @@ pub fn unsolved(context: &Context, attempt: Option<&Attempt>, warnings: Vec<Warn
         plane_at_infinity: None,
         views: vec![ViewResult::default(); input.view_count()],
         tracks,
-        observations: ObservationResults {
-            inlier: vec![false; input.observation_count()],
-            residual_px: vec![None; input.observation_count()],
-        },
+        observations: ObservationResults::unjudged(input.observation_count()),
+        splits: Vec::new(),
         noise_px: None,
         reprojection_rms_px: None,
         reprojection_mean_px: None,
@@ -109,6 +107,8 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
         views: views(context, attempt, &cameras, usable),
         tracks: judged.tracks,
         observations: judged.observations,
+        // Tracks of a block that was solved alone are right in most of their observations or wrong.
+        splits: Vec::new(),
         noise_px: Some(consensus.noise * context.scale_px),
         reprojection_rms_px: rms,
         reprojection_mean_px: mean,
@@ -166,6 +166,7 @@ fn judge_by_depths(attempt: &Attempt, weights: &[f64], local: &[Camera], context
             let place = input.caller_index(k);
             let residual = triangulation::reprojection(&local[view], &point, &sightings[view].xy).norm();
             judged.observations.inlier[place] = inlier;
+            judged.observations.weight[place] = judged.noise.weight(residual * residual) as f32;
             judged.observations.residual_px[place] =
                 Some(residual * context.scale_px).filter(|residual| residual.is_finite());
         }

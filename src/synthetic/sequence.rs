@@ -21,6 +21,8 @@ const SWING_RAD: [f64; 3] = [0.2, 0.35, 0.3];
 const PERIOD_VIEWS: [f64; 3] = [17.0, 23.0, 31.0];
 /// Swing of the path across its direction.
 const WEAVE: f64 = 0.3;
+/// Views that show either point of a track that joins two: three make a point that can be verified.
+const LEAST_SHOWN: usize = 3;
 /// Draws of one point before its views are called impossible.
 const MOST_DRAWS: usize = 1_000;
 
@@ -38,6 +40,9 @@ pub struct SequenceOptions {
     pub outliers: f64,
     /// Share of the observations of the other tracks that are anywhere in their image.
     pub wrong_observations: f64,
+    /// Share of the right tracks, of those that are long enough, that go over to another point on their way: one wrong link
+    /// joins two points.
+    pub joined: f64,
     /// Radial distortion, as in [`SceneOptions::radial_k1`].
     pub radial_k1: f64,
     pub seed: u64,
@@ -53,6 +58,7 @@ impl Default for SequenceOptions {
             noise: 0.0005,
             outliers: 0.3,
             wrong_observations: 0.05,
+            joined: 0.0,
             radial_k1: 0.0,
             seed: 0,
         }
@@ -80,8 +86,12 @@ impl SequenceOptions {
             let reason = format!("{least} to {most} is not a range within 2..={}, the views", self.views);
             found.push(Violation::of("lifetime", reason));
         }
-        let shares =
-            [("noise", self.noise), ("outliers", self.outliers), ("wrong_observations", self.wrong_observations)];
+        let shares = [
+            ("noise", self.noise),
+            ("outliers", self.outliers),
+            ("wrong_observations", self.wrong_observations),
+            ("joined", self.joined),
+        ];
         for (name, share) in shares {
             if !(0.0..=1.0).contains(&share) {
                 found.push(Violation::of(name, format!("{share} is not a share in 0..=1")));
@@ -102,8 +112,12 @@ pub struct SequenceTruth {
     pub principal_point_px: [f64; 2],
     /// Whether a track is of one point, but for single wrong observations; one entry a track.
     pub inlier: Vec<bool>,
-    /// Whether an observation is that of its track's point; one entry an observation, in the input's order.
+    /// Whether an observation is that of its track's point; one entry an observation, in the input's order. A track that
+    /// joins two points has the one that it shows more often, the first of equals.
     pub observation_right: Vec<bool>,
+    /// Whether an observation is that of the other point that its track joins.
+    #[serde(default)]
+    pub observation_of_other: Vec<bool>,
     pub points: Vec<[f64; 3]>,
     /// World-to-camera rotations (row by row) and translations, one a view.
     pub rotations: Vec<[[f64; 3]; 3]>,
@@ -152,25 +166,31 @@ impl Sequence {
             principal_point_px: [centre_px; 2],
             inlier: Vec::with_capacity(options.tracks),
             observation_right: Vec::new(),
+            observation_of_other: Vec::new(),
             points: Vec::with_capacity(options.tracks),
             rotations: poses.iter().map(|pose| rows(&pose.rotation)).collect(),
             translations: poses.iter().map(|pose| (-(pose.rotation * pose.centre)).into()).collect(),
         };
         let focal = focal_px / f64::from(IMAGE_SIDE_PX);
         for track in 0..options.tracks {
-            let Track { point, first, images } = draw_track(options, &poses, focal, &mut rng)?;
+            let mut drawn = draw_track(options, &poses, focal, &mut rng)?;
             let inlier = rng.random::<f64>() >= options.outliers;
+            let joins = inlier && options.joined > 0.0 && rng.random::<f64>() < options.joined;
+            let other = if joins { drawn.join_another(options, &poses, focal, &mut rng) } else { 0..0 };
+            let Track { point, first, images } = drawn;
             truth.inlier.push(inlier);
             truth.points.push(point.into());
             for (k, image) in images.iter().enumerate() {
                 let right = inlier && rng.random::<f64>() >= options.wrong_observations;
+                let of_other = other.contains(&k);
                 let seen = if right { image + options.noise * normals(&mut rng) } else { anywhere(&mut rng) };
                 let [x, y] = (seen * f64::from(IMAGE_SIDE_PX)).into();
                 input.view.push((first + k) as u32);
                 input.track.push(track as u32);
                 input.x.push(x + centre_px);
                 input.y.push(y + centre_px);
-                truth.observation_right.push(right);
+                truth.observation_right.push(right && !of_other);
+                truth.observation_of_other.push(right && of_other);
             }
         }
         Ok(Self { options: options.clone(), input, truth })
@@ -194,23 +214,61 @@ fn draw_track(
     for _ in 0..MOST_DRAWS {
         let length = rng.random_range(options.lifetime.0..=options.lifetime.1);
         let first = rng.random_range(0..=poses.len() - length);
-        let middle = &poses[first + length / 2];
-        let uv = anywhere(rng) / focal;
-        let point = middle.centre + middle.rotation.tr_mul(&(uv.push(1.0) * rng.random_range(DEPTH.0..DEPTH.1)));
-        let image = |pose: &Pose| {
-            let seen = pose.rotation * (point - pose.centre);
-            let uv = seen.xy() / seen.z;
-            let image = focal * uv * (1.0 + options.radial_k1 * uv.norm_squared());
-            // Beyond the fold a lens images two points in one place.
-            let one_to_one = 1.0 + 3.0 * options.radial_k1 * uv.norm_squared() > 0.0;
-            (seen.z > DEPTH.0 / 2.0 && image.amax() < 0.5 && one_to_one).then_some(image)
-        };
-        let images: Option<Vec<Vector2<f64>>> = poses[first..first + length].iter().map(image).collect();
-        if let Some(images) = images {
+        if let Some((point, images)) = draw_point(options, &poses[first..first + length], focal, rng) {
             return Ok(Track { point, first, images });
         }
     }
     Err(Violation::of("lifetime", format!("no point stays in view for {} views", options.lifetime.1)).into())
+}
+
+/// A point before the middle one of these views, with its exact images in them; `None` if one of them does not see it.
+fn draw_point(
+    options: &SequenceOptions,
+    poses: &[Pose],
+    focal: f64,
+    rng: &mut ChaCha8Rng,
+) -> Option<(Vector3<f64>, Vec<Vector2<f64>>)> {
+    let middle = &poses[poses.len() / 2];
+    let uv = anywhere(rng) / focal;
+    let point = middle.centre + middle.rotation.tr_mul(&(uv.push(1.0) * rng.random_range(DEPTH.0..DEPTH.1)));
+    let image = |pose: &Pose| {
+        let seen = pose.rotation * (point - pose.centre);
+        let uv = seen.xy() / seen.z;
+        let image = focal * uv * (1.0 + options.radial_k1 * uv.norm_squared());
+        // Beyond the fold a lens images two points in one place.
+        let one_to_one = 1.0 + 3.0 * options.radial_k1 * uv.norm_squared() > 0.0;
+        (seen.z > DEPTH.0 / 2.0 && image.amax() < 0.5 && one_to_one).then_some(image)
+    };
+    let images: Option<Vec<Vector2<f64>>> = poses.iter().map(image).collect();
+    Some((point, images?))
+}
+
+impl Track {
+    /// Goes over to another point between two views, [`LEAST_SHOWN`] of which show either; returns which observations
+    /// show the point that is not the track's then. A track that is too short stays as it is.
+    fn join_another(
+        &mut self,
+        options: &SequenceOptions,
+        poses: &[Pose],
+        focal: f64,
+        rng: &mut ChaCha8Rng,
+    ) -> std::ops::Range<usize> {
+        let length = self.images.len();
+        if length < 2 * LEAST_SHOWN {
+            return 0..0;
+        }
+        let cut = rng.random_range(LEAST_SHOWN..=length - LEAST_SHOWN);
+        let later = &poses[self.first + cut..self.first + length];
+        let drawn = (0..MOST_DRAWS).find_map(|_| draw_point(options, later, focal, rng));
+        let Some((other, images)) = drawn else { return 0..0 };
+        self.images.truncate(cut);
+        self.images.extend(images);
+        if 2 * cut >= length {
+            return cut..length;
+        }
+        self.point = other;
+        0..cut
+    }
 }
 
 /// Uniform over the image, in image sides about its centre.
@@ -271,6 +329,7 @@ mod tests {
             ("noise", SequenceOptions { noise: f64::NAN, ..default() }),
             ("outliers", SequenceOptions { outliers: 1.1, ..default() }),
             ("wrong_observations", SequenceOptions { wrong_observations: -0.1, ..default() }),
+            ("joined", SequenceOptions { joined: 2.0, ..default() }),
             ("radial_k1", SequenceOptions { radial_k1: 2.0, ..default() }),
         ];
         for (name, options) in cases {

@@ -123,6 +123,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         views: vec![Default::default(); input.view_count()],
         tracks: Default::default(),
         observations: Default::default(),
+        splits: Vec::new(),
         noise_px: None,
         reprojection_rms_px: Some(0.5),
         reprojection_mean_px: None,

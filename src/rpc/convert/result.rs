@@ -3,7 +3,7 @@
 use super::enums::{Twin, optional_to_wire};
 use super::{progress, required};
 use crate::domain::job::JobName;
-use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, ViewResult};
+use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, Method, Prior, Solution, Stage, Status, Violation, Warning, WarningCode};
 use crate::rpc::proto;
 
@@ -22,6 +22,7 @@ pub fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         views: solution.views.iter().map(view_to_wire).collect(),
         tracks: Some(tracks_to_wire(&solution.tracks)),
         observations: Some(observations_to_wire(&solution.observations)),
+        splits: solution.splits.iter().map(split_to_wire).collect(),
         noise_px: solution.noise_px,
         reprojection_rms_px: solution.reprojection_rms_px,
         reprojection_mean_px: solution.reprojection_mean_px,
@@ -64,6 +65,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         views: result.views.iter().enumerate().map(view_from_wire).collect::<Result<_, _>>()?,
         tracks: tracks_from_wire(required(result.tracks, "tracks")?)?,
         observations: observations_from_wire(required(result.observations, "observations")?)?,
+        splits: result.splits.iter().enumerate().map(split_from_wire).collect::<Result<_, _>>()?,
         noise_px: result.noise_px,
         reprojection_rms_px: result.reprojection_rms_px,
         reprojection_mean_px: result.reprojection_mean_px,
@@ -189,17 +191,45 @@ fn observations_to_wire(observations: &ObservationResults) -> proto::Observation
         inlier: observations.inlier.clone(),
         judged: observations.residual_px.iter().map(Option::is_some).collect(),
         residual_px: observations.residual_px.iter().map(|residual| residual.unwrap_or(0.0)).collect(),
+        weight: observations.weight.clone(),
+        split: if observations.split.iter().any(|&split| split > 0) { observations.split.clone() } else { Vec::new() },
     }
 }
 
-fn observations_from_wire(observations: proto::ObservationResults) -> Result<ObservationResults, Violation> {
+fn split_to_wire(split: &TrackSplit) -> proto::TrackSplit {
+    let TrackSplit { track, number, weight, point } = *split;
+    proto::TrackSplit { track, number, weight, point: point.map_or_else(Vec::new, Vec::from) }
+}
+
+fn split_from_wire((index, split): (usize, &proto::TrackSplit)) -> Result<TrackSplit, Violation> {
+    let point = match split.point.as_slice() {
+        [] => None,
+        &[x, y, z] => Some([x, y, z]),
+        other => return Err(Violation::at("splits.point", index, format!("{} numbers instead of three", other.len()))),
+    };
+    Ok(TrackSplit { track: split.track, number: split.number, weight: split.weight, point })
+}
+
+fn observations_from_wire(mut observations: proto::ObservationResults) -> Result<ObservationResults, Violation> {
     let count = observations.inlier.len();
     if observations.judged.len() != count || observations.residual_px.len() != count {
         return Err(Violation::of("observations", "arrays of different lengths"));
     }
+    let lengths = [("weight", observations.weight.len()), ("split", observations.split.len())];
+    if let Some((name, length)) = lengths.into_iter().find(|(_, length)| ![0, count].contains(length)) {
+        return Err(Violation::of(
+            format!("observations.{name}"),
+            format!("{length} entries for {count} observations"),
+        ));
+    }
     let residual_px = observations.judged.iter().zip(&observations.residual_px);
+    // Both are left out where they say nothing.
+    observations.weight.resize(count, 0.0);
+    observations.split.resize(count, 0);
     Ok(ObservationResults {
         residual_px: residual_px.map(|(&judged, &residual)| judged.then_some(residual)).collect(),
+        weight: observations.weight,
+        split: observations.split,
         inlier: observations.inlier,
     })
 }
@@ -275,7 +305,13 @@ mod tests {
             observations: ObservationResults {
                 inlier: vec![true, false, false],
                 residual_px: vec![Some(0.0), Some(17.25), None],
+                weight: vec![0.875, 0.25, 0.0],
+                split: vec![0, 2, 0],
             },
+            splits: vec![
+                TrackSplit { track: 1, number: 1, weight: 0.75, point: None },
+                TrackSplit { track: 1, number: 2, weight: 0.5, point: Some([1.0, -2.0, 3e-9]) },
+            ],
             noise_px: Some(0.5),
             reprojection_rms_px: Some(0.7),
             reprojection_mean_px: Some(0.6),

@@ -3,15 +3,15 @@
 use nalgebra::Matrix4;
 
 use super::Extended;
-use super::model::{Landmark, Model, Scene};
+use super::model::{Model, Scene};
 use super::register::Unregistered;
-use crate::domain::result::ViewResult;
+use crate::domain::result::{TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::Point;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
 use crate::solver::assemble::{dehomogenise, listed, network_weights, pixel_calibration, reprojection};
 use crate::solver::calibration::Outcome;
-use crate::solver::judge::{self, Geometry, Judged};
+use crate::solver::judge::{self, Geometry, Judged, SplitPoint};
 use crate::solver::recorder::Recorder;
 
 /// The solution of a sequence.
@@ -28,7 +28,9 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
     warnings.extend(seed.second_structure.clone());
     warnings.extend(left_out(&unregistered, super::super::block::observed_views(context.input).len()));
     let frames = frames(&scene, &model);
-    judged.tracks.point = points(&judged, &model, &frames, metric);
+    let back = back(&frames, metric);
+    judged.tracks.point = points(&judged, &model, &back);
+    let splits = splits(&judged, &model, &back);
     judged.tracks.network_weight = network_weights(&seed, context);
     let (rms, mean) = reprojection(&judged.observations);
     let views = views(&scene, &model, &frames, metric);
@@ -47,6 +49,7 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
         views,
         tracks: judged.tracks,
         observations: judged.observations,
+        splits,
         noise_px: Some(model.noise * context.scale_px),
         reprojection_rms_px: rms,
         reprojection_mean_px: mean,
@@ -144,15 +147,33 @@ fn views(scene: &Scene, model: &Model, frames: &[Option<Matrix4<f64>>], metric: 
     model.poses.iter().enumerate().map(result).collect()
 }
 
-/// The points of the judged tracks: metric, or in the frame of the first view of their part.
-fn points(judged: &Judged, model: &Model, frames: &[Option<Matrix4<f64>>], metric: bool) -> Vec<Option<[f64; 3]>> {
-    let back: Vec<Option<Matrix4<f64>>> =
-        frames.iter().map(|frame| frame.filter(|_| !metric).and_then(|frame| frame.try_inverse())).collect();
-    let placed = |(point, landmark): (&Option<Point>, &Option<Landmark>)| {
-        let part = landmark.map_or(0, |landmark| landmark.part as usize);
-        point.and_then(|point| dehomogenise(&back[part].map_or(point, |back| back * point)))
+/// What takes the points of each part to where the caller has them: nowhere where the result is metric, else to the frame
+/// of the first view of their part.
+fn back(frames: &[Option<Matrix4<f64>>], metric: bool) -> Vec<Option<Matrix4<f64>>> {
+    frames.iter().map(|frame| frame.filter(|_| !metric).and_then(|frame| frame.try_inverse())).collect()
+}
+
+/// A judged point of a track where the caller has it.
+fn placed(point: &Point, track: usize, model: &Model, back: &[Option<Matrix4<f64>>]) -> Option<[f64; 3]> {
+    let part = model.landmarks[track].map_or(0, |landmark| landmark.part as usize);
+    dehomogenise(&back[part].map_or(*point, |back| back * point))
+}
+
+/// The points of the judged tracks.
+fn points(judged: &Judged, model: &Model, back: &[Option<Matrix4<f64>>]) -> Vec<Option<[f64; 3]>> {
+    let place = |(track, point): (usize, &Option<Point>)| point.and_then(|point| placed(&point, track, model, back));
+    judged.points.iter().enumerate().map(place).collect()
+}
+
+/// The other points of tracks that join several.
+fn splits(judged: &Judged, model: &Model, back: &[Option<Matrix4<f64>>]) -> Vec<TrackSplit> {
+    let split = |split: &SplitPoint| TrackSplit {
+        track: split.track as u32,
+        number: split.number,
+        weight: split.weight as f32,
+        point: placed(&split.point, split.track, model, back),
     };
-    judged.points.iter().zip(&model.landmarks).map(placed).collect()
+    judged.splits.iter().map(split).collect()
 }
 
 fn left_out(unregistered: &[Unregistered], observed: usize) -> Option<Warning> {

@@ -39,6 +39,47 @@ fn every_view_is_registered_and_every_observation_judged() {
 }
 
 #[test]
+fn tracks_that_join_two_points_are_split() {
+    for seed in 0..2 {
+        let options = SequenceOptions { tracks: 800, joined: 0.3, seed, ..SequenceOptions::default() };
+        let sequence = Sequence::generate(&options).expect("valid");
+        let truth = &sequence.truth;
+        let solution = solved(&input_of(&sequence), &SolveSettings { seed, ..SolveSettings::default() });
+        // The two points of each track by the observations that show them; which is the track's own and which the other
+        // is a matter of who has more, and wrong observations change that.
+        let parted = |of: &[bool], of_other: &[bool]| {
+            let mut parts = vec![[vec![], vec![]]; options.tracks];
+            for (k, &track) in sequence.input.track.iter().enumerate() {
+                let sides = &mut parts[track as usize];
+                sides[0].extend(of[k].then_some(k));
+                sides[1].extend(of_other[k].then_some(k));
+            }
+            parts.iter_mut().for_each(|sides| sides.sort());
+            parts
+        };
+        let split: Vec<bool> = solution.observations.split.iter().map(|&split| split > 0).collect();
+        let found = parted(&solution.observations.inlier, &split);
+        let expected = parted(&truth.observation_right, &truth.observation_of_other);
+        // Three observations make a point, two do not.
+        let joined: Vec<usize> =
+            (0..options.tracks).filter(|&track| expected[track].iter().all(|side| side.len() >= 3)).collect();
+        let exact = joined.iter().filter(|&&track| found[track] == expected[track]).count();
+        let in_vain = solution.splits.iter().filter(|split| !joined.contains(&(split.track as usize))).count();
+        println!("seed {seed}: {exact} of {} exactly, {in_vain} of others", joined.len());
+        assert!(
+            joined.len() > 20 && exact as f64 > 0.9 * joined.len() as f64,
+            "seed {seed}: {exact} of {}",
+            joined.len()
+        );
+        assert!(in_vain <= 1, "seed {seed}: {in_vain}");
+        assert!(solution.splits.iter().all(|split| split.weight > 0.5 && split.point.is_some()), "seed {seed}");
+        let listed: std::collections::BTreeSet<u32> = solution.splits.iter().map(|split| split.track).collect();
+        let flagged = (0..split.len()).filter(|&k| split[k]).map(|k| sequence.input.track[k]);
+        assert_eq!(listed, flagged.collect(), "seed {seed}");
+    }
+}
+
+#[test]
 fn what_shares_no_tracks_is_in_parts_of_one_calibration() {
     let options = SequenceOptions { views: 24, tracks: 1_000, seed: 2, ..SequenceOptions::default() };
     let sequence = Sequence::generate(&options).expect("valid");

@@ -94,7 +94,9 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         observations: ObservationResults {
             inlier: vec![true; input.observation_count()],
             residual_px: (0..input.observation_count()).map(|k| Some(input.point_px(k)[0])).collect(),
+            ..ObservationResults::unjudged(input.observation_count())
         },
+        splits: Vec::new(),
         noise_px: Some(0.5),
         reprojection_rms_px: Some(0.75),
         reprojection_mean_px: None,

@@ -1,0 +1,142 @@
+//! How the residuals of right observations are distributed, and what tells them from wrong ones.
+
+use nalgebra::Vector2;
+
+/// Share of right observations in the tail, before it is known, and the tail's width in units of the core. Feature
+/// detectors have a core of .1 to .3 px and tails that a Gaussian of that width would call impossible; together with the
+/// uniform outliers this puts the gate at 12 to 17 core deviations, where real sequences want it (15 to 20).
+const TAIL_SHARE: f64 = 0.05;
+const TAIL_WIDTH: f64 = 3.0;
+/// Bounds of the share that is estimated: noise without a tail still has a rare blunder that is no wrong match.
+const TAIL_BOUNDS: (f64, f64) = (0.001, 0.2);
+/// Observations from which the share is estimated, and rounds of the estimation; it converges in five.
+const TAIL_OBSERVATIONS: usize = 100;
+/// Observations that it is estimated from at most, evenly taken: they tell a share of .05 to .0015.
+const MOST_TAIL_OBSERVATIONS: usize = 20_000;
+const TAIL_ROUNDS: usize = 10;
+/// Prior probability that a single observation of a right track is wrong.
+const WRONG_OBSERVATION: f64 = 0.05;
+
+/// Density of a wrong coordinate among points that are spread like these: one over the width of a uniform distribution
+/// of their standard deviation.
+pub fn outlier_density(points: &[Vector2<f64>]) -> f64 {
+    let count = points.len().max(1) as f64;
+    let mean = points.iter().sum::<Vector2<f64>>() / count;
+    let variance = points.iter().map(|point| (point - mean).norm_squared()).sum::<f64>() / (2.0 * count);
+    density_of_spread(variance.sqrt().clamp(f64::MIN_POSITIVE, crate::solver::portfolio::MOST_SPREAD))
+}
+
+/// The same from the standard deviation of a coordinate: a uniform distribution is `sqrt(12)` times as wide.
+pub fn density_of_spread(spread: f64) -> f64 {
+    1.0 / (12.0f64.sqrt() * spread)
+}
+
+/// Squared residual within which an observation is more likely right than wrong while nothing is known of the noise's tail.
+pub fn working_gate(noise: f64, outlier_density: f64) -> f64 {
+    NoiseModel::new(noise, outlier_density).gate()
+}
+
+/// How the residuals of right observations are distributed.
+///
+/// A core of Gaussian noise and a tail of three times that width, beside wrong observations that may be anywhere.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NoiseModel {
+    /// Core, one standard deviation of a coordinate.
+    core: f64,
+    tail_share: f64,
+    /// Density of a wrong coordinate.
+    outlier_density: f64,
+}
+
+impl NoiseModel {
+    /// The model while nothing is known of the tail.
+    pub fn new(core: f64, outlier_density: f64) -> Self {
+        Self { core, tail_share: TAIL_SHARE, outlier_density }
+    }
+
+    /// The model with the tail that these squared residuals of right observations, in core variances, show: the share by
+    /// expectation and maximisation. `None` for too few of them.
+    pub fn with_tail(self, squared: &[f64]) -> Option<Self> {
+        if squared.len() < TAIL_OBSERVATIONS {
+            return None;
+        }
+        let step = squared.len().div_ceil(MOST_TAIL_OBSERVATIONS).max(1);
+        let squared: Vec<f64> = squared.iter().copied().step_by(step).collect();
+        let mut share = TAIL_SHARE;
+        for _ in 0..TAIL_ROUNDS {
+            let of_tail = |squared: &f64| {
+                let core = (1.0 - share) * (-0.5 * squared).exp();
+                let tail = share * (-0.5 * squared / TAIL_WIDTH.powi(2)).exp() / TAIL_WIDTH.powi(2);
+                tail / (core + tail).max(f64::MIN_POSITIVE)
+            };
+            share = squared.iter().map(of_tail).sum::<f64>() / squared.len() as f64;
+        }
+        Some(Self { tail_share: share.clamp(TAIL_BOUNDS.0, TAIL_BOUNDS.1), ..self })
+    }
+
+    /// Squared residual at which an observation is as likely wrong as right: by its core or by its tail, whichever reaches
+    /// farther. Strong noise has a core that reaches farther than a rare tail.
+    pub fn gate(&self) -> f64 {
+        let wrong = WRONG_OBSERVATION * self.outlier_density.powi(2);
+        let reach = |(share, width): (f64, f64)| {
+            let variance = (width * self.core).powi(2);
+            let right = (1.0 - WRONG_OBSERVATION) * share / (std::f64::consts::TAU * variance);
+            2.0 * variance * (right / wrong).ln().max(0.0)
+        };
+        let [core, tail] = self.parts().map(reach);
+        core.max(tail)
+    }
+
+    /// Probability that an observation with this squared residual is right, of a track that is.
+    pub fn weight(&self, squared: f64) -> f64 {
+        let wrong = WRONG_OBSERVATION * self.outlier_density.powi(2);
+        let density = |(share, width): (f64, f64)| {
+            let variance = (width * self.core).powi(2);
+            (1.0 - WRONG_OBSERVATION) * share * (-0.5 * squared / variance).exp() / (std::f64::consts::TAU * variance)
+        };
+        let right: f64 = self.parts().map(density).iter().sum();
+        right / (right + wrong).max(f64::MIN_POSITIVE)
+    }
+
+    /// Log of the odds that a track is right whose prior probability is `share`: the density of its residuals under core
+    /// and tail, over that of coordinates anywhere, times the price of every dropped observation.
+    ///
+    /// * `cost`: sum of the squared residuals of the `retained` observations about their point
+    pub fn ln_odds(&self, cost: f64, retained: usize, dropped: usize, share: f64) -> f64 {
+        let dof = (2 * retained) as f64 - 3.0;
+        let ln_density = |(share, width): (f64, f64)| {
+            let variance = (width * self.core).powi(2);
+            share.ln() - 0.5 * dof * (std::f64::consts::TAU * variance).ln() - 0.5 * cost / variance
+        };
+        let [core, tail] = self.parts().map(ln_density);
+        let ln_right = core.max(tail) + (-(core - tail).abs()).exp().ln_1p() + dropped as f64 * WRONG_OBSERVATION.ln();
+        let ln_wrong = dof * self.outlier_density.ln();
+        (share / (1.0 - share)).ln() + ln_right - ln_wrong
+    }
+
+    /// Share and width of the core and of the tail.
+    fn parts(&self) -> [(f64, f64); 2] {
+        [(1.0 - self.tail_share, 1.0), (self.tail_share, TAIL_WIDTH)]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_gate_lets_the_core_of_any_noise_through() {
+        for core in [1e-4, 0.003, 0.02, 0.05] {
+            for tail_share in [TAIL_BOUNDS.0, TAIL_SHARE, TAIL_BOUNDS.1] {
+                let noise = NoiseModel { core, tail_share, outlier_density: 1.0 };
+                let gate = noise.gate().sqrt() / core;
+                assert!((2.5..25.0).contains(&gate), "noise {core}, tail {tail_share}: {gate} deviations");
+                let weight = |deviations: f64| noise.weight((deviations * core).powi(2));
+                assert!(
+                    weight(0.0) > 0.9 && weight(gate - 0.5) > 0.5 && weight(gate + 3.0) < 0.5,
+                    "{core} {tail_share}"
+                );
+            }
+        }
+    }
+}
