@@ -10,6 +10,7 @@ use super::interrupt::Signals;
 use super::print;
 use super::service::Service;
 use crate::config::Config;
+use crate::store::postgres::DatabaseUrl;
 use crate::telemetry;
 
 const HELP: &str = "\
@@ -22,11 +23,12 @@ new jobs are refused, running ones get engine.drain_seconds to finish and then g
 Examples:
   scpsfm serve
   scpsfm serve --data-dir /var/lib/scpsfm --listen 0.0.0.0:50051 --workers 4 --log-format json
+  scpsfm serve --store postgres://scpsfm@db.example/scpsfm    # several servers, one store
   scpsfm serve --print-config > scpsfm.toml";
 
 /// Run the server
 ///
-/// Takes jobs over gRPC (scpsfm.v1), keeps them in a data directory and solves them on worker threads. A restart knows
+/// Takes jobs over gRPC (scpsfm.v1), keeps them in a data directory or a shared database and solves them on worker threads. A restart knows
 /// every job and takes up those that were queued or running.
 #[derive(Debug, clap::Args)]
 #[command(after_help = HELP)]
@@ -46,6 +48,11 @@ pub struct Args {
     /// Directory of the embedded store; created [default: scpsfm-data]
     #[arg(long, value_name = "DIR")]
     pub data_dir: Option<PathBuf>,
+
+    /// PostgreSQL database instead, which several servers may share: postgres://USER:PASSWORD@HOST:PORT/DATABASE.
+    /// Other users of the machine see flags; they do not see SCPSFM_STORE__URL
+    #[arg(long, value_name = "URL", conflicts_with = "data_dir")]
+    pub store: Option<DatabaseUrl>,
 
     /// Worker threads, one job each; 0: one a core [default: 0]
     #[arg(long, value_name = "N")]
@@ -85,6 +92,7 @@ impl Args {
             ("server.listen", self.listen.clone()),
             ("metrics.listen", self.metrics_listen.clone()),
             ("store.data_dir", self.data_dir.as_ref().map(|path| path.display().to_string())),
+            ("store.url", self.store.as_ref().map(|url| url.reveal().to_owned())),
             ("engine.workers", self.workers.map(|count| count.to_string())),
             ("engine.queue_capacity", self.queue.map(|count| count.to_string())),
             ("compute.backend", word(self.backend.and_then(|backend| backend.to_possible_value()))),
@@ -158,6 +166,17 @@ mod tests {
         match Cli::try_parse_from(line).expect("valid flags").command {
             Command::Serve(args) => args.overrides(),
             other => panic!("parsed as {other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_shared_store_is_an_address_and_excludes_the_directory() {
+        let address = "postgres://me:hunter2@db/scpsfm";
+        assert_eq!(overrides(&["--store", address]), [("store.url", address.to_owned())]);
+        for flags in [["--store", address, "--data-dir", "d"], ["--store", "mysql://me:hunter2@db/x", "--workers", "1"]]
+        {
+            let error = Cli::try_parse_from(["scpsfm", "serve"].iter().chain(&flags)).expect_err("refused").to_string();
+            assert!(error.contains("--store"), "{error}");
         }
     }
 

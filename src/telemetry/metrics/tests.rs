@@ -56,7 +56,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
         progress: None,
         last_sequence: 1,
         summary: succeeded.then_some(summary),
-        failure: (state == JobState::Failed).then(|| Failure { reason: "INTERNAL".into(), message: "test".into() }),
+        failure: (state == JobState::Failed).then(|| Failure::new("INTERNAL", "test")),
         cancel_requested: false,
     }
 }

@@ -1,0 +1,137 @@
+//! The shared store: PostgreSQL, which several servers use as one.
+//!
+//! Every write of a worker is conditioned on its lease under the job's row lock, so that of two servers that think they
+//! hold a job one is refused. Notifications carry the names of jobs and are hints: what they say is read from the tables.
+
+mod listener;
+#[cfg(test)]
+mod tests;
+mod url;
+
+use std::time::Duration;
+
+use sqlx::Transaction;
+use sqlx::pool::PoolConnection;
+use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRow};
+use tokio::sync::Mutex;
+use tokio::time::timeout;
+
+use super::sql::{self, Change, Connection, Database, Size, Statement, Step};
+use super::{Error, Hint};
+use crate::domain::job::JobName;
+use listener::Listener;
+pub use url::{DatabaseUrl, UrlError};
+
+/// Connections of one server, beside the one that listens. A worker writes a few times a second, an idle one looks once
+/// a second; PostgreSQL's own default of a hundred connections leaves room for some ten servers.
+const CONNECTIONS: u32 = 8;
+/// How long a caller waits for a connection. Callers are told soon that the database is away, before their patience or a
+/// worker's lease is over.
+const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(3);
+/// How long an operation on a few rows may take: what takes longer waits for a database that does not answer.
+const SMALL_BOUND: Duration = Duration::from_secs(5);
+/// How long an input or a result may be on its way: 100 MB at some 3 MB/s.
+const PAYLOAD_BOUND: Duration = Duration::from_secs(30);
+/// How long a connection that comes back may take to answer before it is thrown away.
+const RELEASE_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// What the database ends by itself, in milliseconds, so that a server that was stopped in the middle of a transaction
+/// holds no locks that others wait for. An idle connection is none of these.
+const SESSION: [(&str, &str); 4] = [
+    ("application_name", "scpsfm"),
+    ("statement_timeout", "30000"),
+    ("idle_in_transaction_session_timeout", "5000"),
+    // A connection whose peer vanished without a word, after half a minute; PostgreSQL's default is two hours.
+    ("tcp_keepalives_idle", "30"),
+];
+
+/// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
+const ADMISSION_LOCK: i64 = 0x7363_7073_666d;
+
+const MIGRATIONS: [Step; 1] = [(1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql"))];
+
+/// Store in a PostgreSQL database.
+#[derive(Debug)]
+pub struct Postgres {
+    pool: PgPool,
+    listener: Mutex<Listener>,
+}
+
+impl Postgres {
+    /// Opens the store in a database that exists and brings its schema up to date.
+    ///
+    /// # Errors
+    /// [`Error::Unavailable`] where the database does not answer or refuses, [`Error::Corrupt`] where its schema is of
+    /// a newer version.
+    pub async fn open(url: &DatabaseUrl) -> Result<Self, Error> {
+        let options = url.options().clone().options(SESSION);
+        let pool = pool(CONNECTIONS, options.clone()).await?;
+        sql::migrator(&MIGRATIONS).run(&pool).await.map_err(sql::migration_failed)?;
+        Ok(Self { pool, listener: Mutex::new(Listener::new(options)) })
+    }
+}
+
+async fn pool(connections: u32, options: PgConnectOptions) -> Result<PgPool, Error> {
+    let pool = PgPoolOptions::new()
+        .max_connections(connections)
+        .acquire_timeout(ACQUIRE_TIMEOUT)
+        // A connection that does not answer would keep its place until the network gives it up, a quarter of an hour.
+        .after_release(|connection, _| {
+            Box::pin(async move {
+                match timeout(RELEASE_TIMEOUT, sqlx::Connection::ping(connection)).await {
+                    Ok(answer) => answer.map(|()| true),
+                    Err(_) => Err(sqlx::Error::PoolTimedOut),
+                }
+            })
+        });
+    Ok(pool.connect_with(options).await?)
+}
+
+impl Connection for PgConnection {
+    type Row = PgRow;
+    const FOR_UPDATE: &'static str = " FOR UPDATE";
+    const SKIP_LOCKED: &'static str = " FOR UPDATE SKIP LOCKED";
+
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<PgRow>, Error> {
+        sql::run::<sqlx::Postgres>(self, statement).await
+    }
+
+    async fn lock_admission(&mut self) -> Result<bool, Error> {
+        self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(ADMISSION_LOCK)).await?;
+        Ok(true)
+    }
+
+    async fn tell(&mut self, change: Change, job: &JobName) -> Result<(), Error> {
+        let notify = Statement::new("SELECT pg_notify($1, $2)").bind(listener::channel(change));
+        self.execute(notify.bind(&job.to_string())).await
+    }
+}
+
+impl Database for Postgres {
+    type Sqlx = sqlx::Postgres;
+    const SHARED: bool = true;
+
+    async fn reader(&self) -> Result<PoolConnection<sqlx::Postgres>, Error> {
+        Ok(self.pool.acquire().await?)
+    }
+
+    async fn begin(&self) -> Result<Transaction<'static, sqlx::Postgres>, Error> {
+        Ok(self.pool.begin().await?)
+    }
+
+    fn bound(&self, size: Size) -> Option<Duration> {
+        Some(match size {
+            Size::Small => SMALL_BOUND,
+            Size::Payload => PAYLOAD_BOUND,
+        })
+    }
+
+    async fn heard(&self) -> Hint {
+        self.listener.lock().await.hint().await
+    }
+
+    async fn disconnect(&self) {
+        self.listener.lock().await.close().await;
+        self.pool.close().await;
+    }
+}
