@@ -2,6 +2,9 @@
 //!
 //! The store's unit tests include this file too, so that there is one way to start it.
 
+// Neither of the two uses all of it.
+#![allow(dead_code)]
+
 use std::io::Write;
 use std::net::TcpListener;
 use std::os::unix::fs::chown;
@@ -119,6 +122,19 @@ impl Cluster {
         sqlx::query(create).execute(&mut connection).await.expect("a database");
         connection.close().await.expect("closed");
         self.url(&name)
+    }
+
+    /// Whether a transaction of that database has been waiting for its client for a while.
+    pub async fn waits_for_a_client(&self, url: &str) -> bool {
+        use sqlx::Connection;
+        let mut connection = sqlx::PgConnection::connect(url).await.expect("a connection");
+        sqlx::query_scalar(
+            "SELECT EXISTS (SELECT 1 FROM pg_stat_activity WHERE datname = current_database() \
+             AND state = 'idle in transaction' AND clock_timestamp() - state_change > interval '100 ms')",
+        )
+        .fetch_one(&mut connection)
+        .await
+        .expect("an answer")
     }
 
     /// Stops the database in the midst of whatever it does, as by a crash; everything that was committed stays.
