@@ -114,3 +114,32 @@ impl<S: Store> Store for Timed<S> {
         self.0.close().await;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::contract;
+    use crate::store::sqlite::Sqlite;
+    use crate::telemetry::metrics::tests::{page_after, value};
+
+    #[test]
+    fn writes_that_come_too_late_are_counted() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        let late = async {
+            let directory = tempfile::tempdir().expect("a temporary directory");
+            let store = Timed(Sqlite::open(directory.path()).await.expect("opens"));
+            store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+            let claimed = store.claim("w", contract::time(0), Duration::from_secs(1)).await.expect("claims");
+            let lease = claimed.expect("a job").lease;
+            store.heartbeat(&lease, contract::time(0), Duration::from_secs(1)).await.expect("holds");
+            store.sweep(contract::time(2), 3).await.expect("takes it back");
+            store.heartbeat(&lease, contract::time(3), Duration::from_secs(1)).await.expect_err("too late");
+            store.release(&lease, contract::time(3)).await.expect_err("too late");
+        };
+        let page = page_after(|| runtime.block_on(late));
+        for (operation, count) in [("heartbeat", 1.0), ("release", 1.0), ("finish", 0.0), ("record", 0.0)] {
+            let series = format!("scpsfm_fenced_writes_total{{operation=\"{operation}\"}}");
+            assert_eq!(value(&page, &series), Some(count), "{operation}");
+        }
+    }
+}

@@ -332,4 +332,4 @@ impl Drop for StoreTimer {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

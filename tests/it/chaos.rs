@@ -111,15 +111,16 @@ async fn survive(place: Place, servers: usize, jobs: usize, kills: usize) {
     let mut running: Vec<Serving> = (0..servers).map(|_| place.serve()).collect();
     let addresses: Addresses = Arc::new(Mutex::new(running.iter().map(|server| server.grpc.clone()).collect()));
     let mut following = JoinSet::new();
-    let mut numbers = 0..jobs;
-    for number in numbers.by_ref().take(SUBMITTERS) {
-        following.spawn(follow(addresses.clone(), number));
-    }
-    let (mut followed, mut killed) = (Vec::new(), 0);
+    let (mut submitted, mut followed, mut killed) = (0, Vec::new(), 0);
     while followed.len() < jobs {
+        // Jobs are held back for the kills that are to come.
+        let most = jobs * (killed + 1) / (kills + 1);
+        while submitted < most && following.len() < SUBMITTERS {
+            following.spawn(follow(addresses.clone(), submitted));
+            submitted += 1;
+        }
         let pause = Duration::from_millis(random.random_range(1..600));
         tokio::select! {
-            // While there are kills left, some jobs are held back for them.
             () = tokio::time::sleep(pause), if killed < kills => {
                 let victim = random.random_range(0..servers);
                 tokio::task::block_in_place(|| {
@@ -129,14 +130,10 @@ async fn survive(place: Place, servers: usize, jobs: usize, kills: usize) {
                 addresses.lock().expect("no test panicked here")[victim] = running[victim].grpc.clone();
                 killed += 1;
             }
-            Some(ended) = following.join_next() => {
-                followed.push(ended.expect("no panic"));
-                if let Some(number) = numbers.next() {
-                    following.spawn(follow(addresses.clone(), number));
-                }
-            }
+            Some(ended) = following.join_next() => followed.push(ended.expect("no panic")),
         }
     }
+    assert_eq!(killed, kills);
     assert_all_ended_once(&running[0], followed).await;
     println!("{jobs} jobs on {servers} servers, {killed} kills");
 }

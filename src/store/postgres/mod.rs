@@ -3,28 +3,33 @@
 //! Every write of a worker is conditioned on its lease under the job's row lock, so that of two servers that think they
 //! hold a job one is refused. Notifications carry the names of jobs and are hints: what they say is read from the tables.
 
+mod clock;
 mod listener;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod url;
 
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use sqlx::Transaction;
 use sqlx::pool::PoolConnection;
-use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRow};
+use sqlx::postgres::{PgConnection, PgPool, PgPoolOptions, PgRow};
 use tokio::sync::Mutex;
 use tokio::time::timeout;
 
 use super::sql::{self, Change, Connection, Database, Size, Statement, Step};
 use super::{Error, Hint};
 use crate::domain::job::JobName;
+use clock::Clock;
 use listener::Listener;
 pub use url::{DatabaseUrl, UrlError};
 
-/// Connections of one server, beside the one that listens. A worker writes a few times a second, an idle one looks once
-/// a second; PostgreSQL's own default of a hundred connections leaves room for some ten servers.
-const CONNECTIONS: u32 = 8;
+/// Connections of one server, beside the one that listens: a worker writes a few times a second, an idle one looks once
+/// a second. PostgreSQL's own default of a hundred connections leaves room for some ten servers.
+const CONNECTIONS: u32 = 6;
+/// Connections for inputs and results of callers. Apart, since each may take half a minute, and no lease may be lost
+/// because its heartbeat waits behind uploads.
+const PAYLOAD_CONNECTIONS: u32 = 3;
 /// How long a caller waits for a connection. Callers are told soon that the database is away, before their patience or a
 /// worker's lease is over.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(3);
@@ -54,7 +59,12 @@ const MIGRATIONS: [Step; 1] = [(1, "jobs", include_str!("../migrations/postgres/
 #[derive(Debug)]
 pub struct Postgres {
     pool: PgPool,
+    payloads: PgPool,
+    clock: Clock,
     listener: Mutex<Listener>,
+    /// Hears nothing, for tests of what polls alone achieve.
+    #[cfg(test)]
+    pub(crate) deaf: bool,
 }
 
 impl Postgres {
@@ -65,14 +75,31 @@ impl Postgres {
     /// a newer version.
     pub async fn open(url: &DatabaseUrl) -> Result<Self, Error> {
         let options = url.options().clone().options(SESSION);
-        let pool = pool(CONNECTIONS, options.clone()).await?;
+        let pool = pool_of(CONNECTIONS).connect_with(options.clone()).await?;
+        let payloads = pool_of(PAYLOAD_CONNECTIONS).connect_lazy_with(options.clone());
         sql::migrator(&MIGRATIONS).run(&pool).await.map_err(sql::migration_failed)?;
-        Ok(Self { pool, listener: Mutex::new(Listener::new(options)) })
+        let clock = Clock::default();
+        clock.set(&mut *pool.acquire().await?).await?;
+        Ok(Self {
+            pool,
+            payloads,
+            clock,
+            listener: Mutex::new(Listener::new(options)),
+            #[cfg(test)]
+            deaf: false,
+        })
+    }
+
+    fn pool(&self, size: Size) -> &PgPool {
+        match size {
+            Size::Small | Size::Outcome => &self.pool,
+            Size::Payload => &self.payloads,
+        }
     }
 }
 
-async fn pool(connections: u32, options: PgConnectOptions) -> Result<PgPool, Error> {
-    let pool = PgPoolOptions::new()
+fn pool_of(connections: u32) -> PgPoolOptions {
+    PgPoolOptions::new()
         .max_connections(connections)
         .acquire_timeout(ACQUIRE_TIMEOUT)
         // A connection that does not answer would keep its place until the network gives it up, a quarter of an hour.
@@ -83,8 +110,7 @@ async fn pool(connections: u32, options: PgConnectOptions) -> Result<PgPool, Err
                     Err(_) => Err(sqlx::Error::PoolTimedOut),
                 }
             })
-        });
-    Ok(pool.connect_with(options).await?)
+        })
 }
 
 impl Connection for PgConnection {
@@ -111,27 +137,40 @@ impl Database for Postgres {
     type Sqlx = sqlx::Postgres;
     const SHARED: bool = true;
 
-    async fn reader(&self) -> Result<PoolConnection<sqlx::Postgres>, Error> {
-        Ok(self.pool.acquire().await?)
+    async fn reader(&self, size: Size) -> Result<PoolConnection<sqlx::Postgres>, Error> {
+        Ok(self.pool(size).acquire().await?)
     }
 
-    async fn begin(&self) -> Result<Transaction<'static, sqlx::Postgres>, Error> {
-        Ok(self.pool.begin().await?)
+    async fn begin(&self, size: Size) -> Result<Transaction<'static, sqlx::Postgres>, Error> {
+        Ok(self.pool(size).begin().await?)
     }
 
     fn bound(&self, size: Size) -> Option<Duration> {
         Some(match size {
             Size::Small => SMALL_BOUND,
-            Size::Payload => PAYLOAD_BOUND,
+            Size::Payload | Size::Outcome => PAYLOAD_BOUND,
         })
     }
 
+    fn lease_clock(&self, now: SystemTime) -> SystemTime {
+        self.clock.translate(now)
+    }
+
+    async fn set_lease_clock(&self) -> Result<(), Error> {
+        self.clock.set(&mut *self.pool.acquire().await?).await
+    }
+
     async fn heard(&self) -> Hint {
+        #[cfg(test)]
+        if self.deaf {
+            return std::future::pending().await;
+        }
         self.listener.lock().await.hint().await
     }
 
     async fn disconnect(&self) {
         self.listener.lock().await.close().await;
+        self.payloads.close().await;
         self.pool.close().await;
     }
 }

@@ -1,7 +1,7 @@
 //! PostgreSQL under the store's contract, and what is its own: several servers on one database.
 
 #[path = "../../../tests/it/support/postgres.rs"]
-mod cluster;
+pub(crate) mod cluster;
 
 use std::ops::Deref;
 use std::sync::Arc;
@@ -51,6 +51,23 @@ async fn what_lives_elsewhere_is_not_taken_back_at_a_start() {
     assert_eq!(recovered.iter().map(|job| job.state).collect::<Vec<_>>(), [JobState::Queued]);
     let late = fixture.heartbeat(&claimed.lease, contract::time(61), LEASE).await;
     assert_eq!(late, Err(Error::Fenced(claimed.lease)));
+}
+
+#[tokio::test]
+async fn a_server_whose_clock_is_wrong_takes_and_loses_nothing_early() {
+    let Some(fixture) = Fixture::open().await else { return };
+    let right = Postgres::open(&fixture.url).await.expect("a second server");
+    // Its clock is an hour behind the database's: its second 0 is everyone's second 3600.
+    fixture.clock.pretend(Duration::from_secs(3600));
+    fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+    let claimed = fixture.claim("w", contract::time(0), LEASE).await.expect("claims").expect("a job");
+    assert!(right.sweep(contract::time(3629), 3).await.expect("sweeps").lost.is_empty(), "a second to go");
+    fixture.heartbeat(&claimed.lease, contract::time(10), LEASE).await.expect("holds");
+    assert!(right.sweep(contract::time(3639), 3).await.expect("sweeps").lost.is_empty(), "a second to go");
+    assert_eq!(right.sweep(contract::time(3640), 3).await.expect("sweeps").lost.len(), 1);
+    // A sweep looks at the clocks before anything else; these two are on one machine.
+    fixture.sweep(contract::time(0), 3).await.expect("sweeps");
+    assert_eq!(fixture.lease_clock(contract::time(0)), contract::time(0));
 }
 
 #[tokio::test]
@@ -107,7 +124,7 @@ async fn changes_are_told_to_other_servers_by_name_and_after_the_commit() {
 async fn a_server_that_stops_within_a_transaction_holds_up_nobody_for_long() {
     let Some(fixture) = Fixture::open().await else { return };
     let other = Postgres::open(&fixture.url).await.expect("a second server");
-    let mut stuck = other.begin().await.expect("a transaction");
+    let mut stuck = other.begin(Size::Small).await.expect("a transaction");
     stuck.lock_admission().await.expect("the lock");
     // Only the database itself can end this one: its bound is below what a creation may take.
     fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created in the end");

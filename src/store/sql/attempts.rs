@@ -1,6 +1,6 @@
 //! Leases: claiming, keeping, ending and losing them.
 
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use super::rows::{self, Standing, append, held, leave, micros, number, select_jobs, select_standing, standing};
 use super::{Change, Connection, Row, Statement, jobs};
@@ -19,12 +19,12 @@ pub(super) async fn may_claim<C: Connection>(connection: &mut C) -> Result<bool,
     connection.row(select).await?.flag("found")
 }
 
-/// Leases the next queued job.
+/// Leases the next queued job until `expires`.
 pub(super) async fn claim<C: Connection>(
     connection: &mut C,
     worker: &str,
     now: SystemTime,
-    lease_for: Duration,
+    expires: SystemTime,
 ) -> Result<Option<Claimed>, Error> {
     let next = Statement::new(
         "SELECT id FROM jobs WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) \
@@ -40,7 +40,7 @@ pub(super) async fn claim<C: Connection>(
     )
     .bind(micros(now))
     .bind(worker)
-    .bind(micros(now + lease_for))
+    .bind(micros(expires))
     .bind(id);
     let row = connection.row(lease).await?;
     let name = JobName { tenant: row.text("tenant")?, job: row.text("job")? };
@@ -58,15 +58,14 @@ pub(super) async fn claim<C: Connection>(
     }))
 }
 
-/// Extends a lease.
+/// Extends a lease until `expires`.
 pub(super) async fn heartbeat<C: Connection>(
     connection: &mut C,
     lease: &Lease,
-    now: SystemTime,
-    lease_for: Duration,
+    expires: SystemTime,
 ) -> Result<Heartbeat, Error> {
     let job = held(connection, lease).await?;
-    let extend = Statement::new("UPDATE jobs SET lease_expires = $1 WHERE id = $2").bind(micros(now + lease_for));
+    let extend = Statement::new("UPDATE jobs SET lease_expires = $1 WHERE id = $2").bind(micros(expires));
     connection.execute(extend.bind(job.id)).await?;
     Ok(Heartbeat { cancel_requested: job.cancel_requested, deadline: job.deadline })
 }
@@ -241,13 +240,17 @@ async fn exhausted<C: Connection>(
     Ok(Failure { reason: ATTEMPTS_EXHAUSTED.into(), message, attempts })
 }
 
-/// Whether a sweep would find anything.
-pub(super) async fn needs_sweep<C: Connection>(connection: &mut C, now: SystemTime) -> Result<bool, Error> {
+/// Whether a sweep would find anything: leases that ran out at `expired_at`, or deadlines that have passed.
+pub(super) async fn needs_sweep<C: Connection>(
+    connection: &mut C,
+    expired_at: SystemTime,
+    now: SystemTime,
+) -> Result<bool, Error> {
     let select = Statement::new(
         "SELECT (EXISTS (SELECT 1 FROM jobs WHERE state = 'RUNNING' AND lease_expires <= $1) \
-         OR EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED' AND deadline IS NOT NULL AND deadline <= $1)) AS found",
+         OR EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED' AND deadline IS NOT NULL AND deadline <= $2)) AS found",
     );
-    connection.row(select.bind(micros(now))).await?.flag("found")
+    connection.row(select.bind(micros(expired_at)).bind(micros(now))).await?.flag("found")
 }
 
 /// Ends the queued jobs that are past their deadline.

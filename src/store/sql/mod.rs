@@ -9,7 +9,7 @@ mod statement;
 mod store;
 
 use std::future::Future;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::pool::PoolConnection;
@@ -75,13 +75,24 @@ pub(super) trait Database: Send + Sync + 'static {
     const SHARED: bool;
 
     /// A connection that only reads.
-    fn reader(&self) -> impl Future<Output = Result<PoolConnection<Self::Sqlx>, Error>> + Send;
+    fn reader(&self, size: Size) -> impl Future<Output = Result<PoolConnection<Self::Sqlx>, Error>> + Send;
 
     /// Begins a transaction that may write.
-    fn begin(&self) -> impl Future<Output = Result<Transaction<'static, Self::Sqlx>, Error>> + Send;
+    fn begin(&self, size: Size) -> impl Future<Output = Result<Transaction<'static, Self::Sqlx>, Error>> + Send;
 
     /// How long an operation of this size may take; `None`: as long as it does.
     fn bound(&self, size: Size) -> Option<Duration>;
+
+    /// The time on the clock that leases run on, where the caller's shows `now`: one clock for every process that holds
+    /// or takes back leases.
+    fn lease_clock(&self, now: SystemTime) -> SystemTime {
+        now
+    }
+
+    /// Compares the caller's clock with that of the leases; called again and again, as clocks drift.
+    fn set_lease_clock(&self) -> impl Future<Output = Result<(), Error>> + Send {
+        async { Ok(()) }
+    }
 
     /// See [`crate::store::Store::hint`].
     fn heard(&self) -> impl Future<Output = Hint> + Send;
@@ -95,8 +106,10 @@ pub(super) trait Database: Send + Sync + 'static {
 pub(super) enum Size {
     /// A few rows.
     Small,
-    /// An input or a result.
+    /// An input or a result, for a caller who can wait.
     Payload,
+    /// A result, under a lease that may run out.
+    Outcome,
 }
 
 /// A migration: its version, its name and its SQL. Published ones are never edited.

@@ -29,7 +29,7 @@ async fn bounded<D: Database, T>(
 macro_rules! reads {
     ($database:expr, $size:expr, |$connection:ident| $body:expr) => {
         bounded($database, $size, async {
-            let mut reader = $database.reader().await?;
+            let mut reader = $database.reader($size).await?;
             let $connection = &mut *reader;
             $body.await
         })
@@ -41,7 +41,7 @@ macro_rules! reads {
 macro_rules! writes {
     ($database:expr, $size:expr, |$connection:ident| $body:expr) => {
         bounded($database, $size, async {
-            let mut transaction = $database.begin().await?;
+            let mut transaction = $database.begin($size).await?;
             let $connection = &mut *transaction;
             let value = $body.await?;
             transaction.commit().await?;
@@ -70,11 +70,12 @@ impl<D: Database> Store for D {
     }
 
     async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error> {
+        let expires = self.lease_clock(now) + lease_for;
         // Idle workers look for jobs again and again: a read keeps them out of the writers' queue.
         if !reads!(self, Size::Small, |connection| attempts::may_claim(connection))? {
             return Ok(None);
         }
-        writes!(self, Size::Small, |connection| attempts::claim(connection, worker, now, lease_for))
+        writes!(self, Size::Small, |connection| attempts::claim(connection, worker, now, expires))
     }
 
     async fn input(&self, name: &JobName) -> Result<Vec<u8>, Error> {
@@ -82,7 +83,8 @@ impl<D: Database> Store for D {
     }
 
     async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
-        writes!(self, Size::Small, |connection| attempts::heartbeat(connection, lease, now, lease_for))
+        let expires = self.lease_clock(now) + lease_for;
+        writes!(self, Size::Small, |connection| attempts::heartbeat(connection, lease, expires))
     }
 
     async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error> {
@@ -90,7 +92,7 @@ impl<D: Database> Store for D {
     }
 
     async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error> {
-        writes!(self, Size::Payload, |connection| attempts::finish(connection, lease, ending, now))
+        writes!(self, Size::Outcome, |connection| attempts::finish(connection, lease, ending, now))
     }
 
     async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
@@ -103,17 +105,19 @@ impl<D: Database> Store for D {
 
     async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {
         // Where no other process can be at work, every lease is a dead one's.
-        let expired_at = D::SHARED.then_some(now);
+        let expired_at = D::SHARED.then(|| self.lease_clock(now));
         writes!(self, Size::Small, |connection| attempts::take_back(connection, expired_at, now, max_attempts))
     }
 
     async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
+        bounded(self, Size::Small, self.set_lease_clock()).await?;
+        let expired_at = self.lease_clock(now);
         // Most sweeps find nothing: a look spares the writer, and the disk, a transaction.
-        if !reads!(self, Size::Small, |connection| attempts::needs_sweep(connection, now))? {
+        if !reads!(self, Size::Small, |connection| attempts::needs_sweep(connection, expired_at, now))? {
             return Ok(Swept::default());
         }
         writes!(self, Size::Small, |connection| async {
-            let lost = attempts::take_back(connection, Some(now), now, max_attempts).await?;
+            let lost = attempts::take_back(connection, Some(expired_at), now, max_attempts).await?;
             let expired = attempts::expire_queued(connection, now).await?;
             Ok::<_, Error>(Swept { lost, expired })
         })

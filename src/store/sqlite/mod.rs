@@ -130,13 +130,13 @@ impl Database for Sqlite {
     /// The lock on the directory says that no other process lives here.
     const SHARED: bool = false;
 
-    async fn reader(&self) -> Result<PoolConnection<sqlx::Sqlite>, Error> {
+    async fn reader(&self, _size: Size) -> Result<PoolConnection<sqlx::Sqlite>, Error> {
         Ok(self.readers.acquire().await?)
     }
 
     /// Takes the write lock at once: a transaction that began by reading could not be upgraded after another process
     /// wrote.
-    async fn begin(&self) -> Result<Transaction<'static, sqlx::Sqlite>, Error> {
+    async fn begin(&self, _size: Size) -> Result<Transaction<'static, sqlx::Sqlite>, Error> {
         Ok(self.writer.begin_with("BEGIN IMMEDIATE").await?)
     }
 
