@@ -10,7 +10,6 @@ use super::interrupt::Signals;
 use super::print;
 use super::service::Service;
 use crate::config::Config;
-use crate::store::postgres::DatabaseUrl;
 use crate::telemetry;
 
 const HELP: &str = "\
@@ -52,7 +51,7 @@ pub struct Args {
     /// PostgreSQL database instead, which several servers may share: postgres://USER:PASSWORD@HOST:PORT/DATABASE.
     /// Other users of the machine see flags; they do not see SCPSFM_STORE__URL
     #[arg(long, value_name = "URL", conflicts_with = "data_dir")]
-    pub store: Option<DatabaseUrl>,
+    pub store: Option<GivenUrl>,
 
     /// Worker threads, one job each; 0: one a core [default: 0]
     #[arg(long, value_name = "N")]
@@ -75,6 +74,23 @@ pub struct Args {
     pub print_config: bool,
 }
 
+/// An address as it was given, password included. Checked with the rest of the configuration, whose errors do not repeat
+/// it, as those of the command line would.
+#[derive(Clone)]
+pub struct GivenUrl(String);
+
+impl From<&str> for GivenUrl {
+    fn from(text: &str) -> Self {
+        Self(text.to_owned())
+    }
+}
+
+impl std::fmt::Debug for GivenUrl {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("GivenUrl(***)")
+    }
+}
+
 /// How log lines are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {
@@ -92,7 +108,7 @@ impl Args {
             ("server.listen", self.listen.clone()),
             ("metrics.listen", self.metrics_listen.clone()),
             ("store.data_dir", self.data_dir.as_ref().map(|path| path.display().to_string())),
-            ("store.url", self.store.as_ref().map(|url| url.reveal().to_owned())),
+            ("store.url", self.store.as_ref().map(|url| url.0.clone())),
             ("engine.workers", self.workers.map(|count| count.to_string())),
             ("engine.queue_capacity", self.queue.map(|count| count.to_string())),
             ("compute.backend", word(self.backend.and_then(|backend| backend.to_possible_value()))),
@@ -173,11 +189,12 @@ mod tests {
     fn a_shared_store_is_an_address_and_excludes_the_directory() {
         let address = "postgres://me:hunter2@db/scpsfm";
         assert_eq!(overrides(&["--store", address]), [("store.url", address.to_owned())]);
-        for flags in [["--store", address, "--data-dir", "d"], ["--store", "mysql://me:hunter2@db/x", "--workers", "1"]]
-        {
-            let error = Cli::try_parse_from(["scpsfm", "serve"].iter().chain(&flags)).expect_err("refused").to_string();
-            assert!(error.contains("--store"), "{error}");
-        }
+        let both = ["scpsfm", "serve", "--store", address, "--data-dir", "d"];
+        let error = Cli::try_parse_from(both).expect_err("refused").to_string();
+        assert!(error.contains("--data-dir") && !error.contains("hunter2"), "{error}");
+        let wrong = overrides(&["--store", "mysql://me:hunter2@db/scpsfm"]);
+        let error = Config::load(None, &wrong).expect_err("refused").to_string();
+        assert!(error.contains("store.url") && !error.contains("hunter2"), "{error}");
     }
 
     #[test]

@@ -13,7 +13,7 @@ use std::time::{Duration, SystemTime};
 
 use sqlx::Transaction;
 use sqlx::pool::PoolConnection;
-use sqlx::postgres::{PgConnection, PgPool, PgPoolOptions, PgRow};
+use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRow};
 use tokio::sync::Mutex;
 use tokio::time::timeout;
 
@@ -75,7 +75,11 @@ impl Postgres {
     /// a newer version.
     pub async fn open(url: &DatabaseUrl) -> Result<Self, Error> {
         let options = url.options().clone().options(SESSION);
-        let pool = pool_of(CONNECTIONS).connect_with(options.clone()).await?;
+        let pool = match pool_of(CONNECTIONS).connect_with(options.clone()).await {
+            // A pool says how long it waited, not for what.
+            Err(sqlx::Error::PoolTimedOut) => return Err(cause_of_no_connection(&options).await),
+            pool => pool?,
+        };
         let payloads = pool_of(PAYLOAD_CONNECTIONS).connect_lazy_with(options.clone());
         sql::migrator(&MIGRATIONS).run(&pool).await.map_err(sql::migration_failed)?;
         let clock = Clock::default();
@@ -95,6 +99,14 @@ impl Postgres {
             Size::Small | Size::Outcome => &self.pool,
             Size::Payload => &self.payloads,
         }
+    }
+}
+
+async fn cause_of_no_connection(options: &PgConnectOptions) -> Error {
+    let connecting = <PgConnection as sqlx::Connection>::connect_with(options);
+    match timeout(ACQUIRE_TIMEOUT, connecting).await {
+        Ok(Err(cause)) => cause.into(),
+        Ok(Ok(_)) | Err(_) => sqlx::Error::PoolTimedOut.into(),
     }
 }
 
