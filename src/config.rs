@@ -11,6 +11,7 @@ use serde::de::IntoDeserializer;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::domain::{Backend, Limits};
+use crate::store::postgres::DatabaseUrl;
 use crate::telemetry::tracing::Format;
 use crate::{engine, rpc};
 
@@ -69,14 +70,18 @@ impl Default for Metrics {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Store {
-    /// Folder of the embedded database; made if it does not exist.
+    /// Folder of the embedded database; made if it does not exist. Not used with a `url`.
     pub data_dir: PathBuf,
+    /// PostgreSQL database that several servers may share, `postgres://USER:PASSWORD@HOST:PORT/DATABASE`. None by
+    /// default: one server needs no database beside it. Wherever the configuration is shown, the password is not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub url: Option<DatabaseUrl>,
 }
 
 impl Default for Store {
     fn default() -> Self {
         // Beside the process, with a name that nobody deletes by mistake.
-        Self { data_dir: PathBuf::from("scpsfm-data") }
+        Self { data_dir: PathBuf::from("scpsfm-data"), url: None }
     }
 }
 
@@ -369,15 +374,26 @@ mod tests {
     }
 
     #[test]
+    fn the_password_of_the_store_is_shown_nowhere() {
+        let given = "postgres://me:hunter2@db/scpsfm";
+        let config = Config::from_sources(None, variables(&[("SCPSFM_STORE__URL", given)]), &[]).expect("valid");
+        assert_eq!(config.store.url.as_ref().map(|url| url.reveal()), Some(given));
+        for shown in [format!("{config:?}"), config.to_toml().expect("TOML")] {
+            assert!(shown.contains("me:***@db") && !shown.contains("hunter2"), "{shown}");
+        }
+    }
+
+    #[test]
     fn errors_name_the_key_and_what_would_be_right() {
         let from_file = |text: &str| Config::from_sources(Some(file(text).path()), vec![], &[]);
         let from_variable = |name: &str, value: &str| Config::from_sources(None, variables(&[(name, value)]), &[]);
-        let cases: [(Result<Config, Error>, &[&str]); 9] = [
+        let cases: [(Result<Config, Error>, &[&str]); 10] = [
             (from_file("[engine]\nwrokers = 1\n"), &["wrokers", "workers"]),
             (from_file("[engine]\nqueue_capacity = 0\n"), &["engine.queue_capacity", "from 1 on"]),
             (from_file("[server]\nlisten = \"localhost\"\n"), &["server.listen", "127.0.0.1:50051"]),
             (from_file("[compute]\nbackend = \"cuda\"\n"), &["compute.backend", "flex", "ndarray"]),
             (from_file("[log]\nfilter = \"scpsfm=loud\"\n"), &["log.filter", "`info`"]),
+            (from_variable("SCPSFM_STORE__URL", "mysql://me:hunter2@host/db"), &["store.url", "postgres://USER"]),
             (from_variable("SCPSFM_ENGINE__WORKERS", "many"), &["engine.workers", "many", "environment"]),
             (from_variable("SCPSFM_ENGINE_WORKERS", "4"), &["SCPSFM_ENGINE_WORKERS", "SCPSFM_ENGINE__WORKERS"]),
             (from_variable("SCPSFM_OTLP__ENDPOINT", "https://x:4317"), &["otlp.endpoint", "http://127.0.0.1:4317"]),
@@ -388,6 +404,7 @@ mod tests {
             for part in parts {
                 assert!(message.contains(part), "`{message}` does not say `{part}`");
             }
+            assert!(!message.contains("hunter2"), "{message}");
         }
     }
 }

@@ -8,7 +8,7 @@ use super::client::{self, Client};
 use super::exit::{Exit, Failure};
 use super::print;
 use super::progress::ProgressView;
-use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState, Summary};
+use crate::domain::job::{EventBody, Failure as JobFailure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Grade, Status};
 
 /// Reads a job's name; the id alone stands for a job of the default tenant.
@@ -45,6 +45,24 @@ pub fn print_job(job: &Job, json: bool) -> Result<(), Failure> {
     print(&if json { format!("{:#}", job_json(job)) } else { job_line(job) })
 }
 
+/// Why a job failed, for programs; attempts only where there are any to tell of.
+fn failure_json(failure: &JobFailure) -> Value {
+    let mut value = json!({ "reason": failure.reason, "message": failure.message });
+    let past = |past: &PastAttempt| {
+        json!({
+            "attempt": past.attempt,
+            "worker": past.worker,
+            "start_time": time(past.start_time),
+            "end_time": time(past.end_time),
+            "end": past.end,
+        })
+    };
+    if !failure.attempts.is_empty() {
+        value["attempts"] = failure.attempts.iter().map(past).collect();
+    }
+    value
+}
+
 /// A job for programs; times as RFC 3339.
 pub fn job_json(job: &Job) -> Value {
     json!({
@@ -64,7 +82,7 @@ pub fn job_json(job: &Job) -> Value {
         "progress": job.progress,
         "last_sequence": job.last_sequence,
         "summary": job.summary,
-        "error": job.failure,
+        "error": job.failure.as_ref().map(failure_json),
         "cancel_requested": job.cancel_requested,
     })
 }
@@ -72,7 +90,9 @@ pub fn job_json(job: &Job) -> Value {
 /// An event for programs.
 pub fn event_json(event: &JobEvent) -> Value {
     let (kind, body) = match &event.body {
-        EventBody::State { state, failure } => ("state_change", json!({ "state": state, "error": failure })),
+        EventBody::State { state, failure } => {
+            ("state_change", json!({ "state": state, "error": failure.as_ref().map(failure_json) }))
+        }
         EventBody::Progress(progress) => ("progress", json!(progress)),
         EventBody::Weights { iteration, weights } => ("weights", json!({ "iteration": iteration, "weight": weights })),
         EventBody::Result(summary) => ("result", json!(summary)),

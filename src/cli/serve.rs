@@ -22,11 +22,12 @@ new jobs are refused, running ones get engine.drain_seconds to finish and then g
 Examples:
   scpsfm serve
   scpsfm serve --data-dir /var/lib/scpsfm --listen 0.0.0.0:50051 --workers 4 --log-format json
+  scpsfm serve --store postgres://scpsfm@db.example/scpsfm    # several servers, one store
   scpsfm serve --print-config > scpsfm.toml";
 
 /// Run the server
 ///
-/// Takes jobs over gRPC (scpsfm.v1), keeps them in a data directory and solves them on worker threads. A restart knows
+/// Takes jobs over gRPC (scpsfm.v1), keeps them in a data directory or a shared database and solves them on worker threads. A restart knows
 /// every job and takes up those that were queued or running.
 #[derive(Debug, clap::Args)]
 #[command(after_help = HELP)]
@@ -46,6 +47,11 @@ pub struct Args {
     /// Directory of the embedded store; created [default: scpsfm-data]
     #[arg(long, value_name = "DIR")]
     pub data_dir: Option<PathBuf>,
+
+    /// PostgreSQL database instead, which several servers may share: postgres://USER:PASSWORD@HOST:PORT/DATABASE.
+    /// Other users of the machine see flags; they do not see SCPSFM_STORE__URL
+    #[arg(long, value_name = "URL", conflicts_with = "data_dir")]
+    pub store: Option<GivenUrl>,
 
     /// Worker threads, one job each; 0: one a core [default: 0]
     #[arg(long, value_name = "N")]
@@ -68,6 +74,23 @@ pub struct Args {
     pub print_config: bool,
 }
 
+/// An address as it was given, password included. Checked with the rest of the configuration, whose errors do not repeat
+/// it, as those of the command line would.
+#[derive(Clone)]
+pub struct GivenUrl(String);
+
+impl From<&str> for GivenUrl {
+    fn from(text: &str) -> Self {
+        Self(text.to_owned())
+    }
+}
+
+impl std::fmt::Debug for GivenUrl {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("GivenUrl(***)")
+    }
+}
+
 /// How log lines are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {
@@ -85,6 +108,7 @@ impl Args {
             ("server.listen", self.listen.clone()),
             ("metrics.listen", self.metrics_listen.clone()),
             ("store.data_dir", self.data_dir.as_ref().map(|path| path.display().to_string())),
+            ("store.url", self.store.as_ref().map(|url| url.0.clone())),
             ("engine.workers", self.workers.map(|count| count.to_string())),
             ("engine.queue_capacity", self.queue.map(|count| count.to_string())),
             ("compute.backend", word(self.backend.and_then(|backend| backend.to_possible_value()))),
@@ -159,6 +183,18 @@ mod tests {
             Command::Serve(args) => args.overrides(),
             other => panic!("parsed as {other:?}"),
         }
+    }
+
+    #[test]
+    fn a_shared_store_is_an_address_and_excludes_the_directory() {
+        let address = "postgres://me:hunter2@db/scpsfm";
+        assert_eq!(overrides(&["--store", address]), [("store.url", address.to_owned())]);
+        let both = ["scpsfm", "serve", "--store", address, "--data-dir", "d"];
+        let error = Cli::try_parse_from(both).expect_err("refused").to_string();
+        assert!(error.contains("--data-dir") && !error.contains("hunter2"), "{error}");
+        let wrong = overrides(&["--store", "mysql://me:hunter2@db/scpsfm"]);
+        let error = Config::load(None, &wrong).expect_err("refused").to_string();
+        assert!(error.contains("store.url") && !error.contains("hunter2"), "{error}");
     }
 
     #[test]

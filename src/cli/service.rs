@@ -5,12 +5,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::exit::Failure;
-use crate::config::Config;
+use crate::config::{self, Config};
 use crate::engine::{self, Engine};
 use crate::rpc::server::{self, Server};
-use crate::store::QueueBounds;
+use crate::store::postgres::Postgres;
 use crate::store::sqlite::Sqlite;
 use crate::store::timed::Timed;
+use crate::store::{QueueBounds, Store};
 
 /// How long calls may outlast the engine's drain: their streams end with it, so this is for the network only.
 const CALLS_BOUND: Duration = Duration::from_secs(5);
@@ -28,11 +29,8 @@ impl Service {
     /// # Errors
     /// A data directory that cannot be used or an address that cannot be had.
     pub async fn start(config: &Config) -> Result<Self, Failure> {
-        let directory = &config.store.data_dir;
-        let store = Sqlite::open(directory).await.map_err(|error| {
-            Failure::internal(format_args!("cannot open the data directory {}: {error}", directory.display()))
-        })?;
-        let engine = Engine::start(engine_options(config), Arc::new(Timed(store)), engine::default_solver())
+        let store = open_store(&config.store).await?;
+        let engine = Engine::start(engine_options(config), store, engine::default_solver())
             .await
             .map_err(|error| Failure::internal(format_args!("cannot start the engine: {error}")))?;
         let server = Server::bind(server_options(config), engine.clone()).await.map_err(Failure::internal)?;
@@ -62,6 +60,16 @@ impl Service {
         self.server.shutdown(CALLS_BOUND).await.map_err(Failure::internal)?;
         Ok(drained)
     }
+}
+
+async fn open_store(config: &config::Store) -> Result<Arc<dyn Store>, Failure> {
+    if let Some(url) = &config.url {
+        let failed = |error| Failure::internal(format_args!("cannot open the store {url}: {error}"));
+        return Ok(Arc::new(Timed(Postgres::open(url).await.map_err(failed)?)));
+    }
+    let directory = config.data_dir.display();
+    let failed = |error| Failure::internal(format_args!("cannot open the data directory {directory}: {error}"));
+    Ok(Arc::new(Timed(Sqlite::open(&config.data_dir).await.map_err(failed)?)))
 }
 
 fn engine_options(config: &Config) -> engine::Options {

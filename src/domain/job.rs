@@ -135,6 +135,60 @@ pub struct Failure {
     /// Upper-case reason, stable for programs: `INTERNAL`, `ATTEMPTS_EXHAUSTED`.
     pub reason: String,
     pub message: String,
+    /// Of a job that ran out of attempts: what became of each, oldest first; the latest ones where there were many.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub attempts: Vec<PastAttempt>,
+}
+
+impl Failure {
+    /// A failure that needs no history.
+    pub fn new(reason: &str, message: impl Into<String>) -> Self {
+        Self { reason: reason.into(), message: message.into(), attempts: Vec::new() }
+    }
+}
+
+/// An attempt that is over.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PastAttempt {
+    /// Counted from 1.
+    pub attempt: u32,
+    /// The process that made it.
+    pub worker: String,
+    pub start_time: SystemTime,
+    /// When it ended; of a lost one, when that was found.
+    pub end_time: SystemTime,
+    pub end: AttemptEnd,
+}
+
+/// How an attempt ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum AttemptEnd {
+    /// It ended its job.
+    Ended,
+    /// Its worker gave the job back, as at a drain.
+    GivenBack,
+    /// Its worker was not heard of for the time of a lease, or its process died.
+    Lost,
+}
+
+impl AttemptEnd {
+    /// Every end.
+    pub const ALL: [AttemptEnd; 3] = [AttemptEnd::Ended, AttemptEnd::GivenBack, AttemptEnd::Lost];
+
+    /// The end's name in the store and in answers.
+    pub fn name(self) -> &'static str {
+        match self {
+            AttemptEnd::Ended => "ENDED",
+            AttemptEnd::GivenBack => "GIVEN_BACK",
+            AttemptEnd::Lost => "LOST",
+        }
+    }
+
+    /// The end of that name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|end| end.name() == name)
+    }
 }
 
 /// A job as its owner sees it.

@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use tokio::sync::{oneshot, watch};
-use tokio::time::{Instant, MissedTickBehavior, interval_at, sleep, sleep_until};
+use tokio::time::{Instant, MissedTickBehavior, interval_at, sleep, sleep_until, timeout_at};
 use tracing::Instrument;
 
 use super::observe::{self, Attempt, AttemptLost};
 use super::worker::{Assignment, Report, Verdict, Worker};
 use super::{Inner, locked};
-use crate::domain::job::{Failure, Job};
+use crate::domain::job::{Failure, Job, JobState};
 use crate::domain::{Progress, StopReason, StopToken};
 use crate::store::{self, Claimed, Ending, Lease, Outcome};
 
@@ -20,6 +20,9 @@ const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 
 /// Heartbeats within the time of a lease: two may be lost.
 const HEARTBEATS_A_LEASE: u32 = 3;
+
+/// How long a late heartbeat may take: one that finds that the lease has run out asks whether it was taken over.
+const LATE_HEARTBEAT: Duration = Duration::from_secs(1);
 
 /// Pause before a write is tried again that the store could not take.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);
@@ -34,6 +37,12 @@ pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) {
     let span = attempt.span().clone();
     // All of it inside the span, so that every line carries the job's name.
     async { Course::begin(inner, job, lease).run(worker, attempt).await }.instrument(span).await;
+}
+
+/// Waits for the store no longer than the lease holds: a database that hangs must not keep the work going.
+async fn in_time<T>(until: Instant, writing: impl Future<Output = Result<T, store::Error>>) -> Result<T, store::Error> {
+    let late = |_| Err(store::Error::Unavailable("no answer as long as the lease held".into()));
+    timeout_at(until, writing).await.unwrap_or_else(late)
 }
 
 /// An attempt under way.
@@ -148,7 +157,15 @@ impl<'a> Course<'a> {
         let mut news = false;
         let report = loop {
             tokio::select! {
+                // In this order: a process that slept through its lease asks the store before it gives up.
+                biased;
                 report = &mut answer => break report.ok(),
+                _ = heartbeats.tick(), if !self.lost => {
+                    if !self.heartbeat().await {
+                        heartbeats.reset_after(RETRY_PAUSE.min(beat));
+                    }
+                }
+                () = sleep_until(self.leased_until), if !self.lost => self.lapse(),
                 Ok(()) = reported.changed(), if !news && !self.lost => news = true,
                 () = sleep_until(next_store), if news => {
                     let progress = *reported.borrow_and_update();
@@ -156,7 +173,6 @@ impl<'a> Course<'a> {
                     news = false;
                     next_store = Instant::now() + PROGRESS_PERIOD;
                 }
-                _ = heartbeats.tick(), if !self.lost => self.heartbeat().await,
             }
         };
         let latest = *reported.borrow();
@@ -165,7 +181,8 @@ impl<'a> Course<'a> {
 
     async fn store_progress(&mut self, progress: Option<Progress>) {
         let Some(progress) = progress else { return };
-        match self.inner.store.record(&self.lease, &progress, SystemTime::now()).await {
+        let written = self.inner.store.record(&self.lease, &progress, SystemTime::now());
+        match in_time(self.leased_until, written).await {
             Ok(_) => {
                 self.stored = Some(progress);
                 self.inner.hub.wake(&self.job.name);
@@ -174,9 +191,12 @@ impl<'a> Course<'a> {
         }
     }
 
-    async fn heartbeat(&mut self) {
+    /// Returns whether the store answered; a store that does not is asked again soon.
+    async fn heartbeat(&mut self) -> bool {
         let sent = Instant::now();
-        match self.inner.store.heartbeat(&self.lease, SystemTime::now(), self.inner.options.lease).await {
+        let until = if sent < self.leased_until { self.leased_until } else { sent + LATE_HEARTBEAT };
+        let written = self.inner.store.heartbeat(&self.lease, SystemTime::now(), self.inner.options.lease);
+        match in_time(until, written).await {
             Ok(heartbeat) => {
                 self.leased_until = sent + self.inner.options.lease;
                 if heartbeat.cancel_requested {
@@ -186,8 +206,12 @@ impl<'a> Course<'a> {
                 if heartbeat.deadline.is_some_and(|deadline| deadline <= SystemTime::now()) {
                     self.stop.stop(StopReason::DeadlineExceeded);
                 }
+                true
             }
-            Err(error) => self.store_failed(&error),
+            Err(error) => {
+                self.store_failed(&error);
+                false
+            }
         }
     }
 
@@ -196,16 +220,21 @@ impl<'a> Course<'a> {
         let fenced = matches!(error, store::Error::Fenced(_));
         tracing::warn!(%error, "the store fails");
         if fenced || Instant::now() >= self.leased_until {
-            self.lost = true;
-            self.stop.stop(StopReason::Interrupted);
+            self.lapse();
         }
+    }
+
+    /// The lease is gone, or may be: stops the work, whose outcome nobody may write.
+    fn lapse(&mut self) {
+        self.lost = true;
+        self.stop.stop(StopReason::Interrupted);
     }
 
     /// Commits what the attempt came to.
     async fn conclude(mut self, verdict: Verdict, latest: Option<Progress>, attempt: Option<Attempt>) {
         let outcome = match verdict {
             Verdict::Solved { summary, result } => Some(Outcome::Succeeded { summary, result }),
-            Verdict::Broken(message) => Some(Outcome::Failed(Failure { reason: INTERNAL.into(), message })),
+            Verdict::Broken(message) => Some(Outcome::Failed(Failure::new(INTERNAL, message))),
             Verdict::Stopped(StopReason::Cancelled) => Some(Outcome::Cancelled),
             Verdict::Stopped(StopReason::DeadlineExceeded) => Some(Outcome::Expired),
             Verdict::Stopped(StopReason::Interrupted) => None,
@@ -218,6 +247,8 @@ impl<'a> Course<'a> {
     /// Ends the job or gives it back, trying again as long as the lease holds. `None`: the lease is gone.
     async fn commit(&mut self, ending: Option<&Ending>) -> Option<Job> {
         let store = &self.inner.store;
+        // Of a write that broke off nobody knows whether it was committed.
+        let mut unsure = false;
         while !self.lost {
             let written = match ending {
                 Some(ending) => store.finish(&self.lease, ending, SystemTime::now()).await,
@@ -225,13 +256,30 @@ impl<'a> Course<'a> {
             };
             match written {
                 Ok(job) => return Some(job),
+                Err(store::Error::Fenced(_)) if unsure && let Some(job) = self.committed(ending).await => {
+                    return Some(job);
+                }
                 Err(error) => self.store_failed(&error),
             }
+            unsure = true;
             if !self.lost {
                 sleep(RETRY_PAUSE).await;
             }
         }
         None
+    }
+
+    /// The job, where it stands as this attempt wanted to leave it.
+    async fn committed(&self, ending: Option<&Ending>) -> Option<Job> {
+        let job = self.inner.store.job(&self.lease.name).await.ok()?;
+        let (state, failure) = match &ending?.outcome {
+            Outcome::Succeeded { .. } => (JobState::Succeeded, None),
+            Outcome::Failed(failure) => (JobState::Failed, Some(failure)),
+            Outcome::Cancelled => (JobState::Cancelled, None),
+            Outcome::Expired => (JobState::Expired, None),
+        };
+        let ours = job.attempt == self.lease.attempt && job.state == state && job.failure.as_ref() == failure;
+        ours.then_some(job)
     }
 
     fn announce(self, committed: Option<Job>, attempt: Option<Attempt>) {

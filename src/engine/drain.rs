@@ -29,6 +29,8 @@ pub struct Drained {
 pub(super) struct Crew {
     slots: Vec<JoinHandle<()>>,
     sweeper: Option<JoinHandle<()>>,
+    /// Heeds what other processes tell, where there are any.
+    hints: Option<JoinHandle<()>>,
     threads: Vec<thread::JoinHandle<()>>,
     /// Closes when the last thread has ended.
     threads_ended: Option<mpsc::Receiver<()>>,
@@ -49,6 +51,9 @@ impl Inner {
         }
         crew.slots = workers.into_iter().map(|worker| tokio::spawn(slot::run(self.clone(), worker))).collect();
         crew.sweeper = Some(tokio::spawn(slot::sweep(self.clone())));
+        if self.store.is_shared() {
+            crew.hints = Some(tokio::spawn(super::hints::run(self.clone())));
+        }
         *locked(&self.crew) = crew;
         Ok(())
     }
@@ -76,10 +81,11 @@ impl Inner {
         if !begun {
             return Drained::default();
         }
-        let (mut slots, sweeper, threads, threads_ended) = {
+        let (mut slots, others, threads, threads_ended) = {
             let mut crew = locked(&self.crew);
             let slots = std::mem::take(&mut crew.slots);
-            (slots, crew.sweeper.take(), std::mem::take(&mut crew.threads), crew.threads_ended.take())
+            let others = [crew.sweeper.take(), crew.hints.take()];
+            (slots, others, std::mem::take(&mut crew.threads), crew.threads_ended.take())
         };
         if timeout(bound, all_ended(&mut slots)).await.is_err() {
             for stop in locked(&self.running).values() {
@@ -92,9 +98,9 @@ impl Inner {
             }
         }
         self.phase.send_replace(Phase::Closed);
-        if let Some(sweeper) = sweeper {
+        for task in others.into_iter().flatten() {
             // It only ends early by a panic, which has been reported.
-            let _ = sweeper.await;
+            let _ = task.await;
         }
         join(threads, threads_ended).await;
         locked(&self.crew).drained

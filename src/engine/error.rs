@@ -25,6 +25,9 @@ pub enum Error {
     /// This server is going down and takes on nothing new; what it was given goes on after its restart.
     #[error("the server is draining")]
     Draining,
+    /// The store is out of reach; nothing is known to have changed. Trying again later may help.
+    #[error("the store is out of reach: {0}")]
+    Unavailable(String),
     /// Not the caller's fault: the store or the engine itself failed.
     #[error("{0}")]
     Internal(String),
@@ -41,10 +44,10 @@ impl From<store::Error> for Error {
                 bound: bound.name(),
                 message: bound.to_string(),
             },
-            store::Error::Fenced(_)
-            | store::Error::InUse(_)
-            | store::Error::Unavailable(_)
-            | store::Error::Corrupt(_) => Error::Internal(error.to_string()),
+            store::Error::Unavailable(cause) => Error::Unavailable(cause),
+            store::Error::Fenced(_) | store::Error::InUse(_) | store::Error::Corrupt(_) => {
+                Error::Internal(error.to_string())
+            }
         }
     }
 }

@@ -57,6 +57,13 @@ impl Hub {
         }
     }
 
+    /// Has everyone who follows any job look.
+    pub(super) fn wake_all(&self) {
+        for held in locked(&self.topics).values() {
+            held.topic.version.send_modify(|version| *version = version.wrapping_add(1));
+        }
+    }
+
     #[cfg(test)]
     pub(super) fn topic_count(&self) -> usize {
         locked(&self.topics).len()

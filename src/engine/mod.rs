@@ -5,6 +5,7 @@
 mod attempt;
 mod drain;
 mod error;
+mod hints;
 mod hub;
 mod observe;
 mod slot;
@@ -28,7 +29,7 @@ pub use submit::{Deadline, NewJob};
 pub use watch::Watch;
 
 use crate::domain::job::{Job, JobName, JobState};
-use crate::domain::{Backend, Input, Observer, Solution, SolveSettings, StopReason, StopToken};
+use crate::domain::{Backend, Input, Observer, Solution, SolveSettings, StopToken};
 use crate::solver;
 use crate::store::{Lease, Store, payload};
 
@@ -94,10 +95,18 @@ impl Default for Options {
             lease: Self::DEFAULT_LEASE,
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
             retry_after: Self::DEFAULT_RETRY_AFTER,
-            worker_name: format!("process-{}", std::process::id()),
+            worker_name: worker_name(),
             backend: Backend::default(),
         }
     }
+}
+
+/// This process among those of every server on a store: the machine's name, which a container has of its own, and the
+/// process id.
+fn worker_name() -> String {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").or_else(|_| std::env::var("HOSTNAME"));
+    let host = host.map_or_else(|_| "process".into(), |host| host.trim().to_owned());
+    format!("{host}-{}", std::process::id())
 }
 
 /// A handle on a running engine; clones are the same engine.
@@ -261,10 +270,7 @@ impl Inner {
 
     async fn cancel(&self, name: &JobName) -> Result<Job, Error> {
         let reply = self.store.request_cancel(name, SystemTime::now()).await?;
-        // Of one job there may be two for a while: an attempt that lost its lease and does not know yet.
-        for (_, stop) in locked(&self.running).iter().filter(|(lease, _)| lease.name == *name) {
-            stop.stop(StopReason::Cancelled);
-        }
+        self.stop_attempts(name);
         if reply.ended_now {
             self.ended(&reply.job);
         }

@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::time::Duration;
 
 use futures_util::stream::{self, Stream};
 use tokio::sync::watch as channel;
@@ -10,6 +11,9 @@ use super::hub::Subscription;
 use super::{Error, Inner, Phase};
 use crate::domain::Violation;
 use crate::domain::job::{EventBody, JobEvent, JobName};
+
+/// How often a watcher of a shared store looks unasked: the job may run in another process, whose hints may be lost.
+const WATCH_POLL: Duration = Duration::from_secs(1);
 
 /// Events read from the store at once: a job has some dozens; a reader of thousands holds no more than this.
 const READ_AHEAD: u32 = 128;
@@ -113,11 +117,13 @@ impl Watch {
             if *self.phase.borrow_and_update() == Phase::Closed {
                 return Err(Error::Draining);
             }
+            let shared = self.inner.store.is_shared();
             tokio::select! {
                 biased;
                 // Receivers only fail when their sender is gone, which this watch itself prevents.
                 _ = self.version.changed() => self.caught_up = false,
                 _ = self.phase.changed() => self.caught_up = false,
+                () = tokio::time::sleep(WATCH_POLL), if shared => self.caught_up = false,
                 _ = self.weights.changed() => {
                     if let Some(event) = self.weights.borrow_and_update().clone() {
                         return Ok(event.as_ref().clone());

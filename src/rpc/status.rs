@@ -11,6 +11,7 @@
 //! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes` or `observations`; `RetryInfo` says when to come back |
 //! | `FAILED_PRECONDITION` | `RESULT_NOT_READY` | there is no result, yet or for good |
 //! | `UNAVAILABLE` | `DRAINING` | the server is going down; `RetryInfo` |
+//! | `UNAVAILABLE` | `STORE_UNAVAILABLE` | the database is away; `RetryInfo`. A creation may have been stored: come back with the same request id |
 //! | `DEADLINE_EXCEEDED` | `INPUT_STALLED` | the chunks of a `Solve` stopped coming |
 //! | `UNIMPLEMENTED` | `NOT_IMPLEMENTED` | part of the API that is still to come |
 //! | `INTERNAL` | `INTERNAL` | our defect; what it was is in the log only |
@@ -34,6 +35,9 @@ const SENTENCES_IN_MESSAGE: usize = 3;
 
 /// Pause that a caller of a draining server is told: about what a replacement needs to come up.
 const DRAINING_RETRY: Duration = Duration::from_secs(5);
+
+/// Pause that a caller is told while the store is away: a database that restarts takes a few seconds.
+const STORE_RETRY: Duration = Duration::from_secs(2);
 
 fn status(code: Code, reason: &str, message: impl Into<String>, details: ErrorDetails) -> Status {
     status_with(code, reason, HashMap::new(), message, details)
@@ -133,6 +137,12 @@ pub fn from_engine(error: engine::Error) -> Status {
             let details = ErrorDetails::with_retry_info(Some(DRAINING_RETRY));
             status(Code::Unavailable, "DRAINING", "the server is draining; try another or come back", details)
         }
+        engine::Error::Unavailable(cause) => {
+            // The cause names hosts and users: it is for the log.
+            tracing::warn!(%cause, "the store is out of reach");
+            let details = ErrorDetails::with_retry_info(Some(STORE_RETRY));
+            status(Code::Unavailable, "STORE_UNAVAILABLE", "the store is out of reach; come back soon", details)
+        }
         engine::Error::Internal(error) => internal(&error),
     }
 }
@@ -171,6 +181,15 @@ mod tests {
         assert_eq!(retry.retry_delay, Some(Duration::from_secs(3)));
         let info = status.get_details_error_info().expect("an ErrorInfo");
         assert_eq!((info.reason.as_str(), info.metadata["bound"].as_str()), ("QUEUE_FULL", "jobs"));
+    }
+
+    #[test]
+    fn a_store_that_is_away_is_worth_another_try_and_its_address_stays_inside() {
+        let status = from_engine(engine::Error::Unavailable("no route to db.internal".into()));
+        assert_eq!(status.code(), Code::Unavailable);
+        assert!(!status.message().contains("db.internal"), "{}", status.message());
+        assert!(status.get_details_retry_info().is_some_and(|retry| retry.retry_delay.is_some()));
+        assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "STORE_UNAVAILABLE");
     }
 
     #[test]

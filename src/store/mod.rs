@@ -4,8 +4,10 @@
 //! the state machine's rules are the domain's, what is written in one transaction is decided here.
 
 pub mod payload;
+pub mod postgres;
 pub mod query;
 pub mod record;
+mod sql;
 pub mod sqlite;
 pub mod timed;
 
@@ -50,6 +52,19 @@ pub enum Error {
     /// What was read is not what was written.
     #[error("store corrupt: {0}")]
     Corrupt(String),
+}
+
+/// What another process may have changed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Hint {
+    /// The job has new events.
+    Events(JobName),
+    /// Something entered the queue.
+    Queued,
+    /// The cancel of a running job was asked for.
+    Cancel(JobName),
+    /// Words may have been lost: anything may have changed.
+    Missed,
 }
 
 /// A store of jobs. Every method is one transaction: state, event and lease change together or not at all.
@@ -121,8 +136,9 @@ pub trait Store: Send + Sync + 'static {
     /// [`Error::NotFound`].
     async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error>;
 
-    /// Takes back every lease that no living process can hold; called once, before the first claim. A job that lost
-    /// `max_attempts` attempts this way fails with `ATTEMPTS_EXHAUSTED`. Returns the jobs that changed.
+    /// Takes back every lease that no living process can hold: all of them where one process has the store to itself,
+    /// those that ran out where it is shared. Called once, before the first claim. A job that lost `max_attempts`
+    /// attempts this way fails with `ATTEMPTS_EXHAUSTED`. Returns the jobs that changed.
     async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error>;
 
     /// Takes back leases that ran out, as [`Store::recover`] does, and ends queued jobs that are past their deadline.
@@ -136,6 +152,14 @@ pub trait Store: Send + Sync + 'static {
 
     /// What waits and what runs.
     async fn load(&self) -> Result<Load, Error>;
+
+    /// Whether other processes may be at work on the same jobs.
+    fn is_shared(&self) -> bool;
+
+    /// Waits for word of what another process changed. Words may be lost, repeated or stale: whoever heeds them looks
+    /// into the store, and looks from time to time without one. Never answers where the store is not shared. For one
+    /// caller at a time.
+    async fn hint(&self) -> Hint;
 
     /// Closes every connection; what was acknowledged is durable without it.
     async fn close(&self);

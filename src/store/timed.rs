@@ -1,18 +1,27 @@
-//! A store that tells the metrics how long each of its operations took, whatever implements it.
+//! A store that tells the metrics how long each of its operations took and which came too late, whatever implements it.
 
 use std::time::{Duration, SystemTime};
 
 use super::{
-    CancelReply, Claimed, Created, Ending, Error, Heartbeat, JobPage, JobQuery, Lease, Load, NewRecord, QueueBounds,
-    Store, Swept,
+    CancelReply, Claimed, Created, Ending, Error, Heartbeat, Hint, JobPage, JobQuery, Lease, Load, NewRecord,
+    QueueBounds, Store, Swept,
 };
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
-use crate::telemetry::metrics::store_operation;
+use crate::telemetry::metrics::{store_operation, write_fenced};
 
-/// Times every operation of the store inside. Failed operations count too: a slow failure is still slow.
+/// Times every operation of the store inside. Failed operations count too: a slow failure is still slow. Writes that
+/// were refused because the lease was gone are counted.
 #[derive(Debug)]
 pub struct Timed<S>(pub S);
+
+/// Counts a write that came too late.
+fn counted<T>(operation: &'static str, result: Result<T, Error>) -> Result<T, Error> {
+    if let Err(Error::Fenced(_)) = &result {
+        write_fenced(operation);
+    }
+    result
+}
 
 #[async_trait::async_trait]
 impl<S: Store> Store for Timed<S> {
@@ -48,22 +57,22 @@ impl<S: Store> Store for Timed<S> {
 
     async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
         let _timer = store_operation("heartbeat");
-        self.0.heartbeat(lease, now, lease_for).await
+        counted("heartbeat", self.0.heartbeat(lease, now, lease_for).await)
     }
 
     async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error> {
         let _timer = store_operation("record");
-        self.0.record(lease, progress, now).await
+        counted("record", self.0.record(lease, progress, now).await)
     }
 
     async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error> {
         let _timer = store_operation("finish");
-        self.0.finish(lease, ending, now).await
+        counted("finish", self.0.finish(lease, ending, now).await)
     }
 
     async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
         let _timer = store_operation("release");
-        self.0.release(lease, now).await
+        counted("release", self.0.release(lease, now).await)
     }
 
     async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error> {
@@ -91,8 +100,46 @@ impl<S: Store> Store for Timed<S> {
         self.0.load().await
     }
 
+    fn is_shared(&self) -> bool {
+        self.0.is_shared()
+    }
+
+    /// Not timed: it waits for others.
+    async fn hint(&self) -> Hint {
+        self.0.hint().await
+    }
+
     async fn close(&self) {
         let _timer = store_operation("close");
         self.0.close().await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::contract;
+    use crate::store::sqlite::Sqlite;
+    use crate::telemetry::metrics::tests::{page_after, value};
+
+    #[test]
+    fn writes_that_come_too_late_are_counted() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+        let late = async {
+            let directory = tempfile::tempdir().expect("a temporary directory");
+            let store = Timed(Sqlite::open(directory.path()).await.expect("opens"));
+            store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+            let claimed = store.claim("w", contract::time(0), Duration::from_secs(1)).await.expect("claims");
+            let lease = claimed.expect("a job").lease;
+            store.heartbeat(&lease, contract::time(0), Duration::from_secs(1)).await.expect("holds");
+            store.sweep(contract::time(2), 3).await.expect("takes it back");
+            store.heartbeat(&lease, contract::time(3), Duration::from_secs(1)).await.expect_err("too late");
+            store.release(&lease, contract::time(3)).await.expect_err("too late");
+        };
+        let page = page_after(|| runtime.block_on(late));
+        for (operation, count) in [("heartbeat", 1.0), ("release", 1.0), ("finish", 0.0), ("record", 0.0)] {
+            let series = format!("scpsfm_fenced_writes_total{{operation=\"{operation}\"}}");
+            assert_eq!(value(&page, &series), Some(count), "{operation}");
+        }
     }
 }

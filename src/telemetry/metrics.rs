@@ -165,6 +165,9 @@ fn create_known_series() {
     for refusal in Refusal::ALL {
         counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
     }
+    for operation in FENCED_OPERATIONS {
+        counter!(FENCED_WRITES.name, "operation" => operation).absolute(0);
+    }
     for reason in AttemptLost::ALL {
         counter!(ATTEMPTS_LOST.name, "reason" => reason.name()).absolute(0);
     }
@@ -302,6 +305,14 @@ impl Drop for RpcCall {
 /// Method label of a call to something that this server does not offer.
 pub const UNKNOWN_METHOD: &str = "unknown";
 
+/// What a worker writes, under the lease on its job.
+const FENCED_OPERATIONS: [&str; 4] = ["heartbeat", "record", "finish", "release"];
+
+/// The store refused a write of a worker whose lease was gone; `operation` is the name of the trait's method.
+pub fn write_fenced(operation: &'static str) {
+    counter!(FENCED_WRITES.name, "operation" => operation).increment(1);
+}
+
 /// Times a store operation from its creation to its drop.
 #[must_use = "the operation ends when this is dropped"]
 pub struct StoreTimer {
@@ -321,4 +332,4 @@ impl Drop for StoreTimer {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

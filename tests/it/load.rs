@@ -3,7 +3,7 @@
 use scpsfm::rpc::proto::{self, JobState};
 use tokio::task::JoinSet;
 
-use crate::support::live::{connected, created, easy, reaches};
+use crate::support::live::{connected, created, reaches, small};
 use crate::support::program::Serving;
 use crate::support::scrape::Page;
 
@@ -21,10 +21,7 @@ async fn a_hundred_jobs_of_twenty_clients_all_end_and_the_queue_is_empty() {
         clients.spawn(async move {
             let mut names = Vec::new();
             for job in 0..JOBS_EACH {
-                let mut request = easy(client * JOBS_EACH + job);
-                let settings = proto::SolveSettings { method: proto::Method::Geometry as i32, ..Default::default() };
-                request.job = Some(proto::Job { settings: Some(settings), ..Default::default() });
-                names.push(created(&mut jobs, request).await);
+                names.push(created(&mut jobs, small(client * JOBS_EACH + job)).await);
             }
             for name in &names {
                 let end = reaches(&mut jobs, name, &[JobState::Succeeded, JobState::Failed]).await;

@@ -1,12 +1,14 @@
 //! Every integration test in one binary, so that everything links once. One concept a module.
 
 mod api;
+mod chaos;
 mod cli;
 mod crash;
 mod formats;
 mod load;
 mod readme;
 mod real;
+mod replicas;
 mod sequence;
 mod support;
 mod telemetry;

@@ -2,6 +2,7 @@
 
 mod admission;
 mod lifecycle;
+mod sharing;
 mod survival;
 mod watching;
 

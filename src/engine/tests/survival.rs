@@ -187,7 +187,7 @@ async fn without_a_store_for_a_lease_the_work_stops_and_later_goes_on_by_itself(
     bench.store.execute(NO_WRITES).await;
     eventually(|| async { locked(&bench.engine.inner.running).is_empty().then_some(()) }).await;
     assert_eq!(bench.engine.job(&name).await.expect("reads work").state, JobState::Running, "as far as is known");
-    assert!(matches!(bench.engine.submit(new_job(Script::Wait)).await, Err(Error::Internal(_))));
+    assert!(matches!(bench.engine.submit(new_job(Script::Wait)).await, Err(Error::Unavailable(_))));
     bench.store.execute(MENDED).await;
     bench.gate.open();
     let job = bench.ended(&name).await;

@@ -69,6 +69,10 @@ fn check_labels(labels: &BTreeMap<String, String>, found: &mut Violations) {
             let text = format!("the key {:?} is not 1 to {MAX_LABEL_KEY} bytes", shortened(key));
             found.push(Violation::of("job.labels", text));
         }
+        // A text of PostgreSQL's cannot hold it.
+        if key.contains('\0') || value.contains('\0') {
+            found.push(Violation::of("job.labels", format!("{:?} or its value holds a NUL", shortened(key))));
+        }
         if value.len() > MAX_LABEL_VALUE {
             let text = format!("the value of {:?} is longer than {MAX_LABEL_VALUE} bytes", shortened(key));
             found.push(Violation::of("job.labels", text));

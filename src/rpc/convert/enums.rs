@@ -1,6 +1,6 @@
 //! Enums: the domain's and the wire's have the same variants, but for the wire's `UNSPECIFIED`.
 
-use crate::domain::job::JobState;
+use crate::domain::job::{AttemptEnd, JobState};
 use crate::domain::{Backend, Grade, Method, Prior, Stage, Status, Violation, WarningCode};
 use crate::rpc::proto;
 
@@ -53,6 +53,7 @@ twins! {
     Grade = Grade { Metric, Weak, ProjectiveOnly }
     Prior = Prior { Network, Irls, Consistency, Rigidity, Uniform }
     JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, Expired }
+    AttemptEnd = AttemptEnd { Ended, GivenBack, Lost }
     WarningCode = WarningCode {
         PlanarOrRotation,
         PlanarScene,

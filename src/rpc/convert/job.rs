@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::enums::{Twin, optional_to_wire};
 use super::{optional_time, progress, required, settings, time_from_wire};
-use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState, Summary};
+use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Grade, InvalidInput, Prior, Status, Violation};
 use crate::rpc::proto;
 use proto::job_event::Body;
@@ -59,7 +59,7 @@ pub fn from_wire(job: proto::Job) -> Result<Job, InvalidInput> {
         progress: job.progress.as_ref().map(progress::from_wire).transpose()?,
         last_sequence: job.last_sequence,
         summary: job.summary.as_ref().map(summary_from_wire).transpose()?,
-        failure: job.error.map(failure_from_wire),
+        failure: job.error.map(failure_from_wire).transpose()?,
         cancel_requested: job.cancel_requested,
     })
 }
@@ -91,7 +91,7 @@ pub fn event_from_wire(event: proto::JobEvent) -> Result<JobEvent, Violation> {
     let body = match required(event.body, "body")? {
         Body::StateChange(change) => EventBody::State {
             state: JobState::required(change.state, "state_change.state")?,
-            failure: change.error.map(failure_from_wire),
+            failure: change.error.map(failure_from_wire).transpose()?,
         },
         Body::Progress(record) => EventBody::Progress(progress::from_wire(&record)?),
         Body::Weights(interim) => EventBody::Weights { iteration: interim.iteration, weights: interim.weight },
@@ -111,11 +111,34 @@ fn name_from_wire(name: &str) -> Result<JobName, Violation> {
 }
 
 fn failure_to_wire(failure: &Failure) -> proto::JobError {
-    proto::JobError { reason: failure.reason.clone(), message: failure.message.clone() }
+    let attempts = failure.attempts.iter().map(past_attempt_to_wire).collect();
+    proto::JobError { reason: failure.reason.clone(), message: failure.message.clone(), attempts }
 }
 
-fn failure_from_wire(error: proto::JobError) -> Failure {
-    Failure { reason: error.reason, message: error.message }
+fn failure_from_wire(error: proto::JobError) -> Result<Failure, Violation> {
+    let attempts = error.attempts.into_iter().map(past_attempt_from_wire).collect::<Result<_, _>>()?;
+    Ok(Failure { reason: error.reason, message: error.message, attempts })
+}
+
+fn past_attempt_to_wire(past: &PastAttempt) -> proto::PastAttempt {
+    proto::PastAttempt {
+        attempt: past.attempt,
+        worker: past.worker.clone(),
+        start_time: Some(past.start_time.into()),
+        end_time: Some(past.end_time.into()),
+        end: past.end.to_wire(),
+    }
+}
+
+fn past_attempt_from_wire(past: proto::PastAttempt) -> Result<PastAttempt, Violation> {
+    let time = |time, field| time_from_wire(required(time, field)?, field);
+    Ok(PastAttempt {
+        attempt: past.attempt,
+        worker: past.worker,
+        start_time: time(past.start_time, "error.attempts.start_time")?,
+        end_time: time(past.end_time, "error.attempts.end_time")?,
+        end: AttemptEnd::required(past.end, "error.attempts.end")?,
+    })
 }
 
 fn summary_to_wire(summary: &Summary) -> proto::JobSummary {
@@ -213,7 +236,7 @@ mod tests {
             progress: Some(progress()),
             last_sequence: 17,
             summary: Some(summary()),
-            failure: Some(Failure { reason: "INTERNAL".into(), message: "a defect".into() }),
+            failure: Some(Failure::new("INTERNAL", "a defect")),
             cancel_requested: true,
         };
         assert_eq!(from_wire(to_wire(&job)), Ok(job.clone()));
@@ -234,7 +257,15 @@ mod tests {
 
     #[test]
     fn events_survive_the_wire() {
-        let failure = Some(Failure { reason: "ATTEMPTS_EXHAUSTED".into(), message: "three attempts".into() });
+        let past = |(attempt, end)| PastAttempt {
+            attempt,
+            worker: format!("host-{attempt}"),
+            start_time: time(1),
+            end_time: time(2),
+            end,
+        };
+        let attempts = (1..).zip(AttemptEnd::ALL).map(past).collect();
+        let failure = Some(Failure { attempts, ..Failure::new("ATTEMPTS_EXHAUSTED", "three attempts") });
         let bodies = [
             (Some(1), EventBody::State { state: JobState::Queued, failure: None }),
             (Some(2), EventBody::Progress(progress())),

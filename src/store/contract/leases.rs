@@ -105,7 +105,7 @@ pub(in crate::store) async fn progress_is_an_event_and_stands_in_the_job(store: 
 }
 
 pub(in crate::store) async fn every_outcome_ends_in_its_state(store: &dyn Store) {
-    let failure = Failure { reason: "INTERNAL".into(), message: "a defect".into() };
+    let failure = Failure::new("INTERNAL", "a defect");
     let outcomes = [
         (Outcome::Failed(failure.clone()), JobState::Failed, "FAILED:INTERNAL"),
         (Outcome::Cancelled, JobState::Cancelled, "CANCELLED"),
@@ -138,7 +138,19 @@ pub(in crate::store) async fn giving_back_is_free_and_vanishing_is_not(store: &d
     }
     let job = store.job(&name).await.expect("job");
     assert_eq!((job.state, job.attempt), (JobState::Failed, 8));
-    assert_eq!(job.failure.map(|failure| failure.reason).as_deref(), Some(ATTEMPTS_EXHAUSTED));
+    let failure = job.failure.expect("a reason");
+    assert_eq!(failure.reason, ATTEMPTS_EXHAUSTED);
+    let past = |attempt, start, end_time, end| PastAttempt {
+        attempt,
+        worker: "worker".into(),
+        start_time: time(start),
+        end_time: time(end_time),
+        end,
+    };
+    let given_back = (1..=5).map(|attempt| past(attempt, 1, 1, AttemptEnd::GivenBack));
+    let lost = (6..=8).map(|attempt| past(attempt, 2, 100, AttemptEnd::Lost));
+    assert_eq!(failure.attempts, given_back.chain(lost).collect::<Vec<_>>());
+    assert!(failure.message.ends_with("6 by worker, 7 by worker, 8 by worker"), "{}", failure.message);
     let last = story(store, &name).await.pop().expect("events");
     assert_eq!(last.2, "FAILED:ATTEMPTS_EXHAUSTED");
     assert_eq!(store.claim("worker", time(101), LEASE).await, Ok(None));

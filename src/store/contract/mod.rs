@@ -7,12 +7,13 @@ pub(super) mod reading;
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime};
 
-use crate::domain::job::{EventBody, Failure, Job, JobName, JobState, Summary};
+use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Progress, SolveSettings, Stage, Status};
 use crate::store::record::{Bound, NewRecord, QueueBounds, Request};
 use crate::store::{ATTEMPTS_EXHAUSTED, Claimed, Ending, Error, JobQuery, Lease, Order, Outcome, Store, payload};
 
-/// Runs the contract: `$open` is an async function without arguments whose result derefs to a store that is empty.
+/// Runs the contract: `$open` is an async function without arguments whose result, where the database is there, derefs
+/// to a store that is empty.
 macro_rules! store_contract {
     ($open:path) => {
         $crate::store::contract::store_contract!(@each $open;
@@ -39,7 +40,7 @@ macro_rules! store_contract {
         $(
             #[tokio::test]
             async fn $test() {
-                let fixture = $open().await;
+                let Some(fixture) = $open().await else { return };
                 $crate::store::contract::$part::$test(&*fixture).await;
             }
         )*

@@ -4,7 +4,7 @@ use tempfile::TempDir;
 
 use super::*;
 use crate::domain::job::JobState;
-use crate::store::contract;
+use crate::store::{Store, contract};
 
 /// A store in a directory that lives as long as the test.
 struct Fixture {
@@ -13,9 +13,9 @@ struct Fixture {
 }
 
 impl Fixture {
-    async fn open() -> Self {
+    async fn open() -> Option<Self> {
         let directory = tempfile::tempdir().expect("a temporary directory");
-        Self { store: Sqlite::open(directory.path()).await.expect("opens"), _directory: directory }
+        Some(Self { store: Sqlite::open(directory.path()).await.expect("opens"), _directory: directory })
     }
 }
 
@@ -76,7 +76,7 @@ async fn a_database_of_a_newer_version_is_refused() {
 
 #[tokio::test]
 async fn commits_are_synced_and_the_log_is_written_ahead() {
-    let fixture = Fixture::open().await;
+    let fixture = Fixture::open().await.expect("opens");
     let journal: String = sqlx::query_scalar("PRAGMA journal_mode").fetch_one(&fixture.writer).await.expect("reads");
     let synchronous: i64 = sqlx::query_scalar("PRAGMA synchronous").fetch_one(&fixture.writer).await.expect("reads");
     assert_eq!((journal.as_str(), synchronous), ("wal", 2));

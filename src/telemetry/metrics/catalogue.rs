@@ -154,6 +154,12 @@ pub const STORE_DURATION: Metric = Metric {
     labels: &["operation"],
     help: "Seconds of a store operation, by operation.",
 };
+pub const FENCED_WRITES: Metric = Metric {
+    name: "scpsfm_fenced_writes_total",
+    kind: Kind::Counter,
+    labels: &["operation"],
+    help: "Writes of a worker that the store refused because its lease had been taken over, by operation.",
+};
 pub const WATCHERS: Metric = Metric {
     name: "scpsfm_watchers",
     kind: Kind::Gauge,
@@ -162,7 +168,7 @@ pub const WATCHERS: Metric = Metric {
 };
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 21] = [
+pub const ALL: [Metric; 22] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -183,5 +189,6 @@ pub const ALL: [Metric; 21] = [
     RPC_DURATION,
     RPC_IN_FLIGHT,
     STORE_DURATION,
+    FENCED_WRITES,
     WATCHERS,
 ];

@@ -11,14 +11,14 @@ const DASHBOARD: &str = include_str!("../../../deploy/grafana/dashboards/scpsfm.
 const RULES: &str = include_str!("../../../deploy/prometheus-rules.yml");
 
 /// The page after `act`, on a recorder of its own.
-fn page_after(act: impl FnOnce()) -> String {
+pub(crate) fn page_after(act: impl FnOnce()) -> String {
     let recorder = recorder().expect("recorder");
     metrics::with_local_recorder(&recorder, act);
     recorder.handle().render()
 }
 
 /// Value of a series, written as it stands on the page.
-fn value(page: &str, series: &str) -> Option<f64> {
+pub(crate) fn value(page: &str, series: &str) -> Option<f64> {
     let line = page.lines().find(|line| line.strip_prefix(series).is_some_and(|rest| rest.starts_with(' ')))?;
     line[series.len() + 1..].parse().ok()
 }
@@ -56,7 +56,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
         progress: None,
         last_sequence: 1,
         summary: succeeded.then_some(summary),
-        failure: (state == JobState::Failed).then(|| Failure { reason: "INTERNAL".into(), message: "test".into() }),
+        failure: (state == JobState::Failed).then(|| Failure::new("INTERNAL", "test")),
         cancel_requested: false,
     }
 }

@@ -38,6 +38,14 @@ pub fn lasting(iterations: u32) -> proto::CreateJobRequest {
     request
 }
 
+/// A scene that is solved at once, by geometry alone.
+pub fn small(seed: u64) -> proto::CreateJobRequest {
+    let mut request = easy(seed);
+    let settings = proto::SolveSettings { method: proto::Method::Geometry as i32, ..Default::default() };
+    request.job = Some(proto::Job { settings: Some(settings), ..Default::default() });
+    request
+}
+
 /// Creates a job and returns its name.
 pub async fn created(jobs: &mut JobServiceClient<Channel>, request: proto::CreateJobRequest) -> String {
     jobs.create_job(request).await.expect("a job").into_inner().name

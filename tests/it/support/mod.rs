@@ -2,6 +2,7 @@
 
 pub mod collector;
 pub mod live;
+pub mod postgres;
 pub mod program;
 pub mod python;
 pub mod scrape;

@@ -66,6 +66,10 @@ impl Drop for Running {
     }
 }
 
+fn serve() -> Command {
+    program(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--log-format", "json"])
+}
+
 /// `scpsfm serve` on free ports.
 pub struct Serving {
     pub running: Running,
@@ -94,17 +98,21 @@ impl Serving {
         variables: &[(&str, &str)],
         stderr: impl Into<Stdio>,
     ) -> Self {
-        let mut child =
-            program(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--log-format", "json"])
-                .arg("--data-dir")
-                .arg(data_dir)
-                .args(arguments)
-                .stdin(Stdio::null())
-                .stdout(Stdio::piped())
-                .envs(variables.iter().copied())
-                .stderr(stderr)
-                .spawn()
-                .expect("the server starts");
+        let mut command = serve();
+        command.arg("--data-dir").arg(data_dir).args(arguments).envs(variables.iter().copied());
+        Self::spawned(command.stderr(stderr))
+    }
+
+    /// Starts it with one worker on a PostgreSQL database and waits until it says where it listens.
+    pub fn on_database(url: &str, variables: &[(&str, &str)], stderr: impl Into<Stdio>) -> Self {
+        let mut command = serve();
+        // In the environment, as the README tells to: other users of the machine see flags.
+        command.args(["--workers", "1"]).env("SCPSFM_STORE__URL", url).envs(variables.iter().copied());
+        Self::spawned(command.stderr(stderr))
+    }
+
+    fn spawned(command: &mut Command) -> Self {
+        let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn().expect("the server starts");
         let mut stdout = BufReader::new(child.stdout.take().expect("piped"));
         let running = Running(child);
         let mut told = |prefix: &str| {

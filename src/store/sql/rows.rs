@@ -2,9 +2,7 @@
 
 use std::time::{Duration, SystemTime};
 
-use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
-
+use super::{Change, Connection, Row, Statement};
 use crate::domain::job::{EventBody, Failure, Job, JobName, JobState};
 use crate::store::record::Lease;
 use crate::store::{Error, payload};
@@ -47,53 +45,50 @@ pub(super) fn integer(value: u64) -> i64 {
     i64::try_from(value).unwrap_or(i64::MAX)
 }
 
-/// A column that holds an unsigned number.
-pub(super) fn unsigned<T: TryFrom<i64>>(row: &SqliteRow, column: &str) -> Result<T, Error> {
-    let value: i64 = row.try_get(column)?;
+/// A column that holds a number of this type.
+pub(super) fn number<T: TryFrom<i64>>(row: &impl Row, column: &str) -> Result<T, Error> {
+    let value = row.integer(column)?;
     T::try_from(value).map_err(|_| Error::Corrupt(format!("{column} {value} is out of range")))
 }
 
-fn optional_time(row: &SqliteRow, column: &str) -> Result<Option<SystemTime>, Error> {
-    Ok(row.try_get::<Option<i64>, _>(column)?.map(time))
+fn optional_time(row: &impl Row, column: &str) -> Result<Option<SystemTime>, Error> {
+    Ok(row.optional_integer(column)?.map(time))
 }
 
-fn optional_record<T: serde::de::DeserializeOwned>(row: &SqliteRow, column: &str) -> Result<Option<T>, Error> {
-    let bytes: Option<Vec<u8>> = row.try_get(column)?;
-    bytes.map(|bytes| payload::decode(&bytes, column)).transpose()
+fn optional_record<T: serde::de::DeserializeOwned>(row: &impl Row, column: &str) -> Result<Option<T>, Error> {
+    row.optional_bytes(column)?.map(|bytes| payload::decode(&bytes, column)).transpose()
 }
 
-fn state(row: &SqliteRow) -> Result<JobState, Error> {
-    let name: String = row.try_get("state")?;
+fn state(row: &impl Row) -> Result<JobState, Error> {
+    let name = row.text("state")?;
     JobState::from_name(&name).ok_or_else(|| Error::Corrupt(format!("unknown state {name:?}")))
 }
 
-fn name(row: &SqliteRow) -> Result<JobName, Error> {
-    Ok(JobName { tenant: row.try_get("tenant")?, job: row.try_get("job")? })
+fn name(row: &impl Row) -> Result<JobName, Error> {
+    Ok(JobName { tenant: row.text("tenant")?, job: row.text("job")? })
 }
 
 /// A job from a row of `select_jobs!`.
-pub(super) fn job(row: &SqliteRow) -> Result<Job, Error> {
-    let settings: Vec<u8> = row.try_get("settings")?;
-    let labels: Vec<u8> = row.try_get("labels")?;
+pub(super) fn job(row: &impl Row) -> Result<Job, Error> {
     Ok(Job {
         name: name(row)?,
         state: state(row)?,
-        attempt: unsigned(row, "attempt")?,
-        settings: payload::decode(&settings, "settings")?,
-        view_count: unsigned(row, "view_count")?,
-        track_count: unsigned(row, "track_count")?,
-        observation_count: unsigned(row, "observation_count")?,
-        labels: payload::decode(&labels, "labels")?,
-        priority: row.try_get("priority")?,
-        create_time: time(row.try_get("create_time")?),
+        attempt: number(row, "attempt")?,
+        settings: payload::decode(&row.bytes("settings")?, "settings")?,
+        view_count: number(row, "view_count")?,
+        track_count: number(row, "track_count")?,
+        observation_count: number(row, "observation_count")?,
+        labels: payload::decode(&row.bytes("labels")?, "labels")?,
+        priority: number(row, "priority")?,
+        create_time: time(row.integer("create_time")?),
         start_time: optional_time(row, "start_time")?,
         end_time: optional_time(row, "end_time")?,
         deadline: optional_time(row, "deadline")?,
         progress: optional_record(row, "progress")?,
-        last_sequence: unsigned(row, "last_sequence")?,
+        last_sequence: number(row, "last_sequence")?,
         summary: optional_record(row, "summary")?,
         failure: optional_record(row, "failure")?,
-        cancel_requested: row.try_get("cancel_requested")?,
+        cancel_requested: row.flag("cancel_requested")?,
     })
 }
 
@@ -111,34 +106,42 @@ pub(super) struct Standing {
 
 impl Standing {
     /// From a row with `id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline`.
-    pub(super) fn from_row(row: &SqliteRow) -> Result<Self, Error> {
+    pub(super) fn from_row(row: &impl Row) -> Result<Self, Error> {
         Ok(Self {
-            id: row.try_get("id")?,
+            id: row.integer("id")?,
             name: name(row)?,
             state: state(row)?,
-            attempt: unsigned(row, "attempt")?,
-            lost_attempts: unsigned(row, "lost_attempts")?,
-            cancel_requested: row.try_get("cancel_requested")?,
+            attempt: number(row, "attempt")?,
+            lost_attempts: number(row, "lost_attempts")?,
+            cancel_requested: row.flag("cancel_requested")?,
             deadline: optional_time(row, "deadline")?,
         })
     }
 }
 
-/// How a job stands.
-pub(super) async fn standing(connection: &mut SqliteConnection, name: &JobName) -> Result<Standing, Error> {
-    let row = sqlx::query(
-        "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline FROM jobs \
-         WHERE tenant = ? AND job = ?",
-    )
-    .bind(&name.tenant)
-    .bind(&name.job)
-    .fetch_optional(connection)
-    .await?;
+/// `SELECT` of all that [`Standing::from_row`] reads; the clauses follow.
+macro_rules! select_standing {
+    ($clauses:literal) => {
+        concat!(
+            "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline FROM jobs ",
+            $clauses
+        )
+    };
+}
+pub(super) use select_standing;
+
+/// How a job stands; it changes no more until the transaction ends.
+pub(super) async fn standing<C: Connection>(connection: &mut C, name: &JobName) -> Result<Standing, Error> {
+    let select = Statement::new(select_standing!("WHERE tenant = $1 AND job = $2"))
+        .bind(&name.tenant)
+        .bind(&name.job)
+        .then(C::FOR_UPDATE);
+    let row = connection.optional_row(select).await?;
     row.as_ref().map_or_else(|| Err(Error::NotFound(name.clone())), Standing::from_row)
 }
 
 /// How a job stands that this lease still holds: what every write of a worker begins with.
-pub(super) async fn held(connection: &mut SqliteConnection, lease: &Lease) -> Result<Standing, Error> {
+pub(super) async fn held<C: Connection>(connection: &mut C, lease: &Lease) -> Result<Standing, Error> {
     match standing(connection, &lease.name).await {
         Ok(job) if job.state == JobState::Running && job.attempt == lease.attempt => Ok(job),
         Ok(_) | Err(Error::NotFound(_)) => Err(Error::Fenced(lease.clone())),
@@ -146,33 +149,31 @@ pub(super) async fn held(connection: &mut SqliteConnection, lease: &Lease) -> Re
     }
 }
 
-/// Appends an event and returns its sequence number.
-pub(super) async fn append(
-    connection: &mut SqliteConnection,
-    id: i64,
+/// Appends an event to a job of this row and returns its sequence number.
+pub(super) async fn append<C: Connection>(
+    connection: &mut C,
+    (id, name): (i64, &JobName),
     attempt: u32,
     body: &EventBody,
     now: SystemTime,
 ) -> Result<u64, Error> {
-    let sequence: i64 =
-        sqlx::query_scalar("UPDATE jobs SET last_sequence = last_sequence + 1 WHERE id = ? RETURNING last_sequence")
+    let next = "UPDATE jobs SET last_sequence = last_sequence + 1 WHERE id = $1 RETURNING last_sequence";
+    let sequence = connection.row(Statement::new(next).bind(id)).await?.integer("last_sequence")?;
+    let insert =
+        Statement::new("INSERT INTO events (job_id, sequence, attempt, time, body) VALUES ($1, $2, $3, $4, $5)")
             .bind(id)
-            .fetch_one(&mut *connection)
-            .await?;
-    sqlx::query("INSERT INTO events (job_id, sequence, attempt, time, body) VALUES (?, ?, ?, ?, ?)")
-        .bind(id)
-        .bind(sequence)
-        .bind(attempt)
-        .bind(micros(now))
-        .bind(payload::encode(body)?)
-        .execute(connection)
-        .await?;
+            .bind(sequence)
+            .bind(attempt)
+            .bind(micros(now))
+            .bind(payload::encode(body)?);
+    connection.execute(insert).await?;
+    connection.tell(Change::Events, name).await?;
     Ok(sequence.unsigned_abs())
 }
 
 /// Moves a job out of its state, with the event that says so: to the queue, or to an end. Its lease ends with it.
-pub(super) async fn leave(
-    connection: &mut SqliteConnection,
+pub(super) async fn leave<C: Connection>(
+    connection: &mut C,
     job: &Standing,
     next: JobState,
     failure: Option<Failure>,
@@ -182,17 +183,20 @@ pub(super) async fn leave(
         let (from, to) = (job.state.name(), next.name());
         return Err(Error::Corrupt(format!("{} cannot go from {from} to {to} here", job.name)));
     }
-    sqlx::query(
-        "UPDATE jobs SET state = ?, lease_worker = NULL, lease_expires = NULL, cancel_requested = 0, \
-         queue_time = COALESCE(?, queue_time), end_time = ?, failure = ? WHERE id = ?",
+    let update = Statement::new(
+        "UPDATE jobs SET state = $1, lease_worker = NULL, lease_expires = NULL, cancel_requested = FALSE, \
+         queue_time = COALESCE($2, queue_time), end_time = $3, failure = $4 WHERE id = $5",
     )
     .bind(next.name())
     .bind((next == JobState::Queued).then(|| micros(now)))
     .bind(next.is_terminal().then(|| micros(now)))
     .bind(failure.as_ref().map(payload::encode).transpose()?)
-    .bind(job.id)
-    .execute(&mut *connection)
-    .await?;
-    append(connection, job.id, job.attempt, &EventBody::State { state: next, failure }, now).await?;
+    .bind(job.id);
+    connection.execute(update).await?;
+    let event = EventBody::State { state: next, failure };
+    append(connection, (job.id, &job.name), job.attempt, &event, now).await?;
+    if next == JobState::Queued {
+        connection.tell(Change::Queued, &job.name).await?;
+    }
     Ok(())
 }

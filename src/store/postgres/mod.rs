@@ -1,0 +1,188 @@
+//! The shared store: PostgreSQL, which several servers use as one.
+//!
+//! Every write of a worker is conditioned on its lease under the job's row lock, so that of two servers that think they
+//! hold a job one is refused. Notifications carry the names of jobs and are hints: what they say is read from the tables.
+
+mod clock;
+mod listener;
+#[cfg(test)]
+pub(crate) mod tests;
+mod url;
+
+use std::time::{Duration, SystemTime};
+
+use sqlx::Transaction;
+use sqlx::pool::PoolConnection;
+use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRow};
+use tokio::sync::Mutex;
+use tokio::time::timeout;
+
+use super::sql::{self, Change, Connection, Database, Size, Statement, Step};
+use super::{Error, Hint};
+use crate::domain::job::JobName;
+use clock::Clock;
+use listener::Listener;
+pub use url::{DatabaseUrl, UrlError};
+
+/// Connections of one server, beside the one that listens: a worker writes a few times a second, an idle one looks once
+/// a second. PostgreSQL's own default of a hundred connections leaves room for some ten servers.
+const CONNECTIONS: u32 = 6;
+/// Connections for inputs and results of callers. Apart, since each may take half a minute, and no lease may be lost
+/// because its heartbeat waits behind uploads.
+const PAYLOAD_CONNECTIONS: u32 = 3;
+/// How long a caller waits for a connection. Callers are told soon that the database is away, before their patience or a
+/// worker's lease is over.
+const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(3);
+/// How long an operation on a few rows may take: what takes longer waits for a database that does not answer.
+const SMALL_BOUND: Duration = Duration::from_secs(5);
+/// How long an input or a result may be on its way: 100 MB at some 3 MB/s.
+const PAYLOAD_BOUND: Duration = Duration::from_secs(30);
+/// How long a connection that comes back may take to answer before it is thrown away.
+const RELEASE_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// What the database ends by itself, in milliseconds, so that a server that was stopped in the middle of a transaction
+/// holds no locks that others wait for. An idle connection is none of these.
+const SESSION: [(&str, &str); 4] = [
+    ("application_name", "scpsfm"),
+    ("statement_timeout", "30000"),
+    ("idle_in_transaction_session_timeout", "5000"),
+    // A connection whose peer vanished without a word, after half a minute; PostgreSQL's default is two hours.
+    ("tcp_keepalives_idle", "30"),
+];
+
+/// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
+const ADMISSION_LOCK: i64 = 0x7363_7073_666d;
+
+const MIGRATIONS: [Step; 1] = [(1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql"))];
+
+/// Store in a PostgreSQL database.
+#[derive(Debug)]
+pub struct Postgres {
+    pool: PgPool,
+    payloads: PgPool,
+    clock: Clock,
+    listener: Mutex<Listener>,
+    /// Hears nothing, for tests of what polls alone achieve.
+    #[cfg(test)]
+    pub(crate) deaf: bool,
+}
+
+impl Postgres {
+    /// Opens the store in a database that exists and brings its schema up to date.
+    ///
+    /// # Errors
+    /// [`Error::Unavailable`] where the database does not answer or refuses, [`Error::Corrupt`] where its schema is of
+    /// a newer version.
+    pub async fn open(url: &DatabaseUrl) -> Result<Self, Error> {
+        let options = url.options().clone().options(SESSION);
+        let pool = match pool_of(CONNECTIONS).connect_with(options.clone()).await {
+            // A pool says how long it waited, not for what.
+            Err(sqlx::Error::PoolTimedOut) => return Err(cause_of_no_connection(&options).await),
+            pool => pool?,
+        };
+        let payloads = pool_of(PAYLOAD_CONNECTIONS).connect_lazy_with(options.clone());
+        sql::migrator(&MIGRATIONS).run(&pool).await.map_err(sql::migration_failed)?;
+        let clock = Clock::default();
+        clock.set(&mut *pool.acquire().await?).await?;
+        Ok(Self {
+            pool,
+            payloads,
+            clock,
+            listener: Mutex::new(Listener::new(options)),
+            #[cfg(test)]
+            deaf: false,
+        })
+    }
+
+    fn pool(&self, size: Size) -> &PgPool {
+        match size {
+            Size::Small | Size::Outcome => &self.pool,
+            Size::Payload => &self.payloads,
+        }
+    }
+}
+
+async fn cause_of_no_connection(options: &PgConnectOptions) -> Error {
+    let connecting = <PgConnection as sqlx::Connection>::connect_with(options);
+    match timeout(ACQUIRE_TIMEOUT, connecting).await {
+        Ok(Err(cause)) => cause.into(),
+        Ok(Ok(_)) | Err(_) => sqlx::Error::PoolTimedOut.into(),
+    }
+}
+
+fn pool_of(connections: u32) -> PgPoolOptions {
+    PgPoolOptions::new()
+        .max_connections(connections)
+        .acquire_timeout(ACQUIRE_TIMEOUT)
+        // A connection that does not answer would keep its place until the network gives it up, a quarter of an hour.
+        .after_release(|connection, _| {
+            Box::pin(async move {
+                match timeout(RELEASE_TIMEOUT, sqlx::Connection::ping(connection)).await {
+                    Ok(answer) => answer.map(|()| true),
+                    Err(_) => Err(sqlx::Error::PoolTimedOut),
+                }
+            })
+        })
+}
+
+impl Connection for PgConnection {
+    type Row = PgRow;
+    const FOR_UPDATE: &'static str = " FOR UPDATE";
+    const SKIP_LOCKED: &'static str = " FOR UPDATE SKIP LOCKED";
+
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<PgRow>, Error> {
+        sql::run::<sqlx::Postgres>(self, statement).await
+    }
+
+    async fn lock_admission(&mut self) -> Result<bool, Error> {
+        self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(ADMISSION_LOCK)).await?;
+        Ok(true)
+    }
+
+    async fn tell(&mut self, change: Change, job: &JobName) -> Result<(), Error> {
+        let notify = Statement::new("SELECT pg_notify($1, $2)").bind(listener::channel(change));
+        self.execute(notify.bind(&job.to_string())).await
+    }
+}
+
+impl Database for Postgres {
+    type Sqlx = sqlx::Postgres;
+    const SHARED: bool = true;
+
+    async fn reader(&self, size: Size) -> Result<PoolConnection<sqlx::Postgres>, Error> {
+        Ok(self.pool(size).acquire().await?)
+    }
+
+    async fn begin(&self, size: Size) -> Result<Transaction<'static, sqlx::Postgres>, Error> {
+        Ok(self.pool(size).begin().await?)
+    }
+
+    fn bound(&self, size: Size) -> Option<Duration> {
+        Some(match size {
+            Size::Small => SMALL_BOUND,
+            Size::Payload | Size::Outcome => PAYLOAD_BOUND,
+        })
+    }
+
+    fn lease_clock(&self, now: SystemTime) -> SystemTime {
+        self.clock.translate(now)
+    }
+
+    async fn set_lease_clock(&self) -> Result<(), Error> {
+        self.clock.set(&mut *self.pool.acquire().await?).await
+    }
+
+    async fn heard(&self) -> Hint {
+        #[cfg(test)]
+        if self.deaf {
+            return std::future::pending().await;
+        }
+        self.listener.lock().await.hint().await
+    }
+
+    async fn disconnect(&self) {
+        self.listener.lock().await.close().await;
+        self.payloads.close().await;
+        self.pool.close().await;
+    }
+}

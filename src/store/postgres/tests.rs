@@ -1,0 +1,158 @@
+//! PostgreSQL under the store's contract, and what is its own: several servers on one database.
+
+#[path = "../../../tests/it/support/postgres.rs"]
+pub(crate) mod cluster;
+
+use std::ops::Deref;
+use std::sync::Arc;
+
+use super::*;
+use crate::domain::job::JobState;
+use crate::store::{Store, contract};
+use cluster::Cluster;
+
+/// A store in a database of its own, in a cluster that lives as long as a test needs it.
+struct Fixture {
+    store: Postgres,
+    url: DatabaseUrl,
+    _cluster: Arc<Cluster>,
+}
+
+impl Fixture {
+    async fn open() -> Option<Self> {
+        let cluster = cluster::shared("the contract of the PostgreSQL store")?;
+        let url: DatabaseUrl = cluster.database().await.parse().expect("an address");
+        Some(Self { store: Postgres::open(&url).await.expect("opens"), url, _cluster: cluster })
+    }
+}
+
+impl Deref for Fixture {
+    type Target = Postgres;
+
+    fn deref(&self) -> &Postgres {
+        &self.store
+    }
+}
+
+contract::store_contract!(Fixture::open);
+
+const LEASE: Duration = Duration::from_secs(30);
+
+#[tokio::test]
+async fn what_lives_elsewhere_is_not_taken_back_at_a_start() {
+    let Some(fixture) = Fixture::open().await else { return };
+    let now = contract::time(1);
+    fixture.create_job(contract::record("a"), &contract::ROOM, now).await.expect("created");
+    let claimed = fixture.claim("w", now, LEASE).await.expect("claims").expect("a job");
+    let other = Postgres::open(&fixture.url).await.expect("a second server");
+    assert_eq!(other.recover(contract::time(30), 3).await, Ok(Vec::new()), "the lease has a second to go");
+    fixture.heartbeat(&claimed.lease, contract::time(30), LEASE).await.expect("still holds");
+    let recovered = other.recover(contract::time(60), 3).await.expect("recovers");
+    assert_eq!(recovered.iter().map(|job| job.state).collect::<Vec<_>>(), [JobState::Queued]);
+    let late = fixture.heartbeat(&claimed.lease, contract::time(61), LEASE).await;
+    assert_eq!(late, Err(Error::Fenced(claimed.lease)));
+}
+
+#[tokio::test]
+async fn a_server_whose_clock_is_wrong_takes_and_loses_nothing_early() {
+    let Some(fixture) = Fixture::open().await else { return };
+    let right = Postgres::open(&fixture.url).await.expect("a second server");
+    // Its clock is an hour behind the database's: its second 0 is everyone's second 3600.
+    fixture.clock.pretend(Duration::from_secs(3600));
+    fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+    let claimed = fixture.claim("w", contract::time(0), LEASE).await.expect("claims").expect("a job");
+    assert!(right.sweep(contract::time(3629), 3).await.expect("sweeps").lost.is_empty(), "a second to go");
+    fixture.heartbeat(&claimed.lease, contract::time(10), LEASE).await.expect("holds");
+    assert!(right.sweep(contract::time(3639), 3).await.expect("sweeps").lost.is_empty(), "a second to go");
+    assert_eq!(right.sweep(contract::time(3640), 3).await.expect("sweeps").lost.len(), 1);
+    // A sweep looks at the clocks before anything else; these two are on one machine.
+    fixture.sweep(contract::time(0), 3).await.expect("sweeps");
+    assert_eq!(fixture.lease_clock(contract::time(0)), contract::time(0));
+}
+
+#[tokio::test]
+async fn many_servers_share_one_queue_and_one_set_of_request_ids() {
+    let Some(fixture) = Fixture::open().await else { return };
+    let opened = (0..3).map(|_| Postgres::open(&fixture.url));
+    let servers: Vec<_> = futures_util::future::join_all(opened).await.into_iter().map(|s| s.expect("opens")).collect();
+    // Five at a time of the same body and id, on all servers, into a queue of at most ten.
+    let bounds = crate::store::QueueBounds { max_jobs: 10, ..contract::ROOM };
+    let calls = (0..75).map(|number| {
+        let request = Some(crate::store::Request { id: format!("r-{}", number / 5), digest: [1; 32] });
+        let new = crate::store::NewRecord { request, ..contract::record(&format!("job-{number}")) };
+        servers[number % 3].create_job(new, &bounds, contract::time(0))
+    });
+    let created = futures_util::future::join_all(calls).await;
+    let new = created.iter().filter(|created| created.as_ref().is_ok_and(|created| created.new)).count();
+    assert_eq!(new, 10, "the bound holds over all servers");
+    let names: std::collections::BTreeSet<_> =
+        created.iter().flatten().map(|created| created.job.name.clone()).collect();
+    assert_eq!(names.len(), 10);
+    assert!(created.iter().flatten().count() >= 10);
+
+    let claims = (0..30).map(|number| servers[number % 3].claim("w", contract::time(1), LEASE));
+    let claims = futures_util::future::join_all(claims).await;
+    let mut claimed: Vec<_> =
+        claims.into_iter().filter_map(|claim| claim.expect("claims")).map(|c| c.job.name).collect();
+    claimed.sort();
+    claimed.dedup();
+    assert_eq!(claimed.len(), 10);
+    // And what they lose is taken back once, whoever sweeps.
+    let sweeps = servers.iter().map(|server| server.sweep(contract::time(60), 3));
+    let swept = futures_util::future::join_all(sweeps).await;
+    let lost: usize = swept.into_iter().map(|swept| swept.expect("sweeps").lost.len()).sum();
+    assert_eq!(lost, 10);
+}
+
+#[tokio::test]
+async fn changes_are_told_to_other_servers_by_name_and_after_the_commit() {
+    let Some(fixture) = Fixture::open().await else { return };
+    let other = Postgres::open(&fixture.url).await.expect("a second server");
+    assert_eq!(other.hint().await, Hint::Missed, "from here on it listens");
+    let name = contract::record("a").name;
+    fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+    let told = [other.hint().await, other.hint().await];
+    assert_eq!(told, [Hint::Events(name.clone()), Hint::Queued]);
+    assert_eq!(other.job(&name).await.expect("is there").last_sequence, 1);
+    fixture.claim("w", contract::time(1), LEASE).await.expect("claims").expect("a job");
+    assert_eq!(other.hint().await, Hint::Events(name.clone()));
+    fixture.request_cancel(&name, contract::time(2)).await.expect("flags");
+    assert_eq!(other.hint().await, Hint::Cancel(name));
+}
+
+#[tokio::test]
+async fn a_server_that_stops_within_a_transaction_holds_up_nobody_for_long() {
+    let Some(fixture) = Fixture::open().await else { return };
+    let other = Postgres::open(&fixture.url).await.expect("a second server");
+    let mut stuck = other.begin(Size::Small).await.expect("a transaction");
+    stuck.lock_admission().await.expect("the lock");
+    // Only the database itself can end this one: its bound is below what a creation may take.
+    fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created in the end");
+    assert!(stuck.rows(Statement::new("SELECT 1")).await.is_err(), "it was ended");
+}
+
+#[tokio::test]
+async fn a_database_that_is_away_is_told_soon_and_used_again_by_itself() {
+    let Some(cluster) = Cluster::start("a database that goes away") else { return };
+    let url: DatabaseUrl = cluster.database().await.parse().expect("an address");
+    let store = Postgres::open(&url).await.expect("opens");
+    store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+    assert_eq!(store.hint().await, Hint::Missed);
+    cluster.stop();
+    let error = store.job(&contract::record("a").name).await.expect_err("away");
+    assert!(matches!(&error, Error::Unavailable(cause) if !cause.contains(cluster::PASSWORD)), "{error}");
+    cluster.restart();
+    store.job(&contract::record("a").name).await.expect("back");
+    assert_eq!(store.hint().await, Hint::Missed, "what was told meanwhile is lost, which is told");
+}
+
+#[tokio::test]
+async fn a_wrong_password_is_told_without_the_right_or_the_wrong_one() {
+    let Some(fixture) = Fixture::open().await else { return };
+    let wrong: DatabaseUrl = fixture.url.reveal().replace(cluster::PASSWORD, "swordfish").parse().expect("an address");
+    let error = Postgres::open(&wrong).await.expect_err("refused").to_string();
+    assert!(error.contains("password"), "{error}");
+    for shown in [error, format!("{:?}", fixture.store), format!("{wrong:?}")] {
+        assert!(!shown.contains("swordfish") && !shown.contains(cluster::PASSWORD), "{shown}");
+    }
+}

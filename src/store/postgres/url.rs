@@ -1,0 +1,161 @@
+//! Where the database is, with a password that is never shown.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use sqlx::postgres::PgConnectOptions;
+
+/// What stands in for the password wherever the address is shown.
+const HIDDEN: &str = "***";
+
+/// Parameters that may follow the `?`; all that the driver understands but the password, whose place is before the `@`,
+/// where it is found and hidden.
+const PARAMETERS: [&str; 12] = [
+    "sslmode",
+    "sslrootcert",
+    "sslcert",
+    "sslkey",
+    "statement-cache-capacity",
+    "host",
+    "hostaddr",
+    "port",
+    "dbname",
+    "user",
+    "application_name",
+    "options",
+];
+
+/// Address of a PostgreSQL database: `postgres://user:password@host:port/database?sslmode=verify-full`.
+///
+/// Shown, logged and written to files, it has no password.
+#[derive(Clone)]
+pub struct DatabaseUrl {
+    options: PgConnectOptions,
+    /// Without the password.
+    shown: String,
+    /// As it was given, to tell two apart.
+    given: String,
+}
+
+/// An address that is none; it says nothing of what was given, which may hold a password.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("not the address of a PostgreSQL database ({0}); right would be postgres://USER:PASSWORD@HOST:PORT/DATABASE")]
+pub struct UrlError(&'static str);
+
+impl DatabaseUrl {
+    /// How to connect, password included.
+    pub(super) fn options(&self) -> &PgConnectOptions {
+        &self.options
+    }
+
+    /// As it was given, password included: for whoever hands it on.
+    pub fn reveal(&self) -> &str {
+        &self.given
+    }
+}
+
+impl FromStr for DatabaseUrl {
+    type Err = UrlError;
+
+    fn from_str(given: &str) -> Result<Self, UrlError> {
+        let (scheme, rest) = given.split_once("://").ok_or(UrlError("it has no scheme"))?;
+        if !matches!(scheme, "postgres" | "postgresql") {
+            return Err(UrlError("its scheme is not postgres"));
+        }
+        let (authority, path) = rest.split_at(rest.find(['/', '?', '#']).unwrap_or(rest.len()));
+        if path.contains(['@', '#']) {
+            return Err(UrlError(
+                "there is a `/`, `?` or `#` before the `@`, or a `#`: write them as %2F, %3F and %23",
+            ));
+        }
+        for (name, _) in
+            path.split_once('?').map_or("", |(_, query)| query).split('&').filter_map(|p| p.split_once('='))
+        {
+            if !PARAMETERS.contains(&name) && !name.starts_with("options[") {
+                return Err(UrlError("it has a parameter that is not known, or a password that is not before the `@`"));
+            }
+        }
+        let options = given.parse().map_err(|_| UrlError("it cannot be parsed"))?;
+        let authority = match authority.rsplit_once('@') {
+            Some((user, host)) => match user.split_once(':') {
+                Some((user, _)) => format!("{user}:{HIDDEN}@{host}"),
+                None => format!("{user}@{host}"),
+            },
+            None => authority.to_owned(),
+        };
+        Ok(Self { options, shown: format!("{scheme}://{authority}{path}"), given: given.to_owned() })
+    }
+}
+
+impl fmt::Display for DatabaseUrl {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.shown)
+    }
+}
+
+impl fmt::Debug for DatabaseUrl {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "DatabaseUrl({})", self.shown)
+    }
+}
+
+impl PartialEq for DatabaseUrl {
+    fn eq(&self, other: &Self) -> bool {
+        self.given == other.given
+    }
+}
+
+impl Serialize for DatabaseUrl {
+    /// Without the password.
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&self.shown)
+    }
+}
+
+impl<'de> Deserialize<'de> for DatabaseUrl {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::DatabaseUrl;
+
+    #[test]
+    fn the_password_is_shown_nowhere() {
+        for given in [
+            "postgres://me:hunter2@db.example:5432/scpsfm",
+            "postgresql://me:hunter2@db.example/scpsfm?sslmode=require",
+            "postgres://me:hunter2%40x@[::1]:5432/scpsfm",
+            "postgres://me:a:hunter2@host/scpsfm",
+        ] {
+            let url: DatabaseUrl = given.parse().expect(given);
+            assert_eq!(url.reveal(), given);
+            let toml = toml::to_string(&std::collections::BTreeMap::from([("url", &url)])).expect("TOML");
+            for shown in [url.to_string(), format!("{url:?}"), toml] {
+                assert!(!shown.contains("hunter2") && shown.contains("me:***@"), "{shown}");
+            }
+        }
+        let without: DatabaseUrl = "postgres://me@host/scpsfm".parse().expect("valid");
+        assert_eq!(without.to_string(), "postgres://me@host/scpsfm");
+    }
+
+    #[test]
+    fn what_is_wrong_is_told_without_what_was_given() {
+        for given in [
+            "hunter2",
+            "mysql://me:hunter2@host/db",
+            "postgres://me:hunter2/@host/db",
+            "postgres://me:1/hunter2@host/db",
+            "postgres://me:hunter2@host:port/db",
+            "postgres://me@host/db?password=hunter2",
+            "postgres://me@host/db?pasword=hunter2",
+            "postgres://me@host/db?sslmode=hunter2",
+        ] {
+            let error = given.parse::<DatabaseUrl>().expect_err(given).to_string();
+            assert!(!error.contains("hunter2") && error.contains("postgres://USER:PASSWORD@HOST"), "{error}");
+        }
+    }
+}

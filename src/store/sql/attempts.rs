@@ -1,0 +1,270 @@
+//! Leases: claiming, keeping, ending and losing them.
+
+use std::time::SystemTime;
+
+use super::rows::{self, Standing, append, held, leave, micros, number, select_jobs, select_standing, standing};
+use super::{Change, Connection, Row, Statement, jobs};
+use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt};
+use crate::domain::progress::Progress;
+use crate::store::record::{CancelReply, Claimed, Ending, Heartbeat, Lease, Outcome};
+use crate::store::{ATTEMPTS_EXHAUSTED, Error, payload};
+
+/// Attempts that a failure tells of, the latest ones: those given back at a drain do not count against the cap, and
+/// there is no bound on them.
+const MOST_PAST_ATTEMPTS: u32 = 16;
+
+/// Whether anything is queued.
+pub(super) async fn may_claim<C: Connection>(connection: &mut C) -> Result<bool, Error> {
+    let select = Statement::new("SELECT EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED') AS found");
+    connection.row(select).await?.flag("found")
+}
+
+/// Leases the next queued job until `expires`.
+pub(super) async fn claim<C: Connection>(
+    connection: &mut C,
+    worker: &str,
+    now: SystemTime,
+    expires: SystemTime,
+) -> Result<Option<Claimed>, Error> {
+    let next = Statement::new(
+        "SELECT id FROM jobs WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) \
+         ORDER BY priority DESC, create_time, id LIMIT 1",
+    )
+    .bind(micros(now))
+    .then(C::SKIP_LOCKED);
+    let Some(row) = connection.optional_row(next).await? else { return Ok(None) };
+    let id = row.integer("id")?;
+    let lease = Statement::new(
+        "UPDATE jobs SET state = 'RUNNING', attempt = attempt + 1, start_time = COALESCE(start_time, $1), \
+         lease_worker = $2, lease_expires = $3, progress = NULL WHERE id = $4 RETURNING tenant, job, attempt",
+    )
+    .bind(micros(now))
+    .bind(worker)
+    .bind(micros(expires))
+    .bind(id);
+    let row = connection.row(lease).await?;
+    let name = JobName { tenant: row.text("tenant")?, job: row.text("job")? };
+    let attempt: u32 = number(&row, "attempt")?;
+    let begin = Statement::new("INSERT INTO attempts (job_id, attempt, worker, start_time) VALUES ($1, $2, $3, $4)");
+    connection.execute(begin.bind(id).bind(attempt).bind(worker).bind(micros(now))).await?;
+    let event = EventBody::State { state: JobState::Running, failure: None };
+    append(connection, (id, &name), attempt, &event, now).await?;
+    let row = connection.row(Statement::new(select_jobs!("WHERE id = $1")).bind(id)).await?;
+    Ok(Some(Claimed {
+        job: rows::job(&row)?,
+        lease: Lease { name, attempt },
+        trace_parent: row.optional_text("trace_parent")?,
+        queue_time: rows::time(row.integer("queue_time")?),
+    }))
+}
+
+/// Extends a lease until `expires`.
+pub(super) async fn heartbeat<C: Connection>(
+    connection: &mut C,
+    lease: &Lease,
+    expires: SystemTime,
+) -> Result<Heartbeat, Error> {
+    let job = held(connection, lease).await?;
+    let extend = Statement::new("UPDATE jobs SET lease_expires = $1 WHERE id = $2").bind(micros(expires));
+    connection.execute(extend.bind(job.id)).await?;
+    Ok(Heartbeat { cancel_requested: job.cancel_requested, deadline: job.deadline })
+}
+
+/// Appends a progress event.
+pub(super) async fn record<C: Connection>(
+    connection: &mut C,
+    lease: &Lease,
+    progress: &Progress,
+    now: SystemTime,
+) -> Result<u64, Error> {
+    let job = held(connection, lease).await?;
+    keep_progress(connection, job.id, progress).await?;
+    append(connection, (job.id, &job.name), job.attempt, &EventBody::Progress(*progress), now).await
+}
+
+async fn keep_progress<C: Connection>(connection: &mut C, id: i64, progress: &Progress) -> Result<(), Error> {
+    let update = Statement::new("UPDATE jobs SET progress = $1 WHERE id = $2");
+    connection.execute(update.bind(payload::encode(progress)?).bind(id)).await
+}
+
+/// Ends an attempt and its job.
+pub(super) async fn finish<C: Connection>(
+    connection: &mut C,
+    lease: &Lease,
+    ending: &Ending,
+    now: SystemTime,
+) -> Result<Job, Error> {
+    let job = held(connection, lease).await?;
+    if let Some(progress) = &ending.progress {
+        keep_progress(connection, job.id, progress).await?;
+    }
+    let (next, failure) = match &ending.outcome {
+        Outcome::Succeeded { summary, result } => {
+            insert_result(connection, job.id, result).await?;
+            let update = Statement::new("UPDATE jobs SET summary = $1 WHERE id = $2");
+            connection.execute(update.bind(payload::encode(summary)?).bind(job.id)).await?;
+            let event = EventBody::Result(summary.clone());
+            append(connection, (job.id, &job.name), job.attempt, &event, now).await?;
+            (JobState::Succeeded, None)
+        }
+        Outcome::Failed(failure) => (JobState::Failed, Some(failure.clone())),
+        Outcome::Cancelled => (JobState::Cancelled, None),
+        Outcome::Expired => (JobState::Expired, None),
+    };
+    end_attempt(connection, &job, AttemptEnd::Ended, now).await?;
+    leave(connection, &job, next, failure, now).await?;
+    jobs::get(connection, &lease.name).await
+}
+
+async fn insert_result<C: Connection>(connection: &mut C, id: i64, bytes: &[u8]) -> Result<(), Error> {
+    for (chunk, data) in (0_i64..).zip(bytes.chunks(payload::CHUNK_BYTES)) {
+        let insert = Statement::new("INSERT INTO result_chunks (job_id, chunk, data) VALUES ($1, $2, $3)");
+        connection.execute(insert.bind(id).bind(chunk).bind(data)).await?;
+    }
+    Ok(())
+}
+
+/// Notes how the latest attempt of a job ended.
+async fn end_attempt<C: Connection>(
+    connection: &mut C,
+    job: &Standing,
+    end: AttemptEnd,
+    now: SystemTime,
+) -> Result<(), Error> {
+    let update = Statement::new("UPDATE attempts SET end_time = $1, ending = $2 WHERE job_id = $3 AND attempt = $4");
+    connection.execute(update.bind(micros(now)).bind(end.name()).bind(job.id).bind(job.attempt)).await
+}
+
+/// Gives a lease back.
+pub(super) async fn release<C: Connection>(connection: &mut C, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
+    let job = held(connection, lease).await?;
+    let next = if job.cancel_requested { JobState::Cancelled } else { JobState::Queued };
+    end_attempt(connection, &job, AttemptEnd::GivenBack, now).await?;
+    leave(connection, &job, next, None, now).await?;
+    jobs::get(connection, &lease.name).await
+}
+
+/// Asks for the end of a job.
+pub(super) async fn request_cancel<C: Connection>(
+    connection: &mut C,
+    name: &JobName,
+    now: SystemTime,
+) -> Result<CancelReply, Error> {
+    let job = standing(connection, name).await?;
+    let ended_now = job.state == JobState::Queued;
+    if ended_now {
+        leave(connection, &job, JobState::Cancelled, None, now).await?;
+    } else if job.state == JobState::Running {
+        connection
+            .execute(Statement::new("UPDATE jobs SET cancel_requested = TRUE WHERE id = $1").bind(job.id))
+            .await?;
+        connection.tell(Change::Cancel, name).await?;
+    }
+    Ok(CancelReply { job: jobs::get(connection, name).await?, ended_now })
+}
+
+/// Takes back the leases that ran out at `expired_at`, or all of them.
+pub(super) async fn take_back<C: Connection>(
+    connection: &mut C,
+    expired_at: Option<SystemTime>,
+    now: SystemTime,
+    max_attempts: u32,
+) -> Result<Vec<Job>, Error> {
+    let select = Statement::new(select_standing!("WHERE state = 'RUNNING' AND lease_expires <= $1 ORDER BY id"))
+        .bind(expired_at.map_or(i64::MAX, micros))
+        .then(C::SKIP_LOCKED);
+    let mut changed = Vec::new();
+    for row in connection.rows(select).await? {
+        let job = Standing::from_row(&row)?;
+        let lost_attempts = job.lost_attempts + 1;
+        let update = Statement::new("UPDATE jobs SET lost_attempts = $1 WHERE id = $2");
+        connection.execute(update.bind(lost_attempts).bind(job.id)).await?;
+        end_attempt(connection, &job, AttemptEnd::Lost, now).await?;
+        let next = after_loss(&job, lost_attempts, now, max_attempts);
+        let failure = match next {
+            JobState::Failed => Some(exhausted(connection, &job, lost_attempts, max_attempts).await?),
+            _ => None,
+        };
+        leave(connection, &job, next, failure, now).await?;
+        changed.push(jobs::get(connection, &job.name).await?);
+    }
+    Ok(changed)
+}
+
+/// Where a job goes whose worker vanished.
+fn after_loss(job: &Standing, lost_attempts: u32, now: SystemTime, max_attempts: u32) -> JobState {
+    if job.cancel_requested {
+        JobState::Cancelled
+    } else if job.deadline.is_some_and(|deadline| deadline <= now) {
+        JobState::Expired
+    } else if lost_attempts >= max_attempts {
+        JobState::Failed
+    } else {
+        JobState::Queued
+    }
+}
+
+/// Why a job failed that lost too many attempts, and what became of each.
+async fn exhausted<C: Connection>(
+    connection: &mut C,
+    job: &Standing,
+    lost_attempts: u32,
+    max_attempts: u32,
+) -> Result<Failure, Error> {
+    let select = Statement::new(
+        "SELECT attempt, worker, start_time, end_time, ending FROM attempts WHERE job_id = $1 \
+         ORDER BY attempt DESC LIMIT $2",
+    );
+    let rows = connection.rows(select.bind(job.id).bind(MOST_PAST_ATTEMPTS)).await?;
+    let past = |row: &C::Row| {
+        let ending = row.optional_text("ending")?.unwrap_or_default();
+        Ok(PastAttempt {
+            attempt: number(row, "attempt")?,
+            worker: row.text("worker")?,
+            start_time: rows::time(row.integer("start_time")?),
+            // One that is followed by another has ended, whatever is known of how.
+            end_time: rows::time(row.optional_integer("end_time")?.unwrap_or(row.integer("start_time")?)),
+            end: AttemptEnd::from_name(&ending).unwrap_or(AttemptEnd::Lost),
+        })
+    };
+    let attempts: Vec<_> = rows.iter().rev().map(past).collect::<Result<_, Error>>()?;
+    let told: Vec<String> = attempts
+        .iter()
+        .filter(|past| past.end == AttemptEnd::Lost)
+        .map(|past| format!("{} by {}", past.attempt, past.worker))
+        .collect();
+    let message = format!(
+        "{lost_attempts} attempts ended without a word from their worker, at most {max_attempts} are made: {}",
+        told.join(", ")
+    );
+    Ok(Failure { reason: ATTEMPTS_EXHAUSTED.into(), message, attempts })
+}
+
+/// Whether a sweep would find anything: leases that ran out at `expired_at`, or deadlines that have passed.
+pub(super) async fn needs_sweep<C: Connection>(
+    connection: &mut C,
+    expired_at: SystemTime,
+    now: SystemTime,
+) -> Result<bool, Error> {
+    let select = Statement::new(
+        "SELECT (EXISTS (SELECT 1 FROM jobs WHERE state = 'RUNNING' AND lease_expires <= $1) \
+         OR EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED' AND deadline IS NOT NULL AND deadline <= $2)) AS found",
+    );
+    connection.row(select.bind(micros(expired_at)).bind(micros(now))).await?.flag("found")
+}
+
+/// Ends the queued jobs that are past their deadline.
+pub(super) async fn expire_queued<C: Connection>(connection: &mut C, now: SystemTime) -> Result<Vec<Job>, Error> {
+    let select = Statement::new(select_standing!(
+        "WHERE state = 'QUEUED' AND deadline IS NOT NULL AND deadline <= $1 ORDER BY id"
+    ))
+    .bind(micros(now))
+    .then(C::SKIP_LOCKED);
+    let mut changed = Vec::new();
+    for row in connection.rows(select).await? {
+        let job = Standing::from_row(&row)?;
+        leave(connection, &job, JobState::Expired, None, now).await?;
+        changed.push(jobs::get(connection, &job.name).await?);
+    }
+    Ok(changed)
+}

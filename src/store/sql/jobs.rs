@@ -1,0 +1,255 @@
+//! Creating, reading and listing jobs.
+
+use std::time::SystemTime;
+
+use super::rows::{self, append, integer, micros, number, select_jobs};
+use super::{Change, Connection, Row, Statement};
+use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
+use crate::store::query::Cursor;
+use crate::store::record::{Created, Load, NewRecord, QueueBounds, Request};
+use crate::store::{Error, JobPage, JobQuery, Order, payload};
+
+/// Stores a job; see [`crate::store::Store::create_job`].
+pub(super) async fn create<C: Connection>(
+    connection: &mut C,
+    new: &NewRecord,
+    bounds: &QueueBounds,
+    now: SystemTime,
+) -> Result<Created, Error> {
+    if let Some(job) = admit(connection, new, bounds).await? {
+        return Ok(Created { job, new: false });
+    }
+    // Payloads take long: nobody else's admission waits for them. What was admitted before is looked over again.
+    let input_id = insert_input(connection, &new.name.tenant, &new.input, now).await?;
+    if connection.lock_admission().await?
+        && let Some(job) = admit(connection, new, bounds).await?
+    {
+        let delete = Statement::new("DELETE FROM inputs WHERE id = $1").bind(input_id);
+        connection.execute(delete).await?;
+        return Ok(Created { job, new: false });
+    }
+    let id = insert_job(connection, new, input_id, now).await?;
+    if let Some(request) = &new.request {
+        let insert = Statement::new(
+            "INSERT INTO request_ids (tenant, request_id, digest, job_id, create_time) VALUES ($1, $2, $3, $4, $5)",
+        )
+        .bind(&new.name.tenant)
+        .bind(&request.id)
+        .bind(request.digest.as_slice())
+        .bind(id)
+        .bind(micros(now));
+        connection.execute(insert).await?;
+    }
+    let event = EventBody::State { state: JobState::Queued, failure: None };
+    append(connection, (id, &new.name), 0, &event, now).await?;
+    connection.tell(Change::Queued, &new.name).await?;
+    Ok(Created { job: get(connection, &new.name).await?, new: true })
+}
+
+/// Whether a job may be stored: `Ok(None)`; or the job that the same request made before.
+async fn admit<C: Connection>(connection: &mut C, new: &NewRecord, bounds: &QueueBounds) -> Result<Option<Job>, Error> {
+    if let Some(request) = &new.request
+        && let Some(job) = earlier(connection, &new.name.tenant, request).await?
+    {
+        return Ok(Some(job));
+    }
+    let taken = Statement::new("SELECT EXISTS (SELECT 1 FROM jobs WHERE tenant = $1 AND job = $2) AS taken")
+        .bind(&new.name.tenant)
+        .bind(&new.name.job);
+    if connection.row(taken).await?.flag("taken")? {
+        return Err(Error::AlreadyExists(format!("{} already exists", new.name)));
+    }
+    let load = load(connection).await?;
+    match bounds.refuses(&load, new.input.len() as u64, u64::from(new.observation_count)) {
+        Some(bound) => Err(Error::QueueFull(bound)),
+        None => Ok(None),
+    }
+}
+
+/// The job that this request id made before.
+async fn earlier<C: Connection>(connection: &mut C, tenant: &str, request: &Request) -> Result<Option<Job>, Error> {
+    let select = Statement::new("SELECT digest, job_id FROM request_ids WHERE tenant = $1 AND request_id = $2")
+        .bind(tenant)
+        .bind(&request.id);
+    let Some(known) = connection.optional_row(select).await? else { return Ok(None) };
+    if known.bytes("digest")? != request.digest {
+        return Err(Error::AlreadyExists(format!(
+            "request id {:?} was used before with another body; a new request needs a new id",
+            request.id
+        )));
+    }
+    let select = Statement::new(select_jobs!("WHERE id = $1")).bind(known.integer("job_id")?);
+    rows::job(&connection.row(select).await?).map(Some)
+}
+
+async fn insert_input<C: Connection>(
+    connection: &mut C,
+    tenant: &str,
+    bytes: &[u8],
+    now: SystemTime,
+) -> Result<i64, Error> {
+    let insert = Statement::new("INSERT INTO inputs (tenant, bytes, create_time) VALUES ($1, $2, $3) RETURNING id")
+        .bind(tenant)
+        .bind(integer(bytes.len() as u64))
+        .bind(micros(now));
+    let id = connection.row(insert).await?.integer("id")?;
+    for (chunk, data) in (0_i64..).zip(bytes.chunks(payload::CHUNK_BYTES)) {
+        let insert = Statement::new("INSERT INTO input_chunks (input_id, chunk, data) VALUES ($1, $2, $3)");
+        connection.execute(insert.bind(id).bind(chunk).bind(data)).await?;
+    }
+    Ok(id)
+}
+
+async fn insert_job<C: Connection>(
+    connection: &mut C,
+    new: &NewRecord,
+    input_id: i64,
+    now: SystemTime,
+) -> Result<i64, Error> {
+    let insert = Statement::new(
+        "INSERT INTO jobs (tenant, job, state, priority, create_time, queue_time, deadline, input_id, input_bytes, \
+         view_count, track_count, observation_count, settings, labels, trace_parent) \
+         VALUES ($1, $2, 'QUEUED', $3, $4, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13) RETURNING id",
+    )
+    .bind(&new.name.tenant)
+    .bind(&new.name.job)
+    .bind(new.priority)
+    .bind(micros(now))
+    .bind(new.deadline.map(micros))
+    .bind(input_id)
+    .bind(integer(new.input.len() as u64))
+    .bind(new.view_count)
+    .bind(new.track_count)
+    .bind(new.observation_count)
+    .bind(payload::encode(&new.settings)?)
+    .bind(payload::encode(&new.labels)?)
+    .bind(new.trace_parent.as_deref());
+    let id = connection.row(insert).await?.integer("id")?;
+    for (key, value) in &new.labels {
+        let insert = Statement::new("INSERT INTO job_labels (job_id, key, value) VALUES ($1, $2, $3)");
+        connection.execute(insert.bind(id).bind(key).bind(value)).await?;
+    }
+    Ok(id)
+}
+
+/// One job by its name.
+pub(super) async fn get<C: Connection>(connection: &mut C, name: &JobName) -> Result<Job, Error> {
+    let select = Statement::new(select_jobs!("WHERE tenant = $1 AND job = $2")).bind(&name.tenant).bind(&name.job);
+    let row = connection.optional_row(select).await?;
+    row.as_ref().map_or_else(|| Err(Error::NotFound(name.clone())), rows::job)
+}
+
+/// One page of a listing.
+pub(super) async fn list<C: Connection>(connection: &mut C, query: &JobQuery) -> Result<JobPage, Error> {
+    let size = query.effective_page_size();
+    let mut rows = connection.rows(listing(query)?).await?;
+    let more = rows.len() > size as usize;
+    rows.truncate(size as usize);
+    let next_page_token = match rows.last() {
+        Some(last) if more => {
+            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.integer("id")? };
+            Some(query.token_after(cursor))
+        }
+        _ => None,
+    };
+    Ok(JobPage { jobs: rows.iter().map(rows::job).collect::<Result<_, _>>()?, next_page_token })
+}
+
+/// The `SELECT` of a page, and of one job more: it tells whether there is a next page.
+fn listing(query: &JobQuery) -> Result<Statement, Error> {
+    let cursor = query.cursor()?;
+    let mut select = Statement::new(select_jobs!("WHERE tenant = ")).then_bind(&query.tenant);
+    for (number, state) in query.states.iter().enumerate() {
+        select = select.then(if number == 0 { " AND state IN (" } else { ", " }).then_bind(state.name());
+    }
+    if !query.states.is_empty() {
+        select = select.then(")");
+    }
+    for (key, value) in &query.labels {
+        select = select.then(" AND EXISTS (SELECT 1 FROM job_labels WHERE job_id = jobs.id AND key = ").then_bind(key);
+        select = select.then(" AND value = ").then_bind(value).then(")");
+    }
+    let (beyond, order) = match query.order {
+        Order::CreateTimeDescending => (" AND (create_time, id) < (", " ORDER BY create_time DESC, id DESC LIMIT "),
+        Order::CreateTimeAscending => (" AND (create_time, id) > (", " ORDER BY create_time, id LIMIT "),
+    };
+    if let Some(cursor) = cursor {
+        select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(cursor.id).then(")");
+    }
+    Ok(select.then(order).then_bind(i64::from(query.effective_page_size()) + 1))
+}
+
+/// The row of a job.
+async fn id<C: Connection>(connection: &mut C, name: &JobName) -> Result<i64, Error> {
+    let select =
+        Statement::new("SELECT id FROM jobs WHERE tenant = $1 AND job = $2").bind(&name.tenant).bind(&name.job);
+    let row = connection.optional_row(select).await?;
+    row.ok_or_else(|| Error::NotFound(name.clone()))?.integer("id")
+}
+
+/// Events of a job with a sequence number above `after`.
+pub(super) async fn events_after<C: Connection>(
+    connection: &mut C,
+    name: &JobName,
+    after: u64,
+    limit: u32,
+) -> Result<Vec<JobEvent>, Error> {
+    let select = Statement::new(
+        "SELECT sequence, attempt, time, body FROM events WHERE job_id = $1 AND sequence > $2 ORDER BY sequence LIMIT $3",
+    )
+    .bind(id(connection, name).await?)
+    .bind(integer(after))
+    .bind(limit);
+    let event = |row: &C::Row| {
+        Ok(JobEvent {
+            name: name.clone(),
+            attempt: number(row, "attempt")?,
+            sequence: Some(number(row, "sequence")?),
+            time: rows::time(row.integer("time")?),
+            body: payload::decode(&row.bytes("body")?, "an event")?,
+        })
+    };
+    connection.rows(select).await?.iter().map(event).collect()
+}
+
+/// The encoded input of a job.
+pub(super) async fn input<C: Connection>(connection: &mut C, name: &JobName) -> Result<Vec<u8>, Error> {
+    let select = Statement::new(
+        "SELECT data FROM input_chunks WHERE input_id = (SELECT input_id FROM jobs WHERE id = $1) ORDER BY chunk",
+    )
+    .bind(id(connection, name).await?);
+    joined(&connection.rows(select).await?)
+}
+
+/// The encoded result of a job, if it has one.
+pub(super) async fn result<C: Connection>(connection: &mut C, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
+    let select = Statement::new("SELECT data FROM result_chunks WHERE job_id = $1 ORDER BY chunk")
+        .bind(id(connection, name).await?);
+    let chunks = connection.rows(select).await?;
+    if chunks.is_empty() { Ok(None) } else { joined(&chunks).map(Some) }
+}
+
+fn joined(chunks: &[impl Row]) -> Result<Vec<u8>, Error> {
+    let mut whole = Vec::new();
+    for chunk in chunks {
+        whole.extend(chunk.bytes("data")?);
+    }
+    Ok(whole)
+}
+
+/// What waits and what runs.
+pub(super) async fn load<C: Connection>(connection: &mut C) -> Result<Load, Error> {
+    // Sums of 64-bit numbers have a wider type of their own in PostgreSQL.
+    let select = Statement::new(
+        "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
+         CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, \
+         (SELECT COUNT(*) FROM jobs WHERE state = 'RUNNING') AS running FROM jobs WHERE state = 'QUEUED'",
+    );
+    let row = connection.row(select).await?;
+    Ok(Load {
+        queued: number(&row, "queued")?,
+        queued_bytes: number(&row, "bytes")?,
+        queued_observations: number(&row, "observations")?,
+        running: number(&row, "running")?,
+    })
+}

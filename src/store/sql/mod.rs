@@ -1,0 +1,147 @@
+//! What the SQL databases say in the same words: the statements, what their rows mean, and in which transaction what
+//! changes. A database adds how it is opened, its schema and the few words that are its own, through [`Connection`] and
+//! [`Database`]; whatever implements [`Database`] is a [`crate::store::Store`].
+
+mod attempts;
+mod jobs;
+mod rows;
+mod statement;
+mod store;
+
+use std::future::Future;
+use std::time::{Duration, SystemTime};
+
+use sqlx::migrate::{Migration, MigrationType, Migrator};
+use sqlx::pool::PoolConnection;
+use sqlx::{SqlSafeStr, Transaction};
+
+use super::{Error, Hint};
+use crate::domain::job::JobName;
+pub(super) use statement::{Row, Statement, run};
+
+/// A connection to a database, within a transaction or not.
+pub(super) trait Connection: Send {
+    type Row: Row;
+    /// Ends a `SELECT` whose rows the transaction is about to change.
+    const FOR_UPDATE: &'static str;
+    /// The same, passing over the rows that another transaction is changing.
+    const SKIP_LOCKED: &'static str;
+
+    /// Runs a statement to its end and returns its rows.
+    fn rows(&mut self, statement: Statement) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;
+
+    /// Waits until no other transaction admits jobs, and keeps others from it until this one ends. `false`: nothing
+    /// was waited for, what was read before still holds.
+    fn lock_admission(&mut self) -> impl Future<Output = Result<bool, Error>> + Send;
+
+    /// Tells other processes of a change, once it is committed.
+    fn tell(&mut self, change: Change, job: &JobName) -> impl Future<Output = Result<(), Error>> + Send;
+
+    /// The one row of a statement that always has one.
+    fn row(&mut self, statement: Statement) -> impl Future<Output = Result<Self::Row, Error>> + Send {
+        async {
+            let row = self.optional_row(statement).await?;
+            row.ok_or_else(|| Error::Corrupt("a row that was just written is not there".into()))
+        }
+    }
+
+    /// The first row, if there is any.
+    fn optional_row(&mut self, statement: Statement) -> impl Future<Output = Result<Option<Self::Row>, Error>> + Send {
+        async { Ok(self.rows(statement).await?.into_iter().next()) }
+    }
+
+    /// Runs a statement that has no rows.
+    fn execute(&mut self, statement: Statement) -> impl Future<Output = Result<(), Error>> + Send {
+        async { self.rows(statement).await.map(drop) }
+    }
+}
+
+/// What other processes are told of a job.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Change {
+    /// It has new events.
+    Events,
+    /// It entered the queue.
+    Queued,
+    /// Its cancel was asked for.
+    Cancel,
+}
+
+/// A database as a store uses it.
+pub(super) trait Database: Send + Sync + 'static {
+    type Sqlx: sqlx::Database<Connection: Connection>;
+
+    /// Whether other processes may hold leases and change jobs.
+    const SHARED: bool;
+
+    /// A connection that only reads.
+    fn reader(&self, size: Size) -> impl Future<Output = Result<PoolConnection<Self::Sqlx>, Error>> + Send;
+
+    /// Begins a transaction that may write.
+    fn begin(&self, size: Size) -> impl Future<Output = Result<Transaction<'static, Self::Sqlx>, Error>> + Send;
+
+    /// How long an operation of this size may take; `None`: as long as it does.
+    fn bound(&self, size: Size) -> Option<Duration>;
+
+    /// The time on the clock that leases run on, where the caller's shows `now`: one clock for every process that holds
+    /// or takes back leases.
+    fn lease_clock(&self, now: SystemTime) -> SystemTime {
+        now
+    }
+
+    /// Compares the caller's clock with that of the leases; called again and again, as clocks drift.
+    fn set_lease_clock(&self) -> impl Future<Output = Result<(), Error>> + Send {
+        async { Ok(()) }
+    }
+
+    /// See [`crate::store::Store::hint`].
+    fn heard(&self) -> impl Future<Output = Hint> + Send;
+
+    /// Closes every connection.
+    fn disconnect(&self) -> impl Future<Output = ()> + Send;
+}
+
+/// What an operation moves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Size {
+    /// A few rows.
+    Small,
+    /// An input or a result, for a caller who can wait.
+    Payload,
+    /// A result, under a lease that may run out.
+    Outcome,
+}
+
+/// A migration: its version, its name and its SQL. Published ones are never edited.
+pub(super) type Step = (i64, &'static str, &'static str);
+
+/// The migrations in order.
+pub(super) fn migrator(steps: &[Step]) -> Migrator {
+    let migrations = steps
+        .iter()
+        .map(|&(version, name, sql)| {
+            Migration::new(version, name.into(), MigrationType::Simple, sql.into_sql_str(), false)
+        })
+        .collect();
+    Migrator::with_migrations(migrations)
+}
+
+/// Why the schema cannot be brought up to date.
+pub(super) fn migration_failed(error: sqlx::migrate::MigrateError) -> Error {
+    use sqlx::migrate::MigrateError::{Execute, ExecuteMigration};
+    match error {
+        Execute(error) | ExecuteMigration(error, _) => error.into(),
+        error => Error::Corrupt(format!("cannot bring the schema up to date: {error}")),
+    }
+}
+
+impl From<sqlx::Error> for Error {
+    fn from(error: sqlx::Error) -> Self {
+        match error {
+            sqlx::Error::ColumnDecode { .. } | sqlx::Error::ColumnNotFound(_) | sqlx::Error::Decode(_) => {
+                Error::Corrupt(error.to_string())
+            }
+            _ => Error::Unavailable(error.to_string()),
+        }
+    }
+}

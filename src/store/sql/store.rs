@@ -1,0 +1,145 @@
+//! The store that every database makes: one transaction an operation, within a bound of time.
+
+use std::future::Future;
+use std::time::{Duration, SystemTime};
+
+use super::{Database, Size, attempts, jobs};
+use crate::domain::job::{Job, JobEvent, JobName};
+use crate::domain::progress::Progress;
+use crate::store::record::{
+    CancelReply, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, QueueBounds, Swept,
+};
+use crate::store::{Error, Hint, JobPage, JobQuery, Store};
+
+/// Waits for an operation as long as the database allows it. One that is broken off changed nothing, or all that it was
+/// to change: a commit may have been on its way.
+async fn bounded<D: Database, T>(
+    database: &D,
+    size: Size,
+    operation: impl Future<Output = Result<T, Error>> + Send,
+) -> Result<T, Error> {
+    let Some(bound) = database.bound(size) else { return operation.await };
+    match tokio::time::timeout(bound, operation).await {
+        Ok(result) => result,
+        Err(_) => Err(Error::Unavailable(format!("no answer within {} s", bound.as_secs_f64()))),
+    }
+}
+
+/// Reads through a connection of its own.
+macro_rules! reads {
+    ($database:expr, $size:expr, |$connection:ident| $body:expr) => {
+        bounded($database, $size, async {
+            let mut reader = $database.reader($size).await?;
+            let $connection = &mut *reader;
+            $body.await
+        })
+        .await
+    };
+}
+
+/// Writes in one transaction.
+macro_rules! writes {
+    ($database:expr, $size:expr, |$connection:ident| $body:expr) => {
+        bounded($database, $size, async {
+            let mut transaction = $database.begin($size).await?;
+            let $connection = &mut *transaction;
+            let value = $body.await?;
+            transaction.commit().await?;
+            Ok(value)
+        })
+        .await
+    };
+}
+
+#[async_trait::async_trait]
+impl<D: Database> Store for D {
+    async fn create_job(&self, new: NewRecord, bounds: &QueueBounds, now: SystemTime) -> Result<Created, Error> {
+        writes!(self, Size::Payload, |connection| jobs::create(connection, &new, bounds, now))
+    }
+
+    async fn job(&self, name: &JobName) -> Result<Job, Error> {
+        reads!(self, Size::Small, |connection| jobs::get(connection, name))
+    }
+
+    async fn jobs(&self, query: &JobQuery) -> Result<JobPage, Error> {
+        reads!(self, Size::Small, |connection| jobs::list(connection, query))
+    }
+
+    async fn events_after(&self, name: &JobName, after: u64, limit: u32) -> Result<Vec<JobEvent>, Error> {
+        reads!(self, Size::Small, |connection| jobs::events_after(connection, name, after, limit))
+    }
+
+    async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error> {
+        let expires = self.lease_clock(now) + lease_for;
+        // Idle workers look for jobs again and again: a read keeps them out of the writers' queue.
+        if !reads!(self, Size::Small, |connection| attempts::may_claim(connection))? {
+            return Ok(None);
+        }
+        writes!(self, Size::Small, |connection| attempts::claim(connection, worker, now, expires))
+    }
+
+    async fn input(&self, name: &JobName) -> Result<Vec<u8>, Error> {
+        reads!(self, Size::Payload, |connection| jobs::input(connection, name))
+    }
+
+    async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
+        let expires = self.lease_clock(now) + lease_for;
+        writes!(self, Size::Small, |connection| attempts::heartbeat(connection, lease, expires))
+    }
+
+    async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error> {
+        writes!(self, Size::Small, |connection| attempts::record(connection, lease, progress, now))
+    }
+
+    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error> {
+        writes!(self, Size::Outcome, |connection| attempts::finish(connection, lease, ending, now))
+    }
+
+    async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
+        writes!(self, Size::Small, |connection| attempts::release(connection, lease, now))
+    }
+
+    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error> {
+        writes!(self, Size::Small, |connection| attempts::request_cancel(connection, name, now))
+    }
+
+    async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {
+        // Where no other process can be at work, every lease is a dead one's.
+        let expired_at = D::SHARED.then(|| self.lease_clock(now));
+        writes!(self, Size::Small, |connection| attempts::take_back(connection, expired_at, now, max_attempts))
+    }
+
+    async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
+        bounded(self, Size::Small, self.set_lease_clock()).await?;
+        let expired_at = self.lease_clock(now);
+        // Most sweeps find nothing: a look spares the writer, and the disk, a transaction.
+        if !reads!(self, Size::Small, |connection| attempts::needs_sweep(connection, expired_at, now))? {
+            return Ok(Swept::default());
+        }
+        writes!(self, Size::Small, |connection| async {
+            let lost = attempts::take_back(connection, Some(expired_at), now, max_attempts).await?;
+            let expired = attempts::expire_queued(connection, now).await?;
+            Ok::<_, Error>(Swept { lost, expired })
+        })
+    }
+
+    async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
+        reads!(self, Size::Payload, |connection| jobs::result(connection, name))
+    }
+
+    async fn load(&self) -> Result<Load, Error> {
+        reads!(self, Size::Small, |connection| jobs::load(connection))
+    }
+
+    fn is_shared(&self) -> bool {
+        D::SHARED
+    }
+
+    async fn hint(&self) -> Hint {
+        self.heard().await
+    }
+
+    async fn close(&self) {
+        self.disconnect().await;
+    }
+}
