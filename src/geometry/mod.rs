@@ -12,6 +12,7 @@ pub mod fundamental;
 pub mod homography;
 pub mod measurement;
 pub mod metric;
+mod null_vector;
 pub mod pose;
 pub mod procrustes;
 pub mod resection;

@@ -1,8 +1,9 @@
 //! Points from cameras and image points.
 
-use nalgebra::{Matrix2x4, Matrix4, RowVector4, SymmetricEigen, Vector2};
+use nalgebra::{Matrix2x4, Matrix4, RowVector4, Vector2};
 
 use super::measurement::Sighting;
+use super::null_vector::null_vector;
 use super::{Camera, Point};
 
 /// Smallest homogeneous depth that is divided by; points nearer to the principal plane have no image.
@@ -40,11 +41,7 @@ pub fn linear(cameras: &[Camera], sightings: &[Sighting]) -> Point {
         accumulate(third * sighting.xy.x - camera.row(0));
         accumulate(third * sighting.xy.y - camera.row(1));
     }
-    if normal.iter().any(|entry| !entry.is_finite()) {
-        return Point::new(0.0, 0.0, 0.0, 1.0);
-    }
-    let eigen = SymmetricEigen::new(normal);
-    eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned()
+    null_vector(&normal).unwrap_or(Point::new(0.0, 0.0, 0.0, 1.0))
 }
 
 /// Refines a point by Levenberg-Marquardt on its squared reprojection residuals, at most `iterations` steps.
