@@ -115,10 +115,10 @@ fn deliver(args: &Args, solution: &Solution, input: &LabelledInput) -> Result<Ex
     args.export.write(&args.out, solution, input)?;
     result_files::write(&args.out, solution, Some(input))?;
     if args.json {
-        print(result_files::result_json(solution)?.trim_end())?;
+        print(result_files::result_json(solution, Some(input))?.trim_end())?;
     } else if !args.quiet {
-        print(&summary::text(solution))?;
-        print(&format!("  files        {}", args.out.display()))?;
+        print(&summary::text(solution, Some(input)))?;
+        print(&format!("  files        {}", result_files::said(&args.out, solution)))?;
     }
     Ok(Exit::of(solution))
 }

@@ -63,10 +63,10 @@ pub fn svg(part: &Part) -> String {
     let mut svg = format!(
         "<svg class=\"plan\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"part {} from above: {} cameras, {} points\">\
          <text class=\"title\" x=\"8\" y=\"18\">Part {} from above: {} views, {} points</text>",
-        part.part + 1,
+        part.part,
         part.cameras.len(),
         part.all_points,
-        part.part + 1,
+        part.part,
         part.cameras.len(),
         part.all_points
     );
@@ -138,7 +138,7 @@ mod tests {
         let cameras = vec![camera(0.0, 0.0), camera(1.0, 0.0), camera(1.0, 2.0)];
         let points = vec![Point { at: Vector3::new(0.0, 0.0, 4.0), weight: 1.0 }];
         let svg = svg(&Part { part: 7, cameras, points, all_points: 9 });
-        assert!(svg.contains("Part 8 from above: 3 views, 9 points") && svg.contains("class=\"path p1\""), "{svg}");
+        assert!(svg.contains("Part 7 from above: 3 views, 9 points") && svg.contains("class=\"path p1\""), "{svg}");
         let path = svg.split("points=\"").nth(1).and_then(|rest| rest.split('"').next()).expect("a path");
         let at: Vec<Vec<f64>> =
             path.split(' ').map(|pair| pair.split(',').filter_map(|number| number.parse().ok()).collect()).collect();

@@ -161,6 +161,7 @@ fn judge_under(input: &Input, ranges: &[usize], geometry: &Geometry, noise: &Noi
             inlier: vec![false; count],
             network_weight: Vec::new(),
             point: vec![None; count],
+            part: Vec::new(),
         },
         observations: ObservationResults {
             inlier: vec![false; observation_count],
