@@ -18,6 +18,7 @@ pub mod result_json;
 pub mod source;
 mod text;
 pub mod warnings;
+pub mod windows;
 
 #[cfg(test)]
 pub(crate) mod fixture;

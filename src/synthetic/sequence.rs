@@ -49,7 +49,7 @@ impl Default for SequenceOptions {
         Self {
             views: 20,
             tracks: 1_000,
-            lifetime: (3, 10),
+            lifetime: Self::lifetime_within(20),
             noise: 0.0005,
             outliers: 0.3,
             wrong_observations: 0.05,
@@ -60,6 +60,12 @@ impl Default for SequenceOptions {
 }
 
 impl SequenceOptions {
+    /// Views that a track lives where nothing else is asked for: as feature matching gives them, and never more than there
+    /// are views.
+    pub fn lifetime_within(views: usize) -> (usize, usize) {
+        (3.min(views), 10.min(views))
+    }
+
     /// Tracks that one sequence may have: some 10^7 observations.
     pub const MAX_TRACKS: usize = 2_000_000;
 
@@ -278,5 +284,9 @@ mod tests {
             assert_eq!(error.violations()[0].field, name, "{error}");
         }
         assert_eq!(default().validate(), Ok(()));
+        for views in 2..20 {
+            let options = SequenceOptions { views, lifetime: SequenceOptions::lifetime_within(views), ..default() };
+            assert_eq!(options.validate(), Ok(()), "{views} views");
+        }
     }
 }
