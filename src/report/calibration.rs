@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 
+use super::chart::{WIDTH, anchor};
 use super::html::{escape, short};
 use super::words;
 use crate::domain::Solution;
@@ -68,7 +69,6 @@ fn row(group: &CameraGroupJson) -> String {
 
 /// Focal lengths with whiskers of one standard deviation, one line a group that has one.
 fn bars(groups: &[CameraGroupJson]) -> String {
-    const WIDTH: f64 = 460.0;
     const LINE: f64 = 18.0;
     const LEFT: f64 = 70.0;
     const RIGHT: f64 = 14.0;
@@ -97,14 +97,15 @@ fn bars(groups: &[CameraGroupJson]) -> String {
     if !(low.is_finite() && high.is_finite()) {
         return svg + "</svg>";
     }
-    for (share, anchor) in [(0.0, "middle"), (0.25, "middle"), (0.5, "middle"), (0.75, "middle"), (1.0, "end")] {
+    for share in [0.0, 0.25, 0.5, 0.75, 1.0] {
         let px = low + share * (high - low);
         let at = place(px);
         let _ = write!(
             svg,
             "<line class=\"grid\" x1=\"{at:.1}\" x2=\"{at:.1}\" y1=\"{TOP}\" y2=\"{bottom}\"/>\
-             <text class=\"tick\" x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"{anchor}\">{}</text>",
+             <text class=\"tick\" x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"{}\">{}</text>",
             bottom + 14.0,
+            anchor(at),
             tick(px, high - low)
         );
     }
