@@ -28,8 +28,8 @@ pub struct InputArgs {
     /// The kind is told from the name and the first bytes; --format overrides.
     ///
     /// In the CSV, a line is an observation, in pixels; the centre of the top-left pixel is (0, 0). Ids are any whole
-    /// numbers, other columns are ignored. OpenSfM's coordinates are relative to the image size, which --width and
-    /// --height must give. Of a database, matches are joined into tracks; a match that would put two keypoints of one
+    /// numbers, other columns are ignored. OpenSfM's coordinates are relative to the image size, which is read from
+    /// exif/IMAGE.exif beside the file; --width and --height give that of images without one. Of a database, matches are joined into tracks; a match that would put two keypoints of one
     /// image into one track is cut. A model gives its tracks; its poses, points and calibration are not used.
     #[arg(value_name = "INPUT")]
     pub input: PathBuf,
@@ -73,6 +73,21 @@ pub struct ReadingArgs {
 }
 
 impl ReadingArgs {
+    /// The flags that were given, each with a space before it.
+    pub fn flags(&self) -> String {
+        let mut flags = String::new();
+        if let Some((width, height)) = self.width.zip(self.height) {
+            flags.push_str(&format!(" --width {width} --height {height}"));
+        }
+        if let Some(format) = self.format.and_then(|format| format.to_possible_value()) {
+            flags.push_str(&format!(" --format {}", format.get_name()));
+        }
+        if let Some(matches) = self.matches.and_then(|matches| matches.to_possible_value()) {
+            flags.push_str(&format!(" --matches {}", matches.get_name()));
+        }
+        flags
+    }
+
     /// Reads a file.
     ///
     /// # Errors
@@ -87,6 +102,11 @@ impl ReadingArgs {
     }
 }
 
+/// Threads that solve at a time where nothing is said: one a core.
+pub fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, std::num::NonZeroUsize::get)
+}
+
 /// Tells on stderr what reading changed or left out.
 pub fn tell_notes(input: &LabelledInput) {
     for note in &input.notes {
@@ -98,7 +118,7 @@ pub fn tell_notes(input: &LabelledInput) {
 #[derive(Debug, Clone, Args)]
 pub struct ExportArgs {
     /// Also write a metric result for these programs, below the output directory: colmap/ and colmap-text/ hold a sparse
-    /// model, opensfm/ a reconstruction.json
+    /// model, opensfm/ a reconstruction.json; of several parts, folders 1/ and on hold COLMAP's models of the smaller ones
     #[arg(long, value_name = "KIND", value_enum, value_delimiter = ',')]
     pub export: Vec<ExportArg>,
 }

@@ -17,6 +17,7 @@ use crate::domain::job::JobEvent;
 use crate::domain::{Solution, SolveSettings};
 use crate::formats::LabelledInput;
 use crate::formats::result_files::{self, pretty};
+use crate::formats::result_json::ResultJson;
 use crate::synthetic::Scene;
 use crate::synthetic::metrics::{Agreement, agreement};
 
@@ -137,7 +138,7 @@ impl Comparison {
     fn text(&self, args: &Args, scene: &Scene, solution: &Solution) -> String {
         let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
         let mut lines =
-            vec![summary::text(solution), String::new(), format!("  {:<16}{:>12}{:>12}", "", "found", "true")];
+            vec![summary::text(solution, None), String::new(), format!("  {:<16}{:>12}{:>12}", "", "found", "true")];
         lines.push(format!(
             "  {:<16}{:>12}{right:>12}   F1 {:.3} (precision {:.3}, recall {:.3})",
             "inlier tracks",
@@ -166,7 +167,7 @@ impl Comparison {
             "recall": self.inliers.recall,
             "focal_true_px": self.focal_true_px,
             "focal_error": self.focal_error,
-            "result": result_files::summary(solution),
+            "result": ResultJson::new(solution, None),
         });
         Ok(pretty(&value)?)
     }

@@ -8,6 +8,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
+use super::args::cores;
 use super::evaluate_real::{self, RealArgs};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
@@ -319,10 +320,6 @@ fn table(cells: &[Cell]) -> String {
         ));
     }
     text
-}
-
-fn cores() -> usize {
-    std::thread::available_parallelism().map_or(1, std::num::NonZeroUsize::get)
 }
 
 /// What tells this program from any other that might have written the records: its version and the digest of its file.

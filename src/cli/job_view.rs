@@ -139,8 +139,17 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
             unprinted = print(&event_json(event).to_string());
         }
     };
-    let last = client.watch(name, after, &mut on_event).await?;
+    let mut reached = after;
+    let mut on_numbered = |event: &JobEvent| {
+        reached = event.sequence.unwrap_or(reached);
+        on_event(event);
+    };
+    let watched = client.watch(name, after, &mut on_numbered).await;
     view.finish();
+    let last = watched.map_err(|error| {
+        let server = client.server();
+        lost(error, &Lost { name, server, after: reached, files: " --out DIR" })
+    })?;
     unprinted?;
     if let Some(last) = &last {
         client::ended(last)?;
@@ -157,6 +166,39 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
     Ok(job.summary.map_or(Exit::Done, |summary| Exit::of_status(summary.status)))
 }
 
+/// A job whose server was lost, and what its result is to be read with.
+#[derive(Debug)]
+pub struct Lost<'a> {
+    pub name: &'a JobName,
+    pub server: &'a str,
+    /// The last event that was seen.
+    pub after: u64,
+    /// Flags of `scpsfm result`.
+    pub files: &'a str,
+}
+
+/// The failure of a call; where the server is lost, with the commands that take the job up again.
+pub fn lost(error: client::Error, job: &Lost) -> Failure {
+    if !matches!(error, client::Error::Unavailable(_)) {
+        return error.into();
+    }
+    let Lost { name, server, after, files } = job;
+    let server = quoted(server);
+    let after = if *after > 0 { format!(" --after {after}") } else { String::new() };
+    let mut failure = Failure::from(error);
+    failure.message.push_str(&format!(
+        "\nthe job is {name}; a server that comes back goes on with it:\n  \
+         scpsfm watch {name} --server {server}{after}\n  scpsfm result {name} --server {server}{files}"
+    ));
+    failure
+}
+
+/// A word as a shell reads it whole.
+pub fn quoted(word: &str) -> String {
+    let plain = |c: char| c.is_alphanumeric() || "-_./:@%+=,".contains(c);
+    if !word.is_empty() && word.chars().all(plain) { word.into() } else { format!("'{}'", word.replace('\'', "'\\''")) }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -167,6 +209,21 @@ mod tests {
         assert_eq!(parse_name("a-1"), Ok(full));
         assert!(parse_name("A").is_err());
         assert!(parse_name("jobs/a").is_err());
+    }
+
+    #[test]
+    fn a_lost_server_leaves_the_commands_that_go_on() {
+        let name = parse_name("a-1").expect("a name");
+        let job = Lost { name: &name, server: "http://h:1", after: 7, files: " --out 'a b'" };
+        let words = lost(client::Error::Unavailable("gone".into()), &job).message;
+        assert!(words.starts_with("gone\nthe job is tenants/default/jobs/a-1;"), "{words}");
+        assert!(words.contains("\n  scpsfm watch tenants/default/jobs/a-1 --server http://h:1 --after 7\n"), "{words}");
+        assert!(
+            words.ends_with("\n  scpsfm result tenants/default/jobs/a-1 --server http://h:1 --out 'a b'"),
+            "{words}"
+        );
+        assert_eq!(lost(client::Error::Refused("no".into()), &job).message, "no");
+        assert_eq!((quoted("a/b.csv"), quoted("it's").as_str()), ("a/b.csv".to_owned(), "'it'\\''s'"));
     }
 
     #[test]

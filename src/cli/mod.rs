@@ -23,6 +23,7 @@ pub mod submit;
 pub mod summary;
 pub mod synth;
 pub mod watch;
+pub mod windows;
 
 use std::io::Write;
 use std::process::ExitCode;

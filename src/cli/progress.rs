@@ -71,6 +71,22 @@ impl ProgressView {
         }
     }
 
+    /// Shows one of several pieces of work: a share of the whole that is done now, or one that begins.
+    pub fn part(&mut self, done: Option<f64>, text: &str) {
+        match &self.shown {
+            Shown::Nothing => {}
+            Shown::Bar(bar) => {
+                if let Some(share) = done {
+                    bar.inc((share * BAR_STEPS as f64) as u64);
+                    bar.println(text);
+                } else {
+                    bar.set_message(text.to_owned());
+                }
+            }
+            Shown::Lines { .. } => eprintln!("{text}"),
+        }
+    }
+
     /// Takes the bar away.
     pub fn finish(&mut self) {
         if let Shown::Bar(bar) = &self.shown {

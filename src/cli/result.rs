@@ -65,11 +65,11 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         result_files::write(out, &solution, input.as_ref())?;
     }
     if args.json {
-        print(result_files::result_json(&solution)?.trim_end())?;
+        print(result_files::result_json(&solution, input.as_ref())?.trim_end())?;
     } else {
-        print(&summary::text(&solution))?;
+        print(&summary::text(&solution, input.as_ref()))?;
         if let Some(out) = &args.out {
-            print(&format!("  files        {}", out.display()))?;
+            print(&format!("  files        {}", result_files::said(out, &solution)))?;
         }
     }
     Ok(Exit::of(&solution))

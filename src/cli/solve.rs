@@ -5,7 +5,9 @@ use std::path::PathBuf;
 use super::args::{ExportArgs, InputArgs, ServerArgs, SettingsArgs, tell_notes};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
+use super::job_view::{Lost, quoted};
 use super::progress::ProgressView;
+use super::windows::{self, Show, WindowArgs};
 use super::{client, job_view, print, summary};
 use crate::domain::job::JobEvent;
 use crate::domain::{Limits, Solution, SolveSettings, StopToken};
@@ -19,9 +21,11 @@ Examples:
   scpsfm solve observations.csv --out answer --server http://127.0.0.1:50051
   scpsfm solve database.db --out answer --export colmap,opensfm
   scpsfm solve tracks.csv --width 3072 --height 2048 --out answer
+  scpsfm solve kitti.csv --width 1242 --height 375 --window 11 --out windows   # the paper's KITTI protocol
 
 Files in the output directory: result.json (the summary), tracks.csv, observations.csv (every answer under the ids \
-of the input), cameras.json, points.ply and report.html (open it in a browser).";
+of the input), cameras.json, points.ply (where there are several parts: of the largest; points-part-1.ply and on hold the \
+others) and report.html (open it in a browser).";
 
 /// Solve one input
 ///
@@ -50,6 +54,9 @@ pub struct Args {
     pub quiet: bool,
 
     #[command(flatten)]
+    pub window: WindowArgs,
+
+    #[command(flatten)]
     pub export: ExportArgs,
 
     #[command(flatten)]
@@ -65,9 +72,13 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     }
     // Found out now rather than after the work.
     result_files::create_directory(&args.out)?;
+    if let Some(length) = args.window.window {
+        let show = Show { json: args.json, quiet: args.quiet };
+        return windows::run(&args.window, length, &input, &settings, &args.out, show);
+    }
     let mut progress = ProgressView::new(args.quiet);
     let solution = match &args.server {
-        Some(server) => on_server(server, &input, &settings, &mut progress).await?,
+        Some(server) => on_server(server, &args, &input, &settings, &mut progress).await?,
         None => in_process(&input, &settings, &mut progress)?,
     };
     progress.finish();
@@ -92,20 +103,34 @@ fn in_process(
     })
 }
 
-/// Solves on a server; Ctrl-C cancels the job there.
+/// Solves on a server; Ctrl-C cancels the job there. Where the server is lost, the failure says how to find the job again.
 async fn on_server(
     server: &str,
+    args: &Args,
     input: &LabelledInput,
     settings: &SolveSettings,
     progress: &mut ProgressView,
 ) -> Result<Solution, Failure> {
     let server = ServerArgs { server: server.to_owned() };
     let interrupt = Interrupt::listen()?;
-    let mut on_event = |event: &JobEvent| job_view::show_event(progress, event);
+    let mut seen = None;
+    let mut on_event = |event: &JobEvent| {
+        seen.get_or_insert_with(|| event.name.clone());
+        job_view::show_event(progress, event);
+    };
     let outcome = client::solve(&server, &input.raw, settings, &mut on_event, interrupt.token()).await;
-    outcome.map_err(|error| match error {
-        client::Error::Cancelled if interrupt.token().is_cancelled() => Failure::interrupted(),
-        error => error.at_lines(input),
+    outcome.map_err(|error| match (error, seen) {
+        (client::Error::Cancelled, _) if interrupt.token().is_cancelled() => Failure::interrupted(),
+        (error @ client::Error::Unavailable(_), Some(name)) => {
+            let files = format!(
+                " --out {} --input {}{}",
+                quoted(&args.out.to_string_lossy()),
+                quoted(&args.input.input.to_string_lossy()),
+                args.input.reading.flags()
+            );
+            job_view::lost(error, &Lost { name: &name, server: &server.server, after: 0, files: &files })
+        }
+        (error, _) => error.at_lines(input),
     })
 }
 
@@ -115,10 +140,10 @@ fn deliver(args: &Args, solution: &Solution, input: &LabelledInput) -> Result<Ex
     args.export.write(&args.out, solution, input)?;
     result_files::write(&args.out, solution, Some(input))?;
     if args.json {
-        print(result_files::result_json(solution)?.trim_end())?;
+        print(result_files::result_json(solution, Some(input))?.trim_end())?;
     } else if !args.quiet {
-        print(&summary::text(solution))?;
-        print(&format!("  files        {}", args.out.display()))?;
+        print(&summary::text(solution, Some(input)))?;
+        print(&format!("  files        {}", result_files::said(&args.out, solution)))?;
     }
     Ok(Exit::of(solution))
 }

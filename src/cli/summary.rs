@@ -1,18 +1,30 @@
 //! A result in a few lines for people.
 
 use crate::domain::{Grade, Solution, Status};
+use crate::formats::result_json::{CameraGroupJson, camera_groups};
+use crate::formats::{LabelledInput, warnings};
 
-/// The result in words, one fact a line, without a newline at the end.
-pub fn text(solution: &Solution) -> String {
+/// Cameras told one by one; a photo collection may have one an image, and result.json has them all.
+const MOST_CAMERAS: usize = 20;
+/// Parts whose views are counted one by one.
+const MOST_PARTS: usize = 10;
+
+/// The result in words, one fact a line, without a newline at the end; without the input, warnings number the views.
+pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let mut lines = vec![headline(solution)];
     let mut fact = |name: &str, value: String| lines.push(format!("  {name:<13}{value}"));
-    if let [first, rest @ ..] = solution.calibrations.as_slice() {
-        fact("focal", focal(first.focal_px, first.sigma_log_focal));
-        for camera in rest {
-            fact("", focal(camera.focal_px, camera.sigma_log_focal));
+    match solution.calibrations.as_slice() {
+        [] if solution.is_focal_unobservable() => fact("focal", "unobservable: none is given".into()),
+        [] => {}
+        [only] => fact("focal", focal(only.focal_px, only.sigma_log_focal)),
+        several => {
+            for camera in camera_groups(solution).iter().take(MOST_CAMERAS) {
+                fact(&format!("camera {}", camera.camera_group), self::camera(camera));
+            }
+            if several.len() > MOST_CAMERAS {
+                fact("", format!("and {} more cameras: see result.json", several.len() - MOST_CAMERAS));
+            }
         }
-    } else if solution.is_focal_unobservable() {
-        fact("focal", "unobservable: none is given".into());
     }
     let tracks = solution.tracks.inlier.len();
     let observations = solution.observations.inlier.len();
@@ -25,6 +37,9 @@ pub fn text(solution: &Solution) -> String {
         ),
     );
     fact("views", format!("{} of {} registered", solution.registered_views().len(), solution.views.len()));
+    if let Some(parts) = parts(solution) {
+        fact("parts", parts);
+    }
     if let Some(rms_px) = solution.reprojection_rms_px {
         fact("reprojection", format!("{rms_px:.2} px RMS over the inliers"));
     }
@@ -39,7 +54,7 @@ pub fn text(solution: &Solution) -> String {
         spent.push_str(&format!(", found by the prior `{}`", prior.name()));
     }
     fact("solve", spent);
-    for warning in &solution.warnings {
+    for warning in warnings::named(solution, input) {
         lines.push(format!("  warning: {}: {}", warning.code.name(), warning.detail));
     }
     lines.join("\n")
@@ -60,6 +75,30 @@ fn headline(solution: &Solution) -> String {
     }
 }
 
+/// Where there are several reconstructions: how many, and their views.
+fn parts(solution: &Solution) -> Option<String> {
+    let count = solution.part_count() as usize;
+    if count < 2 {
+        return None;
+    }
+    let mut views = vec![0usize; count];
+    solution.registered_views().into_iter().for_each(|view| views[solution.views[view].part as usize] += 1);
+    let mut each: Vec<String> = views.iter().take(MOST_PARTS).map(usize::to_string).collect();
+    each.extend((count > MOST_PARTS).then(|| "...".to_owned()));
+    Some(format!("{count}, of {} views, each with a frame and a scale of its own", each.join(", ")))
+}
+
+/// What is known of one camera of several.
+fn camera(camera: &CameraGroupJson) -> String {
+    let views = format!("{} of {} views", camera.registered_views, camera.views);
+    let Some(focal_px) = camera.focal_px else { return format!("no calibration, {views}") };
+    let mut text = format!("{}, {views}", focal(focal_px, camera.sigma_log_focal));
+    if let Some(grade) = camera.grade {
+        text.push_str(&format!(", {}", grade.name()));
+    }
+    text
+}
+
 /// `1204.3 px +- 0.40 % (one sigma)`, or that nothing holds it.
 fn focal(focal_px: f64, sigma_log: Option<f64>) -> String {
     match sigma_log {
@@ -71,24 +110,39 @@ fn focal(focal_px: f64, sigma_log: Option<f64>) -> String {
 #[cfg(test)]
 mod tests {
     use super::text;
+    use crate::domain::{Calibration, Grade};
     use crate::formats::fixture;
 
     #[test]
     fn says_what_was_found_and_every_warning() {
         let (_, mut solution) = fixture::solved();
-        let lines = text(&solution);
+        let lines = text(&solution, None);
         assert!(lines.starts_with("SOLVED, METRIC\n"), "{lines}");
         assert!(lines.contains("+- 0.40 % (one sigma)"), "{lines}");
         assert!(lines.contains("20 of 40 tracks, 100 of 200 observations"), "{lines}");
         assert!(lines.contains("5 of 5 registered"), "{lines}");
         assert!(lines.contains("warning: FEW_INLIERS: "), "{lines}");
         solution.calibrations[0].sigma_log_focal = None;
-        assert!(text(&solution).contains("unobservable"));
+        assert!(text(&solution, None).contains("unobservable"));
+    }
+
+    #[test]
+    fn tells_every_camera_and_every_part() {
+        let (_, mut solution) = fixture::solved_in_two_parts();
+        assert!(text(&solution, None).contains("parts        2, of 3, 2 views, each with a frame"));
+        let second = Calibration { focal_px: 77.0, grade: Some(Grade::Weak), ..solution.calibrations[0] };
+        solution.calibrations.push(second);
+        solution.views[4].camera_group = 9;
+        let lines = text(&solution, None);
+        assert!(lines.contains("  camera 0     ") && lines.contains("4 of 4 views, METRIC"), "{lines}");
+        assert!(lines.contains("  camera 9     77.0 px +- 0.40 % (one sigma), 1 of 1 views, WEAK"), "{lines}");
+        solution.views[4].projection = None;
+        assert!(text(&solution, None).contains("camera 9     no calibration, 0 of 1 views"));
     }
 
     #[test]
     fn a_projective_result_names_no_focal_length() {
-        let lines = text(&fixture::projective_only().1);
+        let lines = text(&fixture::projective_only().1, None);
         assert!(lines.starts_with("SOLVED, PROJECTIVE_ONLY: "), "{lines}");
         let focal =
             lines.lines().find(|line| line.trim_start().starts_with("focal")).expect("a line on the focal length");

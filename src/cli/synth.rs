@@ -66,9 +66,9 @@ pub struct SequenceArgs {
         "noise_kind", "principal_point", "zoom", "rotation"])]
     pub sequence: bool,
 
-    /// Views that a track lives, at least and at most
-    #[arg(long, value_name = "LEAST,MOST", default_value = "3,10", value_parser = lifetime, requires = "sequence")]
-    pub lifetime: (usize, usize),
+    /// Views that a track lives, at least and at most [default: 3,10; of fewer than 10 views all: 3,VIEWS]
+    #[arg(long, value_name = "LEAST,MOST", value_parser = lifetime, requires = "sequence")]
+    pub lifetime: Option<(usize, usize)>,
 
     /// Share of the observations of right tracks that are wrong
     #[arg(long, value_name = "SHARE", default_value_t = 0.05, requires = "sequence")]
@@ -96,7 +96,7 @@ impl Args {
         let options = SequenceOptions {
             views: self.scene.views,
             tracks: self.scene.tracks,
-            lifetime: self.sequence.lifetime,
+            lifetime: self.sequence.lifetime.unwrap_or_else(|| SequenceOptions::lifetime_within(self.scene.views)),
             noise: self.scene.noise,
             outliers: self.scene.outliers,
             wrong_observations: self.sequence.wrong_observations,
@@ -125,10 +125,12 @@ pub fn run(args: Args) -> Result<Exit, Failure> {
         write(&args.out, &sequence.input, &sequence.options, &sequence.truth)?;
         let right = sequence.truth.inlier.iter().filter(|&&inlier| inlier).count();
         eprintln!(
-            "{} views, {} observations, {} tracks of which {right} are right, focal {:.1} px: {}",
+            "{} views, {} observations, {} tracks of {} to {} views of which {right} are right, focal {:.1} px: {}",
             args.scene.views,
             sequence.input.x.len(),
             args.scene.tracks,
+            sequence.options.lifetime.0,
+            sequence.options.lifetime.1,
             sequence.truth.focal_px,
             args.out.display()
         );

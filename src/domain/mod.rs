@@ -6,6 +6,7 @@
 pub mod error;
 pub mod input;
 pub mod job;
+pub mod left_out;
 pub mod limits;
 pub mod progress;
 pub mod result;
@@ -14,6 +15,7 @@ pub mod stop;
 
 pub use error::{InvalidInput, Violation};
 pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
+pub use left_out::LeftOut;
 pub use limits::Limits;
 pub use progress::{Losses, Observer, Progress, Silent, Stage};
 pub use result::{Calibration, Grade, Prior, Solution, Status, Warning, WarningCode};

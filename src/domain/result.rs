@@ -1,7 +1,10 @@
 //! What a solve returns. An unsolvable scene is a result with its reason, not an error.
 
+use std::collections::BTreeSet;
+
 use serde::{Deserialize, Serialize};
 
+use super::left_out::LeftOut;
 use super::progress::{Progress, Stage};
 use super::settings::Method;
 
@@ -145,11 +148,19 @@ impl WarningCode {
 pub struct Warning {
     pub code: WarningCode,
     pub detail: String,
+    /// The camera group that it is of, by the input's number; `None`: the result as a whole.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub camera_group: Option<u32>,
 }
 
 impl Warning {
     pub fn new(code: WarningCode, detail: impl Into<String>) -> Self {
-        Self { code, detail: detail.into() }
+        Self { code, detail: detail.into(), camera_group: None }
+    }
+
+    /// The same of one camera group.
+    pub fn of_group(self, camera_group: u32) -> Self {
+        Self { camera_group: Some(camera_group), ..self }
     }
 }
 
@@ -173,6 +184,10 @@ pub struct Calibration {
     /// The second coefficient, `k2`.
     #[serde(default)]
     pub radial_k2: f64,
+    /// How far the group's own calibration can be relied on; that of the result is the worst of its groups. `None`: an
+    /// older server did not say.
+    #[serde(default)]
+    pub grade: Option<Grade>,
 }
 
 impl Calibration {
@@ -203,6 +218,12 @@ pub struct ViewResult {
     /// their own. 0 where there is one, and for views that are not registered.
     #[serde(default)]
     pub part: u32,
+    /// The view's camera group, by the input's number.
+    #[serde(default)]
+    pub camera_group: u32,
+    /// Why the view is not registered; `None` where it is, and where nothing was reconstructed.
+    #[serde(default)]
+    pub left_out: Option<LeftOut>,
 }
 
 /// What the geometry says of every track of the input (parallel arrays, one entry a track).
@@ -217,6 +238,17 @@ pub struct TrackResults {
     /// Point of each track: metric where the result is metric, else in the projective frame (dehomogenised).
     /// `None` for tracks that are not inliers.
     pub point: Vec<Option<[f64; 3]>>,
+    /// Reconstruction in whose frame each track's point is, see [`ViewResult::part`]; empty: all are in that of part 0.
+    #[serde(default)]
+    pub part: Vec<u32>,
+}
+
+impl TrackResults {
+    /// The reconstruction that a track has a point in; `None` where it has none.
+    pub fn part_of(&self, track: usize) -> Option<u32> {
+        self.point.get(track)?.as_ref()?;
+        Some(self.part.get(track).copied().unwrap_or(0))
+    }
 }
 
 /// What the geometry says of every observation (parallel arrays in the caller's order).
@@ -332,6 +364,22 @@ impl Solution {
 
     /// Points of the curves in a report; more than a plot has pixels for is waste.
     pub const MAX_HISTORY: usize = 500;
+
+    /// The camera groups of the views, ascending, and the calibration of each. A single calibration is every group's;
+    /// none: there is no metric reconstruction.
+    pub fn cameras(&self) -> Vec<(u32, Option<&Calibration>)> {
+        let groups: BTreeSet<u32> = self.views.iter().map(|view| view.camera_group).collect();
+        let of = |place: usize| match self.calibrations.as_slice() {
+            [only] => Some(only),
+            several => several.get(place),
+        };
+        groups.into_iter().enumerate().map(|(place, group)| (group, of(place))).collect()
+    }
+
+    /// How many reconstructions there are, each with a frame of its own.
+    pub fn part_count(&self) -> u32 {
+        self.registered_views().into_iter().map(|view| self.views[view].part + 1).max().unwrap_or(0)
+    }
 
     /// Indices of the registered views.
     pub fn registered_views(&self) -> Vec<usize> {

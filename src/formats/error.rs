@@ -40,6 +40,21 @@ impl Problem {
         Self { place: Place::Byte(offset), column: record.into(), description: description.into() }
     }
 
+    /// A line that is not text.
+    pub fn not_text(line: u64) -> Self {
+        Self::at_line(line, "", "is not text; the file may be damaged")
+    }
+
+    /// A file that cannot be opened or read, for this reason.
+    pub fn unreadable(reason: impl fmt::Display) -> Self {
+        Self::of_file(format!("cannot be read: {reason}"))
+    }
+
+    /// The line from which a file is above the limit of observations.
+    pub fn too_many_observations(line: u64, most: usize) -> Self {
+        Self::at_line(line, "", format!("more observations than the limit of {most}"))
+    }
+
     /// A problem of a record that has no line, such as a row of a database.
     pub fn of_record(record: impl Into<String>, description: impl Into<String>) -> Self {
         Self { place: Place::File, column: record.into(), description: description.into() }
@@ -58,6 +73,11 @@ impl Error {
     /// An error with one problem.
     pub fn one(file: &str, problem: Problem) -> Self {
         Self { file: file.into(), problems: vec![problem], unlisted: 0 }
+    }
+
+    /// An error of the file as a whole.
+    pub fn whole(file: &str, description: impl Into<String>) -> Self {
+        Self::one(file, Problem::of_file(description))
     }
 
     /// The problems, in the order in which they were found, at most [`InvalidInput::MAX_LISTED`].

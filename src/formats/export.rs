@@ -1,7 +1,7 @@
 //! A metric result for other programs, in directories of their own below that of the result files.
 
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::metric::{self, Model};
 use super::result_files::{create_directory, pretty, write_atomically};
@@ -11,11 +11,12 @@ use crate::domain::Solution;
 /// What another program reads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Export {
-    /// A COLMAP sparse model, binary: `colmap/{cameras,images,points3D}.bin`.
+    /// A COLMAP sparse model, binary: `colmap/{cameras,images,points3D}.bin`. Of several parts this is the largest, and
+    /// the others are below it in folders of their numbers: `colmap/1/` and on.
     Colmap,
     /// The same as text: `colmap-text/{cameras,images,points3D}.txt`.
     ColmapText,
-    /// `opensfm/reconstruction.json`.
+    /// `opensfm/reconstruction.json`, a list with one reconstruction a part.
     OpenSfm,
 }
 
@@ -39,14 +40,23 @@ impl Export {
         }
     }
 
-    /// The files' contents, in their order.
-    fn contents(self, model: &Model) -> io::Result<Vec<Vec<u8>>> {
+    /// What is to be written: folder below that of [`Export::files`], and the files' contents in their order.
+    fn contents(self, models: &[Model]) -> io::Result<Vec<(PathBuf, Vec<Vec<u8>>)>> {
+        let each =
+            |write: fn(&Model) -> Vec<Vec<u8>>| models.iter().map(move |model| (folder(model.part), write(model)));
         Ok(match self {
-            Export::Colmap => colmap::write::binary(model).into(),
-            Export::ColmapText => colmap::write::text(model).map(String::into_bytes).into(),
-            Export::OpenSfm => vec![pretty(&opensfm::reconstruction::json(model))?.into_bytes()],
+            Export::Colmap => each(|model| colmap::write::binary(model).into()).collect(),
+            Export::ColmapText => each(|model| colmap::write::text(model).map(String::into_bytes).into()).collect(),
+            Export::OpenSfm => {
+                vec![(PathBuf::new(), vec![pretty(&opensfm::reconstruction::json(models))?.into_bytes()])]
+            }
         })
     }
+}
+
+/// Folder of a part's model below that of the largest.
+fn folder(part: u32) -> PathBuf {
+    if part == 0 { PathBuf::new() } else { PathBuf::from(part.to_string()) }
 }
 
 /// Writes what is asked for below `directory`. Files of a former result are removed where there is nothing to replace
@@ -55,21 +65,50 @@ impl Export {
 /// # Errors
 /// The result is not metric, or the first file that cannot be written, named.
 pub fn write(directory: &Path, exports: &[Export], solution: &Solution, input: &LabelledInput) -> Result<(), Error> {
-    let model = Model::new(solution, input);
+    let models = Model::of_parts(solution, input);
     for export in exports {
         let (name, files) = export.files();
         let directory = directory.join(name);
-        match &model {
-            Ok(model) => {
-                create_directory(&directory)?;
-                for (file, bytes) in files.iter().zip(export.contents(model)?) {
-                    write_atomically(&directory, file, &bytes)?;
-                }
+        let contents = match &models {
+            Ok(models) => export.contents(models)?,
+            Err(_) => Vec::new(),
+        };
+        for (folder, contents) in &contents {
+            let directory = directory.join(folder);
+            create_directory(&directory)?;
+            for (file, bytes) in files.iter().zip(contents) {
+                write_atomically(&directory, file, bytes)?;
             }
-            Err(_) => files.iter().try_for_each(|file| remove(&directory.join(file)))?,
+        }
+        let written = |folder: &Path| contents.iter().any(|(of, _)| of == folder);
+        for folder in former(&directory)?.into_iter().filter(|folder| !written(folder)) {
+            let directory = directory.join(&folder);
+            files.iter().try_for_each(|file| remove(&directory.join(file)))?;
+            if folder != Path::new("") {
+                // What is not empty holds files that are not ours.
+                let _ = std::fs::remove_dir(&directory);
+            }
         }
     }
-    model.map(|_| ()).map_err(Error::NotMetric)
+    models.map(|_| ()).map_err(Error::NotMetric)
+}
+
+/// Folders that a former result may have left: that of the largest part, and numbered ones.
+fn former(directory: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut folders = vec![PathBuf::new()];
+    let entries = match std::fs::read_dir(directory) {
+        Ok(entries) => entries,
+        Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+            return Ok(folders);
+        }
+        Err(error) => return Err(error),
+    };
+    for entry in entries {
+        let name = entry?.file_name();
+        let part = name.to_str().and_then(|name| name.parse().ok()).filter(|&part| part > 0);
+        folders.extend(part.map(folder).filter(|folder| folder.as_os_str() == name));
+    }
+    Ok(folders)
 }
 
 fn remove(file: &Path) -> io::Result<()> {

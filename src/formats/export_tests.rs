@@ -7,6 +7,11 @@ use super::*;
 use crate::domain::{Calibration, ImageSize};
 use crate::formats::{Label, fixture};
 
+/// The model of a result in one part.
+fn model_of(solution: &Solution, input: &LabelledInput) -> Model {
+    Model::of_parts(solution, input).expect("metric").remove(0)
+}
+
 const ALL: [Export; 3] = [Export::Colmap, Export::ColmapText, Export::OpenSfm];
 
 #[test]
@@ -84,7 +89,15 @@ fn scene_of(calibration: Calibration, size: ImageSize) -> (LabelledInput, Soluti
 }
 
 fn lens(aspect: f64, [radial_k1, radial_k2]: [f64; 2], principal_point_px: [f64; 2]) -> Calibration {
-    Calibration { focal_px: 900.0, sigma_log_focal: Some(0.01), principal_point_px, aspect, radial_k1, radial_k2 }
+    Calibration {
+        focal_px: 900.0,
+        sigma_log_focal: Some(0.01),
+        principal_point_px,
+        aspect,
+        radial_k1,
+        radial_k2,
+        grade: None,
+    }
 }
 
 #[test]
@@ -97,13 +110,13 @@ fn opensfm_sees_the_points_where_they_were_observed() {
         (lens(1.1, [-0.05, 0.01], [440.0, 610.0]), "brown"),
     ] {
         let (input, solution) = scene_of(calibration, size);
-        let json = opensfm::reconstruction::json(&Model::new(&solution, &input).expect("metric"));
+        let json = opensfm::reconstruction::json(&[model_of(&solution, &input)]);
         let cameras = json[0]["cameras"].as_object().expect("cameras");
         let kinds: Vec<&Value> = cameras.values().map(|camera| &camera["projection_type"]).collect();
         assert_eq!(kinds, [kind]);
         assert_eq!(json[0]["points"].as_object().expect("points").len(), solution.inlier_track_count());
         let error_px = |point: &metric::Point| point.error_px;
-        let model = Model::new(&solution, &input).expect("metric");
+        let model = model_of(&solution, &input);
         assert!(model.points.iter().map(error_px).fold(0.0, f64::max) < 1e-6);
         let worst = worst_of_opensfm(&json, &input, &solution);
         assert!(worst < 1e-6, "{worst} px off under {calibration:?}");
@@ -121,7 +134,7 @@ fn colmap_gets_the_simplest_camera_that_says_the_same_half_a_pixel_on() {
         (lens(1.25, [0.5, 0.25], [449.5, 599.5]), "1 OPENCV 900 1200 900 1125 450 600 0.5 0.25 0 0"),
     ] {
         let (input, solution) = scene_of(calibration, size);
-        let [cameras, ..] = colmap::write::text(&Model::new(&solution, &input).expect("metric"));
+        let [cameras, ..] = colmap::write::text(&model_of(&solution, &input));
         assert_eq!(cameras.lines().nth(1), Some(line));
         assert_eq!(cameras.lines().count(), 2);
     }
@@ -131,7 +144,7 @@ fn colmap_gets_the_simplest_camera_that_says_the_same_half_a_pixel_on() {
 fn cameras_are_apart_where_sizes_groups_or_focal_lengths_are() {
     let (mut input, mut solution) = fixture::solved();
     let ids = |input: &LabelledInput, solution: &Solution| {
-        let model = Model::new(solution, input).expect("metric");
+        let model = model_of(solution, input);
         model.images.iter().map(|image| model.cameras[image.camera].id).collect::<Vec<u32>>()
     };
     assert_eq!(ids(&input, &solution), [1, 1, 1, 1, 1]);
@@ -153,7 +166,7 @@ fn views_without_a_pose_and_points_that_one_image_sees_are_left_out() {
     let track = solution.tracks.inlier.iter().position(|&inlier| inlier).expect("an inlier");
     let of_track: Vec<usize> = (0..input.raw.x.len()).filter(|&k| input.raw.track[k] as usize == track).collect();
     of_track[..4].iter().for_each(|&k| solution.observations.inlier[k] = false);
-    let model = Model::new(&solution, &input).expect("metric");
+    let model = model_of(&solution, &input);
     assert_eq!((model.images.len(), model.points.len()), (4, solution.inlier_track_count() - 1));
     for (position, point) in model.points.iter().enumerate() {
         assert_eq!(point.seen.len(), 4);
@@ -163,9 +176,54 @@ fn views_without_a_pose_and_points_that_one_image_sees_are_left_out() {
     }
     assert_eq!(model.points[0].id, model.points[0].label.number().expect("a number"));
     input.track_labels.iter_mut().for_each(|label| *label = Label::Name(format!("t{label}").into()));
-    let named = Model::new(&solution, &input).expect("metric");
+    let named = model_of(&solution, &input);
     let ids: Vec<u64> = named.points.iter().map(|point| point.id).collect();
     assert_eq!(ids, (1..=ids.len() as u64).collect::<Vec<_>>());
     solution.views.iter_mut().for_each(|view| *view = Default::default());
-    assert_eq!(Model::new(&solution, &input).expect_err("no poses"), metric::Error::NoPose);
+    assert_eq!(Model::of_parts(&solution, &input).expect_err("no poses"), metric::Error::NoPose);
+}
+
+#[test]
+fn every_part_is_exported_in_a_frame_of_its_own() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let directory = directory.path();
+    let (input, solution) = fixture::solved_in_two_parts();
+    write(directory, &ALL, &solution, &input).expect("written");
+    let images = |file: &str| {
+        let text = fs::read_to_string(directory.join("colmap-text").join(file)).expect("a file");
+        let poses = text.lines().filter(|line| !line.starts_with('#')).step_by(2);
+        poses.map(|line| line.rsplit(' ').next().expect("a name").to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(images("images.txt"), ["3", "13", "23"]);
+    assert_eq!(images("1/images.txt"), ["33", "43"]);
+    let points = |file: &str| {
+        let text = fs::read_to_string(directory.join("colmap-text").join(file)).expect("a file");
+        text.lines().filter(|line| !line.starts_with('#')).count()
+    };
+    let inliers = solution.inlier_track_count();
+    assert_eq!(points("points3D.txt") + points("1/points3D.txt"), inliers);
+    assert_eq!(points("1/points3D.txt"), inliers / 2);
+    assert!(directory.join("colmap/1/points3D.bin").is_file() && !directory.join("colmap/2").exists());
+
+    let text = fs::read_to_string(directory.join("opensfm/reconstruction.json")).expect("a file");
+    let list: Value = serde_json::from_str(&text).expect("JSON");
+    let shots = |part: usize| list[part]["shots"].as_object().expect("shots").keys().cloned().collect::<Vec<_>>();
+    assert_eq!(list.as_array().map(Vec::len), Some(2));
+    assert_eq!(shots(1), ["33", "43"]);
+    assert_eq!(shots(0).len(), 3);
+}
+
+#[test]
+fn parts_of_a_former_result_are_taken_away() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let directory = directory.path();
+    let (input, solution) = fixture::solved_in_two_parts();
+    write(directory, &ALL, &solution, &input).expect("written");
+    let mine = directory.join("colmap-text/1/mine.txt");
+    fs::write(&mine, "x").expect("written");
+    let (input, solution) = fixture::solved();
+    write(directory, &ALL, &solution, &input).expect("written");
+    assert!(!directory.join("colmap/1").exists());
+    assert!(mine.exists() && !directory.join("colmap-text/1/cameras.txt").exists());
+    assert!(directory.join("colmap/cameras.bin").is_file());
 }

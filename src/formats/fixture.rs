@@ -6,7 +6,7 @@ use std::path::Path;
 use super::{Label, LabelledInput};
 use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, ViewResult};
 use crate::domain::{
-    Calibration, Grade, Losses, Method, Prior, Progress, Solution, Stage, Status, Warning, WarningCode,
+    Calibration, Grade, LeftOut, Losses, Method, Prior, Progress, Solution, Stage, Status, Warning, WarningCode,
 };
 use crate::synthetic::{Scene, SceneOptions, Sequence, SequenceOptions};
 
@@ -23,6 +23,30 @@ pub(crate) fn solved_with(options: &SceneOptions) -> (LabelledInput, Solution) {
     input.track_labels = (0..input.raw.track_count as u64).map(|track| Label::Number(2 * track + 100)).collect();
     let solution = solution(&scene);
     (input, solution)
+}
+
+/// The solved scene with its last two views and some of its tracks in a part of their own: of the inlier tracks every
+/// other one is seen by the first three views only, the rest by the last two.
+pub(crate) fn solved_in_two_parts() -> (LabelledInput, Solution) {
+    let (input, mut solution) = solved();
+    solution.views.iter_mut().skip(3).for_each(|view| view.part = 1);
+    let inliers: Vec<usize> =
+        (0..solution.tracks.inlier.len()).filter(|&track| solution.tracks.inlier[track]).collect();
+    solution.tracks.part = vec![0; solution.tracks.inlier.len()];
+    inliers.iter().skip(1).step_by(2).for_each(|&track| solution.tracks.part[track] = 1);
+    for k in 0..input.raw.x.len() {
+        let part = solution.tracks.part[input.raw.track[k] as usize];
+        if solution.views[input.raw.view[k] as usize].part != part {
+            solution.observations.inlier[k] = false;
+            solution.observations.residual_px[k] = None;
+        }
+    }
+    (input, solution)
+}
+
+/// A view that is not registered, for this reason.
+pub(crate) fn left_out(reason: LeftOut) -> ViewResult {
+    ViewResult { left_out: Some(reason), ..ViewResult::default() }
 }
 
 /// The truth of a synthetic sequence as the solver answers it; of the fixture of a scene what is no sequence's.
@@ -62,6 +86,7 @@ pub(crate) fn solved_sequence(options: &SequenceOptions) -> (LabelledInput, Solu
             inlier: truth.inlier.clone(),
             network_weight: Vec::new(),
             point: truth.inlier.iter().zip(&truth.points).map(|(&yes, &point)| yes.then_some(point)).collect(),
+            part: Vec::new(),
         },
         observations: ObservationResults {
             inlier: truth.observation_right.clone(),
@@ -137,6 +162,7 @@ fn solution(scene: &Scene) -> Solution {
             aspect: 1.0,
             radial_k1: -0.02,
             radial_k2: 0.0,
+            grade: Some(Grade::Metric),
         }],
         plane_at_infinity: Some([1e-4, -2e-5, 0.03]),
         views: cameras
@@ -146,8 +172,7 @@ fn solution(scene: &Scene) -> Solution {
                 projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| camera[(row, column)]))),
                 rotation: Some(truth.rotations[view]),
                 translation: Some(truth.translations[view]),
-                focal_px: None,
-                part: 0,
+                ..ViewResult::default()
             })
             .collect(),
         tracks: TrackResults {
@@ -155,6 +180,7 @@ fn solution(scene: &Scene) -> Solution {
             inlier: inlier.clone(),
             network_weight: weight(0.8, 0.2),
             point: inlier.iter().zip(&truth.points).map(|(&yes, &point)| yes.then_some(point)).collect(),
+            part: Vec::new(),
         },
         observations: ObservationResults {
             inlier: (0..count).map(inlier_of).collect(),

@@ -63,7 +63,7 @@ impl LabelledInput {
         problems.add_unlisted(unlisted);
         match problems.into_result(&self.file_name()) {
             Err(error) => error,
-            Ok(()) => Error::one(&self.file_name(), Problem::of_file("was refused without a reason")),
+            Ok(()) => Error::whole(&self.file_name(), "was refused without a reason"),
         }
     }
 

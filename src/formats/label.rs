@@ -18,6 +18,9 @@ impl Label {
     /// Longest name in bytes. Paths have at most 4,096 on the usual systems.
     pub const MAX_NAME_BYTES: usize = 4096;
 
+    /// Longest name that a page or a sentence shows, in characters: a page shows a name several times.
+    pub const LONGEST_SHOWN: usize = 48;
+
     /// A name, as of an image.
     ///
     /// # Errors
@@ -51,6 +54,14 @@ impl Label {
             Label::Number(number) => Some(*number),
             Label::Name(_) => None,
         }
+    }
+
+    /// The label as a page or a sentence shows it: whole, or where it is long its end, where the names of one folder
+    /// differ.
+    pub fn shown(&self) -> String {
+        let name = self.to_string();
+        let excess = name.chars().count().saturating_sub(Self::LONGEST_SHOWN);
+        if excess == 0 { name } else { format!("\u{2026}{}", name.chars().skip(excess + 1).collect::<String>()) }
     }
 
     /// The label as a field of a CSV: quoted where a comma or a quote would break the line (RFC 4180).
@@ -101,6 +112,15 @@ mod tests {
         }
         assert!(Label::parse("").is_err() && Label::name("a\nb").is_err());
         assert!(Label::name(&"x".repeat(Label::MAX_NAME_BYTES + 1)).is_err());
+    }
+
+    #[test]
+    fn long_names_lose_their_beginning() {
+        assert_eq!(Label::Number(7).shown(), "7");
+        let long = format!("{}/IMG_1.jpg", "\u{e9}".repeat(200));
+        let shown = Label::Name(long.into()).shown();
+        assert_eq!(shown.chars().count(), Label::LONGEST_SHOWN);
+        assert!(shown.starts_with("\u{2026}\u{e9}") && shown.ends_with("\u{e9}/IMG_1.jpg"), "{shown}");
     }
 
     #[test]

@@ -5,9 +5,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use super::LabelledInput;
+use super::cameras_json::groups_of_views;
 use super::label::Label;
 use super::ply::colour;
-use super::result_json::{camera_groups, view_label};
+use super::result_json::view_label;
 use crate::domain::result::ViewResult;
 use crate::domain::{Calibration, ImageSize, Solution};
 
@@ -22,9 +23,11 @@ pub enum Error {
     NoPose,
 }
 
-/// Cameras, images and points, in the pixels and the metric frame of the result.
+/// Cameras, images and points of one part, in the pixels and the metric frame of that part.
 #[derive(Debug)]
 pub struct Model {
+    /// See [`ViewResult::part`].
+    pub part: u32,
     pub cameras: Vec<Camera>,
     pub images: Vec<Image>,
     pub points: Vec<Point>,
@@ -73,22 +76,29 @@ pub struct Point {
 }
 
 impl Model {
-    /// The model of a metric result.
+    /// The models of a metric result, one a part, the largest first.
     ///
     /// # Errors
     /// The result is not metric, or has no poses.
-    pub fn new(solution: &Solution, input: &LabelledInput) -> Result<Self, Error> {
+    pub fn of_parts(solution: &Solution, input: &LabelledInput) -> Result<Vec<Self>, Error> {
         if !solution.is_metric() {
             return Err(Error::NotMetric);
         }
-        let (cameras, mut images, image_of_view) = images(solution, input);
+        let models: Vec<Self> =
+            (0..solution.part_count()).filter_map(|part| Self::new(solution, input, part)).collect();
+        if models.is_empty() { Err(Error::NoPose) } else { Ok(models) }
+    }
+
+    /// The model of a part of a metric result; `None` where no view of it has a pose.
+    fn new(solution: &Solution, input: &LabelledInput, part: u32) -> Option<Self> {
+        let (cameras, mut images, image_of_view) = images(solution, input, part);
         if images.is_empty() {
-            return Err(Error::NoPose);
+            return None;
         }
         let points = points(solution, input, &image_of_view, &mut images);
-        let mut model = Self { cameras, images, points };
+        let mut model = Self { part, cameras, images, points };
         model.measure();
-        Ok(model)
+        Some(model)
     }
 
     /// Gives every point its error under these cameras. The residuals of the result are those of the projective
@@ -121,17 +131,15 @@ impl Image {
 type CameraKey = (usize, u32, ImageKey, Option<usize>);
 type ImageKey = Option<(u32, u32)>;
 
-/// Cameras, images without keypoints, and the image of each view.
-fn images(solution: &Solution, input: &LabelledInput) -> (Vec<Camera>, Vec<Image>, Vec<Option<usize>>) {
-    let groups = camera_groups(solution, Some(input));
+/// Cameras and images without keypoints of a part, and the image of each view.
+fn images(solution: &Solution, input: &LabelledInput, part: u32) -> (Vec<Camera>, Vec<Image>, Vec<Option<usize>>) {
+    let groups = groups_of_views(solution);
     let mut cameras = Vec::new();
     let mut known: BTreeMap<CameraKey, usize> = BTreeMap::new();
     let mut images: Vec<Image> = Vec::new();
     let mut image_of_view = vec![None; solution.views.len()];
     let mut own_groups = Vec::new();
-    // Other parts have frames of their own, which these files have no word for.
-    let largest = solution.views.iter().enumerate().filter(|(_, result)| result.part == 0);
-    for (view, result) in largest {
+    for (view, result) in solution.views.iter().enumerate().filter(|(_, result)| result.part == part) {
         let calibration = groups.get(view).and_then(|&group| Some((group, solution.calibrations.get(group)?)));
         let (Some(rotation), Some(translation), Some((group, calibration))) =
             (result.rotation, result.translation, calibration)
@@ -185,7 +193,7 @@ fn quaternion(rows: [[f64; 3]; 3]) -> UnitQuaternion<f64> {
     if rotation.w < 0.0 { UnitQuaternion::new_unchecked(-rotation.into_inner()) } else { rotation }
 }
 
-/// The points that two images see or more; hangs every observation on its image.
+/// The points that two images of the part see or more; hangs every observation on its image.
 fn points(
     solution: &Solution,
     input: &LabelledInput,

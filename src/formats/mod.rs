@@ -3,6 +3,7 @@
 //!
 //! May depend on `domain`, and on `report` for the page among the result files; knows nothing of transport.
 
+pub mod cameras_json;
 pub mod colmap;
 pub mod error;
 pub mod export;
@@ -16,6 +17,8 @@ pub mod result_files;
 pub mod result_json;
 pub mod source;
 mod text;
+pub mod warnings;
+pub mod windows;
 
 #[cfg(test)]
 pub(crate) mod fixture;

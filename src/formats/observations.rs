@@ -64,7 +64,7 @@ fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: Option<ImageS
     while lines.advance().map_err(one)? {
         let number = lines.number();
         let Some(columns) = &columns else {
-            refuse_foreign_bytes(lines.bytes()).map_err(|what| one(Problem::of_file(what)))?;
+            refuse_foreign_bytes(lines.bytes()).map_err(|what| Error::whole(&file, what))?;
             let text = lines.expect_text().map_err(one)?.trim();
             if !text.is_empty() {
                 columns = Some(header(text).map_err(|what| one(Problem::at_line(number, "", what)))?);
@@ -72,15 +72,14 @@ fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: Option<ImageS
             continue;
         };
         let Some(text) = lines.text() else {
-            problems.push(Problem::at_line(number, "", "is not text; the file may be damaged"));
+            problems.push(Problem::not_text(number));
             continue;
         };
         if text.trim().is_empty() {
             continue;
         }
         if table.lines.len() == limits.max_observations {
-            let what = format!("more observations than the limit of {}", limits.max_observations);
-            return Err(one(Problem::at_line(number, "", what)));
+            return Err(one(Problem::too_many_observations(number, limits.max_observations)));
         }
         match columns.row(text) {
             Ok(row) => table.push(row, number),
@@ -88,11 +87,11 @@ fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: Option<ImageS
         }
     }
     if columns.is_none() {
-        return Err(one(Problem::of_file("is empty; a header `view,track,x,y` is needed")));
+        return Err(Error::whole(&file, "is empty; a header `view,track,x,y` is needed"));
     }
     problems.into_result(&file)?;
     if table.lines.is_empty() {
-        return Err(one(Problem::of_file("has a header but no observations")));
+        return Err(Error::whole(&file, "has a header but no observations"));
     }
     let labelled = table.into_labelled(path, size);
     labelled.refuse_duplicates()?;

@@ -1,4 +1,4 @@
-//! `points.ply`: the points of the inlier tracks, coloured by weight.
+//! `points.ply`: the points of the inlier tracks of one part, coloured by weight.
 
 use std::fmt::Write;
 
@@ -6,28 +6,33 @@ use super::LabelledInput;
 use super::result_json::track_label;
 use crate::domain::Solution;
 
-/// The points as an ASCII PLY: text, so that results can be compared line by line.
+/// The points of a part as an ASCII PLY: text, so that results can be compared line by line.
 ///
 /// A vertex has `x y z` (metric where the result is metric, else dehomogenised in the frame of the projective cameras,
 /// which a comment tells), a colour from orange (weight 0) to blue
 /// (weight 1), the weight, and the caller's id of the track, or where that is no number its place among the tracks.
-pub fn points(solution: &Solution, input: Option<&LabelledInput>) -> String {
-    let vertices: Vec<(usize, [f64; 3])> =
-        solution.tracks.point.iter().enumerate().filter_map(|(track, point)| Some((track, (*point)?))).collect();
+pub fn points(solution: &Solution, input: Option<&LabelledInput>, part: u32) -> String {
+    let tracks = &solution.tracks;
+    let of_part = (0..tracks.point.len()).filter(|&track| tracks.part_of(track) == Some(part));
+    let vertices: Vec<(usize, [f64; 3])> = of_part.filter_map(|track| Some((track, tracks.point[track]?))).collect();
+    let which = match solution.part_count() {
+        0 | 1 => String::new(),
+        several => format!(" of part {part} of {several}"),
+    };
     let frame = if solution.is_metric() {
         "metric up to scale"
     } else {
         "projective (pixels, frame P1 = [I|0] of the first registered view): no distances, no angles"
     };
     let mut text = format!(
-        "ply\nformat ascii 1.0\ncomment scpsfm points, {frame}, coloured by weight\nelement vertex {}\n\
+        "ply\nformat ascii 1.0\ncomment scpsfm points{which}, {frame}, coloured by weight\nelement vertex {}\n\
          property double x\nproperty double y\nproperty double z\n\
          property uchar red\nproperty uchar green\nproperty uchar blue\n\
          property float weight\nproperty double track\nend_header\n",
         vertices.len()
     );
     for (track, [x, y, z]) in vertices {
-        let weight = solution.tracks.weight.get(track).copied().unwrap_or(0.0);
+        let weight = tracks.weight.get(track).copied().unwrap_or(0.0);
         let [red, green, blue] = colour(weight);
         let label = track_label(input, track).number().unwrap_or(track as u64);
         // Writing to a String cannot fail.
@@ -52,7 +57,7 @@ mod tests {
     #[test]
     fn declares_as_many_vertices_as_it_holds() {
         let (input, solution) = fixture::solved();
-        let text = points(&solution, Some(&input));
+        let text = points(&solution, Some(&input), 0);
         let body = text.split_once("end_header\n").expect("a header").1;
         let inliers = solution.inlier_track_count();
         assert!(inliers > 0);
@@ -68,14 +73,16 @@ mod tests {
     #[test]
     fn says_in_which_frame_the_points_are() {
         let comment = |solution: &Solution| {
-            let text = points(solution, None);
+            let text = points(solution, None, 0);
             text.lines().find(|line| line.starts_with("comment")).expect("a comment").to_owned()
         };
         assert!(comment(&fixture::solved().1).contains("metric up to scale"));
         let (_, projective) = fixture::projective_only();
         let comment = comment(&projective);
         assert!(comment.contains("projective (pixels") && !comment.contains("metric"), "{comment}");
-        assert!(points(&projective, None).contains(&format!("element vertex {}\n", projective.inlier_track_count())));
+        assert!(
+            points(&projective, None, 0).contains(&format!("element vertex {}\n", projective.inlier_track_count()))
+        );
     }
 
     #[test]

@@ -5,8 +5,9 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use super::LabelledInput;
+use super::cameras_json::CamerasJson;
 use super::ply;
-use super::result_json::{CamerasJson, ResultJson, track_label, view_label};
+use super::result_json::{ResultJson, track_label, view_label};
 use crate::domain::Solution;
 use crate::report;
 
@@ -19,17 +20,12 @@ pub const POINTS: &str = "points.ply";
 pub const REPORT: &str = "report.html";
 pub const RESULT: &str = "result.json";
 
-/// What `result.json` holds.
-pub fn summary(solution: &Solution) -> ResultJson {
-    ResultJson::from(solution)
-}
-
-/// `result.json` as text.
+/// `result.json` as text; without the input, warnings name views by their numbers.
 ///
 /// # Errors
 /// None is expected: every field is serialisable.
-pub fn result_json(solution: &Solution) -> io::Result<String> {
-    pretty(&summary(solution))
+pub fn result_json(solution: &Solution, input: Option<&LabelledInput>) -> io::Result<String> {
+    pretty(&ResultJson::new(solution, input))
 }
 
 /// Writes the result files into `directory`, which is created. Without the input, indices stand for labels, there is
@@ -44,9 +40,48 @@ pub fn write(directory: &Path, solution: &Solution, input: Option<&LabelledInput
         write_atomically(directory, OBSERVATIONS, observations_csv(solution, input).as_bytes())?;
     }
     write_atomically(directory, CAMERAS, pretty(&CamerasJson::new(solution, input))?.as_bytes())?;
-    write_atomically(directory, POINTS, ply::points(solution, input).as_bytes())?;
+    write_points(directory, solution, input)?;
     write_atomically(directory, REPORT, report::page(solution, input).as_bytes())?;
-    write_atomically(directory, RESULT, result_json(solution)?.as_bytes())
+    write_atomically(directory, RESULT, result_json(solution, input)?.as_bytes())
+}
+
+/// The points, a file a part: parts have frames of their own, which no program could tell apart in one file. Files of a
+/// former result's parts are removed.
+fn write_points(directory: &Path, solution: &Solution, input: Option<&LabelledInput>) -> io::Result<()> {
+    let parts = solution.part_count().max(1);
+    for part in 0..parts {
+        write_atomically(directory, &points_of(part), ply::points(solution, input, part).as_bytes())?;
+    }
+    for entry in fs::read_dir(directory)? {
+        let name = entry?.file_name();
+        if name.to_str().and_then(part_of_points).is_some_and(|part| part >= parts) {
+            fs::remove_file(directory.join(&name))
+                .map_err(|error| named(&error, &format!("cannot remove {}", directory.join(&name).display())))?;
+        }
+    }
+    Ok(())
+}
+
+/// Name of the file of a part's points: `points.ply` for the largest, `points-part-1.ply` for part 1 of `cameras.json` and
+/// `tracks.csv`.
+pub fn points_of(part: u32) -> String {
+    if part == 0 { POINTS.into() } else { format!("points-part-{part}.ply") }
+}
+
+/// The part whose file has this name, but the largest.
+fn part_of_points(name: &str) -> Option<u32> {
+    let part = name.strip_prefix("points-part-")?.strip_suffix(".ply")?.parse().ok()?;
+    (points_of(part) == name).then_some(part)
+}
+
+/// Where the files are, in words.
+pub fn said(directory: &Path, solution: &Solution) -> String {
+    let others = match solution.part_count() {
+        0 | 1 => return directory.display().to_string(),
+        2 => points_of(1),
+        several => format!("{} to {}", points_of(1), points_of(several - 1)),
+    };
+    format!("{}; {POINTS} holds the points of part 0, {others} those of the others", directory.display())
 }
 
 /// Creates a directory and what is above it.
@@ -95,18 +130,20 @@ pub fn pretty(value: &impl serde::Serialize) -> io::Result<String> {
     Ok(text)
 }
 
-/// `track,weight,inlier`, and `network_weight` where a network ran; one line a track.
+/// `track,weight,inlier`, `network_weight` where a network ran, and the `part` that the track has a point in, empty where it
+/// has none; one line a track.
 fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let tracks = &solution.tracks;
     let has_network = !tracks.network_weight.is_empty();
     let mut text = String::from("track,weight,inlier");
-    text.push_str(if has_network { ",network_weight\n" } else { "\n" });
+    text.push_str(if has_network { ",network_weight,part\n" } else { ",part\n" });
     for (track, (weight, &inlier)) in tracks.weight.iter().zip(&tracks.inlier).enumerate() {
         text.push_str(&format!("{},{weight},{}", track_label(input, track).csv(), u8::from(inlier)));
         if has_network {
             text.push_str(&format!(",{}", tracks.network_weight.get(track).copied().unwrap_or(0.0)));
         }
-        text.push('\n');
+        let part = tracks.part_of(track).map_or_else(String::new, |part| part.to_string());
+        text.push_str(&format!(",{part}\n"));
     }
     text
 }

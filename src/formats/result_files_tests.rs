@@ -3,11 +3,11 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use super::*;
-use crate::domain::{Calibration, Status};
+use crate::domain::{Calibration, Grade, LeftOut, Status, Warning, WarningCode};
 use crate::formats::fixture;
 
 fn json(solution: &Solution) -> Value {
-    serde_json::from_str(&result_json(solution).expect("serialisable")).expect("JSON")
+    serde_json::from_str(&result_json(solution, None).expect("serialisable")).expect("JSON")
 }
 
 fn keys(value: &Value) -> Vec<&str> {
@@ -42,6 +42,7 @@ fn the_fields_of_result_json_are_a_contract() {
         "aspect",
         "radial_k1",
         "radial_k2",
+        "cameras",
         "plane_at_infinity",
         "inlier_tracks",
         "inlier_observations",
@@ -117,7 +118,7 @@ fn a_projective_result_gives_no_calibration_and_says_why() {
 
 #[test]
 fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
-    let (mut input, mut solution) = fixture::solved();
+    let (input, mut solution) = fixture::solved();
     let second = Calibration {
         focal_px: 77.0,
         sigma_log_focal: None,
@@ -125,22 +126,49 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
         aspect: 1.25,
         radial_k1: 0.01,
         radial_k2: 0.002,
+        grade: Some(Grade::ProjectiveOnly),
     };
     solution.calibrations.push(second);
-    input.raw.views[3].camera_group = 9;
+    solution.views[3].camera_group = 9;
+    for _ in 0..2 {
+        solution.warnings.push(Warning::new(WarningCode::UnobservableFocal, "camera group 9: no turning").of_group(9));
+    }
     let result = json(&solution);
-    assert_eq!(result["cameras"].as_array().expect("a list").len(), 2);
-    assert_eq!(
-        keys(&result["cameras"][1]),
-        ["aspect", "focal_px", "focal_unobservable", "principal_point_px", "radial_k1", "radial_k2", "sigma_log_focal"]
-    );
-    assert_eq!(result["cameras"][1]["aspect"], 1.25);
-    assert_eq!(result["cameras"][1]["focal_unobservable"], true);
+    let found = result["cameras"].as_array().expect("a list");
+    assert_eq!(found.len(), 2);
+    let mut names = keys(&found[1]);
+    names.sort_unstable();
+    let mut wanted = [
+        "camera_group",
+        "views",
+        "registered_views",
+        "focal_px",
+        "sigma_log_focal",
+        "focal_unobservable",
+        "principal_point_px",
+        "aspect",
+        "radial_k1",
+        "radial_k2",
+        "grade",
+        "warnings",
+    ];
+    wanted.sort_unstable();
+    assert_eq!(names, wanted);
+    assert_eq!((&found[0]["camera_group"], &found[0]["registered_views"]), (&0.into(), &4.into()));
+    assert_eq!((&found[0]["grade"], &found[0]["sigma_log_focal"]), (&"METRIC".into(), &0.004.into()));
+    assert_eq!(found[0]["warnings"], Value::Array(Vec::new()));
+    assert_eq!((&found[1]["camera_group"], &found[1]["views"]), (&9.into(), &1.into()));
+    assert_eq!((&found[1]["aspect"], &found[1]["grade"]), (&1.25.into(), &"PROJECTIVE_ONLY".into()));
+    assert_eq!((&found[1]["sigma_log_focal"], &found[1]["focal_unobservable"]), (&Value::Null, &true.into()));
+    assert_eq!(found[1]["warnings"], serde_json::json!(["UNOBSERVABLE_FOCAL"]));
+    assert_eq!(result["warnings"][1]["camera_group"], 9);
     let cameras = CamerasJson::new(&solution, Some(&input));
     let focal: Vec<f64> = cameras.views.iter().map(|view| view.K.expect("metric")[0][0]).collect();
     let first = solution.calibrations[0].focal_px;
     assert_eq!(focal, [first, first, first, 77.0, first]);
     assert_eq!(cameras.views[3].K.expect("metric")[1][1], 77.0 * 1.25);
+    let sigmas: Vec<Option<f64>> = cameras.views.iter().map(|view| view.sigma_log_focal).collect();
+    assert_eq!(sigmas, [Some(0.004), Some(0.004), Some(0.004), None, Some(0.004)]);
     solution.views[3].focal_px = Some(80.0);
     assert_eq!(CamerasJson::new(&solution, Some(&input)).views[3].K.expect("metric")[0][0], 80.0);
     assert_eq!((cameras.views[0].radial_k1, cameras.views[3].radial_k1), (Some(-0.02), Some(0.01)));
@@ -149,7 +177,7 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
 #[test]
 fn a_view_without_a_pose_has_no_matrices() {
     let (input, mut solution) = fixture::solved();
-    solution.views[1] = Default::default();
+    solution.views[1] = fixture::left_out(LeftOut::NotRegistered { points: 12, agreeing: 4 });
     solution.views[2].rotation = None;
     let cameras = serde_json::to_value(CamerasJson::new(&solution, Some(&input))).expect("serialisable");
     let view = |k: usize| &cameras["views"][k];
@@ -158,6 +186,9 @@ fn a_view_without_a_pose_has_no_matrices() {
     assert!(view(0)["R"].is_array() && view(0)["t"].is_array() && view(0)["P"].is_array());
     assert_eq!(view(1)["registered"], false);
     assert_eq!(view(1)["P"], Value::Null);
+    assert_eq!(view(1)["left_out"]["code"], "NOT_REGISTERED");
+    assert_eq!(view(1)["left_out"]["detail"], "4 of the 12 points it sees agree on a pose");
+    assert_eq!(view(0)["left_out"], Value::Null);
     assert_eq!(view(2)["registered"], true);
     for matrix in ["K", "R", "t"] {
         assert_eq!(view(2)[matrix], Value::Null, "{matrix}");
@@ -176,9 +207,9 @@ fn answers_carry_the_callers_ids_in_the_callers_order() {
     let files = contents(&out);
     assert_eq!(files.keys().collect::<Vec<_>>(), [CAMERAS, OBSERVATIONS, POINTS, REPORT, RESULT, TRACKS]);
     let tracks: Vec<&str> = files[TRACKS].lines().collect();
-    assert_eq!(tracks[0], "track,weight,inlier,network_weight");
+    assert_eq!(tracks[0], "track,weight,inlier,network_weight,part");
     assert_eq!(tracks.len(), 41);
-    let expected = if solution.tracks.inlier[1] { "102,0.98,1,0.8" } else { "102,0.03,0,0.2" };
+    let expected = if solution.tracks.inlier[1] { "102,0.98,1,0.8,0" } else { "102,0.03,0,0.2," };
     assert_eq!(tracks[2], expected);
     let observations: Vec<&str> = files[OBSERVATIONS].lines().collect();
     assert_eq!(observations[0], "view,track,inlier,residual_px,weight,split");
@@ -197,7 +228,7 @@ fn without_a_network_there_is_no_fourth_column_and_without_the_input_no_observat
     write(directory.path(), &solution, None).expect("written");
     let files = contents(directory.path());
     assert!(!files.contains_key(OBSERVATIONS));
-    assert_eq!(files[TRACKS].lines().next(), Some("track,weight,inlier"));
+    assert_eq!(files[TRACKS].lines().next(), Some("track,weight,inlier,part"));
     assert!(files[TRACKS].lines().nth(1).expect("a track").starts_with("0,"));
 }
 
@@ -236,6 +267,30 @@ fn a_second_result_replaces_the_first_and_leaves_no_temporary_files() {
     let files = contents(directory.path());
     assert_eq!(files.len(), 6);
     assert!(files[RESULT].contains("12345"));
+}
+
+#[test]
+fn frames_are_never_mixed() {
+    let (input, solution) = fixture::solved_in_two_parts();
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    write(directory.path(), &solution, Some(&input)).expect("written");
+    let files = contents(directory.path());
+    let tracks: Vec<Vec<&str>> = files[TRACKS].lines().skip(1).map(|line| line.split(',').collect()).collect();
+    for (name, part) in [(POINTS, "0"), ("points-part-1.ply", "1")] {
+        let (header, body) = files[name].split_once("end_header\n").expect("a header");
+        let points: Vec<&str> = body.lines().map(|line| line.rsplit(' ').next().expect("a track")).collect();
+        let wanted: Vec<&str> = tracks.iter().filter(|row| row[4] == part).map(|row| row[0]).collect();
+        assert!(!points.is_empty() && points == wanted, "{name}: {points:?} {wanted:?}");
+        assert!(header.contains(&format!("of part {part} of 2")), "{header}");
+    }
+    assert!(tracks.iter().all(|row| row[4].is_empty() == (row[2] == "0")), "an outlier is of no part");
+    let words = said(directory.path(), &solution);
+    assert!(words.contains("points-part-1.ply those of the others"), "{words}");
+    // A result in one part takes away what the other parts left.
+    fs::write(directory.path().join("points-part-01.ply"), "mine").expect("written");
+    write(directory.path(), &fixture::solved().1, Some(&input)).expect("written");
+    let names: Vec<String> = contents(directory.path()).into_keys().filter(|name| name.ends_with(".ply")).collect();
+    assert_eq!(names, ["points-part-01.ply", POINTS]);
 }
 
 #[test]

@@ -1,11 +1,11 @@
-//! What `result.json` and `cameras.json` hold. Field names and spellings are a contract: add, never rename.
+//! What `result.json` holds. Field names and spellings are a contract: add, never rename.
 
 use serde::Serialize;
 
-use crate::domain::result::{PriorTime, ViewResult};
-use crate::domain::{Calibration, Grade, Method, Solution, Status, Warning};
+use crate::domain::result::PriorTime;
+use crate::domain::{Calibration, Grade, Method, Solution, Status, Warning, WarningCode};
 
-use super::{Label, LabelledInput};
+use super::{Label, LabelledInput, warnings};
 
 /// The summary of a result.
 ///
@@ -16,7 +16,7 @@ use super::{Label, LabelledInput};
 pub struct ResultJson {
     pub status: Status,
     pub grade: Option<Grade>,
-    /// Of the first camera group; see `cameras` where there are several.
+    /// Of the first camera group that has registered views, down to `radial_k1`; see `cameras` where there are several.
     pub focal_px: Option<f64>,
     pub sigma_log_focal: Option<f64>,
     pub focal_unobservable: Option<bool>,
@@ -27,9 +27,8 @@ pub struct ResultJson {
     /// point at `(u, v, 1)`.
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
-    /// One entry a camera group; absent where all views share one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub cameras: Option<Vec<CalibrationJson>>,
+    /// One entry a camera group, ascending.
+    pub cameras: Vec<CameraGroupJson>,
     /// `(n, 1)` in pixels, in the frame `P1 = [I|0]` of the first registered view.
     pub plane_at_infinity: Option<[f64; 3]>,
     /// Counts.
@@ -51,16 +50,27 @@ pub struct ResultJson {
     pub version: &'static str,
 }
 
-/// Intrinsics of one camera group.
+/// Intrinsics of one camera group. They are null where the group has no metric reconstruction: the result has none, or no
+/// view of the group is registered.
 #[derive(Debug, Clone, Serialize)]
-pub struct CalibrationJson {
-    pub focal_px: f64,
+pub struct CameraGroupJson {
+    /// The input's number of the group.
+    pub camera_group: u32,
+    /// Views of the input, and how many of them are registered.
+    pub views: usize,
+    pub registered_views: usize,
+    pub focal_px: Option<f64>,
+    /// Null: unobservable where `focal_unobservable` is true, else there is no calibration.
     pub sigma_log_focal: Option<f64>,
-    pub focal_unobservable: bool,
-    pub principal_point_px: [f64; 2],
-    pub aspect: f64,
-    pub radial_k1: f64,
-    pub radial_k2: f64,
+    pub focal_unobservable: Option<bool>,
+    pub principal_point_px: Option<[f64; 2]>,
+    pub aspect: Option<f64>,
+    pub radial_k1: Option<f64>,
+    pub radial_k2: Option<f64>,
+    /// The group's own; that of the result is the worst of its groups that have enough views.
+    pub grade: Option<Grade>,
+    /// Codes of the warnings that are of this group, each once.
+    pub warnings: Vec<WarningCode>,
 }
 
 /// Seconds spent in a stage.
@@ -79,18 +89,37 @@ pub struct PriorTimeJson {
     pub iterations: u32,
 }
 
-impl From<&Calibration> for CalibrationJson {
-    fn from(calibration: &Calibration) -> Self {
-        Self {
-            focal_px: calibration.focal_px,
-            sigma_log_focal: calibration.sigma_log_focal,
-            focal_unobservable: calibration.sigma_log_focal.is_none(),
-            principal_point_px: calibration.principal_point_px,
-            aspect: calibration.aspect,
-            radial_k1: calibration.radial_k1,
-            radial_k2: calibration.radial_k2,
+/// The camera groups of a result, ascending.
+pub fn camera_groups(solution: &Solution) -> Vec<CameraGroupJson> {
+    let entry = |(camera_group, calibration): (u32, Option<&Calibration>)| {
+        let views = || solution.views.iter().filter(move |view| view.camera_group == camera_group);
+        let registered_views = views().filter(|view| view.projection.is_some()).count();
+        let calibration = calibration.filter(|_| registered_views > 0);
+        let mut codes: Vec<WarningCode> = Vec::new();
+        for warning in solution.warnings.iter().filter(|warning| warning.camera_group == Some(camera_group)) {
+            if !codes.contains(&warning.code) {
+                codes.push(warning.code);
+            }
         }
-    }
+        CameraGroupJson {
+            camera_group,
+            views: views().count(),
+            registered_views,
+            focal_px: calibration.map(|of| of.focal_px),
+            sigma_log_focal: calibration.and_then(|of| of.sigma_log_focal),
+            focal_unobservable: match calibration {
+                Some(of) => Some(of.sigma_log_focal.is_none()),
+                None => solution.is_focal_unobservable().then_some(true),
+            },
+            principal_point_px: calibration.map(|of| of.principal_point_px),
+            aspect: calibration.map(|of| of.aspect),
+            radial_k1: calibration.map(|of| of.radial_k1),
+            radial_k2: calibration.map(|of| of.radial_k2),
+            grade: calibration.map_or(solution.grade.filter(|_| !solution.is_metric()), |of| of.grade),
+            warnings: codes,
+        }
+    };
+    solution.cameras().into_iter().map(entry).collect()
 }
 
 impl From<&PriorTime> for PriorTimeJson {
@@ -99,21 +128,22 @@ impl From<&PriorTime> for PriorTimeJson {
     }
 }
 
-impl From<&Solution> for ResultJson {
-    fn from(solution: &Solution) -> Self {
-        let cameras: Vec<CalibrationJson> = solution.calibrations.iter().map(CalibrationJson::from).collect();
-        let first = cameras.first();
+impl ResultJson {
+    /// The summary of a solution; without the input, warnings name views by their numbers.
+    pub fn new(solution: &Solution, input: Option<&LabelledInput>) -> Self {
+        let cameras = camera_groups(solution);
+        let first = cameras.iter().find(|camera| camera.focal_px.is_some());
         Self {
             status: solution.status,
             grade: solution.grade,
-            focal_px: first.map(|camera| camera.focal_px),
+            focal_px: first.and_then(|camera| camera.focal_px),
             sigma_log_focal: first.and_then(|camera| camera.sigma_log_focal),
             focal_unobservable: (solution.is_metric() || solution.is_focal_unobservable())
                 .then(|| solution.is_focal_unobservable()),
-            principal_point_px: first.map(|camera| camera.principal_point_px),
-            aspect: first.map(|camera| camera.aspect),
-            radial_k1: first.map(|camera| camera.radial_k1),
-            radial_k2: first.map(|camera| camera.radial_k2),
+            principal_point_px: first.and_then(|camera| camera.principal_point_px),
+            aspect: first.and_then(|camera| camera.aspect),
+            radial_k1: first.and_then(|camera| camera.radial_k1),
+            radial_k2: first.and_then(|camera| camera.radial_k2),
             plane_at_infinity: solution.plane_at_infinity,
             inlier_tracks: solution.inlier_track_count(),
             inlier_observations: solution.inlier_observation_count(),
@@ -121,7 +151,7 @@ impl From<&Solution> for ResultJson {
             reprojection_rms_px: solution.reprojection_rms_px,
             reprojection_mean_px: solution.reprojection_mean_px,
             noise_px: solution.noise_px,
-            warnings: solution.warnings.clone(),
+            warnings: warnings::named(solution, input),
             method: solution.method,
             winning_prior: solution.winning_prior.map(|prior| prior.name()),
             iterations: solution.iterations,
@@ -134,80 +164,9 @@ impl From<&Solution> for ResultJson {
                 .collect(),
             prior_times: solution.prior_times.iter().map(PriorTimeJson::from).collect(),
             version: env!("CARGO_PKG_VERSION"),
-            cameras: (cameras.len() > 1).then_some(cameras),
+            cameras,
         }
     }
-}
-
-/// `cameras.json`.
-#[derive(Debug, Clone, Serialize)]
-pub struct CamerasJson {
-    /// One entry a view of the input.
-    pub views: Vec<CameraJson>,
-}
-
-/// One view: `x ~ P X` in pixels, in the frame `P1 = [I|0]` of the first registered view; `x ~ K (R X + t)` where the
-/// result is metric, before the radial distortion of [`ResultJson::radial_k1`]. Matrices row by row; null where there is
-/// none.
-#[derive(Debug, Clone, Serialize)]
-#[allow(non_snake_case, reason = "the field's names for these matrices are capitals")]
-pub struct CameraJson {
-    /// The caller's id of the view: a number, or a text where the input has names.
-    pub view: Label,
-    pub registered: bool,
-    /// Reconstruction that a registered view belongs to; each has a frame and a scale of its own.
-    pub part: Option<u32>,
-    pub P: Option<[[f64; 4]; 3]>,
-    pub K: Option<[[f64; 3]; 3]>,
-    pub R: Option<[[f64; 3]; 3]>,
-    pub t: Option<[f64; 3]>,
-    pub radial_k1: Option<f64>,
-    pub radial_k2: Option<f64>,
-}
-
-impl CamerasJson {
-    /// The cameras of a solution; without the input, views are numbered from 0.
-    pub fn new(solution: &Solution, input: Option<&LabelledInput>) -> Self {
-        let groups = camera_groups(solution, input);
-        let camera = |(index, view): (usize, &ViewResult)| {
-            let is_metric = view.rotation.is_some() && view.translation.is_some();
-            let calibration = groups.get(index).and_then(|&group| solution.calibrations.get(group));
-            CameraJson {
-                view: view_label(input, index),
-                registered: view.projection.is_some(),
-                part: view.projection.map(|_| view.part),
-                P: view.projection,
-                K: calibration.filter(|_| is_metric).map(|shared| intrinsics(shared, view.focal_px)),
-                R: view.rotation.filter(|_| is_metric),
-                t: view.translation.filter(|_| is_metric),
-                radial_k1: calibration.filter(|_| is_metric).map(|calibration| calibration.radial_k1),
-                radial_k2: calibration.filter(|_| is_metric).map(|calibration| calibration.radial_k2),
-            }
-        };
-        Self { views: solution.views.iter().enumerate().map(camera).collect() }
-    }
-}
-
-/// Position of each view's camera group among the calibrations. Groups are numbered in ascending order of their ids;
-/// a single calibration is everyone's.
-pub(super) fn camera_groups(solution: &Solution, input: Option<&LabelledInput>) -> Vec<usize> {
-    match input {
-        Some(input) if solution.calibrations.len() > 1 => {
-            let mut ids: Vec<u32> = input.raw.views.iter().map(|view| view.camera_group).collect();
-            let all = ids.clone();
-            ids.sort_unstable();
-            ids.dedup();
-            all.iter().map(|id| ids.partition_point(|other| other < id)).collect()
-        }
-        _ => vec![0; solution.views.len()],
-    }
-}
-
-/// The calibration matrix `K`, row by row; `own`: the view's own focal length.
-fn intrinsics(calibration: &Calibration, own: Option<f64>) -> [[f64; 3]; 3] {
-    let [x, y] = calibration.principal_point_px;
-    let focal_px = own.unwrap_or(calibration.focal_px);
-    [[focal_px, 0.0, x], [0.0, focal_px * calibration.aspect, y], [0.0, 0.0, 1.0]]
 }
 
 /// The caller's id of view `index`, or the index where the input is not at hand.

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
-use super::error::{Error, Problem};
+use super::error::Error;
 use super::input::{LabelledInput, display_name};
 use super::{colmap, observations, opensfm};
 use crate::domain::{ImageSize, Limits};
@@ -57,7 +57,7 @@ pub struct Reading {
 /// # Errors
 /// What is wrong with the file, by line, byte or row; a flag that the file needs or contradicts.
 pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledInput, Error> {
-    let whole = |description: String| Error::one(&display_name(path), Problem::of_file(description));
+    let whole = |description: String| Error::whole(&display_name(path), description);
     let format = match reading.format {
         Some(format) => format,
         None => detect(path).map_err(whole)?,
@@ -70,12 +70,7 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
     }
     match format {
         Format::Observations => observations::read(path, limits, reading.size),
-        Format::OpenSfm => {
-            let size = reading.size.ok_or_else(|| {
-                whole("OpenSfM's coordinates are relative to the image size; give it with --width and --height".into())
-            })?;
-            opensfm::tracks::read(path, limits, size)
-        }
+        Format::OpenSfm => opensfm::tracks::read(path, limits, reading.size),
         Format::ColmapDatabase => colmap::database::read(path, limits, reading.matches),
         Format::ColmapModel => colmap::model::read(path, limits),
     }
@@ -165,9 +160,9 @@ mod tests {
         let refused = |reading: Reading| {
             read(&path, &Limits::default(), &reading).expect_err("flags that do not fit").to_string()
         };
-        fs::write(&path, "OPENSFM_TRACKS_VERSION_v2\n").expect("written");
+        fs::write(&path, "OPENSFM_TRACKS_VERSION_v0\na.jpg\t1\t0\t0\t0\t1\t2\t3\n").expect("written");
         let words = refused(Reading::default());
-        assert!(words.starts_with("tracks.csv: ") && words.contains("--width and --height"), "{words}");
+        assert!(words.starts_with("tracks.csv, line 2: image: ") && words.contains("--width and --height"), "{words}");
         let matches = Some(Matches::Raw);
         assert!(refused(Reading { matches, ..Reading::default() }).contains("leave out --matches"));
         let size = Some(ImageSize { width_px: 4, height_px: 3 });

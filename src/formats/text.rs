@@ -24,19 +24,18 @@ const UTF16_BOMS: [&[u8]; 2] = [b"\xFF\xFE", b"\xFE\xFF"];
 /// A file that cannot be opened, is a directory or is larger than any table within `limits`.
 pub(super) fn open_table(path: &Path, limits: &Limits) -> Result<BufReader<File>, Error> {
     let name = display_name(path);
-    let whole = |description: String| Error::one(&name, Problem::of_file(description));
-    let cannot_read = |error: std::io::Error| whole(format!("cannot be read: {error}"));
+    let cannot_read = |error: std::io::Error| Error::one(&name, Problem::unreadable(error));
     let metadata = std::fs::metadata(path).map_err(cannot_read)?;
     if metadata.is_dir() {
-        return Err(whole("is a directory, not a table".into()));
+        return Err(Error::whole(&name, "is a directory, not a table"));
     }
     let most = MAX_BYTES_AN_OBSERVATION.saturating_mul(limits.max_observations as u64);
     if metadata.len() > most {
-        return Err(whole(format!(
-            "has {} bytes, more than the limit of {} observations can take",
-            metadata.len(),
-            limits.max_observations
-        )));
+        let (bytes, most) = (metadata.len(), limits.max_observations);
+        return Err(Error::whole(
+            &name,
+            format!("has {bytes} bytes, more than the limit of {most} observations can take"),
+        ));
     }
     // A pipe has no size beforehand; the count of lines kept and the length of each are bounded while it is read.
     Ok(BufReader::new(File::open(path).map_err(cannot_read)?))
@@ -100,7 +99,7 @@ impl<R: BufRead> Lines<R> {
                     "is not a text file"
                 })
             } else {
-                Problem::at_line(self.number, "", "is not text; the file may be damaged")
+                Problem::not_text(self.number)
             }
         })
     }

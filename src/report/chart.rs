@@ -5,11 +5,12 @@ use std::fmt::Write;
 use super::html::{escape, short};
 
 /// Outer size of a chart and its margins, in the units of its `viewBox`.
-const WIDTH: f64 = 460.0;
-const HEIGHT: f64 = 230.0;
+pub const WIDTH: f64 = 460.0;
+const HEIGHT: f64 = 238.0;
 const LEFT: f64 = 56.0;
 const RIGHT: f64 = 14.0;
-const TOP: f64 = 30.0;
+/// Room for the title, and the names of marks below it.
+const TOP: f64 = 38.0;
 const BOTTOM: f64 = 34.0;
 /// Room for the name of a mark.
 const MARK_NAME: f64 = 40.0;
@@ -111,7 +112,8 @@ impl LineChart<'_> {
             text(svg, LEFT - 6.0, at + 3.5, "end", "tick", &label);
         }
         for tick in x.ticks() {
-            text(svg, x.place(tick), HEIGHT - BOTTOM + 14.0, "middle", "tick", &short(tick));
+            let at = x.place(tick);
+            text(svg, at, HEIGHT - BOTTOM + 14.0, anchor(at), "tick", &short(tick));
         }
         text(svg, (LEFT + WIDTH - RIGHT) / 2.0, HEIGHT - 5.0, "middle", "mute", self.x_label);
     }
@@ -149,6 +151,13 @@ impl LineChart<'_> {
             text(svg, at + 18.0, 18.0, "start", "tick", series.name);
         }
     }
+}
+
+/// Which point of a tick's label stands at `at`: its middle, or near the right border, which would clip it, its end.
+pub fn anchor(at: f64) -> &'static str {
+    /// Half a label of seven digits.
+    const HALF_LABEL: f64 = 22.0;
+    if at + HALF_LABEL > WIDTH { "end" } else { "middle" }
 }
 
 /// A histogram over 0..1 of two kinds, stacked; heights are square roots, so that small bars stay visible.
@@ -193,7 +202,8 @@ pub fn histogram(title: &str, x_label: &str, kinds: [(&str, &[f64]); 2]) -> Stri
         }
     }
     for tick in [0.0, 0.25, 0.5, 0.75, 1.0] {
-        text(&mut svg, x.place(tick), HEIGHT - BOTTOM + 14.0, "middle", "tick", &short(tick));
+        let at = x.place(tick);
+        text(&mut svg, at, HEIGHT - BOTTOM + 14.0, anchor(at), "tick", &short(tick));
     }
     text(&mut svg, (LEFT + WIDTH - RIGHT) / 2.0, HEIGHT - 5.0, "middle", "mute", x_label);
     for (kind, (name, _)) in kinds.iter().enumerate() {

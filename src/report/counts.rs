@@ -68,27 +68,6 @@ pub fn parts(solution: &Solution) -> BTreeMap<u32, Vec<usize>> {
     parts
 }
 
-/// The part that each inlier track is reconstructed in: that of the first registered view with an inlier observation of
-/// it. Where there is one part, its tracks need no input to tell.
-pub fn parts_of_tracks(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Option<u32>> {
-    let all = parts(solution);
-    let tracks = &solution.tracks.inlier;
-    if all.len() < 2 {
-        let only = all.keys().next().copied();
-        return tracks.iter().map(|&inlier| only.filter(|_| inlier)).collect();
-    }
-    let mut of_track = vec![None; tracks.len()];
-    let Some(raw) = input.map(|input| &input.raw) else { return of_track };
-    for (k, (&view, &track)) in raw.view.iter().zip(&raw.track).enumerate() {
-        let registered = solution.views.get(view as usize).filter(|view| view.projection.is_some());
-        let inlier = solution.observations.inlier.get(k) == Some(&true);
-        if let (Some(view), true, Some(part @ None)) = (registered, inlier, of_track.get_mut(track as usize)) {
-            *part = Some(view.part);
-        }
-    }
-    of_track
-}
-
 /// The views of each track's inlier observations, ascending, each once.
 pub fn inlier_views(solution: &Solution, input: &LabelledInput) -> Vec<Vec<u32>> {
     let mut views: Vec<Vec<u32>> = vec![Vec::new(); solution.tracks.inlier.len()];
@@ -131,21 +110,12 @@ mod tests {
     }
 
     #[test]
-    fn tracks_belong_to_the_part_that_sees_them() {
-        let (input, mut solution) = fixture::solved();
-        assert_eq!(parts(&solution).len(), 1);
-        let inlier = solution.tracks.inlier.iter().position(|&inlier| inlier).expect("an inlier");
-        assert_eq!(parts_of_tracks(&solution, None)[inlier], Some(0), "one part needs no input");
-        solution.views.iter_mut().skip(3).for_each(|view| view.part = 1);
-        for k in 0..input.raw.view.len() {
-            // This track is seen by the second part only.
-            if input.raw.track[k] as usize == inlier && input.raw.view[k] < 3 {
-                solution.observations.inlier[k] = false;
-            }
-        }
+    fn the_tracks_of_a_part_are_seen_by_its_views() {
+        assert_eq!(parts(&fixture::solved().1).len(), 1);
+        let (input, solution) = fixture::solved_in_two_parts();
+        let of_part = |part| (0..40).find(|&track| solution.tracks.part_of(track) == Some(part)).expect("a track");
         assert_eq!(parts(&solution)[&1], [3, 4]);
-        assert_eq!(parts_of_tracks(&solution, Some(&input))[inlier], Some(1));
-        assert_eq!(parts_of_tracks(&solution, None)[inlier], None, "nothing tells without the input");
-        assert_eq!(inlier_views(&solution, &input)[inlier], [3, 4]);
+        let views = inlier_views(&solution, &input);
+        assert_eq!((&views[of_part(0)][..], &views[of_part(1)][..]), (&[0, 1, 2][..], &[3, 4][..]));
     }
 }

@@ -44,8 +44,8 @@ pub fn page(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let counts = counts::of_views(solution, input);
     let body = [
         sections::headline(solution),
-        sections::warnings(solution),
-        calibration::section(solution, input),
+        sections::warnings(solution, input),
+        calibration::section(solution),
         space::section(solution, input),
         views::parts(solution, input, &counts),
         scene::section(solution, input, &counts),

@@ -7,6 +7,8 @@ use super::html::{escape, short};
 use super::words;
 use crate::domain::result::PriorTime;
 use crate::domain::{Grade, Losses, Progress, Solution, Status};
+use crate::formats::LabelledInput;
+use crate::formats::warnings::named;
 
 /// A focal length beyond this factor of the final one is drawn at the edge of its chart.
 const FOCAL_CLIP: f64 = 2.5;
@@ -33,7 +35,7 @@ pub fn headline(solution: &Solution) -> String {
         };
         let note = match solution.calibrations.len() {
             1 => note,
-            several => format!("{note}; the first of {several} camera groups"),
+            several => format!("{note}; the first of {several} cameras, see Calibration"),
         };
         card("focal length", format!("{:.1} px", calibration.focal_px), note);
         if calibration.radial_k1 != 0.0 {
@@ -73,13 +75,14 @@ fn stage_times(solution: &Solution) -> String {
 }
 
 /// The warnings, in plain words and in the solver's own.
-pub fn warnings(solution: &Solution) -> String {
+pub fn warnings(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let mut html = String::from("<section id=\"warnings\">\n<h2>Warnings</h2>\n");
-    if solution.warnings.is_empty() {
+    let warnings = named(solution, input);
+    if warnings.is_empty() {
         html.push_str("<p>None.</p>\n");
     } else {
         html.push_str("<ul>\n");
-        for warning in &solution.warnings {
+        for warning in &warnings {
             let _ = writeln!(
                 html,
                 "<li><strong>{}</strong> {} <span class=\"detail\">{}</span></li>",

@@ -10,7 +10,7 @@ use super::pack::Packed;
 use super::{counts, labels, plan};
 use crate::domain::{Grade, Solution};
 use crate::formats::LabelledInput;
-use crate::formats::result_json::CamerasJson;
+use crate::formats::cameras_json::CamerasJson;
 
 /// Points in the page, 18 bytes each: 0.7 MB. As many as turn smoothly on a plain canvas.
 const MAX_POINTS: usize = 40_000;
@@ -66,16 +66,15 @@ pub fn parts(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Part> {
         parts[at].cameras.push(Camera { label: labels::view(input, index), centre, rotation: r, borders });
     }
     parts.retain(|part| !part.cameras.is_empty());
-    add_points(&mut parts, solution, input);
+    add_points(&mut parts, solution);
     parts
 }
 
 /// Every `k`-th point, of all parts together.
-fn add_points(parts: &mut [Part], solution: &Solution, input: Option<&LabelledInput>) {
-    let of_tracks = counts::parts_of_tracks(solution, input);
+fn add_points(parts: &mut [Part], solution: &Solution) {
     let place = |part: u32| parts.binary_search_by_key(&part, |entry| entry.part).ok();
-    let placed: Vec<(usize, usize, [f64; 3])> = (solution.tracks.point.iter().zip(&of_tracks).enumerate())
-        .filter_map(|(track, (point, part))| Some((track, place((*part)?)?, (*point)?)))
+    let placed: Vec<(usize, usize, [f64; 3])> = (solution.tracks.point.iter().enumerate())
+        .filter_map(|(track, point)| Some((track, place(solution.tracks.part_of(track)?)?, (*point)?)))
         .filter(|(_, _, point)| point.iter().all(|value| value.is_finite()))
         .collect();
     let step = placed.len().div_ceil(MAX_POINTS).max(1);
@@ -145,7 +144,7 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
             let _ = write!(
                 html,
                 "<option value=\"{index}\">{} ({} views, {} points)</option>",
-                part.part + 1,
+                part.part,
                 part.cameras.len(),
                 part.all_points
             );
@@ -161,12 +160,7 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
          shift and arrows move, plus and minus zoom, 0 goes back\"></canvas>\n\
          <p class=\"note\">Drag or arrows to turn, wheel, pinch or + and - to zoom, shift-drag, two fingers or shift and arrows to \
          move, double click or 0 to go back. Points are coloured by weight, from orange (0) to blue (1); cameras by part. \
-         {shown} of {all} points are drawn.{}</p>\n",
-        if parts.len() > 1 && input.is_none() {
-            " Without the input nothing tells which part a point is of."
-        } else {
-            ""
-        }
+         {shown} of {all} points are drawn.</p>\n"
     );
     html.push_str("<div class=\"grid\" id=\"plans\">\n");
     for part in parts.iter().take(MAX_PLANS) {
@@ -205,13 +199,13 @@ mod tests {
 
     #[test]
     fn parts_are_shown_apart() {
-        let (input, mut solution) = fixture::solved();
+        let (input, solution) = fixture::solved();
         assert!(!section(&solution, Some(&input)).contains("id=\"part\""), "one part needs no choice");
-        solution.views.iter_mut().skip(3).for_each(|view| view.part = 1);
+        let (input, solution) = fixture::solved_in_two_parts();
         let html = section(&solution, Some(&input));
-        assert!(html.contains("<option value=\"1\">2 (2 views, 0 points)</option>"), "{html}");
+        let points = solution.inlier_track_count() / 2;
+        assert!(html.contains(&format!("<option value=\"1\">1 (2 views, {points} points)</option>")), "{html}");
         assert_eq!(html.matches("class=\"plan\"").count(), 2);
-        assert!(section(&solution, None).contains("nothing tells which part"));
     }
 
     #[test]

@@ -96,6 +96,63 @@ fn a_long_sequence_makes_a_small_page() {
     assert!(page.contains("of 200000 tracks are drawn") && page.contains("form 2 parts"));
 }
 
+/// Three sequences one after the other: more views than the generator makes at once.
+fn long_sequence() -> (LabelledInput, Solution) {
+    let options = SequenceOptions { views: 1000, tracks: 20_000, ..SequenceOptions::default() };
+    let (mut input, mut solution) = fixture::solved_sequence(&options);
+    let (one, answer) = (input.raw.clone(), solution.clone());
+    for copy in 1..3 {
+        input.raw.views.extend(one.views.iter().cloned());
+        input.raw.track_count += one.track_count;
+        input.raw.view.extend(one.view.iter().map(|view| view + copy * 1000));
+        input.raw.track.extend(one.track.iter().map(|track| track + copy * 20_000));
+        input.raw.x.extend(&one.x);
+        input.raw.y.extend(&one.y);
+        solution.views.extend(answer.views.iter().cloned());
+        solution.tracks.weight.extend(&answer.tracks.weight);
+        solution.tracks.inlier.extend(&answer.tracks.inlier);
+        solution.tracks.point.extend(&answer.tracks.point);
+        solution.observations.inlier.extend(&answer.observations.inlier);
+        solution.observations.residual_px.extend(&answer.observations.residual_px);
+    }
+    (LabelledInput::unlabelled(input.raw, &input.path), solution)
+}
+
+/// Names as hostile as a file may hold, more views than a page lists, and reasons that name views.
+#[test]
+fn hostile_names_of_many_views_stay_text_in_a_small_page() {
+    let (mut input, mut solution) = long_sequence();
+    for (view, result) in solution.views.iter_mut().enumerate() {
+        if view % 5 == 0 {
+            *result = fixture::left_out(crate::domain::LeftOut::NotRegistered { points: 9, agreeing: 2 });
+        } else if view > 2000 {
+            result.part = 1;
+        }
+    }
+    let clean = page(&solution, Some(&input));
+    // What a page shows of a long name is its end.
+    let ends = [
+        "\"><img src=x onerror=e(1)>",
+        "'/><b id='e'>&lt;",
+        "</script><script>e(1)//",
+        "</text></svg><svg onload=e(1)>",
+    ];
+    let name = |k: usize| {
+        let end = format!("{k}{}", ends[k % 4]);
+        Label::Name(format!("{}{end}", "\u{e9}".repeat(200 - end.len())).into())
+    };
+    input.view_labels = (0..3000).map(name).collect();
+    input.track_labels = (0..60_000).map(name).collect();
+    let page = page(&solution, Some(&input));
+    assert!(page.len() < 5 * 1024 * 1024, "{} bytes", page.len());
+    // In the data of the script, quotes and `>` stand as they are; what could end it is the `<`.
+    for tag in ["<img", "<b ", "<script", "</script", "</text></svg><svg", "\"><img"] {
+        assert_eq!(page.matches(tag).count(), clean.matches(tag).count(), "names brought in {tag}");
+    }
+    assert!(page.contains("0&quot;&gt;&lt;img src=x onerror=e(1)&gt; (2 of the 9 points it sees agree on a pose)"));
+    assert!(page.contains("600 of 3000 views were left out") && page.contains("2000 of 3000 views are listed"));
+}
+
 #[test]
 fn the_same_result_makes_the_same_page_but_for_two_lines() {
     let options = SequenceOptions { views: 30, tracks: 500, ..SequenceOptions::default() };

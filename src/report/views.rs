@@ -5,7 +5,7 @@ use std::fmt::Write;
 use super::counts::{self, ViewCount};
 use super::html::{escape, short};
 use super::{labels, words};
-use crate::domain::{Solution, WarningCode};
+use crate::domain::Solution;
 use crate::formats::LabelledInput;
 
 /// Rows of a table of views: as many as a sequence may have by default, at some 120 bytes each.
@@ -38,19 +38,19 @@ pub fn parts(solution: &Solution, input: Option<&LabelledInput>, counts: &[ViewC
 
 fn part_table(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let mut tracks = std::collections::BTreeMap::<u32, usize>::new();
-    for part in counts::parts_of_tracks(solution, input).into_iter().flatten() {
+    for part in (0..solution.tracks.point.len()).filter_map(|track| solution.tracks.part_of(track)) {
         *tracks.entry(part).or_default() += 1;
     }
     let mut html = String::from(
-        "<div class=\"table\"><table>\n<tr><th>part</th><th>views</th><th>from</th><th>to</th><th>inlier tracks</th></tr>\n",
+        "<div class=\"table\"><table>\n<tr><th>part</th><th>views</th><th>from</th><th>to</th><th>points</th></tr>\n",
     );
     for (part, views) in counts::parts(solution).iter().take(MAX_PARTS) {
         let end = |view: Option<&usize>| view.map_or_else(String::new, |&view| escape(&labels::view(input, view)));
-        let seen = input.map_or_else(|| "-".into(), |_| tracks.get(part).copied().unwrap_or(0).to_string());
+        let placed = tracks.get(part).copied().unwrap_or(0);
         let _ = writeln!(
             html,
-            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{seen}</td></tr>",
-            part + 1,
+            "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{placed}</td></tr>",
+            part,
             views.len(),
             end(views.first()),
             end(views.last())
@@ -73,41 +73,22 @@ fn left_out(solution: &Solution, input: Option<&LabelledInput>, counts: &[ViewCo
     for &view in missing.iter().take(MAX_ROWS) {
         let observations = counts.get(view).map_or(0, |count| count.observations);
         let seen = if input.is_some() { observations.to_string() } else { "-".into() };
-        let reason = match reason(solution, view) {
-            Some(reason) => reason,
-            None if input.is_some() && observations == 0 => "nothing is observed in it",
-            None => words::warning(WarningCode::ViewsLeftOut),
+        let reason = match solution.views[view].left_out {
+            Some(reason) => reason.to_string(),
+            None => words::outcome(solution).to_owned(),
         };
         let _ = writeln!(
             html,
             "<tr><td>{}</td><td>{seen}</td><td>{}</td></tr>",
             escape(&labels::view(input, view)),
-            escape(reason)
+            escape(&reason)
         );
     }
     html.push_str("</table></div>\n");
-    for warning in solution.warnings.iter().filter(|warning| warning.code == WarningCode::ViewsLeftOut) {
-        let _ = writeln!(
-            html,
-            "<p class=\"note\">In the solver's words, views counted from 0: {}</p>",
-            escape(&warning.detail)
-        );
+    if missing.len() > MAX_ROWS {
+        let _ = writeln!(html, "<p class=\"note\">{MAX_ROWS} of {} views left out are listed.</p>", missing.len());
     }
     html
-}
-
-/// What the warning says of one view: it lists views as `17 (the reason)`, counted from 0, or as numbers alone. What it
-/// lists otherwise stands below the table as it is.
-fn reason(solution: &Solution, view: usize) -> Option<&str> {
-    let warnings = solution.warnings.iter().filter(|warning| warning.code == WarningCode::ViewsLeftOut);
-    let number = view.to_string();
-    warnings.filter_map(|warning| warning.detail.split_once(": ")).find_map(|(sentence, list)| {
-        let entry = list.split(", ").find_map(|entry| entry.strip_prefix(&number))?;
-        match entry.strip_prefix(" (").and_then(|reason| reason.strip_suffix(')')) {
-            Some(reason) => Some(reason),
-            None => entry.is_empty().then(|| sentence.split_once(" views are ").map_or(sentence, |(_, why)| why)),
-        }
-    })
 }
 
 /// A table of all views.
@@ -119,7 +100,7 @@ pub fn table(solution: &Solution, input: Option<&LabelledInput>, counts: &[ViewC
     let px = |value: Option<f64>| value.map_or_else(|| "-".into(), short);
     for (index, (view, count)) in solution.views.iter().zip(counts).take(MAX_ROWS).enumerate() {
         let (registered, part) = match view.projection {
-            Some(_) => ("yes", (view.part + 1).to_string()),
+            Some(_) => ("yes", view.part.to_string()),
             None => ("no", "-".into()),
         };
         let _ = writeln!(
@@ -143,7 +124,7 @@ pub fn table(solution: &Solution, input: Option<&LabelledInput>, counts: &[ViewC
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::Warning;
+    use crate::domain::LeftOut;
     use crate::formats::fixture;
 
     fn parts_of(solution: &Solution, input: &LabelledInput) -> String {
@@ -154,42 +135,33 @@ mod tests {
     fn views_left_out_come_with_their_reason() {
         let (input, mut solution) = fixture::solved();
         assert!(parts_of(&solution, &input).contains("No view was left out"));
-        for view in [1, 3, 4] {
-            solution.views[view] = Default::default();
-        }
-        let detail = "3 of 5 views could not be registered: 1 (sees no point of the reconstruction), \
-                      3 (4 of the 12 points it sees agree on a pose), and 1 more";
-        solution.warnings.push(Warning::new(WarningCode::ViewsLeftOut, detail));
+        solution.views[1] = fixture::left_out(LeftOut::NotRegistered { points: 0, agreeing: 0 });
+        solution.views[3] = fixture::left_out(LeftOut::NotRegistered { points: 12, agreeing: 4 });
+        solution.views[4] = fixture::left_out(LeftOut::NoObservations);
         let html = parts_of(&solution, &input);
         assert!(html.contains("3 of 5 views were left out"));
         let row = |view: &str| {
             let row = html.lines().find(|line| line.starts_with(&format!("<tr><td>{view}<"))).expect("a row");
             row.rsplit("<td>").next().expect("a cell").to_string()
         };
-        assert_eq!(row("13"), "sees no point of the reconstruction</td></tr>");
+        assert_eq!(row("13"), "sees too few points of the reconstruction</td></tr>");
         assert_eq!(row("33"), "4 of the 12 points it sees agree on a pose</td></tr>");
-        assert!(row("43").starts_with(words::warning(WarningCode::ViewsLeftOut)));
-        solution.warnings = vec![Warning::new(
-            WarningCode::ViewsLeftOut,
-            "2 of 5 views are outside the block that was solved and were left out: 1, 13",
-        )];
-        assert_eq!(reason(&solution, 1), Some("outside the block that was solved and were left out"));
-        assert_eq!(reason(&solution, 3), None, "13 is not 3");
+        assert_eq!(row("43"), "nothing is observed in it</td></tr>");
     }
 
     #[test]
     fn parts_are_listed_with_their_views() {
-        let (input, mut solution) = fixture::solved();
+        let (input, solution) = fixture::solved();
         assert!(parts_of(&solution, &input).contains("All 5 registered views form one reconstruction"));
-        solution.views.iter_mut().skip(3).for_each(|view| view.part = 1);
+        let (input, solution) = fixture::solved_in_two_parts();
         let html = parts_of(&solution, &input);
-        let inliers = solution.inlier_track_count();
+        let (most, rest) = (solution.inlier_track_count().div_ceil(2), solution.inlier_track_count() / 2);
         assert!(html.contains("form 2 parts"));
+        assert!(html.contains(&format!("<tr><td>0</td><td>3</td><td>3</td><td>23</td><td>{most}</td></tr>")), "{html}");
         assert!(
-            html.contains(&format!("<tr><td>1</td><td>3</td><td>3</td><td>23</td><td>{inliers}</td></tr>")),
+            html.contains(&format!("<tr><td>1</td><td>2</td><td>33</td><td>43</td><td>{rest}</td></tr>")),
             "{html}"
         );
-        assert!(html.contains("<tr><td>2</td><td>2</td><td>33</td><td>43</td><td>0</td></tr>"), "{html}");
     }
 
     #[test]
@@ -202,7 +174,7 @@ mod tests {
         let html = table(&solution, Some(&input), &counts::of_views(&solution, Some(&input)));
         let inliers = solution.inlier_track_count();
         let row =
-            format!("<tr><td>13</td><td>yes</td><td>1</td><td>40</td><td>{inliers}</td><td>0.5</td><td>0.5</td></tr>");
+            format!("<tr><td>13</td><td>yes</td><td>0</td><td>40</td><td>{inliers}</td><td>0.5</td><td>0.5</td></tr>");
         assert!(html.contains(&row), "{html}");
         assert!(html.contains("<tr><td>43</td><td>no</td><td>-</td>"));
     }

@@ -1,5 +1,7 @@
 //! From the geometry of a block to the solution that callers read.
 
+use std::collections::BTreeSet;
+
 use nalgebra::{Matrix3, Matrix4};
 
 use super::Context;
@@ -9,14 +11,11 @@ use super::grow::Consensus;
 use super::judge::{self, Geometry, Judged};
 use super::recorder::Recorder;
 use crate::domain::result::{ObservationResults, TrackResults, ViewResult};
-use crate::domain::{Calibration, Grade, Input, Solution, Stage, Status, Warning, WarningCode};
+use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning};
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::measurement::Sighting;
 use crate::geometry::{Camera, Point, triangulation};
-
-/// Views named one by one in a warning; past these they are only counted.
-const MOST_LISTED_VIEWS: usize = 20;
 
 /// The solution of a scene in which nothing could be reconstructed; the reason is among `warnings`.
 pub fn unsolved(context: &Context, attempt: Option<&Attempt>, warnings: Vec<Warning>, recorder: Recorder) -> Solution {
@@ -28,6 +27,7 @@ pub fn unsolved(context: &Context, attempt: Option<&Attempt>, warnings: Vec<Warn
         inlier: vec![false; input.track_count()],
         network_weight: Vec::new(),
         point: vec![None; input.track_count()],
+        part: Vec::new(),
     };
     if let Some(attempt) = attempt {
         tracks.network_weight = network_weights(attempt, context);
@@ -79,9 +79,10 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
         mask(context, &attempt.block.tracks, decided, &mut judged);
     }
     let usable = calibration.metric.as_ref().filter(|_| calibration.grade != Grade::ProjectiveOnly);
-    warnings.extend(calibration.warnings.iter().cloned());
+    let groups: BTreeSet<u32> = context.input.views().iter().map(|view| view.camera_group).collect();
+    let only = groups.first().copied().filter(|_| groups.len() == 1);
+    warnings.extend(calibration.warnings.iter().cloned().map(|warning| Warning { camera_group: only, ..warning }));
     warnings.extend(attempt.second_structure.clone());
-    warnings.extend(left_out(context.input, &attempt.block.views));
 
     let first_px = context.normalization.to_pixels(attempt.block.views[0]);
     judged.tracks.point = final_points(context, attempt, usable, &judged, &first_px);
@@ -97,7 +98,10 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
         iterations,
         seed: context.settings.seed,
         calibrations: usable
-            .map(|metric| pixel_calibrations(metric, calibration.sigma_log_focal, context, attempt.block.views[0]))
+            .map(|metric| {
+                let told = (calibration.sigma_log_focal, calibration.grade);
+                pixel_calibrations(metric, told, context, attempt.block.views[0])
+            })
             .unwrap_or_default(),
         // Planes transform by the inverse transpose of what moves points: from normalised to pixels that is T1^-T.
         plane_at_infinity: calibration
@@ -205,34 +209,6 @@ fn mask(context: &Context, block_tracks: &[usize], decided: &Decided, judged: &m
     }
 }
 
-/// The names with commas between them, past the first few only counted.
-pub fn listed(names: impl ExactSizeIterator<Item = String>) -> String {
-    let count = names.len();
-    let mut listed: Vec<String> = names.take(MOST_LISTED_VIEWS).collect();
-    if count > listed.len() {
-        listed.push(format!("and {} more", count - listed.len()));
-    }
-    listed.join(", ")
-}
-
-fn left_out(input: &Input, registered: &[usize]) -> Option<Warning> {
-    let observed = super::block::observed_views(input);
-    let missing: Vec<usize> = observed.iter().copied().filter(|view| !registered.contains(view)).collect();
-    if missing.is_empty() {
-        return None;
-    }
-    let names = listed(missing.iter().map(usize::to_string));
-    Some(Warning::new(
-        WarningCode::ViewsLeftOut,
-        format!(
-            "{} of {} views are outside the block that was solved and were left out: {}",
-            missing.len(),
-            observed.len(),
-            names
-        ),
-    ))
-}
-
 fn views(context: &Context, attempt: &Attempt, local: &[Camera], metric: Option<&Reconstruction>) -> Vec<ViewResult> {
     let mut views = vec![ViewResult::default(); context.input.view_count()];
     let first = attempt.block.views[0];
@@ -250,7 +226,7 @@ fn views(context: &Context, attempt: &Attempt, local: &[Camera], metric: Option<
                 .map(|pose| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
             translation: pose.map(|pose| pose.translation.into()),
             focal_px: pose.and_then(|_| own_focal(attempt, i)).map(|focal| focal * context.scale_px),
-            part: 0,
+            ..ViewResult::default()
         };
     }
     views
@@ -315,11 +291,11 @@ pub fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
 /// order, their principal points about the image centre of the group's first view.
 fn pixel_calibrations(
     metric: &Reconstruction,
-    sigma_log_focal: Option<f64>,
+    told: (Option<f64>, Grade),
     context: &Context,
     first_view: usize,
 ) -> Vec<Calibration> {
-    let about = |view: usize| pixel_calibration(&metric.intrinsics, sigma_log_focal, context, view);
+    let about = |view: usize| pixel_calibration(&metric.intrinsics, told, context, view);
     let (group_of, groups) = super::block::camera_groups(context.input);
     match groups {
         1 => vec![about(first_view)],
@@ -328,9 +304,11 @@ fn pixel_calibrations(
 }
 
 /// One calibration in pixels, its principal point about the image centre of this view.
+///
+/// * `told`: the standard deviation of the log focal length (`None`: unobservable), and the grade
 pub fn pixel_calibration(
     intrinsics: &Intrinsics,
-    sigma_log_focal: Option<f64>,
+    (sigma_log_focal, grade): (Option<f64>, Grade),
     context: &Context,
     view: usize,
 ) -> Calibration {
@@ -342,6 +320,7 @@ pub fn pixel_calibration(
         aspect: intrinsics.aspect,
         radial_k1: intrinsics.radial,
         radial_k2: intrinsics.second_radial,
+        grade: Some(grade),
     }
 }
 

@@ -26,6 +26,7 @@ mod second;
 mod sequence;
 #[cfg(test)]
 mod tests;
+mod views;
 
 use crate::domain::result::ViewResult;
 use crate::domain::{
@@ -58,6 +59,18 @@ pub enum Error {
 /// # Errors
 /// [`Error::Stopped`] when `stop` fired, [`Error::Internal`] for a defect.
 pub fn solve(
+    input: &Input,
+    settings: &SolveSettings,
+    observer: &mut dyn Observer,
+    stop: &StopToken,
+) -> Result<Solution, Error> {
+    let mut solution = solve_views(input, settings, observer, stop)?;
+    views::complete(&mut solution, input);
+    Ok(solution)
+}
+
+/// The solution but for what [`views::complete`] says of the views.
+fn solve_views(
     input: &Input,
     settings: &SolveSettings,
     observer: &mut dyn Observer,
@@ -155,6 +168,7 @@ fn verified(mut solution: Solution) -> Solution {
     solution.tracks.weight.fill(0.0);
     solution.tracks.inlier.fill(false);
     solution.tracks.point.fill(None);
+    solution.tracks.part.clear();
     solution.observations.inlier.fill(false);
     solution.observations.residual_px.fill(None);
     (solution.noise_px, solution.reprojection_rms_px, solution.reprojection_mean_px) = (None, None, None);

@@ -54,7 +54,7 @@ impl Default for SequenceOptions {
         Self {
             views: 20,
             tracks: 1_000,
-            lifetime: (3, 10),
+            lifetime: Self::lifetime_within(20),
             noise: 0.0005,
             outliers: 0.3,
             wrong_observations: 0.05,
@@ -66,6 +66,12 @@ impl Default for SequenceOptions {
 }
 
 impl SequenceOptions {
+    /// Views that a track lives where nothing else is asked for: as feature matching gives them, and never more than there
+    /// are views.
+    pub fn lifetime_within(views: usize) -> (usize, usize) {
+        (3.min(views), 10.min(views))
+    }
+
     /// Tracks that one sequence may have: some 10^7 observations.
     pub const MAX_TRACKS: usize = 2_000_000;
 
@@ -337,5 +343,9 @@ mod tests {
             assert_eq!(error.violations()[0].field, name, "{error}");
         }
         assert_eq!(default().validate(), Ok(()));
+        for views in 2..20 {
+            let options = SequenceOptions { views, lifetime: SequenceOptions::lifetime_within(views), ..default() };
+            assert_eq!(options.validate(), Ok(()), "{views} views");
+        }
     }
 }

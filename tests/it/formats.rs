@@ -126,6 +126,64 @@ for path in sys.argv[1:]:
     }
 }
 
+/// A walk whose tracks end in its middle, so that its halves share none: two parts of one camera.
+fn two_parts(directory: &Path) -> PathBuf {
+    let walk = directory.join("walk");
+    let scene =
+        ["--sequence", "--views", "16", "--tracks", "700", "--noise", "0.0005", "--outliers", "0.2", "--seed", "2"];
+    let made = run(["synth", "--out", text(&walk)].iter().chain(&scene));
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let table = fs::read_to_string(walk.join("observations.csv")).expect("the walk");
+    let mut halves = String::from("view,track,x,y\n");
+    for line in table.lines().skip(1) {
+        let mut fields: Vec<String> = line.split(',').map(str::to_owned).collect();
+        if fields[0].parse::<u32>().expect("a number") >= 8 {
+            fields[1] = format!("{}", 700 + fields[1].parse::<u32>().expect("a number"));
+        }
+        halves.push_str(&format!("{}\n", fields.join(",")));
+    }
+    let path = directory.join("halves.csv");
+    fs::write(&path, halves).expect("written");
+    path
+}
+
+/// Each part goes into files of its own, in every kind of file.
+#[test]
+fn parts_are_exported_apart_and_open_in_colmap() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let out = directory.path().join("out");
+    let input = two_parts(directory.path());
+    let size = ["--width", "1000", "--height", "1000"];
+    let solved = solve(&input, &out, &[&size[..], &["--export", "colmap,colmap-text,opensfm"]].concat());
+    assert_eq!(solved.code, Some(0), "{solved:?}");
+    let cameras = json(&fs::read_to_string(out.join("cameras.json")).expect("cameras.json"));
+    let views = |part: u64| {
+        let all = cameras["views"].as_array().expect("views").iter();
+        all.filter(|view| view["part"] == part).count()
+    };
+    let (first, second) = (views(0), views(1));
+    assert!(first >= second && second >= 5 && first + second >= 14, "{first} and {second} views");
+    let vertices = |name: &str| {
+        let text = fs::read_to_string(out.join(name)).expect("points");
+        text.lines().skip_while(|line| *line != "end_header").skip(1).count()
+    };
+    let rows = fs::read_to_string(out.join("tracks.csv")).expect("tracks.csv");
+    let of_part = |part: &str| rows.lines().skip(1).filter(|row| row.rsplit(',').next() == Some(part)).count();
+    assert_eq!((vertices("points.ply"), vertices("points-part-1.ply")), (of_part("0"), of_part("1")));
+    assert!(of_part("1") > 50, "{}", of_part("1"));
+    let reconstructions = json(&fs::read_to_string(out.join("opensfm/reconstruction.json")).expect("a list"));
+    let shots = |part: usize| reconstructions[part]["shots"].as_object().map(serde_json::Map::len);
+    assert_eq!((shots(0), shots(1), &reconstructions[2]), (Some(first), Some(second), &Value::Null));
+
+    let Some(python) = python("COLMAP's reader", "pycolmap") else { return };
+    let script = "import sys, pycolmap\nfor path in sys.argv[1:]:\n    model = pycolmap.Reconstruction(path)\n    \
+                  print(model.num_reg_images(), model.num_points3D() > 50)\n";
+    let models = ["colmap", "colmap/1", "colmap-text", "colmap-text/1"].map(|name| out.join(name));
+    let printed = succeeds(Command::new(python).args(["-c", script]).args(&models));
+    let wanted = [first, second, first, second].map(|count| format!("{count} True"));
+    assert_eq!(printed.lines().collect::<Vec<_>>(), wanted);
+}
+
 /// A database that COLMAP itself wrote: wrong matches are cut, and what is written goes by COLMAP's ids.
 #[test]
 fn a_database_of_colmap_is_solved_under_its_own_ids() {

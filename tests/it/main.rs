@@ -6,6 +6,7 @@ mod cli;
 mod crash;
 mod formats;
 mod load;
+mod lost;
 mod readme;
 mod real;
 mod replicas;

@@ -48,11 +48,57 @@ fn a_walk_is_registered_whole_and_a_server_gives_the_same_answer() {
 }
 
 #[test]
+fn windows_are_solved_alone_and_alike_on_any_number_of_threads() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let path = |name: &str| directory.path().join(name);
+    let walk = path("walk");
+    let scene = ["--sequence", "--views", "8", "--tracks", "400", "--noise", "0.0005", "--outliers", "0.3"];
+    let made = run(["synth", "--out", text(&walk)].iter().chain(&scene));
+    // Fewer views than a track may live by default.
+    assert_eq!(made.code, Some(0), "{made:?}");
+    assert!(made.stderr.contains("400 tracks of 3 to 8 views"), "{made:?}");
+    let input = walk.join("observations.csv");
+    let windows = |threads: &str| {
+        let out = path(threads);
+        let flags = ["--width", "1000", "--height", "1000", "--method", "geometry", "--window", "5", "--step", "2"];
+        let solve = ["solve", text(&input), "--out", text(&out), "--threads", threads];
+        let done = run(solve.iter().chain(&flags));
+        assert_eq!(done.code, Some(0), "{done:?}");
+        (done, json(&out.join("windows.json")), fs::read_to_string(out.join("windows.csv")).expect("windows.csv"))
+    };
+    let (one, mut of_one, csv) = windows("1");
+    let (_, mut of_three, _) = windows("3");
+    for table in [&mut of_one, &mut of_three] {
+        table["seconds"] = Value::Null;
+        table["windows"].as_array_mut().expect("rows").iter_mut().for_each(|row| row["seconds"] = Value::Null);
+    }
+    assert_eq!(of_one, of_three);
+    let rows = of_one["windows"].as_array().expect("rows");
+    let views: Vec<_> = rows.iter().map(|row| (row["first_view"].as_u64(), row["last_view"].as_u64())).collect();
+    assert_eq!(views, [(Some(0), Some(4)), (Some(2), Some(6))]);
+    assert_eq!((&of_one["views_left"], of_one["solved"].as_u64()), (&1.into(), Some(2)), "{of_one}");
+    for row in rows {
+        assert!(row["reprojection_mean_px"].as_f64().is_some_and(|px| (0.1..1.0).contains(&px)), "{row}");
+        assert!(
+            row["inlier_tracks"].as_u64() > Some(50) && row["tracks"].as_u64() > row["inlier_tracks"].as_u64(),
+            "{row}"
+        );
+    }
+    assert_eq!(csv.lines().count(), 3);
+    assert!(one.stderr.contains("window 2 of 2: views 2 to 6\n"), "{one:?}");
+    assert!(one.stdout.contains("median") && one.stdout.contains("fill no window: 1"), "{one:?}");
+    let none = path("none");
+    let too_long = ["solve", text(&input), "--out", text(&none), "--window", "9"];
+    assert_eq!(run(too_long).code, Some(2));
+    assert_eq!(run(too_long.iter().chain(&["--server", "http://127.0.0.1:1"])).code, Some(2));
+}
+
+#[test]
 fn a_sequence_of_impossible_measures_is_wrong_usage() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let out = directory.path().join("walk");
     for (wrong, named) in [
-        (["--sequence", "--views", "4"].as_slice(), "lifetime"),
+        (["--sequence", "--views", "4", "--lifetime", "3,5"].as_slice(), "lifetime"),
         (&["--sequence", "--motion", "orbit"], "--motion"),
         (&["--sequence", "--lifetime", "3"], "--lifetime"),
     ] {

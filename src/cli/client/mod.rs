@@ -89,6 +89,11 @@ impl Client {
         })
     }
 
+    /// The server's address, as it was given.
+    pub fn server(&self) -> &str {
+        &self.server
+    }
+
     fn error(&self, status: Status) -> Error {
         Error::from_status(&self.server, &status)
     }

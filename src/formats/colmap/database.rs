@@ -28,9 +28,10 @@ use crate::formats::source::Matches;
 /// A file that is no such database, is being written to, is damaged (by table and row) or above `limits`.
 pub fn read(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<LabelledInput, Error> {
     let file = display_name(path);
-    refuse_unfinished(path).map_err(|what| Error::one(&file, Problem::of_file(what)))?;
-    let contents = on_a_runtime_of_its_own(path, limits, matches).map_err(|problem| Error::one(&file, problem))?;
-    let labelled = contents.into_labelled(path, limits).map_err(|problem| Error::one(&file, problem))?;
+    let one = |problem: Problem| Error::one(&file, problem);
+    refuse_unfinished(path).map_err(|what| Error::whole(&file, what))?;
+    let contents = on_a_runtime_of_its_own(path, limits, matches).map_err(one)?;
+    let labelled = contents.into_labelled(path, limits).map_err(one)?;
     labelled.check(limits)?;
     Ok(labelled)
 }
@@ -107,11 +108,11 @@ fn on_a_runtime_of_its_own(path: &Path, limits: &Limits, matches: Option<Matches
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_time()
             .build()
-            .map_err(|error| Problem::of_file(format!("cannot be read: no runtime: {error}")))?;
+            .map_err(|error| Problem::unreadable(format_args!("no runtime: {error}")))?;
         runtime.block_on(contents(path, limits, matches))
     };
     std::thread::scope(|scope| scope.spawn(work).join())
-        .unwrap_or_else(|_| Err(Problem::of_file("cannot be read: reading it failed within this program")))
+        .unwrap_or_else(|_| Err(Problem::unreadable("reading it failed within this program")))
 }
 
 async fn contents(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<Contents, Problem> {

@@ -43,7 +43,7 @@ fn extension(directory: &Path) -> Option<&'static str> {
 pub fn read(directory: &Path, limits: &Limits) -> Result<LabelledInput, Error> {
     let kind = extension(directory).ok_or_else(|| {
         let name = crate::formats::input::display_name(directory);
-        Error::one(&name, Problem::of_file("is no COLMAP model: cameras and images, .bin or .txt, are needed"))
+        Error::whole(&name, "is no COLMAP model: cameras and images, .bin or .txt, are needed")
     })?;
     let mut images = Images::default();
     let names = [format!("cameras.{kind}"), format!("images.{kind}")];
@@ -68,7 +68,7 @@ fn into_labelled(
 ) -> Result<LabelledInput, Error> {
     if observations.is_empty() {
         let what = format!("has {} images, and no keypoint of a point in space", images.len());
-        return Err(Error::one(file, Problem::of_file(what)));
+        return Err(Error::whole(file, what));
     }
     // Lines are those of the images.
     let labelled = images.into_labelled(observations, &directory.join(file), Vec::new());
@@ -79,8 +79,7 @@ fn into_labelled(
 /// Opens a file of a model; returns its length too.
 fn open(directory: &Path, name: &str) -> Result<(BufReader<File>, u64), Error> {
     let opened = File::open(directory.join(name)).and_then(|file| Ok((file.metadata()?.len(), file)));
-    let (length, file) =
-        opened.map_err(|error| Error::one(name, Problem::of_file(format!("cannot be read: {error}"))))?;
+    let (length, file) = opened.map_err(|error| Error::one(name, Problem::unreadable(error)))?;
     Ok((BufReader::new(file), length))
 }
 

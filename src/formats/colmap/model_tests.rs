@@ -13,7 +13,7 @@ fn exported() -> (LabelledInput, [Vec<u8>; 3], [String; 3]) {
     input.view_labels = (0..5).map(|view| Label::Name(format!("image {view}.jpg").into())).collect();
     input.image_ids = (0..5).map(|view| 9 - view).collect();
     input.raw.views.iter_mut().for_each(|view| view.camera_group = 4);
-    let model = Model::new(&solution, &input).expect("a metric result");
+    let model = Model::of_parts(&solution, &input).expect("a metric result").remove(0);
     (input, write::binary(&model), write::text(&model))
 }
 

@@ -4,6 +4,7 @@
 //! `doc/source/geometry.rst` and `opensfm/features.py`).
 
 pub mod reconstruction;
+mod sizes;
 pub mod tracks;
 
 use crate::domain::ImageSize;

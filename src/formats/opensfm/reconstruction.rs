@@ -9,18 +9,22 @@ use crate::formats::metric::{Camera, Image, Model, Point};
 /// a half when a middle is computed.
 const MIDDLE_PX: f64 = 1e-6;
 
-/// A list of one reconstruction: cameras, shots and points.
+/// A list of reconstructions, one a part: cameras, shots and points.
 ///
 /// Lengths of cameras are in units of the larger image side, the origin is the middle of the image; a shot's rotation is
 /// an angle-axis vector, world to camera.
-pub fn json(model: &Model) -> Value {
+pub fn json(models: &[Model]) -> Value {
+    models.iter().map(reconstruction).collect()
+}
+
+fn reconstruction(model: &Model) -> Value {
     let cameras: Map<String, Value> =
         model.cameras.iter().map(|camera| (camera_name(camera), self::camera(camera))).collect();
     let shots: Map<String, Value> =
         model.images.iter().map(|image| (image.name.to_string(), shot(image, model))).collect();
     let points: Map<String, Value> =
         model.points.iter().map(|point| (point.label.to_string(), self::point(point))).collect();
-    json!([{ "cameras": cameras, "shots": shots, "points": points }])
+    json!({ "cameras": cameras, "shots": shots, "points": points })
 }
 
 fn camera_name(camera: &Camera) -> String {

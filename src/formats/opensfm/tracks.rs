@@ -2,13 +2,14 @@
 //!
 //! Version 0 has no header and the columns `image track feature x y r g b`; version 1 adds `scale` after `y`, version 2
 //! `segmentation instance` at the end (mapillary/OpenSfM, `opensfm/src/map/src/tracks_manager.cc`). Only image, track, x
-//! and y are used.
+//! and y are used. x and y are relative to the image size, which the file does not hold.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::io::BufRead;
 use std::path::Path;
 
 use super::frame;
+use super::sizes::Sizes;
 use crate::domain::{ImageSize, Limits, RawInput, View};
 use crate::formats::error::{Error, Problem, Problems};
 use crate::formats::input::{LabelledInput, display_name};
@@ -22,20 +23,21 @@ const COLUMNS: [usize; 3] = [8, 9, 11];
 
 /// Reads the tracks; views are image names, in ascending order.
 ///
-/// * `size`: of every image; the file has none
+/// * `size`: of the images that the data set around the file knows none of; see [`Sizes`]
 ///
 /// # Errors
-/// A file that cannot be opened, is no such table, is above `limits` or has wrong values; by line.
-pub fn read(path: &Path, limits: &Limits, size: ImageSize) -> Result<LabelledInput, Error> {
+/// A file that cannot be opened, is no such table, is above `limits` or has wrong values; an image without a size; by
+/// line.
+pub fn read(path: &Path, limits: &Limits, size: Option<ImageSize>) -> Result<LabelledInput, Error> {
     parse(text::open_table(path, limits)?, path, limits, size)
 }
 
 /// Reads the tracks from anything.
-fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: ImageSize) -> Result<LabelledInput, Error> {
+fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: Option<ImageSize>) -> Result<LabelledInput, Error> {
     let file = display_name(path);
     let one = |problem: Problem| Error::one(&file, problem);
     let mut lines = Lines::new(reader, text::MAX_TABLE_LINE_BYTES);
-    let mut table = Table::new(size);
+    let mut table = Table::new(Sizes::beside(path), size);
     let mut columns = COLUMNS[0];
     let mut problems = Problems::default();
     while lines.advance().map_err(one)? {
@@ -49,8 +51,7 @@ fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: ImageSize) ->
             continue;
         }
         if table.lines.len() == limits.max_observations {
-            let what = format!("more observations than the limit of {}", limits.max_observations);
-            return Err(one(Problem::at_line(number, "", what)));
+            return Err(one(Problem::too_many_observations(number, limits.max_observations)));
         }
         if let Err((column, what)) = table.push(line, columns, number) {
             problems.push(Problem::at_line(number, column, what));
@@ -58,9 +59,9 @@ fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: ImageSize) ->
     }
     problems.into_result(&file)?;
     if table.lines.is_empty() {
-        return Err(one(Problem::of_file("has no observations")));
+        return Err(Error::whole(&file, "has no observations"));
     }
-    let labelled = table.into_labelled(path, size);
+    let labelled = table.into_labelled(path);
     labelled.refuse_duplicates()?;
     labelled.check(limits)?;
     Ok(labelled)
@@ -77,8 +78,11 @@ fn columns_of_version(header: &str) -> Result<usize, String> {
 
 /// Observations as they are read, images and tracks numbered as they come.
 struct Table {
-    middle_px: [f64; 2],
-    side_px: f64,
+    sizes: Sizes,
+    /// Where the data set gives none.
+    size: Option<ImageSize>,
+    /// Of each image; `None`: no size is known, which was told when it came.
+    shots: Vec<Option<Shot>>,
     images: Names,
     tracks: Names,
     view: Vec<u32>,
@@ -88,12 +92,20 @@ struct Table {
     lines: Vec<u64>,
 }
 
+/// What is known of an image beside its points.
+struct Shot {
+    size: ImageSize,
+    camera: Option<String>,
+    /// Whether the data set gives the size.
+    is_own: bool,
+}
+
 impl Table {
-    fn new(size: ImageSize) -> Self {
-        let (middle_px, side_px) = frame(size);
+    fn new(sizes: Sizes, size: Option<ImageSize>) -> Self {
         Self {
-            middle_px,
-            side_px,
+            sizes,
+            size,
+            shots: Vec::new(),
             images: Names::default(),
             tracks: Names::default(),
             view: Vec::new(),
@@ -119,21 +131,66 @@ impl Table {
         let y = number(fields[4].trim()).map_err(|what| ("y", what))?;
         let view = self.images.id(fields[0], Label::name).map_err(|what| ("image", what))?;
         let track = self.tracks.id(fields[1], Label::parse).map_err(|what| ("track_id", what))?;
+        if view as usize == self.shots.len() {
+            let (shot, problem) = match self.shot(fields[0]) {
+                Ok(shot) => (Some(shot), Ok(())),
+                Err(what) => (None, Err(("image", what))),
+            };
+            self.shots.push(shot);
+            problem?;
+        }
+        let Some(Some(shot)) = self.shots.get(view as usize) else { return Ok(()) };
+        let (middle_px, side_px) = frame(shot.size);
         self.view.push(view);
         self.track.push(track);
-        self.x.push(x * self.side_px + self.middle_px[0]);
-        self.y.push(y * self.side_px + self.middle_px[1]);
+        self.x.push(x * side_px + middle_px[0]);
+        self.y.push(y * side_px + middle_px[1]);
         self.lines.push(number_of_line);
         Ok(())
     }
 
-    fn into_labelled(self, path: &Path, size: ImageSize) -> LabelledInput {
+    /// What is known of an image that comes for the first time.
+    fn shot(&self, image: &str) -> Result<Shot, String> {
+        if let Some(exif) = self.sizes.of(image)? {
+            return Ok(Shot { size: exif.size(), camera: exif.camera, is_own: true });
+        }
+        let size = self.size.ok_or_else(|| {
+            format!("no size is known of {}: give it with --width and --height, or as exif/IMAGE.exif", quote(image))
+        })?;
+        Ok(Shot { size, camera: None, is_own: false })
+    }
+
+    /// The views in the order of their labels: the sizes of their images, and a group a camera that the data set names.
+    fn views(&self, positions: &[u32]) -> Vec<View> {
+        let shots = || self.shots.iter().zip(positions).filter_map(|(shot, at)| Some((shot.as_ref()?, *at as usize)));
+        let cameras: BTreeSet<Option<&str>> = shots().map(|(shot, _)| shot.camera.as_deref()).collect();
+        let cameras: Vec<Option<&str>> = cameras.into_iter().collect();
+        let mut views = vec![View::default(); positions.len()];
+        for (shot, position) in shots() {
+            let group = cameras.partition_point(|camera| *camera < shot.camera.as_deref());
+            views[position] = View { size: Some(shot.size), camera_group: group as u32, ..View::default() };
+        }
+        views
+    }
+
+    /// That a size that was given is not that of every image.
+    fn note(&self) -> Option<String> {
+        let own = self.shots.iter().flatten().filter(|shot| shot.is_own).count();
+        let others = self.size.filter(|_| own > 0)?;
+        let (width, height) = (others.width_px, others.height_px);
+        let count = self.shots.len();
+        Some(format!("{own} of {count} image sizes were read from exif/; {width} x {height} px is that of the others"))
+    }
+
+    fn into_labelled(self, path: &Path) -> LabelledInput {
         let (view_labels, view_positions) = dense(&self.images.labels);
         let (track_labels, track_positions) = dense(&self.tracks.labels);
+        let views = self.views(&view_positions);
+        let notes = self.note().into_iter().collect();
         let moved = |ids: &[u32], positions: &[u32]| ids.iter().map(|&id| positions[id as usize]).collect();
         LabelledInput {
             raw: RawInput {
-                views: vec![View { size: Some(size), ..View::default() }; view_labels.len()],
+                views,
                 track_count: track_labels.len(),
                 view: moved(&self.view, &view_positions),
                 track: moved(&self.track, &track_positions),
@@ -144,6 +201,7 @@ impl Table {
             view_labels,
             track_labels,
             lines: self.lines,
+            notes,
             path: path.into(),
             ..LabelledInput::default()
         }

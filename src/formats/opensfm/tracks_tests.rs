@@ -8,7 +8,7 @@ const VERSION_0: &str =
     "b.jpg\t10\t5\t0.25\t-0.125\t1\t2\t3\na.jpg\t10\t6\t0\t0\t1\t2\t3\na.jpg\t9\t7\t-0.5\t0.375\t1\t2\t3\n";
 
 fn parsed(text: impl AsRef<[u8]>) -> Result<LabelledInput, Error> {
-    parse(Cursor::new(text.as_ref()), Path::new("dir/tracks.csv"), &Limits::default(), SIZE)
+    parse(Cursor::new(text.as_ref()), Path::new("dir/tracks.csv"), &Limits::default(), Some(SIZE))
 }
 
 fn bad(text: impl AsRef<[u8]>) -> String {
@@ -78,8 +78,33 @@ fn no_mutation_makes_the_reader_panic() {
     let seeds = [VERSION_0.as_bytes().to_vec(), as_version(1).into_bytes(), as_version(2).into_bytes()];
     let limits = Limits { max_observations: 100, ..Limits::default() };
     let accepted = mutation::survives(&seeds, |bytes| {
-        parse(Cursor::new(bytes), Path::new("tracks.csv"), &limits, SIZE).map(|_| ()).map_err(|error| error.to_string())
+        parse(Cursor::new(bytes), Path::new("tracks.csv"), &limits, Some(SIZE))
+            .map(|_| ())
+            .map_err(|error| error.to_string())
     });
     // Many a digit may be another: were all refused, the mutations would test nothing but the first check.
     assert!(accepted > 0, "every mutated file was refused");
+}
+
+#[test]
+fn every_image_has_the_size_and_the_camera_that_the_data_set_gives_it() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let path = directory.path().join("tracks.csv");
+    std::fs::write(&path, VERSION_0).expect("written");
+    let read = |size| read(&path, &Limits::default(), size);
+    let refused = read(None).expect_err("no size").to_string();
+    assert!(refused.starts_with("tracks.csv, line 1: image: no size is known of `b.jpg`"), "{refused}");
+    assert_eq!(refused.lines().count(), 2, "once an image: {refused}");
+    std::fs::create_dir(directory.path().join("exif")).expect("created");
+    let exif = r#"{"width": 200, "height": 100, "camera": "wide"}"#;
+    std::fs::write(directory.path().join("exif/b.jpg.exif"), exif).expect("written");
+    let refused = read(None).expect_err("no size of a.jpg").to_string();
+    assert!(refused.starts_with("tracks.csv, line 2: image: no size is known of `a.jpg`"), "{refused}");
+    let input = read(Some(SIZE)).expect("every size is known");
+    let views: Vec<_> =
+        input.raw.views.iter().map(|view| (view.size.map(|size| size.width_px), view.camera_group)).collect();
+    assert_eq!(views, [(Some(640), 0), (Some(200), 1)]);
+    // x = .25 * 200 - .5 + 100 in b.jpg; the others as before.
+    assert_eq!(input.raw.x, [149.5, 319.5, -0.5]);
+    assert!(input.notes[0].starts_with("1 of 2 image sizes were read from exif/; 640 x 480 px"), "{:?}", input.notes);
 }

@@ -35,7 +35,7 @@ const images = () => {
     const several = views.some((entry) => entry[2] > 0);
     element("view-figures").textContent = `${inliers} of ${all} observations are inliers` +
       (mean === null ? "" : `; residual ${mean} px on average, ${rms} px RMS`) + (registered ? "" : "; not registered") +
-      (registered && several ? `; part ${part + 1}` : "");
+      (registered && several ? `; part ${part}` : "");
     const table = element("worst");
     table.replaceChildren();
     const row = (kind, cells) => {

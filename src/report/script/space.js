@@ -20,12 +20,15 @@ const space = () => {
     const turned = (v) => axes.map((axis) => dot(axis, v));
     const centres = cameras.map(([, C]) => turned(C)), points = new Float64Array(3 * count);
     for (let k = 0; k < count; k++) points.set(turned([raw[3 * k], raw[3 * k + 1], raw[3 * k + 2]]), 3 * k);
-    // The middle nine tenths of the points and all cameras are looked at, so that a stray one does not shrink the rest.
+    // What is looked at: all cameras, and the points within Tukey's fences along each axis, as in the still plan, so that
+    // neither stray ones nor a cluster far off shrink the rest.
     const low = [], high = [];
     for (let axis = 0; axis < 3; axis++) {
       const values = Float64Array.from({ length: count }, (_, k) => points[3 * k + axis]), own = centres.map((c) => c[axis]);
-      low.push(own.reduce((a, b) => Math.min(a, b), count ? quantile(values, 0.05) : Infinity));
-      high.push(own.reduce((a, b) => Math.max(a, b), count ? quantile(values, 0.95) : -Infinity));
+      const lower = quantile(values, 0.25), upper = quantile(values, 0.75), room = 1.5 * (upper - lower);
+      const inside = values.filter((v) => v >= lower - room && v <= upper + room);
+      low.push([...own, ...inside].reduce((a, b) => Math.min(a, b), Infinity));
+      high.push([...own, ...inside].reduce((a, b) => Math.max(a, b), -Infinity));
     }
     const focus = low.map((v, k) => (v + high[k]) / 2);
     const radius = Math.hypot(...low.map((v, k) => high[k] - v)) / 2 || 1;

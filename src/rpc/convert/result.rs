@@ -4,7 +4,9 @@ use super::enums::{Twin, optional_to_wire};
 use super::{progress, required};
 use crate::domain::job::JobName;
 use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, TrackSplit, ViewResult};
-use crate::domain::{Calibration, Grade, Method, Prior, Solution, Stage, Status, Violation, Warning, WarningCode};
+use crate::domain::{
+    Calibration, Grade, LeftOut, Method, Prior, Solution, Stage, Status, Violation, Warning, WarningCode,
+};
 use crate::rpc::proto;
 
 pub fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
@@ -29,7 +31,11 @@ pub fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         warnings: solution
             .warnings
             .iter()
-            .map(|warning| proto::Warning { code: warning.code.to_wire(), detail: warning.detail.clone() })
+            .map(|warning| proto::Warning {
+                code: warning.code.to_wire(),
+                detail: warning.detail.clone(),
+                camera_group: warning.camera_group,
+            })
             .collect(),
         seconds: solution.seconds,
         stages: solution
@@ -60,7 +66,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         winning_prior: Prior::from_wire(result.winning_prior, "winning_prior")?,
         iterations: result.iterations,
         seed: result.seed,
-        calibrations: result.calibrations.iter().map(calibration_from_wire).collect(),
+        calibrations: result.calibrations.iter().map(calibration_from_wire).collect::<Result<_, _>>()?,
         plane_at_infinity: result.plane_at_infinity.map(|plane| [plane.x, plane.y, plane.z]),
         views: result.views.iter().enumerate().map(view_from_wire).collect::<Result<_, _>>()?,
         tracks: tracks_from_wire(required(result.tracks, "tracks")?)?,
@@ -72,7 +78,10 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         warnings: result
             .warnings
             .into_iter()
-            .map(|warning| Ok(Warning::new(WarningCode::required(warning.code, "warnings.code")?, warning.detail)))
+            .map(|warning| {
+                let code = WarningCode::required(warning.code, "warnings.code")?;
+                Ok(Warning { code, detail: warning.detail, camera_group: warning.camera_group })
+            })
             .collect::<Result<_, Violation>>()?,
         seconds: result.seconds,
         stages: result
@@ -101,18 +110,20 @@ fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
         aspect: calibration.aspect,
         radial_k1: Some(calibration.radial_k1),
         radial_k2: Some(calibration.radial_k2),
+        grade: optional_to_wire(calibration.grade),
     }
 }
 
-fn calibration_from_wire(calibration: &proto::Calibration) -> Calibration {
-    Calibration {
+fn calibration_from_wire(calibration: &proto::Calibration) -> Result<Calibration, Violation> {
+    Ok(Calibration {
         focal_px: calibration.focal_px,
         sigma_log_focal: calibration.sigma_log_focal,
         principal_point_px: [calibration.principal_point_x_px, calibration.principal_point_y_px],
         aspect: calibration.aspect,
         radial_k1: calibration.radial_k1.unwrap_or(0.0),
         radial_k2: calibration.radial_k2.unwrap_or(0.0),
-    }
+        grade: Grade::from_wire(calibration.grade, "calibrations.grade")?,
+    })
 }
 
 fn view_to_wire(view: &ViewResult) -> proto::ViewResult {
@@ -122,7 +133,33 @@ fn view_to_wire(view: &ViewResult) -> proto::ViewResult {
         translation: view.translation.iter().flatten().copied().collect(),
         focal_px: view.focal_px,
         part: view.part,
+        camera_group: view.camera_group,
+        left_out: view.left_out.map(left_out_to_wire),
     }
+}
+
+fn left_out_to_wire(left_out: LeftOut) -> proto::LeftOut {
+    use proto::LeftOutReason as Reason;
+    let (reason, points, agreeing) = match left_out {
+        LeftOut::NoObservations => (Reason::NoObservations, 0, 0),
+        LeftOut::OutsideBlock => (Reason::OutsideBlock, 0, 0),
+        LeftOut::NotRegistered { points, agreeing } => (Reason::NotRegistered, points, agreeing),
+    };
+    proto::LeftOut { reason: reason.into(), points, agreeing }
+}
+
+fn left_out_from_wire(left_out: &proto::LeftOut, view: usize) -> Result<Option<LeftOut>, Violation> {
+    use proto::LeftOutReason as Reason;
+    let unknown = |_| {
+        let what = format!("{} is not a known LeftOutReason", left_out.reason);
+        Violation::at("views.left_out.reason", view, what)
+    };
+    Ok(match Reason::try_from(left_out.reason).map_err(unknown)? {
+        Reason::Unspecified => None,
+        Reason::NoObservations => Some(LeftOut::NoObservations),
+        Reason::OutsideBlock => Some(LeftOut::OutsideBlock),
+        Reason::NotRegistered => Some(LeftOut::NotRegistered { points: left_out.points, agreeing: left_out.agreeing }),
+    })
 }
 
 fn view_from_wire((index, view): (usize, &proto::ViewResult)) -> Result<ViewResult, Violation> {
@@ -139,6 +176,11 @@ fn view_from_wire((index, view): (usize, &proto::ViewResult)) -> Result<ViewResu
         },
         focal_px: view.focal_px,
         part: view.part,
+        camera_group: view.camera_group,
+        left_out: match &view.left_out {
+            Some(left_out) => left_out_from_wire(left_out, index)?,
+            None => None,
+        },
     })
 }
 
@@ -162,6 +204,11 @@ fn tracks_to_wire(tracks: &TrackResults) -> proto::TrackResults {
         network_weight: tracks.network_weight.clone(),
         point_track: with_point().map(|(track, _)| track as u32).collect(),
         point: with_point().flat_map(|(_, point)| point).collect(),
+        point_part: if tracks.part.is_empty() {
+            Vec::new()
+        } else {
+            with_point().map(|(track, _)| tracks.part_of(track).unwrap_or(0)).collect()
+        },
     }
 }
 
@@ -176,14 +223,24 @@ fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violati
             format!("{} numbers for {} points", tracks.point.len(), tracks.point_track.len()),
         ));
     }
+    let part_count = tracks.point_part.len();
+    if part_count != 0 && part_count != tracks.point_track.len() {
+        let what = format!("{part_count} parts for {} points", tracks.point_track.len());
+        return Err(Violation::of("tracks.point_part", what));
+    }
     let mut point = vec![None; count];
+    let mut part = if part_count == 0 { Vec::new() } else { vec![0; count] };
     for (index, (&track, xyz)) in tracks.point_track.iter().zip(tracks.point.chunks_exact(3)).enumerate() {
         let slot = point.get_mut(track as usize).ok_or_else(|| {
             Violation::at("tracks.point_track", index, format!("track {track} is outside the {count} tracks"))
         })?;
         *slot = Some([xyz[0], xyz[1], xyz[2]]);
+        if let (Some(part), Some(&of)) = (part.get_mut(track as usize), tracks.point_part.get(index)) {
+            *part = of;
+        }
     }
-    Ok(TrackResults { weight: tracks.weight, inlier: tracks.inlier, network_weight: tracks.network_weight, point })
+    let proto::TrackResults { weight, inlier, network_weight, .. } = tracks;
+    Ok(TrackResults { weight, inlier, network_weight, point, part })
 }
 
 fn observations_to_wire(observations: &ObservationResults) -> proto::ObservationResults {
@@ -274,6 +331,7 @@ mod tests {
                     aspect: 1.25,
                     radial_k1: -0.05,
                     radial_k2: 0.01,
+                    grade: Some(Grade::Weak),
                 },
                 Calibration {
                     focal_px: 900.0,
@@ -282,6 +340,7 @@ mod tests {
                     aspect: 1.0,
                     radial_k1: 0.0,
                     radial_k2: 0.0,
+                    grade: None,
                 },
             ],
             plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),
@@ -292,15 +351,24 @@ mod tests {
                     translation: Some([0.0, -1.0, 2.0]),
                     focal_px: Some(987.5),
                     part: 1,
+                    camera_group: 7,
+                    left_out: None,
                 },
                 ViewResult { projection, ..ViewResult::default() },
                 ViewResult::default(),
+                ViewResult { left_out: Some(LeftOut::NoObservations), ..ViewResult::default() },
+                ViewResult { left_out: Some(LeftOut::OutsideBlock), ..ViewResult::default() },
+                ViewResult {
+                    left_out: Some(LeftOut::NotRegistered { points: 12, agreeing: 4 }),
+                    ..ViewResult::default()
+                },
             ],
             tracks: TrackResults {
                 weight: vec![0.0, 1.0, 0.25],
                 inlier: vec![false, true, true],
                 network_weight: vec![0.1, 0.2, 0.3],
                 point: vec![None, Some([1.0, -2.0, 3.5]), None],
+                part: vec![0, 1, 0],
             },
             observations: ObservationResults {
                 inlier: vec![true, false, false],
@@ -315,7 +383,10 @@ mod tests {
             noise_px: Some(0.5),
             reprojection_rms_px: Some(0.7),
             reprojection_mean_px: Some(0.6),
-            warnings: vec![Warning::new(WarningCode::ViewsLeftOut, "views 3, 4")],
+            warnings: vec![
+                Warning::new(WarningCode::ViewsLeftOut, "views 3, 4"),
+                Warning::new(WarningCode::UnobservableFocal, "no turning").of_group(7),
+            ],
             seconds: 1.5,
             stages: vec![StageTime { stage: Stage::Prepare, seconds: 0.1 }],
             prior_times: vec![
@@ -372,5 +443,9 @@ mod tests {
         assert_eq!(with(&|result| tracks(result, &|tracks| tracks.inlier.truncate(1))), "tracks");
         assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_track[0] = 3)), "tracks.point_track[0]");
         assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point.truncate(2))), "tracks.point");
+        assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_part.push(1))), "tracks.point_part");
+        assert_eq!(with(&|result| result.calibrations[0].grade = 9), "calibrations.grade");
+        let reason = |result: &mut proto::JobResult| result.views[3].left_out.as_mut().expect("set").reason = 9;
+        assert_eq!(with(&reason), "views.left_out.reason[3]");
     }
 }

@@ -154,6 +154,7 @@ impl Judged {
                 inlier: vec![false; count],
                 network_weight: Vec::new(),
                 point: vec![None; count],
+                part: Vec::new(),
             },
             observations: ObservationResults::unjudged(input.observation_count()),
             retained: vec![Vec::new(); count],

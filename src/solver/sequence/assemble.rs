@@ -3,13 +3,13 @@
 use nalgebra::Matrix4;
 
 use super::Extended;
-use super::model::{Model, Scene};
+use super::model::{Landmark, Model, Scene};
 use super::register::Unregistered;
 use crate::domain::result::{TrackSplit, ViewResult};
-use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
+use crate::domain::{Calibration, Grade, LeftOut, Solution, Stage, Status, Warning};
 use crate::geometry::Point;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
-use crate::solver::assemble::{dehomogenise, listed, network_weights, pixel_calibration, reprojection};
+use crate::solver::assemble::{dehomogenise, network_weights, pixel_calibration, reprojection};
 use crate::solver::calibration::Outcome;
 use crate::solver::judge::{self, Geometry, Judged, SplitPoint};
 use crate::solver::recorder::Recorder;
@@ -24,16 +24,17 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
     let context = &scene.context;
     let mut judged = judged(&scene, &model);
     let metric = grade != Grade::ProjectiveOnly;
-    warnings.extend(told(&calibrations));
+    warnings.extend(told(&calibrations, &scene));
     warnings.extend(seed.second_structure.clone());
-    warnings.extend(left_out(&unregistered, super::super::block::observed_views(context.input).len()));
     let frames = frames(&scene, &model);
     let back = back(&frames, metric);
     judged.tracks.point = points(&judged, &model, &back);
     let splits = splits(&judged, &model, &back);
+    judged.tracks.part = parts(&judged, &model);
     judged.tracks.network_weight = network_weights(&seed, context);
     let (rms, mean) = reprojection(&judged.observations);
-    let views = views(&scene, &model, &frames, metric);
+    let mut views = views(&scene, &model, &frames, metric);
+    unregistered.iter().for_each(|left| views[left.view].left_out = Some(left.reason()));
     let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
     let (stages, history) = recorder.finish();
     Solution {
@@ -62,11 +63,20 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
 }
 
 /// What is to be said of the calibrations, each group's named where there are several.
-fn told(calibrations: &[Outcome]) -> Vec<Warning> {
+fn told(calibrations: &[Outcome], scene: &Scene) -> Vec<Warning> {
+    let id_of = |group: usize| {
+        let view = scene.group_of.iter().position(|of| *of == group)?;
+        Some(scene.context.input.views()[view].camera_group)
+    };
     let of_group = |(group, outcome): (usize, &Outcome)| -> Vec<Warning> {
-        let named = |warning: &Warning| match calibrations.len() {
-            1 => warning.clone(),
-            _ => Warning::new(warning.code, format!("camera group {group}: {}", warning.detail)),
+        let named = |warning: &Warning| match id_of(group) {
+            // One for all groups, or none to tell apart.
+            _ if scene.context.merges_cameras => warning.clone(),
+            Some(id) if calibrations.len() > 1 => {
+                Warning::new(warning.code, format!("camera group {id}: {}", warning.detail)).of_group(id)
+            }
+            Some(id) => warning.clone().of_group(id),
+            None => warning.clone(),
         };
         outcome.warnings.iter().map(named).collect()
     };
@@ -78,7 +88,7 @@ fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Cali
     let of_group = |(group, outcome): (usize, &Outcome)| {
         let intrinsics = &model.lenses[group].intrinsics;
         let view = scene.group_of.iter().position(|of| *of == group).unwrap_or(0);
-        pixel_calibration(intrinsics, outcome.sigma_log_focal, &scene.context, view)
+        pixel_calibration(intrinsics, (outcome.sigma_log_focal, outcome.grade), &scene.context, view)
     };
     if scene.context.merges_cameras {
         // One calibration, told for each of the groups.
@@ -140,8 +150,8 @@ fn views(scene: &Scene, model: &Model, frames: &[Option<Matrix4<f64>>], metric: 
             rotation: metric
                 .then(|| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
             translation: metric.then(|| pose.translation.into()),
-            focal_px: None,
             part: model.part_of[view],
+            ..ViewResult::default()
         }
     };
     model.poses.iter().enumerate().map(result).collect()
@@ -176,17 +186,19 @@ fn splits(judged: &Judged, model: &Model, back: &[Option<Matrix4<f64>>]) -> Vec<
     judged.splits.iter().map(split).collect()
 }
 
-fn left_out(unregistered: &[Unregistered], observed: usize) -> Option<Warning> {
-    if unregistered.is_empty() {
-        return None;
+/// The part that each track's point is in the frame of; empty where there is one.
+fn parts(judged: &Judged, model: &Model) -> Vec<u32> {
+    if model.part_of.iter().all(|&part| part == 0) {
+        return Vec::new();
     }
-    let named = unregistered.iter().map(|left| match left.points {
-        0 => format!("{} (sees too few points of the reconstruction)", left.view),
-        points => format!("{} ({} of the {points} points it sees agree on a pose)", left.view, left.agreeing),
-    });
-    let names = listed(named);
-    Some(Warning::new(
-        WarningCode::ViewsLeftOut,
-        format!("{} of {observed} views could not be registered: {}", unregistered.len(), names),
-    ))
+    let part = |(point, landmark): (&Option<[f64; 3]>, &Option<Landmark>)| {
+        landmark.filter(|_| point.is_some()).map_or(0, |landmark| landmark.part)
+    };
+    judged.tracks.point.iter().zip(&model.landmarks).map(part).collect()
+}
+
+impl Unregistered {
+    fn reason(&self) -> LeftOut {
+        LeftOut::NotRegistered { points: self.points as u32, agreeing: self.agreeing as u32 }
+    }
 }

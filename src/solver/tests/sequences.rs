@@ -1,6 +1,7 @@
 //! Inputs whose tracks live a few views.
 
 use super::*;
+use crate::domain::LeftOut;
 use crate::synthetic::{Sequence, SequenceOptions};
 
 fn input_of(sequence: &Sequence) -> Input {
@@ -93,12 +94,18 @@ fn what_shares_no_tracks_is_in_parts_of_one_calibration() {
         first
     };
     let raw = thinned(&sequence, |k| first[sequence.input.track[k] as usize] >= 14 || sequence.input.view[k] < 14);
+    let (views, tracks) = (raw.view.clone(), raw.track.clone());
     let solution =
         solved(&Input::new(raw, &Limits::default(), "sequence").expect("valid sequence"), &SolveSettings::default());
     let parts: Vec<u32> = solution.views.iter().map(|view| view.part).collect();
     assert_eq!(solution.registered_views().len(), 24, "{:?}", solution.warnings);
     assert_eq!(parts, [vec![0; 14], vec![1; 10]].concat());
     assert_eq!((solution.calibrations.len(), solution.grade), (1, Some(Grade::Metric)), "{:?}", solution.warnings);
+    assert!((0..options.tracks).any(|track| solution.tracks.part_of(track) == Some(1)));
+    for (k, &inlier) in solution.observations.inlier.iter().enumerate().filter(|(_, inlier)| **inlier) {
+        let part = solution.tracks.part_of(tracks[k] as usize);
+        assert!(inlier && part == Some(parts[views[k] as usize]), "observation {k}: {part:?}");
+    }
     for first in [0, 14] {
         let projection = solution.views[first].projection.expect("registered");
         let off = (0..3).flat_map(|row| (0..4).map(move |column| (row, column)));
@@ -121,6 +128,7 @@ fn a_view_of_nothing_but_wrong_observations_is_left_out_with_the_reason() {
     let others: Vec<usize> = (0..20).filter(|&view| view != 11).collect();
     assert_eq!(solution.registered_views(), others);
     let left_out = solution.warnings.iter().find(|warning| warning.code == WarningCode::ViewsLeftOut);
+    assert!(matches!(solution.views[11].left_out, Some(LeftOut::NotRegistered { points: 1.., .. })));
     let detail = &left_out.expect("a warning").detail;
     assert!(detail.starts_with("1 of 20 views") && detail.contains("11 (") && detail.contains("agree"), "{detail}");
     let wrong = in_view.iter().filter(|&&k| solution.observations.inlier[k]).count();
@@ -156,6 +164,12 @@ fn camera_groups_have_focal_lengths_of_their_own_unless_each_is_too_small() {
     let solution = solved(&grouped(&|view| if view < 14 { 3 } else { 7 }), &SolveSettings::default());
     assert_eq!(solution.grade, Some(Grade::Metric), "{:?}", solution.warnings);
     assert_eq!(solution.calibrations[1].sigma_log_focal, None);
+    let told: Vec<_> = solution.calibrations.iter().map(|calibration| calibration.grade).collect();
+    assert_eq!(told, [Some(Grade::Metric), Some(Grade::ProjectiveOnly)]);
+    let of_second = |warning: &Warning| warning.camera_group == Some(7);
+    assert!(
+        solution.warnings.iter().any(|warning| of_second(warning) && warning.detail.starts_with("camera group 7: "))
+    );
     assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::UnobservableFocal));
 
     // A group an image: all are solved as one.

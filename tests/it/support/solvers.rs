@@ -90,6 +90,7 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
             inlier: (0..tracks).map(|track| track % 2 == 0).collect(),
             network_weight: Vec::new(),
             point: vec![None; tracks],
+            part: Vec::new(),
         },
         observations: ObservationResults {
             inlier: vec![true; input.observation_count()],

@@ -1,0 +1,134 @@
+//! Views that take no part in a result: the reason as data, and the sentences made of it.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use super::result::{ViewResult, Warning, WarningCode};
+
+/// Views named one by one in a warning; past these they are only counted.
+const MOST_LISTED: usize = 20;
+/// The same for views that nothing is observed in: their number says what went wrong, a few names where to look.
+const MOST_LISTED_EMPTY: usize = 5;
+
+/// Why a view is not registered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum LeftOut {
+    /// No observation lies in it.
+    NoObservations,
+    /// It is outside the block of views that was solved.
+    OutsideBlock,
+    /// Of the points of a reconstruction that it sees, too few agree on a pose.
+    NotRegistered { points: u32, agreeing: u32 },
+}
+
+impl LeftOut {
+    /// The reason as it stands in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            LeftOut::NoObservations => "NO_OBSERVATIONS",
+            LeftOut::OutsideBlock => "OUTSIDE_BLOCK",
+            LeftOut::NotRegistered { .. } => "NOT_REGISTERED",
+        }
+    }
+}
+
+/// The reason in words, to stand behind a view's name.
+impl fmt::Display for LeftOut {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            LeftOut::NoObservations => f.write_str("nothing is observed in it"),
+            LeftOut::OutsideBlock => f.write_str("is outside the block that was solved"),
+            LeftOut::NotRegistered { points: 0, .. } => f.write_str("sees too few points of the reconstruction"),
+            LeftOut::NotRegistered { points, agreeing } => {
+                write!(f, "{agreeing} of the {points} points it sees agree on a pose")
+            }
+        }
+    }
+}
+
+/// The warnings that the reasons of the views amount to, one a kind of reason; `name` names a view by its index.
+pub fn warnings(views: &[ViewResult], name: impl Fn(usize) -> String) -> Vec<Warning> {
+    let of = |wanted: fn(LeftOut) -> bool| -> Vec<(usize, LeftOut)> {
+        let reasons = views.iter().enumerate().filter_map(|(view, result)| Some((view, result.left_out?)));
+        reasons.filter(|(_, reason)| wanted(*reason)).collect()
+    };
+    let unregistered = of(|reason| matches!(reason, LeftOut::NotRegistered { .. }));
+    let outside = of(|reason| reason == LeftOut::OutsideBlock);
+    let empty = of(|reason| reason == LeftOut::NoObservations);
+    let observed = views.len() - empty.len();
+    let names = |left: &[(usize, LeftOut)], most| listed(left.iter().map(|(view, _)| name(*view)), most);
+    let mut details = Vec::new();
+    if !unregistered.is_empty() {
+        let named = unregistered.iter().map(|(view, reason)| format!("{} ({reason})", name(*view)));
+        details.push(format!(
+            "{} of {observed} views could not be registered: {}",
+            unregistered.len(),
+            listed(named, MOST_LISTED)
+        ));
+    }
+    if !outside.is_empty() {
+        details.push(format!(
+            "{} of {observed} views are outside the block that was solved and were left out: {}",
+            outside.len(),
+            names(&outside, MOST_LISTED)
+        ));
+    }
+    if !empty.is_empty() {
+        details.push(format!(
+            "nothing is observed in {} of {} views: {}",
+            empty.len(),
+            views.len(),
+            names(&empty, MOST_LISTED_EMPTY)
+        ));
+    }
+    details.into_iter().map(|detail| Warning::new(WarningCode::ViewsLeftOut, detail)).collect()
+}
+
+/// The names with commas between them, past the first few only counted.
+fn listed(names: impl ExactSizeIterator<Item = String>, most: usize) -> String {
+    let count = names.len();
+    let mut listed: Vec<String> = names.take(most).collect();
+    if count > listed.len() {
+        listed.push(format!("and {} more", count - listed.len()));
+    }
+    listed.join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn views(reasons: &[Option<LeftOut>]) -> Vec<ViewResult> {
+        reasons.iter().map(|&left_out| ViewResult { left_out, ..ViewResult::default() }).collect()
+    }
+
+    #[test]
+    fn every_kind_of_reason_is_told_once_with_names() {
+        let unseen = LeftOut::NotRegistered { points: 0, agreeing: 0 };
+        let lost = LeftOut::NotRegistered { points: 12, agreeing: 4 };
+        let empty = Some(LeftOut::NoObservations);
+        let views = views(&[None, Some(lost), empty, Some(unseen), empty, empty, empty, empty, empty]);
+        let told = warnings(&views, |view| format!("{view}.jpg"));
+        assert!(told.iter().all(|warning| warning.code == WarningCode::ViewsLeftOut));
+        let details: Vec<&str> = told.iter().map(|warning| warning.detail.as_str()).collect();
+        assert_eq!(
+            details,
+            [
+                "2 of 3 views could not be registered: 1.jpg (4 of the 12 points it sees agree on a pose), 3.jpg (sees too \
+                 few points of the reconstruction)",
+                "nothing is observed in 6 of 9 views: 2.jpg, 4.jpg, 5.jpg, 6.jpg, 7.jpg, and 1 more",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_block_lists_what_it_leaves_out_and_no_reason_tells_nothing() {
+        let views = views(&[None, Some(LeftOut::OutsideBlock)]);
+        let told = warnings(&views, |view| view.to_string());
+        assert_eq!(told.len(), 1);
+        assert_eq!(told[0].detail, "1 of 2 views are outside the block that was solved and were left out: 1");
+        assert!(warnings(&views[..1], |view| view.to_string()).is_empty());
+    }
+}

@@ -1,0 +1,95 @@
+//! What `cameras.json` holds. Field names and spellings are a contract: add, never rename.
+
+use serde::Serialize;
+
+use super::result_json::view_label;
+use super::{Label, LabelledInput};
+use crate::domain::result::ViewResult;
+use crate::domain::{Calibration, LeftOut, Solution};
+
+/// `cameras.json`.
+#[derive(Debug, Clone, Serialize)]
+pub struct CamerasJson {
+    /// One entry a view of the input.
+    pub views: Vec<CameraJson>,
+}
+
+/// One view: `x ~ P X` in pixels, in the frame `P1 = [I|0]` of the first registered view of its part; `x ~ K (R X + t)`
+/// where the result is metric, before the radial distortion `radial_k1`, `radial_k2`. Matrices row by row; null where there is none.
+#[derive(Debug, Clone, Serialize)]
+#[allow(non_snake_case, reason = "the field's names for these matrices are capitals")]
+pub struct CameraJson {
+    /// The caller's id of the view: a number, or a text where the input has names.
+    pub view: Label,
+    pub registered: bool,
+    /// Reconstruction that a registered view belongs to; each has a frame and a scale of its own.
+    pub part: Option<u32>,
+    pub P: Option<[[f64; 4]; 3]>,
+    pub K: Option<[[f64; 3]; 3]>,
+    pub R: Option<[[f64; 3]; 3]>,
+    pub t: Option<[f64; 3]>,
+    pub radial_k1: Option<f64>,
+    pub radial_k2: Option<f64>,
+    /// The input's number of the view's camera; its calibration is among the `cameras` of `result.json`.
+    pub camera_group: u32,
+    /// One standard deviation of the log focal length of the group, for a view with a K; null there: unobservable.
+    pub sigma_log_focal: Option<f64>,
+    /// Why the view is not registered.
+    pub left_out: Option<LeftOutJson>,
+}
+
+/// Why a view is not registered, for programs and for people.
+#[derive(Debug, Clone, Serialize)]
+pub struct LeftOutJson {
+    pub code: &'static str,
+    pub detail: String,
+}
+
+impl From<LeftOut> for LeftOutJson {
+    fn from(left_out: LeftOut) -> Self {
+        Self { code: left_out.name(), detail: left_out.to_string() }
+    }
+}
+
+impl CamerasJson {
+    /// The cameras of a solution; without the input, views are numbered from 0.
+    pub fn new(solution: &Solution, input: Option<&LabelledInput>) -> Self {
+        let groups = groups_of_views(solution);
+        let camera = |(index, view): (usize, &ViewResult)| {
+            let is_metric = view.rotation.is_some() && view.translation.is_some();
+            let calibration =
+                groups.get(index).and_then(|&group| solution.calibrations.get(group)).filter(|_| is_metric);
+            CameraJson {
+                view: view_label(input, index),
+                registered: view.projection.is_some(),
+                part: view.projection.map(|_| view.part),
+                P: view.projection,
+                K: calibration.map(|shared| intrinsics(shared, view.focal_px)),
+                R: view.rotation.filter(|_| is_metric),
+                t: view.translation.filter(|_| is_metric),
+                radial_k1: calibration.map(|calibration| calibration.radial_k1),
+                radial_k2: calibration.map(|calibration| calibration.radial_k2),
+                camera_group: view.camera_group,
+                sigma_log_focal: calibration.and_then(|calibration| calibration.sigma_log_focal),
+                left_out: view.left_out.map(LeftOutJson::from),
+            }
+        };
+        Self { views: solution.views.iter().enumerate().map(camera).collect() }
+    }
+}
+
+/// Position of each view's camera group among the calibrations; a single calibration is everyone's.
+pub(super) fn groups_of_views(solution: &Solution) -> Vec<usize> {
+    if solution.calibrations.len() < 2 {
+        return vec![0; solution.views.len()];
+    }
+    let ids: Vec<u32> = solution.cameras().into_iter().map(|(group, _)| group).collect();
+    solution.views.iter().map(|view| ids.partition_point(|id| *id < view.camera_group)).collect()
+}
+
+/// The calibration matrix `K`, row by row; `own`: the view's own focal length.
+fn intrinsics(calibration: &Calibration, own: Option<f64>) -> [[f64; 3]; 3] {
+    let [x, y] = calibration.principal_point_px;
+    let focal_px = own.unwrap_or(calibration.focal_px);
+    [[focal_px, 0.0, x], [0.0, focal_px * calibration.aspect, y], [0.0, 0.0, 1.0]]
+}
