@@ -41,6 +41,8 @@ pub(super) fn grade(
         verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, choice.scale_px));
     }
     let rms_ratio = verdict.judge_fit(fit, &best.fit, &best.model.name(), choice.scale_px);
+    let is_known = choice.problem.focal_prior.is_some();
+    verdict.judge_plausibility(best.minimum.log_focal().exp(), is_known, choice.scale_px);
     verdict.judge_cheirality(best.minimum.cheirality);
     if verdict.grade != Grade::ProjectiveOnly {
         verdict.warnings.extend(principal_point(&best, choice.prior, choice.scale_px));

@@ -17,6 +17,10 @@ const RMS_RATIO_REFUSAL: f64 = 3.0;
 /// Share of the observations that must lie in front of their cameras, or the reconstruction is not to be used: what was
 /// seen was not behind the camera. A forward-moving car gave 2.9 % behind, with a focal length of a quarter of the true.
 pub const CHEIRALITY_LIMIT: f64 = 0.99;
+/// Focal lengths that lenses have, in the longer image side: rectilinear ones end at a field of view of 135 degrees (.2),
+/// telescopes at half a degree. Beyond, a minimum is no camera: of windows of a forward-moving car one was taken for a
+/// lens of 170 degrees, at a sigma of 10 %.
+const FOCAL_RANGE: (f64, f64) = (0.15, 120.0);
 
 /// The grade with the warnings that led to it.
 pub(super) struct Verdict {
@@ -77,6 +81,17 @@ impl Verdict {
         ratio
     }
 
+    /// Asks whether there is a lens of this focal length, in the longer image side, unless the caller said so.
+    pub fn judge_plausibility(&mut self, focal: f64, is_known: bool, scale_px: f64) {
+        if !is_known && !(FOCAL_RANGE.0..=FOCAL_RANGE.1).contains(&focal) {
+            let detail = format!(
+                "a focal length of {:.1} px, {focal:.2} of the longer image side, is that of no lens",
+                focal * scale_px
+            );
+            self.cap(Grade::ProjectiveOnly, WarningCode::UnobservableFocal, detail);
+        }
+    }
+
     /// Asks for the observations in front of their cameras, and for enough tracks.
     pub fn judge_cheirality(&mut self, in_front: f64) {
         if in_front < CHEIRALITY_LIMIT {
@@ -106,5 +121,26 @@ pub fn grade_of_sigma(sigma: Option<f64>) -> Grade {
         Some(sigma) if sigma < METRIC_BELOW => Grade::Metric,
         Some(sigma) if sigma <= WEAK_UP_TO => Grade::Weak,
         _ => Grade::ProjectiveOnly,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_lens_is_as_wide_or_as_long() {
+        let grade = |focal: f64, is_known: bool| {
+            let mut verdict = Verdict::new(Vec::new());
+            verdict.judge_plausibility(focal, is_known, 1000.0);
+            (verdict.grade, verdict.has(WarningCode::UnobservableFocal))
+        };
+        for focal in [0.2, 1.2, 100.0] {
+            assert_eq!(grade(focal, false), (Grade::Metric, false), "{focal}");
+        }
+        for focal in [0.05, 500.0, f64::NAN] {
+            assert_eq!(grade(focal, false), (Grade::ProjectiveOnly, true), "{focal}");
+        }
+        assert_eq!(grade(0.1, true), (Grade::Metric, false));
     }
 }
