@@ -122,7 +122,8 @@ fn tell(progress: &mut ProgressView, event: &Event, ranges: &[Range<usize>], inp
         }
         Event::Ended(row) => {
             let error = row.reprojection_mean_px.map_or_else(String::new, |px| format!(", {px:.3} px"));
-            let text = format!("window {} of {count}: {}{error}, {:.1} s", row.window, row.grade, row.seconds);
+            let seconds = row.seconds.map_or_else(String::new, |seconds| format!(", {seconds:.1} s"));
+            let text = format!("window {} of {count}: {}{error}{seconds}", row.window, row.grade);
             progress.part(Some(1.0 / count as f64), &text);
         }
     }

@@ -93,7 +93,7 @@ pub enum WarningCode {
     PureRotation,
     /// The camera moved without turning: every focal length fits. Forward motion is a case of it; the detail says so.
     PureTranslation,
-    /// The motion leaves the focal length (nearly) free.
+    /// The motion leaves the focal length (nearly) free, or the one that fits best is that of no lens; the detail says which.
     UnobservableFocal,
     /// Another calibration explains the data about as well.
     SecondMinimum,
@@ -120,6 +120,28 @@ pub enum WarningCode {
 }
 
 impl WarningCode {
+    /// Whether it can be why there is no focal length; the others tell of what was assumed or left out.
+    pub fn refuses(self) -> bool {
+        match self {
+            WarningCode::PlanarOrRotation
+            | WarningCode::PlanarScene
+            | WarningCode::PureRotation
+            | WarningCode::PureTranslation
+            | WarningCode::UnobservableFocal
+            | WarningCode::SecondMinimum
+            | WarningCode::ModelMismatch
+            | WarningCode::FewInliers
+            | WarningCode::Cheirality
+            | WarningCode::NoConsensus => true,
+            WarningCode::PrincipalPointUnobservable
+            | WarningCode::SecondStructure
+            | WarningCode::ViewsLeftOut
+            | WarningCode::AssumedImageSize
+            | WarningCode::CameraGroupsMerged
+            | WarningCode::StoppedEarly => false,
+        }
+    }
+
     /// The code as it stands in files.
     pub fn name(self) -> &'static str {
         match self {
@@ -374,6 +396,13 @@ impl Solution {
             several => several.get(place),
         };
         groups.into_iter().enumerate().map(|(place, group)| (group, of(place))).collect()
+    }
+
+    /// The calibration of the first camera group that has registered views.
+    pub fn first_calibration(&self) -> Option<&Calibration> {
+        let is_seen =
+            |group: u32| self.views.iter().any(|view| view.camera_group == group && view.projection.is_some());
+        self.cameras().into_iter().find(|(group, _)| is_seen(*group)).and_then(|(_, calibration)| calibration)
     }
 
     /// How many reconstructions there are, each with a frame of its own.

@@ -11,12 +11,13 @@ use super::{Label, LabelledInput, warnings};
 ///
 /// Infinity is not JSON: where the focal length is unobservable, `sigma_log_focal` is null and `focal_unobservable`
 /// is true. That is so of every `PROJECTIVE_ONLY` result: it has no `focal_px`, no `principal_point_px`, no `aspect`, no
-/// radial distortion and no `plane_at_infinity` either. Where nothing was calibrated for another reason, `focal_unobservable` is null too.
+/// radial distortion and no `plane_at_infinity` either. Where nothing was calibrated for another reason,
+/// `focal_unobservable` is null too.
 #[derive(Debug, Clone, Serialize)]
 pub struct ResultJson {
     pub status: Status,
     pub grade: Option<Grade>,
-    /// Of the first camera group that has registered views, down to `radial_k1`; see `cameras` where there are several.
+    /// Of the first camera group that has registered views, down to `radial_k2`; see `cameras` where there are several.
     pub focal_px: Option<f64>,
     pub sigma_log_focal: Option<f64>,
     pub focal_unobservable: Option<bool>,

@@ -66,7 +66,8 @@ pub struct Row {
     /// Over the inlier observations, distances.
     pub reprojection_mean_px: Option<f64>,
     pub reprojection_rms_px: Option<f64>,
-    pub seconds: f64,
+    /// Of the solve; `None` where there was none.
+    pub seconds: Option<f64>,
     /// Why there is no focal length.
     pub reason: Option<String>,
 }
@@ -89,15 +90,17 @@ impl Row {
             grade: "NO_RECONSTRUCTION",
             reprojection_mean_px: None,
             reprojection_rms_px: None,
-            seconds: 0.0,
+            seconds: None,
             reason: Some(reason),
         }
     }
 
     /// The same with its solution.
     pub fn solved(index: usize, input: &LabelledInput, solution: &Solution) -> Self {
-        let calibration = solution.calibrations.first();
-        let why = warnings::named(solution, Some(input)).into_iter().next();
+        let calibration = solution.first_calibration();
+        let mut warnings = warnings::named(solution, Some(input));
+        let refusal = warnings.iter().position(|warning| warning.code.refuses());
+        let why = refusal.map(|place| warnings.swap_remove(place));
         let why = why.map_or_else(String::new, |warning| format!("{}: {}", warning.code.name(), warning.detail));
         Self {
             registered_views: solution.registered_views().len(),
@@ -111,7 +114,7 @@ impl Row {
             },
             reprojection_mean_px: solution.reprojection_mean_px,
             reprojection_rms_px: solution.reprojection_rms_px,
-            seconds: solution.seconds,
+            seconds: Some(solution.seconds),
             reason: calibration.is_none().then_some(why),
             ..Self::unsolved(index, input, String::new())
         }
@@ -168,7 +171,7 @@ impl Table {
             focal_px: over(|row| row.focal_px),
             sigma_log_focal: over(|row| row.sigma_log_focal),
             reprojection_mean_px: over(|row| row.reprojection_mean_px),
-            seconds: over(|row| Some(row.seconds)),
+            seconds: over(|row| row.seconds),
             windows,
         }
     }
@@ -197,7 +200,7 @@ impl Table {
                 row.grade,
                 number(row.reprojection_mean_px),
                 number(row.reprojection_rms_px),
-                row.seconds,
+                number(row.seconds),
             ));
         }
         text
@@ -215,7 +218,7 @@ impl Table {
         for row in &self.windows {
             let views = format!("{} to {}", row.first_view.shown(), row.last_view.shown());
             text.push_str(&format!(
-                "{:>6}  {views:<24}{:>8}{:>8}{:>8}{:>10}{:>9}  {:<18}{:>8}{:>9.2}",
+                "{:>6}  {views:<24}{:>8}{:>8}{:>8}{:>10}{:>9}  {:<18}{:>8}{:>9}",
                 row.window,
                 row.tracks,
                 row.inlier_tracks,
@@ -224,7 +227,7 @@ impl Table {
                 shown(row.sigma_log_focal, 100.0, 2),
                 row.grade,
                 shown(row.reprojection_mean_px, 1.0, 3),
-                row.seconds
+                shown(row.seconds, 1.0, 2)
             ));
             text.push_str(&row.reason.as_ref().map_or_else(String::new, |reason| format!("  {reason}")));
             text.push('\n');
@@ -233,7 +236,7 @@ impl Table {
             let of = |average: &Option<Average>| average.as_ref().map(pick);
             format!(
                 "{name:>6}  {:<24}{:>8}{:>8}{:>8}{:>10}{:>9}  {:<18}{:>8}{:>9}\n",
-                format!("of {} of {} windows", self.solved, self.windows.len()),
+                format!("{} of {} windows solved", self.solved, self.windows.len()),
                 "",
                 shown(of(&self.inlier_tracks), 1.0, 1),
                 "",

@@ -28,7 +28,7 @@ pub fn headline(solution: &Solution) -> String {
         let _ =
             writeln!(html, "<div><dt>{}</dt><dd>{}</dd><p>{}</p></div>", escape(name), escape(&figure), escape(&note));
     };
-    if let Some(calibration) = solution.calibrations.first() {
+    if let Some(calibration) = solution.first_calibration() {
         let note = match calibration.sigma_log_focal {
             Some(sigma) => format!("\u{b1} {} % (one sigma)", short(sigma * 100.0)),
             None => "unobservable".into(),

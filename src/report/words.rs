@@ -16,7 +16,7 @@ pub fn warning(code: WarningCode) -> &'static str {
             "The camera moved but did not turn. Such views carry no focal length: every value fits them alike."
         }
         WarningCode::UnobservableFocal => {
-            "The camera's motion leaves the focal length free: many values fit the tracks as well as any other."
+            "The tracks do not tell the focal length: many values fit them alike, or the best is that of no lens."
         }
         WarningCode::SecondMinimum => "Another calibration explains the tracks about as well as the one shown.",
         WarningCode::ModelMismatch => {

@@ -28,7 +28,7 @@ mod sequence;
 mod tests;
 mod views;
 
-use crate::domain::result::ViewResult;
+use crate::domain::result::{ObservationResults, ViewResult};
 use crate::domain::{
     FocalPrior, Input, Observer, Solution, SolveSettings, Status, StopReason, StopToken, Warning, WarningCode,
 };
@@ -169,8 +169,8 @@ fn verified(mut solution: Solution) -> Solution {
     solution.tracks.inlier.fill(false);
     solution.tracks.point.fill(None);
     solution.tracks.part.clear();
-    solution.observations.inlier.fill(false);
-    solution.observations.residual_px.fill(None);
+    solution.observations = ObservationResults::unjudged(solution.observations.inlier.len());
+    solution.splits.clear();
     (solution.noise_px, solution.reprojection_rms_px, solution.reprojection_mean_px) = (None, None, None);
     let detail = format!("{inliers} tracks hold under the final geometry; {} can be verified", grow::LEAST_INLIERS);
     solution.warnings.push(Warning::new(WarningCode::FewInliers, detail));

@@ -179,6 +179,9 @@ impl Table {
         let others = self.size.filter(|_| own > 0)?;
         let (width, height) = (others.width_px, others.height_px);
         let count = self.shots.len();
+        if own == count {
+            return Some(format!("all image sizes were read from exif/; {width} x {height} px was not used"));
+        }
         Some(format!("{own} of {count} image sizes were read from exif/; {width} x {height} px is that of the others"))
     }
 

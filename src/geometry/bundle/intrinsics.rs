@@ -9,8 +9,8 @@ use super::intrinsics_model::Parameter;
 const UNDISTORT_STEPS: usize = 64;
 /// Relative change of the radius that ends them.
 const UNDISTORT_TOLERANCE: f64 = 4.0 * f64::EPSILON;
-/// How far beyond the distorted radius the undistorted one can lie where the image does not fold: without a fold
-/// `k1^2 < 20/9 k2`, so that the scale `1 + k1 r^2 + k2 r^4` is 4/9 at least.
+/// How far beyond the distorted radius the undistorted one can lie where the image does not fold: then either neither
+/// coefficient is negative and the scale `1 + k1 r^2 + k2 r^4` is 1 at least, or `k1^2 < 20/9 k2` and it is 4/9 at least.
 const WIDEST_UNFOLDED: f64 = 9.0 / 4.0;
 
 /// Intrinsics in normalised image units, without skew: `x = f u s + px`, `y = a f v s + py` with

@@ -122,7 +122,30 @@ impl NoiseModel {
 
 #[cfg(test)]
 mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
     use super::*;
+
+    #[test]
+    fn the_tail_is_read_from_the_residuals() {
+        let model = NoiseModel::new(0.001, 1.0);
+        for (seed, share) in [(0, 0.0), (1, 0.02), (2, 0.1), (3, 0.5)] {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            // A squared residual of two Gaussian coordinates is exponential, of mean 2 variances.
+            let squared: Vec<f64> = (0..5_000)
+                .map(|_| {
+                    let width = if rng.random::<f64>() < share { TAIL_WIDTH } else { 1.0 };
+                    -2.0 * width * width * (1.0 - rng.random::<f64>()).ln()
+                })
+                .collect();
+            let found = model.with_tail(&squared).expect("enough").tail_share;
+            let expected = share.clamp(TAIL_BOUNDS.0, TAIL_BOUNDS.1);
+            println!("seed {seed}: share {found} of {share}");
+            assert!((found - expected).abs() < 0.01 + 0.2 * expected, "seed {seed}: {found} instead of {expected}");
+            assert_eq!(model.with_tail(&squared[..TAIL_OBSERVATIONS - 1]), None);
+        }
+    }
 
     #[test]
     fn the_gate_lets_the_core_of_any_noise_through() {
