@@ -1,18 +1,19 @@
 //! One attempt at a job, from its claim to its end: feeds the worker, stores progress, keeps the lease.
 
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use tokio::sync::{oneshot, watch};
-use tokio::time::{Instant, MissedTickBehavior, interval_at, sleep, sleep_until, timeout_at};
+use tokio::time::{Instant, Interval, MissedTickBehavior, interval_at, sleep, sleep_until, timeout_at};
 use tracing::Instrument;
 
 use super::observe::{self, Attempt, AttemptLost};
 use super::worker::{Assignment, Report, Verdict, Worker};
 use super::{Inner, locked};
-use crate::domain::job::{Failure, Job, JobState};
+use crate::domain::job::{Failure, Job, JobName, JobState};
 use crate::domain::{Progress, StopReason, StopToken};
-use crate::store::{self, Claimed, Ending, Lease, Outcome};
+use crate::store::{self, Claimed, Ending, Lease, Outcome, Store};
 
 /// Least time between two stored progress events of a job: twice a second is as fast as people look, and a commit
 /// each is cheap for the disk.
@@ -43,6 +44,14 @@ pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) {
 async fn in_time<T>(until: Instant, writing: impl Future<Output = Result<T, store::Error>>) -> Result<T, store::Error> {
     let late = |_| Err(store::Error::Unavailable("no answer as long as the lease held".into()));
     timeout_at(until, writing).await.unwrap_or_else(late)
+}
+
+/// The input of a job, once the cancel is seen that may have come before the job was listed as running.
+async fn read(store: Arc<dyn Store>, name: JobName, stop: StopToken) -> Result<Vec<u8>, store::Error> {
+    if store.job(&name).await?.cancel_requested {
+        stop.stop(StopReason::Cancelled);
+    }
+    store.input(&name).await
 }
 
 /// An attempt under way.
@@ -121,11 +130,23 @@ impl<'a> Course<'a> {
     }
 
     /// Reads the input, and the cancel that may have come before the job was listed as running. A store that is out
-    /// of reach is asked again as long as the lease holds.
+    /// of reach is asked again as long as the lease holds, which heartbeats keep while a large input is read.
     async fn prepare(&mut self) -> Result<Vec<u8>, Verdict> {
         loop {
-            match self.read().await {
-                Ok(input) => return Ok(input),
+            let mut reading = pin!(read(self.inner.store.clone(), self.job.name.clone(), self.stop.clone()));
+            let mut heartbeats = self.heartbeats();
+            let input = loop {
+                tokio::select! {
+                    biased;
+                    input = &mut reading => break input,
+                    _ = heartbeats.tick(), if !self.lost => {
+                        self.heartbeat().await;
+                    }
+                }
+            };
+            match input {
+                Ok(input) if !self.lost => return Ok(input),
+                Ok(_) => {}
                 Err(error @ store::Error::Unavailable(_)) => self.store_failed(&error),
                 Err(error) => return Err(Verdict::Broken(error.to_string())),
             }
@@ -136,11 +157,13 @@ impl<'a> Course<'a> {
         }
     }
 
-    async fn read(&self) -> Result<Vec<u8>, store::Error> {
-        if self.inner.store.job(&self.job.name).await?.cancel_requested {
-            self.stop.stop(StopReason::Cancelled);
-        }
-        self.inner.store.input(&self.job.name).await
+    /// Ticks when heartbeats are due, the first one as long after the last as any: at once, if that has passed.
+    fn heartbeats(&self) -> Interval {
+        let beat = self.inner.options.lease / HEARTBEATS_A_LEASE;
+        let last = self.leased_until.checked_sub(self.inner.options.lease).unwrap_or_else(Instant::now);
+        let mut heartbeats = interval_at(last + beat, beat);
+        heartbeats.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        heartbeats
     }
 
     /// Keeps the lease and stores progress until the worker reports. Returns the report, if the worker lived to give
@@ -150,9 +173,7 @@ impl<'a> Course<'a> {
         mut answer: oneshot::Receiver<Report>,
         mut reported: watch::Receiver<Option<Progress>>,
     ) -> (Option<Report>, Option<Progress>) {
-        let beat = self.inner.options.lease / HEARTBEATS_A_LEASE;
-        let mut heartbeats = interval_at(Instant::now() + beat, beat);
-        heartbeats.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut heartbeats = self.heartbeats();
         let mut next_store = Instant::now();
         let mut news = false;
         let report = loop {
@@ -162,7 +183,7 @@ impl<'a> Course<'a> {
                 report = &mut answer => break report.ok(),
                 _ = heartbeats.tick(), if !self.lost => {
                     if !self.heartbeat().await {
-                        heartbeats.reset_after(RETRY_PAUSE.min(beat));
+                        heartbeats.reset_after(RETRY_PAUSE.min(heartbeats.period()));
                     }
                 }
                 () = sleep_until(self.leased_until), if !self.lost => self.lapse(),
