@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::args::{ExportArgs, InputArgs, ServerArgs, SettingsArgs, tell_notes};
+use super::client::access::AccessArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::progress::ProgressView;
@@ -37,6 +38,9 @@ pub struct Args {
     #[arg(long, value_name = "URL")]
     pub server: Option<String>,
 
+    #[command(flatten)]
+    pub access: AccessArgs,
+
     /// Directory for the result files; created, files of these names in it are replaced
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -58,6 +62,9 @@ pub struct Args {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
+    if args.server.is_none() && args.access.is_given() {
+        return Err(Failure::usage("flags on the access to a server need --server"));
+    }
     let settings = args.settings.settings()?;
     let input = args.input.read()?;
     if !args.quiet {
@@ -67,7 +74,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     result_files::create_directory(&args.out)?;
     let mut progress = ProgressView::new(args.quiet);
     let solution = match &args.server {
-        Some(server) => on_server(server, &input, &settings, &mut progress).await?,
+        Some(server) => on_server(server, &args.access, &input, &settings, &mut progress).await?,
         None => in_process(&input, &settings, &mut progress)?,
     };
     progress.finish();
@@ -95,11 +102,12 @@ fn in_process(
 /// Solves on a server; Ctrl-C cancels the job there.
 async fn on_server(
     server: &str,
+    access: &AccessArgs,
     input: &LabelledInput,
     settings: &SolveSettings,
     progress: &mut ProgressView,
 ) -> Result<Solution, Failure> {
-    let server = ServerArgs { server: server.to_owned() };
+    let server = ServerArgs { server: server.to_owned(), access: access.clone() };
     let interrupt = Interrupt::listen()?;
     let mut on_event = |event: &JobEvent| job_view::show_event(progress, event);
     let outcome = client::solve(&server, &input.raw, settings, &mut on_event, interrupt.token()).await;
