@@ -172,10 +172,16 @@ impl Sources {
     /// Every key there is now.
     ///
     /// # Errors
-    /// See [`KeyRing::read`].
+    /// See [`KeyRing::read`]; a key that the two give to different tenants.
     pub fn load(&self) -> Result<KeyRing, String> {
         let ring = self.file.as_deref().map(KeyRing::read).transpose()?.unwrap_or_default();
-        Ok(self.fixed.iter().fold(ring, KeyRing::with))
+        let Some(fixed) = &self.fixed else { return Ok(ring) };
+        let disputed =
+            |(digest, tenant): &(Digest, String)| fixed.keys.iter().any(|(other, of)| other == digest && of != tenant);
+        match ring.keys.iter().any(disputed) {
+            true => Err("auth.keys and auth.keys_file give one key to two tenants".into()),
+            false => Ok(ring.with(fixed)),
+        }
     }
 }
 
@@ -188,7 +194,6 @@ mod tests {
 
     #[test]
     fn a_key_stands_for_its_tenant_however_it_is_written() {
-        // echo -n bbb...b | sha256sum
         let hash = digest(B.as_bytes()).map(|byte| format!("{byte:02x}")).concat();
         let text = format!("# tenants\nnorth:{A} # the first\n\nsouth:sha256:{hash}\n");
         let ring: KeyRing = text.parse().expect("two keys");
@@ -200,6 +205,21 @@ mod tests {
         assert_eq!(commas, ring);
         let debug = format!("{ring:?}");
         assert_eq!(debug, "KeyRing(2 keys of {\"north\", \"south\"})");
+    }
+
+    #[test]
+    fn file_and_environment_add_up_and_do_not_dispute_a_key() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("keys.txt");
+        std::fs::write(&path, format!("north:{A}\n")).expect("written");
+        let load = |fixed: &str| {
+            let fixed = Some(fixed.parse().expect("keys"));
+            Sources { file: Some(path.clone()), fixed }.load()
+        };
+        let both = load(&format!("south:{B},north:{A}")).expect("no dispute");
+        assert_eq!((both.tenant_of(A), both.tenant_of(B)), (Some("north"), Some("south")));
+        let error = load(&format!("south:{A}")).expect_err("disputed");
+        assert!(error.contains("two tenants") && !error.contains(A), "{error}");
     }
 
     #[test]

@@ -61,7 +61,9 @@ impl Error {
             return Error::NotLetIn(words);
         }
         if status.source().is_some() && status.get_details_error_info().is_none() {
-            return Error::Unavailable(format!("the connection to {server} broke: {}", root_cause(status)));
+            let cause = root_cause(status);
+            let hint = handshake::plain_hint(server, &cause);
+            return Error::Unavailable(format!("the connection to {server} broke: {cause}{hint}"));
         }
         let message = status.message().to_owned();
         match status.code() {
@@ -101,8 +103,9 @@ pub(super) fn not_connected(server: &str, error: &tonic::transport::Error) -> Er
         return Error::NotLetIn(words);
     }
     let cause = root_cause(error);
+    let hint = handshake::plain_hint(server, &cause);
     Error::Unavailable(format!(
-        "no server answers at {server}: {cause}; start one with `scpsfm serve`, or say --server"
+        "no server answers at {server}: {cause}{hint}; start one with `scpsfm serve`, or say --server"
     ))
 }
 

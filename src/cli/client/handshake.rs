@@ -47,6 +47,11 @@ fn of_handshake(server: &str, error: &rustls::Error) -> Option<String> {
                 "{server}: the server's certificate has expired or is not valid yet, or this machine's clock is wrong"
             )
         }
+        // What `openssl req -x509` makes when it is told nothing else; the error has no type of its own.
+        rustls::Error::InvalidCertificate(other) if format!("{other:?}").contains("CaUsedAsEndEntity") => format!(
+            "{server}: the server's certificate is one of an authority (CA:TRUE) and not of a server; make it with \
+             basicConstraints=CA:FALSE"
+        ),
         rustls::Error::InvalidCertificate(other) => format!("{server}: the server's certificate is not right: {other}"),
         rustls::Error::InvalidMessage(_) => {
             format!("{server}: the server does not speak TLS there; http:// is for one without")
@@ -70,6 +75,15 @@ fn of_alert(server: &str, alert: AlertDescription) -> String {
             format!("{server}: the server does not trust the client's certificate (--tls-cert): {alert:?}")
         }
         other => format!("{server}: the server broke off the TLS handshake: {other:?}"),
+    }
+}
+
+/// What a connection without TLS was broken off with, where the server speaks TLS: its alert reads as a frame of
+/// HTTP/2 that is too long.
+pub(super) fn plain_hint(server: &str, cause: &str) -> &'static str {
+    match server.starts_with("http://") && cause.contains("frame with invalid size") {
+        true => "; a server with TLS is at https://",
+        false => "",
     }
 }
 

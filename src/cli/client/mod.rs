@@ -77,7 +77,8 @@ impl Client {
     /// [`Error::Unavailable`] where no server answers, [`Error::NotLetIn`] where one side does not trust the other,
     /// [`Error::Usage`] for what is not a URL and for files of certificates or keys that cannot be used.
     pub async fn connect(server: &str, access: &AccessArgs) -> Result<Self, Error> {
-        let no_url = || Error::Usage(format!("{server:?} is not a URL of the form http(s)://HOST:PORT"));
+        let no_url =
+            || Error::Usage(format!("{server:?} is not a URL of the form http://HOST:PORT or https://HOST:PORT"));
         if !server.starts_with("http://") && !server.starts_with("https://") {
             return Err(no_url());
         }

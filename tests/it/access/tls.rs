@@ -68,6 +68,12 @@ async fn the_server_must_be_who_it_says_and_errors_say_what_to_do() {
     let elsewhere = authority.issue(at, "elsewhere", &["far.example"]);
     let misnamed = TestServer::start_with(quick(), options(&elsewhere, None), one_worker()).await;
     refused(&url(&misnamed), &trusting(&ours), "another name").await;
+    let unencrypted = format!("http://{}", server.server.address());
+    let error = greet(&unencrypted, &AccessArgs::default()).await.expect_err("TLS there");
+    assert!(error.to_string().contains("https://"), "{error:?}");
+    let own = Authority::new("own").own(at, "own");
+    let itself = TestServer::start_with(quick(), options(&own, None), one_worker()).await;
+    refused(&url(&itself), &trusting(&own.certificate), "CA:FALSE").await;
     let plain = TestServer::start(quick()).await;
     refused(&url(&plain), &trusting(&ours), "http://").await;
     let error = Client::connect(&plain.url(), &trusting(&ours)).await.expect_err("no TLS there");

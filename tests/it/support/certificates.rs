@@ -20,6 +20,15 @@ impl Authority {
         written(directory, name, &self.0.pem())
     }
 
+    /// Writes the authority's own certificate with its key, as if it were a server's.
+    pub fn own(&self, directory: &Path, name: &str) -> Identity {
+        Identity {
+            certificate: self.write(directory, &format!("{name}.pem")),
+            key: written(directory, &format!("{name}.key"), &self.0.key().serialize_pem()),
+            der: self.0.der().to_vec(),
+        }
+    }
+
     /// Issues a certificate for these names and writes it with its key, as `NAME.pem` and `NAME.key`.
     pub fn issue(&self, directory: &Path, name: &str, subjects: &[&str]) -> Identity {
         let subjects: Vec<String> = subjects.iter().map(|&subject| subject.to_owned()).collect();
