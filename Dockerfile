@@ -13,7 +13,11 @@ COPY --from=build /usr/local/bin/scpsfm /usr/local/bin/scpsfm
 USER 10001
 WORKDIR /var/lib/scpsfm
 VOLUME /var/lib/scpsfm
-# Inside a container loopback reaches nobody; what is published decides who may connect.
+# Inside a container loopback reaches nobody, so the server listens on every address, and starts only with TLS or when
+# told that it needs none:
+#   docker run -p 127.0.0.1:50051:50051 -e SCPSFM_SERVER__INSECURE=true IMAGE
+#   docker run -p 50051:50051 -v /etc/scpsfm:/etc/scpsfm:ro -e SCPSFM_TLS__CERTIFICATE=/etc/scpsfm/server.pem \
+#     -e SCPSFM_TLS__KEY=/etc/scpsfm/server.key -e SCPSFM_AUTH__KEYS_FILE=/etc/scpsfm/keys.txt IMAGE
 ENV SCPSFM_SERVER__LISTEN=0.0.0.0:50051 \
     SCPSFM_METRICS__LISTEN=0.0.0.0:9464 \
     SCPSFM_STORE__DATA_DIR=/var/lib/scpsfm \

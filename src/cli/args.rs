@@ -4,6 +4,8 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 
+use super::client::access::AccessArgs;
+use super::client::{self, Client};
 use super::exit::Failure;
 use crate::domain::{Backend, ImageSize, Limits, Method, Solution, SolveSettings};
 use crate::formats::{self, Export, Format, LabelledInput, Matches, Reading};
@@ -14,9 +16,22 @@ pub const DEFAULT_SERVER: &str = "http://127.0.0.1:50051";
 /// Which server to talk to.
 #[derive(Debug, Clone, Args)]
 pub struct ServerArgs {
-    /// Address of the server
+    /// Address of the server, http:// or https://
     #[arg(long, value_name = "URL", env = "SCPSFM_SERVER", default_value = DEFAULT_SERVER)]
     pub server: String,
+
+    #[command(flatten)]
+    pub access: AccessArgs,
+}
+
+impl ServerArgs {
+    /// Connects to it.
+    ///
+    /// # Errors
+    /// See [`Client::connect`].
+    pub async fn connect(&self) -> Result<Client, client::Error> {
+        Client::connect(&self.server, &self.access).await
+    }
 }
 
 /// Which tracks to solve.

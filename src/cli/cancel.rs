@@ -1,10 +1,8 @@
 //! `scpsfm cancel`: stops a job.
 
 use super::args::ServerArgs;
-use super::client::Client;
 use super::exit::{Exit, Failure};
-use super::job_view;
-use crate::domain::job::JobName;
+use super::job_view::{self, GivenName};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -19,8 +17,8 @@ Examples:
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
     /// The job's name, or the last part of it
-    #[arg(value_name = "NAME", value_parser = job_view::parse_name)]
-    pub name: JobName,
+    #[arg(value_name = "NAME", value_parser = GivenName::parse)]
+    pub name: GivenName,
 
     #[command(flatten)]
     pub server: ServerArgs,
@@ -32,7 +30,8 @@ pub struct Args {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
-    let job = Client::connect(&args.server.server).await?.cancel(&args.name).await?;
+    let name = args.name.of(&args.server.access)?;
+    let job = args.server.connect().await?.cancel(&name).await?;
     job_view::print_job(&job, args.json)?;
     Ok(Exit::Done)
 }

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::args::ServerArgs;
+use super::client::access::AccessArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::progress::ProgressView;
@@ -72,7 +73,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     progress.state(&format!("scene: {}", synth::describe(&scene)));
     let data = tempfile::tempdir()?;
     let service = Service::start(&config(data.path())).await?;
-    let server = ServerArgs { server: format!("http://{}", service.address()) };
+    let server = ServerArgs { server: format!("http://{}", service.address()), access: AccessArgs::default() };
     progress.state(&format!("server: {}, store in {}", server.server, data.path().display()));
     let interrupt = Interrupt::listen()?;
     let mut on_event = |event: &JobEvent| job_view::show_event(&mut progress, event);

@@ -16,10 +16,11 @@ Exit codes:
    64  bad configuration
    65  bad input data; no such job
    69  server unavailable or its queue full: try again
+   77  not let in: no API key, an unknown one, or a certificate that one side does not trust
   130  interrupted or cancelled";
 
-/// How a command ended. 2 is clap's own; 64, 65 and 69 are `EX_USAGE`, `EX_DATAERR` and `EX_UNAVAILABLE` of
-/// sysexits.h; 130 is what a shell reports of a program ended by Ctrl-C.
+/// How a command ended. 2 is clap's own; 64, 65, 69 and 77 are `EX_USAGE`, `EX_DATAERR`, `EX_UNAVAILABLE`
+/// and `EX_NOPERM` of sysexits.h; 130 is what a shell reports of a program ended by Ctrl-C.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Exit {
@@ -30,6 +31,7 @@ pub enum Exit {
     BadConfig = 64,
     BadInput = 65,
     Unavailable = 69,
+    NotLetIn = 77,
     Interrupted = 130,
 }
 

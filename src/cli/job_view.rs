@@ -4,6 +4,7 @@ use std::time::SystemTime;
 
 use serde_json::{Value, json};
 
+use super::client::access::AccessArgs;
 use super::client::{self, Client};
 use super::exit::{Exit, Failure};
 use super::print;
@@ -11,10 +12,35 @@ use super::progress::ProgressView;
 use crate::domain::job::{EventBody, Failure as JobFailure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Grade, Status};
 
-/// Reads a job's name; the id alone stands for a job of the default tenant.
-pub fn parse_name(text: &str) -> Result<JobName, String> {
-    let name = if text.contains('/') { text.to_owned() } else { format!("tenants/default/jobs/{text}") };
-    JobName::parse(&name).ok_or_else(|| format!("{text:?} is not a job's name, such as tenants/default/jobs/a1b2"))
+/// A job's name as it was given: whole, or its last part alone.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum GivenName {
+    Whole(JobName),
+    /// Of the tenant that calls.
+    Id(String),
+}
+
+impl GivenName {
+    /// # Errors
+    /// For what is neither.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let given = match text.contains('/') {
+            true => JobName::parse(text).map(Self::Whole),
+            false => JobName::is_id(text).then(|| Self::Id(text.to_owned())),
+        };
+        given.ok_or_else(|| format!("{text:?} is not a job's name, such as tenants/default/jobs/a1b2"))
+    }
+
+    /// The whole name.
+    ///
+    /// # Errors
+    /// For a tenant that is none.
+    pub fn of(&self, access: &AccessArgs) -> Result<JobName, client::Error> {
+        match self {
+            Self::Whole(name) => Ok(name.clone()),
+            Self::Id(job) => Ok(JobName { tenant: access.tenant()?, job: job.clone() }),
+        }
+    }
 }
 
 /// A job in a line.
@@ -205,10 +231,15 @@ mod tests {
 
     #[test]
     fn names_may_be_given_in_full_or_by_their_id() {
-        let full = parse_name("tenants/default/jobs/a-1").expect("a name");
-        assert_eq!(parse_name("a-1"), Ok(full));
-        assert!(parse_name("A").is_err());
-        assert!(parse_name("jobs/a").is_err());
+        let of = |text: &str, tenant: Option<&str>| {
+            let access = AccessArgs { tenant: tenant.map(str::to_owned), ..AccessArgs::default() };
+            GivenName::parse(text).map(|given| given.of(&access).expect("a tenant").to_string())
+        };
+        assert_eq!(of("a-1", None).as_deref(), Ok("tenants/default/jobs/a-1"));
+        assert_eq!(of("a-1", Some("north")).as_deref(), Ok("tenants/north/jobs/a-1"));
+        assert_eq!(of("tenants/south/jobs/a-1", Some("north")).as_deref(), Ok("tenants/south/jobs/a-1"));
+        assert!(of("A", None).is_err());
+        assert!(of("jobs/a", None).is_err());
     }
 
     #[test]
@@ -229,7 +260,7 @@ mod tests {
     #[test]
     fn an_event_is_json_under_its_kind() {
         let event = JobEvent {
-            name: parse_name("a").expect("a name"),
+            name: JobName { tenant: "default".into(), job: "a".into() },
             attempt: 1,
             sequence: Some(3),
             time: SystemTime::UNIX_EPOCH,

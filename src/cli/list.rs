@@ -3,7 +3,6 @@
 use clap::ValueEnum;
 
 use super::args::ServerArgs;
-use super::client::Client;
 use super::exit::{Exit, Failure};
 use super::{job_view, print};
 use crate::domain::job::JobState;
@@ -70,7 +69,7 @@ impl From<StateArg> for JobState {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
-    let mut client = Client::connect(&args.server.server).await?;
+    let mut client = args.server.connect().await?;
     let page = client.list(&filter(&args), args.page_size, &args.page_token).await?;
     for job in &page.jobs {
         print(&if args.json { job_view::job_json(job).to_string() } else { job_view::job_line(job) })?;

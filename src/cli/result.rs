@@ -3,11 +3,10 @@
 use std::path::PathBuf;
 
 use super::args::{ExportArgs, ReadingArgs, ServerArgs};
-use super::client::Client;
 use super::exit::{Exit, Failure};
-use super::{job_view, print, summary};
+use super::job_view::GivenName;
+use super::{print, summary};
 use crate::domain::Solution;
-use crate::domain::job::JobName;
 use crate::formats::{LabelledInput, result_files};
 
 const EXAMPLES: &str = "\
@@ -23,8 +22,8 @@ Examples:
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
     /// The job's name, or the last part of it
-    #[arg(value_name = "NAME", value_parser = job_view::parse_name)]
-    pub name: JobName,
+    #[arg(value_name = "NAME", value_parser = GivenName::parse)]
+    pub name: GivenName,
 
     #[command(flatten)]
     pub server: ServerArgs,
@@ -54,7 +53,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if input.is_none() && !args.export.export.is_empty() {
         return Err(Failure::usage("--export needs --input, whose points and names it writes"));
     }
-    let solution = Client::connect(&args.server.server).await?.read_result(&args.name).await?;
+    let name = args.name.of(&args.server.access)?;
+    let solution = args.server.connect().await?.read_result(&name).await?;
     if let Some(input) = &input {
         belongs_together(input, &solution)?;
     }

@@ -16,12 +16,17 @@ const HELP: &str = "\
 Configuration: defaults, then the file, then the environment, then flags; later ones win. Every key of the file \
 may stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__WORKERS=4. --print-config shows all keys.
 
-When it serves, two lines on stdout say where: `grpc http://...` and `metrics http://...`. SIGTERM or Ctrl-C drains: \
+When it serves, two lines on stdout say where: `grpc http://...` (or https) and `metrics http://...`. SIGTERM or Ctrl-C drains: \
 new jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start.
+
+Without TLS and keys it listens on loopback only. A key is 32 or more random characters (`openssl rand -hex 32`) and \
+stands for a tenant; the file of keys has lines TENANT:KEY or TENANT:sha256:HEX. Certificates and keys are read again \
+when their files change, within a few seconds; connections that are open stay open.
 
 Examples:
   scpsfm serve
-  scpsfm serve --data-dir /var/lib/scpsfm --listen 0.0.0.0:50051 --workers 4 --log-format json
+  scpsfm serve --data-dir /var/lib/scpsfm --workers 4 --log-format json
+  scpsfm serve --listen 0.0.0.0:50051 --tls-certificate server.pem --tls-key server.key --keys-file keys.txt
   scpsfm serve --store postgres://scpsfm@db.example/scpsfm    # several servers, one store
   scpsfm serve --print-config > scpsfm.toml";
 
@@ -69,6 +74,33 @@ pub struct Args {
     #[arg(long, value_enum)]
     pub log_format: Option<LogFormat>,
 
+    /// Certificate of the gRPC port, followed by those that lead to its authority (PEM): connections are encrypted
+    #[arg(long, value_name = "FILE")]
+    pub tls_certificate: Option<PathBuf>,
+
+    /// Private key of the certificate (PEM)
+    #[arg(long, value_name = "FILE")]
+    pub tls_key: Option<PathBuf>,
+
+    /// Take only clients with a certificate that one of these authorities has signed (PEM)
+    #[arg(long, value_name = "FILE")]
+    pub tls_client_ca: Option<PathBuf>,
+
+    /// API keys, one of which every call must carry; its tenant sees its own jobs only. Other keys may stand in
+    /// SCPSFM_AUTH__KEYS
+    #[arg(long, value_name = "FILE")]
+    pub keys_file: Option<PathBuf>,
+
+    /// Listen on other addresses than loopback's with neither TLS nor keys: whoever reaches the port reads and cancels
+    /// every job
+    #[arg(long)]
+    pub insecure: bool,
+
+    /// Take API keys without TLS on other addresses than loopback's: whoever listens in has them. For a proxy that ends
+    /// TLS
+    #[arg(long)]
+    pub plaintext_keys: bool,
+
     /// Print the configuration that would be used, as TOML, and exit
     #[arg(long)]
     pub print_config: bool,
@@ -104,10 +136,18 @@ impl Args {
     /// The flags that were given, as the configuration's keys.
     fn overrides(&self) -> Vec<(&'static str, String)> {
         let word = |value: Option<clap::builder::PossibleValue>| value.map(|value| value.get_name().to_owned());
+        let path = |path: &Option<PathBuf>| path.as_ref().map(|path| path.display().to_string());
+        let switch = |on: bool| on.then(|| "true".to_owned());
         let given = [
             ("server.listen", self.listen.clone()),
+            ("server.insecure", switch(self.insecure)),
+            ("server.plaintext_keys", switch(self.plaintext_keys)),
+            ("tls.certificate", path(&self.tls_certificate)),
+            ("tls.key", path(&self.tls_key)),
+            ("tls.client_ca", path(&self.tls_client_ca)),
+            ("auth.keys_file", path(&self.keys_file)),
             ("metrics.listen", self.metrics_listen.clone()),
-            ("store.data_dir", self.data_dir.as_ref().map(|path| path.display().to_string())),
+            ("store.data_dir", path(&self.data_dir)),
             ("store.url", self.store.as_ref().map(|url| url.0.clone())),
             ("engine.workers", self.workers.map(|count| count.to_string())),
             ("engine.queue_capacity", self.queue.map(|count| count.to_string())),
@@ -150,7 +190,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     })?;
     let mut service = Service::start(&config).await?;
     ready.set(true);
-    print(&format!("grpc http://{}", service.address()))?;
+    let scheme = if config.tls.files().is_some() { "https" } else { "http" };
+    print(&format!("grpc {scheme}://{}", service.address()))?;
     print(&format!("metrics http://{}/metrics", metrics.address()))?;
     tokio::select! {
         ended = service.wait() => {
@@ -215,13 +256,26 @@ mod tests {
             "ndarray",
             "--log-format",
             "json",
+            "--tls-certificate",
+            "c.pem",
+            "--tls-key",
+            "k.pem",
+            "--tls-client-ca",
+            "a.pem",
+            "--keys-file",
+            "keys",
+            "--insecure",
+            "--plaintext-keys",
         ]);
-        assert_eq!(all.len(), 7);
+        assert_eq!(all.len(), 13);
         let config = Config::load(None, &all).expect("valid");
         assert_eq!(config.engine.workers, 3);
         assert_eq!(config.engine.queue_capacity, 9);
         assert_eq!(config.store.data_dir, PathBuf::from("d"));
         assert_eq!(config.compute.backend, crate::domain::Backend::Ndarray);
+        assert_eq!(config.tls.files().expect("TLS").paths().len(), 3);
+        assert_eq!(config.auth.keys_file, Some(PathBuf::from("keys")));
+        assert!(config.server.insecure && config.server.plaintext_keys);
         assert_eq!(config.log.format, telemetry::tracing::Format::Json);
     }
 }

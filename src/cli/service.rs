@@ -7,6 +7,7 @@ use std::time::Duration;
 use super::exit::Failure;
 use crate::config::{self, Config};
 use crate::engine::{self, Engine};
+use crate::rpc::keys::Sources;
 use crate::rpc::server::{self, Server};
 use crate::store::postgres::Postgres;
 use crate::store::sqlite::Sqlite;
@@ -29,11 +30,14 @@ impl Service {
     /// # Errors
     /// A data directory that cannot be used or an address that cannot be had.
     pub async fn start(config: &Config) -> Result<Self, Failure> {
+        let options = server_options(config);
+        // Before the store is opened and its jobs begin: who cannot be let in is no reason to take them up.
+        options.check_access().map_err(Failure::bad_config)?;
         let store = open_store(&config.store).await?;
         let engine = Engine::start(engine_options(config), store, engine::default_solver())
             .await
             .map_err(|error| Failure::internal(format_args!("cannot start the engine: {error}")))?;
-        let server = Server::bind(server_options(config), engine.clone()).await.map_err(Failure::internal)?;
+        let server = Server::bind(options, engine.clone()).await.map_err(Failure::internal)?;
         Ok(Self { engine, server, drain_bound: Duration::from_secs(config.engine.drain_seconds) })
     }
 
@@ -92,6 +96,9 @@ fn server_options(config: &Config) -> server::Options {
         listen: config.server.listen,
         limits: config.limits.clone(),
         max_message_bytes: config.server.max_message_bytes,
+        tls: config.tls.files(),
+        keys: Sources { file: config.auth.keys_file.clone(), fixed: config.auth.keys.clone() },
+        reflection: config.server.reflection,
         ..server::Options::default()
     }
 }
@@ -107,7 +114,10 @@ mod tests {
             (options.workers, options.queue, options.lease, options.max_attempts, options.backend)
         };
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));
-        let of = |options: server::Options| (options.limits, options.max_message_bytes, options.solve_grace);
+        let of = |options: server::Options| {
+            let keys = options.keys.is_on();
+            (options.limits, options.max_message_bytes, options.solve_grace, options.tls, keys, options.reflection)
+        };
         assert_eq!(of(server_options(&config)), of(server::Options::default()));
     }
 }

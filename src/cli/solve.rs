@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use super::args::{ExportArgs, InputArgs, ServerArgs, SettingsArgs, tell_notes};
+use super::client::access::AccessArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::job_view::{Lost, quoted};
@@ -41,6 +42,9 @@ pub struct Args {
     #[arg(long, value_name = "URL")]
     pub server: Option<String>,
 
+    #[command(flatten)]
+    pub access: AccessArgs,
+
     /// Directory for the result files; created, files of these names in it are replaced
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -65,6 +69,9 @@ pub struct Args {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
+    if args.server.is_none() && args.access.is_given() {
+        return Err(Failure::usage("flags on the access to a server need --server"));
+    }
     let settings = args.settings.settings()?;
     let input = args.input.read()?;
     if !args.quiet {
@@ -111,7 +118,7 @@ async fn on_server(
     settings: &SolveSettings,
     progress: &mut ProgressView,
 ) -> Result<Solution, Failure> {
-    let server = ServerArgs { server: server.to_owned() };
+    let server = ServerArgs { server: server.to_owned(), access: args.access.clone() };
     let interrupt = Interrupt::listen()?;
     let mut seen = None;
     let mut on_event = |event: &JobEvent| {

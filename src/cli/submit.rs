@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::args::{InputArgs, ServerArgs, SettingsArgs, tell_notes};
-use super::client::{Client, JobOptions};
+use super::client::JobOptions;
 use super::exit::{Exit, Failure};
 use super::{job_view, print};
 
@@ -58,7 +58,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let settings = args.settings.settings()?;
     let input = args.input.read()?;
     tell_notes(&input);
-    let mut client = Client::connect(&args.server.server).await?;
+    let mut client = args.server.connect().await?;
     let options = JobOptions {
         job_id: args.job_id,
         request_id: args.request_id,

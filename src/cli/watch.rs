@@ -1,10 +1,8 @@
 //! `scpsfm watch`: follows a job.
 
 use super::args::ServerArgs;
-use super::client::Client;
 use super::exit::{Exit, Failure};
-use super::job_view;
-use crate::domain::job::JobName;
+use super::job_view::{self, GivenName};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -20,8 +18,8 @@ Examples:
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
     /// The job's name, or the last part of it
-    #[arg(value_name = "NAME", value_parser = job_view::parse_name)]
-    pub name: JobName,
+    #[arg(value_name = "NAME", value_parser = GivenName::parse)]
+    pub name: GivenName,
 
     #[command(flatten)]
     pub server: ServerArgs,
@@ -37,6 +35,7 @@ pub struct Args {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
-    let mut client = Client::connect(&args.server.server).await?;
-    job_view::watch_to_end(&mut client, &args.name, args.after, args.json).await
+    let name = args.name.of(&args.server.access)?;
+    let mut client = args.server.connect().await?;
+    job_view::watch_to_end(&mut client, &name, args.after, args.json).await
 }

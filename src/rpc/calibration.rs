@@ -82,7 +82,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
         &self,
         request: Request<Streaming<proto::SolveRequest>>,
     ) -> Result<Response<Self::SolveStream>, Status> {
-        let caller = Caller::of(&request);
+        let caller = Caller::of(&request)?;
         let span = telemetry::tracing::submit_span("Solve", caller.trace_parent());
         let accepted = async {
             let submission = self.receive(&caller, request.into_inner()).await?;

@@ -10,7 +10,24 @@ use tonic::Status;
 /// Header of the W3C trace context.
 const TRACE_PARENT: &str = "traceparent";
 
-/// The caller of one call. Without API keys every caller is of the default tenant.
+/// The tenant of a call, as [`Authenticate`](super::auth::Authenticate) puts it into a request's extensions.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Tenant(String);
+
+impl Tenant {
+    pub fn new(id: impl Into<String>) -> Self {
+        Self(id.into())
+    }
+}
+
+impl Default for Tenant {
+    /// Everyone's where nobody needs a key.
+    fn default() -> Self {
+        Self::new(DEFAULT_TENANT)
+    }
+}
+
+/// The caller of one call: the one place where a service learns whose it is.
 #[derive(Debug, Clone)]
 pub struct Caller {
     tenant: String,
@@ -18,9 +35,15 @@ pub struct Caller {
 }
 
 impl Caller {
-    pub fn of<T>(request: &Request<T>) -> Self {
+    /// # Errors
+    /// `INTERNAL` for a request that did not come through the layer that finds the tenant: a service that was put
+    /// outside of it must not answer as if everyone were the default tenant.
+    pub fn of<T>(request: &Request<T>) -> Result<Self, Status> {
+        let Some(Tenant(tenant)) = request.extensions().get().cloned() else {
+            return Err(status::internal(&"a request reached a service without a tenant"));
+        };
         let trace_parent = request.metadata().get(TRACE_PARENT).and_then(|value| value.to_str().ok());
-        Self { tenant: DEFAULT_TENANT.to_owned(), trace_parent: trace_parent.map(str::to_owned) }
+        Ok(Self { tenant, trace_parent: trace_parent.map(str::to_owned) })
     }
 
     /// The trace that the call belongs to.
@@ -31,10 +54,10 @@ impl Caller {
     /// The tenant that `parent` names, which must be the caller's own.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` for another form, `PERMISSION_DENIED` for another tenant.
+    /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant, whether there is one of that name or not.
     pub fn parent(&self, parent: &str) -> Result<String, Status> {
         let tenant = names::tenant(parent).map_err(|error| status::invalid(&error))?;
-        if tenant == self.tenant { Ok(tenant) } else { Err(status::tenant_forbidden(&tenant)) }
+        if tenant == self.tenant { Ok(tenant) } else { Err(status::tenant_not_found(&tenant)) }
     }
 
     /// The job that `name` names; another tenant's is as one that never was.
@@ -55,9 +78,12 @@ mod tests {
 
     #[test]
     fn other_tenants_are_out_of_reach() {
-        let caller = Caller::of(&Request::new(()));
+        let mut request = Request::new(());
+        assert_eq!(Caller::of(&request).expect_err("no tenant").code(), Code::Internal);
+        request.extensions_mut().insert(Tenant::default());
+        let caller = Caller::of(&request).expect("a tenant");
         assert_eq!(caller.parent("tenants/default").expect("own"), "default");
-        assert_eq!(caller.parent("tenants/other").expect_err("another's").code(), Code::PermissionDenied);
+        assert_eq!(caller.parent("tenants/other").expect_err("another's").code(), Code::NotFound);
         assert_eq!(caller.parent("default").expect_err("malformed").code(), Code::InvalidArgument);
         assert!(caller.job("tenants/default/jobs/a").is_ok());
         assert_eq!(caller.job("tenants/other/jobs/a").expect_err("another's").code(), Code::NotFound);

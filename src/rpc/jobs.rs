@@ -38,7 +38,7 @@ type Messages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 #[tonic::async_trait]
 impl proto::job_service_server::JobService for Jobs {
     async fn create_job(&self, request: Request<proto::CreateJobRequest>) -> Result<Response<proto::Job>, Status> {
-        let caller = Caller::of(&request);
+        let caller = Caller::of(&request)?;
         let span = telemetry::tracing::submit_span("CreateJob", caller.trace_parent());
         let created = async {
             let submission = Submission::open(&caller, request.into_inner(), &self.limits)?;
@@ -59,7 +59,7 @@ impl proto::job_service_server::JobService for Jobs {
     }
 
     async fn get_job(&self, request: Request<proto::GetJobRequest>) -> Result<Response<proto::Job>, Status> {
-        let name = Caller::of(&request).job(&request.get_ref().name)?;
+        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
         let found = self.engine.job(&name).await.map_err(status::from_engine)?;
         Ok(Response::new(job::to_wire(&found)))
     }
@@ -68,7 +68,7 @@ impl proto::job_service_server::JobService for Jobs {
         &self,
         request: Request<proto::ListJobsRequest>,
     ) -> Result<Response<proto::ListJobsResponse>, Status> {
-        let tenant = Caller::of(&request).parent(&request.get_ref().parent)?;
+        let tenant = Caller::of(&request)?.parent(&request.get_ref().parent)?;
         let query = list::from_wire(tenant, request.into_inner()).map_err(|error| status::invalid(&error))?;
         let Some(query) = query else {
             return Ok(Response::new(proto::ListJobsResponse::default()));
@@ -86,7 +86,7 @@ impl proto::job_service_server::JobService for Jobs {
         &self,
         request: Request<proto::WatchJobRequest>,
     ) -> Result<Response<Self::WatchJobStream>, Status> {
-        let name = Caller::of(&request).job(&request.get_ref().name)?;
+        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
         let after_sequence = request.get_ref().after_sequence;
         let watch = self.engine.watch(&name, after_sequence).await.map_err(status::from_engine)?;
         let watching = telemetry::metrics::watcher();
@@ -99,7 +99,7 @@ impl proto::job_service_server::JobService for Jobs {
     }
 
     async fn cancel_job(&self, request: Request<proto::CancelJobRequest>) -> Result<Response<proto::Job>, Status> {
-        let name = Caller::of(&request).job(&request.get_ref().name)?;
+        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
         let cancelled = self.engine.cancel(&name).await.map_err(status::from_engine)?;
         Ok(Response::new(job::to_wire(&cancelled)))
     }
@@ -114,7 +114,7 @@ impl proto::job_service_server::JobService for Jobs {
         &self,
         request: Request<proto::ReadJobResultRequest>,
     ) -> Result<Response<Self::ReadJobResultStream>, Status> {
-        let name = Caller::of(&request).job(&request.get_ref().name)?;
+        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
         let offset = request.get_ref().offset;
         let solution = self.engine.result(&name).await.map_err(status::from_engine)?;
         let encode = move || Bytes::from(result::to_wire(&name, &solution).encode_to_vec());

@@ -2,6 +2,7 @@
 //!
 //! Depends on `engine`, `telemetry` and `domain`; only this module and the client side of `cli` see prost and tonic.
 
+pub mod auth;
 pub mod calibration;
 pub mod caller;
 pub mod convert;
@@ -9,11 +10,14 @@ pub mod explain;
 pub mod follow;
 pub mod inputs;
 pub mod jobs;
+pub mod keys;
 pub mod meter;
 pub mod proto;
+pub mod reload;
 pub mod server;
 pub mod status;
 pub mod submission;
+pub mod tls;
 
 use tonic::Status;
 

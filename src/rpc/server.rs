@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use tokio::net::TcpListener;
 use tokio::task::{JoinError, JoinHandle};
+use tokio_rustls::rustls::ServerConfig;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding::Gzip;
 use tonic::transport::server::{Router, TcpIncoming};
@@ -12,15 +13,19 @@ use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 use tower::layer::util::{Identity, Stack};
 
+use super::auth::Authenticate;
 use super::calibration::Calibration;
 use super::explain::Explain;
 use super::inputs::Inputs;
 use super::jobs::Jobs;
+use super::keys::{self, KeyRing};
 use super::meter::Meter;
 use super::proto::FILE_DESCRIPTOR_SET;
 use super::proto::calibration_service_server::CalibrationServiceServer;
 use super::proto::input_service_server::InputServiceServer;
 use super::proto::job_service_server::JobServiceServer;
+use super::reload::{self, Current};
+use super::tls;
 use crate::domain::Limits;
 use crate::engine::Engine;
 
@@ -51,6 +56,16 @@ pub struct Options {
     pub max_message_bytes: usize,
     /// How long after a `Solve` was dropped its job is cancelled.
     pub solve_grace: Duration,
+    /// `None`: connections are not encrypted.
+    pub tls: Option<tls::Files>,
+    /// Where none are, nobody needs one.
+    pub keys: keys::Sources,
+    /// How often the files of certificates and keys are looked at.
+    pub look_every: Duration,
+    /// How long a TLS handshake may take.
+    pub handshake_timeout: Duration,
+    /// Whether callers may ask for the API's description.
+    pub reflection: bool,
 }
 
 impl Options {
@@ -60,6 +75,15 @@ impl Options {
 
     /// Two million observations of at most 33 bytes; a larger input goes in chunks.
     pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
+
+    /// Whether the files of certificates and keys can be used, as they are now.
+    ///
+    /// # Errors
+    /// [`Error::Certificates`], [`Error::Keys`].
+    pub fn check_access(&self) -> Result<(), Error> {
+        self.tls.iter().try_for_each(|files| files.load().map(drop)).map_err(Error::Certificates)?;
+        self.keys.load().map(drop).map_err(Error::Keys)
+    }
 }
 
 impl Default for Options {
@@ -70,6 +94,11 @@ impl Default for Options {
             limits: Limits::default(),
             max_message_bytes: Self::MAX_MESSAGE_BYTES,
             solve_grace: Self::SOLVE_GRACE,
+            tls: None,
+            keys: keys::Sources::default(),
+            look_every: reload::LOOK_EVERY,
+            handshake_timeout: tls::HANDSHAKE_TIMEOUT,
+            reflection: true,
         }
     }
 }
@@ -79,6 +108,10 @@ impl Default for Options {
 pub enum Error {
     #[error("cannot listen on {address}: {source}")]
     Listen { address: SocketAddr, source: std::io::Error },
+    #[error("cannot use the certificates: {0}")]
+    Certificates(String),
+    #[error("cannot use the keys: {0}")]
+    Keys(String),
     #[error("cannot serve reflection: {0}")]
     Reflection(#[from] tonic_reflection::server::Error),
     #[error("the transport failed: {0}")]
@@ -100,8 +133,11 @@ impl Server {
     /// Listens and serves. When this returns, connections are taken and health says SERVING.
     ///
     /// # Errors
-    /// [`Error::Listen`] where the address cannot be had.
+    /// [`Error::Listen`] where the address cannot be had, [`Error::Certificates`], [`Error::Keys`].
     pub async fn bind(options: Options, engine: Engine) -> Result<Self, Error> {
+        // First: an address that is bound takes connections.
+        let certificates = certificates(&options).await?;
+        let keys = keys(&options).await?;
         let listen_error = |source| Error::Listen { address: options.listen, source };
         let listener = TcpListener::bind(options.listen).await.map_err(listen_error)?;
         let address = listener.local_addr().map_err(listen_error)?;
@@ -109,10 +145,19 @@ impl Server {
         for name in HEALTH_NAMES {
             health.set_service_status(name, ServingStatus::Serving).await;
         }
-        let router = router(&options, engine)?.add_service(health_service);
+        let router = router(&options, engine, Authenticate::new(keys))?.add_service(health_service);
         let stop = CancellationToken::new();
-        let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-        let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stop.clone().cancelled_owned()));
+        let stopped = stop.clone().cancelled_owned();
+        let task = match certificates {
+            Some(certificates) => {
+                let incoming = tls::incoming(listener, certificates, options.handshake_timeout);
+                tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped))
+            }
+            None => {
+                let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+                tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped))
+            }
+        };
         Ok(Self { address, health, stop, task })
     }
 
@@ -160,11 +205,31 @@ impl Drop for Server {
     }
 }
 
-/// What goes around every service; the last of them is outermost.
-type Layers = Stack<Explain, Stack<Meter, Identity>>;
+/// The certificates, followed as their files change.
+async fn certificates(options: &Options) -> Result<Option<Current<ServerConfig>>, Error> {
+    let Some(files) = options.tls.clone() else { return Ok(None) };
+    let load = move || files.load();
+    let paths = options.tls.iter().flat_map(tls::Files::paths).collect();
+    let kept = reload::keep("certificates", paths, options.look_every, load).await;
+    kept.map(Some).map_err(Error::Certificates)
+}
+
+/// The keys, followed as their file changes.
+async fn keys(options: &Options) -> Result<Option<Current<KeyRing>>, Error> {
+    let sources = options.keys.clone();
+    if !sources.is_on() {
+        return Ok(None);
+    }
+    let paths = sources.file.iter().cloned().collect();
+    let kept = reload::keep("API keys", paths, options.look_every, move || sources.load()).await;
+    kept.map(Some).map_err(Error::Keys)
+}
+
+/// What goes around every service; the first to be added, [`Meter`], is outermost.
+type Layers = Stack<Authenticate, Stack<Explain, Stack<Meter, Identity>>>;
 
 /// Every service but health.
-fn router(options: &Options, engine: Engine) -> Result<Router<Layers>, Error> {
+fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Result<Router<Layers>, Error> {
     let limits = options.limits.clone();
     let max_bytes = options.max_message_bytes;
     let calibration = Calibration::new(engine.clone(), limits.clone(), max_bytes, options.solve_grace);
@@ -178,17 +243,20 @@ fn router(options: &Options, engine: Engine) -> Result<Router<Layers>, Error> {
             $service.accept_compressed(Gzip).send_compressed(Gzip).max_decoding_message_size(max_bytes)
         };
     }
-    Ok(tonic::transport::Server::builder()
+    let router = tonic::transport::Server::builder()
         .layer(Meter)
         .layer(Explain)
+        .layer(authenticate)
         .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
         .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
         .add_service(with_limits!(CalibrationServiceServer::new(calibration)))
         .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits))))
-        .add_service(with_limits!(InputServiceServer::new(Inputs)))
-        // Older clients, grpcurl and Python's among them, still ask for v1alpha.
-        .add_service(reflection().build_v1()?)
-        .add_service(reflection().build_v1alpha()?))
+        .add_service(with_limits!(InputServiceServer::new(Inputs)));
+    if !options.reflection {
+        return Ok(router);
+    }
+    // Older clients, grpcurl and Python's among them, still ask for v1alpha.
+    Ok(router.add_service(reflection().build_v1()?).add_service(reflection().build_v1alpha()?))
 }

@@ -4,7 +4,9 @@
 //! |---|---|---|
 //! | `INVALID_ARGUMENT` | `INVALID_ARGUMENT` | a request breaks a rule; `BadRequest` names fields and indices |
 //! | `NOT_FOUND` | `JOB_NOT_FOUND` | no such job, or another tenant's |
-//! | `PERMISSION_DENIED` | `TENANT_FORBIDDEN` | a parent that is not the caller's tenant |
+//! | `NOT_FOUND` | `TENANT_NOT_FOUND` | a parent that is not the caller's tenant, whether it exists or not |
+//! | `UNAUTHENTICATED` | `API_KEY_MISSING` | the server asks for a key, and the call carries none |
+//! | `UNAUTHENTICATED` | `API_KEY_UNKNOWN` | the call carries a key that stands for no tenant |
 //! | `ALREADY_EXISTS` | `ALREADY_EXISTS` | a job id is taken, or a request id came with another body |
 //! | `INVALID_ARGUMENT` | `MALFORMED_MESSAGE` | a message that cannot be decoded |
 //! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.limits.max_message_bytes`, packed or not |
@@ -76,10 +78,25 @@ pub fn job_not_found(name: &JobName) -> Status {
     status(Code::NotFound, "JOB_NOT_FOUND", format!("there is no job {name}"), details)
 }
 
-/// A parent that is not the caller's tenant.
-pub fn tenant_forbidden(tenant: &str) -> Status {
-    let message = format!("tenants/{tenant} is not the caller's tenant");
-    status(Code::PermissionDenied, "TENANT_FORBIDDEN", message, ErrorDetails::new())
+/// A parent that is not the caller's tenant: a caller cannot tell whether there is such a tenant.
+pub fn tenant_not_found(tenant: &str) -> Status {
+    let name = format!("tenants/{tenant}");
+    let mut details = ErrorDetails::new();
+    details.set_resource_info("scpsfm.v1.Tenant", &name, "", "there is no such tenant, or the key is not of it");
+    let message = format!("there is no tenant {name}, or the caller's key is not of it");
+    status(Code::NotFound, "TENANT_NOT_FOUND", message, details)
+}
+
+/// A call without a key, or without one that could be read.
+pub fn no_key() -> Status {
+    let message = "this server asks for an API key: send it as `authorization: Bearer KEY`";
+    status(Code::Unauthenticated, "API_KEY_MISSING", message, ErrorDetails::new())
+}
+
+/// A key that is none here. Says nothing of the key.
+pub fn unknown_key() -> Status {
+    let message = "the API key is not known here: it is mistyped, or was withdrawn";
+    status(Code::Unauthenticated, "API_KEY_UNKNOWN", message, ErrorDetails::new())
 }
 
 /// Part of the API that is still to come.

@@ -23,7 +23,7 @@ impl Submission {
     /// Checks everything that a request holds but the input's numbers.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT`, `PERMISSION_DENIED`, or `UNIMPLEMENTED` for an uploaded input.
+    /// `INVALID_ARGUMENT`, `NOT_FOUND` for another tenant, or `UNIMPLEMENTED` for an uploaded input.
     pub fn open(caller: &Caller, request: proto::CreateJobRequest, limits: &Limits) -> Result<Self, Status> {
         let tenant = caller.parent(&request.parent)?;
         if let Some(Inline::InputName(_)) = request.input {

@@ -5,6 +5,7 @@ use std::error::Error as _;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
+use super::handshake;
 use crate::cli::exit::{Exit, Failure};
 use crate::domain::{InvalidInput, Violation};
 use crate::formats::LabelledInput;
@@ -24,6 +25,9 @@ pub enum Error {
     /// The server will not do it: no such job, no result yet, an id that is taken.
     #[error("{0}")]
     Refused(String),
+    /// One of the two does not trust the other: a certificate, or a key.
+    #[error("{0}")]
+    NotLetIn(String),
     #[error("the job was cancelled")]
     Cancelled,
     /// The job or the server failed.
@@ -53,8 +57,13 @@ impl Error {
 
     /// From the status of a call to `server`.
     pub(super) fn from_status(server: &str, status: &Status) -> Self {
+        if let Some(words) = handshake::words(server, status) {
+            return Error::NotLetIn(words);
+        }
         if status.source().is_some() && status.get_details_error_info().is_none() {
-            return Error::Unavailable(format!("the connection to {server} broke: {}", root_cause(status)));
+            let cause = root_cause(status);
+            let hint = handshake::plain_hint(server, &cause);
+            return Error::Unavailable(format!("the connection to {server} broke: {cause}{hint}"));
         }
         let message = status.message().to_owned();
         match status.code() {
@@ -67,11 +76,12 @@ impl Error {
             Code::InvalidArgument => Error::Invalid(violations(status), message),
             // What the transport says of a message above the server's limit.
             Code::OutOfRange => Error::Refused(format!("{message}; `solve --server` sends a large input in parts")),
-            Code::NotFound
-            | Code::AlreadyExists
-            | Code::PermissionDenied
-            | Code::FailedPrecondition
-            | Code::Unauthenticated => Error::Refused(message),
+            Code::NotFound | Code::AlreadyExists | Code::PermissionDenied | Code::FailedPrecondition => {
+                Error::Refused(message)
+            }
+            Code::Unauthenticated => {
+                Error::NotLetIn(format!("{server}: {message}; here: --api-key-file, or the variable SCPSFM_API_KEY"))
+            }
             Code::Cancelled => Error::Cancelled,
             code => Error::Failed(format!("{server}: {message} ({code:?})")),
         }
@@ -80,19 +90,27 @@ impl Error {
 
 /// Whether the same call may fare better soon: the connection broke, or the server is going down.
 pub(super) fn is_transient(status: &Status) -> bool {
+    handshake::words("", status).is_none() && broke_or_ends(status)
+}
+
+fn broke_or_ends(status: &Status) -> bool {
     status.code() == Code::Unavailable || (status.source().is_some() && status.get_details_error_info().is_none())
 }
 
 /// No connection to begin with.
 pub(super) fn not_connected(server: &str, error: &tonic::transport::Error) -> Error {
+    if let Some(words) = handshake::words(server, error) {
+        return Error::NotLetIn(words);
+    }
     let cause = root_cause(error);
+    let hint = handshake::plain_hint(server, &cause);
     Error::Unavailable(format!(
-        "no server answers at {server}: {cause}; start one with `scpsfm serve`, or say --server"
+        "no server answers at {server}: {cause}{hint}; start one with `scpsfm serve`, or say --server"
     ))
 }
 
 /// The innermost error: what the layers above wrap says nothing to a user.
-fn root_cause(error: &dyn std::error::Error) -> String {
+pub(super) fn root_cause(error: &dyn std::error::Error) -> String {
     let mut cause = error;
     while let Some(inner) = cause.source() {
         cause = inner;
@@ -142,6 +160,7 @@ impl From<Error> for Failure {
             Error::Invalid(violations, _) if violations.iter().any(|violation| !is_of_input(violation)) => Exit::Usage,
             Error::Usage(_) => Exit::Usage,
             Error::Invalid(..) | Error::Refused(_) => Exit::BadInput,
+            Error::NotLetIn(_) => Exit::NotLetIn,
             Error::Cancelled => Exit::Interrupted,
             Error::Failed(_) => Exit::Internal,
         };

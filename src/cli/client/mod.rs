@@ -3,8 +3,10 @@
 //! Calls that may be repeated are repeated when the connection breaks, for a bounded time: a watch goes on after its
 //! last event, a result after its last byte, a creation under its request id.
 
+pub mod access;
 mod backoff;
 mod error;
+mod handshake;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -13,14 +15,16 @@ use std::time::Duration;
 use prost::Message;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding::Gzip;
+use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Request, Status, Streaming};
 
 pub use error::Error;
 
+use self::access::{AccessArgs, Bearer};
 use self::backoff::Backoff;
 use super::args::ServerArgs;
-use crate::domain::job::{DEFAULT_TENANT, EventBody, Failure, Job, JobEvent, JobName, JobState};
+use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState};
 use crate::domain::{RawInput, Solution, SolveSettings};
 use crate::rpc::convert;
 use crate::rpc::proto::{self, calibration_service_client as calibration, job_service_client as jobs};
@@ -53,30 +57,41 @@ pub struct Page {
     pub next_page_token: String,
 }
 
+/// A connection whose every call carries the API key, where there is one.
+type Keyed = InterceptedService<Channel, Bearer>;
+
 /// A connection to a server; reconnects by itself.
 #[derive(Debug, Clone)]
 pub struct Client {
-    jobs: jobs::JobServiceClient<Channel>,
-    calibration: calibration::CalibrationServiceClient<Channel>,
+    jobs: jobs::JobServiceClient<Keyed>,
+    calibration: calibration::CalibrationServiceClient<Keyed>,
     server: String,
+    /// Whose jobs are created and listed.
+    tenant: String,
 }
 
 impl Client {
     /// Connects.
     ///
     /// # Errors
-    /// [`Error::Unavailable`] where no server answers, [`Error::Usage`] for what is not a URL.
-    pub async fn connect(server: &str) -> Result<Self, Error> {
-        let no_url = || Error::Usage(format!("{server:?} is not a URL of the form http://HOST:PORT"));
-        if !server.starts_with("http://") {
+    /// [`Error::Unavailable`] where no server answers, [`Error::NotLetIn`] where one side does not trust the other,
+    /// [`Error::Usage`] for what is not a URL and for files of certificates or keys that cannot be used.
+    pub async fn connect(server: &str, access: &AccessArgs) -> Result<Self, Error> {
+        let no_url =
+            || Error::Usage(format!("{server:?} is not a URL of the form http://HOST:PORT or https://HOST:PORT"));
+        if !server.starts_with("http://") && !server.starts_with("https://") {
             return Err(no_url());
         }
+        let tenant = access.tenant()?;
         let endpoint = Endpoint::from_shared(server.to_owned())
             .map_err(|_| no_url())?
             .connect_timeout(CONNECT_TIMEOUT)
             .tcp_nodelay(true)
             .http2_keep_alive_interval(KEEPALIVE);
+        let bearer = access.bearer(&endpoint)?;
+        let endpoint = access.secure(endpoint)?;
         let channel = endpoint.connect().await.map_err(|error| error::not_connected(server, &error))?;
+        let channel = InterceptedService::new(channel, bearer);
         let jobs = jobs::JobServiceClient::new(channel.clone());
         let calibration = calibration::CalibrationServiceClient::new(channel);
         Ok(Self {
@@ -86,12 +101,17 @@ impl Client {
                 .send_compressed(Gzip)
                 .max_decoding_message_size(MAX_MESSAGE_BYTES),
             server: server.to_owned(),
+            tenant,
         })
     }
 
     /// The server's address, as it was given.
     pub fn server(&self) -> &str {
         &self.server
+    }
+
+    fn parent(&self) -> String {
+        format!("tenants/{}", self.tenant)
     }
 
     fn error(&self, status: Status) -> Error {
@@ -109,7 +129,7 @@ impl Client {
         options: JobOptions,
     ) -> Result<Job, Error> {
         let whole = convert::input::to_wire(input);
-        let request = create_request(whole, settings, options);
+        let request = create_request(self.parent(), whole, settings, options);
         let mut backoff = Backoff::default();
         loop {
             match self.jobs.create_job(request.clone()).await {
@@ -132,7 +152,7 @@ impl Client {
     /// See [`Error`].
     pub async fn list(&mut self, filter: &str, page_size: u16, page_token: &str) -> Result<Page, Error> {
         let request = proto::ListJobsRequest {
-            parent: parent(),
+            parent: self.parent(),
             page_size: page_size.into(),
             page_token: page_token.to_owned(),
             filter: filter.to_owned(),
@@ -217,7 +237,8 @@ impl Client {
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
     ) -> Result<JobEvent, Error> {
         let input = Arc::new(input.clone());
-        let config = create_request(convert::input::head_to_wire(&input), settings, JobOptions::default());
+        let config =
+            create_request(self.parent(), convert::input::head_to_wire(&input), settings, JobOptions::default());
         let mut told = Told { last_sequence: 0, on_event };
         let mut backoff = Backoff::default();
         loop {
@@ -354,18 +375,19 @@ pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> R
     }
 }
 
-fn parent() -> String {
-    format!("tenants/{DEFAULT_TENANT}")
-}
-
-fn create_request(input: proto::TrackSet, settings: &SolveSettings, options: JobOptions) -> proto::CreateJobRequest {
+fn create_request(
+    parent: String,
+    input: proto::TrackSet,
+    settings: &SolveSettings,
+    options: JobOptions,
+) -> proto::CreateJobRequest {
     // What the wire cannot say is far above what a server takes: it says so.
     let time_limit = options.time_limit.map(|limit| prost_types::Duration {
         seconds: i64::try_from(limit.as_secs()).unwrap_or(i64::MAX),
         nanos: limit.subsec_nanos() as i32,
     });
     proto::CreateJobRequest {
-        parent: parent(),
+        parent,
         job_id: options.job_id.unwrap_or_default(),
         request_id: options.request_id.unwrap_or_else(|| uuid::Uuid::now_v7().to_string()),
         job: Some(proto::Job {
@@ -390,5 +412,5 @@ pub async fn solve(
     on_event: &mut (dyn FnMut(&JobEvent) + Send),
     stop: CancellationToken,
 ) -> Result<Solution, Error> {
-    Client::connect(&server.server).await?.solve(input, settings, on_event, stop).await
+    server.connect().await?.solve(input, settings, on_event, stop).await
 }

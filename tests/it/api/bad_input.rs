@@ -196,7 +196,7 @@ async fn unknown_and_foreign_names_are_told_apart_from_malformed_ones() {
     assert_eq!(fields(&jobs.get_job(get("none")).await.expect_err("malformed")), ["name"]);
     let foreign = proto::CreateJobRequest { parent: "tenants/other".into(), ..create_tracks() };
     let status = jobs.create_job(foreign).await.expect_err("another tenant");
-    assert_eq!(status.code(), Code::PermissionDenied);
+    assert_eq!((status.code(), reason(&status).as_str()), (Code::NotFound, "TENANT_NOT_FOUND"));
     let watch = proto::WatchJobRequest { name: "tenants/default/jobs/none".into(), after_sequence: 0 };
     assert_eq!(jobs.watch_job(watch).await.expect_err("none").code(), Code::NotFound);
 }

@@ -1,5 +1,6 @@
 //! The command line's client against a real server.
 
+use scpsfm::cli::client::access::AccessArgs;
 use scpsfm::cli::client::{Client, Error, JobOptions, ended};
 use scpsfm::domain::job::{EventBody, JobEvent, JobState};
 use scpsfm::domain::{Input, Limits, SolveSettings};
@@ -94,9 +95,9 @@ async fn errors_are_sentences() {
     let name = scpsfm::domain::job::JobName::parse("tenants/default/jobs/none").expect("a name");
     assert!(matches!(client.get(&name).await, Err(Error::Refused(_))));
     assert!(matches!(client.read_result(&name).await, Err(Error::Refused(_))));
-    assert!(matches!(Client::connect("localhost:1").await, Err(Error::Usage(_))));
+    assert!(matches!(Client::connect("localhost:1", &AccessArgs::default()).await, Err(Error::Usage(_))));
     let url = server.url();
     drop(server);
-    let error = Client::connect(&url).await.expect_err("nobody listens");
+    let error = Client::connect(&url, &AccessArgs::default()).await.expect_err("nobody listens");
     assert!(matches!(&error, Error::Unavailable(message) if message.contains(&url)), "{error:?}");
 }

@@ -1,6 +1,8 @@
 //! What tests share: a server on a free port with a store of its own, and stand-ins for the solver.
 
+pub mod certificates;
 pub mod collector;
+pub mod keys;
 pub mod live;
 pub mod postgres;
 pub mod program;

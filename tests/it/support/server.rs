@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use scpsfm::cli::client::Client;
+use scpsfm::cli::client::access::AccessArgs;
 use scpsfm::engine::{self, Engine, Solver};
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
@@ -64,7 +65,7 @@ impl TestServer {
     }
 
     pub async fn client(&self) -> Client {
-        Client::connect(&self.url()).await.expect("a connection")
+        Client::connect(&self.url(), &AccessArgs::default()).await.expect("a connection")
     }
 }
 

@@ -1,0 +1,167 @@
+//! The server's configuration: typed and checked, from defaults < file < environment < flags.
+//!
+//! Every key may stand in a TOML file (`[engine] workers = 4`), in the environment (`SCPSFM_ENGINE__WORKERS=4`) or,
+//! for some, in a flag. An unknown key is an error: a misspelt limit must not silently be no limit.
+
+mod exposure;
+mod sections;
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::domain::Limits;
+pub use sections::{Auth, Compute, Engine, Log, Metrics, Otlp, Server, Store, Tls};
+
+/// Everything that the server can be told.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    pub server: Server,
+    pub tls: Tls,
+    pub auth: Auth,
+    pub metrics: Metrics,
+    pub store: Store,
+    pub engine: Engine,
+    pub compute: Compute,
+    pub limits: Limits,
+    pub log: Log,
+    pub otlp: Otlp,
+}
+
+/// What is wrong with a configuration.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A source that cannot be read, an unknown key or a value of the wrong type; the message names key and source.
+    #[error("configuration: {0}")]
+    Source(#[from] config::ConfigError),
+    /// A value of the right type that cannot work.
+    #[error("configuration: {key}: {found} is wrong; right would be {right}")]
+    Value { key: &'static str, found: String, right: &'static str },
+    /// A file without the one that belongs to it.
+    #[error("configuration: {key} is set, and {missing} is not: both or neither")]
+    Half { key: &'static str, missing: &'static str },
+    /// A port that would be open to a network without what keeps strangers out.
+    #[error("configuration: {0}")]
+    Exposed(#[from] exposure::Exposed),
+    /// A variable of the environment that looks like a key and is none.
+    #[error("configuration: {found} in the environment is no key; right would be {right} (two underscores)")]
+    Variable { found: String, right: String },
+}
+
+/// First part of every variable of the environment that is ours.
+const PREFIX: &str = "SCPSFM_";
+
+/// Between the section and the key in a variable of the environment.
+const SEPARATOR: &str = "__";
+
+impl Config {
+    /// Reads the defaults, the file (if given), the environment and the flags that were set, later ones winning.
+    ///
+    /// `flags` are pairs of a key (`server.listen`) and its value.
+    ///
+    /// # Errors
+    /// See [`Error`]; each names the key and where its value came from.
+    pub fn load(file: Option<&Path>, flags: &[(&str, String)]) -> Result<Self, Error> {
+        Self::from_sources(file, std::env::vars().collect(), flags)
+    }
+
+    fn from_sources(
+        file: Option<&Path>,
+        variables: Vec<(String, String)>,
+        flags: &[(&str, String)],
+    ) -> Result<Self, Error> {
+        let mut sources = config::Config::builder();
+        if let Some(path) = file {
+            sources = sources.add_source(config::File::from(path).format(config::FileFormat::Toml));
+        }
+        sources = sources.add_source(
+            config::Environment::with_prefix(PREFIX.trim_end_matches('_'))
+                .prefix_separator("_")
+                .separator(SEPARATOR)
+                .ignore_empty(true)
+                .source(Some(keys_among(variables)?.into_iter().collect())),
+        );
+        for (key, value) in flags {
+            sources = sources.set_override(*key, value.as_str())?;
+        }
+        let config: Self = sources.build()?.try_deserialize()?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// The configuration as a TOML file that would give it.
+    ///
+    /// # Errors
+    /// When a value has no form in TOML, such as a path that is not Unicode.
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        toml::to_string(self)
+    }
+
+    fn validate(&self) -> Result<(), Error> {
+        let at_least_one = |key: &'static str, value: u64| match value {
+            0 => Err(Error::Value { key, found: "0".into(), right: "a number from 1 on" }),
+            _ => Ok(()),
+        };
+        at_least_one("server.max_message_bytes", self.server.max_message_bytes as u64)?;
+        at_least_one("engine.queue_capacity", self.engine.queue_capacity as u64)?;
+        at_least_one("engine.queue_bytes", self.engine.queue_bytes)?;
+        at_least_one("engine.queue_observations", self.engine.queue_observations)?;
+        at_least_one("engine.lease_seconds", self.engine.lease_seconds)?;
+        at_least_one("engine.max_attempts", u64::from(self.engine.max_attempts))?;
+        at_least_one("limits.max_views", self.limits.max_views as u64)?;
+        at_least_one("limits.max_tracks", self.limits.max_tracks as u64)?;
+        at_least_one("limits.max_observations", self.limits.max_observations as u64)?;
+        for (key, value) in [
+            ("limits.max_views", self.limits.max_views),
+            ("limits.max_tracks", self.limits.max_tracks),
+            ("limits.max_observations", self.limits.max_observations),
+        ] {
+            // Views, tracks and observations are counted in 32 bits.
+            if u32::try_from(value).is_err() {
+                return Err(Error::Value { key, found: value.to_string(), right: "a number below 4294967296" });
+            }
+        }
+        if tracing_subscriber::EnvFilter::try_new(&self.log.filter).is_err() {
+            return Err(Error::Value {
+                key: "log.filter",
+                found: format!("`{}`", self.log.filter),
+                right: "levels by module, such as `info` or `info,scpsfm::engine=debug`",
+            });
+        }
+        if let Some(endpoint) = self.otlp.endpoint.as_ref().filter(|endpoint| !is_plain_http(endpoint)) {
+            return Err(Error::Value {
+                key: "otlp.endpoint",
+                found: format!("`{endpoint}`"),
+                right: "a collector's http:// address, such as http://127.0.0.1:4317 (TLS is not built in)",
+            });
+        }
+        self.tls.validate()?;
+        Ok(exposure::check(&self.server, &self.tls, &self.auth)?)
+    }
+}
+
+/// The variables that name a key, i.e. have a section: `SCPSFM_ENGINE__WORKERS`. Others of our prefix, such as those
+/// that switch tests, are none of ours here; but `SCPSFM_ENGINE_WORKERS` is a slip that would go unseen.
+fn keys_among(variables: Vec<(String, String)>) -> Result<Vec<(String, String)>, Error> {
+    const SECTIONS: [&str; 10] =
+        ["SERVER", "TLS", "AUTH", "METRICS", "STORE", "ENGINE", "COMPUTE", "LIMITS", "LOG", "OTLP"];
+    let mut keys = Vec::new();
+    for (name, value) in variables {
+        let Some(rest) = name.strip_prefix(PREFIX) else { continue };
+        if rest.contains(SEPARATOR) {
+            keys.push((name, value));
+        } else if let Some((section, key)) = rest.split_once('_').filter(|(section, _)| SECTIONS.contains(section)) {
+            return Err(Error::Variable { right: format!("{PREFIX}{section}{SEPARATOR}{key}"), found: name });
+        }
+    }
+    Ok(keys)
+}
+
+fn is_plain_http(endpoint: &str) -> bool {
+    let uri: Result<axum::http::Uri, _> = endpoint.parse();
+    uri.is_ok_and(|uri| uri.scheme_str() == Some("http") && uri.host().is_some())
+}
+
+#[cfg(test)]
+mod tests;

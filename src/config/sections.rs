@@ -1,0 +1,235 @@
+//! The sections of the configuration, one type each, with every default and its reason.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::num::NonZero;
+use std::path::PathBuf;
+
+use serde::de::IntoDeserializer;
+use serde::{Deserialize, Deserializer, Serialize};
+
+use super::Error;
+use crate::domain::Backend;
+use crate::rpc::keys::KeyRing;
+use crate::store::postgres::DatabaseUrl;
+use crate::telemetry::tracing::Format;
+use crate::{engine, rpc};
+
+/// The gRPC port.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Server {
+    /// Address and port to listen on; port 0 takes a free one.
+    #[serde(deserialize_with = "address")]
+    pub listen: SocketAddr,
+    /// Largest message taken or sent.
+    pub max_message_bytes: usize,
+    /// Whether callers may ask for the API's description (reflection). On, because it says what `proto/` says; with keys
+    /// it asks for one, as every call but a health check does.
+    pub reflection: bool,
+    /// Listen on other addresses than loopback's with neither TLS nor keys: whoever reaches the port reads and cancels
+    /// every job.
+    pub insecure: bool,
+    /// Take keys without TLS on other addresses than loopback's: whoever listens in has them. For a proxy that ends TLS.
+    pub plaintext_keys: bool,
+}
+
+impl Default for Server {
+    fn default() -> Self {
+        Self {
+            // Loopback: whoever opens the service to a network should have meant to. 50051 is gRPC's customary port.
+            listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 50051),
+            max_message_bytes: rpc::server::Options::MAX_MESSAGE_BYTES,
+            reflection: true,
+            insecure: false,
+            plaintext_keys: false,
+        }
+    }
+}
+
+/// Certificates of the gRPC port, PEM files that are read again when they change. None by default: there is no
+/// certificate that would be right everywhere.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Tls {
+    /// The server's certificate, followed by those that lead to its authority.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub certificate: Option<PathBuf>,
+    /// Its private key.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub key: Option<PathBuf>,
+    /// Certificates of authorities one of which must have signed a client's certificate (mTLS); without it, clients need
+    /// none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub client_ca: Option<PathBuf>,
+}
+
+impl Tls {
+    /// The files, where TLS is asked for.
+    pub fn files(&self) -> Option<rpc::tls::Files> {
+        let (certificate, key) = self.certificate.clone().zip(self.key.clone())?;
+        Some(rpc::tls::Files { certificate, key, client_ca: self.client_ca.clone() })
+    }
+
+    pub(super) fn validate(&self) -> Result<(), Error> {
+        let half = |key, missing| Err(Error::Half { key, missing });
+        match (&self.certificate, &self.key, &self.client_ca) {
+            (Some(_), None, _) => half("tls.certificate", "tls.key"),
+            (None, Some(_), _) => half("tls.key", "tls.certificate"),
+            (None, None, Some(_)) => half("tls.client_ca", "tls.certificate"),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Who may call. Without any key, every caller is of the tenant `default`.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Auth {
+    /// File of keys, read again when it changes: lines `TENANT:KEY` or `TENANT:sha256:HEX`, `#` begins a comment.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub keys_file: Option<PathBuf>,
+    /// More keys, in the same form, separated by commas or lines; for the environment. Only their hashes are kept, and
+    /// they are shown nowhere.
+    #[serde(skip_serializing)]
+    pub keys: Option<KeyRing>,
+}
+
+impl Auth {
+    /// Whether callers need a key.
+    pub fn is_on(&self) -> bool {
+        self.keys_file.is_some() || self.keys.is_some()
+    }
+}
+
+/// The scrape port: `/metrics`, `/healthz`, `/readyz`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Metrics {
+    /// Address and port to listen on; port 0 takes a free one.
+    #[serde(deserialize_with = "address")]
+    pub listen: SocketAddr,
+}
+
+impl Default for Metrics {
+    fn default() -> Self {
+        // Loopback for the same reason as the gRPC port; 9464 is the customary port of such an exporter.
+        Self { listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 9464) }
+    }
+}
+
+/// Where jobs are kept.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Store {
+    /// Folder of the embedded database; made if it does not exist. Not used with a `url`.
+    pub data_dir: PathBuf,
+    /// PostgreSQL database that several servers may share, `postgres://USER:PASSWORD@HOST:PORT/DATABASE`. None by
+    /// default: one server needs no database beside it. Wherever the configuration is shown, the password is not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub url: Option<DatabaseUrl>,
+}
+
+impl Default for Store {
+    fn default() -> Self {
+        // Beside the process, with a name that nobody deletes by mistake.
+        Self { data_dir: PathBuf::from("scpsfm-data"), url: None }
+    }
+}
+
+/// Queue, workers and leases.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Engine {
+    /// Worker threads, one job each; 0: one a core.
+    pub workers: usize,
+    /// Waiting jobs at which new ones are refused.
+    pub queue_capacity: usize,
+    /// Bytes of waiting inputs at which new jobs are refused.
+    pub queue_bytes: u64,
+    /// Observations of waiting inputs at which new jobs are refused.
+    pub queue_observations: u64,
+    /// Seconds without a heartbeat after which a job may be taken over.
+    pub lease_seconds: u64,
+    /// Seconds that running jobs get to finish once the server was told to stop; then they go back to the queue.
+    pub drain_seconds: u64,
+    /// Attempts at one job before it counts as poison and fails.
+    pub max_attempts: u32,
+}
+
+impl Default for Engine {
+    /// What [`engine::Options`] has by default, with its reasons.
+    fn default() -> Self {
+        use engine::Options;
+        Self {
+            // A job is single-threaded numerics: more workers than cores only lengthen every job.
+            workers: 0,
+            queue_capacity: Options::DEFAULT_MAX_JOBS as usize,
+            queue_bytes: Options::DEFAULT_MAX_BYTES,
+            queue_observations: Options::DEFAULT_MAX_OBSERVATIONS,
+            lease_seconds: Options::DEFAULT_LEASE.as_secs(),
+            // Kubernetes kills 30 s after it asks; this leaves a third of it for the rest of the exit.
+            drain_seconds: 20,
+            max_attempts: Options::DEFAULT_MAX_ATTEMPTS,
+        }
+    }
+}
+
+impl Engine {
+    /// Worker threads to start: as configured, or one a core.
+    pub fn worker_count(&self) -> usize {
+        match self.workers {
+            0 => std::thread::available_parallelism().map_or(1, NonZero::get),
+            workers => workers,
+        }
+    }
+}
+
+/// What the network runs on.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Compute {
+    /// `flex` or `ndarray`; a job may ask for the other. Flex, because burn deprecates ndarray in its favour and it
+    /// is the faster of the two.
+    #[serde(deserialize_with = "word")]
+    pub backend: Backend,
+}
+
+/// Log lines, on stderr.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Log {
+    /// `human` or `json`. Human, because who starts the server by hand reads it; deploy/ sets json.
+    #[serde(deserialize_with = "word")]
+    pub format: Format,
+    /// Levels by module, e.g. `info,scpsfm::engine=debug`.
+    pub filter: String,
+}
+
+impl Default for Log {
+    fn default() -> Self {
+        // One line a state change of a job; debug would be one a store operation.
+        Self { format: Format::default(), filter: "info".into() }
+    }
+}
+
+/// Export of traces.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Otlp {
+    /// Collector (gRPC), e.g. `http://127.0.0.1:4317`. None by default: a server sends nothing anywhere unasked.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub endpoint: Option<String>,
+}
+
+fn address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<SocketAddr, D::Error> {
+    let text = String::deserialize(deserializer)?;
+    text.parse().map_err(|_| {
+        let message = format!("`{text}` is not an IP address and port, such as 127.0.0.1:50051 or [::1]:50051");
+        serde::de::Error::custom(message)
+    })
+}
+
+/// One word of a few; the error lists them, which the `config` crate's own does not.
+fn word<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<T, D::Error> {
+    String::deserialize(deserializer).and_then(|text| T::deserialize(text.into_deserializer()))
+}

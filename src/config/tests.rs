@@ -1,0 +1,123 @@
+//! Sources, checks, and what a configuration shows of itself.
+
+use std::io::Write;
+
+use super::{Config, Error};
+use crate::domain::Backend;
+use crate::telemetry::tracing::Format;
+
+fn file(text: &str) -> tempfile::NamedTempFile {
+    let mut file = tempfile::NamedTempFile::new().expect("temporary file");
+    file.write_all(text.as_bytes()).expect("write");
+    file
+}
+
+fn variables(pairs: &[(&str, &str)]) -> Vec<(String, String)> {
+    pairs.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect()
+}
+
+#[test]
+fn nothing_given_is_the_default_and_the_example_file_says_the_same() {
+    assert_eq!(Config::from_sources(None, vec![], &[]).expect("defaults"), Config::default());
+    let example = file(include_str!("../../deploy/scpsfm.toml"));
+    let read = Config::from_sources(Some(example.path()), vec![], &[]).expect("example");
+    assert_eq!(read, Config::default());
+    // Every key that the configuration has stands in the example.
+    let keys = |text: &str| -> Vec<String> {
+        let keys = text.lines().filter(|line| !line.starts_with('#')).filter_map(|line| line.split_once(" = "));
+        let mut keys: Vec<String> = keys.map(|(key, _)| key.to_owned()).collect();
+        keys.sort();
+        keys
+    };
+    assert_eq!(keys(include_str!("../../deploy/scpsfm.toml")), keys(&Config::default().to_toml().expect("TOML")));
+}
+
+#[test]
+fn later_sources_win_key_by_key() {
+    let file = file("[engine]\nworkers = 1\nqueue_capacity = 2\nmax_attempts = 4\n[log]\nformat = \"json\"\n");
+    let environment = variables(&[
+        ("SCPSFM_ENGINE__WORKERS", "5"),
+        ("SCPSFM_ENGINE__QUEUE_CAPACITY", "6"),
+        ("SCPSFM_COMPUTE__BACKEND", "ndarray"),
+        ("SCPSFM_OTLP__ENDPOINT", ""),
+        ("SCPSFM_REQUIRE_PYTHON", "1"),
+        ("PATH", "/bin"),
+    ]);
+    let flags = [("engine.workers", "7".to_owned()), ("server.listen", "[::1]:0".to_owned())];
+    let config = Config::from_sources(Some(file.path()), environment, &flags).expect("configuration");
+    assert_eq!(config.engine.max_attempts, 4, "file over default");
+    assert_eq!(config.engine.queue_capacity, 6, "environment over file");
+    assert_eq!(config.engine.workers, 7, "flag over environment");
+    assert_eq!(config.log.format, Format::Json);
+    assert_eq!(config.compute.backend, Backend::Ndarray);
+    assert_eq!(config.otlp.endpoint, None, "an empty variable is none");
+    assert_eq!(config.server.listen, "[::1]:0".parse().expect("address"));
+    assert_eq!(config.engine.lease_seconds, Config::default().engine.lease_seconds);
+}
+
+#[test]
+fn a_printed_configuration_reads_back() {
+    let flags = [("otlp.endpoint", "http://collector:4317".to_owned()), ("engine.workers", "3".to_owned())];
+    let config = Config::from_sources(None, vec![], &flags).expect("configuration");
+    let printed = file(&config.to_toml().expect("TOML"));
+    assert_eq!(Config::from_sources(Some(printed.path()), vec![], &[]).expect("configuration"), config);
+}
+
+#[test]
+fn the_password_of_the_store_is_shown_nowhere() {
+    let given = "postgres://me:hunter2@db/scpsfm";
+    let config = Config::from_sources(None, variables(&[("SCPSFM_STORE__URL", given)]), &[]).expect("valid");
+    assert_eq!(config.store.url.as_ref().map(|url| url.reveal()), Some(given));
+    for shown in [format!("{config:?}"), config.to_toml().expect("TOML")] {
+        assert!(shown.contains("me:***@db") && !shown.contains("hunter2"), "{shown}");
+    }
+}
+
+#[test]
+fn keys_are_kept_as_hashes_and_shown_nowhere() {
+    let key = "0123456789abcdef0123456789abcdef";
+    let given = format!("north:{key}");
+    let variables = variables(&[("SCPSFM_AUTH__KEYS", &given), ("SCPSFM_SERVER__PLAINTEXT_KEYS", "true")]);
+    let config = Config::from_sources(None, variables, &[]).expect("valid");
+    assert!(config.auth.is_on());
+    let ring = config.auth.keys.as_ref().expect("keys");
+    assert_eq!(ring.tenant_of(key), Some("north"));
+    for shown in [format!("{config:?}"), config.to_toml().expect("TOML")] {
+        assert!(!shown.contains(key), "{shown}");
+    }
+}
+
+#[test]
+fn errors_name_the_key_and_what_would_be_right() {
+    let from_file = |text: &str| Config::from_sources(Some(file(text).path()), vec![], &[]);
+    let from_variable = |name: &str, value: &str| Config::from_sources(None, variables(&[(name, value)]), &[]);
+    let cases: [(Result<Config, Error>, &[&str]); 17] = [
+        (from_file("[engine]\nwrokers = 1\n"), &["wrokers", "workers"]),
+        (from_file("[engine]\nqueue_capacity = 0\n"), &["engine.queue_capacity", "from 1 on"]),
+        (from_file("[server]\nlisten = \"localhost\"\n"), &["server.listen", "127.0.0.1:50051"]),
+        (from_file("[compute]\nbackend = \"cuda\"\n"), &["compute.backend", "flex", "ndarray"]),
+        (from_file("[log]\nfilter = \"scpsfm=loud\"\n"), &["log.filter", "`info`"]),
+        (from_variable("SCPSFM_STORE__URL", "mysql://me:hunter2@host/db"), &["store.url", "postgres://USER"]),
+        (from_variable("SCPSFM_ENGINE__WORKERS", "many"), &["engine.workers", "many", "environment"]),
+        (from_variable("SCPSFM_ENGINE_WORKERS", "4"), &["SCPSFM_ENGINE_WORKERS", "SCPSFM_ENGINE__WORKERS"]),
+        (from_variable("SCPSFM_OTLP__ENDPOINT", "https://x:4317"), &["otlp.endpoint", "http://127.0.0.1:4317"]),
+        (from_variable("SCPSFM_AUTH__KEYS", "north:hunter2"), &["auth.keys", "entry 1", "32"]),
+        (from_variable("SCPSFM_AUTH_KEYS", "north:hunter2"), &["SCPSFM_AUTH_KEYS", "SCPSFM_AUTH__KEYS"]),
+        (from_file("[tls]\ncertificate = \"c\"\n"), &["tls.certificate", "tls.key"]),
+        (from_file("[tls]\nclient_ca = \"c\"\n"), &["tls.client_ca", "tls.certificate"]),
+        (from_file("[server]\nlisten = \"0.0.0.0:1\"\n"), &["server.listen", "--tls-certificate", "--insecure"]),
+        (
+            from_file("[server]\nlisten = \"[::]:1\"\ninsecure = true\n[auth]\nkeys_file = \"k\"\n"),
+            &["server.listen", "--tls-certificate", "--plaintext-keys"],
+        ),
+        (from_file("[auth]\nkeys = [\"north:hunter2\"]\n"), &["auth.keys"]),
+        (Config::from_sources(Some("no/such/file".as_ref()), vec![], &[]), &["no/such/file"]),
+    ];
+    for (result, parts) in cases {
+        let message = result.expect_err(parts[0]).to_string();
+        for part in parts {
+            assert!(message.contains(part), "`{message}` does not say `{part}`");
+        }
+        assert!(!message.contains("hunter2"), "{message}");
+    }
+}

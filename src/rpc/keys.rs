@@ -1,0 +1,253 @@
+//! API keys: which tenant a key stands for. Only hashes are kept.
+//!
+//! A key is random and long, so that its plain SHA-256 gives nothing away and needs neither salt nor stretching.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use serde::{Deserialize, Deserializer};
+use sha2::{Digest as _, Sha256};
+
+use crate::domain::job::JobName;
+
+/// Shortest key: 128 random bits in hexadecimal. Anything shorter could be guessed from its hash.
+const MIN_KEY_CHARS: usize = 32;
+
+/// Longest key: well above what any generator makes, well below what a header may hold.
+const MAX_KEY_CHARS: usize = 256;
+
+/// Before the hash of a key that is not written itself.
+const HASHED: &str = "sha256:";
+
+type Digest = [u8; 32];
+
+/// Keys and the tenants they stand for.
+#[derive(Clone, Default, PartialEq, Eq)]
+pub struct KeyRing {
+    keys: Vec<(Digest, String)>,
+}
+
+/// An entry that is none. Says where it stands and what would be right, and nothing of what it holds.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Error {
+    #[error("entry {entry} {problem}; right would be TENANT:KEY or TENANT:sha256:HEX")]
+    Entry { entry: usize, problem: &'static str },
+    #[error("entries {first} and {second} have the same key: a key stands for one tenant")]
+    Repeated { first: usize, second: usize },
+    #[error("there is no key in it; right would be lines TENANT:KEY or TENANT:sha256:HEX")]
+    Empty,
+}
+
+impl KeyRing {
+    /// Reads a file of keys.
+    ///
+    /// # Errors
+    /// A sentence that names the file, and the entry by its number.
+    pub fn read(path: &Path) -> Result<Self, String> {
+        let text = std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
+        text.parse().map_err(|error| format!("{}: {error}", path.display()))
+    }
+
+    /// The keys of both.
+    pub fn with(mut self, other: &Self) -> Self {
+        self.keys.extend(other.keys.iter().cloned());
+        self
+    }
+
+    /// The tenant that a key stands for. Compares with every key, each to its last byte, so that the time tells nothing.
+    pub fn tenant_of(&self, key: &str) -> Option<&str> {
+        let presented = digest(key.as_bytes());
+        let mut found = None;
+        for (known, tenant) in &self.keys {
+            let difference = known.iter().zip(&presented).fold(0, |sum, (a, b)| sum | (a ^ b));
+            // Opaque to the optimiser, which might otherwise end the comparison early.
+            if std::hint::black_box(difference) == 0 {
+                found = Some(tenant.as_str());
+            }
+        }
+        found
+    }
+
+    /// How many keys there are.
+    pub fn len(&self) -> usize {
+        self.keys.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.keys.is_empty()
+    }
+}
+
+fn digest(bytes: &[u8]) -> Digest {
+    Sha256::digest(bytes).into()
+}
+
+impl FromStr for KeyRing {
+    type Err = Error;
+
+    /// Entries on lines of their own or separated by commas; `#` begins a comment.
+    fn from_str(text: &str) -> Result<Self, Error> {
+        let lines = text.lines().map(|line| line.split_once('#').map_or(line, |(entry, _)| entry));
+        let entries = lines.flat_map(|line| line.split(',')).map(str::trim).filter(|entry| !entry.is_empty());
+        let mut keys: Vec<(Digest, String)> = Vec::new();
+        for (k, entry) in entries.enumerate() {
+            let parsed = parse(entry).map_err(|problem| Error::Entry { entry: k + 1, problem })?;
+            if let Some(first) = keys.iter().position(|(known, _)| *known == parsed.0) {
+                return Err(Error::Repeated { first: first + 1, second: k + 1 });
+            }
+            keys.push(parsed);
+        }
+        if keys.is_empty() { Err(Error::Empty) } else { Ok(Self { keys }) }
+    }
+}
+
+fn parse(entry: &str) -> Result<(Digest, String), &'static str> {
+    let (tenant, key) = entry.split_once(':').ok_or("has no tenant")?;
+    if !JobName::is_id(tenant) {
+        return Err("has a tenant that is not 1 to 63 of a-z, 0-9 and -, or begins or ends with -");
+    }
+    let digest = match key.strip_prefix(HASHED) {
+        Some(hex) => from_hex(hex).ok_or("has a hash that is not 64 hexadecimal digits")?,
+        None => digest(checked(key)?.as_bytes()),
+    };
+    Ok((digest, tenant.to_owned()))
+}
+
+/// A key, if it is one: what a bearer token may hold (RFC 6750, section 2.1).
+///
+/// # Errors
+/// What is wrong with it, in words that go on after "the key" or "entry 3".
+pub fn checked(key: &str) -> Result<&str, &'static str> {
+    if !key.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"-._~+/=".contains(&byte)) {
+        return Err("has a key with other characters than letters, digits and -._~+/=");
+    }
+    match key.len() {
+        ..MIN_KEY_CHARS => Err("has a key of fewer than 32 characters"),
+        MIN_KEY_CHARS..=MAX_KEY_CHARS => Ok(key),
+        _ => Err("has a key of more than 256 characters"),
+    }
+}
+
+fn from_hex(text: &str) -> Option<Digest> {
+    let mut digest = Digest::default();
+    if text.len() != 2 * digest.len() || !text.bytes().all(|byte| byte.is_ascii_hexdigit()) {
+        return None;
+    }
+    for (byte, pair) in digest.iter_mut().zip(text.as_bytes().chunks(2)) {
+        *byte = u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok()?;
+    }
+    Some(digest)
+}
+
+impl fmt::Debug for KeyRing {
+    /// Tenants, no hashes.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let tenants: BTreeSet<_> = self.keys.iter().map(|(_, tenant)| tenant.as_str()).collect();
+        write!(f, "KeyRing({} keys of {tenants:?})", self.keys.len())
+    }
+}
+
+impl<'de> Deserialize<'de> for KeyRing {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
+    }
+}
+
+/// Where keys come from.
+#[derive(Debug, Clone, Default)]
+pub struct Sources {
+    /// Read again when it changes.
+    pub file: Option<PathBuf>,
+    pub fixed: Option<KeyRing>,
+}
+
+impl Sources {
+    /// Whether there are any: then every caller needs a key.
+    pub fn is_on(&self) -> bool {
+        self.file.is_some() || self.fixed.is_some()
+    }
+
+    /// Every key there is now.
+    ///
+    /// # Errors
+    /// See [`KeyRing::read`]; a key that the two give to different tenants.
+    pub fn load(&self) -> Result<KeyRing, String> {
+        let ring = self.file.as_deref().map(KeyRing::read).transpose()?.unwrap_or_default();
+        let Some(fixed) = &self.fixed else { return Ok(ring) };
+        let disputed =
+            |(digest, tenant): &(Digest, String)| fixed.keys.iter().any(|(other, of)| other == digest && of != tenant);
+        match ring.keys.iter().any(disputed) {
+            true => Err("auth.keys and auth.keys_file give one key to two tenants".into()),
+            false => Ok(ring.with(fixed)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const A: &str = "aaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaa";
+    const B: &str = "bbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbb";
+
+    #[test]
+    fn a_key_stands_for_its_tenant_however_it_is_written() {
+        let hash = digest(B.as_bytes()).map(|byte| format!("{byte:02x}")).concat();
+        let text = format!("# tenants\nnorth:{A} # the first\n\nsouth:sha256:{hash}\n");
+        let ring: KeyRing = text.parse().expect("two keys");
+        assert_eq!((ring.tenant_of(A), ring.tenant_of(B)), (Some("north"), Some("south")));
+        for wrong in ["", "a", &hash, &format!("{A}a"), &A[1..], "north"] {
+            assert_eq!(ring.tenant_of(wrong), None, "{wrong}");
+        }
+        let commas: KeyRing = format!("north:{A}, south:{B}").parse().expect("two keys");
+        assert_eq!(commas, ring);
+        let debug = format!("{ring:?}");
+        assert_eq!(debug, "KeyRing(2 keys of {\"north\", \"south\"})");
+    }
+
+    #[test]
+    fn file_and_environment_add_up_and_do_not_dispute_a_key() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("keys.txt");
+        std::fs::write(&path, format!("north:{A}\n")).expect("written");
+        let load = |fixed: &str| {
+            let fixed = Some(fixed.parse().expect("keys"));
+            Sources { file: Some(path.clone()), fixed }.load()
+        };
+        let both = load(&format!("south:{B},north:{A}")).expect("no dispute");
+        assert_eq!((both.tenant_of(A), both.tenant_of(B)), (Some("north"), Some("south")));
+        let error = load(&format!("south:{A}")).expect_err("disputed");
+        assert!(error.contains("two tenants") && !error.contains(A), "{error}");
+    }
+
+    #[test]
+    fn the_hash_of_a_key_is_its_sha256() {
+        // FIPS 180-4, of "abc".
+        let expected = from_hex("ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
+        assert_eq!(Some(digest(b"abc")), expected);
+    }
+
+    #[test]
+    fn what_is_no_key_is_named_by_its_place_and_not_repeated() {
+        let short = "hunter2hunter2";
+        let cases = [
+            (format!("north:{A}\n{B}\n"), "entry 2 has no tenant"),
+            (format!("North:{A}"), "entry 1 has a tenant"),
+            (format!("north:{short}"), "fewer than 32"),
+            (format!("north:{}", short.repeat(30)), "more than 256"),
+            (format!("north:{A} {short}"), "other characters"),
+            (format!("north:sha256:{A}"), "64 hexadecimal digits"),
+            (format!("north:{A},south:{B},west:{A}"), "entries 1 and 3"),
+            ("# none\n".to_owned(), "no key"),
+        ];
+        for (text, part) in cases {
+            let message = text.parse::<KeyRing>().expect_err(part).to_string();
+            assert!(message.contains(part), "{message}");
+            for secret in [A, B, short] {
+                assert!(!message.contains(secret), "{message}");
+            }
+        }
+    }
+}

@@ -1,0 +1,5 @@
+//! Who may do what: certificates, keys, tenants, and addresses to listen on.
+
+mod outside;
+mod tenants;
+mod tls;
