@@ -3,12 +3,16 @@
 //! Every key may stand in a TOML file (`[engine] workers = 4`), in the environment (`SCPSFM_ENGINE__WORKERS=4`) or,
 //! for some, in a flag. An unknown key is an error: a misspelt limit must not silently be no limit.
 
+mod retention;
+
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::num::NonZero;
 use std::path::{Path, PathBuf};
 
 use serde::de::IntoDeserializer;
 use serde::{Deserialize, Deserializer, Serialize};
+
+pub use retention::Retention;
 
 use crate::domain::{Backend, Limits};
 use crate::store::postgres::DatabaseUrl;
@@ -72,6 +76,8 @@ impl Default for Metrics {
 pub struct Store {
     /// Folder of the embedded database; made if it does not exist. Not used with a `url`.
     pub data_dir: PathBuf,
+    /// How long ended jobs are kept, with input, events and result: `30d`, `12h`, `90m`, `45s` or `forever`.
+    pub retention: Retention,
     /// PostgreSQL database that several servers may share, `postgres://USER:PASSWORD@HOST:PORT/DATABASE`. None by
     /// default: one server needs no database beside it. Wherever the configuration is shown, the password is not.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -81,7 +87,7 @@ pub struct Store {
 impl Default for Store {
     fn default() -> Self {
         // Beside the process, with a name that nobody deletes by mistake.
-        Self { data_dir: PathBuf::from("scpsfm-data"), url: None }
+        Self { data_dir: PathBuf::from("scpsfm-data"), retention: Retention::default(), url: None }
     }
 }
 

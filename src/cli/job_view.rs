@@ -84,6 +84,8 @@ pub fn job_json(job: &Job) -> Value {
         "summary": job.summary,
         "error": job.failure.as_ref().map(failure_json),
         "cancel_requested": job.cancel_requested,
+        "expire_time": job.expire_time.map(time),
+        "etag": job.etag(),
     })
 }
 

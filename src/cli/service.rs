@@ -82,6 +82,7 @@ fn engine_options(config: &Config) -> engine::Options {
         },
         lease: Duration::from_secs(config.engine.lease_seconds),
         max_attempts: config.engine.max_attempts,
+        retention: config.store.retention.0,
         backend: config.compute.backend,
         ..engine::Options::default()
     }
@@ -104,7 +105,7 @@ mod tests {
     fn a_configuration_of_defaults_is_the_default_of_engine_and_server() {
         let config = Config::default();
         let of = |options: engine::Options| {
-            (options.workers, options.queue, options.lease, options.max_attempts, options.backend)
+            (options.workers, options.queue, options.lease, options.max_attempts, options.retention, options.backend)
         };
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));
         let of = |options: server::Options| (options.limits, options.max_message_bytes, options.solve_grace);

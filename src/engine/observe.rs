@@ -3,7 +3,8 @@
 use crate::store::Bound;
 pub(super) use crate::telemetry::Attempt;
 pub(super) use crate::telemetry::metrics::{
-    AttemptLost, Refusal, attempt_lost, engine_size, job_created, job_finished as job_ended, queue_depth, refused,
+    AttemptLost, Deletion, Refusal, attempt_lost, engine_size, job_created, job_finished as job_ended, jobs_deleted,
+    queue_depth, refused,
 };
 
 /// The refusal by a bound of the queue.

@@ -11,6 +11,7 @@ use super::caller::Caller;
 use super::convert::enums::Twin;
 use super::convert::{job, settings};
 use super::follow::{Follower, Followers};
+use super::jobs::MAX_BATCH;
 use super::submission::Submission;
 use super::{proto, status};
 use crate::domain::job::EventBody;
@@ -115,6 +116,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
         &self,
         _request: Request<proto::GetCapabilitiesRequest>,
     ) -> Result<Response<proto::Capabilities>, Status> {
+        let options = self.engine.options();
         // Counts above 32 bits cannot be asked for on the wire.
         let count = |limit: usize| u32::try_from(limit).unwrap_or(u32::MAX);
         Ok(Response::new(proto::Capabilities {
@@ -128,6 +130,8 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             methods: Method::ALL.map(Twin::to_wire).to_vec(),
             backends: [Backend::Flex, Backend::Ndarray].map(Twin::to_wire).to_vec(),
             default_settings: Some(settings::to_wire(&SolveSettings::default())),
+            retention: options.retention.and_then(|kept| kept.try_into().ok()),
+            max_batch_requests: count(MAX_BATCH),
         }))
     }
 }

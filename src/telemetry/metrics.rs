@@ -63,6 +63,26 @@ impl Refusal {
     }
 }
 
+/// Why a job was deleted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Deletion {
+    /// Its owner asked for it.
+    Requested,
+    /// It was kept long enough.
+    Retention,
+}
+
+impl Deletion {
+    const ALL: [Deletion; 2] = [Deletion::Requested, Deletion::Retention];
+
+    fn name(self) -> &'static str {
+        match self {
+            Deletion::Requested => "REQUESTED",
+            Deletion::Retention => "RETENTION",
+        }
+    }
+}
+
 /// How an attempt ended that did not end its job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AttemptLost {
@@ -165,6 +185,9 @@ fn create_known_series() {
     for refusal in Refusal::ALL {
         counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
     }
+    for reason in Deletion::ALL {
+        counter!(JOBS_DELETED.name, "reason" => reason.name()).absolute(0);
+    }
     for operation in FENCED_OPERATIONS {
         counter!(FENCED_WRITES.name, "operation" => operation).absolute(0);
     }
@@ -206,6 +229,11 @@ pub fn queue_wait(waited: Duration) {
 /// A job was admitted and stored. An idempotent repetition of a request creates nothing and is not counted.
 pub fn job_created() {
     counter!(JOBS_CREATED.name).increment(1);
+}
+
+/// Ended jobs were removed.
+pub fn jobs_deleted(reason: Deletion, count: u32) {
+    counter!(JOBS_DELETED.name, "reason" => reason.name()).increment(u64::from(count));
 }
 
 /// A job was refused.

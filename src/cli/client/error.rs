@@ -71,6 +71,7 @@ impl Error {
             | Code::AlreadyExists
             | Code::PermissionDenied
             | Code::FailedPrecondition
+            | Code::Aborted
             | Code::Unauthenticated => Error::Refused(message),
             Code::Cancelled => Error::Cancelled,
             code => Error::Failed(format!("{server}: {message} ({code:?})")),

@@ -9,25 +9,49 @@ use crate::store::query::Cursor;
 use crate::store::record::{Created, Load, NewRecord, QueueBounds, Request};
 use crate::store::{Error, JobPage, JobQuery, Order, payload};
 
-/// Stores a job; see [`crate::store::Store::create_job`].
+/// Stores jobs, all or none; see [`crate::store::Store::create_jobs`].
 pub(super) async fn create<C: Connection>(
     connection: &mut C,
-    new: &NewRecord,
+    news: &[NewRecord],
     bounds: &QueueBounds,
     now: SystemTime,
+) -> Result<Vec<Created>, Error> {
+    let mut inputs = Vec::new();
+    for new in news {
+        // Payloads take long: nobody else's admission waits for them.
+        let known = admit(connection, new, bounds).await?.is_some();
+        let input = if known { None } else { Some(insert_input(connection, &new.name.tenant, &new.input, now).await?) };
+        inputs.push(input);
+    }
+    connection.lock_admission().await?;
+    let mut created = Vec::new();
+    for (new, input) in news.iter().zip(inputs) {
+        // Looked over again: others may have come in between, and the batch's own jobs are there now.
+        match (admit(connection, new, bounds).await?, input) {
+            (Some(job), input) => {
+                if let Some(input) = input {
+                    connection.execute(Statement::new("DELETE FROM inputs WHERE id = $1").bind(input)).await?;
+                }
+                created.push(Created { job, new: false });
+            }
+            (None, Some(input)) => created.push(enqueue(connection, new, input, now).await?),
+            // The job that its request id had made was deleted in between.
+            (None, None) => {
+                let input = insert_input(connection, &new.name.tenant, &new.input, now).await?;
+                created.push(enqueue(connection, new, input, now).await?);
+            }
+        }
+    }
+    Ok(created)
+}
+
+/// Stores a job that was admitted, and its request id.
+async fn enqueue<C: Connection>(
+    connection: &mut C,
+    new: &NewRecord,
+    input_id: i64,
+    now: SystemTime,
 ) -> Result<Created, Error> {
-    if let Some(job) = admit(connection, new, bounds).await? {
-        return Ok(Created { job, new: false });
-    }
-    // Payloads take long: nobody else's admission waits for them. What was admitted before is looked over again.
-    let input_id = insert_input(connection, &new.name.tenant, &new.input, now).await?;
-    if connection.lock_admission().await?
-        && let Some(job) = admit(connection, new, bounds).await?
-    {
-        let delete = Statement::new("DELETE FROM inputs WHERE id = $1").bind(input_id);
-        connection.execute(delete).await?;
-        return Ok(Created { job, new: false });
-    }
     let id = insert_job(connection, new, input_id, now).await?;
     if let Some(request) = &new.request {
         let insert = Statement::new(

@@ -122,7 +122,7 @@ async fn cancel_reaches_running_queued_and_ended_jobs() {
     let first = created(&mut jobs, create_tracks()).await.name;
     let second = created(&mut jobs, create_tracks()).await.name;
     running(&mut jobs, &first).await;
-    let cancel = |name: &str| proto::CancelJobRequest { name: name.into() };
+    let cancel = |name: &str| proto::CancelJobRequest { name: name.into(), ..Default::default() };
     let queued = jobs.cancel_job(cancel(&second)).await.expect("a cancel").into_inner();
     assert_eq!(queued.state(), JobState::Cancelled);
     let read = proto::ReadJobResultRequest { name: first.clone(), offset: 0 };
