@@ -103,6 +103,10 @@ pub struct Engine {
     pub queue_bytes: u64,
     /// Observations of waiting inputs at which new jobs are refused.
     pub queue_observations: u64,
+    /// Waiting jobs of one tenant at which its new ones are refused; 0: the queue's own bound is enough.
+    pub tenant_queue_capacity: u64,
+    /// Bytes of waiting inputs of one tenant at which its new jobs are refused; 0: the queue's own bound is enough.
+    pub tenant_queue_bytes: u64,
     /// Seconds without a heartbeat after which a job may be taken over.
     pub lease_seconds: u64,
     /// Seconds that running jobs get to finish once the server was told to stop; then they go back to the queue.
@@ -121,6 +125,9 @@ impl Default for Engine {
             queue_capacity: Options::DEFAULT_MAX_JOBS as usize,
             queue_bytes: Options::DEFAULT_MAX_BYTES,
             queue_observations: Options::DEFAULT_MAX_OBSERVATIONS,
+            // Without API keys there is one tenant, and nobody to keep room for.
+            tenant_queue_capacity: 0,
+            tenant_queue_bytes: 0,
             lease_seconds: Options::DEFAULT_LEASE.as_secs(),
             // Kubernetes kills 30 s after it asks; this leaves a third of it for the rest of the exit.
             drain_seconds: 20,

@@ -72,6 +72,11 @@ async fn open_store(config: &config::Store) -> Result<Arc<dyn Store>, Failure> {
     Ok(Arc::new(Timed(Sqlite::open(&config.data_dir).await.map_err(failed)?)))
 }
 
+/// A bound that 0 lifts.
+fn bound_or_none(value: u64) -> u64 {
+    if value == 0 { u64::MAX } else { value }
+}
+
 fn engine_options(config: &Config) -> engine::Options {
     engine::Options {
         workers: config.engine.worker_count(),
@@ -79,6 +84,8 @@ fn engine_options(config: &Config) -> engine::Options {
             max_jobs: config.engine.queue_capacity as u64,
             max_bytes: config.engine.queue_bytes,
             max_observations: config.engine.queue_observations,
+            max_tenant_jobs: bound_or_none(config.engine.tenant_queue_capacity),
+            max_tenant_bytes: bound_or_none(config.engine.tenant_queue_bytes),
         },
         lease: Duration::from_secs(config.engine.lease_seconds),
         max_attempts: config.engine.max_attempts,

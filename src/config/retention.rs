@@ -30,8 +30,9 @@ impl FromStr for Retention {
         }
         let wrong =
             || format!("`{text}` is no time to keep jobs for; right would be `30d`, `12h`, `90m`, `45s` or `forever`");
-        let (unit, seconds) = UNITS.into_iter().find(|&(unit, _)| text.ends_with(unit)).ok_or_else(wrong)?;
-        let count: u64 = text.trim_end_matches(unit).parse().map_err(|_| wrong())?;
+        let split = |(unit, seconds)| text.strip_suffix(unit).map(|count| (count, seconds));
+        let (count, seconds): (_, u64) = UNITS.into_iter().find_map(split).ok_or_else(wrong)?;
+        let count: u64 = count.parse().map_err(|_| wrong())?;
         let seconds = count.checked_mul(seconds).filter(|&seconds| seconds > 0).ok_or_else(wrong)?;
         Ok(Self(Some(Duration::from_secs(seconds))))
     }

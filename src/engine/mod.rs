@@ -95,6 +95,9 @@ impl Default for Options {
                 max_jobs: Self::DEFAULT_MAX_JOBS,
                 max_bytes: Self::DEFAULT_MAX_BYTES,
                 max_observations: Self::DEFAULT_MAX_OBSERVATIONS,
+                // Without API keys there is one tenant, and nobody to keep room for.
+                max_tenant_jobs: u64::MAX,
+                max_tenant_bytes: u64::MAX,
             },
             lease: Self::DEFAULT_LEASE,
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,

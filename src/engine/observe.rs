@@ -13,6 +13,8 @@ pub(super) fn by(bound: Bound) -> Refusal {
         Bound::Jobs { .. } => Refusal::QueueJobs,
         Bound::Bytes { .. } => Refusal::QueueBytes,
         Bound::Observations { .. } => Refusal::QueueObservations,
+        Bound::TenantJobs { .. } => Refusal::TenantJobs,
+        Bound::TenantBytes { .. } => Refusal::TenantBytes,
     }
 }
 
@@ -23,8 +25,13 @@ mod tests {
     #[test]
     fn metrics_and_error_details_name_a_bound_alike() {
         let (waiting, max) = (1, 1);
-        for bound in [Bound::Jobs { waiting, max }, Bound::Bytes { waiting, max }, Bound::Observations { waiting, max }]
-        {
+        for bound in [
+            Bound::Jobs { waiting, max },
+            Bound::Bytes { waiting, max },
+            Bound::Observations { waiting, max },
+            Bound::TenantJobs { waiting, max },
+            Bound::TenantBytes { waiting, max },
+        ] {
             assert_eq!(by(bound).bound(), bound.name());
         }
     }

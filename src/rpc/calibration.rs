@@ -16,7 +16,7 @@ use super::submission::Submission;
 use super::{proto, status};
 use crate::domain::job::EventBody;
 use crate::domain::{Backend, Limits, Method, SolveSettings};
-use crate::engine::{self, Engine};
+use crate::engine::{self, Engine, QueueBounds};
 use crate::telemetry;
 
 /// How long a `Solve` may be silent before its input is complete. A dead connection is found by keep-alive long before;
@@ -72,6 +72,17 @@ async fn next(messages: &mut Streaming<proto::SolveRequest>) -> Result<Option<pr
     match tokio::time::timeout(INPUT_PATIENCE, messages.message()).await {
         Ok(message) => message,
         Err(_) => Err(status::input_stalled(INPUT_PATIENCE)),
+    }
+}
+
+fn queue_limits(bounds: &QueueBounds) -> proto::QueueLimits {
+    let given = |bound: u64| (bound < u64::MAX).then_some(bound);
+    proto::QueueLimits {
+        max_jobs: bounds.max_jobs,
+        max_bytes: bounds.max_bytes,
+        max_observations: bounds.max_observations,
+        max_tenant_jobs: given(bounds.max_tenant_jobs),
+        max_tenant_bytes: given(bounds.max_tenant_bytes),
     }
 }
 
@@ -132,6 +143,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             default_settings: Some(settings::to_wire(&SolveSettings::default())),
             retention: options.retention.and_then(|kept| kept.try_into().ok()),
             max_batch_requests: count(MAX_BATCH),
+            queue_limits: Some(queue_limits(&options.queue)),
         }))
     }
 }

@@ -8,7 +8,7 @@
 //! | `ALREADY_EXISTS` | `ALREADY_EXISTS` | a job id is taken, or a request id came with another body |
 //! | `INVALID_ARGUMENT` | `MALFORMED_MESSAGE` | a message that cannot be decoded |
 //! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.limits.max_message_bytes`, packed or not |
-//! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes` or `observations`; `RetryInfo` says when to come back |
+//! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
 //! | `FAILED_PRECONDITION` | `JOB_NOT_ENDED` | a job that waits or runs is not deleted; cancel it first |
 //! | `ABORTED` | `ETAG_MISMATCH` | the job changed since its etag was read |
 //! | `FAILED_PRECONDITION` | `RESULT_NOT_READY` | there is no result, yet or for good |

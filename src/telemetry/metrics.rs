@@ -25,6 +25,10 @@ pub enum Refusal {
     QueueBytes,
     /// The queue holds as many observations as it may.
     QueueObservations,
+    /// The tenant has as many jobs in the queue as it may.
+    TenantJobs,
+    /// The tenant has as many bytes of inputs in the queue as it may.
+    TenantBytes,
     /// Input or settings broke a rule.
     Invalid,
     /// The input is above the advertised limits.
@@ -34,10 +38,12 @@ pub enum Refusal {
 }
 
 impl Refusal {
-    const ALL: [Refusal; 6] = [
+    const ALL: [Refusal; 8] = [
         Refusal::QueueJobs,
         Refusal::QueueBytes,
         Refusal::QueueObservations,
+        Refusal::TenantJobs,
+        Refusal::TenantBytes,
         Refusal::Invalid,
         Refusal::TooLarge,
         Refusal::Draining,
@@ -45,7 +51,11 @@ impl Refusal {
 
     fn reason(self) -> &'static str {
         match self {
-            Refusal::QueueJobs | Refusal::QueueBytes | Refusal::QueueObservations => "QUEUE_FULL",
+            Refusal::QueueJobs
+            | Refusal::QueueBytes
+            | Refusal::QueueObservations
+            | Refusal::TenantJobs
+            | Refusal::TenantBytes => "QUEUE_FULL",
             Refusal::Invalid => "INVALID",
             Refusal::TooLarge => "TOO_LARGE",
             Refusal::Draining => "DRAINING",
@@ -58,6 +68,8 @@ impl Refusal {
             Refusal::QueueJobs => "jobs",
             Refusal::QueueBytes => "bytes",
             Refusal::QueueObservations => "observations",
+            Refusal::TenantJobs => "tenant_jobs",
+            Refusal::TenantBytes => "tenant_bytes",
             Refusal::Invalid | Refusal::TooLarge | Refusal::Draining => NONE,
         }
     }

@@ -106,8 +106,31 @@ pub(in crate::store) async fn admission_bounds_what_waits(store: &dyn Store) {
     claim(store, 2).await;
     let load = store.load().await.expect("counts");
     assert_eq!((load.queued, load.queued_bytes, load.queued_observations, load.running), (1, 100, 60, 1));
-    let exact = QueueBounds { max_jobs: 2, max_bytes: 200, max_observations: 120 };
+    let exact = QueueBounds { max_jobs: 2, max_bytes: 200, max_observations: 120, ..ROOM };
     store.create_job(record("c"), &exact, time(3)).await.expect("what runs does not wait");
+}
+
+pub(in crate::store) async fn admission_bounds_each_tenant(store: &dyn Store) {
+    let of = |tenant: &str, job: &str| {
+        let mut new = record(job);
+        new.name.tenant = tenant.into();
+        new
+    };
+    let bounds = QueueBounds { max_tenant_jobs: 2, max_tenant_bytes: 250, ..ROOM };
+    let alone = QueueBounds { max_tenant_bytes: 0, ..bounds.clone() };
+    store.create_job(of("t", "a"), &alone, time(0)).await.expect("a job that waits alone always fits");
+    let larger = NewRecord { input: vec![7; 151], ..of("t", "b") };
+    let error = store.create_job(larger, &bounds, time(0)).await.expect_err("too many bytes");
+    assert_eq!(error, Error::QueueFull(Bound::TenantBytes { waiting: 100, max: 250 }));
+    store.create_job(of("t", "b"), &bounds, time(0)).await.expect("room for two");
+    let error = store.create_job(of("t", "c"), &bounds, time(0)).await.expect_err("room for two");
+    assert_eq!(error, Error::QueueFull(Bound::TenantJobs { waiting: 2, max: 2 }));
+    let batch = vec![of("u", "a"), of("u", "b"), of("u", "c")];
+    let error = store.create_jobs(batch, &bounds, time(0)).await.expect_err("a batch counts as a whole");
+    assert_eq!(error, Error::QueueFull(Bound::TenantJobs { waiting: 2, max: 2 }));
+    store.create_job(of("u", "a"), &bounds, time(0)).await.expect("another tenant has its own share");
+    claim(store, 1).await;
+    store.create_job(of("t", "c"), &bounds, time(2)).await.expect("what runs does not wait");
 }
 
 pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &dyn Store) {

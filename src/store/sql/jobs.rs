@@ -83,8 +83,8 @@ async fn admit<C: Connection>(connection: &mut C, new: &NewRecord, bounds: &Queu
     if connection.row(taken).await?.flag("taken")? {
         return Err(Error::AlreadyExists(format!("{} already exists", new.name)));
     }
-    let load = load(connection).await?;
-    match bounds.refuses(&load, new.input.len() as u64, u64::from(new.observation_count)) {
+    let (whole, tenant) = (load(connection).await?, load_of(connection, &new.name.tenant).await?);
+    match bounds.refuses(&whole, &tenant, new.input.len() as u64, u64::from(new.observation_count)) {
         Some(bound) => Err(Error::QueueFull(bound)),
         None => Ok(None),
     }
@@ -103,7 +103,8 @@ async fn earlier<C: Connection>(connection: &mut C, tenant: &str, request: &Requ
         )));
     }
     let select = Statement::new(select_jobs!("WHERE id = $1")).bind(known.integer("job_id")?);
-    rows::job(&connection.row(select).await?).map(Some)
+    // None where the job was deleted between the two looks: its request id is free again.
+    connection.optional_row(select).await?.as_ref().map(rows::job).transpose()
 }
 
 async fn insert_input<C: Connection>(
@@ -269,11 +270,24 @@ pub(super) async fn load<C: Connection>(connection: &mut C) -> Result<Load, Erro
          CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, \
          (SELECT COUNT(*) FROM jobs WHERE state = 'RUNNING') AS running FROM jobs WHERE state = 'QUEUED'",
     );
-    let row = connection.row(select).await?;
+    measured(&connection.row(select).await?)
+}
+
+/// What waits of one tenant; what runs is not counted.
+async fn load_of<C: Connection>(connection: &mut C, tenant: &str) -> Result<Load, Error> {
+    let select = Statement::new(
+        "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
+         CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, CAST(0 AS BIGINT) AS running \
+         FROM jobs WHERE state = 'QUEUED' AND tenant = $1",
+    );
+    measured(&connection.row(select.bind(tenant)).await?)
+}
+
+fn measured(row: &impl Row) -> Result<Load, Error> {
     Ok(Load {
-        queued: number(&row, "queued")?,
-        queued_bytes: number(&row, "bytes")?,
-        queued_observations: number(&row, "observations")?,
-        running: number(&row, "running")?,
+        queued: number(row, "queued")?,
+        queued_bytes: number(row, "bytes")?,
+        queued_observations: number(row, "observations")?,
+        running: number(row, "running")?,
     })
 }

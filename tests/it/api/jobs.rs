@@ -144,7 +144,9 @@ async fn a_full_queue_says_at_once_when_to_come_back_and_which_bound_was_hit() {
     for (queue, bound) in [
         (QueueBounds { max_jobs: 1, ..room.clone() }, "jobs"),
         (QueueBounds { max_bytes: 1, ..room.clone() }, "bytes"),
-        (QueueBounds { max_observations: 23, ..room }, "observations"),
+        (QueueBounds { max_observations: 23, ..room.clone() }, "observations"),
+        (QueueBounds { max_tenant_jobs: 1, ..room.clone() }, "tenant_jobs"),
+        (QueueBounds { max_tenant_bytes: 1, ..room }, "tenant_bytes"),
     ] {
         fills_up(queue, bound).await;
     }

@@ -83,6 +83,8 @@ async fn what_was_kept_long_enough_goes_by_itself() {
     let capabilities = capabilities.expect("capabilities").into_inner();
     assert_eq!(capabilities.retention, Some(prost_types::Duration::default()));
     assert_eq!(capabilities.max_batch_requests, 1000);
+    let queue = capabilities.queue_limits.expect("limits");
+    assert_eq!((queue.max_jobs, queue.max_tenant_jobs, queue.max_tenant_bytes), (256, None, None));
 }
 
 #[tokio::test]
