@@ -110,6 +110,8 @@ pub fn job_json(job: &Job) -> Value {
         "summary": job.summary,
         "error": job.failure.as_ref().map(failure_json),
         "cancel_requested": job.cancel_requested,
+        "expire_time": job.expire_time.map(time),
+        "etag": job.etag(),
     })
 }
 
@@ -244,7 +246,9 @@ mod tests {
 
     #[test]
     fn a_lost_server_leaves_the_commands_that_go_on() {
-        let name = parse_name("a-1").expect("a name");
+        let name = GivenName::parse("a-1")
+            .and_then(|name| Ok(name.of(&AccessArgs::default()).expect("a tenant")))
+            .expect("a name");
         let job = Lost { name: &name, server: "http://h:1", after: 7, files: " --out 'a b'" };
         let words = lost(client::Error::Unavailable("gone".into()), &job).message;
         assert!(words.starts_with("gone\nthe job is tenants/default/jobs/a-1;"), "{words}");

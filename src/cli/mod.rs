@@ -5,6 +5,7 @@
 pub mod args;
 pub mod cancel;
 pub mod client;
+pub mod delete;
 pub mod demo;
 pub mod evaluate;
 pub mod evaluate_real;
@@ -55,6 +56,7 @@ pub enum Command {
     Get(get::Args),
     List(list::Args),
     Cancel(cancel::Args),
+    Delete(delete::Args),
     Result(result::Args),
     Synth(synth::Args),
     Evaluate(evaluate::Args),
@@ -86,6 +88,7 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         Command::Get(args) => runtime.block_on(get::run(args)),
         Command::List(args) => runtime.block_on(list::run(args)),
         Command::Cancel(args) => runtime.block_on(cancel::run(args)),
+        Command::Delete(args) => runtime.block_on(delete::run(args)),
         Command::Result(args) => runtime.block_on(result::run(args)),
         Command::Synth(args) => synth::run(args),
         Command::Evaluate(args) => runtime.block_on(evaluate::run(args)),

@@ -76,6 +76,11 @@ async fn open_store(config: &config::Store) -> Result<Arc<dyn Store>, Failure> {
     Ok(Arc::new(Timed(Sqlite::open(&config.data_dir).await.map_err(failed)?)))
 }
 
+/// A bound that 0 lifts.
+fn bound_or_none(value: u64) -> u64 {
+    if value == 0 { u64::MAX } else { value }
+}
+
 fn engine_options(config: &Config) -> engine::Options {
     engine::Options {
         workers: config.engine.worker_count(),
@@ -83,9 +88,12 @@ fn engine_options(config: &Config) -> engine::Options {
             max_jobs: config.engine.queue_capacity as u64,
             max_bytes: config.engine.queue_bytes,
             max_observations: config.engine.queue_observations,
+            max_tenant_jobs: bound_or_none(config.engine.tenant_queue_capacity),
+            max_tenant_bytes: bound_or_none(config.engine.tenant_queue_bytes),
         },
         lease: Duration::from_secs(config.engine.lease_seconds),
         max_attempts: config.engine.max_attempts,
+        retention: config.store.retention.0,
         backend: config.compute.backend,
         ..engine::Options::default()
     }
@@ -111,7 +119,7 @@ mod tests {
     fn a_configuration_of_defaults_is_the_default_of_engine_and_server() {
         let config = Config::default();
         let of = |options: engine::Options| {
-            (options.workers, options.queue, options.lease, options.max_attempts, options.backend)
+            (options.workers, options.queue, options.lease, options.max_attempts, options.retention, options.backend)
         };
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));
         let of = |options: server::Options| {

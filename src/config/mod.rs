@@ -4,13 +4,15 @@
 //! for some, in a flag. An unknown key is an error: a misspelt limit must not silently be no limit.
 
 mod exposure;
+mod retention;
 mod sections;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
 use crate::domain::Limits;
+pub use retention::Retention;
 pub use sections::{Auth, Compute, Engine, Log, Metrics, Otlp, Server, Store, Tls};
 
 /// Everything that the server can be told.
@@ -34,7 +36,10 @@ pub struct Config {
 pub enum Error {
     /// A source that cannot be read, an unknown key or a value of the wrong type; the message names key and source.
     #[error("configuration: {0}")]
-    Source(#[from] config::ConfigError),
+    Source(config::ConfigError),
+    /// A file that is no TOML; without the line itself, which may hold a password.
+    #[error("configuration: {}: {what}", .file.display())]
+    File { file: PathBuf, what: String },
     /// A value of the right type that cannot work.
     #[error("configuration: {key}: {found} is wrong; right would be {right}")]
     Value { key: &'static str, found: String, right: &'static str },
@@ -47,6 +52,26 @@ pub enum Error {
     /// A variable of the environment that looks like a key and is none.
     #[error("configuration: {found} in the environment is no key; right would be {right} (two underscores)")]
     Variable { found: String, right: String },
+}
+
+impl From<config::ConfigError> for Error {
+    fn from(error: config::ConfigError) -> Self {
+        match error {
+            config::ConfigError::FileParse { uri, cause } => {
+                Error::File { file: uri.unwrap_or_default().into(), what: without_quotation(&cause.to_string()) }
+            }
+            error => Error::Source(error),
+        }
+    }
+}
+
+/// What a parser says, without the lines in which it repeats the text (`2 | url = ...`).
+fn without_quotation(said: &str) -> String {
+    let repeats = |line: &&str| {
+        line.split_once('|').is_some_and(|(margin, _)| margin.trim().chars().all(|sign| sign.is_ascii_digit()))
+    };
+    let kept: Vec<&str> = said.lines().filter(|line| !repeats(line)).collect();
+    kept.join(": ")
 }
 
 /// First part of every variable of the environment that is ours.

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use serde::de::IntoDeserializer;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use super::Error;
+use super::{Error, Retention};
 use crate::domain::Backend;
 use crate::rpc::keys::KeyRing;
 use crate::store::postgres::DatabaseUrl;
@@ -123,6 +123,8 @@ impl Default for Metrics {
 pub struct Store {
     /// Folder of the embedded database; made if it does not exist. Not used with a `url`.
     pub data_dir: PathBuf,
+    /// How long ended jobs are kept, with input, events and result: `30d`, `12h`, `90m`, `45s` or `forever`.
+    pub retention: Retention,
     /// PostgreSQL database that several servers may share, `postgres://USER:PASSWORD@HOST:PORT/DATABASE`. None by
     /// default: one server needs no database beside it. Wherever the configuration is shown, the password is not.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -132,7 +134,7 @@ pub struct Store {
 impl Default for Store {
     fn default() -> Self {
         // Beside the process, with a name that nobody deletes by mistake.
-        Self { data_dir: PathBuf::from("scpsfm-data"), url: None }
+        Self { data_dir: PathBuf::from("scpsfm-data"), retention: Retention::default(), url: None }
     }
 }
 
@@ -148,6 +150,10 @@ pub struct Engine {
     pub queue_bytes: u64,
     /// Observations of waiting inputs at which new jobs are refused.
     pub queue_observations: u64,
+    /// Waiting jobs of one tenant at which its new ones are refused; 0: the queue's own bound is enough.
+    pub tenant_queue_capacity: u64,
+    /// Bytes of waiting inputs of one tenant at which its new jobs are refused; 0: the queue's own bound is enough.
+    pub tenant_queue_bytes: u64,
     /// Seconds without a heartbeat after which a job may be taken over.
     pub lease_seconds: u64,
     /// Seconds that running jobs get to finish once the server was told to stop; then they go back to the queue.
@@ -166,6 +172,9 @@ impl Default for Engine {
             queue_capacity: Options::DEFAULT_MAX_JOBS as usize,
             queue_bytes: Options::DEFAULT_MAX_BYTES,
             queue_observations: Options::DEFAULT_MAX_OBSERVATIONS,
+            // Without API keys there is one tenant, and nobody to keep room for.
+            tenant_queue_capacity: 0,
+            tenant_queue_bytes: 0,
             lease_seconds: Options::DEFAULT_LEASE.as_secs(),
             // Kubernetes kills 30 s after it asks; this leaves a third of it for the rest of the exit.
             drain_seconds: 20,

@@ -121,3 +121,12 @@ fn errors_name_the_key_and_what_would_be_right() {
         assert!(!message.contains("hunter2"), "{message}");
     }
 }
+
+#[test]
+fn a_file_that_is_no_toml_is_told_without_the_line_and_its_password() {
+    let file = file("[store]\nurl = \"postgres://me:hunter2@host/db\n");
+    let error = Config::from_sources(Some(file.path()), vec![], &[]).expect_err("no end of the string");
+    let (shown, debug) = (error.to_string(), format!("{error:?}"));
+    assert!(!shown.contains("hunter2") && !debug.contains("hunter2"), "{shown} {debug}");
+    assert!(shown.contains("line 2") && shown.contains(&file.path().display().to_string()), "{shown}");
+}

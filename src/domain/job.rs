@@ -219,6 +219,17 @@ pub struct Job {
     pub failure: Option<Failure>,
     /// A cancel was asked for and has not yet reached the worker.
     pub cancel_requested: bool,
+    /// When an ended job is removed; `None` while it has not ended, or where it is kept for good.
+    pub expire_time: Option<SystemTime>,
+}
+
+impl Job {
+    /// Changes whenever the job does, but for its latest progress: another one after each event, and another job's of the
+    /// same name, which was created at another time, is another.
+    pub fn etag(&self) -> String {
+        let created = self.create_time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_micros();
+        format!("{created:x}-{:x}-{}", self.last_sequence, u8::from(self.cancel_requested))
+    }
 }
 
 /// Something that happened to a job.

@@ -19,6 +19,12 @@ pub enum Error {
     QueueFull { retry_after: Duration, bound: &'static str, message: String },
     #[error(transparent)]
     InvalidArgument(#[from] InvalidInput),
+    /// Only ended jobs can be deleted.
+    #[error("{0}")]
+    NotEnded(String),
+    /// The job has changed since the caller read it.
+    #[error("{0}")]
+    EtagMismatch(String),
     /// There is no result in this state.
     #[error("the job is {}, it has no result", .0.name())]
     NotReady(JobState),
@@ -38,6 +44,8 @@ impl From<store::Error> for Error {
         match error {
             store::Error::NotFound(name) => Error::NotFound(name),
             store::Error::AlreadyExists(message) => Error::AlreadyExists(message),
+            store::Error::NotEnded(..) => Error::NotEnded(error.to_string()),
+            store::Error::EtagMismatch(_) => Error::EtagMismatch(error.to_string()),
             store::Error::PageToken => Error::InvalidArgument(Violation::of("page_token", error.to_string()).into()),
             store::Error::QueueFull(bound) => Error::QueueFull {
                 retry_after: super::Options::DEFAULT_RETRY_AFTER,

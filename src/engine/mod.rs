@@ -54,6 +54,8 @@ pub struct Options {
     pub lease: Duration,
     /// Attempts that may be lost before a job fails.
     pub max_attempts: u32,
+    /// How long ended jobs are kept; `None`: for good.
+    pub retention: Option<Duration>,
     /// What callers of a full queue are told to wait.
     pub retry_after: Duration,
     /// Tells this process apart in the store.
@@ -78,6 +80,8 @@ impl Options {
     pub const MIN_LEASE: Duration = Duration::from_millis(100);
     /// Longer ones would leave the job of a dead worker lying for good.
     pub const MAX_LEASE: Duration = Duration::from_secs(24 * 60 * 60);
+    /// A month: whoever wants a result has fetched it by then.
+    pub const DEFAULT_RETENTION: Duration = Duration::from_secs(30 * 24 * 60 * 60);
     /// About the time of one job.
     pub const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(3);
 }
@@ -91,9 +95,13 @@ impl Default for Options {
                 max_jobs: Self::DEFAULT_MAX_JOBS,
                 max_bytes: Self::DEFAULT_MAX_BYTES,
                 max_observations: Self::DEFAULT_MAX_OBSERVATIONS,
+                // Without API keys there is one tenant, and nobody to keep room for.
+                max_tenant_jobs: u64::MAX,
+                max_tenant_bytes: u64::MAX,
             },
             lease: Self::DEFAULT_LEASE,
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
+            retention: Some(Self::DEFAULT_RETENTION),
             retry_after: Self::DEFAULT_RETRY_AFTER,
             worker_name: worker_name(),
             backend: Backend::default(),
@@ -177,12 +185,20 @@ impl Engine {
         self.inner.clone().submit(new).await
     }
 
+    /// The same for several jobs, all or none; the answers are in their order.
+    ///
+    /// # Errors
+    /// As [`Engine::submit`], of the first job that is refused.
+    pub async fn submit_batch(&self, news: Vec<NewJob>) -> Result<Vec<Job>, Error> {
+        self.inner.clone().submit_batch(news).await
+    }
+
     /// One job.
     ///
     /// # Errors
     /// [`Error::NotFound`].
     pub async fn job(&self, name: &JobName) -> Result<Job, Error> {
-        Ok(self.inner.store.job(name).await?)
+        Ok(self.inner.dated(self.inner.store.job(name).await?))
     }
 
     /// One page of a tenant's jobs.
@@ -190,7 +206,9 @@ impl Engine {
     /// # Errors
     /// [`Error::InvalidArgument`] for a page token of another query.
     pub async fn list(&self, query: &JobQuery) -> Result<JobPage, Error> {
-        Ok(self.inner.store.jobs(query).await?)
+        let page = self.inner.store.jobs(query).await?;
+        let jobs = page.jobs.into_iter().map(|job| self.inner.dated(job)).collect();
+        Ok(JobPage { jobs, ..page })
     }
 
     /// Replays a job's events after a sequence number (0: all of them), then follows it to its end. See [`Watch`].
@@ -207,9 +225,32 @@ impl Engine {
     /// # Errors
     /// [`Error::NotFound`].
     pub async fn cancel(&self, name: &JobName) -> Result<Job, Error> {
+        self.cancel_as_of(name, None).await
+    }
+
+    /// The same, only where the etag is the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`].
+    pub async fn cancel_as_of(&self, name: &JobName, etag: Option<String>) -> Result<Job, Error> {
         let (inner, name) = (self.inner.clone(), name.clone());
         // On its own task: a caller that goes away must not leave a stored cancel untold.
-        finished(tokio::spawn(async move { inner.cancel(&name).await })).await
+        finished(tokio::spawn(async move { inner.cancel(&name, etag.as_deref()).await })).await
+    }
+
+    /// Removes an ended job with its events, input, result and request ids; with an etag, only where it is the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::NotEnded`], [`Error::EtagMismatch`].
+    pub async fn delete(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
+        self.inner.store.delete_job(name, etag).await?;
+        observe::jobs_deleted(observe::Deletion::Requested, 1);
+        Ok(())
+    }
+
+    /// How this engine works.
+    pub fn options(&self) -> &Options {
+        &self.inner.options
     }
 
     /// The result of a succeeded job.
@@ -268,13 +309,19 @@ impl Inner {
         self.queue_changed.notify_one();
     }
 
-    async fn cancel(&self, name: &JobName) -> Result<Job, Error> {
-        let reply = self.store.request_cancel(name, SystemTime::now()).await?;
+    /// A job as it is answered: with the time of its removal.
+    fn dated(&self, job: Job) -> Job {
+        let expire_time = job.end_time.zip(self.options.retention).and_then(|(end, kept)| end.checked_add(kept));
+        Job { expire_time, ..job }
+    }
+
+    async fn cancel(&self, name: &JobName, etag: Option<&str>) -> Result<Job, Error> {
+        let reply = self.store.request_cancel(name, etag, SystemTime::now()).await?;
         self.stop_attempts(name);
         if reply.ended_now {
             self.ended(&reply.job);
         }
-        Ok(reply.job)
+        Ok(self.dated(reply.job))
     }
 
     /// Tells everyone that a job ended; called once a job, by whoever committed its end.

@@ -3,7 +3,8 @@
 use crate::store::Bound;
 pub(super) use crate::telemetry::Attempt;
 pub(super) use crate::telemetry::metrics::{
-    AttemptLost, Refusal, attempt_lost, engine_size, job_created, job_finished as job_ended, queue_depth, refused,
+    AttemptLost, Deletion, Refusal, attempt_lost, engine_size, job_created, job_finished as job_ended, jobs_deleted,
+    queue_depth, refused,
 };
 
 /// The refusal by a bound of the queue.
@@ -12,6 +13,8 @@ pub(super) fn by(bound: Bound) -> Refusal {
         Bound::Jobs { .. } => Refusal::QueueJobs,
         Bound::Bytes { .. } => Refusal::QueueBytes,
         Bound::Observations { .. } => Refusal::QueueObservations,
+        Bound::TenantJobs { .. } => Refusal::TenantJobs,
+        Bound::TenantBytes { .. } => Refusal::TenantBytes,
     }
 }
 
@@ -22,8 +25,13 @@ mod tests {
     #[test]
     fn metrics_and_error_details_name_a_bound_alike() {
         let (waiting, max) = (1, 1);
-        for bound in [Bound::Jobs { waiting, max }, Bound::Bytes { waiting, max }, Bound::Observations { waiting, max }]
-        {
+        for bound in [
+            Bound::Jobs { waiting, max },
+            Bound::Bytes { waiting, max },
+            Bound::Observations { waiting, max },
+            Bound::TenantJobs { waiting, max },
+            Bound::TenantBytes { waiting, max },
+        ] {
             assert_eq!(by(bound).bound(), bound.name());
         }
     }

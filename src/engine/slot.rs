@@ -12,6 +12,10 @@ const CLAIM_POLL: Duration = Duration::from_secs(1);
 /// How often leases and deadlines are looked over: a queued job expires at most this late.
 const SWEEP_PERIOD: Duration = Duration::from_secs(1);
 
+/// Jobs that one sweep removes at most, in one transaction: at one sweep a second more than any server solves, and
+/// writers wait for some hundred megabytes at worst.
+const PURGE_BATCH: u32 = 32;
+
 /// Claims jobs for one worker, one after the other, until the engine drains.
 pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     let mut work = inner.work.subscribe();
@@ -50,7 +54,10 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
         tokio::select! {
             _ = phase.changed() => {}
             () = inner.queue_changed.notified() => {}
-            _ = ticks.tick() => inner.sweep().await,
+            _ = ticks.tick() => {
+                inner.sweep().await;
+                inner.tidy().await;
+            }
         }
         match inner.store.load().await {
             Ok(load) => observe::queue_depth(load.queued),
@@ -60,6 +67,23 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
 }
 
 impl Inner {
+    /// Removes jobs that have been kept long enough, and gives back the space of what was removed.
+    async fn tidy(&self) {
+        if let Some(ended_by) = self.options.retention.and_then(|kept| SystemTime::now().checked_sub(kept)) {
+            match self.store.purge(ended_by, PURGE_BATCH).await {
+                Ok(0) => {}
+                Ok(removed) => {
+                    tracing::info!(removed, "removed jobs that were kept long enough");
+                    observe::jobs_deleted(observe::Deletion::Retention, removed);
+                }
+                Err(error) => tracing::warn!(%error, "cannot remove old jobs"),
+            }
+        }
+        if let Err(error) = self.store.reclaim().await {
+            tracing::warn!(%error, "cannot give back the space of removed jobs");
+        }
+    }
+
     async fn sweep(&self) {
         match self.store.sweep(SystemTime::now(), self.options.max_attempts).await {
             Ok(swept) => {

@@ -124,27 +124,34 @@ impl NewJob {
 
 impl Inner {
     pub(super) async fn submit(self: Arc<Self>, new: NewJob) -> Result<Job, Error> {
-        new.validate()?;
+        let job = self.submit_batch(vec![new]).await?.pop();
+        job.ok_or_else(|| Error::Internal("one job was to be stored, none was".into()))
+    }
+
+    pub(super) async fn submit_batch(self: Arc<Self>, news: Vec<NewJob>) -> Result<Vec<Job>, Error> {
+        news.iter().try_for_each(NewJob::validate)?;
         if self.phase() != Phase::Open {
             observe::refused(observe::Refusal::Draining);
             return Err(Error::Draining);
         }
         let now = SystemTime::now();
         let backend = self.options.backend;
-        let record = finished(tokio::task::spawn_blocking(move || new.into_record(now, backend))).await?;
+        let encode = move || news.into_iter().map(|new| new.into_record(now, backend)).collect::<Result<Vec<_>, _>>();
+        let records = finished(tokio::task::spawn_blocking(encode)).await?;
         // On its own task: a caller that goes away must not leave a stored job untold.
-        finished(tokio::spawn(async move { self.store_job(record, now).await })).await
+        finished(tokio::spawn(async move { self.store_jobs(records, now).await })).await
     }
 
-    async fn store_job(&self, record: NewRecord, now: SystemTime) -> Result<Job, Error> {
-        match self.store.create_job(record, &self.options.queue, now).await {
+    async fn store_jobs(&self, records: Vec<NewRecord>, now: SystemTime) -> Result<Vec<Job>, Error> {
+        match self.store.create_jobs(records, &self.options.queue, now).await {
             Ok(created) => {
-                if created.new {
-                    observe::job_created();
+                let new = created.iter().filter(|created| created.new).count();
+                (0..new).for_each(|_| observe::job_created());
+                if new > 0 {
                     self.work_waits();
                     self.queue_changed();
                 }
-                Ok(created.job)
+                Ok(created.into_iter().map(|created| self.dated(created.job)).collect())
             }
             Err(store::Error::QueueFull(bound)) => {
                 observe::refused(observe::by(bound));

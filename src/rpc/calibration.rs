@@ -11,11 +11,12 @@ use super::caller::Caller;
 use super::convert::enums::Twin;
 use super::convert::{job, settings};
 use super::follow::{Follower, Followers};
+use super::jobs::MAX_BATCH;
 use super::submission::Submission;
 use super::{proto, status};
 use crate::domain::job::EventBody;
 use crate::domain::{Backend, Limits, Method, SolveSettings};
-use crate::engine::{self, Engine};
+use crate::engine::{self, Engine, QueueBounds};
 use crate::telemetry;
 
 /// How long a `Solve` may be silent before its input is complete. A dead connection is found by keep-alive long before;
@@ -74,6 +75,17 @@ async fn next(messages: &mut Streaming<proto::SolveRequest>) -> Result<Option<pr
     }
 }
 
+fn queue_limits(bounds: &QueueBounds) -> proto::QueueLimits {
+    let given = |bound: u64| (bound < u64::MAX).then_some(bound);
+    proto::QueueLimits {
+        max_jobs: bounds.max_jobs,
+        max_bytes: bounds.max_bytes,
+        max_observations: bounds.max_observations,
+        max_tenant_jobs: given(bounds.max_tenant_jobs),
+        max_tenant_bytes: given(bounds.max_tenant_bytes),
+    }
+}
+
 #[tonic::async_trait]
 impl proto::calibration_service_server::CalibrationService for Calibration {
     type SolveStream = Pin<Box<dyn Stream<Item = Result<proto::JobEvent, Status>> + Send>>;
@@ -115,6 +127,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
         &self,
         _request: Request<proto::GetCapabilitiesRequest>,
     ) -> Result<Response<proto::Capabilities>, Status> {
+        let options = self.engine.options();
         // Counts above 32 bits cannot be asked for on the wire.
         let count = |limit: usize| u32::try_from(limit).unwrap_or(u32::MAX);
         Ok(Response::new(proto::Capabilities {
@@ -128,6 +141,9 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             methods: Method::ALL.map(Twin::to_wire).to_vec(),
             backends: [Backend::Flex, Backend::Ndarray].map(Twin::to_wire).to_vec(),
             default_settings: Some(settings::to_wire(&SolveSettings::default())),
+            retention: options.retention.and_then(|kept| kept.try_into().ok()),
+            max_batch_requests: count(MAX_BATCH),
+            queue_limits: Some(queue_limits(&options.queue)),
         }))
     }
 }

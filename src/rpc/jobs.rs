@@ -13,12 +13,15 @@ use super::convert::{job, list, result};
 use super::submission::Submission;
 use super::{proto, status};
 use crate::domain::Limits;
-use crate::engine::Engine;
+use crate::engine::{Engine, NewJob};
 use crate::telemetry;
 
 /// Bytes of a result in one message: large enough that a hundred megabytes are some hundred messages, small enough for
 /// every client's default limit of 4 MiB.
 const RESULT_CHUNK_BYTES: usize = 256 * 1024;
+
+/// Requests of a batch, as the API says.
+pub const MAX_BATCH: usize = 1_000;
 
 /// The service.
 #[derive(Clone)]
@@ -30,6 +33,36 @@ pub struct Jobs {
 impl Jobs {
     pub fn new(engine: Engine, limits: Limits) -> Self {
         Self { engine, limits }
+    }
+
+    /// Checks every request of a batch before anything is stored.
+    async fn read_batch(
+        &self,
+        caller: &Caller,
+        parent: &str,
+        requests: Vec<proto::CreateJobRequest>,
+        trace_parent: Option<String>,
+    ) -> Result<Vec<NewJob>, Status> {
+        caller.parent(parent)?;
+        if requests.is_empty() || requests.len() > MAX_BATCH {
+            let text = format!("{} requests are not 1 to {MAX_BATCH}", requests.len());
+            return Err(status::invalid(&super::violation("requests", text)));
+        }
+        let mut news = Vec::new();
+        for (index, mut request) in requests.into_iter().enumerate() {
+            if request.parent.is_empty() {
+                request.parent = parent.to_owned();
+            }
+            let read = async {
+                if request.parent != parent {
+                    let text = format!("is neither left out nor the batch's {parent}");
+                    return Err(status::invalid(&super::violation("parent", text)));
+                }
+                Submission::open(caller, request, &self.limits)?.close(trace_parent.clone()).await
+            };
+            news.push(read.await.map_err(|found| status::of_request(index, &found))?);
+        }
+        Ok(news)
     }
 }
 
@@ -53,9 +86,18 @@ impl proto::job_service_server::JobService for Jobs {
 
     async fn batch_create_jobs(
         &self,
-        _request: Request<proto::BatchCreateJobsRequest>,
+        request: Request<proto::BatchCreateJobsRequest>,
     ) -> Result<Response<proto::BatchCreateJobsResponse>, Status> {
-        Err(status::not_implemented("BatchCreateJobs"))
+        let caller = Caller::of(&request)?;
+        let span = telemetry::tracing::submit_span("BatchCreateJobs", caller.trace_parent());
+        let created = async {
+            let proto::BatchCreateJobsRequest { parent, requests } = request.into_inner();
+            let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
+            let news = self.read_batch(&caller, &parent, requests, trace_parent).await?;
+            let created = self.engine.submit_batch(news).await.map_err(status::from_engine)?;
+            Ok(Response::new(proto::BatchCreateJobsResponse { jobs: created.iter().map(job::to_wire).collect() }))
+        };
+        created.instrument(span.clone()).await
     }
 
     async fn get_job(&self, request: Request<proto::GetJobRequest>) -> Result<Response<proto::Job>, Status> {
@@ -100,12 +142,16 @@ impl proto::job_service_server::JobService for Jobs {
 
     async fn cancel_job(&self, request: Request<proto::CancelJobRequest>) -> Result<Response<proto::Job>, Status> {
         let name = Caller::of(&request)?.job(&request.get_ref().name)?;
-        let cancelled = self.engine.cancel(&name).await.map_err(status::from_engine)?;
+        let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
+        let cancelled = self.engine.cancel_as_of(&name, etag).await.map_err(status::from_engine)?;
         Ok(Response::new(job::to_wire(&cancelled)))
     }
 
-    async fn delete_job(&self, _request: Request<proto::DeleteJobRequest>) -> Result<Response<()>, Status> {
-        Err(status::not_implemented("DeleteJob"))
+    async fn delete_job(&self, request: Request<proto::DeleteJobRequest>) -> Result<Response<()>, Status> {
+        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
+        let etag = Some(request.get_ref().etag.as_str()).filter(|etag| !etag.is_empty());
+        self.engine.delete(&name, etag).await.map_err(status::from_engine)?;
+        Ok(Response::new(()))
     }
 
     type ReadJobResultStream = Messages<proto::ResultChunk>;

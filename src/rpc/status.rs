@@ -10,7 +10,9 @@
 //! | `ALREADY_EXISTS` | `ALREADY_EXISTS` | a job id is taken, or a request id came with another body |
 //! | `INVALID_ARGUMENT` | `MALFORMED_MESSAGE` | a message that cannot be decoded |
 //! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.limits.max_message_bytes`, packed or not |
-//! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes` or `observations`; `RetryInfo` says when to come back |
+//! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
+//! | `FAILED_PRECONDITION` | `JOB_NOT_ENDED` | a job that waits or runs is not deleted; cancel it first |
+//! | `ABORTED` | `ETAG_MISMATCH` | the job changed since its etag was read |
 //! | `FAILED_PRECONDITION` | `RESULT_NOT_READY` | there is no result, yet or for good |
 //! | `UNAVAILABLE` | `DRAINING` | the server is going down; `RetryInfo` |
 //! | `UNAVAILABLE` | `STORE_UNAVAILABLE` | the database is away; `RetryInfo`. A creation may have been stored: come back with the same request id |
@@ -69,6 +71,17 @@ pub fn invalid(error: &InvalidInput) -> Status {
     let fields = violations.iter().map(|violation| FieldViolation::new(violation.path(), &violation.description));
     let details = ErrorDetails::with_bad_request(fields.collect::<Vec<_>>());
     status(Code::InvalidArgument, "INVALID_ARGUMENT", message, details)
+}
+
+/// The refusal of one request of a batch: message and fields name it, as `requests[3].track_set.x[17]`.
+pub fn of_request(index: usize, found: &Status) -> Status {
+    let prefix = format!("requests[{index}]");
+    let mut details = found.get_error_details();
+    if let Some(request) = details.bad_request().cloned() {
+        let within = |old: FieldViolation| FieldViolation { field: format!("{prefix}.{}", old.field), ..old };
+        details.set_bad_request(request.field_violations.into_iter().map(within).collect::<Vec<_>>());
+    }
+    Status::with_error_details(found.code(), format!("{prefix}: {}", found.message()), details)
 }
 
 /// No such job, or another tenant's: a caller cannot tell them apart.
@@ -142,6 +155,10 @@ pub fn from_engine(error: engine::Error) -> Status {
             let details = ErrorDetails::with_retry_info(Some(retry_after));
             status_with(Code::ResourceExhausted, "QUEUE_FULL", metadata, message, details)
         }
+        engine::Error::NotEnded(sentence) => {
+            status(Code::FailedPrecondition, "JOB_NOT_ENDED", sentence, ErrorDetails::new())
+        }
+        engine::Error::EtagMismatch(sentence) => status(Code::Aborted, "ETAG_MISMATCH", sentence, ErrorDetails::new()),
         engine::Error::InvalidArgument(error) => invalid(&error),
         engine::Error::NotReady(state) => {
             let message = match state {

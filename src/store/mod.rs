@@ -17,7 +17,7 @@ mod contract;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
-use crate::domain::job::{Job, JobEvent, JobName};
+use crate::domain::job::{Job, JobEvent, JobName, JobState};
 use crate::domain::progress::Progress;
 
 pub use query::{JobPage, JobQuery, Order};
@@ -34,6 +34,12 @@ pub enum Error {
     /// The job id is taken, or the request id stands for another body.
     #[error("{0}")]
     AlreadyExists(String),
+    /// Only ended jobs can be removed.
+    #[error("{0} is {name}; only a job that has ended can be deleted: cancel it first", name = .1.name())]
+    NotEnded(JobName, JobState),
+    /// The job has changed since the caller read it.
+    #[error("{0} has changed since its etag was read")]
+    EtagMismatch(JobName),
     /// The lease is no longer held: the job was taken over, given back or ended. The write was dropped.
     #[error("the lease on {} (attempt {}) is no longer held", .0.name, .0.attempt)]
     Fenced(Lease),
@@ -76,7 +82,22 @@ pub trait Store: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`Error::AlreadyExists`], [`Error::QueueFull`].
-    async fn create_job(&self, new: NewRecord, bounds: &QueueBounds, now: SystemTime) -> Result<Created, Error>;
+    async fn create_job(&self, new: NewRecord, bounds: &QueueBounds, now: SystemTime) -> Result<Created, Error> {
+        let created = self.create_jobs(vec![new], bounds, now).await?.pop();
+        created.ok_or_else(|| Error::Corrupt("one job was to be created, none was".into()))
+    }
+
+    /// The same for several jobs, all or none; the answers are in their order. A request id that comes twice with the
+    /// same body is one job.
+    ///
+    /// # Errors
+    /// As [`Store::create_job`], of the first job that is refused.
+    async fn create_jobs(
+        &self,
+        new: Vec<NewRecord>,
+        bounds: &QueueBounds,
+        now: SystemTime,
+    ) -> Result<Vec<Created>, Error>;
 
     /// # Errors
     /// [`Error::NotFound`].
@@ -130,11 +151,25 @@ pub trait Store: Send + Sync + 'static {
     async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error>;
 
     /// Asks for the end of a job: a queued one ends at once, a running one is flagged for its worker, an ended one is
-    /// left as it is.
+    /// left as it is. With an `etag`, only where it is the job's.
     ///
     /// # Errors
-    /// [`Error::NotFound`].
-    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error>;
+    /// [`Error::NotFound`], [`Error::EtagMismatch`].
+    async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error>;
+
+    /// Removes an ended job with its events, attempts, input, result and request ids. With an `etag`, only where it is
+    /// the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::NotEnded`].
+    async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error>;
+
+    /// Removes at most `limit` of the jobs that ended at that time or before, the oldest first. Returns how many.
+    async fn purge(&self, ended_by: SystemTime, limit: u32) -> Result<u32, Error>;
+
+    /// Gives some of the space that removed jobs took back to the file system, where the database does not do so by
+    /// itself.
+    async fn reclaim(&self) -> Result<(), Error>;
 
     /// Takes back every lease that no living process can hold: all of them where one process has the store to itself,
     /// those that ran out where it is shared. Called once, before the first claim. A job that lost `max_attempts`

@@ -49,11 +49,30 @@ pub struct QueueBounds {
     /// Encoded inputs.
     pub max_bytes: u64,
     pub max_observations: u64,
+    /// Of one tenant alone.
+    pub max_tenant_jobs: u64,
+    /// Encoded inputs of one tenant alone.
+    pub max_tenant_bytes: u64,
 }
 
 impl QueueBounds {
-    /// The first bound that one more job would break.
-    pub fn refuses(&self, load: &Load, bytes: u64, observations: u64) -> Option<Bound> {
+    /// The first bound that one more job would break: of the tenant's own, then of the whole queue's.
+    pub fn refuses(&self, whole: &Load, tenant: &Load, bytes: u64, observations: u64) -> Option<Bound> {
+        self.refuses_tenant(tenant, bytes).or_else(|| self.refuses_all(whole, bytes, observations))
+    }
+
+    fn refuses_tenant(&self, load: &Load, bytes: u64) -> Option<Bound> {
+        if load.queued >= self.max_tenant_jobs {
+            Some(Bound::TenantJobs { waiting: load.queued, max: self.max_tenant_jobs })
+        } else if load.queued > 0 && load.queued_bytes.saturating_add(bytes) > self.max_tenant_bytes {
+            // As below: a tenant's job that waits alone always fits.
+            Some(Bound::TenantBytes { waiting: load.queued_bytes, max: self.max_tenant_bytes })
+        } else {
+            None
+        }
+    }
+
+    fn refuses_all(&self, load: &Load, bytes: u64, observations: u64) -> Option<Bound> {
         if load.queued >= self.max_jobs {
             return Some(Bound::Jobs { waiting: load.queued, max: self.max_jobs });
         }
@@ -76,6 +95,8 @@ pub enum Bound {
     Jobs { waiting: u64, max: u64 },
     Bytes { waiting: u64, max: u64 },
     Observations { waiting: u64, max: u64 },
+    TenantJobs { waiting: u64, max: u64 },
+    TenantBytes { waiting: u64, max: u64 },
 }
 
 impl Bound {
@@ -85,6 +106,8 @@ impl Bound {
             Bound::Jobs { .. } => "jobs",
             Bound::Bytes { .. } => "bytes",
             Bound::Observations { .. } => "observations",
+            Bound::TenantJobs { .. } => "tenant_jobs",
+            Bound::TenantBytes { .. } => "tenant_bytes",
         }
     }
 }
@@ -98,6 +121,12 @@ impl fmt::Display for Bound {
             }
             Bound::Observations { waiting, max } => {
                 write!(f, "the queue is full: {waiting} of at most {max} observations wait")
+            }
+            Bound::TenantJobs { waiting, max } => {
+                write!(f, "the tenant's share of the queue is full: {waiting} of at most {max} jobs wait")
+            }
+            Bound::TenantBytes { waiting, max } => {
+                write!(f, "the tenant's share of the queue is full: {waiting} of at most {max} bytes of input wait")
             }
         }
     }

@@ -30,6 +30,16 @@ impl<S: Store> Store for Timed<S> {
         self.0.create_job(new, bounds, now).await
     }
 
+    async fn create_jobs(
+        &self,
+        new: Vec<NewRecord>,
+        bounds: &QueueBounds,
+        now: SystemTime,
+    ) -> Result<Vec<Created>, Error> {
+        let _timer = store_operation("create_jobs");
+        self.0.create_jobs(new, bounds, now).await
+    }
+
     async fn job(&self, name: &JobName) -> Result<Job, Error> {
         let _timer = store_operation("job");
         self.0.job(name).await
@@ -75,9 +85,24 @@ impl<S: Store> Store for Timed<S> {
         counted("release", self.0.release(lease, now).await)
     }
 
-    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error> {
+    async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error> {
         let _timer = store_operation("request_cancel");
-        self.0.request_cancel(name, now).await
+        self.0.request_cancel(name, etag, now).await
+    }
+
+    async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
+        let _timer = store_operation("delete_job");
+        self.0.delete_job(name, etag).await
+    }
+
+    async fn purge(&self, ended_by: SystemTime, limit: u32) -> Result<u32, Error> {
+        let _timer = store_operation("purge");
+        self.0.purge(ended_by, limit).await
+    }
+
+    async fn reclaim(&self) -> Result<(), Error> {
+        let _timer = store_operation("reclaim");
+        self.0.reclaim().await
     }
 
     async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {

@@ -25,6 +25,10 @@ pub enum Refusal {
     QueueBytes,
     /// The queue holds as many observations as it may.
     QueueObservations,
+    /// The tenant has as many jobs in the queue as it may.
+    TenantJobs,
+    /// The tenant has as many bytes of inputs in the queue as it may.
+    TenantBytes,
     /// Input or settings broke a rule.
     Invalid,
     /// The input is above the advertised limits.
@@ -34,10 +38,12 @@ pub enum Refusal {
 }
 
 impl Refusal {
-    const ALL: [Refusal; 6] = [
+    const ALL: [Refusal; 8] = [
         Refusal::QueueJobs,
         Refusal::QueueBytes,
         Refusal::QueueObservations,
+        Refusal::TenantJobs,
+        Refusal::TenantBytes,
         Refusal::Invalid,
         Refusal::TooLarge,
         Refusal::Draining,
@@ -45,7 +51,11 @@ impl Refusal {
 
     fn reason(self) -> &'static str {
         match self {
-            Refusal::QueueJobs | Refusal::QueueBytes | Refusal::QueueObservations => "QUEUE_FULL",
+            Refusal::QueueJobs
+            | Refusal::QueueBytes
+            | Refusal::QueueObservations
+            | Refusal::TenantJobs
+            | Refusal::TenantBytes => "QUEUE_FULL",
             Refusal::Invalid => "INVALID",
             Refusal::TooLarge => "TOO_LARGE",
             Refusal::Draining => "DRAINING",
@@ -58,7 +68,29 @@ impl Refusal {
             Refusal::QueueJobs => "jobs",
             Refusal::QueueBytes => "bytes",
             Refusal::QueueObservations => "observations",
+            Refusal::TenantJobs => "tenant_jobs",
+            Refusal::TenantBytes => "tenant_bytes",
             Refusal::Invalid | Refusal::TooLarge | Refusal::Draining => NONE,
+        }
+    }
+}
+
+/// Why a job was deleted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Deletion {
+    /// Its owner asked for it.
+    Requested,
+    /// It was kept long enough.
+    Retention,
+}
+
+impl Deletion {
+    const ALL: [Deletion; 2] = [Deletion::Requested, Deletion::Retention];
+
+    fn name(self) -> &'static str {
+        match self {
+            Deletion::Requested => "REQUESTED",
+            Deletion::Retention => "RETENTION",
         }
     }
 }
@@ -165,6 +197,9 @@ fn create_known_series() {
     for refusal in Refusal::ALL {
         counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
     }
+    for reason in Deletion::ALL {
+        counter!(JOBS_DELETED.name, "reason" => reason.name()).absolute(0);
+    }
     for operation in FENCED_OPERATIONS {
         counter!(FENCED_WRITES.name, "operation" => operation).absolute(0);
     }
@@ -206,6 +241,11 @@ pub fn queue_wait(waited: Duration) {
 /// A job was admitted and stored. An idempotent repetition of a request creates nothing and is not counted.
 pub fn job_created() {
     counter!(JOBS_CREATED.name).increment(1);
+}
+
+/// Ended jobs were removed.
+pub fn jobs_deleted(reason: Deletion, count: u32) {
+    counter!(JOBS_DELETED.name, "reason" => reason.name()).increment(u64::from(count));
 }
 
 /// A job was refused.

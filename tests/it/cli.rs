@@ -40,7 +40,8 @@ fn scene(directory: &Path) -> PathBuf {
 #[test]
 fn every_command_explains_itself() {
     let commands =
-        ["demo", "serve", "solve", "submit", "watch", "get", "list", "cancel", "result", "synth", "evaluate"].map(Some);
+        ["demo", "serve", "solve", "submit", "watch", "get", "list", "cancel", "delete", "result", "synth", "evaluate"]
+            .map(Some);
     for command in commands.into_iter().chain([None]) {
         let run = run(command.into_iter().chain(["--help"]));
         assert_eq!(run.code, Some(0), "{run:?}");
@@ -220,6 +221,9 @@ fn a_server_gives_the_same_files_as_the_program_itself_and_drains_on_sigterm() {
     let name = listed.stdout.split_whitespace().find(|word| word.starts_with("tenants/")).expect("a job's name");
     let result = run(["result", name, "--json", "--server", &serving.grpc]);
     assert_eq!(json(&result.stdout)["inlier_tracks"], 30);
+    let deleted = run(["delete", name, "--server", &serving.grpc]);
+    assert_eq!((deleted.code, deleted.stdout.trim()), (Some(0), name), "{deleted:?}");
+    assert_eq!(run(["get", name, "--server", &serving.grpc]).code, Some(65), "it is gone");
     let unknown = run(["get", "tenants/default/jobs/unknown", "--server", &serving.grpc]);
     assert_eq!(unknown.code, Some(65), "{unknown:?}");
 

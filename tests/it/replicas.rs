@@ -162,7 +162,7 @@ async fn a_job_is_watched_and_cancelled_through_a_server_that_does_not_run_it() 
             break;
         }
     }
-    elsewhere.cancel_job(proto::CancelJobRequest { name: name.clone() }).await.expect("a cancel");
+    elsewhere.cancel_job(proto::CancelJobRequest { name: name.clone(), ..Default::default() }).await.expect("a cancel");
     assert_eq!(reaches(&mut elsewhere, &name, &[JobState::Cancelled]).await, JobState::Cancelled);
 }
 

@@ -76,9 +76,11 @@ impl Error {
             Code::InvalidArgument => Error::Invalid(violations(status), message),
             // What the transport says of a message above the server's limit.
             Code::OutOfRange => Error::Refused(format!("{message}; `solve --server` sends a large input in parts")),
-            Code::NotFound | Code::AlreadyExists | Code::PermissionDenied | Code::FailedPrecondition => {
-                Error::Refused(message)
-            }
+            Code::NotFound
+            | Code::AlreadyExists
+            | Code::PermissionDenied
+            | Code::FailedPrecondition
+            | Code::Aborted => Error::Refused(message),
             Code::Unauthenticated => {
                 Error::NotLetIn(format!("{server}: {message}; here: --api-key-file, or the variable SCPSFM_API_KEY"))
             }

@@ -166,8 +166,18 @@ impl Client {
     /// # Errors
     /// See [`Error`].
     pub async fn cancel(&mut self, name: &JobName) -> Result<Job, Error> {
-        let answer = self.jobs.cancel_job(proto::CancelJobRequest { name: name.to_string() }).await;
+        let request = proto::CancelJobRequest { name: name.to_string(), etag: String::new() };
+        let answer = self.jobs.cancel_job(request).await;
         Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+    }
+
+    /// Removes a job that has ended.
+    ///
+    /// # Errors
+    /// See [`Error`]; [`Error::Refused`] for one that has not ended.
+    pub async fn delete(&mut self, name: &JobName) -> Result<(), Error> {
+        let request = proto::DeleteJobRequest { name: name.to_string(), etag: String::new() };
+        self.jobs.delete_job(request).await.map(|_| ()).map_err(|status| self.error(status))
     }
 
     /// Tells a job's events after a sequence number until its end, over broken connections and restarts of the server.

@@ -94,7 +94,7 @@ async fn a_cancel_that_another_process_stored_arrives_with_a_heartbeat() {
     let bench = Bench::start(options).await;
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
-    bench.store.request_cancel(&name, SystemTime::now()).await.expect("flags");
+    bench.store.request_cancel(&name, None, SystemTime::now()).await.expect("flags");
     assert_eq!(bench.ended(&name).await.state, JobState::Cancelled);
 }
 

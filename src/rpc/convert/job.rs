@@ -29,6 +29,8 @@ pub fn to_wire(job: &Job) -> proto::Job {
         summary: job.summary.as_ref().map(summary_to_wire),
         error: job.failure.as_ref().map(failure_to_wire),
         cancel_requested: job.cancel_requested,
+        expire_time: job.expire_time.map(Into::into),
+        etag: job.etag(),
     }
 }
 
@@ -61,6 +63,7 @@ pub fn from_wire(job: proto::Job) -> Result<Job, InvalidInput> {
         summary: job.summary.as_ref().map(summary_from_wire).transpose()?,
         failure: job.error.map(failure_from_wire).transpose()?,
         cancel_requested: job.cancel_requested,
+        expire_time: optional_time(job.expire_time, "expire_time")?,
     })
 }
 
@@ -238,6 +241,7 @@ mod tests {
             summary: Some(summary()),
             failure: Some(Failure::new("INTERNAL", "a defect")),
             cancel_requested: true,
+            expire_time: Some(time(4)),
         };
         assert_eq!(from_wire(to_wire(&job)), Ok(job.clone()));
         let bare = Job {
@@ -250,6 +254,7 @@ mod tests {
             summary: None,
             failure: None,
             cancel_requested: false,
+            expire_time: None,
             ..job
         };
         assert_eq!(from_wire(to_wire(&bare)), Ok(bare));

@@ -36,6 +36,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
         summary: None,
         failure: None,
         cancel_requested: false,
+        expire_time: None,
     };
     assert_eq!(created.job, expected);
     assert_eq!(store.job(&new.name).await, Ok(expected));
@@ -105,6 +106,73 @@ pub(in crate::store) async fn admission_bounds_what_waits(store: &dyn Store) {
     claim(store, 2).await;
     let load = store.load().await.expect("counts");
     assert_eq!((load.queued, load.queued_bytes, load.queued_observations, load.running), (1, 100, 60, 1));
-    let exact = QueueBounds { max_jobs: 2, max_bytes: 200, max_observations: 120 };
+    let exact = QueueBounds { max_jobs: 2, max_bytes: 200, max_observations: 120, ..ROOM };
     store.create_job(record("c"), &exact, time(3)).await.expect("what runs does not wait");
+}
+
+pub(in crate::store) async fn admission_bounds_each_tenant(store: &dyn Store) {
+    let of = |tenant: &str, job: &str| {
+        let mut new = record(job);
+        new.name.tenant = tenant.into();
+        new
+    };
+    let bounds = QueueBounds { max_tenant_jobs: 2, max_tenant_bytes: 250, ..ROOM };
+    let alone = QueueBounds { max_tenant_bytes: 0, ..bounds.clone() };
+    store.create_job(of("t", "a"), &alone, time(0)).await.expect("a job that waits alone always fits");
+    let larger = NewRecord { input: vec![7; 151], ..of("t", "b") };
+    let error = store.create_job(larger, &bounds, time(0)).await.expect_err("too many bytes");
+    assert_eq!(error, Error::QueueFull(Bound::TenantBytes { waiting: 100, max: 250 }));
+    store.create_job(of("t", "b"), &bounds, time(0)).await.expect("room for two");
+    let error = store.create_job(of("t", "c"), &bounds, time(0)).await.expect_err("room for two");
+    assert_eq!(error, Error::QueueFull(Bound::TenantJobs { waiting: 2, max: 2 }));
+    let batch = vec![of("u", "a"), of("u", "b"), of("u", "c")];
+    let error = store.create_jobs(batch, &bounds, time(0)).await.expect_err("a batch counts as a whole");
+    assert_eq!(error, Error::QueueFull(Bound::TenantJobs { waiting: 2, max: 2 }));
+    store.create_job(of("u", "a"), &bounds, time(0)).await.expect("another tenant has its own share");
+    claim(store, 1).await;
+    store.create_job(of("t", "c"), &bounds, time(2)).await.expect("what runs does not wait");
+}
+
+pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &dyn Store) {
+    create(store, record("taken"), 0).await;
+    let names = ["a", "b", "taken"];
+    let batch: Vec<_> = names.map(record).to_vec();
+    let error = store.create_jobs(batch.clone(), &ROOM, time(1)).await.expect_err("a taken id");
+    assert_eq!(error, Error::AlreadyExists("tenants/t/jobs/taken already exists".into()));
+    let twice = vec![record("a"), record("a")];
+    let error = store.create_jobs(twice, &ROOM, time(1)).await.expect_err("an id twice");
+    assert_eq!(error, Error::AlreadyExists("tenants/t/jobs/a already exists".into()));
+    // One of the two has room, both have not.
+    let bounds = QueueBounds { max_jobs: 2, ..ROOM };
+    let error = store.create_jobs(batch[..2].to_vec(), &bounds, time(1)).await.expect_err("full");
+    assert_eq!(error, Error::QueueFull(Bound::Jobs { waiting: 2, max: 2 }));
+    assert!(matches!(store.job(&record("a").name).await, Err(Error::NotFound(_))), "nothing was stored");
+    assert_eq!(store.load().await.expect("counts").queued, 1);
+    let created = store.create_jobs(batch[..2].to_vec(), &ROOM, time(1)).await.expect("created");
+    let created: Vec<_> = created.iter().map(|created| (created.job.name.job.as_str(), created.new)).collect();
+    assert_eq!(created, [("a", true), ("b", true)]);
+    assert_eq!(store.load().await.expect("counts").queued_bytes, 300);
+    assert_eq!(store.input(&record("b").name).await, Ok(vec![7; 100]));
+}
+
+pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &dyn Store) {
+    let request = |id: &str, byte| Some(Request { id: id.into(), digest: [byte; 32] });
+    let batch = || {
+        vec![
+            NewRecord { request: request("r-1", 1), ..record("a") },
+            NewRecord { request: request("r-2", 2), ..record("b") },
+            NewRecord { request: request("r-1", 1), ..record("c") },
+        ]
+    };
+    for news in [[true, true, false], [false, false, false]] {
+        let created = store.create_jobs(batch(), &ROOM, time(0)).await.expect("created or known");
+        assert_eq!(created.iter().map(|created| created.new).collect::<Vec<_>>(), news);
+        assert_eq!(created.iter().map(|created| created.job.name.job.as_str()).collect::<Vec<_>>(), ["a", "b", "a"]);
+    }
+    let mut other = batch();
+    other[1].request = request("r-2", 9);
+    other[0] = record("new");
+    let error = store.create_jobs(other, &ROOM, time(1)).await.expect_err("another body");
+    assert!(matches!(error, Error::AlreadyExists(_)), "{error}");
+    assert_eq!(store.load().await.expect("counts").queued, 2);
 }

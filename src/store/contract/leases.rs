@@ -158,10 +158,10 @@ pub(in crate::store) async fn giving_back_is_free_and_vanishing_is_not(store: &d
 
 pub(in crate::store) async fn a_cancel_ends_what_waits_and_flags_what_runs(store: &dyn Store) {
     let waiting = create(store, record("waiting"), 0).await.name;
-    let reply = store.request_cancel(&waiting, time(1)).await.expect("cancels");
+    let reply = store.request_cancel(&waiting, None, time(1)).await.expect("cancels");
     assert!(reply.ended_now);
     assert_eq!((reply.job.state, reply.job.end_time), (JobState::Cancelled, Some(time(1))));
-    let again = store.request_cancel(&waiting, time(2)).await.expect("is idempotent");
+    let again = store.request_cancel(&waiting, None, time(2)).await.expect("is idempotent");
     assert_eq!((again.ended_now, again.job), (false, reply.job));
     assert_eq!(story(store, &waiting).await, told(&[(1, 0, "QUEUED"), (2, 0, "CANCELLED")]));
 
@@ -170,7 +170,7 @@ pub(in crate::store) async fn a_cancel_ends_what_waits_and_flags_what_runs(store
         let name = create(store, record(way), 0).await.name;
         let lease = claim(store, 1).await.lease;
         assert!(!store.heartbeat(&lease, time(1), LEASE).await.expect("holds").cancel_requested);
-        let reply = store.request_cancel(&name, time(2)).await.expect("flags");
+        let reply = store.request_cancel(&name, None, time(2)).await.expect("flags");
         assert!(!reply.ended_now && reply.job.cancel_requested && reply.job.state == JobState::Running);
         assert!(store.heartbeat(&lease, time(2), LEASE).await.expect("holds").cancel_requested);
         let job = match way {

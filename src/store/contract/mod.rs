@@ -3,6 +3,7 @@
 pub(super) mod creation;
 pub(super) mod leases;
 pub(super) mod reading;
+pub(super) mod removal;
 
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime};
@@ -34,6 +35,13 @@ macro_rules! store_contract {
             reading::listings_page_and_filter,
             reading::events_come_in_order_and_in_portions,
             reading::what_does_not_exist_is_not_found,
+            creation::admission_bounds_each_tenant,
+            creation::a_batch_is_stored_whole_or_not_at_all,
+            creation::a_batch_knows_its_request_ids,
+            removal::an_ended_job_goes_with_all_that_it_had,
+            removal::what_waits_or_runs_is_not_deleted,
+            removal::an_etag_is_honoured_and_changes_with_the_job,
+            removal::what_ended_long_ago_goes_oldest_first_and_in_portions,
         );
     };
     (@each $open:path; $($part:ident :: $test:ident,)*) => {
@@ -49,8 +57,13 @@ macro_rules! store_contract {
 pub(super) use store_contract;
 
 /// Bounds that refuse nothing.
-pub(super) const ROOM: QueueBounds =
-    QueueBounds { max_jobs: u64::MAX, max_bytes: u64::MAX, max_observations: u64::MAX };
+pub(super) const ROOM: QueueBounds = QueueBounds {
+    max_jobs: u64::MAX,
+    max_bytes: u64::MAX,
+    max_observations: u64::MAX,
+    max_tenant_jobs: u64::MAX,
+    max_tenant_bytes: u64::MAX,
+};
 
 const LEASE: Duration = Duration::from_secs(30);
 const MAX_ATTEMPTS: u32 = 3;

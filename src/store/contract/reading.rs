@@ -76,7 +76,7 @@ pub(in crate::store) async fn what_does_not_exist_is_not_found(store: &dyn Store
     assert_eq!(store.input(&name).await, Err(missing.clone()));
     assert_eq!(store.result(&name).await, Err(missing.clone()));
     assert_eq!(store.events_after(&name, 0, 1).await, Err(missing.clone()));
-    assert_eq!(store.request_cancel(&name, time(0)).await, Err(missing));
+    assert_eq!(store.request_cancel(&name, None, time(0)).await, Err(missing));
     let lease = Lease { name, attempt: 1 };
     assert_eq!(store.heartbeat(&lease, time(0), LEASE).await, Err(Error::Fenced(lease)));
 }

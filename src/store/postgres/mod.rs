@@ -53,7 +53,10 @@ const SESSION: [(&str, &str); 4] = [
 /// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
 const ADMISSION_LOCK: i64 = 0x7363_7073_666d;
 
-const MIGRATIONS: [Step; 1] = [(1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql"))];
+const MIGRATIONS: [Step; 2] = [
+    (1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql")),
+    (2, "retention", include_str!("../migrations/postgres/0002_retention.sql")),
+];
 
 /// Store in a PostgreSQL database.
 #[derive(Debug)]
@@ -134,9 +137,8 @@ impl Connection for PgConnection {
         sql::run::<sqlx::Postgres>(self, statement).await
     }
 
-    async fn lock_admission(&mut self) -> Result<bool, Error> {
-        self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(ADMISSION_LOCK)).await?;
-        Ok(true)
+    async fn lock_admission(&mut self) -> Result<(), Error> {
+        self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(ADMISSION_LOCK)).await
     }
 
     async fn tell(&mut self, change: Change, job: &JobName) -> Result<(), Error> {

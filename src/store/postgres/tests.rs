@@ -116,7 +116,7 @@ async fn changes_are_told_to_other_servers_by_name_and_after_the_commit() {
     assert_eq!(other.job(&name).await.expect("is there").last_sequence, 1);
     fixture.claim("w", contract::time(1), LEASE).await.expect("claims").expect("a job");
     assert_eq!(other.hint().await, Hint::Events(name.clone()));
-    fixture.request_cancel(&name, contract::time(2)).await.expect("flags");
+    fixture.request_cancel(&name, None, contract::time(2)).await.expect("flags");
     assert_eq!(other.hint().await, Hint::Cancel(name));
 }
 

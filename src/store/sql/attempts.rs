@@ -3,7 +3,7 @@
 use std::time::SystemTime;
 
 use super::rows::{self, Standing, append, held, leave, micros, number, select_jobs, select_standing, standing};
-use super::{Change, Connection, Row, Statement, jobs};
+use super::{Change, Connection, Row, Statement, jobs, removal};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt};
 use crate::domain::progress::Progress;
 use crate::store::record::{CancelReply, Claimed, Ending, Heartbeat, Lease, Outcome};
@@ -148,9 +148,11 @@ pub(super) async fn release<C: Connection>(connection: &mut C, lease: &Lease, no
 pub(super) async fn request_cancel<C: Connection>(
     connection: &mut C,
     name: &JobName,
+    etag: Option<&str>,
     now: SystemTime,
 ) -> Result<CancelReply, Error> {
     let job = standing(connection, name).await?;
+    removal::check_etag(connection, name, etag).await?;
     let ended_now = job.state == JobState::Queued;
     if ended_now {
         leave(connection, &job, JobState::Cancelled, None, now).await?;

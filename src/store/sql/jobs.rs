@@ -9,25 +9,49 @@ use crate::store::query::Cursor;
 use crate::store::record::{Created, Load, NewRecord, QueueBounds, Request};
 use crate::store::{Error, JobPage, JobQuery, Order, payload};
 
-/// Stores a job; see [`crate::store::Store::create_job`].
+/// Stores jobs, all or none; see [`crate::store::Store::create_jobs`].
 pub(super) async fn create<C: Connection>(
     connection: &mut C,
-    new: &NewRecord,
+    news: &[NewRecord],
     bounds: &QueueBounds,
     now: SystemTime,
+) -> Result<Vec<Created>, Error> {
+    let mut inputs = Vec::new();
+    for new in news {
+        // Payloads take long: nobody else's admission waits for them.
+        let known = admit(connection, new, bounds).await?.is_some();
+        let input = if known { None } else { Some(insert_input(connection, &new.name.tenant, &new.input, now).await?) };
+        inputs.push(input);
+    }
+    connection.lock_admission().await?;
+    let mut created = Vec::new();
+    for (new, input) in news.iter().zip(inputs) {
+        // Looked over again: others may have come in between, and the batch's own jobs are there now.
+        match (admit(connection, new, bounds).await?, input) {
+            (Some(job), input) => {
+                if let Some(input) = input {
+                    connection.execute(Statement::new("DELETE FROM inputs WHERE id = $1").bind(input)).await?;
+                }
+                created.push(Created { job, new: false });
+            }
+            (None, Some(input)) => created.push(enqueue(connection, new, input, now).await?),
+            // The job that its request id had made was deleted in between.
+            (None, None) => {
+                let input = insert_input(connection, &new.name.tenant, &new.input, now).await?;
+                created.push(enqueue(connection, new, input, now).await?);
+            }
+        }
+    }
+    Ok(created)
+}
+
+/// Stores a job that was admitted, and its request id.
+async fn enqueue<C: Connection>(
+    connection: &mut C,
+    new: &NewRecord,
+    input_id: i64,
+    now: SystemTime,
 ) -> Result<Created, Error> {
-    if let Some(job) = admit(connection, new, bounds).await? {
-        return Ok(Created { job, new: false });
-    }
-    // Payloads take long: nobody else's admission waits for them. What was admitted before is looked over again.
-    let input_id = insert_input(connection, &new.name.tenant, &new.input, now).await?;
-    if connection.lock_admission().await?
-        && let Some(job) = admit(connection, new, bounds).await?
-    {
-        let delete = Statement::new("DELETE FROM inputs WHERE id = $1").bind(input_id);
-        connection.execute(delete).await?;
-        return Ok(Created { job, new: false });
-    }
     let id = insert_job(connection, new, input_id, now).await?;
     if let Some(request) = &new.request {
         let insert = Statement::new(
@@ -59,8 +83,8 @@ async fn admit<C: Connection>(connection: &mut C, new: &NewRecord, bounds: &Queu
     if connection.row(taken).await?.flag("taken")? {
         return Err(Error::AlreadyExists(format!("{} already exists", new.name)));
     }
-    let load = load(connection).await?;
-    match bounds.refuses(&load, new.input.len() as u64, u64::from(new.observation_count)) {
+    let (whole, tenant) = (load(connection).await?, load_of(connection, &new.name.tenant).await?);
+    match bounds.refuses(&whole, &tenant, new.input.len() as u64, u64::from(new.observation_count)) {
         Some(bound) => Err(Error::QueueFull(bound)),
         None => Ok(None),
     }
@@ -79,7 +103,8 @@ async fn earlier<C: Connection>(connection: &mut C, tenant: &str, request: &Requ
         )));
     }
     let select = Statement::new(select_jobs!("WHERE id = $1")).bind(known.integer("job_id")?);
-    rows::job(&connection.row(select).await?).map(Some)
+    // None where the job was deleted between the two looks: its request id is free again.
+    connection.optional_row(select).await?.as_ref().map(rows::job).transpose()
 }
 
 async fn insert_input<C: Connection>(
@@ -245,11 +270,24 @@ pub(super) async fn load<C: Connection>(connection: &mut C) -> Result<Load, Erro
          CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, \
          (SELECT COUNT(*) FROM jobs WHERE state = 'RUNNING') AS running FROM jobs WHERE state = 'QUEUED'",
     );
-    let row = connection.row(select).await?;
+    measured(&connection.row(select).await?)
+}
+
+/// What waits of one tenant; what runs is not counted.
+async fn load_of<C: Connection>(connection: &mut C, tenant: &str) -> Result<Load, Error> {
+    let select = Statement::new(
+        "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
+         CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, CAST(0 AS BIGINT) AS running \
+         FROM jobs WHERE state = 'QUEUED' AND tenant = $1",
+    );
+    measured(&connection.row(select.bind(tenant)).await?)
+}
+
+fn measured(row: &impl Row) -> Result<Load, Error> {
     Ok(Load {
-        queued: number(&row, "queued")?,
-        queued_bytes: number(&row, "bytes")?,
-        queued_observations: number(&row, "observations")?,
-        running: number(&row, "running")?,
+        queued: number(row, "queued")?,
+        queued_bytes: number(row, "bytes")?,
+        queued_observations: number(row, "observations")?,
+        running: number(row, "running")?,
     })
 }

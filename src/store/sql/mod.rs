@@ -4,6 +4,7 @@
 
 mod attempts;
 mod jobs;
+mod removal;
 mod rows;
 mod statement;
 mod store;
@@ -30,9 +31,8 @@ pub(super) trait Connection: Send {
     /// Runs a statement to its end and returns its rows.
     fn rows(&mut self, statement: Statement) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;
 
-    /// Waits until no other transaction admits jobs, and keeps others from it until this one ends. `false`: nothing
-    /// was waited for, what was read before still holds.
-    fn lock_admission(&mut self) -> impl Future<Output = Result<bool, Error>> + Send;
+    /// Waits until no other transaction admits jobs, and keeps others from it until this one ends.
+    fn lock_admission(&mut self) -> impl Future<Output = Result<(), Error>> + Send;
 
     /// Tells other processes of a change, once it is committed.
     fn tell(&mut self, change: Change, job: &JobName) -> impl Future<Output = Result<(), Error>> + Send;
@@ -91,6 +91,12 @@ pub(super) trait Database: Send + Sync + 'static {
 
     /// Compares the caller's clock with that of the leases; called again and again, as clocks drift.
     fn set_lease_clock(&self) -> impl Future<Output = Result<(), Error>> + Send {
+        async { Ok(()) }
+    }
+
+    /// Gives back the space of what was removed, some of it at a time; a database that does so by itself does nothing
+    /// here.
+    fn reclaim(&self) -> impl Future<Output = Result<(), Error>> + Send {
         async { Ok(()) }
     }
 

@@ -89,6 +89,8 @@ pub(super) fn job(row: &impl Row) -> Result<Job, Error> {
         summary: optional_record(row, "summary")?,
         failure: optional_record(row, "failure")?,
         cancel_requested: row.flag("cancel_requested")?,
+        // Retention is the engine's; it says until when.
+        expire_time: None,
     })
 }
 

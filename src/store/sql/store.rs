@@ -3,7 +3,7 @@
 use std::future::Future;
 use std::time::{Duration, SystemTime};
 
-use super::{Database, Size, attempts, jobs};
+use super::{Database, Size, attempts, jobs, removal};
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
@@ -53,7 +53,12 @@ macro_rules! writes {
 
 #[async_trait::async_trait]
 impl<D: Database> Store for D {
-    async fn create_job(&self, new: NewRecord, bounds: &QueueBounds, now: SystemTime) -> Result<Created, Error> {
+    async fn create_jobs(
+        &self,
+        new: Vec<NewRecord>,
+        bounds: &QueueBounds,
+        now: SystemTime,
+    ) -> Result<Vec<Created>, Error> {
         writes!(self, Size::Payload, |connection| jobs::create(connection, &new, bounds, now))
     }
 
@@ -99,8 +104,23 @@ impl<D: Database> Store for D {
         writes!(self, Size::Small, |connection| attempts::release(connection, lease, now))
     }
 
-    async fn request_cancel(&self, name: &JobName, now: SystemTime) -> Result<CancelReply, Error> {
-        writes!(self, Size::Small, |connection| attempts::request_cancel(connection, name, now))
+    async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error> {
+        writes!(self, Size::Small, |connection| attempts::request_cancel(connection, name, etag, now))
+    }
+
+    async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
+        writes!(self, Size::Payload, |connection| removal::delete(connection, name, etag))
+    }
+
+    async fn purge(&self, ended_by: SystemTime, limit: u32) -> Result<u32, Error> {
+        if !reads!(self, Size::Small, |connection| removal::needs_purge(connection, ended_by))? {
+            return Ok(0);
+        }
+        writes!(self, Size::Payload, |connection| removal::purge(connection, ended_by, limit))
+    }
+
+    async fn reclaim(&self) -> Result<(), Error> {
+        bounded(self, Size::Small, Database::reclaim(self)).await
     }
 
     async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {

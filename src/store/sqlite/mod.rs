@@ -33,9 +33,16 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a caller waits for a connection; behind a queue of writes this long, the disk has failed.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(60);
 
-const MIGRATIONS: [Step; 2] = [
+/// Pages handed back at a time, 16 MB of them: writers wait meanwhile.
+const VACUUM_PAGES: u32 = 4096;
+/// What the write-ahead log keeps of its length once it is written back, in bytes: a large result would leave it as long
+/// as itself.
+const LOG_BYTES: &str = "67108864";
+
+const MIGRATIONS: [Step; 3] = [
     (1, "jobs", include_str!("../migrations/sqlite/0001_jobs.sql")),
     (2, "attempts", include_str!("../migrations/sqlite/0002_attempts.sql")),
+    (3, "retention", include_str!("../migrations/sqlite/0003_retention.sql")),
 ];
 
 /// Store in a data directory.
@@ -64,6 +71,7 @@ impl Sqlite {
             // What was acknowledged survives a power cut, not only a crash of the process.
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
+            .pragma("journal_size_limit", LOG_BYTES)
             .busy_timeout(BUSY_TIMEOUT);
         let writer = pool(1).connect_with(options.clone()).await?;
         sql::migrator(&MIGRATIONS).run(&writer).await.map_err(sql::migration_failed)?;
@@ -116,8 +124,8 @@ impl Connection for SqliteConnection {
         sql::run::<sqlx::Sqlite>(self, statement).await
     }
 
-    async fn lock_admission(&mut self) -> Result<bool, Error> {
-        Ok(false)
+    async fn lock_admission(&mut self) -> Result<(), Error> {
+        Ok(())
     }
 
     async fn tell(&mut self, _change: Change, _job: &JobName) -> Result<(), Error> {
@@ -142,6 +150,16 @@ impl Database for Sqlite {
 
     fn bound(&self, _size: Size) -> Option<Duration> {
         None
+    }
+
+    /// Gives the file's free pages back, some at a time.
+    async fn reclaim(&self) -> Result<(), Error> {
+        let free: i64 = sqlx::query_scalar("PRAGMA freelist_count").fetch_one(&self.readers).await?;
+        if free > 0 {
+            let vacuum = format!("PRAGMA incremental_vacuum({VACUUM_PAGES})");
+            sqlx::query(sqlx::AssertSqlSafe(vacuum)).fetch_all(&self.writer).await?;
+        }
+        Ok(())
     }
 
     async fn heard(&self) -> Hint {

@@ -81,3 +81,27 @@ async fn commits_are_synced_and_the_log_is_written_ahead() {
     let synchronous: i64 = sqlx::query_scalar("PRAGMA synchronous").fetch_one(&fixture.writer).await.expect("reads");
     assert_eq!((journal.as_str(), synchronous), ("wal", 2));
 }
+
+#[tokio::test]
+async fn deleted_jobs_leave_no_space_taken() {
+    let fixture = Fixture::open().await.expect("opens");
+    let pages =
+        async || -> i64 { sqlx::query_scalar("PRAGMA page_count").fetch_one(&fixture.writer).await.expect("reads") };
+    let mut largest = 0;
+    let empty = pages().await;
+    for round in 0..6 {
+        let new = crate::store::NewRecord { input: vec![round; 4 << 20], ..contract::record("a") };
+        let name = fixture.create_job(new, &contract::ROOM, contract::time(0)).await.expect("created").job.name;
+        largest = largest.max(pages().await);
+        fixture.request_cancel(&name, None, contract::time(1)).await.expect("cancels");
+        fixture.delete_job(&name, None).await.expect("deletes");
+        Store::reclaim(&*fixture).await.expect("gives back");
+        assert!(pages().await < empty + 50, "round {round}: {} pages of {empty} at first", pages().await);
+    }
+    let chunk_pages = (4 << 20) / 4096;
+    assert!(largest > chunk_pages, "{largest}");
+    assert!(largest < empty + 2 * chunk_pages, "the file never held two inputs: {largest}");
+    sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").fetch_all(&fixture.writer).await.expect("writes back");
+    let bytes = std::fs::metadata(fixture._directory.path().join(DATABASE_FILE)).expect("the file").len();
+    assert!(bytes < 1 << 20, "{bytes} bytes");
+}

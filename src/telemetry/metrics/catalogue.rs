@@ -82,6 +82,12 @@ pub const JOBS_CREATED: Metric = Metric {
     labels: &[],
     help: "Jobs that were admitted and stored.",
 };
+pub const JOBS_DELETED: Metric = Metric {
+    name: "scpsfm_jobs_deleted_total",
+    kind: Kind::Counter,
+    labels: &["reason"],
+    help: "Ended jobs that were removed: asked for by their owner, or kept long enough.",
+};
 pub const JOB_DURATION: Metric = Metric {
     name: "scpsfm_job_duration_seconds",
     kind: JOB_SECONDS,
@@ -168,7 +174,7 @@ pub const WATCHERS: Metric = Metric {
 };
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 22] = [
+pub const ALL: [Metric; 23] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -177,6 +183,7 @@ pub const ALL: [Metric; 22] = [
     WORKERS_BUSY,
     JOBS,
     JOBS_CREATED,
+    JOBS_DELETED,
     JOB_DURATION,
     STAGE_DURATION,
     ATTEMPTS_LOST,

@@ -58,6 +58,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
         summary: succeeded.then_some(summary),
         failure: (state == JobState::Failed).then(|| Failure::new("INTERNAL", "test")),
         cancel_requested: false,
+        expire_time: None,
     }
 }
 
@@ -103,6 +104,8 @@ fn what_is_known_beforehand_is_zero_before_the_first_job() {
         "scpsfm_admission_refusals_total{reason=\"QUEUE_FULL\",bound=\"jobs\"}",
         "scpsfm_admission_refusals_total{reason=\"QUEUE_FULL\",bound=\"bytes\"}",
         "scpsfm_admission_refusals_total{reason=\"QUEUE_FULL\",bound=\"observations\"}",
+        "scpsfm_admission_refusals_total{reason=\"QUEUE_FULL\",bound=\"tenant_jobs\"}",
+        "scpsfm_jobs_deleted_total{reason=\"RETENTION\"}",
         "scpsfm_admission_refusals_total{reason=\"DRAINING\",bound=\"NONE\"}",
         "scpsfm_job_duration_seconds_count{state=\"SUCCEEDED\"}",
         "scpsfm_queue_wait_seconds_count",

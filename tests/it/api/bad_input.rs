@@ -208,8 +208,6 @@ async fn what_is_still_to_come_says_so() {
     let mut inputs = proto::input_service_client::InputServiceClient::new(server.channel().await);
     let uploaded = create(Input::InputName("tenants/default/inputs/a".into()));
     let statuses = [
-        jobs.batch_create_jobs(proto::BatchCreateJobsRequest::default()).await.map(drop),
-        jobs.delete_job(proto::DeleteJobRequest::default()).await.map(drop),
         jobs.create_job(uploaded).await.map(drop),
         inputs.upload_input(tokio_stream::empty()).await.map(drop),
         inputs.get_upload_status(proto::GetUploadStatusRequest::default()).await.map(drop),

@@ -122,7 +122,7 @@ async fn cancel_reaches_running_queued_and_ended_jobs() {
     let first = created(&mut jobs, create_tracks()).await.name;
     let second = created(&mut jobs, create_tracks()).await.name;
     running(&mut jobs, &first).await;
-    let cancel = |name: &str| proto::CancelJobRequest { name: name.into() };
+    let cancel = |name: &str| proto::CancelJobRequest { name: name.into(), ..Default::default() };
     let queued = jobs.cancel_job(cancel(&second)).await.expect("a cancel").into_inner();
     assert_eq!(queued.state(), JobState::Cancelled);
     let read = proto::ReadJobResultRequest { name: first.clone(), offset: 0 };
@@ -144,7 +144,9 @@ async fn a_full_queue_says_at_once_when_to_come_back_and_which_bound_was_hit() {
     for (queue, bound) in [
         (QueueBounds { max_jobs: 1, ..room.clone() }, "jobs"),
         (QueueBounds { max_bytes: 1, ..room.clone() }, "bytes"),
-        (QueueBounds { max_observations: 23, ..room }, "observations"),
+        (QueueBounds { max_observations: 23, ..room.clone() }, "observations"),
+        (QueueBounds { max_tenant_jobs: 1, ..room.clone() }, "tenant_jobs"),
+        (QueueBounds { max_tenant_bytes: 1, ..room }, "tenant_bytes"),
     ] {
         fills_up(queue, bound).await;
     }

@@ -4,4 +4,5 @@ mod bad_input;
 mod client;
 mod discovery;
 mod jobs;
+mod removal;
 mod solve;
