@@ -78,13 +78,11 @@ fn of_alert(server: &str, alert: AlertDescription) -> String {
     }
 }
 
-/// What a connection without TLS was broken off with, where the server speaks TLS: its alert reads as a frame of
-/// HTTP/2 that is too long.
+/// A question, where a connection without TLS broke as it does at a server with TLS: its alert reads as a frame of
+/// HTTP/2 that is too long, or the server closes before the call is written.
 pub(super) fn plain_hint(server: &str, cause: &str) -> &'static str {
-    match server.starts_with("http://") && cause.contains("frame with invalid size") {
-        true => "; a server with TLS is at https://",
-        false => "",
-    }
+    let like_it = ["frame with invalid size", "broken pipe"].iter().any(|text| cause.contains(text));
+    if server.starts_with("http://") && like_it { "; does it speak TLS, at https://?" } else { "" }
 }
 
 /// Alerts whose text may come without their type, as rustls writes them.
@@ -105,6 +103,14 @@ fn of_alert_text(server: &str, text: &str) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_missing_https_is_asked_for_where_it_may_be_the_cause() {
+        assert!(plain_hint("http://a", "frame with invalid size").contains("https://"));
+        assert!(plain_hint("http://a", "stream closed because of a broken pipe").contains("https://"));
+        assert_eq!(plain_hint("https://a", "frame with invalid size"), "");
+        assert_eq!(plain_hint("http://a", "connection refused"), "");
+    }
 
     #[test]
     fn an_error_is_found_wherever_it_is_wrapped() {
