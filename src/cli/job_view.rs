@@ -246,9 +246,8 @@ mod tests {
 
     #[test]
     fn a_lost_server_leaves_the_commands_that_go_on() {
-        let name = GivenName::parse("a-1")
-            .and_then(|name| Ok(name.of(&AccessArgs::default()).expect("a tenant")))
-            .expect("a name");
+        let given = GivenName::parse("a-1").expect("a name");
+        let name = given.of(&AccessArgs::default()).expect("a tenant");
         let job = Lost { name: &name, server: "http://h:1", after: 7, files: " --out 'a b'" };
         let words = lost(client::Error::Unavailable("gone".into()), &job).message;
         assert!(words.starts_with("gone\nthe job is tenants/default/jobs/a-1;"), "{words}");

@@ -113,6 +113,8 @@ pub enum WarningCode {
     ViewsLeftOut,
     /// No image size was given; the extent of the points stood in.
     AssumedImageSize,
+    /// Many points lie outside the image size that was given: the size of other images, or of these before a resize.
+    PointsOutsideImage,
     /// Views of several camera groups or sizes were treated as one camera.
     CameraGroupsMerged,
     /// The deadline stopped the search; this is the best found by then. Not given yet: such a job expires.
@@ -137,6 +139,7 @@ impl WarningCode {
             | WarningCode::SecondStructure
             | WarningCode::ViewsLeftOut
             | WarningCode::AssumedImageSize
+            | WarningCode::PointsOutsideImage
             | WarningCode::CameraGroupsMerged
             | WarningCode::StoppedEarly => false,
         }
@@ -159,6 +162,7 @@ impl WarningCode {
             WarningCode::NoConsensus => "NO_CONSENSUS",
             WarningCode::ViewsLeftOut => "VIEWS_LEFT_OUT",
             WarningCode::AssumedImageSize => "ASSUMED_IMAGE_SIZE",
+            WarningCode::PointsOutsideImage => "POINTS_OUTSIDE_IMAGE",
             WarningCode::CameraGroupsMerged => "CAMERA_GROUPS_MERGED",
             WarningCode::StoppedEarly => "STOPPED_EARLY",
         }

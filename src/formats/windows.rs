@@ -146,7 +146,7 @@ pub struct Table {
     /// Views a window, and from the beginning of one to that of the next.
     pub window: usize,
     pub step: usize,
-    /// Views at the end that fill no window.
+    /// Views in no window: at the end, where they fill none, and between windows that are farther apart than long.
     pub views_left: usize,
     pub solved: usize,
     pub inlier_tracks: Option<Average>,
@@ -161,11 +161,12 @@ impl Table {
     /// * `views`: of the input; `window` and `step`: see [`ranges`]
     pub fn new(views: usize, window: usize, step: usize, windows: Vec<Row>) -> Self {
         let over = |pick: fn(&Row) -> Option<f64>| Average::of(windows.iter().filter_map(pick));
-        let end = ranges(views, window, step).last().map_or(0, |range| range.end);
+        let ranges = ranges(views, window, step);
+        let covered = (0..views).filter(|view| ranges.iter().any(|range| range.contains(view))).count();
         Self {
             window,
             step,
-            views_left: views - end,
+            views_left: views - covered,
             solved: windows.iter().filter(|row| row.registered_views > 0).count(),
             inlier_tracks: over(|row| (row.registered_views > 0).then_some(row.inlier_tracks as f64)),
             focal_px: over(|row| row.focal_px),
@@ -250,7 +251,7 @@ impl Table {
         text.push_str(&average("mean", |average| average.mean));
         text.push_str(&average("median", |average| average.median));
         if self.views_left > 0 {
-            text.push_str(&format!("views at the end that fill no window: {}\n", self.views_left));
+            text.push_str(&format!("views in no window: {}\n", self.views_left));
         }
         text
     }
@@ -269,7 +270,8 @@ mod tests {
         assert!(ranges(3, 4, 4).is_empty());
         let table = Table::new(10, 4, 4, Vec::new());
         assert_eq!((table.views_left, table.focal_px), (2, None));
-        assert!(table.text().contains("views at the end that fill no window: 2"));
+        assert!(table.text().contains("views in no window: 2"));
+        assert_eq!(Table::new(11, 3, 5, Vec::new()).views_left, 5, "two gaps and the last");
     }
 
     #[test]

@@ -78,9 +78,37 @@ pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
             ),
         ));
     }
+    warnings.extend(outside(input));
     // All points in one place: any scale will do.
     let scale_px = if scale_px > 0.0 { scale_px } else { 1.0 };
     (Normalization { centres_px, scale_px }, warnings)
+}
+
+/// Share of the observations outside their images from which the image size is doubted: undoing a lens's distortion, and
+/// wrong points, take a few there.
+const DOUBTED_OUTSIDE: f64 = 0.1;
+
+/// Says so where many observations lie outside the image size that was given: the calibration rests on its middle.
+fn outside(input: &Input) -> Option<Warning> {
+    let (mut outside, mut sized) = (0usize, 0usize);
+    for k in 0..input.observation_count() {
+        let Some(size) = input.views()[input.view_of(k)].size else { continue };
+        let [x, y] = input.point_px(k);
+        let within = |at: f64, side: u32| (-0.5..=f64::from(side) - 0.5).contains(&at);
+        sized += 1;
+        outside += usize::from(!(within(x, size.width_px) && within(y, size.height_px)));
+    }
+    let share = outside as f64 / sized.max(1) as f64;
+    (share > DOUBTED_OUTSIDE).then(|| {
+        Warning::new(
+            WarningCode::PointsOutsideImage,
+            format!(
+                "{:.0} % of the points lie outside the image size that was given: is it that of these images, width before \
+                 height?",
+                100.0 * share
+            ),
+        )
+    })
 }
 
 /// Says so where the views of one solve come from several cameras or have several sizes; `cameras`: where each group has
@@ -316,7 +344,7 @@ pub fn extract(input: &Input, ranges: &[usize], normalization: &Normalization, v
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{Limits, RawInput};
+    use crate::domain::{ImageSize, Limits, RawInput};
 
     /// Tracks given as lists of the views that see them.
     fn input(views: usize, tracks: &[Vec<usize>]) -> Input {
@@ -359,6 +387,26 @@ mod tests {
         assert_eq!((sampled.tracks.len(), sampled.complete.tracks()), (7, 7));
         let place = block.tracks.iter().position(|&track| track == sampled.tracks[3]).expect("a track of the block");
         assert_eq!(sampled.complete.track(3), block.complete.track(place));
+    }
+
+    #[test]
+    fn an_image_size_that_does_not_hold_the_points_is_doubted() {
+        let codes = |width_px: u32, height_px: u32| {
+            let raw = RawInput {
+                views: vec![View { size: Some(ImageSize { width_px, height_px }), ..View::default() }; 3],
+                track_count: 10,
+                view: (0..30).map(|k| k % 3).collect(),
+                track: (0..30).map(|k| k / 3).collect(),
+                x: (0..30).map(|k| 30.0 * f64::from(k)).collect(),
+                y: (0..30).map(|k| 20.0 * f64::from(k)).collect(),
+                ..RawInput::default()
+            };
+            let input = Input::new(raw, &Limits::default(), "points").expect("valid");
+            normalization(&input).1.iter().map(|warning| warning.code).collect::<Vec<_>>()
+        };
+        assert_eq!(codes(880, 600), []);
+        assert_eq!(codes(600, 880), [WarningCode::PointsOutsideImage], "width and height swapped");
+        assert_eq!(codes(90, 60), [WarningCode::PointsOutsideImage]);
     }
 
     #[test]

@@ -69,6 +69,7 @@ twins! {
         SecondStructure,
         ViewsLeftOut,
         AssumedImageSize,
+        PointsOutsideImage,
         CameraGroupsMerged,
         StoppedEarly,
     }

@@ -101,6 +101,9 @@ fn state(name: &str) -> Result<JobState, Violation> {
 }
 
 fn add_label(filter: &mut Filter, key: &str, value: &str) -> Result<(), Violation> {
+    if key.contains('\0') || value.contains('\0') {
+        return Err(Violation::of("filter", "a label holds no NUL characters"));
+    }
     match filter.labels.insert(key.to_owned(), value.to_owned()) {
         Some(other) if other != value => {
             let (key, other, value) = (quoted(key), quoted(&other), quoted(value));

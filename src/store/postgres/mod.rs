@@ -35,19 +35,22 @@ const PAYLOAD_CONNECTIONS: u32 = 3;
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(3);
 /// How long an operation on a few rows may take: what takes longer waits for a database that does not answer.
 const SMALL_BOUND: Duration = Duration::from_secs(5);
-/// How long an input or a result may be on its way: 100 MB at some 3 MB/s.
+/// How long an input or a result may be on its way: 100 MB at some 3.5 MB/s.
 const PAYLOAD_BOUND: Duration = Duration::from_secs(30);
 /// How long a connection that comes back may take to answer before it is thrown away.
 const RELEASE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// What the database ends by itself, in milliseconds, so that a server that was stopped in the middle of a transaction
 /// holds no locks that others wait for. An idle connection is none of these.
-const SESSION: [(&str, &str); 4] = [
+const SESSION: [(&str, &str); 6] = [
     ("application_name", "scpsfm"),
     ("statement_timeout", "30000"),
     ("idle_in_transaction_session_timeout", "5000"),
-    // A connection whose peer vanished without a word, after half a minute; PostgreSQL's default is two hours.
+    // A connection whose peer vanished without a word, after a minute: three questions ten seconds apart after half a
+    // minute of silence. PostgreSQL's default is two hours.
     ("tcp_keepalives_idle", "30"),
+    ("tcp_keepalives_interval", "10"),
+    ("tcp_keepalives_count", "3"),
 ];
 
 /// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.

@@ -255,10 +255,11 @@ pub(super) async fn needs_sweep<C: Connection>(
     connection.row(select.bind(micros(expired_at)).bind(micros(now))).await?.flag("found")
 }
 
-/// Ends the queued jobs that are past their deadline.
+/// Ends queued jobs that are past their deadline, at most a hundred: the next sweep, a second later, takes the others,
+/// and none takes longer than an operation may.
 pub(super) async fn expire_queued<C: Connection>(connection: &mut C, now: SystemTime) -> Result<Vec<Job>, Error> {
     let select = Statement::new(select_standing!(
-        "WHERE state = 'QUEUED' AND deadline IS NOT NULL AND deadline <= $1 ORDER BY id"
+        "WHERE state = 'QUEUED' AND deadline IS NOT NULL AND deadline <= $1 ORDER BY id LIMIT 100"
     ))
     .bind(micros(now))
     .then(C::SKIP_LOCKED);

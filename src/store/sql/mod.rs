@@ -141,12 +141,19 @@ pub(super) fn migration_failed(error: sqlx::migrate::MigrateError) -> Error {
     }
 }
 
+/// Whether a database refused for a reason that waiting does not mend: SQLSTATE classes 22 (data), 23 (integrity) and 42
+/// (syntax or access), which have five signs. SQLite's codes, numbers, are none of these.
+fn is_defect(code: Option<&str>) -> bool {
+    code.is_some_and(|code| code.len() == 5 && ["22", "23", "42"].iter().any(|class| code.starts_with(class)))
+}
+
 impl From<sqlx::Error> for Error {
     fn from(error: sqlx::Error) -> Self {
         match error {
             sqlx::Error::ColumnDecode { .. } | sqlx::Error::ColumnNotFound(_) | sqlx::Error::Decode(_) => {
                 Error::Corrupt(error.to_string())
             }
+            sqlx::Error::Database(ref cause) if is_defect(cause.code().as_deref()) => Error::Corrupt(error.to_string()),
             _ => Error::Unavailable(error.to_string()),
         }
     }
