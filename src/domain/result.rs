@@ -113,7 +113,7 @@ pub enum WarningCode {
     ViewsLeftOut,
     /// No image size was given; the extent of the points stood in.
     AssumedImageSize,
-    /// Many points lie outside the image size that was given: the size of other images, or of these before a resize.
+    /// Most points lie far outside the image size that was given: that of other images, or of a reduced copy.
     PointsOutsideImage,
     /// Views of several camera groups or sizes were treated as one camera.
     CameraGroupsMerged,

@@ -86,7 +86,7 @@ fn windows_are_solved_alone_and_alike_on_any_number_of_threads() {
     }
     assert_eq!(csv.lines().count(), 3);
     assert!(one.stderr.contains("window 2 of 2: views 2 to 6\n"), "{one:?}");
-    assert!(one.stdout.contains("median") && one.stdout.contains("fill no window: 1"), "{one:?}");
+    assert!(one.stdout.contains("median") && one.stdout.contains("in no window: 1"), "{one:?}");
     let none = path("none");
     let too_long = ["solve", text(&input), "--out", text(&none), "--window", "9"];
     assert_eq!(run(too_long).code, Some(2));

@@ -90,7 +90,7 @@ async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
             ("scpsfm_queue_wait_seconds_count", 1.0),
             ("scpsfm_solve_iterations_count", 1.0),
             ("scpsfm_inlier_ratio_count", 1.0),
-            ("scpsfm_store_operation_duration_seconds_count{operation=\"create_job\"}", 1.0),
+            ("scpsfm_store_operation_duration_seconds_count{operation=\"create_jobs\"}", 1.0),
             ("scpsfm_store_operation_duration_seconds_count{operation=\"finish\"}", 1.0),
             (CREATED_OK, 1.0),
         ],
