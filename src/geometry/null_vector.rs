@@ -12,7 +12,7 @@ const MOST_ITERATIONS: usize = 60;
 
 /// The unit eigenvector to the smallest eigenvalue of a symmetric positive semidefinite matrix, by inverse iteration
 /// (Golub & Van Loan, section 8.2.2). A sequence of 1,000 views took a quarter less time with it than with a full
-/// decomposition, which had been two fifths of the whole.
+/// decomposition, which had been a third of the whole.
 ///
 /// Returns `None` where the matrix holds what is no number, or is zero.
 pub fn null_vector(matrix: &Matrix4<f64>) -> Option<Vector4<f64>> {

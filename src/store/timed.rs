@@ -25,11 +25,6 @@ fn counted<T>(operation: &'static str, result: Result<T, Error>) -> Result<T, Er
 
 #[async_trait::async_trait]
 impl<S: Store> Store for Timed<S> {
-    async fn create_job(&self, new: NewRecord, bounds: &QueueBounds, now: SystemTime) -> Result<Created, Error> {
-        let _timer = store_operation("create_job");
-        self.0.create_job(new, bounds, now).await
-    }
-
     async fn create_jobs(
         &self,
         new: Vec<NewRecord>,

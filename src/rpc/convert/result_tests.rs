@@ -1,0 +1,154 @@
+//! Results over the wire and back.
+
+use prost::Message;
+
+use super::*;
+use crate::domain::{Losses, Progress};
+
+fn name() -> JobName {
+    JobName { tenant: "default".into(), job: "a".into() }
+}
+
+/// Every field set to something that is not its default, every optional thing both present and absent.
+pub(super) fn rich() -> Solution {
+    let projection = Some([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0], [0.1, 0.2, 0.3, f64::MIN_POSITIVE]]);
+    let rotation = Some([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]);
+    let progress = Progress {
+        stage: Stage::Search,
+        fraction: 0.3,
+        iteration: 7,
+        losses: Some(Losses { num: 1.0, proj: 2.0, daq: 3.0 }),
+        inliers: 20,
+        focal_px: Some(1200.5),
+        best_score: Some(0.9),
+        elapsed_seconds: 0.25,
+    };
+    Solution {
+        status: Status::Solved,
+        grade: Some(Grade::Weak),
+        method: Method::Auto,
+        winning_prior: Some(Prior::Irls),
+        iterations: 150,
+        seed: u64::MAX,
+        calibrations: vec![
+            Calibration {
+                focal_px: 1.0 / 3.0,
+                sigma_log_focal: Some(0.05),
+                principal_point_px: [499.5, 399.5],
+                aspect: 1.25,
+                radial_k1: -0.05,
+                radial_k2: 0.01,
+                grade: Some(Grade::Weak),
+            },
+            Calibration {
+                focal_px: 900.0,
+                sigma_log_focal: None,
+                principal_point_px: [0.0, 0.0],
+                aspect: 1.0,
+                radial_k1: 0.0,
+                radial_k2: 0.0,
+                grade: None,
+            },
+        ],
+        plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),
+        views: vec![
+            ViewResult {
+                projection,
+                rotation,
+                translation: Some([0.0, -1.0, 2.0]),
+                focal_px: Some(987.5),
+                part: 1,
+                camera_group: 7,
+                left_out: None,
+            },
+            ViewResult { projection, ..ViewResult::default() },
+            ViewResult::default(),
+            ViewResult { left_out: Some(LeftOut::NoObservations), ..ViewResult::default() },
+            ViewResult { left_out: Some(LeftOut::OutsideBlock), ..ViewResult::default() },
+            ViewResult { left_out: Some(LeftOut::NotRegistered { points: 12, agreeing: 4 }), ..ViewResult::default() },
+        ],
+        tracks: TrackResults {
+            weight: vec![0.0, 1.0, 0.25],
+            inlier: vec![false, true, true],
+            network_weight: vec![0.1, 0.2, 0.3],
+            point: vec![None, Some([1.0, -2.0, 3.5]), None],
+            part: vec![0, 1, 0],
+        },
+        observations: ObservationResults {
+            inlier: vec![true, false, false],
+            residual_px: vec![Some(0.0), Some(17.25), None],
+            weight: vec![0.875, 0.25, 0.0],
+            split: vec![0, 2, 0],
+        },
+        splits: vec![
+            TrackSplit { track: 1, number: 1, weight: 0.75, point: None },
+            TrackSplit { track: 1, number: 2, weight: 0.5, point: Some([1.0, -2.0, 3e-9]) },
+        ],
+        noise_px: Some(0.5),
+        reprojection_rms_px: Some(0.7),
+        reprojection_mean_px: Some(0.6),
+        warnings: vec![
+            Warning::new(WarningCode::ViewsLeftOut, "views 3, 4"),
+            Warning::new(WarningCode::UnobservableFocal, "no turning").of_group(7),
+        ],
+        seconds: 1.5,
+        stages: vec![StageTime { stage: Stage::Prepare, seconds: 0.1 }],
+        prior_times: vec![
+            PriorTime { prior: Prior::Network, seconds: Some(0.5), iterations: 80 },
+            PriorTime { prior: Prior::Uniform, seconds: None, iterations: 6000 },
+        ],
+        history: vec![progress, Progress { losses: None, focal_px: None, best_score: None, ..progress }],
+    }
+}
+
+fn over_the_wire(solution: &Solution) -> Solution {
+    let bytes = to_wire(&name(), solution).encode_to_vec();
+    from_wire(proto::JobResult::decode(bytes.as_slice()).expect("decodes")).expect("well formed")
+}
+
+#[test]
+fn a_solution_survives_the_wire_unchanged() {
+    assert_eq!(over_the_wire(&rich()), rich());
+}
+
+#[test]
+fn a_solution_without_a_reconstruction_survives_too() {
+    let bare = Solution {
+        status: Status::NoReconstruction,
+        grade: None,
+        winning_prior: None,
+        calibrations: Vec::new(),
+        plane_at_infinity: None,
+        views: vec![ViewResult::default(); 2],
+        tracks: TrackResults::default(),
+        observations: ObservationResults::default(),
+        noise_px: None,
+        reprojection_rms_px: None,
+        reprojection_mean_px: None,
+        ..rich()
+    };
+    assert_eq!(over_the_wire(&bare), bare);
+}
+
+#[test]
+fn a_malformed_answer_names_its_field() {
+    let with = |change: &dyn Fn(&mut proto::JobResult)| {
+        let mut result = to_wire(&name(), &rich());
+        change(&mut result);
+        from_wire(result).expect_err("malformed").path()
+    };
+    assert_eq!(with(&|result| result.status = 0), "status");
+    assert_eq!(with(&|result| result.grade = 9), "grade");
+    assert_eq!(with(&|result| result.tracks = None), "tracks");
+    assert_eq!(with(&|result| result.views[1].projection.truncate(5)), "views.projection[1]");
+    let tracks = |result: &mut proto::JobResult, change: &dyn Fn(&mut proto::TrackResults)| {
+        change(result.tracks.as_mut().expect("set"));
+    };
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.inlier.truncate(1))), "tracks");
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_track[0] = 3)), "tracks.point_track[0]");
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point.truncate(2))), "tracks.point");
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_part.push(1))), "tracks.point_part");
+    assert_eq!(with(&|result| result.calibrations[0].grade = 9), "calibrations.grade");
+    let reason = |result: &mut proto::JobResult| result.views[3].left_out.as_mut().expect("set").reason = 9;
+    assert_eq!(with(&reason), "views.left_out.reason[3]");
+}
