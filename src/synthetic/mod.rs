@@ -1,8 +1,9 @@
 //! The paper's synthetic scenes (its section 5.1), scenes that depart from them, and the metrics to judge answers on
-//! both.
+//! both; and the training scenes of a learned prior (`curriculum`).
 //!
 //! May depend on `domain` only, plus linear algebra.
 
+pub mod curriculum;
 pub mod metrics;
 pub mod scene;
 pub mod sequence;

@@ -23,6 +23,7 @@ use self::camera::{Camera, Lens};
 use self::contamination::Contamination;
 pub use self::contamination::OutlierKind;
 pub use self::motion::Motion;
+pub(super) use self::motion::Pose;
 pub use self::noise::NoiseKind;
 use self::noise::Observation;
 pub(super) use self::noise::normal;
