@@ -31,3 +31,4 @@ pub mod solver;
 pub mod store;
 pub mod synthetic;
 pub mod telemetry;
+pub mod training;

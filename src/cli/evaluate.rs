@@ -9,10 +9,12 @@ use serde_json::json;
 use sha2::{Digest, Sha256};
 
 use super::args::cores;
+use super::evaluate_priors::{self, PriorArgs};
 use super::evaluate_real::{self, RealArgs};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
+use super::prior_file::PriorFileArgs;
 use crate::domain::{SolveSettings, StopToken};
 use crate::evaluation::plan::{Contestant, Depths, Plan};
 use crate::evaluation::runner::{self, Records};
@@ -34,6 +36,7 @@ Examples:
   scpsfm evaluate --beyond --methods oracle,auto --depths none
   scpsfm evaluate --ablation --sweeps outliers,orbit --out ablation
   scpsfm evaluate --sweeps outliers --depths given,epipolar --methods paper,psfm --paper-width 1
+  scpsfm evaluate --priors --seeds 20 --out priors
   scpsfm evaluate --real sequences --peer 'python peer.py' --out side-by-side
 
 Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
@@ -93,6 +96,12 @@ pub struct Args {
     /// Show no progress
     #[arg(long, short)]
     pub quiet: bool,
+
+    #[command(flatten)]
+    pub prior: PriorFileArgs,
+
+    #[command(flatten)]
+    pub priors: PriorArgs,
 
     #[command(flatten)]
     pub real: RealArgs,
@@ -228,7 +237,16 @@ fn is_quick(observations: usize) -> bool {
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     if !args.real.real.is_empty() {
+        if args.prior.prior.is_some() {
+            return Err(Failure::usage("--prior does not reach the programs that --real starts"));
+        }
         return evaluate_real::run(&args.real, &args.out, args.json, args.quiet).await;
+    }
+    args.prior.install()?;
+    let threads = args.threads.map_or_else(cores, usize::from);
+    if args.priors.priors {
+        let seeds = args.seeds.unwrap_or(SEEDS);
+        return evaluate_priors::run(&args.priors, &args.out, seeds, threads, args.json, args.quiet).await;
     }
     let plan = args.plan();
     let runs = plan.runs();
@@ -239,7 +257,6 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let mut records = Records::open(&args.out, &build()?)?;
     let missing = runs.iter().filter(|run| records.get(run).is_none()).count();
     let bar = progress_bar(args.quiet, runs.len(), runs.len() - missing);
-    let threads = args.threads.map_or_else(cores, usize::from);
     let stop = StopToken::default();
     let interrupt = Interrupt::listen()?;
     let relay = interrupt.stops(&stop);
@@ -322,12 +339,15 @@ fn table(cells: &[Cell]) -> String {
     text
 }
 
-/// What tells this program from any other that might have written the records: its version and the digest of its file.
+/// What tells this program from any other that might have written the records: its version, the digest of its file and
+/// that of the network it asks.
 fn build() -> Result<String, Failure> {
     let program = std::fs::read(std::env::current_exe()?)?;
     let digest = Sha256::digest(&program);
     let short: String = digest.iter().take(8).map(|byte| format!("{byte:02x}")).collect();
-    Ok(format!("{} {short}", env!("CARGO_PKG_VERSION")))
+    // Another network gives other figures.
+    let network = &crate::network::subspace::current().checksum()[..16];
+    Ok(format!("{} {short} {network}", env!("CARGO_PKG_VERSION")))
 }
 
 fn progress_bar(quiet: bool, total: usize, done: usize) -> ProgressBar {

@@ -8,12 +8,14 @@ pub mod client;
 pub mod delete;
 pub mod demo;
 pub mod evaluate;
+pub mod evaluate_priors;
 pub mod evaluate_real;
 pub mod exit;
 pub mod get;
 pub mod interrupt;
 pub mod job_view;
 pub mod list;
+pub mod prior_file;
 pub mod progress;
 pub mod result;
 pub mod scene_args;
@@ -23,6 +25,7 @@ pub mod solve;
 pub mod submit;
 pub mod summary;
 pub mod synth;
+pub mod train_prior;
 pub mod watch;
 pub mod windows;
 
@@ -60,6 +63,7 @@ pub enum Command {
     Result(result::Args),
     Synth(synth::Args),
     Evaluate(evaluate::Args),
+    TrainPrior(train_prior::Args),
 }
 
 /// Runs a parsed command line; an error is printed on stderr, once.
@@ -92,6 +96,7 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         Command::Result(args) => runtime.block_on(result::run(args)),
         Command::Synth(args) => synth::run(args),
         Command::Evaluate(args) => runtime.block_on(evaluate::run(args)),
+        Command::TrainPrior(args) => runtime.block_on(train_prior::run(args)),
     }
 }
 

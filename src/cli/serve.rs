@@ -7,8 +7,8 @@ use clap::ValueEnum;
 use super::args::BackendArg;
 use super::exit::{Exit, Failure};
 use super::interrupt::Signals;
-use super::print;
 use super::service::Service;
+use super::{print, prior_file};
 use crate::config::Config;
 use crate::telemetry;
 
@@ -69,6 +69,10 @@ pub struct Args {
     /// Tensor backend of jobs that ask for none [default: flex]
     #[arg(long, value_enum)]
     pub backend: Option<BackendArg>,
+
+    /// Trained network of jobs' searches, written by `scpsfm train-prior` [default: the one that the program carries]
+    #[arg(long, value_name = "FILE")]
+    pub prior: Option<PathBuf>,
 
     /// How log lines are written, on stderr [default: human]
     #[arg(long, value_enum)]
@@ -152,6 +156,7 @@ impl Args {
             ("engine.workers", self.workers.map(|count| count.to_string())),
             ("engine.queue_capacity", self.queue.map(|count| count.to_string())),
             ("compute.backend", word(self.backend.and_then(|backend| backend.to_possible_value()))),
+            ("compute.prior", path(&self.prior)),
             ("log.format", word(self.log_format.and_then(|format| format.to_possible_value()))),
         ];
         given.into_iter().filter_map(|(key, value)| Some((key, value?))).collect()
@@ -174,6 +179,9 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         service_name: "scpsfm",
     })
     .map_err(Failure::bad_config)?;
+    if let Some(path) = &config.compute.prior {
+        prior_file::install(path).map_err(|error| Failure::bad_config(format_args!("compute.prior: {error}")))?;
+    }
     let mut signals = Signals::listen()?;
     let scrape = telemetry::metrics::install().map_err(Failure::internal)?;
     let backend = if config.compute.backend == crate::domain::Backend::Flex { "flex" } else { "ndarray" };
@@ -254,6 +262,8 @@ mod tests {
             "9",
             "--backend",
             "ndarray",
+            "--prior",
+            "my.prior",
             "--log-format",
             "json",
             "--tls-certificate",
@@ -273,6 +283,7 @@ mod tests {
         assert_eq!(config.engine.queue_capacity, 9);
         assert_eq!(config.store.data_dir, PathBuf::from("d"));
         assert_eq!(config.compute.backend, crate::domain::Backend::Ndarray);
+        assert_eq!(config.compute.prior, Some("my.prior".into()));
         assert_eq!(config.tls.files().expect("TLS").paths().len(), 3);
         assert_eq!(config.auth.keys_file, Some(PathBuf::from("keys")));
         assert!(config.server.insecure && config.server.plaintext_keys);

@@ -7,6 +7,7 @@ use super::client::access::AccessArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::job_view::{Lost, quoted};
+use super::prior_file::PriorFileArgs;
 use super::progress::ProgressView;
 use super::windows::{self, Show, WindowArgs};
 use super::{client, job_view, print, summary};
@@ -65,6 +66,9 @@ pub struct Args {
 
     #[command(flatten)]
     pub settings: SettingsArgs,
+
+    #[command(flatten)]
+    pub prior: PriorFileArgs,
 }
 
 /// Runs the command.
@@ -72,6 +76,10 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if args.server.is_none() && args.access.is_given() {
         return Err(Failure::usage("flags on the access to a server need --server"));
     }
+    if args.server.is_some() && args.prior.prior.is_some() {
+        return Err(Failure::usage("--prior: the server asks its own network, see `scpsfm serve --prior`"));
+    }
+    args.prior.install()?;
     let settings = args.settings.settings()?;
     let input = args.input.read()?;
     if !args.quiet {

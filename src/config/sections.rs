@@ -193,7 +193,7 @@ impl Engine {
     }
 }
 
-/// What the network runs on.
+/// What the networks are and run on.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Compute {
@@ -201,6 +201,10 @@ pub struct Compute {
     /// is the faster of the two.
     #[serde(deserialize_with = "word")]
     pub backend: Backend,
+    /// A network written by `scpsfm train-prior`, asked instead of the one that the program carries. Servers that share a
+    /// store should ask the same.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub prior: Option<PathBuf>,
 }
 
 /// Log lines, on stderr.

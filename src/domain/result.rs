@@ -53,7 +53,7 @@ impl Grade {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum Prior {
-    /// The network's weights.
+    /// The weights of the network that is optimised on the request.
     Network,
     /// Iteratively reweighted least squares on the subspace.
     Irls,
@@ -61,13 +61,16 @@ pub enum Prior {
     Consistency,
     /// Distances between tracks that stay the same in all views; where depths are given.
     Rigidity,
+    /// The network that was trained beforehand, see `scpsfm train-prior`.
+    Learned,
     /// None: uniform sampling.
     Uniform,
 }
 
 impl Prior {
     /// Every prior.
-    pub const ALL: [Prior; 5] = [Prior::Network, Prior::Irls, Prior::Consistency, Prior::Rigidity, Prior::Uniform];
+    pub const ALL: [Prior; 6] =
+        [Prior::Learned, Prior::Network, Prior::Irls, Prior::Consistency, Prior::Rigidity, Prior::Uniform];
 
     /// The prior's name in files, metrics and logs.
     pub fn name(self) -> &'static str {
@@ -76,6 +79,7 @@ impl Prior {
             Prior::Irls => "irls",
             Prior::Consistency => "consistency",
             Prior::Rigidity => "rigidity",
+            Prior::Learned => "learned",
             Prior::Uniform => "uniform",
         }
     }
@@ -117,6 +121,8 @@ pub enum WarningCode {
     PointsOutsideImage,
     /// Views of several camera groups or sizes were treated as one camera.
     CameraGroupsMerged,
+    /// Nothing was verified; the weights are the trained network's opinion of which tracks are right.
+    UnverifiedRanking,
     /// The deadline stopped the search; this is the best found by then. Not given yet: such a job expires.
     StoppedEarly,
 }
@@ -141,6 +147,7 @@ impl WarningCode {
             | WarningCode::AssumedImageSize
             | WarningCode::PointsOutsideImage
             | WarningCode::CameraGroupsMerged
+            | WarningCode::UnverifiedRanking
             | WarningCode::StoppedEarly => false,
         }
     }
@@ -164,6 +171,7 @@ impl WarningCode {
             WarningCode::AssumedImageSize => "ASSUMED_IMAGE_SIZE",
             WarningCode::PointsOutsideImage => "POINTS_OUTSIDE_IMAGE",
             WarningCode::CameraGroupsMerged => "CAMERA_GROUPS_MERGED",
+            WarningCode::UnverifiedRanking => "UNVERIFIED_RANKING",
             WarningCode::StoppedEarly => "STOPPED_EARLY",
         }
     }

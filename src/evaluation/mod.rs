@@ -2,8 +2,8 @@
 //!
 //! [`sweeps`] are the scenes, [`plan`] says which contestants solve them, [`runner`] runs and records them one by one (and goes on where it
 //! was stopped), [`measures`] scores an answer, [`oracle`] does what the best could do who knows the truth, and
-//! [`summary`] makes numbers of the records, [`figures`] and [`page`] show them; [`real`] holds this program beside
-//! another one on real sequences. May depend on `solver`, `synthetic`, `geometry`, `formats`, `report` and `domain`; knows
+//! [`summary`] makes numbers of the records, [`figures`] and [`page`] show them; [`priors`] compares what the search
+//! starts from; [`real`] holds this program beside another one on real sequences. May depend on `solver`, `synthetic`, `geometry`, `formats`, `report` and `domain`; knows
 //! nothing of jobs or transport.
 
 pub mod figures;
@@ -11,6 +11,7 @@ pub mod measures;
 pub mod oracle;
 pub mod page;
 pub mod plan;
+pub mod priors;
 pub mod real;
 pub mod runner;
 pub mod summary;

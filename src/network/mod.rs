@@ -33,6 +33,7 @@
 //! The weights rank tracks well and separate them badly: the paper's `t = 15` makes some fifteen to twenty kept
 //! tracks the optimum whatever the true number. The solver therefore takes them as a prior for guided search.
 
+mod lanes;
 pub mod losses;
 mod parameter;
 mod pass;
@@ -41,10 +42,13 @@ mod prior;
 #[cfg(test)]
 mod reference;
 mod settings;
+pub mod subspace;
 #[cfg(test)]
 mod tests;
 
 pub use losses::{Evaluation, LossSettings};
+pub use parameter::Parameter;
+pub use pointnet::standard_normal;
 pub use prior::{DAQ_ONSET, Iteration, PriorNetwork};
 pub use settings::NetworkSettings;
 

@@ -1,6 +1,7 @@
 //! One learnable array and its Adam state.
 
 use burn::tensor::{Device, Tensor, TensorData};
+use serde::{Deserialize, Serialize};
 
 /// Decay of the mean of gradients (Kingma & Ba 2015, algorithm 1).
 const BETA_1: f32 = 0.9;
@@ -16,7 +17,7 @@ const MAX_GRADIENT: f32 = 1e18;
 ///
 /// Adam is written out because one pass over the four arrays does what burn's optimizer does with eight tensor
 /// operations, and so that both backends take bit-identical steps from identical gradients.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameter {
     shape: [usize; 2],
     values: Vec<f32>,
@@ -51,6 +52,17 @@ impl Parameter {
     /// The array on a device.
     pub fn tensor(&self, device: &Device) -> Tensor<2> {
         Tensor::from_data(TensorData::new(self.values.clone(), self.shape), device)
+    }
+
+    /// Whether a parameter that was read from a file has as many numbers as it says.
+    pub fn is_whole(&self) -> bool {
+        let size = self.shape[0].checked_mul(self.shape[1]);
+        [&self.values, &self.mean, &self.mean_square].into_iter().all(|array| Some(array.len()) == size)
+    }
+
+    /// Multiplies every value, and leaves Adam's state alone: weight decay.
+    pub fn scale(&mut self, factor: f32) {
+        self.values.iter_mut().for_each(|value| *value *= factor);
     }
 
     /// One Adam step. Entries of the gradient that are not finite count as 0; returns how many there were.

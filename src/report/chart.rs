@@ -153,6 +153,25 @@ impl LineChart<'_> {
     }
 }
 
+/// What the classes of a chart mean outside the page.
+const STANDALONE_STYLE: &str = "text{font:11px system-ui,sans-serif;fill:#444}.title{font-size:13px;font-weight:600}\
+.grid{stroke:#ddd}.line{fill:none;stroke-width:1.8;stroke:#1668b8}.line.c1{stroke:#c2410c}.line.c2{stroke:#4d7c0f}";
+
+/// Charts one below the other as a file of their own, on white.
+pub fn standalone(charts: &[String]) -> String {
+    let height = HEIGHT * charts.len() as f64;
+    let mut svg = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {height}\" width=\"{WIDTH}\" \
+         height=\"{height}\">\n<style>{STANDALONE_STYLE}</style>\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n"
+    );
+    for (place, chart) in charts.iter().enumerate() {
+        let _ = writeln!(svg, "<g transform=\"translate(0 {})\">", HEIGHT * place as f64);
+        let sized = format!("<svg width=\"{WIDTH}\" height=\"{HEIGHT}\" ");
+        let _ = writeln!(svg, "{}\n</g>", chart.replacen("<svg ", &sized, 1));
+    }
+    svg + "</svg>\n"
+}
+
 /// Which point of a tick's label stands at `at`: its middle, or near the right border, which would clip it, its end.
 pub fn anchor(at: f64) -> &'static str {
     /// Half a label of seven digits.

@@ -37,6 +37,9 @@ pub fn warning(code: WarningCode) -> &'static str {
             "Most points lie far outside the image size that was given; with a wrong size the calibration is wrong."
         }
         WarningCode::CameraGroupsMerged => "Views of different cameras or sizes were treated as one camera.",
+        WarningCode::UnverifiedRanking => {
+            "Too few tracks hold together for geometry to verify them; their weights are the trained network's opinion."
+        }
         WarningCode::StoppedEarly => "Time ran out; this is the best that was found until then.",
     }
 }

@@ -11,14 +11,19 @@ use super::grow::Consensus;
 use super::judge::{self, Geometry, Judged};
 use super::recorder::Recorder;
 use crate::domain::result::{ObservationResults, TrackResults, ViewResult};
-use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning};
+use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::measurement::Sighting;
 use crate::geometry::{Camera, Point, triangulation};
 
 /// The solution of a scene in which nothing could be reconstructed; the reason is among `warnings`.
-pub fn unsolved(context: &Context, attempt: Option<&Attempt>, warnings: Vec<Warning>, recorder: Recorder) -> Solution {
+pub fn unsolved(
+    context: &Context,
+    attempt: Option<&Attempt>,
+    mut warnings: Vec<Warning>,
+    recorder: Recorder,
+) -> Solution {
     let (input, settings) = (context.input, context.settings);
     let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
     let (stages, history) = recorder.finish();
@@ -33,6 +38,15 @@ pub fn unsolved(context: &Context, attempt: Option<&Attempt>, warnings: Vec<Warn
         tracks.network_weight = network_weights(attempt, context);
         if let Some(decided) = &attempt.decided {
             own_verdicts(&attempt.block.tracks, decided, &mut tracks);
+        }
+        if let Some(opinion) = attempt.opinion.as_ref().filter(|opinion| opinion.ranks()) {
+            let probabilities = opinion.probabilities();
+            let likely = probabilities.iter().filter(|&&probability| probability > 0.5).count();
+            tracks.weight = context.scatter(&probabilities, &attempt.block.tracks);
+            let detail = format!(
+                "{likely} tracks look right to the trained network and geometry verifies none: the weights rank, no more"
+            );
+            warnings.push(Warning::new(WarningCode::UnverifiedRanking, detail));
         }
     }
     Solution {

@@ -4,6 +4,7 @@ use super::block::Block;
 use super::calibration::{self, Outcome};
 use super::direct::{self, Decided};
 use super::grow::{self, Consensus, LEAST_INLIERS};
+use super::learned::Opinion;
 use super::portfolio::{self, Evidence, Portfolio};
 use super::recorder::Recorder;
 use super::{Context, Error};
@@ -35,6 +36,8 @@ pub struct Attempt {
     pub evidence: Evidence,
     pub calibration: Option<Outcome>,
     pub winning_prior: Option<Prior>,
+    /// What the trained network says of the tracks that were searched; `None` where it was not asked.
+    pub opinion: Option<Opinion>,
     /// That the tracks left out agree on a motion of their own.
     pub second_structure: Option<Warning>,
     /// Probability of each track of the block to be right by image points and depths together; `None` where depths
@@ -85,6 +88,7 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
         evidence: Evidence::ImagePoints,
         calibration: None,
         winning_prior: None,
+        opinion: None,
         second_structure: None,
         weights_by_depths: None,
         decided: None,
@@ -126,6 +130,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         .map_err(|error| Error::Internal(error.to_string()))?;
     context.stopped()?;
     attempt.winning_prior = found.winning_prior;
+    attempt.opinion = found.opinion;
     attempt.prior_times = found.prior_times;
     attempt.network_weights = found.network_weights;
     let Some(consensus) = found.consensus else { return Ok(()) };

@@ -18,12 +18,14 @@ mod direct;
 mod extend;
 mod grow;
 mod judge;
+mod learned;
 mod portfolio;
 mod priors;
 mod recorder;
 mod search;
 mod second;
 mod sequence;
+pub mod study;
 #[cfg(test)]
 mod tests;
 mod views;

@@ -51,7 +51,7 @@ twins! {
     Stage = Stage { Prepare, Search, Refine, Calibrate, Extend, Judge }
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
-    Prior = Prior { Network, Irls, Consistency, Rigidity, Uniform }
+    Prior = Prior { Network, Irls, Consistency, Rigidity, Uniform, Learned }
     JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, Expired }
     AttemptEnd = AttemptEnd { Ended, GivenBack, Lost }
     WarningCode = WarningCode {
@@ -72,6 +72,7 @@ twins! {
         PointsOutsideImage,
         CameraGroupsMerged,
         StoppedEarly,
+        UnverifiedRanking,
     }
 }
 
@@ -109,6 +110,7 @@ mod tests {
             WarningCode::SecondStructure,
             WarningCode::StoppedEarly,
             WarningCode::CameraGroupsMerged,
+            WarningCode::UnverifiedRanking,
         ] {
             let wire = proto::WarningCode::try_from(code.to_wire()).expect("known");
             assert_eq!(wire.as_str_name(), format!("WARNING_CODE_{}", code.name()));

@@ -1,6 +1,7 @@
 //! The portfolio: priors propose, guided search verifies, the best consensus stands.
 //!
-//! What is cheap goes first: rigid distances where depths are given, reweighting, consistency. Then the network is
+//! What is cheap goes first: rigid distances where depths are given, the opinion of the network that was trained
+//! beforehand, reweighting, consistency. Then the paper's network is
 //! optimised a few iterations at a time; between, its ranking is verified by geometry, and so is uniform sampling, which
 //! needs no prior to be right. A decisive consensus ends the search; the network still gets its least number of
 //! iterations, so that its losses and weights are always seen. Each prior's own time is kept.
@@ -15,6 +16,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::grow::{self, Consensus};
+use super::learned::Opinion;
 use super::recorder::Recorder;
 use super::search::rigid::{self, Rigid};
 use super::search::{Sampler, Seed, Shortlist, affine, subspace};
@@ -52,6 +54,8 @@ pub struct Found {
     /// The rigid consensus behind it or beside it, where depths were given and one is not chance.
     pub rigid: Option<Rigid>,
     pub winning_prior: Option<Prior>,
+    /// What the trained network says of the block; `None` where it was not asked.
+    pub opinion: Option<Opinion>,
     /// The network's last weights, one a track of the block; empty without a network.
     pub network_weights: Vec<f64>,
     pub prior_times: Vec<PriorTime>,
@@ -77,6 +81,7 @@ pub struct Portfolio<'a> {
     accounts: Vec<Account>,
     best: Option<Best>,
     rigid: Option<Rigid>,
+    opinion: Option<Opinion>,
 }
 
 impl<'a> Portfolio<'a> {
@@ -99,6 +104,7 @@ impl<'a> Portfolio<'a> {
             accounts: Prior::ALL.into_iter().map(Account::new).collect(),
             best: None,
             rigid: None,
+            opinion: None,
         }
     }
 
@@ -129,15 +135,16 @@ impl<'a> Portfolio<'a> {
         for round in 0..rounds {
             self.set_noise(round);
             self.propose_rigid(round);
+            self.propose_learned(round);
             if round == 0 {
                 self.propose_geometric();
             }
             self.stand(recorder);
             if let Some(network) = &mut network {
                 self.optimise(network, recorder, scale_px, spread_weights)?;
-                self.propose(Prior::Network, &priors::from_network(network.weights()));
+                self.propose(Prior::Network, &priors::from_network(network.weights()), None);
             }
-            self.propose(Prior::Uniform, &vec![1.0; self.block.tracks()]);
+            self.propose(Prior::Uniform, &vec![1.0; self.block.tracks()], None);
             self.stand(recorder);
             recorder.tell(f64::from(round + 1) / f64::from(rounds));
             let seen_enough = network
@@ -227,6 +234,24 @@ impl<'a> Portfolio<'a> {
         }
     }
 
+    /// The trained network's opinion: grown as it stands at first, then searched from.
+    fn propose_learned(&mut self, round: u32) {
+        if !self.settings.method.uses_network() || !self.is_wanted(Prior::Learned) {
+            return;
+        }
+        if round == 0 {
+            let begun = Instant::now();
+            self.opinion = Opinion::of(self.block);
+            self.account(Prior::Learned).seconds += begun.elapsed().as_secs_f64();
+        }
+        let Some(opinion) = self.opinion.clone() else { return };
+        // The levels of the noise repeat, and so would what is grown from the same tracks.
+        if (round as usize) < NOISE_LADDER.len() && matches!(self.search, Search::Affine(_)) {
+            self.verify(Prior::Learned, affine::seed(self.block, opinion.start()).into_iter().collect());
+        }
+        self.propose(Prior::Learned, &opinion.probabilities(), Some(&opinion.truncations()));
+    }
+
     /// The priors that need no optimisation, once.
     fn propose_geometric(&mut self) {
         if self.is_wanted(Prior::Irls) {
@@ -246,7 +271,7 @@ impl<'a> Portfolio<'a> {
         self.account(Prior::Irls).seconds += begun.elapsed().as_secs_f64();
         if let Some(prior) = irls {
             self.propose_ranking(Prior::Irls, &prior);
-            self.propose(Prior::Irls, &prior);
+            self.propose(Prior::Irls, &prior, None);
         }
     }
 
@@ -257,11 +282,13 @@ impl<'a> Portfolio<'a> {
             Search::Subspace(search) => priors::consistency(&centred_rows(search.balanced()), 3),
         };
         self.account(Prior::Consistency).seconds += begun.elapsed().as_secs_f64();
-        self.propose(Prior::Consistency, &consistency);
+        self.propose(Prior::Consistency, &consistency, None);
     }
 
     /// Searches under a prior and grows what it found.
-    fn propose(&mut self, prior: Prior, weights: &[f64]) {
+    ///
+    /// * `truncations`: see [`affine::Search::run`]; of a search with depths nothing depends on them
+    fn propose(&mut self, prior: Prior, weights: &[f64], truncations: Option<&[f64]>) {
         if !self.is_wanted(prior) {
             return;
         }
@@ -273,9 +300,12 @@ impl<'a> Portfolio<'a> {
             Search::Affine(search) => {
                 let mut shortlist = Shortlist::new(SHORTLIST);
                 let drawn = samples(AFFINE_SAMPLES);
-                search.run(&sampler, drawn, &mut self.rng, &mut shortlist, self.stop);
+                let even = search.even_truncations();
+                let truncations = truncations.unwrap_or(&even);
+                search.run(&sampler, truncations, drawn, &mut self.rng, &mut shortlist, self.stop);
+                let seeds = shortlist.into_entries();
                 let seeds: Vec<Seed> =
-                    shortlist.into_entries().flat_map(|hypothesis| search.seeds(self.block, &hypothesis)).collect();
+                    seeds.flat_map(|hypothesis| search.seeds(self.block, &hypothesis, truncations)).collect();
                 (seeds, drawn)
             }
             Search::Subspace(search) => {
@@ -348,11 +378,11 @@ impl<'a> Portfolio<'a> {
     fn finish(self, network: Option<PriorNetwork>) -> Found {
         let with_network = network.is_some();
         let with_depths = self.block.has_depths();
-        let Self { best, accounts, rigid, .. } = self;
+        let Self { best, accounts, rigid, opinion, .. } = self;
         let accepted = best.filter(Best::is_acceptable);
         let prior_times = accounts
             .into_iter()
-            .filter(|account| with_network || account.prior != Prior::Network)
+            .filter(|account| with_network || !matches!(account.prior, Prior::Network | Prior::Learned))
             .filter(|account| with_depths || account.prior != Prior::Rigidity)
             .map(|account| account.time(accepted.as_ref()))
             .collect();
@@ -363,6 +393,7 @@ impl<'a> Portfolio<'a> {
             evidence,
             rigid,
             winning_prior,
+            opinion,
             network_weights: network.map_or_else(Vec::new, |network| network.weights().to_vec()),
             prior_times,
         }

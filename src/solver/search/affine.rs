@@ -45,10 +45,19 @@ impl Search {
         &self.centred
     }
 
+    /// What every hypothesis pays for a track that it leaves out, where no prior says anything else.
+    pub fn even_truncations(&self) -> Vec<f64> {
+        vec![1.0; self.centred.ncols()]
+    }
+
     /// Draws `samples` samples and offers them to the shortlist.
+    ///
+    /// * `truncations`: what a hypothesis pays for each track that it leaves out, in units of the cost of a residual of
+    ///   [`TOLERANCE`]; more for tracks that a prior believes in (the logarithm of the posterior, up to a constant)
     pub fn run(
         &self,
         sampler: &Sampler,
+        truncations: &[f64],
         samples: usize,
         rng: &mut ChaCha8Rng,
         shortlist: &mut Shortlist<Hypothesis>,
@@ -59,7 +68,7 @@ impl Search {
                 return;
             }
             let Some(hypothesis) = sampler.draw(rng).and_then(|sample| self.span(sample)) else { continue };
-            let cost = self.cost(&hypothesis, shortlist.bound());
+            let cost = self.cost(&hypothesis, truncations, shortlist.bound());
             shortlist.offer(cost, hypothesis);
         }
     }
@@ -88,16 +97,21 @@ impl Search {
     }
 
     /// Truncated cost over all tracks; gives up above `bound`.
-    fn cost(&self, hypothesis: &Hypothesis, bound: f64) -> f64 {
-        let truncation = TOLERANCE * TOLERANCE * self.centred.nrows() as f64;
+    fn cost(&self, hypothesis: &Hypothesis, truncations: &[f64], bound: f64) -> f64 {
+        let unit = self.unit();
         let mut cost = 0.0;
-        for track in 0..self.centred.ncols() {
-            cost += (self.squared(hypothesis, track) / truncation).min(1.0);
+        for (track, &truncation) in truncations.iter().enumerate() {
+            cost += (self.squared(hypothesis, track) / unit).min(truncation);
             if cost >= bound {
                 break;
             }
         }
         cost
+    }
+
+    /// Squared distance of a track that costs 1.
+    fn unit(&self) -> f64 {
+        TOLERANCE * TOLERANCE * self.centred.nrows() as f64
     }
 
     /// Squared distance of a track from the model.
@@ -118,9 +132,11 @@ impl Search {
     }
 
     /// Affine factorisations of the hypothesis's best-ranked tracks.
-    pub fn seeds(&self, block: &CompleteBlock, hypothesis: &Hypothesis) -> Vec<Seed> {
-        let squared: Vec<f64> = (0..block.tracks()).map(|track| self.squared(hypothesis, track)).collect();
-        seeds_from_ranking(block, &squared)
+    pub fn seeds(&self, block: &CompleteBlock, hypothesis: &Hypothesis, truncations: &[f64]) -> Vec<Seed> {
+        let unit = self.unit();
+        let gain = |(track, truncation): (usize, &f64)| self.squared(hypothesis, track) / unit - truncation;
+        let costs: Vec<f64> = truncations.iter().enumerate().map(gain).collect();
+        seeds_from_ranking(block, &costs)
     }
 }
 
@@ -131,13 +147,15 @@ pub fn seeds_from_ranking(block: &CompleteBlock, costs: &[f64]) -> Vec<Seed> {
     SUPPORT_SIZES
         .iter()
         .filter(|&&size| size <= ranked.len())
-        .filter_map(|&size| {
-            let mut support = ranked[..size].to_vec();
-            support.sort_unstable();
-            let (cameras, points) = factorization::affine(block, &support)?;
-            Some(Seed { cameras, points, support })
-        })
+        .filter_map(|&size| seed(block, ranked[..size].to_vec()))
         .collect()
+}
+
+/// The affine factorisation of some tracks.
+pub fn seed(block: &CompleteBlock, mut support: Vec<usize>) -> Option<Seed> {
+    support.sort_unstable();
+    let (cameras, points) = factorization::affine(block, &support)?;
+    Some(Seed { cameras, points, support })
 }
 
 fn dot(a: &[f64], b: &[f64]) -> f64 {

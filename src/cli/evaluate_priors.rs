@@ -1,0 +1,87 @@
+//! `scpsfm evaluate --priors`: what the search starts from, compared.
+
+use std::path::Path;
+
+use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::json;
+
+use super::exit::{Exit, Failure};
+use super::interrupt::Interrupt;
+use super::print;
+use crate::domain::StopToken;
+use crate::evaluation::priors::{Plan, scenes, table};
+use crate::formats::result_files::{create_directory, pretty, write_atomically};
+use crate::network::subspace;
+
+/// The comparison of priors instead of the sweeps.
+#[derive(Debug, Clone, clap::Args)]
+#[command(next_help_heading = "Priors")]
+pub struct PriorArgs {
+    /// Compare priors instead: each alone (ranking, searches of 600, 6,000 and 60,000 samples), and AUTO with and
+    /// without the trained network; scenes without depths, of training's kinds and of others. Writes priors.json
+    #[arg(long, conflicts_with_all = ["real", "quick", "sweeps", "beyond", "ablation", "depths", "methods",
+        "paper_width"])]
+    pub priors: bool,
+
+    /// AUTO alone, without the searches of each prior
+    #[arg(long, requires = "priors")]
+    pub auto_only: bool,
+
+    /// Scenes whose name holds this text [default: all]
+    #[arg(long, value_name = "TEXT", requires = "priors")]
+    pub scenes: Option<String>,
+}
+
+/// Runs the command.
+pub async fn run(
+    args: &PriorArgs,
+    out: &Path,
+    seeds: u64,
+    threads: usize,
+    json: bool,
+    quiet: bool,
+) -> Result<Exit, Failure> {
+    let mut conditions = scenes::all();
+    if let Some(text) = &args.scenes {
+        let names: Vec<&str> = conditions.iter().map(|condition| condition.name).collect();
+        let unknown = format!("--scenes {text}: no scenes have it in their name; there are {}", names.join("; "));
+        conditions.retain(|condition| condition.name.contains(text.as_str()));
+        if conditions.is_empty() {
+            return Err(Failure::usage(unknown));
+        }
+    }
+    let plan = Plan { conditions, seeds, each_prior: !args.auto_only };
+    create_directory(out)?;
+    let bar = progress_bar(quiet, plan.size());
+    let stop = StopToken::default();
+    let interrupt = Interrupt::listen()?;
+    let relay = interrupt.stops(&stop);
+    let outcome = tokio::task::block_in_place(|| plan.run(threads, &stop, &mut || bar.inc(1)));
+    relay.abort();
+    bar.finish_and_clear();
+    let rows = outcome.map_err(Failure::internal)?;
+    let network = subspace::current();
+    let text = pretty(&json!({
+        "version": env!("CARGO_PKG_VERSION"),
+        "seeds": seeds,
+        "network": { "origin": network.origin, "sha256": network.checksum() },
+        "rows": rows,
+    }))?;
+    write_atomically(out, "priors.json", text.as_bytes())?;
+    print(if json { text.trim_end().to_owned() } else { table::text(&rows) }.trim_end())?;
+    if stop.is_stopped() {
+        return Err(Failure::interrupted_with("interrupted; the rows are of the scenes so far"));
+    }
+    Ok(Exit::Done)
+}
+
+fn progress_bar(quiet: bool, total: usize) -> ProgressBar {
+    if quiet {
+        return ProgressBar::hidden();
+    }
+    let bar = ProgressBar::new(total as u64);
+    if let Ok(style) = ProgressStyle::with_template("[{bar:24}] {pos}/{len} scenes, {eta} left") {
+        bar.set_style(style.progress_chars("=> "));
+    }
+    bar
+}

@@ -1,0 +1,204 @@
+//! `scpsfm train-prior`: trains the network whose opinion the search starts from.
+
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::exit::{Exit, Failure};
+use super::interrupt::Interrupt;
+use crate::formats::result_files::{create_directory, write_atomically};
+use crate::network::subspace::Shape;
+use crate::report::chart::{LineChart, Series, standalone};
+use crate::training::{Milestone, Settings, Trainer};
+
+/// Steps of the shipped network.
+const STEPS: u64 = 7_000;
+/// Seconds between two writings of the state: what a power cut costs at most.
+const SECONDS_PER_STATE: f64 = 60.0;
+
+const EXAMPLES: &str = "\
+Examples:
+  scpsfm train-prior --out my.prior --seed 1
+  scpsfm train-prior --out trial.prior --steps 1000   # a seventh of it, for a look
+  scpsfm solve observations.csv --width 1000 --height 1000 --prior my.prior --out answer
+
+Files beside FILE: FILE.svg, the curves of losses and of average precision on scenes that training never sees; and \
+until it ends FILE.state, from which a training that was stopped (Ctrl-C, a power cut) goes on when called again with \
+the same arguments.";
+
+/// Train the network that ranks tracks before the search
+///
+/// A small set network learns to tell right tracks from wrong ones on scenes that are drawn on the fly: all motions,
+/// shapes, kinds of noise and of outliers that the program can make. Everything is counted in steps: one seed gives one
+/// file on one machine, whatever else runs on it and however often the training is interrupted. The program carries the
+/// network that its own defaults give.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct Args {
+    /// File for the network; replaced
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+
+    /// Seed of the first weights and of all scenes
+    #[arg(long, value_name = "SEED", default_value_t = 0)]
+    pub seed: u64,
+
+    /// Steps, each on two batches of 2 to 24 scenes; the learning rate falls with the share that is done
+    #[arg(long, value_name = "N", default_value_t = STEPS, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    pub steps: u64,
+
+    /// Show no progress
+    #[arg(long, short)]
+    pub quiet: bool,
+}
+
+/// Runs the command.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let interrupt = Interrupt::listen()?;
+    let stopped = interrupt.token();
+    let work = tokio::task::spawn_blocking(move || train(&args, &|| stopped.is_cancelled()));
+    work.await.map_err(|error| Failure::internal(format_args!("the training failed: {error}")))?
+}
+
+/// Where a training's files are.
+struct Files {
+    directory: PathBuf,
+    name: String,
+}
+
+impl Files {
+    fn new(out: &Path) -> Result<Self, Failure> {
+        let name = out.file_name().and_then(|name| name.to_str());
+        let name = name.ok_or_else(|| Failure::usage(format_args!("--out {}: not a file's name", out.display())))?;
+        if out.is_dir() {
+            return Err(Failure::usage(format_args!("--out {}: a directory, give a file", out.display())));
+        }
+        let directory = match out.parent() {
+            Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
+            _ => PathBuf::from("."),
+        };
+        create_directory(&directory)?;
+        Ok(Self { directory, name: name.to_owned() })
+    }
+
+    fn state_name(&self) -> String {
+        format!("{}.state", self.name)
+    }
+
+    fn state(&self) -> PathBuf {
+        self.directory.join(self.state_name())
+    }
+}
+
+fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
+    let files = Files::new(&args.out)?;
+    let settings = Settings { seed: args.seed, steps: args.steps, shape: Shape::default() };
+    let mut trainer = take_up(&files, settings)?;
+    let view = View::new(args, trainer.step());
+    let mut written = Instant::now();
+    while !trainer.is_finished() {
+        let milestone = trainer.advance().map_err(Failure::internal)?;
+        view.step(trainer.step());
+        if let Some(milestone) = milestone {
+            view.milestone(&milestone);
+            write_curves(&files, trainer.milestones())?;
+        }
+        let stopped = is_stopped() && !trainer.is_finished();
+        if stopped || written.elapsed().as_secs_f64() > SECONDS_PER_STATE {
+            let state = trainer.state().map_err(Failure::internal)?;
+            write_atomically(&files.directory, &files.state_name(), &state)?;
+            written = Instant::now();
+        }
+        if stopped {
+            view.note(&format!("stopped after step {}; the same command goes on from there", trainer.step()));
+            return Ok(Exit::Interrupted);
+        }
+    }
+    let command = format!("scpsfm train-prior --seed {} --steps {} --out FILE", args.seed, args.steps);
+    let file = trainer.file(command);
+    write_atomically(&files.directory, &files.name, &file.bytes())?;
+    write_curves(&files, trainer.milestones())?;
+    if let Err(error) = fs::remove_file(files.state())
+        && error.kind() != ErrorKind::NotFound
+    {
+        return Err(Failure::internal(format_args!("cannot remove {}: {error}", files.state().display())));
+    }
+    view.note(&format!("{}: sha256 of the numbers {}", args.out.display(), file.checksum()));
+    Ok(Exit::Done)
+}
+
+/// A new training, or the one that was stopped.
+fn take_up(files: &Files, settings: Settings) -> Result<Trainer, Failure> {
+    let path = files.state();
+    match fs::read(&path) {
+        Ok(state) => Trainer::resume(&state, settings)
+            .map_err(|error| Failure::bad_input(format_args!("{}: {error}; remove it to start anew", path.display()))),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(Trainer::new(settings)),
+        Err(error) => Err(Failure::internal(format_args!("cannot read {}: {error}", path.display()))),
+    }
+}
+
+fn write_curves(files: &Files, milestones: &[Milestone]) -> Result<(), Failure> {
+    let curve = |name, value: fn(&Milestone) -> f64| Series {
+        name,
+        points: milestones.iter().map(|milestone| (milestone.step as f64, value(milestone))).collect(),
+    };
+    let chart = |title, series| {
+        LineChart { title, x_label: "step", series, logarithmic: false, clip: None, marks: Vec::new() }.svg()
+    };
+    let losses = vec![
+        curve("tracks", |milestone| milestone.track_loss),
+        curve("observ.", |milestone| milestone.observation_loss),
+    ];
+    let charts = [
+        chart("Cross-entropy in training", losses),
+        chart("Average precision on unseen scenes", vec![curve("", |milestone| milestone.precision)]),
+    ];
+    write_atomically(&files.directory, &format!("{}.svg", files.name), standalone(&charts).as_bytes())?;
+    Ok(())
+}
+
+/// Progress on stderr: a bar on a terminal, a line a milestone elsewhere.
+struct View {
+    quiet: bool,
+    bar: ProgressBar,
+}
+
+impl View {
+    fn new(args: &Args, step: u64) -> Self {
+        let bar = if args.quiet { ProgressBar::hidden() } else { ProgressBar::new(args.steps) };
+        if let Ok(style) = ProgressStyle::with_template("[{bar:24}] {pos}/{len} steps, {eta} left {wide_msg}") {
+            bar.set_style(style.progress_chars("=> "));
+        }
+        bar.set_position(step);
+        bar.reset_eta();
+        let view = Self { quiet: args.quiet, bar };
+        if step > 0 {
+            view.note(&format!("going on after step {step}"));
+        }
+        view
+    }
+
+    fn step(&self, step: u64) {
+        self.bar.set_position(step);
+    }
+
+    fn milestone(&self, milestone: &Milestone) {
+        let Milestone { step, lessons, loss, track_loss, observation_loss, precision } = milestone;
+        let line = format!(
+            "step {step}, {lessons} scenes: loss {loss:.4} (tracks {track_loss:.4}, observations \
+             {observation_loss:.4}), average precision {precision:.4}"
+        );
+        self.bar.set_message(format!("AP {precision:.4}"));
+        self.note(&line);
+    }
+
+    fn note(&self, line: &str) {
+        if !self.quiet {
+            self.bar.suspend(|| eprintln!("{line}"));
+        }
+    }
+}

@@ -1,0 +1,88 @@
+//! What the trained network says of a block, in the forms that the search takes.
+//!
+//! The network knows thousands of scenes and nothing of this one but its image points; it is believed only in what
+//! geometry then verifies. Constants without another reason come from the sweep that
+//! `the_sweep_of_the_learned_prior` prints (an ignored test of the solver's).
+
+use crate::geometry::measurement::CompleteBlock;
+use crate::network::subspace::{self, Cloud, MOST_VIEWS};
+
+/// Logit that stands for even odds. Training counts the few right tracks of a scene more than the many wrong ones, by
+/// the square root of the odds against them: at 95 % outliers that adds 1.5 to every logit.
+const EVEN_LOGIT: f64 = 1.5;
+/// Cost by which one nat of the odds widens the truncation of a track's cost in the affine search, in units of the
+/// truncated cost of a track at even odds.
+const COST_PER_NAT: f64 = 0.15;
+/// Nats that count at most, either way: beyond, the network's confidence was not earned on scenes like this one.
+const MOST_NATS: f64 = 5.0;
+/// Logit above which a track belongs to the set that growing is started from, and the bounds of that set's size: what
+/// determines the cameras, and what a first adjustment can carry.
+const START_LOGIT: f64 = 1.0;
+const START_SIZES: (usize, usize) = (8, 60);
+/// Tracks that must be likely right before a ranking without verification is worth telling: entirely wrong input has up
+/// to three by chance.
+const LEAST_LIKELY: usize = 4;
+
+/// The network's opinion of the tracks of one block.
+#[derive(Debug, Clone)]
+pub struct Opinion {
+    /// Natural logarithms of the odds that a track is right.
+    ln_odds: Vec<f64>,
+}
+
+impl Opinion {
+    /// Asks the network; `None` where there are more views than it is asked about.
+    pub fn of(block: &CompleteBlock) -> Option<Self> {
+        let (views, tracks) = (block.views(), block.tracks());
+        if views > MOST_VIEWS {
+            return None;
+        }
+        let point = |view: usize| (0..tracks).map(move |track| block.point(view, track).into());
+        let points: Vec<[f64; 2]> = (0..views).flat_map(point).collect();
+        let cloud = Cloud::new(views, tracks, &points, &vec![true; points.len()]);
+        let scores = subspace::current().network.forward(&cloud);
+        Some(Self { ln_odds: scores.tracks.iter().map(|&logit| f64::from(logit) - EVEN_LOGIT).collect() })
+    }
+
+    /// Probability of every track to be right.
+    pub fn probabilities(&self) -> Vec<f64> {
+        self.ln_odds.iter().map(|odds| 1.0 / (1.0 + (-odds).exp())).collect()
+    }
+
+    /// What it costs a hypothesis of the affine search to leave a track out, 1 at even odds.
+    pub fn truncations(&self) -> Vec<f64> {
+        self.ln_odds.iter().map(|odds| 1.0 + COST_PER_NAT * odds.clamp(-MOST_NATS, MOST_NATS)).collect()
+    }
+
+    /// The tracks to grow from without any search, most likely first.
+    pub fn start(&self) -> Vec<usize> {
+        let mut ranked: Vec<usize> = (0..self.ln_odds.len()).collect();
+        ranked.sort_by(|&a, &b| self.ln_odds[b].total_cmp(&self.ln_odds[a]).then(a.cmp(&b)));
+        let likely = ranked.iter().filter(|&&track| self.ln_odds[track] + EVEN_LOGIT > START_LOGIT).count();
+        ranked.truncate(likely.clamp(START_SIZES.0, START_SIZES.1));
+        ranked
+    }
+
+    /// Whether enough tracks are likely right for their ranking to be told where geometry verifies none.
+    pub fn ranks(&self) -> bool {
+        self.ln_odds.iter().filter(|odds| **odds > 0.0).count() >= LEAST_LIKELY
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_opinion_is_told_in_every_form() {
+        let opinion = Opinion { ln_odds: vec![-20.0, 0.0, 20.0, 1.0] };
+        let probabilities = opinion.probabilities();
+        assert!(probabilities[0] < 1e-8 && probabilities[1] == 0.5 && probabilities[2] > 1.0 - 1e-8);
+        let truncations = opinion.truncations();
+        assert!((truncations[0] - 0.25).abs() < 1e-12 && truncations[1] == 1.0, "{truncations:?}");
+        assert!((truncations[2] - 1.75).abs() < 1e-12 && truncations.iter().all(|cost| *cost > 0.0));
+        assert_eq!(opinion.start(), [2, 3, 1, 0], "no more than there are");
+        assert!(!opinion.ranks());
+        assert!(Opinion { ln_odds: vec![0.1; LEAST_LIKELY] }.ranks());
+    }
+}

@@ -1,0 +1,99 @@
+//! One prior alone: how well it ranks, and what a search of a given length finds under it. For `scpsfm evaluate
+//! --priors`; a solve does not come through here.
+
+use std::time::Instant;
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::grow::{self, Consensus};
+use super::learned::Opinion;
+use super::portfolio::{LN_DECISIVE, spread};
+use super::search::{Sampler, Shortlist, affine};
+use super::{block, priors};
+use crate::domain::{Input, Prior, StopToken};
+use crate::geometry::measurement::CompleteBlock;
+
+/// Hypotheses of a search that are grown: enough that the ranking of hypotheses is not what is measured.
+const SHORTLIST: usize = 6;
+/// Noise that growing starts from, normalised units: a solve's own without a hint.
+const NOISE: f64 = 0.005;
+
+/// A scene made ready for every prior.
+pub struct Study {
+    block: CompleteBlock,
+    search: affine::Search,
+    stop: StopToken,
+}
+
+/// What a prior says of every track, larger where it is more likely right.
+pub struct Ranking {
+    pub prior: Prior,
+    pub weights: Vec<f64>,
+    pub seconds: f64,
+    opinion: Option<Opinion>,
+}
+
+/// What a search under a prior found.
+pub struct Found {
+    /// One entry a track.
+    pub inlier: Vec<bool>,
+    /// Of ranking, searching and growing.
+    pub seconds: f64,
+}
+
+impl Study {
+    /// The input's tracks that are complete over all its views, their depths left aside.
+    pub fn new(input: &Input) -> Self {
+        let ranges = block::track_ranges(input);
+        let (normalization, _) = block::normalization(input);
+        let views: Vec<usize> = (0..input.view_count()).collect();
+        let block = block::extract(input, &ranges, &normalization, &views).complete;
+        Self { search: affine::Search::new(&block), block, stop: StopToken::default() }
+    }
+
+    /// Asks a prior; `None` for one that does not rank image points by themselves.
+    pub fn rank(&self, prior: Prior) -> Option<Ranking> {
+        let begun = Instant::now();
+        let mut opinion = None;
+        let weights = match prior {
+            Prior::Uniform => vec![1.0; self.block.tracks()],
+            Prior::Irls => priors::affine_irls(self.search.centred(), &self.stop)?,
+            Prior::Consistency => priors::consistency(self.search.centred(), 2),
+            Prior::Learned => opinion.insert(Opinion::of(&self.block)?).probabilities(),
+            Prior::Network | Prior::Rigidity => return None,
+        };
+        Some(Ranking { prior, weights, seconds: begun.elapsed().as_secs_f64(), opinion })
+    }
+
+    /// Searches under a prior with so many samples, and grows the best hypotheses.
+    pub fn search(&self, ranking: &Ranking, samples: usize, seed: u64) -> Found {
+        let begun = Instant::now();
+        let mut best: Option<(f64, Consensus)> = None;
+        let (truncations, mut seeds) = match &ranking.opinion {
+            Some(opinion) => (opinion.truncations(), affine::seed(&self.block, opinion.start()).into_iter().collect()),
+            None => (self.search.even_truncations(), Vec::new()),
+        };
+        let mut shortlist = Shortlist::new(SHORTLIST);
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let sampler = Sampler::new(&ranking.weights);
+        self.search.run(&sampler, &truncations, samples, &mut rng, &mut shortlist, &self.stop);
+        let spread = spread(&self.block);
+        for hypothesis in shortlist.into_entries() {
+            seeds.extend(self.search.seeds(&self.block, &hypothesis, &truncations));
+        }
+        for seed in seeds {
+            let grown = grow::grow(&self.block, seed.cameras, seed.points, seed.support, NOISE, &self.stop);
+            let Some(consensus) = grown else { continue };
+            let certainty = consensus.ln_false_alarms(spread);
+            if best.as_ref().is_none_or(|(least, _)| certainty < *least) {
+                best = Some((certainty, consensus));
+            }
+            if best.as_ref().is_some_and(|(least, _)| *least < LN_DECISIVE) {
+                break;
+            }
+        }
+        let inlier = best.map_or_else(|| vec![false; self.block.tracks()], |(_, consensus)| consensus.inlier);
+        Found { inlier, seconds: ranking.seconds + begun.elapsed().as_secs_f64() }
+    }
+}

@@ -1,0 +1,94 @@
+//! Lessons as tensors, and the derivatives of their loss.
+
+use burn::tensor::{DType, Device, Tensor, TensorData};
+
+use super::Error;
+use super::loss::{self, Labels, loss};
+use super::tape::{Batch, constant};
+use crate::network::Parameter;
+use crate::network::subspace::{Cloud, SubspaceNet};
+use crate::synthetic::curriculum::Lesson;
+
+/// The losses of some lessons, each a mean over them.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Losses {
+    /// What is minimised.
+    pub total: f64,
+    /// Of the tracks, by the last block.
+    pub tracks: f64,
+    pub observations: f64,
+}
+
+/// The losses at one point and their derivatives.
+pub struct Slope {
+    pub losses: Losses,
+    pub gradient: SubspaceNet<Vec<f32>>,
+}
+
+/// Losses and derivatives of a network on lessons of one size.
+///
+/// # Errors
+/// [`Error::Backend`] for a defect of burn.
+pub fn differentiate(network: &SubspaceNet<Parameter>, lessons: &[Lesson]) -> Result<Slope, Error> {
+    let device = Device::flex().autodiff();
+    let leaves = network.map(|parameter| parameter.tensor(&device).require_grad());
+    let (batch, labels) = tensors(lessons, DType::F32, &device);
+    let loss = loss(leaves.on_tape(&batch, DType::F32)?, &labels);
+    let losses = Losses {
+        total: number(&loss.total)?,
+        tracks: number(&loss.last_block)?,
+        observations: number(&loss.observations)?,
+    };
+    let mut reached = loss.total.backward();
+    let mut failed = None;
+    let gradient = leaves.map(|leaf| {
+        let [rows, columns] = leaf.dims();
+        match leaf.grad_remove(&mut reached).map(|gradient| gradient.into_data().try_into_vec()) {
+            Some(Ok(gradient)) => gradient,
+            // The last block's depths reach nothing.
+            None => vec![0.0; rows * columns],
+            Some(Err(error)) => {
+                failed = Some(Error::Backend(format!("{error:?}")));
+                Vec::new()
+            }
+        }
+    });
+    failed.map_or(Ok(Slope { losses, gradient }), Err)
+}
+
+/// What the network sees of lessons of one size, and what it should say.
+pub fn tensors(lessons: &[Lesson], dtype: DType, device: &Device) -> (Batch, Labels) {
+    let (views, tracks) = lessons.first().map_or((0, 0), |lesson| (lesson.views, lesson.tracks));
+    let count = lessons.len();
+    let (mut places, mut visible) = (Vec::new(), Vec::new());
+    let (mut inlier, mut of_tracks, mut right, mut of_observations) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let label = |right: &bool| f64::from(u8::from(*right));
+    for lesson in lessons {
+        let cloud = Cloud::new(views, tracks, &lesson.points, &lesson.visible);
+        places.extend(cloud.places().iter().map(|&place| f64::from(place)));
+        visible.extend(cloud.visible().iter().map(|&seen| f64::from(seen)));
+        inlier.extend(lesson.inlier.iter().map(label));
+        right.extend(lesson.right.iter().map(label));
+        let weights = loss::weights(&lesson.inlier, &vec![true; tracks]);
+        let total: f64 = weights.iter().sum();
+        of_tracks.extend(weights.into_iter().map(|weight| weight / (total * count as f64)));
+        of_observations.extend(loss::weights(&lesson.right, &lesson.visible));
+    }
+    let total: f64 = of_observations.iter().sum();
+    of_observations.iter_mut().for_each(|weight| *weight /= total);
+    let by_view = |values, features| constant(values, [count, views, features, tracks], dtype, device);
+    let labels = Labels {
+        tracks: constant(inlier, [count, 1, tracks], dtype, device),
+        track_weights: constant(of_tracks, [count, 1, tracks], dtype, device),
+        observations: by_view(right, 1),
+        observation_weights: by_view(of_observations, 1),
+    };
+    (Batch { places: by_view(places, 2), visible: by_view(visible, 1) }, labels)
+}
+
+/// The value of a loss.
+fn number(loss: &Tensor<1>) -> Result<f64, Error> {
+    let data: TensorData = loss.clone().inner().into_data().convert::<f64>();
+    let values: Vec<f64> = data.try_into_vec().map_err(|error| Error::Backend(format!("{error:?}")))?;
+    values.first().copied().ok_or_else(|| Error::Backend("a loss without a value".into()))
+}

@@ -1,0 +1,112 @@
+use burn::tensor::{DType, Device, Tensor};
+
+use super::lesson::{differentiate, tensors};
+use super::loss::loss;
+use super::tape::constant;
+use super::*;
+use crate::network::Parameter;
+use crate::network::subspace::{Cloud, Shape, SubspaceNet};
+use crate::synthetic::curriculum::{self, Lesson};
+
+const SMALL: Shape = Shape { state: 6, selections: 3, blocks: 3, encoding: 5 };
+
+/// Some lessons with holes.
+fn lessons(seed: u64) -> Vec<Lesson> {
+    let mut numbers = 0..;
+    let holed = |lessons: &Vec<Lesson>| lessons.iter().all(|lesson| lesson.visible.iter().any(|seen| !seen));
+    let mut lessons = numbers.find_map(|number| Some(curriculum::batch(seed, number)).filter(holed)).expect("holes");
+    lessons.truncate(2);
+    lessons
+}
+
+#[test]
+fn the_tape_says_what_the_network_says() {
+    let seed = 3;
+    let network = initial::initial(SMALL, seed);
+    let device = Device::flex().autodiff();
+    for lesson in lessons(seed) {
+        let (batch, _) = tensors(std::slice::from_ref(&lesson), DType::F32, &device);
+        let output = network.map(|parameter| parameter.tensor(&device)).on_tape(&batch, DType::F32).expect("a pass");
+        let cloud = Cloud::new(lesson.views, lesson.tracks, &lesson.points, &lesson.visible);
+        let scores = network.map(|parameter| parameter.values().to_vec()).forward(&cloud);
+        let last = output.tracks.last().expect("blocks").clone();
+        assert_near(&scores.tracks, &values(last.inner()));
+        assert_near(&scores.observations, &values(output.observations.inner()));
+    }
+}
+
+fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor.into_data().try_into_vec().expect("f32")
+}
+
+fn assert_near(found: &[f32], expected: &[f32]) {
+    assert_eq!(found.len(), expected.len());
+    let worst = found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(worst < 1e-3, "apart by {worst}");
+}
+
+/// The loss in f64 at a network moved along a direction.
+fn loss_at(
+    network: &SubspaceNet<Parameter>,
+    direction: &SubspaceNet<Vec<f64>>,
+    length: f64,
+    lessons: &[Lesson],
+) -> f64 {
+    let device = Device::flex();
+    let mut directions = direction.arrays().into_iter();
+    let moved = network.map(|parameter| {
+        let moves = directions.next().expect("as many arrays");
+        let moved = parameter.values().iter().zip(moves).map(|(value, slope)| f64::from(*value) + length * slope);
+        constant::<2>(moved.collect(), parameter.shape(), DType::F64, &device)
+    });
+    let (batch, labels) = tensors(lessons, DType::F64, &device);
+    let total = loss(moved.on_tape(&batch, DType::F64).expect("a pass"), &labels).total;
+    total.into_data().try_into_vec::<f64>().expect("f64")[0]
+}
+
+/// Central differences of the loss in f64, one direction for every kind of array, against the derivatives in f32.
+#[test]
+fn derivatives_agree_with_finite_differences() {
+    use rand::{Rng, SeedableRng};
+    const LENGTH: f64 = 1e-5;
+    let seed = 5;
+    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let network = initial::initial(SMALL, seed);
+    let lessons = lessons(seed);
+    let gradient = differentiate(&network, &lessons).expect("a gradient").gradient;
+    let count = network.arrays().len();
+    let largest = gradient.arrays().into_iter().flatten().map(|slope| slope.abs()).fold(0.0, f32::max);
+    for chosen in 0..count {
+        let mut place = 0;
+        let direction = network.map(|parameter| {
+            let of_chosen = f64::from(u8::from(place == chosen));
+            place += 1;
+            parameter.values().iter().map(|_| of_chosen * (2.0 * rng.random::<f64>() - 1.0)).collect::<Vec<f64>>()
+        });
+        let expected = (loss_at(&network, &direction, LENGTH, &lessons)
+            - loss_at(&network, &direction, -LENGTH, &lessons))
+            / (2.0 * LENGTH);
+        let (slopes, moves) = (gradient.arrays()[chosen], direction.arrays()[chosen]);
+        let found: f64 = slopes.iter().zip(moves).map(|(slope, length)| f64::from(*slope) * length).sum();
+        let tolerance = 0.01 * expected.abs() + 1e-3 * f64::from(largest);
+        assert!((found - expected).abs() < tolerance, "array {chosen} of {count}: {found} for {expected}, seed {seed}");
+    }
+}
+
+#[test]
+fn a_training_put_aside_goes_on_as_if_it_had_not_been() {
+    let settings = Settings { seed: 11, steps: 4, shape: SMALL };
+    let mut whole = Trainer::new(settings);
+    let mut parted = Trainer::new(settings);
+    while !whole.is_finished() {
+        whole.advance().expect("a step");
+        parted.advance().expect("a step");
+        parted = Trainer::resume(&parted.state().expect("a state"), settings).expect("its own state");
+    }
+    assert_eq!(whole, parted);
+    assert_eq!(whole.milestones().len(), 1);
+    let other = Settings { seed: 12, ..settings };
+    let error = Trainer::resume(&whole.state().expect("a state"), other).expect_err("another training");
+    assert_eq!(error.to_string(), "it belongs to a training with --seed 11 --steps 4");
+    assert!(Trainer::resume(b"no state", settings).is_err());
+}
