@@ -91,6 +91,14 @@ fn engine_options(config: &Config) -> engine::Options {
             max_tenant_jobs: bound_or_none(config.engine.tenant_queue_capacity),
             max_tenant_bytes: bound_or_none(config.engine.tenant_queue_bytes),
         },
+        uploads: engine::UploadOptions {
+            max_bytes: config.upload.max_bytes,
+            bounds: engine::UploadBounds {
+                max_tenant_uploads: config.upload.tenant_uploads,
+                max_tenant_bytes: config.upload.tenant_bytes,
+            },
+            abandoned_after: config.upload.abandoned_after.0,
+        },
         lease: Duration::from_secs(config.engine.lease_seconds),
         max_attempts: config.engine.max_attempts,
         retention: config.store.retention.0,
@@ -119,7 +127,8 @@ mod tests {
     fn a_configuration_of_defaults_is_the_default_of_engine_and_server() {
         let config = Config::default();
         let of = |options: engine::Options| {
-            (options.workers, options.queue, options.lease, options.max_attempts, options.retention, options.backend)
+            let queue = (options.queue, options.uploads);
+            (options.workers, queue, options.lease, options.max_attempts, options.retention, options.backend)
         };
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));
         let of = |options: server::Options| {

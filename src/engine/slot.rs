@@ -79,6 +79,7 @@ impl Inner {
                 Err(error) => tracing::warn!(%error, "cannot remove old jobs"),
             }
         }
+        self.tidy_uploads().await;
         if let Err(error) = self.store.reclaim().await {
             tracing::warn!(%error, "cannot give back the space of removed jobs");
         }

@@ -12,6 +12,7 @@ pub mod inputs;
 pub mod jobs;
 pub mod keys;
 pub mod meter;
+mod parts;
 pub mod proto;
 pub mod reload;
 pub mod server;

@@ -16,7 +16,7 @@ use tower::layer::util::{Identity, Stack};
 use super::auth::Authenticate;
 use super::calibration::Calibration;
 use super::explain::Explain;
-use super::inputs::Inputs;
+use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
 use super::meter::Meter;
@@ -233,6 +233,7 @@ fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Resu
     let limits = options.limits.clone();
     let max_bytes = options.max_message_bytes;
     let calibration = Calibration::new(engine.clone(), limits.clone(), max_bytes, options.solve_grace);
+    let inputs = Inputs::new(engine.clone(), limits.clone());
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
@@ -253,7 +254,10 @@ fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Resu
         .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
         .add_service(with_limits!(CalibrationServiceServer::new(calibration)))
         .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits))))
-        .add_service(with_limits!(InputServiceServer::new(Inputs)));
+        .add_service(
+            with_limits!(InputServiceServer::new(inputs))
+                .max_decoding_message_size(max_bytes.min(inputs::MAX_MESSAGE_BYTES)),
+        );
     if !options.reflection {
         return Ok(router);
     }

@@ -39,9 +39,11 @@ fn scene(directory: &Path) -> PathBuf {
 
 #[test]
 fn every_command_explains_itself() {
-    let commands =
-        ["demo", "serve", "solve", "submit", "watch", "get", "list", "cancel", "delete", "result", "synth", "evaluate"]
-            .map(Some);
+    let commands = [
+        "demo", "serve", "solve", "upload", "submit", "watch", "get", "list", "cancel", "delete", "result", "synth",
+        "evaluate",
+    ]
+    .map(Some);
     for command in commands.into_iter().chain([None]) {
         let run = run(command.into_iter().chain(["--help"]));
         assert_eq!(run.code, Some(0), "{run:?}");

@@ -14,3 +14,4 @@ mod replicas;
 mod sequence;
 mod support;
 mod telemetry;
+mod upload;
