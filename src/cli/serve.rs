@@ -189,6 +189,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         Failure::internal(format_args!("cannot listen on {} (metrics): {error}", config.metrics.listen))
     })?;
     let mut service = Service::start(&config).await?;
+    follow_store(&ready, service.store_reachable());
     ready.set(true);
     let scheme = if config.tls.files().is_some() { "https" } else { "http" };
     print(&format!("grpc {scheme}://{}", service.address()))?;
@@ -209,6 +210,19 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     tracing::info!(finished = drained.finished, given_back = drained.given_back, "drained");
     metrics.shutdown().await;
     Ok(Exit::Done)
+}
+
+/// Keeps readiness true to whether the store answers, as long as the service lives.
+fn follow_store(ready: &telemetry::Readiness, mut reachable: tokio::sync::watch::Receiver<bool>) {
+    let ready = ready.clone();
+    tokio::spawn(async move {
+        loop {
+            ready.set_store(*reachable.borrow_and_update());
+            if reachable.changed().await.is_err() {
+                return;
+            }
+        }
+    });
 }
 
 #[cfg(test)]

@@ -46,6 +46,11 @@ impl Service {
         self.server.address()
     }
 
+    /// Whether the store answers.
+    pub fn store_reachable(&self) -> tokio::sync::watch::Receiver<bool> {
+        self.engine.store_reachable()
+    }
+
     /// Ends only when the server fails.
     ///
     /// # Errors

@@ -154,6 +154,8 @@ struct Inner {
     /// Wakes the task that counts the queue.
     queue_changed: Notify,
     phase: channel::Sender<Phase>,
+    /// Whether the last sweep found the store.
+    store_reachable: channel::Sender<bool>,
     crew: Mutex<drain::Crew>,
 }
 
@@ -173,10 +175,12 @@ impl Engine {
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             phase: channel::Sender::new(Phase::Open),
+            store_reachable: channel::Sender::new(true),
             crew: Mutex::default(),
             options,
         });
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
+        observe::store_reachable(true);
         inner.taken_back(&recovered);
         inner.hire(solver)?;
         inner.queue_changed();
@@ -281,6 +285,11 @@ impl Engine {
     /// [`Error::Internal`].
     pub async fn load(&self) -> Result<Load, Error> {
         Ok(self.inner.store.load().await?)
+    }
+
+    /// Whether the store answers, as of a look a second: without it this server can neither take on nor tell anything.
+    pub fn store_reachable(&self) -> channel::Receiver<bool> {
+        self.inner.store_reachable.subscribe()
     }
 
     /// Whether a drain has begun.

@@ -4,7 +4,8 @@ use crate::store::Bound;
 pub(super) use crate::telemetry::Attempt;
 pub(super) use crate::telemetry::metrics::{
     AttemptLost, Deletion, GivenUp, Refusal, attempt_lost, engine_size, input_created, job_created,
-    job_finished as job_ended, jobs_deleted, queue_depth, refused, upload_refused, uploaded, uploads_given_up,
+    job_finished as job_ended, jobs_deleted, queue_depth, refused, store_reachable, upload_refused, uploaded,
+    uploads_given_up,
 };
 
 /// The refusal by a bound of the queue.

@@ -1,9 +1,11 @@
 //! The server: services, health, reflection, compression and limits, put together in one place.
 
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::net::TcpListener;
+use tokio::sync::{Mutex, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio_rustls::rustls::ServerConfig;
 use tokio_util::sync::CancellationToken;
@@ -124,7 +126,9 @@ pub enum Error {
 #[derive(Debug)]
 pub struct Server {
     address: SocketAddr,
-    health: HealthReporter,
+    health: Arc<Health>,
+    /// Follows the store; ended with the server.
+    follower: JoinHandle<()>,
     stop: CancellationToken,
     task: JoinHandle<Result<(), tonic::transport::Error>>,
 }
@@ -141,10 +145,10 @@ impl Server {
         let listen_error = |source| Error::Listen { address: options.listen, source };
         let listener = TcpListener::bind(options.listen).await.map_err(listen_error)?;
         let address = listener.local_addr().map_err(listen_error)?;
-        let (health, health_service) = tonic_health::server::health_reporter();
-        for name in HEALTH_NAMES {
-            health.set_service_status(name, ServingStatus::Serving).await;
-        }
+        let (reporter, health_service) = tonic_health::server::health_reporter();
+        let health = Arc::new(Health { reporter, draining: Mutex::new(false) });
+        let mut reachable = engine.store_reachable();
+        health.tell(*reachable.borrow_and_update()).await;
         let router = router(&options, engine, Authenticate::new(keys))?.add_service(health_service);
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
@@ -158,7 +162,8 @@ impl Server {
                 tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped))
             }
         };
-        Ok(Self { address, health, stop, task })
+        let follower = tokio::spawn(follow_store(Arc::clone(&health), reachable));
+        Ok(Self { address, health, follower, stop, task })
     }
 
     /// Where the server listens.
@@ -168,9 +173,7 @@ impl Server {
 
     /// First phase of a drain: tells health checks NOT_SERVING, so that no new callers are sent here. Calls go on.
     pub async fn set_draining(&self) {
-        for name in HEALTH_NAMES {
-            self.health.set_service_status(name, ServingStatus::NotServing).await;
-        }
+        self.health.drain().await;
     }
 
     /// Ends only when the server fails.
@@ -202,6 +205,45 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.task.abort();
+        self.follower.abort();
+    }
+}
+
+/// What health checks are told.
+#[derive(Debug)]
+struct Health {
+    reporter: HealthReporter,
+    /// Held while the statuses change, so that a store that comes back does not undo a drain.
+    draining: Mutex<bool>,
+}
+
+impl Health {
+    /// Tells whether calls can be answered; while the server drains, nothing changes.
+    async fn tell(&self, serving: bool) {
+        let draining = self.draining.lock().await;
+        if !*draining {
+            self.set(if serving { ServingStatus::Serving } else { ServingStatus::NotServing }).await;
+        }
+    }
+
+    async fn drain(&self) {
+        let mut draining = self.draining.lock().await;
+        *draining = true;
+        self.set(ServingStatus::NotServing).await;
+    }
+
+    async fn set(&self, status: ServingStatus) {
+        for name in HEALTH_NAMES {
+            self.reporter.set_service_status(name, status).await;
+        }
+    }
+}
+
+/// Tells health checks NOT_SERVING while the store is out of reach.
+async fn follow_store(health: Arc<Health>, mut reachable: watch::Receiver<bool>) {
+    while reachable.changed().await.is_ok() {
+        let reachable = *reachable.borrow_and_update();
+        health.tell(reachable).await;
     }
 }
 

@@ -265,6 +265,11 @@ pub fn engine_size(queue_capacity: u64, workers: usize) {
     gauge!(WORKERS.name).set(workers as f64);
 }
 
+/// Tells whether the store answers.
+pub fn store_reachable(reachable: bool) {
+    gauge!(STORE_REACHABLE.name).set(f64::from(u8::from(reachable)));
+}
+
 /// A worker claimed a job that had waited this long.
 pub fn queue_wait(waited: Duration) {
     histogram!(QUEUE_WAIT.name).record(waited.as_secs_f64());

@@ -184,6 +184,12 @@ pub const STORE_DURATION: Metric = Metric {
     labels: &["operation"],
     help: "Seconds of a store operation, by operation.",
 };
+pub const STORE_REACHABLE: Metric = Metric {
+    name: "scpsfm_store_reachable",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "1 while the store answers; at 0 the server is not ready.",
+};
 pub const FENCED_WRITES: Metric = Metric {
     name: "scpsfm_fenced_writes_total",
     kind: Kind::Counter,
@@ -198,7 +204,7 @@ pub const WATCHERS: Metric = Metric {
 };
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 27] = [
+pub const ALL: [Metric; 28] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -224,6 +230,7 @@ pub const ALL: [Metric; 27] = [
     RPC_DURATION,
     RPC_IN_FLIGHT,
     STORE_DURATION,
+    STORE_REACHABLE,
     FENCED_WRITES,
     WATCHERS,
 ];
