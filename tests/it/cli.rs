@@ -241,12 +241,31 @@ fn what_cannot_be_solved_ends_with_3_and_says_why() {
     let (scene, out) = (directory.path().join("scene"), directory.path().join("out"));
     run(["synth", "--views", "4", "--tracks", "20", "--outliers", "1", "--out", text(&scene)]);
     let input = scene.join("observations.csv");
-    let run = run(["solve", text(&input), "--out", text(&out), "--json", "--method", "geometry"]);
-    assert_eq!(run.code, Some(3), "{run:?}");
-    let result = json(&run.stdout);
+    let solved = run(["solve", text(&input), "--out", text(&out), "--json", "--method", "geometry"]);
+    assert_eq!(solved.code, Some(3), "{solved:?}");
+    let result = json(&solved.stdout);
     assert_eq!(result["status"], "NO_RECONSTRUCTION");
     assert_ne!(result["warnings"], Value::Array(Vec::new()));
     assert!(out.join("report.html").exists());
+
+    // The same words from a server, on watch and on get, as soon as the job has ended.
+    let serving = Serving::start(&directory.path().join("data"));
+    let server = ["--server", serving.grpc.as_str()];
+    let submitted = run(["submit", text(&input), "--method", "geometry", "--watch"].iter().chain(&server));
+    assert_eq!(submitted.code, Some(3), "{submitted:?}");
+    let name = submitted.stdout.trim();
+    let got = run(["get", name].iter().chain(&server));
+    let watched = run(["watch", name].iter().chain(&server));
+    for warning in result["warnings"].as_array().expect("a list") {
+        let (code, detail) = (warning["code"].as_str().expect("a code"), warning["detail"].as_str().expect("words"));
+        let line = format!("  warning: {code}: {detail}\n");
+        for told in [&submitted.stderr, &watched.stderr, &got.stdout] {
+            assert!(told.contains(&line), "{line:?} is not in {told}");
+        }
+        assert!(got.stdout.contains("no reconstruction: ") && got.stdout.contains(code), "{got:?}");
+    }
+    let all = json(&run(["get", name, "--json"].iter().chain(&server)).stdout);
+    assert_eq!(all["summary"]["warnings"], result["warnings"]);
 }
 
 #[test]

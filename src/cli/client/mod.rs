@@ -160,7 +160,7 @@ impl Client {
         let request = create_request(self.parent(), input, settings, options);
         let mut backoff = Backoff::default();
         loop {
-            match self.jobs.create_job(request.clone()).await {
+            match backoff.within(self.jobs.create_job(request.clone())).await {
                 Ok(job) => return Ok(convert::job::from_wire(job.into_inner())?),
                 Err(status) => self.pause(&mut backoff, status).await?,
             }
@@ -225,7 +225,7 @@ impl Client {
         let mut backoff = Backoff::default();
         loop {
             let request = proto::WatchJobRequest { name: name.to_string(), after_sequence: told.last_sequence };
-            let outcome = match self.jobs.watch_job(request).await {
+            let outcome = match backoff.within(self.jobs.watch_job(request)).await {
                 Ok(events) => told.follow(events.into_inner(), &mut backoff).await?,
                 Err(status) => Err(status),
             };
@@ -323,7 +323,7 @@ impl Client {
         backoff: &mut Backoff,
     ) -> Result<Result<(), Status>, Error> {
         let request = proto::ReadJobResultRequest { name: name.to_string(), offset: bytes.len() as i64 };
-        let mut chunks = match self.jobs.read_job_result(request).await {
+        let mut chunks = match backoff.within(self.jobs.read_job_result(request)).await {
             Ok(chunks) => chunks.into_inner(),
             Err(status) => return Ok(Err(status)),
         };
@@ -350,8 +350,9 @@ impl Client {
     /// a quarter of a minute of silence looks like a hang.
     async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
         let transient = error::is_transient(&status);
+        let first = transient && backoff.failed(&status);
         let error = self.error(status);
-        if transient && backoff.is_first_try() {
+        if first {
             eprintln!("waiting up to {} s: {error}", Backoff::TOTAL.as_secs());
         }
         if transient && backoff.pause().await { Ok(()) } else { Err(error) }

@@ -123,7 +123,7 @@ impl Client {
         on_progress: &mut (dyn FnMut(u64) + Send),
     ) -> Result<proto::Input, Status> {
         let status = proto::GetUploadStatusRequest { parent: self.parent(), upload_id: input.upload_id() };
-        let from = match self.inputs.get_upload_status(status).await {
+        let from = match backoff.within(self.inputs.get_upload_status(status)).await {
             Ok(status) => match status.into_inner() {
                 proto::UploadStatus { input: Some(stored), .. } => return Ok(stored),
                 proto::UploadStatus { committed_bytes, .. } => u64::try_from(committed_bytes).unwrap_or(0),

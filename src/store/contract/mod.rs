@@ -132,6 +132,7 @@ fn summary() -> Summary {
         iterations: 1,
         seconds: 0.5,
         result_bytes: 10,
+        warnings: Vec::new(),
     }
 }
 
