@@ -101,7 +101,8 @@ pub struct Args {
     #[arg(long)]
     pub plaintext_keys: bool,
 
-    /// Print the configuration that would be used, as TOML, and exit
+    /// Print the configuration that would be used, as TOML, and exit. A password in store.url and auth.keys are left out,
+    /// which the file says
     #[arg(long)]
     pub print_config: bool,
 }

@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::domain::Limits;
+use crate::store::postgres::DatabaseUrl;
 pub use retention::Retention;
 pub use sections::{Auth, Compute, Engine, Log, Metrics, Otlp, Server, Store, Tls, Upload};
 
@@ -116,12 +117,24 @@ impl Config {
         Ok(config)
     }
 
-    /// The configuration as a TOML file that would give it.
+    /// The configuration as a TOML file that would give it, but for its secrets: of each that is left out a comment says
+    /// so, and a file whose store's password is missing is refused rather than misunderstood.
     ///
     /// # Errors
     /// When a value has no form in TOML, such as a path that is not Unicode.
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
-        toml::to_string(self)
+        let mut text = String::new();
+        if self.store.url.as_ref().is_some_and(DatabaseUrl::has_password) {
+            text.push_str(
+                "# The password in store.url is not shown, and this file is refused without it: put it in the place of ***,\n\
+                 # or the whole address into SCPSFM_STORE__URL, which wins over the file.\n\n",
+            );
+        }
+        if self.auth.keys.is_some() {
+            text.push_str("# auth.keys are set and not shown: this file needs SCPSFM_AUTH__KEYS beside it.\n\n");
+        }
+        text.push_str(&toml::to_string(self)?);
+        Ok(text)
     }
 
     fn validate(&self) -> Result<(), Error> {

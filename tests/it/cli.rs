@@ -157,6 +157,31 @@ fn a_bad_configuration_ends_with_64_and_a_printed_one_reads_back() {
     fs::write(&file, &printed.stdout).expect("written");
     assert_eq!(run(["serve", "--print-config", "--config", text(&file)]).stdout, printed.stdout);
     assert!(printed.stdout.contains("workers = 3") && printed.stdout.contains("ndarray"), "{printed:?}");
+
+    // With a password: not shown, which the file says, and refused until it is there again.
+    let url = ["--store", "postgres://me:hunter2@db.example/scpsfm"];
+    let printed = run(["serve", "--print-config"].iter().chain(&url));
+    assert!(printed.code == Some(0) && !printed.stdout.contains("hunter2"), "{printed:?}");
+    assert!(printed.stdout.starts_with("# The password in store.url is not shown"), "{printed:?}");
+    fs::write(&file, &printed.stdout).expect("written");
+    let refused = run(["serve", "--print-config", "--config", text(&file)]);
+    assert_eq!(refused.code, Some(64), "{refused:?}");
+    assert!(refused.stderr.contains("store.url") && refused.stderr.contains("SCPSFM_STORE__URL"), "{refused:?}");
+    let complete = run(["serve", "--print-config", "--config", text(&file)].iter().chain(&url));
+    assert_eq!(complete.stdout, printed.stdout);
+}
+
+#[test]
+fn a_password_in_a_servers_address_is_refused_and_not_repeated() {
+    for server in ["http://me:hunter2@127.0.0.1:1", "me:hunter2@127.0.0.1:1", "https://me:hunter2@localhost"] {
+        let refused = run(["list", "--server", server]);
+        assert_eq!(refused.code, Some(2), "{refused:?}");
+        let told = refused.stdout + &refused.stderr;
+        assert!(told.contains("--api-key-file") && !told.contains("hunter2"), "{told}");
+    }
+    let output = program(["list", "--help"]).env("SCPSFM_SERVER", "http://me:hunter2@h").output().expect("runs");
+    let help = String::from_utf8(output.stdout).expect("UTF-8");
+    assert!(help.contains("SCPSFM_SERVER") && !help.contains("hunter2"), "{help}");
 }
 
 #[test]

@@ -82,6 +82,14 @@ impl Client {
     /// [`Error::Unavailable`] where no server answers, [`Error::NotLetIn`] where one side does not trust the other,
     /// [`Error::Usage`] for what is not a URL and for files of certificates or keys that cannot be used.
     pub async fn connect(server: &str, access: &AccessArgs) -> Result<Self, Error> {
+        if server.contains('@') {
+            // Not repeated: what stands there may be a password.
+            return Err(Error::Usage(
+                "the server's address holds a user or a password (`@`), which no server asks for: an API key goes into \
+                 --api-key-file or SCPSFM_API_KEY"
+                    .into(),
+            ));
+        }
         let no_url =
             || Error::Usage(format!("{server:?} is not a URL of the form http://HOST:PORT or https://HOST:PORT"));
         if !server.starts_with("http://") && !server.starts_with("https://") {
