@@ -7,6 +7,7 @@
 //! | `NOT_FOUND` | `TENANT_NOT_FOUND` | a parent that is not the caller's tenant, whether it exists or not |
 //! | `UNAUTHENTICATED` | `API_KEY_MISSING` | the server asks for a key, and the call carries none |
 //! | `UNAUTHENTICATED` | `API_KEY_UNKNOWN` | the call carries a key that stands for no tenant |
+//! | `UNAUTHENTICATED` | `API_KEY_WITHDRAWN` | the key was withdrawn while the call lasted, within seconds |
 //! | `ALREADY_EXISTS` | `ALREADY_EXISTS` | a job id is taken, or a request id came with another body |
 //! | `NOT_FOUND` | `INPUT_NOT_FOUND` | no such uploaded input, or another tenant's |
 //! | `NOT_FOUND` | `UPLOAD_NOT_FOUND` | no such upload, or it was given up |
@@ -118,6 +119,12 @@ pub fn no_key() -> Status {
 pub fn unknown_key() -> Status {
     let message = "the API key is not known here: it is mistyped, or was withdrawn";
     status(Code::Unauthenticated, "API_KEY_UNKNOWN", message, ErrorDetails::new())
+}
+
+/// A key that was withdrawn while a call lasted.
+pub fn withdrawn_key() -> Status {
+    let message = "the API key was withdrawn while the call lasted";
+    status(Code::Unauthenticated, "API_KEY_WITHDRAWN", message, ErrorDetails::new())
 }
 
 /// No such uploaded input, or another tenant's: a caller cannot tell them apart.

@@ -21,7 +21,7 @@ use crate::support::certificates::written;
 use crate::support::keys::{Keyed, NORTH, SOUTH, keyed};
 use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::{held, quick};
-use crate::support::uploads::{id, request, start};
+use crate::support::uploads::{id, part, request, start};
 use crate::support::wire::{all, create_tracks, solve_request, state_of};
 
 fn two_tenants() -> Options {
@@ -255,15 +255,29 @@ async fn ids_and_page_tokens_are_each_tenants_own() {
     assert_eq!(listed, ["tenants/north/jobs/b", "tenants/north/jobs/a"]);
 }
 
+/// A server whose keys are in a file that is looked at all the time.
+async fn with_a_file_of_keys(solver: scpsfm::engine::Solver, file: std::path::PathBuf) -> TestServer {
+    let keys = Sources { file: Some(file), fixed: None };
+    let options = Options { keys, look_every: Duration::from_millis(10), ..Options::default() };
+    TestServer::start_with(solver, options, one_worker()).await
+}
+
+async fn until_let_in(tenant: &mut Tenant, parent: &str) {
+    soon(async {
+        while tenant.list(parent, "").await.is_err() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
+}
+
 #[tokio::test]
 async fn a_file_of_keys_is_read_again_and_open_streams_go_on() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let write = |text: &str| written(directory.path(), "keys.txt", text);
     let file = write(&format!("north:{NORTH}\n"));
     let (solver, hold) = held();
-    let keys = Sources { file: Some(file), fixed: None };
-    let options = Options { keys, look_every: Duration::from_millis(10), ..Options::default() };
-    let server = TestServer::start_with(solver, options, one_worker()).await;
+    let server = with_a_file_of_keys(solver, file).await;
     let (mut north, mut south) = (Tenant::of(&server, NORTH).await, Tenant::of(&server, SOUTH).await);
     let request = proto::CreateJobRequest { parent: "tenants/north".into(), ..create_tracks() };
     let name = north.create(request).await.expect("a job").name;
@@ -271,18 +285,75 @@ async fn a_file_of_keys_is_read_again_and_open_streams_go_on() {
     let watch = watch.expect("a watch").into_inner();
     assert_eq!(south.list("tenants/south", "").await.expect_err("no key yet").code(), Code::Unauthenticated);
 
-    // What is no list of keys changes nothing; after it, a withdrawn key and a new one do.
+    // What is no list of keys changes nothing; after it, a new key is let in, and who was in is not disturbed.
     write("north");
-    write(&format!("south:{SOUTH}\n"));
-    soon(async {
-        while south.list("tenants/south", "").await.is_err() {
-            tokio::time::sleep(Duration::from_millis(5)).await;
-        }
-    })
-    .await;
-    assert_eq!(north.list("tenants/north", "").await.expect_err("withdrawn").code(), Code::Unauthenticated);
+    write(&format!("south:{SOUTH}\nnorth:{NORTH}\n"));
+    until_let_in(&mut south, "tenants/south").await;
+    north.list("tenants/north", "").await.expect("still let in");
     hold.let_go();
     let (events, end) = soon(all(watch)).await;
     end.expect("a stream that was open goes on");
     assert_eq!(events.last().and_then(state_of), Some(JobState::Succeeded));
+}
+
+#[tokio::test]
+async fn a_withdrawn_key_ends_its_streams_both_ways_and_nobody_elses() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let write = |text: &str| written(directory.path(), "keys.txt", text);
+    let file = write(&format!("south:{SOUTH}\nnorth:{NORTH}\n"));
+    let (solver, hold) = held();
+    let server = with_a_file_of_keys(solver, file).await;
+    let (mut north, mut south) = (Tenant::of(&server, NORTH).await, Tenant::of(&server, SOUTH).await);
+    let mut watches = Vec::new();
+    for (tenant, parent) in [(&mut north, "tenants/north"), (&mut south, "tenants/south")] {
+        let name = tenant.create(proto::CreateJobRequest { parent: parent.into(), ..create_tracks() }).await;
+        let request = proto::WatchJobRequest { name: name.expect("a job").name, after_sequence: 0 };
+        watches.push(tenant.jobs.watch_job(request).await.expect("a watch").into_inner());
+    }
+    // And one that sends: an upload of which half has come.
+    let (sender, messages) = tokio::sync::mpsc::channel(8);
+    let mut sending = north.inputs.clone();
+    let messages = tokio_stream::wrappers::ReceiverStream::new(messages);
+    let upload = tokio::spawn(async move { sending.upload_input(messages).await });
+    let bytes = vec![1; 1_000];
+    for message in part("tenants/north", &id(1), &bytes, 0..500, 100) {
+        sender.send(message).await.expect("taken");
+    }
+    soon(async {
+        while sender.capacity() < 8 {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
+    // What has left this side arrives meanwhile, or the part of it that does is kept.
+    tokio::time::sleep(Duration::from_millis(50)).await;
+
+    write(&format!("south:{SOUTH}\n"));
+    let withdrawn = |status: Status| {
+        assert_eq!((status.code(), reason(&status).as_str()), (Code::Unauthenticated, "API_KEY_WITHDRAWN"), "{status}");
+    };
+    let theirs = watches.remove(0);
+    withdrawn(soon(all(theirs)).await.1.expect_err("cut off"));
+    withdrawn(soon(upload).await.expect("no panic").expect_err("cut off"));
+    assert_eq!(north.list("tenants/north", "").await.expect_err("withdrawn").code(), Code::Unauthenticated);
+    south.list("tenants/south", "").await.expect("let in");
+
+    // A key that moves to another tenant was withdrawn from the first.
+    write(&format!("north:{SOUTH}\n"));
+    let (_, end) = soon(all(watches.remove(0))).await;
+    withdrawn(end.expect_err("another tenant's now"));
+    hold.let_go();
+    // The upload was told of its end on the way in too: what had come is kept, and no more is taken.
+    until_let_in(&mut south, "tenants/north").await;
+    let asked = proto::GetUploadStatusRequest { parent: "tenants/north".into(), upload_id: id(1) };
+    soon(async {
+        loop {
+            let status = south.inputs.get_upload_status(asked.clone()).await.expect("begun").into_inner();
+            if status.committed_bytes > 0 {
+                break assert_eq!(status.committed_bytes % 100, 0);
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
 }
