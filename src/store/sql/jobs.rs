@@ -186,8 +186,8 @@ pub(super) async fn list<C: Connection>(connection: &mut C, query: &JobQuery) ->
     rows.truncate(size as usize);
     let next_page_token = match rows.last() {
         Some(last) if more => {
-            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.integer("id")? };
-            Some(query.token_after(cursor))
+            let cursor = Cursor { create_micros: last.integer("create_time")?, job: last.text("job")? };
+            Some(query.token_after(&cursor))
         }
         _ => None,
     };
@@ -209,11 +209,11 @@ fn listing(query: &JobQuery) -> Result<Statement, Error> {
         select = select.then(" AND value = ").then_bind(value).then(")");
     }
     let (beyond, order) = match query.order {
-        Order::CreateTimeDescending => (" AND (create_time, id) < (", " ORDER BY create_time DESC, id DESC LIMIT "),
-        Order::CreateTimeAscending => (" AND (create_time, id) > (", " ORDER BY create_time, id LIMIT "),
+        Order::CreateTimeDescending => (" AND (create_time, job) < (", " ORDER BY create_time DESC, job DESC LIMIT "),
+        Order::CreateTimeAscending => (" AND (create_time, job) > (", " ORDER BY create_time, job LIMIT "),
     };
     if let Some(cursor) = cursor {
-        select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(cursor.id).then(")");
+        select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(&cursor.job).then(")");
     }
     Ok(select.then(order).then_bind(i64::from(query.effective_page_size()) + 1))
 }

@@ -253,6 +253,15 @@ async fn ids_and_page_tokens_are_each_tenants_own() {
         }
     }
     assert_eq!(listed, ["tenants/north/jobs/b", "tenants/north/jobs/a"]);
+
+    // What others have made shows nowhere in a token: it holds the query, a time and an id of the tenant's own.
+    let token = north.list("tenants/north", "").await.expect("a page").next_page_token;
+    let (_, rest) = token.split_once('-').expect("a query");
+    let (micros, id) = rest.split_once('-').expect("a time");
+    let job = proto::GetJobRequest { name: listed[0].clone() };
+    let created = north.jobs.get_job(job).await.expect("a job").into_inner().create_time.expect("a time");
+    let micros = i64::from_str_radix(micros, 16).expect("a number");
+    assert_eq!((micros / 1_000_000, id), (created.seconds, "b"));
 }
 
 /// A server whose keys are in a file that is looked at all the time.
