@@ -175,6 +175,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         service_name: "scpsfm",
     })
     .map_err(Failure::bad_config)?;
+    raise_file_limit();
     let mut signals = Signals::listen()?;
     let scrape = telemetry::metrics::install().map_err(Failure::internal)?;
     let backend = if config.compute.backend == crate::domain::Backend::Flex { "flex" } else { "ndarray" };
@@ -211,6 +212,17 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     tracing::info!(finished = drained.finished, given_back = drained.given_back, "drained");
     metrics.shutdown().await;
     Ok(Exit::Done)
+}
+
+/// Lets the process have as many files as it may: every connection is one, and shells start programs with a thousand.
+fn raise_file_limit() {
+    #[cfg(unix)]
+    {
+        use rustix::process::{Resource, getrlimit, setrlimit};
+        let limit = getrlimit(Resource::Nofile);
+        // Where it is refused, the old limit stands: fewer connections at a time.
+        let _ = setrlimit(Resource::Nofile, rustix::process::Rlimit { current: limit.maximum, ..limit });
+    }
 }
 
 /// Keeps readiness true to whether the store answers, as long as the service lives.

@@ -6,6 +6,7 @@ pub mod auth;
 pub mod calibration;
 pub mod caller;
 pub mod convert;
+mod door;
 pub mod explain;
 pub mod follow;
 pub mod inputs;

@@ -10,7 +10,7 @@ use tokio::task::{JoinError, JoinHandle};
 use tokio_rustls::rustls::ServerConfig;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding::Gzip;
-use tonic::transport::server::{Router, TcpIncoming};
+use tonic::transport::server::Router;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 use tower::layer::util::{Identity, Stack};
@@ -27,7 +27,7 @@ use super::proto::calibration_service_server::CalibrationServiceServer;
 use super::proto::input_service_server::InputServiceServer;
 use super::proto::job_service_server::JobServiceServer;
 use super::reload::{self, Current};
-use super::tls;
+use super::{door, tls};
 use crate::domain::Limits;
 use crate::engine::Engine;
 
@@ -64,8 +64,14 @@ pub struct Options {
     pub keys: keys::Sources,
     /// How often the files of certificates and keys are looked at.
     pub look_every: Duration,
-    /// How long a TLS handshake may take.
+    /// How long a connection may take to shake hands and to say its first words.
     pub handshake_timeout: Duration,
+    /// Connections that have not come to their first words yet, at most; one more ends the oldest of them.
+    pub max_silent_connections: usize,
+    /// How long a connection may be silent before it is asked whether it lives.
+    pub keepalive: Duration,
+    /// How long the answer to that may take.
+    pub keepalive_timeout: Duration,
     /// Whether callers may ask for the API's description.
     pub reflection: bool,
 }
@@ -99,7 +105,10 @@ impl Default for Options {
             tls: None,
             keys: keys::Sources::default(),
             look_every: reload::LOOK_EVERY,
-            handshake_timeout: tls::HANDSHAKE_TIMEOUT,
+            handshake_timeout: door::HANDSHAKE_TIMEOUT,
+            max_silent_connections: door::MAX_GREETED,
+            keepalive: KEEPALIVE,
+            keepalive_timeout: KEEPALIVE_TIMEOUT,
             reflection: true,
         }
     }
@@ -152,16 +161,13 @@ impl Server {
         let router = router(&options, engine, Authenticate::new(keys))?.add_service(health_service);
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
-        let task = match certificates {
-            Some(certificates) => {
-                let incoming = tls::incoming(listener, certificates, options.handshake_timeout);
-                tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped))
-            }
-            None => {
-                let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-                tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped))
-            }
+        let entrance = door::Options {
+            certificates,
+            timeout: options.handshake_timeout,
+            max_greeted: options.max_silent_connections,
         };
+        let incoming = door::incoming(listener, entrance);
+        let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));
         let follower = tokio::spawn(follow_store(Arc::clone(&health), reachable));
         Ok(Self { address, health, follower, stop, task })
     }
@@ -292,8 +298,8 @@ fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Resu
         .layer(authenticate)
         .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
         .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
-        .http2_keepalive_interval(Some(KEEPALIVE))
-        .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
+        .http2_keepalive_interval(Some(options.keepalive))
+        .http2_keepalive_timeout(Some(options.keepalive_timeout))
         .add_service(with_limits!(CalibrationServiceServer::new(calibration)))
         .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits))))
         .add_service(

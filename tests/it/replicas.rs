@@ -242,7 +242,8 @@ async fn a_server_without_its_database_is_not_ready_until_it_is_back() {
     let Some(cluster) = Cluster::start("a server without its database") else { return };
     let url = cluster.database().await;
     let server = Serving::on_database(&url, &[], Stdio::null());
-    let mut health = HealthClient::connect(server.grpc.clone()).await.expect("a connection");
+    let channel = Channel::from_shared(server.grpc.clone()).expect("a URL").connect().await.expect("a connection");
+    let mut health = HealthClient::new(channel);
     let mut serving = async |service: &str| {
         let answer = health.check(HealthCheckRequest { service: service.into() }).await.expect("known");
         answer.into_inner().status() == ServingStatus::Serving
