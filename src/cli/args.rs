@@ -17,7 +17,7 @@ pub const DEFAULT_SERVER: &str = "http://127.0.0.1:50051";
 #[derive(Debug, Clone, Args)]
 pub struct ServerArgs {
     /// Address of the server, http:// or https://
-    #[arg(long, value_name = "URL", env = "SCPSFM_SERVER", default_value = DEFAULT_SERVER)]
+    #[arg(long, value_name = "URL", env = "SCPSFM_SERVER", hide_env_values = true, default_value = DEFAULT_SERVER)]
     pub server: String,
 
     #[command(flatten)]

@@ -10,7 +10,7 @@ use super::exit::{Exit, Failure};
 use super::print;
 use super::progress::ProgressView;
 use crate::domain::job::{EventBody, Failure as JobFailure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
-use crate::domain::{Grade, Status};
+use crate::domain::{Grade, Status, Warning};
 
 /// A job's name as it was given: whole, or its last part alone.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -59,16 +59,29 @@ pub fn job_line(job: &Job) -> String {
 
 fn summary_words(summary: &Summary) -> String {
     if summary.status == Status::NoReconstruction {
-        return "no reconstruction".into();
+        let codes: Vec<&str> = summary.warnings.iter().map(|warning| warning.code.name()).collect();
+        let why = if codes.is_empty() { String::new() } else { format!(": {}", codes.join(", ")) };
+        return format!("no reconstruction{why}");
     }
     let grade = summary.grade.map_or("solved", Grade::name);
     let focal = summary.focal_px.map(|focal_px| format!(", focal {focal_px:.1} px")).unwrap_or_default();
     format!("{grade}, {} inlier tracks{focal}, {:.1} s", summary.inlier_tracks, summary.seconds)
 }
 
-/// Prints a job: a line, or everything as JSON.
+/// The warnings of a result, a line each as `scpsfm solve` tells them; where there is no reconstruction, they say why.
+fn warning_lines(summary: &Summary) -> Vec<String> {
+    let line = |warning: &Warning| format!("  warning: {}: {}", warning.code.name(), warning.detail);
+    summary.warnings.iter().map(line).collect()
+}
+
+/// Prints a job: a line, and one more for each of its warnings; or everything as JSON.
 pub fn print_job(job: &Job, json: bool) -> Result<(), Failure> {
-    print(&if json { format!("{:#}", job_json(job)) } else { job_line(job) })
+    if json {
+        return print(&format!("{:#}", job_json(job)));
+    }
+    let mut lines = vec![job_line(job)];
+    lines.extend(job.summary.iter().flat_map(warning_lines));
+    print(&lines.join("\n"))
 }
 
 /// Why a job failed, for programs; attempts only where there are any to tell of.
@@ -163,6 +176,9 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
         }
         if !json {
             show_event(&mut view, event);
+            if let EventBody::Result(summary) = &event.body {
+                warning_lines(summary).iter().for_each(|line| view.state(line));
+            }
         } else if unprinted.is_ok() {
             unprinted = print(&event_json(event).to_string());
         }

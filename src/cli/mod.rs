@@ -26,6 +26,7 @@ pub mod submit;
 pub mod summary;
 pub mod synth;
 pub mod train_prior;
+pub mod upload;
 pub mod watch;
 pub mod windows;
 
@@ -54,6 +55,7 @@ pub enum Command {
     Demo(demo::Args),
     Serve(serve::Args),
     Solve(solve::Args),
+    Upload(upload::Args),
     Submit(submit::Args),
     Watch(watch::Args),
     Get(get::Args),
@@ -87,6 +89,7 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         Command::Demo(args) => runtime.block_on(demo::run(args)),
         Command::Serve(args) => runtime.block_on(serve::run(args)),
         Command::Solve(args) => runtime.block_on(solve::run(args)),
+        Command::Upload(args) => runtime.block_on(upload::run(args)),
         Command::Submit(args) => runtime.block_on(submit::run(args)),
         Command::Watch(args) => runtime.block_on(watch::run(args)),
         Command::Get(args) => runtime.block_on(get::run(args)),

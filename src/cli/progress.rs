@@ -95,6 +95,47 @@ impl ProgressView {
     }
 }
 
+/// Shows how many bytes of a transfer are done.
+pub struct TransferView {
+    bar: Option<ProgressBar>,
+}
+
+impl TransferView {
+    /// A bar when stderr is a terminal, nothing elsewhere: a transfer is short, and its end says that it was done.
+    pub fn new(quiet: bool, bytes: u64) -> Self {
+        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
+            let bar = ProgressBar::new(bytes);
+            if let Ok(style) = ProgressStyle::with_template(
+                "{bytes:>10} of {total_bytes} [{bar:24}] {percent:>3}% {bytes_per_sec}, {eta}",
+            ) {
+                bar.set_style(style.progress_chars("=> "));
+            }
+            bar
+        });
+        Self { bar }
+    }
+
+    /// So many bytes are done.
+    pub fn show(&mut self, bytes: u64) {
+        if let Some(bar) = &self.bar {
+            bar.set_position(bytes);
+        }
+    }
+
+    /// Takes the bar away.
+    pub fn finish(&mut self) {
+        if let Some(bar) = self.bar.take() {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+impl Drop for TransferView {
+    fn drop(&mut self) {
+        self.finish();
+    }
+}
+
 impl Drop for ProgressView {
     fn drop(&mut self) {
         self.finish();

@@ -105,7 +105,8 @@ pub struct Args {
     #[arg(long)]
     pub plaintext_keys: bool,
 
-    /// Print the configuration that would be used, as TOML, and exit
+    /// Print the configuration that would be used, as TOML, and exit. A password in store.url and auth.keys are left out,
+    /// which the file says
     #[arg(long)]
     pub print_config: bool,
 }
@@ -182,6 +183,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if let Some(path) = &config.compute.prior {
         prior_file::install(path).map_err(|error| Failure::bad_config(format_args!("compute.prior: {error}")))?;
     }
+    raise_file_limit();
     let mut signals = Signals::listen()?;
     let scrape = telemetry::metrics::install().map_err(Failure::internal)?;
     let backend = if config.compute.backend == crate::domain::Backend::Flex { "flex" } else { "ndarray" };
@@ -197,6 +199,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         Failure::internal(format_args!("cannot listen on {} (metrics): {error}", config.metrics.listen))
     })?;
     let mut service = Service::start(&config).await?;
+    follow_store(&ready, service.store_reachable());
     ready.set(true);
     let scheme = if config.tls.files().is_some() { "https" } else { "http" };
     print(&format!("grpc {scheme}://{}", service.address()))?;
@@ -217,6 +220,30 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     tracing::info!(finished = drained.finished, given_back = drained.given_back, "drained");
     metrics.shutdown().await;
     Ok(Exit::Done)
+}
+
+/// Lets the process have as many files as it may: every connection is one, and shells start programs with a thousand.
+fn raise_file_limit() {
+    #[cfg(unix)]
+    {
+        use rustix::process::{Resource, getrlimit, setrlimit};
+        let limit = getrlimit(Resource::Nofile);
+        // Where it is refused, the old limit stands: fewer connections at a time.
+        let _ = setrlimit(Resource::Nofile, rustix::process::Rlimit { current: limit.maximum, ..limit });
+    }
+}
+
+/// Keeps readiness true to whether the store answers, as long as the service lives.
+fn follow_store(ready: &telemetry::Readiness, mut reachable: tokio::sync::watch::Receiver<bool>) {
+    let ready = ready.clone();
+    tokio::spawn(async move {
+        loop {
+            ready.set_store(*reachable.borrow_and_update());
+            if reachable.changed().await.is_err() {
+                return;
+            }
+        }
+    });
 }
 
 #[cfg(test)]

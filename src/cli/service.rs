@@ -46,6 +46,11 @@ impl Service {
         self.server.address()
     }
 
+    /// Whether the store answers.
+    pub fn store_reachable(&self) -> tokio::sync::watch::Receiver<bool> {
+        self.engine.store_reachable()
+    }
+
     /// Ends only when the server fails.
     ///
     /// # Errors
@@ -91,6 +96,14 @@ fn engine_options(config: &Config) -> engine::Options {
             max_tenant_jobs: bound_or_none(config.engine.tenant_queue_capacity),
             max_tenant_bytes: bound_or_none(config.engine.tenant_queue_bytes),
         },
+        uploads: engine::UploadOptions {
+            max_bytes: config.upload.max_bytes,
+            bounds: engine::UploadBounds {
+                max_tenant_uploads: config.upload.tenant_uploads,
+                max_tenant_bytes: config.upload.tenant_bytes,
+            },
+            abandoned_after: config.upload.abandoned_after.0,
+        },
         lease: Duration::from_secs(config.engine.lease_seconds),
         max_attempts: config.engine.max_attempts,
         retention: config.store.retention.0,
@@ -119,7 +132,8 @@ mod tests {
     fn a_configuration_of_defaults_is_the_default_of_engine_and_server() {
         let config = Config::default();
         let of = |options: engine::Options| {
-            (options.workers, options.queue, options.lease, options.max_attempts, options.retention, options.backend)
+            let queue = (options.queue, options.uploads);
+            (options.workers, queue, options.lease, options.max_attempts, options.retention, options.backend)
         };
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));
         let of = |options: server::Options| {

@@ -1,15 +1,20 @@
 //! `scpsfm submit`: leaves a job with a server.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
-use super::args::{InputArgs, ServerArgs, SettingsArgs, tell_notes};
-use super::client::JobOptions;
+use super::args::{ReadingArgs, ServerArgs, SettingsArgs, tell_notes};
+use super::client::access::AccessArgs;
+use super::client::{self, JobOptions};
 use super::exit::{Exit, Failure};
 use super::{job_view, print};
+use crate::domain::InputName;
+use crate::domain::job::JobName;
 
 const EXAMPLES: &str = "\
 Examples:
   scpsfm submit observations.csv --width 3072 --height 2048
+  scpsfm submit --input $(scpsfm upload observations.csv) --method geometry
   scpsfm submit observations.csv --label site=north --time-limit 60 --watch
   job=$(scpsfm submit observations.csv) && scpsfm watch $job && scpsfm result $job --out answer";
 
@@ -19,8 +24,16 @@ Examples:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
+    /// Tracks, as `scpsfm solve` takes them
+    #[arg(value_name = "INPUT", required_unless_present = "uploaded", conflicts_with = "uploaded")]
+    pub input: Option<PathBuf>,
+
+    /// Solve an input that was uploaded with `scpsfm upload`: its name, or the last part of it
+    #[arg(long = "input", value_name = "NAME", value_parser = GivenInput::parse)]
+    pub uploaded: Option<GivenInput>,
+
     #[command(flatten)]
-    pub input: InputArgs,
+    pub reading: ReadingArgs,
 
     #[command(flatten)]
     pub server: ServerArgs,
@@ -56,8 +69,8 @@ pub struct Args {
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let settings = args.settings.settings()?;
-    let input = args.input.read()?;
-    tell_notes(&input);
+    let input = args.input.as_deref().map(|path| args.reading.read(path)).transpose()?;
+    input.iter().for_each(tell_notes);
     let mut client = args.server.connect().await?;
     let options = JobOptions {
         job_id: args.job_id,
@@ -66,9 +79,42 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         priority: args.priority,
         time_limit: args.time_limit,
     };
-    let job = client.create(&input.raw, &settings, options).await.map_err(|error| error.at_lines(&input))?;
+    let job = match (&input, &args.uploaded) {
+        (Some(input), _) => {
+            client.create(&input.raw, &settings, options).await.map_err(|error| error.at_lines(input))?
+        }
+        (None, Some(given)) => client.create_with(&given.of(&args.server.access)?, &settings, options).await?,
+        (None, None) => return Err(Failure::usage("neither INPUT nor --input says what to solve")),
+    };
     print(&job.name.to_string())?;
     if args.watch { job_view::watch_to_end(&mut client, &job.name, 0, false).await } else { Ok(Exit::Done) }
+}
+
+/// An uploaded input's name as it was given: whole, or its last part alone.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum GivenInput {
+    Whole(InputName),
+    /// Of the tenant that calls.
+    Id(String),
+}
+
+impl GivenInput {
+    /// # Errors
+    /// For what is neither.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let given = match text.contains('/') {
+            true => InputName::parse(text).map(Self::Whole),
+            false => JobName::is_id(text).then(|| Self::Id(text.to_owned())),
+        };
+        given.ok_or_else(|| format!("{text:?} is not an input's name, as `scpsfm upload` prints it"))
+    }
+
+    fn of(&self, access: &AccessArgs) -> Result<InputName, client::Error> {
+        match self {
+            Self::Whole(name) => Ok(name.clone()),
+            Self::Id(input) => Ok(InputName { tenant: access.tenant()?, input: input.clone() }),
+        }
+    }
 }
 
 fn parse_label(text: &str) -> Result<(String, String), String> {

@@ -12,8 +12,9 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::domain::Limits;
+use crate::store::postgres::DatabaseUrl;
 pub use retention::Retention;
-pub use sections::{Auth, Compute, Engine, Log, Metrics, Otlp, Server, Store, Tls};
+pub use sections::{Auth, Compute, Engine, Log, Metrics, Otlp, Server, Store, Tls, Upload};
 
 /// Everything that the server can be told.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -25,6 +26,7 @@ pub struct Config {
     pub metrics: Metrics,
     pub store: Store,
     pub engine: Engine,
+    pub upload: Upload,
     pub compute: Compute,
     pub limits: Limits,
     pub log: Log,
@@ -115,12 +117,24 @@ impl Config {
         Ok(config)
     }
 
-    /// The configuration as a TOML file that would give it.
+    /// The configuration as a TOML file that would give it, but for its secrets: of each that is left out a comment says
+    /// so, and a file whose store's password is missing is refused rather than misunderstood.
     ///
     /// # Errors
     /// When a value has no form in TOML, such as a path that is not Unicode.
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
-        toml::to_string(self)
+        let mut text = String::new();
+        if self.store.url.as_ref().is_some_and(DatabaseUrl::has_password) {
+            text.push_str(
+                "# The password in store.url is not shown, and this file is refused without it: put it in the place of ***,\n\
+                 # or the whole address into SCPSFM_STORE__URL, which wins over the file.\n\n",
+            );
+        }
+        if self.auth.keys.is_some() {
+            text.push_str("# auth.keys are set and not shown: this file needs SCPSFM_AUTH__KEYS beside it.\n\n");
+        }
+        text.push_str(&toml::to_string(self)?);
+        Ok(text)
     }
 
     fn validate(&self) -> Result<(), Error> {
@@ -134,6 +148,9 @@ impl Config {
         at_least_one("engine.queue_observations", self.engine.queue_observations)?;
         at_least_one("engine.lease_seconds", self.engine.lease_seconds)?;
         at_least_one("engine.max_attempts", u64::from(self.engine.max_attempts))?;
+        at_least_one("upload.max_bytes", self.upload.max_bytes)?;
+        at_least_one("upload.tenant_uploads", self.upload.tenant_uploads)?;
+        at_least_one("upload.tenant_bytes", self.upload.tenant_bytes)?;
         at_least_one("limits.max_views", self.limits.max_views as u64)?;
         at_least_one("limits.max_tracks", self.limits.max_tracks as u64)?;
         at_least_one("limits.max_observations", self.limits.max_observations as u64)?;
@@ -169,8 +186,8 @@ impl Config {
 /// The variables that name a key, i.e. have a section: `SCPSFM_ENGINE__WORKERS`. Others of our prefix, such as those
 /// that switch tests, are none of ours here; but `SCPSFM_ENGINE_WORKERS` is a slip that would go unseen.
 fn keys_among(variables: Vec<(String, String)>) -> Result<Vec<(String, String)>, Error> {
-    const SECTIONS: [&str; 10] =
-        ["SERVER", "TLS", "AUTH", "METRICS", "STORE", "ENGINE", "COMPUTE", "LIMITS", "LOG", "OTLP"];
+    const SECTIONS: [&str; 11] =
+        ["SERVER", "TLS", "AUTH", "METRICS", "STORE", "ENGINE", "UPLOAD", "COMPUTE", "LIMITS", "LOG", "OTLP"];
     let mut keys = Vec::new();
     for (name, value) in variables {
         let Some(rest) = name.strip_prefix(PREFIX) else { continue };

@@ -1,4 +1,4 @@
-//! How long ended jobs are kept, as it is written: `30d` or `forever`.
+//! How long ended jobs and begun uploads are kept, as it is written: `30d` or `forever`.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,7 +11,7 @@ use crate::engine;
 /// Seconds of each unit.
 const UNITS: [(char, u64); 4] = [('d', 86_400), ('h', 3_600), ('m', 60), ('s', 1)];
 
-/// How long an ended job is kept; `None`: forever.
+/// How long an ended job, or an upload, is kept; `None`: forever.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Retention(pub Option<Duration>);
 
@@ -28,8 +28,9 @@ impl FromStr for Retention {
         if text == "forever" {
             return Ok(Self(None));
         }
-        let wrong =
-            || format!("`{text}` is no time to keep jobs for; right would be `30d`, `12h`, `90m`, `45s` or `forever`");
+        let wrong = || {
+            format!("`{text}` is no time to keep anything for; right would be `30d`, `12h`, `90m`, `45s` or `forever`")
+        };
         let split = |(unit, seconds)| text.strip_suffix(unit).map(|count| (count, seconds));
         let (count, seconds): (_, u64) = UNITS.into_iter().find_map(split).ok_or_else(wrong)?;
         let count: u64 = count.parse().map_err(|_| wrong())?;

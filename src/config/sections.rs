@@ -193,6 +193,33 @@ impl Engine {
     }
 }
 
+/// What may be uploaded, and for how long the unfinished is kept.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Upload {
+    /// Bytes of one upload at most.
+    pub max_bytes: u64,
+    /// Uploads of one tenant that may be begun and not finished.
+    pub tenant_uploads: u64,
+    /// Bytes of one tenant's uploads and uploaded inputs at most.
+    pub tenant_bytes: u64,
+    /// How long an upload to which nothing comes is kept: `24h`, `90m`, `45s` or `forever`.
+    pub abandoned_after: Retention,
+}
+
+impl Default for Upload {
+    /// What [`engine::UploadOptions`] has by default, with its reasons.
+    fn default() -> Self {
+        let options = engine::UploadOptions::default();
+        Self {
+            max_bytes: options.max_bytes,
+            tenant_uploads: options.bounds.max_tenant_uploads,
+            tenant_bytes: options.bounds.max_tenant_bytes,
+            abandoned_after: Retention(options.abandoned_after),
+        }
+    }
+}
+
 /// What the networks are and run on.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]

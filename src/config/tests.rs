@@ -71,6 +71,17 @@ fn the_password_of_the_store_is_shown_nowhere() {
     for shown in [format!("{config:?}"), config.to_toml().expect("TOML")] {
         assert!(shown.contains("me:***@db") && !shown.contains("hunter2"), "{shown}");
     }
+    // Printed and read back: with the address from elsewhere it is the same, without it is refused in plain words.
+    let printed = config.to_toml().expect("TOML");
+    assert!(printed.starts_with("# The password in store.url is not shown"), "{printed}");
+    let printed = file(&printed);
+    let again = Config::from_sources(Some(printed.path()), variables(&[("SCPSFM_STORE__URL", given)]), &[]);
+    assert_eq!(again.expect("complete"), config);
+    let error = Config::from_sources(Some(printed.path()), vec![], &[]).expect_err("no password").to_string();
+    assert!(error.contains("store.url") && error.contains("***") && error.contains("SCPSFM_STORE__URL"), "{error}");
+    let bare = Config::from_sources(None, variables(&[("SCPSFM_STORE__URL", "postgres://me@db/scpsfm")]), &[]);
+    let printed = file(&bare.expect("valid").to_toml().expect("TOML"));
+    assert!(Config::from_sources(Some(printed.path()), vec![], &[]).is_ok(), "nothing is hidden");
 }
 
 #[test]
@@ -85,6 +96,8 @@ fn keys_are_kept_as_hashes_and_shown_nowhere() {
     for shown in [format!("{config:?}"), config.to_toml().expect("TOML")] {
         assert!(!shown.contains(key), "{shown}");
     }
+    let printed = config.to_toml().expect("TOML");
+    assert!(printed.contains("# auth.keys are set and not shown"), "{printed}");
 }
 
 #[test]

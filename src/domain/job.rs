@@ -7,7 +7,7 @@ use std::time::SystemTime;
 use serde::{Deserialize, Serialize};
 
 use super::progress::Progress;
-use super::result::{Grade, Prior, Status};
+use super::result::{Grade, Prior, Status, Warning};
 use super::settings::SolveSettings;
 
 /// Tenant of callers without an API key.
@@ -127,6 +127,28 @@ pub struct Summary {
     pub seconds: f64,
     /// Size of the stored result in bytes; `ReadJobResult` streams about as much.
     pub result_bytes: u64,
+    /// The result's first warnings, see [`Summary::warnings_of`]; of one without a reconstruction, why there is none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<Warning>,
+}
+
+impl Summary {
+    /// Warnings in a summary at most; a result seldom has more, unless it has many camera groups.
+    pub const MAX_WARNINGS: usize = 8;
+    /// Longest detail of a warning in a summary, in characters: a page of a thousand jobs stays below a message's limit.
+    pub const MAX_DETAIL_CHARS: usize = 400;
+
+    /// So much of a result's warnings as a summary holds.
+    pub fn warnings_of(warnings: &[Warning]) -> Vec<Warning> {
+        let shortened = |warning: &Warning| {
+            let mut detail: String = warning.detail.chars().take(Self::MAX_DETAIL_CHARS).collect();
+            if detail.len() < warning.detail.len() {
+                detail.push_str("...");
+            }
+            Warning { detail, ..warning.clone() }
+        };
+        warnings.iter().take(Self::MAX_WARNINGS).map(shortened).collect()
+    }
 }
 
 /// Why a job failed.

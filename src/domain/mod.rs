@@ -5,6 +5,7 @@
 
 pub mod error;
 pub mod input;
+pub mod input_name;
 pub mod job;
 pub mod left_out;
 pub mod limits;
@@ -15,6 +16,7 @@ pub mod stop;
 
 pub use error::{InvalidInput, Violation};
 pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
+pub use input_name::InputName;
 pub use left_out::LeftOut;
 pub use limits::Limits;
 pub use progress::{Losses, Observer, Progress, Silent, Stage};

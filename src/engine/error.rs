@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::domain::job::{JobName, JobState};
-use crate::domain::{InvalidInput, Violation};
+use crate::domain::{InputName, InvalidInput, Violation};
 use crate::store;
 
 /// Why the engine refused or could not answer.
@@ -11,7 +11,17 @@ use crate::store;
 pub enum Error {
     #[error("{0} does not exist")]
     NotFound(JobName),
-    /// The job id is taken, or the request id stands for another body.
+    #[error("{0} does not exist")]
+    InputNotFound(InputName),
+    #[error("there is no upload {}", .0.input)]
+    UploadNotFound(InputName),
+    /// Another stream goes on with the upload.
+    #[error("{0}")]
+    TakenOver(String),
+    /// The tenant has uploaded as much as it may; `bound` names for programs what there is too much of.
+    #[error("{message}")]
+    UploadsFull { bound: &'static str, message: String },
+    /// The job id is taken, or the request id or upload id stands for another body.
     #[error("{0}")]
     AlreadyExists(String),
     /// Too much waits already; `bound` names for programs what there is too much of.
@@ -43,6 +53,10 @@ impl From<store::Error> for Error {
     fn from(error: store::Error) -> Self {
         match error {
             store::Error::NotFound(name) => Error::NotFound(name),
+            store::Error::InputNotFound(name) => Error::InputNotFound(name),
+            store::Error::UploadNotFound(name) => Error::UploadNotFound(name),
+            store::Error::UploadTakenOver(_) => Error::TakenOver(error.to_string()),
+            store::Error::UploadsFull(bound) => Error::UploadsFull { bound: bound.name(), message: bound.to_string() },
             store::Error::AlreadyExists(message) => Error::AlreadyExists(message),
             store::Error::NotEnded(..) => Error::NotEnded(error.to_string()),
             store::Error::EtagMismatch(_) => Error::EtagMismatch(error.to_string()),

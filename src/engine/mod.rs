@@ -10,6 +10,7 @@ mod hub;
 mod observe;
 mod slot;
 mod submit;
+mod upload;
 mod watch;
 mod worker;
 
@@ -22,10 +23,14 @@ use std::time::{Duration, SystemTime};
 
 use tokio::sync::{Notify, watch as channel};
 
-pub use crate::store::{JobPage, JobQuery, Load, Order, QueueBounds};
+pub use crate::store::{
+    JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, StoredInput, UploadBounds, UploadStatus,
+};
+pub use crate::telemetry::metrics::GivenUp;
 pub use drain::Drained;
 pub use error::Error;
-pub use submit::{Deadline, NewJob};
+pub use submit::{Deadline, JobInput, NewJob};
+pub use upload::{Begun, Upload, UploadOptions};
 pub use watch::Watch;
 
 use crate::domain::job::{Job, JobName, JobState};
@@ -54,7 +59,8 @@ pub struct Options {
     pub lease: Duration,
     /// Attempts that may be lost before a job fails.
     pub max_attempts: u32,
-    /// How long ended jobs are kept; `None`: for good.
+    pub uploads: UploadOptions,
+    /// How long ended jobs are kept, and uploaded inputs that no job has; `None`: for good.
     pub retention: Option<Duration>,
     /// What callers of a full queue are told to wait.
     pub retry_after: Duration,
@@ -99,6 +105,7 @@ impl Default for Options {
                 max_tenant_jobs: u64::MAX,
                 max_tenant_bytes: u64::MAX,
             },
+            uploads: UploadOptions::default(),
             lease: Self::DEFAULT_LEASE,
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
             retention: Some(Self::DEFAULT_RETENTION),
@@ -147,6 +154,8 @@ struct Inner {
     /// Wakes the task that counts the queue.
     queue_changed: Notify,
     phase: channel::Sender<Phase>,
+    /// Whether the last sweep found the store.
+    store_reachable: channel::Sender<bool>,
     crew: Mutex<drain::Crew>,
 }
 
@@ -166,10 +175,12 @@ impl Engine {
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             phase: channel::Sender::new(Phase::Open),
+            store_reachable: channel::Sender::new(true),
             crew: Mutex::default(),
             options,
         });
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
+        observe::store_reachable(true);
         inner.taken_back(&recovered);
         inner.hire(solver)?;
         inner.queue_changed();
@@ -274,6 +285,11 @@ impl Engine {
     /// [`Error::Internal`].
     pub async fn load(&self) -> Result<Load, Error> {
         Ok(self.inner.store.load().await?)
+    }
+
+    /// Whether the store answers, as of a look a second: without it this server can neither take on nor tell anything.
+    pub fn store_reachable(&self) -> channel::Receiver<bool> {
+        self.inner.store_reachable.subscribe()
     }
 
     /// Whether a drain has begun.

@@ -3,8 +3,9 @@
 use crate::store::Bound;
 pub(super) use crate::telemetry::Attempt;
 pub(super) use crate::telemetry::metrics::{
-    AttemptLost, Deletion, Refusal, attempt_lost, engine_size, job_created, job_finished as job_ended, jobs_deleted,
-    queue_depth, refused,
+    AttemptLost, Deletion, GivenUp, Refusal, attempt_lost, engine_size, input_created, job_created,
+    job_finished as job_ended, jobs_deleted, queue_depth, refused, store_reachable, upload_refused, uploaded,
+    uploads_given_up,
 };
 
 /// The refusal by a bound of the queue.

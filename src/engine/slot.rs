@@ -5,6 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use super::worker::Worker;
 use super::{Inner, Phase, attempt, observe};
+use crate::store;
 
 /// How often a slot looks for work unasked: jobs of other processes and of a store that failed come without a wake-up.
 const CLAIM_POLL: Duration = Duration::from_secs(1);
@@ -56,6 +57,10 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
             () = inner.queue_changed.notified() => {}
             _ = ticks.tick() => {
                 inner.sweep().await;
+                if !*inner.store_reachable.borrow() {
+                    // Each further question would take its time to come to nothing, and the next look is due.
+                    continue;
+                }
                 inner.tidy().await;
             }
         }
@@ -79,13 +84,29 @@ impl Inner {
                 Err(error) => tracing::warn!(%error, "cannot remove old jobs"),
             }
         }
+        self.tidy_uploads().await;
         if let Err(error) = self.store.reclaim().await {
             tracing::warn!(%error, "cannot give back the space of removed jobs");
         }
     }
 
+    /// Notes whether the store answers, for those who ask whether this server is of any use.
+    fn store_answers(&self, answers: bool) {
+        let changed =
+            self.store_reachable.send_if_modified(|reachable| std::mem::replace(reachable, answers) != answers);
+        if changed {
+            observe::store_reachable(answers);
+            match answers {
+                true => tracing::info!("the store is back, this server is ready again"),
+                false => tracing::error!("the store is out of reach, this server is not ready"),
+            }
+        }
+    }
+
     async fn sweep(&self) {
-        match self.store.sweep(SystemTime::now(), self.options.max_attempts).await {
+        let swept = self.store.sweep(SystemTime::now(), self.options.max_attempts).await;
+        self.store_answers(!matches!(swept, Err(store::Error::Unavailable(_))));
+        match swept {
             Ok(swept) => {
                 self.taken_back(&swept.lost);
                 for job in &swept.expired {

@@ -9,8 +9,8 @@ use sha2::{Digest, Sha256};
 use super::{Error, Inner, Phase, finished, observe};
 use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::job::{Job, JobName};
-use crate::domain::{Backend, Input, SolveSettings};
-use crate::store::{self, NewRecord, Request, payload};
+use crate::domain::{Backend, Input, InputName, SolveSettings};
+use crate::store::{self, NewRecord, Request, StoredInput, payload};
 
 /// Longest request id: a UUID with room for a prefix.
 const MAX_REQUEST_ID_BYTES: usize = 128;
@@ -23,6 +23,20 @@ pub enum Deadline {
     After(Duration),
 }
 
+/// What a job works on.
+#[derive(Debug, Clone)]
+pub enum JobInput {
+    Inline(Input),
+    /// An uploaded input of the job's tenant.
+    Uploaded(InputName),
+}
+
+impl From<Input> for JobInput {
+    fn from(input: Input) -> Self {
+        JobInput::Inline(input)
+    }
+}
+
 /// What a caller wants solved.
 #[derive(Debug, Clone)]
 pub struct NewJob {
@@ -31,7 +45,7 @@ pub struct NewJob {
     pub job_id: Option<String>,
     /// Makes creation idempotent; scoped to the tenant.
     pub request_id: Option<String>,
-    pub input: Input,
+    pub input: JobInput,
     pub settings: SolveSettings,
     pub deadline: Option<Deadline>,
     /// Larger is sooner; 0 is the default.
@@ -43,12 +57,12 @@ pub struct NewJob {
 
 impl NewJob {
     /// A job with nothing but what every job has.
-    pub fn new(tenant: impl Into<String>, input: Input, settings: SolveSettings) -> Self {
+    pub fn new(tenant: impl Into<String>, input: impl Into<JobInput>, settings: SolveSettings) -> Self {
         Self {
             tenant: tenant.into(),
             job_id: None,
             request_id: None,
-            input,
+            input: input.into(),
             settings,
             deadline: None,
             priority: 0,
@@ -70,15 +84,40 @@ impl NewJob {
             let length = id.len();
             found.push(Violation::of("request_id", format!("{length} bytes are not in 1..={MAX_REQUEST_ID_BYTES}")));
         }
+        if let JobInput::Uploaded(name) = &self.input
+            && name.tenant != self.tenant
+        {
+            return Err(Error::InputNotFound(name.clone()));
+        }
         found.into_result()?;
         Ok(self.settings.validate()?)
     }
 
-    /// What is stored. Encodes and, for a request id, hashes the whole input: not for an async thread.
-    fn into_record(self, now: SystemTime, backend: Backend) -> Result<NewRecord, Error> {
-        let input = payload::encode(&self.input)?;
+    /// What is stored; `uploaded` is the input that it names, where it names one. Encodes and, for a request id, hashes
+    /// the whole input: not for an async thread.
+    fn into_record(self, uploaded: Option<StoredInput>, now: SystemTime, backend: Backend) -> Result<NewRecord, Error> {
+        // Bounded by the limits on inputs, which are far below what a u32 holds.
+        let count = |number: usize| u32::try_from(number).unwrap_or(u32::MAX);
+        let mut named = Vec::new();
+        let (input, [view_count, track_count, observation_count]) = match (&self.input, uploaded) {
+            (JobInput::Inline(input), _) => {
+                let counts = [input.view_count(), input.track_count(), input.observation_count()].map(count);
+                (store::JobInput::Inline(payload::encode(input)?), counts)
+            }
+            (JobInput::Uploaded(_), Some(found)) => {
+                let counts = [found.view_count, found.track_count, found.observation_count];
+                // An encoded input begins as a map does, and a name as text: neither is ever taken for the other.
+                named = payload::encode(&found.name.to_string())?;
+                (store::JobInput::Uploaded { input: found.name.input, bytes: found.payload_bytes }, counts)
+            }
+            (JobInput::Uploaded(name), None) => return Err(Error::InputNotFound(name.clone())),
+        };
+        let digested = match &input {
+            store::JobInput::Inline(bytes) => bytes.as_slice(),
+            store::JobInput::Uploaded { .. } => &named,
+        };
         let request = match &self.request_id {
-            Some(id) => Some(Request { id: id.clone(), digest: self.digest(&input)? }),
+            Some(id) => Some(Request { id: id.clone(), digest: self.digest(digested)? }),
             None => None,
         };
         let deadline = match self.deadline {
@@ -92,10 +131,9 @@ impl NewJob {
         Ok(NewRecord {
             name: JobName { tenant: self.tenant, job },
             request,
-            // Bounded by the limits on inputs, which are far below what a u32 holds.
-            view_count: u32::try_from(self.input.view_count()).unwrap_or(u32::MAX),
-            track_count: u32::try_from(self.input.track_count()).unwrap_or(u32::MAX),
-            observation_count: u32::try_from(self.input.observation_count()).unwrap_or(u32::MAX),
+            view_count,
+            track_count,
+            observation_count,
             input,
             settings: SolveSettings { backend: Some(self.settings.backend.unwrap_or(backend)), ..self.settings },
             deadline,
@@ -136,7 +174,17 @@ impl Inner {
         }
         let now = SystemTime::now();
         let backend = self.options.backend;
-        let encode = move || news.into_iter().map(|new| new.into_record(now, backend)).collect::<Result<Vec<_>, _>>();
+        let mut uploaded = Vec::new();
+        for new in &news {
+            uploaded.push(match &new.input {
+                JobInput::Inline(_) => None,
+                JobInput::Uploaded(name) => Some(self.store.uploaded_input(name).await?),
+            });
+        }
+        let encode = move || {
+            let each = news.into_iter().zip(uploaded);
+            each.map(|(new, uploaded)| new.into_record(uploaded, now, backend)).collect::<Result<Vec<_>, _>>()
+        };
         let records = finished(tokio::task::spawn_blocking(encode)).await?;
         // On its own task: a caller that goes away must not leave a stored job untold.
         finished(tokio::spawn(async move { self.store_jobs(records, now).await })).await

@@ -140,6 +140,7 @@ fn summarise(solution: &Solution, result_bytes: u64) -> Summary {
         iterations: solution.iterations,
         seconds: solution.seconds,
         result_bytes,
+        warnings: Summary::warnings_of(&solution.warnings),
     }
 }
 

@@ -1,8 +1,11 @@
-//! The layer that finds out whose call it is: before any service sees a request, its key becomes a tenant.
+//! The layer that finds out whose call it is: before any service sees a request, its key becomes a tenant. A call whose
+//! key is withdrawn while it lasts ends, in both directions.
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
 
+use http_body::{Body as HttpBody, Frame, SizeHint};
+use prost::bytes::Bytes;
 use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::http::header::AUTHORIZATION;
@@ -10,7 +13,7 @@ use tonic::codegen::http::{HeaderMap, Request, Response};
 use tower::{Layer, Service};
 
 use super::caller::Tenant;
-use super::keys::KeyRing;
+use super::keys::{Hash, KeyRing};
 use super::reload::Current;
 use super::status;
 
@@ -29,11 +32,79 @@ impl Authenticate {
         Self { keys }
     }
 
-    fn tenant(&self, headers: &HeaderMap) -> Result<Tenant, Status> {
-        let Some(keys) = &self.keys else { return Ok(Tenant::default()) };
-        let key = bearer(headers)?;
-        let keys = keys.borrow();
-        keys.tenant_of(key).map(Tenant::new).ok_or_else(status::unknown_key)
+    /// Whose call it is, and what it hangs on.
+    fn admit(&self, headers: &HeaderMap) -> Result<(Tenant, Option<Standing>), Status> {
+        let Some(keys) = &self.keys else { return Ok((Tenant::default(), None)) };
+        let key = Hash::of(bearer(headers)?);
+        let mut keys = keys.clone();
+        let tenant = keys.borrow_and_update().tenant_of_hash(&key).map(str::to_owned);
+        let tenant = tenant.ok_or_else(status::unknown_key)?;
+        Ok((Tenant::new(&tenant), Some(Standing { keys, key, tenant })))
+    }
+}
+
+/// A key that was accepted, and the tenant that it stood for then.
+#[derive(Clone)]
+struct Standing {
+    keys: Current<KeyRing>,
+    key: Hash,
+    tenant: String,
+}
+
+impl Standing {
+    /// Ends when the key does not stand for the tenant any more; keys that cannot change never end.
+    async fn lost(mut self) {
+        while self.keys.changed().await.is_ok() {
+            if self.keys.borrow_and_update().tenant_of_hash(&self.key) != Some(&self.tenant) {
+                return;
+            }
+        }
+        std::future::pending().await
+    }
+}
+
+/// Ends with a key.
+type Lost = Pin<Box<dyn Future<Output = ()> + Send>>;
+
+/// The frames of one direction of a call, as long as its key stands.
+struct Watched {
+    body: Body,
+    /// `None`: it was lost, and nothing follows.
+    lost: Option<Lost>,
+    /// An answer ends with a status, a request with an error.
+    is_answer: bool,
+}
+
+impl Watched {
+    fn over(body: Body, standing: &Standing, is_answer: bool) -> Body {
+        Body::new(Self { body, lost: Some(Box::pin(standing.clone().lost())), is_answer })
+    }
+}
+
+impl HttpBody for Watched {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        let Some(lost) = &mut self.lost else { return Poll::Ready(None) };
+        if lost.as_mut().poll(context).is_ready() {
+            self.lost = None;
+            let status = status::withdrawn_key();
+            // An error of an answer's body would reset the stream, and its caller would not learn why.
+            return Poll::Ready(Some(match self.is_answer {
+                true => Ok(Frame::trailers(status.into_http::<Body>().headers().clone())),
+                false => Err(status),
+            }));
+        }
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.lost.is_none() || self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        SizeHint::default()
     }
 }
 
@@ -64,9 +135,9 @@ pub struct Authenticated<S> {
     layer: Authenticate,
 }
 
-impl<S, B> Service<Request<B>> for Authenticated<S>
+impl<S> Service<Request<Body>> for Authenticated<S>
 where
-    S: Service<Request<B>, Response = Response<Body>>,
+    S: Service<Request<Body>, Response = Response<Body>>,
     S::Future: Send + 'static,
 {
     type Response = Response<Body>;
@@ -77,19 +148,29 @@ where
         self.inner.poll_ready(context)
     }
 
-    fn call(&mut self, mut request: Request<B>) -> Self::Future {
-        if !request.uri().path().starts_with(OPEN) {
-            match self.layer.tenant(request.headers()) {
-                Ok(tenant) => drop(request.extensions_mut().insert(tenant)),
-                Err(status) => {
-                    let refusal = status.into_http();
-                    return Box::pin(async { Ok(refusal) });
-                }
-            }
-            // No service needs it any more, and none can let it slip.
-            request.headers_mut().remove(AUTHORIZATION);
+    fn call(&mut self, mut request: Request<Body>) -> Self::Future {
+        if request.uri().path().starts_with(OPEN) {
+            return Box::pin(self.inner.call(request));
         }
-        Box::pin(self.inner.call(request))
+        let (tenant, standing) = match self.layer.admit(request.headers()) {
+            Ok(admitted) => admitted,
+            Err(status) => {
+                let refusal = status.into_http();
+                return Box::pin(async { Ok(refusal) });
+            }
+        };
+        request.extensions_mut().insert(tenant);
+        // No service needs it any more, and none can let it slip.
+        request.headers_mut().remove(AUTHORIZATION);
+        let Some(standing) = standing else { return Box::pin(self.inner.call(request)) };
+        let answer = self.inner.call(request.map(|body| Watched::over(body, &standing, false)));
+        Box::pin(async move {
+            let answer = tokio::select! {
+                answer = answer => answer?,
+                () = standing.clone().lost() => return Ok(status::withdrawn_key().into_http()),
+            };
+            Ok(answer.map(|body| Watched::over(body, &standing, true)))
+        })
     }
 }
 
@@ -114,7 +195,7 @@ mod tests {
         let (_sender, keys) = watch::channel(Arc::new(ring));
         let layer = Authenticate::new(Some(keys));
         for right in ["Bearer", "bearer", "BEARER"] {
-            let tenant = layer.tenant(&headers(&[&format!("{right} {KEY}")])).expect("known");
+            let (tenant, _) = layer.admit(&headers(&[&format!("{right} {KEY}")])).expect("known");
             assert_eq!(tenant, Tenant::new("north"));
         }
         let bearer = format!("Bearer {KEY}");
@@ -129,7 +210,7 @@ mod tests {
             &[&bearer, &bearer],
         ];
         for values in wrong {
-            let status = layer.tenant(&headers(values)).expect_err("refused");
+            let status = layer.admit(&headers(values)).map(|_| ()).expect_err("refused");
             assert_eq!(status.code(), Code::Unauthenticated, "{values:?}");
             assert!(!status.message().contains(KEY), "{status}");
         }
@@ -137,6 +218,7 @@ mod tests {
 
     #[test]
     fn without_keys_everyone_is_of_the_default_tenant() {
-        assert_eq!(Authenticate::new(None).tenant(&headers(&[])).expect("open"), Tenant::default());
+        let (tenant, standing) = Authenticate::new(None).admit(&headers(&[])).expect("open");
+        assert!(tenant == Tenant::default() && standing.is_none());
     }
 }

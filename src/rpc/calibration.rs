@@ -11,12 +11,13 @@ use super::caller::Caller;
 use super::convert::enums::Twin;
 use super::convert::{job, settings};
 use super::follow::{Follower, Followers};
+use super::inputs::MAX_CHUNK_BYTES;
 use super::jobs::MAX_BATCH;
 use super::submission::Submission;
 use super::{proto, status};
 use crate::domain::job::EventBody;
 use crate::domain::{Backend, Limits, Method, SolveSettings};
-use crate::engine::{self, Engine, QueueBounds};
+use crate::engine::{self, Engine, QueueBounds, UploadOptions};
 use crate::telemetry;
 
 /// How long a `Solve` may be silent before its input is complete. A dead connection is found by keep-alive long before;
@@ -72,6 +73,16 @@ async fn next(messages: &mut Streaming<proto::SolveRequest>) -> Result<Option<pr
     match tokio::time::timeout(INPUT_PATIENCE, messages.message()).await {
         Ok(message) => message,
         Err(_) => Err(status::input_stalled(INPUT_PATIENCE)),
+    }
+}
+
+fn upload_limits(options: &UploadOptions) -> proto::UploadLimits {
+    proto::UploadLimits {
+        max_bytes: options.max_bytes,
+        max_chunk_bytes: MAX_CHUNK_BYTES as u64,
+        max_tenant_uploads: options.bounds.max_tenant_uploads,
+        max_tenant_bytes: options.bounds.max_tenant_bytes,
+        abandoned_after: options.abandoned_after.and_then(|kept| kept.try_into().ok()),
     }
 }
 
@@ -144,6 +155,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             retention: options.retention.and_then(|kept| kept.try_into().ok()),
             max_batch_requests: count(MAX_BATCH),
             queue_limits: Some(queue_limits(&options.queue)),
+            upload_limits: Some(upload_limits(&options.uploads)),
         }))
     }
 }

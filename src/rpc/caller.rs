@@ -4,6 +4,7 @@ use tonic::Request;
 
 use super::convert::names;
 use super::status;
+use crate::domain::InputName;
 use crate::domain::job::{DEFAULT_TENANT, JobName};
 use tonic::Status;
 
@@ -67,6 +68,15 @@ impl Caller {
     pub fn job(&self, name: &str) -> Result<JobName, Status> {
         let name = names::job(name).map_err(|error| status::invalid(&error))?;
         if name.tenant == self.tenant { Ok(name) } else { Err(status::job_not_found(&name)) }
+    }
+
+    /// The uploaded input that `name` names; another tenant's is as one that never was.
+    ///
+    /// # Errors
+    /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
+    pub fn input(&self, name: &str) -> Result<InputName, Status> {
+        let name = names::input(name).map_err(|error| status::invalid(&error))?;
+        if name.tenant == self.tenant { Ok(name) } else { Err(status::input_not_found(&name)) }
     }
 }
 

@@ -1,26 +1,258 @@
-//! `InputService`, still to come: an input travels with its job.
+//! `InputService`.
 
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::Semaphore;
 use tonic::{Request, Response, Status, Streaming};
+use tracing::Instrument;
 
-use super::{proto, status};
+use super::caller::Caller;
+use super::convert::{self, input};
+use super::parts::{self, Parts};
+use super::{proto, status, violation};
+use crate::domain::{InputName, Limits};
+use crate::engine::{Begun, Engine, GivenUp, NewUpload, Upload};
+use proto::upload_input_request::Message;
+
+/// Data of one chunk, in bytes: below the message limit of every client and proxy.
+pub const MAX_CHUNK_BYTES: usize = 1 << 20;
+
+/// Largest message of an upload: a chunk and its few other bytes.
+pub const MAX_MESSAGE_BYTES: usize = MAX_CHUNK_BYTES + 1024;
+
+/// What is gathered before it is stored: smaller chunks would be a commit each.
+const WRITE_BYTES: usize = MAX_CHUNK_BYTES;
+
+/// How long a stream may be silent, as in `Solve`.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Uploads that are decoded at a time: each takes as much memory as the largest input.
+const DECODED_AT_ONCE: usize = 2;
 
 /// The service.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Inputs;
+#[derive(Debug, Clone)]
+pub struct Inputs {
+    engine: Engine,
+    limits: Limits,
+    decoders: Arc<Semaphore>,
+}
+
+impl Inputs {
+    pub fn new(engine: Engine, limits: Limits) -> Self {
+        Self { engine, limits, decoders: Arc::new(Semaphore::new(DECODED_AT_ONCE)) }
+    }
+
+    /// The whole of an upload, from its first message on.
+    async fn receive(
+        &self,
+        caller: &Caller,
+        mut messages: Streaming<proto::UploadInputRequest>,
+    ) -> Result<proto::Input, Status> {
+        let Some(Message::Start(start)) = next(&mut messages).await? else {
+            return Err(status::invalid(&violation("start", "is not the first message")));
+        };
+        let new = self.read_start(caller, start)?;
+        let upload = match self.engine.begin_upload(new).await.map_err(status::from_engine)? {
+            Begun::Finished(input) => return Ok(input::uploaded_to_wire(&input)),
+            Begun::Open(upload) => upload,
+        };
+        let mut reception = Reception { upload, gathered: Vec::new() };
+        let finish = reception.until_finish(&mut messages).await;
+        // Whatever ended the stream: what came before is kept.
+        let kept = reception.store().await;
+        let sha256 = finish?;
+        kept?;
+        self.finish(reception.upload, sha256).await
+    }
+
+    fn read_start(&self, caller: &Caller, start: proto::UploadStart) -> Result<NewUpload, Status> {
+        let name = name(caller, &start.parent, &start.upload_id, "start.upload_id")?;
+        let max = self.engine.options().uploads.max_bytes;
+        let bytes = match u64::try_from(start.size_bytes) {
+            Ok(bytes) if (1..=max).contains(&bytes) => bytes,
+            _ => {
+                let text = format!("{} is not 1 to {max} bytes", start.size_bytes);
+                return Err(status::invalid(&violation("start.size_bytes", text)));
+            }
+        };
+        let sha256 = match start.sha256.is_empty() {
+            true => None,
+            false => Some(digest(&start.sha256, "start.sha256")?),
+        };
+        Ok(NewUpload { name, bytes, sha256 })
+    }
+
+    /// Makes an input of the bytes that are stored, if they are one.
+    async fn finish(&self, upload: Upload, sha256: [u8; 32]) -> Result<proto::Input, Status> {
+        let _turn = self.decoders.acquire().await.map_err(|error| status::internal(&error))?;
+        let length = usize::try_from(upload.bytes()).map_err(|error| status::internal(&error))?;
+        let (sender, reader) = Parts::new(length);
+        let limits = self.limits.clone();
+        let decode = super::blocking(move || {
+            let mut reader = reader.begun();
+            let draft = convert::upload::read(&mut reader, &limits);
+            let found = reader.into_hash()?;
+            // Of bytes that are not those that were meant, nothing else is worth telling.
+            let input = if found == sha256 { Some(draft.and_then(input::Draft::finish)) } else { None };
+            Ok((found, input))
+        });
+        let (outcome, ()) = tokio::join!(decode, parts::feed(&upload, sender));
+        match outcome?.map_err(status::from_engine)? {
+            (found, None) => {
+                upload.give_up(GivenUp::WrongHash).await.map_err(status::from_engine)?;
+                Err(status::hash_mismatch(&sha256, &found))
+            }
+            (_, Some(Err(invalid))) => {
+                upload.give_up(GivenUp::Invalid).await.map_err(status::from_engine)?;
+                Err(status::invalid(&invalid))
+            }
+            (found, Some(Ok(input))) => {
+                let stored = upload.finish(input, found).await.map_err(status::from_engine)?;
+                Ok(input::uploaded_to_wire(&stored))
+            }
+        }
+    }
+}
+
+/// A stream on its way into an upload.
+struct Reception {
+    upload: Upload,
+    /// Checked, and not stored yet.
+    gathered: Vec<u8>,
+}
+
+impl Reception {
+    /// Takes chunks until the last message; returns the SHA-256 that it names.
+    async fn until_finish(&mut self, messages: &mut Streaming<proto::UploadInputRequest>) -> Result<[u8; 32], Status> {
+        loop {
+            match next(messages).await? {
+                Some(Message::Chunk(chunk)) => self.take(chunk).await?,
+                Some(Message::Finish(finish)) => return self.check_finish(&finish),
+                Some(Message::Start(_)) => {
+                    return Err(status::invalid(&violation("start", "comes once, in the first message")));
+                }
+                None => {
+                    let text = format!("is missing: the stream ended at {}", self.progress());
+                    return Err(status::invalid(&violation("finish", text)));
+                }
+            }
+        }
+    }
+
+    fn received(&self) -> u64 {
+        self.upload.committed() + self.gathered.len() as u64
+    }
+
+    fn progress(&self) -> String {
+        format!("{} of {} bytes, which are kept", self.received(), self.upload.bytes())
+    }
+
+    async fn take(&mut self, chunk: proto::UploadChunk) -> Result<(), Status> {
+        let invalid = |field: &str, text: String| Err(status::invalid(&violation(field, text)));
+        let received = self.received();
+        let length = chunk.data.len();
+        if u64::try_from(chunk.offset) != Ok(received) {
+            let what = if chunk.offset < received as i64 { "overlaps" } else { "leaves a gap" };
+            return invalid("chunk.offset", format!("{} {what}: {received} is next", chunk.offset));
+        }
+        if length == 0 || length > MAX_CHUNK_BYTES {
+            return invalid(
+                "chunk.data",
+                format!("{length} bytes at offset {received} are not 1 to {MAX_CHUNK_BYTES}"),
+            );
+        }
+        if received + length as u64 > self.upload.bytes() {
+            let declared = self.upload.bytes();
+            return invalid(
+                "chunk.data",
+                format!("{length} bytes at offset {received} go beyond the {declared} declared"),
+            );
+        }
+        let found = crc32c::crc32c(&chunk.data);
+        if found != chunk.crc32c {
+            return Err(status::chunk_corrupted(received, chunk.crc32c, found));
+        }
+        self.gathered.extend_from_slice(&chunk.data);
+        if self.gathered.len() >= WRITE_BYTES { self.store().await } else { Ok(()) }
+    }
+
+    fn check_finish(&self, finish: &proto::UploadFinish) -> Result<[u8; 32], Status> {
+        let invalid = |field: &str, text: String| Err(status::invalid(&violation(field, text)));
+        let sha256 = digest(&finish.sha256, "finish.sha256")?;
+        if self.received() != self.upload.bytes() {
+            return invalid("finish", format!("comes too early, at {}", self.progress()));
+        }
+        match self.upload.sha256() {
+            Some(declared) if declared != sha256 => invalid("finish.sha256", "is not that of the start".into()),
+            _ => Ok(sha256),
+        }
+    }
+
+    async fn store(&mut self) -> Result<(), Status> {
+        let gathered = std::mem::take(&mut self.gathered);
+        if gathered.is_empty() {
+            return Ok(());
+        }
+        self.upload.append(&gathered).await.map_err(status::from_engine)
+    }
+}
+
+async fn next(messages: &mut Streaming<proto::UploadInputRequest>) -> Result<Option<Message>, Status> {
+    let message = match tokio::time::timeout(PATIENCE, messages.message()).await {
+        Ok(message) => message?,
+        Err(_) => return Err(status::input_stalled(PATIENCE)),
+    };
+    match message {
+        None => Ok(None),
+        Some(proto::UploadInputRequest { message: Some(message) }) => Ok(Some(message)),
+        Some(_) => Err(status::invalid(&violation("message", "is not set"))),
+    }
+}
+
+/// The input that an upload becomes: its id is the upload's, in the one form that UUIDs have here.
+fn name(caller: &Caller, parent: &str, upload_id: &str, field: &str) -> Result<InputName, Status> {
+    let tenant = caller.parent(parent)?;
+    match uuid::Uuid::try_parse(upload_id) {
+        Ok(id) => Ok(InputName { tenant, input: id.hyphenated().to_string() }),
+        Err(_) => {
+            Err(status::invalid(&violation(field, "is not a UUID, such as 123e4567-e89b-42d3-a456-426614174000")))
+        }
+    }
+}
+
+fn digest(bytes: &[u8], field: &str) -> Result<[u8; 32], Status> {
+    bytes
+        .try_into()
+        .map_err(|_| status::invalid(&violation(field, format!("{} bytes are not the 32 of a SHA-256", bytes.len()))))
+}
 
 #[tonic::async_trait]
 impl proto::input_service_server::InputService for Inputs {
     async fn upload_input(
         &self,
-        _request: Request<Streaming<proto::UploadInputRequest>>,
+        request: Request<Streaming<proto::UploadInputRequest>>,
     ) -> Result<Response<proto::Input>, Status> {
-        Err(status::not_implemented("UploadInput"))
+        let caller = Caller::of(&request)?;
+        let (inputs, messages) = (self.clone(), request.into_inner());
+        // In a task of its own: if this call is dropped with its connection, what has come is stored all the same.
+        let receiving = async move { inputs.receive(&caller, messages).await };
+        let outcome = tokio::spawn(receiving.in_current_span()).await;
+        outcome.map_err(|error| status::internal(&error))?.map(Response::new)
     }
 
     async fn get_upload_status(
         &self,
-        _request: Request<proto::GetUploadStatusRequest>,
+        request: Request<proto::GetUploadStatusRequest>,
     ) -> Result<Response<proto::UploadStatus>, Status> {
-        Err(status::not_implemented("GetUploadStatus"))
+        let caller = Caller::of(&request)?;
+        let request = request.into_inner();
+        let name = name(&caller, &request.parent, &request.upload_id, "upload_id")?;
+        let found = self.engine.upload_status(&name).await.map_err(status::from_engine)?;
+        Ok(Response::new(proto::UploadStatus {
+            committed_bytes: input::wire_size(found.committed),
+            input: found.input.as_ref().map(input::uploaded_to_wire),
+            size_bytes: input::wire_size(found.bytes),
+        }))
     }
 }

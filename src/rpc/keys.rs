@@ -23,6 +23,16 @@ const HASHED: &str = "sha256:";
 
 type Digest = [u8; 32];
 
+/// What is kept of a key that a caller presented, to see later whether it still stands.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Hash(Digest);
+
+impl Hash {
+    pub fn of(key: &str) -> Self {
+        Self(digest(key.as_bytes()))
+    }
+}
+
 /// Keys and the tenants they stand for.
 #[derive(Clone, Default, PartialEq, Eq)]
 pub struct KeyRing {
@@ -56,12 +66,17 @@ impl KeyRing {
         self
     }
 
-    /// The tenant that a key stands for. Compares with every key, each to its last byte, so that the time tells nothing.
+    /// The tenant that a key stands for.
     pub fn tenant_of(&self, key: &str) -> Option<&str> {
-        let presented = digest(key.as_bytes());
+        self.tenant_of_hash(&Hash::of(key))
+    }
+
+    /// The tenant that the key of this hash stands for. Compares with every key, each to its last byte, so that the time
+    /// tells nothing.
+    pub fn tenant_of_hash(&self, key: &Hash) -> Option<&str> {
         let mut found = None;
         for (known, tenant) in &self.keys {
-            let difference = known.iter().zip(&presented).fold(0, |sum, (a, b)| sum | (a ^ b));
+            let difference = known.iter().zip(&key.0).fold(0, |sum, (a, b)| sum | (a ^ b));
             // Opaque to the optimiser, which might otherwise end the comparison early.
             if std::hint::black_box(difference) == 0 {
                 found = Some(tenant.as_str());

@@ -1,14 +1,16 @@
 //! The server: services, health, reflection, compression and limits, put together in one place.
 
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::net::TcpListener;
+use tokio::sync::{Mutex, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio_rustls::rustls::ServerConfig;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding::Gzip;
-use tonic::transport::server::{Router, TcpIncoming};
+use tonic::transport::server::Router;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 use tower::layer::util::{Identity, Stack};
@@ -16,7 +18,7 @@ use tower::layer::util::{Identity, Stack};
 use super::auth::Authenticate;
 use super::calibration::Calibration;
 use super::explain::Explain;
-use super::inputs::Inputs;
+use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
 use super::meter::Meter;
@@ -25,7 +27,7 @@ use super::proto::calibration_service_server::CalibrationServiceServer;
 use super::proto::input_service_server::InputServiceServer;
 use super::proto::job_service_server::JobServiceServer;
 use super::reload::{self, Current};
-use super::tls;
+use super::{door, tls};
 use crate::domain::Limits;
 use crate::engine::Engine;
 
@@ -62,8 +64,14 @@ pub struct Options {
     pub keys: keys::Sources,
     /// How often the files of certificates and keys are looked at.
     pub look_every: Duration,
-    /// How long a TLS handshake may take.
+    /// How long a connection may take to shake hands and to say its first words.
     pub handshake_timeout: Duration,
+    /// Connections that have not come to their first words yet, at most; one more ends the oldest of them.
+    pub max_silent_connections: usize,
+    /// How long a connection may be silent before it is asked whether it lives.
+    pub keepalive: Duration,
+    /// How long the answer to that may take.
+    pub keepalive_timeout: Duration,
     /// Whether callers may ask for the API's description.
     pub reflection: bool,
 }
@@ -97,7 +105,10 @@ impl Default for Options {
             tls: None,
             keys: keys::Sources::default(),
             look_every: reload::LOOK_EVERY,
-            handshake_timeout: tls::HANDSHAKE_TIMEOUT,
+            handshake_timeout: door::HANDSHAKE_TIMEOUT,
+            max_silent_connections: door::MAX_GREETED,
+            keepalive: KEEPALIVE,
+            keepalive_timeout: KEEPALIVE_TIMEOUT,
             reflection: true,
         }
     }
@@ -124,7 +135,9 @@ pub enum Error {
 #[derive(Debug)]
 pub struct Server {
     address: SocketAddr,
-    health: HealthReporter,
+    health: Arc<Health>,
+    /// Follows the store; ended with the server.
+    follower: JoinHandle<()>,
     stop: CancellationToken,
     task: JoinHandle<Result<(), tonic::transport::Error>>,
 }
@@ -141,24 +154,22 @@ impl Server {
         let listen_error = |source| Error::Listen { address: options.listen, source };
         let listener = TcpListener::bind(options.listen).await.map_err(listen_error)?;
         let address = listener.local_addr().map_err(listen_error)?;
-        let (health, health_service) = tonic_health::server::health_reporter();
-        for name in HEALTH_NAMES {
-            health.set_service_status(name, ServingStatus::Serving).await;
-        }
+        let (reporter, health_service) = tonic_health::server::health_reporter();
+        let health = Arc::new(Health { reporter, draining: Mutex::new(false) });
+        let mut reachable = engine.store_reachable();
+        health.tell(*reachable.borrow_and_update()).await;
         let router = router(&options, engine, Authenticate::new(keys))?.add_service(health_service);
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
-        let task = match certificates {
-            Some(certificates) => {
-                let incoming = tls::incoming(listener, certificates, options.handshake_timeout);
-                tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped))
-            }
-            None => {
-                let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-                tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped))
-            }
+        let entrance = door::Options {
+            certificates,
+            timeout: options.handshake_timeout,
+            max_greeted: options.max_silent_connections,
         };
-        Ok(Self { address, health, stop, task })
+        let incoming = door::incoming(listener, entrance);
+        let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));
+        let follower = tokio::spawn(follow_store(Arc::clone(&health), reachable));
+        Ok(Self { address, health, follower, stop, task })
     }
 
     /// Where the server listens.
@@ -168,9 +179,7 @@ impl Server {
 
     /// First phase of a drain: tells health checks NOT_SERVING, so that no new callers are sent here. Calls go on.
     pub async fn set_draining(&self) {
-        for name in HEALTH_NAMES {
-            self.health.set_service_status(name, ServingStatus::NotServing).await;
-        }
+        self.health.drain().await;
     }
 
     /// Ends only when the server fails.
@@ -202,6 +211,45 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.task.abort();
+        self.follower.abort();
+    }
+}
+
+/// What health checks are told.
+#[derive(Debug)]
+struct Health {
+    reporter: HealthReporter,
+    /// Held while the statuses change, so that a store that comes back does not undo a drain.
+    draining: Mutex<bool>,
+}
+
+impl Health {
+    /// Tells whether calls can be answered; while the server drains, nothing changes.
+    async fn tell(&self, serving: bool) {
+        let draining = self.draining.lock().await;
+        if !*draining {
+            self.set(if serving { ServingStatus::Serving } else { ServingStatus::NotServing }).await;
+        }
+    }
+
+    async fn drain(&self) {
+        let mut draining = self.draining.lock().await;
+        *draining = true;
+        self.set(ServingStatus::NotServing).await;
+    }
+
+    async fn set(&self, status: ServingStatus) {
+        for name in HEALTH_NAMES {
+            self.reporter.set_service_status(name, status).await;
+        }
+    }
+}
+
+/// Tells health checks NOT_SERVING while the store is out of reach.
+async fn follow_store(health: Arc<Health>, mut reachable: watch::Receiver<bool>) {
+    while reachable.changed().await.is_ok() {
+        let reachable = *reachable.borrow_and_update();
+        health.tell(reachable).await;
     }
 }
 
@@ -233,6 +281,7 @@ fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Resu
     let limits = options.limits.clone();
     let max_bytes = options.max_message_bytes;
     let calibration = Calibration::new(engine.clone(), limits.clone(), max_bytes, options.solve_grace);
+    let inputs = Inputs::new(engine.clone(), limits.clone());
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
@@ -249,11 +298,14 @@ fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Resu
         .layer(authenticate)
         .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
         .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
-        .http2_keepalive_interval(Some(KEEPALIVE))
-        .http2_keepalive_timeout(Some(KEEPALIVE_TIMEOUT))
+        .http2_keepalive_interval(Some(options.keepalive))
+        .http2_keepalive_timeout(Some(options.keepalive_timeout))
         .add_service(with_limits!(CalibrationServiceServer::new(calibration)))
         .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits))))
-        .add_service(with_limits!(InputServiceServer::new(Inputs)));
+        .add_service(
+            with_limits!(InputServiceServer::new(inputs))
+                .max_decoding_message_size(max_bytes.min(inputs::MAX_MESSAGE_BYTES)),
+        );
     if !options.reflection {
         return Ok(router);
     }

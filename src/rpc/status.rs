@@ -7,7 +7,14 @@
 //! | `NOT_FOUND` | `TENANT_NOT_FOUND` | a parent that is not the caller's tenant, whether it exists or not |
 //! | `UNAUTHENTICATED` | `API_KEY_MISSING` | the server asks for a key, and the call carries none |
 //! | `UNAUTHENTICATED` | `API_KEY_UNKNOWN` | the call carries a key that stands for no tenant |
+//! | `UNAUTHENTICATED` | `API_KEY_WITHDRAWN` | the key was withdrawn while the call lasted, within seconds |
 //! | `ALREADY_EXISTS` | `ALREADY_EXISTS` | a job id is taken, or a request id came with another body |
+//! | `NOT_FOUND` | `INPUT_NOT_FOUND` | no such uploaded input, or another tenant's |
+//! | `NOT_FOUND` | `UPLOAD_NOT_FOUND` | no such upload, or it was given up |
+//! | `DATA_LOSS` | `CHUNK_CORRUPTED` | a chunk of an upload does not match its CRC-32C; `metadata["offset"]` says which |
+//! | `DATA_LOSS` | `HASH_MISMATCH` | the bytes of an upload do not have the SHA-256 that `finish` names |
+//! | `ABORTED` | `UPLOAD_TAKEN_OVER` | another stream goes on with the upload |
+//! | `RESOURCE_EXHAUSTED` | `UPLOADS_FULL` | the tenant has uploaded as much as it may, by the bound of `metadata["bound"]`: `tenant_uploads` or `tenant_upload_bytes`; `RetryInfo` |
 //! | `INVALID_ARGUMENT` | `MALFORMED_MESSAGE` | a message that cannot be decoded |
 //! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.limits.max_message_bytes`, packed or not |
 //! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
@@ -16,8 +23,7 @@
 //! | `FAILED_PRECONDITION` | `RESULT_NOT_READY` | there is no result, yet or for good |
 //! | `UNAVAILABLE` | `DRAINING` | the server is going down; `RetryInfo` |
 //! | `UNAVAILABLE` | `STORE_UNAVAILABLE` | the database is away; `RetryInfo`. A creation may have been stored: come back with the same request id |
-//! | `DEADLINE_EXCEEDED` | `INPUT_STALLED` | the chunks of a `Solve` stopped coming |
-//! | `UNIMPLEMENTED` | `NOT_IMPLEMENTED` | part of the API that is still to come |
+//! | `DEADLINE_EXCEEDED` | `INPUT_STALLED` | the chunks of a `Solve` or of an upload stopped coming |
 //! | `INTERNAL` | `INTERNAL` | our defect; what it was is in the log only |
 
 use std::collections::HashMap;
@@ -27,7 +33,7 @@ use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt};
 
 use crate::domain::job::{JobName, JobState};
-use crate::domain::{InvalidInput, Violation};
+use crate::domain::{InputName, InvalidInput, Violation};
 use crate::engine;
 
 /// Domain of every `ErrorInfo`.
@@ -42,6 +48,9 @@ const DRAINING_RETRY: Duration = Duration::from_secs(5);
 
 /// Pause that a caller is told while the store is away: a database that restarts takes a few seconds.
 const STORE_RETRY: Duration = Duration::from_secs(2);
+
+/// Pause that a caller is told who has uploaded as much as it may: another upload takes about as long.
+const UPLOADS_RETRY: Duration = Duration::from_secs(60);
 
 fn status(code: Code, reason: &str, message: impl Into<String>, details: ErrorDetails) -> Status {
     status_with(code, reason, HashMap::new(), message, details)
@@ -112,13 +121,37 @@ pub fn unknown_key() -> Status {
     status(Code::Unauthenticated, "API_KEY_UNKNOWN", message, ErrorDetails::new())
 }
 
-/// Part of the API that is still to come.
-pub fn not_implemented(what: &str) -> Status {
-    let message = format!("{what} is not implemented yet");
-    status(Code::Unimplemented, "NOT_IMPLEMENTED", message, ErrorDetails::new())
+/// A key that was withdrawn while a call lasted.
+pub fn withdrawn_key() -> Status {
+    let message = "the API key was withdrawn while the call lasted";
+    status(Code::Unauthenticated, "API_KEY_WITHDRAWN", message, ErrorDetails::new())
 }
 
-/// The chunks of a `Solve` stopped coming.
+/// No such uploaded input, or another tenant's: a caller cannot tell them apart.
+pub fn input_not_found(name: &InputName) -> Status {
+    let mut details = ErrorDetails::new();
+    details.set_resource_info("scpsfm.v1.Input", name.to_string(), "", "there is no such input");
+    status(Code::NotFound, "INPUT_NOT_FOUND", format!("there is no input {name}"), details)
+}
+
+/// A chunk of an upload that is not what its sender computed the sum of.
+pub fn chunk_corrupted(offset: u64, told: u32, found: u32) -> Status {
+    let message = format!(
+        "chunk.crc32c: the chunk at offset {offset} was damaged on its way: its CRC-32C is {found:08x}, not {told:08x}"
+    );
+    let metadata = HashMap::from([("offset".to_owned(), offset.to_string())]);
+    status_with(Code::DataLoss, "CHUNK_CORRUPTED", metadata, message, ErrorDetails::new())
+}
+
+/// An upload whose bytes are others than those that were meant.
+pub fn hash_mismatch(told: &[u8; 32], found: &[u8; 32]) -> Status {
+    let hex = |digest: &[u8; 32]| digest.map(|byte| format!("{byte:02x}")).concat();
+    let message =
+        format!("finish.sha256: the bytes have the SHA-256 {}, not {}; the upload is given up", hex(found), hex(told));
+    status(Code::DataLoss, "HASH_MISMATCH", message, ErrorDetails::new())
+}
+
+/// The messages of a `Solve` or of an upload stopped coming.
 pub fn input_stalled(patience: Duration) -> Status {
     let message = format!("no message arrived for {} s and the input is not complete", patience.as_secs());
     status(Code::DeadlineExceeded, "INPUT_STALLED", message, ErrorDetails::new())
@@ -147,6 +180,17 @@ pub fn internal(error: &dyn std::fmt::Display) -> Status {
 pub fn from_engine(error: engine::Error) -> Status {
     match error {
         engine::Error::NotFound(name) => job_not_found(&name),
+        engine::Error::InputNotFound(name) => input_not_found(&name),
+        engine::Error::UploadNotFound(name) => {
+            let message = format!("there is no upload {}: it was never begun, or was given up", name.input);
+            status(Code::NotFound, "UPLOAD_NOT_FOUND", message, ErrorDetails::new())
+        }
+        engine::Error::TakenOver(sentence) => status(Code::Aborted, "UPLOAD_TAKEN_OVER", sentence, ErrorDetails::new()),
+        engine::Error::UploadsFull { bound, message } => {
+            let metadata = HashMap::from([("bound".to_owned(), bound.to_owned())]);
+            let details = ErrorDetails::with_retry_info(Some(UPLOADS_RETRY));
+            status_with(Code::ResourceExhausted, "UPLOADS_FULL", metadata, message, details)
+        }
         engine::Error::AlreadyExists(sentence) => {
             status(Code::AlreadyExists, "ALREADY_EXISTS", sentence, ErrorDetails::new())
         }

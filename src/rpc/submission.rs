@@ -7,8 +7,8 @@ use super::caller::Caller;
 use super::convert::create::{self, Description};
 use super::convert::input::Draft;
 use super::{proto, status};
-use crate::domain::{InvalidInput, Limits};
-use crate::engine::NewJob;
+use crate::domain::{InputName, InvalidInput, Limits};
+use crate::engine::{JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
 use proto::create_job_request::Input as Inline;
 
@@ -16,23 +16,29 @@ use proto::create_job_request::Input as Inline;
 pub struct Submission {
     tenant: String,
     description: Description,
-    draft: Draft,
+    input: Source,
+}
+
+/// Where the input comes from.
+enum Source {
+    Draft(Draft),
+    Uploaded(InputName),
 }
 
 impl Submission {
     /// Checks everything that a request holds but the input's numbers.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT`, `NOT_FOUND` for another tenant, or `UNIMPLEMENTED` for an uploaded input.
+    /// `INVALID_ARGUMENT`, `NOT_FOUND` for another tenant, or for an uploaded input of another tenant.
     pub fn open(caller: &Caller, request: proto::CreateJobRequest, limits: &Limits) -> Result<Self, Status> {
         let tenant = caller.parent(&request.parent)?;
-        if let Some(Inline::InputName(_)) = request.input {
-            return Err(status::not_implemented("a job with an uploaded input (input_name)"));
-        }
         let description =
             create::from_wire(request.job_id, request.request_id, request.job).map_err(|error| invalid(&error))?;
-        let draft = Draft::begin(request.input, limits).map_err(|error| invalid(&error))?;
-        let submission = Self { tenant, description, draft };
+        let input = match request.input {
+            Some(Inline::InputName(name)) => Source::Uploaded(caller.input(&name)?),
+            input => Source::Draft(Draft::begin(input, limits).map_err(|error| invalid(&error))?),
+        };
+        let submission = Self { tenant, description, input };
         submission.check_size()?;
         Ok(submission)
     }
@@ -43,11 +49,17 @@ impl Submission {
     /// `INVALID_ARGUMENT` for a chunk of the wrong kind, a second config, or more than the limits allow.
     pub fn append(&mut self, message: proto::SolveRequest) -> Result<(), Status> {
         use proto::solve_request::Message;
-        match message.message {
-            Some(Message::TrackSetChunk(chunk)) => self.draft.append_track_set(chunk),
-            Some(Message::MeasurementMatrixChunk(chunk)) => self.draft.append_matrix(chunk),
-            Some(Message::Config(_)) => Err(super::violation("config", "comes once, in the first message")),
-            None => Err(super::violation("message", "is not set")),
+        match (message.message, &mut self.input) {
+            (Some(Message::Config(_)), _) => Err(super::violation("config", "comes once, in the first message")),
+            (None, _) => Err(super::violation("message", "is not set")),
+            (Some(Message::TrackSetChunk(chunk)), Source::Draft(draft)) => draft.append_track_set(chunk),
+            (Some(Message::MeasurementMatrixChunk(chunk)), Source::Draft(draft)) => draft.append_matrix(chunk),
+            (Some(Message::TrackSetChunk(_)), Source::Uploaded(_)) => {
+                Err(super::violation("track_set_chunk", "the config names an uploaded input"))
+            }
+            (Some(Message::MeasurementMatrixChunk(_)), Source::Uploaded(_)) => {
+                Err(super::violation("measurement_matrix_chunk", "the config names an uploaded input"))
+            }
         }
         .map_err(|error| invalid(&error))?;
         self.check_size()
@@ -58,9 +70,15 @@ impl Submission {
     /// # Errors
     /// `INVALID_ARGUMENT` with every violation found.
     pub async fn close(self, trace_parent: Option<String>) -> Result<NewJob, Status> {
-        let Self { tenant, description, draft } = self;
-        // Sorting millions of observations takes a second: not on a thread that serves others.
-        let input = super::blocking(move || draft.finish()).await?.map_err(|error| invalid(&error))?;
+        let Self { tenant, description, input } = self;
+        let input = match input {
+            Source::Uploaded(name) => JobInput::Uploaded(name),
+            Source::Draft(draft) => {
+                // Sorting millions of observations takes a second: not on a thread that serves others.
+                let checked = super::blocking(move || draft.finish()).await?;
+                JobInput::Inline(checked.map_err(|error| invalid(&error))?)
+            }
+        };
         let mut job = NewJob::new(tenant, input, description.settings);
         job.job_id = description.job_id;
         job.request_id = description.request_id;
@@ -72,7 +90,8 @@ impl Submission {
     }
 
     fn check_size(&self) -> Result<(), Status> {
-        self.draft.check_size().map_err(|error| {
+        let Source::Draft(draft) = &self.input else { return Ok(()) };
+        draft.check_size().map_err(|error| {
             refused(Refusal::TooLarge);
             status::invalid(&error)
         })

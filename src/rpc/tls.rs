@@ -1,29 +1,13 @@
-//! TLS on the gRPC port: certificates from files that may change, handshakes that hold up nobody.
+//! TLS on the gRPC port: certificates from files that may change.
 
-use std::convert::Infallible;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
-use futures_util::stream::{self, Stream};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::task::JoinSet;
-use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use tokio_rustls::rustls::server::WebPkiClientVerifier;
 use tokio_rustls::rustls::{RootCertStore, ServerConfig};
-use tokio_rustls::server::TlsStream;
-
-use super::reload::Current;
-
-/// How long a handshake may take: three round trips of the slowest link, and no reason for a caller to be slower.
-pub const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
-
-/// Pause after a connection could not be taken, which is usually a lack of file descriptors: some free up meanwhile.
-const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 
 /// What gRPC speaks, as the handshake names it (RFC 7301).
 const HTTP_2: &[u8] = b"h2";
@@ -103,59 +87,4 @@ fn roots(path: &Path) -> Result<RootCertStore, String> {
 
 fn read(path: &Path) -> Result<Vec<u8>, String> {
     std::fs::read(path).map_err(|error| format!("{}: {error}", path.display()))
-}
-
-/// Connections whose handshake is done, in the order in which they end. Each handshake begins with the certificate that
-/// is in force then; those that fail or stall leave nothing but a line in the log.
-pub fn incoming(
-    listener: TcpListener,
-    config: Current<ServerConfig>,
-    handshake_timeout: Duration,
-) -> impl Stream<Item = Result<TlsStream<TcpStream>, Infallible>> {
-    let door = Door { listener, config, handshake_timeout, handshakes: JoinSet::new() };
-    stream::unfold(door, async |mut door| {
-        let connection = door.next().await;
-        Some((Ok(connection), door))
-    })
-}
-
-struct Door {
-    listener: TcpListener,
-    config: Current<ServerConfig>,
-    handshake_timeout: Duration,
-    handshakes: JoinSet<Result<TlsStream<TcpStream>, String>>,
-}
-
-impl Door {
-    async fn next(&mut self) -> TlsStream<TcpStream> {
-        loop {
-            tokio::select! {
-                accepted = self.listener.accept() => match accepted {
-                    Ok((connection, _)) => self.greet(connection),
-                    Err(error) => {
-                        tracing::warn!(%error, "a connection could not be taken");
-                        tokio::time::sleep(ACCEPT_PAUSE).await;
-                    }
-                },
-                Some(ended) = self.handshakes.join_next() => match ended {
-                    Ok(Ok(connection)) => return connection,
-                    Ok(Err(error)) => tracing::debug!(error, "a handshake failed"),
-                    Err(error) => tracing::error!(%error, "a handshake's task failed"),
-                },
-            }
-        }
-    }
-
-    fn greet(&mut self, connection: TcpStream) {
-        let acceptor = TlsAcceptor::from(self.config.borrow().clone());
-        let bound = self.handshake_timeout;
-        self.handshakes.spawn(async move {
-            let words = |error: io::Error| error.to_string();
-            connection.set_nodelay(true).map_err(words)?;
-            match tokio::time::timeout(bound, acceptor.accept(connection)).await {
-                Ok(done) => done.map_err(words),
-                Err(_) => Err(format!("not done within {} s", bound.as_secs_f64())),
-            }
-        });
-    }
 }

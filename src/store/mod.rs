@@ -10,6 +10,7 @@ pub mod record;
 mod sql;
 pub mod sqlite;
 pub mod timed;
+pub mod upload;
 
 #[cfg(test)]
 mod contract;
@@ -17,13 +18,17 @@ mod contract;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
+use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName, JobState};
 use crate::domain::progress::Progress;
 
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
-    Bound, CancelReply, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, Outcome, QueueBounds, Request,
-    Swept,
+    Bound, CancelReply, Claimed, Created, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome, QueueBounds,
+    Request, Swept,
+};
+pub use upload::{
+    BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
 };
 
 /// Why the store did not do what it was asked.
@@ -31,7 +36,17 @@ pub use record::{
 pub enum Error {
     #[error("{0} does not exist")]
     NotFound(JobName),
-    /// The job id is taken, or the request id stands for another body.
+    #[error("{0} does not exist")]
+    InputNotFound(InputName),
+    #[error("there is no upload {} of tenants/{}", .0.input, .0.tenant)]
+    UploadNotFound(InputName),
+    /// Another stream goes on with the upload. The write was dropped.
+    #[error("another stream has taken over the upload {}", .0.input)]
+    UploadTakenOver(InputName),
+    /// The tenant has as many uploads as it may.
+    #[error("{0}")]
+    UploadsFull(UploadBound),
+    /// The job id is taken, or the request id or upload id stands for another body.
     #[error("{0}")]
     AlreadyExists(String),
     /// Only ended jobs can be removed.
@@ -184,6 +199,59 @@ pub trait Store: Send + Sync + 'static {
     /// # Errors
     /// [`Error::NotFound`].
     async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error>;
+
+    /// Begins an upload, or goes on with one: from here on its earlier streams cannot write.
+    ///
+    /// # Errors
+    /// [`Error::AlreadyExists`] where it was begun with another length or hash, [`Error::UploadsFull`].
+    async fn begin_upload(&self, new: &NewUpload, bounds: &UploadBounds, now: SystemTime)
+    -> Result<BegunUpload, Error>;
+
+    /// Adds bytes to an upload, at its end.
+    ///
+    /// # Errors
+    /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`] where it was given up.
+    async fn append_upload(&self, lease: &UploadLease, at_byte: u64, data: &[u8], now: SystemTime)
+    -> Result<(), Error>;
+
+    /// Some of an upload's bytes from there on, which must be where a read before it ended; none at the end.
+    ///
+    /// # Errors
+    /// [`Error::UploadTakenOver`].
+    async fn read_upload(&self, lease: &UploadLease, at_byte: u64) -> Result<Vec<u8>, Error>;
+
+    /// Makes an input of an upload whose bytes are all there.
+    ///
+    /// # Errors
+    /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`] where it was given up.
+    async fn finish_upload(&self, lease: &UploadLease, new: &NewInput, now: SystemTime) -> Result<StoredInput, Error>;
+
+    /// Gives an upload up: its id is free again.
+    ///
+    /// # Errors
+    /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`].
+    async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error>;
+
+    /// How far an upload has come.
+    ///
+    /// # Errors
+    /// [`Error::UploadNotFound`].
+    async fn upload(&self, name: &InputName) -> Result<UploadStatus, Error>;
+
+    /// An uploaded input.
+    ///
+    /// # Errors
+    /// [`Error::InputNotFound`].
+    async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error>;
+
+    /// Gives up the uploads to which nothing came since `abandoned_by`, and removes some of the bytes of those that were
+    /// given up or finished, and some of the uploaded inputs that no job has and none was created with since
+    /// `unused_since`. `None`: none.
+    async fn purge_uploads(
+        &self,
+        abandoned_by: Option<SystemTime>,
+        unused_since: Option<SystemTime>,
+    ) -> Result<PurgedUploads, Error>;
 
     /// What waits and what runs.
     async fn load(&self) -> Result<Load, Error>;

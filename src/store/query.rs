@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use sha2::{Digest, Sha256};
 
 use super::Error;
-use crate::domain::job::{DEFAULT_TENANT, Job, JobState};
+use crate::domain::job::{DEFAULT_TENANT, Job, JobName, JobState};
 
 /// Order of a listing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -53,19 +53,23 @@ impl JobQuery {
     pub(super) fn cursor(&self) -> Result<Option<Cursor>, Error> {
         match self.page_token.as_deref() {
             None | Some("") => Ok(None),
-            Some(token) => Cursor::parse(token, self.digest()).map(Some).ok_or(Error::PageToken),
+            Some(token) => {
+                let cursor = Cursor::parse(token).filter(|cursor| self.token_after(cursor) == token);
+                cursor.map(Some).ok_or(Error::PageToken)
+            }
         }
     }
 
     /// The token of the page that begins after `cursor`.
-    pub(super) fn token_after(&self, cursor: Cursor) -> String {
-        format!("{:016x}-{:x}-{:x}", self.digest(), cursor.create_micros, cursor.id)
+    pub(super) fn token_after(&self, cursor: &Cursor) -> String {
+        format!("{:016x}-{:x}-{}", self.digest(cursor), cursor.create_micros, cursor.job)
     }
 
-    /// Ties a token to its query; a slip is to be caught, nothing is to be kept secret, so 64 bits do.
-    fn digest(&self) -> u64 {
+    /// Ties a token to its query, and its parts to each other; a slip is to be caught, nothing is to be kept secret, so 64
+    /// bits do.
+    fn digest(&self, cursor: &Cursor) -> u64 {
         let mut hash = Sha256::new();
-        hash.update(format!("{:?}", (&self.tenant, &self.states, &self.labels, self.order)));
+        hash.update(format!("{:?}", (&self.tenant, &self.states, &self.labels, self.order, cursor)));
         let digest = hash.finalize();
         digest.iter().take(8).fold(0, |value, &byte| value << 8 | u64::from(byte))
     }
@@ -92,20 +96,19 @@ pub struct JobPage {
     pub next_page_token: Option<String>,
 }
 
-/// The last job of a page; jobs of one microsecond are told apart by their row.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The last job of a page; jobs of one microsecond are told apart by their id. Nothing in it is of another tenant.
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Cursor {
     pub create_micros: i64,
-    pub id: i64,
+    pub job: String,
 }
 
 impl Cursor {
-    fn parse(token: &str, digest: u64) -> Option<Self> {
-        let rest = token.strip_prefix(&format!("{digest:016x}-"))?;
-        let mut parts = rest.split('-');
-        let mut number = || i64::from_str_radix(parts.next()?, 16).ok();
-        let cursor = Self { create_micros: number()?, id: number()? };
-        parts.next().is_none().then_some(cursor)
+    fn parse(token: &str) -> Option<Self> {
+        let (_, rest) = token.split_once('-')?;
+        let (create_micros, job) = rest.split_once('-')?;
+        let create_micros = i64::from_str_radix(create_micros, 16).ok()?;
+        JobName::is_id(job).then(|| Self { create_micros, job: job.to_owned() })
     }
 }
 
@@ -117,15 +120,18 @@ mod tests {
     #[test]
     fn a_token_leads_back_into_its_own_query_only() {
         let mut query = JobQuery::default();
-        let cursor = Cursor { create_micros: 1_700_000_000_000_001, id: 17 };
-        query.page_token = Some(query.token_after(cursor));
-        assert_eq!(query.cursor(), Ok(Some(cursor)));
+        let cursor = Cursor { create_micros: 1_700_000_000_000_001, job: "a-1-b".into() };
+        query.page_token = Some(query.token_after(&cursor));
+        assert_eq!(query.cursor(), Ok(Some(cursor.clone())));
         query.page_size = 7;
         assert_eq!(query.cursor(), Ok(Some(cursor)), "the page size may change between pages");
         query.order = Order::CreateTimeAscending;
         assert_eq!(query.cursor(), Err(Error::PageToken));
-        for bad in ["x", "-", "0-0-0", "0000000000000000-1-1"] {
-            query.page_token = Some(bad.into());
+        query.order = Order::default();
+        let token = query.page_token.take().expect("a token");
+        let wrong = [format!("{token}0"), token[..token.len() - 1].to_owned(), token.replace("-a-1-b", "-a-2-b")];
+        for bad in ["x", "-", "0-0-0", "0000000000000000-1-1"].map(str::to_owned).into_iter().chain(wrong) {
+            query.page_token = Some(bad.clone());
             assert_eq!(query.cursor(), Err(Error::PageToken), "{bad}");
         }
     }

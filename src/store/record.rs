@@ -13,8 +13,7 @@ use crate::domain::progress::Progress;
 pub struct NewRecord {
     pub name: JobName,
     pub request: Option<Request>,
-    /// Encoded [`crate::domain::Input`], see [`super::payload`].
-    pub input: Vec<u8>,
+    pub input: JobInput,
     pub view_count: u32,
     pub track_count: u32,
     pub observation_count: u32,
@@ -24,6 +23,31 @@ pub struct NewRecord {
     pub labels: BTreeMap<String, String>,
     /// W3C `traceparent` of the call that created the job, so that its trace goes on after a restart.
     pub trace_parent: Option<String>,
+}
+
+/// What a job works on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum JobInput {
+    /// Encoded [`crate::domain::Input`], see [`super::payload`].
+    Inline(Vec<u8>),
+    /// An uploaded input of the job's tenant, by its id, with the length of its payload.
+    Uploaded { input: String, bytes: u64 },
+}
+
+impl From<Vec<u8>> for JobInput {
+    fn from(payload: Vec<u8>) -> Self {
+        JobInput::Inline(payload)
+    }
+}
+
+impl JobInput {
+    /// Length of the encoded input.
+    pub fn bytes(&self) -> u64 {
+        match self {
+            JobInput::Inline(bytes) => bytes.len() as u64,
+            JobInput::Uploaded { bytes, .. } => *bytes,
+        }
+    }
 }
 
 /// A request id of the job's tenant, with the digest of the body that it stands for.

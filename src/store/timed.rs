@@ -3,9 +3,11 @@
 use std::time::{Duration, SystemTime};
 
 use super::{
-    CancelReply, Claimed, Created, Ending, Error, Heartbeat, Hint, JobPage, JobQuery, Lease, Load, NewRecord,
-    QueueBounds, Store, Swept,
+    BegunUpload, CancelReply, Claimed, Created, Ending, Error, Heartbeat, Hint, JobPage, JobQuery, Lease, Load,
+    NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, Store, StoredInput, Swept, UploadBounds, UploadLease,
+    UploadStatus,
 };
+use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::telemetry::metrics::{store_operation, write_fenced};
@@ -113,6 +115,61 @@ impl<S: Store> Store for Timed<S> {
     async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
         let _timer = store_operation("result");
         self.0.result(name).await
+    }
+
+    async fn begin_upload(
+        &self,
+        new: &NewUpload,
+        bounds: &UploadBounds,
+        now: SystemTime,
+    ) -> Result<BegunUpload, Error> {
+        let _timer = store_operation("begin_upload");
+        self.0.begin_upload(new, bounds, now).await
+    }
+
+    async fn append_upload(
+        &self,
+        lease: &UploadLease,
+        at_byte: u64,
+        data: &[u8],
+        now: SystemTime,
+    ) -> Result<(), Error> {
+        let _timer = store_operation("append_upload");
+        self.0.append_upload(lease, at_byte, data, now).await
+    }
+
+    async fn read_upload(&self, lease: &UploadLease, at_byte: u64) -> Result<Vec<u8>, Error> {
+        let _timer = store_operation("read_upload");
+        self.0.read_upload(lease, at_byte).await
+    }
+
+    async fn finish_upload(&self, lease: &UploadLease, new: &NewInput, now: SystemTime) -> Result<StoredInput, Error> {
+        let _timer = store_operation("finish_upload");
+        self.0.finish_upload(lease, new, now).await
+    }
+
+    async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error> {
+        let _timer = store_operation("give_up_upload");
+        self.0.give_up_upload(lease).await
+    }
+
+    async fn upload(&self, name: &InputName) -> Result<UploadStatus, Error> {
+        let _timer = store_operation("upload");
+        self.0.upload(name).await
+    }
+
+    async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error> {
+        let _timer = store_operation("uploaded_input");
+        self.0.uploaded_input(name).await
+    }
+
+    async fn purge_uploads(
+        &self,
+        abandoned_by: Option<SystemTime>,
+        unused_since: Option<SystemTime>,
+    ) -> Result<PurgedUploads, Error> {
+        let _timer = store_operation("purge_uploads");
+        self.0.purge_uploads(abandoned_by, unused_since).await
     }
 
     async fn load(&self) -> Result<Load, Error> {

@@ -95,6 +95,32 @@ impl Deletion {
     }
 }
 
+/// Why an upload was given up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GivenUp {
+    /// Nothing came for too long.
+    Abandoned,
+    /// Its bytes do not have the SHA-256 that its caller named.
+    WrongHash,
+    /// Its bytes are no valid input.
+    Invalid,
+}
+
+impl GivenUp {
+    const ALL: [GivenUp; 3] = [GivenUp::Abandoned, GivenUp::WrongHash, GivenUp::Invalid];
+
+    fn name(self) -> &'static str {
+        match self {
+            GivenUp::Abandoned => "ABANDONED",
+            GivenUp::WrongHash => "WRONG_HASH",
+            GivenUp::Invalid => "INVALID",
+        }
+    }
+}
+
+/// Bounds of a tenant's uploads, as error details name them.
+const UPLOAD_BOUNDS: [&str; 2] = ["tenant_uploads", "tenant_upload_bytes"];
+
 /// How an attempt ended that did not end its job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AttemptLost {
@@ -203,6 +229,12 @@ fn create_known_series() {
     for operation in FENCED_OPERATIONS {
         counter!(FENCED_WRITES.name, "operation" => operation).absolute(0);
     }
+    for reason in GivenUp::ALL {
+        counter!(UPLOADS_GIVEN_UP.name, "reason" => reason.name()).absolute(0);
+    }
+    for bound in UPLOAD_BOUNDS {
+        counter!(UPLOAD_REFUSALS.name, "bound" => bound).absolute(0);
+    }
     for reason in AttemptLost::ALL {
         counter!(ATTEMPTS_LOST.name, "reason" => reason.name()).absolute(0);
     }
@@ -233,6 +265,11 @@ pub fn engine_size(queue_capacity: u64, workers: usize) {
     gauge!(WORKERS.name).set(workers as f64);
 }
 
+/// Tells whether the store answers.
+pub fn store_reachable(reachable: bool) {
+    gauge!(STORE_REACHABLE.name).set(f64::from(u8::from(reachable)));
+}
+
 /// A worker claimed a job that had waited this long.
 pub fn queue_wait(waited: Duration) {
     histogram!(QUEUE_WAIT.name).record(waited.as_secs_f64());
@@ -251,6 +288,26 @@ pub fn jobs_deleted(reason: Deletion, count: u32) {
 /// A job was refused.
 pub fn refused(refusal: Refusal) {
     counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).increment(1);
+}
+
+/// Bytes of an upload were stored.
+pub fn uploaded(bytes: u64) {
+    counter!(UPLOADED_BYTES.name).increment(bytes);
+}
+
+/// An upload became an input.
+pub fn input_created() {
+    counter!(INPUTS_CREATED.name).increment(1);
+}
+
+/// Uploads were given up.
+pub fn uploads_given_up(reason: GivenUp, count: u32) {
+    counter!(UPLOADS_GIVEN_UP.name, "reason" => reason.name()).increment(u64::from(count));
+}
+
+/// An upload was refused, by this bound of its tenant.
+pub fn upload_refused(bound: &'static str) {
+    counter!(UPLOAD_REFUSALS.name, "bound" => bound).increment(1);
 }
 
 /// A job reached a terminal state, `job.state`; once a job, by whoever committed it.

@@ -21,18 +21,36 @@ const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
 /// Between two drains of the histograms' samples: often enough that a server nobody scrapes stays small.
 const UPKEEP_INTERVAL: Duration = Duration::from_secs(5);
 
-/// Whether the service takes work: false until it does, and again while it drains. Clones share one latch.
+/// Whether the service can do its work. Clones share one latch.
 #[derive(Debug, Clone, Default)]
-pub struct Readiness(Arc<AtomicBool>);
+pub struct Readiness(Arc<State>);
+
+#[derive(Debug, Default)]
+struct State {
+    taking_work: AtomicBool,
+    store_away: AtomicBool,
+}
 
 impl Readiness {
-    /// Says whether the service takes work.
+    /// Says whether the service takes work: not until it is up, and no more while it drains.
     pub fn set(&self, ready: bool) {
-        self.0.store(ready, Ordering::Relaxed);
+        self.0.taking_work.store(ready, Ordering::Relaxed);
     }
 
-    fn get(&self) -> bool {
-        self.0.load(Ordering::Relaxed)
+    /// Says whether the store answers.
+    pub fn set_store(&self, reachable: bool) {
+        self.0.store_away.store(!reachable, Ordering::Relaxed);
+    }
+
+    /// Why the service cannot do its work, if it cannot.
+    fn obstacle(&self) -> Option<&'static str> {
+        if !self.0.taking_work.load(Ordering::Relaxed) {
+            Some("not ready\n")
+        } else if self.0.store_away.load(Ordering::Relaxed) {
+            Some("not ready: the store is out of reach\n")
+        } else {
+            None
+        }
     }
 }
 
@@ -106,9 +124,9 @@ fn router(scrape: PrometheusHandle, ready: Readiness) -> Router {
         .route(
             "/readyz",
             get(move || async move {
-                match ready.get() {
-                    true => (StatusCode::OK, "ready\n").into_response(),
-                    false => (StatusCode::SERVICE_UNAVAILABLE, "not ready\n").into_response(),
+                match ready.obstacle() {
+                    None => (StatusCode::OK, "ready\n").into_response(),
+                    Some(obstacle) => (StatusCode::SERVICE_UNAVAILABLE, obstacle).into_response(),
                 }
             }),
         )
@@ -149,6 +167,11 @@ mod tests {
         assert!(get(address, "/healthz").await.starts_with("HTTP/1.1 200"));
         assert!(get(address, "/readyz").await.starts_with("HTTP/1.1 503"));
         ready.set(true);
+        assert!(get(address, "/readyz").await.starts_with("HTTP/1.1 200"));
+        ready.set_store(false);
+        let away = get(address, "/readyz").await;
+        assert!(away.starts_with("HTTP/1.1 503") && away.contains("store"), "{away}");
+        ready.set_store(true);
         assert!(get(address, "/readyz").await.starts_with("HTTP/1.1 200"));
         let page = get(address, "/metrics").await;
         assert!(page.contains("content-type: text/plain; version=0.0.4"), "{page}");

@@ -39,9 +39,11 @@ fn scene(directory: &Path) -> PathBuf {
 
 #[test]
 fn every_command_explains_itself() {
-    let commands =
-        ["demo", "serve", "solve", "submit", "watch", "get", "list", "cancel", "delete", "result", "synth", "evaluate"]
-            .map(Some);
+    let commands = [
+        "demo", "serve", "solve", "upload", "submit", "watch", "get", "list", "cancel", "delete", "result", "synth",
+        "evaluate",
+    ]
+    .map(Some);
     for command in commands.into_iter().chain([None]) {
         let run = run(command.into_iter().chain(["--help"]));
         assert_eq!(run.code, Some(0), "{run:?}");
@@ -155,6 +157,31 @@ fn a_bad_configuration_ends_with_64_and_a_printed_one_reads_back() {
     fs::write(&file, &printed.stdout).expect("written");
     assert_eq!(run(["serve", "--print-config", "--config", text(&file)]).stdout, printed.stdout);
     assert!(printed.stdout.contains("workers = 3") && printed.stdout.contains("ndarray"), "{printed:?}");
+
+    // With a password: not shown, which the file says, and refused until it is there again.
+    let url = ["--store", "postgres://me:hunter2@db.example/scpsfm"];
+    let printed = run(["serve", "--print-config"].iter().chain(&url));
+    assert!(printed.code == Some(0) && !printed.stdout.contains("hunter2"), "{printed:?}");
+    assert!(printed.stdout.starts_with("# The password in store.url is not shown"), "{printed:?}");
+    fs::write(&file, &printed.stdout).expect("written");
+    let refused = run(["serve", "--print-config", "--config", text(&file)]);
+    assert_eq!(refused.code, Some(64), "{refused:?}");
+    assert!(refused.stderr.contains("store.url") && refused.stderr.contains("SCPSFM_STORE__URL"), "{refused:?}");
+    let complete = run(["serve", "--print-config", "--config", text(&file)].iter().chain(&url));
+    assert_eq!(complete.stdout, printed.stdout);
+}
+
+#[test]
+fn a_password_in_a_servers_address_is_refused_and_not_repeated() {
+    for server in ["http://me:hunter2@127.0.0.1:1", "me:hunter2@127.0.0.1:1", "https://me:hunter2@localhost"] {
+        let refused = run(["list", "--server", server]);
+        assert_eq!(refused.code, Some(2), "{refused:?}");
+        let told = refused.stdout + &refused.stderr;
+        assert!(told.contains("--api-key-file") && !told.contains("hunter2"), "{told}");
+    }
+    let output = program(["list", "--help"]).env("SCPSFM_SERVER", "http://me:hunter2@h").output().expect("runs");
+    let help = String::from_utf8(output.stdout).expect("UTF-8");
+    assert!(help.contains("SCPSFM_SERVER") && !help.contains("hunter2"), "{help}");
 }
 
 #[test]
@@ -207,7 +234,7 @@ fn a_server_gives_the_same_files_as_the_program_itself_and_drains_on_sigterm() {
     assert_eq!(json(&fs::read_to_string(path("local").join("result.json")).expect("result.json")), local);
 
     let mut serving = Serving::start(&path("data"));
-    assert!(serving.page("/readyz").contains("200"));
+    assert!(serving.page("/readyz").starts_with("ready"));
     solve(&path("remote"), &["--server", &serving.grpc]);
     let (local, remote) = (files_but_for_times(&path("local")), files_but_for_times(&path("remote")));
     assert_eq!(local.keys().collect::<Vec<_>>(), remote.keys().collect::<Vec<_>>());
@@ -239,12 +266,31 @@ fn what_cannot_be_solved_ends_with_3_and_says_why() {
     let (scene, out) = (directory.path().join("scene"), directory.path().join("out"));
     run(["synth", "--views", "4", "--tracks", "20", "--outliers", "1", "--out", text(&scene)]);
     let input = scene.join("observations.csv");
-    let run = run(["solve", text(&input), "--out", text(&out), "--json", "--method", "geometry"]);
-    assert_eq!(run.code, Some(3), "{run:?}");
-    let result = json(&run.stdout);
+    let solved = run(["solve", text(&input), "--out", text(&out), "--json", "--method", "geometry"]);
+    assert_eq!(solved.code, Some(3), "{solved:?}");
+    let result = json(&solved.stdout);
     assert_eq!(result["status"], "NO_RECONSTRUCTION");
     assert_ne!(result["warnings"], Value::Array(Vec::new()));
     assert!(out.join("report.html").exists());
+
+    // The same words from a server, on watch and on get, as soon as the job has ended.
+    let serving = Serving::start(&directory.path().join("data"));
+    let server = ["--server", serving.grpc.as_str()];
+    let submitted = run(["submit", text(&input), "--method", "geometry", "--watch"].iter().chain(&server));
+    assert_eq!(submitted.code, Some(3), "{submitted:?}");
+    let name = submitted.stdout.trim();
+    let got = run(["get", name].iter().chain(&server));
+    let watched = run(["watch", name].iter().chain(&server));
+    for warning in result["warnings"].as_array().expect("a list") {
+        let (code, detail) = (warning["code"].as_str().expect("a code"), warning["detail"].as_str().expect("words"));
+        let line = format!("  warning: {code}: {detail}\n");
+        for told in [&submitted.stderr, &watched.stderr, &got.stdout] {
+            assert!(told.contains(&line), "{line:?} is not in {told}");
+        }
+        assert!(got.stdout.contains("no reconstruction: ") && got.stdout.contains(code), "{got:?}");
+    }
+    let all = json(&run(["get", name, "--json"].iter().chain(&server)).stdout);
+    assert_eq!(all["summary"]["warnings"], result["warnings"]);
 }
 
 #[test]

@@ -12,5 +12,7 @@ mod readme;
 mod real;
 mod replicas;
 mod sequence;
+mod silence;
 mod support;
 mod telemetry;
+mod upload;

@@ -13,7 +13,7 @@ use tonic_types::StatusExt;
 
 use crate::support::live::{connected, created, lasting, reaches, small};
 use crate::support::postgres::{self, Cluster, PASSWORD};
-use crate::support::program::Serving;
+use crate::support::program::{Serving, run};
 use crate::support::scrape::Page;
 use crate::support::server::{PATIENCE, soon};
 use crate::support::wire::{all, state_of};
@@ -225,4 +225,62 @@ async fn a_job_that_takes_every_server_down_fails_and_tells_its_history() {
         let (start, end) = (past.start_time.expect("a start"), past.end_time.expect("an end"));
         assert!((start.seconds, start.nanos) < (end.seconds, end.nanos));
     }
+}
+
+/// The status code of `/readyz` and its words.
+fn readiness(server: &Serving) -> (bool, String) {
+    let (head, body) = tokio::task::block_in_place(|| server.answer("/readyz"));
+    (head.starts_with("HTTP/1.1 200"), body)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_without_its_database_is_not_ready_until_it_is_back() {
+    use tonic_health::pb::HealthCheckRequest;
+    use tonic_health::pb::health_check_response::ServingStatus;
+    use tonic_health::pb::health_client::HealthClient;
+
+    let Some(cluster) = Cluster::start("a server without its database") else { return };
+    let url = cluster.database().await;
+    let server = Serving::on_database(&url, &[], Stdio::null());
+    let channel = Channel::from_shared(server.grpc.clone()).expect("a URL").connect().await.expect("a connection");
+    let mut health = HealthClient::new(channel);
+    let mut serving = async |service: &str| {
+        let answer = health.check(HealthCheckRequest { service: service.into() }).await.expect("known");
+        answer.into_inner().status() == ServingStatus::Serving
+    };
+    for _ in 0..2 {
+        assert_eq!(readiness(&server), (true, "ready\n".into()));
+        assert_eq!(scraped(&server).value("scpsfm_store_reachable"), 1.0);
+        assert!(serving("").await && serving("scpsfm.v1.JobService").await);
+
+        tokio::task::block_in_place(|| cluster.stop());
+        eventually(async || !readiness(&server).0).await;
+        assert_eq!(readiness(&server).1, "not ready: the store is out of reach\n");
+        eventually(async || !serving("").await).await;
+        assert!(!serving("scpsfm.v1.JobService").await);
+        assert_eq!(scraped(&server).value("scpsfm_store_reachable"), 0.0);
+        assert!(tokio::task::block_in_place(|| server.answer("/healthz")).0.starts_with("HTTP/1.1 200"), "it lives");
+
+        tokio::task::block_in_place(|| cluster.restart());
+        eventually(async || readiness(&server).0).await;
+        eventually(async || serving("").await).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_command_waits_for_a_store_that_is_away_no_longer_than_it_says() {
+    let Some(cluster) = Cluster::start("a command without a store") else { return };
+    let url = cluster.database().await;
+    let server = Serving::on_database(&url, &[], Stdio::null());
+    let mut jobs = connected(&server).await;
+    let name = created(&mut jobs, small(1)).await;
+    reaches(&mut jobs, &name, &[JobState::Succeeded]).await;
+    tokio::task::block_in_place(|| cluster.stop());
+    let begun = std::time::Instant::now();
+    let watched = tokio::task::block_in_place(|| run(["watch", &name, "--server", &server.grpc]));
+    assert_eq!(watched.code, Some(69), "{watched:?}");
+    assert!(watched.stderr.starts_with("waiting up to 15 s: "), "{watched:?}");
+    // The first try, which finds out, and the wait that was announced.
+    let seconds = begun.elapsed().as_secs_f64();
+    assert!(seconds < 15.0 + 10.0, "{seconds} s");
 }

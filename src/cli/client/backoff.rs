@@ -1,36 +1,66 @@
-//! Pauses between tries.
+//! Pauses between tries, and how long all of them may take.
 
+use std::future::Future;
 use std::time::Duration;
+
+use tokio::time::{Instant, timeout_at};
+use tonic::Status;
 
 /// The pauses, in milliseconds: a hiccup is over at once, a restart of a server takes some seconds, and after a quarter
 /// of a minute without a sign of life a person should know.
 const PAUSES_MS: [u64; 8] = [100, 200, 400, 800, 1_500, 3_000, 4_000, 5_000];
 
-/// Counts tries that came to nothing.
+/// Counts tries that came to nothing, and the time since the first of them.
 #[derive(Debug, Default)]
 pub struct Backoff {
     tries: usize,
+    trouble: Option<Trouble>,
+}
+
+/// A time of trouble.
+#[derive(Debug)]
+struct Trouble {
+    /// When it counts as lasting.
+    end: Instant,
+    /// What the latest try came to.
+    last: Status,
 }
 
 impl Backoff {
-    /// All pauses together.
+    /// How long a trouble is waited for, tries and pauses together.
     pub const TOTAL: Duration = Duration::from_millis(total_ms());
-
-    /// Whether no try has come to nothing yet.
-    pub fn is_first_try(&self) -> bool {
-        self.tries == 0
-    }
 
     /// Something arrived: the next trouble is a new one.
     pub fn reset(&mut self) {
-        self.tries = 0;
+        *self = Self::default();
+    }
+
+    /// Makes a call, which in times of trouble may take no longer than the trouble is waited for.
+    ///
+    /// # Errors
+    /// The call's; that of the one before, where this one took too long.
+    pub async fn within<T>(&self, call: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
+        let Some(trouble) = &self.trouble else { return call.await };
+        timeout_at(trouble.end, call).await.unwrap_or_else(|_| Err(trouble.last.clone()))
+    }
+
+    /// Notes what a try came to; returns whether it is the first of its trouble.
+    pub fn failed(&mut self, status: &Status) -> bool {
+        let first = self.trouble.is_none();
+        let end = self.trouble.as_ref().map_or_else(|| Instant::now() + Self::TOTAL, |trouble| trouble.end);
+        self.trouble = Some(Trouble { end, last: status.clone() });
+        first
     }
 
     /// Waits for the next try; `false` when there is none.
     pub async fn pause(&mut self) -> bool {
         let Some(&pause_ms) = PAUSES_MS.get(self.tries) else { return false };
+        let next = Instant::now() + Duration::from_millis(pause_ms);
+        if self.trouble.as_ref().is_some_and(|trouble| next >= trouble.end) {
+            return false;
+        }
         self.tries += 1;
-        tokio::time::sleep(Duration::from_millis(pause_ms)).await;
+        tokio::time::sleep_until(next).await;
         true
     }
 }
@@ -42,4 +72,42 @@ const fn total_ms() -> u64 {
         k += 1;
     }
     total
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Seconds until a call is given up each of whose tries takes so long, and how many tries that were. The runtime's
+    /// clock jumps to whatever is waited for.
+    fn given_up_after(try_for: Duration) -> (f64, usize) {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
+        runtime.block_on(async {
+            let (begun, mut tries, mut backoff) = (std::time::Instant::now(), 0, Backoff::default());
+            loop {
+                tries += 1;
+                let call = async {
+                    tokio::time::sleep(try_for).await;
+                    Err::<(), _>(Status::unavailable("away"))
+                };
+                let status = backoff.within(call).await.expect_err("away");
+                assert_eq!(status.message(), "away");
+                backoff.failed(&status);
+                if !backoff.pause().await {
+                    return (begun.elapsed().as_secs_f64() - try_for.as_secs_f64(), tries);
+                }
+            }
+        })
+    }
+
+    #[test]
+    fn tries_that_take_long_do_not_make_the_wait_longer_than_it_says() {
+        // Both at once, since they really wait.
+        let slow = std::thread::spawn(|| given_up_after(Duration::from_secs(3)));
+        let (seconds, tries) = given_up_after(Duration::ZERO);
+        let total = Backoff::TOTAL.as_secs_f64();
+        assert!((0.5 * total..=total + 1.0).contains(&seconds) && tries == 8, "{seconds} s, {tries} tries");
+        let (seconds, tries) = slow.join().expect("no panic");
+        assert!((0.5 * total..=total + 1.0).contains(&seconds) && tries >= 3, "{seconds} s, {tries} tries");
+    }
 }

@@ -90,6 +90,11 @@ impl Error {
     }
 }
 
+/// The reason that a status carries for programs.
+pub(super) fn reason(status: &Status) -> Option<String> {
+    Some(status.get_details_error_info()?.reason)
+}
+
 /// Whether the same call may fare better soon: the connection broke, or the server is going down.
 pub(super) fn is_transient(status: &Status) -> bool {
     handshake::words("", status).is_none() && broke_or_ends(status)

@@ -7,6 +7,7 @@ pub mod access;
 mod backoff;
 mod error;
 mod handshake;
+pub mod upload;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -25,9 +26,12 @@ use self::access::{AccessArgs, Bearer};
 use self::backoff::Backoff;
 use super::args::ServerArgs;
 use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState};
-use crate::domain::{RawInput, Solution, SolveSettings};
+use crate::domain::{InputName, RawInput, Solution, SolveSettings};
 use crate::rpc::convert;
-use crate::rpc::proto::{self, calibration_service_client as calibration, job_service_client as jobs};
+use crate::rpc::proto::{
+    self, calibration_service_client as calibration, create_job_request::Input as JobInput,
+    input_service_client as inputs, job_service_client as jobs,
+};
 
 /// A server that does not answer within this is not there.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
@@ -65,6 +69,7 @@ type Keyed = InterceptedService<Channel, Bearer>;
 pub struct Client {
     jobs: jobs::JobServiceClient<Keyed>,
     calibration: calibration::CalibrationServiceClient<Keyed>,
+    inputs: inputs::InputServiceClient<Keyed>,
     server: String,
     /// Whose jobs are created and listed.
     tenant: String,
@@ -77,6 +82,14 @@ impl Client {
     /// [`Error::Unavailable`] where no server answers, [`Error::NotLetIn`] where one side does not trust the other,
     /// [`Error::Usage`] for what is not a URL and for files of certificates or keys that cannot be used.
     pub async fn connect(server: &str, access: &AccessArgs) -> Result<Self, Error> {
+        if server.contains('@') {
+            // Not repeated: what stands there may be a password.
+            return Err(Error::Usage(
+                "the server's address holds a user or a password (`@`), which no server asks for: an API key goes into \
+                 --api-key-file or SCPSFM_API_KEY"
+                    .into(),
+            ));
+        }
         let no_url =
             || Error::Usage(format!("{server:?} is not a URL of the form http://HOST:PORT or https://HOST:PORT"));
         if !server.starts_with("http://") && !server.starts_with("https://") {
@@ -93,13 +106,15 @@ impl Client {
         let channel = endpoint.connect().await.map_err(|error| error::not_connected(server, &error))?;
         let channel = InterceptedService::new(channel, bearer);
         let jobs = jobs::JobServiceClient::new(channel.clone());
-        let calibration = calibration::CalibrationServiceClient::new(channel);
+        let calibration = calibration::CalibrationServiceClient::new(channel.clone());
         Ok(Self {
             jobs: jobs.accept_compressed(Gzip).send_compressed(Gzip).max_decoding_message_size(MAX_MESSAGE_BYTES),
             calibration: calibration
                 .accept_compressed(Gzip)
                 .send_compressed(Gzip)
                 .max_decoding_message_size(MAX_MESSAGE_BYTES),
+            // Coordinates hardly become shorter by compression.
+            inputs: inputs::InputServiceClient::new(channel),
             server: server.to_owned(),
             tenant,
         })
@@ -128,11 +143,32 @@ impl Client {
         settings: &SolveSettings,
         options: JobOptions,
     ) -> Result<Job, Error> {
-        let whole = convert::input::to_wire(input);
-        let request = create_request(self.parent(), whole, settings, options);
+        self.create_of(JobInput::TrackSet(convert::input::to_wire(input)), settings, options).await
+    }
+
+    /// The same with an input that was uploaded.
+    ///
+    /// # Errors
+    /// See [`Error`].
+    pub async fn create_with(
+        &mut self,
+        input: &InputName,
+        settings: &SolveSettings,
+        options: JobOptions,
+    ) -> Result<Job, Error> {
+        self.create_of(JobInput::InputName(input.to_string()), settings, options).await
+    }
+
+    async fn create_of(
+        &mut self,
+        input: JobInput,
+        settings: &SolveSettings,
+        options: JobOptions,
+    ) -> Result<Job, Error> {
+        let request = create_request(self.parent(), input, settings, options);
         let mut backoff = Backoff::default();
         loop {
-            match self.jobs.create_job(request.clone()).await {
+            match backoff.within(self.jobs.create_job(request.clone())).await {
                 Ok(job) => return Ok(convert::job::from_wire(job.into_inner())?),
                 Err(status) => self.pause(&mut backoff, status).await?,
             }
@@ -197,7 +233,7 @@ impl Client {
         let mut backoff = Backoff::default();
         loop {
             let request = proto::WatchJobRequest { name: name.to_string(), after_sequence: told.last_sequence };
-            let outcome = match self.jobs.watch_job(request).await {
+            let outcome = match backoff.within(self.jobs.watch_job(request)).await {
                 Ok(events) => told.follow(events.into_inner(), &mut backoff).await?,
                 Err(status) => Err(status),
             };
@@ -247,8 +283,12 @@ impl Client {
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
     ) -> Result<JobEvent, Error> {
         let input = Arc::new(input.clone());
-        let config =
-            create_request(self.parent(), convert::input::head_to_wire(&input), settings, JobOptions::default());
+        let config = create_request(
+            self.parent(),
+            JobInput::TrackSet(convert::input::head_to_wire(&input)),
+            settings,
+            JobOptions::default(),
+        );
         let mut told = Told { last_sequence: 0, on_event };
         let mut backoff = Backoff::default();
         loop {
@@ -291,7 +331,7 @@ impl Client {
         backoff: &mut Backoff,
     ) -> Result<Result<(), Status>, Error> {
         let request = proto::ReadJobResultRequest { name: name.to_string(), offset: bytes.len() as i64 };
-        let mut chunks = match self.jobs.read_job_result(request).await {
+        let mut chunks = match backoff.within(self.jobs.read_job_result(request)).await {
             Ok(chunks) => chunks.into_inner(),
             Err(status) => return Ok(Err(status)),
         };
@@ -318,8 +358,9 @@ impl Client {
     /// a quarter of a minute of silence looks like a hang.
     async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
         let transient = error::is_transient(&status);
+        let first = transient && backoff.failed(&status);
         let error = self.error(status);
-        if transient && backoff.is_first_try() {
+        if first {
             eprintln!("waiting up to {} s: {error}", Backoff::TOTAL.as_secs());
         }
         if transient && backoff.pause().await { Ok(()) } else { Err(error) }
@@ -387,7 +428,7 @@ pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> R
 
 fn create_request(
     parent: String,
-    input: proto::TrackSet,
+    input: JobInput,
     settings: &SolveSettings,
     options: JobOptions,
 ) -> proto::CreateJobRequest {
@@ -407,7 +448,7 @@ fn create_request(
             deadline: time_limit.map(proto::job::Deadline::TimeLimit),
             ..proto::Job::default()
         }),
-        input: Some(proto::create_job_request::Input::TrackSet(input)),
+        input: Some(input),
     }
 }
 

@@ -48,7 +48,7 @@ async fn an_input_that_cannot_be_read_fails_its_job() {
     let broken = crate::store::NewRecord {
         name: JobName { tenant: DEFAULT_TENANT.into(), job: "broken".into() },
         request: None,
-        input: b"not an input".to_vec(),
+        input: b"not an input".to_vec().into(),
         view_count: 2,
         track_count: 2,
         observation_count: 4,

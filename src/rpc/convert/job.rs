@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::enums::{Twin, optional_to_wire};
-use super::{optional_time, progress, required, settings, time_from_wire};
+use super::{optional_time, progress, required, result, settings, time_from_wire};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Grade, InvalidInput, Prior, Status, Violation};
 use crate::rpc::proto;
@@ -157,6 +157,7 @@ fn summary_to_wire(summary: &Summary) -> proto::JobSummary {
         iterations: summary.iterations,
         seconds: summary.seconds,
         result_bytes: summary.result_bytes,
+        warnings: result::warnings_to_wire(&summary.warnings),
     }
 }
 
@@ -173,6 +174,7 @@ fn summary_from_wire(summary: &proto::JobSummary) -> Result<Summary, Violation> 
         iterations: summary.iterations,
         seconds: summary.seconds,
         result_bytes: summary.result_bytes,
+        warnings: result::warnings_from_wire(&summary.warnings, "summary.warnings.code")?,
     })
 }
 
@@ -181,7 +183,7 @@ mod tests {
     use std::time::{Duration, SystemTime};
 
     use super::*;
-    use crate::domain::{Progress, SolveSettings, Stage};
+    use crate::domain::{Progress, SolveSettings, Stage, Warning, WarningCode};
 
     fn name() -> JobName {
         JobName { tenant: "default".into(), job: "a-1".into() }
@@ -204,6 +206,7 @@ mod tests {
             iterations: 60,
             seconds: 1.25,
             result_bytes: 12_345,
+            warnings: vec![Warning::new(WarningCode::FewInliers, "three").of_group(2)],
         }
     }
 

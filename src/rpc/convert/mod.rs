@@ -15,6 +15,7 @@ pub mod progress;
 pub mod result;
 pub mod settings;
 mod time;
+pub mod upload;
 
 pub(crate) use time::{optional_time, positive_duration, time_from_wire};
 

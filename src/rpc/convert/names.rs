@@ -2,7 +2,7 @@
 
 use crate::domain::error::quoted;
 use crate::domain::job::JobName;
-use crate::domain::{InvalidInput, Violation};
+use crate::domain::{InputName, InvalidInput, Violation};
 
 /// The tenant of `tenants/{tenant}`.
 ///
@@ -26,6 +26,17 @@ pub fn tenant(parent: &str) -> Result<String, InvalidInput> {
 pub fn job(name: &str) -> Result<JobName, InvalidInput> {
     JobName::parse(name).ok_or_else(|| {
         Violation::of("name", format!("{} is not of the form tenants/{{tenant}}/jobs/{{job}}", quoted(name))).into()
+    })
+}
+
+/// The input of `tenants/{tenant}/inputs/{input}`.
+///
+/// # Errors
+/// A violation of `input_name` where the name has another form.
+pub fn input(name: &str) -> Result<InputName, InvalidInput> {
+    InputName::parse(name).ok_or_else(|| {
+        let text = format!("{} is not of the form tenants/{{tenant}}/inputs/{{input}}", quoted(name));
+        Violation::of("input_name", text).into()
     })
 }
 

@@ -28,15 +28,7 @@ pub fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         noise_px: solution.noise_px,
         reprojection_rms_px: solution.reprojection_rms_px,
         reprojection_mean_px: solution.reprojection_mean_px,
-        warnings: solution
-            .warnings
-            .iter()
-            .map(|warning| proto::Warning {
-                code: warning.code.to_wire(),
-                detail: warning.detail.clone(),
-                camera_group: warning.camera_group,
-            })
-            .collect(),
+        warnings: warnings_to_wire(&solution.warnings),
         seconds: solution.seconds,
         stages: solution
             .stages
@@ -75,14 +67,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         noise_px: result.noise_px,
         reprojection_rms_px: result.reprojection_rms_px,
         reprojection_mean_px: result.reprojection_mean_px,
-        warnings: result
-            .warnings
-            .into_iter()
-            .map(|warning| {
-                let code = WarningCode::required(warning.code, "warnings.code")?;
-                Ok(Warning { code, detail: warning.detail, camera_group: warning.camera_group })
-            })
-            .collect::<Result<_, Violation>>()?,
+        warnings: warnings_from_wire(&result.warnings, "warnings.code")?,
         seconds: result.seconds,
         stages: result
             .stages
@@ -99,6 +84,26 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
             .collect::<Result<_, Violation>>()?,
         history: result.history.iter().map(progress::from_wire).collect::<Result<_, _>>()?,
     })
+}
+
+/// Warnings of a result or of its summary.
+pub(super) fn warnings_to_wire(warnings: &[Warning]) -> Vec<proto::Warning> {
+    let warning = |warning: &Warning| proto::Warning {
+        code: warning.code.to_wire(),
+        detail: warning.detail.clone(),
+        camera_group: warning.camera_group,
+    };
+    warnings.iter().map(warning).collect()
+}
+
+/// # Errors
+/// A violation of `field` for a code that this version does not know.
+pub(super) fn warnings_from_wire(warnings: &[proto::Warning], field: &str) -> Result<Vec<Warning>, Violation> {
+    let warning = |warning: &proto::Warning| {
+        let code = WarningCode::required(warning.code, field)?;
+        Ok(Warning { code, detail: warning.detail.clone(), camera_group: warning.camera_group })
+    };
+    warnings.iter().map(warning).collect()
 }
 
 fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {

@@ -8,7 +8,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
     // More than two rows, and not a whole number of them.
     let input: Vec<u8> = (0..2 * payload::CHUNK_BYTES + 17).map(|k| (k % 251) as u8).collect();
     let new = NewRecord {
-        input: input.clone(),
+        input: input.clone().into(),
         labels: labels.clone(),
         priority: -3,
         deadline: Some(time(60)),
@@ -119,7 +119,7 @@ pub(in crate::store) async fn admission_bounds_each_tenant(store: &dyn Store) {
     let bounds = QueueBounds { max_tenant_jobs: 2, max_tenant_bytes: 250, ..ROOM };
     let alone = QueueBounds { max_tenant_bytes: 0, ..bounds.clone() };
     store.create_job(of("t", "a"), &alone, time(0)).await.expect("a job that waits alone always fits");
-    let larger = NewRecord { input: vec![7; 151], ..of("t", "b") };
+    let larger = NewRecord { input: vec![7; 151].into(), ..of("t", "b") };
     let error = store.create_job(larger, &bounds, time(0)).await.expect_err("too many bytes");
     assert_eq!(error, Error::QueueFull(Bound::TenantBytes { waiting: 100, max: 250 }));
     store.create_job(of("t", "b"), &bounds, time(0)).await.expect("room for two");

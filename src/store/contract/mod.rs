@@ -4,6 +4,7 @@ pub(super) mod creation;
 pub(super) mod leases;
 pub(super) mod reading;
 pub(super) mod removal;
+pub(super) mod uploads;
 
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime};
@@ -42,6 +43,13 @@ macro_rules! store_contract {
             removal::what_waits_or_runs_is_not_deleted,
             removal::an_etag_is_honoured_and_changes_with_the_job,
             removal::what_ended_long_ago_goes_oldest_first_and_in_portions,
+            uploads::an_upload_goes_on_where_it_ended_and_becomes_an_input,
+            uploads::the_latest_stream_has_the_upload,
+            uploads::an_upload_id_stands_for_one_length_and_hash,
+            uploads::a_tenants_uploads_are_bounded,
+            uploads::what_nobody_goes_on_with_is_given_up_and_removed,
+            uploads::an_input_lives_as_long_as_a_job_has_it,
+            uploads::many_that_begin_at_once_share_the_last_room,
         );
     };
     (@each $open:path; $($part:ident :: $test:ident,)*) => {
@@ -78,7 +86,7 @@ pub(super) fn record(job: &str) -> NewRecord {
     NewRecord {
         name: JobName { tenant: "t".into(), job: job.into() },
         request: None,
-        input: vec![7; 100],
+        input: vec![7; 100].into(),
         view_count: 3,
         track_count: 20,
         observation_count: 60,
@@ -124,6 +132,7 @@ fn summary() -> Summary {
         iterations: 1,
         seconds: 0.5,
         result_bytes: 10,
+        warnings: Vec::new(),
     }
 }
 

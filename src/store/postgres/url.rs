@@ -49,6 +49,11 @@ impl DatabaseUrl {
         &self.options
     }
 
+    /// Whether it has a password, which is not shown.
+    pub fn has_password(&self) -> bool {
+        self.shown != self.given
+    }
+
     /// As it was given, password included: for whoever hands it on.
     pub fn reveal(&self) -> &str {
         &self.given
@@ -79,6 +84,12 @@ impl FromStr for DatabaseUrl {
         let options = given.parse().map_err(|_| UrlError("it cannot be parsed"))?;
         let authority = match authority.rsplit_once('@') {
             Some((user, host)) => match user.split_once(':') {
+                Some((_, HIDDEN)) => {
+                    return Err(UrlError(
+                        "its password is ***, which stands for one that is not shown: put the password in its place, or \
+                         the whole address into SCPSFM_STORE__URL",
+                    ));
+                }
                 Some((user, _)) => format!("{user}:{HIDDEN}@{host}"),
                 None => format!("{user}@{host}"),
             },

@@ -3,10 +3,11 @@
 use std::time::SystemTime;
 
 use super::rows::{self, append, integer, micros, number, select_jobs};
-use super::{Change, Connection, Row, Statement};
+use super::{Change, Connection, Row, Statement, uploads};
+use crate::domain::InputName;
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::store::query::Cursor;
-use crate::store::record::{Created, Load, NewRecord, QueueBounds, Request};
+use crate::store::record::{Created, JobInput, Load, NewRecord, QueueBounds, Request};
 use crate::store::{Error, JobPage, JobQuery, Order, payload};
 
 /// Stores jobs, all or none; see [`crate::store::Store::create_jobs`].
@@ -20,7 +21,7 @@ pub(super) async fn create<C: Connection>(
     for new in news {
         // Payloads take long: nobody else's admission waits for them.
         let known = admit(connection, new, bounds).await?.is_some();
-        let input = if known { None } else { Some(insert_input(connection, &new.name.tenant, &new.input, now).await?) };
+        let input = if known { None } else { Some(input_of(connection, new, now).await?) };
         inputs.push(input);
     }
     connection.lock_admission().await?;
@@ -30,14 +31,15 @@ pub(super) async fn create<C: Connection>(
         match (admit(connection, new, bounds).await?, input) {
             (Some(job), input) => {
                 if let Some(input) = input {
-                    connection.execute(Statement::new("DELETE FROM inputs WHERE id = $1").bind(input)).await?;
+                    let delete = Statement::new("DELETE FROM inputs WHERE id = $1 AND input IS NULL");
+                    connection.execute(delete.bind(input)).await?;
                 }
                 created.push(Created { job, new: false });
             }
             (None, Some(input)) => created.push(enqueue(connection, new, input, now).await?),
             // The job that its request id had made was deleted in between.
             (None, None) => {
-                let input = insert_input(connection, &new.name.tenant, &new.input, now).await?;
+                let input = input_of(connection, new, now).await?;
                 created.push(enqueue(connection, new, input, now).await?);
             }
         }
@@ -84,7 +86,7 @@ async fn admit<C: Connection>(connection: &mut C, new: &NewRecord, bounds: &Queu
         return Err(Error::AlreadyExists(format!("{} already exists", new.name)));
     }
     let (whole, tenant) = (load(connection).await?, load_of(connection, &new.name.tenant).await?);
-    match bounds.refuses(&whole, &tenant, new.input.len() as u64, u64::from(new.observation_count)) {
+    match bounds.refuses(&whole, &tenant, new.input.bytes(), u64::from(new.observation_count)) {
         Some(bound) => Err(Error::QueueFull(bound)),
         None => Ok(None),
     }
@@ -107,7 +109,19 @@ async fn earlier<C: Connection>(connection: &mut C, tenant: &str, request: &Requ
     connection.optional_row(select).await?.as_ref().map(rows::job).transpose()
 }
 
-async fn insert_input<C: Connection>(
+/// The row of a job's input: one that is stored now, or that of an uploaded one.
+async fn input_of<C: Connection>(connection: &mut C, new: &NewRecord, now: SystemTime) -> Result<i64, Error> {
+    match &new.input {
+        JobInput::Inline(bytes) => insert_input(connection, &new.name.tenant, bytes, now).await,
+        JobInput::Uploaded { input, .. } => {
+            let name = InputName { tenant: new.name.tenant.clone(), input: input.clone() };
+            uploads::use_input(connection, &name, now).await
+        }
+    }
+}
+
+/// Stores an encoded input; returns its row.
+pub(super) async fn insert_input<C: Connection>(
     connection: &mut C,
     tenant: &str,
     bytes: &[u8],
@@ -142,7 +156,7 @@ async fn insert_job<C: Connection>(
     .bind(micros(now))
     .bind(new.deadline.map(micros))
     .bind(input_id)
-    .bind(integer(new.input.len() as u64))
+    .bind(integer(new.input.bytes()))
     .bind(new.view_count)
     .bind(new.track_count)
     .bind(new.observation_count)
@@ -172,8 +186,8 @@ pub(super) async fn list<C: Connection>(connection: &mut C, query: &JobQuery) ->
     rows.truncate(size as usize);
     let next_page_token = match rows.last() {
         Some(last) if more => {
-            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.integer("id")? };
-            Some(query.token_after(cursor))
+            let cursor = Cursor { create_micros: last.integer("create_time")?, job: last.text("job")? };
+            Some(query.token_after(&cursor))
         }
         _ => None,
     };
@@ -195,11 +209,11 @@ fn listing(query: &JobQuery) -> Result<Statement, Error> {
         select = select.then(" AND value = ").then_bind(value).then(")");
     }
     let (beyond, order) = match query.order {
-        Order::CreateTimeDescending => (" AND (create_time, id) < (", " ORDER BY create_time DESC, id DESC LIMIT "),
-        Order::CreateTimeAscending => (" AND (create_time, id) > (", " ORDER BY create_time, id LIMIT "),
+        Order::CreateTimeDescending => (" AND (create_time, job) < (", " ORDER BY create_time DESC, job DESC LIMIT "),
+        Order::CreateTimeAscending => (" AND (create_time, job) > (", " ORDER BY create_time, job LIMIT "),
     };
     if let Some(cursor) = cursor {
-        select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(cursor.id).then(")");
+        select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(&cursor.job).then(")");
     }
     Ok(select.then(order).then_bind(i64::from(query.effective_page_size()) + 1))
 }
@@ -254,7 +268,7 @@ pub(super) async fn result<C: Connection>(connection: &mut C, name: &JobName) ->
     if chunks.is_empty() { Ok(None) } else { joined(&chunks).map(Some) }
 }
 
-fn joined(chunks: &[impl Row]) -> Result<Vec<u8>, Error> {
+pub(super) fn joined(chunks: &[impl Row]) -> Result<Vec<u8>, Error> {
     let mut whole = Vec::new();
     for chunk in chunks {
         whole.extend(chunk.bytes("data")?);

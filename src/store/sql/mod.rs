@@ -8,6 +8,7 @@ mod removal;
 mod rows;
 mod statement;
 mod store;
+mod uploads;
 
 use std::future::Future;
 use std::time::{Duration, SystemTime};

@@ -3,11 +3,15 @@
 use std::future::Future;
 use std::time::{Duration, SystemTime};
 
-use super::{Database, Size, attempts, jobs, removal};
+use super::{Database, Size, attempts, jobs, removal, uploads};
+use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
     CancelReply, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, QueueBounds, Swept,
+};
+use crate::store::upload::{
+    BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
 };
 use crate::store::{Error, Hint, JobPage, JobQuery, Store};
 
@@ -145,6 +149,56 @@ impl<D: Database> Store for D {
 
     async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
         reads!(self, Size::Payload, |connection| jobs::result(connection, name))
+    }
+
+    async fn begin_upload(
+        &self,
+        new: &NewUpload,
+        bounds: &UploadBounds,
+        now: SystemTime,
+    ) -> Result<BegunUpload, Error> {
+        writes!(self, Size::Small, |connection| uploads::begin(connection, new, bounds, now))
+    }
+
+    async fn append_upload(
+        &self,
+        lease: &UploadLease,
+        at_byte: u64,
+        data: &[u8],
+        now: SystemTime,
+    ) -> Result<(), Error> {
+        writes!(self, Size::Payload, |connection| uploads::append(connection, lease, at_byte, data, now))
+    }
+
+    async fn read_upload(&self, lease: &UploadLease, at_byte: u64) -> Result<Vec<u8>, Error> {
+        reads!(self, Size::Payload, |connection| uploads::read(connection, lease, at_byte))
+    }
+
+    async fn finish_upload(&self, lease: &UploadLease, new: &NewInput, now: SystemTime) -> Result<StoredInput, Error> {
+        writes!(self, Size::Payload, |connection| uploads::finish(connection, lease, new, now))
+    }
+
+    async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error> {
+        writes!(self, Size::Small, |connection| uploads::give_up(connection, lease))
+    }
+
+    async fn upload(&self, name: &InputName) -> Result<UploadStatus, Error> {
+        reads!(self, Size::Small, |connection| uploads::status(connection, name))
+    }
+
+    async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error> {
+        reads!(self, Size::Small, |connection| uploads::input(connection, name))
+    }
+
+    async fn purge_uploads(
+        &self,
+        abandoned_by: Option<SystemTime>,
+        unused_since: Option<SystemTime>,
+    ) -> Result<PurgedUploads, Error> {
+        if !reads!(self, Size::Small, |connection| uploads::needs_purge(connection, abandoned_by, unused_since))? {
+            return Ok(PurgedUploads::default());
+        }
+        writes!(self, Size::Payload, |connection| uploads::purge(connection, abandoned_by, unused_since))
     }
 
     async fn load(&self) -> Result<Load, Error> {

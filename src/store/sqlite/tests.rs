@@ -90,7 +90,7 @@ async fn deleted_jobs_leave_no_space_taken() {
     let mut largest = 0;
     let empty = pages().await;
     for round in 0..6 {
-        let new = crate::store::NewRecord { input: vec![round; 4 << 20], ..contract::record("a") };
+        let new = crate::store::NewRecord { input: vec![round; 4 << 20].into(), ..contract::record("a") };
         let name = fixture.create_job(new, &contract::ROOM, contract::time(0)).await.expect("created").job.name;
         largest = largest.max(pages().await);
         fixture.request_cancel(&name, None, contract::time(1)).await.expect("cancels");

@@ -136,6 +136,30 @@ pub const REFUSALS: Metric = Metric {
     labels: &["reason", "bound"],
     help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL, by the bound that was hit.",
 };
+pub const UPLOADED_BYTES: Metric = Metric {
+    name: "scpsfm_uploaded_bytes_total",
+    kind: Kind::Counter,
+    labels: &[],
+    help: "Bytes of uploads that were stored.",
+};
+pub const INPUTS_CREATED: Metric = Metric {
+    name: "scpsfm_inputs_created_total",
+    kind: Kind::Counter,
+    labels: &[],
+    help: "Uploads that became an input.",
+};
+pub const UPLOADS_GIVEN_UP: Metric = Metric {
+    name: "scpsfm_uploads_given_up_total",
+    kind: Kind::Counter,
+    labels: &["reason"],
+    help: "Uploads that were given up: nobody went on with them, their hash was wrong, or they were no valid input.",
+};
+pub const UPLOAD_REFUSALS: Metric = Metric {
+    name: "scpsfm_upload_refusals_total",
+    kind: Kind::Counter,
+    labels: &["bound"],
+    help: "Uploads refused before anything was stored, by the bound of the tenant that was hit.",
+};
 pub const RPC_REQUESTS: Metric = Metric {
     name: "scpsfm_grpc_requests_total",
     kind: Kind::Counter,
@@ -160,6 +184,12 @@ pub const STORE_DURATION: Metric = Metric {
     labels: &["operation"],
     help: "Seconds of a store operation, by operation.",
 };
+pub const STORE_REACHABLE: Metric = Metric {
+    name: "scpsfm_store_reachable",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "1 while the store answers; at 0 the server is not ready.",
+};
 pub const FENCED_WRITES: Metric = Metric {
     name: "scpsfm_fenced_writes_total",
     kind: Kind::Counter,
@@ -174,7 +204,7 @@ pub const WATCHERS: Metric = Metric {
 };
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 23] = [
+pub const ALL: [Metric; 28] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -192,10 +222,15 @@ pub const ALL: [Metric; 23] = [
     SOLVE_ITERATIONS,
     WINNING_PRIOR,
     REFUSALS,
+    UPLOADED_BYTES,
+    INPUTS_CREATED,
+    UPLOADS_GIVEN_UP,
+    UPLOAD_REFUSALS,
     RPC_REQUESTS,
     RPC_DURATION,
     RPC_IN_FLIGHT,
     STORE_DURATION,
+    STORE_REACHABLE,
     FENCED_WRITES,
     WATCHERS,
 ];

@@ -38,6 +38,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
         iterations: 120,
         seconds: 2.5,
         result_bytes: 1,
+        warnings: Vec::new(),
     };
     Job {
         name: JobName { tenant: "default".into(), job: "a".into() },

@@ -7,7 +7,7 @@ use scpsfm::rpc::keys::Sources;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::input_service_client::InputServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
-use scpsfm::rpc::proto::{self, FILE_DESCRIPTOR_SET, JobState, solve_request::Message};
+use scpsfm::rpc::proto::{self, FILE_DESCRIPTOR_SET, JobState, solve_request::Message, upload_input_request};
 use scpsfm::rpc::server::Options;
 use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::Channel;
@@ -21,6 +21,7 @@ use crate::support::certificates::written;
 use crate::support::keys::{Keyed, NORTH, SOUTH, keyed};
 use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::{held, quick};
+use crate::support::uploads::{id, part, request, start};
 use crate::support::wire::{all, create_tracks, solve_request, state_of};
 
 fn two_tenants() -> Options {
@@ -129,12 +130,13 @@ impl Tenant {
     }
 
     /// What every call says that names this job, by method; the parent is the job's.
-    async fn every_call_on(&mut self, name: &str, request: &proto::CreateJobRequest) -> Vec<(&'static str, Status)> {
+    async fn every_call_on(&mut self, name: &str, job: &proto::CreateJobRequest) -> Vec<(&'static str, Status)> {
         let parent = name.split("/jobs/").next().expect("a parent");
-        let create = proto::CreateJobRequest { parent: parent.into(), ..request.clone() };
+        let create = proto::CreateJobRequest { parent: parent.into(), ..job.clone() };
         let name = || name.to_owned();
         let batch = proto::BatchCreateJobsRequest { parent: parent.into(), requests: vec![create.clone()] };
         let upload = proto::GetUploadStatusRequest { parent: parent.into(), ..Default::default() };
+        let begin = request(upload_input_request::Message::Start(start(parent, &id(1), 100)));
         let answers = [
             ("GetJob", self.jobs.get_job(proto::GetJobRequest { name: name() }).await.map(drop)),
             (
@@ -158,7 +160,7 @@ impl Tenant {
             ("Solve", self.solve(create).await.map(drop)),
             ("BatchCreateJobs", self.jobs.batch_create_jobs(batch).await.map(drop)),
             ("GetUploadStatus", self.inputs.get_upload_status(upload).await.map(drop)),
-            ("UploadInput", self.inputs.upload_input(tokio_stream::empty()).await.map(drop)),
+            ("UploadInput", self.inputs.upload_input(tokio_stream::once(begin)).await.map(drop)),
         ];
         answers.map(|(method, answer)| (method, answer.expect_err(method))).into()
     }
@@ -209,11 +211,7 @@ async fn of_another_tenants_job_nothing_can_be_learned_or_done() {
             }
         }
         for (method, status) in &of_theirs {
-            let expected = match *method {
-                "GetUploadStatus" | "UploadInput" => Code::Unimplemented,
-                _ => Code::NotFound,
-            };
-            assert_eq!(status.code(), expected, "{method}");
+            assert_eq!(status.code(), Code::NotFound, "{method}");
         }
         // Every method was tried; GetCapabilities names nothing.
         assert_eq!(of_theirs.len() + 1, methods().len());
@@ -255,6 +253,31 @@ async fn ids_and_page_tokens_are_each_tenants_own() {
         }
     }
     assert_eq!(listed, ["tenants/north/jobs/b", "tenants/north/jobs/a"]);
+
+    // What others have made shows nowhere in a token: it holds the query, a time and an id of the tenant's own.
+    let token = north.list("tenants/north", "").await.expect("a page").next_page_token;
+    let (_, rest) = token.split_once('-').expect("a query");
+    let (micros, id) = rest.split_once('-').expect("a time");
+    let job = proto::GetJobRequest { name: listed[0].clone() };
+    let created = north.jobs.get_job(job).await.expect("a job").into_inner().create_time.expect("a time");
+    let micros = i64::from_str_radix(micros, 16).expect("a number");
+    assert_eq!((micros / 1_000_000, id), (created.seconds, "b"));
+}
+
+/// A server whose keys are in a file that is looked at all the time.
+async fn with_a_file_of_keys(solver: scpsfm::engine::Solver, file: std::path::PathBuf) -> TestServer {
+    let keys = Sources { file: Some(file), fixed: None };
+    let options = Options { keys, look_every: Duration::from_millis(10), ..Options::default() };
+    TestServer::start_with(solver, options, one_worker()).await
+}
+
+async fn until_let_in(tenant: &mut Tenant, parent: &str) {
+    soon(async {
+        while tenant.list(parent, "").await.is_err() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
 }
 
 #[tokio::test]
@@ -263,9 +286,7 @@ async fn a_file_of_keys_is_read_again_and_open_streams_go_on() {
     let write = |text: &str| written(directory.path(), "keys.txt", text);
     let file = write(&format!("north:{NORTH}\n"));
     let (solver, hold) = held();
-    let keys = Sources { file: Some(file), fixed: None };
-    let options = Options { keys, look_every: Duration::from_millis(10), ..Options::default() };
-    let server = TestServer::start_with(solver, options, one_worker()).await;
+    let server = with_a_file_of_keys(solver, file).await;
     let (mut north, mut south) = (Tenant::of(&server, NORTH).await, Tenant::of(&server, SOUTH).await);
     let request = proto::CreateJobRequest { parent: "tenants/north".into(), ..create_tracks() };
     let name = north.create(request).await.expect("a job").name;
@@ -273,18 +294,75 @@ async fn a_file_of_keys_is_read_again_and_open_streams_go_on() {
     let watch = watch.expect("a watch").into_inner();
     assert_eq!(south.list("tenants/south", "").await.expect_err("no key yet").code(), Code::Unauthenticated);
 
-    // What is no list of keys changes nothing; after it, a withdrawn key and a new one do.
+    // What is no list of keys changes nothing; after it, a new key is let in, and who was in is not disturbed.
     write("north");
-    write(&format!("south:{SOUTH}\n"));
-    soon(async {
-        while south.list("tenants/south", "").await.is_err() {
-            tokio::time::sleep(Duration::from_millis(5)).await;
-        }
-    })
-    .await;
-    assert_eq!(north.list("tenants/north", "").await.expect_err("withdrawn").code(), Code::Unauthenticated);
+    write(&format!("south:{SOUTH}\nnorth:{NORTH}\n"));
+    until_let_in(&mut south, "tenants/south").await;
+    north.list("tenants/north", "").await.expect("still let in");
     hold.let_go();
     let (events, end) = soon(all(watch)).await;
     end.expect("a stream that was open goes on");
     assert_eq!(events.last().and_then(state_of), Some(JobState::Succeeded));
+}
+
+#[tokio::test]
+async fn a_withdrawn_key_ends_its_streams_both_ways_and_nobody_elses() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let write = |text: &str| written(directory.path(), "keys.txt", text);
+    let file = write(&format!("south:{SOUTH}\nnorth:{NORTH}\n"));
+    let (solver, hold) = held();
+    let server = with_a_file_of_keys(solver, file).await;
+    let (mut north, mut south) = (Tenant::of(&server, NORTH).await, Tenant::of(&server, SOUTH).await);
+    let mut watches = Vec::new();
+    for (tenant, parent) in [(&mut north, "tenants/north"), (&mut south, "tenants/south")] {
+        let name = tenant.create(proto::CreateJobRequest { parent: parent.into(), ..create_tracks() }).await;
+        let request = proto::WatchJobRequest { name: name.expect("a job").name, after_sequence: 0 };
+        watches.push(tenant.jobs.watch_job(request).await.expect("a watch").into_inner());
+    }
+    // And one that sends: an upload of which half has come.
+    let (sender, messages) = tokio::sync::mpsc::channel(8);
+    let mut sending = north.inputs.clone();
+    let messages = tokio_stream::wrappers::ReceiverStream::new(messages);
+    let upload = tokio::spawn(async move { sending.upload_input(messages).await });
+    let bytes = vec![1; 1_000];
+    for message in part("tenants/north", &id(1), &bytes, 0..500, 100) {
+        sender.send(message).await.expect("taken");
+    }
+    soon(async {
+        while sender.capacity() < 8 {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
+    // What has left this side arrives meanwhile, or the part of it that does is kept.
+    tokio::time::sleep(Duration::from_millis(50)).await;
+
+    write(&format!("south:{SOUTH}\n"));
+    let withdrawn = |status: Status| {
+        assert_eq!((status.code(), reason(&status).as_str()), (Code::Unauthenticated, "API_KEY_WITHDRAWN"), "{status}");
+    };
+    let theirs = watches.remove(0);
+    withdrawn(soon(all(theirs)).await.1.expect_err("cut off"));
+    withdrawn(soon(upload).await.expect("no panic").expect_err("cut off"));
+    assert_eq!(north.list("tenants/north", "").await.expect_err("withdrawn").code(), Code::Unauthenticated);
+    south.list("tenants/south", "").await.expect("let in");
+
+    // A key that moves to another tenant was withdrawn from the first.
+    write(&format!("north:{SOUTH}\n"));
+    let (_, end) = soon(all(watches.remove(0))).await;
+    withdrawn(end.expect_err("another tenant's now"));
+    hold.let_go();
+    // The upload was told of its end on the way in too: what had come is kept, and no more is taken.
+    until_let_in(&mut south, "tenants/north").await;
+    let asked = proto::GetUploadStatusRequest { parent: "tenants/north".into(), upload_id: id(1) };
+    soon(async {
+        loop {
+            let status = south.inputs.get_upload_status(asked.clone()).await.expect("begun").into_inner();
+            if status.committed_bytes > 0 {
+                break assert_eq!(status.committed_bytes % 100, 0);
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
 }

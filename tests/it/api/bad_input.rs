@@ -202,24 +202,6 @@ async fn unknown_and_foreign_names_are_told_apart_from_malformed_ones() {
 }
 
 #[tokio::test]
-async fn what_is_still_to_come_says_so() {
-    let server = TestServer::start(quick()).await;
-    let mut jobs = server.jobs().await;
-    let mut inputs = proto::input_service_client::InputServiceClient::new(server.channel().await);
-    let uploaded = create(Input::InputName("tenants/default/inputs/a".into()));
-    let statuses = [
-        jobs.create_job(uploaded).await.map(drop),
-        inputs.upload_input(tokio_stream::empty()).await.map(drop),
-        inputs.get_upload_status(proto::GetUploadStatusRequest::default()).await.map(drop),
-    ];
-    for status in statuses {
-        let status = status.expect_err("not implemented");
-        assert_eq!(status.code(), Code::Unimplemented, "{status}");
-        assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "NOT_IMPLEMENTED");
-    }
-}
-
-#[tokio::test]
 async fn bad_watches_and_reads_are_refused() {
     let server = TestServer::start(quick()).await;
     let mut jobs = server.jobs().await;

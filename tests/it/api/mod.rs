@@ -6,3 +6,4 @@ mod discovery;
 mod jobs;
 mod removal;
 mod solve;
+mod uploads;

@@ -10,4 +10,5 @@ pub mod python;
 pub mod scrape;
 pub mod server;
 pub mod solvers;
+pub mod uploads;
 pub mod wire;

@@ -128,13 +128,20 @@ impl Serving {
 
     /// Body of a page of the metrics port.
     pub fn page(&self, path: &str) -> String {
+        let (head, body) = self.answer(path);
+        assert!(head.starts_with("HTTP/1.1 200"), "{head}");
+        body
+    }
+
+    /// Head and body of an answer of the metrics port, whatever its code.
+    pub fn answer(&self, path: &str) -> (String, String) {
         use std::io::Write;
         let mut stream = std::net::TcpStream::connect(&self.metrics).expect("the metrics port answers");
         stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
         write!(stream, "GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").expect("a request");
         let mut text = String::new();
         stream.read_to_string(&mut text).expect("an answer");
-        assert!(text.starts_with("HTTP/1.1 200"), "{text}");
-        text
+        let (head, body) = text.split_once("\r\n\r\n").expect("a head and a body");
+        (head.to_owned(), body.to_owned())
     }
 }

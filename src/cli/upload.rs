@@ -1,0 +1,44 @@
+//! `scpsfm upload`: leaves an input with a server.
+
+use super::args::{InputArgs, ServerArgs, tell_notes};
+use super::client::upload::Encoded;
+use super::exit::{Exit, Failure};
+use super::print;
+use super::progress::TransferView;
+
+const EXAMPLES: &str = "\
+Examples:
+  scpsfm upload observations.csv --width 3072 --height 2048
+  input=$(scpsfm upload observations.csv) && scpsfm submit --input $input --method geometry";
+
+/// Leave an input with a server, for any number of jobs
+///
+/// Prints the input's name, for `scpsfm submit --input NAME`. Goes on by itself where a connection breaks; stopped and
+/// given again with the same tracks, it goes on where it was, and what the server has already it does not send again.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
+pub struct Args {
+    #[command(flatten)]
+    pub input: InputArgs,
+
+    #[command(flatten)]
+    pub server: ServerArgs,
+
+    /// No progress on stderr
+    #[arg(long)]
+    pub quiet: bool,
+}
+
+/// Runs the command.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let input = args.input.read()?;
+    tell_notes(&input);
+    let mut client = args.server.connect().await?;
+    let encoded = Encoded::new(&input.raw);
+    let mut view = TransferView::new(args.quiet, encoded.len());
+    let uploaded = client.upload(&encoded, &mut |bytes| view.show(bytes)).await;
+    view.finish();
+    let name = uploaded.map_err(|error| error.at_lines(&input))?;
+    print(&name.to_string())?;
+    Ok(Exit::Done)
+}

@@ -1,0 +1,182 @@
+//! Where connections come in: each has a bound of time to shake hands and to say that it speaks HTTP/2, and those that
+//! have not yet are few enough to hold up nobody.
+
+use std::collections::VecDeque;
+use std::convert::Infallible;
+use std::io;
+use std::pin::Pin;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use futures_util::stream::{self, Stream};
+use prost::bytes::{Buf, Bytes};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::task::{AbortHandle, JoinSet};
+use tokio_rustls::TlsAcceptor;
+use tokio_rustls::rustls::ServerConfig;
+use tonic::transport::server::{Connected, TcpConnectInfo};
+
+use super::reload::Current;
+
+/// How long a connection may take to its first words: three round trips of the slowest link, and no reason for a caller to
+/// be slower.
+pub const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Connections that have not come to their first words yet, at most; one more ends the oldest of them. Callers that mean it
+/// need milliseconds for it, so that a thousand are a thousand new ones a round trip.
+pub const MAX_GREETED: usize = 1_024;
+
+/// Pause after a connection could not be taken, which is usually a lack of file descriptors: some free up meanwhile.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
+
+/// What every client says first (RFC 9113, section 3.4).
+const PREFACE: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+
+/// How connections are let in.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// `None`: they are not encrypted.
+    pub certificates: Option<Current<ServerConfig>>,
+    /// How long a connection may take to its first words.
+    pub timeout: Duration,
+    /// Connections that have not come to them yet, at most.
+    pub max_greeted: usize,
+}
+
+/// Connections that speak, in the order in which they began to. Each handshake begins with the certificate that is in
+/// force then; those that fail or stall leave nothing but a line in the log.
+pub fn incoming(listener: TcpListener, options: Options) -> impl Stream<Item = Result<Connection, Infallible>> {
+    let door = Door { listener, options, greeted: JoinSet::new(), oldest_first: VecDeque::new() };
+    stream::unfold(door, async |mut door| {
+        let connection = door.next().await;
+        Some((Ok(connection), door))
+    })
+}
+
+struct Door {
+    listener: TcpListener,
+    options: Options,
+    greeted: JoinSet<Result<Connection, String>>,
+    oldest_first: VecDeque<AbortHandle>,
+}
+
+impl Door {
+    async fn next(&mut self) -> Connection {
+        loop {
+            tokio::select! {
+                accepted = self.listener.accept() => match accepted {
+                    Ok((connection, _)) => self.greet(connection),
+                    Err(error) => {
+                        tracing::warn!(%error, "a connection could not be taken");
+                        tokio::time::sleep(ACCEPT_PAUSE).await;
+                    }
+                },
+                Some(ended) = self.greeted.join_next() => match ended {
+                    Ok(Ok(connection)) => return connection,
+                    Ok(Err(error)) => tracing::debug!(error, "a connection came to nothing"),
+                    Err(error) if error.is_cancelled() => tracing::debug!("a silent connection made room for another"),
+                    Err(error) => tracing::error!(%error, "a connection's task failed"),
+                },
+            }
+        }
+    }
+
+    fn greet(&mut self, connection: TcpStream) {
+        self.oldest_first.retain(|greeted| !greeted.is_finished());
+        while self.oldest_first.len() >= self.options.max_greeted.max(1) {
+            if let Some(oldest) = self.oldest_first.pop_front() {
+                oldest.abort();
+            }
+        }
+        let acceptor = self.options.certificates.as_ref().map(|current| TlsAcceptor::from(current.borrow().clone()));
+        let bound = self.options.timeout;
+        let greeting = self.greeted.spawn(async move {
+            match tokio::time::timeout(bound, begin(connection, acceptor)).await {
+                Ok(begun) => begun.map_err(|error| error.to_string()),
+                Err(_) => Err(format!("silent for {} s", bound.as_secs_f64())),
+            }
+        });
+        self.oldest_first.push_back(greeting);
+    }
+}
+
+/// Shakes hands, where there is TLS, and waits for the first words.
+async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Result<Connection> {
+    connection.set_nodelay(true)?;
+    let info = connection.connect_info();
+    let mut io: Box<dyn Io> = match acceptor {
+        Some(acceptor) => Box::new(acceptor.accept(connection).await?),
+        None => Box::new(connection),
+    };
+    let mut early = Vec::with_capacity(PREFACE.len());
+    // What is something else already is for the transport to refuse.
+    while early.len() < PREFACE.len() && PREFACE.starts_with(&early) {
+        let mut rest = [0; PREFACE.len()];
+        let wanted = PREFACE.len() - early.len();
+        let count = io.read(&mut rest[..wanted]).await?;
+        if count == 0 {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        early.extend_from_slice(&rest[..count]);
+    }
+    Ok(Connection { io, early: early.into(), info })
+}
+
+/// A connection, encrypted or not.
+trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
+
+impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
+
+/// A connection whose first words have been heard, and are said again.
+pub struct Connection {
+    io: Box<dyn Io>,
+    early: Bytes,
+    info: TcpConnectInfo,
+}
+
+impl Connected for Connection {
+    type ConnectInfo = TcpConnectInfo;
+
+    fn connect_info(&self) -> TcpConnectInfo {
+        self.info.clone()
+    }
+}
+
+impl AsyncRead for Connection {
+    fn poll_read(mut self: Pin<&mut Self>, context: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        if self.early.is_empty() {
+            return Pin::new(&mut self.io).poll_read(context, buf);
+        }
+        let count = self.early.len().min(buf.remaining());
+        buf.put_slice(&self.early[..count]);
+        self.early.advance(count);
+        Poll::Ready(Ok(()))
+    }
+}
+
+impl AsyncWrite for Connection {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.io).poll_write(context, buf)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bufs: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.io).poll_write_vectored(context, bufs)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.io.is_write_vectored()
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.io).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.io).poll_shutdown(context)
+    }
+}

@@ -1,0 +1,129 @@
+//! Connections that say nothing: they end in time, and hold up nobody meanwhile.
+
+use std::time::Duration;
+
+use scpsfm::rpc::proto;
+use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
+use scpsfm::rpc::server::Options;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+use crate::support::program::Serving;
+use crate::support::server::{TestServer, one_worker, soon};
+use crate::support::solvers::quick;
+
+/// What every client of HTTP/2 says first (RFC 9113, section 3.4), and empty settings.
+const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
+
+/// A new client gets an answer.
+async fn is_served(url: &str) {
+    let call = async {
+        let mut client = CalibrationServiceClient::connect(url.to_owned()).await.expect("a connection");
+        client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("an answer");
+    };
+    soon(call).await;
+}
+
+/// Connections each of which has said that much.
+async fn saying(address: &str, count: usize, words: &[u8]) -> Vec<TcpStream> {
+    let mut connections = Vec::new();
+    for _ in 0..count {
+        let mut connection = TcpStream::connect(address).await.expect("a connection");
+        connection.write_all(words).await.expect("written");
+        connections.push(connection);
+    }
+    connections
+}
+
+/// Reads until the other side closes the connection.
+async fn until_closed(mut connection: TcpStream) {
+    let mut buffer = [0; 256];
+    while matches!(connection.read(&mut buffer).await, Ok(1..)) {}
+}
+
+#[tokio::test]
+async fn hundreds_of_silent_connections_hold_up_nobody_and_are_ended() {
+    let half_a_second = Duration::from_millis(500);
+    let options = Options {
+        handshake_timeout: half_a_second,
+        keepalive: half_a_second,
+        keepalive_timeout: half_a_second,
+        ..Options::default()
+    };
+    let server = TestServer::start_with(quick(), options, one_worker()).await;
+    let address = server.server.address().to_string();
+    // Nothing at all, half of the first words, and all of them with nothing after.
+    let mut silent = Vec::new();
+    for words in [&PREFACE[..0], &PREFACE[..11], PREFACE] {
+        silent.extend(saying(&address, 150, words).await);
+    }
+    is_served(&server.url()).await;
+    let good = server.channel().await;
+    soon(futures_util::future::join_all(silent.into_iter().map(until_closed))).await;
+    // One that answers when it is asked whether it lives is left alone, however little it has to say.
+    tokio::time::sleep(4 * half_a_second).await;
+    let mut client = CalibrationServiceClient::new(good);
+    client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("the same connection, or another");
+    is_served(&server.url()).await;
+}
+
+#[tokio::test]
+async fn of_too_many_silent_connections_the_oldest_make_room() {
+    let options =
+        Options { handshake_timeout: Duration::from_secs(3_600), max_silent_connections: 20, ..Options::default() };
+    let server = TestServer::start_with(quick(), options, one_worker()).await;
+    let address = server.server.address().to_string();
+    let mut silent = saying(&address, 100, b"PRI").await;
+    let newest = silent.split_off(80);
+    soon(futures_util::future::join_all(silent.into_iter().map(until_closed))).await;
+    is_served(&server.url()).await;
+    // Whoever is among the latest may take its time.
+    let mut last = newest.into_iter().next_back().expect("the newest");
+    last.write_all(&PREFACE[3..]).await.expect("still open");
+    assert!(matches!(soon(last.read(&mut [0; 9])).await, Ok(1..)), "the server's settings");
+}
+
+#[tokio::test]
+async fn what_is_not_http2_is_refused_at_once() {
+    let options = Options { handshake_timeout: Duration::from_secs(3_600), ..Options::default() };
+    let server = TestServer::start_with(quick(), options, one_worker()).await;
+    let address = server.server.address().to_string();
+    for words in [&b"GET / HTTP/1.1\r\nhost: x\r\n\r\n"[..], b"\x16\x03\x01\x02\0", b"PRI * HTTP/2.1\r\n\r\nSM\r\n\r\n"]
+    {
+        let mut connections = saying(&address, 1, words).await;
+        let mut connection = connections.remove(0);
+        // Enough for a transport that waits for a preface's length.
+        let _ = connection.write_all(&[0; 64]).await;
+        soon(until_closed(connection)).await;
+    }
+    is_served(&server.url()).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "ten thousand connections, half a minute"]
+async fn ten_thousand_silent_connections_cost_little_and_go_away() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let server = Serving::start(directory.path());
+    let address = server.grpc.trim_start_matches("http://").to_owned();
+    let resident_mb = || {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", server.running.0.id())).expect("a process");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("its memory").trim();
+        line.trim_end_matches(" kB").parse::<u64>().expect("a number") / 1024
+    };
+    let before = resident_mb();
+    let begun = std::time::Instant::now();
+    let mut silent = saying(&address, 5_000, b"").await;
+    is_served(&server.grpc).await;
+    silent.extend(saying(&address, 5_000, b"PRI").await);
+    let one = std::time::Instant::now();
+    is_served(&server.grpc).await;
+    let (served, grown) = (one.elapsed(), resident_mb() - before);
+    soon(futures_util::future::join_all(silent.into_iter().map(until_closed))).await;
+    eprintln!(
+        "10,000 connections: {grown} MB more, a call in {} ms, all gone after {:.1} s, {} MB then",
+        served.as_millis(),
+        begun.elapsed().as_secs_f64(),
+        resident_mb() - before
+    );
+    assert!(grown < 50, "{grown} MB");
+}
