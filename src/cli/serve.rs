@@ -193,6 +193,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         listen: config.metrics.listen,
         scrape,
         ready: ready.clone(),
+        silence: telemetry::server::Options::SILENCE,
     })
     .await
     .map_err(|error| {

@@ -15,6 +15,8 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
+use super::silence::Bounded;
+
 /// Prometheus' text format, as its exposition documentation names it.
 const TEXT_FORMAT: &str = "text/plain; version=0.0.4; charset=utf-8";
 
@@ -60,6 +62,13 @@ pub struct Options {
     pub listen: SocketAddr,
     pub scrape: PrometheusHandle,
     pub ready: Readiness,
+    /// How long a connection may be silent.
+    pub silence: Duration,
+}
+
+impl Options {
+    /// Twice the longest interval of scrapes that is common, so that a scraper's connection lasts from one to the next.
+    pub const SILENCE: Duration = Duration::from_secs(120);
 }
 
 /// The running scrape port.
@@ -78,6 +87,7 @@ pub async fn bind(options: Options) -> std::io::Result<Server> {
     let listener = TcpListener::bind(options.listen).await?;
     let address = listener.local_addr()?;
     let stop = CancellationToken::new();
+    let listener = Bounded { listener, silence: options.silence };
     let router = router(options.scrape.clone(), options.ready);
     let stopped = stop.clone();
     let upkeep = stop.clone();
@@ -161,7 +171,8 @@ mod tests {
         let ready = Readiness::default();
         let scrape = metrics::install().expect("recorder");
         let listen = "127.0.0.1:0".parse().expect("address");
-        let server = bind(Options { listen, scrape, ready: ready.clone() }).await.expect("bind");
+        let server =
+            bind(Options { listen, scrape, ready: ready.clone(), silence: Options::SILENCE }).await.expect("bind");
         let address = server.address();
 
         assert!(get(address, "/healthz").await.starts_with("HTTP/1.1 200"));
@@ -179,5 +190,29 @@ mod tests {
 
         server.shutdown().await;
         assert!(TcpStream::connect(address).await.is_err(), "the port is closed");
+    }
+
+    #[tokio::test]
+    async fn a_connection_that_says_nothing_is_ended_and_one_that_scrapes_is_not() {
+        let scrape = metrics::install().expect("recorder");
+        let listen = "127.0.0.1:0".parse().expect("address");
+        let silence = std::time::Duration::from_secs(1);
+        let server = bind(Options { listen, scrape, ready: Readiness::default(), silence }).await.expect("bind");
+        let mut silent = TcpStream::connect(server.address()).await.expect("connect");
+        let mut begun = TcpStream::connect(server.address()).await.expect("connect");
+        begun.write_all(b"GET /healthz HTTP/1.1\r\nhost").await.expect("send");
+        let mut scraper = TcpStream::connect(server.address()).await.expect("connect");
+        let mut answer = [0; 1024];
+        for _ in 0..6 {
+            scraper.write_all(b"GET /healthz HTTP/1.1\r\nhost: test\r\n\r\n").await.expect("send");
+            let count = scraper.read(&mut answer).await.expect("an answer");
+            assert!(answer[..count].starts_with(b"HTTP/1.1 200"));
+            tokio::time::sleep(silence / 3).await;
+        }
+        for connection in [&mut silent, &mut begun] {
+            let read = tokio::time::timeout(silence * 60, connection.read(&mut answer)).await.expect("ended long ago");
+            assert!(!matches!(read, Ok(1..)), "{read:?}");
+        }
+        server.shutdown().await;
     }
 }

@@ -78,8 +78,8 @@ const fn total_ms() -> u64 {
 mod tests {
     use super::*;
 
-    /// Seconds until a call is given up each of whose tries takes so long, and how many tries that were. The runtime's
-    /// clock jumps to whatever is waited for.
+    /// Seconds until a call is given up each of whose tries takes so long, from the end of the first, and how many tries
+    /// that were.
     fn given_up_after(try_for: Duration) -> (f64, usize) {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
         runtime.block_on(async {
