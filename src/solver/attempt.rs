@@ -147,7 +147,11 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     recorder.standing.inliers = refined.inlier_count() as u32;
     recorder.standing.best_score = Some(refined.score);
     recorder.tell(1.0);
-    if refined.inlier_count() < LEAST_INLIERS {
+    let counted = match &attempt.opinion {
+        Some(opinion) => opinion.counted(&refined.inliers()),
+        None => refined.inlier_count(),
+    };
+    if counted < LEAST_INLIERS {
         return Ok(());
     }
     attempt.second_structure = second::structure(complete, &refined, context.stop);

@@ -4,6 +4,7 @@
 //! geometry then verifies. Constants without another reason come from the sweep that
 //! `the_sweep_of_the_learned_prior` prints (an ignored test of the solver's).
 
+use super::grow::LEAST_INLIERS;
 use crate::geometry::measurement::CompleteBlock;
 use crate::network::subspace::{self, Cloud, MOST_VIEWS};
 
@@ -22,6 +23,11 @@ const START_SIZES: (usize, usize) = (8, 60);
 /// Tracks that must be likely right before a ranking without verification is worth telling: entirely wrong input has up
 /// to three by chance.
 const LEAST_LIKELY: usize = 4;
+
+/// Inliers from which on geometry needs no second opinion: twice what it needs for any.
+const SURELY_ENOUGH: usize = 2 * LEAST_INLIERS;
+/// Odds against a track, in nats, at which it is held to be wrong: twenty to one.
+const DOUBT_NATS: f64 = 3.0;
 
 /// The network's opinion of the tracks of one block.
 #[derive(Debug, Clone)]
@@ -63,6 +69,17 @@ impl Opinion {
         ranked
     }
 
+    /// How many of these inliers count towards those that geometry needs for a verification.
+    ///
+    /// With few of them the cameras are flexible enough to take up a wrong one or two; then those that the network holds
+    /// to be wrong do not count. With many, geometry alone has the word.
+    pub fn counted(&self, inliers: &[usize]) -> usize {
+        if inliers.len() >= SURELY_ENOUGH {
+            return inliers.len();
+        }
+        inliers.iter().filter(|&&track| self.ln_odds[track] > -DOUBT_NATS).count()
+    }
+
     /// Whether enough tracks are likely right for their ranking to be told where geometry verifies none.
     pub fn ranks(&self) -> bool {
         self.ln_odds.iter().filter(|odds| **odds > 0.0).count() >= LEAST_LIKELY
@@ -82,6 +99,7 @@ mod tests {
         assert!((truncations[0] - 0.25).abs() < 1e-12 && truncations[1] == 1.0, "{truncations:?}");
         assert!((truncations[2] - 1.75).abs() < 1e-12 && truncations.iter().all(|cost| *cost > 0.0));
         assert_eq!(opinion.start(), [2, 3, 1, 0], "no more than there are");
+        assert_eq!((opinion.counted(&[0, 1, 3]), opinion.counted(&[0; SURELY_ENOUGH])), (2, SURELY_ENOUGH));
         assert!(!opinion.ranks());
         assert!(Opinion { ln_odds: vec![0.1; LEAST_LIKELY] }.ranks());
     }

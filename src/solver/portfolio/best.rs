@@ -28,6 +28,8 @@ pub struct Best {
     pub prior: Prior,
     pub ln_false_alarms: f64,
     pub evidence: Evidence,
+    /// Inliers that count where few are verified, see [`Opinion::counted`](crate::solver::learned::Opinion::counted).
+    pub counted: usize,
 }
 
 impl Best {
@@ -42,7 +44,7 @@ impl Best {
     /// Whether there are enough inliers for its kind of evidence.
     fn is_verified(&self) -> bool {
         match self.evidence {
-            Evidence::ImagePoints => self.consensus.inlier_count() >= LEAST_INLIERS,
+            Evidence::ImagePoints => self.counted >= LEAST_INLIERS,
             Evidence::Depths { .. } => true,
         }
     }

@@ -33,8 +33,9 @@ pub use spread::{MOST_SPREAD, spread};
 
 /// Network iterations between two verifications of its ranking.
 const ITERATIONS_PER_ROUND: u32 = 25;
-/// Network iterations that AUTO always spends, so that its losses and weights are always seen.
-pub const LEAST_ITERATIONS: u32 = 50;
+/// Network iterations that AUTO always spends, so that its losses are always seen; where the search was decided without
+/// it, its opinion would come too late, and fifty took as long as all the rest.
+pub const LEAST_ITERATIONS: u32 = 10;
 /// Rounds without a network: as many samples as the longest search with one.
 const ROUNDS_WITHOUT_NETWORK: u32 = 16;
 /// Samples a round and prior, without depths (a sample costs microseconds) and with.
@@ -56,7 +57,8 @@ pub struct Found {
     pub winning_prior: Option<Prior>,
     /// What the trained network says of the block; `None` where it was not asked.
     pub opinion: Option<Opinion>,
-    /// The network's last weights, one a track of the block; empty without a network.
+    /// The weights of the network that was trained beforehand, or where it was not asked the last ones of the paper's, one
+    /// a track of the block; empty without a network.
     pub network_weights: Vec<f64>,
     pub prior_times: Vec<PriorTime>,
 }
@@ -135,7 +137,7 @@ impl<'a> Portfolio<'a> {
         for round in 0..rounds {
             self.set_noise(round);
             self.propose_rigid(round);
-            self.propose_learned(round);
+            self.propose_learned(round, recorder, spread_weights);
             if round == 0 {
                 self.propose_geometric();
             }
@@ -175,7 +177,8 @@ impl<'a> Portfolio<'a> {
     ) -> Result<(), crate::network::Error> {
         let begun = Instant::now();
         let iterations = self.settings.iterations;
-        let goal = (network.iteration() + ITERATIONS_PER_ROUND).min(iterations);
+        let more = if self.is_decisive() { LEAST_ITERATIONS } else { ITERATIONS_PER_ROUND };
+        let goal = (network.iteration() + more).min(iterations);
         while network.iteration() < goal && !self.stop.is_stopped() {
             let step = network.step()?;
             recorder.standing.iteration = step.iteration;
@@ -222,6 +225,7 @@ impl<'a> Portfolio<'a> {
                 ln_false_alarms: rigid.ln_false_alarms(search.spread()),
                 evidence: Evidence::Depths { focal: rigid.focal },
                 consensus: depths::consensus(self.block, &rigid, self.noise),
+                counted: rigid.inlier_count(),
                 prior: Prior::Rigidity,
             };
             self.account(Prior::Rigidity).record(&found);
@@ -235,7 +239,7 @@ impl<'a> Portfolio<'a> {
     }
 
     /// The trained network's opinion: grown as it stands at first, then searched from.
-    fn propose_learned(&mut self, round: u32) {
+    fn propose_learned(&mut self, round: u32, recorder: &mut Recorder, spread_weights: &dyn Fn(&[f64]) -> Vec<f32>) {
         if !self.settings.method.uses_network() || !self.is_wanted(Prior::Learned) {
             return;
         }
@@ -245,6 +249,9 @@ impl<'a> Portfolio<'a> {
             self.account(Prior::Learned).seconds += begun.elapsed().as_secs_f64();
         }
         let Some(opinion) = self.opinion.clone() else { return };
+        if round == 0 && self.settings.weights_every > 0 {
+            recorder.weights(&spread_weights(&opinion.probabilities()));
+        }
         // The levels of the noise repeat, and so would what is grown from the same tracks.
         if (round as usize) < NOISE_LADDER.len() && matches!(self.search, Search::Affine(_)) {
             self.verify(Prior::Learned, affine::seed(self.block, opinion.start()).into_iter().collect());
@@ -337,11 +344,12 @@ impl<'a> Portfolio<'a> {
             let begun = Instant::now();
             let grown = grow::grow(self.block, seed.cameras, seed.points, seed.support, self.noise, self.stop);
             let spread = self.spread;
+            let counted = grown.as_ref().map_or(0, |consensus| self.counted(consensus));
             let account = self.account(prior);
             account.seconds += begun.elapsed().as_secs_f64();
             let Some(consensus) = grown else { continue };
             let ln_false_alarms = consensus.ln_false_alarms(spread);
-            let grown = Best { consensus, prior, ln_false_alarms, evidence: Evidence::ImagePoints };
+            let grown = Best { consensus, prior, ln_false_alarms, evidence: Evidence::ImagePoints, counted };
             account.record(&grown);
             let decisive = grown.decides();
             self.offer(grown);
@@ -349,6 +357,12 @@ impl<'a> Portfolio<'a> {
                 break;
             }
         }
+    }
+
+    /// Inliers that count as verified by geometry.
+    fn counted(&self, consensus: &Consensus) -> usize {
+        let count = consensus.inlier_count();
+        self.opinion.as_ref().map_or(count, |opinion| opinion.counted(&consensus.inliers()))
     }
 
     /// Keeps the better one.
@@ -393,8 +407,12 @@ impl<'a> Portfolio<'a> {
             evidence,
             rigid,
             winning_prior,
+            network_weights: match (&opinion, network) {
+                (Some(opinion), _) => opinion.probabilities(),
+                (None, Some(network)) => network.weights().to_vec(),
+                (None, None) => Vec::new(),
+            },
             opinion,
-            network_weights: network.map_or_else(Vec::new, |network| network.weights().to_vec()),
             prior_times,
         }
     }
