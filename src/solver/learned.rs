@@ -57,7 +57,12 @@ impl Opinion {
 
     /// What it costs a hypothesis of the affine search to leave a track out, 1 at even odds.
     pub fn truncations(&self) -> Vec<f64> {
-        self.ln_odds.iter().map(|odds| 1.0 + COST_PER_NAT * odds.clamp(-MOST_NATS, MOST_NATS)).collect()
+        self.truncations_at(COST_PER_NAT)
+    }
+
+    /// The same at another cost of a nat.
+    pub fn truncations_at(&self, per_nat: f64) -> Vec<f64> {
+        self.ln_odds.iter().map(|odds| 1.0 + per_nat * odds.clamp(-MOST_NATS, MOST_NATS)).collect()
     }
 
     /// The tracks to grow from without any search, most likely first.

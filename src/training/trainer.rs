@@ -15,7 +15,7 @@ const BATCHES_PER_STEP: u64 = 2;
 /// Steps between two milestones.
 const STEPS_PER_MILESTONE: u64 = 200;
 /// Batches that the average of the weights is validated on.
-const VALIDATION_BATCHES: u64 = 24;
+const VALIDATION_BATCHES: u64 = 12;
 /// Weight of the past in the average of the weights, once there is one.
 const MOST_PAST: f64 = 0.998;
 /// Steps without a finite gradient in a row that end a training.

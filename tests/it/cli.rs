@@ -41,7 +41,7 @@ fn scene(directory: &Path) -> PathBuf {
 fn every_command_explains_itself() {
     let commands = [
         "demo", "serve", "solve", "upload", "submit", "watch", "get", "list", "cancel", "delete", "result", "synth",
-        "evaluate",
+        "evaluate", "train-prior",
     ]
     .map(Some);
     for command in commands.into_iter().chain([None]) {

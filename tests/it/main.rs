@@ -8,6 +8,7 @@ mod crash;
 mod formats;
 mod load;
 mod lost;
+mod prior;
 mod readme;
 mod real;
 mod replicas;

@@ -131,12 +131,16 @@ impl Search {
         (energy - along.iter().map(|value| value * value).sum::<f64>()).max(0.0)
     }
 
+    /// What each track costs a hypothesis more than leaving it out would: least for those that belong to it.
+    pub fn costs(&self, hypothesis: &Hypothesis, truncations: &[f64]) -> Vec<f64> {
+        let unit = self.unit();
+        let cost = |(track, truncation): (usize, &f64)| self.squared(hypothesis, track) / unit - truncation;
+        truncations.iter().enumerate().map(cost).collect()
+    }
+
     /// Affine factorisations of the hypothesis's best-ranked tracks.
     pub fn seeds(&self, block: &CompleteBlock, hypothesis: &Hypothesis, truncations: &[f64]) -> Vec<Seed> {
-        let unit = self.unit();
-        let gain = |(track, truncation): (usize, &f64)| self.squared(hypothesis, track) / unit - truncation;
-        let costs: Vec<f64> = truncations.iter().enumerate().map(gain).collect();
-        seeds_from_ranking(block, &costs)
+        seeds_from_ranking(block, &self.costs(hypothesis, truncations))
     }
 }
 

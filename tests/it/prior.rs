@@ -1,0 +1,85 @@
+//! The trained network from the shell: training, its files, asking another one.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::support::program::{Run, run};
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("a path of ours")
+}
+
+fn train(out: &Path, seed: &str) -> Run {
+    run(["train-prior", "--out", text(out), "--seed", seed, "--steps", "2"])
+}
+
+#[test]
+fn a_seed_gives_one_network_that_a_solve_asks() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let at = |name: &str| directory.path().join(name);
+    for (name, seed) in [("new/a.prior", "3"), ("b.prior", "3"), ("c.prior", "4")] {
+        let run = train(&at(name), seed);
+        assert_eq!(run.code, Some(0), "{run:?}");
+        assert!(run.stderr.contains("step 2, ") && run.stderr.contains("sha256"), "{run:?}");
+    }
+    let bytes = |name: &str| fs::read(at(name)).expect(name);
+    assert_eq!(bytes("new/a.prior"), bytes("b.prior"), "one seed, one file");
+    assert_ne!(bytes("b.prior"), bytes("c.prior"));
+    assert!(fs::read_to_string(at("b.prior.svg")).expect("curves").starts_with("<svg xmlns="));
+    assert!(!at("b.prior.state").exists(), "a training that ended has nothing to go on from");
+
+    let scene = at("scene");
+    let made = run(["synth", "--views", "6", "--tracks", "60", "--outliers", "0.5", "--seed", "5", "--out", text(&scene)]);
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let input = scene.join("observations.csv");
+    let solve = |prior: &Path, out: &str| {
+        let out = at(out);
+        let files = ["--out", text(&out), "--prior", text(prior), "--json", "--quiet"];
+        run(["solve", text(&input), "--width", "1000", "--height", "1000"].into_iter().chain(files))
+    };
+    let solved = solve(&at("b.prior"), "answer");
+    assert_eq!(solved.code, Some(0), "{solved:?}");
+    let result: Value = serde_json::from_str(&solved.stdout).expect("JSON");
+    assert_eq!(result["status"], "SOLVED", "two steps teach nothing, and a search does not need it");
+
+    let mut damaged = bytes("b.prior");
+    *damaged.last_mut().expect("numbers") ^= 1;
+    fs::write(at("damaged.prior"), damaged).expect("a file");
+    let refused = solve(&at("damaged.prior"), "refused");
+    assert_eq!(refused.code, Some(65), "{refused:?}");
+    assert!(refused.stderr.contains("damaged.prior") && refused.stderr.contains("checksum"), "{refused:?}");
+    let missing = solve(&at("none.prior"), "missing");
+    assert!(missing.code == Some(65) && missing.stderr.contains("none.prior"), "{missing:?}");
+}
+
+#[test]
+fn the_state_of_another_training_is_refused() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let out = directory.path().join("a.prior");
+    fs::write(directory.path().join("a.prior.state"), b"not a state").expect("a file");
+    let refused = train(&out, "1");
+    assert_eq!(refused.code, Some(65), "{refused:?}");
+    assert!(refused.stderr.contains("a.prior.state") && refused.stderr.contains("remove it"), "{refused:?}");
+    let nowhere = train(directory.path(), "1");
+    assert!(nowhere.code == Some(2) && nowhere.stderr.contains("--out"), "{nowhere:?}");
+}
+
+#[test]
+fn priors_are_compared_in_a_table_and_a_file() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let out = text(directory.path());
+    let run_of = |scenes: &'static str| {
+        run(["evaluate", "--priors", "--scenes", scenes, "--seeds", "1", "--auto-only", "--quiet", "--out", out])
+    };
+    let compared = run_of("outliers .9");
+    assert_eq!(compared.code, Some(0), "{compared:?}");
+    assert!(compared.stdout.contains("with learned") && compared.stdout.contains("outliers .96"), "{compared:?}");
+    let written = fs::read_to_string(directory.path().join("priors.json")).expect("priors.json");
+    let written: Value = serde_json::from_str(&written).expect("JSON");
+    let rows = written["rows"]["auto"].as_array().expect("rows");
+    assert!(rows.len() >= 2 && rows.iter().all(|row| row["seeds"] == 1), "{written}");
+    let unknown = run_of("no such scenes");
+    assert!(unknown.code == Some(2) && unknown.stderr.contains("outliers .9"), "{unknown:?}");
+}
