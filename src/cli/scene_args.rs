@@ -70,12 +70,16 @@ pub struct GeometryArgs {
     /// How the cameras move
     #[arg(long, value_enum, default_value_t = MotionArg::General)]
     pub motion: MotionArg,
+
+    /// Largest turn of each camera about its optical axis in radians, beside the motion's
+    #[arg(long, value_name = "RAD", default_value_t = 0.0)]
+    pub roll: f64,
 }
 
 impl GeometryArgs {
     /// These options with this geometry.
     pub fn apply(&self, options: SceneOptions) -> SceneOptions {
-        SceneOptions { shape: self.shape.into(), motion: self.motion.into(), ..options }
+        SceneOptions { shape: self.shape.into(), motion: self.motion.into(), max_roll_rad: self.roll, ..options }
     }
 }
 
@@ -182,6 +186,8 @@ pub enum MotionArg {
     Forward,
     /// Rotation about the camera centre: no depth
     PureRotation,
+    /// Anywhere on a sphere around the scene, with any roll
+    Sphere,
 }
 
 impl From<MotionArg> for Motion {
@@ -193,6 +199,7 @@ impl From<MotionArg> for Motion {
             MotionArg::PureTranslation => Motion::PureTranslation,
             MotionArg::Forward => Motion::Forward,
             MotionArg::PureRotation => Motion::PureRotation,
+            MotionArg::Sphere => Motion::Sphere,
         }
     }
 }

@@ -63,7 +63,7 @@ pub struct SequenceArgs {
     /// A camera that travels, whose tracks live a few views each; of the scene's options, --views, --tracks, --noise,
     /// --outliers, --radial-k1 and --seed apply
     #[arg(long, conflicts_with_all = ["depths", "shape", "motion", "outlier_kind", "wrong_views", "second_motion",
-        "noise_kind", "principal_point", "zoom", "rotation"])]
+        "noise_kind", "principal_point", "zoom", "rotation", "roll"])]
     pub sequence: bool,
 
     /// Views that a track lives, at least and at most [default: 3,10; of fewer than 10 views all: 3,VIEWS]
@@ -246,9 +246,11 @@ mod tests {
     #[test]
     fn every_argument_reaches_its_option() {
         let base = args(Path::new("out"), &[]).generate().expect("valid options").options;
-        let cases: [(&[&str], SceneOptions); 9] = [
+        let cases: [(&[&str], SceneOptions); 11] = [
             (&["--shape", "plane"], SceneOptions { shape: Shape::Plane, ..base.clone() }),
             (&["--motion", "pure-rotation"], SceneOptions { motion: Motion::PureRotation, ..base.clone() }),
+            (&["--motion", "sphere"], SceneOptions { motion: Motion::Sphere, ..base.clone() }),
+            (&["--roll", "1.5"], SceneOptions { max_roll_rad: 1.5, ..base.clone() }),
             (&["--outlier-kind", "slid"], SceneOptions { outlier_kind: OutlierKind::Slid, ..base.clone() }),
             (&["--wrong-views", "2"], SceneOptions { wrong_views: 2, ..base.clone() }),
             (&["--second-motion", "0.3"], SceneOptions { second_motion: 0.3, ..base.clone() }),

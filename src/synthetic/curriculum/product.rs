@@ -91,6 +91,8 @@ pub fn options(views: usize, tracks: usize, rng: &mut ChaCha8Rng) -> SceneOption
         shape: if chance(PLANES, rng) { Shape::Plane } else { Shape::Box },
         motion,
         max_rotation_rad: uniform(if turns_widely { WIDE_TURN_RAD } else { TURN_RAD }, rng),
+        // Kept, as cameras on a sphere are, to show what the network makes of what it has not seen.
+        max_roll_rad: 0.0,
         principal_point: [right, down],
         radial_k1,
         zoom,

@@ -3,13 +3,14 @@
 //! The critical motions of self-calibration are Sturm's (Critical motion sequences for monocular self-calibration and
 //! uncalibrated Euclidean reconstruction, CVPR 1997): whatever the images, more than one calibration explains them.
 
-use nalgebra::{Matrix3, Rotation3, Vector3};
+use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::SceneOptions;
 use super::camera::Lens;
+use super::noise::normal;
 use super::shape::SCENE_CENTRE;
 use super::stream::Stream;
 use crate::domain::error::{InvalidInput, Violation};
@@ -44,6 +45,9 @@ pub enum Motion {
     Forward,
     /// Rotations about a camera centre that stays: a homography relates any two views, and depths do not show.
     PureRotation,
+    /// Anywhere on a sphere about the scene, of radius 3, the optical axes through its centre: rotations uniform among
+    /// all there are, rolls included. The largest rotation does not matter.
+    Sphere,
 }
 
 impl Motion {
@@ -56,6 +60,7 @@ impl Motion {
             Motion::PureTranslation => "pure-translation",
             Motion::Forward => "forward",
             Motion::PureRotation => "pure-rotation",
+            Motion::Sphere => "sphere",
         }
     }
 
@@ -81,6 +86,12 @@ impl Pose {
     /// The camera's centre in the world.
     pub fn centre(&self) -> Vector3<f64> {
         -(self.rotation.transpose() * self.translation)
+    }
+
+    /// The same camera turned by an angle about its optical axis.
+    fn rolled(&self, angle_rad: f64) -> Self {
+        let roll = *Rotation3::from_axis_angle(&Vector3::z_axis(), angle_rad).matrix();
+        Self { rotation: roll * self.rotation, translation: roll * self.translation }
     }
 
     /// A turn about the scene's centre, then a shift.
@@ -117,7 +128,10 @@ pub fn draw_poses(
         }
         Err(blind(options))
     };
-    (0..options.views).map(|_| draw()).collect()
+    let poses: Result<Vec<Pose>, InvalidInput> = (0..options.views).map(|_| draw()).collect();
+    let mut roll = Stream::Roll.of(options.seed);
+    // A roll changes neither depths nor distances from the axis: what was seen still is.
+    Ok(poses?.iter().map(|pose| pose.rolled(draw_angle(options.max_roll_rad, &mut roll))).collect())
 }
 
 /// No camera was found; names what is more likely to be in the way.
@@ -155,6 +169,7 @@ fn propose(motion: Motion, max_rotation_rad: f64, common: &Matrix3<f64>, rng: &m
         Motion::PureTranslation => Pose::about_centre(*common, draw_translation(rng)),
         Motion::Forward => Pose { rotation: *common, translation: Vector3::new(0.0, 0.0, rng.random_range(-1.0..1.0)) },
         Motion::PureRotation => Pose { rotation: draw_rotation(max_rotation_rad, rng), translation: Vector3::zeros() },
+        Motion::Sphere => Pose::about_centre(draw_any_rotation(rng), Vector3::zeros()),
     }
 }
 
@@ -169,6 +184,12 @@ pub fn draw_rotation(max_rotation_rad: f64, rng: &mut ChaCha8Rng) -> Matrix3<f64
         * Rotation3::from_axis_angle(&Vector3::y_axis(), about_y)
         * Rotation3::from_axis_angle(&Vector3::z_axis(), about_z);
     *rotation.matrix()
+}
+
+/// Uniform among all rotations: the quaternion of four normals (Muller 1959).
+fn draw_any_rotation(rng: &mut ChaCha8Rng) -> Matrix3<f64> {
+    let [w, x, y, z] = std::array::from_fn(|_| normal(rng.random(), rng.random()));
+    *UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)).to_rotation_matrix().matrix()
 }
 
 /// Uniform in `[-1, 1]^3`.

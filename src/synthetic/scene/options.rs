@@ -35,6 +35,9 @@ pub struct SceneOptions {
     pub motion: Motion,
     /// Largest rotation about each axis that the motion turns about, in radians.
     pub max_rotation_rad: f64,
+    /// Largest roll: each camera is turned about its optical axis as well, uniform in `+-max_roll_rad`, whatever the
+    /// motion.
+    pub max_roll_rad: f64,
     /// Displacement of the principal point from the image's centre, right and down, as a share of the image width.
     pub principal_point: [f64; 2],
     /// Radial distortion, `x_d = x_n (1 + k1 r^2)` with `x_n` and its length `r` in normalised camera coordinates (focal
@@ -63,6 +66,7 @@ impl Default for SceneOptions {
             shape: Shape::Box,
             motion: Motion::General,
             max_rotation_rad: 0.4,
+            max_roll_rad: 0.0,
             principal_point: [0.0, 0.0],
             radial_k1: 0.0,
             zoom: 0.0,
@@ -137,6 +141,9 @@ impl SceneOptions {
         if !(0.0..=std::f64::consts::PI).contains(&self.max_rotation_rad) {
             found.push(Violation::of("rotation", format!("{} is not in 0..=pi", self.max_rotation_rad)));
         }
+        if !(0.0..=std::f64::consts::PI).contains(&self.max_roll_rad) {
+            found.push(Violation::of("roll", format!("{} is not in 0..=pi", self.max_roll_rad)));
+        }
         if self.motion.needs_rotation() && self.max_rotation_rad == 0.0 {
             let motion = self.motion.name();
             found.push(Violation::of("rotation", format!("0 leaves nothing of the motion {motion}, give more than 0")));
@@ -187,6 +194,8 @@ mod tests {
             ("rotation", SceneOptions { max_rotation_rad: 4.0, ..default() }),
             ("rotation", SceneOptions { max_rotation_rad: 0.0, motion: Motion::Orbit, ..default() }),
             ("rotation", SceneOptions { max_rotation_rad: 0.0, motion: Motion::PureRotation, ..default() }),
+            ("roll", SceneOptions { max_roll_rad: -0.1, ..default() }),
+            ("roll", SceneOptions { max_roll_rad: 3.2, ..default() }),
             ("principal_point", SceneOptions { principal_point: [0.0, 0.6], ..default() }),
             ("radial_k1", SceneOptions { radial_k1: f64::INFINITY, ..default() }),
             ("zoom", SceneOptions { zoom: 1.0, ..default() }),

@@ -15,6 +15,7 @@ pub enum Stream {
     Contamination = 3,
     SecondBody = 4,
     Zoom = 5,
+    Roll = 6,
 }
 
 impl Stream {

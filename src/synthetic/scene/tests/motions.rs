@@ -4,8 +4,15 @@ use nalgebra::{Matrix3, SMatrix, Vector3};
 
 use super::*;
 
-const MOTIONS: [Motion; 6] =
-    [Motion::General, Motion::Orbit, Motion::Turntable, Motion::PureTranslation, Motion::Forward, Motion::PureRotation];
+const MOTIONS: [Motion; 7] = [
+    Motion::General,
+    Motion::Orbit,
+    Motion::Turntable,
+    Motion::PureTranslation,
+    Motion::Forward,
+    Motion::PureRotation,
+    Motion::Sphere,
+];
 
 fn scene_of(motion: Motion, shape: Shape, seed: u64) -> Scene {
     generate(SceneOptions { motion, shape, ..exact(seed) })
@@ -140,5 +147,51 @@ fn orbiting_cameras_look_at_the_centre_and_a_turntable_has_one_axis() {
             }
         }
         assert!((1..scene.options.views).contains(&behind), "{motion:?} seed {seed}: {behind} views from behind");
+    }
+}
+
+#[test]
+fn cameras_on_a_sphere_are_on_all_sides_of_it_and_upside_down_too() {
+    let centre = Vector3::from(shape::SCENE_CENTRE);
+    for seed in SEEDS {
+        let scene = generate(SceneOptions { motion: Motion::Sphere, views: 40, tracks: 10, ..exact(seed) });
+        let (mut directions, mut rolls) = (Vec::new(), Vec::new());
+        for view in 0..40 {
+            let (rotation, translation) = (rotation(&scene, view), translation(&scene, view));
+            let camera = -rotation.transpose() * translation - centre;
+            assert!((camera.norm() - 3.0).abs() < 1e-12, "seed {seed}: at a distance of {}", camera.norm());
+            assert!((rotation * centre + translation).xy().norm() < 1e-12, "seed {seed}: looks elsewhere");
+            directions.push(camera);
+            rolls.push(rotation[(1, 1)]);
+        }
+        for axis in 0..3 {
+            let (low, high) = (|x: &Vector3<f64>| x[axis] < -1.0, |x: &Vector3<f64>| x[axis] > 1.0);
+            assert!(directions.iter().any(low) && directions.iter().any(high), "seed {seed}: {directions:?}");
+        }
+        assert!(rolls.iter().any(|&up| up < -0.3) && rolls.iter().any(|&up| up > 0.3), "seed {seed}: {rolls:?}");
+    }
+}
+
+#[test]
+fn a_roll_turns_each_image_about_its_centre_and_leaves_the_rest_of_the_scene() {
+    for (motion, seed) in SEEDS.flat_map(|seed| MOTIONS.map(|motion| (motion, seed))) {
+        let level = generate(SceneOptions { motion, outliers: 0.5, tracks: 30, ..exact(seed) });
+        let rolled = generate(SceneOptions { max_roll_rad: 2.0, ..level.options.clone() });
+        assert_eq!((&rolled.truth.points, &rolled.truth.inlier), (&level.truth.points, &level.truth.inlier));
+        let mut largest = 0.0f64;
+        for view in 0..level.options.views {
+            let [px, py] = level.truth.principal_point_px;
+            let turn = rotation(&rolled, view) * rotation(&level, view).transpose();
+            let angle = turn[(1, 0)].atan2(turn[(0, 0)]);
+            assert!((turn[(2, 2)] - 1.0).abs() < 1e-12 && angle.abs() <= 2.0, "{motion:?} seed {seed}: {turn}");
+            largest = largest.max(angle.abs());
+            for track in 0..30 {
+                let ([x, y, depth], [u, v, same]) = (observed(&level, view, track), observed(&rolled, view, track));
+                let image = turn * Vector3::new(x - px, y - py, 1.0);
+                assert!((image.x - u + px).hypot(image.y - v + py) < 1e-6, "{motion:?} seed {seed}");
+                assert!((depth - same).abs() < 1e-12, "{motion:?} seed {seed}");
+            }
+        }
+        assert!(largest > 0.5, "{motion:?} seed {seed}: rolled by {largest} at most");
     }
 }
