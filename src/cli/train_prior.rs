@@ -126,7 +126,7 @@ fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
     {
         return Err(Failure::internal(format_args!("cannot remove {}: {error}", files.state().display())));
     }
-    view.note(&format!("{}: sha256 of the numbers {}", args.out.display(), file.checksum()));
+    view.note(&format!("{}: sha256 {}", args.out.display(), file.checksum()));
     Ok(Exit::Done)
 }
 

@@ -41,8 +41,8 @@ pub fn unsolved(
         }
         if let Some(opinion) = attempt.opinion.as_ref().filter(|opinion| opinion.ranks()) {
             let probabilities = opinion.probabilities();
-            let likely = probabilities.iter().filter(|&&probability| probability > 0.5).count();
             tracks.weight = context.scatter(&probabilities, &attempt.block.tracks);
+            let likely = opinion.likely();
             let detail = format!(
                 "{likely} tracks look right to the trained network and geometry verifies none: the weights rank, no more"
             );

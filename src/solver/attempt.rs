@@ -38,6 +38,8 @@ pub struct Attempt {
     pub winning_prior: Option<Prior>,
     /// What the trained network says of the tracks that were searched; `None` where it was not asked.
     pub opinion: Option<Opinion>,
+    /// Tracks that hold under one geometry, and how many of them count; `None` but where too few count.
+    pub doubted: Option<(usize, usize)>,
     /// That the tracks left out agree on a motion of their own.
     pub second_structure: Option<Warning>,
     /// Probability of each track of the block to be right by image points and depths together; `None` where depths
@@ -89,6 +91,7 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
         calibration: None,
         winning_prior: None,
         opinion: None,
+        doubted: None,
         second_structure: None,
         weights_by_depths: None,
         decided: None,
@@ -131,6 +134,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     context.stopped()?;
     attempt.winning_prior = found.winning_prior;
     attempt.opinion = found.opinion;
+    attempt.doubted = found.doubted;
     attempt.prior_times = found.prior_times;
     attempt.network_weights = found.network_weights;
     let Some(consensus) = found.consensus else { return Ok(()) };
@@ -152,6 +156,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         None => refined.inlier_count(),
     };
     if counted < LEAST_INLIERS {
+        attempt.doubted = (counted < refined.inlier_count()).then_some((refined.inlier_count(), counted));
         return Ok(());
     }
     attempt.second_structure = second::structure(complete, &refined, context.stop);

@@ -1,7 +1,7 @@
 //! What the trained network says of a block, in the forms that the search takes.
 //!
-//! The network knows thousands of scenes and nothing of this one but its image points; it is believed only in what
-//! geometry then verifies. Constants without another reason come from the sweep that
+//! The network knows thousands of scenes and nothing of this one but its image points: what it believes in, geometry must
+//! verify. What it disbelieves counts only where geometry has little to go by ([`Opinion::counted`]). Constants without another reason come from the sweep that
 //! `the_sweep_of_the_learned_prior` prints (an ignored test of the solver's).
 
 use super::grow::LEAST_INLIERS;
@@ -37,7 +37,7 @@ pub struct Opinion {
 }
 
 impl Opinion {
-    /// Asks the network; `None` where there are more views than it is asked about.
+    /// Asks the network; `None` where there are more views than it is asked about, or it has no finite answer.
     pub fn of(block: &CompleteBlock) -> Option<Self> {
         let (views, tracks) = (block.views(), block.tracks());
         if views > MOST_VIEWS {
@@ -47,7 +47,9 @@ impl Opinion {
         let points: Vec<[f64; 2]> = (0..views).flat_map(point).collect();
         let cloud = Cloud::new(views, tracks, &points, &vec![true; points.len()]);
         let scores = subspace::current().network.forward(&cloud);
-        Some(Self { ln_odds: scores.tracks.iter().map(|&logit| f64::from(logit) - EVEN_LOGIT).collect() })
+        let ln_odds: Vec<f64> = scores.tracks.iter().map(|&logit| f64::from(logit) - EVEN_LOGIT).collect();
+        // A network of finite numbers may still overflow; one that says nothing is not asked.
+        ln_odds.iter().all(|odds| odds.is_finite()).then_some(Self { ln_odds })
     }
 
     /// Probability of every track to be right.
@@ -74,6 +76,11 @@ impl Opinion {
         ranked
     }
 
+    /// How many tracks it holds to be right.
+    pub fn likely(&self) -> usize {
+        self.ln_odds.iter().filter(|odds| **odds > 0.0).count()
+    }
+
     /// How many of these inliers count towards those that geometry needs for a verification.
     ///
     /// With few of them the cameras are flexible enough to take up a wrong one or two; then those that the network holds
@@ -87,7 +94,7 @@ impl Opinion {
 
     /// Whether enough tracks are likely right for their ranking to be told where geometry verifies none.
     pub fn ranks(&self) -> bool {
-        self.ln_odds.iter().filter(|odds| **odds > 0.0).count() >= LEAST_LIKELY
+        self.likely() >= LEAST_LIKELY
     }
 }
 

@@ -254,6 +254,14 @@ fn why_unsolved(input: &Input, best: Option<&Attempt>) -> Warning {
                 grow::LEAST_SUPPORT
             ),
         ),
+        Some(Attempt { doubted: Some((inliers, counted)), .. }) => Warning::new(
+            WarningCode::FewInliers,
+            format!(
+                "{inliers} tracks hold under one geometry, but the trained network takes only {counted} of them to be \
+                 right, and so few cameras can adapt to wrong ones; {} are needed. GEOMETRY does not ask the network",
+                grow::LEAST_INLIERS
+            ),
+        ),
         Some(attempt) => Warning::new(
             WarningCode::NoConsensus,
             format!(

@@ -44,12 +44,12 @@ pub struct Found {
 
 impl Study {
     /// The input's tracks that are complete over all its views, their depths left aside.
-    pub fn new(input: &Input) -> Self {
+    pub fn new(input: &Input, stop: &StopToken) -> Self {
         let ranges = block::track_ranges(input);
         let (normalization, _) = block::normalization(input);
         let views: Vec<usize> = (0..input.view_count()).collect();
         let block = block::extract(input, &ranges, &normalization, &views).complete;
-        Self { search: affine::Search::new(&block), block, stop: StopToken::default() }
+        Self { search: affine::Search::new(&block), block, stop: stop.clone() }
     }
 
     /// Asks a prior; `None` for one that does not rank image points by themselves.

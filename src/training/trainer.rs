@@ -20,6 +20,8 @@ const VALIDATION_BATCHES: u64 = 12;
 const MOST_PAST: f64 = 0.998;
 /// Steps without a finite gradient in a row that end a training.
 const MOST_REJECTED: u64 = 50;
+/// Version of this program.
+const PROGRAM: &str = env!("CARGO_PKG_VERSION");
 /// Layout of a saved state.
 const STATE_VERSION: u32 = 1;
 
@@ -56,6 +58,8 @@ pub struct Milestone {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Trainer {
     version: u32,
+    /// Version of the program: another one may draw other lessons.
+    program: String,
     settings: Settings,
     network: SubspaceNet<Parameter>,
     /// Average of the weights along the way, heavier on the latest: what is shipped.
@@ -74,6 +78,7 @@ impl Trainer {
         let network = initial::initial(settings.shape, settings.seed);
         Self {
             version: STATE_VERSION,
+            program: PROGRAM.to_owned(),
             settings,
             average: network.map(|parameter| parameter.values().to_vec()),
             network,
@@ -97,15 +102,21 @@ impl Trainer {
             let version = trainer.version;
             return Err(Error::State(format!("its layout is {version}, this program reads {STATE_VERSION}")));
         }
+        if trainer.program != PROGRAM {
+            return Err(Error::State(format!("it is of scpsfm {}, this is {PROGRAM}", trainer.program)));
+        }
         if trainer.settings != settings {
             let Settings { seed, steps, .. } = trainer.settings;
             return Err(Error::State(format!("it belongs to a training with --seed {seed} --steps {steps}")));
         }
         let shapes = settings.shape.arrays();
-        let mut pairs = trainer.network.arrays().into_iter().zip(shapes.arrays());
-        let fits = pairs.all(|(parameter, shape)| parameter.is_whole() && parameter.shape() == *shape);
-        let counted = trainer.network.blocks.len() == settings.shape.blocks;
-        if !fits || !counted {
+        let (network, average) = (trainer.network.arrays(), trainer.average.arrays());
+        let shapes = shapes.arrays();
+        let counted = [network.len(), average.len()] == [shapes.len(); 2];
+        let fits = |((parameter, average), shape): ((&&Parameter, &&Vec<f32>), &&[usize; 2])| {
+            parameter.is_whole() && parameter.shape() == **shape && average.len() == shape[0] * shape[1]
+        };
+        if !counted || !network.iter().zip(&average).zip(&shapes).all(fits) {
             return Err(Error::State("its arrays do not have the shape that it names".into()));
         }
         Ok(trainer)
@@ -157,12 +168,12 @@ impl Trainer {
 
     /// The network as it stands: the average of the weights.
     pub fn file(&self, command: String) -> PriorFile {
-        let version = env!("CARGO_PKG_VERSION").to_owned();
+        let version = PROGRAM.to_owned();
         let origin = Origin { version, command, seed: self.settings.seed, steps: self.step };
         PriorFile { origin, shape: self.settings.shape, network: self.average.clone() }
     }
 
-    /// Losses and derivatives of the step's batches, each on a thread.
+    /// Losses and derivatives of the step's batches, each on a thread where there is more than one core.
     fn slopes(&mut self) -> Result<Vec<Slope>, Error> {
         let (seed, first) = (self.settings.seed, self.step * BATCHES_PER_STEP);
         let network = &self.network;

@@ -40,8 +40,20 @@ fn scene(directory: &Path) -> PathBuf {
 #[test]
 fn every_command_explains_itself() {
     let commands = [
-        "demo", "serve", "solve", "upload", "submit", "watch", "get", "list", "cancel", "delete", "result", "synth",
-        "evaluate", "train-prior",
+        "demo",
+        "serve",
+        "solve",
+        "upload",
+        "submit",
+        "watch",
+        "get",
+        "list",
+        "cancel",
+        "delete",
+        "result",
+        "synth",
+        "evaluate",
+        "train-prior",
     ]
     .map(Some);
     for command in commands.into_iter().chain([None]) {

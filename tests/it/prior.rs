@@ -31,7 +31,8 @@ fn a_seed_gives_one_network_that_a_solve_asks() {
     assert!(!at("b.prior.state").exists(), "a training that ended has nothing to go on from");
 
     let scene = at("scene");
-    let made = run(["synth", "--views", "6", "--tracks", "60", "--outliers", "0.5", "--seed", "5", "--out", text(&scene)]);
+    let made =
+        run(["synth", "--views", "6", "--tracks", "60", "--outliers", "0.5", "--seed", "5", "--out", text(&scene)]);
     assert_eq!(made.code, Some(0), "{made:?}");
     let input = scene.join("observations.csv");
     let solve = |prior: &Path, out: &str| {

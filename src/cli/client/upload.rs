@@ -6,7 +6,8 @@ use prost::Message as _;
 use prost::bytes::Bytes;
 use sha2::{Digest, Sha256};
 use tokio::sync::watch;
-use tonic::{Code, Request, Status};
+use tonic::{Request, Status};
+use tonic_types::StatusExt as _;
 
 use super::backoff::Backoff;
 use super::{Client, Error, error};
@@ -103,13 +104,7 @@ impl Client {
                 }
                 Err(status) => status,
             };
-            // A chunk that was damaged on its way is sent again as one that was lost.
-            let again = match trouble.code() {
-                Code::DataLoss if error::reason(&trouble).as_deref() == Some("CHUNK_CORRUPTED") => {
-                    Status::unavailable(trouble.message())
-                }
-                _ => trouble,
-            };
+            let again = if goes_on(&trouble) { Status::unavailable(trouble.message()) } else { trouble };
             self.pause(&mut backoff, again).await?;
         }
     }
@@ -150,6 +145,14 @@ impl Client {
             }
         }
     }
+}
+
+/// Whether the server's answer is about this stream and not about the input: a chunk was damaged on its way, or another
+/// stream of the upload, perhaps this command's own before the connection broke, wrote after its state was asked.
+fn goes_on(status: &Status) -> bool {
+    let bad = status.get_details_bad_request();
+    let outrun = bad.is_some_and(|bad| bad.field_violations.iter().any(|violation| violation.field == "chunk.offset"));
+    outrun || matches!(error::reason(status).as_deref(), Some("CHUNK_CORRUPTED" | "UPLOAD_TAKEN_OVER"))
 }
 
 #[cfg(test)]

@@ -76,6 +76,7 @@ pub struct Plan {
 
 /// One scene's measures.
 struct Measured {
+    job: usize,
     place: usize,
     priors: Vec<Alone>,
     /// With the learned prior, and without.
@@ -114,7 +115,7 @@ impl Plan {
     pub fn run(&self, threads: usize, stop: &StopToken, told: &mut dyn FnMut()) -> Result<Rows, String> {
         let next = AtomicUsize::new(0);
         let (sender, receiver) = mpsc::channel();
-        let measured = std::thread::scope(|scope| {
+        let mut measured = std::thread::scope(|scope| {
             for _ in 0..threads.clamp(1, self.size().max(1)) {
                 let (sender, next) = (sender.clone(), &next);
                 scope.spawn(move || {
@@ -134,6 +135,8 @@ impl Plan {
             }
             Ok::<_, String>(all)
         })?;
+        // Sums in one order, whichever thread was first.
+        measured.sort_by_key(|measured: &Measured| measured.job);
         Ok(self.rows(&measured))
     }
 
@@ -146,7 +149,7 @@ impl Plan {
         let scene = Scene::generate(&condition.scene(seed)).map_err(|error| failed(&error))?;
         let truth = &scene.truth.inlier;
         let input = Input::new(scene.input.clone(), &Limits::default(), "scene").map_err(|error| failed(&error))?;
-        let priors = if self.each_prior { alone(&Study::new(&input), truth, seed, stop) } else { Vec::new() };
+        let priors = if self.each_prior { alone(&Study::new(&input, stop), truth, seed, stop) } else { Vec::new() };
         let mut auto = Vec::with_capacity(2);
         for excluded in [Vec::new(), vec![Prior::Learned]] {
             let settings = SolveSettings { excluded_priors: excluded, ..SolveSettings::default() };
@@ -157,7 +160,7 @@ impl Plan {
             }
         }
         let auto = auto.try_into().map_err(|_| failed(&"two answers were asked for"))?;
-        Ok(Some(Measured { place, priors, auto }))
+        Ok(Some(Measured { job, place, priors, auto }))
     }
 
     fn rows(&self, measured: &[Measured]) -> Rows {

@@ -30,8 +30,23 @@ struct Header {
     #[serde(flatten)]
     origin: Origin,
     shape: Shape,
-    /// Of the bytes of the numbers, in hexadecimal digits.
+    /// Of this header with nothing here, a line end and the numbers, in hexadecimal digits.
     sha256: String,
+}
+
+impl Header {
+    /// The same with the checksum of itself and the numbers.
+    fn sealed(mut self, numbers: &[u8]) -> Self {
+        self.sha256.clear();
+        let digest = Sha256::new_with_prefix(self.line()).chain_update(b"\n").chain_update(numbers).finalize();
+        self.sha256 = digest.iter().map(|byte| format!("{byte:02x}")).collect();
+        self
+    }
+
+    fn line(&self) -> String {
+        // Plain numbers and strings: nothing of it can fail to be JSON.
+        serde_json::to_string(self).unwrap_or_default()
+    }
 }
 
 /// A trained network and where it comes from.
@@ -53,7 +68,7 @@ pub enum FileError {
     Shape(String),
     #[error("it holds {found} bytes of numbers, its shape has {expected}")]
     Length { found: usize, expected: usize },
-    #[error("its numbers do not have the checksum of its header: the file is damaged")]
+    #[error("it does not have the checksum of its header: the file is damaged")]
     Checksum,
     #[error("number {0} is not finite")]
     NotFinite(usize),
@@ -79,7 +94,9 @@ impl PriorFile {
         if numbers.len() != expected {
             return Err(FileError::Length { found: numbers.len(), expected });
         }
-        if checksum(numbers) != header.sha256 {
+        let claimed = header.sha256.clone();
+        let header = header.sealed(numbers);
+        if claimed != header.sha256 {
             return Err(FileError::Checksum);
         }
         let values: Vec<f32> = numbers.as_chunks::<NUMBER>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
@@ -97,24 +114,22 @@ impl PriorFile {
 
     /// The file's bytes.
     pub fn bytes(&self) -> Vec<u8> {
-        let numbers: Vec<u8> =
-            self.network.arrays().into_iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
-        let header = Header { origin: self.origin.clone(), shape: self.shape, sha256: checksum(&numbers) };
-        // Plain numbers and strings: nothing of it can fail to be JSON.
-        let header = serde_json::to_string(&header).unwrap_or_default();
-        [MAGIC.as_bytes(), b"\n", header.as_bytes(), b"\n", &numbers].concat()
+        let numbers = self.numbers();
+        [MAGIC.as_bytes(), b"\n", self.header(&numbers).line().as_bytes(), b"\n", &numbers].concat()
     }
 
-    /// The checksum that the file's header carries.
+    /// The checksum that the file's header carries: what tells one network from another.
     pub fn checksum(&self) -> String {
-        let numbers: Vec<u8> =
-            self.network.arrays().into_iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
-        checksum(&numbers)
+        self.header(&self.numbers()).sha256
     }
-}
 
-fn checksum(numbers: &[u8]) -> String {
-    Sha256::digest(numbers).iter().map(|byte| format!("{byte:02x}")).collect()
+    fn numbers(&self) -> Vec<u8> {
+        self.network.arrays().into_iter().flatten().flat_map(|value| value.to_le_bytes()).collect()
+    }
+
+    fn header(&self, numbers: &[u8]) -> Header {
+        Header { origin: self.origin.clone(), shape: self.shape, sha256: String::new() }.sealed(numbers)
+    }
 }
 
 #[cfg(test)]
@@ -155,6 +170,8 @@ mod tests {
         let mut damaged = bytes.clone();
         *damaged.last_mut().expect("numbers") ^= 1;
         assert_eq!(PriorFile::read(&damaged), Err(FileError::Checksum));
+        let forged = replaced("\"seed\":7", "\"seed\":8");
+        assert_eq!(PriorFile::read(&forged), Err(FileError::Checksum), "the origin is under the checksum, too");
         let mut infinite = file();
         infinite.network.first_encoder.bias[0] = f32::INFINITY;
         assert!(matches!(PriorFile::read(&infinite.bytes()), Err(FileError::NotFinite(_))));

@@ -41,6 +41,13 @@ impl Best {
         self.is_verified() && self.ln_false_alarms < LN_ACCEPTABLE
     }
 
+    /// Its inliers and how many of them count, where that is what keeps it from being accepted.
+    pub fn doubted(&self) -> Option<(usize, usize)> {
+        let inliers = self.consensus.inlier_count();
+        let only_by_count = inliers >= LEAST_INLIERS && !self.is_verified() && self.ln_false_alarms < LN_ACCEPTABLE;
+        only_by_count.then_some((inliers, self.counted))
+    }
+
     /// Whether there are enough inliers for its kind of evidence.
     fn is_verified(&self) -> bool {
         match self.evidence {
@@ -57,7 +64,36 @@ impl Best {
         match (self.evidence, other.evidence) {
             (Evidence::ImagePoints, Evidence::Depths { .. }) => self.decides(),
             (Evidence::Depths { .. }, Evidence::ImagePoints) => self.is_acceptable() && !other.decides(),
+            // What cannot be accepted keeps nothing out that can.
+            _ if self.is_verified() != other.is_verified() => self.is_verified(),
             _ => self.ln_false_alarms < other.ln_false_alarms - LN_MARGIN,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_verified_keeps_nothing_out_that_is() {
+        let best = |counted, ln_false_alarms| Best {
+            consensus: Consensus {
+                cameras: Vec::new(),
+                points: Vec::new(),
+                squared: Vec::new(),
+                inlier: vec![true; 12],
+                noise: 1e-3,
+                score: 0.5,
+            },
+            prior: Prior::Uniform,
+            ln_false_alarms,
+            evidence: Evidence::ImagePoints,
+            counted,
+        };
+        let (doubted, verified) = (best(7, -100.0), best(9, -50.0));
+        assert!(verified.displaces(&doubted) && !doubted.displaces(&verified));
+        assert!(verified.decides() && !doubted.decides() && !doubted.is_acceptable());
+        assert!(best(9, -60.0).displaces(&verified) && !best(9, -51.0).displaces(&verified));
     }
 }

@@ -55,6 +55,8 @@ pub struct Found {
     /// The rigid consensus behind it or beside it, where depths were given and one is not chance.
     pub rigid: Option<Rigid>,
     pub winning_prior: Option<Prior>,
+    /// Inliers of a consensus that the trained network keeps from being accepted, and how many of them count.
+    pub doubted: Option<(usize, usize)>,
     /// What the trained network says of the block; `None` where it was not asked.
     pub opinion: Option<Opinion>,
     /// The weights of the network that was trained beforehand, or where it was not asked the last ones of the paper's, one
@@ -393,6 +395,7 @@ impl<'a> Portfolio<'a> {
         let with_network = network.is_some();
         let with_depths = self.block.has_depths();
         let Self { best, accounts, rigid, opinion, .. } = self;
+        let doubted = best.as_ref().filter(|best| !best.is_acceptable()).and_then(Best::doubted);
         let accepted = best.filter(Best::is_acceptable);
         let prior_times = accounts
             .into_iter()
@@ -407,6 +410,7 @@ impl<'a> Portfolio<'a> {
             evidence,
             rigid,
             winning_prior,
+            doubted,
             network_weights: match (&opinion, network) {
                 (Some(opinion), _) => opinion.probabilities(),
                 (None, Some(network)) => network.weights().to_vec(),

@@ -117,10 +117,12 @@ async fn open<C: Connection>(
     bounds: &UploadBounds,
     now: SystemTime,
 ) -> Result<BegunUpload, Error> {
+    // Of what was given up counts what has not been removed yet: it lies on the disk all the same.
     let taken = Statement::new(
-        "SELECT COUNT(*) AS open, CAST(COALESCE(SUM(bytes), 0) AS BIGINT) AS bytes, \
+        "SELECT COUNT(upload) AS open, \
+         CAST(COALESCE(SUM(CASE WHEN upload IS NULL THEN committed ELSE bytes END), 0) AS BIGINT) AS bytes, \
          (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM inputs WHERE tenant = $1 AND input IS NOT NULL) AS kept \
-         FROM uploads WHERE tenant = $1 AND upload IS NOT NULL AND input_id IS NULL",
+         FROM uploads WHERE tenant = $1 AND input_id IS NULL",
     );
     let row = connection.row(taken.bind(&new.name.tenant)).await?;
     let taken: u64 = number::<u64>(&row, "bytes")?.saturating_add(number(&row, "kept")?);
