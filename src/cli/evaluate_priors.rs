@@ -18,7 +18,8 @@ use crate::network::subspace;
 #[command(next_help_heading = "Priors")]
 pub struct PriorArgs {
     /// Compare priors instead: each alone (ranking, searches of 600, 6,000 and 60,000 samples), and AUTO with and
-    /// without the trained network; scenes without depths, of training's kinds and of others. Writes priors.json
+    /// without the trained network; scenes without depths, of training's kinds and of others. Writes priors.json at its end; it does
+    /// not go on where it was stopped
     #[arg(long, conflicts_with_all = ["real", "quick", "sweeps", "beyond", "ablation", "depths", "methods",
         "paper_width"])]
     pub priors: bool,
@@ -27,7 +28,7 @@ pub struct PriorArgs {
     #[arg(long, requires = "priors")]
     pub auto_only: bool,
 
-    /// Scenes whose name holds this text [default: all]
+    /// The scenes of this name, or all whose name holds this text [default: all]
     #[arg(long, value_name = "TEXT", requires = "priors")]
     pub scenes: Option<String>,
 }
@@ -45,7 +46,12 @@ pub async fn run(
     if let Some(text) = &args.scenes {
         let names: Vec<&str> = conditions.iter().map(|condition| condition.name).collect();
         let unknown = format!("--scenes {text}: no scenes have it in their name; there are {}", names.join("; "));
-        conditions.retain(|condition| condition.name.contains(text.as_str()));
+        let exact = names.contains(&text.as_str());
+        conditions.retain(
+            |condition| {
+                if exact { condition.name == text } else { condition.name.contains(text.as_str()) }
+            },
+        );
         if conditions.is_empty() {
             return Err(Failure::usage(unknown));
         }
@@ -60,6 +66,10 @@ pub async fn run(
     relay.abort();
     bar.finish_and_clear();
     let rows = outcome.map_err(Failure::internal)?;
+    if stop.is_stopped() {
+        print(table::text(&rows).trim_end())?;
+        return Err(Failure::interrupted_with("interrupted; the rows are of the scenes so far, and were not written"));
+    }
     let network = subspace::current();
     let text = pretty(&json!({
         "version": env!("CARGO_PKG_VERSION"),
@@ -69,9 +79,6 @@ pub async fn run(
     }))?;
     write_atomically(out, "priors.json", text.as_bytes())?;
     print(if json { text.trim_end().to_owned() } else { table::text(&rows) }.trim_end())?;
-    if stop.is_stopped() {
-        return Err(Failure::interrupted_with("interrupted; the rows are of the scenes so far"));
-    }
     Ok(Exit::Done)
 }
 

@@ -1,6 +1,5 @@
 //! A trained network given in place of the shipped one.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::exit::Failure;
@@ -27,7 +26,6 @@ impl PriorFileArgs {
 /// From now on, this process asks the network in a file; the error says what is wrong with it.
 pub fn install(path: &Path) -> Result<(), String> {
     let named = |what: &dyn std::fmt::Display| format!("{}: {what}", path.display());
-    let bytes = fs::read(path).map_err(|error| named(&error))?;
-    let file = PriorFile::read(&bytes).map_err(|error| named(&format_args!("not a trained network: {error}")))?;
+    let file = PriorFile::open(path).map_err(|what| named(&what))?;
     subspace::install(file).map_err(|_| named(&"another network was given before"))
 }

@@ -10,14 +10,14 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use crate::formats::result_files::{create_directory, write_atomically};
-use crate::network::subspace::Shape;
+use crate::network::subspace::{PriorFile, Shape};
 use crate::report::chart::{LineChart, Series, standalone};
 use crate::training::{Milestone, Settings, Trainer};
 
 /// Steps of the shipped network.
 const STEPS: u64 = 7_000;
 /// Seconds between two writings of the state: what a power cut costs at most.
-const SECONDS_PER_STATE: f64 = 60.0;
+const SECONDS_PER_STATE: f64 = 10.0;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -26,8 +26,8 @@ Examples:
   scpsfm solve observations.csv --width 1000 --height 1000 --prior my.prior --out answer
 
 Files beside FILE: FILE.svg, the curves of losses and of average precision on scenes that training never sees; and \
-until it ends FILE.state, from which a training that was stopped (Ctrl-C, a power cut) goes on when called again with \
-the same arguments.";
+until it ends FILE.state, written every ten seconds, from which a training that was stopped (Ctrl-C, a power cut) goes on \
+when called again with the same arguments.";
 
 /// Train the network that ranks tracks before the search
 ///
@@ -36,9 +36,9 @@ the same arguments.";
 /// file on one machine, whatever else runs on it and however often the training is interrupted. The program carries the
 /// network that its own defaults give.
 #[derive(Debug, clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
-    /// File for the network; replaced
+    /// File for the network; an earlier network there is replaced, another file is not
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
 
@@ -73,8 +73,8 @@ impl Files {
     fn new(out: &Path) -> Result<Self, Failure> {
         let name = out.file_name().and_then(|name| name.to_str());
         let name = name.ok_or_else(|| Failure::usage(format_args!("--out {}: not a file's name", out.display())))?;
-        if out.is_dir() {
-            return Err(Failure::usage(format_args!("--out {}: a directory, give a file", out.display())));
+        if let Ok(there) = fs::symlink_metadata(out) {
+            check_replaceable(out, &there)?;
         }
         let directory = match out.parent() {
             Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
@@ -98,6 +98,8 @@ fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
     let settings = Settings { seed: args.seed, steps: args.steps, shape: Shape::default() };
     let mut trainer = take_up(&files, settings)?;
     let view = View::new(args, trainer.step());
+    // At once, too: a folder that cannot be written to is better known before the work.
+    write_state(&files, &trainer)?;
     let mut written = Instant::now();
     while !trainer.is_finished() {
         let milestone = trainer.advance().map_err(Failure::internal)?;
@@ -108,8 +110,7 @@ fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
         }
         let stopped = is_stopped() && !trainer.is_finished();
         if stopped || written.elapsed().as_secs_f64() > SECONDS_PER_STATE {
-            let state = trainer.state().map_err(Failure::internal)?;
-            write_atomically(&files.directory, &files.state_name(), &state)?;
+            write_state(&files, &trainer)?;
             written = Instant::now();
         }
         if stopped {
@@ -130,6 +131,22 @@ fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
     Ok(Exit::Done)
 }
 
+/// Whether what is there may be replaced: a network may, anything else was not meant.
+fn check_replaceable(out: &Path, there: &fs::Metadata) -> Result<(), Failure> {
+    let refused = |what: &str| Err(Failure::usage(format_args!("--out {}: {what}", out.display())));
+    if there.is_dir() {
+        return refused("a directory, give a file");
+    }
+    if !there.is_file() {
+        return refused("a link or a device, which would be replaced by a file: give a file of its own");
+    }
+    match PriorFile::open(out) {
+        Ok(_) => Ok(()),
+        Err(_) if there.len() == 0 => Ok(()),
+        Err(_) => refused("there is a file that is no trained network, and it would be replaced: give another name"),
+    }
+}
+
 /// A new training, or the one that was stopped.
 fn take_up(files: &Files, settings: Settings) -> Result<Trainer, Failure> {
     let path = files.state();
@@ -139,6 +156,11 @@ fn take_up(files: &Files, settings: Settings) -> Result<Trainer, Failure> {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(Trainer::new(settings)),
         Err(error) => Err(Failure::internal(format_args!("cannot read {}: {error}", path.display()))),
     }
+}
+
+fn write_state(files: &Files, trainer: &Trainer) -> Result<(), Failure> {
+    let state = trainer.state().map_err(Failure::internal)?;
+    Ok(write_atomically(&files.directory, &files.state_name(), &state)?)
 }
 
 fn write_curves(files: &Files, milestones: &[Milestone]) -> Result<(), Failure> {

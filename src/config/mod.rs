@@ -151,6 +151,10 @@ impl Config {
         at_least_one("upload.max_bytes", self.upload.max_bytes)?;
         at_least_one("upload.tenant_uploads", self.upload.tenant_uploads)?;
         at_least_one("upload.tenant_bytes", self.upload.tenant_bytes)?;
+        if self.engine.workers > Engine::MOST_WORKERS {
+            let found = self.engine.workers.to_string();
+            return Err(Error::Value { key: "engine.workers", found, right: "a number up to 1024" });
+        }
         at_least_one("limits.max_views", self.limits.max_views as u64)?;
         at_least_one("limits.max_tracks", self.limits.max_tracks as u64)?;
         at_least_one("limits.max_observations", self.limits.max_observations as u64)?;

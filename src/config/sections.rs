@@ -184,6 +184,9 @@ impl Default for Engine {
 }
 
 impl Engine {
+    /// Threads that one server may be asked for: more is a slip, and the system refuses them one by one.
+    pub const MOST_WORKERS: usize = 1024;
+
     /// Worker threads to start: as configured, or one a core.
     pub fn worker_count(&self) -> usize {
         match self.workers {

@@ -44,7 +44,8 @@ pub fn unsolved(
             tracks.weight = context.scatter(&probabilities, &attempt.block.tracks);
             let likely = opinion.likely();
             let detail = format!(
-                "{likely} tracks look right to the trained network and geometry verifies none: the weights rank, no more"
+                "{likely} tracks look right to the trained network and geometry verifies none: `weight` of the \
+                 tracks is its opinion, nothing has checked it"
             );
             warnings.push(Warning::new(WarningCode::UnverifiedRanking, detail));
         }

@@ -20,6 +20,9 @@ const MOST_NATS: f64 = 5.0;
 /// determines the cameras, and what a first adjustment can carry.
 const START_LOGIT: f64 = 1.0;
 const START_SIZES: (usize, usize) = (8, 60);
+/// Share of likely tracks above which a scene has statistics of its own: from a third on, reweighting and consistency
+/// rank right tracks first (average precision above .99 on real matches).
+const MANY: f64 = 1.0 / 3.0;
 /// Tracks that must be likely right before a ranking without verification is worth telling: entirely wrong input has up
 /// to three by chance.
 const LEAST_LIKELY: usize = 4;
@@ -74,6 +77,11 @@ impl Opinion {
         let likely = ranked.iter().filter(|&&track| self.ln_odds[track] + EVEN_LOGIT > START_LOGIT).count();
         ranked.truncate(likely.clamp(START_SIZES.0, START_SIZES.1));
         ranked
+    }
+
+    /// Whether it takes many of the tracks to be right.
+    pub fn expects_many(&self) -> bool {
+        self.likely() as f64 > MANY * self.ln_odds.len() as f64
     }
 
     /// How many tracks it holds to be right.

@@ -187,7 +187,12 @@ fn of_block(
     recorder: Recorder,
 ) -> Result<Solution, Error> {
     let solution = match best {
-        Some(attempt) if attempt.consensus.is_some() => assemble::solved(context, attempt, warnings, recorder),
+        Some(attempt) if attempt.consensus.is_some() => {
+            let solution = assemble::solved(context, attempt, warnings, recorder);
+            // Depths verify fewer, and PAPER and PSFM keep what they keep.
+            let by_points = matches!(attempt.evidence, portfolio::Evidence::ImagePoints) && attempt.decided.is_none();
+            if by_points { verified(solution) } else { solution }
+        }
         best => {
             warnings.push(why_unsolved(context.input, best));
             assemble::unsolved(context, best, warnings, recorder)

@@ -62,5 +62,8 @@ pub fn text(rows: &Rows) -> String {
             row.median_seconds
         );
     }
+    text.push_str(
+        "F1 of auto: inliers of verified answers; where none is verified, the tracks that the ranking gives more than one half.\n",
+    );
     text
 }

@@ -1,6 +1,9 @@
 //! The file that a trained network lives in: a line that says what it is, a line of JSON that says where it comes from,
 //! then the numbers, little-endian f32, array by array in the order of [`SubspaceNet::map`].
 
+use std::fs;
+use std::path::Path;
+
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -74,7 +77,23 @@ pub enum FileError {
     NotFinite(usize),
 }
 
+/// Bytes that a file may have: the largest [`Shape`] has fewer.
+const MOST_BYTES: u64 = 64 << 20;
+
 impl PriorFile {
+    /// Reads the file at a path, if it is a regular one of a network's size.
+    ///
+    /// # Errors
+    /// What is wrong with it, in words without its name.
+    pub fn open(path: &Path) -> Result<Self, String> {
+        let there = fs::metadata(path).map_err(|error| error.to_string())?;
+        if !there.is_file() || there.len() > MOST_BYTES {
+            return Err(format!("not a trained network: not a regular file of {MOST_BYTES} bytes or fewer"));
+        }
+        let bytes = fs::read(path).map_err(|error| error.to_string())?;
+        Self::read(&bytes).map_err(|error| format!("not a trained network: {error}"))
+    }
+
     /// Reads a file; nothing of its header is believed before it is checked.
     ///
     /// # Errors

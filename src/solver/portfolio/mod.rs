@@ -8,6 +8,7 @@
 
 mod account;
 mod best;
+mod proposals;
 mod spread;
 
 use std::time::Instant;
@@ -15,16 +16,15 @@ use std::time::Instant;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::grow::{self, Consensus};
+use super::grow::Consensus;
 use super::learned::Opinion;
+use super::priors;
 use super::recorder::Recorder;
-use super::search::rigid::{self, Rigid};
-use super::search::{Sampler, Seed, Shortlist, affine, subspace};
-use super::{depths, priors};
+use super::search::rigid::Rigid;
+use super::search::{affine, subspace};
 use crate::domain::result::PriorTime;
 use crate::domain::{Prior, SolveSettings, StopToken};
 use crate::geometry::measurement::{CompleteBlock, balance};
-use crate::geometry::statistics::median;
 use crate::network::{NetworkSettings, PriorNetwork};
 use account::Account;
 use best::Best;
@@ -136,13 +136,11 @@ impl<'a> Portfolio<'a> {
             Some(_) => self.settings.iterations.div_ceil(ITERATIONS_PER_ROUND),
             None => ROUNDS_WITHOUT_NETWORK,
         };
+        self.ask(recorder, spread_weights);
         for round in 0..rounds {
             self.set_noise(round);
             self.propose_rigid(round);
-            self.propose_learned(round, recorder, spread_weights);
-            if round == 0 {
-                self.propose_geometric();
-            }
+            self.propose_at_once(round);
             self.stand(recorder);
             if let Some(network) = &mut network {
                 self.optimise(network, recorder, scale_px, spread_weights)?;
@@ -159,6 +157,19 @@ impl<'a> Portfolio<'a> {
             }
         }
         Ok(self.finish(network))
+    }
+
+    /// Asks the network that was trained beforehand.
+    fn ask(&mut self, recorder: &mut Recorder, spread_weights: &dyn Fn(&[f64]) -> Vec<f32>) {
+        if !self.settings.method.uses_network() || self.settings.excluded_priors.contains(&Prior::Learned) {
+            return;
+        }
+        let begun = Instant::now();
+        self.opinion = Opinion::of(self.block);
+        self.account(Prior::Learned).seconds += begun.elapsed().as_secs_f64();
+        if let Some(opinion) = self.opinion.as_ref().filter(|_| self.settings.weights_every > 0) {
+            recorder.weights(&spread_weights(&opinion.probabilities()));
+        }
     }
 
     /// The noise that a round searches and grows at.
@@ -198,167 +209,6 @@ impl<'a> Portfolio<'a> {
         account.seconds += begun.elapsed().as_secs_f64();
         account.work = network.iteration();
         Ok(())
-    }
-
-    /// Whether this prior has anything left to say.
-    fn is_wanted(&self, prior: Prior) -> bool {
-        !self.is_decisive() && !self.stop.is_stopped() && !self.settings.excluded_priors.contains(&prior)
-    }
-
-    /// Tracks whose distances stay the same, once a noise level: where depths are given and true up to one scale.
-    fn propose_rigid(&mut self, round: u32) {
-        let is_new = NOISE_LADDER.iter().position(|level| *level == NOISE_LADDER[round as usize % NOISE_LADDER.len()])
-            == Some(round as usize);
-        // A zoom moves distances with the focal length.
-        if !is_new || self.settings.focal_per_view || !self.is_wanted(Prior::Rigidity) {
-            return;
-        }
-        let Some(search) = rigid::Search::new(self.block, self.spread, self.stop) else { return };
-        let begun = Instant::now();
-        let found = search.run(self.noise);
-        let pairs = self.block.tracks() * (self.block.tracks() - 1) / 2;
-        let account = self.account(Prior::Rigidity);
-        account.seconds += begun.elapsed().as_secs_f64();
-        account.work += pairs as u32;
-        let Some(rigid) = found else { return };
-        self.verify(Prior::Rigidity, vec![depths::seed(&rigid)]);
-        if !self.is_decisive() {
-            let found = Best {
-                ln_false_alarms: rigid.ln_false_alarms(search.spread()),
-                evidence: Evidence::Depths { focal: rigid.focal },
-                consensus: depths::consensus(self.block, &rigid, self.noise),
-                counted: rigid.inlier_count(),
-                prior: Prior::Rigidity,
-            };
-            self.account(Prior::Rigidity).record(&found);
-            self.offer(found);
-        }
-        let certainty = |rigid: &Rigid| rigid.ln_false_alarms(search.spread());
-        let least = self.rigid.as_ref().map_or(LN_DECISIVE, certainty);
-        if certainty(&rigid) < least {
-            self.rigid = Some(rigid);
-        }
-    }
-
-    /// The trained network's opinion: grown as it stands at first, then searched from.
-    fn propose_learned(&mut self, round: u32, recorder: &mut Recorder, spread_weights: &dyn Fn(&[f64]) -> Vec<f32>) {
-        if !self.settings.method.uses_network() || !self.is_wanted(Prior::Learned) {
-            return;
-        }
-        if round == 0 {
-            let begun = Instant::now();
-            self.opinion = Opinion::of(self.block);
-            self.account(Prior::Learned).seconds += begun.elapsed().as_secs_f64();
-        }
-        let Some(opinion) = self.opinion.clone() else { return };
-        if round == 0 && self.settings.weights_every > 0 {
-            recorder.weights(&spread_weights(&opinion.probabilities()));
-        }
-        // The levels of the noise repeat, and so would what is grown from the same tracks.
-        if (round as usize) < NOISE_LADDER.len() && matches!(self.search, Search::Affine(_)) {
-            self.verify(Prior::Learned, affine::seed(self.block, opinion.start()).into_iter().collect());
-        }
-        self.propose(Prior::Learned, &opinion.probabilities(), Some(&opinion.truncations()));
-    }
-
-    /// The priors that need no optimisation, once.
-    fn propose_geometric(&mut self) {
-        if self.is_wanted(Prior::Irls) {
-            self.propose_irls();
-        }
-        if self.is_wanted(Prior::Consistency) {
-            self.propose_consistency();
-        }
-    }
-
-    fn propose_irls(&mut self) {
-        let begun = Instant::now();
-        let irls = match &self.search {
-            Search::Affine(search) => priors::affine_irls(search.centred(), self.stop),
-            Search::Subspace(search) => priors::irls(search.balanced(), subspace::RANK, self.stop),
-        };
-        self.account(Prior::Irls).seconds += begun.elapsed().as_secs_f64();
-        if let Some(prior) = irls {
-            self.propose_ranking(Prior::Irls, &prior);
-            self.propose(Prior::Irls, &prior, None);
-        }
-    }
-
-    fn propose_consistency(&mut self) {
-        let begun = Instant::now();
-        let consistency = match &self.search {
-            Search::Affine(search) => priors::consistency(search.centred(), 2),
-            Search::Subspace(search) => priors::consistency(&centred_rows(search.balanced()), 3),
-        };
-        self.account(Prior::Consistency).seconds += begun.elapsed().as_secs_f64();
-        self.propose(Prior::Consistency, &consistency, None);
-    }
-
-    /// Searches under a prior and grows what it found.
-    ///
-    /// * `truncations`: see [`affine::Search::run`]; of a search with depths nothing depends on them
-    fn propose(&mut self, prior: Prior, weights: &[f64], truncations: Option<&[f64]>) {
-        if !self.is_wanted(prior) {
-            return;
-        }
-        let begun = Instant::now();
-        let sampler = Sampler::new(weights);
-        let uniform = prior == Prior::Uniform;
-        let samples = |(guided, free): (usize, usize)| if uniform { free } else { guided };
-        let (seeds, drawn) = match &self.search {
-            Search::Affine(search) => {
-                let mut shortlist = Shortlist::new(SHORTLIST);
-                let drawn = samples(AFFINE_SAMPLES);
-                let even = search.even_truncations();
-                let truncations = truncations.unwrap_or(&even);
-                search.run(&sampler, truncations, drawn, &mut self.rng, &mut shortlist, self.stop);
-                let seeds = shortlist.into_entries();
-                let seeds: Vec<Seed> =
-                    seeds.flat_map(|hypothesis| search.seeds(self.block, &hypothesis, truncations)).collect();
-                (seeds, drawn)
-            }
-            Search::Subspace(search) => {
-                let mut shortlist = Shortlist::new(SHORTLIST);
-                let drawn = samples(SUBSPACE_SAMPLES);
-                search.run(&sampler, drawn, &mut self.rng, &mut shortlist, self.stop);
-                (shortlist.into_entries().map(|hypothesis| search.seed(self.block, &hypothesis)).collect(), drawn)
-            }
-        };
-        let account = self.account(prior);
-        account.seconds += begun.elapsed().as_secs_f64();
-        if prior != Prior::Network {
-            account.work += drawn as u32;
-        }
-        self.verify(prior, seeds);
-    }
-
-    /// Grows a prior's own best-ranked tracks, without sampling.
-    fn propose_ranking(&mut self, prior: Prior, weights: &[f64]) {
-        if matches!(self.search, Search::Affine(_)) {
-            let costs: Vec<f64> = weights.iter().map(|weight| -weight).collect();
-            self.verify(prior, affine::seeds_from_ranking(self.block, &costs));
-        }
-    }
-
-    /// Grows seeds until one is decisive, and keeps account.
-    fn verify(&mut self, prior: Prior, seeds: Vec<Seed>) {
-        for seed in seeds {
-            let begun = Instant::now();
-            let grown = grow::grow(self.block, seed.cameras, seed.points, seed.support, self.noise, self.stop);
-            let spread = self.spread;
-            let counted = grown.as_ref().map_or(0, |consensus| self.counted(consensus));
-            let account = self.account(prior);
-            account.seconds += begun.elapsed().as_secs_f64();
-            let Some(consensus) = grown else { continue };
-            let ln_false_alarms = consensus.ln_false_alarms(spread);
-            let grown = Best { consensus, prior, ln_false_alarms, evidence: Evidence::ImagePoints, counted };
-            account.record(&grown);
-            let decisive = grown.decides();
-            self.offer(grown);
-            if decisive || self.stop.is_stopped() {
-                break;
-            }
-        }
     }
 
     /// Inliers that count as verified by geometry.
@@ -420,15 +270,4 @@ impl<'a> Portfolio<'a> {
             prior_times,
         }
     }
-}
-
-/// Every row centred on its median.
-fn centred_rows(matrix: &nalgebra::DMatrix<f64>) -> nalgebra::DMatrix<f64> {
-    let mut centred = matrix.clone();
-    for mut row in centred.row_iter_mut() {
-        let mut values: Vec<f64> = row.iter().copied().collect();
-        let middle = median(&mut values);
-        row.add_scalar_mut(-middle);
-    }
-    centred
 }
