@@ -28,6 +28,8 @@ pub(super) trait Connection: Send {
     const FOR_UPDATE: &'static str;
     /// The same, passing over the rows that another transaction is changing.
     const SKIP_LOCKED: &'static str;
+    /// Whether a transaction that writes is alone in the database: what it has seen stays as it is.
+    const WRITES_ALONE: bool;
 
     /// Runs a statement to its end and returns its rows.
     fn rows(&mut self, statement: Statement) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;

@@ -121,6 +121,7 @@ impl Connection for SqliteConnection {
     // The one writer has the database to itself.
     const FOR_UPDATE: &'static str = "";
     const SKIP_LOCKED: &'static str = "";
+    const WRITES_ALONE: bool = true;
 
     async fn rows(&mut self, statement: Statement) -> Result<Vec<SqliteRow>, Error> {
         sql::run::<sqlx::Sqlite>(self, statement).await
