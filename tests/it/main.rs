@@ -1,5 +1,6 @@
 //! Every integration test in one binary, so that everything links once. One concept a module.
 
+mod abuse;
 mod access;
 mod api;
 mod chaos;

@@ -5,6 +5,7 @@ pub mod collector;
 pub mod keys;
 pub mod live;
 pub mod memory;
+pub mod mutation;
 pub mod postgres;
 pub mod program;
 pub mod python;
