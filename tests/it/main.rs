@@ -6,6 +6,7 @@ mod api;
 mod chaos;
 mod cli;
 mod crash;
+mod dashboards;
 mod formats;
 mod load;
 mod lost;
