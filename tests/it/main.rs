@@ -7,6 +7,7 @@ mod chaos;
 mod cli;
 mod crash;
 mod dashboards;
+mod disk;
 mod formats;
 mod load;
 mod lost;
