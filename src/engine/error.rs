@@ -44,6 +44,9 @@ pub enum Error {
     /// The store is out of reach; nothing is known to have changed. Trying again later may help.
     #[error("the store is out of reach: {0}")]
     Unavailable(String),
+    /// The store has no room for what was to be stored; it is not. Trying again helps once somebody has made room.
+    #[error("no space is left for the store: {0}")]
+    NoSpace(String),
     /// Not the caller's fault: the store or the engine itself failed.
     #[error("{0}")]
     Internal(String),
@@ -67,6 +70,7 @@ impl From<store::Error> for Error {
                 message: bound.to_string(),
             },
             store::Error::Unavailable(cause) => Error::Unavailable(cause),
+            store::Error::NoSpace(cause) => Error::NoSpace(cause),
             store::Error::Fenced(_) | store::Error::InUse(_) | store::Error::Corrupt(_) => {
                 Error::Internal(error.to_string())
             }

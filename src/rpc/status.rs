@@ -18,6 +18,7 @@
 //! | `INVALID_ARGUMENT` | `MALFORMED_MESSAGE` | a message that cannot be decoded |
 //! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.limits.max_message_bytes`, packed or not |
 //! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
+//! | `RESOURCE_EXHAUSTED` | `STORE_FULL` | the server's disk is full and nothing was stored; `RetryInfo`. What was acknowledged before is there |
 //! | `FAILED_PRECONDITION` | `JOB_NOT_ENDED` | a job that waits or runs is not deleted; cancel it first |
 //! | `ABORTED` | `ETAG_MISMATCH` | the job changed since its etag was read |
 //! | `FAILED_PRECONDITION` | `RESULT_NOT_READY` | there is no result, yet or for good |
@@ -48,6 +49,9 @@ const DRAINING_RETRY: Duration = Duration::from_secs(5);
 
 /// Pause that a caller is told while the store is away: a database that restarts takes a few seconds.
 const STORE_RETRY: Duration = Duration::from_secs(2);
+
+/// Pause that a caller is told while the disk is full: somebody has to make room.
+const SPACE_RETRY: Duration = Duration::from_secs(60);
 
 /// Pause that a caller is told who has uploaded as much as it may: another upload takes about as long.
 const UPLOADS_RETRY: Duration = Duration::from_secs(60);
@@ -221,6 +225,13 @@ pub fn from_engine(error: engine::Error) -> Status {
             let details = ErrorDetails::with_retry_info(Some(STORE_RETRY));
             status(Code::Unavailable, "STORE_UNAVAILABLE", "the store is out of reach; come back soon", details)
         }
+        engine::Error::NoSpace(cause) => {
+            // The cause may name paths: it is for the log.
+            tracing::error!(%cause, "no space is left for the store");
+            let details = ErrorDetails::with_retry_info(Some(SPACE_RETRY));
+            let message = "no space is left for the store: nothing was stored; whoever runs the server must make room";
+            status(Code::ResourceExhausted, "STORE_FULL", message, details)
+        }
         engine::Error::Internal(error) => internal(&error),
     }
 }
@@ -268,6 +279,15 @@ mod tests {
         assert!(!status.message().contains("db.internal"), "{}", status.message());
         assert!(status.get_details_retry_info().is_some_and(|retry| retry.retry_delay.is_some()));
         assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "STORE_UNAVAILABLE");
+    }
+
+    #[test]
+    fn a_full_disk_is_told_and_its_path_stays_inside() {
+        let status = from_engine(engine::Error::NoSpace("/srv/secret is full".into()));
+        assert_eq!(status.code(), Code::ResourceExhausted);
+        assert!(!status.message().contains("secret"), "{}", status.message());
+        assert!(status.get_details_retry_info().is_some_and(|retry| retry.retry_delay.is_some()));
+        assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "STORE_FULL");
     }
 
     #[test]

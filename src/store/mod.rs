@@ -70,6 +70,9 @@ pub enum Error {
     /// The database or the file system failed; trying again later may help.
     #[error("store unavailable: {0}")]
     Unavailable(String),
+    /// There is no room for what was to be written; it is not. What is there can be read.
+    #[error("no space is left for the store: {0}")]
+    NoSpace(String),
     /// What was read is not what was written.
     #[error("store corrupt: {0}")]
     Corrupt(String),

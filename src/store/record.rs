@@ -80,6 +80,11 @@ pub struct QueueBounds {
 }
 
 impl QueueBounds {
+    /// Whether tenants have bounds of their own.
+    pub fn has_tenant_bounds(&self) -> bool {
+        self.max_tenant_jobs < u64::MAX || self.max_tenant_bytes < u64::MAX
+    }
+
     /// The first bound that one more job would break: of the tenant's own, then of the whole queue's.
     pub fn refuses(&self, whole: &Load, tenant: &Load, bytes: u64, observations: u64) -> Option<Bound> {
         self.refuses_tenant(tenant, bytes).or_else(|| self.refuses_all(whole, bytes, observations))

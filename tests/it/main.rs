@@ -1,10 +1,13 @@
 //! Every integration test in one binary, so that everything links once. One concept a module.
 
+mod abuse;
 mod access;
 mod api;
 mod chaos;
 mod cli;
 mod crash;
+mod dashboards;
+mod disk;
 mod formats;
 mod load;
 mod lost;

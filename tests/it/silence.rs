@@ -8,21 +8,14 @@ use scpsfm::rpc::server::Options;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
+use crate::support::live::is_served;
+use crate::support::memory::resident_mb;
 use crate::support::program::Serving;
 use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::quick;
 
 /// What every client of HTTP/2 says first (RFC 9113, section 3.4), and empty settings.
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
-
-/// A new client gets an answer.
-async fn is_served(url: &str) {
-    let call = async {
-        let mut client = CalibrationServiceClient::connect(url.to_owned()).await.expect("a connection");
-        client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("an answer");
-    };
-    soon(call).await;
-}
 
 /// Connections each of which has said that much.
 async fn saying(address: &str, count: usize, words: &[u8]) -> Vec<TcpStream> {
@@ -105,11 +98,7 @@ async fn ten_thousand_silent_connections_cost_little_and_go_away() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let server = Serving::start(directory.path());
     let address = server.grpc.trim_start_matches("http://").to_owned();
-    let resident_mb = || {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", server.running.0.id())).expect("a process");
-        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("its memory").trim();
-        line.trim_end_matches(" kB").parse::<u64>().expect("a number") / 1024
-    };
+    let resident_mb = || resident_mb(server.running.0.id());
     let before = resident_mb();
     let begun = std::time::Instant::now();
     let mut silent = saying(&address, 5_000, b"").await;

@@ -137,6 +137,7 @@ impl Connection for PgConnection {
     type Row = PgRow;
     const FOR_UPDATE: &'static str = " FOR UPDATE";
     const SKIP_LOCKED: &'static str = " FOR UPDATE SKIP LOCKED";
+    const WRITES_ALONE: bool = false;
 
     async fn rows(&mut self, statement: Statement) -> Result<Vec<PgRow>, Error> {
         sql::run::<sqlx::Postgres>(self, statement).await

@@ -1,5 +1,6 @@
 //! Creating, reading and listing jobs.
 
+use std::collections::HashMap;
 use std::time::SystemTime;
 
 use super::rows::{self, append, integer, micros, number, select_jobs};
@@ -18,17 +19,21 @@ pub(super) async fn create<C: Connection>(
     now: SystemTime,
 ) -> Result<Vec<Created>, Error> {
     let mut inputs = Vec::new();
+    let mut waiting = Waiting::default();
     for new in news {
         // Payloads take long: nobody else's admission waits for them.
-        let known = admit(connection, new, bounds).await?.is_some();
+        let known = admit(connection, new, bounds, &mut waiting).await?.is_some();
         let input = if known { None } else { Some(input_of(connection, new, now).await?) };
         inputs.push(input);
     }
     connection.lock_admission().await?;
     let mut created = Vec::new();
+    if !C::WRITES_ALONE {
+        waiting = Waiting::default();
+    }
     for (new, input) in news.iter().zip(inputs) {
         // Looked over again: others may have come in between, and the batch's own jobs are there now.
-        match (admit(connection, new, bounds).await?, input) {
+        match (admit(connection, new, bounds, &mut waiting).await?, input) {
             (Some(job), input) => {
                 if let Some(input) = input {
                     let delete = Statement::new("DELETE FROM inputs WHERE id = $1 AND input IS NULL");
@@ -36,15 +41,60 @@ pub(super) async fn create<C: Connection>(
                 }
                 created.push(Created { job, new: false });
             }
-            (None, Some(input)) => created.push(enqueue(connection, new, input, now).await?),
+            (None, Some(input)) => {
+                created.push(enqueue(connection, new, input, now).await?);
+                waiting.add(new);
+            }
             // The job that its request id had made was deleted in between.
             (None, None) => {
                 let input = input_of(connection, new, now).await?;
                 created.push(enqueue(connection, new, input, now).await?);
+                waiting.add(new);
             }
         }
     }
     Ok(created)
+}
+
+/// What waits, as admission needs it: summed up once a batch, since a sum goes through the whole queue.
+#[derive(Default)]
+struct Waiting {
+    whole: Option<Load>,
+    tenants: HashMap<String, Load>,
+}
+
+impl Waiting {
+    /// What waits of all tenants, and of this one where it has bounds of its own.
+    async fn look<C: Connection>(
+        &mut self,
+        connection: &mut C,
+        tenant: &str,
+        bounds: &QueueBounds,
+    ) -> Result<(Load, Load), Error> {
+        let whole = match self.whole {
+            Some(whole) => whole,
+            None => load(connection).await?,
+        };
+        self.whole = Some(whole);
+        if !bounds.has_tenant_bounds() {
+            return Ok((whole, Load::default()));
+        }
+        if let Some(known) = self.tenants.get(tenant) {
+            return Ok((whole, *known));
+        }
+        let of_tenant = load_of(connection, tenant).await?;
+        self.tenants.insert(tenant.to_owned(), of_tenant);
+        Ok((whole, of_tenant))
+    }
+
+    /// One more job is stored.
+    fn add(&mut self, new: &NewRecord) {
+        for load in self.whole.iter_mut().chain(self.tenants.get_mut(&new.name.tenant)) {
+            load.queued += 1;
+            load.queued_bytes += new.input.bytes();
+            load.queued_observations += u64::from(new.observation_count);
+        }
+    }
 }
 
 /// Stores a job that was admitted, and its request id.
@@ -73,7 +123,12 @@ async fn enqueue<C: Connection>(
 }
 
 /// Whether a job may be stored: `Ok(None)`; or the job that the same request made before.
-async fn admit<C: Connection>(connection: &mut C, new: &NewRecord, bounds: &QueueBounds) -> Result<Option<Job>, Error> {
+async fn admit<C: Connection>(
+    connection: &mut C,
+    new: &NewRecord,
+    bounds: &QueueBounds,
+    waiting: &mut Waiting,
+) -> Result<Option<Job>, Error> {
     if let Some(request) = &new.request
         && let Some(job) = earlier(connection, &new.name.tenant, request).await?
     {
@@ -85,7 +140,7 @@ async fn admit<C: Connection>(connection: &mut C, new: &NewRecord, bounds: &Queu
     if connection.row(taken).await?.flag("taken")? {
         return Err(Error::AlreadyExists(format!("{} already exists", new.name)));
     }
-    let (whole, tenant) = (load(connection).await?, load_of(connection, &new.name.tenant).await?);
+    let (whole, tenant) = waiting.look(connection, &new.name.tenant, bounds).await?;
     match bounds.refuses(&whole, &tenant, new.input.bytes(), u64::from(new.observation_count)) {
         Some(bound) => Err(Error::QueueFull(bound)),
         None => Ok(None),

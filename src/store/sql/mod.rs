@@ -28,6 +28,8 @@ pub(super) trait Connection: Send {
     const FOR_UPDATE: &'static str;
     /// The same, passing over the rows that another transaction is changing.
     const SKIP_LOCKED: &'static str;
+    /// Whether a transaction that writes is alone in the database: what it has seen stays as it is.
+    const WRITES_ALONE: bool;
 
     /// Runs a statement to its end and returns its rows.
     fn rows(&mut self, statement: Statement) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;
@@ -148,14 +150,54 @@ fn is_defect(code: Option<&str>) -> bool {
     code.is_some_and(|code| code.len() == 5 && ["22", "23", "42"].iter().any(|class| code.starts_with(class)))
 }
 
+/// SQLite's primary code is the low byte of the one that it gives (sqlite.org/rescode.html): 13, `SQLITE_FULL`.
+/// PostgreSQL's is the SQLSTATE 53100, `disk_full`.
+fn is_no_space(code: &str) -> bool {
+    code == "53100" || sqlite_code(code) == Some(13)
+}
+
+/// SQLite's 11, `SQLITE_CORRUPT`, and 26, `SQLITE_NOTADB`; PostgreSQL's SQLSTATE class XX: its files, or its index, are
+/// damaged.
+fn is_damaged(code: &str) -> bool {
+    code == "XX001" || code == "XX002" || matches!(sqlite_code(code), Some(11 | 26))
+}
+
+/// The primary one of SQLite's codes, which have four digits at most; none of a SQLSTATE, which has five signs.
+fn sqlite_code(code: &str) -> Option<u32> {
+    if code.len() >= 5 { None } else { code.parse::<u32>().ok().map(|code| code & 0xff) }
+}
+
 impl From<sqlx::Error> for Error {
     fn from(error: sqlx::Error) -> Self {
+        let code = error.as_database_error().and_then(|cause| cause.code()).unwrap_or_default();
+        if is_no_space(&code) {
+            return Error::NoSpace(error.to_string());
+        }
+        if is_damaged(&code) {
+            return Error::Corrupt(error.to_string());
+        }
         match error {
             sqlx::Error::ColumnDecode { .. } | sqlx::Error::ColumnNotFound(_) | sqlx::Error::Decode(_) => {
                 Error::Corrupt(error.to_string())
             }
             sqlx::Error::Database(ref cause) if is_defect(cause.code().as_deref()) => Error::Corrupt(error.to_string()),
             _ => Error::Unavailable(error.to_string()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{is_damaged, is_no_space};
+
+    #[test]
+    fn codes_of_either_database_tell_a_full_disk_and_a_damaged_file() {
+        // SQLITE_FULL; SQLITE_CORRUPT, SQLITE_CORRUPT_INDEX = 11 | 3 << 8 and SQLITE_NOTADB.
+        assert!(is_no_space("13") && is_no_space("53100"));
+        assert!(is_damaged("11") && is_damaged("779") && is_damaged("26") && is_damaged("XX001"));
+        // SQLITE_BUSY, SQLITE_IOERR_WRITE = 10 | 3 << 8, too many connections, a serialization failure; no code at all.
+        for other in ["5", "778", "53300", "40001", ""] {
+            assert!(!is_no_space(other) && !is_damaged(other), "{other}");
         }
     }
 }

@@ -94,6 +94,12 @@ fn pool(connections: u32) -> SqlitePoolOptions {
         .max_connections(connections)
         .acquire_timeout(ACQUIRE_TIMEOUT)
         .test_before_acquire(false)
+        // A disk that is full makes SQLite roll a transaction back by itself. sqlx, which then has nothing to roll back,
+        // goes on to count it, and the connection never begins another: it is closed, and a new one opened.
+        .before_acquire(|connection, _| {
+            let ended = !sqlx::Connection::is_in_transaction(connection);
+            Box::pin(async move { Ok(ended) })
+        })
         .idle_timeout(None)
         .max_lifetime(None)
 }
@@ -121,6 +127,7 @@ impl Connection for SqliteConnection {
     // The one writer has the database to itself.
     const FOR_UPDATE: &'static str = "";
     const SKIP_LOCKED: &'static str = "";
+    const WRITES_ALONE: bool = true;
 
     async fn rows(&mut self, statement: Statement) -> Result<Vec<SqliteRow>, Error> {
         sql::run::<sqlx::Sqlite>(self, statement).await

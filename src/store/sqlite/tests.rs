@@ -105,3 +105,15 @@ async fn deleted_jobs_leave_no_space_taken() {
     let bytes = std::fs::metadata(fixture._directory.path().join(DATABASE_FILE)).expect("the file").len();
     assert!(bytes < 1 << 20, "{bytes} bytes");
 }
+
+#[tokio::test]
+async fn after_a_full_disk_the_next_write_goes_through() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let store = Sqlite::open(directory.path()).await.expect("a store");
+    // As full as it is; the next connection knows nothing of the limit, as if room had been made.
+    store.execute("PRAGMA max_page_count = 1").await;
+    let new = || crate::store::NewRecord { input: vec![7; 1 << 20].into(), ..contract::record("a") };
+    let refused = store.create_job(new(), &contract::ROOM, contract::time(0)).await.expect_err("no room");
+    assert!(matches!(refused, Error::NoSpace(_)), "{refused}");
+    store.create_job(new(), &contract::ROOM, contract::time(1)).await.expect("room again");
+}

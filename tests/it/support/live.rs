@@ -1,6 +1,7 @@
 //! Talking to the real program over gRPC.
 
 use scpsfm::rpc::convert;
+use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState, create_job_request::Input};
 use scpsfm::synthetic::{Scene, SceneOptions};
@@ -13,6 +14,15 @@ use super::wire::{create, state_of};
 /// The client of a running server.
 pub async fn connected(server: &Serving) -> JobServiceClient<Channel> {
     JobServiceClient::connect(server.grpc.clone()).await.expect("a connection")
+}
+
+/// A new client gets an answer.
+pub async fn is_served(url: &str) {
+    let call = async {
+        let mut client = CalibrationServiceClient::connect(url.to_owned()).await.expect("a connection");
+        client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("an answer");
+    };
+    soon(call).await;
 }
 
 /// A request for that scene.
@@ -40,7 +50,20 @@ pub fn lasting(iterations: u32) -> proto::CreateJobRequest {
 
 /// A scene that is solved at once, by geometry alone.
 pub fn small(seed: u64) -> proto::CreateJobRequest {
-    let mut request = easy(seed);
+    by_geometry(easy(seed))
+}
+
+/// A scene that is solved within some ten milliseconds by an optimised build: what counts is the job, not the solve.
+pub fn tiny_options(seed: u64) -> SceneOptions {
+    SceneOptions { views: 3, tracks: 16, outliers: 0.0, seed, ..SceneOptions::default() }
+}
+
+/// A request for that scene.
+pub fn tiny(seed: u64) -> proto::CreateJobRequest {
+    by_geometry(scene_request(&tiny_options(seed)))
+}
+
+fn by_geometry(mut request: proto::CreateJobRequest) -> proto::CreateJobRequest {
     let settings = proto::SolveSettings { method: proto::Method::Geometry as i32, ..Default::default() };
     request.job = Some(proto::Job { settings: Some(settings), ..Default::default() });
     request

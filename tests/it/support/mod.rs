@@ -4,6 +4,8 @@ pub mod certificates;
 pub mod collector;
 pub mod keys;
 pub mod live;
+pub mod memory;
+pub mod mutation;
 pub mod postgres;
 pub mod program;
 pub mod python;

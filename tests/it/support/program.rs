@@ -20,9 +20,11 @@ pub struct Run {
     pub stderr: String,
 }
 
-/// The program with these arguments, free of this shell's settings.
+/// The program with these arguments, free of this shell's settings. `SCPSFM_PROGRAM` names another build of it, such as an
+/// optimised one where figures are wanted.
 pub fn program<S: AsRef<std::ffi::OsStr>>(arguments: impl IntoIterator<Item = S>) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_scpsfm"));
+    let path = std::env::var_os("SCPSFM_PROGRAM").unwrap_or_else(|| env!("CARGO_BIN_EXE_scpsfm").into());
+    let mut command = Command::new(path);
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SCPSFM_")) {
         command.env_remove(name);
     }

@@ -1,9 +1,9 @@
-//! Many clients at once.
+//! Many clients at once, each with jobs of its own.
 
 use scpsfm::rpc::proto::{self, JobState};
 use tokio::task::JoinSet;
 
-use crate::support::live::{connected, created, reaches, small};
+use crate::support::live::{connected, created, reaches, tiny};
 use crate::support::program::Serving;
 use crate::support::scrape::Page;
 
@@ -21,7 +21,7 @@ async fn a_hundred_jobs_of_twenty_clients_all_end_and_the_queue_is_empty() {
         clients.spawn(async move {
             let mut names = Vec::new();
             for job in 0..JOBS_EACH {
-                names.push(created(&mut jobs, small(client * JOBS_EACH + job)).await);
+                names.push(created(&mut jobs, tiny(client * JOBS_EACH + job)).await);
             }
             for name in &names {
                 let end = reaches(&mut jobs, name, &[JobState::Succeeded, JobState::Failed]).await;

@@ -1,0 +1,164 @@
+//! A disk that is full, and a database that was cut off.
+
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use scpsfm::rpc::proto::input_service_client::InputServiceClient;
+use scpsfm::rpc::proto::{self, JobState};
+use tonic::{Code, Status};
+
+use crate::support::live::{connected, created, is_served, reaches};
+use crate::support::program::{Serving, run};
+use crate::support::uploads::{DEFAULT, encoded, id, part, reason, whole};
+use crate::support::wire::{create_tracks, raw};
+
+/// Size of the disk: the empty store with its log, and a few of the inputs below.
+const DISK: &str = "size=24m";
+
+/// A file system of its own, as small as we like; unmounted when dropped.
+struct SmallDisk {
+    folder: tempfile::TempDir,
+}
+
+impl SmallDisk {
+    /// Without the right to mount, the test is skipped, loudly.
+    fn mount(what: &str) -> Option<Self> {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let mounted = cfg!(target_os = "linux")
+            && Command::new("mount")
+                .args(["-t", "tmpfs", "-o", DISK, "tmpfs"])
+                .arg(folder.path())
+                .stderr(Stdio::null())
+                .status()
+                .is_ok_and(|status| status.success());
+        if mounted {
+            return Some(Self { folder });
+        }
+        let missing = "a small file system cannot be mounted here (it takes root)";
+        assert!(std::env::var_os("SCPSFM_REQUIRE_MOUNT").is_none(), "{missing}");
+        // Past the capture of a passing test's output.
+        writeln!(std::io::stderr(), "SKIPPED {what}: {missing}").expect("stderr");
+        None
+    }
+
+    fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// Takes all the room but this much, by a file that is returned.
+    fn fill(&self, left_bytes: usize) -> PathBuf {
+        let path = self.path().join("filler");
+        let mut file = File::create(&path).expect("a file");
+        while file.write_all(&[1; 65_536]).is_ok() {}
+        let length = file.metadata().expect("its length").len();
+        file.set_len(length.saturating_sub(left_bytes as u64)).expect("shorter");
+        path
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg(self.folder.path()).status();
+    }
+}
+
+/// Asserts that a call was refused for want of room, with words for whoever runs the server.
+fn is_full(status: &Status) {
+    assert_eq!((status.code(), reason(status).as_str()), (Code::ResourceExhausted, "STORE_FULL"), "{status:?}");
+    assert!(status.message().contains("space"), "{status:?}");
+}
+
+/// The end of an input's upload, or why there is none.
+async fn upload(server: &Serving, messages: Vec<proto::UploadInputRequest>) -> Result<proto::Input, Status> {
+    let mut inputs = InputServiceClient::connect(server.grpc.clone()).await.expect("a connection");
+    inputs.upload_input(tokio_stream::iter(messages)).await.map(tonic::Response::into_inner)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_full_disk_is_told_and_loses_nothing_and_room_is_all_it_takes() {
+    let Some(disk) = SmallDisk::mount("a full disk") else { return };
+    let data_dir = disk.path().join("data");
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    let first = created(&mut jobs, create_tracks()).await;
+    assert_eq!(reaches(&mut jobs, &first, &[JobState::Succeeded]).await, JobState::Succeeded);
+    let bytes = encoded(&raw(20, 20_000));
+    assert!(bytes.len() > 4 << 20, "larger than what is left");
+    let sent = upload(&server, part(DEFAULT, &id(1), &bytes, 0..1 << 20, 1 << 20)).await;
+    assert_eq!(sent.expect_err("its finish is missing").code(), Code::InvalidArgument);
+
+    let filler = disk.fill(1 << 20);
+    is_full(&upload(&server, whole(DEFAULT, &id(2), &bytes, 1 << 20)).await.expect_err("no room"));
+    // Small jobs fit until they do not.
+    disk.fill(0);
+    let mut acknowledged = Vec::new();
+    let refused = loop {
+        match jobs.create_job(create_tracks()).await {
+            Ok(job) => acknowledged.push(job.into_inner().name),
+            Err(status) => break status,
+        }
+        assert!(acknowledged.len() < 10_000, "the disk never fills up");
+    };
+    is_full(&refused);
+    println!("{} jobs fitted into what was left", acknowledged.len());
+    // What is there can be read.
+    is_served(&server.grpc).await;
+    jobs.get_job(proto::GetJobRequest { name: first.clone() }).await.expect("the first job");
+
+    std::fs::remove_file(filler).expect("room again");
+    for name in &acknowledged {
+        assert_eq!(reaches(&mut jobs, name, &[JobState::Succeeded, JobState::Failed]).await, JobState::Succeeded);
+    }
+    let next = created(&mut jobs, create_tracks()).await;
+    assert_eq!(reaches(&mut jobs, &next, &[JobState::Succeeded]).await, JobState::Succeeded);
+    let input = upload(&server, whole(DEFAULT, &id(3), &bytes, 1 << 20)).await.expect("an input");
+    assert_eq!(input.size_bytes, bytes.len() as i64);
+
+    // Killed, and back: everything that was acknowledged is there, the first upload's bytes too.
+    drop(server);
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    for name in acknowledged.iter().chain([&first, &next]) {
+        let job = jobs.get_job(proto::GetJobRequest { name: name.clone() }).await.expect("acknowledged").into_inner();
+        assert_eq!(job.state(), JobState::Succeeded, "{name}");
+    }
+    let mut inputs = InputServiceClient::connect(server.grpc.clone()).await.expect("a connection");
+    let status = proto::GetUploadStatusRequest { parent: DEFAULT.into(), upload_id: id(1) };
+    let status = inputs.get_upload_status(status).await.expect("the upload of the beginning").into_inner();
+    assert_eq!(status.committed_bytes, 1 << 20);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_database_that_was_cut_off_is_told_at_the_start_and_left_as_it_is() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let data_dir = directory.path().join("data");
+    let mut server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    let name = created(&mut jobs, create_tracks()).await;
+    reaches(&mut jobs, &name, &[JobState::Succeeded]).await;
+    server.running.signal(rustix::process::Signal::TERM);
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success(), "its log is written back");
+
+    let database = data_dir.join("scpsfm.db");
+    let whole = std::fs::read(&database).expect("the database");
+    let start = || {
+        let listen = ["--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--data-dir"];
+        let path = data_dir.to_str().expect("UTF-8");
+        tokio::task::block_in_place(|| run(["serve"].iter().chain(&listen).copied().chain([path])))
+    };
+    // In the header, after it, within a page, in the middle.
+    for length in [50, 100, 5_000, whole.len() / 2] {
+        std::fs::write(&database, &whole[..length]).expect("written");
+        let refused = start();
+        assert_eq!(refused.code, Some(1), "{length} bytes: {}", refused.stderr);
+        assert!(refused.stderr.contains("corrupt") && refused.stderr.contains("data"), "{}", refused.stderr);
+        assert!(!refused.stderr.contains("panicked"), "{}", refused.stderr);
+        assert_eq!(std::fs::read(&database).expect("still there"), whole[..length], "{length} bytes");
+    }
+    std::fs::write(&database, &whole).expect("written");
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    jobs.get_job(proto::GetJobRequest { name }).await.expect("the job");
+}

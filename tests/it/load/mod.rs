@@ -1,0 +1,5 @@
+//! Many clients, jobs and watchers at once, and what the service costs beside the solve.
+
+mod clients;
+mod crowd;
+mod throughput;
