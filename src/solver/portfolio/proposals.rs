@@ -56,7 +56,7 @@ impl Portfolio<'_> {
     /// Of mostly right tracks the statistics of the scene itself rank better than what was learned from others: on real
     /// photographs they put nearly every right track first. Where few are right they rank worse the fewer there are.
     pub(super) fn propose_at_once(&mut self, round: u32) {
-        let many = self.opinion.as_ref().is_none_or(Opinion::expects_many);
+        let many = self.geometry_first || self.opinion.as_ref().is_none_or(Opinion::expects_many);
         if many && round == 0 {
             self.propose_geometric();
         }
