@@ -55,13 +55,13 @@ impl Lesson {
             right[k] = false;
         }
         let mut inlier = vec![false; tracks];
-        for track in 0..tracks {
+        for (track, inlier) in inlier.iter_mut().enumerate() {
             let of_track = || (0..views).map(|view| view * tracks + track);
             let count = of_track().filter(|&k| right[k]).count();
             if count < LEAST_RIGHT_IN_TRACK {
                 of_track().for_each(|k| right[k] = false);
             } else {
-                inlier[track] = of_track().all(|k| right[k] || !visible[k]);
+                *inlier = of_track().all(|k| right[k] || !visible[k]);
             }
         }
         Self { views, tracks, points, visible, right, inlier }

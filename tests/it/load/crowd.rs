@@ -66,7 +66,7 @@ struct Watcher {
 impl Watcher {
     /// Asserts that it saw each event once and one end. Returns how long the events that happened meanwhile were on
     /// their way.
-    async fn to_the_end(mut self) -> Vec<Duration> {
+    async fn drained(mut self) -> Vec<Duration> {
         let (mut last, mut delays, mut end) = (0, Vec::new(), None);
         let begun = SystemTime::now();
         while let Some(event) = self.events.message().await.unwrap_or_else(|error| panic!("{}: {error}", self.name)) {
@@ -125,7 +125,7 @@ impl Crowd {
         let watched = &names[ahead.min(self.jobs - self.watchers)..][..self.watchers];
         let (fast, slow) = watch_all(&server, watched, self.slow_pause).await;
         let through = watch::Sender::new(false);
-        let mut delays: JoinSet<Vec<Duration>> = fast.into_iter().map(Watcher::to_the_end).collect();
+        let mut delays: JoinSet<Vec<Duration>> = fast.into_iter().map(Watcher::drained).collect();
         let reads_late = self.slow_pause.is_none();
         let mut late: JoinSet<Vec<Duration>> = JoinSet::new();
         for watcher in slow {
@@ -134,7 +134,7 @@ impl Crowd {
                 if reads_late {
                     all_through.wait_for(|&through| through).await.expect("the test goes on");
                 }
-                watcher.to_the_end().await
+                watcher.drained().await
             });
         }
         let mut on_their_way: Vec<Duration> = Vec::new();
