@@ -7,6 +7,8 @@ use std::process::{Command, Stdio};
 
 use scpsfm::rpc::proto::input_service_client::InputServiceClient;
 use scpsfm::rpc::proto::{self, JobState};
+use scpsfm::store::Store;
+use scpsfm::store::sqlite::Sqlite;
 use tonic::{Code, Status};
 
 use crate::support::live::{connected, created, is_served, reaches};
@@ -14,8 +16,8 @@ use crate::support::program::{Serving, run};
 use crate::support::uploads::{DEFAULT, encoded, id, part, reason, whole};
 use crate::support::wire::{create_tracks, raw};
 
-/// Size of the disk: the empty store with its log, and a few of the inputs below.
-const DISK: &str = "size=24m";
+/// Size of the disk: a few of the inputs below, each in the store and in its log.
+const DISK: &str = "size=96m";
 
 /// A file system of its own, as small as we like; unmounted when dropped.
 struct SmallDisk {
@@ -139,7 +141,10 @@ async fn a_database_that_was_cut_off_is_told_at_the_start_and_left_as_it_is() {
     let name = created(&mut jobs, create_tracks()).await;
     reaches(&mut jobs, &name, &[JobState::Succeeded]).await;
     server.running.signal(rustix::process::Signal::TERM);
-    assert!(tokio::task::block_in_place(|| server.running.wait()).success(), "its log is written back");
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success(), "a clean end");
+    // Writes the log back into the file: as long as it is there, it mends what is missing.
+    Sqlite::open(&data_dir).await.expect("a store").close().await;
+    assert!(!data_dir.join("scpsfm.db-wal").exists(), "the log is written back");
 
     let database = data_dir.join("scpsfm.db");
     let whole = std::fs::read(&database).expect("the database");
