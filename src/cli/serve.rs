@@ -305,7 +305,7 @@ mod tests {
             "--insecure",
             "--plaintext-keys",
         ]);
-        assert_eq!(all.len(), 13);
+        assert_eq!(all.len(), 14);
         let config = Config::load(None, &all).expect("valid");
         assert_eq!(config.engine.workers, 3);
         assert_eq!(config.engine.queue_capacity, 9);
