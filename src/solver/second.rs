@@ -13,6 +13,8 @@ use crate::geometry::statistics::chi_square_gate;
 const FAR_GATES: f64 = 16.0;
 /// Tracks of a second structure, at least, as a share of the first: a handful that moves together is no second body.
 const LEAST_SHARE: f64 = 0.1;
+/// Weight of the affine ranking from which a track agrees with it: its residual is within the ranking's own scale.
+const AGREES: f64 = 0.25;
 
 /// Searches the tracks that a consensus leaves out for another.
 pub fn structure(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken) -> Option<Warning> {
@@ -47,8 +49,15 @@ fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize
 
 /// Tracks of another projective reconstruction: one ranking, grown; a structure that takes more to be found is not worth
 /// the time that every solve would spend.
+///
+/// Nothing is grown where the ranking holds fewer tracks than determine cameras. Any four tracks agree on affine cameras,
+/// and of wrong ones no fifth does: of 95 scenes without a second motion 95 rankings held two to four, of 72 with one the
+/// least held 14. Growing from four by chance had taken half of a solve.
 fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize> {
     let ranking = priors::affine_irls(affine::Search::new(rest).centred(), stop)?;
+    if ranking.iter().filter(|weight| **weight > AGREES).count() < grow::LEAST_SUPPORT {
+        return None;
+    }
     let costs: Vec<f64> = ranking.iter().map(|weight| -weight).collect();
     let spread = portfolio::spread(rest);
     affine::seeds_from_ranking(rest, &costs).into_iter().find_map(|seed| {
