@@ -21,8 +21,12 @@ const MOST_INLIERS: usize = 600;
 const MOST_VIEWS: usize = 100;
 /// Iterations of an adjustment that starts at the noise.
 const ADJUSTMENTS: usize = 10;
-/// Rounds of judging, estimating the noise and adjusting.
-const ROUNDS: usize = 2;
+/// Rounds of judging, adjusting and estimating the noise, at most.
+const MOST_ROUNDS: usize = 7;
+/// Noise that the first rounds judge at, in units of what is estimated: the cameras were fitted to fewer tracks, and what
+/// they err adds to the residuals of the others. At the noise itself up to a third of the right ones stayed outside, and
+/// some for good.
+const WIDENINGS: [f64; 3] = [2.0, 1.5, 1.2];
 /// Share of the searched inliers that must remain, or the extension is given up.
 const LEAST_KEPT: f64 = 0.8;
 /// Gates within which an image agrees with a camera that was resected from points with errors of their own.
@@ -61,15 +65,21 @@ fn extend_to(block: &Block, consensus: &Consensus, views: &[usize], context: &Co
         whole = extract(&fitting);
     }
     let cameras: Vec<Camera> = registered.into_iter().flatten().collect();
-    let mut found = grow::judge(&whole.complete, cameras, consensus.noise, context.stop);
-    for _ in 0..ROUNDS {
+    let mut found = grow::judge(&whole.complete, cameras, WIDENINGS[0] * consensus.noise, context.stop);
+    let mut before = Vec::new();
+    for round in 1..=MOST_ROUNDS {
         let inliers = found.inliers();
+        if round > WIDENINGS.len() && inliers == before {
+            break;
+        }
         if inliers.len() < grow::LEAST_INLIERS || context.stop.is_stopped() {
             return None;
         }
         let noise = grow::estimate_noise(&found, &inliers);
         let cameras = adjusted(&whole, &found, &evenly(&inliers, MOST_INLIERS), noise, context);
-        found = grow::judge(&whole.complete, cameras, noise, context.stop);
+        let widening = WIDENINGS.get(round).copied().unwrap_or(1.0);
+        found = grow::judge(&whole.complete, cameras, widening * noise, context.stop);
+        before = inliers;
     }
     (kept_share(block, consensus, &whole, &found) >= LEAST_KEPT).then_some((whole, found))
 }
