@@ -381,6 +381,9 @@ pub struct Solution {
     pub prior_times: Vec<PriorTime>,
     /// Curves for the report: progress records thinned to at most [`Solution::MAX_HISTORY`].
     pub history: Vec<Progress>,
+    /// SHA-256 of the trained network that AUTO had at hand, hexadecimal; `None` where it was not to be asked.
+    #[serde(default)]
+    pub trained_network: Option<String>,
 }
 
 impl Solution {

@@ -196,6 +196,7 @@ fn solution(scene: &Scene) -> Solution {
         stages: Stage::ALL.iter().map(|&stage| StageTime { stage, seconds: 0.3 }).collect(),
         prior_times: vec![PriorTime { prior: Prior::Uniform, seconds: None, iterations: 600 }],
         history: history(truth.focal_px),
+        trained_network: None,
     }
 }
 

@@ -53,6 +53,7 @@ fn the_fields_of_result_json_are_a_contract() {
         "method",
         "iterations",
         "winning_prior",
+        "trained_network",
         "noise_px",
         "seconds",
         "stages",

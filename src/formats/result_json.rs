@@ -42,6 +42,8 @@ pub struct ResultJson {
     pub warnings: Vec<Warning>,
     pub method: Method,
     pub winning_prior: Option<&'static str>,
+    /// SHA-256 of the trained network that AUTO had at hand.
+    pub trained_network: Option<String>,
     pub iterations: u32,
     pub seed: u64,
     pub seconds: f64,
@@ -155,6 +157,7 @@ impl ResultJson {
             warnings: warnings::named(solution, input),
             method: solution.method,
             winning_prior: solution.winning_prior.map(|prior| prior.name()),
+            trained_network: solution.trained_network.clone(),
             iterations: solution.iterations,
             seed: solution.seed,
             seconds: solution.seconds,

@@ -18,7 +18,7 @@ use super::{proto, status};
 use crate::domain::job::EventBody;
 use crate::domain::{Backend, Limits, Method, SolveSettings};
 use crate::engine::{self, Engine, QueueBounds, UploadOptions};
-use crate::telemetry;
+use crate::{solver, telemetry};
 
 /// How long a `Solve` may be silent before its input is complete. A dead connection is found by keep-alive long before;
 /// this is for a caller that lives and forgets.
@@ -156,6 +156,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             max_batch_requests: count(MAX_BATCH),
             queue_limits: Some(queue_limits(&options.queue)),
             upload_limits: Some(upload_limits(&options.uploads)),
+            trained_network: solver::trained_network(),
         }))
     }
 }

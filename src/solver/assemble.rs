@@ -71,6 +71,7 @@ pub fn unsolved(
         stages,
         prior_times: attempt.map_or_else(Vec::new, |attempt| attempt.prior_times.clone()),
         history,
+        trained_network: None,
     }
 }
 
@@ -136,6 +137,7 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
         stages,
         prior_times: attempt.prior_times.clone(),
         history,
+        trained_network: None,
     }
 }
 

@@ -1,10 +1,11 @@
 //! What the trained network says of a block, in the forms that the search takes.
 //!
 //! The network knows thousands of scenes and nothing of this one but its image points: what it believes in, geometry must
-//! verify. What it disbelieves counts only where geometry has little to go by ([`Opinion::counted`]). Constants without another reason come from the sweep that
-//! `the_sweep_of_the_learned_prior` prints (an ignored test of the solver's).
+//! verify. What it disbelieves counts only where geometry has little to go by ([`Opinion::counted`]).
+//! What its odds are worth in the score of hypotheses comes from `scpsfm evaluate --priors --sweep`.
 
 use super::grow::LEAST_INLIERS;
+use crate::domain::{Method, Prior, SolveSettings};
 use crate::geometry::measurement::CompleteBlock;
 use crate::network::subspace::{self, Cloud, MOST_VIEWS};
 
@@ -31,6 +32,11 @@ const LEAST_LIKELY: usize = 4;
 const SURELY_ENOUGH: usize = 2 * LEAST_INLIERS;
 /// Odds against a track, in nats, at which it is held to be wrong: twenty to one.
 const DOUBT_NATS: f64 = 3.0;
+
+/// Whether these settings let the search ask the network.
+pub fn may_be_asked(settings: &SolveSettings) -> bool {
+    settings.method == Method::Auto && !settings.excluded_priors.contains(&Prior::Learned)
+}
 
 /// The network's opinion of the tracks of one block.
 #[derive(Debug, Clone)]

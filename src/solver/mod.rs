@@ -68,7 +68,13 @@ pub fn solve(
 ) -> Result<Solution, Error> {
     let mut solution = solve_views(input, settings, observer, stop)?;
     views::complete(&mut solution, input);
+    solution.trained_network = learned::may_be_asked(settings).then(trained_network);
     Ok(solution)
+}
+
+/// SHA-256, hexadecimal, of the trained network that AUTO asks in this process.
+pub fn trained_network() -> String {
+    crate::network::subspace::current().checksum()
 }
 
 /// The solution but for what [`views::complete`] says of the views.

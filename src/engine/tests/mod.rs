@@ -133,6 +133,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         stages: Vec::new(),
         prior_times: Vec::new(),
         history: vec![progress(1)],
+        trained_network: None,
     }
 }
 

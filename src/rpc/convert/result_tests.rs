@@ -98,6 +98,7 @@ pub(super) fn rich() -> Solution {
             PriorTime { prior: Prior::Uniform, seconds: None, iterations: 6000 },
         ],
         history: vec![progress, Progress { losses: None, focal_px: None, best_score: None, ..progress }],
+        trained_network: Some("5ea1".into()),
     }
 }
 

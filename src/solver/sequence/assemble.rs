@@ -59,6 +59,7 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
         stages,
         prior_times: seed.prior_times.clone(),
         history,
+        trained_network: None,
     }
 }
 

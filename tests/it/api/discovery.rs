@@ -7,6 +7,7 @@ use scpsfm::domain::{Limits, SolveSettings};
 use scpsfm::rpc::convert;
 use scpsfm::rpc::proto::{self, Method};
 use scpsfm::rpc::server::Options;
+use scpsfm::solver;
 use tonic::Code;
 use tonic::codec::CompressionEncoding::Gzip;
 use tonic_health::pb::health_check_response::ServingStatus;
@@ -108,6 +109,7 @@ async fn capabilities_tell_limits_and_defaults() {
     );
     assert_eq!(convert::settings::from_wire(capabilities.default_settings), Ok(SolveSettings::default()));
     assert_eq!(capabilities.version, env!("CARGO_PKG_VERSION"));
+    assert_eq!(capabilities.trained_network, solver::trained_network());
 }
 
 #[tokio::test]

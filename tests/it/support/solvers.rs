@@ -106,5 +106,6 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         stages: Vec::new(),
         prior_times: Vec::new(),
         history: Vec::new(),
+        trained_network: None,
     }
 }
