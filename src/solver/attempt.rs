@@ -130,7 +130,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     let tracks = &attempt.block.tracks;
     let found = Portfolio::new(complete, context.settings, initial_noise(context), context.stop)
         .geometry_first(context.seeding)
-        .run(recorder, context.scale_px, &|weights| context.scatter(weights, tracks))
+        .run(recorder, &|weights| context.scatter(weights, tracks))
         .map_err(|error| Error::Internal(error.to_string()))?;
     context.stopped()?;
     attempt.winning_prior = found.winning_prior;

@@ -1,10 +1,10 @@
 //! The portfolio: priors propose, guided search verifies, the best consensus stands.
 //!
 //! What is cheap goes first: rigid distances where depths are given, the opinion of the network that was trained
-//! beforehand, reweighting, consistency. Then the paper's network is
-//! optimised a few iterations at a time; between, its ranking is verified by geometry, and so is uniform sampling, which
-//! needs no prior to be right. A decisive consensus ends the search; the network still gets its least number of
-//! iterations, so that its losses and weights are always seen. Each prior's own time is kept.
+//! beforehand, reweighting, consistency. Where they decide nothing, the paper's network is optimised a few iterations at
+//! a time; between, its ranking is verified by geometry, and so is uniform sampling, which needs no prior to be right. A
+//! decisive consensus ends the search: the paper's network would say nothing after it that anyone waits for, and its first
+//! iterations took as long as everything else. Each prior's own time is kept.
 
 mod account;
 mod best;
@@ -17,7 +17,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::grow::Consensus;
-use super::learned::Opinion;
+use super::learned::{self, Opinion};
 use super::priors;
 use super::recorder::Recorder;
 use super::search::rigid::Rigid;
@@ -33,9 +33,6 @@ pub use spread::{MOST_SPREAD, spread};
 
 /// Network iterations between two verifications of its ranking.
 const ITERATIONS_PER_ROUND: u32 = 25;
-/// Network iterations that AUTO always spends, so that its losses are always seen; where the search was decided without
-/// it, its opinion would come too late, and fifty took as long as all the rest.
-pub const LEAST_ITERATIONS: u32 = 10;
 /// Rounds without a network: as many samples as the longest search with one.
 const ROUNDS_WITHOUT_NETWORK: u32 = 16;
 /// Samples a round and prior, without depths (a sample costs microseconds) and with.
@@ -121,56 +118,62 @@ impl<'a> Portfolio<'a> {
         Self { geometry_first, ..self }
     }
 
-    /// Runs the search; `scale_px` turns the network's focal length into pixels and `weights` maps the block's weights
-    /// to the caller's tracks.
+    /// Runs the search; `spread_weights` maps the block's weights to the caller's tracks.
+    ///
+    /// The paper's network's own focal length is not told: nothing of a search has verified it.
     ///
     /// # Errors
     /// The network's own, which are defects: a block has more columns than it asks for.
     pub fn run(
         mut self,
         recorder: &mut Recorder,
-        scale_px: f64,
         spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
     ) -> Result<Found, crate::network::Error> {
-        let mut network = if self.settings.method.uses_network() {
-            let matrix = match &self.search {
-                Search::Subspace(search) => search.balanced().clone(),
-                Search::Affine(_) => balance(&self.block.measurement_matrix()),
-            };
-            Some(PriorNetwork::new(&matrix, &NetworkSettings::from(self.settings))?)
-        } else {
-            None
+        let uses_network = self.settings.method.uses_network();
+        let rounds = match uses_network {
+            true => self.settings.iterations.div_ceil(ITERATIONS_PER_ROUND),
+            false => ROUNDS_WITHOUT_NETWORK,
         };
-        let rounds = match network {
-            Some(_) => self.settings.iterations.div_ceil(ITERATIONS_PER_ROUND),
-            None => ROUNDS_WITHOUT_NETWORK,
-        };
+        let mut network = None;
         self.ask(recorder, spread_weights);
         for round in 0..rounds {
             self.set_noise(round);
             self.propose_rigid(round);
             self.propose_at_once(round);
             self.stand(recorder);
-            if let Some(network) = &mut network {
-                self.optimise(network, recorder, scale_px, spread_weights)?;
+            if uses_network && !self.is_decisive() && !self.stop.is_stopped() {
+                let network = match &mut network {
+                    Some(network) => network,
+                    none => none.insert(self.paper_network()?),
+                };
+                self.optimise(network, recorder, spread_weights)?;
                 self.propose(Prior::Network, &priors::from_network(network.weights()), None);
             }
             self.propose(Prior::Uniform, &vec![1.0; self.block.tracks()], None);
             self.stand(recorder);
             recorder.tell(f64::from(round + 1) / f64::from(rounds));
-            let seen_enough = network
-                .as_ref()
-                .is_none_or(|network| network.iteration() >= LEAST_ITERATIONS.min(self.settings.iterations));
-            if (seen_enough && self.is_decisive()) || self.stop.is_stopped() {
+            if self.is_decisive() || self.stop.is_stopped() {
                 break;
             }
         }
         Ok(self.finish(network))
     }
 
+    /// The paper's network on this block, before its first iteration.
+    fn paper_network(&mut self) -> Result<PriorNetwork, crate::network::Error> {
+        let begun = Instant::now();
+        let matrix = match &self.search {
+            Search::Subspace(search) => search.balanced().clone(),
+            Search::Affine(_) => balance(&self.block.measurement_matrix()),
+        };
+        let network = PriorNetwork::new(&matrix, &NetworkSettings::from(self.settings))?;
+        self.account(Prior::Network).seconds += begun.elapsed().as_secs_f64();
+        Ok(network)
+    }
+
     /// Asks the network that was trained beforehand.
     fn ask(&mut self, recorder: &mut Recorder, spread_weights: &dyn Fn(&[f64]) -> Vec<f32>) {
-        if !self.settings.method.uses_network() || self.settings.excluded_priors.contains(&Prior::Learned) {
+        if !learned::may_be_asked(self.settings) {
             return;
         }
         let begun = Instant::now();
@@ -194,20 +197,15 @@ impl<'a> Portfolio<'a> {
         &mut self,
         network: &mut PriorNetwork,
         recorder: &mut Recorder,
-        scale_px: f64,
         spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
     ) -> Result<(), crate::network::Error> {
         let begun = Instant::now();
         let iterations = self.settings.iterations;
-        let more = if self.is_decisive() { LEAST_ITERATIONS } else { ITERATIONS_PER_ROUND };
-        let goal = (network.iteration() + more).min(iterations);
+        let goal = (network.iteration() + ITERATIONS_PER_ROUND).min(iterations);
         while network.iteration() < goal && !self.stop.is_stopped() {
             let step = network.step()?;
             recorder.standing.iteration = step.iteration;
             recorder.standing.losses = Some(step.losses);
-            if self.settings.use_daq {
-                recorder.standing.focal_px = Some(network.focal() * scale_px);
-            }
             recorder.tell(f64::from(step.iteration) / f64::from(iterations));
             let every = self.settings.weights_every;
             if every > 0 && step.iteration.is_multiple_of(every) {
@@ -251,7 +249,7 @@ impl<'a> Portfolio<'a> {
     }
 
     fn finish(self, network: Option<PriorNetwork>) -> Found {
-        let with_network = network.is_some();
+        let with_network = self.settings.method.uses_network();
         let with_depths = self.block.has_depths();
         let Self { best, accounts, rigid, opinion, .. } = self;
         let doubted = best.as_ref().filter(|best| !best.is_acceptable()).and_then(Best::doubted);

@@ -31,7 +31,7 @@ fn nine_in_ten_wrong_without_depths() {
         assert_eq!((solution.status, solution.grade), (Status::Solved, Some(Grade::Metric)), "seed {seed}");
         let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
         assert!(f1 > 0.99, "seed {seed}: F1 {f1}");
-        assert!(solution.winning_prior.is_some() && solution.iterations >= portfolio::LEAST_ITERATIONS);
+        assert!(solution.winning_prior.is_some());
         assert_eq!(solution.tracks.network_weight.len(), 200);
         errors.push(focal_error(&solution, &scene));
     }
@@ -374,12 +374,32 @@ impl Observer for StopAt {
 
 #[test]
 fn a_stop_ends_the_solve_wherever_it_is() {
-    let (input, _) = scene(SceneOptions { tracks: 60, outliers: 0.5, ..SceneOptions::default() });
-    for reports in [1, 5, 10] {
+    // Decided at once, and never: there the paper's network reports every iteration.
+    for (outliers, reports) in [(0.5, 1), (0.5, 2), (0.5, 3), (1.0, 5), (1.0, 30)] {
+        let (input, _) = scene(SceneOptions { tracks: 60, outliers, ..SceneOptions::default() });
         let token = StopToken::default();
         let mut observer = StopAt { token: token.clone(), reports, seen: Vec::new() };
         let outcome = solve(&input, &SolveSettings::default(), &mut observer, &token);
-        assert_eq!(outcome, Err(Error::Stopped(StopReason::Cancelled)), "stopped after {reports} reports");
+        let error = outcome.map(|solution| solution.status);
+        assert_eq!(error, Err(Error::Stopped(StopReason::Cancelled)), "{outliers}: stopped after {reports} reports");
         assert!(!observer.seen.contains(&Stage::Judge));
+    }
+}
+
+/// More tracks than a search looks at: those that it left aside must join all, or the calibration stays that of a sample.
+#[test]
+fn all_right_tracks_calibrate_though_a_search_sees_some() {
+    for seed in [10_002, 10_003, 10_010] {
+        let options = SceneOptions { tracks: 500, views: 20, noise: 0.006, seed, ..SceneOptions::default() };
+        let (input, truth) = scene(options);
+        let settings = SolveSettings { method: Method::Geometry, ..SolveSettings::default() };
+        let focals = [0, 1].map(|seed| {
+            let solution = solved(&input, &SolveSettings { seed, ..settings.clone() });
+            assert_eq!(agreement(&solution.tracks.inlier, &truth.truth.inlier).f1, 1.0, "seed {seed}");
+            (solution.calibrations[0].focal_px, solution.calibrations[0].sigma_log_focal.expect("observable"))
+        });
+        // A right track or two may stay beyond the gate of one and not of the other.
+        let apart = (focals[0].0 / focals[1].0).ln().abs() / focals[0].1;
+        assert!(apart < 0.1, "scene {seed}: whichever tracks the search saw, all calibrate: {focals:?}");
     }
 }
