@@ -17,6 +17,7 @@ use super::print;
 use super::prior_file::PriorFileArgs;
 use crate::domain::{SolveSettings, StopToken};
 use crate::evaluation::plan::{Contestant, Depths, Plan};
+use crate::evaluation::records;
 use crate::evaluation::runner::{self, Records};
 use crate::evaluation::summary::{self, Cell};
 use crate::evaluation::{Sweep, figures, page};
@@ -254,18 +255,18 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         return Err(Failure::usage("no method has anything to say of these sweeps and depths: give others"));
     }
     create_directory(&args.out)?;
-    let mut records = Records::open(&args.out, &build()?)?;
+    let mut records = Records::open(&args.out, runner::RECORDS, &build()?)?;
     let missing = runs.iter().filter(|run| records.get(run).is_none()).count();
     let bar = progress_bar(args.quiet, runs.len(), runs.len() - missing);
     let stop = StopToken::default();
     let interrupt = Interrupt::listen()?;
     let relay = interrupt.stops(&stop);
     let outcome = tokio::task::block_in_place(|| {
-        runner::run(&runs, &mut records, threads, &stop, &mut |record| {
-            let scene = &record.run.scene;
+        records.run(&runs, threads, &stop, &|run| runner::measure(run, &stop), &mut |run| {
+            let scene = &run.scene;
             bar.set_message(format!(
                 "{}: {} views, {} tracks, {} outliers, {} noise",
-                record.run.contestant.name(),
+                run.contestant.name(),
                 scene.views,
                 scene.tracks,
                 scene.outliers,
@@ -341,7 +342,7 @@ fn table(cells: &[Cell]) -> String {
 
 /// What tells this program from any other that might have written the records: its version, the digest of its file and
 /// that of the network it asks.
-fn build() -> Result<String, Failure> {
+pub(super) fn build() -> Result<String, Failure> {
     let program = std::fs::read(std::env::current_exe()?)?;
     let digest = Sha256::digest(&program);
     let short: String = digest.iter().take(8).map(|byte| format!("{byte:02x}")).collect();
@@ -350,7 +351,7 @@ fn build() -> Result<String, Failure> {
     Ok(format!("{} {short} {network}", env!("CARGO_PKG_VERSION")))
 }
 
-fn progress_bar(quiet: bool, total: usize, done: usize) -> ProgressBar {
+pub(super) fn progress_bar(quiet: bool, total: usize, done: usize) -> ProgressBar {
     if quiet {
         return ProgressBar::hidden();
     }
@@ -363,11 +364,11 @@ fn progress_bar(quiet: bool, total: usize, done: usize) -> ProgressBar {
     bar
 }
 
-impl From<runner::Error> for Failure {
-    fn from(error: runner::Error) -> Self {
+impl From<records::Error> for Failure {
+    fn from(error: records::Error) -> Self {
         match error {
-            runner::Error::Io { .. } | runner::Error::Failed { .. } => Failure::internal(error),
-            runner::Error::OtherBuild { .. } | runner::Error::Malformed { .. } => Failure::bad_input(error),
+            records::Error::Io { .. } | records::Error::Failed { .. } => Failure::internal(error),
+            records::Error::OtherBuild { .. } | records::Error::Malformed { .. } => Failure::bad_input(error),
         }
     }
 }

@@ -2,14 +2,14 @@
 
 use std::path::Path;
 
-use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
+use super::evaluate;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
 use crate::domain::StopToken;
-use crate::evaluation::priors::{Plan, scenes, table};
+use crate::evaluation::priors::{self, Condition, Plan, Records, scenes, sweep, table};
 use crate::formats::result_files::{create_directory, pretty, write_atomically};
 use crate::network::subspace;
 
@@ -18,8 +18,8 @@ use crate::network::subspace;
 #[command(next_help_heading = "Priors")]
 pub struct PriorArgs {
     /// Compare priors instead: each alone (ranking, searches of 600, 6,000 and 60,000 samples), and AUTO with and
-    /// without the trained network; scenes without depths, of training's kinds and of others. Writes priors.json at its end; it does
-    /// not go on where it was stopped
+    /// without the trained network; scenes without depths, of training's kinds and of others. Writes priors.json, and
+    /// priors.jsonl, with which it goes on where it was stopped
     #[arg(long, conflicts_with_all = ["real", "quick", "sweeps", "beyond", "ablation", "depths", "methods",
         "paper_width"])]
     pub priors: bool,
@@ -27,6 +27,11 @@ pub struct PriorArgs {
     /// AUTO alone, without the searches of each prior
     #[arg(long, requires = "priors")]
     pub auto_only: bool,
+
+    /// Only the sweep over what a nat of the trained network's odds counts in the score of hypotheses, on other seeds than
+    /// those of every comparison; writes nothing
+    #[arg(long, requires = "priors", conflicts_with = "auto_only")]
+    pub sweep: bool,
 
     /// The scenes of this name, or all whose name holds this text [default: all]
     #[arg(long, value_name = "TEXT", requires = "priors")]
@@ -56,20 +61,25 @@ pub async fn run(
             return Err(Failure::usage(unknown));
         }
     }
+    if args.sweep {
+        return sweep(&conditions, seeds, json, quiet);
+    }
     let plan = Plan { conditions, seeds, each_prior: !args.auto_only };
     create_directory(out)?;
-    let bar = progress_bar(quiet, plan.size());
+    let mut records = Records::open(out, priors::RECORDS, &evaluate::build()?)?;
+    let runs = plan.runs();
+    let done = runs.iter().filter(|run| records.get(run).is_some()).count();
+    let bar = evaluate::progress_bar(quiet, runs.len(), done);
     let stop = StopToken::default();
     let interrupt = Interrupt::listen()?;
     let relay = interrupt.stops(&stop);
-    let outcome = tokio::task::block_in_place(|| plan.run(threads, &stop, &mut || bar.inc(1)));
+    let outcome = tokio::task::block_in_place(|| {
+        records.run(&runs, threads, &stop, &|run| priors::measure(run, &stop), &mut |_| bar.inc(1))
+    });
     relay.abort();
     bar.finish_and_clear();
-    let rows = outcome.map_err(Failure::internal)?;
-    if stop.is_stopped() {
-        print(table::text(&rows).trim_end())?;
-        return Err(Failure::interrupted_with("interrupted; the rows are of the scenes so far, and were not written"));
-    }
+    outcome?;
+    let rows = plan.rows(&records);
     let network = subspace::current();
     let text = pretty(&json!({
         "version": env!("CARGO_PKG_VERSION"),
@@ -79,16 +89,29 @@ pub async fn run(
     }))?;
     write_atomically(out, "priors.json", text.as_bytes())?;
     print(if json { text.trim_end().to_owned() } else { table::text(&rows) }.trim_end())?;
+    if stop.is_stopped() {
+        return Err(Failure::interrupted_with("interrupted; called again with the same --out it goes on"));
+    }
     Ok(Exit::Done)
 }
 
-fn progress_bar(quiet: bool, total: usize) -> ProgressBar {
-    if quiet {
-        return ProgressBar::hidden();
+/// `--sweep`.
+fn sweep(conditions: &[Condition], seeds: u64, json: bool, quiet: bool) -> Result<Exit, Failure> {
+    let bar = evaluate::progress_bar(quiet, conditions.len() * seeds as usize, 0);
+    let stop = StopToken::default();
+    let interrupt = Interrupt::listen()?;
+    let relay = interrupt.stops(&stop);
+    let outcome = tokio::task::block_in_place(|| sweep::run(conditions, seeds, &stop, &mut || bar.inc(1)));
+    relay.abort();
+    bar.finish_and_clear();
+    let rows = outcome.map_err(Failure::internal)?;
+    let text = match json {
+        true => pretty(&json!({ "costs_per_nat": sweep::COSTS_PER_NAT, "rows": rows }))?,
+        false => sweep::text(&rows),
+    };
+    print(text.trim_end())?;
+    if stop.is_stopped() {
+        return Err(Failure::interrupted_with("interrupted; the rows are of the scenes so far"));
     }
-    let bar = ProgressBar::new(total as u64);
-    if let Ok(style) = ProgressStyle::with_template("[{bar:24}] {pos}/{len} scenes, {eta} left") {
-        bar.set_style(style.progress_chars("=> "));
-    }
-    bar
+    Ok(Exit::Done)
 }

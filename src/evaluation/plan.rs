@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::records;
 use super::sweeps::Sweep;
 use crate::domain::{Method, Prior, SolveSettings};
 use crate::synthetic::SceneOptions;
@@ -174,8 +175,7 @@ impl Run {
 
     /// What makes a run the same as another: its own text.
     pub fn key(&self) -> String {
-        // Plain data: serialisation cannot fail.
-        serde_json::to_string(self).unwrap_or_default()
+        records::key(self)
     }
 }
 

@@ -66,6 +66,20 @@ impl Study {
         Some(Ranking { prior, weights, seconds: begun.elapsed().as_secs_f64(), opinion })
     }
 
+    /// What the best hypothesis of so many samples under the trained network says of every track, larger where it is
+    /// more likely right, when a nat of the network's odds counts `per_nat` in the score of hypotheses; `None` where the
+    /// network has no answer.
+    pub fn best_under(&self, per_nat: f64, samples: usize, seed: u64) -> Option<Vec<f64>> {
+        let opinion = Opinion::of(&self.block)?;
+        let truncations = opinion.truncations_at(per_nat);
+        let mut shortlist = Shortlist::new(1);
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let sampler = Sampler::new(&opinion.probabilities());
+        self.search.run(&sampler, &truncations, samples, &mut rng, &mut shortlist, &self.stop);
+        let best = shortlist.into_entries().next()?;
+        Some(self.search.costs(&best, &truncations).into_iter().map(|cost| -cost).collect())
+    }
+
     /// Searches under a prior with so many samples, and grows the best hypotheses.
     pub fn search(&self, ranking: &Ranking, samples: usize, seed: u64) -> Found {
         let begun = Instant::now();

@@ -81,6 +81,10 @@ fn priors_are_compared_in_a_table_and_a_file() {
     let written: Value = serde_json::from_str(&written).expect("JSON");
     let rows = written["rows"]["auto"].as_array().expect("rows");
     assert!(rows.len() == 2 && rows.iter().all(|row| row["seeds"] == 1), "{written}");
+    let lines = || fs::read_to_string(directory.path().join("priors.jsonl")).expect("records").lines().count();
+    assert_eq!(lines(), 2, "a header and a scene");
+    assert_eq!(run_of("outliers .9").stdout, compared.stdout, "what is recorded is not done again, times included");
+    assert_eq!(lines(), 2);
     let unknown = run_of("no such scenes");
     assert!(unknown.code == Some(2) && unknown.stderr.contains("outliers .9"), "{unknown:?}");
 }

@@ -1,20 +1,19 @@
 //! What the search starts from, compared: every prior that ranks image points, alone and at several lengths of the
 //! search, and AUTO with and without the network that was trained beforehand. [`scenes`] are the scenes, [`table`]
-//! shows the rows.
+//! shows the rows; [`sweep`] is where a constant of the search comes from.
 
 pub mod scenes;
+pub mod sweep;
 pub mod table;
 
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::mpsc;
-
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::domain::{Input, Limits, Prior, Silent, SolveSettings, Status, StopToken};
+use crate::evaluation::records;
 use crate::geometry::statistics::median;
 use crate::solver::{self, study::Study};
-use crate::synthetic::Scene;
 use crate::synthetic::metrics::{agreement, average_precision};
+use crate::synthetic::{Scene, SceneOptions};
 pub use scenes::Condition;
 
 /// Priors that rank image points by themselves.
@@ -74,16 +73,29 @@ pub struct Plan {
     pub each_prior: bool,
 }
 
+/// The file of the records.
+pub const RECORDS: &str = "priors.jsonl";
+
+/// The records of the comparison.
+pub type Records = records::Records<Run, Measured>;
+
+/// One scene, given to AUTO with and without the learned prior, and to every prior alone if that is asked.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Run {
+    scene: SceneOptions,
+    each_prior: bool,
+}
+
 /// One scene's measures.
-struct Measured {
-    job: usize,
-    place: usize,
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Measured {
     priors: Vec<Alone>,
     /// With the learned prior, and without.
     auto: [Answer; 2],
 }
 
 /// One prior on one scene.
+#[derive(Debug, Clone, Serialize, Deserialize)]
 struct Alone {
     prior: Prior,
     average_precision: Option<f64>,
@@ -94,6 +106,7 @@ struct Alone {
 }
 
 /// AUTO's answer on one scene.
+#[derive(Debug, Clone, Serialize, Deserialize)]
 struct Answer {
     f1: f64,
     solved: bool,
@@ -103,70 +116,23 @@ struct Answer {
 }
 
 impl Plan {
-    /// Scenes in all.
-    pub fn size(&self) -> usize {
-        self.conditions.len() * self.seeds as usize
+    /// Every scene, seed by seed, so that a stopped comparison has all conditions with fewer seeds.
+    pub fn runs(&self) -> Vec<Run> {
+        (0..self.seeds)
+            .flat_map(|seed| self.conditions.iter().map(move |condition| self.run(condition, seed)))
+            .collect()
     }
 
-    /// Runs every scene on so many threads; a stopped run leaves out what was not reached.
-    ///
-    /// # Errors
-    /// A scene that cannot be made, or a defect of the solver, in words.
-    pub fn run(&self, threads: usize, stop: &StopToken, told: &mut dyn FnMut()) -> Result<Rows, String> {
-        let next = AtomicUsize::new(0);
-        let (sender, receiver) = mpsc::channel();
-        let mut measured = std::thread::scope(|scope| {
-            for _ in 0..threads.clamp(1, self.size().max(1)) {
-                let (sender, next) = (sender.clone(), &next);
-                scope.spawn(move || {
-                    while !stop.is_stopped() {
-                        let job = next.fetch_add(1, Ordering::Relaxed);
-                        if job >= self.size() || sender.send(self.measure(job, stop)).is_err() {
-                            break;
-                        }
-                    }
-                });
-            }
-            drop(sender);
-            let mut all = Vec::new();
-            for measured in receiver {
-                all.extend(measured?);
-                told();
-            }
-            Ok::<_, String>(all)
-        })?;
-        // Sums in one order, whichever thread was first.
-        measured.sort_by_key(|measured: &Measured| measured.job);
-        Ok(self.rows(&measured))
+    fn run(&self, condition: &Condition, seed: u64) -> Run {
+        Run { scene: condition.scene(FIRST_SEED + seed), each_prior: self.each_prior }
     }
 
-    /// One scene; `None` where it was stopped.
-    fn measure(&self, job: usize, stop: &StopToken) -> Result<Option<Measured>, String> {
-        let seeds = self.seeds as usize;
-        let (place, seed) = (job / seeds, FIRST_SEED + (job % seeds) as u64);
-        let condition = &self.conditions[place];
-        let failed = |error: &dyn std::fmt::Display| format!("{}, seed {seed}: {error}", condition.name);
-        let scene = Scene::generate(&condition.scene(seed)).map_err(|error| failed(&error))?;
-        let truth = &scene.truth.inlier;
-        let input = Input::new(scene.input.clone(), &Limits::default(), "scene").map_err(|error| failed(&error))?;
-        let priors = if self.each_prior { alone(&Study::new(&input, stop), truth, seed, stop) } else { Vec::new() };
-        let mut auto = Vec::with_capacity(2);
-        for excluded in [Vec::new(), vec![Prior::Learned]] {
-            let settings = SolveSettings { excluded_priors: excluded, ..SolveSettings::default() };
-            match solver::solve(&input, &settings, &mut Silent, stop) {
-                Ok(solution) => auto.push(answer(&solution, truth)),
-                Err(solver::Error::Stopped(_)) => return Ok(None),
-                Err(error) => return Err(failed(&error)),
-            }
-        }
-        let auto = auto.try_into().map_err(|_| failed(&"two answers were asked for"))?;
-        Ok(Some(Measured { job, place, priors, auto }))
-    }
-
-    fn rows(&self, measured: &[Measured]) -> Rows {
+    /// The rows of what is recorded.
+    pub fn rows(&self, records: &Records) -> Rows {
         let mut rows = Rows::default();
-        for (place, condition) in self.conditions.iter().enumerate() {
-            let here: Vec<&Measured> = measured.iter().filter(|measured| measured.place == place).collect();
+        for condition in &self.conditions {
+            let here: Vec<&Measured> =
+                (0..self.seeds).filter_map(|seed| records.get(&self.run(condition, seed))).collect();
             if here.is_empty() {
                 continue;
             }
@@ -184,6 +150,31 @@ impl Plan {
         }
         rows
     }
+}
+
+/// One scene; `None` where it was stopped.
+///
+/// # Errors
+/// A scene that cannot be made, or a defect of the solver, in words.
+pub fn measure(run: &Run, stop: &StopToken) -> Result<Option<Measured>, String> {
+    let scene = Scene::generate(&run.scene).map_err(|error| error.to_string())?;
+    let truth = &scene.truth.inlier;
+    let input = Input::new(scene.input.clone(), &Limits::default(), "scene").map_err(|error| error.to_string())?;
+    let answer = |excluded_priors: Vec<Prior>| {
+        let settings = SolveSettings { excluded_priors, ..SolveSettings::default() };
+        match solver::solve(&input, &settings, &mut Silent, stop) {
+            Ok(solution) => Ok(Some(answer(&solution, truth))),
+            Err(solver::Error::Stopped(_)) => Ok(None),
+            Err(error) => Err(error.to_string()),
+        }
+    };
+    let priors = match run.each_prior {
+        true => alone(&Study::new(&input, stop), truth, run.scene.seed, stop),
+        false => Vec::new(),
+    };
+    let Some(with) = answer(Vec::new())? else { return Ok(None) };
+    let Some(without) = answer(vec![Prior::Learned])? else { return Ok(None) };
+    Ok(Some(Measured { priors, auto: [with, without] }))
 }
 
 /// Every prior by itself.

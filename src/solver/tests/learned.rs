@@ -2,10 +2,6 @@
 
 use super::*;
 use crate::domain::WarningCode;
-use crate::geometry::measurement::CompleteBlock;
-use crate::solver::learned::Opinion;
-use crate::solver::search::{Sampler, Shortlist, affine};
-use crate::synthetic::Motion;
 use crate::synthetic::metrics::average_precision;
 
 fn wrong(outliers: f64, seed: u64) -> (Input, Scene) {
@@ -26,6 +22,8 @@ fn eight_right_tracks_of_two_hundred_are_found_at_once() {
         let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
         assert!(f1 > 0.99, "seed {seed}: F1 {f1}");
         assert!(!warns_of_ranking(&solution), "what is verified needs no ranking");
+        assert_eq!(solution.trained_network, Some(trained_network()), "two networks, two answers");
+        assert_eq!(solution.iterations, 0, "decided before the paper's network");
     }
 }
 
@@ -63,47 +61,6 @@ fn without_the_trained_network_the_search_stands_on_its_own() {
         assert!(solution.winning_prior.is_some_and(|prior| prior != Prior::Learned));
         let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
         assert!(f1 > 0.99, "F1 {f1}");
+        assert_eq!(solution.trained_network, None);
     }
-}
-
-/// How often the best hypothesis of 600 samples ranks right tracks first, over what a nat of the network's odds counts.
-#[test]
-#[ignore = "a sweep to read, some minutes"]
-fn the_sweep_of_the_learned_prior() {
-    const SEEDS: std::ops::Range<u64> = 7_000..7_040;
-    let paper = SceneOptions::default;
-    let orbit = SceneOptions { motion: Motion::Orbit, max_rotation_rad: 1.57, outliers: 0.97, ..paper() };
-    let kinds = [
-        ("outliers .95", SceneOptions { outliers: 0.95, ..paper() }),
-        ("outliers .97", SceneOptions { outliers: 0.97, ..paper() }),
-        ("orbit .97", orbit),
-        ("noise 5 %, .9", SceneOptions { noise: 0.05, ..paper() }),
-    ];
-    for (name, options) in kinds {
-        for per_nat in [0.0, 0.05, 0.1, 0.15, 0.2, 0.3] {
-            let mut precisions = Vec::new();
-            for seed in SEEDS {
-                let (input, scene) = scene(SceneOptions { seed, ..options.clone() });
-                let block = whole(&input);
-                let opinion = Opinion::of(&block).expect("few views");
-                let search = affine::Search::new(&block);
-                let truncations = opinion.truncations_at(per_nat);
-                let mut shortlist = Shortlist::new(1);
-                let mut rng = rand::SeedableRng::seed_from_u64(seed);
-                let sampler = Sampler::new(&opinion.probabilities());
-                search.run(&sampler, &truncations, 600, &mut rng, &mut shortlist, &StopToken::default());
-                let best = shortlist.into_entries().next().expect("a hypothesis");
-                let gains: Vec<f64> = search.costs(&best, &truncations).into_iter().map(|cost| -cost).collect();
-                precisions.extend(average_precision(&gains, &scene.truth.inlier));
-            }
-            let mean = precisions.iter().sum::<f64>() / precisions.len() as f64;
-            println!("{name}: {per_nat} a nat: mean average precision {mean:.4} over {} scenes", precisions.len());
-        }
-    }
-}
-
-fn whole(input: &Input) -> CompleteBlock {
-    let (normalization, _) = block::normalization(input);
-    let views: Vec<usize> = (0..input.view_count()).collect();
-    block::extract(input, &block::track_ranges(input), &normalization, &views).complete
 }
