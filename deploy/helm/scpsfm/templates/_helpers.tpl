@@ -38,9 +38,11 @@ app.kubernetes.io/managed-by: {{ .Release.Service }}
 {{- end -}}
 {{- if not .Values.tls.secret -}}
 {{- if and .Values.auth.keysSecret (ne $open "keys-in-the-clear") -}}
-{{- fail "without tls.secret the keys would travel readable; right would be tls.secret, or behind a proxy that ends TLS tls.unencrypted=keys-in-the-clear" -}}
+{{- $right := "tls.secret, or behind a proxy that ends TLS tls.unencrypted=keys-in-the-clear" -}}
+{{- fail (printf "without tls.secret the keys would travel readable; right would be %s" $right) -}}
 {{- else if and (not .Values.auth.keysSecret) (ne $open "anyone") -}}
-{{- fail "neither TLS nor keys keep strangers out; right would be tls.secret and auth.keysSecret, or tls.unencrypted=anyone" -}}
+{{- $right := "tls.secret and auth.keysSecret, or tls.unencrypted=anyone" -}}
+{{- fail (printf "neither TLS nor keys keep strangers out; right would be %s" $right) -}}
 {{- end -}}
 {{- end -}}
 {{- end }}
@@ -50,7 +52,7 @@ app.kubernetes.io/managed-by: {{ .Release.Service }}
 {{- if kindIs "string" . }}{{ . | toJson }}{{ else if kindIs "bool" . }}{{ . }}{{ else }}{{ int64 . }}{{ end -}}
 {{- end }}
 
-{{/* Jobs that wait or run. Every replica tells the same queue, since they share it: its largest count, not the sum. */}}
+{{/* Jobs that wait or run. Replicas share the queue and each tells all of it: the largest count, not the sum. */}}
 {{- define "scpsfm.jobsQuery" -}}
 {{- $of := printf "namespace=%q,service=%q" .Release.Namespace (printf "%s-metrics" (include "scpsfm.fullname" .)) -}}
 max(scpsfm_queue_depth{ {{- $of -}} }) + sum(scpsfm_workers_busy{ {{- $of -}} })
