@@ -8,6 +8,8 @@ RUN --mount=type=cache,target=/usr/local/cargo/registry \
     cp target/release/scpsfm /usr/local/bin/scpsfm
 
 FROM debian:bookworm-slim
+# The public authorities, for a database whose certificate one of them has signed (sslmode=verify-full).
+RUN apt-get update && apt-get install -y --no-install-recommends ca-certificates && rm -rf /var/lib/apt/lists/*
 RUN useradd --system --uid 10001 --home-dir /var/lib/scpsfm --create-home --shell /usr/sbin/nologin scpsfm
 COPY --from=build /usr/local/bin/scpsfm /usr/local/bin/scpsfm
 USER 10001
@@ -25,7 +27,8 @@ ENV SCPSFM_SERVER__LISTEN=0.0.0.0:50051 \
 EXPOSE 50051 9464
 # bash opens the connection itself: the image needs no client for its own check.
 HEALTHCHECK --interval=10s --timeout=3s --start-period=20s --retries=3 \
-    CMD ["bash", "-c", "exec 3<>/dev/tcp/127.0.0.1/9464 && printf 'GET /readyz HTTP/1.0\\r\\n\\r\\n' >&3 && head -n 1 <&3 | grep -q ' 200 '"]
+    CMD ["bash", "-c", "exec 3<>/dev/tcp/127.0.0.1/9464 && \
+      printf 'GET /readyz HTTP/1.0\\r\\n\\r\\n' >&3 && head -n 1 <&3 | grep -q ' 200 '"]
 # The server is process 1 and takes SIGTERM itself: it drains, then exits.
 ENTRYPOINT ["scpsfm"]
 CMD ["serve"]

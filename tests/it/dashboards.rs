@@ -1,4 +1,4 @@
-//! The dashboard and the alerts ask for metrics that the server has.
+//! The dashboard, the alerts and the chart's autoscaling ask for metrics that the server has.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -41,7 +41,7 @@ fn exported(page: &str) -> BTreeSet<String> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn every_metric_of_the_dashboard_and_of_the_alerts_is_exported() {
+async fn every_metric_that_is_asked_for_is_exported() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let server = Serving::start(&directory.path().join("data"));
     // The series of calls begin with the first one.
@@ -52,8 +52,11 @@ async fn every_metric_of_the_dashboard_and_of_the_alerts_is_exported() {
     let in_dashboard = named(&asked.join(" "));
     let in_rules = named(&deployed("prometheus-rules.yml"));
     assert!(in_dashboard.len() > 10 && in_rules.len() > 5, "{in_dashboard:?} {in_rules:?}");
+    let in_chart = named(&deployed("helm/scpsfm/templates/_helpers.tpl"));
+    assert_eq!(in_chart.len(), 2, "{in_chart:?}");
     let page = server.page("/metrics");
     let exported = exported(&page);
-    let missing: Vec<_> = in_dashboard.union(&in_rules).filter(|name| !exported.contains(*name)).collect();
+    let asked = [in_dashboard, in_rules, in_chart].into_iter().flatten();
+    let missing: Vec<_> = asked.filter(|name| !exported.contains(name)).collect();
     assert!(missing.is_empty(), "{missing:?} are not in\n{page}");
 }

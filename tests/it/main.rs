@@ -4,6 +4,7 @@ mod abuse;
 mod access;
 mod api;
 mod chaos;
+mod chart;
 mod cli;
 mod crash;
 mod dashboards;

@@ -66,6 +66,9 @@ impl Error {
             return Error::Unavailable(format!("the connection to {server} broke: {cause}{hint}"));
         }
         let message = status.message().to_owned();
+        if was_cut(status) {
+            return Error::Unavailable(format!("the connection to {server} broke: {message}"));
+        }
         match status.code() {
             Code::Unavailable => Error::Unavailable(format!("{server}: {message}")),
             Code::ResourceExhausted => {
@@ -101,7 +104,14 @@ pub(super) fn is_transient(status: &Status) -> bool {
 }
 
 fn broke_or_ends(status: &Status) -> bool {
-    status.code() == Code::Unavailable || (status.source().is_some() && status.get_details_error_info().is_none())
+    let broke = status.source().is_some() && status.get_details_error_info().is_none();
+    status.code() == Code::Unavailable || broke || was_cut(status)
+}
+
+/// Whether an answer ended without its status, as a balancer ends it whose server has died. That reads as UNKNOWN, which
+/// our server never says.
+fn was_cut(status: &Status) -> bool {
+    status.code() == Code::Unknown && status.get_details_error_info().is_none()
 }
 
 /// No connection to begin with.
@@ -191,6 +201,17 @@ mod tests {
         assert_eq!(message, "track_set.x[17]: NaN is not a finite number");
         let whole = violation("settings.alpha", "is wrong".into());
         assert_eq!(whole, Violation::of("settings.alpha", "is wrong"));
+    }
+
+    #[test]
+    fn an_answer_that_a_balancer_cut_short_is_a_broken_connection() {
+        let cut = Status::unknown("stream was terminated without a final status");
+        assert!(is_transient(&cut));
+        let error = Error::from_status("http://a", &cut);
+        assert_eq!(Failure::from(error.clone()).exit, Exit::Unavailable, "{error}");
+        let defect = status::internal(&"a defect");
+        assert!(!is_transient(&defect));
+        assert_eq!(Failure::from(Error::from_status("http://a", &defect)).exit, Exit::Internal);
     }
 
     #[test]
