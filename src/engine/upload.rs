@@ -172,7 +172,7 @@ impl Upload {
                 observation_count: count(input.observation_count()),
             })
         };
-        let new = finished(tokio::task::spawn_blocking(encode)).await?;
+        let new = Arc::new(finished(tokio::task::spawn_blocking(encode)).await?);
         let store = Arc::clone(&self.engine.inner.store);
         let input = store.finish_upload(&self.lease, &new, SystemTime::now()).await?;
         observe::input_created();

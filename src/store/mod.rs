@@ -16,6 +16,7 @@ pub mod upload;
 mod contract;
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use crate::domain::InputName;
@@ -25,7 +26,7 @@ use crate::domain::progress::Progress;
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
     Bound, CancelReply, Claimed, Created, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome, QueueBounds,
-    Request, Swept,
+    Request, Swept, Work,
 };
 pub use upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
@@ -137,11 +138,11 @@ pub trait Store: Send + Sync + 'static {
     /// deadline are left to [`Store::sweep`].
     async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error>;
 
-    /// The encoded input of a job.
+    /// The encoded input of a job, and whether its cancel has been asked for.
     ///
     /// # Errors
     /// [`Error::NotFound`].
-    async fn input(&self, name: &JobName) -> Result<Vec<u8>, Error>;
+    async fn work(&self, name: &JobName) -> Result<Work, Error>;
 
     /// Extends a lease and brings back what its holder must know.
     ///
@@ -159,7 +160,7 @@ pub trait Store: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`Error::Fenced`].
-    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error>;
+    async fn finish(&self, lease: &Lease, ending: &Arc<Ending>, now: SystemTime) -> Result<Job, Error>;
 
     /// Gives a lease back. The job returns to the queue, or ends if its cancel was asked for; the attempt does not
     /// count against the cap. Returns the job as it stands then.
@@ -227,7 +228,12 @@ pub trait Store: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`] where it was given up.
-    async fn finish_upload(&self, lease: &UploadLease, new: &NewInput, now: SystemTime) -> Result<StoredInput, Error>;
+    async fn finish_upload(
+        &self,
+        lease: &UploadLease,
+        new: &Arc<NewInput>,
+        now: SystemTime,
+    ) -> Result<StoredInput, Error>;
 
     /// Gives an upload up: its id is free again.
     ///

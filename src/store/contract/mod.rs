@@ -7,6 +7,7 @@ pub(super) mod removal;
 pub(super) mod uploads;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt, Summary};
@@ -136,8 +137,8 @@ fn summary() -> Summary {
     }
 }
 
-fn success(result: Vec<u8>) -> Ending {
-    Ending { outcome: Outcome::Succeeded { summary: summary(), result }, progress: None }
+fn success(result: Vec<u8>) -> Arc<Ending> {
+    Ending { outcome: Outcome::Succeeded { summary: summary(), result }, progress: None }.into()
 }
 
 /// The events of a job as `(sequence, attempt, what)`.

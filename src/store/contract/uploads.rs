@@ -24,8 +24,8 @@ async fn begin(store: &dyn Store, new: &NewUpload, seconds: u64) -> (UploadLease
     }
 }
 
-fn input(payload: Vec<u8>) -> NewInput {
-    NewInput { payload, sha256: [3; 32], view_count: 2, track_count: 5, observation_count: 9 }
+fn input(payload: Vec<u8>) -> Arc<NewInput> {
+    NewInput { payload, sha256: [3; 32], view_count: 2, track_count: 5, observation_count: 9 }.into()
 }
 
 /// An upload of a few bytes that became an input at that second.
@@ -198,7 +198,7 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
     };
     let job = create(store, of("a", "used"), 5).await;
     create(store, of("b", "used"), 5).await;
-    assert_eq!(store.input(&job.name).await, Ok(payload.clone()));
+    assert_eq!(store.work(&job.name).await.map(|work| work.input), Ok(payload.clone()));
     assert_eq!(store.load().await.expect("counts").queued_bytes, 100);
     let missing = store.create_job(of("c", "none"), &ROOM, time(5)).await;
     assert_eq!(missing.expect_err("no such input"), Error::InputNotFound(name("none")));
@@ -219,7 +219,7 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
     assert_eq!(store.upload(&name("unused")).await, Err(Error::UploadNotFound(name("unused"))));
     for job in ["a", "b", "d"] {
         let job = record(job).name;
-        assert_eq!(store.input(&job).await, Ok(payload.clone()));
+        assert_eq!(store.work(&job).await.map(|work| work.input), Ok(payload.clone()));
         store.request_cancel(&job, None, time(6)).await.expect("ends");
         store.delete_job(&job, None).await.expect("deletes");
     }

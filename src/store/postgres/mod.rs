@@ -11,13 +11,12 @@ mod url;
 
 use std::time::{Duration, SystemTime};
 
-use sqlx::Transaction;
 use sqlx::pool::PoolConnection;
 use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRow};
 use tokio::sync::Mutex;
 use tokio::time::timeout;
 
-use super::sql::{self, Change, Connection, Database, Size, Statement, Step};
+use super::sql::{self, Change, Connection, Database, Operation, Size, Statement, Step};
 use super::{Error, Hint};
 use crate::domain::job::JobName;
 use clock::Clock;
@@ -143,6 +142,15 @@ impl Connection for PgConnection {
         sql::run::<sqlx::Postgres>(self, statement).await
     }
 
+    /// One after the other: the protocol takes one statement with parameters at a time.
+    async fn batch(&mut self, statements: Vec<Statement>) -> Result<Vec<PgRow>, Error> {
+        let mut rows = Vec::new();
+        for statement in statements {
+            rows.append(&mut self.rows(statement).await?);
+        }
+        Ok(rows)
+    }
+
     async fn lock_admission(&mut self) -> Result<(), Error> {
         self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(ADMISSION_LOCK)).await
     }
@@ -161,8 +169,11 @@ impl Database for Postgres {
         Ok(self.pool(size).acquire().await?)
     }
 
-    async fn begin(&self, size: Size) -> Result<Transaction<'static, sqlx::Postgres>, Error> {
-        Ok(self.pool(size).begin().await?)
+    async fn write<T: Send + 'static>(&self, size: Size, operation: Operation<PgConnection, T>) -> Result<T, Error> {
+        let mut transaction = self.pool(size).begin().await?;
+        let value = operation(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(value)
     }
 
     fn bound(&self, size: Size) -> Option<Duration> {

@@ -4,6 +4,7 @@ use tempfile::TempDir;
 
 use super::*;
 use crate::domain::job::JobState;
+use crate::store::sql::Row;
 use crate::store::{Store, contract};
 
 /// A store in a directory that lives as long as the test.
@@ -24,6 +25,14 @@ impl std::ops::Deref for Fixture {
 
     fn deref(&self) -> &Sqlite {
         &self.store
+    }
+}
+
+impl Sqlite {
+    /// What a pragma says on the connection that writes.
+    async fn on_writer<T>(&self, pragma: &'static str, read: fn(&SqliteRow) -> Result<T, Error>) -> T {
+        let rows = self.writer.run(pragma).await.expect("an answer");
+        read(&rows[0]).expect("a value")
     }
 }
 
@@ -77,16 +86,15 @@ async fn a_database_of_a_newer_version_is_refused() {
 #[tokio::test]
 async fn commits_are_synced_and_the_log_is_written_ahead() {
     let fixture = Fixture::open().await.expect("opens");
-    let journal: String = sqlx::query_scalar("PRAGMA journal_mode").fetch_one(&fixture.writer).await.expect("reads");
-    let synchronous: i64 = sqlx::query_scalar("PRAGMA synchronous").fetch_one(&fixture.writer).await.expect("reads");
+    let journal = fixture.on_writer("PRAGMA journal_mode", |row| row.text("journal_mode")).await;
+    let synchronous = fixture.on_writer("PRAGMA synchronous", |row| row.integer("synchronous")).await;
     assert_eq!((journal.as_str(), synchronous), ("wal", 2));
 }
 
 #[tokio::test]
 async fn deleted_jobs_leave_no_space_taken() {
     let fixture = Fixture::open().await.expect("opens");
-    let pages =
-        async || -> i64 { sqlx::query_scalar("PRAGMA page_count").fetch_one(&fixture.writer).await.expect("reads") };
+    let pages = async || fixture.on_writer("PRAGMA page_count", |row| row.integer("page_count")).await;
     let mut largest = 0;
     let empty = pages().await;
     for round in 0..6 {
@@ -101,7 +109,7 @@ async fn deleted_jobs_leave_no_space_taken() {
     let chunk_pages = (4 << 20) / 4096;
     assert!(largest > chunk_pages, "{largest}");
     assert!(largest < empty + 2 * chunk_pages, "the file never held two inputs: {largest}");
-    sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").fetch_all(&fixture.writer).await.expect("writes back");
+    fixture.close().await;
     let bytes = std::fs::metadata(fixture._directory.path().join(DATABASE_FILE)).expect("the file").len();
     assert!(bytes < 1 << 20, "{bytes} bytes");
 }
