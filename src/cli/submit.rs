@@ -69,6 +69,13 @@ pub struct Args {
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let settings = args.settings.settings()?;
+    let reading = args.reading.flags();
+    if args.uploaded.is_some() && !reading.is_empty() {
+        return Err(Failure::usage(format!(
+            "{}: of no use with --input, whose tracks and image sizes are those of its upload; say it to `scpsfm upload`",
+            reading.trim_start()
+        )));
+    }
     let input = args.input.as_deref().map(|path| args.reading.read(path)).transpose()?;
     input.iter().for_each(tell_notes);
     let mut client = args.server.connect().await?;

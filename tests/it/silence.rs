@@ -1,12 +1,15 @@
 //! Connections that say nothing: they end in time, and hold up nobody meanwhile.
 
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use scpsfm::rpc::proto;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::server::Options;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
+use tokio::net::{TcpListener, TcpStream};
 
 use crate::support::live::is_served;
 use crate::support::memory::resident_mb;
@@ -26,6 +29,26 @@ async fn saying(address: &str, count: usize, words: &[u8]) -> Vec<TcpStream> {
         connections.push(connection);
     }
     connections
+}
+
+/// The address of a door to this one, and how many have come through it: a client connects again by itself, and says
+/// nothing of it.
+async fn counting(address: SocketAddr) -> (String, Arc<AtomicUsize>) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let url = format!("http://{}", listener.local_addr().expect("an address"));
+    let connections = Arc::new(AtomicUsize::new(0));
+    let counted = connections.clone();
+    tokio::spawn(async move {
+        while let Ok((mut outside, _)) = listener.accept().await {
+            counted.fetch_add(1, Ordering::SeqCst);
+            tokio::spawn(async move {
+                let mut inside = TcpStream::connect(address).await.expect("the server listens");
+                // Whichever side ends it, the test looks at what it sees.
+                let _ = tokio::io::copy_bidirectional(&mut outside, &mut inside).await;
+            });
+        }
+    });
+    (url, connections)
 }
 
 /// Reads until the other side closes the connection.
@@ -51,12 +74,14 @@ async fn hundreds_of_silent_connections_hold_up_nobody_and_are_ended() {
         silent.extend(saying(&address, 150, words).await);
     }
     is_served(&server.url()).await;
-    let good = server.channel().await;
+    let (counted, connections) = counting(server.server.address()).await;
+    let mut client = CalibrationServiceClient::connect(counted).await.expect("a connection");
+    client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("an answer");
     soon(futures_util::future::join_all(silent.into_iter().map(until_closed))).await;
     // One that answers when it is asked whether it lives is left alone, however little it has to say.
     tokio::time::sleep(4 * half_a_second).await;
-    let mut client = CalibrationServiceClient::new(good);
-    client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("the same connection, or another");
+    client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("an answer");
+    assert_eq!(connections.load(Ordering::SeqCst), 1, "a client that had to connect again was not left alone");
     is_served(&server.url()).await;
 }
 

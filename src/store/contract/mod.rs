@@ -50,6 +50,7 @@ macro_rules! store_contract {
             uploads::a_tenants_uploads_are_bounded,
             uploads::what_nobody_goes_on_with_is_given_up_and_removed,
             uploads::an_input_lives_as_long_as_a_job_has_it,
+            uploads::a_finished_upload_that_is_begun_again_is_kept_as_one_that_is_used,
             uploads::many_that_begin_at_once_share_the_last_room,
         );
     };

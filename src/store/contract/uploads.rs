@@ -229,6 +229,18 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
     assert!(store.uploaded_input(&name("used")).await.is_err());
 }
 
+pub(in crate::store) async fn a_finished_upload_that_is_begun_again_is_kept_as_one_that_is_used(store: &dyn Store) {
+    for input in ["asked", "forgotten"] {
+        finished(store, input, vec![7; 10], 0).await;
+    }
+    let again = store.begin_upload(&new("asked", 4), &ROOMY, time(50)).await.expect("is known");
+    assert!(matches!(again, BegunUpload::Finished(_)), "{again:?}");
+    assert_eq!(store.purge_uploads(None, Some(time(49))).await, Ok(PurgedUploads { abandoned: 0, inputs: 1 }));
+    assert!(store.uploaded_input(&name("forgotten")).await.is_err());
+    assert!(store.uploaded_input(&name("asked")).await.is_ok());
+    assert_eq!(store.purge_uploads(None, Some(time(50))).await, Ok(PurgedUploads { abandoned: 0, inputs: 1 }));
+}
+
 pub(in crate::store) async fn many_that_begin_at_once_share_the_last_room(store: &dyn Store) {
     let bounds = UploadBounds { max_tenant_uploads: 3, ..ROOMY };
     let uploads: Vec<_> = (0..24).map(|number| new(&format!("upload-{}", number % 12), 10)).collect();

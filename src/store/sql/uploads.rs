@@ -96,7 +96,10 @@ pub(super) async fn begin<C: Connection>(
             new.name.input
         )));
     }
-    if let Some(input) = finished {
+    if let Some((id, input)) = upload.input_id.zip(finished) {
+        // Whoever asks for it anew is going to use it.
+        let update = Statement::new("UPDATE inputs SET use_time = $1 WHERE id = $2");
+        connection.execute(update.bind(micros(now)).bind(id)).await?;
         return Ok(BegunUpload::Finished(input));
     }
     let sha256 = upload.sha256.or(new.sha256);

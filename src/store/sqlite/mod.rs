@@ -25,6 +25,8 @@ use writer::Writer;
 
 /// The database within the data directory.
 const DATABASE_FILE: &str = "scpsfm.db";
+/// The same while it is made.
+const DRAFT_FILE: &str = "scpsfm.db.new";
 /// Held locked while a server uses the directory. A file of its own: SQLite's locks are on the database, and are let
 /// go between transactions.
 const LOCK_FILE: &str = "scpsfm.lock";
@@ -63,22 +65,16 @@ impl Sqlite {
     ///
     /// # Errors
     /// [`Error::InUse`] while another server holds the directory, [`Error::Unavailable`] where it cannot be written,
-    /// [`Error::Corrupt`] where its schema is of a newer version.
+    /// [`Error::Corrupt`] where its schema is of a newer version, or its file is there and empty.
     pub async fn open(directory: &Path) -> Result<Self, Error> {
         let lock = lock(directory)?;
-        let options = SqliteConnectOptions::new()
-            .filename(directory.join(DATABASE_FILE))
-            .create_if_missing(true)
-            // Only takes effect in a new file; lets retention hand space back.
-            .auto_vacuum(SqliteAutoVacuum::Incremental)
-            .journal_mode(SqliteJournalMode::Wal)
-            // What was acknowledged survives a power cut, not only a crash of the process.
-            .synchronous(SqliteSynchronous::Full)
-            .foreign_keys(true)
-            .pragma("journal_size_limit", LOG_BYTES)
-            .busy_timeout(BUSY_TIMEOUT);
+        let database = directory.join(DATABASE_FILE);
+        if !is_there(&database)? {
+            create(directory, &database).await?;
+        }
+        let options = options(&database);
         let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(&options).await?;
-        sql::migrator(&MIGRATIONS).run(&mut connection).await.map_err(sql::migration_failed)?;
+        migrate(&mut connection).await?;
         let writer = Writer::start(connection, options.clone())?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
         Ok(Self { writer, readers, _lock: lock })
@@ -89,6 +85,58 @@ impl Sqlite {
     pub(crate) async fn execute(&self, statement: &'static str) {
         self.writer.run(statement).await.expect("a valid statement");
     }
+}
+
+/// How the database is opened, to write.
+fn options(database: &Path) -> SqliteConnectOptions {
+    SqliteConnectOptions::new()
+        .filename(database)
+        // Only takes effect in a new file; lets retention hand space back.
+        .auto_vacuum(SqliteAutoVacuum::Incremental)
+        .journal_mode(SqliteJournalMode::Wal)
+        // What was acknowledged survives a power cut, not only a crash of the process.
+        .synchronous(SqliteSynchronous::Full)
+        .foreign_keys(true)
+        .pragma("journal_size_limit", LOG_BYTES)
+        .busy_timeout(BUSY_TIMEOUT)
+}
+
+async fn migrate(connection: &mut SqliteConnection) -> Result<(), Error> {
+    sql::migrator(&MIGRATIONS).run(connection).await.map_err(sql::migration_failed)
+}
+
+/// Whether the database's file is there. One of no bytes is refused: no server leaves one behind, so that it is what is
+/// left of jobs, and a store that began anew on it would hide that they are gone.
+fn is_there(database: &Path) -> Result<bool, Error> {
+    match std::fs::metadata(database) {
+        Ok(file) if file.len() == 0 => Err(Error::Corrupt(format!(
+            "{} has no bytes; restore it, or move it and the files beside it away to begin without jobs",
+            database.display()
+        ))),
+        Ok(_) => Ok(true),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(Error::Unavailable(format!("cannot look at {}: {error}", database.display()))),
+    }
+}
+
+/// Makes the database under another name, and gives it its own once it is whole: a process that dies in between leaves
+/// nothing that looks like a store.
+async fn create(directory: &Path, database: &Path) -> Result<(), Error> {
+    let draft = directory.join(DRAFT_FILE);
+    // Of a start that was cut off; and of a database that was taken away: its log would be taken for the new one's.
+    for name in [DRAFT_FILE, DATABASE_FILE] {
+        for suffix in ["", "-wal", "-shm"] {
+            // Where there is none, there is nothing to remove.
+            let _ = std::fs::remove_file(directory.join(format!("{name}{suffix}")));
+        }
+    }
+    let new = options(&draft).create_if_missing(true);
+    let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(&new).await?;
+    migrate(&mut connection).await?;
+    // Writes the log back into the file and removes it.
+    sqlx::Connection::close(connection).await?;
+    std::fs::rename(&draft, database)
+        .map_err(|error| Error::Unavailable(format!("cannot make {}: {error}", database.display())))
 }
 
 fn readers() -> SqlitePoolOptions {

@@ -84,6 +84,22 @@ async fn a_database_of_a_newer_version_is_refused() {
 }
 
 #[tokio::test]
+async fn an_empty_file_is_refused_and_half_a_start_is_none() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    // What a start leaves that is cut off.
+    std::fs::write(directory.path().join(DRAFT_FILE), b"half").expect("written");
+    let store = Sqlite::open(directory.path()).await.expect("opens");
+    store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+    store.close().await;
+    drop(store);
+    let database = directory.path().join(DATABASE_FILE);
+    std::fs::write(&database, b"").expect("emptied");
+    let error = Sqlite::open(directory.path()).await.expect_err("its jobs are gone");
+    assert!(matches!(&error, Error::Corrupt(text) if text.contains("has no bytes")), "{error}");
+    assert_eq!(std::fs::metadata(&database).expect("is there").len(), 0, "left as it was found");
+}
+
+#[tokio::test]
 async fn commits_are_synced_and_the_log_is_written_ahead() {
     let fixture = Fixture::open().await.expect("opens");
     let journal = fixture.on_writer("PRAGMA journal_mode", |row| row.text("journal_mode")).await;
