@@ -23,7 +23,7 @@ use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName, JobState};
 use crate::domain::progress::Progress;
 
-pub use query::{JobPage, JobQuery, Order};
+pub use query::{InputPage, InputQuery, JobPage, JobQuery, Order};
 pub use record::{
     Bound, CancelReply, Claimed, Created, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome, QueueBounds,
     Request, Swept, Work,
@@ -252,6 +252,19 @@ pub trait Store: Send + Sync + 'static {
     /// # Errors
     /// [`Error::InputNotFound`].
     async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error>;
+
+    /// One page of a tenant's uploaded inputs.
+    ///
+    /// # Errors
+    /// [`Error::PageToken`].
+    async fn inputs(&self, query: &InputQuery) -> Result<InputPage, Error>;
+
+    /// Takes an uploaded input's name away, which is free again at once. Jobs that were created with it keep it; it is
+    /// removed with the last of them, or at once where there is none.
+    ///
+    /// # Errors
+    /// [`Error::InputNotFound`].
+    async fn delete_input(&self, name: &InputName) -> Result<(), Error>;
 
     /// Gives up the uploads to which nothing came since `abandoned_by`, and removes some of the bytes of those that were
     /// given up or finished, and some of the uploaded inputs that no job has and none was created with since

@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::{
-    BegunUpload, CancelReply, Claimed, Created, Ending, Error, Heartbeat, Hint, JobPage, JobQuery, Lease, Load,
-    NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, Store, StoredInput, Swept, UploadBounds, UploadLease,
-    UploadStatus, Work,
+    BegunUpload, CancelReply, Claimed, Created, Ending, Error, Heartbeat, Hint, InputPage, InputQuery, JobPage,
+    JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, Store, StoredInput, Swept,
+    UploadBounds, UploadLease, UploadStatus, Work,
 };
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
@@ -167,6 +167,16 @@ impl<S: Store> Store for Timed<S> {
     async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error> {
         let _timer = store_operation("uploaded_input");
         self.0.uploaded_input(name).await
+    }
+
+    async fn inputs(&self, query: &InputQuery) -> Result<InputPage, Error> {
+        let _timer = store_operation("inputs");
+        self.0.inputs(query).await
+    }
+
+    async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
+        let _timer = store_operation("delete_input");
+        self.0.delete_input(name).await
     }
 
     async fn purge_uploads(

@@ -3,12 +3,14 @@
 mod abuse;
 mod access;
 mod api;
+mod batch;
 mod chaos;
 mod cli;
 mod crash;
 mod dashboards;
 mod disk;
 mod formats;
+mod inputs;
 mod load;
 mod lost;
 mod prior;

@@ -1,6 +1,7 @@
 //! Connections that say nothing: they end in time, and hold up nobody meanwhile.
 
 use std::net::SocketAddr;
+use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -10,10 +11,12 @@ use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::server::Options;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
+use tonic::Code;
 
 use crate::support::live::is_served;
 use crate::support::memory::resident_mb;
 use crate::support::program::Serving;
+use crate::support::scrape::Page;
 use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::quick;
 
@@ -99,6 +102,46 @@ async fn of_too_many_silent_connections_the_oldest_make_room() {
     let mut last = newest.into_iter().next_back().expect("the newest");
     last.write_all(&PREFACE[3..]).await.expect("still open");
     assert!(matches!(soon(last.read(&mut [0; 9])).await, Ok(1..)), "the server's settings");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_connection_too_many_is_refused_and_there_is_room_when_one_ends() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let server = Serving::start_with(directory.path(), &[("SCPSFM_SERVER__MAX_CONNECTIONS", "3")], Stdio::null());
+    let count = |series: &str| Page::parse(&server.page("/metrics")).value(series);
+    let mut clients = Vec::new();
+    for _ in 0..3 {
+        let mut client = CalibrationServiceClient::connect(server.grpc.clone()).await.expect("a connection");
+        let capabilities = client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("an answer");
+        assert_eq!(capabilities.into_inner().max_connections, 3);
+        clients.push(client);
+    }
+    assert_eq!((count("scpsfm_connections"), count("scpsfm_connections_refused_total")), (3.0, 0.0));
+    // One that listens hears why; a client of gRPC may come again.
+    let address = server.grpc.trim_start_matches("http://").to_owned();
+    let mut heard = Vec::new();
+    let mut one_more = saying(&address, 1, PREFACE).await.remove(0);
+    soon(one_more.read_to_end(&mut heard)).await.expect("it is told, and closed");
+    assert!(heard.ends_with(b"too many connections"), "{heard:?}");
+    let refused = async {
+        let mut client = CalibrationServiceClient::connect(server.grpc.clone()).await.map_err(|_| Code::Unavailable)?;
+        client.get_capabilities(proto::GetCapabilitiesRequest {}).await.map(drop).map_err(|status| status.code())
+    };
+    let code = soon(refused).await.expect_err("no room");
+    assert!(matches!(code, Code::Unavailable | Code::Unknown | Code::ResourceExhausted), "{code:?}");
+    assert!(count("scpsfm_connections_refused_total") >= 2.0);
+    for client in &mut clients {
+        client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("those that are in stay in");
+    }
+    assert_eq!(count("scpsfm_connections"), 3.0);
+    drop(clients.pop());
+    soon(async {
+        while count("scpsfm_connections") > 2.0 {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    })
+    .await;
+    is_served(&server.grpc).await;
 }
 
 #[tokio::test]

@@ -5,8 +5,10 @@
 
 pub mod access;
 mod backoff;
+mod batch;
 mod error;
 mod handshake;
+pub mod inputs;
 pub mod upload;
 
 use std::collections::BTreeMap;

@@ -51,6 +51,8 @@ macro_rules! store_contract {
             uploads::what_nobody_goes_on_with_is_given_up_and_removed,
             uploads::an_input_lives_as_long_as_a_job_has_it,
             uploads::a_finished_upload_that_is_begun_again_is_kept_as_one_that_is_used,
+            uploads::inputs_are_listed_page_by_page,
+            uploads::a_deleted_input_is_kept_by_its_jobs_alone,
             uploads::many_that_begin_at_once_share_the_last_room,
         );
     };

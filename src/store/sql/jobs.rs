@@ -241,7 +241,7 @@ pub(super) async fn list<C: Connection>(connection: &mut C, query: &JobQuery) ->
     rows.truncate(size as usize);
     let next_page_token = match rows.last() {
         Some(last) if more => {
-            let cursor = Cursor { create_micros: last.integer("create_time")?, job: last.text("job")? };
+            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text("job")? };
             Some(query.token_after(&cursor))
         }
         _ => None,
@@ -268,7 +268,7 @@ fn listing(query: &JobQuery) -> Result<Statement, Error> {
         Order::CreateTimeAscending => (" AND (create_time, job) > (", " ORDER BY create_time, job LIMIT "),
     };
     if let Some(cursor) = cursor {
-        select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(&cursor.job).then(")");
+        select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(&cursor.id).then(")");
     }
     Ok(select.then(order).then_bind(i64::from(query.effective_page_size()) + 1))
 }

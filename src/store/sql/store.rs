@@ -16,7 +16,7 @@ use crate::store::record::{
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
 };
-use crate::store::{Error, Hint, JobPage, JobQuery, Store};
+use crate::store::{Error, Hint, InputPage, InputQuery, JobPage, JobQuery, Store};
 
 /// Waits for an operation as long as the database allows it. One that is broken off changed nothing, or all that it was
 /// to change: a commit may have been on its way.
@@ -206,6 +206,14 @@ impl<D: Database> Store for D {
 
     async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error> {
         reads!(self, Size::Small, |connection| uploads::input(connection, name))
+    }
+
+    async fn inputs(&self, query: &InputQuery) -> Result<InputPage, Error> {
+        reads!(self, Size::Small, |connection| uploads::list(connection, query))
+    }
+
+    async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
+        writes!(self, Size::Payload, [name], |connection| uploads::delete(connection, &name))
     }
 
     async fn purge_uploads(

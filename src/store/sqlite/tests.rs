@@ -131,6 +131,20 @@ async fn deleted_jobs_leave_no_space_taken() {
 }
 
 #[tokio::test]
+async fn of_a_deleted_input_nothing_is_left_once_its_jobs_are_gone() {
+    let fixture = Fixture::open().await.expect("opens");
+    contract::uploads::a_deleted_input_is_kept_by_its_jobs_alone(&*fixture).await;
+    for _ in 0..3 {
+        fixture.purge_uploads(None, None).await.expect("clears away");
+    }
+    let rows = async |count: &'static str| fixture.on_writer(count, |row| row.integer("count")).await;
+    // Of the new one alone.
+    assert_eq!(rows("SELECT COUNT(*) AS count FROM inputs").await, 1);
+    assert_eq!(rows("SELECT COUNT(*) AS count FROM uploads").await, 1);
+    assert_eq!(rows("SELECT COUNT(*) AS count FROM upload_parts").await, 0);
+}
+
+#[tokio::test]
 async fn after_a_full_disk_the_next_write_goes_through() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let store = Sqlite::open(directory.path()).await.expect("a store");
