@@ -8,7 +8,7 @@ mod backoff;
 mod batch;
 mod error;
 mod handshake;
-pub mod inputs;
+mod listing;
 pub mod upload;
 
 use std::collections::BTreeMap;

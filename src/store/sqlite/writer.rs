@@ -33,6 +33,9 @@ const BEGIN: &str = "BEGIN IMMEDIATE";
 #[derive(Debug, Clone)]
 pub(super) struct Writer {
     inbox: mpsc::UnboundedSender<Message>,
+    /// Commits so far.
+    #[cfg(test)]
+    pub commits: Arc<std::sync::atomic::AtomicUsize>,
 }
 
 enum Message {
@@ -94,10 +97,22 @@ impl Writer {
         // A runtime of its own: each statement is a round trip to SQLite's thread, and waking this one thread is cheaper
         // than finding one among those of the server.
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().map_err(failed)?;
-        let desk = Desk { connection: Some(connection), options, messages };
+        #[cfg(test)]
+        let commits = Arc::default();
+        let desk = Desk {
+            connection: Some(connection),
+            options,
+            messages,
+            #[cfg(test)]
+            commits: Arc::clone(&commits),
+        };
         let work = move || runtime.block_on(desk.serve());
         thread::Builder::new().name("store-writer".into()).spawn(work).map_err(failed)?;
-        Ok(Self { inbox })
+        Ok(Self {
+            inbox,
+            #[cfg(test)]
+            commits,
+        })
     }
 
     /// Runs an operation and answers once what it wrote is on the disk.
@@ -144,6 +159,8 @@ struct Desk {
     connection: Option<SqliteConnection>,
     options: SqliteConnectOptions,
     messages: mpsc::UnboundedReceiver<Message>,
+    #[cfg(test)]
+    commits: Arc<std::sync::atomic::AtomicUsize>,
 }
 
 /// An operation of a group and what it came to: answered with that once the group is committed, also where it was
@@ -208,14 +225,15 @@ impl Desk {
 
     /// Begins a transaction with this operation; without one where it is refused.
     async fn open(&mut self, operation: &mut dyn Waiting) -> Result<Result<(), Error>, Error> {
-        self.control(BEGIN).await?;
-        match operation.run(self.connection().await?).await {
-            Ok(()) => Ok(Ok(())),
-            Err(error) => {
-                self.roll_back().await;
-                Err(error)
-            }
+        let begun = self.control(BEGIN).await;
+        let ran = match begun {
+            Ok(()) => operation.run(self.connection().await?).await,
+            Err(error) => Err(error),
+        };
+        if ran.is_err() {
+            self.roll_back().await;
         }
+        ran.map(Ok)
     }
 
     /// Runs an operation in the transaction of others, which stand whatever becomes of it. An error says that the
@@ -236,7 +254,7 @@ impl Desk {
         if group.is_empty() {
             return;
         }
-        if let Err(error) = self.control("COMMIT").await {
+        if let Err(error) = self.end().await {
             if group.len() > 1 {
                 return self.each_alone(group).await;
             }
@@ -254,7 +272,7 @@ impl Desk {
         for (mut operation, _) in group {
             let mut committed = self.open(operation.as_mut()).await.and_then(|outcome| outcome);
             if committed.is_ok() {
-                committed = self.control("COMMIT").await;
+                committed = self.end().await;
                 if committed.is_err() {
                     self.roll_back().await;
                 }
@@ -263,7 +281,14 @@ impl Desk {
         }
     }
 
-    /// Ends the transaction, if there is one. A connection that cannot even do that is given up.
+    /// Commits: what was written is on the disk then.
+    async fn end(&mut self) -> Result<(), Error> {
+        #[cfg(test)]
+        self.commits.fetch_add(1, Ordering::SeqCst);
+        self.control("COMMIT").await
+    }
+
+    /// Breaks the transaction off, if there is one. A connection that cannot even do that is given up.
     async fn roll_back(&mut self) {
         if self.control("ROLLBACK").await.is_err() {
             self.connection = None;
