@@ -1,25 +1,32 @@
-//! `scpsfm delete`: removes jobs that have ended.
+//! `scpsfm delete`: removes jobs that have ended, and uploaded inputs.
 
 use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
 use super::job_view::GivenName;
 use super::print;
+use super::submit::GivenInput;
 
 const EXAMPLES: &str = "\
 Examples:
   scpsfm delete a1b2 c3d4
+  scpsfm delete --input 123e4567-e89b-42d3-a456-426614174000
   scpsfm list --state failed --json | jq -r .name | xargs scpsfm delete";
 
-/// Delete jobs that have ended
+/// Delete jobs that have ended, and uploaded inputs
 ///
-/// Removes each with its input, events and result, for good, and prints its name. One that waits or runs is refused:
-/// cancel it first. Stops at the first that cannot be deleted.
+/// Removes each job with its input, events and result, for good, and prints its name. One that waits or runs is refused:
+/// cancel it first. Of an uploaded input the name goes at once; jobs that were created with it go on, and its bytes go with
+/// the last of them. Stops at the first that cannot be deleted.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
     /// The jobs' names, or the last parts of them
-    #[arg(value_name = "JOB", required = true, value_parser = GivenName::parse)]
+    #[arg(value_name = "JOB", required_unless_present = "inputs", value_parser = GivenName::parse)]
     pub names: Vec<GivenName>,
+
+    /// An uploaded input: its name, or the last part of it; may be given more than once
+    #[arg(long = "input", value_name = "NAME", value_parser = GivenInput::parse)]
+    pub inputs: Vec<GivenInput>,
 
     #[command(flatten)]
     pub server: ServerArgs,
@@ -29,9 +36,14 @@ pub struct Args {
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     // All of them are named before the first is gone.
     let names = args.names.iter().map(|name| name.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
+    let inputs = args.inputs.iter().map(|given| given.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
     let mut client = args.server.connect().await?;
     for name in names {
         client.delete(&name).await?;
+        print(&name.to_string())?;
+    }
+    for name in inputs {
+        client.delete_input(&name).await?;
         print(&name.to_string())?;
     }
     Ok(Exit::Done)

@@ -12,6 +12,7 @@ pub mod evaluate_priors;
 pub mod evaluate_real;
 pub mod exit;
 pub mod get;
+pub mod inputs;
 pub mod interrupt;
 pub mod job_view;
 pub mod list;
@@ -56,6 +57,7 @@ pub enum Command {
     Serve(serve::Args),
     Solve(solve::Args),
     Upload(upload::Args),
+    Inputs(inputs::Args),
     Submit(submit::Args),
     Watch(watch::Args),
     Get(get::Args),
@@ -90,6 +92,7 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         Command::Serve(args) => runtime.block_on(serve::run(args)),
         Command::Solve(args) => runtime.block_on(solve::run(args)),
         Command::Upload(args) => runtime.block_on(upload::run(args)),
+        Command::Inputs(args) => runtime.block_on(inputs::run(args)),
         Command::Submit(args) => runtime.block_on(submit::run(args)),
         Command::Watch(args) => runtime.block_on(watch::run(args)),
         Command::Get(args) => runtime.block_on(get::run(args)),

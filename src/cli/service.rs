@@ -117,6 +117,7 @@ fn server_options(config: &Config) -> server::Options {
         listen: config.server.listen,
         limits: config.limits.clone(),
         max_message_bytes: config.server.max_message_bytes,
+        max_connections: config.server.max_connections,
         tls: config.tls.files(),
         keys: Sources { file: config.auth.keys_file.clone(), fixed: config.auth.keys.clone() },
         reflection: config.server.reflection,
@@ -138,7 +139,8 @@ mod tests {
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));
         let of = |options: server::Options| {
             let keys = options.keys.is_on();
-            (options.limits, options.max_message_bytes, options.solve_grace, options.tls, keys, options.reflection)
+            let bounds = (options.limits, options.max_message_bytes, options.max_connections);
+            (bounds, options.solve_grace, options.tls, keys, options.reflection)
         };
         assert_eq!(of(server_options(&config)), of(server::Options::default()));
     }

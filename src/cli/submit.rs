@@ -15,22 +15,24 @@ const EXAMPLES: &str = "\
 Examples:
   scpsfm submit observations.csv --width 3072 --height 2048
   scpsfm submit --input $(scpsfm upload observations.csv) --method geometry
+  scpsfm submit scene-*.csv --width 3072 --height 2048
   scpsfm submit observations.csv --label site=north --time-limit 60 --watch
   job=$(scpsfm submit observations.csv) && scpsfm watch $job && scpsfm result $job --out answer";
 
-/// Leave a job with a server
+/// Leave jobs with a server
 ///
-/// Prints the job's name. The job goes on without this command, and over restarts of the server.
+/// Prints each job's name. The jobs go on without this command, and over restarts of the server. Of several inputs each
+/// is a job of its own, with the same settings; all of them are stored, or none.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
     /// Tracks, as `scpsfm solve` takes them
     #[arg(value_name = "INPUT", required_unless_present = "uploaded", conflicts_with = "uploaded")]
-    pub input: Option<PathBuf>,
+    pub inputs: Vec<PathBuf>,
 
-    /// Solve an input that was uploaded with `scpsfm upload`: its name, or the last part of it
+    /// Solve an input that was uploaded with `scpsfm upload`: its name, or the last part of it; may be given more than once
     #[arg(long = "input", value_name = "NAME", value_parser = GivenInput::parse)]
-    pub uploaded: Option<GivenInput>,
+    pub uploaded: Vec<GivenInput>,
 
     #[command(flatten)]
     pub reading: ReadingArgs,
@@ -38,7 +40,7 @@ pub struct Args {
     #[command(flatten)]
     pub server: ServerArgs,
 
-    /// Follow the job to its end, as `scpsfm watch` does
+    /// Follow the job to its end, as `scpsfm watch` does; for one input
     #[arg(long)]
     pub watch: bool,
 
@@ -54,11 +56,12 @@ pub struct Args {
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     pub time_limit: Option<Duration>,
 
-    /// Last part of the job's name; the server chooses one otherwise
+    /// Last part of the job's name, for one input; the server chooses one otherwise
     #[arg(long, value_name = "ID")]
     pub job_id: Option<String>,
 
-    /// Makes this command safe to repeat: the same id and job give the same job
+    /// Makes this command safe to repeat: the same id and job give the same job. Of several inputs, each job has this id
+    /// with `-1`, `-2`, ... after it
     #[arg(long, value_name = "ID")]
     pub request_id: Option<String>,
 
@@ -69,8 +72,22 @@ pub struct Args {
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let settings = args.settings.settings()?;
-    let input = args.input.as_deref().map(|path| args.reading.read(path)).transpose()?;
-    input.iter().for_each(tell_notes);
+    let reading = args.reading.flags();
+    if !args.uploaded.is_empty() && !reading.is_empty() {
+        return Err(Failure::usage(format!(
+            "{}: of no use with --input, whose tracks and image sizes are those of its upload; say it to `scpsfm upload`",
+            reading.trim_start()
+        )));
+    }
+    let several = args.inputs.len() + args.uploaded.len() > 1;
+    for (given, flag) in [(args.watch, "--watch"), (args.job_id.is_some(), "--job-id")] {
+        if several && given {
+            return Err(Failure::usage(format!("{flag} is for one input")));
+        }
+    }
+    let read = args.inputs.iter().map(|path| args.reading.read(path)).collect::<Result<Vec<_>, _>>()?;
+    read.iter().for_each(tell_notes);
+    let named = args.uploaded.iter().map(|given| given.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
     let mut client = args.server.connect().await?;
     let options = JobOptions {
         job_id: args.job_id,
@@ -79,11 +96,17 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         priority: args.priority,
         time_limit: args.time_limit,
     };
-    let job = match (&input, &args.uploaded) {
+    if several {
+        let inputs = read.iter().map(|input| &input.raw);
+        let created = client.create_batch(inputs, &named, &settings, &options).await;
+        let jobs = created.map_err(|error| error.at_lines_of(&read))?;
+        return jobs.iter().try_for_each(|job| print(&job.name.to_string())).map(|()| Exit::Done);
+    }
+    let job = match (read.first(), named.first()) {
         (Some(input), _) => {
             client.create(&input.raw, &settings, options).await.map_err(|error| error.at_lines(input))?
         }
-        (None, Some(given)) => client.create_with(&given.of(&args.server.access)?, &settings, options).await?,
+        (None, Some(name)) => client.create_with(name, &settings, options).await?,
         (None, None) => return Err(Failure::usage("neither INPUT nor --input says what to solve")),
     };
     print(&job.name.to_string())?;
@@ -109,7 +132,11 @@ impl GivenInput {
         given.ok_or_else(|| format!("{text:?} is not an input's name, as `scpsfm upload` prints it"))
     }
 
-    fn of(&self, access: &AccessArgs) -> Result<InputName, client::Error> {
+    /// The whole name.
+    ///
+    /// # Errors
+    /// For a tenant that is none.
+    pub fn of(&self, access: &AccessArgs) -> Result<InputName, client::Error> {
         match self {
             Self::Whole(name) => Ok(name.clone()),
             Self::Id(input) => Ok(InputName { tenant: access.tenant()?, input: input.clone() }),

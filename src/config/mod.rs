@@ -143,6 +143,7 @@ impl Config {
             _ => Ok(()),
         };
         at_least_one("server.max_message_bytes", self.server.max_message_bytes as u64)?;
+        at_least_one("server.max_connections", self.server.max_connections as u64)?;
         at_least_one("engine.queue_capacity", self.engine.queue_capacity as u64)?;
         at_least_one("engine.queue_bytes", self.engine.queue_bytes)?;
         at_least_one("engine.queue_observations", self.engine.queue_observations)?;

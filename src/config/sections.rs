@@ -23,6 +23,8 @@ pub struct Server {
     pub listen: SocketAddr,
     /// Largest message taken or sent.
     pub max_message_bytes: usize,
+    /// Connections that speak at once; one more is refused. Those that say nothing yet are bounded apart.
+    pub max_connections: usize,
     /// Whether callers may ask for the API's description (reflection). On, because it says what `proto/` says; with keys
     /// it asks for one, as every call but a health check does.
     pub reflection: bool,
@@ -39,6 +41,7 @@ impl Default for Server {
             // Loopback: whoever opens the service to a network should have meant to. 50051 is gRPC's customary port.
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 50051),
             max_message_bytes: rpc::server::Options::MAX_MESSAGE_BYTES,
+            max_connections: rpc::server::Options::MAX_CONNECTIONS,
             reflection: true,
             insecure: false,
             plaintext_keys: false,

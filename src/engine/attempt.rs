@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use tokio::sync::{oneshot, watch};
+use tokio::task::JoinHandle;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval_at, sleep, sleep_until, timeout_at};
 use tracing::Instrument;
 
@@ -19,6 +20,10 @@ use crate::store::{self, Claimed, Ending, Lease, Outcome, Store};
 /// each is cheap for the disk.
 const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 
+/// How long a job has been solved before its progress is stored: nobody watches one that ends at once, and the commit
+/// would cost as much as its end. Its last progress is stored with that.
+const FIRST_PROGRESS: Duration = Duration::from_millis(100);
+
 /// Heartbeats within the time of a lease: two may be lost.
 const HEARTBEATS_A_LEASE: u32 = 3;
 
@@ -31,13 +36,20 @@ const RETRY_PAUSE: Duration = Duration::from_millis(500);
 /// `Failure::reason` of a defect of ours.
 const INTERNAL: &str = "INTERNAL";
 
-/// Makes one attempt at a claimed job and commits what it came to.
-pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) {
+/// Makes one attempt at a claimed job. Returns once the worker is free again, with the task that commits what the attempt
+/// came to.
+pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) -> JoinHandle<()> {
     let Claimed { job, lease, trace_parent, queue_time } = claimed;
     let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref(), queue_time);
     let span = attempt.span().clone();
     // All of it inside the span, so that every line carries the job's name.
-    async { Course::begin(inner, job, lease).run(worker, attempt).await }.instrument(span).await;
+    async {
+        let mut course = Course::begin(inner.clone(), job, lease);
+        let end = course.run(worker, attempt).await;
+        tokio::spawn(course.conclude(end).in_current_span())
+    }
+    .instrument(span)
+    .await
 }
 
 /// Waits for the store no longer than the lease holds: a database that hangs must not keep the work going.
@@ -46,17 +58,25 @@ async fn in_time<T>(until: Instant, writing: impl Future<Output = Result<T, stor
     timeout_at(until, writing).await.unwrap_or_else(late)
 }
 
-/// The input of a job, once the cancel is seen that may have come before the job was listed as running.
+/// The input of a job, with the cancel that may have come before the job was listed as running.
 async fn read(store: Arc<dyn Store>, name: JobName, stop: StopToken) -> Result<Vec<u8>, store::Error> {
-    if store.job(&name).await?.cancel_requested {
+    let work = store.work(&name).await?;
+    if work.cancel_requested {
         stop.stop(StopReason::Cancelled);
     }
-    store.input(&name).await
+    Ok(work.input)
+}
+
+/// What an attempt came to, to be committed.
+struct End {
+    verdict: Verdict,
+    latest: Option<Progress>,
+    attempt: Option<Attempt>,
 }
 
 /// An attempt under way.
-struct Course<'a> {
-    inner: &'a Arc<Inner>,
+struct Course {
+    inner: Arc<Inner>,
     job: Job,
     lease: Lease,
     stop: StopToken,
@@ -66,44 +86,45 @@ struct Course<'a> {
     lost: bool,
     /// The last progress that was stored.
     stored: Option<Progress>,
-    _running: Running<'a>,
+    _running: Running,
 }
 
 /// Lists an attempt among the running ones as long as it lives.
-struct Running<'a> {
-    inner: &'a Inner,
+struct Running {
+    inner: Arc<Inner>,
     lease: Lease,
 }
 
-impl<'a> Running<'a> {
-    fn list(inner: &'a Inner, lease: &Lease, stop: &StopToken) -> Self {
+impl Running {
+    fn list(inner: Arc<Inner>, lease: &Lease, stop: &StopToken) -> Self {
         locked(&inner.running).insert(lease.clone(), stop.clone());
         Self { inner, lease: lease.clone() }
     }
 }
 
-impl Drop for Running<'_> {
+impl Drop for Running {
     fn drop(&mut self) {
         locked(&self.inner.running).remove(&self.lease);
     }
 }
 
-impl<'a> Course<'a> {
-    fn begin(inner: &'a Arc<Inner>, job: Job, lease: Lease) -> Self {
+impl Course {
+    fn begin(inner: Arc<Inner>, job: Job, lease: Lease) -> Self {
         let left = job.deadline.map(|deadline| deadline.duration_since(SystemTime::now()).unwrap_or_default());
         // A deadline beyond what the clock can express is none.
         let stop = StopToken::with_deadline(left.and_then(|left| std::time::Instant::now().checked_add(left)));
-        let running = Running::list(inner, &lease, &stop);
+        let running = Running::list(inner.clone(), &lease, &stop);
         let leased_until = Instant::now() + inner.options.lease;
         inner.hub.wake(&job.name);
         tracing::info!("attempt begins");
         Self { inner, job, lease, stop, leased_until, lost: false, stored: None, _running: running }
     }
 
-    async fn run(mut self, worker: &Worker, attempt: Attempt) {
+    /// Has the worker solve the job, and keeps the lease meanwhile.
+    async fn run(&mut self, worker: &Worker, attempt: Attempt) -> End {
         let input = match self.prepare().await {
             Ok(input) => input,
-            Err(verdict) => return self.conclude(verdict, None, Some(attempt)).await,
+            Err(verdict) => return End { verdict, latest: None, attempt: Some(attempt) },
         };
         let subscription = self.inner.hub.subscribe(&self.job.name);
         // Weights of an attempt before this one are nobody's any more.
@@ -124,8 +145,8 @@ impl<'a> Course<'a> {
         worker.assign(assignment).await;
         let (report, latest) = self.attend(answer, reported).await;
         match report {
-            Some(Report { verdict, attempt }) => self.conclude(verdict, latest, Some(attempt)).await,
-            None => self.conclude(Verdict::Stopped(StopReason::Interrupted), latest, None).await,
+            Some(Report { verdict, attempt }) => End { verdict, latest, attempt: Some(attempt) },
+            None => End { verdict: Verdict::Stopped(StopReason::Interrupted), latest, attempt: None },
         }
     }
 
@@ -174,7 +195,7 @@ impl<'a> Course<'a> {
         mut reported: watch::Receiver<Option<Progress>>,
     ) -> (Option<Report>, Option<Progress>) {
         let mut heartbeats = self.heartbeats();
-        let mut next_store = Instant::now();
+        let mut next_store = Instant::now() + FIRST_PROGRESS;
         let mut news = false;
         let report = loop {
             tokio::select! {
@@ -252,7 +273,8 @@ impl<'a> Course<'a> {
     }
 
     /// Commits what the attempt came to.
-    async fn conclude(mut self, verdict: Verdict, latest: Option<Progress>, attempt: Option<Attempt>) {
+    async fn conclude(mut self, end: End) {
+        let End { verdict, latest, attempt } = end;
         let outcome = match verdict {
             Verdict::Solved { summary, result } => Some(Outcome::Succeeded { summary, result }),
             Verdict::Broken(message) => Some(Outcome::Failed(Failure::new(INTERNAL, message))),
@@ -260,14 +282,15 @@ impl<'a> Course<'a> {
             Verdict::Stopped(StopReason::DeadlineExceeded) => Some(Outcome::Expired),
             Verdict::Stopped(StopReason::Interrupted) => None,
         };
-        let ending = outcome.map(|outcome| Ending { outcome, progress: latest.filter(|_| self.stored != latest) });
+        let progress = latest.filter(|_| self.stored != latest);
+        let ending = outcome.map(|outcome| Arc::new(Ending { outcome, progress }));
         let committed = self.commit(ending.as_ref()).await;
         self.announce(committed, attempt);
     }
 
     /// Ends the job or gives it back, trying again as long as the lease holds. `None`: the lease is gone.
-    async fn commit(&mut self, ending: Option<&Ending>) -> Option<Job> {
-        let store = &self.inner.store;
+    async fn commit(&mut self, ending: Option<&Arc<Ending>>) -> Option<Job> {
+        let store = self.inner.store.clone();
         // Of a write that broke off nobody knows whether it was committed.
         let mut unsure = false;
         while !self.lost {
@@ -277,7 +300,9 @@ impl<'a> Course<'a> {
             };
             match written {
                 Ok(job) => return Some(job),
-                Err(store::Error::Fenced(_)) if unsure && let Some(job) = self.committed(ending).await => {
+                Err(store::Error::Fenced(_))
+                    if unsure && let Some(job) = self.committed(ending.map(Arc::as_ref)).await =>
+                {
                     return Some(job);
                 }
                 Err(error) => self.store_failed(&error),

@@ -24,7 +24,8 @@ use std::time::{Duration, SystemTime};
 use tokio::sync::{Notify, watch as channel};
 
 pub use crate::store::{
-    JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, StoredInput, UploadBounds, UploadStatus,
+    InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, StoredInput, UploadBounds,
+    UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;
 pub use drain::Drained;

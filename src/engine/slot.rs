@@ -3,6 +3,9 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
+
 use super::worker::Worker;
 use super::{Inner, Phase, attempt, observe};
 use crate::store;
@@ -13,14 +16,20 @@ const CLAIM_POLL: Duration = Duration::from_secs(1);
 /// How often leases and deadlines are looked over: a queued job expires at most this late.
 const SWEEP_PERIOD: Duration = Duration::from_secs(1);
 
+/// Least time between two counts of the queue: each goes through all of it, and dashboards look every few seconds.
+const COUNT_PERIOD: Duration = Duration::from_millis(200);
+
 /// Jobs that one sweep removes at most, in one transaction: at one sweep a second more than any server solves, and
 /// writers wait for some hundred megabytes at worst.
 const PURGE_BATCH: u32 = 32;
 
-/// Claims jobs for one worker, one after the other, until the engine drains.
+/// Claims jobs for one worker, one after the other, until the engine drains. While what a job came to is committed, the
+/// next one is claimed, so that the worker waits for one commit of the store, not for two, and the store may make one of
+/// both.
 pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     let mut work = inner.work.subscribe();
     let mut phase = inner.phase.subscribe();
+    let mut committing: Option<Committing> = None;
     while *phase.borrow_and_update() == Phase::Open {
         // Before the look, so that a job that is stored during it is not missed.
         work.mark_unchanged();
@@ -28,10 +37,14 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
         match inner.store.claim(&options.worker_name, SystemTime::now(), options.lease).await {
             Ok(Some(claimed)) => {
                 inner.queue_changed();
-                attempt::run(&inner, &worker, claimed).await;
+                let next = Committing(attempt::run(&inner, &worker, claimed).await);
+                if let Some(before) = committing.replace(next) {
+                    // Results that the store cannot take must not pile up.
+                    before.done().await;
+                }
                 if worker.is_gone() {
                     tracing::error!("a worker thread is gone, its slot ends");
-                    return;
+                    break;
                 }
                 continue;
             }
@@ -44,17 +57,37 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
             () = tokio::time::sleep(CLAIM_POLL) => {}
         }
     }
+    if let Some(last) = committing {
+        last.done().await;
+    }
+}
+
+/// The end of a job on its way to the store; given up with the slot that waits for it.
+struct Committing(JoinHandle<()>);
+
+impl Committing {
+    async fn done(mut self) {
+        // It only breaks off by a panic, which has been reported; the lease runs out.
+        let _ = (&mut self.0).await;
+    }
+}
+
+impl Drop for Committing {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
 }
 
 /// Ends what waited too long, takes back what was left lying, and counts the queue whenever it changed.
 pub(super) async fn sweep(inner: Arc<Inner>) {
     let mut phase = inner.phase.subscribe();
     let mut ticks = tokio::time::interval(SWEEP_PERIOD);
+    let mut counted = Instant::now();
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     while *phase.borrow_and_update() != Phase::Closed {
         tokio::select! {
             _ = phase.changed() => {}
-            () = inner.queue_changed.notified() => {}
+            () = due(&inner, counted) => {}
             _ = ticks.tick() => {
                 inner.sweep().await;
                 if !*inner.store_reachable.borrow() {
@@ -64,11 +97,18 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
                 inner.tidy().await;
             }
         }
+        counted = Instant::now();
         match inner.store.load().await {
             Ok(load) => observe::queue_depth(load.queued),
             Err(error) => tracing::warn!(%error, "cannot count the queue"),
         }
     }
+}
+
+/// Waits until the queue is to be counted: it changed, and the last count is old enough.
+async fn due(inner: &Inner, counted: Instant) {
+    inner.queue_changed.notified().await;
+    tokio::time::sleep_until(counted + COUNT_PERIOD).await;
 }
 
 impl Inner {

@@ -6,7 +6,8 @@ use std::time::{Duration, SystemTime};
 use super::{Engine, Error, Inner, Phase, finished, observe};
 use crate::domain::{Input, InputName};
 use crate::store::{
-    self, BegunUpload, NewInput, NewUpload, StoredInput, UploadBounds, UploadLease, UploadStatus, payload,
+    self, BegunUpload, InputPage, InputQuery, NewInput, NewUpload, StoredInput, UploadBounds, UploadLease,
+    UploadStatus, payload,
 };
 
 /// How much may be uploaded, and how long the unfinished is kept.
@@ -93,6 +94,26 @@ impl Engine {
     }
 }
 
+impl Engine {
+    /// One page of a tenant's uploaded inputs.
+    ///
+    /// # Errors
+    /// [`Error::InvalidArgument`] for a page token of another query.
+    pub async fn list_inputs(&self, query: &InputQuery) -> Result<InputPage, Error> {
+        Ok(self.inner.store.inputs(query).await?)
+    }
+
+    /// Deletes an uploaded input; jobs that were created with it keep it to their end.
+    ///
+    /// # Errors
+    /// [`Error::InputNotFound`].
+    pub async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
+        self.inner.store.delete_input(name).await?;
+        tracing::info!(input = %name, "input deleted");
+        Ok(())
+    }
+}
+
 impl Inner {
     /// # Errors
     /// [`Error::Draining`].
@@ -172,7 +193,7 @@ impl Upload {
                 observation_count: count(input.observation_count()),
             })
         };
-        let new = finished(tokio::task::spawn_blocking(encode)).await?;
+        let new = Arc::new(finished(tokio::task::spawn_blocking(encode)).await?);
         let store = Arc::clone(&self.engine.inner.store);
         let input = store.finish_upload(&self.lease, &new, SystemTime::now()).await?;
         observe::input_created();

@@ -110,7 +110,7 @@ impl Watch {
                 self.version.mark_unchanged();
                 self.caught_up = false;
                 self.ahead = self.inner.store.events_after(&self.name, self.after, READ_AHEAD).await?.into();
-                self.caught_up = self.ahead.is_empty();
+                self.caught_up = self.ahead.len() < READ_AHEAD as usize;
                 self.after = self.ahead.back().and_then(|event| event.sequence).unwrap_or(self.after);
                 continue;
             }

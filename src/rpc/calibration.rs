@@ -24,20 +24,27 @@ use crate::{solver, telemetry};
 /// this is for a caller that lives and forgets.
 const INPUT_PATIENCE: Duration = Duration::from_secs(60);
 
+/// What the transport bounds, as the server tells it.
+#[derive(Debug, Clone, Copy)]
+pub struct Bounds {
+    pub max_message_bytes: usize,
+    pub max_connections: usize,
+}
+
 /// The service.
 #[derive(Clone)]
 pub struct Calibration {
     engine: Engine,
     limits: Limits,
-    max_message_bytes: usize,
+    bounds: Bounds,
     followers: Followers,
 }
 
 impl Calibration {
     /// `grace`: how long after the last `Solve` that follows a job was dropped the job is cancelled.
-    pub fn new(engine: Engine, limits: Limits, max_message_bytes: usize, grace: Duration) -> Self {
+    pub fn new(engine: Engine, limits: Limits, bounds: Bounds, grace: Duration) -> Self {
         let followers = Followers::new(engine.clone(), grace);
-        Self { engine, limits, max_message_bytes, followers }
+        Self { engine, limits, bounds, followers }
     }
 
     /// Reads the whole of a stream.
@@ -147,7 +154,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
                 max_views: count(self.limits.max_views),
                 max_tracks: count(self.limits.max_tracks),
                 max_observations: count(self.limits.max_observations),
-                max_message_bytes: self.max_message_bytes as u64,
+                max_message_bytes: self.bounds.max_message_bytes as u64,
             }),
             methods: Method::ALL.map(Twin::to_wire).to_vec(),
             backends: [Backend::Flex, Backend::Ndarray].map(Twin::to_wire).to_vec(),
@@ -157,6 +164,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             queue_limits: Some(queue_limits(&options.queue)),
             upload_limits: Some(upload_limits(&options.uploads)),
             trained_network: solver::trained_network(),
+            max_connections: count(self.bounds.max_connections),
         }))
     }
 }

@@ -70,12 +70,12 @@ impl Caller {
         if name.tenant == self.tenant { Ok(name) } else { Err(status::job_not_found(&name)) }
     }
 
-    /// The uploaded input that `name` names; another tenant's is as one that never was.
+    /// The uploaded input that `name`, of that field, names; another tenant's is as one that never was.
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
-    pub fn input(&self, name: &str) -> Result<InputName, Status> {
-        let name = names::input(name).map_err(|error| status::invalid(&error))?;
+    pub fn input(&self, name: &str, field: &str) -> Result<InputName, Status> {
+        let name = names::input(name, field).map_err(|error| status::invalid(&error))?;
         if name.tenant == self.tenant { Ok(name) } else { Err(status::input_not_found(&name)) }
     }
 }

@@ -5,19 +5,22 @@ use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::io;
 use std::pin::Pin;
+use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
 use futures_util::stream::{self, Stream};
 use prost::bytes::{Buf, Bytes};
-use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
 use super::reload::Current;
+use crate::telemetry::metrics;
 
 /// How long a connection may take to its first words: three round trips of the slowest link, and no reason for a caller to
 /// be slower.
@@ -26,6 +29,17 @@ pub const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Connections that have not come to their first words yet, at most; one more ends the oldest of them. Callers that mean it
 /// need milliseconds for it, so that a thousand are a thousand new ones a round trip.
 pub const MAX_GREETED: usize = 1_024;
+
+/// Connections that speak, at most: one for each of some thousand callers who watch. Each takes some ten kilobytes while it
+/// is idle, and a file descriptor.
+pub const MAX_SPEAKING: usize = 4_096;
+
+/// How long a connection that is refused may take to hear of it.
+const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// What a connection is told for which there is no room: empty settings, and GOAWAY (RFC 9113, sections 6.5 and 6.8) after
+/// stream 0 with ENHANCE_YOUR_CALM. No call of it was begun, so that a client may come again.
+const NO_ROOM: &[u8] = b"\0\0\0\x04\0\0\0\0\0\0\0\x1c\x07\0\0\0\0\0\0\0\0\0\0\0\0\x0btoo many connections";
 
 /// Pause after a connection could not be taken, which is usually a lack of file descriptors: some free up meanwhile.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
@@ -42,12 +56,15 @@ pub struct Options {
     pub timeout: Duration,
     /// Connections that have not come to them yet, at most.
     pub max_greeted: usize,
+    /// Connections that have, at most; one more is refused.
+    pub max_speaking: usize,
 }
 
 /// Connections that speak, in the order in which they began to. Each handshake begins with the certificate that is in
 /// force then; those that fail or stall leave nothing but a line in the log.
 pub fn incoming(listener: TcpListener, options: Options) -> impl Stream<Item = Result<Connection, Infallible>> {
-    let door = Door { listener, options, greeted: JoinSet::new(), oldest_first: VecDeque::new() };
+    let seats = Arc::new(Semaphore::new(options.max_speaking.min(Semaphore::MAX_PERMITS)));
+    let door = Door { listener, options, seats, greeted: JoinSet::new(), oldest_first: VecDeque::new() };
     stream::unfold(door, async |mut door| {
         let connection = door.next().await;
         Some((Ok(connection), door))
@@ -57,7 +74,9 @@ pub fn incoming(listener: TcpListener, options: Options) -> impl Stream<Item = R
 struct Door {
     listener: TcpListener,
     options: Options,
-    greeted: JoinSet<Result<Connection, String>>,
+    /// One for each connection that may speak.
+    seats: Arc<Semaphore>,
+    greeted: JoinSet<Result<Begun, String>>,
     oldest_first: VecDeque<AbortHandle>,
 }
 
@@ -73,7 +92,14 @@ impl Door {
                     }
                 },
                 Some(ended) = self.greeted.join_next() => match ended {
-                    Ok(Ok(connection)) => return connection,
+                    Ok(Ok(begun)) => match self.seats.clone().try_acquire_owned() {
+                        Ok(seat) => {
+                            let Begun { io, early, info } = begun;
+                            let held = (seat, metrics::connection());
+                            return Connection { io, early, info, _held: held };
+                        }
+                        Err(_) => refuse(begun),
+                    },
                     Ok(Err(error)) => tracing::debug!(error, "a connection came to nothing"),
                     Err(error) if error.is_cancelled() => tracing::debug!("a silent connection made room for another"),
                     Err(error) => tracing::error!(%error, "a connection's task failed"),
@@ -101,8 +127,23 @@ impl Door {
     }
 }
 
+/// Tells a connection that there is no room for it.
+fn refuse(begun: Begun) {
+    metrics::connection_refused();
+    tracing::debug!("a connection was refused: too many speak");
+    tokio::spawn(async move {
+        let mut io = begun.io;
+        let told = async {
+            io.write_all(NO_ROOM).await?;
+            io.shutdown().await
+        };
+        // Whoever does not listen is not waited for.
+        let _ = tokio::time::timeout(REFUSAL_TIMEOUT, told).await;
+    });
+}
+
 /// Shakes hands, where there is TLS, and waits for the first words.
-async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Result<Connection> {
+async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Result<Begun> {
     connection.set_nodelay(true)?;
     let info = connection.connect_info();
     let mut io: Box<dyn Io> = match acceptor {
@@ -120,7 +161,14 @@ async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Resu
         }
         early.extend_from_slice(&rest[..count]);
     }
-    Ok(Connection { io, early: early.into(), info })
+    Ok(Begun { io, early: early.into(), info })
+}
+
+/// A connection that has said its first words.
+struct Begun {
+    io: Box<dyn Io>,
+    early: Bytes,
+    info: TcpConnectInfo,
 }
 
 /// A connection, encrypted or not.
@@ -133,6 +181,8 @@ pub struct Connection {
     io: Box<dyn Io>,
     early: Bytes,
     info: TcpConnectInfo,
+    /// Its place, and its count among those that speak, for as long as it lives.
+    _held: (OwnedSemaphorePermit, metrics::Held),
 }
 
 impl Connected for Connection {

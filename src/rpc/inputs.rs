@@ -12,7 +12,7 @@ use super::convert::{self, input};
 use super::parts::{self, Parts};
 use super::{proto, status, violation};
 use crate::domain::{InputName, Limits};
-use crate::engine::{Begun, Engine, GivenUp, NewUpload, Upload};
+use crate::engine::{Begun, Engine, GivenUp, InputQuery, NewUpload, Upload};
 use proto::upload_input_request::Message;
 
 /// Data of one chunk, in bytes: below the message limit of every client and proxy.
@@ -254,5 +254,28 @@ impl proto::input_service_server::InputService for Inputs {
             input: found.input.as_ref().map(input::uploaded_to_wire),
             size_bytes: input::wire_size(found.bytes),
         }))
+    }
+
+    async fn list_inputs(
+        &self,
+        request: Request<proto::ListInputsRequest>,
+    ) -> Result<Response<proto::ListInputsResponse>, Status> {
+        let tenant = Caller::of(&request)?.parent(&request.get_ref().parent)?;
+        let proto::ListInputsRequest { page_size, page_token, .. } = request.into_inner();
+        let Ok(page_size) = u32::try_from(page_size) else {
+            return Err(status::invalid(&violation("page_size", format!("{page_size} is negative"))));
+        };
+        let query = InputQuery { tenant, page_size, page_token: Some(page_token) };
+        let page = self.engine.list_inputs(&query).await.map_err(status::from_engine)?;
+        Ok(Response::new(proto::ListInputsResponse {
+            inputs: page.inputs.iter().map(input::uploaded_to_wire).collect(),
+            next_page_token: page.next_page_token.unwrap_or_default(),
+        }))
+    }
+
+    async fn delete_input(&self, request: Request<proto::DeleteInputRequest>) -> Result<Response<()>, Status> {
+        let name = Caller::of(&request)?.input(&request.get_ref().name, "name")?;
+        self.engine.delete_input(&name).await.map_err(status::from_engine)?;
+        Ok(Response::new(()))
     }
 }

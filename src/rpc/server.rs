@@ -16,7 +16,7 @@ use tonic_health::server::HealthReporter;
 use tower::layer::util::{Identity, Stack};
 
 use super::auth::Authenticate;
-use super::calibration::Calibration;
+use super::calibration::{self, Calibration};
 use super::explain::Explain;
 use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
@@ -68,6 +68,8 @@ pub struct Options {
     pub handshake_timeout: Duration,
     /// Connections that have not come to their first words yet, at most; one more ends the oldest of them.
     pub max_silent_connections: usize,
+    /// Connections that speak, at most; one more is refused.
+    pub max_connections: usize,
     /// How long a connection may be silent before it is asked whether it lives.
     pub keepalive: Duration,
     /// How long the answer to that may take.
@@ -83,6 +85,9 @@ impl Options {
 
     /// Two million observations of at most 33 bytes; a larger input goes in chunks.
     pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
+
+    /// See [`door::MAX_SPEAKING`].
+    pub const MAX_CONNECTIONS: usize = door::MAX_SPEAKING;
 
     /// Whether the files of certificates and keys can be used, as they are now.
     ///
@@ -107,6 +112,7 @@ impl Default for Options {
             look_every: reload::LOOK_EVERY,
             handshake_timeout: door::HANDSHAKE_TIMEOUT,
             max_silent_connections: door::MAX_GREETED,
+            max_connections: door::MAX_SPEAKING,
             keepalive: KEEPALIVE,
             keepalive_timeout: KEEPALIVE_TIMEOUT,
             reflection: true,
@@ -165,6 +171,7 @@ impl Server {
             certificates,
             timeout: options.handshake_timeout,
             max_greeted: options.max_silent_connections,
+            max_speaking: options.max_connections,
         };
         let incoming = door::incoming(listener, entrance);
         let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));
@@ -280,7 +287,8 @@ type Layers = Stack<Authenticate, Stack<Explain, Stack<Meter, Identity>>>;
 fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Result<Router<Layers>, Error> {
     let limits = options.limits.clone();
     let max_bytes = options.max_message_bytes;
-    let calibration = Calibration::new(engine.clone(), limits.clone(), max_bytes, options.solve_grace);
+    let bounds = calibration::Bounds { max_message_bytes: max_bytes, max_connections: options.max_connections };
+    let calibration = Calibration::new(engine.clone(), limits.clone(), bounds, options.solve_grace);
     let inputs = Inputs::new(engine.clone(), limits.clone());
     let reflection = || {
         tonic_reflection::server::Builder::configure()

@@ -35,7 +35,7 @@ impl Submission {
         let description =
             create::from_wire(request.job_id, request.request_id, request.job).map_err(|error| invalid(&error))?;
         let input = match request.input {
-            Some(Inline::InputName(name)) => Source::Uploaded(caller.input(&name)?),
+            Some(Inline::InputName(name)) => Source::Uploaded(caller.input(&name, "input_name")?),
             input => Source::Draft(Draft::begin(input, limits).map_err(|error| invalid(&error))?),
         };
         let submission = Self { tenant, description, input };

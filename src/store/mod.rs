@@ -16,16 +16,17 @@ pub mod upload;
 mod contract;
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName, JobState};
 use crate::domain::progress::Progress;
 
-pub use query::{JobPage, JobQuery, Order};
+pub use query::{InputPage, InputQuery, JobPage, JobQuery, Order};
 pub use record::{
     Bound, CancelReply, Claimed, Created, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome, QueueBounds,
-    Request, Swept,
+    Request, Swept, Work,
 };
 pub use upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
@@ -137,11 +138,11 @@ pub trait Store: Send + Sync + 'static {
     /// deadline are left to [`Store::sweep`].
     async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error>;
 
-    /// The encoded input of a job.
+    /// The encoded input of a job, and whether its cancel has been asked for.
     ///
     /// # Errors
     /// [`Error::NotFound`].
-    async fn input(&self, name: &JobName) -> Result<Vec<u8>, Error>;
+    async fn work(&self, name: &JobName) -> Result<Work, Error>;
 
     /// Extends a lease and brings back what its holder must know.
     ///
@@ -159,7 +160,7 @@ pub trait Store: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`Error::Fenced`].
-    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error>;
+    async fn finish(&self, lease: &Lease, ending: &Arc<Ending>, now: SystemTime) -> Result<Job, Error>;
 
     /// Gives a lease back. The job returns to the queue, or ends if its cancel was asked for; the attempt does not
     /// count against the cap. Returns the job as it stands then.
@@ -227,7 +228,12 @@ pub trait Store: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`] where it was given up.
-    async fn finish_upload(&self, lease: &UploadLease, new: &NewInput, now: SystemTime) -> Result<StoredInput, Error>;
+    async fn finish_upload(
+        &self,
+        lease: &UploadLease,
+        new: &Arc<NewInput>,
+        now: SystemTime,
+    ) -> Result<StoredInput, Error>;
 
     /// Gives an upload up: its id is free again.
     ///
@@ -246,6 +252,19 @@ pub trait Store: Send + Sync + 'static {
     /// # Errors
     /// [`Error::InputNotFound`].
     async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error>;
+
+    /// One page of a tenant's uploaded inputs.
+    ///
+    /// # Errors
+    /// [`Error::PageToken`].
+    async fn inputs(&self, query: &InputQuery) -> Result<InputPage, Error>;
+
+    /// Takes an uploaded input's name away, which is free again at once. Jobs that were created with it keep it; it is
+    /// removed with the last of them, or at once where there is none.
+    ///
+    /// # Errors
+    /// [`Error::InputNotFound`].
+    async fn delete_input(&self, name: &InputName) -> Result<(), Error>;
 
     /// Gives up the uploads to which nothing came since `abandoned_by`, and removes some of the bytes of those that were
     /// given up or finished, and some of the uploaded inputs that no job has and none was created with since

@@ -1,10 +1,11 @@
-//! Listing jobs: the query, the page, and the token that leads to the next one.
+//! Listing jobs and uploaded inputs: the query, the page, and the token that leads to the next one.
 
 use std::collections::BTreeMap;
+use std::fmt::Debug;
 
 use sha2::{Digest, Sha256};
 
-use super::Error;
+use super::{Error, StoredInput};
 use crate::domain::job::{DEFAULT_TENANT, Job, JobName, JobState};
 
 /// Order of a listing.
@@ -40,10 +41,7 @@ impl JobQuery {
 
     /// The page size in force.
     pub fn effective_page_size(&self) -> u32 {
-        match self.page_size {
-            0 => Self::DEFAULT_PAGE_SIZE,
-            size => size.min(Self::MAX_PAGE_SIZE),
-        }
+        effective(self.page_size)
     }
 
     /// Where the page begins; `None`: at the first job.
@@ -51,28 +49,64 @@ impl JobQuery {
     /// # Errors
     /// [`Error::PageToken`] for a token that was not made for this query (AIP-158: only the page size may change).
     pub(super) fn cursor(&self) -> Result<Option<Cursor>, Error> {
-        match self.page_token.as_deref() {
-            None | Some("") => Ok(None),
-            Some(token) => {
-                let cursor = Cursor::parse(token).filter(|cursor| self.token_after(cursor) == token);
-                cursor.map(Some).ok_or(Error::PageToken)
-            }
-        }
+        cursor_of(self.page_token.as_deref(), |cursor| self.token_after(cursor))
     }
 
     /// The token of the page that begins after `cursor`.
     pub(super) fn token_after(&self, cursor: &Cursor) -> String {
-        format!("{:016x}-{:x}-{}", self.digest(cursor), cursor.create_micros, cursor.job)
+        cursor.token(&(&self.tenant, &self.states, &self.labels, self.order))
+    }
+}
+
+fn effective(page_size: u32) -> u32 {
+    match page_size {
+        0 => JobQuery::DEFAULT_PAGE_SIZE,
+        size => size.min(JobQuery::MAX_PAGE_SIZE),
+    }
+}
+
+fn cursor_of(token: Option<&str>, token_after: impl Fn(&Cursor) -> String) -> Result<Option<Cursor>, Error> {
+    match token {
+        None | Some("") => Ok(None),
+        Some(token) => {
+            let cursor = Cursor::parse(token).filter(|cursor| token_after(cursor) == token);
+            cursor.map(Some).ok_or(Error::PageToken)
+        }
+    }
+}
+
+/// Which uploaded inputs of a tenant to list, the newest first.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct InputQuery {
+    pub tenant: String,
+    /// As in [`JobQuery`].
+    pub page_size: u32,
+    /// `None` or empty: the first page.
+    pub page_token: Option<String>,
+}
+
+impl InputQuery {
+    pub(super) fn effective_page_size(&self) -> u32 {
+        effective(self.page_size)
     }
 
-    /// Ties a token to its query, and its parts to each other; a slip is to be caught, nothing is to be kept secret, so 64
-    /// bits do.
-    fn digest(&self, cursor: &Cursor) -> u64 {
-        let mut hash = Sha256::new();
-        hash.update(format!("{:?}", (&self.tenant, &self.states, &self.labels, self.order, cursor)));
-        let digest = hash.finalize();
-        digest.iter().take(8).fold(0, |value, &byte| value << 8 | u64::from(byte))
+    /// See [`JobQuery::cursor`].
+    pub(super) fn cursor(&self) -> Result<Option<Cursor>, Error> {
+        cursor_of(self.page_token.as_deref(), |cursor| self.token_after(cursor))
     }
+
+    /// The token of the page that begins after `cursor`.
+    pub(super) fn token_after(&self, cursor: &Cursor) -> String {
+        cursor.token(&("inputs", &self.tenant))
+    }
+}
+
+/// One page of uploaded inputs.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct InputPage {
+    pub inputs: Vec<StoredInput>,
+    /// `None` on the last page.
+    pub next_page_token: Option<String>,
 }
 
 impl Default for JobQuery {
@@ -96,19 +130,28 @@ pub struct JobPage {
     pub next_page_token: Option<String>,
 }
 
-/// The last job of a page; jobs of one microsecond are told apart by their id. Nothing in it is of another tenant.
+/// The last job or input of a page; those of one microsecond are told apart by their id. Nothing in it is of another
+/// tenant.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Cursor {
     pub create_micros: i64,
-    pub job: String,
+    pub id: String,
 }
 
 impl Cursor {
     fn parse(token: &str) -> Option<Self> {
         let (_, rest) = token.split_once('-')?;
-        let (create_micros, job) = rest.split_once('-')?;
+        let (create_micros, id) = rest.split_once('-')?;
         let create_micros = i64::from_str_radix(create_micros, 16).ok()?;
-        JobName::is_id(job).then(|| Self { create_micros, job: job.to_owned() })
+        JobName::is_id(id).then(|| Self { create_micros, id: id.to_owned() })
+    }
+
+    /// The token of the page of this query that begins after it. The digest ties it to its query, and its parts to each
+    /// other; a slip is to be caught, nothing is to be kept secret, so 64 bits do.
+    fn token(&self, query: &impl Debug) -> String {
+        let digest = Sha256::digest(format!("{:?}", (query, self)));
+        let digest = digest.iter().take(8).fold(0_u64, |value, &byte| value << 8 | u64::from(byte));
+        format!("{digest:016x}-{:x}-{}", self.create_micros, self.id)
     }
 }
 
@@ -120,7 +163,7 @@ mod tests {
     #[test]
     fn a_token_leads_back_into_its_own_query_only() {
         let mut query = JobQuery::default();
-        let cursor = Cursor { create_micros: 1_700_000_000_000_001, job: "a-1-b".into() };
+        let cursor = Cursor { create_micros: 1_700_000_000_000_001, id: "a-1-b".into() };
         query.page_token = Some(query.token_after(&cursor));
         assert_eq!(query.cursor(), Ok(Some(cursor.clone())));
         query.page_size = 7;

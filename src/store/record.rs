@@ -187,6 +187,14 @@ pub struct Claimed {
     pub queue_time: SystemTime,
 }
 
+/// What there is to do for a job that is claimed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Work {
+    /// Encoded [`crate::domain::Input`], see [`super::payload`].
+    pub input: Vec<u8>,
+    pub cancel_requested: bool,
+}
+
 /// What a heartbeat brings back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Heartbeat {

@@ -1,11 +1,12 @@
 //! A store that tells the metrics how long each of its operations took and which came too late, whatever implements it.
 
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::{
-    BegunUpload, CancelReply, Claimed, Created, Ending, Error, Heartbeat, Hint, JobPage, JobQuery, Lease, Load,
-    NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, Store, StoredInput, Swept, UploadBounds, UploadLease,
-    UploadStatus,
+    BegunUpload, CancelReply, Claimed, Created, Ending, Error, Heartbeat, Hint, InputPage, InputQuery, JobPage,
+    JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, Store, StoredInput, Swept,
+    UploadBounds, UploadLease, UploadStatus, Work,
 };
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
@@ -57,9 +58,9 @@ impl<S: Store> Store for Timed<S> {
         self.0.claim(worker, now, lease_for).await
     }
 
-    async fn input(&self, name: &JobName) -> Result<Vec<u8>, Error> {
-        let _timer = store_operation("input");
-        self.0.input(name).await
+    async fn work(&self, name: &JobName) -> Result<Work, Error> {
+        let _timer = store_operation("work");
+        self.0.work(name).await
     }
 
     async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
@@ -72,7 +73,7 @@ impl<S: Store> Store for Timed<S> {
         counted("record", self.0.record(lease, progress, now).await)
     }
 
-    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error> {
+    async fn finish(&self, lease: &Lease, ending: &Arc<Ending>, now: SystemTime) -> Result<Job, Error> {
         let _timer = store_operation("finish");
         counted("finish", self.0.finish(lease, ending, now).await)
     }
@@ -143,7 +144,12 @@ impl<S: Store> Store for Timed<S> {
         self.0.read_upload(lease, at_byte).await
     }
 
-    async fn finish_upload(&self, lease: &UploadLease, new: &NewInput, now: SystemTime) -> Result<StoredInput, Error> {
+    async fn finish_upload(
+        &self,
+        lease: &UploadLease,
+        new: &Arc<NewInput>,
+        now: SystemTime,
+    ) -> Result<StoredInput, Error> {
         let _timer = store_operation("finish_upload");
         self.0.finish_upload(lease, new, now).await
     }
@@ -161,6 +167,16 @@ impl<S: Store> Store for Timed<S> {
     async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error> {
         let _timer = store_operation("uploaded_input");
         self.0.uploaded_input(name).await
+    }
+
+    async fn inputs(&self, query: &InputQuery) -> Result<InputPage, Error> {
+        let _timer = store_operation("inputs");
+        self.0.inputs(query).await
+    }
+
+    async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
+        let _timer = store_operation("delete_input");
+        self.0.delete_input(name).await
     }
 
     async fn purge_uploads(

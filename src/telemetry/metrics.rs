@@ -369,6 +369,16 @@ pub fn watcher() -> Held {
     Held::new(gauge!(WATCHERS.name))
 }
 
+/// A connection speaks until the guard is dropped.
+pub fn connection() -> Held {
+    Held::new(gauge!(CONNECTIONS.name))
+}
+
+/// A connection was refused for want of room.
+pub fn connection_refused() {
+    counter!(CONNECTIONS_REFUSED.name).increment(1);
+}
+
 /// A gRPC call that has begun. Dropping it without a code counts it as `CANCELLED`: the client went away.
 #[must_use = "the call ends when this is dropped"]
 pub struct RpcCall {

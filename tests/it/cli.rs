@@ -44,6 +44,7 @@ fn every_command_explains_itself() {
         "serve",
         "solve",
         "upload",
+        "inputs",
         "submit",
         "watch",
         "get",

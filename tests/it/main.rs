@@ -3,6 +3,7 @@
 mod abuse;
 mod access;
 mod api;
+mod batch;
 mod chaos;
 mod chart;
 mod cli;
@@ -10,6 +11,7 @@ mod crash;
 mod dashboards;
 mod disk;
 mod formats;
+mod inputs;
 mod load;
 mod lost;
 mod prior;

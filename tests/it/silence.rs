@@ -1,16 +1,22 @@
 //! Connections that say nothing: they end in time, and hold up nobody meanwhile.
 
+use std::net::SocketAddr;
+use std::process::Stdio;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use scpsfm::rpc::proto;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::server::Options;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
+use tokio::net::{TcpListener, TcpStream};
+use tonic::Code;
 
 use crate::support::live::is_served;
 use crate::support::memory::resident_mb;
 use crate::support::program::Serving;
+use crate::support::scrape::Page;
 use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::quick;
 
@@ -26,6 +32,26 @@ async fn saying(address: &str, count: usize, words: &[u8]) -> Vec<TcpStream> {
         connections.push(connection);
     }
     connections
+}
+
+/// The address of a door to this one, and how many have come through it: a client connects again by itself, and says
+/// nothing of it.
+async fn counting(address: SocketAddr) -> (String, Arc<AtomicUsize>) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let url = format!("http://{}", listener.local_addr().expect("an address"));
+    let connections = Arc::new(AtomicUsize::new(0));
+    let counted = connections.clone();
+    tokio::spawn(async move {
+        while let Ok((mut outside, _)) = listener.accept().await {
+            counted.fetch_add(1, Ordering::SeqCst);
+            tokio::spawn(async move {
+                let mut inside = TcpStream::connect(address).await.expect("the server listens");
+                // Whichever side ends it, the test looks at what it sees.
+                let _ = tokio::io::copy_bidirectional(&mut outside, &mut inside).await;
+            });
+        }
+    });
+    (url, connections)
 }
 
 /// Reads until the other side closes the connection.
@@ -51,12 +77,14 @@ async fn hundreds_of_silent_connections_hold_up_nobody_and_are_ended() {
         silent.extend(saying(&address, 150, words).await);
     }
     is_served(&server.url()).await;
-    let good = server.channel().await;
+    let (counted, connections) = counting(server.server.address()).await;
+    let mut client = CalibrationServiceClient::connect(counted).await.expect("a connection");
+    client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("an answer");
     soon(futures_util::future::join_all(silent.into_iter().map(until_closed))).await;
     // One that answers when it is asked whether it lives is left alone, however little it has to say.
     tokio::time::sleep(4 * half_a_second).await;
-    let mut client = CalibrationServiceClient::new(good);
-    client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("the same connection, or another");
+    client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("an answer");
+    assert_eq!(connections.load(Ordering::SeqCst), 1, "a client that had to connect again was not left alone");
     is_served(&server.url()).await;
 }
 
@@ -74,6 +102,46 @@ async fn of_too_many_silent_connections_the_oldest_make_room() {
     let mut last = newest.into_iter().next_back().expect("the newest");
     last.write_all(&PREFACE[3..]).await.expect("still open");
     assert!(matches!(soon(last.read(&mut [0; 9])).await, Ok(1..)), "the server's settings");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_connection_too_many_is_refused_and_there_is_room_when_one_ends() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let server = Serving::start_with(directory.path(), &[("SCPSFM_SERVER__MAX_CONNECTIONS", "3")], Stdio::null());
+    let count = |series: &str| Page::parse(&server.page("/metrics")).value(series);
+    let mut clients = Vec::new();
+    for _ in 0..3 {
+        let mut client = CalibrationServiceClient::connect(server.grpc.clone()).await.expect("a connection");
+        let capabilities = client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("an answer");
+        assert_eq!(capabilities.into_inner().max_connections, 3);
+        clients.push(client);
+    }
+    assert_eq!((count("scpsfm_connections"), count("scpsfm_connections_refused_total")), (3.0, 0.0));
+    // One that listens hears why; a client of gRPC may come again.
+    let address = server.grpc.trim_start_matches("http://").to_owned();
+    let mut heard = Vec::new();
+    let mut one_more = saying(&address, 1, PREFACE).await.remove(0);
+    soon(one_more.read_to_end(&mut heard)).await.expect("it is told, and closed");
+    assert!(heard.ends_with(b"too many connections"), "{heard:?}");
+    let refused = async {
+        let mut client = CalibrationServiceClient::connect(server.grpc.clone()).await.map_err(|_| Code::Unavailable)?;
+        client.get_capabilities(proto::GetCapabilitiesRequest {}).await.map(drop).map_err(|status| status.code())
+    };
+    let code = soon(refused).await.expect_err("no room");
+    assert!(matches!(code, Code::Unavailable | Code::Unknown | Code::ResourceExhausted), "{code:?}");
+    assert!(count("scpsfm_connections_refused_total") >= 2.0);
+    for client in &mut clients {
+        client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("those that are in stay in");
+    }
+    assert_eq!(count("scpsfm_connections"), 3.0);
+    drop(clients.pop());
+    soon(async {
+        while count("scpsfm_connections") > 2.0 {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    })
+    .await;
+    is_served(&server.grpc).await;
 }
 
 #[tokio::test]

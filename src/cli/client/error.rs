@@ -55,6 +55,21 @@ impl Error {
         }
     }
 
+    /// The same where each of several inputs is a request of one call.
+    pub fn at_lines_of(self, inputs: &[LabelledInput]) -> Failure {
+        let Error::Invalid(violations, message) = &self else { return self.into() };
+        let first = violations.first().and_then(|found| within_request(&found.field));
+        let Some((index, input)) = first.and_then(|(index, _)| Some((index, inputs.get(index)?))) else {
+            return self.into();
+        };
+        // The server tells of the first request that it refuses.
+        let own = violations.iter().filter_map(|found| match within_request(&found.field) {
+            Some((of, field)) if of == index => Some(Violation { field: field.to_owned(), ..found.clone() }),
+            _ => None,
+        });
+        Error::Invalid(own.collect(), message.clone()).at_lines(input)
+    }
+
     /// From the status of a call to `server`.
     pub(super) fn from_status(server: &str, status: &Status) -> Self {
         if let Some(words) = handshake::words(server, status) {
@@ -78,7 +93,9 @@ impl Error {
             }
             Code::InvalidArgument => Error::Invalid(violations(status), message),
             // What the transport says of a message above the server's limit.
-            Code::OutOfRange => Error::Refused(format!("{message}; `solve --server` sends a large input in parts")),
+            Code::OutOfRange => {
+                Error::Refused(format!("{message}; `solve --server` and `upload` send a large input in parts"))
+            }
             Code::NotFound
             | Code::AlreadyExists
             | Code::PermissionDenied
@@ -139,6 +156,12 @@ pub(super) fn root_cause(error: &dyn std::error::Error) -> String {
 fn violations(status: &Status) -> Vec<Violation> {
     let fields = status.get_details_bad_request().map(|request| request.field_violations).unwrap_or_default();
     fields.into_iter().map(|found| violation(&found.field, found.description)).collect()
+}
+
+/// Number and field of `requests[3].track_set.x`.
+fn within_request(field: &str) -> Option<(usize, &str)> {
+    let (index, field) = field.strip_prefix("requests[")?.split_once("].")?;
+    Some((index.parse().ok()?, field))
 }
 
 /// Whether the fault is the input's. Every other field is one that a flag set.

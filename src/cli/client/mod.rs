@@ -5,8 +5,10 @@
 
 pub mod access;
 mod backoff;
+mod batch;
 mod error;
 mod handshake;
+mod listing;
 pub mod upload;
 
 use std::collections::BTreeMap;

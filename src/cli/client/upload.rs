@@ -119,10 +119,8 @@ impl Client {
     ) -> Result<proto::Input, Status> {
         let status = proto::GetUploadStatusRequest { parent: self.parent(), upload_id: input.upload_id() };
         let from = match backoff.within(self.inputs.get_upload_status(status)).await {
-            Ok(status) => match status.into_inner() {
-                proto::UploadStatus { input: Some(stored), .. } => return Ok(stored),
-                proto::UploadStatus { committed_bytes, .. } => u64::try_from(committed_bytes).unwrap_or(0),
-            },
+            // A finished one is begun again all the same, which says that it is wanted, and sends no more of it.
+            Ok(status) => u64::try_from(status.into_inner().committed_bytes).unwrap_or(0),
             Err(status) if error::reason(&status).as_deref() == Some("UPLOAD_NOT_FOUND") => 0,
             Err(status) => return Err(status),
         };

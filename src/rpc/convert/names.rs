@@ -32,11 +32,11 @@ pub fn job(name: &str) -> Result<JobName, InvalidInput> {
 /// The input of `tenants/{tenant}/inputs/{input}`.
 ///
 /// # Errors
-/// A violation of `input_name` where the name has another form.
-pub fn input(name: &str) -> Result<InputName, InvalidInput> {
+/// A violation of `field` where the name has another form.
+pub fn input(name: &str, field: &str) -> Result<InputName, InvalidInput> {
     InputName::parse(name).ok_or_else(|| {
         let text = format!("{} is not of the form tenants/{{tenant}}/inputs/{{input}}", quoted(name));
-        Violation::of("input_name", text).into()
+        Violation::of(field, text).into()
     })
 }
 

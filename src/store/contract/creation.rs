@@ -40,7 +40,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
     };
     assert_eq!(created.job, expected);
     assert_eq!(store.job(&new.name).await, Ok(expected));
-    assert_eq!(store.input(&new.name).await, Ok(input));
+    assert_eq!(store.work(&new.name).await.map(|work| work.input), Ok(input));
     assert_eq!(store.result(&new.name).await, Ok(None));
     assert_eq!(story(store, &new.name).await, told(&[(1, 0, "QUEUED")]));
     let claimed = claim(store, 1).await;
@@ -152,7 +152,7 @@ pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &dyn 
     let created: Vec<_> = created.iter().map(|created| (created.job.name.job.as_str(), created.new)).collect();
     assert_eq!(created, [("a", true), ("b", true)]);
     assert_eq!(store.load().await.expect("counts").queued_bytes, 300);
-    assert_eq!(store.input(&record("b").name).await, Ok(vec![7; 100]));
+    assert_eq!(store.work(&record("b").name).await.map(|work| work.input), Ok(vec![7; 100]));
 }
 
 pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &dyn Store) {

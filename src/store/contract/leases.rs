@@ -79,7 +79,8 @@ pub(in crate::store) async fn a_success_stores_its_result_then_its_state(store: 
     let lease = claim(store, 1).await.lease;
     let result: Vec<u8> = (0..3 * payload::CHUNK_BYTES).map(|k| (k % 253) as u8).collect();
     let last = progress(400);
-    let ending = Ending { progress: Some(last), ..success(result.clone()) };
+    let outcome = success(result.clone()).outcome.clone();
+    let ending = Arc::new(Ending { progress: Some(last), outcome });
     let job = store.finish(&lease, &ending, time(2)).await.expect("finishes");
     assert_eq!((job.state, job.end_time), (JobState::Succeeded, Some(time(2))));
     assert_eq!((job.summary.clone(), job.progress), (Some(summary()), Some(last)));
@@ -115,7 +116,7 @@ pub(in crate::store) async fn every_outcome_ends_in_its_state(store: &dyn Store)
         let name = create(store, record(&state.name().to_lowercase()), 0).await.name;
         let lease = claim(store, 1).await.lease;
         assert_eq!(lease.name, name);
-        let job = store.finish(&lease, &Ending { outcome, progress: None }, time(2)).await.expect("finishes");
+        let job = store.finish(&lease, &Ending { outcome, progress: None }.into(), time(2)).await.expect("finishes");
         assert_eq!((job.state, job.end_time), (state, Some(time(2))));
         assert_eq!(job.failure, (state == JobState::Failed).then(|| failure.clone()));
         assert_eq!(story(store, &name).await, told(&[(1, 0, "QUEUED"), (2, 1, "RUNNING"), (3, 1, event)]));
@@ -177,7 +178,7 @@ pub(in crate::store) async fn a_cancel_ends_what_waits_and_flags_what_runs(store
             "released" => store.release(&lease, time(3)).await.expect("gives back"),
             "vanished" => store.sweep(time(99), MAX_ATTEMPTS).await.expect("sweeps").lost.remove(0),
             _ => {
-                let ending = Ending { outcome: Outcome::Cancelled, progress: None };
+                let ending = Arc::new(Ending { outcome: Outcome::Cancelled, progress: None });
                 store.finish(&lease, &ending, time(3)).await.expect("ends")
             }
         };

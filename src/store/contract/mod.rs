@@ -7,6 +7,7 @@ pub(super) mod removal;
 pub(super) mod uploads;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt, Summary};
@@ -49,6 +50,9 @@ macro_rules! store_contract {
             uploads::a_tenants_uploads_are_bounded,
             uploads::what_nobody_goes_on_with_is_given_up_and_removed,
             uploads::an_input_lives_as_long_as_a_job_has_it,
+            uploads::a_finished_upload_that_is_begun_again_is_kept_as_one_that_is_used,
+            uploads::inputs_are_listed_page_by_page,
+            uploads::a_deleted_input_is_kept_by_its_jobs_alone,
             uploads::many_that_begin_at_once_share_the_last_room,
         );
     };
@@ -136,8 +140,8 @@ fn summary() -> Summary {
     }
 }
 
-fn success(result: Vec<u8>) -> Ending {
-    Ending { outcome: Outcome::Succeeded { summary: summary(), result }, progress: None }
+fn success(result: Vec<u8>) -> Arc<Ending> {
+    Ending { outcome: Outcome::Succeeded { summary: summary(), result }, progress: None }.into()
 }
 
 /// The events of a job as `(sequence, attempt, what)`.

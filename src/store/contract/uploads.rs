@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::domain::InputName;
+use crate::store::query::{InputPage, InputQuery};
 use crate::store::record::JobInput;
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease,
@@ -24,8 +25,8 @@ async fn begin(store: &dyn Store, new: &NewUpload, seconds: u64) -> (UploadLease
     }
 }
 
-fn input(payload: Vec<u8>) -> NewInput {
-    NewInput { payload, sha256: [3; 32], view_count: 2, track_count: 5, observation_count: 9 }
+fn input(payload: Vec<u8>) -> Arc<NewInput> {
+    NewInput { payload, sha256: [3; 32], view_count: 2, track_count: 5, observation_count: 9 }.into()
 }
 
 /// An upload of a few bytes that became an input at that second.
@@ -198,7 +199,7 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
     };
     let job = create(store, of("a", "used"), 5).await;
     create(store, of("b", "used"), 5).await;
-    assert_eq!(store.input(&job.name).await, Ok(payload.clone()));
+    assert_eq!(store.work(&job.name).await.map(|work| work.input), Ok(payload.clone()));
     assert_eq!(store.load().await.expect("counts").queued_bytes, 100);
     let missing = store.create_job(of("c", "none"), &ROOM, time(5)).await;
     assert_eq!(missing.expect_err("no such input"), Error::InputNotFound(name("none")));
@@ -219,7 +220,7 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
     assert_eq!(store.upload(&name("unused")).await, Err(Error::UploadNotFound(name("unused"))));
     for job in ["a", "b", "d"] {
         let job = record(job).name;
-        assert_eq!(store.input(&job).await, Ok(payload.clone()));
+        assert_eq!(store.work(&job).await.map(|work| work.input), Ok(payload.clone()));
         store.request_cancel(&job, None, time(6)).await.expect("ends");
         store.delete_job(&job, None).await.expect("deletes");
     }
@@ -227,6 +228,80 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
     assert_eq!(store.purge_uploads(None, Some(time(4))).await, Ok(PurgedUploads::default()), "used since");
     assert_eq!(store.purge_uploads(None, Some(time(5))).await, Ok(PurgedUploads { abandoned: 0, inputs: 1 }));
     assert!(store.uploaded_input(&name("used")).await.is_err());
+}
+
+pub(in crate::store) async fn a_finished_upload_that_is_begun_again_is_kept_as_one_that_is_used(store: &dyn Store) {
+    for input in ["asked", "forgotten"] {
+        finished(store, input, vec![7; 10], 0).await;
+    }
+    let again = store.begin_upload(&new("asked", 4), &ROOMY, time(50)).await.expect("is known");
+    assert!(matches!(again, BegunUpload::Finished(_)), "{again:?}");
+    assert_eq!(store.purge_uploads(None, Some(time(49))).await, Ok(PurgedUploads { abandoned: 0, inputs: 1 }));
+    assert!(store.uploaded_input(&name("forgotten")).await.is_err());
+    assert!(store.uploaded_input(&name("asked")).await.is_ok());
+    assert_eq!(store.purge_uploads(None, Some(time(50))).await, Ok(PurgedUploads { abandoned: 0, inputs: 1 }));
+}
+
+pub(in crate::store) async fn inputs_are_listed_page_by_page(store: &dyn Store) {
+    for (input, seconds) in [("a", 3), ("b", 1), ("c", 3), ("d", 2)] {
+        finished(store, input, vec![7; 10], seconds).await;
+    }
+    begin(store, &new("open", 10), 9).await;
+    create(store, record("of-a-job-alone"), 9).await;
+    let page = async |tenant: &str, page_size, page_token: Option<String>| {
+        store.inputs(&InputQuery { tenant: tenant.into(), page_size, page_token }).await
+    };
+    let ids = |page: &InputPage| page.inputs.iter().map(|input| input.name.input.clone()).collect::<Vec<_>>();
+    let whole = page("t", 0, None).await.expect("a page");
+    assert_eq!((ids(&whole), &whole.next_page_token), (["c", "a", "d", "b"].map(str::to_owned).to_vec(), &None));
+    assert_eq!(whole.inputs[3], store.uploaded_input(&name("b")).await.expect("is there"));
+    let first = page("t", 3, None).await.expect("a page");
+    assert_eq!(ids(&first), ["c", "a", "d"]);
+    let token = first.next_page_token.clone();
+    let second = page("t", 3, token.clone()).await.expect("a page");
+    assert_eq!((ids(&second), second.next_page_token), (vec!["b".to_owned()], None));
+    assert_eq!(page("u", 0, None).await, Ok(InputPage { inputs: Vec::new(), next_page_token: None }));
+    assert_eq!(page("u", 3, token.clone()).await, Err(Error::PageToken));
+    let of_jobs = JobQuery { tenant: "t".into(), page_token: token, ..JobQuery::default() };
+    assert_eq!(store.jobs(&of_jobs).await, Err(Error::PageToken), "a token of inputs is none of jobs");
+}
+
+pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &dyn Store) {
+    let payload = vec![7; payload::CHUNK_BYTES + 3];
+    for input in ["shared", "free"] {
+        finished(store, input, payload.clone(), 0).await;
+    }
+    let of = |job: &str| NewRecord { input: JobInput::Uploaded { input: "shared".into(), bytes: 50 }, ..record(job) };
+    let (a, b) = (create(store, of("a"), 1).await.name, create(store, of("b"), 1).await.name);
+    let stranger = InputName { tenant: "u".into(), input: "shared".into() };
+    assert_eq!(store.delete_input(&stranger).await, Err(Error::InputNotFound(stranger.clone())));
+    for input in ["shared", "free"] {
+        store.delete_input(&name(input)).await.expect("deletes");
+        assert_eq!(store.delete_input(&name(input)).await, Err(Error::InputNotFound(name(input))));
+        assert_eq!(store.uploaded_input(&name(input)).await, Err(Error::InputNotFound(name(input))));
+        assert_eq!(store.upload(&name(input)).await, Err(Error::UploadNotFound(name(input))));
+    }
+    let late = store.create_job(of("c"), &ROOM, time(2)).await;
+    assert_eq!(late.expect_err("its name is gone"), Error::InputNotFound(name("shared")));
+    // Its id is free for other bytes, and nothing of the old ones counts against the tenant once it is cleared away.
+    for _ in 0..3 {
+        store.purge_uploads(None, None).await.expect("clears away");
+    }
+    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: 4 };
+    let again = store.begin_upload(&new("shared", 4), &bounds, time(3)).await.expect("room");
+    let BegunUpload::Open { lease, committed: 0, .. } = again else { panic!("{again:?}") };
+    store.append_upload(&lease, 0, &[1; 4], time(3)).await.expect("appends");
+    store.finish_upload(&lease, &input(vec![9; 10]), time(3)).await.expect("finishes");
+    // Each job has the old bytes to its end, also once the other is gone.
+    for (job, other) in [(&a, Some(&b)), (&b, None)] {
+        assert_eq!(store.work(job).await.map(|work| work.input), Ok(payload.clone()));
+        store.request_cancel(job, None, time(4)).await.expect("ends");
+        store.delete_job(job, None).await.expect("deletes");
+        if let Some(other) = other {
+            assert_eq!(store.work(other).await.map(|work| work.input), Ok(payload.clone()));
+        }
+    }
+    assert!(store.uploaded_input(&name("shared")).await.is_ok(), "the new one has nothing to do with them");
 }
 
 pub(in crate::store) async fn many_that_begin_at_once_share_the_last_room(store: &dyn Store) {

@@ -11,13 +11,12 @@ mod url;
 
 use std::time::{Duration, SystemTime};
 
-use sqlx::Transaction;
 use sqlx::pool::PoolConnection;
 use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRow};
 use tokio::sync::Mutex;
 use tokio::time::timeout;
 
-use super::sql::{self, Change, Connection, Database, Size, Statement, Step};
+use super::sql::{self, Change, Connection, Database, Operation, Size, Statement, Step};
 use super::{Error, Hint};
 use crate::domain::job::JobName;
 use clock::Clock;
@@ -56,11 +55,12 @@ const SESSION: [(&str, &str); 6] = [
 /// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
 const ADMISSION_LOCK: i64 = 0x7363_7073_666d;
 
-const MIGRATIONS: [Step; 4] = [
+const MIGRATIONS: [Step; 5] = [
     (1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql")),
     (2, "retention", include_str!("../migrations/postgres/0002_retention.sql")),
     (3, "uploads", include_str!("../migrations/postgres/0003_uploads.sql")),
     (4, "listing", include_str!("../migrations/postgres/0004_listing.sql")),
+    (5, "inputs", include_str!("../migrations/postgres/0005_inputs.sql")),
 ];
 
 /// Store in a PostgreSQL database.
@@ -143,6 +143,15 @@ impl Connection for PgConnection {
         sql::run::<sqlx::Postgres>(self, statement).await
     }
 
+    /// One after the other: the protocol takes one statement with parameters at a time.
+    async fn batch(&mut self, statements: Vec<Statement>) -> Result<Vec<PgRow>, Error> {
+        let mut rows = Vec::new();
+        for statement in statements {
+            rows.append(&mut self.rows(statement).await?);
+        }
+        Ok(rows)
+    }
+
     async fn lock_admission(&mut self) -> Result<(), Error> {
         self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(ADMISSION_LOCK)).await
     }
@@ -161,8 +170,11 @@ impl Database for Postgres {
         Ok(self.pool(size).acquire().await?)
     }
 
-    async fn begin(&self, size: Size) -> Result<Transaction<'static, sqlx::Postgres>, Error> {
-        Ok(self.pool(size).begin().await?)
+    async fn write<T: Send + 'static>(&self, size: Size, operation: Operation<PgConnection, T>) -> Result<T, Error> {
+        let mut transaction = self.pool(size).begin().await?;
+        let value = operation(&mut transaction).await?;
+        transaction.commit().await?;
+        Ok(value)
     }
 
     fn bound(&self, size: Size) -> Option<Duration> {

@@ -124,7 +124,7 @@ async fn changes_are_told_to_other_servers_by_name_and_after_the_commit() {
 async fn a_server_that_stops_within_a_transaction_holds_up_nobody_for_long() {
     let Some(fixture) = Fixture::open().await else { return };
     let other = Postgres::open(&fixture.url).await.expect("a second server");
-    let mut stuck = other.begin(Size::Small).await.expect("a transaction");
+    let mut stuck = other.pool(Size::Small).begin().await.expect("a transaction");
     stuck.lock_admission().await.expect("the lock");
     // Only the database itself can end this one: its bound is below what a creation may take.
     fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created in the end");

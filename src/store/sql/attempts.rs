@@ -2,7 +2,10 @@
 
 use std::time::SystemTime;
 
-use super::rows::{self, Standing, append, held, leave, micros, number, select_jobs, select_standing, standing};
+use super::rows::{
+    self, Departure, Standing, end_attempt, held, insert_event, integer, leave, micros, number, one_job, returning_job,
+    select_standing, standing,
+};
 use super::{Change, Connection, Row, Statement, jobs, removal};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt};
 use crate::domain::progress::Progress;
@@ -26,33 +29,38 @@ pub(super) async fn claim<C: Connection>(
     now: SystemTime,
     expires: SystemTime,
 ) -> Result<Option<Claimed>, Error> {
-    let next = Statement::new(
-        "SELECT id FROM jobs WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) \
-         ORDER BY priority DESC, create_time, id LIMIT 1",
-    )
+    let next = Statement::new(select_standing!(
+        "WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) ORDER BY priority DESC, create_time, id LIMIT 1"
+    ))
     .bind(micros(now))
     .then(C::SKIP_LOCKED);
     let Some(row) = connection.optional_row(next).await? else { return Ok(None) };
-    let id = row.integer("id")?;
-    let lease = Statement::new(
-        "UPDATE jobs SET state = 'RUNNING', attempt = attempt + 1, start_time = COALESCE(start_time, $1), \
-         lease_worker = $2, lease_expires = $3, progress = NULL WHERE id = $4 RETURNING tenant, job, attempt",
-    )
+    let job = Standing::from_row(&row)?;
+    let (attempt, sequence) = (job.attempt + 1, job.last_sequence + 1);
+    let lease = Statement::new(returning_job!(
+        "UPDATE jobs SET state = 'RUNNING', attempt = $1, start_time = COALESCE(start_time, $2), lease_worker = $3, \
+         lease_expires = $4, progress = NULL, last_sequence = $5 WHERE id = $6"
+    ))
+    .bind(attempt)
     .bind(micros(now))
     .bind(worker)
     .bind(micros(expires))
-    .bind(id);
-    let row = connection.row(lease).await?;
-    let name = JobName { tenant: row.text("tenant")?, job: row.text("job")? };
-    let attempt: u32 = number(&row, "attempt")?;
-    let begin = Statement::new("INSERT INTO attempts (job_id, attempt, worker, start_time) VALUES ($1, $2, $3, $4)");
-    connection.execute(begin.bind(id).bind(attempt).bind(worker).bind(micros(now))).await?;
+    .bind(integer(sequence))
+    .bind(job.id);
+    let begin = Statement::new("INSERT INTO attempts (job_id, attempt, worker, start_time) VALUES ($1, $2, $3, $4)")
+        .bind(job.id)
+        .bind(attempt)
+        .bind(worker)
+        .bind(micros(now));
     let event = EventBody::State { state: JobState::Running, failure: None };
-    append(connection, (id, &name), attempt, &event, now).await?;
-    let row = connection.row(Statement::new(select_jobs!("WHERE id = $1")).bind(id)).await?;
+    let event = insert_event(job.id, sequence, attempt, &event, now)?;
+    let rows = connection.batch(vec![lease, begin, event]).await?;
+    connection.tell(Change::Events, &job.name).await?;
+    let claimed = one_job(&rows)?;
+    let row = &rows[0];
     Ok(Some(Claimed {
-        job: rows::job(&row)?,
-        lease: Lease { name, attempt },
+        lease: Lease { name: claimed.name.clone(), attempt },
+        job: claimed,
         trace_parent: row.optional_text("trace_parent")?,
         queue_time: rows::time(row.integer("queue_time")?),
     }))
@@ -78,13 +86,15 @@ pub(super) async fn record<C: Connection>(
     now: SystemTime,
 ) -> Result<u64, Error> {
     let job = held(connection, lease).await?;
-    keep_progress(connection, job.id, progress).await?;
-    append(connection, (job.id, &job.name), job.attempt, &EventBody::Progress(*progress), now).await
-}
-
-async fn keep_progress<C: Connection>(connection: &mut C, id: i64, progress: &Progress) -> Result<(), Error> {
-    let update = Statement::new("UPDATE jobs SET progress = $1 WHERE id = $2");
-    connection.execute(update.bind(payload::encode(progress)?).bind(id)).await
+    let sequence = job.last_sequence + 1;
+    let update = Statement::new("UPDATE jobs SET progress = $1, last_sequence = $2 WHERE id = $3")
+        .bind(payload::encode(progress)?)
+        .bind(integer(sequence))
+        .bind(job.id);
+    let event = insert_event(job.id, sequence, job.attempt, &EventBody::Progress(*progress), now)?;
+    connection.batch(vec![update, event]).await?;
+    connection.tell(Change::Events, &job.name).await?;
+    Ok(sequence)
 }
 
 /// Ends an attempt and its job.
@@ -95,25 +105,18 @@ pub(super) async fn finish<C: Connection>(
     now: SystemTime,
 ) -> Result<Job, Error> {
     let job = held(connection, lease).await?;
-    if let Some(progress) = &ending.progress {
-        keep_progress(connection, job.id, progress).await?;
-    }
-    let (next, failure) = match &ending.outcome {
+    let mut departure = match &ending.outcome {
         Outcome::Succeeded { summary, result } => {
             insert_result(connection, job.id, result).await?;
-            let update = Statement::new("UPDATE jobs SET summary = $1 WHERE id = $2");
-            connection.execute(update.bind(payload::encode(summary)?).bind(job.id)).await?;
-            let event = EventBody::Result(summary.clone());
-            append(connection, (job.id, &job.name), job.attempt, &event, now).await?;
-            (JobState::Succeeded, None)
+            Departure { summary: Some(summary), ..Departure::to(JobState::Succeeded) }
         }
-        Outcome::Failed(failure) => (JobState::Failed, Some(failure.clone())),
-        Outcome::Cancelled => (JobState::Cancelled, None),
-        Outcome::Expired => (JobState::Expired, None),
+        Outcome::Failed(failure) => Departure { failure: Some(failure.clone()), ..Departure::to(JobState::Failed) },
+        Outcome::Cancelled => Departure::to(JobState::Cancelled),
+        Outcome::Expired => Departure::to(JobState::Expired),
     };
-    end_attempt(connection, &job, AttemptEnd::Ended, now).await?;
-    leave(connection, &job, next, failure, now).await?;
-    jobs::get(connection, &lease.name).await
+    departure.progress = ending.progress.as_ref();
+    departure.attempt_end = Some(AttemptEnd::Ended);
+    leave(connection, &job, departure, now).await
 }
 
 async fn insert_result<C: Connection>(connection: &mut C, id: i64, bytes: &[u8]) -> Result<(), Error> {
@@ -124,24 +127,12 @@ async fn insert_result<C: Connection>(connection: &mut C, id: i64, bytes: &[u8])
     Ok(())
 }
 
-/// Notes how the latest attempt of a job ended.
-async fn end_attempt<C: Connection>(
-    connection: &mut C,
-    job: &Standing,
-    end: AttemptEnd,
-    now: SystemTime,
-) -> Result<(), Error> {
-    let update = Statement::new("UPDATE attempts SET end_time = $1, ending = $2 WHERE job_id = $3 AND attempt = $4");
-    connection.execute(update.bind(micros(now)).bind(end.name()).bind(job.id).bind(job.attempt)).await
-}
-
 /// Gives a lease back.
 pub(super) async fn release<C: Connection>(connection: &mut C, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
     let job = held(connection, lease).await?;
     let next = if job.cancel_requested { JobState::Cancelled } else { JobState::Queued };
-    end_attempt(connection, &job, AttemptEnd::GivenBack, now).await?;
-    leave(connection, &job, next, None, now).await?;
-    jobs::get(connection, &lease.name).await
+    let departure = Departure { attempt_end: Some(AttemptEnd::GivenBack), ..Departure::to(next) };
+    leave(connection, &job, departure, now).await
 }
 
 /// Asks for the end of a job.
@@ -155,7 +146,7 @@ pub(super) async fn request_cancel<C: Connection>(
     removal::check_etag(connection, name, etag).await?;
     let ended_now = job.state == JobState::Queued;
     if ended_now {
-        leave(connection, &job, JobState::Cancelled, None, now).await?;
+        leave(connection, &job, Departure::to(JobState::Cancelled), now).await?;
     } else if job.state == JobState::Running {
         connection
             .execute(Statement::new("UPDATE jobs SET cancel_requested = TRUE WHERE id = $1").bind(job.id))
@@ -181,14 +172,14 @@ pub(super) async fn take_back<C: Connection>(
         let lost_attempts = job.lost_attempts + 1;
         let update = Statement::new("UPDATE jobs SET lost_attempts = $1 WHERE id = $2");
         connection.execute(update.bind(lost_attempts).bind(job.id)).await?;
-        end_attempt(connection, &job, AttemptEnd::Lost, now).await?;
+        connection.execute(end_attempt(&job, AttemptEnd::Lost, now)).await?;
         let next = after_loss(&job, lost_attempts, now, max_attempts);
         let failure = match next {
             JobState::Failed => Some(exhausted(connection, &job, lost_attempts, max_attempts).await?),
             _ => None,
         };
-        leave(connection, &job, next, failure, now).await?;
-        changed.push(jobs::get(connection, &job.name).await?);
+        let departure = Departure { failure, ..Departure::to(next) };
+        changed.push(leave(connection, &job, departure, now).await?);
     }
     Ok(changed)
 }
@@ -266,8 +257,7 @@ pub(super) async fn expire_queued<C: Connection>(connection: &mut C, now: System
     let mut changed = Vec::new();
     for row in connection.rows(select).await? {
         let job = Standing::from_row(&row)?;
-        leave(connection, &job, JobState::Expired, None, now).await?;
-        changed.push(jobs::get(connection, &job.name).await?);
+        changed.push(leave(connection, &job, Departure::to(JobState::Expired), now).await?);
     }
     Ok(changed)
 }

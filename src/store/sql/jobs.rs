@@ -3,12 +3,12 @@
 use std::collections::HashMap;
 use std::time::SystemTime;
 
-use super::rows::{self, append, integer, micros, number, select_jobs};
+use super::rows::{self, integer, micros, number, one_job, returning_job, select_jobs};
 use super::{Change, Connection, Row, Statement, uploads};
 use crate::domain::InputName;
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::store::query::Cursor;
-use crate::store::record::{Created, JobInput, Load, NewRecord, QueueBounds, Request};
+use crate::store::record::{Created, JobInput, Load, NewRecord, QueueBounds, Request, Work};
 use crate::store::{Error, JobPage, JobQuery, Order, payload};
 
 /// Stores jobs, all or none; see [`crate::store::Store::create_jobs`].
@@ -18,37 +18,35 @@ pub(super) async fn create<C: Connection>(
     bounds: &QueueBounds,
     now: SystemTime,
 ) -> Result<Vec<Created>, Error> {
-    let mut inputs = Vec::new();
     let mut waiting = Waiting::default();
-    for new in news {
-        // Payloads take long: nobody else's admission waits for them.
-        let known = admit(connection, new, bounds, &mut waiting).await?.is_some();
-        let input = if known { None } else { Some(input_of(connection, new, now).await?) };
-        inputs.push(input);
-    }
-    connection.lock_admission().await?;
-    let mut created = Vec::new();
+    let mut inputs = vec![None; news.len()];
     if !C::WRITES_ALONE {
+        for (new, input) in news.iter().zip(&mut inputs) {
+            // Payloads take long: nobody else's admission waits for them.
+            if admit(connection, new, bounds, &mut waiting).await?.is_none() {
+                *input = Some(input_of(connection, new, now).await?);
+            }
+        }
+        connection.lock_admission().await?;
+        // Looked over again below: others may have come in between.
         waiting = Waiting::default();
     }
+    let mut created = Vec::new();
     for (new, input) in news.iter().zip(inputs) {
-        // Looked over again: others may have come in between, and the batch's own jobs are there now.
-        match (admit(connection, new, bounds, &mut waiting).await?, input) {
-            (Some(job), input) => {
+        match admit(connection, new, bounds, &mut waiting).await? {
+            Some(job) => {
                 if let Some(input) = input {
                     let delete = Statement::new("DELETE FROM inputs WHERE id = $1 AND input IS NULL");
                     connection.execute(delete.bind(input)).await?;
                 }
                 created.push(Created { job, new: false });
             }
-            (None, Some(input)) => {
-                created.push(enqueue(connection, new, input, now).await?);
-                waiting.add(new);
-            }
-            // The job that its request id had made was deleted in between.
-            (None, None) => {
-                let input = input_of(connection, new, now).await?;
-                created.push(enqueue(connection, new, input, now).await?);
+            None => {
+                let input = match input {
+                    Some(input) => input,
+                    None => input_of(connection, new, now).await?,
+                };
+                created.push(Created { job: enqueue(connection, new, input, now).await?, new: true });
                 waiting.add(new);
             }
         }
@@ -97,29 +95,40 @@ impl Waiting {
     }
 }
 
-/// Stores a job that was admitted, and its request id.
+/// Stores a job that was admitted, its labels, its request id and its first event.
 async fn enqueue<C: Connection>(
     connection: &mut C,
     new: &NewRecord,
     input_id: i64,
     now: SystemTime,
-) -> Result<Created, Error> {
-    let id = insert_job(connection, new, input_id, now).await?;
+) -> Result<Job, Error> {
+    let mut batch = vec![insert_job(new, input_id, now)?];
+    // The row's id is known to the database alone until all of it is written.
+    let of_job = |statement: Statement| {
+        let job = statement.then(" FROM jobs WHERE tenant = ").then_bind(&new.name.tenant);
+        job.then(" AND job = ").then_bind(&new.name.job)
+    };
+    for (key, value) in &new.labels {
+        let insert = Statement::new("INSERT INTO job_labels (job_id, key, value) SELECT id, $1, $2");
+        batch.push(of_job(insert.bind(key).bind(value)));
+    }
     if let Some(request) = &new.request {
         let insert = Statement::new(
-            "INSERT INTO request_ids (tenant, request_id, digest, job_id, create_time) VALUES ($1, $2, $3, $4, $5)",
+            "INSERT INTO request_ids (job_id, tenant, request_id, digest, create_time) SELECT id, $1, $2, $3, $4",
         )
         .bind(&new.name.tenant)
         .bind(&request.id)
         .bind(request.digest.as_slice())
-        .bind(id)
         .bind(micros(now));
-        connection.execute(insert).await?;
+        batch.push(of_job(insert));
     }
     let event = EventBody::State { state: JobState::Queued, failure: None };
-    append(connection, (id, &new.name), 0, &event, now).await?;
+    let insert = Statement::new("INSERT INTO events (job_id, sequence, attempt, time, body) SELECT id, 1, 0, $1, $2");
+    batch.push(of_job(insert.bind(micros(now)).bind(payload::encode(&event)?)));
+    let job = one_job(&connection.batch(batch).await?)?;
+    connection.tell(Change::Events, &new.name).await?;
     connection.tell(Change::Queued, &new.name).await?;
-    Ok(Created { job: get(connection, &new.name).await?, new: true })
+    Ok(job)
 }
 
 /// Whether a job may be stored: `Ok(None)`; or the job that the same request made before.
@@ -194,36 +203,27 @@ pub(super) async fn insert_input<C: Connection>(
     Ok(id)
 }
 
-async fn insert_job<C: Connection>(
-    connection: &mut C,
-    new: &NewRecord,
-    input_id: i64,
-    now: SystemTime,
-) -> Result<i64, Error> {
-    let insert = Statement::new(
+/// The row of a job, whose first event has the number 1.
+fn insert_job(new: &NewRecord, input_id: i64, now: SystemTime) -> Result<Statement, Error> {
+    let insert = Statement::new(returning_job!(
         "INSERT INTO jobs (tenant, job, state, priority, create_time, queue_time, deadline, input_id, input_bytes, \
-         view_count, track_count, observation_count, settings, labels, trace_parent) \
-         VALUES ($1, $2, 'QUEUED', $3, $4, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13) RETURNING id",
-    )
-    .bind(&new.name.tenant)
-    .bind(&new.name.job)
-    .bind(new.priority)
-    .bind(micros(now))
-    .bind(new.deadline.map(micros))
-    .bind(input_id)
-    .bind(integer(new.input.bytes()))
-    .bind(new.view_count)
-    .bind(new.track_count)
-    .bind(new.observation_count)
-    .bind(payload::encode(&new.settings)?)
-    .bind(payload::encode(&new.labels)?)
-    .bind(new.trace_parent.as_deref());
-    let id = connection.row(insert).await?.integer("id")?;
-    for (key, value) in &new.labels {
-        let insert = Statement::new("INSERT INTO job_labels (job_id, key, value) VALUES ($1, $2, $3)");
-        connection.execute(insert.bind(id).bind(key).bind(value)).await?;
-    }
-    Ok(id)
+         view_count, track_count, observation_count, settings, labels, trace_parent, last_sequence) \
+         VALUES ($1, $2, 'QUEUED', $3, $4, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, 1)"
+    ));
+    Ok(insert
+        .bind(&new.name.tenant)
+        .bind(&new.name.job)
+        .bind(new.priority)
+        .bind(micros(now))
+        .bind(new.deadline.map(micros))
+        .bind(input_id)
+        .bind(integer(new.input.bytes()))
+        .bind(new.view_count)
+        .bind(new.track_count)
+        .bind(new.observation_count)
+        .bind(payload::encode(&new.settings)?)
+        .bind(payload::encode(&new.labels)?)
+        .bind(new.trace_parent.as_deref()))
 }
 
 /// One job by its name.
@@ -241,7 +241,7 @@ pub(super) async fn list<C: Connection>(connection: &mut C, query: &JobQuery) ->
     rows.truncate(size as usize);
     let next_page_token = match rows.last() {
         Some(last) if more => {
-            let cursor = Cursor { create_micros: last.integer("create_time")?, job: last.text("job")? };
+            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text("job")? };
             Some(query.token_after(&cursor))
         }
         _ => None,
@@ -268,7 +268,7 @@ fn listing(query: &JobQuery) -> Result<Statement, Error> {
         Order::CreateTimeAscending => (" AND (create_time, job) > (", " ORDER BY create_time, job LIMIT "),
     };
     if let Some(cursor) = cursor {
-        select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(&cursor.job).then(")");
+        select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(&cursor.id).then(")");
     }
     Ok(select.then(order).then_bind(i64::from(query.effective_page_size()) + 1))
 }
@@ -289,9 +289,12 @@ pub(super) async fn events_after<C: Connection>(
     limit: u32,
 ) -> Result<Vec<JobEvent>, Error> {
     let select = Statement::new(
-        "SELECT sequence, attempt, time, body FROM events WHERE job_id = $1 AND sequence > $2 ORDER BY sequence LIMIT $3",
+        "SELECT sequence, attempt, time, body FROM events \
+         WHERE job_id = (SELECT id FROM jobs WHERE tenant = $1 AND job = $2) AND sequence > $3 \
+         ORDER BY sequence LIMIT $4",
     )
-    .bind(id(connection, name).await?)
+    .bind(&name.tenant)
+    .bind(&name.job)
     .bind(integer(after))
     .bind(limit);
     let event = |row: &C::Row| {
@@ -303,16 +306,24 @@ pub(super) async fn events_after<C: Connection>(
             body: payload::decode(&row.bytes("body")?, "an event")?,
         })
     };
-    connection.rows(select).await?.iter().map(event).collect()
+    let rows = connection.rows(select).await?;
+    if rows.is_empty() {
+        // None yet, or of a job that is not there: an error then.
+        id(connection, name).await?;
+    }
+    rows.iter().map(event).collect()
 }
 
-/// The encoded input of a job.
-pub(super) async fn input<C: Connection>(connection: &mut C, name: &JobName) -> Result<Vec<u8>, Error> {
+/// The encoded input of a job, and whether its cancel was asked for.
+pub(super) async fn work<C: Connection>(connection: &mut C, name: &JobName) -> Result<Work, Error> {
     let select = Statement::new(
-        "SELECT data FROM input_chunks WHERE input_id = (SELECT input_id FROM jobs WHERE id = $1) ORDER BY chunk",
-    )
-    .bind(id(connection, name).await?);
-    joined(&connection.rows(select).await?)
+        "SELECT data, cancel_requested FROM jobs JOIN input_chunks ON input_chunks.input_id = jobs.input_id \
+         WHERE tenant = $1 AND job = $2 ORDER BY chunk",
+    );
+    let chunks = connection.rows(select.bind(&name.tenant).bind(&name.job)).await?;
+    // An encoded input has a byte at least, and so a chunk.
+    let first = chunks.first().ok_or_else(|| Error::NotFound(name.clone()))?;
+    Ok(Work { cancel_requested: first.flag("cancel_requested")?, input: joined(&chunks)? })
 }
 
 /// The encoded result of a job, if it has one.

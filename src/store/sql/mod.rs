@@ -13,9 +13,10 @@ mod uploads;
 use std::future::Future;
 use std::time::{Duration, SystemTime};
 
+use futures_util::future::BoxFuture;
+use sqlx::SqlSafeStr;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::pool::PoolConnection;
-use sqlx::{SqlSafeStr, Transaction};
 
 use super::{Error, Hint};
 use crate::domain::job::JobName;
@@ -33,6 +34,9 @@ pub(super) trait Connection: Send {
 
     /// Runs a statement to its end and returns its rows.
     fn rows(&mut self, statement: Statement) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;
+
+    /// Runs statements in their order, of which none needs another's answer. Returns the rows of all of them.
+    fn batch(&mut self, statements: Vec<Statement>) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;
 
     /// Waits until no other transaction admits jobs, and keeps others from it until this one ends.
     fn lock_admission(&mut self) -> impl Future<Output = Result<(), Error>> + Send;
@@ -70,6 +74,20 @@ pub(super) enum Change {
     Cancel,
 }
 
+/// What is one transaction. It may be run again where its transaction came to nothing.
+pub(super) type Operation<C, T> =
+    Box<dyn for<'c> Fn(&'c mut C) -> BoxFuture<'c, Result<T, Error>> + Send + Sync + 'static>;
+
+/// An operation from a closure.
+pub(super) fn operation<C, T>(
+    run: impl for<'c> Fn(&'c mut C) -> BoxFuture<'c, Result<T, Error>> + Send + Sync + 'static,
+) -> Operation<C, T> {
+    Box::new(run)
+}
+
+/// The connection of a database.
+pub(super) type ConnectionOf<D> = <<D as Database>::Sqlx as sqlx::Database>::Connection;
+
 /// A database as a store uses it.
 pub(super) trait Database: Send + Sync + 'static {
     type Sqlx: sqlx::Database<Connection: Connection>;
@@ -80,8 +98,13 @@ pub(super) trait Database: Send + Sync + 'static {
     /// A connection that only reads.
     fn reader(&self, size: Size) -> impl Future<Output = Result<PoolConnection<Self::Sqlx>, Error>> + Send;
 
-    /// Begins a transaction that may write.
-    fn begin(&self, size: Size) -> impl Future<Output = Result<Transaction<'static, Self::Sqlx>, Error>> + Send;
+    /// Runs an operation in a transaction, and answers once it is committed and durable. Where it is refused, nothing of
+    /// it is.
+    fn write<T: Send + 'static>(
+        &self,
+        size: Size,
+        operation: Operation<ConnectionOf<Self>, T>,
+    ) -> impl Future<Output = Result<T, Error>> + Send;
 
     /// How long an operation of this size may take; `None`: as long as it does.
     fn bound(&self, size: Size) -> Option<Duration>;

@@ -3,7 +3,7 @@
 use std::time::SystemTime;
 
 use super::rows::{micros, standing};
-use super::{Connection, Row, Statement, jobs};
+use super::{Connection, Row, Statement, jobs, uploads};
 use crate::domain::job::JobName;
 use crate::store::Error;
 
@@ -56,5 +56,5 @@ pub(super) async fn purge<C: Connection>(connection: &mut C, ended_by: SystemTim
 async fn remove<C: Connection>(connection: &mut C, id: i64) -> Result<(), Error> {
     let delete = Statement::new("DELETE FROM jobs WHERE id = $1 RETURNING input_id").bind(id);
     let input = connection.row(delete).await?.integer("input_id")?;
-    connection.execute(Statement::new("DELETE FROM inputs WHERE id = $1 AND input IS NULL").bind(input)).await
+    uploads::remove_orphan(connection, input).await
 }

@@ -3,22 +3,36 @@
 use std::time::{Duration, SystemTime};
 
 use super::{Change, Connection, Row, Statement};
-use crate::domain::job::{EventBody, Failure, Job, JobName, JobState};
+use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, Summary};
+use crate::domain::progress::Progress;
 use crate::store::record::Lease;
 use crate::store::{Error, payload};
+
+/// Columns that [`job`] reads.
+macro_rules! job_columns {
+    () => {
+        "id, tenant, job, state, attempt, settings, view_count, track_count, observation_count, labels, priority, \
+         create_time, start_time, end_time, deadline, progress, last_sequence, summary, failure, cancel_requested, \
+         trace_parent, queue_time"
+    };
+}
+pub(super) use job_columns;
 
 /// `SELECT` of all that [`job`] reads; the clauses follow.
 macro_rules! select_jobs {
     ($clauses:literal) => {
-        concat!(
-            "SELECT id, tenant, job, state, attempt, settings, view_count, track_count, observation_count, labels, ",
-            "priority, create_time, start_time, end_time, deadline, progress, last_sequence, summary, failure, ",
-            "cancel_requested, trace_parent, queue_time FROM jobs ",
-            $clauses
-        )
+        concat!("SELECT ", $crate::store::sql::rows::job_columns!(), " FROM jobs ", $clauses)
     };
 }
 pub(super) use select_jobs;
+
+/// A statement that changes one job and returns all that [`job`] reads of it.
+macro_rules! returning_job {
+    ($change:literal) => {
+        concat!($change, " RETURNING ", $crate::store::sql::rows::job_columns!())
+    };
+}
+pub(super) use returning_job;
 
 /// Microseconds since the epoch; times outside of what an `i64` holds are clamped.
 pub(super) fn micros(time: SystemTime) -> i64 {
@@ -104,10 +118,12 @@ pub(super) struct Standing {
     pub lost_attempts: u32,
     pub cancel_requested: bool,
     pub deadline: Option<SystemTime>,
+    /// Number of its latest event.
+    pub last_sequence: u64,
 }
 
 impl Standing {
-    /// From a row with `id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline`.
+    /// From a row of `select_standing!`.
     pub(super) fn from_row(row: &impl Row) -> Result<Self, Error> {
         Ok(Self {
             id: row.integer("id")?,
@@ -117,6 +133,7 @@ impl Standing {
             lost_attempts: number(row, "lost_attempts")?,
             cancel_requested: row.flag("cancel_requested")?,
             deadline: optional_time(row, "deadline")?,
+            last_sequence: number(row, "last_sequence")?,
         })
     }
 }
@@ -125,7 +142,7 @@ impl Standing {
 macro_rules! select_standing {
     ($clauses:literal) => {
         concat!(
-            "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline FROM jobs ",
+            "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline, last_sequence FROM jobs ",
             $clauses
         )
     };
@@ -151,54 +168,93 @@ pub(super) async fn held<C: Connection>(connection: &mut C, lease: &Lease) -> Re
     }
 }
 
-/// Appends an event to a job of this row and returns its sequence number.
-pub(super) async fn append<C: Connection>(
-    connection: &mut C,
-    (id, name): (i64, &JobName),
+/// Stores an event of a job of this row; whoever runs it counts it in the row.
+pub(super) fn insert_event(
+    id: i64,
+    sequence: u64,
     attempt: u32,
     body: &EventBody,
     now: SystemTime,
-) -> Result<u64, Error> {
-    let next = "UPDATE jobs SET last_sequence = last_sequence + 1 WHERE id = $1 RETURNING last_sequence";
-    let sequence = connection.row(Statement::new(next).bind(id)).await?.integer("last_sequence")?;
-    let insert =
-        Statement::new("INSERT INTO events (job_id, sequence, attempt, time, body) VALUES ($1, $2, $3, $4, $5)")
-            .bind(id)
-            .bind(sequence)
-            .bind(attempt)
-            .bind(micros(now))
-            .bind(payload::encode(body)?);
-    connection.execute(insert).await?;
-    connection.tell(Change::Events, name).await?;
-    Ok(sequence.unsigned_abs())
+) -> Result<Statement, Error> {
+    let insert = "INSERT INTO events (job_id, sequence, attempt, time, body) VALUES ($1, $2, $3, $4, $5)";
+    let insert = Statement::new(insert).bind(id).bind(integer(sequence)).bind(attempt).bind(micros(now));
+    Ok(insert.bind(payload::encode(body)?))
+}
+
+/// Notes how the latest attempt of a job ended.
+pub(super) fn end_attempt(job: &Standing, end: AttemptEnd, now: SystemTime) -> Statement {
+    Statement::new("UPDATE attempts SET end_time = $1, ending = $2 WHERE job_id = $3 AND attempt = $4")
+        .bind(micros(now))
+        .bind(end.name())
+        .bind(job.id)
+        .bind(job.attempt)
+}
+
+/// Where a job goes that leaves its state, and what it takes along.
+#[derive(Debug)]
+pub(super) struct Departure<'a> {
+    pub next: JobState,
+    pub failure: Option<Failure>,
+    /// Of a success: it has an event of its own.
+    pub summary: Option<&'a Summary>,
+    /// The last progress, where it is newer than what is stored.
+    pub progress: Option<&'a Progress>,
+    /// How its attempt ended, where that is not noted yet.
+    pub attempt_end: Option<AttemptEnd>,
+}
+
+impl Departure<'_> {
+    /// One that takes nothing along.
+    pub(super) fn to(next: JobState) -> Self {
+        Self { next, failure: None, summary: None, progress: None, attempt_end: None }
+    }
 }
 
 /// Moves a job out of its state, with the event that says so: to the queue, or to an end. Its lease ends with it.
+/// Returns the job as it stands then.
 pub(super) async fn leave<C: Connection>(
     connection: &mut C,
     job: &Standing,
-    next: JobState,
-    failure: Option<Failure>,
+    departure: Departure<'_>,
     now: SystemTime,
-) -> Result<(), Error> {
+) -> Result<Job, Error> {
+    let Departure { next, failure, summary, progress, attempt_end } = departure;
     if !job.state.may_become(next) || next == JobState::Running {
         let (from, to) = (job.state.name(), next.name());
         return Err(Error::Corrupt(format!("{} cannot go from {from} to {to} here", job.name)));
     }
-    let update = Statement::new(
+    let mut batch: Vec<Statement> = attempt_end.map(|end| end_attempt(job, end, now)).into_iter().collect();
+    let mut sequence = job.last_sequence;
+    if let Some(summary) = summary {
+        sequence += 1;
+        batch.push(insert_event(job.id, sequence, job.attempt, &EventBody::Result(summary.clone()), now)?);
+    }
+    sequence += 1;
+    let encoded_failure = failure.as_ref().map(payload::encode).transpose()?;
+    batch.push(insert_event(job.id, sequence, job.attempt, &EventBody::State { state: next, failure }, now)?);
+    let update = Statement::new(returning_job!(
         "UPDATE jobs SET state = $1, lease_worker = NULL, lease_expires = NULL, cancel_requested = FALSE, \
-         queue_time = COALESCE($2, queue_time), end_time = $3, failure = $4 WHERE id = $5",
-    )
+         queue_time = COALESCE($2, queue_time), end_time = $3, failure = $4, summary = COALESCE($5, summary), \
+         progress = COALESCE($6, progress), last_sequence = $7 WHERE id = $8"
+    ))
     .bind(next.name())
     .bind((next == JobState::Queued).then(|| micros(now)))
     .bind(next.is_terminal().then(|| micros(now)))
-    .bind(failure.as_ref().map(payload::encode).transpose()?)
+    .bind(encoded_failure)
+    .bind(summary.map(payload::encode).transpose()?)
+    .bind(progress.map(payload::encode).transpose()?)
+    .bind(integer(sequence))
     .bind(job.id);
-    connection.execute(update).await?;
-    let event = EventBody::State { state: next, failure };
-    append(connection, (job.id, &job.name), job.attempt, &event, now).await?;
+    batch.push(update);
+    let changed = one_job(&connection.batch(batch).await?)?;
+    connection.tell(Change::Events, &job.name).await?;
     if next == JobState::Queued {
         connection.tell(Change::Queued, &job.name).await?;
     }
-    Ok(())
+    Ok(changed)
+}
+
+/// The job of a batch that changes one.
+pub(super) fn one_job(rows: &[impl Row]) -> Result<Job, Error> {
+    rows.first().map_or_else(|| Err(Error::Corrupt("a job that was just changed is not there".into())), job)
 }

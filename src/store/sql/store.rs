@@ -1,19 +1,22 @@
 //! The store that every database makes: one transaction an operation, within a bound of time.
 
 use std::future::Future;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use super::{Database, Size, attempts, jobs, removal, uploads};
+use futures_util::FutureExt;
+
+use super::{ConnectionOf, Database, Size, attempts, jobs, operation, removal, uploads};
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
-    CancelReply, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, QueueBounds, Swept,
+    CancelReply, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, QueueBounds, Swept, Work,
 };
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
 };
-use crate::store::{Error, Hint, JobPage, JobQuery, Store};
+use crate::store::{Error, Hint, InputPage, InputQuery, JobPage, JobQuery, Store};
 
 /// Waits for an operation as long as the database allows it. One that is broken off changed nothing, or all that it was
 /// to change: a commit may have been on its way.
@@ -41,18 +44,17 @@ macro_rules! reads {
     };
 }
 
-/// Writes in one transaction.
+/// Writes in one transaction, which has the values in brackets to itself: a caller that goes away leaves it whole. They
+/// are cloned for each run of it; what is large is in an [`Arc`].
 macro_rules! writes {
-    ($database:expr, $size:expr, |$connection:ident| $body:expr) => {
-        bounded($database, $size, async {
-            let mut transaction = $database.begin($size).await?;
-            let $connection = &mut *transaction;
-            let value = $body.await?;
-            transaction.commit().await?;
-            Ok(value)
-        })
-        .await
-    };
+    ($database:expr, $size:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {{
+        $(let $owned = $owned.clone();)*
+        let run = operation::<ConnectionOf<D>, _>(move |$connection| {
+            $(let $owned = $owned.clone();)*
+            async move { $body.await }.boxed()
+        });
+        bounded($database, $size, $database.write($size, run)).await
+    }};
 }
 
 #[async_trait::async_trait]
@@ -63,7 +65,8 @@ impl<D: Database> Store for D {
         bounds: &QueueBounds,
         now: SystemTime,
     ) -> Result<Vec<Created>, Error> {
-        writes!(self, Size::Payload, |connection| jobs::create(connection, &new, bounds, now))
+        let new: Arc<[NewRecord]> = new.into();
+        writes!(self, Size::Payload, [new, bounds], |connection| jobs::create(connection, &new, &bounds, now))
     }
 
     async fn job(&self, name: &JobName) -> Result<Job, Error> {
@@ -80,47 +83,53 @@ impl<D: Database> Store for D {
 
     async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error> {
         let expires = self.lease_clock(now) + lease_for;
-        // Idle workers look for jobs again and again: a read keeps them out of the writers' queue.
-        if !reads!(self, Size::Small, |connection| attempts::may_claim(connection))? {
+        // Idle workers look for jobs again and again: a read is one question over the network, a transaction is three.
+        if D::SHARED && !reads!(self, Size::Small, |connection| attempts::may_claim(connection))? {
             return Ok(None);
         }
-        writes!(self, Size::Small, |connection| attempts::claim(connection, worker, now, expires))
+        let worker = worker.to_owned();
+        writes!(self, Size::Small, [worker], |connection| attempts::claim(connection, &worker, now, expires))
     }
 
-    async fn input(&self, name: &JobName) -> Result<Vec<u8>, Error> {
-        reads!(self, Size::Payload, |connection| jobs::input(connection, name))
+    async fn work(&self, name: &JobName) -> Result<Work, Error> {
+        reads!(self, Size::Payload, |connection| jobs::work(connection, name))
     }
 
     async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
         let expires = self.lease_clock(now) + lease_for;
-        writes!(self, Size::Small, |connection| attempts::heartbeat(connection, lease, expires))
+        writes!(self, Size::Small, [lease], |connection| attempts::heartbeat(connection, &lease, expires))
     }
 
     async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error> {
-        writes!(self, Size::Small, |connection| attempts::record(connection, lease, progress, now))
+        let progress = *progress;
+        writes!(self, Size::Small, [lease], |connection| attempts::record(connection, &lease, &progress, now))
     }
 
-    async fn finish(&self, lease: &Lease, ending: &Ending, now: SystemTime) -> Result<Job, Error> {
-        writes!(self, Size::Outcome, |connection| attempts::finish(connection, lease, ending, now))
+    async fn finish(&self, lease: &Lease, ending: &Arc<Ending>, now: SystemTime) -> Result<Job, Error> {
+        writes!(self, Size::Outcome, [lease, ending], |connection| attempts::finish(connection, &lease, &ending, now))
     }
 
     async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
-        writes!(self, Size::Small, |connection| attempts::release(connection, lease, now))
+        writes!(self, Size::Small, [lease], |connection| attempts::release(connection, &lease, now))
     }
 
     async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error> {
-        writes!(self, Size::Small, |connection| attempts::request_cancel(connection, name, etag, now))
+        let etag = etag.map(str::to_owned);
+        writes!(self, Size::Small, [name, etag], |connection| {
+            attempts::request_cancel(connection, &name, etag.as_deref(), now)
+        })
     }
 
     async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
-        writes!(self, Size::Payload, |connection| removal::delete(connection, name, etag))
+        let etag = etag.map(str::to_owned);
+        writes!(self, Size::Payload, [name, etag], |connection| { removal::delete(connection, &name, etag.as_deref()) })
     }
 
     async fn purge(&self, ended_by: SystemTime, limit: u32) -> Result<u32, Error> {
         if !reads!(self, Size::Small, |connection| removal::needs_purge(connection, ended_by))? {
             return Ok(0);
         }
-        writes!(self, Size::Payload, |connection| removal::purge(connection, ended_by, limit))
+        writes!(self, Size::Payload, [], |connection| removal::purge(connection, ended_by, limit))
     }
 
     async fn reclaim(&self) -> Result<(), Error> {
@@ -130,7 +139,7 @@ impl<D: Database> Store for D {
     async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {
         // Where no other process can be at work, every lease is a dead one's.
         let expired_at = D::SHARED.then(|| self.lease_clock(now));
-        writes!(self, Size::Small, |connection| attempts::take_back(connection, expired_at, now, max_attempts))
+        writes!(self, Size::Small, [], |connection| attempts::take_back(connection, expired_at, now, max_attempts))
     }
 
     async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
@@ -140,7 +149,7 @@ impl<D: Database> Store for D {
         if !reads!(self, Size::Small, |connection| attempts::needs_sweep(connection, expired_at, now))? {
             return Ok(Swept::default());
         }
-        writes!(self, Size::Small, |connection| async {
+        writes!(self, Size::Small, [], |connection| async {
             let lost = attempts::take_back(connection, Some(expired_at), now, max_attempts).await?;
             let expired = attempts::expire_queued(connection, now).await?;
             Ok::<_, Error>(Swept { lost, expired })
@@ -157,7 +166,8 @@ impl<D: Database> Store for D {
         bounds: &UploadBounds,
         now: SystemTime,
     ) -> Result<BegunUpload, Error> {
-        writes!(self, Size::Small, |connection| uploads::begin(connection, new, bounds, now))
+        let bounds = *bounds;
+        writes!(self, Size::Small, [new], |connection| uploads::begin(connection, &new, &bounds, now))
     }
 
     async fn append_upload(
@@ -167,19 +177,27 @@ impl<D: Database> Store for D {
         data: &[u8],
         now: SystemTime,
     ) -> Result<(), Error> {
-        writes!(self, Size::Payload, |connection| uploads::append(connection, lease, at_byte, data, now))
+        let data: Arc<[u8]> = data.into();
+        writes!(self, Size::Payload, [lease, data], |connection| {
+            uploads::append(connection, &lease, at_byte, &data, now)
+        })
     }
 
     async fn read_upload(&self, lease: &UploadLease, at_byte: u64) -> Result<Vec<u8>, Error> {
         reads!(self, Size::Payload, |connection| uploads::read(connection, lease, at_byte))
     }
 
-    async fn finish_upload(&self, lease: &UploadLease, new: &NewInput, now: SystemTime) -> Result<StoredInput, Error> {
-        writes!(self, Size::Payload, |connection| uploads::finish(connection, lease, new, now))
+    async fn finish_upload(
+        &self,
+        lease: &UploadLease,
+        new: &Arc<NewInput>,
+        now: SystemTime,
+    ) -> Result<StoredInput, Error> {
+        writes!(self, Size::Payload, [lease, new], |connection| uploads::finish(connection, &lease, &new, now))
     }
 
     async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error> {
-        writes!(self, Size::Small, |connection| uploads::give_up(connection, lease))
+        writes!(self, Size::Small, [lease], |connection| uploads::give_up(connection, &lease))
     }
 
     async fn upload(&self, name: &InputName) -> Result<UploadStatus, Error> {
@@ -190,6 +208,14 @@ impl<D: Database> Store for D {
         reads!(self, Size::Small, |connection| uploads::input(connection, name))
     }
 
+    async fn inputs(&self, query: &InputQuery) -> Result<InputPage, Error> {
+        reads!(self, Size::Small, |connection| uploads::list(connection, query))
+    }
+
+    async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
+        writes!(self, Size::Payload, [name], |connection| uploads::delete(connection, &name))
+    }
+
     async fn purge_uploads(
         &self,
         abandoned_by: Option<SystemTime>,
@@ -198,7 +224,7 @@ impl<D: Database> Store for D {
         if !reads!(self, Size::Small, |connection| uploads::needs_purge(connection, abandoned_by, unused_since))? {
             return Ok(PurgedUploads::default());
         }
-        writes!(self, Size::Payload, |connection| uploads::purge(connection, abandoned_by, unused_since))
+        writes!(self, Size::Payload, [], |connection| uploads::purge(connection, abandoned_by, unused_since))
     }
 
     async fn load(&self) -> Result<Load, Error> {

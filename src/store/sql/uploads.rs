@@ -5,10 +5,11 @@ use std::time::SystemTime;
 use super::rows::{self, integer, micros, number};
 use super::{Connection, Row, Statement, jobs};
 use crate::domain::input_name::InputName;
+use crate::store::query::Cursor;
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
 };
-use crate::store::{Error, payload};
+use crate::store::{Error, InputPage, InputQuery, payload};
 
 /// Rows of parts that one look removes at most, 32 MB of them: writers wait meanwhile.
 const PURGE_PARTS: u32 = 128;
@@ -96,7 +97,10 @@ pub(super) async fn begin<C: Connection>(
             new.name.input
         )));
     }
-    if let Some(input) = finished {
+    if let Some((id, input)) = upload.input_id.zip(finished) {
+        // Whoever asks for it anew is going to use it.
+        let update = Statement::new("UPDATE inputs SET use_time = $1 WHERE id = $2");
+        connection.execute(update.bind(micros(now)).bind(id)).await?;
         return Ok(BegunUpload::Finished(input));
     }
     let sha256 = upload.sha256.or(new.sha256);
@@ -240,6 +244,58 @@ pub(super) async fn input<C: Connection>(connection: &mut C, name: &InputName) -
         Statement::new(select_inputs!("WHERE tenant = $1 AND input = $2")).bind(&name.tenant).bind(&name.input);
     let row = connection.optional_row(select).await?;
     row.as_ref().map_or_else(|| Err(Error::InputNotFound(name.clone())), stored_input)
+}
+
+/// One page of a tenant's uploaded inputs, the newest first.
+pub(super) async fn list<C: Connection>(connection: &mut C, query: &InputQuery) -> Result<InputPage, Error> {
+    let size = query.effective_page_size();
+    let mut select = Statement::new(select_inputs!("WHERE input IS NOT NULL AND tenant = ")).then_bind(&query.tenant);
+    if let Some(cursor) = query.cursor()? {
+        select = select.then(" AND (create_time, input) < (").then_bind(cursor.create_micros);
+        select = select.then(", ").then_bind(&cursor.id).then(")");
+    }
+    // One more than asked for tells whether there is a next page.
+    let select = select.then(" ORDER BY create_time DESC, input DESC LIMIT ").then_bind(i64::from(size) + 1);
+    let mut rows = connection.rows(select).await?;
+    let more = rows.len() > size as usize;
+    rows.truncate(size as usize);
+    let next_page_token = match rows.last() {
+        Some(last) if more => {
+            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text("input")? };
+            Some(query.token_after(&cursor))
+        }
+        _ => None,
+    };
+    Ok(InputPage { inputs: rows.iter().map(stored_input).collect::<Result<_, _>>()?, next_page_token })
+}
+
+/// Takes an uploaded input's name away; see [`crate::store::Store::delete_input`].
+pub(super) async fn delete<C: Connection>(connection: &mut C, name: &InputName) -> Result<(), Error> {
+    let select = Statement::new("SELECT id FROM inputs WHERE tenant = $1 AND input = $2")
+        .bind(&name.tenant)
+        .bind(&name.input)
+        .then(C::FOR_UPDATE);
+    let row = connection.optional_row(select).await?;
+    let id = row.ok_or_else(|| Error::InputNotFound(name.clone()))?.integer("id")?;
+    // Those of its upload's parts that are left are removed by and by, as of one that was given up.
+    let uploads = [
+        "DELETE FROM uploads WHERE input_id = $1 AND NOT leftover",
+        "UPDATE uploads SET upload = NULL, input_id = NULL WHERE input_id = $1",
+        "UPDATE inputs SET input = NULL WHERE id = $1",
+    ];
+    connection.batch(uploads.map(|statement| Statement::new(statement).bind(id)).into()).await?;
+    remove_orphan(connection, id).await
+}
+
+/// Removes an input that has no name, once no job has it.
+pub(super) async fn remove_orphan<C: Connection>(connection: &mut C, id: i64) -> Result<(), Error> {
+    // Of two jobs that are removed at once, the later one sees that the other is gone.
+    let lock = Statement::new("SELECT id FROM inputs WHERE id = $1 AND input IS NULL").bind(id).then(C::FOR_UPDATE);
+    if connection.optional_row(lock).await?.is_none() {
+        return Ok(());
+    }
+    let delete = "DELETE FROM inputs WHERE id = $1 AND NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.input_id = $1)";
+    connection.execute(Statement::new(delete).bind(id)).await
 }
 
 async fn input_by_id<C: Connection>(connection: &mut C, id: i64) -> Result<StoredInput, Error> {

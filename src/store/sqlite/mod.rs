@@ -1,28 +1,32 @@
 //! The embedded store: SQLite in a data directory that one server at a time may hold.
 //!
 //! All writes go through one connection, so that they queue up in the process and no caller ever sees `SQLITE_BUSY`;
-//! reads have their own connections and, thanks to the write-ahead log, never wait for the writer.
+//! those that wait together are committed together. Reads have their own connections and, thanks to the write-ahead
+//! log, never wait for the writer.
 
 #[cfg(test)]
 mod tests;
+mod writer;
 
 use std::fs::{File, TryLockError};
 use std::path::Path;
 use std::time::Duration;
 
-use sqlx::Transaction;
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{
     SqliteAutoVacuum, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions,
     SqliteRow, SqliteSynchronous,
 };
 
-use super::sql::{self, Change, Connection, Database, Size, Statement, Step};
+use super::sql::{self, Change, Connection, Database, Operation, Size, Statement, Step};
 use super::{Error, Hint};
 use crate::domain::job::JobName;
+use writer::Writer;
 
 /// The database within the data directory.
 const DATABASE_FILE: &str = "scpsfm.db";
+/// The same while it is made.
+const DRAFT_FILE: &str = "scpsfm.db.new";
 /// Held locked while a server uses the directory. A file of its own: SQLite's locks are on the database, and are let
 /// go between transactions.
 const LOCK_FILE: &str = "scpsfm.lock";
@@ -33,24 +37,25 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a caller waits for a connection; behind a queue of writes this long, the disk has failed.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Pages handed back at a time, 16 MB of them: writers wait meanwhile.
-const VACUUM_PAGES: u32 = 4096;
+/// Hands pages back, 4,096 at a time, which are 16 MB: writers wait meanwhile.
+const VACUUM: &str = "PRAGMA incremental_vacuum(4096)";
 /// What the write-ahead log keeps of its length once it is written back, in bytes: a large result would leave it as long
 /// as itself.
 const LOG_BYTES: &str = "67108864";
 
-const MIGRATIONS: [Step; 5] = [
+const MIGRATIONS: [Step; 6] = [
     (1, "jobs", include_str!("../migrations/sqlite/0001_jobs.sql")),
     (2, "attempts", include_str!("../migrations/sqlite/0002_attempts.sql")),
     (3, "retention", include_str!("../migrations/sqlite/0003_retention.sql")),
     (4, "uploads", include_str!("../migrations/sqlite/0004_uploads.sql")),
     (5, "listing", include_str!("../migrations/sqlite/0005_listing.sql")),
+    (6, "inputs", include_str!("../migrations/sqlite/0006_inputs.sql")),
 ];
 
 /// Store in a data directory.
 #[derive(Debug)]
 pub struct Sqlite {
-    writer: SqlitePool,
+    writer: Writer,
     readers: SqlitePool,
     /// Unlocked when it is closed, also by the death of the process.
     _lock: File,
@@ -61,45 +66,86 @@ impl Sqlite {
     ///
     /// # Errors
     /// [`Error::InUse`] while another server holds the directory, [`Error::Unavailable`] where it cannot be written,
-    /// [`Error::Corrupt`] where its schema is of a newer version.
+    /// [`Error::Corrupt`] where its schema is of a newer version, or its file is there and empty.
     pub async fn open(directory: &Path) -> Result<Self, Error> {
         let lock = lock(directory)?;
-        let options = SqliteConnectOptions::new()
-            .filename(directory.join(DATABASE_FILE))
-            .create_if_missing(true)
-            // Only takes effect in a new file; lets retention hand space back.
-            .auto_vacuum(SqliteAutoVacuum::Incremental)
-            .journal_mode(SqliteJournalMode::Wal)
-            // What was acknowledged survives a power cut, not only a crash of the process.
-            .synchronous(SqliteSynchronous::Full)
-            .foreign_keys(true)
-            .pragma("journal_size_limit", LOG_BYTES)
-            .busy_timeout(BUSY_TIMEOUT);
-        let writer = pool(1).connect_with(options.clone()).await?;
-        sql::migrator(&MIGRATIONS).run(&writer).await.map_err(sql::migration_failed)?;
-        let readers = pool(READERS).connect_with(options.pragma("query_only", "1")).await?;
+        let database = directory.join(DATABASE_FILE);
+        if !is_there(&database)? {
+            create(directory, &database).await?;
+        }
+        let options = options(&database);
+        let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(&options).await?;
+        migrate(&mut connection).await?;
+        let writer = Writer::start(connection, options.clone())?;
+        let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
         Ok(Self { writer, readers, _lock: lock })
     }
 
-    /// Runs a statement as it is, for tests that need the database to misbehave.
+    /// Runs a statement as it is on the writer's connection, for tests that need the database to misbehave.
     #[cfg(test)]
     pub(crate) async fn execute(&self, statement: &'static str) {
-        sqlx::query(statement).execute(&self.writer).await.expect("a valid statement");
+        self.writer.run(statement).await.expect("a valid statement");
     }
 }
 
-fn pool(connections: u32) -> SqlitePoolOptions {
+/// How the database is opened, to write.
+fn options(database: &Path) -> SqliteConnectOptions {
+    SqliteConnectOptions::new()
+        .filename(database)
+        // Only takes effect in a new file; lets retention hand space back.
+        .auto_vacuum(SqliteAutoVacuum::Incremental)
+        .journal_mode(SqliteJournalMode::Wal)
+        // What was acknowledged survives a power cut, not only a crash of the process.
+        .synchronous(SqliteSynchronous::Full)
+        .foreign_keys(true)
+        .pragma("journal_size_limit", LOG_BYTES)
+        .busy_timeout(BUSY_TIMEOUT)
+}
+
+async fn migrate(connection: &mut SqliteConnection) -> Result<(), Error> {
+    sql::migrator(&MIGRATIONS).run(connection).await.map_err(sql::migration_failed)
+}
+
+/// Whether the database's file is there. One of no bytes is refused: no server leaves one behind, so that it is what is
+/// left of jobs, and a store that began anew on it would hide that they are gone.
+fn is_there(database: &Path) -> Result<bool, Error> {
+    match std::fs::metadata(database) {
+        Ok(file) if file.len() == 0 => Err(Error::Corrupt(format!(
+            "{} has no bytes; restore it, or move it and the files beside it away to begin without jobs",
+            database.display()
+        ))),
+        Ok(_) => Ok(true),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(Error::Unavailable(format!("cannot look at {}: {error}", database.display()))),
+    }
+}
+
+/// Makes the database under another name, and gives it its own once it is whole: a process that dies in between leaves
+/// nothing that looks like a store.
+async fn create(directory: &Path, database: &Path) -> Result<(), Error> {
+    let draft = directory.join(DRAFT_FILE);
+    // Of a start that was cut off; and of a database that was taken away: its log would be taken for the new one's.
+    for name in [DRAFT_FILE, DATABASE_FILE] {
+        for suffix in ["", "-wal", "-shm"] {
+            // Where there is none, there is nothing to remove.
+            let _ = std::fs::remove_file(directory.join(format!("{name}{suffix}")));
+        }
+    }
+    let new = options(&draft).create_if_missing(true);
+    let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(&new).await?;
+    migrate(&mut connection).await?;
+    // Writes the log back into the file and removes it.
+    sqlx::Connection::close(connection).await?;
+    std::fs::rename(&draft, database)
+        .map_err(|error| Error::Unavailable(format!("cannot make {}: {error}", database.display())))
+}
+
+fn readers() -> SqlitePoolOptions {
     // Connections to a file do not age, and need not be tried before every use.
     SqlitePoolOptions::new()
-        .max_connections(connections)
+        .max_connections(READERS)
         .acquire_timeout(ACQUIRE_TIMEOUT)
         .test_before_acquire(false)
-        // A disk that is full makes SQLite roll a transaction back by itself. sqlx, which then has nothing to roll back,
-        // goes on to count it, and the connection never begins another: it is closed, and a new one opened.
-        .before_acquire(|connection, _| {
-            let ended = !sqlx::Connection::is_in_transaction(connection);
-            Box::pin(async move { Ok(ended) })
-        })
         .idle_timeout(None)
         .max_lifetime(None)
 }
@@ -133,6 +179,11 @@ impl Connection for SqliteConnection {
         sql::run::<sqlx::Sqlite>(self, statement).await
     }
 
+    /// In one round trip to SQLite's thread.
+    async fn batch(&mut self, statements: Vec<Statement>) -> Result<Vec<SqliteRow>, Error> {
+        sql::run::<sqlx::Sqlite>(self, Statement::joined(statements)).await
+    }
+
     async fn lock_admission(&mut self) -> Result<(), Error> {
         Ok(())
     }
@@ -151,10 +202,12 @@ impl Database for Sqlite {
         Ok(self.readers.acquire().await?)
     }
 
-    /// Takes the write lock at once: a transaction that began by reading could not be upgraded after another process
-    /// wrote.
-    async fn begin(&self, _size: Size) -> Result<Transaction<'static, sqlx::Sqlite>, Error> {
-        Ok(self.writer.begin_with("BEGIN IMMEDIATE").await?)
+    async fn write<T: Send + 'static>(
+        &self,
+        _size: Size,
+        operation: Operation<SqliteConnection, T>,
+    ) -> Result<T, Error> {
+        self.writer.write(operation).await
     }
 
     fn bound(&self, _size: Size) -> Option<Duration> {
@@ -165,8 +218,7 @@ impl Database for Sqlite {
     async fn reclaim(&self) -> Result<(), Error> {
         let free: i64 = sqlx::query_scalar("PRAGMA freelist_count").fetch_one(&self.readers).await?;
         if free > 0 {
-            let vacuum = format!("PRAGMA incremental_vacuum({VACUUM_PAGES})");
-            sqlx::query(sqlx::AssertSqlSafe(vacuum)).fetch_all(&self.writer).await?;
+            self.writer.run(VACUUM).await?;
         }
         Ok(())
     }

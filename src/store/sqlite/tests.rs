@@ -1,9 +1,13 @@
 //! SQLite under the store's contract, and what is its own: the lock on the directory and its file.
 
+use std::sync::atomic::Ordering;
+
+use futures_util::FutureExt;
 use tempfile::TempDir;
 
 use super::*;
 use crate::domain::job::JobState;
+use crate::store::sql::Row;
 use crate::store::{Store, contract};
 
 /// A store in a directory that lives as long as the test.
@@ -24,6 +28,14 @@ impl std::ops::Deref for Fixture {
 
     fn deref(&self) -> &Sqlite {
         &self.store
+    }
+}
+
+impl Sqlite {
+    /// What a pragma says on the connection that writes.
+    async fn on_writer<T>(&self, pragma: &'static str, read: fn(&SqliteRow) -> Result<T, Error>) -> T {
+        let rows = self.writer.run(pragma).await.expect("an answer");
+        read(&rows[0]).expect("a value")
     }
 }
 
@@ -75,18 +87,33 @@ async fn a_database_of_a_newer_version_is_refused() {
 }
 
 #[tokio::test]
+async fn an_empty_file_is_refused_and_half_a_start_is_none() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    // What a start leaves that is cut off.
+    std::fs::write(directory.path().join(DRAFT_FILE), b"half").expect("written");
+    let store = Sqlite::open(directory.path()).await.expect("opens");
+    store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+    store.close().await;
+    drop(store);
+    let database = directory.path().join(DATABASE_FILE);
+    std::fs::write(&database, b"").expect("emptied");
+    let error = Sqlite::open(directory.path()).await.expect_err("its jobs are gone");
+    assert!(matches!(&error, Error::Corrupt(text) if text.contains("has no bytes")), "{error}");
+    assert_eq!(std::fs::metadata(&database).expect("is there").len(), 0, "left as it was found");
+}
+
+#[tokio::test]
 async fn commits_are_synced_and_the_log_is_written_ahead() {
     let fixture = Fixture::open().await.expect("opens");
-    let journal: String = sqlx::query_scalar("PRAGMA journal_mode").fetch_one(&fixture.writer).await.expect("reads");
-    let synchronous: i64 = sqlx::query_scalar("PRAGMA synchronous").fetch_one(&fixture.writer).await.expect("reads");
+    let journal = fixture.on_writer("PRAGMA journal_mode", |row| row.text("journal_mode")).await;
+    let synchronous = fixture.on_writer("PRAGMA synchronous", |row| row.integer("synchronous")).await;
     assert_eq!((journal.as_str(), synchronous), ("wal", 2));
 }
 
 #[tokio::test]
 async fn deleted_jobs_leave_no_space_taken() {
     let fixture = Fixture::open().await.expect("opens");
-    let pages =
-        async || -> i64 { sqlx::query_scalar("PRAGMA page_count").fetch_one(&fixture.writer).await.expect("reads") };
+    let pages = async || fixture.on_writer("PRAGMA page_count", |row| row.integer("page_count")).await;
     let mut largest = 0;
     let empty = pages().await;
     for round in 0..6 {
@@ -101,9 +128,106 @@ async fn deleted_jobs_leave_no_space_taken() {
     let chunk_pages = (4 << 20) / 4096;
     assert!(largest > chunk_pages, "{largest}");
     assert!(largest < empty + 2 * chunk_pages, "the file never held two inputs: {largest}");
-    sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").fetch_all(&fixture.writer).await.expect("writes back");
+    fixture.close().await;
     let bytes = std::fs::metadata(fixture._directory.path().join(DATABASE_FILE)).expect("the file").len();
     assert!(bytes < 1 << 20, "{bytes} bytes");
+}
+
+/// Runs an operation that keeps the writer until the sender says so, or is dropped.
+fn hold(store: &Sqlite) -> (tokio::sync::watch::Sender<bool>, impl Future<Output = ()>) {
+    let (go, gone) = tokio::sync::watch::channel(false);
+    let writer = store.writer.clone();
+    let holding = async move {
+        let wait = sql::operation(move |_: &mut SqliteConnection| {
+            let mut gone = gone.clone();
+            async move {
+                // An error says that the sender was dropped.
+                let _ = gone.wait_for(|&gone| gone).await;
+                Ok(())
+            }
+            .boxed()
+        });
+        writer.write(wait).await.expect("holds");
+    };
+    (go, holding)
+}
+
+#[tokio::test]
+async fn what_waits_together_is_committed_together_and_each_is_told_what_became_of_it() {
+    let fixture = Fixture::open().await.expect("opens");
+    fixture.create_job(contract::record("taken"), &contract::ROOM, contract::time(0)).await.expect("created");
+    let before = fixture.writer.commits.load(Ordering::SeqCst);
+    let (go, holding) = hold(&fixture);
+    let names: Vec<String> = (0..20).map(|number| format!("job-{number}")).chain(["taken".into()]).collect();
+    let creations = names
+        .iter()
+        .map(|name| async { fixture.create_job(contract::record(name), &contract::ROOM, contract::time(1)).await });
+    // All of them are on their way before the writer is let go.
+    let let_go = async { drop(go) };
+    let ((), outcomes, ()) = tokio::join!(holding, futures_util::future::join_all(creations), let_go);
+    for (name, outcome) in names.iter().zip(outcomes) {
+        match (name.as_str(), outcome) {
+            ("taken", Err(Error::AlreadyExists(_))) => {}
+            (_, Ok(created)) => assert_eq!(fixture.job(&created.job.name).await, Ok(created.job), "{name}"),
+            (_, other) => panic!("{name}: {other:?}"),
+        }
+    }
+    let commits = fixture.writer.commits.load(Ordering::SeqCst) - before;
+    // One for all; on a machine that is slow beyond measure, some.
+    assert!(commits < names.len() / 2, "{commits} commits");
+}
+
+#[tokio::test]
+async fn one_that_breaks_the_transaction_of_all_costs_only_itself() {
+    let fixture = Fixture::open().await.expect("opens");
+    // As SQLite does by itself where the disk is full: everything is rolled back, not only the statement.
+    fixture
+        .execute(
+            "CREATE TRIGGER breaks BEFORE INSERT ON inputs WHEN NEW.bytes = 13 \
+             BEGIN SELECT RAISE(ROLLBACK, 'broken'); END",
+        )
+        .await;
+    let (go, holding) = hold(&fixture);
+    let creations = ["a", "b", "bad", "c"].map(|name| {
+        let bytes = if name == "bad" { 13 } else { 14 };
+        let new = crate::store::NewRecord { input: vec![1; bytes].into(), ..contract::record(name) };
+        fixture.create_job(new, &contract::ROOM, contract::time(1))
+    });
+    let ((), outcomes, ()) = tokio::join!(holding, futures_util::future::join_all(creations), async { drop(go) });
+    for (name, outcome) in ["a", "b", "bad", "c"].iter().zip(outcomes) {
+        let stored = fixture.job(&contract::record(name).name).await;
+        assert_eq!((outcome.is_ok(), stored.is_ok()), (*name != "bad", *name != "bad"), "{name}: {outcome:?}");
+    }
+}
+
+#[tokio::test]
+async fn of_a_caller_that_went_away_before_its_turn_nothing_is_written() {
+    let fixture = Fixture::open().await.expect("opens");
+    let (go, holding) = hold(&fixture);
+    let gone = async {
+        let creating = fixture.create_job(contract::record("gone"), &contract::ROOM, contract::time(1));
+        // Long enough to be on its way, and behind one that waits for the other side.
+        let waited = tokio::time::timeout(Duration::from_millis(1), creating).await;
+        assert!(waited.is_err(), "{waited:?}");
+        drop(go);
+    };
+    tokio::join!(holding, gone);
+    fixture.create_job(contract::record("here"), &contract::ROOM, contract::time(1)).await.expect("created");
+    assert!(matches!(fixture.job(&contract::record("gone").name).await, Err(Error::NotFound(_))));
+}
+
+#[tokio::test]
+async fn of_a_deleted_input_nothing_is_left_once_its_jobs_are_gone() {
+    let fixture = Fixture::open().await.expect("opens");
+    contract::uploads::a_deleted_input_is_kept_by_its_jobs_alone(&*fixture).await;
+    for _ in 0..3 {
+        fixture.purge_uploads(None, None).await.expect("clears away");
+    }
+    let rows = async |count: &'static str| fixture.on_writer(count, |row| row.integer("count")).await;
+    // Of the new one alone.
+    assert_eq!(rows("SELECT COUNT(*) AS count FROM inputs").await, 1);
+    assert_eq!(rows("SELECT COUNT(*) AS count FROM uploads").await, 1);
+    assert_eq!(rows("SELECT COUNT(*) AS count FROM upload_parts").await, 0);
 }
 
 #[tokio::test]

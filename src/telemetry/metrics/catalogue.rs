@@ -202,9 +202,17 @@ pub const WATCHERS: Metric = Metric {
     labels: &[],
     help: "Streams that follow a job (WatchJob and Solve).",
 };
+pub const CONNECTIONS: Metric =
+    Metric { name: "scpsfm_connections", kind: Kind::Gauge, labels: &[], help: "Connections that speak gRPC." };
+pub const CONNECTIONS_REFUSED: Metric = Metric {
+    name: "scpsfm_connections_refused_total",
+    kind: Kind::Counter,
+    labels: &[],
+    help: "Connections refused because as many speak as may.",
+};
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 28] = [
+pub const ALL: [Metric; 30] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -233,4 +241,6 @@ pub const ALL: [Metric; 28] = [
     STORE_REACHABLE,
     FENCED_WRITES,
     WATCHERS,
+    CONNECTIONS,
+    CONNECTIONS_REFUSED,
 ];

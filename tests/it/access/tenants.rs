@@ -62,7 +62,7 @@ async fn without_a_key_of_this_server_nothing_but_health_answers() {
     let server = TestServer::start_with(quick(), two_tenants(), one_worker()).await;
     let channel = server.channel().await;
     let mut paths = methods();
-    assert_eq!(paths.len(), 12);
+    assert_eq!(paths.len(), 14);
     paths.push("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo".into());
     paths.push("/scpsfm.v1.JobService/Invented".into());
     let cases = [
@@ -136,6 +136,8 @@ impl Tenant {
         let name = || name.to_owned();
         let batch = proto::BatchCreateJobsRequest { parent: parent.into(), requests: vec![create.clone()] };
         let upload = proto::GetUploadStatusRequest { parent: parent.into(), ..Default::default() };
+        let inputs = proto::ListInputsRequest { parent: parent.into(), ..Default::default() };
+        let delete_input = proto::DeleteInputRequest { name: format!("{parent}/inputs/{}", id(1)) };
         let begin = request(upload_input_request::Message::Start(start(parent, &id(1), 100)));
         let answers = [
             ("GetJob", self.jobs.get_job(proto::GetJobRequest { name: name() }).await.map(drop)),
@@ -160,6 +162,8 @@ impl Tenant {
             ("Solve", self.solve(create).await.map(drop)),
             ("BatchCreateJobs", self.jobs.batch_create_jobs(batch).await.map(drop)),
             ("GetUploadStatus", self.inputs.get_upload_status(upload).await.map(drop)),
+            ("ListInputs", self.inputs.list_inputs(inputs).await.map(drop)),
+            ("DeleteInput", self.inputs.delete_input(delete_input).await.map(drop)),
             ("UploadInput", self.inputs.upload_input(tokio_stream::once(begin)).await.map(drop)),
         ];
         answers.map(|(method, answer)| (method, answer.expect_err(method))).into()

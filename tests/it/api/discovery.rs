@@ -95,7 +95,7 @@ async fn a_drained_server_turns_callers_away_and_ends() {
 #[tokio::test]
 async fn capabilities_tell_limits_and_defaults() {
     let limits = Limits { max_views: 10, max_tracks: 20, max_observations: 30 };
-    let options = Options { limits, max_message_bytes: 12_345, ..Options::default() };
+    let options = Options { limits, max_message_bytes: 12_345, max_connections: 77, ..Options::default() };
     let server = TestServer::start_with(quick(), options, one_worker()).await;
     let mut calibration = server.calibration().await;
     let answer = calibration.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("capabilities");
@@ -103,6 +103,7 @@ async fn capabilities_tell_limits_and_defaults() {
     let limits = capabilities.limits.expect("limits");
     assert_eq!((limits.max_views, limits.max_tracks, limits.max_observations), (10, 20, 30));
     assert_eq!(limits.max_message_bytes, 12_345);
+    assert_eq!(capabilities.max_connections, 77);
     assert_eq!(
         capabilities.methods().collect::<Vec<_>>(),
         [Method::Auto, Method::Paper, Method::Geometry, Method::Psfm]

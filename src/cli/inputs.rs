@@ -1,0 +1,72 @@
+//! `scpsfm inputs`: a server's uploaded inputs.
+
+use serde_json::json;
+
+use super::args::ServerArgs;
+use super::exit::{Exit, Failure};
+use super::print;
+use crate::rpc::proto;
+
+const EXAMPLES: &str = "\
+Examples:
+  scpsfm inputs
+  scpsfm inputs --json | jq -r .name | xargs -n1 scpsfm delete --input";
+
+/// List uploaded inputs, the newest first
+///
+/// Prints one page; where there are more, the token of the next page goes to stderr. Uploads that are not finished are not
+/// listed.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
+pub struct Args {
+    #[command(flatten)]
+    pub server: ServerArgs,
+
+    /// Inputs in a page
+    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    pub page_size: u16,
+
+    /// The page that follows another
+    #[arg(long, value_name = "TOKEN", default_value = "")]
+    pub page_token: String,
+
+    /// One input a line, as JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Runs the command.
+pub async fn run(args: Args) -> Result<Exit, Failure> {
+    let mut client = args.server.connect().await?;
+    let page = client.list_inputs(args.page_size, &args.page_token).await?;
+    for input in &page.inputs {
+        print(&if args.json { as_json(input) } else { line(input) })?;
+    }
+    if !page.next_page_token.is_empty() {
+        eprintln!("more: --page-token {}", page.next_page_token);
+    }
+    Ok(Exit::Done)
+}
+
+fn created(input: &proto::Input) -> String {
+    input.create_time.as_ref().map(ToString::to_string).unwrap_or_default()
+}
+
+fn line(input: &proto::Input) -> String {
+    let proto::Input { name, size_bytes, view_count, track_count, .. } = input;
+    format!("{name}  {}  {view_count} views, {track_count} tracks  {size_bytes} bytes", created(input))
+}
+
+fn as_json(input: &proto::Input) -> String {
+    let sha256: String = input.sha256.iter().map(|byte| format!("{byte:02x}")).collect();
+    json!({
+        "name": input.name,
+        "create_time": created(input),
+        "bytes": input.size_bytes,
+        "sha256": sha256,
+        "views": input.view_count,
+        "tracks": input.track_count,
+        "observations": input.observation_count,
+    })
+    .to_string()
+}

@@ -1,0 +1,54 @@
+//! `scpsfm submit` with several inputs: one call, all jobs or none.
+
+use std::path::Path;
+
+use crate::support::program::{Serving, run};
+
+/// A table of so many tracks, with this line at the end.
+fn table(directory: &Path, tracks: usize, last: &str) -> String {
+    let path = directory.join(format!("{tracks}.csv"));
+    let rows: String = (0..2 * tracks).map(|k| format!("{},{},{k},{}\n", k % 2, k / 2, 3 * k)).collect();
+    std::fs::write(&path, format!("view,track,x,y\n{rows}{last}")).expect("written");
+    path.to_str().expect("a path of ours").to_owned()
+}
+
+#[test]
+fn several_inputs_are_several_jobs_or_none() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let server = Serving::start(&directory.path().join("data"));
+    let submit = |more: &[&str]| run(["submit", "--method", "geometry", "--server", &server.grpc].iter().chain(more));
+    let count = || run(["list", "--server", &server.grpc]).stdout.lines().count();
+    let (a, b) = (table(directory.path(), 3, ""), table(directory.path(), 4, ""));
+
+    let both = submit(&[&a, &b, "--request-id", "r", "--label", "of=both"]);
+    assert_eq!(both.code, Some(0), "{both:?}");
+    let names: Vec<&str> = both.stdout.lines().collect();
+    for (name, tracks) in names.iter().zip([3, 4]) {
+        let got = run(["get", name, "--server", &server.grpc]);
+        assert!(got.stdout.contains(&format!("2 views, {tracks} tracks")), "{got:?}");
+    }
+    assert_eq!(names.len(), 2);
+    let again = submit(&[&a, &b, "--request-id", "r", "--label", "of=both"]);
+    assert_eq!((again.code, &again.stdout), (Some(0), &both.stdout), "the same ids are the same jobs");
+    assert_eq!(count(), 2);
+
+    // One that only the server finds bad: the file is named, and nothing is stored.
+    let twice = table(directory.path(), 5, "0,0,9,9\n");
+    let refused = submit(&[&a, &twice]);
+    assert_eq!(refused.code, Some(65), "{refused:?}");
+    assert!(refused.stderr.contains("5.csv") && !refused.stderr.contains("3.csv"), "{refused:?}");
+    let by_flag = submit(&[&a, &b, "--priority", "99999"]);
+    assert_eq!(by_flag.code, Some(2), "{by_flag:?}");
+    assert!(by_flag.stderr.contains("job.priority") && !by_flag.stderr.contains(".csv"), "{by_flag:?}");
+    for one_only in [&["--watch"][..], &["--job-id", "a"]] {
+        let refused = submit(&[&[a.as_str(), b.as_str()], one_only].concat());
+        assert_eq!(refused.code, Some(2), "{refused:?}");
+        assert!(refused.stderr.contains(one_only[0]), "{refused:?}");
+    }
+    assert_eq!(count(), 2);
+
+    let upload = |file: &str| run(["upload", file, "--quiet", "--server", &server.grpc]).stdout.trim().to_owned();
+    let named = submit(&["--input", &upload(&a), "--input", &upload(&b)]);
+    assert_eq!((named.code, named.stdout.lines().count()), (Some(0), 2), "{named:?}");
+    assert_eq!(count(), 4);
+}
