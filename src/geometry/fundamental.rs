@@ -86,6 +86,19 @@ impl Fundamental {
         (squared > LEAST_SQUARED_SINE * to.norm_squared() && ratio.is_finite()).then_some(ratio)
     }
 
+    /// The matrix refitted to weighted matches, each weighted besides so that its algebraic error is its Sampson distance
+    /// under this matrix.
+    ///
+    /// * `weights`: one a match, not negative
+    ///
+    /// Returns `None` where fewer than [`LEAST_MATCHES`] have a weight, or as [`eight_point`] does.
+    pub fn refitted(&self, matches: &[Match], weights: &[f64]) -> Option<Self> {
+        let weigh = |(seen, &weight): (&Match, &f64)| if weight > 0.0 { weight / self.algebraic(seen).1 } else { 0.0 };
+        let weights: Vec<f64> = matches.iter().zip(weights).map(weigh).collect();
+        let weighted = weights.iter().filter(|&&weight| weight > 0.0).count();
+        (weighted >= LEAST_MATCHES).then(|| eight_point(matches, &weights)).flatten()
+    }
+
     /// Whether all of some matches lie on the same side of both cameras (Chum, Werner & Matas 2004): a sample with
     /// outliers rarely does, and one look spares scoring it.
     fn is_oriented(&self, sample: &[Match]) -> bool {
@@ -219,17 +232,9 @@ fn cost_below(fundamental: &Fundamental, matches: &[Match], gate: f64, to_beat: 
 fn optimise(start: Fundamental, cost: f64, matches: &[Match], gate: f64) -> (Fundamental, f64) {
     let (mut current, mut best) = (start, (start, cost));
     for wide in LOCAL_GATES {
-        let weights: Vec<f64> = matches
-            .iter()
-            .map(|seen| {
-                let gradient_squared = current.algebraic(seen).1;
-                if current.sampson_squared(seen) < wide * gate { gradient_squared.recip() } else { 0.0 }
-            })
-            .collect();
-        if weights.iter().filter(|&&weight| weight > 0.0).count() < LEAST_MATCHES {
-            break;
-        }
-        let Some(refitted) = eight_point(matches, &weights) else { break };
+        let within = |seen: &Match| f64::from(u8::from(current.sampson_squared(seen) < wide * gate));
+        let weights: Vec<f64> = matches.iter().map(within).collect();
+        let Some(refitted) = current.refitted(matches, &weights) else { break };
         current = refitted;
         if let Some(cost) = cost_below(&current, matches, gate, best.1) {
             best = (current, cost);
