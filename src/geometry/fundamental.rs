@@ -13,7 +13,7 @@ use crate::domain::StopToken;
 pub const LEAST_MATCHES: usize = 8;
 /// Samples of the robust estimate at most: enough where 43 % of the matches are right. At ninety per cent outliers
 /// 10⁸ would be, which nobody waits for.
-const MOST_SAMPLES: usize = 4_000;
+pub const MOST_SAMPLES: usize = 4_000;
 /// Probability with which one sample without outliers is to be among those drawn.
 const CONFIDENCE: f64 = 0.99;
 /// Chi-square quantile of .95 for one degree of freedom, which is what a Sampson distance has.
@@ -182,12 +182,23 @@ pub struct Robust {
 ///
 /// Returns `None` for too few matches, no usable noise, or when no sample gives a matrix.
 pub fn robust(matches: &[Match], noise: f64, rng: &mut ChaCha8Rng, stop: &StopToken) -> Option<Robust> {
+    robust_within(matches, noise, MOST_SAMPLES, rng, stop)
+}
+
+/// The same with another bound on the samples: `n` of them are reliable down to a share of inliers of `(4.6 / n)^(1/8)`.
+pub fn robust_within(
+    matches: &[Match],
+    noise: f64,
+    most_samples: usize,
+    rng: &mut ChaCha8Rng,
+    stop: &StopToken,
+) -> Option<Robust> {
     let gate = squared_gate(noise);
     if matches.len() < LEAST_MATCHES || !(gate > 0.0 && gate.is_finite()) {
         return None;
     }
     let mut best: Option<(Fundamental, f64)> = None;
-    let (mut drawn, mut wanted) = (0, MOST_SAMPLES);
+    let (mut drawn, mut wanted) = (0, most_samples);
     while drawn < wanted && !(drawn % STOP_EVERY == 0 && stop.is_stopped()) {
         drawn += 1;
         let sample: Vec<Match> =
@@ -199,7 +210,7 @@ pub fn robust(matches: &[Match], noise: f64, rng: &mut ChaCha8Rng, stop: &StopTo
         let to_beat = best.map_or(f64::INFINITY, |(_, cost)| cost);
         if let Some(cost) = cost_below(&found, matches, gate, to_beat) {
             let improved = optimise(found, cost, matches, gate);
-            wanted = samples_wanted(inlier_share(&improved.0, matches, gate)).min(MOST_SAMPLES);
+            wanted = samples_wanted(inlier_share(&improved.0, matches, gate)).min(most_samples);
             best = Some(improved);
         }
     }

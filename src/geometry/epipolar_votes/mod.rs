@@ -25,7 +25,7 @@ mod tracks;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::fundamental::{self, Fundamental, Match};
+use super::fundamental::{self, Fundamental, Match, Robust};
 use crate::domain::StopToken;
 use residuals::{Residuals, noise_of};
 pub use tracks::Tracks;
@@ -81,16 +81,18 @@ impl Votes {
     /// Asks every pair.
     ///
     /// * `noise`: standard deviation of a coordinate; rather too high than too low
+    /// * `most_samples`: that a pair's matrix may take, see [`fundamental::robust_within`]
     /// * `seed`: of the samples drawn
     ///
     /// Returns `None` where no pair has a vote, or once `stop` fires.
-    pub fn ask(tracks: &Tracks, noise: f64, seed: u64, stop: &StopToken) -> Option<Self> {
+    pub fn ask(tracks: &Tracks, noise: f64, most_samples: usize, seed: u64, stop: &StopToken) -> Option<Self> {
         let mut pairs = Vec::new();
         for (k, (places, matches)) in matched(tracks).into_iter().enumerate() {
             // A stream of its own for every pair: what one draws does not move the others.
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             rng.set_stream(k as u64);
-            pairs.extend(Pair::estimate(places, matches, noise, &mut rng, stop));
+            let robust = |sampled: &[Match]| fundamental::robust_within(sampled, noise, most_samples, &mut rng, stop);
+            pairs.extend(Pair::estimate(places, matches, robust));
             if stop.is_stopped() {
                 return None;
             }
@@ -140,13 +142,11 @@ impl Pair {
     fn estimate(
         places: Vec<(usize, usize)>,
         matches: Vec<Match>,
-        noise: f64,
-        rng: &mut ChaCha8Rng,
-        stop: &StopToken,
+        robust: impl FnOnce(&[Match]) -> Option<Robust>,
     ) -> Option<Self> {
         let count = matches.len().min(MOST_MATCHES);
         let sampled: Vec<Match> = (0..count).map(|k| matches[k * matches.len() / count]).collect();
-        let fundamental = fundamental::robust(&sampled, noise, rng, stop)?.fundamental;
+        let fundamental = robust(&sampled)?.fundamental;
         let residuals = Residuals::new(&sampled, squared(&fundamental, &sampled));
         Some(Self { places, matches, fundamental, residuals, sampled })
     }

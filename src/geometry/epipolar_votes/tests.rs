@@ -11,6 +11,8 @@ use crate::synthetic::metrics::average_precision;
 const NOISE: f64 = 0.001;
 /// What the votes are told of it, five times as much.
 const ASSUMED: f64 = 0.005;
+/// Enough for half of the matches to be wrong.
+const SAMPLES: usize = 1_000;
 const VIEWS: usize = 6;
 const TRACKS: usize = 80;
 
@@ -47,7 +49,7 @@ fn contaminated(seed: u64) -> (Tracks, Vec<bool>) {
 }
 
 fn votes(tracks: &Tracks, seed: u64) -> Option<Votes> {
-    Votes::ask(tracks, ASSUMED, seed, &StopToken::default())
+    Votes::ask(tracks, ASSUMED, SAMPLES, seed, &StopToken::default())
 }
 
 #[test]
@@ -144,7 +146,7 @@ fn where_pairs_agree_by_chance_or_not_at_all_there_are_no_votes() {
     assert_eq!(votes(&Tracks::new(0, Vec::<Vec<Sighting>>::new()), 0), None);
     let stop = StopToken::default();
     stop.stop(crate::domain::StopReason::Cancelled);
-    assert_eq!(Votes::ask(&tracks, ASSUMED, 0, &stop), None);
+    assert_eq!(Votes::ask(&tracks, ASSUMED, SAMPLES, 0, &stop), None);
 }
 
 #[test]
