@@ -1,9 +1,10 @@
 //! What the search starts from, compared: every prior that ranks image points, alone and at several lengths of the
 //! search, and AUTO with and without the network that was trained beforehand. [`scenes`] are the scenes, [`table`]
-//! shows the rows.
+//! shows the rows; [`windows`] does so for the windows of real sequences.
 
 pub mod scenes;
 pub mod table;
+pub mod windows;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc;
