@@ -25,7 +25,7 @@ K, the known calibration, 3x3 row by row or a list of such, one a view
   labels.csv: view,track,inlier (0 or 1), one line an observation; other columns are ignored
   cameras.json, where known: P, a list of 3x4 matrices, one a view, null where none is known; estimated, true where they \
 were found from these tracks
-Written to --out: real.json, real.csv and real.html.
+Written to --out: real.json, real.csv and real.html; with --priors windows.json.
 
 A peer is called as COMMAND observations.csv WIDTH HEIGHT -o FILE and writes a JSON object: views (how many it \
 registered, in one reconstruction), focal (pixels or null), inlier (0 or 1 for each track id from 0 on) or observation_inlier (the same for each \
@@ -42,7 +42,7 @@ pub struct RealArgs {
     pub real: Vec<PathBuf>,
 
     /// Another program to run on the same sequences: one text, split at spaces, or one argument at a time, repeated
-    #[arg(long, value_name = "COMMAND", requires = "real", allow_hyphen_values = true)]
+    #[arg(long, value_name = "COMMAND", requires = "real", conflicts_with = "priors", allow_hyphen_values = true)]
     pub peer: Vec<String>,
 
     /// Seconds after which the peer is ended on a sequence

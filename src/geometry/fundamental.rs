@@ -13,7 +13,7 @@ use crate::domain::StopToken;
 pub const LEAST_MATCHES: usize = 8;
 /// Samples of the robust estimate at most: enough where 43 % of the matches are right. At ninety per cent outliers
 /// 10⁸ would be, which nobody waits for.
-const MOST_SAMPLES: usize = 4_000;
+pub const MOST_SAMPLES: usize = 4_000;
 /// Probability with which one sample without outliers is to be among those drawn.
 const CONFIDENCE: f64 = 0.99;
 /// Chi-square quantile of .95 for one degree of freedom, which is what a Sampson distance has.
@@ -84,6 +84,19 @@ impl Fundamental {
         let squared = across.norm_squared();
         let ratio = across.dot(&(self.matrix * seen.from.push(1.0))) / squared;
         (squared > LEAST_SQUARED_SINE * to.norm_squared() && ratio.is_finite()).then_some(ratio)
+    }
+
+    /// The matrix refitted to weighted matches, each weighted besides so that its algebraic error is its Sampson distance
+    /// under this matrix.
+    ///
+    /// * `weights`: one a match, not negative
+    ///
+    /// Returns `None` where fewer than [`LEAST_MATCHES`] have a weight, or as [`eight_point`] does.
+    pub fn refitted(&self, matches: &[Match], weights: &[f64]) -> Option<Self> {
+        let weigh = |(seen, &weight): (&Match, &f64)| if weight > 0.0 { weight / self.algebraic(seen).1 } else { 0.0 };
+        let weights: Vec<f64> = matches.iter().zip(weights).map(weigh).collect();
+        let weighted = weights.iter().filter(|&&weight| weight > 0.0).count();
+        (weighted >= LEAST_MATCHES).then(|| eight_point(matches, &weights)).flatten()
     }
 
     /// Whether all of some matches lie on the same side of both cameras (Chum, Werner & Matas 2004): a sample with
@@ -169,12 +182,23 @@ pub struct Robust {
 ///
 /// Returns `None` for too few matches, no usable noise, or when no sample gives a matrix.
 pub fn robust(matches: &[Match], noise: f64, rng: &mut ChaCha8Rng, stop: &StopToken) -> Option<Robust> {
+    robust_within(matches, noise, MOST_SAMPLES, rng, stop)
+}
+
+/// The same with another bound on the samples: `n` of them are reliable down to a share of inliers of `(4.6 / n)^(1/8)`.
+pub fn robust_within(
+    matches: &[Match],
+    noise: f64,
+    most_samples: usize,
+    rng: &mut ChaCha8Rng,
+    stop: &StopToken,
+) -> Option<Robust> {
     let gate = squared_gate(noise);
     if matches.len() < LEAST_MATCHES || !(gate > 0.0 && gate.is_finite()) {
         return None;
     }
     let mut best: Option<(Fundamental, f64)> = None;
-    let (mut drawn, mut wanted) = (0, MOST_SAMPLES);
+    let (mut drawn, mut wanted) = (0, most_samples);
     while drawn < wanted && !(drawn % STOP_EVERY == 0 && stop.is_stopped()) {
         drawn += 1;
         let sample: Vec<Match> =
@@ -186,7 +210,7 @@ pub fn robust(matches: &[Match], noise: f64, rng: &mut ChaCha8Rng, stop: &StopTo
         let to_beat = best.map_or(f64::INFINITY, |(_, cost)| cost);
         if let Some(cost) = cost_below(&found, matches, gate, to_beat) {
             let improved = optimise(found, cost, matches, gate);
-            wanted = samples_wanted(inlier_share(&improved.0, matches, gate)).min(MOST_SAMPLES);
+            wanted = samples_wanted(inlier_share(&improved.0, matches, gate)).min(most_samples);
             best = Some(improved);
         }
     }
@@ -219,17 +243,9 @@ fn cost_below(fundamental: &Fundamental, matches: &[Match], gate: f64, to_beat: 
 fn optimise(start: Fundamental, cost: f64, matches: &[Match], gate: f64) -> (Fundamental, f64) {
     let (mut current, mut best) = (start, (start, cost));
     for wide in LOCAL_GATES {
-        let weights: Vec<f64> = matches
-            .iter()
-            .map(|seen| {
-                let gradient_squared = current.algebraic(seen).1;
-                if current.sampson_squared(seen) < wide * gate { gradient_squared.recip() } else { 0.0 }
-            })
-            .collect();
-        if weights.iter().filter(|&&weight| weight > 0.0).count() < LEAST_MATCHES {
-            break;
-        }
-        let Some(refitted) = eight_point(matches, &weights) else { break };
+        let within = |seen: &Match| f64::from(u8::from(current.sampson_squared(seen) < wide * gate));
+        let weights: Vec<f64> = matches.iter().map(within).collect();
+        let Some(refitted) = current.refitted(matches, &weights) else { break };
         current = refitted;
         if let Some(cost) = cost_below(&current, matches, gate, best.1) {
             best = (current, cost);

@@ -7,6 +7,7 @@ pub mod bundle;
 pub mod critical;
 pub mod daq;
 pub mod epipolar_depths;
+pub mod epipolar_votes;
 pub mod factorization;
 pub mod fundamental;
 pub mod homography;

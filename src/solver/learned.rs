@@ -6,6 +6,7 @@
 
 use super::grow::LEAST_INLIERS;
 use crate::domain::{Method, Prior, SolveSettings};
+use crate::geometry::epipolar_votes::{Tracks, Votes};
 use crate::geometry::measurement::CompleteBlock;
 use crate::network::subspace::{self, Cloud, MOST_VIEWS};
 
@@ -38,27 +39,69 @@ pub fn may_be_asked(settings: &SolveSettings) -> bool {
     settings.method == Method::Auto && !settings.excluded_priors.contains(&Prior::Learned)
 }
 
-/// The network's opinion of the tracks of one block.
+/// The network's opinion of some tracks.
 #[derive(Debug, Clone)]
 pub struct Opinion {
     /// Natural logarithms of the odds that a track is right.
     ln_odds: Vec<f64>,
+    /// The same of each observation, track by track.
+    observations: Vec<f64>,
 }
 
 impl Opinion {
     /// Asks the network; `None` where there are more views than it is asked about, or it has no finite answer.
     pub fn of(block: &CompleteBlock) -> Option<Self> {
-        let (views, tracks) = (block.views(), block.tracks());
+        Self::of_tracks(&Tracks::of_block(block))
+    }
+
+    /// The same of tracks with holes.
+    pub fn of_tracks(tracks: &Tracks) -> Option<Self> {
+        let (views, count) = (tracks.views(), tracks.len());
         if views > MOST_VIEWS {
             return None;
         }
-        let point = |view: usize| (0..tracks).map(move |track| block.point(view, track).into());
-        let points: Vec<[f64; 2]> = (0..views).flat_map(point).collect();
-        let cloud = Cloud::new(views, tracks, &points, &vec![true; points.len()]);
-        let scores = subspace::current().network.forward(&cloud);
-        let ln_odds: Vec<f64> = scores.tracks.iter().map(|&logit| f64::from(logit) - EVEN_LOGIT).collect();
+        let mut points = vec![[0.0; 2]; views * count];
+        let mut visible = vec![false; views * count];
+        let places: Vec<usize> = (0..count)
+            .flat_map(|track| tracks.sightings()[tracks.range(track)].iter().map(move |seen| seen.view * count + track))
+            .collect();
+        for (&place, seen) in places.iter().zip(tracks.sightings()) {
+            (points[place], visible[place]) = (seen.xy.into(), true);
+        }
+        let scores = subspace::current().network.forward(&Cloud::new(views, count, &points, &visible));
+        let ln_odds = |&logit: &f32| f64::from(logit) - EVEN_LOGIT;
+        let opinion = Self {
+            ln_odds: scores.tracks.iter().map(ln_odds).collect(),
+            observations: places.iter().map(|&place| ln_odds(&scores.observations[place])).collect(),
+        };
         // A network of finite numbers may still overflow; one that says nothing is not asked.
-        ln_odds.iter().all(|odds| odds.is_finite()).then_some(Self { ln_odds })
+        opinion.ln_odds.iter().chain(&opinion.observations).all(|odds| odds.is_finite()).then_some(opinion)
+    }
+
+    /// What pairs of views say by themselves.
+    pub fn of_votes(votes: &Votes) -> Self {
+        let said = votes.alone();
+        Self { ln_odds: said.tracks, observations: said.observations }
+    }
+
+    /// This opinion corrected by what pairs of views say: the odds of the observations enter the votes, and a track is
+    /// right where all its observations are.
+    ///
+    /// Nothing weighs the one against the other, both being logarithms of odds; with the network's halved or doubled, or
+    /// moved by 1.5 either way, the mean average precision over real windows changes by .002 at most.
+    pub fn with_votes(&self, votes: &Votes) -> Self {
+        let said = votes.with(&self.observations);
+        Self { ln_odds: said.tracks, observations: said.observations }
+    }
+
+    /// Logarithms of the odds that each observation is right, track by track.
+    pub fn observations(&self) -> &[f64] {
+        &self.observations
+    }
+
+    /// Logarithms of the odds that each track is right.
+    pub fn tracks(&self) -> &[f64] {
+        &self.ln_odds
     }
 
     /// Probability of every track to be right.
@@ -118,7 +161,8 @@ mod tests {
 
     #[test]
     fn an_opinion_is_told_in_every_form() {
-        let opinion = Opinion { ln_odds: vec![-20.0, 0.0, 20.0, 1.0] };
+        let of = |ln_odds: Vec<f64>| Opinion { ln_odds, observations: Vec::new() };
+        let opinion = of(vec![-20.0, 0.0, 20.0, 1.0]);
         let probabilities = opinion.probabilities();
         assert!(probabilities[0] < 1e-8 && probabilities[1] == 0.5 && probabilities[2] > 1.0 - 1e-8);
         let truncations = opinion.truncations();
@@ -127,6 +171,6 @@ mod tests {
         assert_eq!(opinion.start(), [2, 3, 1, 0], "no more than there are");
         assert_eq!((opinion.counted(&[0, 1, 3]), opinion.counted(&[0; SURELY_ENOUGH])), (2, SURELY_ENOUGH));
         assert!(!opinion.ranks());
-        assert!(Opinion { ln_odds: vec![0.1; LEAST_LIKELY] }.ranks());
+        assert!(of(vec![0.1; LEAST_LIKELY]).ranks());
     }
 }

@@ -1,10 +1,12 @@
 //! What the search starts from, compared: every prior that ranks image points, alone and at several lengths of the
 //! search, and AUTO with and without the network that was trained beforehand. [`scenes`] are the scenes, [`table`]
-//! shows the rows; [`sweep`] is where a constant of the search comes from.
+//! shows the rows; [`sweep`] is where a constant of the search comes from; [`windows`] ranks the observations of real
+//! sequences.
 
 pub mod scenes;
 pub mod sweep;
 pub mod table;
+pub mod windows;
 
 use serde::{Deserialize, Serialize};
 
