@@ -159,8 +159,9 @@ async fn a_lost_lease_stops_the_work() {
 
 /// Statements after which no job can change its state, or none can be written at all, as with a full disk.
 const NO_ENDS: &str = "CREATE TRIGGER broken BEFORE UPDATE OF state ON jobs BEGIN SELECT RAISE(ABORT, 'broken'); END";
-const NO_WRITES: &str = "CREATE TRIGGER broken BEFORE UPDATE ON jobs BEGIN SELECT RAISE(ABORT, 'broken'); END";
-const MENDED: &str = "DROP TRIGGER broken";
+const NO_WRITES: &str = "CREATE TRIGGER broken BEFORE UPDATE ON jobs BEGIN SELECT RAISE(ABORT, 'broken'); END; \
+    CREATE TRIGGER broken_too BEFORE INSERT ON jobs BEGIN SELECT RAISE(ABORT, 'broken'); END";
+const MENDED: &str = "DROP TRIGGER broken; DROP TRIGGER IF EXISTS broken_too";
 
 #[tokio::test]
 async fn a_result_waits_for_a_store_that_comes_back_in_time() {

@@ -63,7 +63,8 @@ pub fn tiny(seed: u64) -> proto::CreateJobRequest {
     by_geometry(scene_request(&tiny_options(seed)))
 }
 
-fn by_geometry(mut request: proto::CreateJobRequest) -> proto::CreateJobRequest {
+/// The same, solved without the network.
+pub fn by_geometry(mut request: proto::CreateJobRequest) -> proto::CreateJobRequest {
     let settings = proto::SolveSettings { method: proto::Method::Geometry as i32, ..Default::default() };
     request.job = Some(proto::Job { settings: Some(settings), ..Default::default() });
     request
