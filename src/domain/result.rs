@@ -59,9 +59,6 @@ pub enum Prior {
     Irls,
     /// Agreement of a track's motion over the views.
     Consistency,
-    /// Epipolar geometry of pairs of views, together with the network that was trained beforehand; in the windows that seed
-    /// a sequence.
-    Epipolar,
     /// Distances between tracks that stay the same in all views; where depths are given.
     Rigidity,
     /// The network that was trained beforehand, see `scpsfm train-prior`.
@@ -72,15 +69,8 @@ pub enum Prior {
 
 impl Prior {
     /// Every prior.
-    pub const ALL: [Prior; 7] = [
-        Prior::Learned,
-        Prior::Epipolar,
-        Prior::Network,
-        Prior::Irls,
-        Prior::Consistency,
-        Prior::Rigidity,
-        Prior::Uniform,
-    ];
+    pub const ALL: [Prior; 6] =
+        [Prior::Learned, Prior::Network, Prior::Irls, Prior::Consistency, Prior::Rigidity, Prior::Uniform];
 
     /// The prior's name in files, metrics and logs.
     pub fn name(self) -> &'static str {
@@ -88,7 +78,6 @@ impl Prior {
             Prior::Network => "network",
             Prior::Irls => "irls",
             Prior::Consistency => "consistency",
-            Prior::Epipolar => "epipolar",
             Prior::Rigidity => "rigidity",
             Prior::Learned => "learned",
             Prior::Uniform => "uniform",

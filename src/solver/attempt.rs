@@ -129,7 +129,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     let complete = &attempt.block.complete;
     let tracks = &attempt.block.tracks;
     let found = Portfolio::new(complete, context.settings, initial_noise(context), context.stop)
-        .seeding(context.seeding)
+        .geometry_first(context.seeding)
         .run(recorder, &|weights| context.scatter(weights, tracks))
         .map_err(|error| Error::Internal(error.to_string()))?;
     context.stopped()?;

@@ -99,11 +99,6 @@ impl Opinion {
         &self.observations
     }
 
-    /// Logarithms of the odds that each track is right.
-    pub fn tracks(&self) -> &[f64] {
-        &self.ln_odds
-    }
-
     /// Probability of every track to be right.
     pub fn probabilities(&self) -> Vec<f64> {
         self.ln_odds.iter().map(|odds| 1.0 / (1.0 + (-odds).exp())).collect()

@@ -51,7 +51,7 @@ twins! {
     Stage = Stage { Prepare, Search, Refine, Calibrate, Extend, Judge }
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
-    Prior = Prior { Network, Irls, Consistency, Rigidity, Uniform, Learned, Epipolar }
+    Prior = Prior { Network, Irls, Consistency, Rigidity, Uniform, Learned }
     JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, Expired }
     AttemptEnd = AttemptEnd { Ended, GivenBack, Lost }
     WarningCode = WarningCode {

@@ -1,11 +1,10 @@
 //! The portfolio: priors propose, guided search verifies, the best consensus stands.
 //!
 //! What is cheap goes first: rigid distances where depths are given, the opinion of the network that was trained
-//! beforehand, pairs of views where a block seeds a sequence, reweighting, consistency. Where they decide nothing, the
-//! paper's network is optimised a few iterations at a time; between, its ranking is verified by geometry, and so is
-//! uniform sampling, which needs no prior to be right. A decisive consensus ends the search: the paper's network would
-//! say nothing after it that anyone waits for, and its first iterations took as long as everything else. Each prior's own
-//! time is kept.
+//! beforehand, reweighting, consistency. Where they decide nothing, the paper's network is optimised a few iterations at
+//! a time; between, its ranking is verified by geometry, and so is uniform sampling, which needs no prior to be right. A
+//! decisive consensus ends the search: the paper's network would say nothing after it that anyone waits for, and its first
+//! iterations took as long as everything else. Each prior's own time is kept.
 
 mod account;
 mod best;
@@ -84,8 +83,8 @@ pub struct Portfolio<'a> {
     best: Option<Best>,
     rigid: Option<Rigid>,
     opinion: Option<Opinion>,
-    /// The block seeds a sequence.
-    seeds: bool,
+    /// The scene's own statistics go first, whatever the trained network says.
+    geometry_first: bool,
 }
 
 impl<'a> Portfolio<'a> {
@@ -109,20 +108,14 @@ impl<'a> Portfolio<'a> {
             best: None,
             rigid: None,
             opinion: None,
-            seeds: false,
+            geometry_first: false,
         }
     }
 
-    /// Whether the block seeds a sequence. Such tracks are real ones: pairs of views vote on them, and the scene's own
-    /// statistics go first whatever the trained network says, for it was measured to cost a seed a hundredth of F1 to hear
-    /// the network first.
-    pub fn seeding(self, seeds: bool) -> Self {
-        Self { seeds, ..self }
-    }
-
-    /// Whether pairs of views are asked.
-    fn votes(&self) -> bool {
-        self.seeds && matches!(self.search, Search::Affine(_))
+    /// Whether the scene's own statistics go first, whatever the trained network says: in the windows that seed a
+    /// sequence, where it was measured to cost a seed a hundredth of F1 to hear the network first.
+    pub fn geometry_first(self, geometry_first: bool) -> Self {
+        Self { geometry_first, ..self }
     }
 
     /// Runs the search; `spread_weights` maps the block's weights to the caller's tracks.
@@ -257,7 +250,7 @@ impl<'a> Portfolio<'a> {
 
     fn finish(self, network: Option<PriorNetwork>) -> Found {
         let with_network = self.settings.method.uses_network();
-        let (with_depths, with_votes) = (self.block.has_depths(), self.votes());
+        let with_depths = self.block.has_depths();
         let Self { best, accounts, rigid, opinion, .. } = self;
         let doubted = best.as_ref().filter(|best| !best.is_acceptable()).and_then(Best::doubted);
         let accepted = best.filter(Best::is_acceptable);
@@ -265,7 +258,6 @@ impl<'a> Portfolio<'a> {
             .into_iter()
             .filter(|account| with_network || !matches!(account.prior, Prior::Network | Prior::Learned))
             .filter(|account| with_depths || account.prior != Prior::Rigidity)
-            .filter(|account| with_votes || account.prior != Prior::Epipolar)
             .map(|account| account.time(accepted.as_ref()))
             .collect();
         let evidence = accepted.as_ref().map_or(Evidence::ImagePoints, |best| best.evidence);

@@ -5,15 +5,10 @@ use std::time::Instant;
 use super::best::Best;
 use super::{AFFINE_SAMPLES, Evidence, LN_DECISIVE, NOISE_LADDER, Portfolio, SHORTLIST, SUBSPACE_SAMPLES, Search};
 use crate::domain::Prior;
-use crate::geometry::epipolar_votes::{Tracks, Votes};
 use crate::geometry::statistics::median;
 use crate::solver::learned::Opinion;
 use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid, subspace};
 use crate::solver::{depths, grow, priors};
-
-/// Samples of a pair of views at most: reliable where half of the matches are right, as real ones are. Where more are
-/// wrong four times as many would take longer than the rest of a solve.
-const VOTE_SAMPLES: usize = 1_000;
 
 impl Portfolio<'_> {
     /// Whether this prior has anything left to say.
@@ -60,41 +55,15 @@ impl Portfolio<'_> {
     ///
     /// Of mostly right tracks the statistics of the scene itself rank better than what was learned from others: on real
     /// photographs they put nearly every right track first. Where few are right they rank worse the fewer there are.
-    ///
-    /// Pairs of views come after those statistics: they rank observations better, yet of fourteen real sequences asking
-    /// them first cost one three of its nine views and gave none a better calibration, and of synthetic ones with seven
-    /// tracks of ten wrong it took up to twice as long for the same answer.
     pub(super) fn propose_at_once(&mut self, round: u32) {
-        let many = self.seeds || self.opinion.as_ref().is_none_or(Opinion::expects_many);
+        let many = self.geometry_first || self.opinion.as_ref().is_none_or(Opinion::expects_many);
         if many && round == 0 {
             self.propose_geometric();
-        }
-        if round == 0 {
-            self.propose_epipolar();
         }
         self.propose_learned(round);
         if !many && round == 0 {
             self.propose_geometric();
         }
-    }
-
-    /// What pairs of views say, together with the trained network where it was asked.
-    fn propose_epipolar(&mut self) {
-        if !self.votes() || !self.is_wanted(Prior::Epipolar) {
-            return;
-        }
-        let begun = Instant::now();
-        let tracks = Tracks::of_block(self.block);
-        let votes = Votes::ask(&tracks, self.assumed_noise, VOTE_SAMPLES, self.settings.seed, self.stop);
-        self.account(Prior::Epipolar).seconds += begun.elapsed().as_secs_f64();
-        let Some(votes) = votes else { return };
-        let weighed = match &self.opinion {
-            Some(opinion) => opinion.with_votes(&votes),
-            None => Opinion::of_votes(&votes),
-        };
-        self.verify(Prior::Epipolar, affine::seed(self.block, weighed.start()).into_iter().collect());
-        self.propose_ranking(Prior::Epipolar, weighed.tracks());
-        self.propose(Prior::Epipolar, &weighed.probabilities(), Some(&weighed.truncations()));
     }
 
     /// The trained network's opinion: grown as it stands at first, then searched from.
