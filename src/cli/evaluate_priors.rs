@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use serde_json::json;
 
 use super::evaluate;
@@ -9,8 +11,9 @@ use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
 use crate::domain::StopToken;
-use crate::evaluation::priors::{self, Condition, Plan, Records, scenes, sweep, table, windows};
+use crate::evaluation::priors::{self, Plan, scenes, sweep, table, windows};
 use crate::evaluation::real::{Sequence, folder};
+use crate::evaluation::records;
 use crate::formats::result_files::{create_directory, pretty, write_atomically};
 use crate::network::subspace;
 
@@ -29,8 +32,8 @@ pub struct PriorArgs {
     #[arg(long, requires = "priors", conflicts_with = "real")]
     pub auto_only: bool,
 
-    /// Only the sweep over what a nat of the trained network's odds counts in the score of hypotheses, on other seeds than
-    /// those of every comparison; writes nothing
+    /// Only the sweep over what a nat of the trained network's odds counts in the score of hypotheses, on other seeds
+    /// than those of every comparison; writes sweep.json, and sweep.jsonl, with which it goes on
     #[arg(long, requires = "priors", conflicts_with_all = ["auto_only", "real"])]
     pub sweep: bool,
 
@@ -62,52 +65,67 @@ pub async fn run(
             return Err(Failure::usage(unknown));
         }
     }
+    create_directory(out)?;
+    let work = Work { out, threads, quiet };
     if args.sweep {
-        return sweep(&conditions, seeds, json, quiet);
+        let runs = sweep::runs(&conditions, seeds);
+        let records = work.run(sweep::RECORDS, &runs, &sweep::measure, |records| {
+            print(sweep::text(&sweep::rows(&conditions, seeds, records)).trim_end())
+        })?;
+        let rows = sweep::rows(&conditions, seeds, &records);
+        let text = json!({ "seeds": seeds, "costs_per_nat": sweep::COSTS_PER_NAT, "rows": rows });
+        let text = written(out, "sweep.json", text)?;
+        print(if json { text.trim_end().to_owned() } else { sweep::text(&rows) }.trim_end())?;
+        return Ok(Exit::Done);
     }
     let plan = Plan { conditions, seeds, each_prior: !args.auto_only };
-    create_directory(out)?;
-    let mut records = Records::open(out, priors::RECORDS, &evaluate::build()?)?;
-    let runs = plan.runs();
-    let done = runs.iter().filter(|run| records.get(run).is_some()).count();
-    let bar = evaluate::progress_bar(quiet, runs.len(), done);
-    let stop = StopToken::default();
-    let interrupt = Interrupt::listen()?;
-    let relay = interrupt.stops(&stop);
-    let outcome = tokio::task::block_in_place(|| {
-        records.run(&runs, threads, &stop, &|run| priors::measure(run, &stop), &mut |_| bar.inc(1))
-    });
-    relay.abort();
-    bar.finish_and_clear();
-    outcome?;
+    let records = work.run(priors::RECORDS, &plan.runs(), &priors::measure, |records| {
+        print(table::text(&plan.rows(records)).trim_end())
+    })?;
     let rows = plan.rows(&records);
     let text = written(out, "priors.json", json!({ "seeds": seeds, "rows": rows }))?;
     print(if json { text.trim_end().to_owned() } else { table::text(&rows) }.trim_end())?;
-    if stop.is_stopped() {
-        return Err(Failure::interrupted_with("interrupted; called again with the same --out it goes on"));
-    }
     Ok(Exit::Done)
 }
 
-/// `--sweep`.
-fn sweep(conditions: &[Condition], seeds: u64, json: bool, quiet: bool) -> Result<Exit, Failure> {
-    let bar = evaluate::progress_bar(quiet, conditions.len() * seeds as usize, 0);
-    let stop = StopToken::default();
-    let interrupt = Interrupt::listen()?;
-    let relay = interrupt.stops(&stop);
-    let outcome = tokio::task::block_in_place(|| sweep::run(conditions, seeds, &stop, &mut || bar.inc(1)));
-    relay.abort();
-    bar.finish_and_clear();
-    let rows = outcome.map_err(Failure::internal)?;
-    let text = match json {
-        true => pretty(&json!({ "costs_per_nat": sweep::COSTS_PER_NAT, "rows": rows }))?,
-        false => sweep::text(&rows),
-    };
-    print(text.trim_end())?;
-    if stop.is_stopped() {
-        return Err(Failure::interrupted_with("interrupted; the rows are of the scenes so far"));
+/// Where and how runs are done.
+struct Work<'a> {
+    out: &'a Path,
+    threads: usize,
+    quiet: bool,
+}
+
+impl Work<'_> {
+    /// Does what the records of this name lack; where it was interrupted `so_far` shows what there is.
+    fn run<R, M>(
+        &self,
+        name: &str,
+        runs: &[R],
+        measure: &(dyn Fn(&R, &StopToken) -> Result<Option<M>, String> + Sync),
+        so_far: impl Fn(&records::Records<R, M>) -> Result<(), Failure>,
+    ) -> Result<records::Records<R, M>, Failure>
+    where
+        R: Serialize + DeserializeOwned + Sync,
+        M: Serialize + DeserializeOwned + Clone + Send,
+    {
+        let mut records: records::Records<R, M> = records::Records::open(self.out, name, &evaluate::build()?)?;
+        let done = runs.iter().filter(|run| records.get(run).is_some()).count();
+        let bar = evaluate::progress_bar(self.quiet, runs.len(), done);
+        let stop = StopToken::default();
+        let interrupt = Interrupt::listen()?;
+        let relay = interrupt.stops(&stop);
+        let outcome = tokio::task::block_in_place(|| {
+            records.run(runs, self.threads, &stop, &|run| measure(run, &stop), &mut |_| bar.inc(1))
+        });
+        relay.abort();
+        bar.finish_and_clear();
+        outcome?;
+        if stop.is_stopped() {
+            so_far(&records)?;
+            return Err(Failure::interrupted_with("interrupted; called again with the same --out it goes on"));
+        }
+        Ok(records)
     }
-    Ok(Exit::Done)
 }
 
 /// Runs the command with `--real`.

@@ -21,7 +21,8 @@ const MOST_INLIERS: usize = 600;
 const MOST_VIEWS: usize = 100;
 /// Iterations of an adjustment that starts at the noise.
 const ADJUSTMENTS: usize = 10;
-/// Rounds of judging, adjusting and estimating the noise, at most.
+/// Rounds of judging, adjusting and estimating the noise, at most: those that judge wider, and as many again, of which
+/// two make the inliers stand still most of the time.
 const MOST_ROUNDS: usize = 7;
 /// Noise that the first rounds judge at, in units of what is estimated: the cameras were fitted to fewer tracks, and what
 /// they err adds to the residuals of the others. At the noise itself up to a third of the right ones stayed outside, and

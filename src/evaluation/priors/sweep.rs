@@ -1,13 +1,14 @@
-//! What a nat of the trained network's odds is worth in the score of hypotheses: the sweep that the solver's constant comes
-//! from. Its scenes are none of the comparison's.
+//! What a nat of the trained network's odds is worth in the score of hypotheses: the sweep that the solver's constant
+//! comes from. Its scenes are none of the comparison's.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::Condition;
 use crate::domain::{Input, Limits, StopToken};
+use crate::evaluation::records;
 use crate::solver::study::Study;
-use crate::synthetic::Scene;
 use crate::synthetic::metrics::average_precision;
+use crate::synthetic::{Scene, SceneOptions};
 
 /// Costs that are tried, in units of the truncated cost of a track at even odds; 0: the network only draws the samples.
 pub const COSTS_PER_NAT: [f64; 7] = [0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5];
@@ -16,46 +17,63 @@ const SAMPLES: usize = 600;
 /// First seed, below those of every comparison.
 const FIRST_SEED: u64 = 7_000;
 
+/// The file of the records.
+pub const RECORDS: &str = "sweep.jsonl";
+
+/// The records of the sweep: average precision of the best hypothesis's ranking of the tracks, in the order of
+/// [`COSTS_PER_NAT`], where a scene has right tracks.
+pub type Records = records::Records<Run, Vec<Option<f64>>>;
+
+/// One scene under every cost.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Run {
+    scene: SceneOptions,
+}
+
 /// One condition.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
     pub condition: &'static str,
-    pub seeds: u64,
-    /// Mean average precision of the best hypothesis's ranking of the tracks, in the order of [`COSTS_PER_NAT`].
+    pub seeds: usize,
+    /// Means over the seeds, in the order of [`COSTS_PER_NAT`].
     pub average_precision: Vec<f64>,
 }
 
-/// Sweeps the conditions that have right tracks to rank; a stopped sweep leaves out what was not reached. `told` hears of
-/// every scene.
+/// Every scene, seed by seed.
+pub fn runs(conditions: &[Condition], seeds: u64) -> Vec<Run> {
+    (0..seeds).flat_map(|seed| conditions.iter().map(move |condition| run(condition, seed))).collect()
+}
+
+fn run(condition: &Condition, seed: u64) -> Run {
+    Run { scene: condition.scene(FIRST_SEED + seed) }
+}
+
+/// One scene; `None` where it was stopped.
 ///
 /// # Errors
 /// A scene that cannot be made, in words.
-pub fn run(conditions: &[Condition], seeds: u64, stop: &StopToken, told: &mut dyn FnMut()) -> Result<Vec<Row>, String> {
-    let mut rows = Vec::new();
-    for condition in conditions {
-        let mut totals = vec![(0.0, 0usize); COSTS_PER_NAT.len()];
-        for seed in FIRST_SEED..FIRST_SEED + seeds {
-            let scene = Scene::generate(&condition.scene(seed)).map_err(|error| error.to_string())?;
-            let input = Input::new(scene.input, &Limits::default(), "scene").map_err(|error| error.to_string())?;
-            let study = Study::new(&input, stop);
-            for (per_nat, (sum, count)) in COSTS_PER_NAT.into_iter().zip(&mut totals) {
-                let ranking = study.best_under(per_nat, SAMPLES, seed);
-                if let Some(precision) = ranking.and_then(|ranking| average_precision(&ranking, &scene.truth.inlier)) {
-                    *sum += precision;
-                    *count += 1;
-                }
-            }
-            if stop.is_stopped() {
-                return Ok(rows);
-            }
-            told();
-        }
-        if totals.iter().all(|(_, count)| *count > 0) {
-            let average_precision = totals.into_iter().map(|(sum, count)| sum / count as f64).collect();
-            rows.push(Row { condition: condition.name, seeds, average_precision });
-        }
-    }
-    Ok(rows)
+pub fn measure(run: &Run, stop: &StopToken) -> Result<Option<Vec<Option<f64>>>, String> {
+    let scene = Scene::generate(&run.scene).map_err(|error| error.to_string())?;
+    let input = Input::new(scene.input, &Limits::default(), "scene").map_err(|error| error.to_string())?;
+    let study = Study::new(&input, stop);
+    let precision = |per_nat| {
+        let ranking = study.best_under(per_nat, SAMPLES, run.scene.seed)?;
+        average_precision(&ranking, &scene.truth.inlier)
+    };
+    let precisions = COSTS_PER_NAT.into_iter().map(precision).collect();
+    Ok((!stop.is_stopped()).then_some(precisions))
+}
+
+/// A row for each condition with right tracks to rank, of what is recorded.
+pub fn rows(conditions: &[Condition], seeds: u64, records: &Records) -> Vec<Row> {
+    let row = |condition: &Condition| {
+        let of_seed = |seed| records.get(&run(condition, seed))?.iter().copied().collect::<Option<Vec<f64>>>();
+        let all: Vec<Vec<f64>> = (0..seeds).filter_map(of_seed).collect();
+        let mean = |k: usize| all.iter().map(|of_scene| of_scene[k]).sum::<f64>() / all.len() as f64;
+        let average_precision = (0..COSTS_PER_NAT.len()).map(mean).collect();
+        (!all.is_empty()).then_some(Row { condition: condition.name, seeds: all.len(), average_precision })
+    };
+    conditions.iter().filter_map(row).collect()
 }
 
 /// The rows in words.
@@ -80,9 +98,14 @@ mod tests {
     #[test]
     fn a_sweep_ranks_scenes_with_right_tracks_and_leaves_out_those_without() {
         let few = |name: &str| scenes::all().into_iter().find(|condition| condition.name == name).expect("a condition");
+        let conditions = [few("outliers .9"), few("all wrong")];
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let mut records = Records::open(directory.path(), RECORDS, "a build").expect("a writable directory");
+        let stop = StopToken::default();
         let mut scenes = 0;
-        let rows = run(&[few("outliers .9"), few("all wrong")], 1, &StopToken::default(), &mut || scenes += 1);
-        let rows = rows.expect("rows");
+        let told = &mut |_: &Run| scenes += 1;
+        records.run(&runs(&conditions, 1), 2, &stop, &|run| measure(run, &stop), told).expect("runs");
+        let rows = rows(&conditions, 1, &records);
         assert_eq!((rows.len(), scenes, rows[0].condition), (1, 2, "outliers .9"));
         assert!(rows[0].average_precision.iter().all(|value| (0.5..=1.0).contains(value)), "{rows:?}");
         assert_eq!(text(&rows).lines().count(), 2);

@@ -8,7 +8,7 @@ use serde::Serialize;
 use crate::domain::{Limits, StopToken};
 use crate::evaluation::real::Sequence;
 use crate::geometry::statistics::median;
-use crate::solver::study::{self, WindowRankings};
+use crate::solver::study::windows::{self, WindowRankings};
 use crate::synthetic::metrics::average_precision;
 
 /// Seed of the samples that pairs of views draw.
@@ -46,9 +46,10 @@ struct Measured {
 pub fn rows(sequences: &[Sequence], stop: &StopToken, told: &mut dyn FnMut()) -> Result<Vec<WindowRow>, String> {
     let mut rows = Vec::new();
     for sequence in sequences {
-        let input = sequence.input.check(&Limits::default()).map_err(|error| error.to_string())?;
+        let checked = sequence.input.check(&Limits::default());
+        let input = checked.map_err(|error| format!("{}: {error}", sequence.name))?;
         let mut measured = Vec::new();
-        for window in study::windows(&input) {
+        for window in windows::windows(&input) {
             let truth: Vec<bool> =
                 window.observations.iter().map(|&k| sequence.inlier[input.caller_index(k)]).collect();
             // Where all are right, or none is, every ranking is as good.
@@ -67,11 +68,13 @@ pub fn rows(sequences: &[Sequence], stop: &StopToken, told: &mut dyn FnMut()) ->
 }
 
 fn measure(rankings: &WindowRankings, truth: &[bool]) -> Option<Measured> {
-    let even = vec![0.0; truth.len()];
-    let precision = |said: &Option<Vec<f64>>| average_precision(said.as_ref().unwrap_or(&even), truth);
+    let right = truth.iter().filter(|right| **right).count();
+    // Who says nothing ranks as chance does.
+    let chance = right as f64 / truth.len() as f64;
+    let precision = |said: &Option<Vec<f64>>| said.as_ref().map_or(Some(chance), |said| average_precision(said, truth));
     Some(Measured {
         observations: truth.len(),
-        right: truth.iter().filter(|right| **right).count(),
+        right,
         precisions: [precision(&rankings.epipolar)?, precision(&rankings.learned)?, precision(&rankings.together)?],
         seconds: rankings.seconds,
     })
@@ -121,7 +124,7 @@ pub fn text(rows: &[WindowRow]) -> String {
     let _ = writeln!(
         text,
         "Average precision of the observations, mean over windows of {} views that have right and wrong ones.",
-        study::WINDOW_VIEWS
+        windows::WINDOW_VIEWS
     );
     text
 }

@@ -51,12 +51,15 @@ impl Residuals {
                 let [core, tail] = [core, tail].map(|density| self.share * density / all);
                 // A match of the tail says as much of the noise as one of the core, in its own units.
                 let information = core + tail / TAIL.1.powi(2);
-                if information > 0.0 {
+                // Residuals may be infinite, and one that is no number must not take the noise of all with it.
+                if information > 0.0 && squared.is_finite() {
                     sums[0] += information * squared;
+                    sums[1] += core + tail;
+                    right += core + tail;
+                    information
+                } else {
+                    0.0
                 }
-                sums[1] += core + tail;
-                right += core + tail;
-                information
             })
             .collect();
         let share = right / self.squared.len().max(1) as f64;

@@ -1,5 +1,7 @@
-//! One prior alone: how well it ranks, and what a search of a given length finds under it; and the same of windows of
-//! real sequences. For `scpsfm evaluate --priors`; a solve does not come through here.
+//! One prior alone: how well it ranks, and what a search of a given length finds under it; [`windows`] does so for the
+//! observations of real sequences. For `scpsfm evaluate --priors`; a solve does not come through here.
+
+pub mod windows;
 
 use std::time::Instant;
 
@@ -12,9 +14,7 @@ use super::portfolio::{LN_DECISIVE, spread};
 use super::search::{Sampler, Shortlist, affine};
 use super::{block, priors};
 use crate::domain::{Input, Prior, StopToken};
-use crate::geometry::epipolar_votes::{Tracks, Votes};
-use crate::geometry::fundamental::MOST_SAMPLES;
-use crate::geometry::measurement::{CompleteBlock, Sighting};
+use crate::geometry::measurement::CompleteBlock;
 
 /// Hypotheses of a search that are grown: enough that the ranking of hypotheses is not what is measured.
 const SHORTLIST: usize = 6;
@@ -111,74 +111,5 @@ impl Study {
         }
         let inlier = best.map_or_else(|| vec![false; self.block.tracks()], |(_, consensus)| consensus.inlier);
         Found { inlier, seconds: ranking.seconds + begun.elapsed().as_secs_f64() }
-    }
-}
-
-/// Views of a window: those of a block that seeds a sequence, for long complete ones hold few tracks.
-pub const WINDOW_VIEWS: usize = 5;
-
-/// Consecutive views of a sequence with the tracks that three or more of them show: fewer verify nothing.
-pub struct Window {
-    tracks: Tracks,
-    /// Observations of the input, in the order of the tracks.
-    pub observations: Vec<usize>,
-}
-
-/// What is said of every observation of a window, larger where it is more likely right; `None` from those who say
-/// nothing.
-pub struct WindowRankings {
-    /// Pairs of views.
-    pub epipolar: Option<Vec<f64>>,
-    /// The network that was trained beforehand.
-    pub learned: Option<Vec<f64>>,
-    /// Both. No search is guided by it: on real sequences the scene's own statistics decide every seed, and hearing these
-    /// first took three of nine views from one sequence and gave none a better calibration.
-    pub together: Option<Vec<f64>>,
-    /// Of asking the pairs, and of asking the network.
-    pub seconds: [f64; 2],
-}
-
-/// Every window of an input, those that show no tracks left out.
-pub fn windows(input: &Input) -> Vec<Window> {
-    let ranges = block::track_ranges(input);
-    let (normalization, _) = block::normalization(input);
-    let seen = |k: usize, first: usize| {
-        let view = input.view_of(k);
-        Sighting { view: view - first, xy: normalization.normalize(view, input.point_px(k)) }
-    };
-    let window = |first: usize| {
-        let inside = |track: usize| -> Vec<usize> {
-            let within = first..first + WINDOW_VIEWS;
-            (ranges[track]..ranges[track + 1]).filter(|&k| within.contains(&input.view_of(k))).collect()
-        };
-        let shown: Vec<Vec<usize>> =
-            (0..input.track_count()).map(inside).filter(|seen| seen.len() >= block::LEAST_VIEWS).collect();
-        let tracks = Tracks::new(WINDOW_VIEWS, shown.iter().map(|track| track.iter().map(|&k| seen(k, first))));
-        Window { tracks, observations: shown.concat() }
-    };
-    let last = (input.view_count() + 1).saturating_sub(WINDOW_VIEWS);
-    (0..last).map(window).filter(|window| !window.observations.is_empty()).collect()
-}
-
-impl Window {
-    /// Asks pairs of views and the trained network.
-    pub fn rank(&self, seed: u64, stop: &StopToken) -> WindowRankings {
-        let begun = Instant::now();
-        let votes = Votes::ask(&self.tracks, NOISE, MOST_SAMPLES, seed, stop);
-        let voted = begun.elapsed().as_secs_f64();
-        let opinion = Opinion::of_tracks(&self.tracks);
-        let seconds = [voted, begun.elapsed().as_secs_f64() - voted];
-        let together = match (&votes, &opinion) {
-            (Some(votes), Some(opinion)) => Some(opinion.with_votes(votes)),
-            (Some(votes), None) => Some(Opinion::of_votes(votes)),
-            (None, opinion) => opinion.clone(),
-        };
-        let said = |opinion: &Opinion| opinion.observations().to_vec();
-        WindowRankings {
-            epipolar: votes.map(|votes| votes.alone().observations),
-            learned: opinion.as_ref().map(said),
-            together: together.as_ref().map(said),
-            seconds,
-        }
     }
 }
