@@ -42,7 +42,8 @@ Examples:
   scpsfm evaluate --real sequences --peer 'python peer.py' --out side-by-side
 
 Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
-figure-depths-*.svg (the paper's layout) and index.html, which shows all of it. Stopped by Ctrl-C, a crash or a power cut it goes on where it was when called again with the same directory.";
+figure-depths-*.svg (the paper's layout) and index.html, which shows all of it. Stopped by Ctrl-C, a crash or a power \
+cut it goes on where it was when called again with the same directory.";
 
 /// Run the paper's evaluation: sweeps over points, outliers, noise and views, every method against the oracle
 ///

@@ -28,8 +28,8 @@ were found from these tracks
 Written to --out: real.json, real.csv and real.html; with --priors windows.json.
 
 A peer is called as COMMAND observations.csv WIDTH HEIGHT -o FILE and writes a JSON object: views (how many it \
-registered, in one reconstruction), focal (pixels or null), inlier (0 or 1 for each track id from 0 on) or observation_inlier (the same for each \
-line of its input), and where it has them sigma_log_focal, k1, reproj (mean) and rms in pixels, grade, warnings (texts), \
+registered, in one reconstruction), focal (pixels or null), inlier (0 or 1 for each track id from 0 on) or \
+observation_inlier (the same for each line of its input), and where it has them sigma_log_focal, k1, reproj (mean) and rms in pixels, grade, warnings (texts), \
 centres ([x, y, z] or null for each view).";
 
 /// Real sequences instead of sweeps.

@@ -97,7 +97,8 @@ pub enum WarningCode {
     PureRotation,
     /// The camera moved without turning: every focal length fits. Forward motion is a case of it; the detail says so.
     PureTranslation,
-    /// The motion leaves the focal length (nearly) free, or the one that fits best is that of no lens; the detail says which.
+    /// The motion leaves the focal length (nearly) free, or the one that fits best is that of no lens; the detail says
+    /// which.
     UnobservableFocal,
     /// Another calibration explains the data about as well.
     SecondMinimum,

@@ -47,6 +47,8 @@ fn stroke(contestant: Contestant) -> (&'static str, &'static str) {
         Contestant::AutoWithoutConsistency => ("#56b4e9", "5 3"),
         Contestant::AutoWithoutRigidity => ("#e69f00", ""),
         Contestant::AutoWithoutUniform => ("#e69f00", "5 3"),
+        Contestant::AutoWithoutLearned => ("#d55e00", "1 3"),
+        Contestant::LearnedAlone => ("#56b4e9", "1 3"),
         Contestant::NetworkAlone => ("#009e73", "2 2"),
     }
 }

@@ -52,13 +52,17 @@ pub enum Contestant {
     AutoWithoutConsistency,
     AutoWithoutRigidity,
     AutoWithoutUniform,
-    /// AUTO with the network's prior and no other.
+    /// AUTO without the network that was trained beforehand.
+    AutoWithoutLearned,
+    /// AUTO with the prior of the paper's network and no other.
     NetworkAlone,
+    /// AUTO with the prior of the network that was trained beforehand and no other.
+    LearnedAlone,
 }
 
 impl Contestant {
-    /// AUTO and what is left of it: without the network it is GEOMETRY.
-    pub const ABLATION: [Contestant; 8] = [
+    /// AUTO and what is left of it: without both networks it is GEOMETRY.
+    pub const ABLATION: [Contestant; 10] = [
         Contestant::Auto,
         Contestant::Geometry,
         Contestant::AutoWithoutDaq,
@@ -66,7 +70,9 @@ impl Contestant {
         Contestant::AutoWithoutConsistency,
         Contestant::AutoWithoutRigidity,
         Contestant::AutoWithoutUniform,
+        Contestant::AutoWithoutLearned,
         Contestant::NetworkAlone,
+        Contestant::LearnedAlone,
     ];
     /// The contestants of the paper's figure.
     pub const ALL: [Contestant; 6] = [
@@ -91,7 +97,9 @@ impl Contestant {
             Contestant::AutoWithoutConsistency => "auto-without-consistency",
             Contestant::AutoWithoutRigidity => "auto-without-rigidity",
             Contestant::AutoWithoutUniform => "auto-without-uniform",
+            Contestant::AutoWithoutLearned => "auto-without-learned",
             Contestant::NetworkAlone => "network-alone",
+            Contestant::LearnedAlone => "learned-alone",
         }
     }
 
@@ -115,7 +123,9 @@ impl Contestant {
             Contestant::AutoWithoutConsistency => vec![Prior::Consistency],
             Contestant::AutoWithoutRigidity => vec![Prior::Rigidity],
             Contestant::AutoWithoutUniform => vec![Prior::Uniform],
-            Contestant::NetworkAlone => Prior::ALL.into_iter().filter(|&prior| prior != Prior::Network).collect(),
+            Contestant::AutoWithoutLearned => vec![Prior::Learned],
+            Contestant::NetworkAlone => all_but(Prior::Network),
+            Contestant::LearnedAlone => all_but(Prior::Learned),
             _ => Vec::new(),
         }
     }
@@ -124,6 +134,10 @@ impl Contestant {
     fn is_paper(self) -> bool {
         matches!(self, Contestant::Paper | Contestant::PaperWithoutDaq)
     }
+}
+
+fn all_but(one: Prior) -> Vec<Prior> {
+    Prior::ALL.into_iter().filter(|&prior| prior != one).collect()
 }
 
 /// One scene given to one contestant.
@@ -160,7 +174,9 @@ impl Run {
             | Contestant::AutoWithoutConsistency
             | Contestant::AutoWithoutRigidity
             | Contestant::AutoWithoutUniform
-            | Contestant::NetworkAlone => (Method::Auto, true),
+            | Contestant::AutoWithoutLearned
+            | Contestant::NetworkAlone
+            | Contestant::LearnedAlone => (Method::Auto, true),
         };
         Some(SolveSettings {
             method,
