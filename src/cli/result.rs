@@ -75,12 +75,21 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     Ok(Exit::of(&solution))
 }
 
-/// Refuses a file of another shape than the job's input.
+/// Refuses a file that is not the job's input: its verdicts are listed by place alone.
 fn belongs_together(input: &LabelledInput, solution: &Solution) -> Result<(), Failure> {
     let of_file = (input.raw.views.len(), input.raw.track_count, input.raw.x.len());
     let of_job = (solution.views.len(), solution.tracks.inlier.len(), solution.observations.inlier.len());
     if of_file == of_job {
-        return Ok(());
+        return match &solution.input_sha256 {
+            Some(sha256) if *sha256 != input.raw.sha256() => Err(Failure {
+                exit: Exit::BadInput,
+                message:
+                    "the file is not the job's input: its points, their order or the sizes of the images (--width, \
+                          --height) are others, and verdicts would go to the wrong observations"
+                        .to_owned(),
+            }),
+            _ => Ok(()),
+        };
     }
     let words =
         |(views, tracks, observations)| format!("{views} views, {tracks} tracks and {observations} observations");

@@ -5,6 +5,7 @@
 
 pub mod error;
 pub mod input;
+mod input_digest;
 pub mod input_name;
 pub mod job;
 pub mod left_out;

@@ -385,6 +385,9 @@ pub struct Solution {
     /// SHA-256 of the trained network that AUTO had at hand, hexadecimal; `None` where it was not to be asked.
     #[serde(default)]
     pub trained_network: Option<String>,
+    /// [`RawInput::sha256`](super::RawInput::sha256) of the input; `None` in results of older versions.
+    #[serde(default)]
+    pub input_sha256: Option<String>,
 }
 
 impl Solution {

@@ -197,6 +197,7 @@ fn solution(scene: &Scene) -> Solution {
         prior_times: vec![PriorTime { prior: Prior::Uniform, seconds: None, iterations: 600 }],
         history: history(truth.focal_px),
         trained_network: None,
+        input_sha256: None,
     }
 }
 

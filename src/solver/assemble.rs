@@ -72,6 +72,7 @@ pub fn unsolved(
         prior_times: attempt.map_or_else(Vec::new, |attempt| attempt.prior_times.clone()),
         history,
         trained_network: None,
+        input_sha256: None,
     }
 }
 
@@ -138,6 +139,7 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
         prior_times: attempt.prior_times.clone(),
         history,
         trained_network: None,
+        input_sha256: None,
     }
 }
 

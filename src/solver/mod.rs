@@ -68,6 +68,7 @@ pub fn solve(
 ) -> Result<Solution, Error> {
     let mut solution = solve_views(input, settings, observer, stop)?;
     views::complete(&mut solution, input);
+    solution.input_sha256 = Some(input.to_raw().sha256());
     solution.trained_network = learned::may_be_asked(settings).then(trained_network);
     Ok(solution)
 }

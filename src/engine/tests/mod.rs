@@ -134,6 +134,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         prior_times: Vec::new(),
         history: vec![progress(1)],
         trained_network: None,
+        input_sha256: None,
     }
 }
 

@@ -46,6 +46,7 @@ pub fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
             .collect(),
         history: solution.history.iter().map(progress::to_wire).collect(),
         trained_network: solution.trained_network.clone().unwrap_or_default(),
+        input_sha256: solution.input_sha256.clone().unwrap_or_default(),
     }
 }
 
@@ -85,6 +86,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
             .collect::<Result<_, Violation>>()?,
         history: result.history.iter().map(progress::from_wire).collect::<Result<_, _>>()?,
         trained_network: Some(result.trained_network).filter(|sha256| !sha256.is_empty()),
+        input_sha256: Some(result.input_sha256).filter(|sha256| !sha256.is_empty()),
     })
 }
 

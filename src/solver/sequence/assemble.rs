@@ -60,6 +60,7 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
         prior_times: seed.prior_times.clone(),
         history,
         trained_network: None,
+        input_sha256: None,
     }
 }
 

@@ -107,5 +107,6 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         prior_times: Vec::new(),
         history: Vec::new(),
         trained_network: None,
+        input_sha256: None,
     }
 }
