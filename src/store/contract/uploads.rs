@@ -8,13 +8,13 @@ use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease,
 };
 
-const ROOMY: UploadBounds = UploadBounds { max_tenant_uploads: u64::MAX, max_tenant_bytes: u64::MAX };
+pub(in crate::store) const ROOMY: UploadBounds = UploadBounds { max_tenant_uploads: u64::MAX, max_tenant_bytes: u64::MAX };
 
-fn name(input: &str) -> InputName {
+pub(in crate::store) fn name(input: &str) -> InputName {
     InputName { tenant: "t".into(), input: input.into() }
 }
 
-fn new(input: &str, bytes: u64) -> NewUpload {
+pub(in crate::store) fn new(input: &str, bytes: u64) -> NewUpload {
     NewUpload { name: name(input), bytes, sha256: None }
 }
 
@@ -30,7 +30,7 @@ fn input(payload: Vec<u8>) -> Arc<NewInput> {
 }
 
 /// An upload of a few bytes that became an input at that second.
-async fn finished(store: &dyn Store, id: &str, payload: Vec<u8>, seconds: u64) -> StoredInput {
+pub(in crate::store) async fn finished(store: &dyn Store, id: &str, payload: Vec<u8>, seconds: u64) -> StoredInput {
     let (lease, _) = begin(store, &new(id, 4), seconds).await;
     store.append_upload(&lease, 0, &[1; 4], time(seconds)).await.expect("appends");
     store.finish_upload(&lease, &input(payload), time(seconds)).await.expect("finishes")

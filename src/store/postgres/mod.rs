@@ -6,6 +6,8 @@
 mod clock;
 mod listener;
 #[cfg(test)]
+mod locks_tests;
+#[cfg(test)]
 pub(crate) mod tests;
 mod url;
 

@@ -21,6 +21,9 @@ pub(super) async fn create<C: Connection>(
     let mut waiting = Waiting::default();
     let mut inputs = vec![None; news.len()];
     if !C::WRITES_ALONE {
+        // Before anything else, and each name once: two batches of the same inputs in other orders would wait for each
+        // other.
+        uploads::lock(connection, &news.iter().filter_map(uploaded).collect()).await?;
         for (new, input) in news.iter().zip(&mut inputs) {
             // Payloads take long: nobody else's admission waits for them.
             if admit(connection, new, bounds, &mut waiting).await?.is_none() {
@@ -177,11 +180,20 @@ async fn earlier<C: Connection>(connection: &mut C, tenant: &str, request: &Requ
 async fn input_of<C: Connection>(connection: &mut C, new: &NewRecord, now: SystemTime) -> Result<i64, Error> {
     match &new.input {
         JobInput::Inline(bytes) => insert_input(connection, &new.name.tenant, bytes, now).await,
-        JobInput::Uploaded { input, .. } => {
-            let name = InputName { tenant: new.name.tenant.clone(), input: input.clone() };
-            uploads::use_input(connection, &name, now).await
-        }
+        JobInput::Uploaded { input, .. } => uploads::use_input(connection, &named(new, input), now).await,
     }
+}
+
+/// The uploaded input of a job, where it has one.
+fn uploaded(new: &NewRecord) -> Option<InputName> {
+    match &new.input {
+        JobInput::Inline(_) => None,
+        JobInput::Uploaded { input, .. } => Some(named(new, input)),
+    }
+}
+
+fn named(new: &NewRecord, input: &str) -> InputName {
+    InputName { tenant: new.name.tenant.clone(), input: input.to_owned() }
 }
 
 /// Stores an encoded input; returns its row.
