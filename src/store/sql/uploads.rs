@@ -148,11 +148,13 @@ async fn open<C: Connection>(
     bounds: &UploadBounds,
     now: SystemTime,
 ) -> Result<BegunUpload, Error> {
-    // Of what was given up counts what has not been removed yet: it lies on the disk all the same.
+    // Of what was given up counts what has not been removed yet, and of what was deleted, what jobs still have: it lies
+    // on the disk all the same, and could else be uploaded and deleted again and again.
     let taken = Statement::new(
         "SELECT COUNT(upload) AS open, \
          CAST(COALESCE(SUM(CASE WHEN upload IS NULL THEN committed ELSE bytes END), 0) AS BIGINT) AS bytes, \
-         (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM inputs WHERE tenant = $1 AND input IS NOT NULL) AS kept \
+         (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM inputs \
+         WHERE tenant = $1 AND upload_bytes IS NOT NULL) AS kept \
          FROM uploads WHERE tenant = $1 AND input_id IS NULL",
     );
     let row = connection.row(taken.bind(&new.name.tenant)).await?;

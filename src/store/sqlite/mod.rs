@@ -43,13 +43,14 @@ const VACUUM: &str = "PRAGMA incremental_vacuum(4096)";
 /// as itself.
 const LOG_BYTES: &str = "67108864";
 
-const MIGRATIONS: [Step; 6] = [
+const MIGRATIONS: [Step; 7] = [
     (1, "jobs", include_str!("../migrations/sqlite/0001_jobs.sql")),
     (2, "attempts", include_str!("../migrations/sqlite/0002_attempts.sql")),
     (3, "retention", include_str!("../migrations/sqlite/0003_retention.sql")),
     (4, "uploads", include_str!("../migrations/sqlite/0004_uploads.sql")),
     (5, "listing", include_str!("../migrations/sqlite/0005_listing.sql")),
     (6, "inputs", include_str!("../migrations/sqlite/0006_inputs.sql")),
+    (7, "uploaded", include_str!("../migrations/sqlite/0007_uploaded.sql")),
 ];
 
 /// Store in a data directory.
