@@ -173,7 +173,12 @@ impl Database for Postgres {
         Ok(self.pool(size).acquire().await?)
     }
 
-    async fn write<T: Send + 'static>(&self, size: Size, operation: Operation<PgConnection, T>) -> Result<T, Error> {
+    async fn write<T: Send + 'static>(
+        &self,
+        size: Size,
+        _bytes: u64,
+        operation: Operation<PgConnection, T>,
+    ) -> Result<T, Error> {
         let mut transaction = self.pool(size).begin().await?;
         let value = operation(&mut transaction).await?;
         transaction.commit().await?;
