@@ -26,12 +26,12 @@ use crate::telemetry::metrics;
 /// to be slower.
 pub const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Connections that have not come to their first words yet, at most; one more ends the oldest of them. Callers that mean
-/// it need milliseconds for it, so that a thousand are a thousand new ones a round trip.
+/// Connections that have not come to their first words yet, at most; one more ends the oldest of them. Callers that
+/// mean it need milliseconds for it, so that a thousand are a thousand new ones a round trip.
 pub const MAX_GREETED: usize = 1_024;
 
-/// Connections that speak, at most: one for each of some thousand callers who watch. Each takes some ten kilobytes while
-/// it is idle, and a file descriptor.
+/// Connections that speak, at most: one for each of some thousand callers who watch. Each takes some ten kilobytes
+/// while it is idle, and a file descriptor.
 pub const MAX_SPEAKING: usize = 4_096;
 
 /// How long a connection that is refused may take to hear of it.

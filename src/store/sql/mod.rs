@@ -98,8 +98,8 @@ pub(super) trait Database: Send + Sync + 'static {
     /// A connection that only reads.
     fn reader(&self, size: Size) -> impl Future<Output = Result<PoolConnection<Self::Sqlx>, Error>> + Send;
 
-    /// Runs an operation in a transaction, and answers once it is committed and durable. Where it is refused, nothing of
-    /// it is. `bytes`: about what it writes or removes.
+    /// Runs an operation in a transaction, and answers once it is committed and durable. Where it is refused, nothing
+    /// of it is. `bytes`: about what it writes or removes.
     fn write<T: Send + 'static>(
         &self,
         size: Size,

@@ -142,7 +142,8 @@ impl Standing {
 macro_rules! select_standing {
     ($clauses:literal) => {
         concat!(
-            "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline, last_sequence FROM jobs ",
+            "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline, last_sequence ",
+            "FROM jobs ",
             $clauses
         )
     };

@@ -318,8 +318,8 @@ pub(super) async fn delete<C: Connection>(connection: &mut C, name: &InputName) 
 
 /// Removes an input that has no name, once no job has it.
 pub(super) async fn remove_orphan<C: Connection>(connection: &mut C, id: i64) -> Result<(), Error> {
-    // Of two that take away the last uses of it at once, the later one waits, and then sees that the other is gone: what
-    // it asks of the row, it asks after the wait.
+    // Of two that take away the last uses of it at once, the later one waits, and then sees that the other is gone:
+    // what it asks of the row, it asks after the wait.
     let lock = Statement::new("SELECT id FROM inputs WHERE id = $1").bind(id).then(C::FOR_UPDATE);
     connection.execute(lock).await?;
     let delete = Statement::new(

@@ -36,8 +36,8 @@ const LOCK_FILE: &str = "scpsfm.lock";
 const READERS: u32 = 4;
 /// How long a statement waits for another process on the file, such as a backup.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long a reader waits for one of the connections, none of which waits for a write: reads that take this long are of
-/// a disk that has failed.
+/// How long a reader waits for one of the connections, none of which waits for a write: reads that take this long are
+/// of a disk that has failed.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Hands pages back, 4,096 at a time, which are 16 MB: writers wait meanwhile.

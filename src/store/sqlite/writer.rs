@@ -24,12 +24,13 @@ use crate::telemetry::metrics;
 /// How long an operation waits for its turn; behind a queue of writes this long, the disk has failed.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// How long a group goes on taking operations, each of [`LARGE_BYTES`] at most: about what a commit takes on a slow disk,
-/// so that the first of a group waits for the others about as long as for the disk.
+/// How long a group goes on taking operations, each of [`LARGE_BYTES`] at most: about what a commit takes on a slow
+/// disk, so that the first of a group waits for the others about as long as for the disk.
 pub(super) const GROUP_TIME: Duration = Duration::from_millis(10);
 
 /// An operation that writes or removes more than this has a commit of its own: what a disk of 100 MB/s takes in
-/// [`GROUP_TIME`]. The others neither wait for it longer than for their own group, nor are they run again where it fails.
+/// [`GROUP_TIME`]. The others neither wait for it longer than for their own group, nor are they run again where it
+/// fails.
 pub(super) const LARGE_BYTES: u64 = 1 << 20;
 
 /// Begun as a writer at once: a transaction that began by reading could not be upgraded after another process wrote.
@@ -124,8 +125,8 @@ impl<T: Send + 'static> Waiting for Pending<T> {
 }
 
 impl Writer {
-    /// Starts the thread on a connection; `options` open another one when that is of no more use. A group goes on taking
-    /// operations for `group_time`.
+    /// Starts the thread on a connection; `options` open another one when that is of no more use. A group goes on
+    /// taking operations for `group_time`.
     ///
     /// # Errors
     /// [`Error::Unavailable`] where the system has no thread to give.
