@@ -258,10 +258,10 @@ mod tests {
         let options =
             Options { certificates: None, timeout: HANDSHAKE_TIMEOUT, max_greeted: MAX_GREETED, max_speaking: 0 };
         let door = tokio::spawn(async move { Box::pin(incoming(listener, options)).next().await });
-        // More often than not a reset would be faster than the word in some of them.
+        // A reset overtakes the answer in some of so many.
         for attempt in 0..100 {
             let Ok(mut client) = CalibrationServiceClient::connect(url.clone()).await else {
-                // To be told before the first call is to be told.
+                // Refused before the first call could be made.
                 continue;
             };
             let refused = client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect_err("no room");
