@@ -2,11 +2,11 @@
 
 use super::*;
 use crate::domain::InputName;
-use crate::store::query::{InputPage, InputQuery};
 use crate::store::record::JobInput;
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease,
 };
+use crate::store::{InputPage, InputQuery};
 
 pub(in crate::store) const ROOMY: UploadBounds =
     UploadBounds { max_tenant_uploads: u64::MAX, max_tenant_bytes: u64::MAX };

@@ -6,7 +6,6 @@ use std::time::SystemTime;
 use super::rows::{self, integer, micros, number};
 use super::{Connection, Row, Statement, jobs};
 use crate::domain::input_name::InputName;
-use crate::store::query::Cursor;
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
 };
@@ -283,18 +282,9 @@ pub(super) async fn list<C: Connection>(connection: &mut C, query: &InputQuery) 
         select = select.then(" AND (create_time, input) < (").then_bind(cursor.create_micros);
         select = select.then(", ").then_bind(&cursor.id).then(")");
     }
-    // One more than asked for tells whether there is a next page.
-    let select = select.then(" ORDER BY create_time DESC, input DESC LIMIT ").then_bind(i64::from(size) + 1);
-    let mut rows = connection.rows(select).await?;
-    let more = rows.len() > size as usize;
-    rows.truncate(size as usize);
-    let next_page_token = match rows.last() {
-        Some(last) if more => {
-            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text("input")? };
-            Some(query.token_after(&cursor))
-        }
-        _ => None,
-    };
+    let select = select.then(" ORDER BY create_time DESC, input DESC LIMIT ").then_bind(rows::limit(size));
+    let rows = connection.rows(select).await?;
+    let (rows, next_page_token) = rows::page(rows, size, "input", |cursor| query.token_after(cursor))?;
     Ok(InputPage { inputs: rows.iter().map(stored_input).collect::<Result<_, _>>()?, next_page_token })
 }
 
