@@ -14,9 +14,9 @@ Examples:
 
 /// Delete jobs that have ended, and uploaded inputs
 ///
-/// Removes each job with its input, events and result, for good, and prints its name. One that waits or runs is refused:
-/// cancel it first. Of an uploaded input the name goes at once; jobs that were created with it go on, and its bytes go with
-/// the last of them. Stops at the first that cannot be deleted.
+/// Removes each job with its input, events and result, for good, and prints its name. One that waits or runs is
+/// refused: cancel it first. Of an uploaded input the name goes at once; jobs that were created with it go on, and its
+/// bytes go with the last of them. Stops at the first that cannot be deleted.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {

@@ -30,7 +30,8 @@ pub struct Args {
     #[arg(value_name = "INPUT", required_unless_present = "uploaded", conflicts_with = "uploaded")]
     pub inputs: Vec<PathBuf>,
 
-    /// Solve an input that was uploaded with `scpsfm upload`: its name, or the last part of it; may be given more than once
+    /// Solve an input that was uploaded with `scpsfm upload`: its name, or the last part of it; may be given more than
+    /// once
     #[arg(long = "input", value_name = "NAME", value_parser = GivenInput::parse)]
     pub uploaded: Vec<GivenInput>,
 
@@ -60,8 +61,8 @@ pub struct Args {
     #[arg(long, value_name = "ID")]
     pub job_id: Option<String>,
 
-    /// Makes this command safe to repeat: the same id and job give the same job. Of several inputs, each job has this id
-    /// with `-1`, `-2`, ... after it
+    /// Makes this command safe to repeat: the same id and job give the same job. Of several inputs, each job has this
+    /// id with `-1`, `-2`, ... after it
     #[arg(long, value_name = "ID")]
     pub request_id: Option<String>,
 
@@ -75,7 +76,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let reading = args.reading.flags();
     if !args.uploaded.is_empty() && !reading.is_empty() {
         return Err(Failure::usage(format!(
-            "{}: of no use with --input, whose tracks and image sizes are those of its upload; say it to `scpsfm upload`",
+            "{}: of no use with --input, whose tracks and image sizes are those of its upload; say it to \
+             `scpsfm upload`",
             reading.trim_start()
         )));
     }

@@ -207,7 +207,7 @@ pub struct Upload {
     pub max_bytes: u64,
     /// Uploads of one tenant that may be begun and not finished.
     pub tenant_uploads: u64,
-    /// Bytes of one tenant's uploads and uploaded inputs at most.
+    /// Bytes of one tenant's uploads and uploaded inputs at most; one that was deleted counts while a job has it.
     pub tenant_bytes: u64,
     /// How long an upload to which nothing comes is kept: `24h`, `90m`, `45s` or `forever`.
     pub abandoned_after: Retention,

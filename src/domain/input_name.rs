@@ -5,7 +5,7 @@ use std::fmt;
 use super::job::JobName;
 
 /// An uploaded input's resource name, `tenants/{tenant}/inputs/{input}`; ids are as those of jobs.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct InputName {
     pub tenant: String,
     pub input: String,

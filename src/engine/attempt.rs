@@ -36,8 +36,8 @@ const RETRY_PAUSE: Duration = Duration::from_millis(500);
 /// `Failure::reason` of a defect of ours.
 const INTERNAL: &str = "INTERNAL";
 
-/// Makes one attempt at a claimed job. Returns once the worker is free again, with the task that commits what the attempt
-/// came to.
+/// Makes one attempt at a claimed job. Returns once the worker is free again, with the task that commits what the
+/// attempt came to.
 pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) -> JoinHandle<()> {
     let Claimed { job, lease, trace_parent, queue_time } = claimed;
     let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref(), queue_time);

@@ -24,8 +24,8 @@ const COUNT_PERIOD: Duration = Duration::from_millis(200);
 const PURGE_BATCH: u32 = 32;
 
 /// Claims jobs for one worker, one after the other, until the engine drains. While what a job came to is committed, the
-/// next one is claimed, so that the worker waits for one commit of the store, not for two, and the store may make one of
-/// both.
+/// next one is claimed, so that the worker waits for one commit of the store, not for two, and the store may make one
+/// of both.
 pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     let mut work = inner.work.subscribe();
     let mut phase = inner.phase.subscribe();

@@ -22,24 +22,28 @@ use tonic::transport::server::{Connected, TcpConnectInfo};
 use super::reload::Current;
 use crate::telemetry::metrics;
 
-/// How long a connection may take to its first words: three round trips of the slowest link, and no reason for a caller to
-/// be slower.
+/// How long a connection may take to its first words: three round trips of the slowest link, and no reason for a caller
+/// to be slower.
 pub const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Connections that have not come to their first words yet, at most; one more ends the oldest of them. Callers that mean it
-/// need milliseconds for it, so that a thousand are a thousand new ones a round trip.
+/// Connections that have not come to their first words yet, at most; one more ends the oldest of them. Callers that
+/// mean it need milliseconds for it, so that a thousand are a thousand new ones a round trip.
 pub const MAX_GREETED: usize = 1_024;
 
-/// Connections that speak, at most: one for each of some thousand callers who watch. Each takes some ten kilobytes while it
-/// is idle, and a file descriptor.
+/// Connections that speak, at most: one for each of some thousand callers who watch. Each takes some ten kilobytes
+/// while it is idle, and a file descriptor.
 pub const MAX_SPEAKING: usize = 4_096;
 
 /// How long a connection that is refused may take to hear of it.
 const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// What a connection is told for which there is no room: empty settings, and GOAWAY (RFC 9113, sections 6.5 and 6.8) after
-/// stream 0 with ENHANCE_YOUR_CALM. No call of it was begun, so that a client may come again.
-const NO_ROOM: &[u8] = b"\0\0\0\x04\0\0\0\0\0\0\0\x1c\x07\0\0\0\0\0\0\0\0\0\0\0\0\x0btoo many connections";
+/// Connections that are being refused, at most: as many as may be about to speak. One more is closed without a word.
+const MAX_REFUSALS: usize = MAX_GREETED;
+
+/// What a connection is told for which there is no room: empty settings, and GOAWAY (RFC 9113, sections 6.5 and 6.8)
+/// after stream 0 with REFUSED_STREAM. No call of it was begun, so that a client may come again: gRPC calls that
+/// UNAVAILABLE, where ENHANCE_YOUR_CALM would be RESOURCE_EXHAUSTED.
+const NO_ROOM: &[u8] = b"\0\0\0\x04\0\0\0\0\0\0\0\x1c\x07\0\0\0\0\0\0\0\0\0\0\0\0\x07too many connections";
 
 /// Pause after a connection could not be taken, which is usually a lack of file descriptors: some free up meanwhile.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
@@ -64,7 +68,8 @@ pub struct Options {
 /// force then; those that fail or stall leave nothing but a line in the log.
 pub fn incoming(listener: TcpListener, options: Options) -> impl Stream<Item = Result<Connection, Infallible>> {
     let seats = Arc::new(Semaphore::new(options.max_speaking.min(Semaphore::MAX_PERMITS)));
-    let door = Door { listener, options, seats, greeted: JoinSet::new(), oldest_first: VecDeque::new() };
+    let refusals = Arc::new(Semaphore::new(MAX_REFUSALS));
+    let door = Door { listener, options, seats, refusals, greeted: JoinSet::new(), oldest_first: VecDeque::new() };
     stream::unfold(door, async |mut door| {
         let connection = door.next().await;
         Some((Ok(connection), door))
@@ -76,6 +81,8 @@ struct Door {
     options: Options,
     /// One for each connection that may speak.
     seats: Arc<Semaphore>,
+    /// One for each connection that is being refused.
+    refusals: Arc<Semaphore>,
     greeted: JoinSet<Result<Begun, String>>,
     oldest_first: VecDeque<AbortHandle>,
 }
@@ -98,7 +105,7 @@ impl Door {
                             let held = (seat, metrics::connection());
                             return Connection { io, early, info, _held: held };
                         }
-                        Err(_) => refuse(begun),
+                        Err(_) => self.refuse(begun),
                     },
                     Ok(Err(error)) => tracing::debug!(error, "a connection came to nothing"),
                     Err(error) if error.is_cancelled() => tracing::debug!("a silent connection made room for another"),
@@ -125,21 +132,25 @@ impl Door {
         });
         self.oldest_first.push_back(greeting);
     }
-}
 
-/// Tells a connection that there is no room for it.
-fn refuse(begun: Begun) {
-    metrics::connection_refused();
-    tracing::debug!("a connection was refused: too many speak");
-    tokio::spawn(async move {
-        let mut io = begun.io;
-        let told = async {
-            io.write_all(NO_ROOM).await?;
-            io.shutdown().await
-        };
-        // Whoever does not listen is not waited for.
-        let _ = tokio::time::timeout(REFUSAL_TIMEOUT, told).await;
-    });
+    /// Tells a connection that there is no room for it.
+    fn refuse(&self, begun: Begun) {
+        metrics::connection_refused();
+        tracing::debug!("a connection was refused: too many speak");
+        let Ok(place) = self.refusals.clone().try_acquire_owned() else { return };
+        tokio::spawn(async move {
+            let _place = place;
+            let mut io = begun.io;
+            let told = async {
+                io.write_all(NO_ROOM).await?;
+                io.shutdown().await?;
+                // A socket that is closed with bytes that nobody read is reset, and what it said may be lost with it.
+                tokio::io::copy(&mut io, &mut tokio::io::sink()).await
+            };
+            // Whoever does not listen is not waited for.
+            let _ = tokio::time::timeout(REFUSAL_TIMEOUT, told).await;
+        });
+    }
 }
 
 /// Shakes hands, where there is TLS, and waits for the first words.
@@ -228,5 +239,34 @@ impl AsyncWrite for Connection {
 
     fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
         Pin::new(&mut self.io).poll_shutdown(context)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use futures_util::StreamExt;
+    use tonic::Code;
+
+    use super::*;
+    use crate::rpc::proto;
+    use crate::rpc::proto::calibration_service_client::CalibrationServiceClient;
+
+    #[tokio::test]
+    async fn every_connection_without_room_hears_so() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let url = format!("http://{}", listener.local_addr().expect("an address"));
+        let options =
+            Options { certificates: None, timeout: HANDSHAKE_TIMEOUT, max_greeted: MAX_GREETED, max_speaking: 0 };
+        let door = tokio::spawn(async move { Box::pin(incoming(listener, options)).next().await });
+        // A reset overtakes the answer in some of so many.
+        for attempt in 0..100 {
+            let Ok(mut client) = CalibrationServiceClient::connect(url.clone()).await else {
+                // Refused before the first call could be made.
+                continue;
+            };
+            let refused = client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect_err("no room");
+            assert_eq!(refused.code(), Code::Unavailable, "attempt {attempt}: {refused:?}");
+        }
+        door.abort();
     }
 }

@@ -3,6 +3,7 @@
 //! Only this module sees SQL, but for `formats`, which reads COLMAP's databases. Depends on `domain` and `telemetry`;
 //! the state machine's rules are the domain's, what is written in one transaction is decided here.
 
+mod input_query;
 pub mod payload;
 pub mod postgres;
 pub mod query;
@@ -23,7 +24,8 @@ use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName, JobState};
 use crate::domain::progress::Progress;
 
-pub use query::{InputPage, InputQuery, JobPage, JobQuery, Order};
+pub use input_query::{InputPage, InputQuery};
+pub use query::{JobPage, JobQuery, Order};
 pub use record::{
     Bound, CancelReply, Claimed, Created, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome, QueueBounds,
     Request, Swept, Work,

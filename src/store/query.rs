@@ -1,11 +1,11 @@
-//! Listing jobs and uploaded inputs: the query, the page, and the token that leads to the next one.
+//! Listing jobs: the query, the page, and the token that leads to the next one; what listings of other things share.
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
 
 use sha2::{Digest, Sha256};
 
-use super::{Error, StoredInput};
+use super::Error;
 use crate::domain::job::{DEFAULT_TENANT, Job, JobName, JobState};
 
 /// Order of a listing.
@@ -58,14 +58,16 @@ impl JobQuery {
     }
 }
 
-fn effective(page_size: u32) -> u32 {
+/// The page size in force where this one is asked for.
+pub(super) fn effective(page_size: u32) -> u32 {
     match page_size {
         0 => JobQuery::DEFAULT_PAGE_SIZE,
         size => size.min(JobQuery::MAX_PAGE_SIZE),
     }
 }
 
-fn cursor_of(token: Option<&str>, token_after: impl Fn(&Cursor) -> String) -> Result<Option<Cursor>, Error> {
+/// Where the page of this token begins: a query whose tokens are those of `token_after`.
+pub(super) fn cursor_of(token: Option<&str>, token_after: impl Fn(&Cursor) -> String) -> Result<Option<Cursor>, Error> {
     match token {
         None | Some("") => Ok(None),
         Some(token) => {
@@ -73,40 +75,6 @@ fn cursor_of(token: Option<&str>, token_after: impl Fn(&Cursor) -> String) -> Re
             cursor.map(Some).ok_or(Error::PageToken)
         }
     }
-}
-
-/// Which uploaded inputs of a tenant to list, the newest first.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct InputQuery {
-    pub tenant: String,
-    /// As in [`JobQuery`].
-    pub page_size: u32,
-    /// `None` or empty: the first page.
-    pub page_token: Option<String>,
-}
-
-impl InputQuery {
-    pub(super) fn effective_page_size(&self) -> u32 {
-        effective(self.page_size)
-    }
-
-    /// See [`JobQuery::cursor`].
-    pub(super) fn cursor(&self) -> Result<Option<Cursor>, Error> {
-        cursor_of(self.page_token.as_deref(), |cursor| self.token_after(cursor))
-    }
-
-    /// The token of the page that begins after `cursor`.
-    pub(super) fn token_after(&self, cursor: &Cursor) -> String {
-        cursor.token(&("inputs", &self.tenant))
-    }
-}
-
-/// One page of uploaded inputs.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct InputPage {
-    pub inputs: Vec<StoredInput>,
-    /// `None` on the last page.
-    pub next_page_token: Option<String>,
 }
 
 impl Default for JobQuery {
@@ -148,7 +116,7 @@ impl Cursor {
 
     /// The token of the page of this query that begins after it. The digest ties it to its query, and its parts to each
     /// other; a slip is to be caught, nothing is to be kept secret, so 64 bits do.
-    fn token(&self, query: &impl Debug) -> String {
+    pub fn token(&self, query: &impl Debug) -> String {
         let digest = Sha256::digest(format!("{:?}", (query, self)));
         let digest = digest.iter().take(8).fold(0_u64, |value, &byte| value << 8 | u64::from(byte));
         format!("{digest:016x}-{:x}-{}", self.create_micros, self.id)

@@ -75,7 +75,8 @@ pub struct StoredInput {
 pub struct UploadBounds {
     /// Uploads that are begun and not finished.
     pub max_tenant_uploads: u64,
-    /// Declared lengths of those, and the uploaded inputs that are kept.
+    /// Declared lengths of those, and the uploaded inputs that are kept, also those that were deleted and that jobs
+    /// still have.
     pub max_tenant_bytes: u64,
 }
 

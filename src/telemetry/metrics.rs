@@ -438,5 +438,10 @@ impl Drop for StoreTimer {
     }
 }
 
+/// So many operations were committed together.
+pub fn store_commit(operations: usize) {
+    histogram!(STORE_COMMIT_OPERATIONS.name).record(operations as f64);
+}
+
 #[cfg(test)]
 pub(crate) mod tests;

@@ -125,8 +125,8 @@ fn broke_or_ends(status: &Status) -> bool {
     status.code() == Code::Unavailable || broke || was_cut(status)
 }
 
-/// Whether an answer ended without its status, as a balancer ends it whose server has died. That reads as UNKNOWN, which
-/// our server never says.
+/// Whether an answer ended without its status, as a balancer ends it whose server has died. That reads as UNKNOWN,
+/// which our server never says.
 fn was_cut(status: &Status) -> bool {
     status.code() == Code::Unknown && status.get_details_error_info().is_none()
 }

@@ -8,8 +8,8 @@ mod backoff;
 mod batch;
 mod error;
 mod handshake;
-mod listing;
 pub mod upload;
+mod uploaded_inputs;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

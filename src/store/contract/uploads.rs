@@ -2,19 +2,20 @@
 
 use super::*;
 use crate::domain::InputName;
-use crate::store::query::{InputPage, InputQuery};
 use crate::store::record::JobInput;
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease,
 };
+use crate::store::{InputPage, InputQuery};
 
-const ROOMY: UploadBounds = UploadBounds { max_tenant_uploads: u64::MAX, max_tenant_bytes: u64::MAX };
+pub(in crate::store) const ROOMY: UploadBounds =
+    UploadBounds { max_tenant_uploads: u64::MAX, max_tenant_bytes: u64::MAX };
 
-fn name(input: &str) -> InputName {
+pub(in crate::store) fn name(input: &str) -> InputName {
     InputName { tenant: "t".into(), input: input.into() }
 }
 
-fn new(input: &str, bytes: u64) -> NewUpload {
+pub(in crate::store) fn new(input: &str, bytes: u64) -> NewUpload {
     NewUpload { name: name(input), bytes, sha256: None }
 }
 
@@ -30,7 +31,7 @@ fn input(payload: Vec<u8>) -> Arc<NewInput> {
 }
 
 /// An upload of a few bytes that became an input at that second.
-async fn finished(store: &dyn Store, id: &str, payload: Vec<u8>, seconds: u64) -> StoredInput {
+pub(in crate::store) async fn finished(store: &dyn Store, id: &str, payload: Vec<u8>, seconds: u64) -> StoredInput {
     let (lease, _) = begin(store, &new(id, 4), seconds).await;
     store.append_upload(&lease, 0, &[1; 4], time(seconds)).await.expect("appends");
     store.finish_upload(&lease, &input(payload), time(seconds)).await.expect("finishes")
@@ -283,11 +284,16 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
     }
     let late = store.create_job(of("c"), &ROOM, time(2)).await;
     assert_eq!(late.expect_err("its name is gone"), Error::InputNotFound(name("shared")));
-    // Its id is free for other bytes, and nothing of the old ones counts against the tenant once it is cleared away.
+    // Its id is free for other bytes; the old ones count against the tenant while jobs have them, and once they are
+    // cleared away the free one's do not.
     for _ in 0..3 {
         store.purge_uploads(None, None).await.expect("clears away");
     }
-    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: 4 };
+    let taken = payload.len() as u64;
+    let tight = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: taken + 3 };
+    let refused = store.begin_upload(&new("shared", 4), &tight, time(3)).await;
+    assert_eq!(refused, Err(Error::UploadsFull(UploadBound::Bytes { taken, asked: 4, max: taken + 3 })));
+    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: taken + 4 };
     let again = store.begin_upload(&new("shared", 4), &bounds, time(3)).await.expect("room");
     let BegunUpload::Open { lease, committed: 0, .. } = again else { panic!("{again:?}") };
     store.append_upload(&lease, 0, &[1; 4], time(3)).await.expect("appends");
@@ -302,6 +308,10 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
         }
     }
     assert!(store.uploaded_input(&name("shared")).await.is_ok(), "the new one has nothing to do with them");
+    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: 10 + 4 };
+    let room = store.begin_upload(&new("next", 4), &bounds, time(5)).await;
+    let Ok(BegunUpload::Open { lease, .. }) = room else { panic!("only the new one counts: {room:?}") };
+    store.give_up_upload(&lease).await.expect("gives up");
 }
 
 pub(in crate::store) async fn many_that_begin_at_once_share_the_last_room(store: &dyn Store) {

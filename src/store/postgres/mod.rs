@@ -6,6 +6,8 @@
 mod clock;
 mod listener;
 #[cfg(test)]
+mod locks_tests;
+#[cfg(test)]
 pub(crate) mod tests;
 mod url;
 
@@ -55,12 +57,13 @@ const SESSION: [(&str, &str); 6] = [
 /// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
 const ADMISSION_LOCK: i64 = 0x7363_7073_666d;
 
-const MIGRATIONS: [Step; 5] = [
+const MIGRATIONS: [Step; 6] = [
     (1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql")),
     (2, "retention", include_str!("../migrations/postgres/0002_retention.sql")),
     (3, "uploads", include_str!("../migrations/postgres/0003_uploads.sql")),
     (4, "listing", include_str!("../migrations/postgres/0004_listing.sql")),
     (5, "inputs", include_str!("../migrations/postgres/0005_inputs.sql")),
+    (6, "uploaded", include_str!("../migrations/postgres/0006_uploaded.sql")),
 ];
 
 /// Store in a PostgreSQL database.
@@ -170,7 +173,12 @@ impl Database for Postgres {
         Ok(self.pool(size).acquire().await?)
     }
 
-    async fn write<T: Send + 'static>(&self, size: Size, operation: Operation<PgConnection, T>) -> Result<T, Error> {
+    async fn write<T: Send + 'static>(
+        &self,
+        size: Size,
+        _bytes: u64,
+        operation: Operation<PgConnection, T>,
+    ) -> Result<T, Error> {
         let mut transaction = self.pool(size).begin().await?;
         let value = operation(&mut transaction).await?;
         transaction.commit().await?;

@@ -12,14 +12,14 @@ use crate::store::{Store, contract};
 use cluster::Cluster;
 
 /// A store in a database of its own, in a cluster that lives as long as a test needs it.
-struct Fixture {
+pub(super) struct Fixture {
     store: Postgres,
     url: DatabaseUrl,
     _cluster: Arc<Cluster>,
 }
 
 impl Fixture {
-    async fn open() -> Option<Self> {
+    pub(super) async fn open() -> Option<Self> {
         let cluster = cluster::shared("the contract of the PostgreSQL store")?;
         let url: DatabaseUrl = cluster.database().await.parse().expect("an address");
         Some(Self { store: Postgres::open(&url).await.expect("opens"), url, _cluster: cluster })

@@ -7,7 +7,6 @@ use super::rows::{self, integer, micros, number, one_job, returning_job, select_
 use super::{Change, Connection, Row, Statement, uploads};
 use crate::domain::InputName;
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
-use crate::store::query::Cursor;
 use crate::store::record::{Created, JobInput, Load, NewRecord, QueueBounds, Request, Work};
 use crate::store::{Error, JobPage, JobQuery, Order, payload};
 
@@ -21,6 +20,9 @@ pub(super) async fn create<C: Connection>(
     let mut waiting = Waiting::default();
     let mut inputs = vec![None; news.len()];
     if !C::WRITES_ALONE {
+        // Before anything else, and each name once: two batches of the same inputs in other orders would wait for each
+        // other.
+        uploads::lock(connection, &news.iter().filter_map(uploaded).collect()).await?;
         for (new, input) in news.iter().zip(&mut inputs) {
             // Payloads take long: nobody else's admission waits for them.
             if admit(connection, new, bounds, &mut waiting).await?.is_none() {
@@ -177,11 +179,20 @@ async fn earlier<C: Connection>(connection: &mut C, tenant: &str, request: &Requ
 async fn input_of<C: Connection>(connection: &mut C, new: &NewRecord, now: SystemTime) -> Result<i64, Error> {
     match &new.input {
         JobInput::Inline(bytes) => insert_input(connection, &new.name.tenant, bytes, now).await,
-        JobInput::Uploaded { input, .. } => {
-            let name = InputName { tenant: new.name.tenant.clone(), input: input.clone() };
-            uploads::use_input(connection, &name, now).await
-        }
+        JobInput::Uploaded { input, .. } => uploads::use_input(connection, &named(new, input), now).await,
     }
+}
+
+/// The uploaded input of a job, where it has one.
+fn uploaded(new: &NewRecord) -> Option<InputName> {
+    match &new.input {
+        JobInput::Inline(_) => None,
+        JobInput::Uploaded { input, .. } => Some(named(new, input)),
+    }
+}
+
+fn named(new: &NewRecord, input: &str) -> InputName {
+    InputName { tenant: new.name.tenant.clone(), input: input.to_owned() }
 }
 
 /// Stores an encoded input; returns its row.
@@ -236,21 +247,13 @@ pub(super) async fn get<C: Connection>(connection: &mut C, name: &JobName) -> Re
 /// One page of a listing.
 pub(super) async fn list<C: Connection>(connection: &mut C, query: &JobQuery) -> Result<JobPage, Error> {
     let size = query.effective_page_size();
-    let mut rows = connection.rows(listing(query)?).await?;
-    let more = rows.len() > size as usize;
-    rows.truncate(size as usize);
-    let next_page_token = match rows.last() {
-        Some(last) if more => {
-            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text("job")? };
-            Some(query.token_after(&cursor))
-        }
-        _ => None,
-    };
+    let rows = connection.rows(listing(query, size)?).await?;
+    let (rows, next_page_token) = rows::page(rows, size, "job", |cursor| query.token_after(cursor))?;
     Ok(JobPage { jobs: rows.iter().map(rows::job).collect::<Result<_, _>>()?, next_page_token })
 }
 
-/// The `SELECT` of a page, and of one job more: it tells whether there is a next page.
-fn listing(query: &JobQuery) -> Result<Statement, Error> {
+/// The `SELECT` of a page of that size.
+fn listing(query: &JobQuery, size: u32) -> Result<Statement, Error> {
     let cursor = query.cursor()?;
     let mut select = Statement::new(select_jobs!("WHERE tenant = ")).then_bind(&query.tenant);
     for (number, state) in query.states.iter().enumerate() {
@@ -270,7 +273,7 @@ fn listing(query: &JobQuery) -> Result<Statement, Error> {
     if let Some(cursor) = cursor {
         select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(&cursor.id).then(")");
     }
-    Ok(select.then(order).then_bind(i64::from(query.effective_page_size()) + 1))
+    Ok(select.then(order).then_bind(rows::limit(size)))
 }
 
 /// The row of a job.

@@ -98,11 +98,12 @@ pub(super) trait Database: Send + Sync + 'static {
     /// A connection that only reads.
     fn reader(&self, size: Size) -> impl Future<Output = Result<PoolConnection<Self::Sqlx>, Error>> + Send;
 
-    /// Runs an operation in a transaction, and answers once it is committed and durable. Where it is refused, nothing of
-    /// it is.
+    /// Runs an operation in a transaction, and answers once it is committed and durable. Where it is refused, nothing
+    /// of it is. `bytes`: about what it writes or removes.
     fn write<T: Send + 'static>(
         &self,
         size: Size,
+        bytes: u64,
         operation: Operation<ConnectionOf<Self>, T>,
     ) -> impl Future<Output = Result<T, Error>> + Send;
 

@@ -5,6 +5,7 @@ use std::time::{Duration, SystemTime};
 use super::{Change, Connection, Row, Statement};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, Summary};
 use crate::domain::progress::Progress;
+use crate::store::query::Cursor;
 use crate::store::record::Lease;
 use crate::store::{Error, payload};
 
@@ -138,11 +139,38 @@ impl Standing {
     }
 }
 
+/// Rows to ask for where a page has so many: one more tells whether there is a next page.
+pub(super) fn limit(page_size: u32) -> i64 {
+    i64::from(page_size) + 1
+}
+
+/// The page of rows that were asked for with [`limit`], and the token of the next one, where there is one. `id` is the
+/// column that tells those of one time apart.
+pub(super) fn page<R: Row>(
+    mut rows: Vec<R>,
+    page_size: u32,
+    id: &str,
+    token_after: impl Fn(&Cursor) -> String,
+) -> Result<(Vec<R>, Option<String>), Error> {
+    let size = page_size as usize;
+    let more = rows.len() > size;
+    rows.truncate(size);
+    let next_page_token = match rows.last() {
+        Some(last) if more => {
+            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text(id)? };
+            Some(token_after(&cursor))
+        }
+        _ => None,
+    };
+    Ok((rows, next_page_token))
+}
+
 /// `SELECT` of all that [`Standing::from_row`] reads; the clauses follow.
 macro_rules! select_standing {
     ($clauses:literal) => {
         concat!(
-            "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline, last_sequence FROM jobs ",
+            "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline, last_sequence ",
+            "FROM jobs ",
             $clauses
         )
     };

@@ -11,7 +11,8 @@ use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
-    CancelReply, Claimed, Created, Ending, Heartbeat, Lease, Load, NewRecord, QueueBounds, Swept, Work,
+    CancelReply, Claimed, Created, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome, QueueBounds, Swept,
+    Work,
 };
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
@@ -44,16 +45,24 @@ macro_rules! reads {
     };
 }
 
+/// Bytes of what removes as much as there is.
+const ANY_BYTES: u64 = u64::MAX;
+
 /// Writes in one transaction, which has the values in brackets to itself: a caller that goes away leaves it whole. They
-/// are cloned for each run of it; what is large is in an [`Arc`].
+/// are cloned for each run of it; what is large is in an [`Arc`]. Before them, the bytes that it moves, where that is
+/// more than a few rows.
 macro_rules! writes {
-    ($database:expr, $size:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {{
+    ($database:expr, $size:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {
+        writes!($database, $size, 0, [$($owned),*], |$connection| $body)
+    };
+    ($database:expr, $size:expr, $bytes:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {{
+        let bytes: u64 = $bytes;
         $(let $owned = $owned.clone();)*
         let run = operation::<ConnectionOf<D>, _>(move |$connection| {
             $(let $owned = $owned.clone();)*
             async move { $body.await }.boxed()
         });
-        bounded($database, $size, $database.write($size, run)).await
+        bounded($database, $size, $database.write($size, bytes, run)).await
     }};
 }
 
@@ -66,7 +75,13 @@ impl<D: Database> Store for D {
         now: SystemTime,
     ) -> Result<Vec<Created>, Error> {
         let new: Arc<[NewRecord]> = new.into();
-        writes!(self, Size::Payload, [new, bounds], |connection| jobs::create(connection, &new, &bounds, now))
+        let stored = new.iter().map(|new| match &new.input {
+            JobInput::Inline(bytes) => bytes.len() as u64,
+            JobInput::Uploaded { .. } => 0,
+        });
+        writes!(self, Size::Payload, stored.sum(), [new, bounds], |connection| jobs::create(
+            connection, &new, &bounds, now
+        ))
     }
 
     async fn job(&self, name: &JobName) -> Result<Job, Error> {
@@ -106,7 +121,13 @@ impl<D: Database> Store for D {
     }
 
     async fn finish(&self, lease: &Lease, ending: &Arc<Ending>, now: SystemTime) -> Result<Job, Error> {
-        writes!(self, Size::Outcome, [lease, ending], |connection| attempts::finish(connection, &lease, &ending, now))
+        let bytes = match &ending.outcome {
+            Outcome::Succeeded { result, .. } => result.len() as u64,
+            _ => 0,
+        };
+        writes!(self, Size::Outcome, bytes, [lease, ending], |connection| {
+            attempts::finish(connection, &lease, &ending, now)
+        })
     }
 
     async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
@@ -122,14 +143,16 @@ impl<D: Database> Store for D {
 
     async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
         let etag = etag.map(str::to_owned);
-        writes!(self, Size::Payload, [name, etag], |connection| { removal::delete(connection, &name, etag.as_deref()) })
+        writes!(self, Size::Payload, ANY_BYTES, [name, etag], |connection| {
+            removal::delete(connection, &name, etag.as_deref())
+        })
     }
 
     async fn purge(&self, ended_by: SystemTime, limit: u32) -> Result<u32, Error> {
         if !reads!(self, Size::Small, |connection| removal::needs_purge(connection, ended_by))? {
             return Ok(0);
         }
-        writes!(self, Size::Payload, [], |connection| removal::purge(connection, ended_by, limit))
+        writes!(self, Size::Payload, ANY_BYTES, [], |connection| removal::purge(connection, ended_by, limit))
     }
 
     async fn reclaim(&self) -> Result<(), Error> {
@@ -178,7 +201,7 @@ impl<D: Database> Store for D {
         now: SystemTime,
     ) -> Result<(), Error> {
         let data: Arc<[u8]> = data.into();
-        writes!(self, Size::Payload, [lease, data], |connection| {
+        writes!(self, Size::Payload, data.len() as u64, [lease, data], |connection| {
             uploads::append(connection, &lease, at_byte, &data, now)
         })
     }
@@ -193,7 +216,10 @@ impl<D: Database> Store for D {
         new: &Arc<NewInput>,
         now: SystemTime,
     ) -> Result<StoredInput, Error> {
-        writes!(self, Size::Payload, [lease, new], |connection| uploads::finish(connection, &lease, &new, now))
+        let bytes = new.payload.len() as u64;
+        writes!(self, Size::Payload, bytes, [lease, new], |connection| {
+            uploads::finish(connection, &lease, &new, now)
+        })
     }
 
     async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error> {
@@ -213,7 +239,7 @@ impl<D: Database> Store for D {
     }
 
     async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
-        writes!(self, Size::Payload, [name], |connection| uploads::delete(connection, &name))
+        writes!(self, Size::Payload, ANY_BYTES, [name], |connection| uploads::delete(connection, &name))
     }
 
     async fn purge_uploads(
@@ -224,7 +250,9 @@ impl<D: Database> Store for D {
         if !reads!(self, Size::Small, |connection| uploads::needs_purge(connection, abandoned_by, unused_since))? {
             return Ok(PurgedUploads::default());
         }
-        writes!(self, Size::Payload, [], |connection| uploads::purge(connection, abandoned_by, unused_since))
+        writes!(self, Size::Payload, ANY_BYTES, [], |connection| {
+            uploads::purge(connection, abandoned_by, unused_since)
+        })
     }
 
     async fn load(&self) -> Result<Load, Error> {

@@ -1,11 +1,11 @@
 //! Uploads: begun, continued, made an input of, given up; and the uploaded inputs.
 
+use std::collections::BTreeSet;
 use std::time::SystemTime;
 
 use super::rows::{self, integer, micros, number};
 use super::{Connection, Row, Statement, jobs};
 use crate::domain::input_name::InputName;
-use crate::store::query::Cursor;
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
 };
@@ -20,14 +20,17 @@ const READ_PARTS: u32 = 4;
 /// Inputs that one look removes at most; each may have a hundred megabytes.
 const PURGE_INPUTS: u32 = 4;
 
+/// The columns that [`stored_input`] reads.
+macro_rules! input_columns {
+    () => {
+        "id, tenant, input, bytes, create_time, upload_bytes, sha256, view_count, track_count, observation_count"
+    };
+}
+
 /// `SELECT` of all that [`stored_input`] reads; the clauses follow.
 macro_rules! select_inputs {
     ($clauses:literal) => {
-        concat!(
-            "SELECT id, tenant, input, bytes, create_time, upload_bytes, sha256, view_count, track_count, ",
-            "observation_count FROM inputs ",
-            $clauses
-        )
+        concat!("SELECT ", input_columns!(), " FROM inputs ", $clauses)
     };
 }
 
@@ -79,30 +82,23 @@ pub(super) async fn begin<C: Connection>(
     bounds: &UploadBounds,
     now: SystemTime,
 ) -> Result<BegunUpload, Error> {
+    // Where an operation needs several of them, an input's row comes first, admission next, an upload's row last: two
+    // that took them in different orders would wait for each other.
+    if let Some(input) = begun_again(connection, new, now).await? {
+        return Ok(BegunUpload::Finished(input));
+    }
     // Of two that begin the same one, or that share the last room, one waits for the other.
     connection.lock_admission().await?;
     let Some(upload) = find(connection, &new.name, true).await? else {
         return open(connection, new, bounds, now).await;
     };
-    let finished = match upload.input_id {
-        Some(id) => Some(input_by_id(connection, id).await?),
-        None => None,
-    };
-    let known = finished.as_ref().map(|input| input.sha256).or(upload.sha256);
-    let other_hash = new.sha256.zip(known).is_some_and(|(declared, known)| declared != known);
-    if upload.bytes != new.bytes || other_hash {
-        let what = if other_hash { "SHA-256" } else { "length" };
-        return Err(Error::AlreadyExists(format!(
-            "upload {} was begun with another {what}; other bytes need a new upload id",
-            new.name.input
-        )));
-    }
-    if let Some((id, input)) = upload.input_id.zip(finished) {
-        // Whoever asks for it anew is going to use it.
-        let update = Statement::new("UPDATE inputs SET use_time = $1 WHERE id = $2");
-        connection.execute(update.bind(micros(now)).bind(id)).await?;
+    if let Some(id) = upload.input_id {
+        // It was finished since the look above, and so is as good as used now.
+        let input = input_by_id(connection, id).await?;
+        check_same(new, upload.bytes, Some(input.sha256))?;
         return Ok(BegunUpload::Finished(input));
     }
+    check_same(new, upload.bytes, upload.sha256)?;
     let sha256 = upload.sha256.or(new.sha256);
     let update = Statement::new(
         "UPDATE uploads SET writer = writer + 1, update_time = $1, sha256 = $2 WHERE id = $3 RETURNING writer",
@@ -115,17 +111,49 @@ pub(super) async fn begin<C: Connection>(
     Ok(BegunUpload::Open { lease, committed: upload.committed, sha256 })
 }
 
+/// The input that a finished upload of this name became; whoever asks for it anew is going to use it.
+async fn begun_again<C: Connection>(
+    connection: &mut C,
+    new: &NewUpload,
+    now: SystemTime,
+) -> Result<Option<StoredInput>, Error> {
+    let update = Statement::new(concat!(
+        "UPDATE inputs SET use_time = $1 WHERE tenant = $2 AND input = $3 RETURNING ",
+        input_columns!()
+    ));
+    let update = update.bind(micros(now)).bind(&new.name.tenant).bind(&new.name.input);
+    let Some(row) = connection.optional_row(update).await? else { return Ok(None) };
+    let input = stored_input(&row)?;
+    check_same(new, input.upload_bytes, Some(input.sha256))?;
+    Ok(Some(input))
+}
+
+/// Refuses other bytes than those that the upload was begun with.
+fn check_same(new: &NewUpload, bytes: u64, sha256: Option<[u8; 32]>) -> Result<(), Error> {
+    let other_hash = new.sha256.zip(sha256).is_some_and(|(declared, known)| declared != known);
+    if bytes == new.bytes && !other_hash {
+        return Ok(());
+    }
+    let what = if other_hash { "SHA-256" } else { "length" };
+    Err(Error::AlreadyExists(format!(
+        "upload {} was begun with another {what}; other bytes need a new upload id",
+        new.name.input
+    )))
+}
+
 async fn open<C: Connection>(
     connection: &mut C,
     new: &NewUpload,
     bounds: &UploadBounds,
     now: SystemTime,
 ) -> Result<BegunUpload, Error> {
-    // Of what was given up counts what has not been removed yet: it lies on the disk all the same.
+    // Of what was given up counts what has not been removed yet, and of what was deleted, what jobs still have: it lies
+    // on the disk all the same, and could else be uploaded and deleted again and again.
     let taken = Statement::new(
         "SELECT COUNT(upload) AS open, \
          CAST(COALESCE(SUM(CASE WHEN upload IS NULL THEN committed ELSE bytes END), 0) AS BIGINT) AS bytes, \
-         (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM inputs WHERE tenant = $1 AND input IS NOT NULL) AS kept \
+         (SELECT CAST(COALESCE(SUM(bytes), 0) AS BIGINT) FROM inputs \
+         WHERE tenant = $1 AND upload_bytes IS NOT NULL) AS kept \
          FROM uploads WHERE tenant = $1 AND input_id IS NULL",
     );
     let row = connection.row(taken.bind(&new.name.tenant)).await?;
@@ -254,18 +282,9 @@ pub(super) async fn list<C: Connection>(connection: &mut C, query: &InputQuery) 
         select = select.then(" AND (create_time, input) < (").then_bind(cursor.create_micros);
         select = select.then(", ").then_bind(&cursor.id).then(")");
     }
-    // One more than asked for tells whether there is a next page.
-    let select = select.then(" ORDER BY create_time DESC, input DESC LIMIT ").then_bind(i64::from(size) + 1);
-    let mut rows = connection.rows(select).await?;
-    let more = rows.len() > size as usize;
-    rows.truncate(size as usize);
-    let next_page_token = match rows.last() {
-        Some(last) if more => {
-            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text("input")? };
-            Some(query.token_after(&cursor))
-        }
-        _ => None,
-    };
+    let select = select.then(" ORDER BY create_time DESC, input DESC LIMIT ").then_bind(rows::limit(size));
+    let rows = connection.rows(select).await?;
+    let (rows, next_page_token) = rows::page(rows, size, "input", |cursor| query.token_after(cursor))?;
     Ok(InputPage { inputs: rows.iter().map(stored_input).collect::<Result<_, _>>()?, next_page_token })
 }
 
@@ -289,13 +308,15 @@ pub(super) async fn delete<C: Connection>(connection: &mut C, name: &InputName) 
 
 /// Removes an input that has no name, once no job has it.
 pub(super) async fn remove_orphan<C: Connection>(connection: &mut C, id: i64) -> Result<(), Error> {
-    // Of two jobs that are removed at once, the later one sees that the other is gone.
-    let lock = Statement::new("SELECT id FROM inputs WHERE id = $1 AND input IS NULL").bind(id).then(C::FOR_UPDATE);
-    if connection.optional_row(lock).await?.is_none() {
-        return Ok(());
-    }
-    let delete = "DELETE FROM inputs WHERE id = $1 AND NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.input_id = $1)";
-    connection.execute(Statement::new(delete).bind(id)).await
+    // Of two that take away the last uses of it at once, the later one waits, and then sees that the other is gone:
+    // what it asks of the row, it asks after the wait.
+    let lock = Statement::new("SELECT id FROM inputs WHERE id = $1").bind(id).then(C::FOR_UPDATE);
+    connection.execute(lock).await?;
+    let delete = Statement::new(
+        "DELETE FROM inputs WHERE id = $1 AND input IS NULL \
+         AND NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.input_id = $1)",
+    );
+    connection.execute(delete.bind(id)).await
 }
 
 async fn input_by_id<C: Connection>(connection: &mut C, id: i64) -> Result<StoredInput, Error> {
@@ -313,6 +334,18 @@ fn stored_input(row: &impl Row) -> Result<StoredInput, Error> {
         track_count: number(row, "track_count")?,
         observation_count: number(row, "observation_count")?,
     })
+}
+
+/// Locks the rows of these inputs, in one order whoever asks for them; those that are not there are passed over.
+pub(super) async fn lock<C: Connection>(connection: &mut C, names: &BTreeSet<InputName>) -> Result<(), Error> {
+    for name in names {
+        let select = Statement::new("SELECT id FROM inputs WHERE tenant = $1 AND input = $2")
+            .bind(&name.tenant)
+            .bind(&name.input)
+            .then(C::FOR_UPDATE);
+        connection.execute(select).await?;
+    }
+    Ok(())
 }
 
 /// The row of an uploaded input that a job is about to have; it stays until the transaction ends.

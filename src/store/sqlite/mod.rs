@@ -5,6 +5,8 @@
 //! log, never wait for the writer.
 
 #[cfg(test)]
+mod groups_tests;
+#[cfg(test)]
 mod tests;
 mod writer;
 
@@ -34,22 +36,25 @@ const LOCK_FILE: &str = "scpsfm.lock";
 const READERS: u32 = 4;
 /// How long a statement waits for another process on the file, such as a backup.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long a caller waits for a connection; behind a queue of writes this long, the disk has failed.
+/// How long a reader waits for one of the connections, none of which waits for a write: reads that take this long are
+/// of a disk that has failed.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Hands pages back, 4,096 at a time, which are 16 MB: writers wait meanwhile.
 const VACUUM: &str = "PRAGMA incremental_vacuum(4096)";
-/// What the write-ahead log keeps of its length once it is written back, in bytes: a large result would leave it as long
-/// as itself.
+const VACUUM_BYTES: u64 = 16 << 20;
+/// What the write-ahead log keeps of its length once it is written back, in bytes: a large result would leave it as
+/// long as itself.
 const LOG_BYTES: &str = "67108864";
 
-const MIGRATIONS: [Step; 6] = [
+const MIGRATIONS: [Step; 7] = [
     (1, "jobs", include_str!("../migrations/sqlite/0001_jobs.sql")),
     (2, "attempts", include_str!("../migrations/sqlite/0002_attempts.sql")),
     (3, "retention", include_str!("../migrations/sqlite/0003_retention.sql")),
     (4, "uploads", include_str!("../migrations/sqlite/0004_uploads.sql")),
     (5, "listing", include_str!("../migrations/sqlite/0005_listing.sql")),
     (6, "inputs", include_str!("../migrations/sqlite/0006_inputs.sql")),
+    (7, "uploaded", include_str!("../migrations/sqlite/0007_uploaded.sql")),
 ];
 
 /// Store in a data directory.
@@ -68,6 +73,10 @@ impl Sqlite {
     /// [`Error::InUse`] while another server holds the directory, [`Error::Unavailable`] where it cannot be written,
     /// [`Error::Corrupt`] where its schema is of a newer version, or its file is there and empty.
     pub async fn open(directory: &Path) -> Result<Self, Error> {
+        Self::open_with(directory, writer::GROUP_TIME).await
+    }
+
+    async fn open_with(directory: &Path, group_time: Duration) -> Result<Self, Error> {
         let lock = lock(directory)?;
         let database = directory.join(DATABASE_FILE);
         if !is_there(&database)? {
@@ -76,7 +85,7 @@ impl Sqlite {
         let options = options(&database);
         let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(&options).await?;
         migrate(&mut connection).await?;
-        let writer = Writer::start(connection, options.clone())?;
+        let writer = Writer::start(connection, options.clone(), group_time)?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
         Ok(Self { writer, readers, _lock: lock })
     }
@@ -84,7 +93,7 @@ impl Sqlite {
     /// Runs a statement as it is on the writer's connection, for tests that need the database to misbehave.
     #[cfg(test)]
     pub(crate) async fn execute(&self, statement: &'static str) {
-        self.writer.run(statement).await.expect("a valid statement");
+        self.writer.run(0, statement).await.expect("a valid statement");
     }
 }
 
@@ -205,9 +214,10 @@ impl Database for Sqlite {
     async fn write<T: Send + 'static>(
         &self,
         _size: Size,
+        bytes: u64,
         operation: Operation<SqliteConnection, T>,
     ) -> Result<T, Error> {
-        self.writer.write(operation).await
+        self.writer.write(bytes, operation).await
     }
 
     fn bound(&self, _size: Size) -> Option<Duration> {
@@ -218,7 +228,7 @@ impl Database for Sqlite {
     async fn reclaim(&self) -> Result<(), Error> {
         let free: i64 = sqlx::query_scalar("PRAGMA freelist_count").fetch_one(&self.readers).await?;
         if free > 0 {
-            self.writer.run(VACUUM).await?;
+            self.writer.run(VACUUM_BYTES, VACUUM).await?;
         }
         Ok(())
     }

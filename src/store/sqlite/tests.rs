@@ -1,8 +1,5 @@
 //! SQLite under the store's contract, and what is its own: the lock on the directory and its file.
 
-use std::sync::atomic::Ordering;
-
-use futures_util::FutureExt;
 use tempfile::TempDir;
 
 use super::*;
@@ -11,15 +8,22 @@ use crate::store::sql::Row;
 use crate::store::{Store, contract};
 
 /// A store in a directory that lives as long as the test.
-struct Fixture {
-    store: Sqlite,
+pub(super) struct Fixture {
+    pub store: Sqlite,
     _directory: TempDir,
 }
 
 impl Fixture {
-    async fn open() -> Option<Self> {
+    pub async fn open() -> Option<Self> {
         let directory = tempfile::tempdir().expect("a temporary directory");
         Some(Self { store: Sqlite::open(directory.path()).await.expect("opens"), _directory: directory })
+    }
+
+    /// One whose groups take all that waits, however long that takes.
+    pub async fn open_patient() -> Self {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let store = Sqlite::open_with(directory.path(), Duration::MAX).await.expect("opens");
+        Self { store, _directory: directory }
     }
 }
 
@@ -34,7 +38,7 @@ impl std::ops::Deref for Fixture {
 impl Sqlite {
     /// What a pragma says on the connection that writes.
     async fn on_writer<T>(&self, pragma: &'static str, read: fn(&SqliteRow) -> Result<T, Error>) -> T {
-        let rows = self.writer.run(pragma).await.expect("an answer");
+        let rows = self.writer.run(0, pragma).await.expect("an answer");
         read(&rows[0]).expect("a value")
     }
 }
@@ -131,89 +135,6 @@ async fn deleted_jobs_leave_no_space_taken() {
     fixture.close().await;
     let bytes = std::fs::metadata(fixture._directory.path().join(DATABASE_FILE)).expect("the file").len();
     assert!(bytes < 1 << 20, "{bytes} bytes");
-}
-
-/// Runs an operation that keeps the writer until the sender says so, or is dropped.
-fn hold(store: &Sqlite) -> (tokio::sync::watch::Sender<bool>, impl Future<Output = ()>) {
-    let (go, gone) = tokio::sync::watch::channel(false);
-    let writer = store.writer.clone();
-    let holding = async move {
-        let wait = sql::operation(move |_: &mut SqliteConnection| {
-            let mut gone = gone.clone();
-            async move {
-                // An error says that the sender was dropped.
-                let _ = gone.wait_for(|&gone| gone).await;
-                Ok(())
-            }
-            .boxed()
-        });
-        writer.write(wait).await.expect("holds");
-    };
-    (go, holding)
-}
-
-#[tokio::test]
-async fn what_waits_together_is_committed_together_and_each_is_told_what_became_of_it() {
-    let fixture = Fixture::open().await.expect("opens");
-    fixture.create_job(contract::record("taken"), &contract::ROOM, contract::time(0)).await.expect("created");
-    let before = fixture.writer.commits.load(Ordering::SeqCst);
-    let (go, holding) = hold(&fixture);
-    let names: Vec<String> = (0..20).map(|number| format!("job-{number}")).chain(["taken".into()]).collect();
-    let creations = names
-        .iter()
-        .map(|name| async { fixture.create_job(contract::record(name), &contract::ROOM, contract::time(1)).await });
-    // All of them are on their way before the writer is let go.
-    let let_go = async { drop(go) };
-    let ((), outcomes, ()) = tokio::join!(holding, futures_util::future::join_all(creations), let_go);
-    for (name, outcome) in names.iter().zip(outcomes) {
-        match (name.as_str(), outcome) {
-            ("taken", Err(Error::AlreadyExists(_))) => {}
-            (_, Ok(created)) => assert_eq!(fixture.job(&created.job.name).await, Ok(created.job), "{name}"),
-            (_, other) => panic!("{name}: {other:?}"),
-        }
-    }
-    let commits = fixture.writer.commits.load(Ordering::SeqCst) - before;
-    // One for all; on a machine that is slow beyond measure, some.
-    assert!(commits < names.len() / 2, "{commits} commits");
-}
-
-#[tokio::test]
-async fn one_that_breaks_the_transaction_of_all_costs_only_itself() {
-    let fixture = Fixture::open().await.expect("opens");
-    // As SQLite does by itself where the disk is full: everything is rolled back, not only the statement.
-    fixture
-        .execute(
-            "CREATE TRIGGER breaks BEFORE INSERT ON inputs WHEN NEW.bytes = 13 \
-             BEGIN SELECT RAISE(ROLLBACK, 'broken'); END",
-        )
-        .await;
-    let (go, holding) = hold(&fixture);
-    let creations = ["a", "b", "bad", "c"].map(|name| {
-        let bytes = if name == "bad" { 13 } else { 14 };
-        let new = crate::store::NewRecord { input: vec![1; bytes].into(), ..contract::record(name) };
-        fixture.create_job(new, &contract::ROOM, contract::time(1))
-    });
-    let ((), outcomes, ()) = tokio::join!(holding, futures_util::future::join_all(creations), async { drop(go) });
-    for (name, outcome) in ["a", "b", "bad", "c"].iter().zip(outcomes) {
-        let stored = fixture.job(&contract::record(name).name).await;
-        assert_eq!((outcome.is_ok(), stored.is_ok()), (*name != "bad", *name != "bad"), "{name}: {outcome:?}");
-    }
-}
-
-#[tokio::test]
-async fn of_a_caller_that_went_away_before_its_turn_nothing_is_written() {
-    let fixture = Fixture::open().await.expect("opens");
-    let (go, holding) = hold(&fixture);
-    let gone = async {
-        let creating = fixture.create_job(contract::record("gone"), &contract::ROOM, contract::time(1));
-        // Long enough to be on its way, and behind one that waits for the other side.
-        let waited = tokio::time::timeout(Duration::from_millis(1), creating).await;
-        assert!(waited.is_err(), "{waited:?}");
-        drop(go);
-    };
-    tokio::join!(holding, gone);
-    fixture.create_job(contract::record("here"), &contract::ROOM, contract::time(1)).await.expect("created");
-    assert!(matches!(fixture.job(&contract::record("gone").name).await, Err(Error::NotFound(_))));
 }
 
 #[tokio::test]

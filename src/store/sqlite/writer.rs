@@ -1,11 +1,12 @@
 //! The one writer: a thread that holds the only connection that writes, and commits together what waits together.
 //!
 //! A commit costs a sync of the disk, whatever is in it. Operations that arrive while one is under way are the next
-//! group: each is a transaction of its own to its caller, who hears of it once the group's commit is on the disk.
+//! group: each is a transaction of its own to its caller, who hears of it once the group's commit is on the disk. What
+//! is large is a group of its own.
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -18,13 +19,19 @@ use tokio::time::timeout;
 
 use crate::store::Error;
 use crate::store::sql::{self, Operation, Statement};
+use crate::telemetry::metrics;
 
 /// How long an operation waits for its turn; behind a queue of writes this long, the disk has failed.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// How long a group goes on taking operations: about what a commit takes on a slow disk, so that the first of a group
-/// waits for the others no longer than for the disk.
-const GROUP_TIME: Duration = Duration::from_millis(10);
+/// How long a group goes on taking operations, each of [`LARGE_BYTES`] at most: about what a commit takes on a slow
+/// disk, so that the first of a group waits for the others about as long as for the disk.
+pub(super) const GROUP_TIME: Duration = Duration::from_millis(10);
+
+/// An operation that writes or removes more than this has a commit of its own: what a disk of 100 MB/s takes in
+/// [`GROUP_TIME`]. The others neither wait for it longer than for their own group, nor are they run again where it
+/// fails.
+pub(super) const LARGE_BYTES: u64 = 1 << 20;
 
 /// Begun as a writer at once: a transaction that began by reading could not be upgraded after another process wrote.
 const BEGIN: &str = "BEGIN IMMEDIATE";
@@ -33,9 +40,8 @@ const BEGIN: &str = "BEGIN IMMEDIATE";
 #[derive(Debug, Clone)]
 pub(super) struct Writer {
     inbox: mpsc::UnboundedSender<Message>,
-    /// Commits so far.
-    #[cfg(test)]
-    pub commits: Arc<std::sync::atomic::AtomicUsize>,
+    /// [`PATIENCE`], but in tests.
+    pub(super) patience: Duration,
 }
 
 enum Message {
@@ -48,6 +54,9 @@ trait Waiting: Send {
     /// Marks it as begun; `false` where its caller is gone, and nobody wants it any more.
     fn begins(&self) -> bool;
 
+    /// Whether it is to have a commit of its own.
+    fn is_large(&self) -> bool;
+
     /// Runs it within the transaction and keeps its answer. It may be run again where the transaction came to nothing.
     fn run<'c>(&'c mut self, connection: &'c mut SqliteConnection) -> BoxFuture<'c, Result<(), Error>>;
 
@@ -55,23 +64,52 @@ trait Waiting: Send {
     fn answer(self: Box<Self>, committed: Result<(), Error>);
 }
 
+/// Whether an operation has begun, or its caller has given it up: whichever comes first.
+#[derive(Debug, Default)]
+struct Turn(AtomicU8);
+
+impl Turn {
+    const WAITING: u8 = 0;
+    const BEGUN: u8 = 1;
+    const GIVEN_UP: u8 = 2;
+
+    /// `false` where its caller has given it up.
+    fn begin(&self) -> bool {
+        self.leave_waiting(Self::BEGUN)
+    }
+
+    /// `false` where it has begun.
+    fn give_up(&self) -> bool {
+        self.leave_waiting(Self::GIVEN_UP)
+    }
+
+    fn leave_waiting(&self, to: u8) -> bool {
+        self.0.compare_exchange(Self::WAITING, to, Ordering::AcqRel, Ordering::Acquire).is_ok()
+    }
+}
+
 struct Pending<T> {
     operation: Operation<SqliteConnection, T>,
+    large: bool,
     value: Option<T>,
-    begun: Arc<AtomicBool>,
+    turn: Arc<Turn>,
     reply: oneshot::Sender<Result<T, Error>>,
 }
 
 impl<T: Send + 'static> Waiting for Pending<T> {
     fn begins(&self) -> bool {
-        self.begun.store(true, Ordering::Release);
-        !self.reply.is_closed()
+        self.turn.begin() && !self.reply.is_closed()
+    }
+
+    fn is_large(&self) -> bool {
+        self.large
     }
 
     fn run<'c>(&'c mut self, connection: &'c mut SqliteConnection) -> BoxFuture<'c, Result<(), Error>> {
         Box::pin(async {
-            // A defect in one operation must not cost the others their writer.
-            let outcome = AssertUnwindSafe((self.operation)(connection)).catch_unwind().await;
+            // A defect in one operation must not cost the others their writer, be it in its call or in what it awaits.
+            let run = async { (self.operation)(connection).await };
+            let outcome = AssertUnwindSafe(run).catch_unwind().await;
             let value = outcome.unwrap_or_else(|_| Err(Error::Corrupt("an operation of the store panicked".into())))?;
             self.value = Some(value);
             Ok(())
@@ -87,60 +125,57 @@ impl<T: Send + 'static> Waiting for Pending<T> {
 }
 
 impl Writer {
-    /// Starts the thread on a connection; `options` open another one when that is of no more use.
+    /// Starts the thread on a connection; `options` open another one when that is of no more use. A group goes on
+    /// taking operations for `group_time`.
     ///
     /// # Errors
     /// [`Error::Unavailable`] where the system has no thread to give.
-    pub(super) fn start(connection: SqliteConnection, options: SqliteConnectOptions) -> Result<Self, Error> {
+    pub(super) fn start(
+        connection: SqliteConnection,
+        options: SqliteConnectOptions,
+        group_time: Duration,
+    ) -> Result<Self, Error> {
         let (inbox, messages) = mpsc::unbounded_channel();
         let failed = |error: std::io::Error| Error::Unavailable(format!("cannot start the writer's thread: {error}"));
-        // A runtime of its own: each statement is a round trip to SQLite's thread, and waking this one thread is cheaper
-        // than finding one among those of the server.
+        // A runtime of its own: each statement is a round trip to SQLite's thread, and waking this one thread is
+        // cheaper than finding one among those of the server.
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().map_err(failed)?;
-        #[cfg(test)]
-        let commits = Arc::default();
-        let desk = Desk {
-            connection: Some(connection),
-            options,
-            messages,
-            #[cfg(test)]
-            commits: Arc::clone(&commits),
-        };
+        let desk = Desk { connection: Some(connection), options, messages, group_time };
         let work = move || runtime.block_on(desk.serve());
         thread::Builder::new().name("store-writer".into()).spawn(work).map_err(failed)?;
-        Ok(Self {
-            inbox,
-            #[cfg(test)]
-            commits,
-        })
+        Ok(Self { inbox, patience: PATIENCE })
     }
 
-    /// Runs an operation and answers once what it wrote is on the disk.
-    pub(super) async fn write<T: Send + 'static>(&self, operation: Operation<SqliteConnection, T>) -> Result<T, Error> {
-        let begun = Arc::new(AtomicBool::new(false));
+    /// Runs an operation, which writes or removes about so many bytes, and answers once what it wrote is on the disk.
+    pub(super) async fn write<T: Send + 'static>(
+        &self,
+        bytes: u64,
+        operation: Operation<SqliteConnection, T>,
+    ) -> Result<T, Error> {
+        let turn = Arc::new(Turn::default());
         let (reply, mut answer) = oneshot::channel();
-        let pending = Pending { operation, value: None, begun: begun.clone(), reply };
+        let pending = Pending { operation, large: bytes > LARGE_BYTES, value: None, turn: turn.clone(), reply };
         let closed = || Error::Unavailable("the store is closed".into());
         self.inbox.send(Message::Write(Box::new(pending))).map_err(|_| closed())?;
         loop {
-            match timeout(PATIENCE, &mut answer).await {
+            match timeout(self.patience, &mut answer).await {
                 Ok(answered) => return answered.unwrap_or_else(|_| Err(closed())),
-                // What has begun ends, sooner or later, and whether it came to anything is known only then.
-                Err(_) if begun.load(Ordering::Acquire) => {}
-                Err(_) => {
-                    let waited = PATIENCE.as_secs();
+                Err(_) if turn.give_up() => {
+                    let waited = self.patience.as_secs_f64();
                     return Err(Error::Unavailable(format!("no turn to write came within {waited} s")));
                 }
+                // What has begun ends, sooner or later, and whether it came to anything is known only then.
+                Err(_) => {}
             }
         }
     }
 
-    /// Runs one statement without parameters, and returns its rows.
-    pub(super) async fn run(&self, statement: &'static str) -> Result<Vec<SqliteRow>, Error> {
+    /// Runs one statement without parameters, which moves about so many bytes, and returns its rows.
+    pub(super) async fn run(&self, bytes: u64, statement: &'static str) -> Result<Vec<SqliteRow>, Error> {
         let run = sql::operation(move |connection: &mut SqliteConnection| {
             async move { sql::Connection::rows(connection, Statement::new(statement)).await }.boxed()
         });
-        self.write(run).await
+        self.write(bytes, run).await
     }
 
     /// Ends the thread after what is already waiting, and closes the connection.
@@ -159,8 +194,7 @@ struct Desk {
     connection: Option<SqliteConnection>,
     options: SqliteConnectOptions,
     messages: mpsc::UnboundedReceiver<Message>,
-    #[cfg(test)]
-    commits: Arc<std::sync::atomic::AtomicUsize>,
+    group_time: Duration,
 }
 
 /// An operation of a group and what it came to: answered with that once the group is committed, also where it was
@@ -169,25 +203,32 @@ type Ran = (Box<dyn Waiting>, Result<(), Error>);
 
 impl Desk {
     async fn serve(mut self) {
-        while let Some(message) = self.messages.recv().await {
-            let close = match message {
+        let mut next = self.messages.recv().await;
+        while let Some(message) = next {
+            let left_over = match message {
                 Message::Write(first) => self.group(first).await,
-                Message::Close(done) => Some(done),
+                Message::Close(done) => {
+                    if let Some(connection) = self.connection.take() {
+                        // What was acknowledged is durable without it.
+                        let _ = connection.close().await;
+                    }
+                    let _ = done.send(());
+                    return;
+                }
             };
-            let Some(done) = close else { continue };
-            if let Some(connection) = self.connection.take() {
-                // What was acknowledged is durable without it.
-                let _ = connection.close().await;
-            }
-            let _ = done.send(());
-            return;
+            next = match left_over {
+                Some(message) => Some(message),
+                None => self.messages.recv().await,
+            };
         }
     }
 
-    /// Runs operations until none waits, commits them together and answers them. Returns the close that was asked for
-    /// meanwhile.
-    async fn group(&mut self, first: Box<dyn Waiting>) -> Option<oneshot::Sender<()>> {
+    /// Runs operations until none waits, commits them together and answers them; a large one alone. Returns what it was
+    /// handed and is no part of the group: a large operation, or the close.
+    async fn group(&mut self, first: Box<dyn Waiting>) -> Option<Message> {
         let begun = Instant::now();
+        let alone = first.is_large();
+        let mut left_over = None;
         let mut group: Vec<Ran> = Vec::new();
         let mut next = Some(first);
         while let Some(mut operation) = next.take() {
@@ -207,20 +248,17 @@ impl Desk {
                     }
                 }
             }
-            if begun.elapsed() >= GROUP_TIME {
+            if alone || begun.elapsed() >= self.group_time {
                 break;
             }
             match self.messages.try_recv() {
-                Ok(Message::Write(operation)) => next = Some(operation),
-                Ok(Message::Close(done)) => {
-                    self.commit(group).await;
-                    return Some(done);
-                }
+                Ok(Message::Write(operation)) if !operation.is_large() => next = Some(operation),
+                Ok(other) => left_over = Some(other),
                 Err(_) => {}
             }
         }
         self.commit(group).await;
-        None
+        left_over
     }
 
     /// Begins a transaction with this operation; without one where it is refused.
@@ -254,7 +292,7 @@ impl Desk {
         if group.is_empty() {
             return;
         }
-        if let Err(error) = self.end().await {
+        if let Err(error) = self.end(group.len()).await {
             if group.len() > 1 {
                 return self.each_alone(group).await;
             }
@@ -272,7 +310,7 @@ impl Desk {
         for (mut operation, _) in group {
             let mut committed = self.open(operation.as_mut()).await.and_then(|outcome| outcome);
             if committed.is_ok() {
-                committed = self.end().await;
+                committed = self.end(1).await;
                 if committed.is_err() {
                     self.roll_back().await;
                 }
@@ -281,11 +319,11 @@ impl Desk {
         }
     }
 
-    /// Commits: what was written is on the disk then.
-    async fn end(&mut self) -> Result<(), Error> {
-        #[cfg(test)]
-        self.commits.fetch_add(1, Ordering::SeqCst);
-        self.control("COMMIT").await
+    /// Commits what so many operations wrote: it is on the disk then.
+    async fn end(&mut self, operations: usize) -> Result<(), Error> {
+        self.control("COMMIT").await?;
+        metrics::store_commit(operations);
+        Ok(())
     }
 
     /// Breaks the transaction off, if there is one. A connection that cannot even do that is given up.
@@ -305,5 +343,31 @@ impl Desk {
             self.connection = Some(SqliteConnection::connect_with(&self.options).await?);
         }
         self.connection.as_mut().ok_or_else(|| Error::Unavailable("no connection to the database".into()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_a_writer_and_a_caller_one_has_the_turn() {
+        let turn = || Arc::new(Turn::default());
+        let (begun, given_up) = (turn(), turn());
+        assert!(begun.begin() && !begun.give_up());
+        assert!(given_up.give_up() && !given_up.begin());
+        for round in 0..1_000 {
+            let (turn, both) = (turn(), Arc::new(std::sync::Barrier::new(2)));
+            let begins = thread::spawn({
+                let (turn, both) = (turn.clone(), both.clone());
+                move || {
+                    both.wait();
+                    turn.begin()
+                }
+            });
+            both.wait();
+            let given_up = turn.give_up();
+            assert_ne!(begins.join().expect("no panic"), given_up, "round {round}");
+        }
     }
 }

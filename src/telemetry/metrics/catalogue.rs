@@ -36,6 +36,9 @@ const RPC_SECONDS: Kind = Kind::Histogram(&[0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 
 /// Seconds of a store operation: a synced commit takes 1 to 20 ms on ordinary disks; a second is trouble.
 const STORE_SECONDS: Kind = Kind::Histogram(&[0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0]);
 
+/// Operations of a commit: one where nothing else waits, some tens where many callers wait for a slow disk.
+const COMMIT_OPERATIONS: Kind = Kind::Histogram(&[1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0]);
+
 /// Share of the tracks that are inliers, in tenths; below a tenth the search is hard, so it is cut once more.
 const RATIO: Kind = Kind::Histogram(&[0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]);
 
@@ -184,6 +187,12 @@ pub const STORE_DURATION: Metric = Metric {
     labels: &["operation"],
     help: "Seconds of a store operation, by operation.",
 };
+pub const STORE_COMMIT_OPERATIONS: Metric = Metric {
+    name: "scpsfm_store_commit_operations",
+    kind: COMMIT_OPERATIONS,
+    labels: &[],
+    help: "Operations that the embedded store committed together, one sample a commit.",
+};
 pub const STORE_REACHABLE: Metric = Metric {
     name: "scpsfm_store_reachable",
     kind: Kind::Gauge,
@@ -212,7 +221,7 @@ pub const CONNECTIONS_REFUSED: Metric = Metric {
 };
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 30] = [
+pub const ALL: [Metric; 31] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -238,6 +247,7 @@ pub const ALL: [Metric; 30] = [
     RPC_DURATION,
     RPC_IN_FLIGHT,
     STORE_DURATION,
+    STORE_COMMIT_OPERATIONS,
     STORE_REACHABLE,
     FENCED_WRITES,
     WATCHERS,

@@ -37,7 +37,7 @@ fn creation(bytes: &[u8]) -> Outcome {
         names::tenant(&request.parent)?;
         create::from_wire(request.job_id, request.request_id, request.job)?;
         if let Some(Inline::InputName(name)) = &request.input {
-            names::input(name, "name")?;
+            names::input(name, "input_name")?;
             return Ok(None);
         }
         let draft = Draft::begin(request.input, &limits())?;
