@@ -116,15 +116,25 @@ async fn migrate(connection: &mut SqliteConnection) -> Result<(), Error> {
 }
 
 /// Whether the database's file is there. One of no bytes is refused: no server leaves one behind, so that it is what is
-/// left of jobs, and a store that began anew on it would hide that they are gone.
+/// left of jobs, and a store that began anew on it would hide that they are gone. So is none at all beside a log with
+/// commits that only it holds.
 fn is_there(database: &Path) -> Result<bool, Error> {
+    let log = database.with_file_name(format!("{DATABASE_FILE}-wal"));
     match std::fs::metadata(database) {
         Ok(file) if file.len() == 0 => Err(Error::Corrupt(format!(
             "{} has no bytes; restore it, or move it and the files beside it away to begin without jobs",
             database.display()
         ))),
         Ok(_) => Ok(true),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(false),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => match std::fs::metadata(&log) {
+            Ok(log_file) if log_file.len() > 0 => Err(Error::Corrupt(format!(
+                "{} is missing beside its log {}, which holds jobs; restore it, or move the log away, too, to begin \
+                 without jobs",
+                database.display(),
+                log.display()
+            ))),
+            _ => Ok(false),
+        },
         Err(error) => Err(Error::Unavailable(format!("cannot look at {}: {error}", database.display()))),
     }
 }
@@ -133,7 +143,7 @@ fn is_there(database: &Path) -> Result<bool, Error> {
 /// nothing that looks like a store.
 async fn create(directory: &Path, database: &Path) -> Result<(), Error> {
     let draft = directory.join(DRAFT_FILE);
-    // Of a start that was cut off; and of a database that was taken away: its log would be taken for the new one's.
+    // Of a start that was cut off; and an empty log of a database that was taken away.
     for name in [DRAFT_FILE, DATABASE_FILE] {
         for suffix in ["", "-wal", "-shm"] {
             // Where there is none, there is nothing to remove.

@@ -104,6 +104,12 @@ async fn an_empty_file_is_refused_and_half_a_start_is_none() {
     let error = Sqlite::open(directory.path()).await.expect_err("its jobs are gone");
     assert!(matches!(&error, Error::Corrupt(text) if text.contains("has no bytes")), "{error}");
     assert_eq!(std::fs::metadata(&database).expect("is there").len(), 0, "left as it was found");
+    let log = directory.path().join(format!("{DATABASE_FILE}-wal"));
+    std::fs::remove_file(&database).expect("removed");
+    std::fs::write(&log, b"commits").expect("written");
+    let error = Sqlite::open(directory.path()).await.expect_err("the log is all that is left");
+    assert!(matches!(&error, Error::Corrupt(text) if text.contains("is missing beside its log")), "{error}");
+    assert_eq!(std::fs::read(&log).expect("is there"), b"commits", "left as it was found");
 }
 
 #[tokio::test]
