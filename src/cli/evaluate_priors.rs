@@ -69,7 +69,7 @@ pub async fn run(
     let work = Work { out, threads, quiet };
     if args.sweep {
         let runs = sweep::runs(&conditions, seeds);
-        let records = work.run(sweep::RECORDS, &runs, &sweep::measure, |records| {
+        let records = work.run(sweep::RECORDS, &runs, sweep::measure, |records| {
             print(sweep::text(&sweep::rows(&conditions, seeds, records)).trim_end())
         })?;
         let rows = sweep::rows(&conditions, seeds, &records);
@@ -79,7 +79,7 @@ pub async fn run(
         return Ok(Exit::Done);
     }
     let plan = Plan { conditions, seeds, each_prior: !args.auto_only };
-    let records = work.run(priors::RECORDS, &plan.runs(), &priors::measure, |records| {
+    let records = work.run(priors::RECORDS, &plan.runs(), priors::measure, |records| {
         print(table::text(&plan.rows(records)).trim_end())
     })?;
     let rows = plan.rows(&records);
@@ -101,7 +101,7 @@ impl Work<'_> {
         &self,
         name: &str,
         runs: &[R],
-        measure: &(dyn Fn(&R, &StopToken) -> Result<Option<M>, String> + Sync),
+        measure: fn(&R, &StopToken) -> Result<Option<M>, String>,
         so_far: impl Fn(&records::Records<R, M>) -> Result<(), Failure>,
     ) -> Result<records::Records<R, M>, Failure>
     where

@@ -43,13 +43,14 @@ pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) -
     let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref(), queue_time);
     let span = attempt.span().clone();
     // All of it inside the span, so that every line carries the job's name.
-    async {
+    let (course, end) = async {
         let mut course = Course::begin(inner.clone(), job, lease);
         let end = course.run(worker, attempt).await;
-        tokio::spawn(course.conclude(end).in_current_span())
+        (course, end)
     }
-    .instrument(span)
-    .await
+    .instrument(span.clone())
+    .await;
+    tokio::spawn(course.conclude(end).instrument(span))
 }
 
 /// Waits for the store no longer than the lease holds: a database that hangs must not keep the work going.

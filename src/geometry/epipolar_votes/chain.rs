@@ -58,9 +58,9 @@ pub fn posterior(alone: &[f64], ratios: &[[f64; 2]]) -> Posterior {
     };
     // All are right, or observation k is the first that is not.
     let (mut all, mut not_all) = (0.0, f64::NEG_INFINITY);
-    for k in 0..count {
+    for (k, after) in backward.iter().enumerate() {
         let (older, newer) = (usize::from(k > 1), usize::from(k > 0));
-        not_all = ln_sum([not_all, all + backward[k][2 * newer]]);
+        not_all = ln_sum([not_all, all + after[2 * newer]]);
         all += gain(k, older, newer, 1);
     }
     Posterior { observations: (0..count).map(odds).collect(), track: bounded(all - not_all) }

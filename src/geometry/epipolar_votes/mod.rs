@@ -156,8 +156,11 @@ fn squared(fundamental: &Fundamental, matches: &[Match]) -> Vec<f64> {
     matches.iter().map(|seen| fundamental.sampson_squared(seen)).collect()
 }
 
-/// The matches of every pair, with their places: see [`Pair::places`].
-fn matched(tracks: &Tracks) -> Vec<(Vec<(usize, usize)>, Vec<Match>)> {
+/// Places of matches, see [`Pair::places`], and the matches.
+type Placed = (Vec<(usize, usize)>, Vec<Match>);
+
+/// The matches of every pair.
+fn matched(tracks: &Tracks) -> Vec<Placed> {
     let mut pairs = vec![(Vec::new(), Vec::new()); STRIDES.len() * tracks.views()];
     let sightings = tracks.sightings();
     for track in 0..tracks.len() {

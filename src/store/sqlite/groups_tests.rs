@@ -29,7 +29,11 @@ async fn hold(store: &Sqlite) -> (watch::Sender<()>, JoinHandle<Result<(), Error
             tell.send(()).expect("somebody waits");
         }
         // An error says that the sender was dropped, which is what is waited for.
-        async move { Ok(gone.changed().await.unwrap_or(())) }.boxed()
+        async move {
+            let _ = gone.changed().await;
+            Ok(())
+        }
+        .boxed()
     });
     let writer = store.writer.clone();
     let held = tokio::spawn(async move { writer.write(0, wait).await });
