@@ -335,7 +335,8 @@ fn the_demo_finds_what_is_true() {
     let figures = json(&run.stdout);
     assert!(figures["f1"].as_f64().is_some_and(|f1| f1 >= 0.95), "{figures}");
     assert_eq!(figures["result"]["status"], "SOLVED");
-    for state in ["QUEUED", "RUNNING", "SUCCEEDED", "search"] {
+    // Stages are told of jobs that take longer than this one does on a fast machine.
+    for state in ["QUEUED", "RUNNING", "SUCCEEDED", "METRIC"] {
         assert!(run.stderr.contains(state), "{state} is not among {}", run.stderr);
     }
     for file in ["result.json", "report.html", "scene/observations.csv", "scene/truth.json"] {

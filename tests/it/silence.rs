@@ -129,7 +129,9 @@ async fn one_connection_too_many_is_refused_and_there_is_room_when_one_ends() {
             let mut client = connected.map_err(|_| Code::Unavailable)?;
             client.get_capabilities(proto::GetCapabilitiesRequest {}).await.map(drop).map_err(|status| status.code())
         };
-        assert_eq!(soon(refused).await, Err(Code::Unavailable), "attempt {attempt}");
+        // Cancelled by the client's own library, where the connection was gone before the call was sent.
+        let code = soon(refused).await.expect_err("there is no room");
+        assert!(matches!(code, Code::Unavailable | Code::Cancelled), "attempt {attempt}: {code:?}");
     }
     assert!(count("scpsfm_connections_refused_total") >= 21.0);
     for client in &mut clients {
