@@ -353,7 +353,7 @@ pub(super) fn build() -> Result<String, Failure> {
     let digest = Sha256::digest(&program);
     let short: String = digest.iter().take(8).map(|byte| format!("{byte:02x}")).collect();
     // Another network gives other figures.
-    let network = &crate::network::subspace::current().checksum()[..16];
+    let network = &crate::network::subspace::current_checksum()[..16];
     Ok(format!("{} {short} {network}", env!("CARGO_PKG_VERSION")))
 }
 

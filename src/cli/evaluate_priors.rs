@@ -154,7 +154,7 @@ pub async fn run_on_windows(directories: &[PathBuf], out: &Path, json: bool, qui
 fn written(out: &Path, name: &str, mut rows: serde_json::Value) -> Result<String, Failure> {
     let network = subspace::current();
     rows["version"] = json!(env!("CARGO_PKG_VERSION"));
-    rows["network"] = json!({ "origin": network.origin, "sha256": network.checksum() });
+    rows["network"] = json!({ "origin": network.origin, "sha256": subspace::current_checksum() });
     let text = pretty(&rows)?;
     write_atomically(out, name, text.as_bytes())?;
     Ok(text)

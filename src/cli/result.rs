@@ -79,22 +79,17 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
 fn belongs_together(input: &LabelledInput, solution: &Solution) -> Result<(), Failure> {
     let of_file = (input.raw.views.len(), input.raw.track_count, input.raw.x.len());
     let of_job = (solution.views.len(), solution.tracks.inlier.len(), solution.observations.inlier.len());
-    if of_file == of_job {
-        return match &solution.input_sha256 {
-            Some(sha256) if *sha256 != input.raw.sha256() => Err(Failure {
-                exit: Exit::BadInput,
-                message:
-                    "the file is not the job's input: its points, their order or the sizes of the images (--width, \
-                          --height) are others, and verdicts would go to the wrong observations"
-                        .to_owned(),
-            }),
-            _ => Ok(()),
-        };
+    if of_file != of_job {
+        let words =
+            |(views, tracks, observations)| format!("{views} views, {tracks} tracks and {observations} observations");
+        let message = format!("the file has {}, the job's input had {}", words(of_file), words(of_job));
+        return Err(Failure { exit: Exit::BadInput, message });
     }
-    let words =
-        |(views, tracks, observations)| format!("{views} views, {tracks} tracks and {observations} observations");
-    Err(Failure {
-        exit: Exit::BadInput,
-        message: format!("the file has {}, the job's input had {}", words(of_file), words(of_job)),
-    })
+    // Servers of older versions do not tell.
+    if solution.input_sha256.as_ref().is_none_or(|sha256| *sha256 == input.raw.sha256()) {
+        return Ok(());
+    }
+    let message = "the file is not the job's input: its points, their order or the sizes of the images (--width, \
+                   --height) are others, and verdicts would go to the wrong observations";
+    Err(Failure { exit: Exit::BadInput, message: message.to_owned() })
 }

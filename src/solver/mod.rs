@@ -75,7 +75,7 @@ pub fn solve(
 
 /// SHA-256, hexadecimal, of the trained network that AUTO asks in this process.
 pub fn trained_network() -> String {
-    crate::network::subspace::current().checksum()
+    crate::network::subspace::current_checksum().to_owned()
 }
 
 /// The solution but for what [`views::complete`] says of the views.

@@ -15,6 +15,16 @@ pub fn current() -> &'static PriorFile {
     INSTALLED.get().unwrap_or_else(|| shipped())
 }
 
+/// [`PriorFile::checksum`] of the network that this process asks, summed up once: every result has it.
+pub fn current_checksum() -> &'static str {
+    static OF_INSTALLED: OnceLock<String> = OnceLock::new();
+    static OF_SHIPPED: LazyLock<String> = LazyLock::new(|| shipped().checksum());
+    match INSTALLED.get() {
+        Some(installed) => OF_INSTALLED.get_or_init(|| installed.checksum()),
+        None => &OF_SHIPPED,
+    }
+}
+
 /// Puts another network in place of the shipped one, for as long as the process lives. The first one given stays: one
 /// process gives one answer.
 ///
