@@ -317,10 +317,11 @@ fn check_views_with_observations(raw: &RawInput, field: &impl Fn(&str) -> String
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    fn raw() -> RawInput {
+    /// Four observations, not in order.
+    pub fn raw() -> RawInput {
         RawInput {
             views: vec![View::default(); 2],
             track_count: 2,

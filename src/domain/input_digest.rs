@@ -31,26 +31,19 @@ impl RawInput {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{ImageSize, Input, Limits, View};
-
-    fn raw() -> RawInput {
-        RawInput {
-            views: vec![View::default(); 2],
-            track_count: 2,
-            view: vec![0, 1, 0, 1],
-            track: vec![0, 0, 1, 1],
-            x: vec![1.0, 2.0, 3.0, 4.0],
-            y: vec![5.0, 6.0, 7.0, 8.0],
-            ..RawInput::default()
-        }
-    }
+    use crate::domain::input::tests::raw;
+    use crate::domain::{ImageSize, Input, Limits};
 
     #[test]
     fn the_order_the_points_and_the_sizes_count() {
         let sha256 = raw().sha256();
-        let swapped =
-            RawInput { view: vec![1, 0, 0, 1], x: vec![2.0, 1.0, 3.0, 4.0], y: vec![6.0, 5.0, 7.0, 8.0], ..raw() };
-        let moved = RawInput { x: vec![1.0, 2.0, 3.0, 4.5], ..raw() };
+        let mut swapped = raw();
+        swapped.view.swap(0, 1);
+        swapped.track.swap(0, 1);
+        swapped.x.swap(0, 1);
+        swapped.y.swap(0, 1);
+        let mut moved = raw();
+        moved.x[3] += 0.5;
         let mut sized = raw();
         sized.views[1].size = Some(ImageSize { width_px: 640, height_px: 480 });
         for other in [&swapped, &moved, &sized] {

@@ -261,6 +261,7 @@ fn a_server_gives_the_same_files_as_the_program_itself_and_drains_on_sigterm() {
     let name = listed.stdout.split_whitespace().find(|word| word.starts_with("tenants/")).expect("a job's name");
     let result = run(["result", name, "--json", "--server", &serving.grpc]);
     assert_eq!(json(&result.stdout)["inlier_tracks"], 30);
+    a_result_goes_with_its_own_input_alone(name, &serving.grpc, &input);
     let deleted = run(["delete", name, "--server", &serving.grpc]);
     assert_eq!((deleted.code, deleted.stdout.trim()), (Some(0), name), "{deleted:?}");
     assert_eq!(run(["get", name, "--server", &serving.grpc]).code, Some(65), "it is gone");
@@ -271,6 +272,24 @@ fn a_server_gives_the_same_files_as_the_program_itself_and_drains_on_sigterm() {
     serving.running.signal(Signal::TERM);
     serving.running.signal(Signal::TERM);
     assert_eq!(serving.running.wait().code(), Some(0));
+}
+
+/// Verdicts are listed by place: rows in another order, or images of another size, would be judged wrongly.
+fn a_result_goes_with_its_own_input_alone(name: &str, server: &str, input: &Path) {
+    let with = |file: &Path, width: &str| {
+        let size = ["--width", width, "--height", "1000"];
+        run(["result", name, "--json", "--server", server, "--input", text(file)].iter().chain(&size))
+    };
+    let own = with(input, "1000");
+    assert_eq!(own.code, Some(0), "{own:?}");
+    let table = fs::read_to_string(input).expect("the input");
+    let (head, rows) = table.split_once('\n').expect("a header");
+    let reversed: Vec<&str> = rows.lines().rev().collect();
+    let shuffled = input.with_file_name("reversed.csv");
+    fs::write(&shuffled, format!("{head}\n{}\n", reversed.join("\n"))).expect("written");
+    for refused in [with(&shuffled, "1000"), with(input, "500")] {
+        assert!(refused.code == Some(65) && refused.stderr.contains("not the job's input"), "{refused:?}");
+    }
 }
 
 #[test]
