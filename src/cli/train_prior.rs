@@ -12,7 +12,7 @@ use super::interrupt::Interrupt;
 use crate::formats::result_files::{create_directory, write_atomically};
 use crate::network::subspace::{PriorFile, Shape};
 use crate::report::chart::{LineChart, Series, standalone};
-use crate::training::{Milestone, Settings, Trainer};
+use crate::training::{Milestone, Objective, Settings, Trainer};
 
 /// Steps of the shipped network.
 const STEPS: u64 = 7_000;
@@ -49,6 +49,11 @@ pub struct Args {
     /// Steps, each on two batches of 2 to 24 scenes; the learning rate falls with the share that is done
     #[arg(long, value_name = "N", default_value_t = STEPS, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
     pub steps: u64,
+
+    /// Learn from the paper's losses L_num and L_proj instead of labels, for comparison: such a network ranks tracks
+    /// only, and worse
+    #[arg(long)]
+    pub unlabelled: bool,
 
     /// Show no progress
     #[arg(long, short)]
@@ -95,9 +100,10 @@ impl Files {
 
 fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
     let files = Files::new(&args.out)?;
-    let settings = Settings { seed: args.seed, steps: args.steps, shape: Shape::default() };
+    let objective = if args.unlabelled { Objective::PaperLosses } else { Objective::Labels };
+    let settings = Settings { seed: args.seed, steps: args.steps, shape: Shape::default(), objective };
     let mut trainer = take_up(&files, settings)?;
-    let view = View::new(args, trainer.step());
+    let view = View::new(args, objective, trainer.step());
     // At once, too: a folder that cannot be written to is better known before the work.
     write_state(&files, &trainer)?;
     let mut written = Instant::now();
@@ -106,7 +112,7 @@ fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
         view.step(trainer.step());
         if let Some(milestone) = milestone {
             view.milestone(&milestone);
-            write_curves(&files, trainer.milestones())?;
+            write_curves(&files, objective, trainer.milestones())?;
         }
         let stopped = is_stopped() && !trainer.is_finished();
         if stopped || written.elapsed().as_secs_f64() > SECONDS_PER_STATE {
@@ -118,10 +124,10 @@ fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
             return Ok(Exit::Interrupted);
         }
     }
-    let command = format!("scpsfm train-prior --seed {} --steps {} --out FILE", args.seed, args.steps);
+    let command = format!("scpsfm train-prior {} --out FILE", settings.arguments());
     let file = trainer.file(command);
     write_atomically(&files.directory, &files.name, &file.bytes())?;
-    write_curves(&files, trainer.milestones())?;
+    write_curves(&files, objective, trainer.milestones())?;
     if let Err(error) = fs::remove_file(files.state())
         && error.kind() != ErrorKind::NotFound
     {
@@ -163,21 +169,19 @@ fn write_state(files: &Files, trainer: &Trainer) -> Result<(), Failure> {
     Ok(write_atomically(&files.directory, &files.state_name(), &state)?)
 }
 
-fn write_curves(files: &Files, milestones: &[Milestone]) -> Result<(), Failure> {
-    let curve = |name, value: fn(&Milestone) -> f64| Series {
+fn write_curves(files: &Files, objective: Objective, milestones: &[Milestone]) -> Result<(), Failure> {
+    let curve = |name, value: &dyn Fn(&Milestone) -> f64| Series {
         name,
         points: milestones.iter().map(|milestone| (milestone.step as f64, value(milestone))).collect(),
     };
     let chart = |title, series| {
         LineChart { title, x_label: "step", series, logarithmic: false, clip: None, marks: Vec::new() }.svg()
     };
-    let losses = vec![
-        curve("tracks", |milestone| milestone.track_loss),
-        curve("observ.", |milestone| milestone.observation_loss),
-    ];
+    let [first, second] = objective.parts();
+    let losses = vec![curve(first, &|milestone| milestone.parts[0]), curve(second, &|milestone| milestone.parts[1])];
     let charts = [
-        chart("Cross-entropy in training", losses),
-        chart("Average precision on unseen scenes", vec![curve("", |milestone| milestone.precision)]),
+        chart("Losses in training", losses),
+        chart("Average precision on unseen scenes", vec![curve("", &|milestone| milestone.precision)]),
     ];
     write_atomically(&files.directory, &format!("{}.svg", files.name), standalone(&charts).as_bytes())?;
     Ok(())
@@ -186,18 +190,19 @@ fn write_curves(files: &Files, milestones: &[Milestone]) -> Result<(), Failure> 
 /// Progress on stderr: a bar on a terminal, a line a milestone elsewhere.
 struct View {
     quiet: bool,
+    objective: Objective,
     bar: ProgressBar,
 }
 
 impl View {
-    fn new(args: &Args, step: u64) -> Self {
+    fn new(args: &Args, objective: Objective, step: u64) -> Self {
         let bar = if args.quiet { ProgressBar::hidden() } else { ProgressBar::new(args.steps) };
         if let Ok(style) = ProgressStyle::with_template("[{bar:24}] {pos}/{len} steps, {eta} left {wide_msg}") {
             bar.set_style(style.progress_chars("=> "));
         }
         bar.set_position(step);
         bar.reset_eta();
-        let view = Self { quiet: args.quiet, bar };
+        let view = Self { quiet: args.quiet, objective, bar };
         if step > 0 {
             view.note(&format!("going on after step {step}"));
         }
@@ -209,10 +214,11 @@ impl View {
     }
 
     fn milestone(&self, milestone: &Milestone) {
-        let Milestone { step, lessons, loss, track_loss, observation_loss, precision } = milestone;
+        let Milestone { step, lessons, loss, parts: [first, second], precision } = milestone;
+        let [first_name, second_name] = self.objective.parts();
         let line = format!(
-            "step {step}, {lessons} scenes: loss {loss:.4} (tracks {track_loss:.4}, observations \
-             {observation_loss:.4}), average precision {precision:.4}"
+            "step {step}, {lessons} scenes: loss {loss:.4} ({first_name} {first:.4}, {second_name} {second:.4}), average \
+             precision {precision:.4}"
         );
         self.bar.set_message(format!("AP {precision:.4}"));
         self.note(&line);

@@ -30,7 +30,6 @@ impl RawInput {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use crate::domain::input::tests::raw;
     use crate::domain::{ImageSize, Input, Limits};
 

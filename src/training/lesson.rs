@@ -2,9 +2,9 @@
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
 
-use super::Error;
-use super::loss::{self, Labels, loss};
+use super::labelled::{self, Labels};
 use super::tape::{Batch, constant};
+use super::{Error, Objective, unlabelled};
 use crate::network::Parameter;
 use crate::network::subspace::{Cloud, SubspaceNet};
 use crate::synthetic::curriculum::Lesson;
@@ -14,9 +14,8 @@ use crate::synthetic::curriculum::Lesson;
 pub struct Losses {
     /// What is minimised.
     pub total: f64,
-    /// Of the tracks, by the last block.
-    pub tracks: f64,
-    pub observations: f64,
+    /// By the last block, see [`Objective::parts`].
+    pub parts: [f64; 2],
 }
 
 /// The losses at one point and their derivatives.
@@ -28,24 +27,29 @@ pub struct Slope {
 /// Losses and derivatives of a network on lessons of one size.
 ///
 /// # Errors
-/// [`Error::Backend`] for a defect of burn.
-pub fn differentiate(network: &SubspaceNet<Parameter>, lessons: &[Lesson]) -> Result<Slope, Error> {
+/// [`Error::Backend`] for a defect of burn; [`Error::NoDecomposition`] without labels, for columns that are not finite.
+pub fn differentiate(
+    network: &SubspaceNet<Parameter>,
+    lessons: &[Lesson],
+    objective: Objective,
+) -> Result<Slope, Error> {
     let device = Device::flex().autodiff();
     let leaves = network.map(|parameter| parameter.tensor(&device).require_grad());
     let (batch, labels) = tensors(lessons, DType::F32, &device);
-    let loss = loss(leaves.on_tape(&batch, DType::F32)?, &labels);
-    let losses = Losses {
-        total: number(&loss.total)?,
-        tracks: number(&loss.last_block)?,
-        observations: number(&loss.observations)?,
+    let output = leaves.on_tape(&batch, DType::F32)?;
+    let loss = match objective {
+        Objective::Labels => labelled::loss(output, &labels),
+        Objective::PaperLosses => unlabelled::loss(output, DType::F32)?,
     };
+    let [first, second] = &loss.parts;
+    let losses = Losses { total: number(&loss.total)?, parts: [number(first)?, number(second)?] };
     let mut reached = loss.total.backward();
     let mut failed = None;
     let gradient = leaves.map(|leaf| {
         let [rows, columns] = leaf.dims();
         match leaf.grad_remove(&mut reached).map(|gradient| gradient.into_data().try_into_vec()) {
             Some(Ok(gradient)) => gradient,
-            // The last block's depths reach nothing.
+            // The last block's depths reach nothing; nor do the observations' layers, without labels.
             None => vec![0.0; rows * columns],
             Some(Err(error)) => {
                 failed = Some(Error::Backend(format!("{error:?}")));
@@ -69,10 +73,10 @@ pub fn tensors(lessons: &[Lesson], dtype: DType, device: &Device) -> (Batch, Lab
         visible.extend(cloud.visible().iter().map(|&seen| f64::from(seen)));
         inlier.extend(lesson.inlier.iter().map(label));
         right.extend(lesson.right.iter().map(label));
-        let weights = loss::weights(&lesson.inlier, &vec![true; tracks]);
+        let weights = labelled::weights(&lesson.inlier, &vec![true; tracks]);
         let total: f64 = weights.iter().sum();
         of_tracks.extend(weights.into_iter().map(|weight| weight / (total * count as f64)));
-        of_observations.extend(loss::weights(&lesson.right, &lesson.visible));
+        of_observations.extend(labelled::weights(&lesson.right, &lesson.visible));
     }
     let total: f64 = of_observations.iter().sum();
     of_observations.iter_mut().for_each(|weight| *weight /= total);

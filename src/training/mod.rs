@@ -8,14 +8,17 @@
 
 mod adam;
 mod initial;
+mod labelled;
 mod lesson;
-mod loss;
+mod objective;
 mod tape;
 #[cfg(test)]
 mod tests;
 mod trainer;
+mod unlabelled;
 
 pub use lesson::Losses;
+pub use objective::Objective;
 pub use trainer::{Milestone, Settings, Trainer};
 
 /// Why training could not go on.
@@ -27,6 +30,9 @@ pub enum Error {
     /// The state of an interrupted training cannot be taken up.
     #[error("{0}")]
     State(String),
+    /// What the network made of its tracks is not finite.
+    #[error("the tracks have no singular values: the network's columns are not finite")]
+    NoDecomposition,
     /// Too many steps in a row had no finite gradient.
     #[error("the network diverged in step {step}: no finite gradient in {rejected} steps")]
     Diverged { step: u64, rejected: u64 },

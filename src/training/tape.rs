@@ -33,6 +33,8 @@ pub struct Output {
     pub tracks: Vec<Tensor<3>>,
     /// Logits of the observations, B x n x 1 x m.
     pub observations: Tensor<4>,
+    /// Homogeneous points times the last block's depths, holes filled, B x n x 3 x m.
+    pub columns: Tensor<4>,
 }
 
 /// What a block's selections leave of every track.
@@ -86,7 +88,8 @@ impl SubspaceNet<Tensor<2>> {
             last = Some(residuals);
         }
         let last = last.ok_or_else(|| Error::Backend("a network without blocks".into()))?;
-        Ok(Output { tracks, observations: state.observations(self, last) })
+        let columns = state.columns.clone();
+        Ok(Output { tracks, observations: state.observations(self, last), columns })
     }
 }
 

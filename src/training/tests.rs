@@ -1,7 +1,7 @@
 use burn::tensor::{DType, Device, Tensor};
 
+use super::labelled::loss;
 use super::lesson::{differentiate, tensors};
-use super::loss::loss;
 use super::tape::constant;
 use super::*;
 use crate::network::Parameter;
@@ -73,7 +73,7 @@ fn derivatives_agree_with_finite_differences() {
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
     let network = initial::initial(SMALL, seed);
     let lessons = lessons(seed);
-    let gradient = differentiate(&network, &lessons).expect("a gradient").gradient;
+    let gradient = differentiate(&network, &lessons, Objective::Labels).expect("a gradient").gradient;
     let count = network.arrays().len();
     let largest = gradient.arrays().into_iter().flatten().map(|slope| slope.abs()).fold(0.0, f32::max);
     for chosen in 0..count {
@@ -95,7 +95,7 @@ fn derivatives_agree_with_finite_differences() {
 
 #[test]
 fn a_training_put_aside_goes_on_as_if_it_had_not_been() {
-    let settings = Settings { seed: 11, steps: 4, shape: SMALL };
+    let settings = Settings { seed: 11, steps: 4, shape: SMALL, objective: Objective::Labels };
     let mut whole = Trainer::new(settings);
     let mut parted = Trainer::new(settings);
     while !whole.is_finished() {
@@ -109,4 +109,48 @@ fn a_training_put_aside_goes_on_as_if_it_had_not_been() {
     let error = Trainer::resume(&whole.state().expect("a state"), other).expect_err("another training");
     assert_eq!(error.to_string(), "it belongs to a training with --seed 11 --steps 4");
     assert!(Trainer::resume(b"no state", settings).is_err());
+}
+
+/// The plane that stands for the loss without labels: its derivative along the logits is that of the losses themselves.
+#[test]
+fn without_labels_the_weights_follow_the_papers_losses() {
+    use super::tape::Output;
+    use crate::network::NetworkSettings;
+    use rand::{Rng, SeedableRng};
+    const LENGTH: f64 = 1e-5;
+    let (seed, views, tracks, lessons, blocks) = (7, 4, 30, 2, 2);
+    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let mut draw = |count: usize| (0..count).map(|_| 2.0 * rng.random::<f64>() - 1.0).collect::<Vec<f64>>();
+    let columns = draw(lessons * views * 3 * tracks);
+    let (logits, directions) =
+        ([draw(lessons * tracks), draw(lessons * tracks)], [(); 2].map(|()| draw(lessons * tracks)));
+    let device = Device::flex().autodiff();
+    let at = |length: f64| {
+        let leaves: Vec<Tensor<3>> = (0..blocks)
+            .map(|block| {
+                let moved = logits[block].iter().zip(&directions[block]).map(|(logit, step)| logit + length * step);
+                constant(moved.collect(), [lessons, 1, tracks], DType::F64, &device).require_grad()
+            })
+            .collect();
+        let output = Output {
+            tracks: leaves.clone(),
+            observations: constant(vec![0.0], [1, 1, 1, 1], DType::F64, &device),
+            columns: constant(columns.clone(), [lessons, views, 3, tracks], DType::F64, &device),
+        };
+        (unlabelled::loss(output, DType::F64).expect("finite columns"), leaves)
+    };
+    let number = |tensor: Tensor<1>| tensor.inner().into_data().try_into_vec::<f64>().expect("f64")[0];
+    let total = |length: f64| number(at(length).0.total);
+    let expected = (total(LENGTH) - total(-LENGTH)) / (2.0 * LENGTH);
+    let (loss, leaves) = at(0.0);
+    let mut reached = loss.total.clone().backward();
+    let mut found = 0.0;
+    for (leaf, direction) in leaves.into_iter().zip(&directions) {
+        let slopes: Vec<f64> =
+            leaf.grad_remove(&mut reached).expect("a gradient").into_data().try_into_vec().expect("f64");
+        found += slopes.iter().zip(direction).map(|(slope, step)| slope * step).sum::<f64>();
+    }
+    assert!((found - expected).abs() < 1e-5 * expected.abs().max(1.0), "{found} for {expected}, seed {seed}");
+    let [num, proj] = loss.parts.map(number);
+    assert!(num > 0.0 && proj > NetworkSettings::default().alpha / 100.0, "L_num {num}, L_proj {proj}");
 }

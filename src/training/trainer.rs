@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::lesson::{Losses, Slope, differentiate};
-use super::{Error, adam, initial};
+use super::{Error, Objective, adam, initial};
 use crate::network::Parameter;
 use crate::network::subspace::{Cloud, Origin, PriorFile, Shape, SubspaceNet};
 use crate::synthetic::curriculum::{self, Lesson};
@@ -23,7 +23,7 @@ const MOST_REJECTED: u64 = 50;
 /// Version of this program.
 const PROGRAM: &str = env!("CARGO_PKG_VERSION");
 /// Layout of a saved state.
-const STATE_VERSION: u32 = 1;
+const STATE_VERSION: u32 = 2;
 
 /// What is trained, how long and from what.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -31,9 +31,19 @@ pub struct Settings {
     pub seed: u64,
     pub steps: u64,
     pub shape: Shape,
+    pub objective: Objective,
 }
 
 impl Settings {
+    /// Arguments of `scpsfm train-prior` that stand for these.
+    pub fn arguments(&self) -> String {
+        let objective = match self.objective {
+            Objective::Labels => "",
+            Objective::PaperLosses => " --unlabelled",
+        };
+        format!("--seed {} --steps {}{objective}", self.seed, self.steps)
+    }
+
     /// Seed of the lessons that the training is validated on, which it never sees.
     fn validation_seed(&self) -> u64 {
         !self.seed
@@ -48,8 +58,8 @@ pub struct Milestone {
     pub lessons: u64,
     /// Means since the last milestone.
     pub loss: f64,
-    pub track_loss: f64,
-    pub observation_loss: f64,
+    /// See [`Objective::parts`].
+    pub parts: [f64; 2],
     /// Mean average precision on lessons that training never sees, of the average of the weights.
     pub precision: f64,
 }
@@ -106,8 +116,8 @@ impl Trainer {
             return Err(Error::State(format!("it is of scpsfm {}, this is {PROGRAM}", trainer.program)));
         }
         if trainer.settings != settings {
-            let Settings { seed, steps, .. } = trainer.settings;
-            return Err(Error::State(format!("it belongs to a training with --seed {seed} --steps {steps}")));
+            let arguments = trainer.settings.arguments();
+            return Err(Error::State(format!("it belongs to a training with {arguments}")));
         }
         let shapes = settings.shape.arrays();
         let (network, average) = (trainer.network.arrays(), trainer.average.arrays());
@@ -152,7 +162,8 @@ impl Trainer {
         let (losses, gradient) = mean(&slopes);
         if adam::step(&mut self.network, &gradient, adam::rate(self.step, self.settings.steps)) {
             self.rejected = 0;
-            self.sums = [self.sums[0] + losses.total, self.sums[1] + losses.tracks, self.sums[2] + losses.observations];
+            let [first, second] = losses.parts;
+            self.sums = [self.sums[0] + losses.total, self.sums[1] + first, self.sums[2] + second];
             self.summed += 1;
         } else {
             self.rejected += 1;
@@ -175,11 +186,12 @@ impl Trainer {
 
     /// Losses and derivatives of the step's batches, each on a thread where there is more than one core.
     fn slopes(&mut self) -> Result<Vec<Slope>, Error> {
-        let (seed, first) = (self.settings.seed, self.step * BATCHES_PER_STEP);
+        let Settings { seed, objective, .. } = self.settings;
+        let first = self.step * BATCHES_PER_STEP;
         let network = &self.network;
         let work = |number: u64| {
             let lessons = curriculum::batch(seed, number);
-            differentiate(network, &lessons).map(|slope| (slope, lessons.len() as u64))
+            differentiate(network, &lessons, objective).map(|slope| (slope, lessons.len() as u64))
         };
         let threads = std::thread::available_parallelism().map_or(1, |count| count.get() as u64);
         let results: Vec<_> = if threads == 1 {
@@ -212,11 +224,11 @@ impl Trainer {
     }
 
     fn milestone(&mut self) -> Milestone {
-        let [loss, track_loss, observation_loss] = self.sums.map(|sum| sum / self.summed.max(1) as f64);
+        let [loss, first, second] = self.sums.map(|sum| sum / self.summed.max(1) as f64);
         (self.sums, self.summed) = ([0.0; 3], 0);
         let precision = validate(&self.average, self.settings.validation_seed());
         let (step, lessons) = (self.step, self.lessons);
-        let milestone = Milestone { step, lessons, loss, track_loss, observation_loss, precision };
+        let milestone = Milestone { step, lessons, loss, parts: [first, second], precision };
         self.milestones.push(milestone);
         milestone
     }
@@ -229,8 +241,9 @@ fn mean(slopes: &[Slope]) -> (Losses, SubspaceNet<Vec<f32>>) {
     let mut gradient = slopes[0].gradient.map(|array| vec![0.0f32; array.len()]);
     for slope in slopes {
         losses.total += share * slope.losses.total;
-        losses.tracks += share * slope.losses.tracks;
-        losses.observations += share * slope.losses.observations;
+        for (sum, part) in losses.parts.iter_mut().zip(slope.losses.parts) {
+            *sum += share * part;
+        }
         for (sum, array) in gradient.arrays_mut().into_iter().zip(slope.gradient.arrays()) {
             for (sum, slope) in sum.iter_mut().zip(array) {
                 *sum += share as f32 * slope;

@@ -72,9 +72,8 @@ pub fn evaluate(
     settings: &LossSettings,
 ) -> Result<Evaluation, Error> {
     debug_assert_eq!(balanced.ncols(), w.len());
-    let (num, grad_w_num) = inlier_count(w, settings);
     let spectrum = Spectrum::of(balanced, w)?;
-    let (proj, grad_w_proj) = spectrum.tail_sum(w);
+    let RankTerms { num, proj, grad_w_num, grad_w_proj } = RankTerms::of(&spectrum, w, settings);
     let cameras = gauge::CanonicalCameras::of(spectrum.span());
     let daq = daq::residual(&cameras, log_focal, &Vector3::from(n_inf));
     let grad_span = cameras.pull_back(&daq.grad_rotational, &daq.grad_translational);
@@ -87,6 +86,34 @@ pub fn evaluate(
         grad_log_focal: daq.grad_log_focal,
         grad_n_inf: daq.grad_n_inf.into(),
     })
+}
+
+/// The two terms that know of no calibration, and their derivatives, one entry a column.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RankTerms {
+    pub num: f64,
+    pub proj: f64,
+    pub grad_w_num: Vec<f64>,
+    pub grad_w_proj: Vec<f64>,
+}
+
+impl RankTerms {
+    fn of(spectrum: &Spectrum, w: &[f64], settings: &LossSettings) -> Self {
+        let (num, grad_w_num) = inlier_count(w, settings);
+        let (proj, grad_w_proj) = spectrum.tail_sum(w);
+        Self { num, proj, grad_w_num, grad_w_proj }
+    }
+}
+
+/// L_num and L_proj alone, for points whose coordinates no calibration is known to fit.
+///
+/// * `balanced`, `w`: as for [`evaluate`]
+///
+/// # Errors
+/// [`Error::NoDecomposition`] when the weighted matrix overflows.
+pub fn rank_terms(balanced: &DMatrix<f64>, w: &[f64], settings: &LossSettings) -> Result<RankTerms, Error> {
+    debug_assert_eq!(balanced.ncols(), w.len());
+    Ok(RankTerms::of(&Spectrum::of(balanced, w)?, w, settings))
 }
 
 /// L_num and its derivative `-κ s_j (1 - s_j) L_num`.

@@ -1,13 +1,11 @@
-//! What training minimises: binary cross-entropy of tracks after every block and of observations after the last.
+//! Learning from labels: binary cross-entropy of tracks after every block and of observations after the last.
 
 use burn::tensor::Tensor;
 use burn::tensor::activation::log_sigmoid;
 
+use super::objective::{Loss, importance};
 use super::tape::Output;
 
-/// Weight of the first block's tracks; the last one's is 1, linear between (deep supervision: early blocks learn to rank,
-/// later ones to refine).
-const FIRST_BLOCK: f64 = 0.3;
 /// Weight of the observations beside that of the last block's tracks.
 const OBSERVATIONS: f64 = 0.5;
 /// Bounds of how much more a right one counts than a wrong one.
@@ -47,14 +45,7 @@ pub fn weights(right: &[bool], counted: &[bool]) -> Vec<f64> {
     .collect()
 }
 
-/// The loss of a batch, and the last block's and the observations' share of it.
-pub struct Loss {
-    pub total: Tensor<1>,
-    pub last_block: Tensor<1>,
-    pub observations: Tensor<1>,
-}
-
-/// The loss of what the network said.
+/// The loss of what the network said; its parts are the tracks' by the last block and the observations'.
 pub fn loss(output: Output, labels: &Labels) -> Loss {
     let blocks = output.tracks.len();
     let of_blocks: Vec<Tensor<1>> = output
@@ -62,16 +53,14 @@ pub fn loss(output: Output, labels: &Labels) -> Loss {
         .into_iter()
         .map(|logits| cross_entropy(logits, labels.tracks.clone(), labels.track_weights.clone()))
         .collect();
-    let importance = |block: usize| FIRST_BLOCK + (1.0 - FIRST_BLOCK) * (block + 1) as f64 / blocks as f64;
-    let total: f64 = (0..blocks).map(importance).sum();
     let observations =
         cross_entropy(output.observations, labels.observations.clone(), labels.observation_weights.clone());
     let last_block = of_blocks[blocks - 1].clone();
-    let mut sum = last_block.clone() + observations.clone().mul_scalar(OBSERVATIONS);
+    let mut total = last_block.clone() + observations.clone().mul_scalar(OBSERVATIONS);
     for (block, loss) in of_blocks.into_iter().enumerate() {
-        sum = sum + loss.mul_scalar(importance(block) / total);
+        total = total + loss.mul_scalar(importance(block, blocks));
     }
-    Loss { total: sum, last_block, observations }
+    Loss { total, parts: [last_block, observations] }
 }
 
 /// `-w (y log s(x) + (1 - y) log s(-x))`, summed.

@@ -1,0 +1,74 @@
+//! Learning without labels: the paper's L_num and L_proj (its eq. 9), each scene's own, summed over many scenes.
+//!
+//! The weights of a scene's tracks are the sigmoids of their logits; the matrix is what the network itself made of the
+//! tracks: places in units of their view's spread, times the projective depths of its last block, holes filled.
+//! Derivatives are exact ([`rank_terms`]) and reach the network through the weights; the matrix counts as given, for the
+//! depths and the filled holes could otherwise be bent until wrong tracks fit.
+//!
+//! L_DAQ has no part in it: it needs coordinates in which the principal point is known, and a lesson's points come with
+//! any origin. Observations have no loss of their own, so a network that learned this way ranks tracks only.
+
+use burn::tensor::activation::sigmoid;
+use burn::tensor::{DType, Tensor};
+use nalgebra::DMatrix;
+
+use super::Error;
+use super::objective::{Loss, importance};
+use super::tape::{Output, constant};
+use crate::network::NetworkSettings;
+use crate::network::losses::{LossSettings, rank_terms};
+
+/// The loss of what the network said; its parts are L_num and L_proj by the last block, means over the lessons.
+///
+/// # Errors
+/// [`Error::Backend`] for a defect of burn; [`Error::NoDecomposition`] for columns that are not finite.
+pub fn loss(output: Output, dtype: DType) -> Result<Loss, Error> {
+    // The terms, their weights and `t` are those of the paper's network in its own use.
+    let NetworkSettings { alpha, min_inliers, kappa, .. } = NetworkSettings::default();
+    let settings = LossSettings { min_inliers, kappa };
+    let matrices = matrices(&output.columns)?;
+    let device = output.columns.device();
+    let blocks = output.tracks.len();
+    let scalar = |value: f64| constant::<1>(vec![value], [1], dtype, &device);
+    let (mut total, mut parts) = (scalar(0.0), [0.0; 2]);
+    for (block, logits) in output.tracks.into_iter().enumerate() {
+        let weights = sigmoid(logits);
+        let [lessons, _, tracks] = weights.dims();
+        let share = 1.0 / lessons as f64;
+        let values = numbers(weights.clone())?;
+        let mut slopes = Vec::with_capacity(values.len());
+        parts = [0.0; 2];
+        for (matrix, w) in matrices.iter().zip(values.chunks_exact(tracks)) {
+            let terms = rank_terms(matrix, w, &settings).map_err(|_| Error::NoDecomposition)?;
+            parts = [parts[0] + share * terms.num, parts[1] + share * terms.proj];
+            let both = terms.grad_w_num.iter().zip(&terms.grad_w_proj);
+            slopes.extend(both.map(|(num, proj)| share * (num + alpha * proj)));
+        }
+        // A plane through the loss: its value and its slope, which is all that a step takes.
+        let offset = parts[0] + alpha * parts[1] - values.iter().zip(&slopes).map(|(w, slope)| w * slope).sum::<f64>();
+        let slopes = constant(slopes, [lessons, 1, tracks], dtype, &device);
+        total = total + ((weights * slopes).sum() + scalar(offset)).mul_scalar(importance(block, blocks));
+    }
+    Ok(Loss { total, parts: parts.map(scalar) })
+}
+
+/// Every lesson's matrix, 3n x m, columns of unit norm; their views have comparable energy by their own units.
+fn matrices(columns: &Tensor<4>) -> Result<Vec<DMatrix<f64>>, Error> {
+    let [_, views, _, tracks] = columns.dims();
+    let rows = 3 * views;
+    let of_lesson = |values: &[f64]| {
+        let mut matrix = DMatrix::from_row_slice(rows, tracks, values);
+        // The third coordinate of a column is its depth, of mean 1: none has length 0.
+        matrix.column_iter_mut().for_each(|mut column| {
+            column.normalize_mut();
+        });
+        matrix
+    };
+    Ok(numbers(columns.clone())?.chunks_exact(rows * tracks).map(of_lesson).collect())
+}
+
+/// The values of a tensor, off the tape.
+fn numbers<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f64>, Error> {
+    let data = tensor.inner().into_data().convert::<f64>();
+    data.try_into_vec().map_err(|error| Error::Backend(format!("{error:?}")))
+}
