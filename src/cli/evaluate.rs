@@ -9,9 +9,10 @@ use serde_json::json;
 use sha2::{Digest, Sha256};
 
 use super::args::cores;
+use super::evaluate_choices::{ContestantArg, DepthsArg, SweepArg};
 use super::evaluate_priors::{self, PriorArgs};
 use super::evaluate_real::{self, RealArgs};
-use super::exit::{Exit, Failure};
+use super::exit::{self, Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
 use super::prior_file::PriorFileArgs;
@@ -45,12 +46,24 @@ Files in the output directory: runs.jsonl (every run, one a line), summary.csv a
 figure-depths-*.svg (the paper's layout) and index.html, which shows all of it. Stopped by Ctrl-C, a crash or a power \
 cut it goes on where it was when called again with the same directory.";
 
+/// What the columns of the tables are, for the long help.
+const COLUMNS: &str = "\
+Columns of the table, of the cells by seeds and method:
+  F1, min F1   of the inlier verdicts, mean and least; what is not verified counts as rejected
+  2D px        root mean square distance of the reprojections from the points without noise, of the true inliers that
+               were kept; median over the seeds that reconstruct something
+  focal %      |log(f / true f)| in per cent, median over the seeds that give a focal length
+  seconds      median of a solve; with several threads or other work on the machine it is longer
+More, in summary.csv: 3D error, ratio of the focal error to the oracle's with its 95 % interval, grades.
+Of --priors: AP, the average precision of the ranking by a prior alone; F1 and s after 600, 6,000 and 60,000 samples;
+verified, ranked, none: answers of AUTO by kind; AP rank, of the ranked ones.";
+
 /// Run the paper's evaluation: sweeps over points, outliers, noise and views, every method against the oracle
 ///
 /// Scenes are made by the generator of `scpsfm synth`, with projective depths given (as the paper does) and without.
 /// The oracle knows the truth: its gate and its bundle adjustment are the best that anyone can do on the same scenes.
 #[derive(Debug, clap::Args)]
-#[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", evaluate_real::FORMAT))]
+#[command(after_help = EXAMPLES, after_long_help = long_help())]
 pub struct Args {
     /// Directory for records and figures; created; runs that it already holds are not repeated
     #[arg(long, value_name = "DIR", default_value = "scpsfm-evaluation")]
@@ -110,90 +123,16 @@ pub struct Args {
     pub real: RealArgs,
 }
 
+fn long_help() -> String {
+    [EXAMPLES, COLUMNS, evaluate_real::FORMAT, exit::HELP].join("\n\n")
+}
+
 /// A width that the solver accepts.
 fn width(text: &str) -> Result<f64, String> {
     let width = text.parse().map_err(|_| "not a number".to_owned())?;
     let settings = SolveSettings { network_width: width, ..SolveSettings::default() };
     settings.validate().map_err(|error| error.to_string())?;
     Ok(width)
-}
-
-/// [`Sweep`] on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
-pub enum SweepArg {
-    /// Tracks m, 50 to 1000 in 20 views
-    Points,
-    /// Share of outliers, .5 to .98
-    Outliers,
-    /// Noise, .1 to 2 % of the width
-    Noise,
-    /// Views n, 5 to 100 of 500 tracks
-    Views,
-    /// Noise, 3 to 11 % (the supplement)
-    StrongNoise,
-    /// Rotations to 3.1 rad, .5 to .95 outliers
-    Orbit,
-    /// Uniform, slid, repeated outliers, a second motion
-    Structured,
-    /// Outliers that are wrong in 1, 2, 5 of 10 views
-    Partial,
-    /// Noise that is not Gaussian
-    NoiseKind,
-    /// Critical motions and a planar scene
-    Motion,
-    /// Displaced principal points, distortion, zooms
-    Lens,
-}
-
-/// [`Depths`] on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum DepthsArg {
-    /// True up to noise
-    Given,
-    /// Image points alone
-    None,
-    /// Estimated from fundamental matrices and epipoles
-    Epipolar,
-}
-
-/// [`Contestant`] on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum ContestantArg {
-    /// Knows the truth: the limit
-    Oracle,
-    /// The network's prior and geometry together
-    Auto,
-    /// Geometry alone
-    Geometry,
-    /// The paper's method
-    Paper,
-    /// The paper's method without its self-calibration term
-    PaperWithoutDaq,
-    /// Plain projective factorisation at its best threshold
-    Psfm,
-}
-
-impl From<DepthsArg> for Depths {
-    fn from(depths: DepthsArg) -> Self {
-        match depths {
-            DepthsArg::Given => Depths::Given,
-            DepthsArg::None => Depths::None,
-            DepthsArg::Epipolar => Depths::Epipolar,
-        }
-    }
-}
-
-impl From<ContestantArg> for Contestant {
-    fn from(contestant: ContestantArg) -> Self {
-        match contestant {
-            ContestantArg::Oracle => Contestant::Oracle,
-            ContestantArg::Auto => Contestant::Auto,
-            ContestantArg::Geometry => Contestant::Geometry,
-            ContestantArg::Paper => Contestant::Paper,
-            ContestantArg::PaperWithoutDaq => Contestant::PaperWithoutDaq,
-            ContestantArg::Psfm => Contestant::Psfm,
-        }
-    }
 }
 
 impl Args {
@@ -374,7 +313,9 @@ impl From<records::Error> for Failure {
     fn from(error: records::Error) -> Self {
         match error {
             records::Error::Io { .. } | records::Error::Failed { .. } => Failure::internal(error),
-            records::Error::OtherBuild { .. } | records::Error::Malformed { .. } => Failure::bad_input(error),
+            records::Error::OtherBuild { .. } | records::Error::Malformed { .. } | records::Error::Busy { .. } => {
+                Failure::bad_input(error)
+            }
         }
     }
 }

@@ -8,6 +8,7 @@ pub mod client;
 pub mod delete;
 pub mod demo;
 pub mod evaluate;
+pub mod evaluate_choices;
 pub mod evaluate_priors;
 pub mod evaluate_real;
 pub mod exit;

@@ -1,7 +1,7 @@
 //! Runs a list on several threads and records every answer as it comes, so that a stopped evaluation goes on.
 
 use std::collections::HashMap;
-use std::fs::{File, OpenOptions};
+use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufRead, BufReader, Write};
 use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
@@ -18,6 +18,9 @@ use crate::domain::{StopReason, StopToken};
 pub enum Error {
     #[error("{}: {source}", path.display())]
     Io { path: PathBuf, source: std::io::Error },
+    /// Two processes would each lose what the other writes.
+    #[error("{} is being written by another process: wait for it, or give another directory", path.display())]
+    Busy { path: PathBuf },
     /// Figures of two builds do not mix.
     #[error(
         "{} was recorded by another build ({recorded}; this is {current}): remove it, or give another directory",
@@ -73,7 +76,14 @@ impl<R: Serialize + DeserializeOwned + Sync, M: Serialize + DeserializeOwned + C
         let path = directory.join(name);
         let at = |source| Error::Io { path: path.clone(), source };
         let mut by_key = HashMap::new();
-        let whole = if path.exists() { whole_lines(&path).map_err(at)? } else { Vec::new() };
+        let mut file = OpenOptions::new().create(true).read(true).append(true).open(&path).map_err(at)?;
+        // Held until the file is closed, by a killed process, too.
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => return Err(Error::Busy { path }),
+            Err(TryLockError::Error(source)) => return Err(at(source)),
+        }
+        let whole = whole_lines(&file).map_err(at)?;
         if let Some((first, rest)) = whole.split_first() {
             let malformed = |line: usize, error: serde_json::Error| Error::Malformed {
                 path: path.clone(),
@@ -89,7 +99,6 @@ impl<R: Serialize + DeserializeOwned + Sync, M: Serialize + DeserializeOwned + C
                 by_key.insert(key(&record.run), record.measures);
             }
         }
-        let mut file = OpenOptions::new().create(true).append(true).open(&path).map_err(at)?;
         let length: u64 = whole.iter().map(|line| line.len() as u64 + 1).sum();
         file.set_len(length).map_err(at)?;
         if whole.is_empty() {
@@ -175,8 +184,8 @@ impl<R: Serialize + DeserializeOwned + Sync, M: Serialize + DeserializeOwned + C
 }
 
 /// The lines of a file that end, without their ends.
-fn whole_lines(path: &Path) -> std::io::Result<Vec<String>> {
-    let mut reader = BufReader::new(File::open(path)?);
+fn whole_lines(file: &File) -> std::io::Result<Vec<String>> {
+    let mut reader = BufReader::new(file);
     let mut lines = Vec::new();
     loop {
         let mut line = String::new();

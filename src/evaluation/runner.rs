@@ -92,6 +92,15 @@ mod tests {
     }
 
     #[test]
+    fn two_evaluations_do_not_write_the_same_records() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let first = Records::open(directory.path(), RECORDS, "a build").expect("a writable directory");
+        assert!(matches!(Records::open(directory.path(), RECORDS, "a build"), Err(Error::Busy { .. })));
+        drop(first);
+        assert!(Records::open(directory.path(), RECORDS, "a build").is_ok());
+    }
+
+    #[test]
     fn a_stopped_evaluation_ends_and_keeps_what_it_has() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let mut records = Records::open(directory.path(), RECORDS, "a build").expect("a writable directory");
