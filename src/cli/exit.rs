@@ -14,7 +14,7 @@ Exit codes:
     2  wrong usage
     3  no reconstruction: the result files were written and say why
    64  bad configuration
-   65  bad input data; no such job
+   65  bad input data, or more than the server ever takes; no such job
    69  server unavailable or its queue full: try again
    77  not let in: no API key, an unknown one, or a certificate that one side does not trust
   130  interrupted or cancelled";

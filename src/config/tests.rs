@@ -33,6 +33,16 @@ fn nothing_given_is_the_default_and_the_example_file_says_the_same() {
 }
 
 #[test]
+fn refusals_name_keys_that_there_are() {
+    use crate::domain::Quota;
+    let all: toml::Table = toml::from_str(&Config::default().to_toml().expect("TOML")).expect("a table");
+    for quota in Quota::OF_QUEUE.into_iter().chain(Quota::OF_UPLOADS) {
+        let (section, key) = quota.key().split_once('.').expect("a section");
+        assert!(all[section].get(key).is_some(), "{} is no key", quota.key());
+    }
+}
+
+#[test]
 fn later_sources_win_key_by_key() {
     let file = file("[engine]\nworkers = 1\nqueue_capacity = 2\nmax_attempts = 4\n[log]\nformat = \"json\"\n");
     let environment = variables(&[

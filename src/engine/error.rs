@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::domain::job::{JobName, JobState};
-use crate::domain::{InputName, InvalidInput, Violation};
+use crate::domain::{InputName, InvalidInput, Oversize, Violation};
 use crate::store;
 
 /// Why the engine refused or could not answer.
@@ -21,12 +21,18 @@ pub enum Error {
     /// The tenant has uploaded as much as it may; `bound` names for programs what there is too much of.
     #[error("{message}")]
     UploadsFull { bound: &'static str, message: String },
+    /// The upload alone is more than the server or the tenant may ever have.
+    #[error("{0}")]
+    UploadTooLarge(Oversize),
     /// The job id is taken, or the request id or upload id stands for another body.
     #[error("{0}")]
     AlreadyExists(String),
     /// Too much waits already; `bound` names for programs what there is too much of.
     #[error("{message}; try again in {} s", .retry_after.as_secs_f64())]
     QueueFull { retry_after: Duration, bound: &'static str, message: String },
+    /// The batch alone is more than may ever wait.
+    #[error("{0}")]
+    BatchTooLarge(Oversize),
     #[error(transparent)]
     InvalidArgument(#[from] InvalidInput),
     /// Only ended jobs can be deleted.
@@ -59,14 +65,18 @@ impl From<store::Error> for Error {
             store::Error::InputNotFound(name) => Error::InputNotFound(name),
             store::Error::UploadNotFound(name) => Error::UploadNotFound(name),
             store::Error::UploadTakenOver(_) => Error::TakenOver(error.to_string()),
-            store::Error::UploadsFull(bound) => Error::UploadsFull { bound: bound.name(), message: bound.to_string() },
+            store::Error::UploadsFull(bound) => {
+                Error::UploadsFull { bound: bound.quota().name(), message: bound.to_string() }
+            }
+            store::Error::UploadTooLarge(oversize) => Error::UploadTooLarge(oversize),
+            store::Error::BatchTooLarge(oversize) => Error::BatchTooLarge(oversize),
             store::Error::AlreadyExists(message) => Error::AlreadyExists(message),
             store::Error::NotEnded(..) => Error::NotEnded(error.to_string()),
             store::Error::EtagMismatch(_) => Error::EtagMismatch(error.to_string()),
             store::Error::PageToken => Error::InvalidArgument(Violation::of("page_token", error.to_string()).into()),
             store::Error::QueueFull(bound) => Error::QueueFull {
                 retry_after: super::Options::DEFAULT_RETRY_AFTER,
-                bound: bound.name(),
+                bound: bound.quota().name(),
                 message: bound.to_string(),
             },
             store::Error::Unavailable(cause) => Error::Unavailable(cause),

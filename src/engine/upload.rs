@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::{Engine, Error, Inner, Phase, finished, observe};
-use crate::domain::{Input, InputName};
+use crate::domain::{Input, InputName, Oversize, Quota};
 use crate::store::{
     self, BegunUpload, InputPage, InputQuery, NewInput, NewUpload, StoredInput, UploadBounds, UploadLease,
     UploadStatus, payload,
@@ -68,18 +68,30 @@ impl Engine {
     ///
     /// # Errors
     /// [`Error::AlreadyExists`] where it was begun with another length or hash, [`Error::UploadsFull`],
-    /// [`Error::Draining`].
+    /// [`Error::UploadTooLarge`], [`Error::Draining`].
     pub async fn begin_upload(&self, new: NewUpload) -> Result<Begun, Error> {
         self.inner.check_open()?;
-        let bounds = &self.inner.options.uploads.bounds;
+        let UploadOptions { max_bytes, bounds, .. } = &self.inner.options.uploads;
+        if new.bytes > *max_bytes {
+            observe::upload_refused(observe::UploadRefusal::TooLarge(Quota::UploadBytes));
+            return Err(Error::UploadTooLarge(Oversize {
+                quota: Quota::UploadBytes,
+                asked: new.bytes,
+                max: *max_bytes,
+            }));
+        }
         match self.inner.store.begin_upload(&new, bounds, SystemTime::now()).await {
             Ok(BegunUpload::Finished(input)) => Ok(Begun::Finished(input)),
             Ok(BegunUpload::Open { lease, committed, sha256 }) => {
                 Ok(Begun::Open(Upload { engine: self.clone(), lease, committed, bytes: new.bytes, sha256 }))
             }
             Err(store::Error::UploadsFull(bound)) => {
-                observe::upload_refused(bound.name());
+                observe::upload_refused(observe::UploadRefusal::Full(bound.quota()));
                 Err(store::Error::UploadsFull(bound).into())
+            }
+            Err(store::Error::UploadTooLarge(oversize)) => {
+                observe::upload_refused(observe::UploadRefusal::TooLarge(oversize.quota));
+                Err(Error::UploadTooLarge(oversize))
             }
             Err(error) => Err(error.into()),
         }

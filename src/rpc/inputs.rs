@@ -52,7 +52,7 @@ impl Inputs {
         let Some(Message::Start(start)) = next(&mut messages).await? else {
             return Err(status::invalid(&violation("start", "is not the first message")));
         };
-        let new = self.read_start(caller, start)?;
+        let new = Self::read_start(caller, start)?;
         let upload = match self.engine.begin_upload(new).await.map_err(status::from_engine)? {
             Begun::Finished(input) => return Ok(input::uploaded_to_wire(&input)),
             Begun::Open(upload) => upload,
@@ -66,13 +66,12 @@ impl Inputs {
         self.finish(reception.upload, sha256).await
     }
 
-    fn read_start(&self, caller: &Caller, start: proto::UploadStart) -> Result<NewUpload, Status> {
+    fn read_start(caller: &Caller, start: proto::UploadStart) -> Result<NewUpload, Status> {
         let name = name(caller, &start.parent, &start.upload_id, "start.upload_id")?;
-        let max = self.engine.options().uploads.max_bytes;
         let bytes = match u64::try_from(start.size_bytes) {
-            Ok(bytes) if (1..=max).contains(&bytes) => bytes,
+            Ok(bytes) if bytes > 0 => bytes,
             _ => {
-                let text = format!("{} is not 1 to {max} bytes", start.size_bytes);
+                let text = format!("{} is not a length in bytes, from 1 on", start.size_bytes);
                 return Err(status::invalid(&violation("start.size_bytes", text)));
             }
         };

@@ -15,9 +15,11 @@
 //! | `DATA_LOSS` | `HASH_MISMATCH` | the bytes of an upload do not have the SHA-256 that `finish` names |
 //! | `ABORTED` | `UPLOAD_TAKEN_OVER` | another stream goes on with the upload |
 //! | `RESOURCE_EXHAUSTED` | `UPLOADS_FULL` | the tenant has uploaded as much as it may, by the bound of `metadata["bound"]`: `tenant_uploads` or `tenant_upload_bytes`; `RetryInfo` |
+//! | `INVALID_ARGUMENT` | `UPLOAD_TOO_LARGE` | the upload alone is more than the bound of `metadata["bound"]` ever allows: `upload_bytes` or `tenant_upload_bytes`; `metadata` has `key`, `asked` and `max` too |
 //! | `INVALID_ARGUMENT` | `MALFORMED_MESSAGE` | a message that cannot be decoded |
 //! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.limits.max_message_bytes`, packed or not |
 //! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
+//! | `INVALID_ARGUMENT` | `BATCH_TOO_LARGE` | the batch alone is more than the queue's bound of `metadata["bound"]` ever allows, named as for `QUEUE_FULL`; `metadata` has `key`, `asked` and `max` too |
 //! | `RESOURCE_EXHAUSTED` | `STORE_FULL` | the server's disk is full and nothing was stored; `RetryInfo`. What was acknowledged before is there |
 //! | `FAILED_PRECONDITION` | `JOB_NOT_ENDED` | a job that waits or runs is not deleted; cancel it first |
 //! | `ABORTED` | `ETAG_MISMATCH` | the job changed since its etag was read |
@@ -26,6 +28,10 @@
 //! | `UNAVAILABLE` | `STORE_UNAVAILABLE` | the database is away; `RetryInfo`. A creation may have been stored: come back with the same request id |
 //! | `DEADLINE_EXCEEDED` | `INPUT_STALLED` | the chunks of a `Solve` or of an upload stopped coming |
 //! | `INTERNAL` | `INTERNAL` | our defect; what it was is in the log only |
+//!
+//! Only what may fare better later has a `RetryInfo`. What is too large whatever the state of the server is
+//! `INVALID_ARGUMENT`, as `google.rpc.Code` has it: `FAILED_PRECONDITION` would be for a state that the caller can mend,
+//! and `RESOURCE_EXHAUSTED` is what polite clients repeat.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -34,7 +40,7 @@ use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt};
 
 use crate::domain::job::{JobName, JobState};
-use crate::domain::{InputName, InvalidInput, Violation};
+use crate::domain::{InputName, InvalidInput, Oversize, Violation};
 use crate::engine;
 
 /// Domain of every `ErrorInfo`.
@@ -84,6 +90,20 @@ pub fn invalid(error: &InvalidInput) -> Status {
     let fields = violations.iter().map(|violation| FieldViolation::new(violation.path(), &violation.description));
     let details = ErrorDetails::with_bad_request(fields.collect::<Vec<_>>());
     status(Code::InvalidArgument, "INVALID_ARGUMENT", message, details)
+}
+
+/// What is more by itself than a bound of the server allows; `field` is where it comes from.
+fn too_large(reason: &str, field: &str, oversize: &Oversize) -> Status {
+    let Oversize { quota, asked, max } = oversize;
+    let metadata = HashMap::from([
+        ("bound".to_owned(), quota.name().to_owned()),
+        ("key".to_owned(), quota.key().to_owned()),
+        ("asked".to_owned(), asked.to_string()),
+        ("max".to_owned(), max.to_string()),
+    ]);
+    let message = oversize.to_string();
+    let details = ErrorDetails::with_bad_request(vec![FieldViolation::new(field, &message)]);
+    status_with(Code::InvalidArgument, reason, metadata, format!("{field}: {message}"), details)
 }
 
 /// The refusal of one request of a batch: message and fields name it, as `requests[3].track_set.x[17]`.
@@ -195,6 +215,8 @@ pub fn from_engine(error: engine::Error) -> Status {
             let details = ErrorDetails::with_retry_info(Some(UPLOADS_RETRY));
             status_with(Code::ResourceExhausted, "UPLOADS_FULL", metadata, message, details)
         }
+        engine::Error::UploadTooLarge(oversize) => too_large("UPLOAD_TOO_LARGE", "start.size_bytes", &oversize),
+        engine::Error::BatchTooLarge(oversize) => too_large("BATCH_TOO_LARGE", "requests", &oversize),
         engine::Error::AlreadyExists(sentence) => {
             status(Code::AlreadyExists, "ALREADY_EXISTS", sentence, ErrorDetails::new())
         }
@@ -270,6 +292,27 @@ mod tests {
         assert_eq!(retry.retry_delay, Some(Duration::from_secs(3)));
         let info = status.get_details_error_info().expect("an ErrorInfo");
         assert_eq!((info.reason.as_str(), info.metadata["bound"].as_str()), ("QUEUE_FULL", "jobs"));
+    }
+
+    #[test]
+    fn what_never_fits_is_no_matter_of_time() {
+        use crate::domain::Quota;
+        let oversize = |quota| Oversize { quota, asked: 9, max: 8 };
+        let of_batch = Quota::OF_QUEUE.map(|quota| (quota, engine::Error::BatchTooLarge(oversize(quota)), "requests"));
+        let of_upload = [Quota::UploadBytes, Quota::TenantUploadBytes]
+            .map(|quota| (quota, engine::Error::UploadTooLarge(oversize(quota)), "start.size_bytes"));
+        for (quota, error, field) in of_batch.into_iter().chain(of_upload) {
+            let status = from_engine(error);
+            assert_eq!(status.code(), Code::InvalidArgument);
+            assert!(status.get_details_retry_info().is_none(), "{status:?}");
+            let (name, key) = (quota.name(), quota.key());
+            assert!(status.message().contains(&format!("{key} is 8")), "{status}");
+            let metadata = status.get_details_error_info().expect("an ErrorInfo").metadata;
+            assert_eq!((metadata["bound"].as_str(), metadata["key"].as_str()), (name, key));
+            assert_eq!((metadata["asked"].as_str(), metadata["max"].as_str()), ("9", "8"));
+            let request = status.get_details_bad_request().expect("a BadRequest");
+            assert_eq!(request.field_violations[0].field, field);
+        }
     }
 
     #[test]

@@ -20,9 +20,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName, JobState};
 use crate::domain::progress::Progress;
+use crate::domain::{InputName, Oversize};
 
 pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
@@ -49,6 +49,9 @@ pub enum Error {
     /// The tenant has as many uploads as it may.
     #[error("{0}")]
     UploadsFull(UploadBound),
+    /// The upload alone is more than the tenant may ever have.
+    #[error("{0}")]
+    UploadTooLarge(Oversize),
     /// The job id is taken, or the request id or upload id stands for another body.
     #[error("{0}")]
     AlreadyExists(String),
@@ -64,6 +67,9 @@ pub enum Error {
     /// Admission refused the job.
     #[error("{0}")]
     QueueFull(Bound),
+    /// The batch alone is more than may ever wait.
+    #[error("{0}")]
+    BatchTooLarge(Oversize),
     /// A page token that this query did not give out.
     #[error("page token is not one that this query returned")]
     PageToken,
@@ -102,7 +108,7 @@ pub trait Store: Send + Sync + 'static {
     /// Stores a queued job with its input and its first event, unless the request id is known or admission refuses.
     ///
     /// # Errors
-    /// [`Error::AlreadyExists`], [`Error::QueueFull`].
+    /// [`Error::AlreadyExists`], [`Error::QueueFull`], [`Error::BatchTooLarge`].
     async fn create_job(&self, new: NewRecord, bounds: &QueueBounds, now: SystemTime) -> Result<Created, Error> {
         let created = self.create_jobs(vec![new], bounds, now).await?.pop();
         created.ok_or_else(|| Error::Corrupt("one job was to be created, none was".into()))
@@ -209,7 +215,8 @@ pub trait Store: Send + Sync + 'static {
     /// Begins an upload, or goes on with one: from here on its earlier streams cannot write.
     ///
     /// # Errors
-    /// [`Error::AlreadyExists`] where it was begun with another length or hash, [`Error::UploadsFull`].
+    /// [`Error::AlreadyExists`] where it was begun with another length or hash, [`Error::UploadsFull`],
+    /// [`Error::UploadTooLarge`].
     async fn begin_upload(&self, new: &NewUpload, bounds: &UploadBounds, now: SystemTime)
     -> Result<BegunUpload, Error>;
 

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::time::SystemTime;
 
-use crate::domain::SolveSettings;
 use crate::domain::job::{Failure, Job, JobName, Summary};
 use crate::domain::progress::Progress;
+use crate::domain::{Oversize, Quota, SolveSettings};
 
 /// A job to be stored.
 #[derive(Debug, Clone)]
@@ -85,6 +85,26 @@ impl QueueBounds {
         self.max_tenant_jobs < u64::MAX || self.max_tenant_bytes < u64::MAX
     }
 
+    /// The bound that these jobs break by themselves, however little waits: together they never fit.
+    pub fn never_takes(&self, batch: &[&NewRecord]) -> Option<Oversize> {
+        let mut whole = Load::default();
+        let mut tenants: BTreeMap<&str, Load> = BTreeMap::new();
+        for new in batch {
+            whole.add(new);
+            tenants.entry(&new.name.tenant).or_default().add(new);
+        }
+        let of_tenant = |load: &Load| {
+            load.over([(Quota::TenantJobs, self.max_tenant_jobs), (Quota::TenantBytes, self.max_tenant_bytes)])
+        };
+        tenants.values().find_map(of_tenant).or_else(|| {
+            whole.over([
+                (Quota::Jobs, self.max_jobs),
+                (Quota::Bytes, self.max_bytes),
+                (Quota::Observations, self.max_observations),
+            ])
+        })
+    }
+
     /// The first bound that one more job would break: of the tenant's own, then of the whole queue's.
     pub fn refuses(&self, whole: &Load, tenant: &Load, bytes: u64, observations: u64) -> Option<Bound> {
         self.refuses_tenant(tenant, bytes).or_else(|| self.refuses_all(whole, bytes, observations))
@@ -129,14 +149,14 @@ pub enum Bound {
 }
 
 impl Bound {
-    /// The bound's name in metrics and error details.
-    pub fn name(self) -> &'static str {
+    /// What there is too much of.
+    pub fn quota(self) -> Quota {
         match self {
-            Bound::Jobs { .. } => "jobs",
-            Bound::Bytes { .. } => "bytes",
-            Bound::Observations { .. } => "observations",
-            Bound::TenantJobs { .. } => "tenant_jobs",
-            Bound::TenantBytes { .. } => "tenant_bytes",
+            Bound::Jobs { .. } => Quota::Jobs,
+            Bound::Bytes { .. } => Quota::Bytes,
+            Bound::Observations { .. } => Quota::Observations,
+            Bound::TenantJobs { .. } => Quota::TenantJobs,
+            Bound::TenantBytes { .. } => Quota::TenantBytes,
         }
     }
 }
@@ -168,6 +188,30 @@ pub struct Load {
     pub queued_bytes: u64,
     pub queued_observations: u64,
     pub running: u64,
+}
+
+impl Load {
+    /// One more job waits.
+    pub fn add(&mut self, new: &NewRecord) {
+        self.queued += 1;
+        self.queued_bytes = self.queued_bytes.saturating_add(new.input.bytes());
+        self.queued_observations = self.queued_observations.saturating_add(u64::from(new.observation_count));
+    }
+
+    /// The first of these bounds that the waiting jobs break. One that waits alone may be of any size.
+    fn over<const N: usize>(&self, bounds: [(Quota, u64); N]) -> Option<Oversize> {
+        let of_several = |amount| if self.queued > 1 { amount } else { 0 };
+        let over = |(quota, max)| {
+            let asked = match quota {
+                Quota::Jobs | Quota::TenantJobs => self.queued,
+                Quota::Bytes | Quota::TenantBytes => of_several(self.queued_bytes),
+                Quota::Observations => of_several(self.queued_observations),
+                Quota::UploadBytes | Quota::TenantUploads | Quota::TenantUploadBytes => 0,
+            };
+            (asked > max).then_some(Oversize { quota, asked, max })
+        };
+        bounds.into_iter().find_map(over)
+    }
 }
 
 /// The right to write to a running job. `attempt` is the fencing token: a later lease has a larger one.

@@ -4,6 +4,7 @@ use std::fmt;
 use std::time::SystemTime;
 
 use crate::domain::input_name::InputName;
+use crate::domain::{Oversize, Quota};
 
 /// The first word of an upload, new or resumed.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -81,6 +82,12 @@ pub struct UploadBounds {
 }
 
 impl UploadBounds {
+    /// The bound that an upload of so many bytes breaks by itself, however little the tenant has: it never fits.
+    pub fn never_takes(&self, bytes: u64) -> Option<Oversize> {
+        let max = self.max_tenant_bytes;
+        (bytes > max).then_some(Oversize { quota: Quota::TenantUploadBytes, asked: bytes, max })
+    }
+
     /// The bound that one more upload would break, where so many are open and so many bytes are taken.
     pub fn refuses(&self, open: u64, taken_bytes: u64, bytes: u64) -> Option<UploadBound> {
         if open >= self.max_tenant_uploads {
@@ -101,11 +108,11 @@ pub enum UploadBound {
 }
 
 impl UploadBound {
-    /// The bound's name in metrics and error details.
-    pub fn name(self) -> &'static str {
+    /// What there is too much of.
+    pub fn quota(self) -> Quota {
         match self {
-            UploadBound::Uploads { .. } => "tenant_uploads",
-            UploadBound::Bytes { .. } => "tenant_upload_bytes",
+            UploadBound::Uploads { .. } => Quota::TenantUploads,
+            UploadBound::Bytes { .. } => Quota::TenantUploadBytes,
         }
     }
 }

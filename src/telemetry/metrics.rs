@@ -12,23 +12,17 @@ use metrics::{counter, gauge, histogram};
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle, PrometheusRecorder};
 
 use crate::domain::job::{Job, JobState};
-use crate::domain::{Grade, Prior, Stage};
+use crate::domain::{Grade, Prior, Quota, Stage};
 
 pub use catalogue::*;
 
 /// Why a job was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refusal {
-    /// The queue holds as many jobs as it may.
-    QueueJobs,
-    /// The queue holds as many bytes of inputs as it may.
-    QueueBytes,
-    /// The queue holds as many observations as it may.
-    QueueObservations,
-    /// The tenant has as many jobs in the queue as it may.
-    TenantJobs,
-    /// The tenant has as many bytes of inputs in the queue as it may.
-    TenantBytes,
+    /// As much of this waits as may.
+    QueueFull(Quota),
+    /// The batch alone has more of this than may ever wait.
+    BatchTooLarge(Quota),
     /// Input or settings broke a rule.
     Invalid,
     /// The input is above the advertised limits.
@@ -38,24 +32,16 @@ pub enum Refusal {
 }
 
 impl Refusal {
-    const ALL: [Refusal; 8] = [
-        Refusal::QueueJobs,
-        Refusal::QueueBytes,
-        Refusal::QueueObservations,
-        Refusal::TenantJobs,
-        Refusal::TenantBytes,
-        Refusal::Invalid,
-        Refusal::TooLarge,
-        Refusal::Draining,
-    ];
+    fn all() -> impl Iterator<Item = Refusal> {
+        let by_bound =
+            Quota::OF_QUEUE.into_iter().flat_map(|quota| [Refusal::QueueFull(quota), Refusal::BatchTooLarge(quota)]);
+        by_bound.chain([Refusal::Invalid, Refusal::TooLarge, Refusal::Draining])
+    }
 
     fn reason(self) -> &'static str {
         match self {
-            Refusal::QueueJobs
-            | Refusal::QueueBytes
-            | Refusal::QueueObservations
-            | Refusal::TenantJobs
-            | Refusal::TenantBytes => "QUEUE_FULL",
+            Refusal::QueueFull(_) => "QUEUE_FULL",
+            Refusal::BatchTooLarge(_) => "BATCH_TOO_LARGE",
             Refusal::Invalid => "INVALID",
             Refusal::TooLarge => "TOO_LARGE",
             Refusal::Draining => "DRAINING",
@@ -63,14 +49,41 @@ impl Refusal {
     }
 
     /// The bound of the queue that was hit; `NONE` where it was no bound.
-    pub fn bound(self) -> &'static str {
+    fn bound(self) -> &'static str {
         match self {
-            Refusal::QueueJobs => "jobs",
-            Refusal::QueueBytes => "bytes",
-            Refusal::QueueObservations => "observations",
-            Refusal::TenantJobs => "tenant_jobs",
-            Refusal::TenantBytes => "tenant_bytes",
+            Refusal::QueueFull(quota) | Refusal::BatchTooLarge(quota) => quota.name(),
             Refusal::Invalid | Refusal::TooLarge | Refusal::Draining => NONE,
+        }
+    }
+}
+
+/// Why an upload was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum UploadRefusal {
+    /// The tenant has as much of this as it may.
+    Full(Quota),
+    /// The upload alone has more of this than may ever be.
+    TooLarge(Quota),
+}
+
+impl UploadRefusal {
+    const ALL: [UploadRefusal; 4] = [
+        UploadRefusal::Full(Quota::TenantUploads),
+        UploadRefusal::Full(Quota::TenantUploadBytes),
+        UploadRefusal::TooLarge(Quota::UploadBytes),
+        UploadRefusal::TooLarge(Quota::TenantUploadBytes),
+    ];
+
+    fn reason(self) -> &'static str {
+        match self {
+            UploadRefusal::Full(_) => "UPLOADS_FULL",
+            UploadRefusal::TooLarge(_) => "UPLOAD_TOO_LARGE",
+        }
+    }
+
+    fn bound(self) -> &'static str {
+        match self {
+            UploadRefusal::Full(quota) | UploadRefusal::TooLarge(quota) => quota.name(),
         }
     }
 }
@@ -117,9 +130,6 @@ impl GivenUp {
         }
     }
 }
-
-/// Bounds of a tenant's uploads, as error details name them.
-const UPLOAD_BOUNDS: [&str; 2] = ["tenant_uploads", "tenant_upload_bytes"];
 
 /// How an attempt ended that did not end its job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -220,7 +230,7 @@ fn create_known_series() {
     for prior in Prior::ALL {
         counter!(WINNING_PRIOR.name, "prior" => prior.name()).absolute(0);
     }
-    for refusal in Refusal::ALL {
+    for refusal in Refusal::all() {
         counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
     }
     for reason in Deletion::ALL {
@@ -232,8 +242,8 @@ fn create_known_series() {
     for reason in GivenUp::ALL {
         counter!(UPLOADS_GIVEN_UP.name, "reason" => reason.name()).absolute(0);
     }
-    for bound in UPLOAD_BOUNDS {
-        counter!(UPLOAD_REFUSALS.name, "bound" => bound).absolute(0);
+    for refusal in UploadRefusal::ALL {
+        counter!(UPLOAD_REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
     }
     for reason in AttemptLost::ALL {
         counter!(ATTEMPTS_LOST.name, "reason" => reason.name()).absolute(0);
@@ -305,9 +315,9 @@ pub fn uploads_given_up(reason: GivenUp, count: u32) {
     counter!(UPLOADS_GIVEN_UP.name, "reason" => reason.name()).increment(u64::from(count));
 }
 
-/// An upload was refused, by this bound of its tenant.
-pub fn upload_refused(bound: &'static str) {
-    counter!(UPLOAD_REFUSALS.name, "bound" => bound).increment(1);
+/// An upload was refused.
+pub fn upload_refused(refusal: UploadRefusal) {
+    counter!(UPLOAD_REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).increment(1);
 }
 
 /// A job reached a terminal state, `job.state`; once a job, by whoever committed it.

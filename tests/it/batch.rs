@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use crate::support::program::{Serving, run};
+use crate::support::scrape::Page;
 
 /// A table of so many tracks, with this line at the end.
 fn table(directory: &Path, tracks: usize, last: &str) -> String {
@@ -51,4 +52,26 @@ fn several_inputs_are_several_jobs_or_none() {
     let named = submit(&["--input", &upload(&a), "--input", &upload(&b)]);
     assert_eq!((named.code, named.stdout.lines().count()), (Some(0), 2), "{named:?}");
     assert_eq!(count(), 4);
+}
+
+#[test]
+fn what_never_fits_is_bad_input_and_names_the_key() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let bounds = [("SCPSFM_ENGINE__QUEUE_CAPACITY", "1"), ("SCPSFM_UPLOAD__TENANT_BYTES", "20")];
+    let server = Serving::start_with(&directory.path().join("data"), &bounds, std::process::Stdio::null());
+    let (a, b) = (table(directory.path(), 3, ""), table(directory.path(), 4, ""));
+    let batch = run(["submit", &a, &b, "--server", &server.grpc]);
+    assert_eq!(batch.code, Some(65), "{batch:?}");
+    assert!(batch.stderr.contains("2 jobs in one batch never fit: engine.queue_capacity is 1 here"), "{batch:?}");
+    let upload = run(["upload", &a, "--quiet", "--server", &server.grpc]);
+    assert_eq!(upload.code, Some(65), "{upload:?}");
+    assert!(upload.stderr.contains("upload.tenant_bytes is 20 here"), "{upload:?}");
+    for refused in [&batch, &upload] {
+        assert!(!refused.stderr.contains("try again"), "{refused:?}");
+    }
+    let page = Page::parse(&server.page("/metrics"));
+    let of_batch = "scpsfm_admission_refusals_total{reason=\"BATCH_TOO_LARGE\",bound=\"jobs\"}";
+    assert_eq!((page.value(of_batch), page.sum("scpsfm_admission_refusals_total")), (1.0, 1.0));
+    let of_upload = "scpsfm_upload_refusals_total{reason=\"UPLOAD_TOO_LARGE\",bound=\"tenant_upload_bytes\"}";
+    assert_eq!((page.value(of_upload), page.sum("scpsfm_upload_refusals_total")), (1.0, 1.0));
 }

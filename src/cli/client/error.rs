@@ -22,7 +22,7 @@ pub enum Error {
     /// What was asked makes no sense for any server.
     #[error("{0}")]
     Usage(String),
-    /// The server will not do it: no such job, no result yet, an id that is taken.
+    /// The server will not do it: no such job, no result yet, an id that is taken, more than it ever has room for.
     #[error("{0}")]
     Refused(String),
     /// One of the two does not trust the other: a certificate, or a key.
@@ -91,6 +91,8 @@ impl Error {
                 let hint = retry.map(|delay| format!("; try again in {} s", delay.as_secs_f64())).unwrap_or_default();
                 Error::Unavailable(format!("{server}: {message}{hint}"))
             }
+            // Sound, and more than this server ever takes: neither the usage nor a line of the input is wrong.
+            Code::InvalidArgument if is_too_large(status) => Error::Refused(format!("{server}: {message}")),
             Code::InvalidArgument => Error::Invalid(violations(status), message),
             // What the transport says of a message above the server's limit.
             Code::OutOfRange => {
@@ -113,6 +115,11 @@ impl Error {
 /// The reason that a status carries for programs.
 pub(super) fn reason(status: &Status) -> Option<String> {
     Some(status.get_details_error_info()?.reason)
+}
+
+/// Whether what was sent is more by itself than the server has room for.
+fn is_too_large(status: &Status) -> bool {
+    matches!(reason(status).as_deref(), Some("BATCH_TOO_LARGE" | "UPLOAD_TOO_LARGE"))
 }
 
 /// Whether the same call may fare better soon: the connection broke, or the server is going down.

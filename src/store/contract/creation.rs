@@ -1,6 +1,7 @@
 //! Creating jobs: what is kept, what is the same, what is refused.
 
 use super::*;
+use crate::domain::{Oversize, Quota};
 
 pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
     let now = time(0) + Duration::from_micros(1);
@@ -127,7 +128,7 @@ pub(in crate::store) async fn admission_bounds_each_tenant(store: &dyn Store) {
     assert_eq!(error, Error::QueueFull(Bound::TenantJobs { waiting: 2, max: 2 }));
     let batch = vec![of("u", "a"), of("u", "b"), of("u", "c")];
     let error = store.create_jobs(batch, &bounds, time(0)).await.expect_err("a batch counts as a whole");
-    assert_eq!(error, Error::QueueFull(Bound::TenantJobs { waiting: 2, max: 2 }));
+    assert_eq!(error, Error::BatchTooLarge(Oversize { quota: Quota::TenantJobs, asked: 3, max: 2 }));
     store.create_job(of("u", "a"), &bounds, time(0)).await.expect("another tenant has its own share");
     claim(store, 1).await;
     store.create_job(of("t", "c"), &bounds, time(2)).await.expect("what runs does not wait");
@@ -175,4 +176,39 @@ pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &dyn Store) {
     let error = store.create_jobs(other, &ROOM, time(1)).await.expect_err("another body");
     assert!(matches!(error, Error::AlreadyExists(_)), "{error}");
     assert_eq!(store.load().await.expect("counts").queued, 2);
+}
+
+pub(in crate::store) async fn a_batch_that_never_fits_is_told_so(store: &dyn Store) {
+    let batch = |count: usize| (0..count).map(|k| record(&format!("job-{k}"))).collect::<Vec<_>>();
+    let refused = async |new: Vec<NewRecord>, bounds: QueueBounds| match store.create_jobs(new, &bounds, time(0)).await
+    {
+        Err(Error::BatchTooLarge(Oversize { quota, asked, max })) => (quota, asked, max),
+        other => panic!("{other:?}"),
+    };
+    // Each has 100 bytes and 60 observations. In an empty queue, and in one that is full besides.
+    for round in 0..2 {
+        assert_eq!(refused(batch(3), QueueBounds { max_jobs: 2, ..ROOM }).await, (Quota::Jobs, 3, 2));
+        assert_eq!(refused(batch(3), QueueBounds { max_bytes: 299, ..ROOM }).await, (Quota::Bytes, 300, 299));
+        let bounds = QueueBounds { max_observations: 179, ..ROOM };
+        assert_eq!(refused(batch(3), bounds).await, (Quota::Observations, 180, 179));
+        assert_eq!(refused(batch(3), QueueBounds { max_tenant_jobs: 2, ..ROOM }).await, (Quota::TenantJobs, 3, 2));
+        let bounds = QueueBounds { max_tenant_bytes: 299, ..ROOM };
+        assert_eq!(refused(batch(3), bounds).await, (Quota::TenantBytes, 300, 299));
+        assert!(matches!(store.job(&record("job-0").name).await, Err(Error::NotFound(_))), "nothing was stored");
+        create(store, record(&format!("waiting-{round}")), 0).await;
+    }
+    // What just fits an empty queue is worth another try.
+    let exact =
+        QueueBounds { max_jobs: 3, max_bytes: 300, max_observations: 180, max_tenant_jobs: 3, max_tenant_bytes: 300 };
+    let error = store.create_jobs(batch(3), &exact, time(0)).await.expect_err("two wait");
+    assert!(matches!(error, Error::QueueFull(_)), "{error}");
+    // Jobs that an earlier call made need no room, and one that comes twice needs it once.
+    let request = |k: usize| Some(Request { id: format!("r-{k}"), digest: [1; 32] });
+    let known = NewRecord { request: request(0), ..record("known") };
+    create(store, known.clone(), 0).await;
+    let fresh = NewRecord { request: request(1), ..record("fresh") };
+    let bounds = QueueBounds { max_jobs: 4, ..ROOM };
+    let batch = vec![known.clone(), fresh.clone(), fresh.clone(), known.clone(), fresh];
+    let created = store.create_jobs(batch, &bounds, time(1)).await.expect("one more fits");
+    assert_eq!(created.iter().filter(|created| created.new).count(), 1);
 }

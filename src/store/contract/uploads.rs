@@ -1,7 +1,7 @@
 //! Uploads: where they go on, who may write, what they become, what is removed.
 
 use super::*;
-use crate::domain::InputName;
+use crate::domain::{InputName, Oversize, Quota};
 use crate::store::record::JobInput;
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease,
@@ -148,7 +148,8 @@ pub(in crate::store) async fn a_tenants_uploads_are_bounded(store: &dyn Store) {
         Err(Error::UploadsFull(bound)) => bound,
         other => panic!("{other:?}"),
     };
-    assert_eq!(refused(new("a", 401)).await, UploadBound::Bytes { taken: 0, asked: 401, max: 400 });
+    let oversize = Oversize { quota: Quota::TenantUploadBytes, asked: 401, max: 400 };
+    assert_eq!(begin_within(new("a", 401)).await, Err(Error::UploadTooLarge(oversize)));
     // An input counts with its payload, and is not open any more.
     finished(store, "done", vec![7; 100], 0).await;
     begin_within(new("a", 200)).await.expect("room");

@@ -1,6 +1,6 @@
 //! Creating, reading and listing jobs.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::time::SystemTime;
 
 use super::rows::{self, integer, micros, number, one_job, returning_job, select_jobs};
@@ -17,6 +17,7 @@ pub(super) async fn create<C: Connection>(
     bounds: &QueueBounds,
     now: SystemTime,
 ) -> Result<Vec<Created>, Error> {
+    check_size(connection, news, bounds).await?;
     let mut waiting = Waiting::default();
     let mut inputs = vec![None; news.len()];
     if !C::WRITES_ALONE {
@@ -56,6 +57,28 @@ pub(super) async fn create<C: Connection>(
     Ok(created)
 }
 
+/// Refuses jobs that are more by themselves than may ever wait: told to come back, their caller would do so for ever.
+async fn check_size<C: Connection>(connection: &mut C, news: &[NewRecord], bounds: &QueueBounds) -> Result<(), Error> {
+    if bounds.never_takes(&news.iter().collect::<Vec<_>>()).is_none() {
+        return Ok(());
+    }
+    // Those that an earlier call has created are not created again, and one that comes twice is one.
+    let (mut fresh, mut requests) = (Vec::new(), HashSet::new());
+    for new in news {
+        let known = match &new.request {
+            Some(request) => {
+                !requests.insert((&new.name.tenant, &request.id))
+                    || earlier(connection, &new.name.tenant, request).await?.is_some()
+            }
+            None => false,
+        };
+        if !known {
+            fresh.push(new);
+        }
+    }
+    bounds.never_takes(&fresh).map_or(Ok(()), |oversize| Err(Error::BatchTooLarge(oversize)))
+}
+
 /// What waits, as admission needs it: summed up once a batch, since a sum goes through the whole queue.
 #[derive(Default)]
 struct Waiting {
@@ -90,9 +113,7 @@ impl Waiting {
     /// One more job is stored.
     fn add(&mut self, new: &NewRecord) {
         for load in self.whole.iter_mut().chain(self.tenants.get_mut(&new.name.tenant)) {
-            load.queued += 1;
-            load.queued_bytes += new.input.bytes();
-            load.queued_observations += u64::from(new.observation_count);
+            load.add(new);
         }
     }
 }

@@ -147,6 +147,9 @@ async fn open<C: Connection>(
     bounds: &UploadBounds,
     now: SystemTime,
 ) -> Result<BegunUpload, Error> {
+    if let Some(oversize) = bounds.never_takes(new.bytes) {
+        return Err(Error::UploadTooLarge(oversize));
+    }
     // Of what was given up counts what has not been removed yet, and of what was deleted, what jobs still have: it lies
     // on the disk all the same, and could else be uploaded and deleted again and again.
     let taken = Statement::new(

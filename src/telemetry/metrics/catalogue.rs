@@ -137,7 +137,7 @@ pub const REFUSALS: Metric = Metric {
     name: "scpsfm_admission_refusals_total",
     kind: Kind::Counter,
     labels: &["reason", "bound"],
-    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL, by the bound that was hit.",
+    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL and BATCH_TOO_LARGE, by the bound that was hit.",
 };
 pub const UPLOADED_BYTES: Metric = Metric {
     name: "scpsfm_uploaded_bytes_total",
@@ -160,8 +160,8 @@ pub const UPLOADS_GIVEN_UP: Metric = Metric {
 pub const UPLOAD_REFUSALS: Metric = Metric {
     name: "scpsfm_upload_refusals_total",
     kind: Kind::Counter,
-    labels: &["bound"],
-    help: "Uploads refused before anything was stored, by the bound of the tenant that was hit.",
+    labels: &["reason", "bound"],
+    help: "Uploads refused before anything was stored, by reason and by the bound that was hit.",
 };
 pub const RPC_REQUESTS: Metric = Metric {
     name: "scpsfm_grpc_requests_total",

@@ -152,6 +152,49 @@ async fn a_full_queue_says_at_once_when_to_come_back_and_which_bound_was_hit() {
     }
 }
 
+#[tokio::test]
+async fn a_batch_that_never_fits_is_not_told_to_come_back() {
+    let room = one_worker().queue;
+    // Three jobs of 12 observations each.
+    for (queue, bound, key, asked) in [
+        (QueueBounds { max_jobs: 2, ..room.clone() }, "jobs", "engine.queue_capacity is 2", Some("3")),
+        (QueueBounds { max_bytes: 40, ..room.clone() }, "bytes", "engine.queue_bytes is 40", None),
+        (
+            QueueBounds { max_observations: 35, ..room.clone() },
+            "observations",
+            "engine.queue_observations is 35",
+            Some("36"),
+        ),
+        (
+            QueueBounds { max_tenant_jobs: 2, ..room.clone() },
+            "tenant_jobs",
+            "engine.tenant_queue_capacity is 2",
+            Some("3"),
+        ),
+        (QueueBounds { max_tenant_bytes: 40, ..room }, "tenant_bytes", "engine.tenant_queue_bytes is 40", None),
+    ] {
+        let engine = engine::Options { queue, ..one_worker() };
+        let server = TestServer::start_with(quick(), Options::default(), engine).await;
+        let mut jobs = server.jobs().await;
+        let request = |count: usize| proto::BatchCreateJobsRequest {
+            parent: "tenants/default".into(),
+            requests: vec![create_tracks(); count],
+        };
+        let status = jobs.batch_create_jobs(request(3)).await.expect_err("never fits");
+        assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+        assert!(status.get_details_retry_info().is_none(), "{status:?}");
+        assert!(status.message().contains(key), "{status}");
+        let info = status.get_details_error_info().expect("an ErrorInfo");
+        assert_eq!((info.reason.as_str(), info.metadata["bound"].as_str()), ("BATCH_TOO_LARGE", bound));
+        if let Some(asked) = asked {
+            assert_eq!(info.metadata["asked"], asked);
+        }
+        let list = proto::ListJobsRequest { parent: "tenants/default".into(), ..Default::default() };
+        assert!(jobs.list_jobs(list).await.expect("a page").into_inner().jobs.is_empty(), "nothing was stored");
+        jobs.batch_create_jobs(request(1)).await.expect("one alone always fits");
+    }
+}
+
 /// Fills a queue of these bounds until it refuses, by `bound`.
 async fn fills_up(queue: QueueBounds, bound: &str) {
     let (solver, hold) = held();

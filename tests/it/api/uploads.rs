@@ -357,7 +357,9 @@ async fn bounds_are_advertised_and_hold() {
 
     let mut inputs = inputs(&server).await;
     let begin = |number, size| vec![request(Message::Start(start(DEFAULT, &id(number), size)))];
-    assert_eq!(fields(&send(&mut inputs, begin(1, 10_001)).await.expect_err("long")), ["start.size_bytes"]);
+    let long = send(&mut inputs, begin(1, 10_001)).await.expect_err("long");
+    assert_eq!(never_fits(&long), ("upload_bytes".to_owned(), "10001".to_owned()));
+    assert!(long.message().contains("upload.max_bytes is 10000"), "{long}");
     assert_eq!(fields(&send(&mut inputs, begin(1, 10_000)).await.expect_err("begun")), ["finish"]);
     let full = async |inputs: &mut Inputs, number, size| {
         let status = send(inputs, begin(number, size)).await.expect_err("full");
@@ -368,6 +370,31 @@ async fn bounds_are_advertised_and_hold() {
     assert_eq!(full(&mut inputs, 2, 5_001).await, "tenant_upload_bytes");
     assert_eq!(fields(&send(&mut inputs, begin(2, 5_000)).await.expect_err("begun")), ["finish"]);
     assert_eq!(full(&mut inputs, 3, 1).await, "tenant_uploads");
+}
+
+/// Bound and length of an upload that is refused for good.
+fn never_fits(status: &Status) -> (String, String) {
+    assert_eq!(fields(status), ["start.size_bytes"]);
+    assert!(status.get_details_retry_info().is_none(), "{status:?}");
+    let info = status.get_details_error_info().expect("an ErrorInfo");
+    assert_eq!(info.reason, "UPLOAD_TOO_LARGE");
+    (info.metadata["bound"].clone(), info.metadata["asked"].clone())
+}
+
+#[tokio::test]
+async fn an_upload_above_all_that_a_tenant_may_have_is_refused_for_good() {
+    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: 4_000 };
+    let uploads = UploadOptions { bounds, ..UploadOptions::default() };
+    let server = TestServer::start_with(quick(), Options::default(), bounded(uploads)).await;
+    let mut inputs = inputs(&server).await;
+    let begin = |number, size| vec![request(Message::Start(start(DEFAULT, &id(number), size)))];
+    // With room for one more upload, and without.
+    for _ in 0..2 {
+        let status = send(&mut inputs, begin(2, 4_001)).await.expect_err("never");
+        assert_eq!(never_fits(&status), ("tenant_upload_bytes".to_owned(), "4001".to_owned()));
+        assert!(status.message().contains("upload.tenant_bytes is 4000"), "{status}");
+        assert_eq!(fields(&send(&mut inputs, begin(1, 4_000)).await.expect_err("begun")), ["finish"]);
+    }
 }
 
 #[tokio::test]
