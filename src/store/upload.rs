@@ -76,8 +76,8 @@ pub struct StoredInput {
 pub struct UploadBounds {
     /// Uploads that are begun and not finished.
     pub max_tenant_uploads: u64,
-    /// Declared lengths of those, and the uploaded inputs that are kept, also those that were deleted and that jobs
-    /// still have.
+    /// Lengths of those as they were declared, and of the uploaded inputs that are kept as they were uploaded, also of
+    /// those that were deleted and that jobs still have. What is stored of an input takes about 1.3 times as much.
     pub max_tenant_bytes: u64,
 }
 

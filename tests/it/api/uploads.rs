@@ -398,6 +398,27 @@ async fn an_upload_above_all_that_a_tenant_may_have_is_refused_for_good() {
 }
 
 #[tokio::test]
+async fn the_bound_and_the_list_count_the_same_bytes() {
+    let bytes = encoded(&raw(3, 40));
+    let room = 2 * bytes.len() as u64;
+    let bounds = UploadBounds { max_tenant_uploads: 4, max_tenant_bytes: room };
+    let uploads = UploadOptions { bounds, ..UploadOptions::default() };
+    let server = TestServer::start_with(quick(), Options::default(), bounded(uploads)).await;
+    let mut inputs = inputs(&server).await;
+    for number in [1, 2] {
+        send(&mut inputs, whole(DEFAULT, &id(number), &bytes, 1_000)).await.expect("two fit, to the byte");
+    }
+    let list = proto::ListInputsRequest { parent: DEFAULT.into(), ..Default::default() };
+    let listed = inputs.list_inputs(list).await.expect("a page").into_inner().inputs;
+    let listed: i64 = listed.iter().map(|input| input.size_bytes).sum();
+    assert_eq!(listed, room as i64);
+    let one_more = vec![request(Message::Start(start(DEFAULT, &id(3), 1)))];
+    let status = send(&mut inputs, one_more).await.expect_err("full");
+    assert_eq!(reason(&status), "UPLOADS_FULL");
+    assert!(status.message().contains(&format!("take {listed} of at most {room} bytes")), "{status}");
+}
+
+#[tokio::test]
 async fn an_upload_that_nobody_goes_on_with_expires() {
     let uploads = UploadOptions { abandoned_after: Some(Duration::from_millis(10)), ..UploadOptions::default() };
     let server = TestServer::start_with(quick(), Options::default(), bounded(uploads)).await;
