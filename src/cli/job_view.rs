@@ -10,7 +10,7 @@ use super::exit::{Exit, Failure};
 use super::print;
 use super::progress::ProgressView;
 use crate::domain::job::{EventBody, Failure as JobFailure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
-use crate::domain::{Grade, Status, Warning};
+use crate::domain::{Grade, InputName, Status, Warning};
 
 /// A job's name as it was given: whole, or its last part alone.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -74,12 +74,13 @@ fn warning_lines(summary: &Summary) -> Vec<String> {
     summary.warnings.iter().map(line).collect()
 }
 
-/// Prints a job: a line, and one more for each of its warnings; or everything as JSON.
+/// Prints a job: a line, one more for its uploaded input and for each of its warnings; or everything as JSON.
 pub fn print_job(job: &Job, json: bool) -> Result<(), Failure> {
     if json {
         return print(&format!("{:#}", job_json(job)));
     }
     let mut lines = vec![job_line(job)];
+    lines.extend(job.input.as_ref().map(|input| format!("  input: {input}")));
     lines.extend(job.summary.iter().flat_map(warning_lines));
     print(&lines.join("\n"))
 }
@@ -109,6 +110,7 @@ pub fn job_json(job: &Job) -> Value {
         "state": job.state,
         "attempt": job.attempt,
         "settings": job.settings,
+        "input": job.input.as_ref().map(InputName::to_string),
         "views": job.view_count,
         "tracks": job.track_count,
         "observations": job.observation_count,

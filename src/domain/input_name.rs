@@ -2,10 +2,12 @@
 
 use std::fmt;
 
+use serde::{Deserialize, Serialize};
+
 use super::job::JobName;
 
 /// An uploaded input's resource name, `tenants/{tenant}/inputs/{input}`; ids are as those of jobs.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct InputName {
     pub tenant: String,
     pub input: String,

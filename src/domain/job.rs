@@ -6,6 +6,7 @@ use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
 
+use super::input_name::InputName;
 use super::progress::Progress;
 use super::result::{Grade, Prior, Status, Warning};
 use super::settings::SolveSettings;
@@ -221,6 +222,8 @@ pub struct Job {
     /// Attempts begun so far; the fencing token of the one that runs.
     pub attempt: u32,
     pub settings: SolveSettings,
+    /// The uploaded input that it was created with, be that still there or not; `None`: its input came with it.
+    pub input: Option<InputName>,
     pub view_count: u32,
     pub track_count: u32,
     pub observation_count: u32,

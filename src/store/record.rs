@@ -41,6 +41,14 @@ impl From<Vec<u8>> for JobInput {
 }
 
 impl JobInput {
+    /// The id of the uploaded input, where it is one.
+    pub fn uploaded(&self) -> Option<&str> {
+        match self {
+            JobInput::Inline(_) => None,
+            JobInput::Uploaded { input, .. } => Some(input),
+        }
+    }
+
     /// Length of the encoded input.
     pub fn bytes(&self) -> u64 {
         match self {

@@ -57,7 +57,16 @@ async fn a_deleted_input_leaves_the_list_and_the_jobs_that_have_it_go_on() {
     let running = created(&mut jobs, named()).await;
     reaches(&mut jobs, &running, &[JobState::Running]).await;
     let waiting = created(&mut jobs, named()).await;
+    let inline = created(&mut jobs, create(Input::TrackSet(scpsfm::rpc::convert::input::to_wire(&raw(3, 40))))).await;
     inputs.delete_input(deletion(&stored[0].name)).await.expect("deleted");
+    // Each tells what it was created with, also now.
+    let listed = proto::ListJobsRequest { parent: DEFAULT.into(), ..Default::default() };
+    let listed = jobs.list_jobs(listed).await.expect("a page").into_inner().jobs;
+    let told: Vec<_> = listed.iter().map(|job| (job.name.as_str(), job.input_name.as_str())).collect();
+    let uploaded = stored[0].name.as_str();
+    assert_eq!(told, [(inline.as_str(), ""), (waiting.as_str(), uploaded), (running.as_str(), uploaded)]);
+    let got = jobs.get_job(proto::GetJobRequest { name: waiting.clone() }).await.expect("a job").into_inner();
+    assert_eq!(got.input_name, uploaded);
     let gone = inputs.delete_input(deletion(&stored[0].name)).await.expect_err("gone");
     assert_eq!((gone.code(), reason(&gone).as_str()), (Code::NotFound, "INPUT_NOT_FOUND"));
     assert_eq!(fields(&inputs.delete_input(deletion("inputs/a")).await.expect_err("malformed")), ["name"]);
@@ -66,7 +75,7 @@ async fn a_deleted_input_leaves_the_list_and_the_jobs_that_have_it_go_on() {
     let left = inputs.list_inputs(list(DEFAULT, 0, "")).await.expect("a page").into_inner();
     assert_eq!(left.inputs, stored[1..]);
     hold.let_go();
-    for job in [running, waiting] {
+    for job in [running, waiting, inline] {
         let ends = [JobState::Succeeded, JobState::Failed];
         assert_eq!(reaches(&mut jobs, &job, &ends).await, JobState::Succeeded, "{job}");
     }
@@ -136,6 +145,14 @@ fn commands_list_and_delete_inputs() {
     let next = run(["inputs", "--page-token", token, "--json"].iter().chain(&to));
     let line: serde_json::Value = serde_json::from_str(&next.stdout).expect("one line of JSON");
     assert_eq!((line["name"].as_str(), line["tracks"].as_u64()), (Some(names[1].as_str()), Some(3)));
+
+    // A job says which of them it was created with.
+    let job = run(["submit", "--input", &names[0], "--method", "geometry"].iter().chain(&to)).stdout;
+    let got = run(["get", job.trim()].iter().chain(&to));
+    assert!(got.stdout.contains(&format!("\n  input: {}\n", names[0])), "{got:?}");
+    let lines = run(["list", "--json"].iter().chain(&to)).stdout;
+    let line: serde_json::Value = serde_json::from_str(&lines).expect("one line of JSON");
+    assert_eq!((line["name"].as_str(), line["input"].as_str()), (Some(job.trim()), Some(names[0].as_str())));
 
     // Flags that say how to read a file say nothing of one that is there.
     let sized = run(["submit", "--input", &names[0], "--width", "10", "--height", "10"].iter().chain(&to));

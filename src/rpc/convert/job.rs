@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::enums::{Twin, optional_to_wire};
 use super::{optional_time, progress, required, result, settings, time_from_wire};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
-use crate::domain::{Grade, InvalidInput, Prior, Status, Violation};
+use crate::domain::{Grade, InputName, InvalidInput, Prior, Status, Violation};
 use crate::rpc::proto;
 use proto::job_event::Body;
 
@@ -31,6 +31,7 @@ pub fn to_wire(job: &Job) -> proto::Job {
         cancel_requested: job.cancel_requested,
         expire_time: job.expire_time.map(Into::into),
         etag: job.etag(),
+        input_name: job.input.as_ref().map(InputName::to_string).unwrap_or_default(),
     }
 }
 
@@ -49,6 +50,7 @@ pub fn from_wire(job: proto::Job) -> Result<Job, InvalidInput> {
         state: JobState::required(job.state, "state")?,
         attempt: job.attempt,
         settings: settings::from_wire(job.settings)?,
+        input: input_from_wire(&job.input_name)?,
         view_count: job.view_count,
         track_count: job.track_count,
         observation_count: job.observation_count,
@@ -111,6 +113,14 @@ pub fn event_from_wire(event: proto::JobEvent) -> Result<JobEvent, Violation> {
 
 fn name_from_wire(name: &str) -> Result<JobName, Violation> {
     JobName::parse(name).ok_or_else(|| Violation::of("name", format!("{name:?} is not a job's name")))
+}
+
+fn input_from_wire(name: &str) -> Result<Option<InputName>, Violation> {
+    if name.is_empty() {
+        return Ok(None);
+    }
+    let parsed = InputName::parse(name);
+    parsed.map(Some).ok_or_else(|| Violation::of("input_name", format!("{name:?} is not an input's name")))
 }
 
 fn failure_to_wire(failure: &Failure) -> proto::JobError {
@@ -230,6 +240,7 @@ mod tests {
             state: JobState::Failed,
             attempt: 3,
             settings: SolveSettings { seed: 5, ..SolveSettings::default() },
+            input: Some(InputName { tenant: "default".into(), input: "a-1".into() }),
             view_count: 10,
             track_count: 200,
             observation_count: 2000,
@@ -249,6 +260,7 @@ mod tests {
         assert_eq!(from_wire(to_wire(&job)), Ok(job.clone()));
         let bare = Job {
             state: JobState::Queued,
+            input: None,
             labels: BTreeMap::new(),
             start_time: None,
             end_time: None,

@@ -23,6 +23,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
         state: JobState::Queued,
         attempt: 0,
         settings: new.settings,
+        input: None,
         view_count: 3,
         track_count: 20,
         observation_count: 60,

@@ -201,6 +201,7 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
         ..record(job)
     };
     let job = create(store, of("a", "used"), 5).await;
+    assert_eq!(job.input, Some(name("used")));
     create(store, of("b", "used"), 5).await;
     assert_eq!(store.work(&job.name).await.map(|work| work.input), Ok(payload.clone()));
     assert_eq!(store.load().await.expect("counts").queued_bytes, 100);
@@ -283,6 +284,10 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
         assert_eq!(store.delete_input(&name(input)).await, Err(Error::InputNotFound(name(input))));
         assert_eq!(store.uploaded_input(&name(input)).await, Err(Error::InputNotFound(name(input))));
         assert_eq!(store.upload(&name(input)).await, Err(Error::UploadNotFound(name(input))));
+    }
+    for job in [&a, &b] {
+        let input = store.job(job).await.expect("is there").input;
+        assert_eq!(input, Some(name("shared")), "what it was created with, though that has no name any more");
     }
     let late = store.create_job(of("c"), &ROOM, time(2)).await;
     assert_eq!(late.expect_err("its name is gone"), Error::InputNotFound(name("shared")));

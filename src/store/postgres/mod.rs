@@ -57,7 +57,7 @@ const SESSION: [(&str, &str); 6] = [
 /// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
 const ADMISSION_LOCK: i64 = 0x7363_7073_666d;
 
-const MIGRATIONS: [Step; 7] = [
+const MIGRATIONS: [Step; 8] = [
     (1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql")),
     (2, "retention", include_str!("../migrations/postgres/0002_retention.sql")),
     (3, "uploads", include_str!("../migrations/postgres/0003_uploads.sql")),
@@ -65,6 +65,7 @@ const MIGRATIONS: [Step; 7] = [
     (5, "inputs", include_str!("../migrations/postgres/0005_inputs.sql")),
     (6, "uploaded", include_str!("../migrations/postgres/0006_uploaded.sql")),
     (7, "upload_bytes", include_str!("../migrations/postgres/0007_upload_bytes.sql")),
+    (8, "job_inputs", include_str!("../migrations/postgres/0008_job_inputs.sql")),
 ];
 
 /// Store in a PostgreSQL database.

@@ -206,10 +206,7 @@ async fn input_of<C: Connection>(connection: &mut C, new: &NewRecord, now: Syste
 
 /// The uploaded input of a job, where it has one.
 fn uploaded(new: &NewRecord) -> Option<InputName> {
-    match &new.input {
-        JobInput::Inline(_) => None,
-        JobInput::Uploaded { input, .. } => Some(named(new, input)),
-    }
+    new.input.uploaded().map(|input| named(new, input))
 }
 
 fn named(new: &NewRecord, input: &str) -> InputName {
@@ -239,8 +236,8 @@ pub(super) async fn insert_input<C: Connection>(
 fn insert_job(new: &NewRecord, input_id: i64, now: SystemTime) -> Result<Statement, Error> {
     let insert = Statement::new(returning_job!(
         "INSERT INTO jobs (tenant, job, state, priority, create_time, queue_time, deadline, input_id, input_bytes, \
-         view_count, track_count, observation_count, settings, labels, trace_parent, last_sequence) \
-         VALUES ($1, $2, 'QUEUED', $3, $4, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, 1)"
+         view_count, track_count, observation_count, settings, labels, trace_parent, uploaded_input, \
+         last_sequence) VALUES ($1, $2, 'QUEUED', $3, $4, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, 1)"
     ));
     Ok(insert
         .bind(&new.name.tenant)
@@ -255,7 +252,8 @@ fn insert_job(new: &NewRecord, input_id: i64, now: SystemTime) -> Result<Stateme
         .bind(new.observation_count)
         .bind(payload::encode(&new.settings)?)
         .bind(payload::encode(&new.labels)?)
-        .bind(new.trace_parent.as_deref()))
+        .bind(new.trace_parent.as_deref())
+        .bind(new.input.uploaded()))
 }
 
 /// One job by its name.

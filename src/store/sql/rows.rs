@@ -3,6 +3,7 @@
 use std::time::{Duration, SystemTime};
 
 use super::{Change, Connection, Row, Statement};
+use crate::domain::InputName;
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, Summary};
 use crate::domain::progress::Progress;
 use crate::store::query::Cursor;
@@ -14,7 +15,7 @@ macro_rules! job_columns {
     () => {
         "id, tenant, job, state, attempt, settings, view_count, track_count, observation_count, labels, priority, \
          create_time, start_time, end_time, deadline, progress, last_sequence, summary, failure, cancel_requested, \
-         trace_parent, queue_time"
+         trace_parent, queue_time, uploaded_input"
     };
 }
 pub(super) use job_columns;
@@ -85,8 +86,11 @@ fn name(row: &impl Row) -> Result<JobName, Error> {
 
 /// A job from a row of `select_jobs!`.
 pub(super) fn job(row: &impl Row) -> Result<Job, Error> {
+    let name = name(row)?;
+    let input = row.optional_text("uploaded_input")?.map(|input| InputName { tenant: name.tenant.clone(), input });
     Ok(Job {
-        name: name(row)?,
+        name,
+        input,
         state: state(row)?,
         attempt: number(row, "attempt")?,
         settings: payload::decode(&row.bytes("settings")?, "settings")?,

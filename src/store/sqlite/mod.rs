@@ -47,7 +47,7 @@ const VACUUM_BYTES: u64 = 16 << 20;
 /// long as itself.
 const LOG_BYTES: &str = "67108864";
 
-const MIGRATIONS: [Step; 8] = [
+const MIGRATIONS: [Step; 9] = [
     (1, "jobs", include_str!("../migrations/sqlite/0001_jobs.sql")),
     (2, "attempts", include_str!("../migrations/sqlite/0002_attempts.sql")),
     (3, "retention", include_str!("../migrations/sqlite/0003_retention.sql")),
@@ -56,6 +56,7 @@ const MIGRATIONS: [Step; 8] = [
     (6, "inputs", include_str!("../migrations/sqlite/0006_inputs.sql")),
     (7, "uploaded", include_str!("../migrations/sqlite/0007_uploaded.sql")),
     (8, "upload_bytes", include_str!("../migrations/sqlite/0008_upload_bytes.sql")),
+    (9, "job_inputs", include_str!("../migrations/sqlite/0009_job_inputs.sql")),
 ];
 
 /// Store in a data directory.

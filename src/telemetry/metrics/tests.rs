@@ -45,6 +45,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
         state,
         attempt: 1,
         settings: SolveSettings::default(),
+        input: None,
         view_count: 10,
         track_count: 200,
         observation_count: 2_000,
