@@ -1,6 +1,8 @@
 //! Where connections come in: each has a bound of time to shake hands and to say that it speaks HTTP/2, and those that
 //! have not yet are few enough to hold up nobody.
 
+mod refusals;
+
 use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::io;
@@ -15,10 +17,12 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::{AbortHandle, JoinSet};
+use tokio::time::Instant;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
+use self::refusals::Refusals;
 use super::reload::Current;
 use crate::telemetry::metrics;
 
@@ -69,7 +73,15 @@ pub struct Options {
 pub fn incoming(listener: TcpListener, options: Options) -> impl Stream<Item = Result<Connection, Infallible>> {
     let seats = Arc::new(Semaphore::new(options.max_speaking.min(Semaphore::MAX_PERMITS)));
     let refusals = Arc::new(Semaphore::new(MAX_REFUSALS));
-    let door = Door { listener, options, seats, refusals, greeted: JoinSet::new(), oldest_first: VecDeque::new() };
+    let door = Door {
+        listener,
+        options,
+        seats,
+        refusals,
+        refused: Refusals::default(),
+        greeted: JoinSet::new(),
+        oldest_first: VecDeque::new(),
+    };
     stream::unfold(door, async |mut door| {
         let connection = door.next().await;
         Some((Ok(connection), door))
@@ -83,6 +95,7 @@ struct Door {
     seats: Arc<Semaphore>,
     /// One for each connection that is being refused.
     refusals: Arc<Semaphore>,
+    refused: Refusals,
     greeted: JoinSet<Result<Begun, String>>,
     oldest_first: VecDeque<AbortHandle>,
 }
@@ -111,6 +124,7 @@ impl Door {
                     Err(error) if error.is_cancelled() => tracing::debug!("a silent connection made room for another"),
                     Err(error) => tracing::error!(%error, "a connection's task failed"),
                 },
+                count = self.refused.told() => self.tell_refused(count),
             }
         }
     }
@@ -133,10 +147,17 @@ impl Door {
         self.oldest_first.push_back(greeting);
     }
 
+    fn tell_refused(&self, count: u64) {
+        let max_connections = self.options.max_speaking;
+        tracing::warn!(count, max_connections, "connections were refused: as many speak as may");
+    }
+
     /// Tells a connection that there is no room for it.
-    fn refuse(&self, begun: Begun) {
+    fn refuse(&mut self, begun: Begun) {
         metrics::connection_refused();
-        tracing::debug!("a connection was refused: too many speak");
+        if let Some(count) = self.refused.add(Instant::now()) {
+            self.tell_refused(count);
+        }
         let Ok(place) = self.refusals.clone().try_acquire_owned() else { return };
         tokio::spawn(async move {
             let _place = place;

@@ -107,7 +107,9 @@ async fn of_too_many_silent_connections_the_oldest_make_room() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn one_connection_too_many_is_refused_and_there_is_room_when_one_ends() {
     let directory = tempfile::tempdir().expect("a temporary directory");
-    let server = Serving::start_with(directory.path(), &[("SCPSFM_SERVER__MAX_CONNECTIONS", "3")], Stdio::null());
+    let log = directory.path().join("log");
+    let stderr = std::fs::File::create(&log).expect("a file");
+    let server = Serving::start_with(directory.path(), &[("SCPSFM_SERVER__MAX_CONNECTIONS", "3")], stderr);
     let count = |series: &str| Page::parse(&server.page("/metrics")).value(series);
     let mut clients = Vec::new();
     for _ in 0..3 {
@@ -134,6 +136,12 @@ async fn one_connection_too_many_is_refused_and_there_is_room_when_one_ends() {
         assert!(matches!(code, Code::Unavailable | Code::Cancelled), "attempt {attempt}: {code:?}");
     }
     assert!(count("scpsfm_connections_refused_total") >= 21.0);
+    // The log tells of the first at once, and of the others together.
+    let log = std::fs::read_to_string(&log).expect("the log");
+    let warnings = log.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("a line of JSON"));
+    let warnings: Vec<_> = warnings.filter(|line| line.to_string().contains("connections were refused")).collect();
+    assert!((1..21).contains(&warnings.len()), "{warnings:?}");
+    assert_eq!((warnings[0]["level"].as_str(), warnings[0]["count"].as_u64()), (Some("WARN"), Some(1)), "{warnings:?}");
     for client in &mut clients {
         client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("those that are in stay in");
     }
