@@ -118,6 +118,10 @@ fn server_options(config: &Config) -> server::Options {
         limits: config.limits.clone(),
         max_message_bytes: config.server.max_message_bytes,
         max_connections: config.server.max_connections,
+        first_call_timeout: match config.server.first_call_seconds {
+            0 => None,
+            seconds => Some(Duration::from_secs(seconds)),
+        },
         tls: config.tls.files(),
         keys: Sources { file: config.auth.keys_file.clone(), fixed: config.auth.keys.clone() },
         reflection: config.server.reflection,
@@ -139,7 +143,8 @@ mod tests {
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));
         let of = |options: server::Options| {
             let keys = options.keys.is_on();
-            let bounds = (options.limits, options.max_message_bytes, options.max_connections);
+            let connections = (options.max_connections, options.first_call_timeout);
+            let bounds = (options.limits, options.max_message_bytes, connections);
             (bounds, options.solve_grace, options.tls, keys, options.reflection)
         };
         assert_eq!(of(server_options(&config)), of(server::Options::default()));

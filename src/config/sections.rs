@@ -25,6 +25,9 @@ pub struct Server {
     pub max_message_bytes: usize,
     /// Connections that speak at once; one more is refused. Those that say nothing yet are bounded apart.
     pub max_connections: usize,
+    /// Seconds that a connection may take to its first call with a key, or to its first call where none is asked for; then
+    /// it is closed. Health checks need no key and do not count where others do. 0: for ever.
+    pub first_call_seconds: u64,
     /// Whether callers may ask for the API's description (reflection). On, because it says what `proto/` says; with keys
     /// it asks for one, as every call but a health check does.
     pub reflection: bool,
@@ -42,6 +45,7 @@ impl Default for Server {
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 50051),
             max_message_bytes: rpc::server::Options::MAX_MESSAGE_BYTES,
             max_connections: rpc::server::Options::MAX_CONNECTIONS,
+            first_call_seconds: rpc::server::Options::FIRST_CALL_TIMEOUT.as_secs(),
             reflection: true,
             insecure: false,
             plaintext_keys: false,

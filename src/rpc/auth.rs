@@ -8,17 +8,21 @@ use http_body::{Body as HttpBody, Frame, SizeHint};
 use prost::bytes::Bytes;
 use tonic::Status;
 use tonic::body::Body;
-use tonic::codegen::http::header::AUTHORIZATION;
-use tonic::codegen::http::{HeaderMap, Request, Response};
+use tonic::codegen::http::header::{AUTHORIZATION, CONTENT_TYPE};
+use tonic::codegen::http::{HeaderMap, Method, Request, Response};
 use tower::{Layer, Service};
 
 use super::caller::Tenant;
+use super::door::Introduction;
 use super::keys::{Hash, KeyRing};
 use super::reload::Current;
 use super::status;
 
 /// What needs no key: whoever spreads calls over servers asks for their health, and has no tenant.
 const OPEN: &str = "/grpc.health.v1.Health/";
+
+/// How the content type of every call begins (gRPC over HTTP/2, "Requests").
+const GRPC: &str = "application/grpc";
 
 /// The layer; goes around every service, and within the one that counts calls.
 #[derive(Debug, Clone)]
@@ -120,6 +124,16 @@ fn bearer(headers: &HeaderMap) -> Result<&str, Status> {
     if scheme.eq_ignore_ascii_case("bearer") { Ok(key.trim()) } else { Err(status::no_key()) }
 }
 
+/// Notes that someone who may call does, so that the connection may stay. What is no call of gRPC says nothing of who it
+/// is.
+fn introduce(request: &Request<Body>) {
+    let content_type = request.headers().get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let is_call = request.method() == Method::POST && content_type.is_some_and(|kind| kind.starts_with(GRPC));
+    if let Some(introduction) = request.extensions().get::<Introduction>().filter(|_| is_call) {
+        introduction.make();
+    }
+}
+
 impl<S> Layer<S> for Authenticate {
     type Service = Authenticated<S>;
 
@@ -150,6 +164,10 @@ where
 
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
         if request.uri().path().starts_with(OPEN) {
+            // Where keys are asked for, one who checks the server's health is still a stranger.
+            if self.layer.keys.is_none() {
+                introduce(&request);
+            }
             return Box::pin(self.inner.call(request));
         }
         let (tenant, standing) = match self.layer.admit(request.headers()) {
@@ -159,6 +177,7 @@ where
                 return Box::pin(async { Ok(refusal) });
             }
         };
+        introduce(&request);
         request.extensions_mut().insert(tenant);
         // No service needs it any more, and none can let it slip.
         request.headers_mut().remove(AUTHORIZATION);

@@ -1,7 +1,8 @@
 //! Where connections come in: each has a bound of time to shake hands and to say that it speaks HTTP/2, and those that
-//! have not yet are few enough to hold up nobody.
+//! have not yet are few enough to hold up nobody. Those that speak have a bound of time to call as someone who may.
 
 mod refusals;
+mod stranger;
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -20,9 +21,11 @@ use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::Instant;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
-use tonic::transport::server::{Connected, TcpConnectInfo};
+use tonic::transport::server::Connected;
 
 use self::refusals::Refusals;
+use self::stranger::Patience;
+pub use self::stranger::{FIRST_CALL_TIMEOUT, Introduction};
 use super::reload::Current;
 use crate::telemetry::metrics;
 
@@ -66,6 +69,8 @@ pub struct Options {
     pub max_greeted: usize,
     /// Connections that have, at most; one more is refused.
     pub max_speaking: usize,
+    /// How long one that has may take until someone calls over it who may; `None`: for ever.
+    pub first_call: Option<Duration>,
 }
 
 /// Connections that speak, in the order in which they began to. Each handshake begins with the certificate that is in
@@ -114,9 +119,9 @@ impl Door {
                 Some(ended) = self.greeted.join_next() => match ended {
                     Ok(Ok(begun)) => match self.seats.clone().try_acquire_owned() {
                         Ok(seat) => {
-                            let Begun { io, early, info } = begun;
-                            let held = (seat, metrics::connection());
-                            return Connection { io, early, info, _held: held };
+                            let Begun { io, early } = begun;
+                            let patience = Patience::begin(self.options.first_call);
+                            return Connection { io, early, patience, _held: (seat, metrics::connection()) };
                         }
                         Err(_) => self.refuse(begun),
                     },
@@ -177,7 +182,6 @@ impl Door {
 /// Shakes hands, where there is TLS, and waits for the first words.
 async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Result<Begun> {
     connection.set_nodelay(true)?;
-    let info = connection.connect_info();
     let mut io: Box<dyn Io> = match acceptor {
         Some(acceptor) => Box::new(acceptor.accept(connection).await?),
         None => Box::new(connection),
@@ -193,14 +197,13 @@ async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Resu
         }
         early.extend_from_slice(&rest[..count]);
     }
-    Ok(Begun { io, early: early.into(), info })
+    Ok(Begun { io, early: early.into() })
 }
 
 /// A connection that has said its first words.
 struct Begun {
     io: Box<dyn Io>,
     early: Bytes,
-    info: TcpConnectInfo,
 }
 
 /// A connection, encrypted or not.
@@ -212,21 +215,23 @@ impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
 pub struct Connection {
     io: Box<dyn Io>,
     early: Bytes,
-    info: TcpConnectInfo,
+    patience: Patience,
     /// Its place, and its count among those that speak, for as long as it lives.
     _held: (OwnedSemaphorePermit, metrics::Held),
 }
 
 impl Connected for Connection {
-    type ConnectInfo = TcpConnectInfo;
+    /// For [`Authenticate`](super::auth::Authenticate), which knows who may call.
+    type ConnectInfo = Introduction;
 
-    fn connect_info(&self) -> TcpConnectInfo {
-        self.info.clone()
+    fn connect_info(&self) -> Introduction {
+        self.patience.introduction.clone()
     }
 }
 
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, context: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        self.patience.check(context)?;
         if self.early.is_empty() {
             return Pin::new(&mut self.io).poll_read(context, buf);
         }
@@ -239,6 +244,8 @@ impl AsyncRead for Connection {
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
+        // Also here: the transport does not read while it cannot write to one who does not read either.
+        self.patience.check(context)?;
         Pin::new(&mut self.io).poll_write(context, buf)
     }
 
@@ -247,6 +254,7 @@ impl AsyncWrite for Connection {
         context: &mut Context<'_>,
         bufs: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
+        self.patience.check(context)?;
         Pin::new(&mut self.io).poll_write_vectored(context, bufs)
     }
 
@@ -255,6 +263,7 @@ impl AsyncWrite for Connection {
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.patience.check(context)?;
         Pin::new(&mut self.io).poll_flush(context)
     }
 
@@ -276,8 +285,13 @@ mod tests {
     async fn every_connection_without_room_hears_so() {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let url = format!("http://{}", listener.local_addr().expect("an address"));
-        let options =
-            Options { certificates: None, timeout: HANDSHAKE_TIMEOUT, max_greeted: MAX_GREETED, max_speaking: 0 };
+        let options = Options {
+            certificates: None,
+            timeout: HANDSHAKE_TIMEOUT,
+            max_greeted: MAX_GREETED,
+            max_speaking: 0,
+            first_call: None,
+        };
         let door = tokio::spawn(async move { Box::pin(incoming(listener, options)).next().await });
         // A reset overtakes the answer in some of so many.
         for attempt in 0..100 {

@@ -70,6 +70,9 @@ pub struct Options {
     pub max_silent_connections: usize,
     /// Connections that speak, at most; one more is refused.
     pub max_connections: usize,
+    /// How long a connection may take until someone calls over it who may: with a key, where keys are asked for. `None`:
+    /// for ever.
+    pub first_call_timeout: Option<Duration>,
     /// How long a connection may be silent before it is asked whether it lives.
     pub keepalive: Duration,
     /// How long the answer to that may take.
@@ -88,6 +91,9 @@ impl Options {
 
     /// See [`door::MAX_SPEAKING`].
     pub const MAX_CONNECTIONS: usize = door::MAX_SPEAKING;
+
+    /// See [`door::FIRST_CALL_TIMEOUT`].
+    pub const FIRST_CALL_TIMEOUT: Duration = door::FIRST_CALL_TIMEOUT;
 
     /// Whether the files of certificates and keys can be used, as they are now.
     ///
@@ -113,6 +119,7 @@ impl Default for Options {
             handshake_timeout: door::HANDSHAKE_TIMEOUT,
             max_silent_connections: door::MAX_GREETED,
             max_connections: door::MAX_SPEAKING,
+            first_call_timeout: Some(Self::FIRST_CALL_TIMEOUT),
             keepalive: KEEPALIVE,
             keepalive_timeout: KEEPALIVE_TIMEOUT,
             reflection: true,
@@ -172,6 +179,7 @@ impl Server {
             timeout: options.handshake_timeout,
             max_greeted: options.max_silent_connections,
             max_speaking: options.max_connections,
+            first_call: options.first_call_timeout,
         };
         let incoming = door::incoming(listener, entrance);
         let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));

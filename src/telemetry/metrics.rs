@@ -389,6 +389,11 @@ pub fn connection_refused() {
     counter!(CONNECTIONS_REFUSED.name).increment(1);
 }
 
+/// A connection was closed because nobody who may call had called over it in time.
+pub fn stranger_closed() {
+    counter!(STRANGERS_CLOSED.name).increment(1);
+}
+
 /// A gRPC call that has begun. Dropping it without a code counts it as `CANCELLED`: the client went away.
 #[must_use = "the call ends when this is dropped"]
 pub struct RpcCall {

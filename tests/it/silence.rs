@@ -1,64 +1,21 @@
 //! Connections that say nothing: they end in time, and hold up nobody meanwhile.
 
-use std::net::SocketAddr;
-use std::process::Stdio;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use scpsfm::rpc::proto;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::server::Options;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpListener, TcpStream};
 use tonic::Code;
 
+use crate::support::connections::{PREFACE, counting, saying, until_closed};
 use crate::support::live::is_served;
 use crate::support::memory::resident_mb;
 use crate::support::program::Serving;
 use crate::support::scrape::Page;
 use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::quick;
-
-/// What every client of HTTP/2 says first (RFC 9113, section 3.4), and empty settings.
-const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
-
-/// Connections each of which has said that much.
-async fn saying(address: &str, count: usize, words: &[u8]) -> Vec<TcpStream> {
-    let mut connections = Vec::new();
-    for _ in 0..count {
-        let mut connection = TcpStream::connect(address).await.expect("a connection");
-        connection.write_all(words).await.expect("written");
-        connections.push(connection);
-    }
-    connections
-}
-
-/// The address of a door to this one, and how many have come through it: a client connects again by itself, and says
-/// nothing of it.
-async fn counting(address: SocketAddr) -> (String, Arc<AtomicUsize>) {
-    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
-    let url = format!("http://{}", listener.local_addr().expect("an address"));
-    let connections = Arc::new(AtomicUsize::new(0));
-    let counted = connections.clone();
-    tokio::spawn(async move {
-        while let Ok((mut outside, _)) = listener.accept().await {
-            counted.fetch_add(1, Ordering::SeqCst);
-            tokio::spawn(async move {
-                let mut inside = TcpStream::connect(address).await.expect("the server listens");
-                // Whichever side ends it, the test looks at what it sees.
-                let _ = tokio::io::copy_bidirectional(&mut outside, &mut inside).await;
-            });
-        }
-    });
-    (url, connections)
-}
-
-/// Reads until the other side closes the connection.
-async fn until_closed(mut connection: TcpStream) {
-    let mut buffer = [0; 256];
-    while matches!(connection.read(&mut buffer).await, Ok(1..)) {}
-}
 
 #[tokio::test]
 async fn hundreds_of_silent_connections_hold_up_nobody_and_are_ended() {

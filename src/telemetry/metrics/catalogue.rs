@@ -220,8 +220,15 @@ pub const CONNECTIONS_REFUSED: Metric = Metric {
     help: "Connections refused because as many speak as may.",
 };
 
+pub const STRANGERS_CLOSED: Metric = Metric {
+    name: "scpsfm_strangers_closed_total",
+    kind: Kind::Counter,
+    labels: &[],
+    help: "Connections closed because nobody who may call had called over them in time.",
+};
+
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 31] = [
+pub const ALL: [Metric; 32] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -253,4 +260,5 @@ pub const ALL: [Metric; 31] = [
     WATCHERS,
     CONNECTIONS,
     CONNECTIONS_REFUSED,
+    STRANGERS_CLOSED,
 ];

@@ -2,6 +2,7 @@
 
 pub mod certificates;
 pub mod collector;
+pub mod connections;
 pub mod keys;
 pub mod live;
 pub mod memory;

@@ -1,0 +1,73 @@
+//! Connections of which nobody knows yet whether anyone who may call is behind them: how long they keep their place.
+
+use std::io;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use tokio::time::Sleep;
+
+use crate::telemetry::metrics;
+
+/// How long a connection may take to its first call by someone who may call. Clients connect in order to call; half a
+/// minute is one that reads a large input in between, on a machine that is busy.
+pub const FIRST_CALL_TIMEOUT: Duration = Duration::from_secs(30);
+
+/// Whether someone who may call has called over a connection. Goes with each of its requests; clones are the same one.
+#[derive(Debug, Clone, Default)]
+pub struct Introduction(Arc<AtomicBool>);
+
+impl Introduction {
+    /// Someone who may call has.
+    pub fn make(&self) {
+        // Nothing else is read by it.
+        self.0.store(true, Ordering::Relaxed);
+    }
+
+    fn is_made(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// The time that a connection has for its introduction.
+pub(super) struct Patience {
+    pub(super) introduction: Introduction,
+    /// `None`: it has been introduced, or may take for ever.
+    end: Option<Pin<Box<Sleep>>>,
+}
+
+impl Patience {
+    /// From now on; `None`: for ever.
+    pub(super) fn begin(bound: Option<Duration>) -> Self {
+        let end = bound.map(|bound| Box::pin(tokio::time::sleep(bound)));
+        Self { introduction: Introduction::default(), end }
+    }
+
+    /// Lets the connection go on as long as there is time. Its task is woken when there is none any more.
+    ///
+    /// # Errors
+    /// Once the time is over and nobody was introduced: for the transport, the connection has broken.
+    pub(super) fn check(&mut self, context: &mut Context<'_>) -> io::Result<()> {
+        let Some(end) = &mut self.end else { return Ok(()) };
+        if self.introduction.is_made() {
+            self.end = None;
+            return Ok(());
+        }
+        match end.as_mut().poll(context) {
+            Poll::Pending => Ok(()),
+            Poll::Ready(()) => Err(io::ErrorKind::TimedOut.into()),
+        }
+    }
+}
+
+impl Drop for Patience {
+    fn drop(&mut self) {
+        let over = self.end.as_ref().is_some_and(|end| end.is_elapsed());
+        if over && !self.introduction.is_made() {
+            metrics::stranger_closed();
+            tracing::debug!("a connection was closed: nobody who may call had called over it");
+        }
+    }
+}

@@ -1,0 +1,48 @@
+//! Connections below gRPC: what they say, how many there are, when they end.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+
+/// What every client of HTTP/2 says first (RFC 9113, section 3.4), and empty settings.
+pub const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
+
+/// Connections each of which has said that much.
+pub async fn saying(address: &str, count: usize, words: &[u8]) -> Vec<TcpStream> {
+    let mut connections = Vec::new();
+    for _ in 0..count {
+        let mut connection = TcpStream::connect(address).await.expect("a connection");
+        connection.write_all(words).await.expect("written");
+        connections.push(connection);
+    }
+    connections
+}
+
+/// The address of a door to this one, and how many have come through it: a client connects again by itself, and says
+/// nothing of it.
+pub async fn counting(address: SocketAddr) -> (String, Arc<AtomicUsize>) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let url = format!("http://{}", listener.local_addr().expect("an address"));
+    let connections = Arc::new(AtomicUsize::new(0));
+    let counted = connections.clone();
+    tokio::spawn(async move {
+        while let Ok((mut outside, _)) = listener.accept().await {
+            counted.fetch_add(1, Ordering::SeqCst);
+            tokio::spawn(async move {
+                let mut inside = TcpStream::connect(address).await.expect("the server listens");
+                // Whichever side ends it, the test looks at what it sees.
+                let _ = tokio::io::copy_bidirectional(&mut outside, &mut inside).await;
+            });
+        }
+    });
+    (url, connections)
+}
+
+/// Reads until the other side closes the connection.
+pub async fn until_closed(mut connection: TcpStream) {
+    let mut buffer = [0; 256];
+    while matches!(connection.read(&mut buffer).await, Ok(1..)) {}
+}
