@@ -7,6 +7,7 @@ mod clock;
 mod listener;
 #[cfg(test)]
 mod locks_tests;
+mod schema;
 #[cfg(test)]
 pub(crate) mod tests;
 mod url;
@@ -18,7 +19,7 @@ use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRo
 use tokio::sync::Mutex;
 use tokio::time::timeout;
 
-use super::sql::{self, Change, Connection, Database, Operation, Size, Statement, Step};
+use super::sql::{self, Change, Connection, Database, Operation, Size, Statement};
 use super::{Error, Hint};
 use crate::domain::job::JobName;
 use clock::Clock;
@@ -57,17 +58,6 @@ const SESSION: [(&str, &str); 6] = [
 /// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
 const ADMISSION_LOCK: i64 = 0x7363_7073_666d;
 
-const MIGRATIONS: [Step; 8] = [
-    (1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql")),
-    (2, "retention", include_str!("../migrations/postgres/0002_retention.sql")),
-    (3, "uploads", include_str!("../migrations/postgres/0003_uploads.sql")),
-    (4, "listing", include_str!("../migrations/postgres/0004_listing.sql")),
-    (5, "inputs", include_str!("../migrations/postgres/0005_inputs.sql")),
-    (6, "uploaded", include_str!("../migrations/postgres/0006_uploaded.sql")),
-    (7, "upload_bytes", include_str!("../migrations/postgres/0007_upload_bytes.sql")),
-    (8, "job_inputs", include_str!("../migrations/postgres/0008_job_inputs.sql")),
-];
-
 /// Store in a PostgreSQL database.
 #[derive(Debug)]
 pub struct Postgres {
@@ -84,7 +74,8 @@ impl Postgres {
     /// Opens the store in a database that exists and brings its schema up to date.
     ///
     /// # Errors
-    /// [`Error::Unavailable`] where the database does not answer or refuses, [`Error::Corrupt`] where its schema is of
+    /// [`Error::Unavailable`] where the database does not answer or refuses, or another server is at the schema for too
+    /// long, [`Error::Corrupt`] where its schema is of
     /// a newer version.
     pub async fn open(url: &DatabaseUrl) -> Result<Self, Error> {
         let options = url.options().clone().options(SESSION);
@@ -94,7 +85,7 @@ impl Postgres {
             pool => pool?,
         };
         let payloads = pool_of(PAYLOAD_CONNECTIONS).connect_lazy_with(options.clone());
-        sql::migrator(&MIGRATIONS).run(&pool).await.map_err(sql::migration_failed)?;
+        schema::update(&options).await?;
         let clock = Clock::default();
         clock.set(&mut *pool.acquire().await?).await?;
         Ok(Self {

@@ -1,0 +1,148 @@
+//! Brings the schema up to date, over a connection of its own: what callers wait for is bounded by the session, and a step
+//! on a large table takes as long as it takes.
+
+use std::time::Duration;
+
+use sqlx::migrate::Migrate;
+use sqlx::postgres::{PgConnectOptions, PgConnection};
+use tokio::time::{Instant, timeout};
+
+use super::ACQUIRE_TIMEOUT;
+use crate::store::Error;
+use crate::store::sql::{self, Connection, Statement, Step};
+
+const MIGRATIONS: [Step; 8] = [
+    (1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql")),
+    (2, "retention", include_str!("../migrations/postgres/0002_retention.sql")),
+    (3, "uploads", include_str!("../migrations/postgres/0003_uploads.sql")),
+    (4, "listing", include_str!("../migrations/postgres/0004_listing.sql")),
+    (5, "inputs", include_str!("../migrations/postgres/0005_inputs.sql")),
+    (6, "uploaded", include_str!("../migrations/postgres/0006_uploaded.sql")),
+    (7, "upload_bytes", include_str!("../migrations/postgres/0007_upload_bytes.sql")),
+    (8, "job_inputs", include_str!("../migrations/postgres/0008_job_inputs.sql")),
+];
+
+/// How long a server waits for another one that is at the schema: a step that goes through some ten million jobs takes
+/// minutes. Then it ends, and whoever started it may start it again.
+const PATIENCE: Duration = Duration::from_secs(15 * 60);
+
+/// Between two lines that say that it waits.
+const TOLD_EVERY: Duration = Duration::from_secs(5);
+
+/// How long a step waits for a table, all of whose users wait behind it: as long as the longest statement of a server.
+/// Only others, such as a backup, hold one for longer.
+const TABLE_PATIENCE: Duration = Duration::from_secs(30);
+
+/// What a wait for a lock ends with that took too long (PostgreSQL, appendix A: `lock_not_available`).
+const LOCK_NOT_AVAILABLE: &str = "55P03";
+
+/// Brings the schema up to date, or waits until another server has.
+///
+/// # Errors
+/// [`Error::Unavailable`] where the database refuses, or another server takes too long; [`Error::Corrupt`] where its
+/// schema is of a newer version.
+pub(super) async fn update(options: &PgConnectOptions) -> Result<(), Error> {
+    migrate(options, &MIGRATIONS, PATIENCE).await
+}
+
+async fn migrate(options: &PgConnectOptions, steps: &[Step], patience: Duration) -> Result<(), Error> {
+    // Of two values of a setting, the later one holds.
+    let options = options.clone().options([("statement_timeout", "0")]);
+    let connecting = <PgConnection as sqlx::Connection>::connect_with(&options);
+    let mut connection = timeout(ACQUIRE_TIMEOUT, connecting).await.map_err(|_| sqlx::Error::PoolTimedOut)??;
+    lock(&mut connection, patience).await?;
+    bound_locks(&mut connection, TABLE_PATIENCE).await?;
+    // The lock ends with the connection, however this does.
+    let mut migrator = sql::migrator(steps);
+    migrator.set_locking(false);
+    let migrated = migrator.run(&mut connection).await.map_err(sql::migration_failed);
+    // What was done is committed: there is nothing to lose with the connection.
+    let _ = timeout(ACQUIRE_TIMEOUT, sqlx::Connection::close(connection)).await;
+    migrated
+}
+
+/// Waits until no other server is at the schema, and keeps others from it. Says so while it waits.
+async fn lock(connection: &mut PgConnection, patience: Duration) -> Result<(), Error> {
+    bound_locks(connection, patience).await?;
+    let too_long = || {
+        let seconds = patience.as_secs_f64();
+        Error::Unavailable(format!("another server has been bringing the schema up to date for {seconds} s"))
+    };
+    let begun = Instant::now();
+    let mut lock = connection.lock();
+    loop {
+        match timeout(TOLD_EVERY, &mut lock).await {
+            Ok(Err(error)) if is_late(&error) => return Err(too_long()),
+            Ok(locked) => return locked.map_err(sql::migration_failed),
+            // The database ends the wait by itself, unless it has gone away meanwhile.
+            Err(_) if begun.elapsed() > patience + ACQUIRE_TIMEOUT => return Err(too_long()),
+            Err(_) => tracing::info!(
+                waited_seconds = begun.elapsed().as_secs(),
+                "waiting for another server that brings the schema up to date"
+            ),
+        }
+    }
+}
+
+/// How long each wait for a lock may take from here on.
+async fn bound_locks(connection: &mut PgConnection, bound: Duration) -> Result<(), Error> {
+    // 0 would be no bound.
+    let milliseconds = bound.as_millis().max(1).to_string();
+    let set = Statement::new("SELECT set_config('lock_timeout', $1, FALSE)").bind(&milliseconds);
+    Connection::execute(connection, set).await
+}
+
+fn is_late(error: &sqlx::migrate::MigrateError) -> bool {
+    use sqlx::migrate::MigrateError::Execute;
+    let Execute(error) = error else { return false };
+    error.as_database_error().and_then(|cause| cause.code()).as_deref() == Some(LOCK_NOT_AVAILABLE)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::cluster;
+    use super::super::url::DatabaseUrl;
+    use super::*;
+
+    /// How a server that holds its statements to a bound reaches a database without a schema.
+    async fn hasty(cluster: &cluster::Cluster) -> PgConnectOptions {
+        let url: DatabaseUrl = cluster.database().await.parse().expect("an address");
+        url.options().clone().options([("statement_timeout", "100")])
+    }
+
+    async fn connected(options: &PgConnectOptions) -> PgConnection {
+        <PgConnection as sqlx::Connection>::connect_with(options).await.expect("a connection")
+    }
+
+    #[tokio::test]
+    async fn a_step_may_take_longer_than_what_a_caller_waits_for() {
+        let Some(cluster) = cluster::shared("a step of the schema that takes long") else { return };
+        let options = hasty(&cluster).await;
+        let sleep = "SELECT pg_sleep(0.5)";
+        let statement = connected(&options).await.rows(Statement::new(sleep)).await;
+        assert!(statement.is_err(), "a caller's is ended");
+        migrate(&options, &[(1, "slow", sleep)], PATIENCE).await.expect("takes its time");
+        let mut connection = connected(&options).await;
+        let done = connection.rows(Statement::new("SELECT version FROM _sqlx_migrations")).await.expect("a table");
+        assert_eq!(done.iter().map(|row| sql::Row::integer(row, "version")).collect::<Vec<_>>(), [Ok(1)]);
+    }
+
+    #[tokio::test]
+    async fn the_wait_for_another_server_is_bounded_and_says_what_it_was_for() {
+        let Some(cluster) = cluster::shared("two servers that bring one schema up to date") else { return };
+        let options = hasty(&cluster).await;
+        let mut other = connected(&options).await;
+        other.lock().await.expect("the lock");
+        let error = migrate(&options, &MIGRATIONS, Duration::from_millis(300)).await.expect_err("is held");
+        let expected = "another server has been bringing the schema up to date for 0.3 s";
+        assert_eq!(error, Error::Unavailable(expected.into()));
+        // One that waits goes on once the other is through.
+        let waiting = migrate(&options, &MIGRATIONS, PATIENCE);
+        let unlocking = async {
+            other.unlock().await.expect("unlocks");
+        };
+        let (migrated, ()) = tokio::join!(waiting, unlocking);
+        migrated.expect("up to date");
+        migrate(&options, &MIGRATIONS, PATIENCE).await.expect("nothing is left to do, and nobody holds the lock");
+    }
+}
