@@ -199,7 +199,14 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     .map_err(|error| {
         Failure::internal(format_args!("cannot listen on {} (metrics): {error}", config.metrics.listen))
     })?;
-    let mut service = Service::start(&config).await?;
+    // The store may have its schema to bring up to date, or wait for another server that does.
+    let mut service = tokio::select! {
+        started = Service::start(&config) => started?,
+        () = signals.next() => {
+            tracing::info!("ended before it had started");
+            return Ok(Exit::Done);
+        }
+    };
     follow_store(&ready, service.store_reachable());
     ready.set(true);
     let scheme = if config.tls.files().is_some() { "https" } else { "http" };
