@@ -34,6 +34,27 @@ impl ServerArgs {
     }
 }
 
+/// Which page of a list.
+#[derive(Debug, Clone, Args)]
+pub struct PageArgs {
+    /// Entries in a page
+    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    pub page_size: u16,
+
+    /// The page that follows another
+    #[arg(long, value_name = "TOKEN", default_value = "")]
+    pub page_token: String,
+}
+
+impl PageArgs {
+    /// Says on stderr how to ask for the next page, where there is one.
+    pub fn tell_next(next_page_token: &str) {
+        if !next_page_token.is_empty() {
+            eprintln!("more: --page-token {next_page_token}");
+        }
+    }
+}
+
 /// Which tracks to solve.
 #[derive(Debug, Clone, Args)]
 pub struct InputArgs {

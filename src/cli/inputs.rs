@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::args::ServerArgs;
+use super::args::{PageArgs, ServerArgs};
 use super::exit::{Exit, Failure};
 use super::print;
 use crate::rpc::proto;
@@ -22,13 +22,8 @@ pub struct Args {
     #[command(flatten)]
     pub server: ServerArgs,
 
-    /// Inputs in a page
-    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u16).range(1..=1000))]
-    pub page_size: u16,
-
-    /// The page that follows another
-    #[arg(long, value_name = "TOKEN", default_value = "")]
-    pub page_token: String,
+    #[command(flatten)]
+    pub page: PageArgs,
 
     /// One input a line, as JSON
     #[arg(long)]
@@ -38,13 +33,11 @@ pub struct Args {
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let mut client = args.server.connect().await?;
-    let page = client.list_inputs(args.page_size, &args.page_token).await?;
+    let page = client.list_inputs(args.page.page_size, &args.page.page_token).await?;
     for input in &page.inputs {
         print(&if args.json { as_json(input) } else { line(input) })?;
     }
-    if !page.next_page_token.is_empty() {
-        eprintln!("more: --page-token {}", page.next_page_token);
-    }
+    PageArgs::tell_next(&page.next_page_token);
     Ok(Exit::Done)
 }
 

@@ -2,7 +2,7 @@
 
 use clap::ValueEnum;
 
-use super::args::ServerArgs;
+use super::args::{PageArgs, ServerArgs};
 use super::exit::{Exit, Failure};
 use super::{job_view, print};
 use crate::domain::job::JobState;
@@ -30,13 +30,8 @@ pub struct Args {
     #[arg(long, default_value = "")]
     pub filter: String,
 
-    /// Jobs in a page
-    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u16).range(1..=1000))]
-    pub page_size: u16,
-
-    /// The page that follows another
-    #[arg(long, value_name = "TOKEN", default_value = "")]
-    pub page_token: String,
+    #[command(flatten)]
+    pub page: PageArgs,
 
     /// One job a line, as JSON
     #[arg(long)]
@@ -70,13 +65,11 @@ impl From<StateArg> for JobState {
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let mut client = args.server.connect().await?;
-    let page = client.list(&filter(&args), args.page_size, &args.page_token).await?;
+    let page = client.list(&filter(&args), args.page.page_size, &args.page.page_token).await?;
     for job in &page.jobs {
         print(&if args.json { job_view::job_json(job).to_string() } else { job_view::job_line(job) })?;
     }
-    if !page.next_page_token.is_empty() {
-        eprintln!("more: --page-token {}", page.next_page_token);
-    }
+    PageArgs::tell_next(&page.next_page_token);
     Ok(Exit::Done)
 }
 

@@ -8,8 +8,9 @@ use serde::{Deserialize, Serialize};
 
 use super::input_name::InputName;
 use super::progress::Progress;
-use super::result::{Grade, Prior, Status, Warning};
+use super::result::{Grade, Prior, Status};
 use super::settings::SolveSettings;
+use super::warning::Warning;
 
 /// Tenant of callers without an API key.
 pub const DEFAULT_TENANT: &str = "default";

@@ -4,7 +4,8 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::result::{ViewResult, Warning, WarningCode};
+use super::result::ViewResult;
+use super::warning::{Warning, WarningCode};
 
 /// Views named one by one in a warning; past these they are only counted.
 const MOST_LISTED: usize = 20;

@@ -15,6 +15,7 @@ pub mod quota;
 pub mod result;
 pub mod settings;
 pub mod stop;
+pub mod warning;
 
 pub use error::{InvalidInput, Violation};
 pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
@@ -23,6 +24,7 @@ pub use left_out::LeftOut;
 pub use limits::Limits;
 pub use progress::{Losses, Observer, Progress, Silent, Stage};
 pub use quota::{Oversize, Quota};
-pub use result::{Calibration, Grade, Prior, Solution, Status, Warning, WarningCode};
+pub use result::{Calibration, Grade, Prior, Solution, Status};
 pub use settings::{Backend, Method, SolveSettings};
 pub use stop::{StopReason, StopToken};
+pub use warning::{Warning, WarningCode};

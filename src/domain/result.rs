@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::left_out::LeftOut;
 use super::progress::{Progress, Stage};
 use super::settings::Method;
+use super::warning::Warning;
 
 /// Whether a reconstruction stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -85,120 +86,6 @@ impl Prior {
     }
 }
 
-/// What a caller must know about a result, by a code that programs can match.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
-pub enum WarningCode {
-    /// Homographies explain the views, and the data do not tell a planar scene from a camera that only rotated.
-    PlanarOrRotation,
-    /// The points of the consensus lie on a plane.
-    PlanarScene,
-    /// The camera turned about its centre without moving.
-    PureRotation,
-    /// The camera moved without turning: every focal length fits. Forward motion is a case of it; the detail says so.
-    PureTranslation,
-    /// The motion leaves the focal length (nearly) free, or the one that fits best is that of no lens; the detail says
-    /// which.
-    UnobservableFocal,
-    /// Another calibration explains the data about as well.
-    SecondMinimum,
-    /// The metric model fits notably worse than the projective one: distortion, a zoom, a wrong principal point.
-    ModelMismatch,
-    /// Too few inlier tracks to verify or to calibrate.
-    FewInliers,
-    /// The data do not determine the principal point; it was taken to be near the image centre.
-    PrincipalPointUnobservable,
-    /// Points lie behind cameras.
-    Cheirality,
-    /// No consensus was found.
-    NoConsensus,
-    /// Tracks outside the consensus agree on another rigid structure: a second motion.
-    SecondStructure,
-    /// Views were left out; the detail lists them.
-    ViewsLeftOut,
-    /// No image size was given; the extent of the points stood in.
-    AssumedImageSize,
-    /// Most points lie far outside the image size that was given: that of other images, or of a reduced copy.
-    PointsOutsideImage,
-    /// Views of several camera groups or sizes were treated as one camera.
-    CameraGroupsMerged,
-    /// Nothing was verified; the weights are the trained network's opinion of which tracks are right.
-    UnverifiedRanking,
-    /// The deadline stopped the search; this is the best found by then. Not given yet: such a job expires.
-    StoppedEarly,
-}
-
-impl WarningCode {
-    /// Whether it can be why there is no focal length; the others tell of what was assumed or left out.
-    pub fn refuses(self) -> bool {
-        match self {
-            WarningCode::PlanarOrRotation
-            | WarningCode::PlanarScene
-            | WarningCode::PureRotation
-            | WarningCode::PureTranslation
-            | WarningCode::UnobservableFocal
-            | WarningCode::SecondMinimum
-            | WarningCode::ModelMismatch
-            | WarningCode::FewInliers
-            | WarningCode::Cheirality
-            | WarningCode::NoConsensus => true,
-            WarningCode::PrincipalPointUnobservable
-            | WarningCode::SecondStructure
-            | WarningCode::ViewsLeftOut
-            | WarningCode::AssumedImageSize
-            | WarningCode::PointsOutsideImage
-            | WarningCode::CameraGroupsMerged
-            | WarningCode::UnverifiedRanking
-            | WarningCode::StoppedEarly => false,
-        }
-    }
-
-    /// The code as it stands in files.
-    pub fn name(self) -> &'static str {
-        match self {
-            WarningCode::PlanarOrRotation => "PLANAR_OR_ROTATION",
-            WarningCode::PlanarScene => "PLANAR_SCENE",
-            WarningCode::PureRotation => "PURE_ROTATION",
-            WarningCode::PureTranslation => "PURE_TRANSLATION",
-            WarningCode::UnobservableFocal => "UNOBSERVABLE_FOCAL",
-            WarningCode::PrincipalPointUnobservable => "PRINCIPAL_POINT_UNOBSERVABLE",
-            WarningCode::SecondStructure => "SECOND_STRUCTURE",
-            WarningCode::SecondMinimum => "SECOND_MINIMUM",
-            WarningCode::ModelMismatch => "MODEL_MISMATCH",
-            WarningCode::FewInliers => "FEW_INLIERS",
-            WarningCode::Cheirality => "CHEIRALITY",
-            WarningCode::NoConsensus => "NO_CONSENSUS",
-            WarningCode::ViewsLeftOut => "VIEWS_LEFT_OUT",
-            WarningCode::AssumedImageSize => "ASSUMED_IMAGE_SIZE",
-            WarningCode::PointsOutsideImage => "POINTS_OUTSIDE_IMAGE",
-            WarningCode::CameraGroupsMerged => "CAMERA_GROUPS_MERGED",
-            WarningCode::UnverifiedRanking => "UNVERIFIED_RANKING",
-            WarningCode::StoppedEarly => "STOPPED_EARLY",
-        }
-    }
-}
-
-/// A warning in words.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Warning {
-    pub code: WarningCode,
-    pub detail: String,
-    /// The camera group that it is of, by the input's number; `None`: the result as a whole.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub camera_group: Option<u32>,
-}
-
-impl Warning {
-    pub fn new(code: WarningCode, detail: impl Into<String>) -> Self {
-        Self { code, detail: detail.into(), camera_group: None }
-    }
-
-    /// The same of one camera group.
-    pub fn of_group(self, camera_group: u32) -> Self {
-        Self { camera_group: Some(camera_group), ..self }
-    }
-}
-
 /// Intrinsics of one camera group, with their uncertainty.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
@@ -264,7 +151,7 @@ pub struct ViewResult {
 /// What the geometry says of every track of the input (parallel arrays, one entry a track).
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrackResults {
-    /// AUTO, GEOMETRY: probability that the track is an inlier, under [`WarningCode::UnverifiedRanking`] by the trained
+    /// AUTO, GEOMETRY: probability that the track is an inlier, under `UNVERIFIED_RANKING` by the trained
     /// network alone; PAPER: the network's own weight; PSFM: closeness to the
     /// subspace. 0 for tracks that were not judged.
     pub weight: Vec<f32>,
@@ -454,7 +341,5 @@ mod tests {
         for grade in [Grade::Metric, Grade::Weak, Grade::ProjectiveOnly] {
             assert_eq!(serde_json::to_value(grade).expect("serialisable"), grade.name());
         }
-        let code = WarningCode::CameraGroupsMerged;
-        assert_eq!(serde_json::to_value(code).expect("serialisable"), code.name());
     }
 }

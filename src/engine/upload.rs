@@ -104,9 +104,7 @@ impl Engine {
     pub async fn upload_status(&self, name: &InputName) -> Result<UploadStatus, Error> {
         Ok(self.inner.store.upload(name).await?)
     }
-}
 
-impl Engine {
     /// One page of a tenant's uploaded inputs.
     ///
     /// # Errors

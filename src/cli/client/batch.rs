@@ -1,7 +1,8 @@
 //! Several jobs in one call, all or none.
 
 use super::backoff::Backoff;
-use super::{Client, Error, JobOptions, create_request};
+use super::jobs::{JobOptions, create_request};
+use super::{Client, Error};
 use crate::domain::job::Job;
 use crate::domain::{InputName, RawInput, SolveSettings};
 use crate::rpc::convert;

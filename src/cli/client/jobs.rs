@@ -1,0 +1,251 @@
+//! Calls of the job API.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use prost::Message;
+use tonic::{Status, Streaming};
+
+use super::backoff::Backoff;
+use super::{Client, Error};
+use crate::domain::job::{EventBody, Job, JobEvent, JobName};
+use crate::domain::{InputName, RawInput, Solution, SolveSettings};
+use crate::rpc::convert;
+use crate::rpc::proto::{self, create_job_request::Input as JobInput};
+
+/// What a caller says of a job beside input and settings.
+#[derive(Debug, Clone, Default)]
+pub struct JobOptions {
+    pub job_id: Option<String>,
+    /// `None`: one is made, so that a broken call can be repeated.
+    pub request_id: Option<String>,
+    pub labels: BTreeMap<String, String>,
+    pub priority: i32,
+    pub time_limit: Option<Duration>,
+}
+
+/// One page of a list.
+#[derive(Debug)]
+pub struct Page {
+    pub jobs: Vec<Job>,
+    /// Empty on the last page.
+    pub next_page_token: String,
+}
+
+impl Client {
+    /// Creates a job that lives on without this client.
+    ///
+    /// # Errors
+    /// See [`Error`].
+    pub async fn create(
+        &mut self,
+        input: &RawInput,
+        settings: &SolveSettings,
+        options: JobOptions,
+    ) -> Result<Job, Error> {
+        self.create_of(JobInput::TrackSet(convert::input::to_wire(input)), settings, options).await
+    }
+
+    /// The same with an input that was uploaded.
+    ///
+    /// # Errors
+    /// See [`Error`].
+    pub async fn create_with(
+        &mut self,
+        input: &InputName,
+        settings: &SolveSettings,
+        options: JobOptions,
+    ) -> Result<Job, Error> {
+        self.create_of(JobInput::InputName(input.to_string()), settings, options).await
+    }
+
+    async fn create_of(
+        &mut self,
+        input: JobInput,
+        settings: &SolveSettings,
+        options: JobOptions,
+    ) -> Result<Job, Error> {
+        let request = create_request(self.parent(), input, settings, options);
+        let mut backoff = Backoff::default();
+        loop {
+            match backoff.within(self.jobs.create_job(request.clone())).await {
+                Ok(job) => return Ok(convert::job::from_wire(job.into_inner())?),
+                Err(status) => self.pause(&mut backoff, status).await?,
+            }
+        }
+    }
+
+    /// # Errors
+    /// See [`Error`].
+    pub async fn get(&mut self, name: &JobName) -> Result<Job, Error> {
+        let answer = self.jobs.get_job(proto::GetJobRequest { name: name.to_string() }).await;
+        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+    }
+
+    /// One page of the jobs that `filter` lets through, the newest first.
+    ///
+    /// # Errors
+    /// See [`Error`].
+    pub async fn list(&mut self, filter: &str, page_size: u16, page_token: &str) -> Result<Page, Error> {
+        let request = proto::ListJobsRequest {
+            parent: self.parent(),
+            page_size: page_size.into(),
+            page_token: page_token.to_owned(),
+            filter: filter.to_owned(),
+            order_by: String::new(),
+        };
+        let page = self.jobs.list_jobs(request).await.map_err(|status| self.error(status))?.into_inner();
+        let jobs = page.jobs.into_iter().map(convert::job::from_wire).collect::<Result<_, _>>()?;
+        Ok(Page { jobs, next_page_token: page.next_page_token })
+    }
+
+    /// # Errors
+    /// See [`Error`].
+    pub async fn cancel(&mut self, name: &JobName) -> Result<Job, Error> {
+        let request = proto::CancelJobRequest { name: name.to_string(), etag: String::new() };
+        let answer = self.jobs.cancel_job(request).await;
+        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+    }
+
+    /// Removes a job that has ended.
+    ///
+    /// # Errors
+    /// See [`Error`]; [`Error::Refused`] for one that has not ended.
+    pub async fn delete(&mut self, name: &JobName) -> Result<(), Error> {
+        let request = proto::DeleteJobRequest { name: name.to_string(), etag: String::new() };
+        self.jobs.delete_job(request).await.map(|_| ()).map_err(|status| self.error(status))
+    }
+
+    /// Tells a job's events after a sequence number until its end, over broken connections and restarts of the server.
+    ///
+    /// How the job ended is in the event that is returned, its last; `None` where the job has ended and nothing came
+    /// after that number.
+    ///
+    /// # Errors
+    /// What went wrong with the watch.
+    pub async fn watch(
+        &mut self,
+        name: &JobName,
+        after_sequence: u64,
+        on_event: &mut (dyn FnMut(&JobEvent) + Send),
+    ) -> Result<Option<JobEvent>, Error> {
+        let mut told = Told { last_sequence: after_sequence, on_event };
+        let mut backoff = Backoff::default();
+        loop {
+            let request = proto::WatchJobRequest { name: name.to_string(), after_sequence: told.last_sequence };
+            let outcome = match backoff.within(self.jobs.watch_job(request)).await {
+                Ok(events) => told.follow(events.into_inner(), &mut backoff).await?,
+                Err(status) => Err(status),
+            };
+            match outcome {
+                Ok(last) => return Ok(last),
+                Err(status) => self.pause(&mut backoff, status).await?,
+            }
+        }
+    }
+
+    /// Reads a result.
+    ///
+    /// # Errors
+    /// See [`Error`]; [`Error::Refused`] while there is none.
+    pub async fn read_result(&mut self, name: &JobName) -> Result<Solution, Error> {
+        let mut bytes = Vec::new();
+        let mut backoff = Backoff::default();
+        while let Err(status) = self.read_on(name, &mut bytes, &mut backoff).await? {
+            self.pause(&mut backoff, status).await?;
+        }
+        let result = proto::JobResult::decode(bytes.as_slice())
+            .map_err(|error| Error::Failed(format!("the server's result cannot be decoded: {error}")))?;
+        Ok(convert::result::from_wire(result)?)
+    }
+
+    /// Reads on from what is there; the inner error is worth another try.
+    async fn read_on(
+        &mut self,
+        name: &JobName,
+        bytes: &mut Vec<u8>,
+        backoff: &mut Backoff,
+    ) -> Result<Result<(), Status>, Error> {
+        let request = proto::ReadJobResultRequest { name: name.to_string(), offset: bytes.len() as i64 };
+        let mut chunks = match backoff.within(self.jobs.read_job_result(request)).await {
+            Ok(chunks) => chunks.into_inner(),
+            Err(status) => return Ok(Err(status)),
+        };
+        let mut total = 0;
+        loop {
+            match chunks.message().await {
+                Ok(Some(chunk)) if chunk.offset == bytes.len() as i64 => {
+                    total = chunk.total_size;
+                    bytes.extend_from_slice(&chunk.data);
+                    backoff.reset();
+                }
+                Ok(Some(chunk)) => {
+                    let text = format!("a chunk begins at {} where {} was due", chunk.offset, bytes.len());
+                    return Err(Error::Failed(text));
+                }
+                Ok(None) if total == bytes.len() as i64 => return Ok(Ok(())),
+                Ok(None) => return Err(Error::Failed(format!("the result ended at {} of {total}", bytes.len()))),
+                Err(status) => return Ok(Err(status)),
+            }
+        }
+    }
+}
+
+/// Passes events on, each sequenced one once.
+pub(super) struct Told<'a> {
+    pub(super) last_sequence: u64,
+    pub(super) on_event: &'a mut (dyn FnMut(&JobEvent) + Send),
+}
+
+impl Told<'_> {
+    /// Follows one stream to its end. The inner error is worth another try; `None`: it ended without a terminal state.
+    pub(super) async fn follow(
+        &mut self,
+        mut events: Streaming<proto::JobEvent>,
+        backoff: &mut Backoff,
+    ) -> Result<Result<Option<JobEvent>, Status>, Error> {
+        loop {
+            let event = match events.message().await {
+                Ok(Some(event)) => convert::job::event_from_wire(event)?,
+                Ok(None) => return Ok(Ok(None)),
+                Err(status) => return Ok(Err(status)),
+            };
+            if event.sequence.is_some_and(|sequence| sequence <= self.last_sequence) {
+                continue;
+            }
+            backoff.reset();
+            self.last_sequence = event.sequence.unwrap_or(self.last_sequence);
+            (self.on_event)(&event);
+            if matches!(event.body, EventBody::State { state, .. } if state.is_terminal()) {
+                return Ok(Ok(Some(event)));
+            }
+        }
+    }
+}
+
+/// A request with a request id, so that it can be made again where the answer is lost.
+pub(super) fn create_request(
+    parent: String,
+    input: JobInput,
+    settings: &SolveSettings,
+    options: JobOptions,
+) -> proto::CreateJobRequest {
+    // What the wire cannot say is far above what a server takes: it says so.
+    let time_limit = options.time_limit.map(|limit| prost_types::Duration {
+        seconds: i64::try_from(limit.as_secs()).unwrap_or(i64::MAX),
+        nanos: limit.subsec_nanos() as i32,
+    });
+    proto::CreateJobRequest {
+        parent,
+        job_id: options.job_id.unwrap_or_default(),
+        request_id: options.request_id.unwrap_or_else(|| uuid::Uuid::now_v7().to_string()),
+        job: Some(proto::Job {
+            settings: Some(convert::settings::to_wire(settings)),
+            labels: options.labels,
+            priority: options.priority,
+            deadline: time_limit.map(proto::job::Deadline::TimeLimit),
+            ..proto::Job::default()
+        }),
+        input: Some(input),
+    }
+}

@@ -1,0 +1,122 @@
+//! One job from its input to its result, over one connection after another.
+
+use std::sync::Arc;
+
+use tokio_util::sync::CancellationToken;
+use tonic::Request;
+
+use super::backoff::Backoff;
+use super::jobs::{JobOptions, Told, create_request};
+use super::{Client, Error};
+use crate::cli::args::ServerArgs;
+use crate::domain::job::{EventBody, Failure, JobEvent, JobName, JobState};
+use crate::domain::{RawInput, Solution, SolveSettings};
+use crate::rpc::convert;
+use crate::rpc::proto::{self, create_job_request::Input as JobInput};
+
+impl Client {
+    /// Creates a job, follows it to its end and reads its result. When `stop` is cancelled, so is the job.
+    ///
+    /// # Errors
+    /// See [`Error`]; a job that ended without a result is an error here.
+    pub async fn solve(
+        &mut self,
+        input: &RawInput,
+        settings: &SolveSettings,
+        on_event: &mut (dyn FnMut(&JobEvent) + Send),
+        stop: CancellationToken,
+    ) -> Result<Solution, Error> {
+        let mut name = None;
+        let mut on_named_event = |event: &JobEvent| {
+            name.get_or_insert_with(|| event.name.clone());
+            on_event(event);
+        };
+        let mut solving = self.clone();
+        let last = tokio::select! {
+            last = solving.follow_solve(input, settings, &mut on_named_event) => last?,
+            () = stop.cancelled() => {
+                if let Some(name) = &name {
+                    self.cancel(name).await?;
+                }
+                return Err(Error::Cancelled);
+            }
+        };
+        ended(&last)?;
+        self.read_result(&last.name).await
+    }
+
+    /// A broken call is made again under the same request id: it takes up the job within the server's grace period, and
+    /// tells its events anew, of which only new ones are passed on.
+    async fn follow_solve(
+        &mut self,
+        input: &RawInput,
+        settings: &SolveSettings,
+        on_event: &mut (dyn FnMut(&JobEvent) + Send),
+    ) -> Result<JobEvent, Error> {
+        let input = Arc::new(input.clone());
+        let config = create_request(
+            self.parent(),
+            JobInput::TrackSet(convert::input::head_to_wire(&input)),
+            settings,
+            JobOptions::default(),
+        );
+        let mut told = Told { last_sequence: 0, on_event };
+        let mut backoff = Backoff::default();
+        loop {
+            use proto::solve_request::Message;
+            let chunks = convert::input::chunks(Arc::clone(&input)).map(Message::TrackSetChunk);
+            let messages = std::iter::once(Message::Config(config.clone())).chain(chunks);
+            let messages = messages.map(|message| proto::SolveRequest { message: Some(message) });
+            let outcome = match self.calibration.solve(Request::new(tokio_stream::iter(messages))).await {
+                Ok(events) => told.follow(events.into_inner(), &mut backoff).await?,
+                Err(status) => Err(status),
+            };
+            match outcome {
+                Ok(Some(last)) => return Ok(last),
+                Ok(None) => return Err(Error::Failed("the server ended a solve without its last event".into())),
+                Err(status) => self.pause(&mut backoff, status).await?,
+            }
+        }
+    }
+}
+
+/// `Ok` when a job's last event says that its result stands.
+///
+/// # Errors
+/// [`Error::Cancelled`], or [`Error::Failed`] with the reason.
+pub fn ended(last: &JobEvent) -> Result<(), Error> {
+    match &last.body {
+        EventBody::State { state, failure } => ended_as(&last.name, *state, failure.as_ref()),
+        _ => Err(Error::Failed(format!("{} did not succeed", last.name))),
+    }
+}
+
+/// The same of a job's state.
+///
+/// # Errors
+/// See [`ended`].
+pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> Result<(), Error> {
+    match (state, failure) {
+        (JobState::Succeeded, _) => Ok(()),
+        (JobState::Cancelled, _) => Err(Error::Cancelled),
+        (JobState::Expired, _) => {
+            Err(Error::Failed(format!("{name} expired: its deadline passed before a result stood")))
+        }
+        (_, Some(failure)) => Err(Error::Failed(format!("{name} failed: {} ({})", failure.message, failure.reason))),
+        _ => Err(Error::Failed(format!("{name} did not succeed"))),
+    }
+}
+
+/// Runs one job on a server: what `scpsfm solve --server` and `scpsfm demo` do. See [`Client::solve`].
+///
+/// # Errors
+/// See [`Error`].
+pub async fn solve(
+    server: &ServerArgs,
+    input: &RawInput,
+    settings: &SolveSettings,
+    on_event: &mut (dyn FnMut(&JobEvent) + Send),
+    stop: CancellationToken,
+) -> Result<Solution, Error> {
+    server.connect().await?.solve(input, settings, on_event, stop).await
+}
