@@ -160,14 +160,12 @@ pub struct ExportArgs {
 }
 
 impl ExportArgs {
-    /// Writes what is asked for. A result that is not metric is no failure: it is told on stderr.
+    /// Writes what is asked for, and takes away what a former run was asked for. A result that is not metric is no
+    /// failure: it is told on stderr.
     ///
     /// # Errors
-    /// A file that cannot be written.
+    /// A file that cannot be written or removed.
     pub fn write(&self, directory: &Path, solution: &Solution, input: &LabelledInput) -> Result<(), Failure> {
-        if self.export.is_empty() {
-            return Ok(());
-        }
         let exports: Vec<Export> = self.export.iter().copied().map(Export::from).collect();
         match formats::export::write(directory, &exports, solution, input) {
             Err(error @ formats::export::Error::NotMetric(_)) => eprintln!("warning: {error}"),

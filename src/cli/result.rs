@@ -7,7 +7,7 @@ use super::exit::{Exit, Failure};
 use super::job_view::GivenName;
 use super::{print, summary};
 use crate::domain::Solution;
-use crate::formats::{LabelledInput, result_files};
+use crate::formats::{LabelledInput, export, result_files};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -38,7 +38,7 @@ pub struct Args {
     #[command(flatten)]
     pub export: ExportArgs,
 
-    /// Directory for the result files; created, files of these names in it are replaced
+    /// Directory for the result files; created, files of these names in it are replaced, and those of a former result go
     #[arg(long, value_name = "DIR", required_unless_present = "json")]
     pub out: Option<PathBuf>,
 
@@ -59,8 +59,9 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         belongs_together(input, &solution)?;
     }
     if let Some(out) = &args.out {
-        if let Some(input) = &input {
-            args.export.write(out, &solution, input)?;
+        match &input {
+            Some(input) => args.export.write(out, &solution, input)?,
+            None => export::remove_former(out, &[], None)?,
         }
         result_files::write(out, &solution, input.as_ref())?;
     }

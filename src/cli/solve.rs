@@ -46,7 +46,7 @@ pub struct Args {
     #[command(flatten)]
     pub access: AccessArgs,
 
-    /// Directory for the result files; created, files of these names in it are replaced
+    /// Directory for the result files; created, files of these names in it are replaced, and those of a former result go
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
 

@@ -12,7 +12,7 @@ fn model_of(solution: &Solution, input: &LabelledInput) -> Model {
     Model::of_parts(solution, input).expect("metric").remove(0)
 }
 
-const ALL: [Export; 3] = [Export::Colmap, Export::ColmapText, Export::OpenSfm];
+const ALL: [Export; 3] = Export::ALL;
 
 #[test]
 fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
@@ -226,4 +226,51 @@ fn parts_of_a_former_result_are_taken_away() {
     assert!(!directory.join("colmap/1").exists());
     assert!(mine.exists() && !directory.join("colmap-text/1/cameras.txt").exists());
     assert!(directory.join("colmap/cameras.bin").is_file());
+}
+
+#[test]
+fn exports_of_a_former_run_go_whatever_this_one_is_asked_for() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let directory = directory.path();
+    let (mut input, solution) = fixture::solved_in_two_parts();
+    write(directory, &ALL, &solution, &input).expect("written");
+    assert!(directory.join("colmap/1/points3D.bin").is_file());
+    write(directory, &[Export::OpenSfm], &solution, &input).expect("written");
+    assert!(!directory.join("colmap").exists() && !directory.join("colmap-text").exists());
+    assert!(directory.join("opensfm/reconstruction.json").is_file());
+    write(directory, &[], &fixture::projective_only().1, &input).expect("nothing is asked for");
+    assert!(!directory.join("opensfm").exists());
+    // What this run was given to solve stays.
+    write(directory, &ALL, &solution, &input).expect("written");
+    input.path = directory.join("colmap");
+    write(directory, &[], &solution, &input).expect("written");
+    assert!(directory.join("colmap/cameras.bin").is_file() && !directory.join("colmap/1").exists());
+}
+
+#[test]
+fn models_of_other_programs_stay() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let directory = directory.path();
+    let (input, mut solution) = fixture::solved();
+    let model = |solution: &Solution| model_of(solution, &input);
+    let put = |folder: &str, file: &str, bytes: &[u8]| {
+        create_directory(&directory.join(folder)).expect("created");
+        fs::write(directory.join(folder).join(file), bytes).expect("written");
+    };
+    let mut coloured = model(&solution);
+    coloured.points[3].colour = [90, 120, 30];
+    for (file, bytes) in Export::Colmap.files().1.iter().zip(colmap::write::binary(&coloured)) {
+        put("colmap", file, &bytes);
+    }
+    for (file, text) in Export::ColmapText.files().1.iter().zip(colmap::write::text(&model(&solution))) {
+        put("colmap-text", file, text.replace("# ", "# Camera list with ").as_bytes());
+    }
+    let json = pretty(&opensfm::reconstruction::json(&[model(&solution)])).expect("JSON");
+    put("opensfm", "reconstruction.json", json.replace("scpsfm camera", "v2 unknown").as_bytes());
+    solution.calibrations.clear();
+    write(directory, &[], &solution, &input).expect("written");
+    for export in ALL {
+        let (folder, files) = export.files();
+        assert!(files.iter().all(|file| directory.join(folder).join(file).is_file()), "{export:?}");
+    }
 }

@@ -7,6 +7,7 @@ pub mod cameras_json;
 pub mod colmap;
 pub mod error;
 pub mod export;
+mod former;
 pub mod input;
 pub mod label;
 pub mod metric;

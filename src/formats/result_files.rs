@@ -4,10 +4,9 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use super::LabelledInput;
 use super::cameras_json::CamerasJson;
-use super::ply;
 use super::result_json::{ResultJson, track_label, view_label};
+use super::{LabelledInput, former, ply};
 use crate::domain::Solution;
 use crate::report;
 
@@ -29,37 +28,25 @@ pub fn result_json(solution: &Solution, input: Option<&LabelledInput>) -> io::Re
 }
 
 /// Writes the result files into `directory`, which is created. Without the input, indices stand for labels, there is
-/// no `observations.csv` and the report has no picture of the tracks.
+/// no `observations.csv` and the report has no picture of the tracks. What a former run left there and this one does not
+/// make goes, but for other programs' files: see [`super::export`].
 ///
 /// # Errors
-/// The first file that cannot be written, named.
+/// The first file that cannot be written, named; until every file is on the disk the former ones stand.
 pub fn write(directory: &Path, solution: &Solution, input: Option<&LabelledInput>) -> io::Result<()> {
     create_directory(directory)?;
-    write_atomically(directory, TRACKS, tracks_csv(solution, input).as_bytes())?;
+    let mut draft = Draft::new(directory);
+    draft.add(TRACKS, tracks_csv(solution, input).as_bytes())?;
     if let Some(input) = input {
-        write_atomically(directory, OBSERVATIONS, observations_csv(solution, input).as_bytes())?;
+        draft.add(OBSERVATIONS, observations_csv(solution, input).as_bytes())?;
     }
-    write_atomically(directory, CAMERAS, pretty(&CamerasJson::new(solution, input))?.as_bytes())?;
-    write_points(directory, solution, input)?;
-    write_atomically(directory, REPORT, report::page(solution, input).as_bytes())?;
-    write_atomically(directory, RESULT, result_json(solution, input)?.as_bytes())
-}
-
-/// The points, a file a part: parts have frames of their own, which no program could tell apart in one file. Files of a
-/// former result's parts are removed.
-fn write_points(directory: &Path, solution: &Solution, input: Option<&LabelledInput>) -> io::Result<()> {
-    let parts = solution.part_count().max(1);
-    for part in 0..parts {
-        write_atomically(directory, &points_of(part), ply::points(solution, input, part).as_bytes())?;
+    draft.add(CAMERAS, pretty(&CamerasJson::new(solution, input))?.as_bytes())?;
+    // A file a part: parts have frames of their own, which no program could tell apart in one file.
+    for part in 0..solution.part_count().max(1) {
+        draft.add(&points_of(part), ply::points(solution, input, part).as_bytes())?;
     }
-    for entry in fs::read_dir(directory)? {
-        let name = entry?.file_name();
-        if name.to_str().and_then(part_of_points).is_some_and(|part| part >= parts) {
-            fs::remove_file(directory.join(&name))
-                .map_err(|error| named(&error, &format!("cannot remove {}", directory.join(&name).display())))?;
-        }
-    }
-    Ok(())
+    draft.add(REPORT, report::page(solution, input).as_bytes())?;
+    draft.publish(RESULT, result_json(solution, input)?.as_bytes())
 }
 
 /// Name of the file of a part's points: `points.ply` for the largest, `points-part-1.ply` for part 1 of `cameras.json` and
@@ -69,7 +56,7 @@ pub fn points_of(part: u32) -> String {
 }
 
 /// The part whose file has this name, but the largest.
-fn part_of_points(name: &str) -> Option<u32> {
+pub(super) fn part_of_points(name: &str) -> Option<u32> {
     let part = name.strip_prefix("points-part-")?.strip_suffix(".ply")?.parse().ok()?;
     (points_of(part) == name).then_some(part)
 }
@@ -99,23 +86,95 @@ pub fn create_directory(directory: &Path) -> io::Result<()> {
 /// # Errors
 /// The file cannot be written; the message names it.
 pub fn write_atomically(directory: &Path, name: &str, bytes: &[u8]) -> io::Result<()> {
-    let target = directory.join(name);
-    let temporary = TemporaryFile(directory.join(format!(".{name}.{}", std::process::id())));
-    let attempt = || {
-        let mut file = File::create(&temporary.0)?;
-        file.write_all(bytes)?;
-        file.sync_all()?;
-        fs::rename(&temporary.0, &target)
-    };
-    attempt().map_err(|error| named(&error, &format!("cannot write {}", target.display())))
+    TemporaryFile::write(directory, name, bytes)?.rename()
 }
 
-/// Removes the file when dropped; after the rename there is nothing left to remove.
-struct TemporaryFile(PathBuf);
+/// Files of one run that are to stand together: all are on the disk before the first takes its name.
+pub struct Draft<'a> {
+    directory: &'a Path,
+    files: Vec<TemporaryFile>,
+}
+
+impl<'a> Draft<'a> {
+    /// Nothing yet; the directory exists.
+    pub fn new(directory: &'a Path) -> Self {
+        Self { directory, files: Vec::new() }
+    }
+
+    /// Writes a file under a temporary name.
+    ///
+    /// # Errors
+    /// The file cannot be written; the message names it.
+    pub fn add(&mut self, name: &str, bytes: &[u8]) -> io::Result<()> {
+        self.files.push(TemporaryFile::write(self.directory, name, bytes)?);
+        Ok(())
+    }
+
+    /// Gives the files their names, and takes away what former runs left beside them. The file that says that the others
+    /// are there goes before any other changes, and comes last.
+    ///
+    /// # Errors
+    /// The first file that cannot be written or removed, named.
+    pub fn publish(mut self, last: &str, bytes: &[u8]) -> io::Result<()> {
+        let complete = TemporaryFile::write(self.directory, last, bytes)?;
+        if !complete.target.is_dir() {
+            remove(&complete.target)?;
+        }
+        let mut names = vec![last.to_owned()];
+        for file in self.files.drain(..) {
+            names.extend(file.target.file_name().and_then(|name| name.to_str()).map(str::to_owned));
+            file.rename()?;
+        }
+        former::remove_beside(self.directory, &names)?;
+        complete.rename()
+    }
+}
+
+/// A file that is on the disk under a temporary name, and is removed when dropped; after the rename there is nothing left
+/// to remove.
+struct TemporaryFile {
+    temporary: PathBuf,
+    target: PathBuf,
+}
+
+impl TemporaryFile {
+    fn write(directory: &Path, name: &str, bytes: &[u8]) -> io::Result<Self> {
+        let file =
+            Self { temporary: directory.join(format!(".{name}.{}", std::process::id())), target: directory.join(name) };
+        let attempt = || {
+            let mut open = File::create(&file.temporary)?;
+            open.write_all(bytes)?;
+            open.sync_all()
+        };
+        attempt().map_err(|error| file.failed(&error))?;
+        Ok(file)
+    }
+
+    fn rename(self) -> io::Result<()> {
+        fs::rename(&self.temporary, &self.target).map_err(|error| self.failed(&error))
+    }
+
+    fn failed(&self, error: &io::Error) -> io::Error {
+        named(error, &format!("cannot write {}", self.target.display()))
+    }
+}
 
 impl Drop for TemporaryFile {
     fn drop(&mut self) {
-        let _ = fs::remove_file(&self.0);
+        let _ = fs::remove_file(&self.temporary);
+    }
+}
+
+/// Removes a file if it is there.
+///
+/// # Errors
+/// It cannot be removed; the message names it.
+pub(super) fn remove(file: &Path) -> io::Result<()> {
+    match fs::remove_file(file) {
+        Err(error) if !matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+            Err(named(&error, &format!("cannot remove {}", file.display())))
+        }
+        _ => Ok(()),
     }
 }
 

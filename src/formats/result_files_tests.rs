@@ -5,6 +5,7 @@ use serde_json::Value;
 use super::*;
 use crate::domain::{Calibration, Grade, LeftOut, Status, Warning, WarningCode};
 use crate::formats::fixture;
+use crate::formats::windows::{self, Table};
 
 fn json(solution: &Solution) -> Value {
     serde_json::from_str(&result_json(solution, None).expect("serialisable")).expect("JSON")
@@ -288,10 +289,12 @@ fn frames_are_never_mixed() {
     let words = said(directory.path(), &solution);
     assert!(words.contains("points-part-1.ply those of the others"), "{words}");
     // A result in one part takes away what the other parts left.
-    fs::write(directory.path().join("points-part-01.ply"), "mine").expect("written");
+    for name in ["points-part-01.ply", "points-part-2.ply"] {
+        fs::write(directory.path().join(name), "mine").expect("written");
+    }
     write(directory.path(), &fixture::solved().1, Some(&input)).expect("written");
     let names: Vec<String> = contents(directory.path()).into_keys().filter(|name| name.ends_with(".ply")).collect();
-    assert_eq!(names, ["points-part-01.ply", POINTS]);
+    assert_eq!(names, ["points-part-01.ply", "points-part-2.ply", POINTS]);
 }
 
 #[test]
@@ -305,4 +308,50 @@ fn what_cannot_be_written_is_named() {
     fs::create_dir_all(directory.path().join(TRACKS)).expect("created");
     let error = write(directory.path(), &solution, Some(&input)).expect_err("a directory stands there");
     assert!(error.to_string().contains(TRACKS), "{error}");
+}
+
+#[test]
+fn what_a_former_run_alone_made_goes_and_what_is_the_callers_stays() {
+    let (input, solution) = fixture::solved();
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let directory = directory.path();
+    let names = || contents(directory).into_keys().collect::<Vec<_>>();
+    write(directory, &solution, Some(&input)).expect("written");
+    // The same without the input has no table of the observations.
+    write(directory, &solution, None).expect("written");
+    assert_eq!(names(), [CAMERAS, POINTS, REPORT, RESULT, TRACKS]);
+    // Windows have other files, and a result replaces those.
+    let windows = || {
+        let mut draft = Draft::new(directory);
+        let table = Table::new(5, 5, 5, Vec::new());
+        draft.add(windows::CSV, table.csv().as_bytes()).expect("written");
+        draft.publish(windows::JSON, pretty(&table).expect("JSON").as_bytes()).expect("written");
+    };
+    windows();
+    assert_eq!(names(), [windows::CSV, windows::JSON]);
+    write(directory, &solution, Some(&input)).expect("written");
+    assert_eq!(names(), [CAMERAS, OBSERVATIONS, POINTS, REPORT, RESULT, TRACKS]);
+    // The same names with other contents are a caller's.
+    for name in names() {
+        fs::write(directory.join(name), "view,track,x,y\n").expect("written");
+    }
+    windows();
+    assert_eq!(names().len(), 8);
+}
+
+#[test]
+fn while_files_change_none_says_that_they_are_complete() {
+    let (input, solution) = fixture::solved();
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    write(directory.path(), &solution, Some(&input)).expect("written");
+    // The page cannot be replaced: others are by then.
+    let page = directory.path().join(REPORT);
+    fs::remove_file(&page).expect("removed");
+    fs::create_dir_all(page.join("full")).expect("created");
+    let error = write(directory.path(), &solution, None).expect_err("a directory stands there");
+    assert!(error.to_string().contains(REPORT), "{error}");
+    assert!(!directory.path().join(RESULT).exists());
+    let hidden =
+        |entry: io::Result<fs::DirEntry>| entry.expect("an entry").file_name().to_string_lossy().starts_with('.');
+    assert!(!fs::read_dir(directory.path()).expect("a directory").any(hidden), "temporary files are left");
 }
