@@ -36,6 +36,9 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
             solution.inlier_observation_count()
         ),
     );
+    if !solution.splits.is_empty() {
+        fact("splits", format!("{} further points in tracks that join several", solution.splits.len()));
+    }
     fact("views", format!("{} of {} registered", solution.registered_views().len(), solution.views.len()));
     if let Some(parts) = parts(solution) {
         fact("parts", parts);
@@ -124,6 +127,11 @@ mod tests {
         assert!(lines.contains("warning: FEW_INLIERS: "), "{lines}");
         solution.calibrations[0].sigma_log_focal = None;
         assert!(text(&solution, None).contains("unobservable"));
+    }
+
+    #[test]
+    fn tells_of_tracks_that_join_points() {
+        assert!(text(&fixture::solved_with_a_split().1, None).contains("splits       1 further points"));
     }
 
     #[test]

@@ -274,3 +274,35 @@ fn models_of_other_programs_stay() {
         assert!(files.iter().all(|file| directory.join(folder).join(file).is_file()), "{export:?}");
     }
 }
+
+/// A track that joins two points: both are there, each with the observations that show it.
+#[test]
+fn both_points_of_a_split_track_are_exported() {
+    let (mut input, solution) = fixture::solved_with_a_split();
+    let (track, inliers) = (solution.splits[0].track as usize, solution.inlier_track_count());
+    let model = model_of(&solution, &input);
+    assert_eq!(model.points.len(), inliers + 1);
+    let own = model.points.iter().find(|point| point.label == input.track_labels[track]).expect("its own point");
+    let other = model.points.last().expect("the other point");
+    assert_eq!((own.seen.len(), other.seen.len(), other.number), (3, 2, 1));
+    assert_eq!(other.id, model.points.iter().map(|point| point.id).max().expect("points"));
+    assert!(model.points[..inliers].iter().all(|point| point.id < other.id));
+    // Its keypoints lie where it is seen: it is the point of a right track.
+    let typical = model.points[..inliers].iter().map(|point| point.error_px).fold(0.0, f64::max);
+    assert!(other.error_px <= 2.0 * typical, "{} px beside {typical} px", other.error_px);
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    write(directory.path(), &[Export::ColmapText], &solution, &input).expect("written");
+    let again = colmap::model::read(&directory.path().join("colmap-text"), &crate::domain::Limits::default());
+    let again = again.expect("our own reader reads it").raw;
+    let seen = |point: u32| again.track.iter().filter(|&&track| track == point).count();
+    assert_eq!((again.track_count, seen(inliers as u32)), (inliers + 1, 2));
+    // A track of the caller's may be called what the other point would be.
+    let name = |label: &Label| format!("{label}+1");
+    let free = solution.tracks.inlier.iter().rposition(|&inlier| inlier).expect("an inlier");
+    input.track_labels[free] = Label::Name(name(&input.track_labels[track]).into());
+    let json = opensfm::reconstruction::json(&[model_of(&solution, &input)]);
+    assert_eq!(json[0]["points"].as_object().expect("points").len(), inliers + 1);
+    let ids: std::collections::BTreeSet<u64> =
+        model_of(&solution, &input).points.iter().map(|point| point.id).collect();
+    assert_eq!(ids.len(), inliers + 1);
+}

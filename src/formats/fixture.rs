@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, Matrix3x4, Matrix4, Vector3};
 use std::path::Path;
 
 use super::{Label, LabelledInput};
-use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, ViewResult};
+use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{
     Calibration, Grade, LeftOut, Losses, Method, Prior, Progress, Solution, Stage, Status, Warning, WarningCode,
 };
@@ -40,6 +40,31 @@ pub(crate) fn solved_in_two_parts() -> (LabelledInput, Solution) {
             solution.observations.inlier[k] = false;
             solution.observations.residual_px[k] = None;
         }
+    }
+    (input, solution)
+}
+
+/// The solved scene with two of its right tracks joined: of one the first three views, of the other the last two, under
+/// the number of the first. The other is empty then.
+pub(crate) fn solved_with_a_split() -> (LabelledInput, Solution) {
+    let (mut input, mut solution) = solved();
+    let mut inliers = (0..solution.tracks.inlier.len()).filter(|&track| solution.tracks.inlier[track]);
+    let (Some(first), Some(second)) = (inliers.next(), inliers.next()) else { panic!("no inliers") };
+    solution.splits =
+        vec![TrackSplit { track: first as u32, number: 1, weight: 0.9, point: solution.tracks.point[second].take() }];
+    (solution.tracks.inlier[second], solution.tracks.weight[second]) = (false, 0.0);
+    let place = |track: usize, view: u32| {
+        let of = |k: &usize| input.raw.track[*k] as usize == track && input.raw.view[*k] == view;
+        (0..input.raw.x.len()).find(of).expect("complete tracks")
+    };
+    let moved: Vec<(usize, usize)> = (3..5).map(|view| (place(first, view), place(second, view))).collect();
+    for (to, from) in moved {
+        (input.raw.x[to], input.raw.y[to]) = (input.raw.x[from], input.raw.y[from]);
+        (solution.observations.inlier[to], solution.observations.split[to]) = (false, 1);
+    }
+    let of_second = |k: &usize| input.raw.track[*k] as usize == second;
+    for k in (0..input.raw.x.len()).filter(of_second) {
+        (solution.observations.inlier[k], solution.observations.residual_px[k]) = (false, None);
     }
     (input, solution)
 }

@@ -8,8 +8,8 @@ use super::LabelledInput;
 use super::cameras_json::groups_of_views;
 use super::label::Label;
 use super::ply::colour;
-use super::result_json::view_label;
-use crate::domain::result::ViewResult;
+use super::result_json::{track_label, view_label};
+use crate::domain::result::{TrackSplit, ViewResult};
 use crate::domain::{Calibration, ImageSize, Solution};
 
 /// Why a result cannot be exported.
@@ -62,11 +62,14 @@ pub struct Keypoint {
     pub point: Option<usize>,
 }
 
-/// A point that two images see or more.
+/// A point that two images see or more: the own point of a track, or another that the track joins to it.
 #[derive(Debug)]
 pub struct Point {
     pub id: u64,
+    /// The track's, for another point of it with `+` and the number behind.
     pub label: Label,
+    /// 0: the track's own; else see [`TrackSplit::number`].
+    pub number: u32,
     pub position: [f64; 3],
     pub colour: [u8; 3],
     /// Mean reprojection error over its keypoints, a distance.
@@ -193,7 +196,8 @@ fn quaternion(rows: [[f64; 3]; 3]) -> UnitQuaternion<f64> {
     if rotation.w < 0.0 { UnitQuaternion::new_unchecked(-rotation.into_inner()) } else { rotation }
 }
 
-/// The points that two images of the part see or more; hangs every observation on its image.
+/// The points that two images of the part see or more, those that tracks join to their own at the end; hangs every
+/// observation on its image.
 fn points(
     solution: &Solution,
     input: &LabelledInput,
@@ -201,26 +205,22 @@ fn points(
     images: &mut [Image],
 ) -> Vec<Point> {
     let raw = &input.raw;
-    let point_of = |track: usize| solution.tracks.point.get(track).copied().flatten();
     let image_of = |k: usize| image_of_view.get(raw.view[k] as usize).copied().flatten();
-    let is_right = |k: usize| solution.observations.inlier.get(k) == Some(&true);
-    let mut seen_by = vec![0u32; raw.track_count];
-    for k in (0..raw.x.len()).filter(|&k| is_right(k) && image_of(k).is_some()) {
-        seen_by[raw.track[k] as usize] += 1;
+    let mut seen_by = vec![0u32; raw.track_count + solution.splits.len()];
+    for place in (0..raw.x.len()).filter(|&k| image_of(k).is_some()).filter_map(|k| shown(solution, input, k)) {
+        seen_by[place] += 1;
     }
-    let mut position_of = vec![None; raw.track_count];
+    let mut position_of = vec![None; seen_by.len()];
     let mut points = Vec::new();
-    for track in (0..raw.track_count).filter(|&track| seen_by[track] >= 2) {
-        let Some(position) = point_of(track) else { continue };
-        position_of[track] = Some(points.len());
-        let weight = solution.tracks.weight.get(track).copied().unwrap_or(0.0);
-        let label = input.track_labels.get(track).cloned().unwrap_or(Label::Number(track as u64));
-        let (colour, error_px, seen) = (colour(weight), 0.0, Vec::new());
-        points.push(Point { id: 0, label, position, colour, error_px, seen });
+    for place in (0..seen_by.len()).filter(|&place| seen_by[place] >= 2) {
+        if let Some(point) = point(solution, input, place) {
+            position_of[place] = Some(points.len());
+            points.push(point);
+        }
     }
     for k in 0..raw.x.len() {
         let Some(image) = image_of(k) else { continue };
-        let point = position_of[raw.track[k] as usize].filter(|_| is_right(k));
+        let point = shown(solution, input, k).and_then(|place| position_of[place]);
         if let Some(point) = point {
             points[point].seen.push((image, images[image].keypoints.len()));
         }
@@ -230,12 +230,49 @@ fn points(
     points
 }
 
-/// Ids of points: those of the tracks where all are numbers that COLMAP takes, else their positions from 1.
+/// Which point an observation shows: the index of its track for the track's own, behind all tracks the position among the
+/// splits for another; `None`: none.
+fn shown(solution: &Solution, input: &LabelledInput, k: usize) -> Option<usize> {
+    let track = input.raw.track[k];
+    if solution.observations.inlier.get(k) == Some(&true) {
+        return Some(track as usize);
+    }
+    let number = solution.observations.split.get(k).copied().filter(|number| *number > 0)?;
+    let split = solution.splits.binary_search_by_key(&(track, number), |split| (split.track, split.number)).ok()?;
+    Some(input.raw.track_count + split)
+}
+
+/// The point of this place, see [`shown`], without id, error and observations.
+fn point(solution: &Solution, input: &LabelledInput, place: usize) -> Option<Point> {
+    let (track, number, weight, position) = match place.checked_sub(input.raw.track_count) {
+        None => {
+            let weight = solution.tracks.weight.get(place).copied().unwrap_or(0.0);
+            (place, 0, weight, solution.tracks.point.get(place).copied().flatten()?)
+        }
+        Some(split) => {
+            let TrackSplit { track, number, weight, point } = *solution.splits.get(split)?;
+            (track as usize, number, weight, point?)
+        }
+    };
+    let label = match number {
+        0 => track_label(Some(input), track),
+        number => Label::Name(format!("{}+{number}", track_label(Some(input), track)).into()),
+    };
+    Some(Point { id: 0, label, number, position, colour: colour(weight), error_px: 0.0, seen: Vec::new() })
+}
+
+/// Ids of points: those of the tracks where all are numbers that COLMAP takes, else their positions from 1. A point that
+/// is not its track's own gets one behind the largest.
 fn number(points: &mut [Point]) {
     // COLMAP reads ids of text files as signed.
     const MOST: u64 = i64::MAX as u64;
-    let own = points.iter().all(|point| point.label.number().is_some_and(|number| number <= MOST));
-    for (position, point) in points.iter_mut().enumerate() {
-        point.id = point.label.number().filter(|_| own).unwrap_or(position as u64 + 1);
+    let of_tracks = || points.iter().filter(|point| point.number == 0);
+    let own: Option<Vec<u64>> = of_tracks().map(|point| point.label.number()).collect();
+    let others = (points.len() - of_tracks().count()) as u64;
+    let largest = own.as_ref().and_then(|own| own.iter().max().copied()).unwrap_or(0);
+    let own = own.filter(|_| largest <= MOST - others).unwrap_or_else(|| (1..=of_tracks().count() as u64).collect());
+    let behind = own.iter().max().map_or(1, |largest| largest + 1);
+    for (point, id) in points.iter_mut().zip(own.into_iter().chain(behind..)) {
+        point.id = id;
     }
 }

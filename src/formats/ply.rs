@@ -13,11 +13,18 @@ pub const MARK: &str = "\ncomment scpsfm points";
 ///
 /// A vertex has `x y z` (metric where the result is metric, else dehomogenised in the frame of the projective cameras,
 /// which a comment tells), a colour from orange (weight 0) to blue
-/// (weight 1), the weight, and the caller's id of the track, or where that is no number its place among the tracks.
+/// (weight 1), the weight, the caller's id of the track, or where that is no number its place among the tracks, and which
+/// of the points that the track joins it is: 0 for its own, else the number in the column `split` of `observations.csv`.
 pub fn points(solution: &Solution, input: Option<&LabelledInput>, part: u32) -> String {
     let tracks = &solution.tracks;
-    let of_part = (0..tracks.point.len()).filter(|&track| tracks.part_of(track) == Some(part));
-    let vertices: Vec<(usize, [f64; 3])> = of_part.filter_map(|track| Some((track, tracks.point[track]?))).collect();
+    let of_part = |track: usize| tracks.part_of(track) == Some(part);
+    let own = (0..tracks.point.len()).filter(|&track| of_part(track)).filter_map(|track| {
+        let weight = tracks.weight.get(track).copied().unwrap_or(0.0);
+        Some((track, 0, weight, tracks.point[track]?))
+    });
+    let others = solution.splits.iter().filter(|split| of_part(split.track as usize));
+    let others = others.filter_map(|split| Some((split.track as usize, split.number, split.weight, split.point?)));
+    let vertices: Vec<(usize, u32, f32, [f64; 3])> = own.chain(others).collect();
     let which = match solution.part_count() {
         0 | 1 => String::new(),
         several => format!(" of part {part} of {several}"),
@@ -31,15 +38,14 @@ pub fn points(solution: &Solution, input: Option<&LabelledInput>, part: u32) -> 
         "ply\nformat ascii 1.0{MARK}{which}, {frame}, coloured by weight\nelement vertex {}\n\
          property double x\nproperty double y\nproperty double z\n\
          property uchar red\nproperty uchar green\nproperty uchar blue\n\
-         property float weight\nproperty double track\nend_header\n",
+         property float weight\nproperty double track\nproperty uint split\nend_header\n",
         vertices.len()
     );
-    for (track, [x, y, z]) in vertices {
-        let weight = tracks.weight.get(track).copied().unwrap_or(0.0);
+    for (track, number, weight, [x, y, z]) in vertices {
         let [red, green, blue] = colour(weight);
         let label = track_label(input, track).number().unwrap_or(track as u64);
         // Writing to a String cannot fail.
-        let _ = writeln!(text, "{x} {y} {z} {red} {green} {blue} {weight} {label}");
+        let _ = writeln!(text, "{x} {y} {z} {red} {green} {blue} {weight} {label} {number}");
     }
     text
 }
@@ -78,7 +84,7 @@ mod tests {
         assert_eq!(body.lines().count(), inliers);
         let first = body.lines().next().expect("a vertex").split(' ').collect::<Vec<_>>();
         let track = solution.tracks.inlier.iter().position(|&inlier| inlier).expect("an inlier");
-        assert_eq!(first.len(), 8);
+        assert_eq!((first.len(), first[8]), (9, "0"));
         assert_eq!(first[7], input.track_labels[track].to_string());
         assert_eq!(first[0], solution.tracks.point[track].expect("a point")[0].to_string());
     }
@@ -96,6 +102,18 @@ mod tests {
         assert!(
             points(&projective, None, 0).contains(&format!("element vertex {}\n", projective.inlier_track_count()))
         );
+    }
+
+    #[test]
+    fn both_points_of_a_split_track_are_vertices() {
+        let (input, solution) = fixture::solved_with_a_split();
+        let split = solution.splits[0];
+        let text = points(&solution, Some(&input), 0);
+        assert!(text.contains(&format!("element vertex {}\n", solution.inlier_track_count() + 1)));
+        let label = input.track_labels[split.track as usize].to_string();
+        let of_track = text.lines().filter(|line| line.split(' ').nth(7) == Some(&label));
+        let numbers: Vec<&str> = of_track.filter_map(|line| line.rsplit(' ').next()).collect();
+        assert_eq!(numbers, ["0", "1"]);
     }
 
     #[test]

@@ -47,6 +47,7 @@ fn the_fields_of_result_json_are_a_contract() {
         "plane_at_infinity",
         "inlier_tracks",
         "inlier_observations",
+        "split_points",
         "registered_views",
         "reprojection_rms_px",
         "reprojection_mean_px",
@@ -280,7 +281,7 @@ fn frames_are_never_mixed() {
     let tracks: Vec<Vec<&str>> = files[TRACKS].lines().skip(1).map(|line| line.split(',').collect()).collect();
     for (name, part) in [(POINTS, "0"), ("points-part-1.ply", "1")] {
         let (header, body) = files[name].split_once("end_header\n").expect("a header");
-        let points: Vec<&str> = body.lines().map(|line| line.rsplit(' ').next().expect("a track")).collect();
+        let points: Vec<&str> = body.lines().map(|line| line.split(' ').nth(7).expect("a track")).collect();
         let wanted: Vec<&str> = tracks.iter().filter(|row| row[4] == part).map(|row| row[0]).collect();
         assert!(!points.is_empty() && points == wanted, "{name}: {points:?} {wanted:?}");
         assert!(header.contains(&format!("of part {part} of 2")), "{header}");

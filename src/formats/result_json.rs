@@ -35,6 +35,8 @@ pub struct ResultJson {
     /// Counts.
     pub inlier_tracks: usize,
     pub inlier_observations: usize,
+    /// Points beside its own that a track joins: each is one of its own in the exports.
+    pub split_points: usize,
     pub registered_views: usize,
     pub reprojection_rms_px: Option<f64>,
     pub reprojection_mean_px: Option<f64>,
@@ -150,6 +152,7 @@ impl ResultJson {
             plane_at_infinity: solution.plane_at_infinity,
             inlier_tracks: solution.inlier_track_count(),
             inlier_observations: solution.inlier_observation_count(),
+            split_points: solution.splits.len(),
             registered_views: solution.registered_views().len(),
             reprojection_rms_px: solution.reprojection_rms_px,
             reprojection_mean_px: solution.reprojection_mean_px,

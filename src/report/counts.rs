@@ -13,6 +13,8 @@ const WORST: usize = 5;
 pub struct ViewCount {
     pub observations: usize,
     pub inliers: usize,
+    /// Observations that show another point of their track than its own.
+    pub others: usize,
     judged: usize,
     sum_px: f64,
     sum_px2: f64,
@@ -54,6 +56,8 @@ pub fn of_views(solution: &Solution, input: Option<&LabelledInput>) -> Vec<ViewC
             if let Some(px) = residual.filter(|px| px.is_finite()) {
                 count.add_residual(px, track as usize);
             }
+        } else if solution.observations.split.get(k).is_some_and(|&number| number > 0) {
+            count.others += 1;
         }
     }
     counts

@@ -13,6 +13,7 @@ pub mod plan;
 pub mod scene;
 pub mod sections;
 pub mod space;
+pub mod splits;
 pub mod views;
 pub mod words;
 
@@ -52,6 +53,7 @@ pub fn page(solution: &Solution, input: Option<&LabelledInput>) -> String {
         space::section(solution, input),
         views::parts(solution, input, &counts),
         scene::section(solution, input, &counts),
+        splits::section(solution, input),
         covisibility::section(solution, input),
         sections::convergence(solution),
         sections::weights(solution),

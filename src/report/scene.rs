@@ -20,6 +20,9 @@ const RESIDUALS_SHOWN: f64 = 3.0;
 /// Set in the code of an observation, and of a track, that is an inlier.
 const INLIER: u16 = 0x8000;
 
+/// Set in the code of an observation that shows another point of its track; residuals end below it.
+const OTHER_POINT: u16 = 0x4000;
+
 /// The tracks to draw, and how many of all they are.
 pub struct Tracks {
     pub json: Value,
@@ -66,11 +69,11 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>, counts: &[Vie
 /// What the script draws.
 ///
 /// * `views`: `[label, registered, part, x0, y0, x1, y1 (the frame of the image), observations, inliers, mean px,
-///   RMS px, [[track, px] of the worst]]`
+///   RMS px, [[track, px] of the worst], observations that show another point of their track]`
 /// * `labels`: of the tracks; null where they are too long together: `numbers` counts the tracks from 0 then
 /// * `tracks`: packed, two u16 a track: observations, weight in thousandths + [`INLIER`]
 /// * `observations`: packed, four u16 each, track by track: view, x and y as shares of the frame widened by itself on
-///   every side, residual + [`INLIER`]
+///   every side, residual + [`INLIER`] or [`OTHER_POINT`]
 ///
 /// Thinned by whole tracks: half of the room is the inliers'.
 pub fn tracks(solution: &Solution, input: &LabelledInput, counts: &[ViewCount]) -> Tracks {
@@ -100,7 +103,9 @@ pub fn tracks(solution: &Solution, input: &LabelledInput, counts: &[ViewCount]) 
             observations.push_u16(raw.view[k] as u16);
             observations.push_u16(quantised(raw.x[k], 2.0 * x0 - x1, 2.0 * x1 - x0));
             observations.push_u16(quantised(raw.y[k], 2.0 * y0 - y1, 2.0 * y1 - y0));
-            observations.push_u16(residual_code(residual) | if inlier { INLIER } else { 0 });
+            let shows_other = solution.observations.split.get(k).is_some_and(|&number| number > 0);
+            let flag = if inlier { INLIER } else { OTHER_POINT * u16::from(shows_other) };
+            observations.push_u16(residual_code(residual) | flag);
         }
     }
     let named = names_fit(input, &kept, counts);
@@ -161,7 +166,8 @@ fn views(
             count.inliers,
             px(count.mean_px()),
             px(count.rms_px()),
-            worst
+            worst,
+            count.others
         ])
     };
     frames.iter().enumerate().map(entry).collect()
@@ -223,6 +229,16 @@ mod tests {
         assert_eq!(view[..8], json!(["13", 1, 0, -0.5, -0.5, 999.5, 999.5, 40]).as_array().expect("array")[..]);
         assert_eq!(view[8], solution.inlier_track_count());
         assert_eq!(view[11].as_array().expect("the worst").len(), 5);
+    }
+
+    #[test]
+    fn an_observation_of_another_point_is_marked() {
+        let (input, solution) = fixture::solved_with_a_split();
+        let counts = counts::of_views(&solution, Some(&input));
+        let views = tracks(&solution, &input, &counts).json["views"].clone();
+        let others: Vec<&Value> = (0..5).map(|view| &views[view][12]).collect();
+        assert_eq!(others, [0, 0, 0, 1, 1]);
+        assert!(residual_code(Some(1e300)) < OTHER_POINT && residual_code(None) < OTHER_POINT);
     }
 
     #[test]

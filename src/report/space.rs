@@ -27,7 +27,7 @@ pub struct Camera {
     pub borders: [f64; 4],
 }
 
-/// A point in the frame of its part, with its track's weight.
+/// A point in the frame of its part, with its weight: that of its track, or its own where the track joins several.
 pub struct Point {
     pub at: Vector3<f64>,
     pub weight: f64,
@@ -70,19 +70,25 @@ pub fn parts(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Part> {
     parts
 }
 
-/// Every `k`-th point, of all parts together.
+/// Every `k`-th point, of all parts together; the points that tracks join to their own are points too.
 fn add_points(parts: &mut [Part], solution: &Solution) {
-    let place = |part: u32| parts.binary_search_by_key(&part, |entry| entry.part).ok();
-    let placed: Vec<(usize, usize, [f64; 3])> = (solution.tracks.point.iter().enumerate())
-        .filter_map(|(track, point)| Some((track, place(solution.tracks.part_of(track)?)?, (*point)?)))
-        .filter(|(_, _, point)| point.iter().all(|value| value.is_finite()))
-        .collect();
+    let place = |track: usize| {
+        let part = solution.tracks.part_of(track)?;
+        parts.binary_search_by_key(&part, |entry| entry.part).ok()
+    };
+    let tracks = &solution.tracks;
+    let own = tracks.point.iter().enumerate().filter_map(|(track, point)| {
+        Some((tracks.weight.get(track).copied().unwrap_or(0.0), place(track)?, (*point)?))
+    });
+    let others =
+        solution.splits.iter().filter_map(|split| Some((split.weight, place(split.track as usize)?, split.point?)));
+    let placed: Vec<(f32, usize, [f64; 3])> =
+        own.chain(others).filter(|(_, _, point)| point.iter().all(|value| value.is_finite())).collect();
     let step = placed.len().div_ceil(MAX_POINTS).max(1);
-    for (index, (track, part, point)) in placed.into_iter().enumerate() {
+    for (index, (weight, part, point)) in placed.into_iter().enumerate() {
         parts[part].all_points += 1;
         if index % step == 0 {
-            let weight = f64::from(solution.tracks.weight.get(track).copied().unwrap_or(0.0)).clamp(0.0, 1.0);
-            parts[part].points.push(Point { at: point.into(), weight });
+            parts[part].points.push(Point { at: point.into(), weight: f64::from(weight).clamp(0.0, 1.0) });
         }
     }
 }
@@ -195,6 +201,12 @@ mod tests {
         let focal = solution.calibrations[0].focal_px;
         let [left, right, ..] = parts[0].cameras[0].borders;
         assert!(((right - left) * focal - 1000.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn both_points_of_a_split_track_are_there() {
+        let (input, solution) = fixture::solved_with_a_split();
+        assert_eq!(parts(&solution, Some(&input))[0].all_points, solution.inlier_track_count() + 1);
     }
 
     #[test]

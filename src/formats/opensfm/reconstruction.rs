@@ -25,8 +25,15 @@ fn reconstruction(model: &Model) -> Value {
         model.cameras.iter().map(|camera| (camera_name(camera), self::camera(camera))).collect();
     let shots: Map<String, Value> =
         model.images.iter().map(|image| (image.name.to_string(), shot(image, model))).collect();
-    let points: Map<String, Value> =
-        model.points.iter().map(|point| (point.label.to_string(), self::point(point))).collect();
+    let mut points = Map::new();
+    // Those of the tracks come first: no name of another point may be that of a track.
+    for point in &model.points {
+        let mut name = point.label.to_string();
+        while points.contains_key(&name) {
+            name.push('+');
+        }
+        points.insert(name, self::point(point));
+    }
     json!({ "cameras": cameras, "shots": shots, "points": points })
 }
 

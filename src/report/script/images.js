@@ -1,7 +1,7 @@
 const images = () => {
   const { views, labels, numbers, limit, ...packed } = data("tracks-data");
   const tracks = shorts(packed.tracks), observations = shorts(packed.observations);
-  const INLIER = 0x8000, UNKNOWN = 0x3fff;
+  const INLIER = 0x8000, OTHER_POINT = 0x4000, UNKNOWN = 0x3fff;
   const element = (id) => document.getElementById(id);
   const canvas = element("image"), hover = element("hover"), legend = element("legend");
   const [view, colour, outliers, flow] = ["view", "colour", "outliers", "flow"].map(element);
@@ -18,6 +18,7 @@ const images = () => {
     return [2 * x0 - x1 + 3 * (x1 - x0) * observations[4 * k + 1] / 65535, 2 * y0 - y1 + 3 * (y1 - y0) * observations[4 * k + 2] / 65535];
   };
   const kept = (k) => (observations[4 * k + 3] & INLIER) !== 0;
+  const other = (k) => (observations[4 * k + 3] & OTHER_POINT) !== 0;
   const residual = (k) => {
     const code = observations[4 * k + 3] & UNKNOWN;
     return code === UNKNOWN ? null : Math.expm1(code / 1000) / 100;
@@ -31,10 +32,10 @@ const images = () => {
   view.value = views.reduce((best, entry, k) => entry[8] > views[best][8] ? k : best, 0);
 
   const figures = () => {
-    const [, registered, part, , , , , all, inliers, mean, rms, worst] = views[+view.value];
+    const [, registered, part, , , , , all, inliers, mean, rms, worst, others] = views[+view.value];
     const several = views.some((entry) => entry[2] > 0);
     element("view-figures").textContent = `${inliers} of ${all} observations are inliers` +
-      (mean === null ? "" : `; residual ${mean} px on average, ${rms} px RMS`) + (registered ? "" : "; not registered") +
+      (others ? `, ${others} show another point of their track` : "") + (mean === null ? "" : `; residual ${mean} px on average, ${rms} px RMS`) + (registered ? "" : "; not registered") +
       (registered && several ? `; part ${part}` : "");
     const table = element("worst");
     table.replaceChildren();
@@ -44,10 +45,11 @@ const images = () => {
     };
     if (worst.length) row("th", ["track of the largest residuals among the inliers", "residual (px)"]);
     for (const entry of worst) row("td", entry);
+    const ring = views.some((entry) => entry[12]) ? " Green ring: it shows another point that its track joins." : "";
     legend.textContent = {
-      inlier: "Blue disc: inlier. Orange cross: outlier track. Red cross: an observation left out of an inlier track.",
-      weight: "From orange (weight 0) to blue (weight 1). Crosses are wrong observations.",
-      residual: `From blue (0 px) to orange (${limit.toPrecision(3)} px and more); grey: not judged. Crosses are wrong observations.`,
+      inlier: "Blue disc: inlier. Orange cross: outlier track. Red cross: an observation left out of an inlier track." + ring,
+      weight: "From orange (weight 0) to blue (weight 1). Crosses are wrong observations." + ring,
+      residual: `From blue (0 px) to orange (${limit.toPrecision(3)} px and more); grey: not judged. Crosses are wrong observations.` + ring,
     }[colour.value];
   };
 
@@ -66,8 +68,9 @@ const images = () => {
     const margin = 14, scale = Math.min((width - 2 * margin) / across, (height - 2 * margin) / down);
     const place = ([x, y]) => [
       width / 2 + (x - (shown[0] + shown[2]) / 2) * scale, height / 2 + (y - (shown[1] + shown[3]) / 2) * scale];
-    const [inside, outside, bad, mute] = ["in", "out", "bad", "mute"].map(theme);
+    const [inside, outside, bad, mute, third] = ["in", "out", "bad", "mute", "third"].map(theme);
     const paint = (k, track) => {
+      if (other(k)) return third;
       if (colour.value === "weight") return byWeight(weight(track));
       if (colour.value === "residual") return residual(k) === null ? mute : byWeight(1 - Math.min(1, residual(k) / limit));
       return inlier(track) ? (kept(k) ? inside : bad) : outside;
@@ -88,6 +91,7 @@ const images = () => {
       context.globalAlpha = right ? 1 : 0.7;
       context.beginPath();
       if (right) { context.arc(...at, 3.2, 0, 7); context.fill(); }
+      else if (other(k)) { context.arc(...at, 3.2, 0, 7); context.stroke(); }
       else {
         const arm = inlier(track) ? 4 : 2.5;
         context.moveTo(at[0] - arm, at[1] - arm); context.lineTo(at[0] + arm, at[1] + arm);
@@ -108,7 +112,7 @@ const images = () => {
       best = distance;
       const track = trackOf[k], px = residual(k);
       text = `Track ${name(track)}: ${inlier(track) ? "inlier" : "outlier"}, weight ${weight(track)}` +
-        (inlier(track) && !kept(k) ? ", this observation left out" : "") + (px === null ? "" : `, residual ${px.toPrecision(3)} px`);
+        (other(k) ? ", this observation shows another point" : inlier(track) && !kept(k) ? ", this observation left out" : "") + (px === null ? "" : `, residual ${px.toPrecision(3)} px`);
     }
     hover.textContent = text;
   });
