@@ -3,13 +3,16 @@
 use serde::Serialize;
 
 use super::result_json::view_label;
-use super::{Label, LabelledInput};
+use super::{Label, LabelledInput, warnings};
 use crate::domain::result::ViewResult;
-use crate::domain::{Calibration, LeftOut, Solution};
+use crate::domain::{Calibration, LeftOut, Solution, Status, Warning};
 
 /// `cameras.json`.
 #[derive(Debug, Clone, Serialize)]
 pub struct CamerasJson {
+    pub status: Status,
+    /// Why there are no cameras, or none with a calibration; null where there are.
+    pub reason: Option<ReasonJson>,
     /// One entry a view of the input.
     pub views: Vec<CameraJson>,
 }
@@ -34,20 +37,26 @@ pub struct CameraJson {
     pub camera_group: u32,
     /// One standard deviation of the log focal length of the group, for a view with a K; null there: unobservable.
     pub sigma_log_focal: Option<f64>,
-    /// Why the view is not registered.
-    pub left_out: Option<LeftOutJson>,
+    /// Why the view is not registered: where no view is, that of the whole.
+    pub left_out: Option<ReasonJson>,
 }
 
-/// Why a view is not registered, for programs and for people.
-#[derive(Debug, Clone, Serialize)]
-pub struct LeftOutJson {
+/// Why something is missing, for programs and for people.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ReasonJson {
     pub code: &'static str,
     pub detail: String,
 }
 
-impl From<LeftOut> for LeftOutJson {
+impl From<LeftOut> for ReasonJson {
     fn from(left_out: LeftOut) -> Self {
         Self { code: left_out.name(), detail: left_out.to_string() }
+    }
+}
+
+impl From<Warning> for ReasonJson {
+    fn from(warning: Warning) -> Self {
+        Self { code: warning.code.name(), detail: warning.detail }
     }
 }
 
@@ -55,6 +64,8 @@ impl CamerasJson {
     /// The cameras of a solution; without the input, views are numbered from 0.
     pub fn new(solution: &Solution, input: Option<&LabelledInput>) -> Self {
         let groups = groups_of_views(solution);
+        let reason = warnings::reason(solution, input).map(ReasonJson::from);
+        let of_all = reason.as_ref().filter(|_| solution.status == Status::NoReconstruction);
         let camera = |(index, view): (usize, &ViewResult)| {
             let is_metric = view.rotation.is_some() && view.translation.is_some();
             let calibration =
@@ -71,10 +82,10 @@ impl CamerasJson {
                 radial_k2: calibration.map(|calibration| calibration.radial_k2),
                 camera_group: view.camera_group,
                 sigma_log_focal: calibration.and_then(|calibration| calibration.sigma_log_focal),
-                left_out: view.left_out.map(LeftOutJson::from),
+                left_out: view.left_out.map(ReasonJson::from).or_else(|| of_all.cloned()),
             }
         };
-        Self { views: solution.views.iter().enumerate().map(camera).collect() }
+        Self { status: solution.status, views: solution.views.iter().enumerate().map(camera).collect(), reason }
     }
 }
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use super::cameras_json::CamerasJson;
 use super::result_json::{ResultJson, track_label, view_label};
 use super::{LabelledInput, former, ply};
-use crate::domain::Solution;
+use crate::domain::{Solution, Status};
 use crate::report;
 
 /// Names of the files, in the order in which they are written; `result.json` comes last, so that whoever waits for it
@@ -209,6 +209,8 @@ fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
 
 /// `view,track,inlier,residual_px,weight,split` in the order of the caller's file; an observation that was not judged has
 /// an empty residual, one that shows no other point of its track an empty split.
+///
+/// Where nothing was reconstructed there is no point that an observation could show: its weight is that of its track.
 fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {
     let judged = &solution.observations;
     let mut text = String::from("view,track,inlier,residual_px,weight,split\n");
@@ -216,13 +218,17 @@ fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {
         let inlier = judged.inlier.get(k).copied().unwrap_or(false);
         let residual = judged.residual_px.get(k).copied().flatten();
         let split = judged.split.get(k).copied().unwrap_or(0);
+        let weight = match solution.status {
+            Status::Solved => judged.weight.get(k),
+            Status::NoReconstruction => solution.tracks.weight.get(track as usize),
+        };
         text.push_str(&format!(
             "{},{},{},{},{},{}\n",
             view_label(Some(input), view as usize).csv(),
             track_label(Some(input), track as usize).csv(),
             u8::from(inlier),
             residual.map_or_else(String::new, |px| px.to_string()),
-            judged.weight.get(k).copied().unwrap_or(0.0),
+            weight.copied().unwrap_or(0.0),
             if split > 0 { split.to_string() } else { String::new() },
         ));
     }

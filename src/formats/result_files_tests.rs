@@ -3,6 +3,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use super::*;
+use crate::domain::result::ObservationResults;
 use crate::domain::{Calibration, Grade, LeftOut, Status, Warning, WarningCode};
 use crate::formats::fixture;
 use crate::formats::windows::{self, Table};
@@ -355,4 +356,39 @@ fn while_files_change_none_says_that_they_are_complete() {
     let hidden =
         |entry: io::Result<fs::DirEntry>| entry.expect("an entry").file_name().to_string_lossy().starts_with('.');
     assert!(!fs::read_dir(directory.path()).expect("a directory").any(hidden), "temporary files are left");
+}
+
+/// Ranked and not verified: the ranking is in every table, and cameras.json says why there are no cameras.
+#[test]
+fn without_a_reconstruction_the_files_say_the_weights_and_the_reason() {
+    let (input, mut solution) = fixture::solved();
+    (solution.status, solution.grade) = (Status::NoReconstruction, None);
+    solution.calibrations.clear();
+    solution.views.fill(Default::default());
+    solution.tracks.inlier.fill(false);
+    solution.tracks.point.fill(None);
+    solution.observations = ObservationResults::unjudged(input.raw.x.len());
+    solution.warnings = vec![
+        Warning::new(WarningCode::UnverifiedRanking, "20 tracks look right"),
+        Warning::new(WarningCode::NoConsensus, "no 8 tracks agree"),
+    ];
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    write(directory.path(), &solution, Some(&input)).expect("written");
+    let files = contents(directory.path());
+    let mut weights = Vec::new();
+    for (row, &track) in files[OBSERVATIONS].lines().skip(1).zip(&input.raw.track) {
+        let fields: Vec<&str> = row.split(',').collect();
+        assert_eq!(fields[4], solution.tracks.weight[track as usize].to_string(), "{row}");
+        weights.push(fields[4]);
+    }
+    assert!(weights.contains(&"0.98") && weights.contains(&"0.03"));
+    let cameras: Value = serde_json::from_str(&files[CAMERAS]).expect("JSON");
+    let reason = serde_json::json!({ "code": "NO_CONSENSUS", "detail": "no 8 tracks agree" });
+    assert_eq!((&cameras["status"], &cameras["reason"]), (&"NO_RECONSTRUCTION".into(), &reason));
+    assert_eq!((&cameras["views"][2]["registered"], &cameras["views"][2]["left_out"]), (&false.into(), &reason));
+    let solved = serde_json::to_value(CamerasJson::new(&fixture::solved().1, None)).expect("JSON");
+    assert_eq!((&solved["status"], &solved["reason"]), (&"SOLVED".into(), &Value::Null));
+    let projective = CamerasJson::new(&fixture::projective_only().1, None);
+    assert_eq!(projective.reason.expect("a reason").code, "UNOBSERVABLE_FOCAL");
+    assert!(projective.views.iter().all(|view| view.left_out.is_none()));
 }

@@ -14,6 +14,14 @@ pub fn named(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Warning>
     others.cloned().chain(told).collect()
 }
 
+/// Why there is no calibration; `None` where there is one, or where nothing was said.
+pub fn reason(solution: &Solution, input: Option<&LabelledInput>) -> Option<Warning> {
+    if solution.is_metric() {
+        return None;
+    }
+    named(solution, input).into_iter().find(|warning| warning.code.refuses())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

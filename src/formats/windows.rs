@@ -98,9 +98,7 @@ impl Row {
     /// The same with its solution.
     pub fn solved(index: usize, input: &LabelledInput, solution: &Solution) -> Self {
         let calibration = solution.first_calibration();
-        let mut warnings = warnings::named(solution, Some(input));
-        let refusal = warnings.iter().position(|warning| warning.code.refuses());
-        let why = refusal.map(|place| warnings.swap_remove(place));
+        let why = warnings::reason(solution, Some(input));
         let why = why.map_or_else(String::new, |warning| format!("{}: {}", warning.code.name(), warning.detail));
         Self {
             registered_views: solution.registered_views().len(),
