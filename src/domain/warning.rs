@@ -41,6 +41,8 @@ pub enum WarningCode {
     CameraGroupsMerged,
     /// Nothing was verified; the weights are the trained network's opinion of which tracks are right.
     UnverifiedRanking,
+    /// Tracks have the very same observations as others; they were solved as one.
+    DuplicateTracks,
     /// The deadline stopped the search; this is the best found by then. Not given yet: such a job expires.
     StoppedEarly,
 }
@@ -66,6 +68,7 @@ impl WarningCode {
             | WarningCode::PointsOutsideImage
             | WarningCode::CameraGroupsMerged
             | WarningCode::UnverifiedRanking
+            | WarningCode::DuplicateTracks
             | WarningCode::StoppedEarly => false,
         }
     }
@@ -90,6 +93,7 @@ impl WarningCode {
             WarningCode::PointsOutsideImage => "POINTS_OUTSIDE_IMAGE",
             WarningCode::CameraGroupsMerged => "CAMERA_GROUPS_MERGED",
             WarningCode::UnverifiedRanking => "UNVERIFIED_RANKING",
+            WarningCode::DuplicateTracks => "DUPLICATE_TRACKS",
             WarningCode::StoppedEarly => "STOPPED_EARLY",
         }
     }

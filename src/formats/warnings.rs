@@ -1,17 +1,28 @@
-//! Warnings in the caller's words: the solver numbers views, an input has names for them.
+//! Warnings in the caller's words: the solver numbers views and tracks, an input has names for them.
 
 use super::LabelledInput;
-use super::result_json::view_label;
-use crate::domain::{Solution, Warning, WarningCode, left_out};
+use super::result_json::{track_label, view_label};
+use crate::domain::copies::Copies;
+use crate::domain::{Limits, Solution, Warning, WarningCode, left_out};
 
-/// The warnings of a result, views under the input's own ids or image names; without the input, as the solver gave them.
+/// The warnings of a result, views and tracks under the input's own ids or names; without the input, as the solver gave
+/// them.
 pub fn named(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Warning> {
-    let told = left_out::warnings(&solution.views, |view| view_label(input, view).shown());
-    if input.is_none() || told.is_empty() {
-        return solution.warnings.clone();
+    let Some(input) = input else { return solution.warnings.clone() };
+    let told = left_out::warnings(&solution.views, |view| view_label(Some(input), view).shown());
+    let mut warnings: Vec<Warning> = solution.warnings.clone();
+    if !told.is_empty() {
+        warnings.retain(|warning| warning.code != WarningCode::ViewsLeftOut);
+        warnings.extend(told);
     }
-    let others = solution.warnings.iter().filter(|warning| warning.code != WarningCode::ViewsLeftOut);
-    others.cloned().chain(told).collect()
+    if let Some(place) = warnings.iter().position(|warning| warning.code == WarningCode::DuplicateTracks) {
+        // Above the limits of this program, as a server may allow, tracks keep their numbers.
+        let copies = input.check(&Limits::default()).ok().and_then(|checked| Copies::of(&checked));
+        if let Some(copies) = copies {
+            warnings[place] = copies.warning(|track| track_label(Some(input), track).shown());
+        }
+    }
+    warnings
 }
 
 /// Why there is no calibration; `None` where there is one, or where nothing was said.
@@ -47,5 +58,21 @@ mod tests {
             ]
         );
         assert!(details(None)[0].contains(": 3 (4 of"), "{:?}", details(None));
+    }
+
+    #[test]
+    fn copies_go_by_the_names_of_the_input() {
+        let (mut input, mut solution) = fixture::solved();
+        for k in 0..input.raw.x.len() {
+            let like = |j: &usize| input.raw.track[*j] == 4 && input.raw.view[*j] == input.raw.view[k];
+            if input.raw.track[k] == 7 {
+                let like = (0..input.raw.x.len()).find(like).expect("complete tracks");
+                (input.raw.x[k], input.raw.y[k]) = (input.raw.x[like], input.raw.y[like]);
+            }
+        }
+        solution.warnings.push(Warning::new(WarningCode::DuplicateTracks, "1 of 40 tracks: 7 (as 4)"));
+        let detail = |input| named(&solution, input).pop().expect("a warning").detail;
+        assert!(detail(Some(&input)).ends_with(": 114 (as 108)"), "{}", detail(Some(&input)));
+        assert!(detail(None).ends_with(": 7 (as 4)"));
     }
 }

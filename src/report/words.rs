@@ -40,6 +40,9 @@ pub fn warning(code: WarningCode) -> &'static str {
         WarningCode::UnverifiedRanking => {
             "Too few tracks hold together for geometry to verify them; their weights are the trained network's opinion."
         }
+        WarningCode::DuplicateTracks => {
+            "Some tracks stand in the input several times; they count once, and all have the same answer."
+        }
         WarningCode::StoppedEarly => "Time ran out; this is the best that was found until then.",
     }
 }

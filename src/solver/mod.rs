@@ -2,7 +2,7 @@
 //!
 //! Depends on `network`, `geometry` and `domain`; knows nothing of jobs, transport or files.
 //!
-//! The way through: [`block`] chooses views whose tracks are complete; [`attempt`] solves one such block, by
+//! The way through: [`copies`] leaves of tracks that stand several times one; [`block`] chooses views whose tracks are complete; [`attempt`] solves one such block, by
 //! [`portfolio`] (priors, [`search`], [`grow`]; [`depths`] where those verify what image points cannot; [`extend`] to what a search leaves aside) or
 //! [`direct`], and [`calibration`] upgrades it; where tracks are not complete, [`sequence`] extends the best block to the
 //! other views; [`judge`] has the last
@@ -13,6 +13,7 @@ mod assemble;
 mod attempt;
 mod block;
 pub mod calibration;
+mod copies;
 mod depths;
 mod direct;
 mod extend;
@@ -30,6 +31,7 @@ pub mod study;
 mod tests;
 mod views;
 
+use crate::domain::copies::Copies;
 use crate::domain::result::{ObservationResults, ViewResult};
 use crate::domain::{
     FocalPrior, Input, Observer, Solution, SolveSettings, Status, StopReason, StopToken, Warning, WarningCode,
@@ -58,6 +60,8 @@ pub enum Error {
 /// view that can be registered. Where neither applies, the best block is solved, views outside it are left out with a
 /// warning, and blocks that disagree raise its uncertainty.
 ///
+/// Tracks that are [copies](Copies) of another count once, whatever the method.
+///
 /// # Errors
 /// [`Error::Stopped`] when `stop` fired, [`Error::Internal`] for a defect.
 pub fn solve(
@@ -66,7 +70,12 @@ pub fn solve(
     observer: &mut dyn Observer,
     stop: &StopToken,
 ) -> Result<Solution, Error> {
-    let mut solution = solve_views(input, settings, observer, stop)?;
+    let mut solution = match Copies::of(input) {
+        None => solve_views(input, settings, observer, stop)?,
+        Some(found) => {
+            copies::solve_once(input, &found, observer, |rest, observer| solve_views(rest, settings, observer, stop))?
+        }
+    };
     views::complete(&mut solution, input);
     solution.input_sha256 = Some(input.to_raw().sha256());
     solution.trained_network = learned::may_be_asked(settings).then(trained_network);

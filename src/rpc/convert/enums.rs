@@ -73,6 +73,7 @@ twins! {
         CameraGroupsMerged,
         StoppedEarly,
         UnverifiedRanking,
+        DuplicateTracks,
     }
 }
 
@@ -111,6 +112,7 @@ mod tests {
             WarningCode::StoppedEarly,
             WarningCode::CameraGroupsMerged,
             WarningCode::UnverifiedRanking,
+            WarningCode::DuplicateTracks,
         ] {
             let wire = proto::WarningCode::try_from(code.to_wire()).expect("known");
             assert_eq!(wire.as_str_name(), format!("WARNING_CODE_{}", code.name()));
