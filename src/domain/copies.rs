@@ -37,7 +37,8 @@ impl Copies {
             }
         }
         let copies = Self { first };
-        copies.list().next().is_some().then_some(copies)
+        let any = copies.list().next().is_some();
+        any.then_some(copies)
     }
 
     /// Whether a track stands in the input before.

@@ -110,6 +110,24 @@ pub struct Calibration {
     /// older server did not say.
     #[serde(default)]
     pub grade: Option<Grade>,
+    /// Of the intrinsics beside the focal length.
+    #[serde(default)]
+    pub sigmas: Sigmas,
+}
+
+/// One standard deviation of each intrinsic that was estimated beside the focal length, in the unit of the intrinsic.
+///
+/// They come of the covariance that [`Calibration::sigma_log_focal`] comes of, the doubt about the model included, and
+/// what raises that one (a model that does not fit, a contradicted prior, views that disagree) raises them in the same
+/// proportion. `None`: it was not estimated, see [`Calibration`] for the value that it was taken to have, or an older
+/// server did not say.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Sigmas {
+    pub principal_point_px: Option<[f64; 2]>,
+    pub aspect: Option<f64>,
+    pub radial_k1: Option<f64>,
+    pub radial_k2: Option<f64>,
 }
 
 impl Calibration {

@@ -37,6 +37,11 @@ pub struct CameraJson {
     pub camera_group: u32,
     /// One standard deviation of the log focal length of the group, for a view with a K; null there: unobservable.
     pub sigma_log_focal: Option<f64>,
+    /// The same of the other intrinsics in their units; null: not estimated.
+    pub sigma_principal_point_px: Option<[f64; 2]>,
+    pub sigma_aspect: Option<f64>,
+    pub sigma_radial_k1: Option<f64>,
+    pub sigma_radial_k2: Option<f64>,
     /// Why the view is not registered: where no view is, that of the whole.
     pub left_out: Option<ReasonJson>,
 }
@@ -82,6 +87,10 @@ impl CamerasJson {
                 radial_k2: calibration.map(|calibration| calibration.radial_k2),
                 camera_group: view.camera_group,
                 sigma_log_focal: calibration.and_then(|calibration| calibration.sigma_log_focal),
+                sigma_principal_point_px: calibration.and_then(|calibration| calibration.sigmas.principal_point_px),
+                sigma_aspect: calibration.and_then(|calibration| calibration.sigmas.aspect),
+                sigma_radial_k1: calibration.and_then(|calibration| calibration.sigmas.radial_k1),
+                sigma_radial_k2: calibration.and_then(|calibration| calibration.sigmas.radial_k2),
                 left_out: view.left_out.map(ReasonJson::from).or_else(|| of_all.cloned()),
             }
         };

@@ -97,6 +97,7 @@ fn lens(aspect: f64, [radial_k1, radial_k2]: [f64; 2], principal_point_px: [f64;
         radial_k1,
         radial_k2,
         grade: None,
+        sigmas: Default::default(),
     }
 }
 

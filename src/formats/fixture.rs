@@ -188,6 +188,7 @@ fn solution(scene: &Scene) -> Solution {
             radial_k1: -0.02,
             radial_k2: 0.0,
             grade: Some(Grade::Metric),
+            sigmas: Default::default(),
         }],
         plane_at_infinity: Some([1e-4, -2e-5, 0.03]),
         views: cameras

@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use super::*;
-use crate::domain::result::ObservationResults;
+use crate::domain::result::{ObservationResults, Sigmas};
 use crate::domain::{Calibration, Grade, LeftOut, Status, Warning, WarningCode};
 use crate::formats::fixture;
 use crate::formats::windows::{self, Table};
@@ -44,6 +44,10 @@ fn the_fields_of_result_json_are_a_contract() {
         "aspect",
         "radial_k1",
         "radial_k2",
+        "sigma_principal_point_px",
+        "sigma_aspect",
+        "sigma_radial_k1",
+        "sigma_radial_k2",
         "cameras",
         "plane_at_infinity",
         "inlier_tracks",
@@ -131,6 +135,7 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
         radial_k1: 0.01,
         radial_k2: 0.002,
         grade: Some(Grade::ProjectiveOnly),
+        sigmas: Sigmas { principal_point_px: Some([3.0, 4.0]), radial_k1: Some(0.002), ..Sigmas::default() },
     };
     solution.calibrations.push(second);
     solution.views[3].camera_group = 9;
@@ -153,6 +158,10 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
         "aspect",
         "radial_k1",
         "radial_k2",
+        "sigma_principal_point_px",
+        "sigma_aspect",
+        "sigma_radial_k1",
+        "sigma_radial_k2",
         "grade",
         "warnings",
     ];
@@ -175,6 +184,9 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     assert_eq!(sigmas, [Some(0.004), Some(0.004), Some(0.004), None, Some(0.004)]);
     solution.views[3].focal_px = Some(80.0);
     assert_eq!(CamerasJson::new(&solution, Some(&input)).views[3].K.expect("metric")[0][0], 80.0);
+    assert_eq!((&found[1]["sigma_principal_point_px"][1], &found[1]["sigma_radial_k1"]), (&4.0.into(), &0.002.into()));
+    assert_eq!((&found[1]["sigma_aspect"], &found[0]["sigma_radial_k1"]), (&Value::Null, &Value::Null));
+    assert_eq!((cameras.views[3].sigma_radial_k1, cameras.views[0].sigma_radial_k1), (Some(0.002), None));
     assert_eq!((cameras.views[0].radial_k1, cameras.views[3].radial_k1), (Some(-0.02), Some(0.01)));
 }
 

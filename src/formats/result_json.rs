@@ -17,7 +17,7 @@ use super::{Label, LabelledInput, warnings};
 pub struct ResultJson {
     pub status: Status,
     pub grade: Option<Grade>,
-    /// Of the first camera group that has registered views, down to `radial_k2`; see `cameras` where there are several.
+    /// Of the first camera group that has registered views, down to `sigma_radial_k2`; see `cameras` where there are several.
     pub focal_px: Option<f64>,
     pub sigma_log_focal: Option<f64>,
     pub focal_unobservable: Option<bool>,
@@ -28,6 +28,11 @@ pub struct ResultJson {
     /// point at `(u, v, 1)`.
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
+    /// One standard deviation of each that was estimated, in its unit; null: it was not.
+    pub sigma_principal_point_px: Option<[f64; 2]>,
+    pub sigma_aspect: Option<f64>,
+    pub sigma_radial_k1: Option<f64>,
+    pub sigma_radial_k2: Option<f64>,
     /// One entry a camera group, ascending.
     pub cameras: Vec<CameraGroupJson>,
     /// `(n, 1)` in pixels, in the frame `P1 = [I|0]` of the first registered view.
@@ -72,6 +77,11 @@ pub struct CameraGroupJson {
     pub aspect: Option<f64>,
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
+    /// One standard deviation of each that was estimated, in its unit; null: it was not.
+    pub sigma_principal_point_px: Option<[f64; 2]>,
+    pub sigma_aspect: Option<f64>,
+    pub sigma_radial_k1: Option<f64>,
+    pub sigma_radial_k2: Option<f64>,
     /// The group's own; that of the result is the worst of its groups that have enough views.
     pub grade: Option<Grade>,
     /// Codes of the warnings that are of this group, each once.
@@ -120,6 +130,10 @@ pub fn camera_groups(solution: &Solution) -> Vec<CameraGroupJson> {
             aspect: calibration.map(|of| of.aspect),
             radial_k1: calibration.map(|of| of.radial_k1),
             radial_k2: calibration.map(|of| of.radial_k2),
+            sigma_principal_point_px: calibration.and_then(|of| of.sigmas.principal_point_px),
+            sigma_aspect: calibration.and_then(|of| of.sigmas.aspect),
+            sigma_radial_k1: calibration.and_then(|of| of.sigmas.radial_k1),
+            sigma_radial_k2: calibration.and_then(|of| of.sigmas.radial_k2),
             grade: calibration.map_or(solution.grade.filter(|_| !solution.is_metric()), |of| of.grade),
             warnings: codes,
         }
@@ -149,6 +163,10 @@ impl ResultJson {
             aspect: first.and_then(|camera| camera.aspect),
             radial_k1: first.and_then(|camera| camera.radial_k1),
             radial_k2: first.and_then(|camera| camera.radial_k2),
+            sigma_principal_point_px: first.and_then(|camera| camera.sigma_principal_point_px),
+            sigma_aspect: first.and_then(|camera| camera.sigma_aspect),
+            sigma_radial_k1: first.and_then(|camera| camera.sigma_radial_k1),
+            sigma_radial_k2: first.and_then(|camera| camera.sigma_radial_k2),
             plane_at_infinity: solution.plane_at_infinity,
             inlier_tracks: solution.inlier_track_count(),
             inlier_observations: solution.inlier_observation_count(),

@@ -35,7 +35,7 @@ pub fn section(solution: &Solution) -> String {
     }
     let _ = writeln!(html, "<figure>{}</figure>", bars(&groups[..groups.len().min(MAX_GROUPS)]));
     html.push_str(
-        "<p class=\"note\">Errors are one standard deviation of the focal length; none is estimated for the rest. \
+        "<p class=\"note\">Errors are one standard deviation; what has none was not estimated but taken to be in order. \
          Aspect is vertical over horizontal focal length; k1 and k2 are the radial distortion, 0 for a pinhole.</p>\n",
     );
     html.push_str(&own_focals(solution));
@@ -52,17 +52,26 @@ fn row(group: &CameraGroupJson) -> String {
             None => format!("{focal_px:.1} (unobservable)"),
         },
     );
-    let number = |value: Option<f64>| value.map_or_else(|| "-".into(), short);
+    let number = |value: Option<f64>, sigma: Option<f64>| {
+        let error = sigma.map_or_else(String::new, |sigma| format!(" \u{b1} {}", short(sigma)));
+        value.map_or_else(|| "-".into(), |value| short(value) + &error)
+    };
+    let point = |[x, y]: [f64; 2]| match group.sigma_principal_point_px {
+        Some([sigma_x, sigma_y]) => {
+            format!("{x:.1} \u{b1} {}, {y:.1} \u{b1} {}", short(sigma_x), short(sigma_y))
+        }
+        None => format!("{x:.1}, {y:.1}"),
+    };
     let codes: Vec<&str> = group.warnings.iter().map(|code| code.name()).collect();
     format!(
         "<tr><td>{}</td><td>{} of {}</td><td>{focal}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>\n",
         group.camera_group,
         group.registered_views,
         group.views,
-        group.principal_point_px.map_or_else(|| "-".into(), |[x, y]| format!("{x:.1}, {y:.1}")),
-        number(group.aspect),
-        number(group.radial_k1),
-        number(group.radial_k2),
+        group.principal_point_px.map_or_else(|| "-".into(), point),
+        number(group.aspect, group.sigma_aspect),
+        number(group.radial_k1, group.sigma_radial_k1),
+        number(group.radial_k2, group.sigma_radial_k2),
         group.grade.map_or("-", |grade| grade.name()),
         if codes.is_empty() { "none".into() } else { codes.join(", ") }
     )
@@ -155,6 +164,7 @@ fn own_focals(solution: &Solution) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::result::Sigmas;
     use crate::domain::{Calibration, Grade, Warning, WarningCode};
     use crate::formats::fixture;
 
@@ -170,6 +180,12 @@ mod tests {
             radial_k1: -0.125,
             radial_k2: 0.25,
             grade: Some(Grade::Weak),
+            sigmas: Sigmas {
+                principal_point_px: Some([2.5, 3.0]),
+                aspect: None,
+                radial_k1: Some(0.004),
+                radial_k2: Some(0.03),
+            },
         };
         solution.calibrations.push(second);
         solution.views[4].projection = None;
@@ -178,8 +194,8 @@ mod tests {
         let html = section(&solution);
         let sigma = format!("{:.1} \u{b1} {} (0.4 %)", first.focal_px, short(first.focal_px * 0.004));
         assert!(html.contains(&format!("<tr><td>4</td><td>2 of 2</td><td>{sigma}</td>")), "{html}");
-        let row = "<tr><td>9</td><td>2 of 3</td><td>2000.0 \u{b1} 20 (1 %)</td><td>640.0, 480.5</td><td>1.002</td>\
-                   <td>-0.125</td><td>0.25</td><td>WEAK</td><td>CHEIRALITY</td></tr>";
+        let row = "<tr><td>9</td><td>2 of 3</td><td>2000.0 \u{b1} 20 (1 %)</td><td>640.0 \u{b1} 2.5, 480.5 \u{b1} 3</td><td>1.002</td>\
+                   <td>-0.125 \u{b1} 0.004</td><td>0.25 \u{b1} 0.03</td><td>WEAK</td><td>CHEIRALITY</td></tr>";
         assert!(html.contains(row), "{html}");
         assert_eq!(html.matches("<circle").count(), 2);
         solution.views[2].projection = None;

@@ -43,7 +43,12 @@ pub fn headline(solution: &Solution) -> String {
                 0.0 => String::new(),
                 k2 => format!(", k2 {}", short(k2)),
             };
-            card("radial distortion", format!("k1 {}{second}", short(calibration.radial_k1)), "estimated".into());
+            let errors = [calibration.sigmas.radial_k1, calibration.sigmas.radial_k2];
+            let errors: Vec<String> =
+                errors.into_iter().flatten().map(|sigma| format!("\u{b1} {}", short(sigma))).collect();
+            let note =
+                if errors.is_empty() { "estimated".into() } else { format!("{} (one sigma)", errors.join(", ")) };
+            card("radial distortion", format!("k1 {}{second}", short(calibration.radial_k1)), note);
         }
     } else if solution.is_focal_unobservable() {
         card("focal length", "none".into(), "unobservable".into());

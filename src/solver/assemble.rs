@@ -6,13 +6,14 @@ use nalgebra::{Matrix3, Matrix4};
 
 use super::Context;
 use super::attempt::Attempt;
+use super::calibration::Outcome;
 use super::direct::Decided;
 use super::grow::Consensus;
 use super::judge::{self, Geometry, Judged};
 use super::recorder::Recorder;
-use crate::domain::result::{ObservationResults, TrackResults, ViewResult};
+use crate::domain::result::{ObservationResults, Sigmas, TrackResults, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
-use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
+use crate::geometry::bundle::metric::{Intrinsics, Parameter, Reconstruction};
 use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::measurement::Sighting;
 use crate::geometry::{Camera, Point, triangulation};
@@ -115,10 +116,7 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
         iterations,
         seed: context.settings.seed,
         calibrations: usable
-            .map(|metric| {
-                let told = (calibration.sigma_log_focal, calibration.grade);
-                pixel_calibrations(metric, told, context, attempt.block.views[0])
-            })
+            .map(|metric| pixel_calibrations(metric, calibration, context, attempt.block.views[0]))
             .unwrap_or_default(),
         // Planes transform by the inverse transpose of what moves points: from normalised to pixels that is T1^-T.
         plane_at_infinity: calibration
@@ -310,11 +308,11 @@ pub fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
 /// order, their principal points about the image centre of the group's first view.
 fn pixel_calibrations(
     metric: &Reconstruction,
-    told: (Option<f64>, Grade),
+    outcome: &Outcome,
     context: &Context,
     first_view: usize,
 ) -> Vec<Calibration> {
-    let about = |view: usize| pixel_calibration(&metric.intrinsics, told, context, view);
+    let about = |view: usize| pixel_calibration(&metric.intrinsics, outcome, context, view);
     let (group_of, groups) = super::block::camera_groups(context.input);
     match groups {
         1 => vec![about(first_view)],
@@ -324,22 +322,30 @@ fn pixel_calibrations(
 
 /// One calibration in pixels, its principal point about the image centre of this view.
 ///
-/// * `told`: the standard deviation of the log focal length (`None`: unobservable), and the grade
-pub fn pixel_calibration(
-    intrinsics: &Intrinsics,
-    (sigma_log_focal, grade): (Option<f64>, Grade),
-    context: &Context,
-    view: usize,
-) -> Calibration {
+/// * `outcome`: says what it is worth
+pub fn pixel_calibration(intrinsics: &Intrinsics, outcome: &Outcome, context: &Context, view: usize) -> Calibration {
     let offset = intrinsics.principal_point * context.scale_px;
     Calibration {
         focal_px: intrinsics.focal * context.scale_px,
-        sigma_log_focal,
+        sigma_log_focal: outcome.sigma_log_focal,
         principal_point_px: (context.normalization.centres_px[view] + offset).into(),
         aspect: intrinsics.aspect,
         radial_k1: intrinsics.radial,
         radial_k2: intrinsics.second_radial,
-        grade: Some(grade),
+        grade: Some(outcome.grade),
+        sigmas: sigmas(intrinsics, outcome, context.scale_px),
+    }
+}
+
+/// Standard deviations of what was estimated beside the focal length, in its units.
+fn sigmas(intrinsics: &Intrinsics, outcome: &Outcome, scale_px: f64) -> Sigmas {
+    let centre = outcome.sigma(Parameter::PrincipalX).zip(outcome.sigma(Parameter::PrincipalY));
+    Sigmas {
+        principal_point_px: centre.map(|(x, y)| [x * scale_px, y * scale_px]),
+        // A small deviation of the logarithm is one of the ratio.
+        aspect: outcome.sigma(Parameter::LogAspect).map(|sigma| sigma * intrinsics.aspect),
+        radial_k1: outcome.sigma(Parameter::Radial),
+        radial_k2: outcome.sigma(Parameter::SecondRadial),
     }
 }
 

@@ -3,7 +3,7 @@
 use super::enums::{Twin, optional_to_wire};
 use super::{progress, required};
 use crate::domain::job::JobName;
-use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, TrackSplit, ViewResult};
+use crate::domain::result::{ObservationResults, PriorTime, Sigmas, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{
     Calibration, Grade, LeftOut, Method, Prior, Solution, Stage, Status, Violation, Warning, WarningCode,
 };
@@ -120,6 +120,11 @@ fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
         radial_k1: Some(calibration.radial_k1),
         radial_k2: Some(calibration.radial_k2),
         grade: optional_to_wire(calibration.grade),
+        sigma_principal_point_x_px: calibration.sigmas.principal_point_px.map(|[x, _]| x),
+        sigma_principal_point_y_px: calibration.sigmas.principal_point_px.map(|[_, y]| y),
+        sigma_aspect: calibration.sigmas.aspect,
+        sigma_radial_k1: calibration.sigmas.radial_k1,
+        sigma_radial_k2: calibration.sigmas.radial_k2,
     }
 }
 
@@ -132,6 +137,15 @@ fn calibration_from_wire(calibration: &proto::Calibration) -> Result<Calibration
         radial_k1: calibration.radial_k1.unwrap_or(0.0),
         radial_k2: calibration.radial_k2.unwrap_or(0.0),
         grade: Grade::from_wire(calibration.grade, "calibrations.grade")?,
+        sigmas: Sigmas {
+            principal_point_px: calibration
+                .sigma_principal_point_x_px
+                .zip(calibration.sigma_principal_point_y_px)
+                .map(|(x, y)| [x, y]),
+            aspect: calibration.sigma_aspect,
+            radial_k1: calibration.sigma_radial_k1,
+            radial_k2: calibration.sigma_radial_k2,
+        },
     })
 }
 

@@ -39,6 +39,12 @@ pub(super) fn rich() -> Solution {
                 radial_k1: -0.05,
                 radial_k2: 0.01,
                 grade: Some(Grade::Weak),
+                sigmas: Sigmas {
+                    principal_point_px: Some([3.5, 4.5]),
+                    aspect: Some(0.01),
+                    radial_k1: Some(0.02),
+                    radial_k2: None,
+                },
             },
             Calibration {
                 focal_px: 900.0,
@@ -48,6 +54,7 @@ pub(super) fn rich() -> Solution {
                 radial_k1: 0.0,
                 radial_k2: 0.0,
                 grade: None,
+                sigmas: Sigmas::default(),
             },
         ],
         plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),

@@ -29,7 +29,9 @@ pub(super) fn grade(
 ) -> Result<Outcome, Stopped> {
     let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
     Stopped::check(choice.stop)?;
-    let mut sigma = choice.sigma(&best).filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
+    let sigmas = choice.sigmas(&best);
+    let of_focal = sigmas[Parameter::LogFocal as usize];
+    let mut sigma = of_focal.filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
     let mut verdict = Verdict::new(warnings);
     if let Some(focal_prior) = choice.problem.focal_prior {
         weigh_prior(&mut verdict, &mut sigma, choice, &best, focal_prior);
@@ -49,6 +51,7 @@ pub(super) fn grade(
     }
     Ok(Outcome {
         sigma_log_focal: verdict.told(sigma),
+        sigma_ratios: sigmas.map(|sigma| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite())),
         grade: verdict.grade,
         warnings: verdict.warnings,
         model: best.model,

@@ -62,6 +62,9 @@ pub struct Outcome {
     pub focals: Option<Vec<f64>>,
     /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable.
     pub sigma_log_focal: Option<f64>,
+    /// The standard deviation of each intrinsic that the model frees over that of the log focal length, indexed by
+    /// [`Parameter`]: what raises the latter raises them all. `None`: not free, or not determined.
+    pub sigma_ratios: [Option<f64>; Parameter::COUNT],
     pub grade: Grade,
     pub warnings: Vec<Warning>,
     /// Which intrinsics the data could carry.
@@ -75,12 +78,18 @@ pub struct Outcome {
 }
 
 impl Outcome {
+    /// One standard deviation of an intrinsic in the form in which it is adjusted; `None`: not free, or unobservable.
+    pub fn sigma(&self, parameter: Parameter) -> Option<f64> {
+        Some(self.sigma_ratios[parameter as usize]? * self.sigma_log_focal?)
+    }
+
     /// An outcome without a calibration, for these reasons.
     pub fn refused(warnings: Vec<Warning>) -> Self {
         Self {
             metric: None,
             focals: None,
             sigma_log_focal: None,
+            sigma_ratios: [None; Parameter::COUNT],
             grade: Grade::ProjectiveOnly,
             warnings,
             model: IntrinsicsModel::FOCAL,

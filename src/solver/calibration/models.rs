@@ -190,16 +190,19 @@ impl Choice<'_> {
         Warning::new(WarningCode::ModelMismatch, detail)
     }
 
-    /// Standard deviation of the log focal length, the doubt about the model included; `None`: unobservable.
+    /// Standard deviations of the intrinsics that the model frees, the doubt about the model included, indexed by
+    /// [`Parameter`]; `None`: unobservable or not free.
     ///
     /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
-    /// the expected squared error of the focal length reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights
+    /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights
     /// from Laplace's approximation of each model's evidence under [`knowledge`]. An extension that the data can
     /// neither confirm nor refute thus costs what it would move.
-    pub fn sigma(&self, best: &Candidate) -> Option<f64> {
-        let own = best.sigma_log_focal(self.prior)?;
+    pub fn sigmas(&self, best: &Candidate) -> [Option<f64>; Parameter::COUNT] {
+        let own = best.sigma_log_focal(self.prior);
+        let (Some(own), Some(here)) = (own, best.optimum(best.model, self.prior)) else {
+            return [None; Parameter::COUNT];
+        };
         let profiled = self.profiled(own, best);
-        let here = best.optimum(best.model, self.prior)?;
         let unit = best.fit.noise.powi(2);
         let models: Vec<(f64, Optimum)> = IntrinsicsModel::all()
             .filter_map(|model| {
@@ -209,20 +212,23 @@ impl Choice<'_> {
             .collect();
         let highest = models.iter().map(|(weight, _)| *weight).fold(f64::NEG_INFINITY, f64::max);
         let total: f64 = models.iter().map(|(weight, _)| (weight - highest).exp()).sum();
-        let mut squared = 0.0;
-        for (weight, there) in &models {
-            let weight = (weight - highest).exp() / total;
-            let index = Parameter::LogFocal as usize;
-            match there.variance[index] {
-                Some(variance) => {
-                    squared += weight * (variance * unit + (there.shift[index] - here.shift[index]).powi(2))
+        let averaged = |index: usize| {
+            let mut squared = 0.0;
+            for (weight, there) in &models {
+                let weight = (weight - highest).exp() / total;
+                match there.variance[index] {
+                    Some(variance) => {
+                        squared += weight * (variance * unit + (there.shift[index] - here.shift[index]).powi(2))
+                    }
+                    None if weight > NEGLIGIBLE => return None,
+                    None => {}
                 }
-                None if weight > NEGLIGIBLE => return None,
-                None => {}
             }
-        }
-        // What the profile adds to the chosen model's own deviation, it adds to the whole.
-        Some(squared.sqrt() * profiled / own).filter(|sigma| sigma.is_finite())
+            // What the profile adds to the chosen model's own deviation, it adds to the whole.
+            Some(squared.sqrt() * profiled / own).filter(|sigma| sigma.is_finite())
+        };
+        let free = best.model.parameters();
+        Parameter::ALL.map(|parameter| averaged(parameter as usize).filter(|_| free.contains(&parameter)))
     }
 
     /// Logarithm of prior probability times evidence, up to what all models share.

@@ -9,7 +9,7 @@ use super::verdict::{UNOBSERVABLE_ABOVE, Verdict};
 use super::{Outcome, Problem, Stopped, no_start};
 use crate::domain::{Grade, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::Options;
-use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior};
+use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter};
 use crate::geometry::bundle::zoom::Zooming;
 use crate::geometry::daq::{self, FirstViewFrame, to_first_view_frame};
 use crate::geometry::metric::{cheirality, upgrade_zooming};
@@ -85,6 +85,7 @@ pub(super) fn calibrate(
     verdict.judge_cheirality(in_front);
     Ok(Outcome {
         sigma_log_focal: verdict.told(sigma),
+        sigma_ratios: [None; Parameter::COUNT],
         grade: verdict.grade,
         warnings: verdict.warnings,
         model: IntrinsicsModel::FOCAL,

@@ -90,7 +90,7 @@ fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Cali
     let of_group = |(group, outcome): (usize, &Outcome)| {
         let intrinsics = &model.lenses[group].intrinsics;
         let view = scene.group_of.iter().position(|of| *of == group).unwrap_or(0);
-        pixel_calibration(intrinsics, (outcome.sigma_log_focal, outcome.grade), &scene.context, view)
+        pixel_calibration(intrinsics, outcome, &scene.context, view)
     };
     if scene.context.merges_cameras {
         // One calibration, told for each of the groups.

@@ -121,3 +121,68 @@ fn sigma_is_the_error_through_distorting_lenses() {
     assert!(all.within(3.0) >= 0.97, "{:.3} within 3 sigma", all.within(3.0));
     assert!((0.60..=0.80).contains(&all.within(1.0)), "{:.3} within 1 sigma", all.within(1.0));
 }
+
+/// A lens of which everything is to be estimated: each is far enough from where a pinhole has it that chance does not
+/// decide whether it is freed.
+fn strange_lens(seed: u64) -> TestScene {
+    const NOISE: f64 = 0.0007;
+    let mut scene = testing::scene(seed, 10, 100, 0.0);
+    let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x1e45);
+    let mut beyond = |least: f64, most: f64| {
+        let size = rng.random_range(least..most);
+        if rng.random::<bool>() { size } else { -size }
+    };
+    scene.intrinsics.principal_point = Vector2::new(beyond(0.03, 0.06), beyond(0.03, 0.06));
+    scene.intrinsics.aspect = beyond(0.03, 0.08).exp();
+    (scene.intrinsics.radial, scene.intrinsics.second_radial) = (-0.25, 0.2);
+    scene.observe(NOISE, &mut rng);
+    scene.crop();
+    scene
+}
+
+/// The sigmas of the other intrinsics against their errors, over 100 scenes.
+#[test]
+fn sigmas_of_the_other_intrinsics_are_about_their_errors() {
+    let mut deviations: Vec<(Parameter, Coverage)> = Parameter::ALL
+        .into_iter()
+        .map(|parameter| (parameter, Coverage { deviations: Vec::new(), scenes: 100 }))
+        .collect();
+    for seed in 0..100 {
+        let scene = strange_lens(seed);
+        let outcome = calibrated(&scene, seed, 0.0007);
+        // Capped: sigma is that of the grade then.
+        if outcome.grade != Grade::Metric {
+            println!("seed {seed}: {:?} {:?} {:?}", outcome.grade, outcome.sigma_log_focal, codes(&outcome));
+            continue;
+        }
+        let found = outcome.metric.as_ref().expect("metric").intrinsics;
+        for (parameter, coverage) in &mut deviations {
+            let Some(sigma) = outcome.sigma(*parameter) else { continue };
+            coverage.deviations.push((found.value(*parameter) - scene.intrinsics.value(*parameter)) / sigma);
+        }
+    }
+    for (parameter, coverage) in &deviations {
+        coverage.tell(&format!("{parameter:?}"));
+    }
+    for (parameter, coverage) in &deviations {
+        let (count, within) = (coverage.deviations.len(), coverage.within(1.0));
+        assert!(count >= 50, "{parameter:?} was estimated in {count} scenes");
+        assert!((0.55..=0.80).contains(&within), "{parameter:?}: {within:.2} of {count} within 1 sigma");
+        assert!(coverage.within(3.0) >= 0.95, "{parameter:?}: {:.2} within 3 sigma", coverage.within(3.0));
+    }
+}
+
+/// What is not estimated has no sigma, and that of the focal length is as it was told.
+#[test]
+fn only_what_is_free_has_a_sigma() {
+    let outcome = calibrated(&testing::scene(3, 10, 60, 0.001), 3, 0.001);
+    assert_eq!(outcome.model, IntrinsicsModel::FOCAL);
+    for parameter in Parameter::ALL {
+        let sigma = outcome.sigma(parameter);
+        assert_eq!(sigma.is_some(), parameter == Parameter::LogFocal, "{parameter:?}: {sigma:?}");
+    }
+    assert_eq!(outcome.sigma(Parameter::LogFocal), outcome.sigma_log_focal);
+    let raised = Outcome { sigma_log_focal: outcome.sigma_log_focal.map(|sigma| 3.0 * sigma), ..outcome.clone() };
+    let of = |outcome: &Outcome| outcome.sigma(Parameter::LogFocal).expect("observable");
+    assert!((of(&raised) / of(&outcome) - 3.0).abs() < 1e-12);
+}
