@@ -169,7 +169,9 @@ fn parts_are_exported_apart_and_open_in_colmap() {
     };
     let rows = fs::read_to_string(out.join("tracks.csv")).expect("tracks.csv");
     let of_part = |part: &str| rows.lines().skip(1).filter(|row| row.rsplit(',').next() == Some(part)).count();
-    assert_eq!((vertices("points.ply"), vertices("points-part-1.ply")), (of_part("0"), of_part("1")));
+    let splits = json(&solved.stdout)["split_points"].as_u64().expect("a count") as usize;
+    assert_eq!(vertices("points.ply") + vertices("points-part-1.ply"), of_part("0") + of_part("1") + splits);
+    assert!(vertices("points.ply") >= of_part("0") && vertices("points-part-1.ply") >= of_part("1"));
     assert!(of_part("1") > 50, "{}", of_part("1"));
     let reconstructions = json(&fs::read_to_string(out.join("opensfm/reconstruction.json")).expect("a list"));
     let shots = |part: usize| reconstructions[part]["shots"].as_object().map(serde_json::Map::len);
@@ -182,6 +184,59 @@ fn parts_are_exported_apart_and_open_in_colmap() {
     let printed = succeeds(Command::new(python).args(["-c", script]).args(&models));
     let wanted = [first, second, first, second].map(|count| format!("{count} True"));
     assert_eq!(printed.lines().collect::<Vec<_>>(), wanted);
+}
+
+/// Tracks that go over to another point on their way: both points are in every export, where their observations are.
+#[test]
+fn both_points_of_a_split_track_are_exported() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let path = |name: &str| directory.path().join(name);
+    let scene =
+        ["--sequence", "--views", "12", "--tracks", "500", "--noise", "0.0005", "--joined", "0.4", "--seed", "3"];
+    let made = run(["synth", "--out", text(&path("walk"))].iter().chain(&scene));
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let size = ["--width", "1000", "--height", "1000"];
+    let input = path("walk/observations.csv");
+    let solved = solve(&input, &path("out"), &[&size[..], &["--export", "colmap,colmap-text,opensfm"]].concat());
+    assert_eq!(solved.code, Some(0), "{solved:?}");
+    let result = json(&solved.stdout);
+    let count = |name: &str| result[name].as_u64().expect("a count");
+    let (tracks, splits) = (count("inlier_tracks"), count("split_points"));
+    assert!(splits > 5, "{result}");
+    let reconstruction = json(&fs::read_to_string(path("out/opensfm/reconstruction.json")).expect("a list"));
+    let points = reconstruction[0]["points"].as_object().expect("points").len() as u64;
+    let points3d = fs::read_to_string(path("out/colmap-text/points3D.txt")).expect("points3D.txt");
+    let rows: Vec<Vec<&str>> =
+        points3d.lines().filter(|line| !line.starts_with('#')).map(|line| line.split(' ').collect()).collect();
+    // A point that one registered image sees is in none of them.
+    assert!(
+        points == rows.len() as u64 && points > tracks && points <= tracks + splits,
+        "{points} of {tracks} + {splits}"
+    );
+    // Their ids are behind those of the tracks, which are below 500; each has the three observations that made it one.
+    let others = || rows.iter().filter(|row| row[0].parse::<u64>().is_ok_and(|id| id >= 500));
+    assert!(others().count() as u64 > splits / 2 && others().all(|row| row.len() >= 8 + 2 * 3), "{points3d}");
+
+    let again = solve(&path("out/colmap"), &path("again"), &[]);
+    assert_eq!(again.code, Some(0), "{again:?}");
+    let right = json(&again.stdout)["inlier_tracks"].as_u64().expect("a count");
+    assert!(right as f64 > 0.97 * points as f64, "{right} of {points} points stand when they are tracks");
+
+    // The next run is asked for none of them, and what it does not make is gone.
+    let last = solve(&input, &path("out"), &[&size[..], &["--export", "opensfm"]].concat());
+    assert_eq!(last.code, Some(0), "{last:?}");
+    assert!(!path("out/colmap").exists() && !path("out/colmap-text").exists());
+    assert!(path("out/opensfm/reconstruction.json").is_file() && path("out/report.html").is_file());
+
+    let Some(python) = python("COLMAP's reader", "pycolmap") else { return };
+    let script = "import sys, pycolmap\nmodel = pycolmap.Reconstruction(sys.argv[1])\n\
+                  others = [point for id, point in model.points3D.items() if id >= 500]\n\
+                  print(model.num_points3D(), len(others), sum(point.error < 5 for point in others))\n";
+    let exported = solve(&input, &path("out"), &[&size[..], &["--export", "colmap"]].concat());
+    assert_eq!(exported.code, Some(0), "{exported:?}");
+    let printed = succeeds(Command::new(python).args(["-c", script]).arg(path("out/colmap")));
+    let others = others().count();
+    assert_eq!(printed.trim(), format!("{points} {others} {others}"));
 }
 
 /// A database that COLMAP itself wrote: wrong matches are cut, and what is written goes by COLMAP's ids.
