@@ -5,6 +5,7 @@
 //! not make two of them: coordinates are compared bit by bit.
 
 use std::cmp::Ordering;
+use std::collections::HashMap;
 use std::ops::Range;
 
 use super::input::Input;
@@ -93,13 +94,24 @@ impl Copies {
                 observations.weight[k] = observations.weight[like];
                 observations.split[k] = observations.split[like];
             }
-            let of_first = |track: u32| track as usize == first;
-            let splits: Vec<_> = solution.splits.iter().filter(|split| of_first(split.track)).copied().collect();
-            solution.splits.extend(splits.into_iter().map(|mut split| {
-                split.track = copy as u32;
-                split
-            }));
         }
+        let mut of_first: HashMap<u32, Vec<usize>> = HashMap::new();
+        for (copy, first) in self.list() {
+            of_first.entry(first as u32).or_default().push(copy);
+        }
+        let split_copies: Vec<_> = solution
+            .splits
+            .iter()
+            .flat_map(|split| {
+                let copies = of_first.get(&split.track).into_iter().flatten();
+                copies.map(move |&copy| {
+                    let mut split = *split;
+                    split.track = copy as u32;
+                    split
+                })
+            })
+            .collect();
+        solution.splits.extend(split_copies);
         solution.splits.sort_by_key(|split| (split.track, split.number));
     }
 }
