@@ -8,7 +8,7 @@ use super::client::access::AccessArgs;
 use super::client::{self, Client};
 use super::exit::Failure;
 use crate::domain::{Backend, ImageSize, Limits, Method, Solution, SolveSettings};
-use crate::formats::{self, Export, Format, LabelledInput, Matches, Reading};
+use crate::formats::{self, Export, Format, LabelledInput, Matches, Reading, result_files};
 
 /// Where the server listens by default; `serve --listen` has the same port.
 pub const DEFAULT_SERVER: &str = "http://127.0.0.1:50051";
@@ -160,16 +160,30 @@ pub struct ExportArgs {
 }
 
 impl ExportArgs {
-    /// Writes what is asked for, and takes away what a former run was asked for. A result that is not metric is no
-    /// failure: it is told on stderr.
+    fn exports(&self) -> Vec<Export> {
+        self.export.iter().copied().map(Export::from).collect()
+    }
+
+    /// Refuses, before any work, a directory in which the result would replace what it is made from.
+    pub fn check(&self, directory: &Path, input: &Path) -> Result<(), Failure> {
+        match result_files::replaced(directory, &self.exports(), input) {
+            Some(place) => Err(Failure::usage(format_args!(
+                "--out {}: the result would replace its own input, {}: give another directory",
+                directory.display(),
+                place.display()
+            ))),
+            None => Ok(()),
+        }
+    }
+
+    /// Writes the result files and, where there is the input, what is asked for other programs. A result that is not
+    /// metric is no failure: it is told on stderr.
     ///
     /// # Errors
     /// A file that cannot be written or removed.
-    pub fn write(&self, directory: &Path, solution: &Solution, input: &LabelledInput) -> Result<(), Failure> {
-        let exports: Vec<Export> = self.export.iter().copied().map(Export::from).collect();
-        match formats::export::write(directory, &exports, solution, input) {
-            Err(error @ formats::export::Error::NotMetric(_)) => eprintln!("warning: {error}"),
-            outcome => outcome.map_err(Failure::internal)?,
+    pub fn write(&self, directory: &Path, solution: &Solution, input: Option<&LabelledInput>) -> Result<(), Failure> {
+        if let Some(refused) = result_files::write(directory, solution, input, &self.exports())? {
+            eprintln!("warning: nothing was exported: {refused}");
         }
         Ok(())
     }

@@ -16,9 +16,10 @@ use super::{client, job_view, print, summary};
 use crate::config::Config;
 use crate::domain::job::JobEvent;
 use crate::domain::{Solution, SolveSettings};
-use crate::formats::result_files::{self, pretty};
+use crate::formats::LabelledInput;
+use crate::formats::publish::pretty;
+use crate::formats::result_files;
 use crate::formats::result_json::ResultJson;
-use crate::formats::{LabelledInput, export};
 use crate::synthetic::Scene;
 use crate::synthetic::metrics::{Agreement, agreement};
 
@@ -83,8 +84,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     service.stop().await?;
     let solution = outcome?;
     let input = LabelledInput::unlabelled(scene.input.clone(), Path::new(result_files::OBSERVATIONS));
-    export::remove_former(&args.out, &[], None)?;
-    result_files::write(&args.out, &solution, Some(&input))?;
+    result_files::write(&args.out, &solution, Some(&input), &[])?;
     let comparison = Comparison::new(&scene, &solution);
     print(
         if args.json { comparison.json(&args, &solution)? } else { comparison.text(&args, &scene, &solution) }

@@ -22,7 +22,7 @@ use crate::evaluation::records;
 use crate::evaluation::runner::{self, Records};
 use crate::evaluation::summary::{self, Cell};
 use crate::evaluation::{Sweep, figures, page};
-use crate::formats::result_files::{create_directory, pretty, write_atomically};
+use crate::formats::publish::{create_directory, pretty, write_atomically};
 
 /// Seeds of a full evaluation and of a quick one.
 const SEEDS: u64 = 20;

@@ -14,7 +14,7 @@ use crate::domain::StopToken;
 use crate::evaluation::priors::{self, Plan, scenes, sweep, table, windows};
 use crate::evaluation::real::{Sequence, folder};
 use crate::evaluation::records;
-use crate::formats::result_files::{create_directory, pretty, write_atomically};
+use crate::formats::publish::{create_directory, pretty, write_atomically};
 use crate::network::subspace;
 
 /// The comparison of priors instead of the sweeps.

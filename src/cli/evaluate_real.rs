@@ -11,7 +11,7 @@ use super::interrupt::Interrupt;
 use super::print;
 use crate::domain::StopToken;
 use crate::evaluation::real::{self, Options, Row, Sequence, folder, page, table};
-use crate::formats::result_files::{create_directory, pretty, write_atomically};
+use crate::formats::publish::{create_directory, pretty, write_atomically};
 
 /// How often the progress shows that something still runs.
 const TICK: Duration = Duration::from_millis(200);

@@ -7,7 +7,7 @@ use super::exit::{Exit, Failure};
 use super::job_view::GivenName;
 use super::{print, summary};
 use crate::domain::Solution;
-use crate::formats::{LabelledInput, export, result_files};
+use crate::formats::{LabelledInput, result_files};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -53,17 +53,16 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if input.is_none() && !args.export.export.is_empty() {
         return Err(Failure::usage("--export needs --input, whose points and names it writes"));
     }
+    if let (Some(out), Some(path)) = (&args.out, &args.input) {
+        args.export.check(out, path)?;
+    }
     let name = args.name.of(&args.server.access)?;
     let solution = args.server.connect().await?.read_result(&name).await?;
     if let Some(input) = &input {
         belongs_together(input, &solution)?;
     }
     if let Some(out) = &args.out {
-        match &input {
-            Some(input) => args.export.write(out, &solution, input)?,
-            None => export::remove_former(out, &[], None)?,
-        }
-        result_files::write(out, &solution, input.as_ref())?;
+        args.export.write(out, &solution, input.as_ref())?;
     }
     if args.json {
         print(result_files::result_json(&solution, input.as_ref())?.trim_end())?;

@@ -13,6 +13,7 @@ use super::windows::{self, Show, WindowArgs};
 use super::{client, job_view, print, summary};
 use crate::domain::job::JobEvent;
 use crate::domain::{Limits, Solution, SolveSettings, StopToken};
+use crate::formats::publish::create_directory;
 use crate::formats::{LabelledInput, result_files};
 use crate::solver;
 
@@ -86,7 +87,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         tell_notes(&input);
     }
     // Found out now rather than after the work.
-    result_files::create_directory(&args.out)?;
+    args.export.check(&args.out, &args.input.input)?;
+    create_directory(&args.out)?;
     if let Some(length) = args.window.window {
         let show = Show { json: args.json, quiet: args.quiet };
         return windows::run(&args.window, length, &input, &settings, &args.out, show);
@@ -151,9 +153,7 @@ async fn on_server(
 
 /// Writes the files and tells what they hold.
 fn deliver(args: &Args, solution: &Solution, input: &LabelledInput) -> Result<Exit, Failure> {
-    // First: whoever waits for result.json, the last file, finds them.
-    args.export.write(&args.out, solution, input)?;
-    result_files::write(&args.out, solution, Some(input))?;
+    args.export.write(&args.out, solution, Some(input))?;
     if args.json {
         print(result_files::result_json(solution, Some(input))?.trim_end())?;
     } else if !args.quiet {

@@ -8,7 +8,8 @@ pub use super::scene_args::SceneArgs;
 use super::scene_args::{CameraArgs, GeometryArgs, OutlierArgs};
 use crate::domain::RawInput;
 use crate::domain::error::quoted;
-use crate::formats::result_files::{OBSERVATIONS, create_directory, pretty, write_atomically};
+use crate::formats::publish::{create_directory, pretty, write_atomically};
+use crate::formats::result_files::OBSERVATIONS;
 pub use crate::synthetic::scene::IMAGE_SIDE_PX;
 use crate::synthetic::{Scene, Sequence, SequenceOptions};
 

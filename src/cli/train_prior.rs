@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
-use crate::formats::result_files::{create_directory, write_atomically};
+use crate::formats::publish::{create_directory, write_atomically};
 use crate::network::subspace::{PriorFile, Shape};
 use crate::report::chart::{LineChart, Series, standalone};
 use crate::training::{Milestone, Objective, Settings, Trainer};

@@ -11,9 +11,9 @@ use super::interrupt::Interrupt;
 use super::print;
 use super::progress::ProgressView;
 use crate::domain::{Limits, Silent, SolveSettings, StopReason, StopToken};
-use crate::formats::result_files::{Draft, pretty};
+use crate::formats::LabelledInput;
+use crate::formats::publish::{Draft, pretty};
 use crate::formats::windows::{self, Row, Table};
-use crate::formats::{LabelledInput, export};
 use crate::solver;
 
 /// Views that a reconstruction needs at least.
@@ -78,8 +78,7 @@ pub fn run(
     progress.finish();
     let table = Table::new(views, length, step, rows?);
     let json = pretty(&table)?;
-    export::remove_former(out, &[], Some(&input.path))?;
-    let mut draft = Draft::new(out);
+    let mut draft = Draft::new(out, Some(&input.path))?;
     draft.add(windows::CSV, table.csv().as_bytes())?;
     draft.publish(windows::JSON, json.as_bytes())?;
     if show.json {

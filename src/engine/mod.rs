@@ -191,8 +191,8 @@ impl Engine {
     /// Admits and stores a job. A repeated request id with the same body gives the job that the first call made.
     ///
     /// # Errors
-    /// [`Error::QueueFull`] at once when too much waits, [`Error::BatchTooLarge`], [`Error::AlreadyExists`] for a taken job id or a request id
-    /// with another body, [`Error::InvalidArgument`], [`Error::Draining`].
+    /// [`Error::QueueFull`] at once when too much waits, [`Error::BatchTooLarge`], [`Error::AlreadyExists`] for a taken job
+    /// id or a request id with another body, [`Error::InvalidArgument`], [`Error::Draining`].
     pub async fn submit(&self, new: NewJob) -> Result<Job, Error> {
         self.inner.clone().submit(new).await
     }

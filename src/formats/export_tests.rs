@@ -5,7 +5,7 @@ use serde_json::Value;
 
 use super::*;
 use crate::domain::{Calibration, ImageSize};
-use crate::formats::{Label, fixture};
+use crate::formats::{Label, fixture, result_files};
 
 /// The model of a result in one part.
 fn model_of(solution: &Solution, input: &LabelledInput) -> Model {
@@ -14,12 +14,17 @@ fn model_of(solution: &Solution, input: &LabelledInput) -> Model {
 
 const ALL: [Export; 3] = Export::ALL;
 
+/// Writes a result and these exports of it; returns why there are none.
+fn write(directory: &Path, exports: &[Export], solution: &Solution, input: &LabelledInput) -> Option<metric::Error> {
+    result_files::write(directory, solution, Some(input), exports).expect("written")
+}
+
 #[test]
 fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let directory = directory.path();
     let (input, solution) = fixture::solved();
-    write(directory, &ALL, &solution, &input).expect("written");
+    write(directory, &ALL, &solution, &input);
     let paths: Vec<_> = ALL
         .iter()
         .flat_map(|export| export.files().1.iter().map(|file| directory.join(export.files().0).join(file)))
@@ -29,8 +34,8 @@ fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
     let mine = directory.join("colmap/mine.txt");
     fs::write(&mine, "x").expect("written");
     let (input, projective) = fixture::projective_only();
-    let error = write(directory, &ALL, &projective, &input).expect_err("not metric");
-    assert!(matches!(error, Error::NotMetric(_)) && error.to_string().contains("not metric"), "{error}");
+    let refused = write(directory, &ALL, &projective, &input).expect("not metric");
+    assert!(refused.to_string().contains("not metric"), "{refused}");
     assert!(paths.iter().all(|path| !path.exists()) && mine.exists());
 }
 
@@ -189,7 +194,7 @@ fn every_part_is_exported_in_a_frame_of_its_own() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let directory = directory.path();
     let (input, solution) = fixture::solved_in_two_parts();
-    write(directory, &ALL, &solution, &input).expect("written");
+    write(directory, &ALL, &solution, &input);
     let images = |file: &str| {
         let text = fs::read_to_string(directory.join("colmap-text").join(file)).expect("a file");
         let poses = text.lines().filter(|line| !line.starts_with('#')).step_by(2);
@@ -219,11 +224,11 @@ fn parts_of_a_former_result_are_taken_away() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let directory = directory.path();
     let (input, solution) = fixture::solved_in_two_parts();
-    write(directory, &ALL, &solution, &input).expect("written");
+    write(directory, &ALL, &solution, &input);
     let mine = directory.join("colmap-text/1/mine.txt");
     fs::write(&mine, "x").expect("written");
     let (input, solution) = fixture::solved();
-    write(directory, &ALL, &solution, &input).expect("written");
+    write(directory, &ALL, &solution, &input);
     assert!(!directory.join("colmap/1").exists());
     assert!(mine.exists() && !directory.join("colmap-text/1/cameras.txt").exists());
     assert!(directory.join("colmap/cameras.bin").is_file());
@@ -234,42 +239,40 @@ fn exports_of_a_former_run_go_whatever_this_one_is_asked_for() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let directory = directory.path();
     let (mut input, solution) = fixture::solved_in_two_parts();
-    write(directory, &ALL, &solution, &input).expect("written");
+    write(directory, &ALL, &solution, &input);
     assert!(directory.join("colmap/1/points3D.bin").is_file());
-    write(directory, &[Export::OpenSfm], &solution, &input).expect("written");
+    write(directory, &[Export::OpenSfm], &solution, &input);
     assert!(!directory.join("colmap").exists() && !directory.join("colmap-text").exists());
     assert!(directory.join("opensfm/reconstruction.json").is_file());
-    write(directory, &[], &fixture::projective_only().1, &input).expect("nothing is asked for");
+    write(directory, &[], &fixture::projective_only().1, &input);
     assert!(!directory.join("opensfm").exists());
     // What this run was given to solve stays.
-    write(directory, &ALL, &solution, &input).expect("written");
+    write(directory, &ALL, &solution, &input);
     input.path = directory.join("colmap");
-    write(directory, &[], &solution, &input).expect("written");
+    write(directory, &[], &solution, &input);
     assert!(directory.join("colmap/cameras.bin").is_file() && !directory.join("colmap/1").exists());
 }
 
+/// A model that another program wrote, or refined in its place, is its own; so is what belongs to it.
 #[test]
 fn models_of_other_programs_stay() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let directory = directory.path();
-    let (input, mut solution) = fixture::solved();
-    let model = |solution: &Solution| model_of(solution, &input);
-    let put = |folder: &str, file: &str, bytes: &[u8]| {
-        create_directory(&directory.join(folder)).expect("created");
-        fs::write(directory.join(folder).join(file), bytes).expect("written");
-    };
-    let mut coloured = model(&solution);
-    coloured.points[3].colour = [90, 120, 30];
-    for (file, bytes) in Export::Colmap.files().1.iter().zip(colmap::write::binary(&coloured)) {
-        put("colmap", file, &bytes);
+    let (input, solution) = fixture::solved();
+    let folders = ALL.map(|export| directory.join(export.folder()));
+    for folder in &folders {
+        fs::create_dir_all(folder).expect("created");
     }
-    for (file, text) in Export::ColmapText.files().1.iter().zip(colmap::write::text(&model(&solution))) {
-        put("colmap-text", file, text.replace("# ", "# Camera list with ").as_bytes());
+    fs::write(folders[0].join("cameras.bin"), "another program's").expect("written");
+    assert!(write(directory, &[], &solution, &input).is_none());
+    assert!(folders[0].join("cameras.bin").is_file());
+    write(directory, &ALL, &solution, &input);
+    for (folder, file) in folders.iter().zip(["points3D.bin", "images.txt", "reconstruction.json"]) {
+        let mut bytes = fs::read(folder.join(file)).expect("a file");
+        *bytes.last_mut().expect("bytes") ^= 1;
+        fs::write(folder.join(file), bytes).expect("written");
     }
-    let json = pretty(&opensfm::reconstruction::json(&[model(&solution)])).expect("JSON");
-    put("opensfm", "reconstruction.json", json.replace("scpsfm camera", "v2 unknown").as_bytes());
-    solution.calibrations.clear();
-    write(directory, &[], &solution, &input).expect("written");
+    write(directory, &[], &solution, &input);
     for export in ALL {
         let (folder, files) = export.files();
         assert!(files.iter().all(|file| directory.join(folder).join(file).is_file()), "{export:?}");
@@ -292,7 +295,7 @@ fn both_points_of_a_split_track_are_exported() {
     let typical = model.points[..inliers].iter().map(|point| point.error_px).fold(0.0, f64::max);
     assert!(other.error_px <= 2.0 * typical, "{} px beside {typical} px", other.error_px);
     let directory = tempfile::tempdir().expect("a temporary directory");
-    write(directory.path(), &[Export::ColmapText], &solution, &input).expect("written");
+    write(directory.path(), &[Export::ColmapText], &solution, &input);
     let again = colmap::model::read(&directory.path().join("colmap-text"), &crate::domain::Limits::default());
     let again = again.expect("our own reader reads it").raw;
     let seen = |point: u32| again.track.iter().filter(|&&track| track == point).count();

@@ -6,9 +6,6 @@ use super::LabelledInput;
 use super::result_json::track_label;
 use crate::domain::Solution;
 
-/// What tells the file from those of other programs.
-pub const MARK: &str = "\ncomment scpsfm points";
-
 /// The points of a part as an ASCII PLY: text, so that results can be compared line by line.
 ///
 /// A vertex has `x y z` (metric where the result is metric, else dehomogenised in the frame of the projective cameras,
@@ -35,7 +32,7 @@ pub fn points(solution: &Solution, input: Option<&LabelledInput>, part: u32) -> 
         "projective (pixels, frame P1 = [I|0] of the first registered view): no distances, no angles"
     };
     let mut text = format!(
-        "ply\nformat ascii 1.0{MARK}{which}, {frame}, coloured by weight\nelement vertex {}\n\
+        "ply\nformat ascii 1.0\ncomment scpsfm points{which}, {frame}, coloured by weight\nelement vertex {}\n\
          property double x\nproperty double y\nproperty double z\n\
          property uchar red\nproperty uchar green\nproperty uchar blue\n\
          property float weight\nproperty double track\nproperty uint split\nend_header\n",
@@ -53,14 +50,6 @@ pub fn points(solution: &Solution, input: Option<&LabelledInput>, part: u32) -> 
 /// Colours of the weights 0 and 1, orange and blue.
 const LOW: [f32; 3] = [230.0, 120.0, 20.0];
 const HIGH: [f32; 3] = [30.0, 100.0, 220.0];
-
-/// Whether a weight has this colour.
-pub fn is_colour(rgb: [u8; 3]) -> bool {
-    // Blue changes most, a step a level: it tells the weight to within what the others are rounded by.
-    let share = (f32::from(rgb[2]) - LOW[2]) / (HIGH[2] - LOW[2]);
-    (0.0..=1.0).contains(&share)
-        && (0..3).all(|k| (LOW[k] + (HIGH[k] - LOW[k]) * share - f32::from(rgb[k])).abs() <= 1.0)
-}
 
 /// The colour of a weight: a straight line from orange (0) to blue (1), apart for the colour-blind too.
 pub fn colour(weight: f32) -> [u8; 3] {
@@ -122,7 +111,5 @@ mod tests {
         assert_eq!(colour(1.0), [30, 100, 220]);
         assert_eq!(colour(f32::NAN), colour(0.0));
         assert_eq!(colour(7.0), colour(1.0));
-        assert!((0..=1000).all(|weight| is_colour(colour(weight as f32 / 1e3))));
-        assert!([[0; 3], [255; 3], [128; 3], [230, 120, 24], [230, 120, 18]].into_iter().all(|rgb| !is_colour(rgb)));
     }
 }

@@ -1,4 +1,5 @@
 use std::collections::BTreeMap;
+use std::fs;
 
 use serde_json::Value;
 
@@ -6,6 +7,7 @@ use super::*;
 use crate::domain::result::{ObservationResults, Sigmas};
 use crate::domain::{Calibration, Grade, LeftOut, Status, Warning, WarningCode};
 use crate::formats::fixture;
+use crate::formats::manifest::Manifest;
 use crate::formats::windows::{self, Table};
 
 fn json(solution: &Solution) -> Value {
@@ -21,6 +23,7 @@ fn contents(directory: &Path) -> BTreeMap<String, String> {
     let entries = fs::read_dir(directory).expect("a directory");
     entries
         .map(|entry| entry.expect("an entry").path())
+        .filter(|path| !path.ends_with(manifest::NAME))
         .map(|path| {
             let name = path.file_name().expect("a name").to_string_lossy().into_owned();
             (name, fs::read_to_string(&path).expect("text"))
@@ -219,7 +222,7 @@ fn answers_carry_the_callers_ids_in_the_callers_order() {
     input.raw.track.swap(0, 1);
     let directory = tempfile::tempdir().expect("a temporary directory");
     let out = directory.path().join("a/b");
-    write(&out, &solution, Some(&input)).expect("written");
+    write(&out, &solution, Some(&input), &[]).expect("written");
     let files = contents(&out);
     assert_eq!(files.keys().collect::<Vec<_>>(), [CAMERAS, OBSERVATIONS, POINTS, REPORT, RESULT, TRACKS]);
     let tracks: Vec<&str> = files[TRACKS].lines().collect();
@@ -241,7 +244,7 @@ fn without_a_network_there_is_no_fourth_column_and_without_the_input_no_observat
     let (_, mut solution) = fixture::solved();
     solution.tracks.network_weight.clear();
     let directory = tempfile::tempdir().expect("a temporary directory");
-    write(directory.path(), &solution, None).expect("written");
+    write(directory.path(), &solution, None, &[]).expect("written");
     let files = contents(directory.path());
     assert!(!files.contains_key(OBSERVATIONS));
     assert_eq!(files[TRACKS].lines().next(), Some("track,weight,inlier,part"));
@@ -254,7 +257,7 @@ fn the_same_solution_gives_the_same_bytes_but_for_times() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let written = |name: &str, solution: &Solution| {
         let out = directory.path().join(name);
-        write(&out, solution, Some(&input)).expect("written");
+        write(&out, solution, Some(&input), &[]).expect("written");
         contents(&out)
     };
     let first = written("first", &solution);
@@ -277,9 +280,9 @@ fn the_same_solution_gives_the_same_bytes_but_for_times() {
 fn a_second_result_replaces_the_first_and_leaves_no_temporary_files() {
     let (input, mut solution) = fixture::solved();
     let directory = tempfile::tempdir().expect("a temporary directory");
-    write(directory.path(), &solution, Some(&input)).expect("written");
+    write(directory.path(), &solution, Some(&input), &[]).expect("written");
     solution.iterations = 12_345;
-    write(directory.path(), &solution, Some(&input)).expect("written");
+    write(directory.path(), &solution, Some(&input), &[]).expect("written");
     let files = contents(directory.path());
     assert_eq!(files.len(), 6);
     assert!(files[RESULT].contains("12345"));
@@ -289,7 +292,7 @@ fn a_second_result_replaces_the_first_and_leaves_no_temporary_files() {
 fn frames_are_never_mixed() {
     let (input, solution) = fixture::solved_in_two_parts();
     let directory = tempfile::tempdir().expect("a temporary directory");
-    write(directory.path(), &solution, Some(&input)).expect("written");
+    write(directory.path(), &solution, Some(&input), &[]).expect("written");
     let files = contents(directory.path());
     let tracks: Vec<Vec<&str>> = files[TRACKS].lines().skip(1).map(|line| line.split(',').collect()).collect();
     for (name, part) in [(POINTS, "0"), ("points-part-1.ply", "1")] {
@@ -306,7 +309,7 @@ fn frames_are_never_mixed() {
     for name in ["points-part-01.ply", "points-part-2.ply"] {
         fs::write(directory.path().join(name), "mine").expect("written");
     }
-    write(directory.path(), &fixture::solved().1, Some(&input)).expect("written");
+    write(directory.path(), &fixture::solved().1, Some(&input), &[]).expect("written");
     let names: Vec<String> = contents(directory.path()).into_keys().filter(|name| name.ends_with(".ply")).collect();
     assert_eq!(names, ["points-part-01.ply", "points-part-2.ply", POINTS]);
 }
@@ -317,10 +320,10 @@ fn what_cannot_be_written_is_named() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let file = directory.path().join("file");
     fs::write(&file, "x").expect("written");
-    let error = write(&file, &solution, Some(&input)).expect_err("a file stands there");
+    let error = write(&file, &solution, Some(&input), &[]).expect_err("a file stands there");
     assert!(error.to_string().contains("cannot create the directory"), "{error}");
     fs::create_dir_all(directory.path().join(TRACKS)).expect("created");
-    let error = write(directory.path(), &solution, Some(&input)).expect_err("a directory stands there");
+    let error = write(directory.path(), &solution, Some(&input), &[]).expect_err("a directory stands there");
     assert!(error.to_string().contains(TRACKS), "{error}");
 }
 
@@ -330,20 +333,20 @@ fn what_a_former_run_alone_made_goes_and_what_is_the_callers_stays() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let directory = directory.path();
     let names = || contents(directory).into_keys().collect::<Vec<_>>();
-    write(directory, &solution, Some(&input)).expect("written");
+    write(directory, &solution, Some(&input), &[]).expect("written");
     // The same without the input has no table of the observations.
-    write(directory, &solution, None).expect("written");
+    write(directory, &solution, None, &[]).expect("written");
     assert_eq!(names(), [CAMERAS, POINTS, REPORT, RESULT, TRACKS]);
     // Windows have other files, and a result replaces those.
     let windows = || {
-        let mut draft = Draft::new(directory);
+        let mut draft = Draft::new(directory, None).expect("created");
         let table = Table::new(5, 5, 5, Vec::new());
         draft.add(windows::CSV, table.csv().as_bytes()).expect("written");
         draft.publish(windows::JSON, pretty(&table).expect("JSON").as_bytes()).expect("written");
     };
     windows();
     assert_eq!(names(), [windows::CSV, windows::JSON]);
-    write(directory, &solution, Some(&input)).expect("written");
+    write(directory, &solution, Some(&input), &[]).expect("written");
     assert_eq!(names(), [CAMERAS, OBSERVATIONS, POINTS, REPORT, RESULT, TRACKS]);
     // The same names with other contents are a caller's.
     for name in names() {
@@ -357,17 +360,53 @@ fn what_a_former_run_alone_made_goes_and_what_is_the_callers_stays() {
 fn while_files_change_none_says_that_they_are_complete() {
     let (input, solution) = fixture::solved();
     let directory = tempfile::tempdir().expect("a temporary directory");
-    write(directory.path(), &solution, Some(&input)).expect("written");
+    write(directory.path(), &solution, Some(&input), &[]).expect("written");
     // The page cannot be replaced: others are by then.
     let page = directory.path().join(REPORT);
     fs::remove_file(&page).expect("removed");
     fs::create_dir_all(page.join("full")).expect("created");
-    let error = write(directory.path(), &solution, None).expect_err("a directory stands there");
+    let error = write(directory.path(), &solution, None, &[]).expect_err("a directory stands there");
     assert!(error.to_string().contains(REPORT), "{error}");
     assert!(!directory.path().join(RESULT).exists());
     let hidden =
         |entry: io::Result<fs::DirEntry>| entry.expect("an entry").file_name().to_string_lossy().starts_with('.');
     assert!(!fs::read_dir(directory.path()).expect("a directory").any(hidden), "temporary files are left");
+}
+
+/// What a killed run leaves is listed, and the next one takes it away.
+#[test]
+fn what_a_broken_run_left_goes_with_the_next() {
+    let (input, solution) = fixture::solved_in_two_parts();
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let directory = directory.path();
+    // `result.json` cannot take its name: everything else has by then.
+    fs::create_dir_all(directory.join(RESULT).join("full")).expect("created");
+    write(directory, &solution, Some(&input), &[Export::Colmap]).expect_err("a directory stands there");
+    assert!(directory.join("points-part-1.ply").is_file() && directory.join("colmap/1/cameras.bin").is_file());
+    fs::remove_dir_all(directory.join(RESULT)).expect("removed");
+    write(directory, &fixture::solved().1, Some(&input), &[]).expect("written");
+    assert_eq!(
+        contents(directory).into_keys().collect::<Vec<_>>(),
+        [CAMERAS, OBSERVATIONS, POINTS, REPORT, RESULT, TRACKS]
+    );
+    let listed = Manifest::read(directory);
+    assert_eq!((listed.files.len(), listed.last.as_str()), (6, RESULT));
+    assert!(listed.files.iter().all(|file| file.stands(directory)));
+}
+
+#[test]
+fn the_input_is_not_replaced() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let (inside, beside) = (directory.path().join(OBSERVATIONS), directory.path().join("tracks-of-mine.csv"));
+    fs::write(&inside, "view,track,x,y\n").expect("written");
+    fs::write(&beside, "view,track,x,y\n").expect("written");
+    fs::create_dir(directory.path().join("colmap")).expect("created");
+    let model = directory.path().join("colmap");
+    assert_eq!(replaced(directory.path(), &[], &inside), Some(inside.clone()));
+    assert_eq!(replaced(directory.path(), &Export::ALL, &beside), None);
+    assert_eq!(replaced(directory.path(), &[], &model), None);
+    assert_eq!(replaced(directory.path(), &[Export::Colmap], &model), Some(model.clone()));
+    assert_eq!(replaced(&directory.path().join("new"), &Export::ALL, &inside), None);
 }
 
 /// Ranked and not verified: the ranking is in every table, and cameras.json says why there are no cameras.
@@ -385,7 +424,7 @@ fn without_a_reconstruction_the_files_say_the_weights_and_the_reason() {
         Warning::new(WarningCode::NoConsensus, "no 8 tracks agree"),
     ];
     let directory = tempfile::tempdir().expect("a temporary directory");
-    write(directory.path(), &solution, Some(&input)).expect("written");
+    write(directory.path(), &solution, Some(&input), &[]).expect("written");
     let files = contents(directory.path());
     let mut weights = Vec::new();
     for (row, &track) in files[OBSERVATIONS].lines().skip(1).zip(&input.raw.track) {

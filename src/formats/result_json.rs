@@ -17,7 +17,8 @@ use super::{Label, LabelledInput, warnings};
 pub struct ResultJson {
     pub status: Status,
     pub grade: Option<Grade>,
-    /// Of the first camera group that has registered views, down to `sigma_radial_k2`; see `cameras` where there are several.
+    /// Of the first camera group that has registered views, down to `sigma_radial_k2`; see `cameras` where there are
+    /// several.
     pub focal_px: Option<f64>,
     pub sigma_log_focal: Option<f64>,
     pub focal_unobservable: Option<bool>,
@@ -28,7 +29,7 @@ pub struct ResultJson {
     /// point at `(u, v, 1)`.
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
-    /// One standard deviation of each that was estimated, in its unit; null: it was not.
+    /// One standard deviation of each that was estimated, in its unit; null: it was not, or an older version solved it.
     pub sigma_principal_point_px: Option<[f64; 2]>,
     pub sigma_aspect: Option<f64>,
     pub sigma_radial_k1: Option<f64>,
@@ -77,7 +78,7 @@ pub struct CameraGroupJson {
     pub aspect: Option<f64>,
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
-    /// One standard deviation of each that was estimated, in its unit; null: it was not.
+    /// One standard deviation of each that was estimated, in its unit; null: it was not, or an older version solved it.
     pub sigma_principal_point_px: Option<[f64; 2]>,
     pub sigma_aspect: Option<f64>,
     pub sigma_radial_k1: Option<f64>,

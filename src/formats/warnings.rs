@@ -27,7 +27,8 @@ pub fn named(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Warning>
 
 /// Why there is no calibration; `None` where there is one, or where nothing was said.
 pub fn reason(solution: &Solution, input: Option<&LabelledInput>) -> Option<Warning> {
-    if solution.is_metric() {
+    // Looking for copies again would be for nothing: it is never why.
+    if solution.is_metric() || !solution.warnings.iter().any(|warning| warning.code.refuses()) {
         return None;
     }
     named(solution, input).into_iter().find(|warning| warning.code.refuses())

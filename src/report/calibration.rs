@@ -35,8 +35,8 @@ pub fn section(solution: &Solution) -> String {
     }
     let _ = writeln!(html, "<figure>{}</figure>", bars(&groups[..groups.len().min(MAX_GROUPS)]));
     html.push_str(
-        "<p class=\"note\">Errors are one standard deviation; what has none was not estimated but taken to be in order. \
-         Aspect is vertical over horizontal focal length; k1 and k2 are the radial distortion, 0 for a pinhole.</p>\n",
+        "<p class=\"note\">Errors are one standard deviation; what has none was not estimated but taken to be in \
+         order, or an older version solved it, which did not tell. Aspect is vertical over horizontal focal length; k1 and k2 are the radial distortion, 0 for a pinhole.</p>\n",
     );
     html.push_str(&own_focals(solution));
     html.push_str("</section>\n");

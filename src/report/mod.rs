@@ -32,9 +32,6 @@ const SCRIPT: &str = concat!(
     "})();\n"
 );
 
-/// What tells a page from those of other programs.
-pub const TITLE: &str = "<title>scpsfm report</title>";
-
 /// Nothing may be fetched, from wherever the page is opened.
 const POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'";
 
@@ -66,7 +63,7 @@ pub fn page(solution: &Solution, input: Option<&LabelledInput>) -> String {
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
          <meta name=\"color-scheme\" content=\"light dark\">\n\
          <meta http-equiv=\"Content-Security-Policy\" content=\"{POLICY}\">\n\
-         {TITLE}\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{body}</main>\n\
+         <title>scpsfm report</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{body}</main>\n\
          <script>\n{SCRIPT}</script>\n</body>\n</html>\n"
     )
 }

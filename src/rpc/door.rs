@@ -77,13 +77,13 @@ pub struct Options {
 /// force then; those that fail or stall leave nothing but a line in the log.
 pub fn incoming(listener: TcpListener, options: Options) -> impl Stream<Item = Result<Connection, Infallible>> {
     let seats = Arc::new(Semaphore::new(options.max_speaking.min(Semaphore::MAX_PERMITS)));
-    let refusals = Arc::new(Semaphore::new(MAX_REFUSALS));
+    let refusing_seats = Arc::new(Semaphore::new(MAX_REFUSALS));
     let door = Door {
         listener,
         options,
         seats,
-        refusals,
-        refused: Refusals::default(),
+        refusing_seats,
+        refusal_log: Refusals::default(),
         greeted: JoinSet::new(),
         oldest_first: VecDeque::new(),
     };
@@ -99,8 +99,8 @@ struct Door {
     /// One for each connection that may speak.
     seats: Arc<Semaphore>,
     /// One for each connection that is being refused.
-    refusals: Arc<Semaphore>,
-    refused: Refusals,
+    refusing_seats: Arc<Semaphore>,
+    refusal_log: Refusals,
     greeted: JoinSet<Result<Begun, String>>,
     oldest_first: VecDeque<AbortHandle>,
 }
@@ -129,7 +129,7 @@ impl Door {
                     Err(error) if error.is_cancelled() => tracing::debug!("a silent connection made room for another"),
                     Err(error) => tracing::error!(%error, "a connection's task failed"),
                 },
-                count = self.refused.told() => self.tell_refused(count),
+                count = self.refusal_log.told() => self.tell_refused(count),
             }
         }
     }
@@ -160,10 +160,10 @@ impl Door {
     /// Tells a connection that there is no room for it.
     fn refuse(&mut self, begun: Begun) {
         metrics::connection_refused();
-        if let Some(count) = self.refused.add(Instant::now()) {
+        if let Some(count) = self.refusal_log.add(Instant::now()) {
             self.tell_refused(count);
         }
-        let Ok(place) = self.refusals.clone().try_acquire_owned() else { return };
+        let Ok(place) = self.refusing_seats.clone().try_acquire_owned() else { return };
         tokio::spawn(async move {
             let _place = place;
             let mut io = begun.io;

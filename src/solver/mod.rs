@@ -2,11 +2,11 @@
 //!
 //! Depends on `network`, `geometry` and `domain`; knows nothing of jobs, transport or files.
 //!
-//! The way through: [`copies`] leaves of tracks that stand several times one; [`block`] chooses views whose tracks are complete; [`attempt`] solves one such block, by
-//! [`portfolio`] (priors, [`search`], [`grow`]; [`depths`] where those verify what image points cannot; [`extend`] to what a search leaves aside) or
-//! [`direct`], and [`calibration`] upgrades it; where tracks are not complete, [`sequence`] extends the best block to the
-//! other views; [`judge`] has the last
-//! word on every track and observation; [`assemble`] writes it down.
+//! The way through: [`copies`] keeps one of the tracks that stand in the input several times; [`block`] chooses views whose
+//! tracks are complete; [`attempt`] solves one such block, by [`portfolio`] (priors, [`search`], [`grow`]; [`depths`] where
+//! those verify what image points cannot; [`extend`] to what a search leaves aside) or [`direct`], and [`calibration`]
+//! upgrades it; where tracks are not complete, [`sequence`] extends the best block to the other views; [`judge`] has the
+//! last word on every track and observation; [`assemble`] writes it down.
 
 mod agreement;
 mod assemble;

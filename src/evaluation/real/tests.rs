@@ -70,7 +70,7 @@ fn a_solve_is_scored_against_all_that_is_known() {
     let input = sequence.input.check(&Limits::default()).expect("valid");
     let settings = SolveSettings { method: Method::Geometry, ..SolveSettings::default() };
     let solution = crate::solver::solve(&input, &settings, &mut Silent, &StopToken::default()).expect("a solution");
-    result_files::write(&ours::files(directory.path()), &solution, Some(&sequence.input)).expect("written");
+    result_files::write(&ours::files(directory.path()), &solution, Some(&sequence.input), &[]).expect("written");
 
     let answer = ours::answer(&sequence, directory.path(), ExitStatus::default(), "").expect("an answer");
     let scores = super::Scores::of(&sequence, &answer);

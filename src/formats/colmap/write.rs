@@ -8,7 +8,6 @@ use std::fmt::Write;
 use super::FIRST_PIXEL;
 use super::cameras::Model as CameraModel;
 use crate::formats::metric::{Camera, Image, Model, Point};
-use crate::formats::ply;
 
 /// What the text files begin with; other programs write other comments.
 const CAMERAS_TXT: &str = "# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n";
@@ -94,37 +93,6 @@ pub fn text(model: &Model) -> [String; 3] {
         points.push('\n');
     }
     [cameras, images, points]
-}
-
-/// What tells our text file of this name from COLMAP's own.
-pub fn mark(file: &str) -> &'static str {
-    match file {
-        "cameras.txt" => CAMERAS_TXT,
-        "images.txt" => IMAGES_TXT,
-        _ => POINTS_TXT,
-    }
-}
-
-/// Whether the points of a `points3D.bin`, of which these are the first bytes, have colours that stand for weights, which
-/// those of photographs do not; false where there is no point.
-pub fn has_our_colours(points3d: &[u8]) -> bool {
-    /// Bytes of a point before its track: id, position, colour, error, and the length of the track.
-    const HEAD: usize = 8 + 3 * 8 + 3 + 8 + 8;
-    const COLOUR: usize = 8 + 3 * 8;
-    /// Bytes of an element of a track: image and keypoint.
-    const ELEMENT: u64 = 4 + 4;
-    let Some(mut rest) = points3d.get(size_of::<u64>()..) else { return false };
-    let mut any = false;
-    while let Some(head) = rest.get(..HEAD) {
-        if !ply::is_colour([head[COLOUR], head[COLOUR + 1], head[COLOUR + 2]]) {
-            return false;
-        }
-        any = true;
-        let length = u64::from_le_bytes(std::array::from_fn(|k| head[HEAD - 8 + k]));
-        let past = length.checked_mul(ELEMENT).and_then(|bytes| usize::try_from(bytes).ok());
-        rest = past.and_then(|bytes| rest.get(HEAD.checked_add(bytes)?..)).unwrap_or_default();
-    }
-    any
 }
 
 /// Model and parameters of a camera: the model with the fewest that says the same. COLMAP's radial terms are those of

@@ -9,9 +9,6 @@ use crate::formats::metric::{Camera, Image, Model, Point};
 /// a half when a middle is computed.
 const MIDDLE_PX: f64 = 1e-6;
 
-/// What cameras are called before their number, and what tells the file from those of other programs.
-pub const MARK: &str = "scpsfm camera ";
-
 /// A list of reconstructions, one a part: cameras, shots and points.
 ///
 /// Lengths of cameras are in units of the larger image side, the origin is the middle of the image; a shot's rotation is
@@ -38,7 +35,7 @@ fn reconstruction(model: &Model) -> Value {
 }
 
 fn camera_name(camera: &Camera) -> String {
-    format!("{MARK}{}", camera.id)
+    format!("scpsfm camera {}", camera.id)
 }
 
 /// `perspective` where the principal point is the middle and pixels are square, else `brown`.

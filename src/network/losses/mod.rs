@@ -107,13 +107,14 @@ impl RankTerms {
 
 /// L_num and L_proj alone, for points whose coordinates no calibration is known to fit.
 ///
-/// * `balanced`, `w`: as for [`evaluate`]
+/// * `columns`: 3n x m, each of comparable length, for L_proj is in their unit
+/// * `w`: one weight a column
 ///
 /// # Errors
 /// [`Error::NoDecomposition`] when the weighted matrix overflows.
-pub fn rank_terms(balanced: &DMatrix<f64>, w: &[f64], settings: &LossSettings) -> Result<RankTerms, Error> {
-    debug_assert_eq!(balanced.ncols(), w.len());
-    Ok(RankTerms::of(&Spectrum::of(balanced, w)?, w, settings))
+pub fn rank_terms(columns: &DMatrix<f64>, w: &[f64], settings: &LossSettings) -> Result<RankTerms, Error> {
+    debug_assert_eq!(columns.ncols(), w.len());
+    Ok(RankTerms::of(&Spectrum::of(columns, w)?, w, settings))
 }
 
 /// L_num and its derivative `-κ s_j (1 - s_j) L_num`.

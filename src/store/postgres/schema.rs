@@ -66,7 +66,7 @@ async fn lock(connection: &mut PgConnection, patience: Duration) -> Result<(), E
     bound_locks(connection, patience).await?;
     let too_long = || {
         let seconds = patience.as_secs_f64();
-        Error::Unavailable(format!("another server has been bringing the schema up to date for {seconds} s"))
+        Error::Unavailable(format!("waited {seconds} s for other servers that bring the schema up to date"))
     };
     let begun = Instant::now();
     let mut lock = connection.lock();
