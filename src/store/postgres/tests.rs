@@ -128,9 +128,10 @@ async fn persistent<T, F>(operation: impl Fn() -> F) -> Result<T, Error>
 where
     F: Future<Output = Result<T, Error>>,
 {
+    // Each waits for seconds before it is told so: minutes of them are a database that is gone, which fails the test.
+    const TRIES: usize = 100;
     let mut outcome = operation().await;
-    // As many more times as a minute has bounds: a database that is gone fails the test.
-    for _ in 0..20 {
+    for _ in 1..TRIES {
         if !matches!(outcome, Err(Error::Unavailable(_))) {
             break;
         }
