@@ -226,7 +226,7 @@ fn points(
         }
         images[image].keypoints.push(Keypoint { x: raw.x[k], y: raw.y[k], point });
     }
-    number(&mut points);
+    number(&mut points, input);
     points
 }
 
@@ -262,17 +262,20 @@ fn point(solution: &Solution, input: &LabelledInput, place: usize) -> Option<Poi
 }
 
 /// Ids of points: those of the tracks where all are numbers that COLMAP takes, else their positions from 1. A point that
-/// is not its track's own gets one behind the largest.
-fn number(points: &mut [Point]) {
+/// is not its track's own gets one behind those of all tracks, right or wrong.
+fn number(points: &mut [Point], input: &LabelledInput) {
     // COLMAP reads ids of text files as signed.
     const MOST: u64 = i64::MAX as u64;
     let of_tracks = || points.iter().filter(|point| point.number == 0);
     let own: Option<Vec<u64>> = of_tracks().map(|point| point.label.number()).collect();
-    let others = (points.len() - of_tracks().count()) as u64;
-    let largest = own.as_ref().and_then(|own| own.iter().max().copied()).unwrap_or(0);
-    let own = own.filter(|_| largest <= MOST - others).unwrap_or_else(|| (1..=of_tracks().count() as u64).collect());
-    let behind = own.iter().max().map_or(1, |largest| largest + 1);
-    for (point, id) in points.iter_mut().zip(own.into_iter().chain(behind..)) {
+    let count = of_tracks().count() as u64;
+    let others = points.len() as u64 - count;
+    let largest = input.track_labels.iter().filter_map(Label::number).max().unwrap_or(0);
+    let (own, last) = match own {
+        Some(own) if largest <= MOST - others => (own, largest),
+        _ => ((1..=count).collect(), count),
+    };
+    for (point, id) in points.iter_mut().zip(own.into_iter().chain(last + 1..)) {
         point.id = id;
     }
 }

@@ -220,7 +220,7 @@ fn both_points_of_a_split_track_are_exported() {
     let again = solve(&path("out/colmap"), &path("again"), &[]);
     assert_eq!(again.code, Some(0), "{again:?}");
     let right = json(&again.stdout)["inlier_tracks"].as_u64().expect("a count");
-    assert!(right as f64 > 0.97 * points as f64, "{right} of {points} points stand when they are tracks");
+    assert!(right as f64 > 0.9 * points as f64, "{right} of {points} points stand when they are tracks");
 
     // The next run is asked for none of them, and what it does not make is gone.
     let last = solve(&input, &path("out"), &[&size[..], &["--export", "opensfm"]].concat());
