@@ -35,7 +35,7 @@ pub mod windows;
 use std::io::Write;
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use exit::{Exit, Failure};
 
@@ -69,6 +69,18 @@ pub enum Command {
     Synth(synth::Args),
     Evaluate(evaluate::Args),
     TrainPrior(train_prior::Args),
+}
+
+impl Cli {
+    /// Parses this process's arguments; ends the process with help or a complaint where they are none.
+    pub fn from_arguments() -> Self {
+        Self::from_arg_matches(&command().get_matches()).unwrap_or_else(|error| error.exit())
+    }
+}
+
+/// The command line. A negative number is a value, out of range perhaps, and no flag with a wrong name.
+fn command() -> clap::Command {
+    Cli::command().mut_subcommands(|subcommand| subcommand.allow_negative_numbers(true))
 }
 
 /// Runs a parsed command line; an error is printed on stderr, once.
@@ -115,5 +127,20 @@ pub(crate) fn print(text: &str) -> Result<(), Failure> {
             Err(Failure::internal(format_args!("cannot write to stdout: {error}")))
         }
         _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_negative_number_is_told_its_range() {
+        for flag in ["--seed", "--width", "--height"] {
+            let given = command().try_get_matches_from(["scpsfm", "solve", "x.csv", "--out", "y", flag, "-1"]);
+            let complaint =
+                given.and_then(|matches| Cli::from_arg_matches(&matches)).expect_err("negative").to_string();
+            assert!(complaint.contains(flag) && complaint.contains("invalid value '-1'"), "{complaint}");
+        }
     }
 }

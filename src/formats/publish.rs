@@ -75,6 +75,10 @@ impl<'a> Draft<'a> {
     pub fn publish(mut self, last: &str, bytes: &[u8]) -> io::Result<()> {
         let former = Manifest::read(self.directory);
         self.add(last, bytes)?;
+        // Before the first is renamed: a run that cannot end leaves the former one whole.
+        if let Some((_, file)) = self.files.iter().find(|(_, file)| file.target.is_dir()) {
+            return Err(file.failed(&io::Error::from(io::ErrorKind::IsADirectory)));
+        }
         let own: Vec<Written> = self.files.iter().map(|(written, _)| written.clone()).collect();
         // Until all is in its place both are listed: wherever this ends, the next run knows what is there.
         let both = former.files.iter().filter(|file| !own.contains(file)).chain(&own).cloned().collect();
@@ -82,7 +86,7 @@ impl<'a> Draft<'a> {
         let former_mark = former.files.iter().find(|file| file.path() == former.last && file.stands(self.directory));
         let marks =
             former_mark.and_then(|file| file.place(self.directory)).into_iter().chain([self.directory.join(last)]);
-        for mark in marks.filter(|mark| !mark.is_dir()) {
+        for mark in marks {
             remove(&mark)?;
         }
         self.sync();

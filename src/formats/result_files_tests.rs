@@ -357,20 +357,22 @@ fn what_a_former_run_alone_made_goes_and_what_is_the_callers_stays() {
 }
 
 #[test]
-fn while_files_change_none_says_that_they_are_complete() {
+fn a_run_that_cannot_end_leaves_the_former_one_whole() {
     let (input, solution) = fixture::solved();
     let directory = tempfile::tempdir().expect("a temporary directory");
-    write(directory.path(), &solution, Some(&input), &[]).expect("written");
-    // The page cannot be replaced: others are by then.
-    let page = directory.path().join(REPORT);
-    fs::remove_file(&page).expect("removed");
-    fs::create_dir_all(page.join("full")).expect("created");
-    let error = write(directory.path(), &solution, None, &[]).expect_err("a directory stands there");
-    assert!(error.to_string().contains(REPORT), "{error}");
-    assert!(!directory.path().join(RESULT).exists());
+    let directory = directory.path();
+    write(directory, &solution, Some(&input), &[]).expect("written");
+    let before = contents(directory);
+    fs::create_dir_all(directory.join("opensfm/reconstruction.json")).expect("created");
+    write(directory, &solution, None, &[]).expect("this one writes nothing there");
+    write(directory, &solution, Some(&input), &[]).expect("written");
+    let error = write(directory, &solution, Some(&input), &[Export::OpenSfm]).expect_err("a directory stands there");
+    assert!(error.to_string().contains("reconstruction.json"), "{error}");
+    fs::remove_dir_all(directory.join("opensfm")).expect("removed");
+    assert_eq!(contents(directory), before);
     let hidden =
         |entry: io::Result<fs::DirEntry>| entry.expect("an entry").file_name().to_string_lossy().starts_with('.');
-    assert!(!fs::read_dir(directory.path()).expect("a directory").any(hidden), "temporary files are left");
+    assert!(!fs::read_dir(directory).expect("a directory").any(hidden), "temporary files are left");
 }
 
 /// What a killed run leaves is listed, and the next one takes it away.
@@ -379,11 +381,10 @@ fn what_a_broken_run_left_goes_with_the_next() {
     let (input, solution) = fixture::solved_in_two_parts();
     let directory = tempfile::tempdir().expect("a temporary directory");
     let directory = directory.path();
-    // `result.json` cannot take its name: everything else has by then.
-    fs::create_dir_all(directory.join(RESULT).join("full")).expect("created");
-    write(directory, &solution, Some(&input), &[Export::Colmap]).expect_err("a directory stands there");
+    // Killed before the last name: everything else is there.
+    write(directory, &solution, Some(&input), &[Export::Colmap]).expect("written");
+    fs::remove_file(directory.join(RESULT)).expect("removed");
     assert!(directory.join("points-part-1.ply").is_file() && directory.join("colmap/1/cameras.bin").is_file());
-    fs::remove_dir_all(directory.join(RESULT)).expect("removed");
     write(directory, &fixture::solved().1, Some(&input), &[]).expect("written");
     assert_eq!(
         contents(directory).into_keys().collect::<Vec<_>>(),

@@ -126,7 +126,8 @@ impl fmt::Display for UploadBound {
             UploadBound::Bytes { taken, asked, max } => write!(
                 f,
                 "{asked} bytes more are too many: the tenant's uploads and uploaded inputs take {taken} of at most {max} \
-                 bytes"
+                 bytes; delete inputs that no job needs any more (`scpsfm inputs`, `scpsfm delete --input`), or have \
+                 `upload.tenant_bytes` raised"
             ),
         }
     }

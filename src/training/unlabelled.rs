@@ -5,6 +5,13 @@
 //! Derivatives are exact ([`rank_terms`]) and reach the network through the weights; the matrix counts as given, for the
 //! depths and the filled holes could otherwise be bent until wrong tracks fit.
 //!
+//! # What comes of it
+//! After 200, 400 and 600 steps of seed 0 the average precision on unseen lessons is .884, .892 and .890; with labels,
+//! .956, .968 and .965 (of a training of 7,000 steps, which ends at .971). In the search the difference is small: over 20
+//! scenes of 10 views and 200 tracks it ranks with .999 (labels: 1.000) at 95 % outliers, where 600 samples suffice with
+//! either, and with .988 at 97 %. L_num asks for the same number of tracks of every scene, also of those with fewer right
+//! ones: they are most of the loss (2,557 of it, L_proj .9, after 400 steps).
+//!
 //! L_DAQ has no part in it: it needs coordinates in which the principal point is known, and a lesson's points come with
 //! any origin. Observations have no loss of their own, so a network that learned this way ranks tracks only.
 

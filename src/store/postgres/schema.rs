@@ -134,7 +134,7 @@ mod tests {
         let mut other = connected(&options).await;
         other.lock().await.expect("the lock");
         let error = migrate(&options, &MIGRATIONS, Duration::from_millis(300)).await.expect_err("is held");
-        let expected = "another server has been bringing the schema up to date for 0.3 s";
+        let expected = "waited 0.3 s for other servers that bring the schema up to date";
         assert_eq!(error, Error::Unavailable(expected.into()));
         // One that waits goes on once the other is through.
         let waiting = migrate(&options, &MIGRATIONS, PATIENCE);
