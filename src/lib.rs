@@ -24,6 +24,7 @@ pub mod evaluation;
 pub mod formats;
 pub mod geometry;
 pub mod network;
+pub mod parallel;
 pub mod report;
 pub mod rpc;
 mod simd;

@@ -9,6 +9,7 @@ use super::client::{self, Client};
 use super::exit::Failure;
 use crate::domain::{Backend, ImageSize, Limits, Method, Solution, SolveSettings};
 use crate::formats::{self, Export, Format, LabelledInput, Matches, Reading, result_files};
+use crate::parallel::Threads;
 
 /// Where the server listens by default; `serve --listen` has the same port.
 pub const DEFAULT_SERVER: &str = "http://127.0.0.1:50051";
@@ -140,7 +141,7 @@ impl ReadingArgs {
 
 /// Threads that solve at a time where nothing is said: one a core.
 pub fn cores() -> usize {
-    std::thread::available_parallelism().map_or(1, std::num::NonZeroUsize::get)
+    Threads::one_a_core().count()
 }
 
 /// Tells on stderr what reading changed or left out.
@@ -201,8 +202,9 @@ pub struct SettingsArgs {
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
 
-    /// Network iterations at most; `auto` usually stops earlier
-    #[arg(long, value_name = "N", default_value_t = SolveSettings::DEFAULT_ITERATIONS)]
+    #[arg(long, value_name = "N", default_value_t = SolveSettings::DEFAULT_ITERATIONS,
+        help = format!("Network iterations at most, 1 to {}; `auto` usually stops earlier", SolveSettings::MAX_ITERATIONS),
+        value_parser = clap::value_parser!(u32).range(1..=i64::from(SolveSettings::MAX_ITERATIONS)))]
     pub iterations: u32,
 
     /// Leave the DAQ residual (self-calibration) out of the losses and scores
@@ -275,6 +277,9 @@ impl SettingsArgs {
             ..SolveSettings::default()
         };
         settings.validate().map_err(Failure::usage)?;
+        if self.epipolar_depths && !matches!(self.method, MethodArg::Paper | MethodArg::Psfm) {
+            return Err(Failure::usage("--epipolar-depths is of use with --method paper and psfm only"));
+        }
         Ok(settings)
     }
 }

@@ -4,7 +4,7 @@ use std::io::IsTerminal;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::domain::{Observer, Progress};
+use crate::domain::{Course, Observer, Progress, Stage, Step, Task};
 
 /// Steps of the bar: finer than any terminal is wide.
 const BAR_STEPS: u64 = 1_000;
@@ -158,7 +158,8 @@ fn is_line_due(last: &Progress, now: &Progress) -> bool {
 
 /// What a progress record says, in a line.
 fn describe(progress: &Progress) -> String {
-    let mut text = format!("{} inliers", progress.inliers);
+    let mut text = whereabouts(progress);
+    text.push_str(&format!("{} inliers", progress.inliers));
     if let Some(focal_px) = progress.focal_px {
         text.push_str(&format!(", focal {focal_px:.1} px"));
     }
@@ -175,10 +176,32 @@ fn describe(progress: &Progress) -> String {
     text
 }
 
+/// Where a solve is, with a comma behind it; nothing where the stage says it all.
+fn whereabouts(progress: &Progress) -> String {
+    let Course { block, blocks, part, registered_views, views, step } = progress.course;
+    let of_part = if part > 0 { format!(", part {part}") } else { String::new() };
+    match (step, progress.stage) {
+        (Some(Step { task: Task::Adjust, step, steps }), _) => format!("adjusting: round {step} of {steps}, "),
+        (Some(Step { task: Task::Cameras, step, steps }), _) if steps > 1 => {
+            format!("calibrating: camera {step} of {steps}, ")
+        }
+        (Some(Step { task: Task::Cameras, .. }), _) => String::new(),
+        (Some(Step { task: Task::Windows, step, steps }), _) => format!("comparing: window {step} of {steps}, "),
+        (Some(Step { task: Task::Judge, step, steps }), _) => format!("judging: {step} of {steps} verdicts, "),
+        (None, Stage::Extend) => format!("registering: {registered_views} of {views} views{of_part}, "),
+        // Of one block there is nothing to say, unless it is a further part's.
+        (None, Stage::Search | Stage::Refine | Stage::Calibrate) if part > 0 => {
+            format!("trying a block for part {part}, ")
+        }
+        (None, Stage::Search | Stage::Refine) if blocks > 1 => format!("block {block} of {blocks}, "),
+        _ => String::new(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{Losses, Stage};
+    use crate::domain::{Course, Losses, Stage};
 
     fn at(stage: Stage, fraction: f64, elapsed_seconds: f64) -> Progress {
         Progress {
@@ -190,6 +213,7 @@ mod tests {
             focal_px: None,
             best_score: None,
             elapsed_seconds,
+            course: Course::default(),
         }
     }
 
@@ -223,6 +247,7 @@ mod tests {
             focal_px: None,
             best_score: None,
             elapsed_seconds: 1.25,
+            course: Course::default(),
         };
         assert_eq!(describe(&progress), "19 inliers, 1.2 s");
         progress.focal_px = Some(1204.26);
@@ -232,5 +257,25 @@ mod tests {
             describe(&progress),
             "19 inliers, focal 1204.3 px, score 0.2500, iteration 120, L_num 1.00e-4 L_proj 0.500 L_DAQ 2.000, 1.2 s"
         );
+    }
+
+    #[test]
+    fn a_line_says_where_a_solve_is() {
+        let said = |stage: Stage, course: Course| {
+            let line = describe(&Progress { course, ..at(stage, 0.5, 1.25) });
+            line.strip_suffix("0 inliers, 1.2 s").expect("the rest as ever").to_owned()
+        };
+        let walk = Course { block: 2, blocks: 4, registered_views: 120, views: 300, ..Course::default() };
+        assert_eq!(said(Stage::Search, walk), "block 2 of 4, ");
+        assert_eq!(said(Stage::Search, Course { block: 1, blocks: 1, ..walk }), "");
+        assert_eq!(said(Stage::Refine, Course { part: 1, ..walk }), "trying a block for part 1, ");
+        assert_eq!(said(Stage::Extend, walk), "registering: 120 of 300 views, ");
+        assert_eq!(said(Stage::Extend, Course { part: 1, ..walk }), "registering: 120 of 300 views, part 1, ");
+        let step = |task: Task| Course { part: 1, step: Some(Step { task, step: 3, steps: 7 }), ..walk };
+        assert_eq!(said(Stage::Extend, step(Task::Adjust)), "adjusting: round 3 of 7, ");
+        assert_eq!(said(Stage::Calibrate, step(Task::Cameras)), "calibrating: camera 3 of 7, ");
+        assert_eq!(said(Stage::Calibrate, step(Task::Windows)), "comparing: window 3 of 7, ");
+        assert_eq!(said(Stage::Judge, step(Task::Judge)), "judging: 3 of 7 verdicts, ");
+        assert_eq!(said(Stage::Calibrate, walk), "");
     }
 }

@@ -62,6 +62,11 @@ pub struct Args {
     #[arg(long, value_name = "N")]
     pub workers: Option<usize>,
 
+    /// Threads that one job may keep busy, its worker's among them; 0: one a core. The result is the same. Worth more
+    /// than one where fewer long sequences wait than there are cores [default: 1]
+    #[arg(long, value_name = "N")]
+    pub threads: Option<usize>,
+
     /// Waiting jobs at which new ones are refused [default: 256]
     #[arg(long, value_name = "N")]
     pub queue: Option<usize>,
@@ -156,6 +161,7 @@ impl Args {
             ("store.url", self.store.as_ref().map(|url| url.0.clone())),
             ("engine.workers", self.workers.map(|count| count.to_string())),
             ("engine.queue_capacity", self.queue.map(|count| count.to_string())),
+            ("compute.threads", self.threads.map(|count| count.to_string())),
             ("compute.backend", word(self.backend.and_then(|backend| backend.to_possible_value()))),
             ("compute.prior", path(&self.prior)),
             ("log.format", word(self.log_format.and_then(|format| format.to_possible_value()))),
@@ -295,6 +301,8 @@ mod tests {
             "3",
             "--queue",
             "9",
+            "--threads",
+            "2",
             "--backend",
             "ndarray",
             "--prior",
@@ -312,11 +320,12 @@ mod tests {
             "--insecure",
             "--plaintext-keys",
         ]);
-        assert_eq!(all.len(), 14);
+        assert_eq!(all.len(), 15);
         let config = Config::load(None, &all).expect("valid");
         assert_eq!(config.engine.workers, 3);
         assert_eq!(config.engine.queue_capacity, 9);
         assert_eq!(config.store.data_dir, PathBuf::from("d"));
+        assert_eq!(config.compute.threads, 2);
         assert_eq!(config.compute.backend, crate::domain::Backend::Ndarray);
         assert_eq!(config.compute.prior, Some("my.prior".into()));
         assert_eq!(config.tls.files().expect("TLS").paths().len(), 3);

@@ -15,7 +15,11 @@ use crate::domain::job::JobEvent;
 use crate::domain::{Limits, Solution, SolveSettings, StopToken};
 use crate::formats::publish::create_directory;
 use crate::formats::{LabelledInput, result_files};
+use crate::parallel::Threads;
 use crate::solver;
+
+/// More threads than any machine has cores for one solve: a slip of the finger.
+const MOST_THREADS: i64 = 1_024;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -59,6 +63,11 @@ pub struct Args {
     #[arg(long, short)]
     pub quiet: bool,
 
+    /// Threads to solve on; with --window, windows at a time, one thread each. The answers are the same [default: one a
+    /// core]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_THREADS), conflicts_with = "server")]
+    pub threads: Option<u16>,
+
     #[command(flatten)]
     pub window: WindowArgs,
 
@@ -89,14 +98,15 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     // Found out now rather than after the work.
     args.export.check(&args.out, &args.input.input)?;
     create_directory(&args.out)?;
+    let threads = args.threads.map_or_else(Threads::one_a_core, |count| Threads::new(count.into()));
     if let Some(length) = args.window.window {
         let show = Show { json: args.json, quiet: args.quiet };
-        return windows::run(&args.window, length, &input, &settings, &args.out, show);
+        return windows::run(&args.window, length, threads, &input, &settings, &args.out, show);
     }
     let mut progress = ProgressView::new(args.quiet);
     let solution = match &args.server {
         Some(server) => on_server(server, &args, &input, &settings, &mut progress).await?,
-        None => in_process(&input, &settings, &mut progress)?,
+        None => in_process(threads, &input, &settings, &mut progress)?,
     };
     progress.finish();
     deliver(&args, &solution, &input)
@@ -104,6 +114,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
 
 /// Solves here; Ctrl-C stops it within 50 ms or one network iteration.
 fn in_process(
+    threads: Threads,
     input: &LabelledInput,
     settings: &SolveSettings,
     progress: &mut ProgressView,
@@ -112,7 +123,7 @@ fn in_process(
     let stop = StopToken::default();
     let interrupt = Interrupt::listen()?;
     let relay = interrupt.stops(&stop);
-    let outcome = tokio::task::block_in_place(|| solver::solve(&checked, settings, progress, &stop));
+    let outcome = tokio::task::block_in_place(|| solver::solve_on(threads, &checked, settings, progress, &stop));
     relay.abort();
     outcome.map_err(|error| match error {
         solver::Error::Stopped(_) => Failure::interrupted(),

@@ -5,7 +5,6 @@ use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc;
 
-use super::args::cores;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
@@ -14,6 +13,7 @@ use crate::domain::{Limits, Silent, SolveSettings, StopReason, StopToken};
 use crate::formats::LabelledInput;
 use crate::formats::publish::{Draft, pretty};
 use crate::formats::windows::{self, Row, Table};
+use crate::parallel::Threads;
 use crate::solver;
 
 /// Views that a reconstruction needs at least.
@@ -37,10 +37,6 @@ pub struct WindowArgs {
     /// Views from the beginning of a window to that of the next [default: N, so that no view is in two windows]
     #[arg(long, help_heading = HEADING, value_name = "VIEWS", value_parser = clap::value_parser!(u32).range(1..), requires = "window")]
     pub step: Option<u32>,
-
-    /// Windows at a time, one thread each; the answers are the same [default: one a core]
-    #[arg(long, help_heading = HEADING, value_name = "N", value_parser = clap::value_parser!(u16).range(1..), requires = "window")]
-    pub threads: Option<u16>,
 }
 
 /// How to show what comes.
@@ -54,6 +50,7 @@ pub struct Show {
 pub fn run(
     args: &WindowArgs,
     length: u32,
+    threads: Threads,
     input: &LabelledInput,
     settings: &SolveSettings,
     out: &Path,
@@ -65,14 +62,15 @@ pub fn run(
     if ranges.is_empty() {
         return Err(Failure::usage(format!("--window {length} is more than the {views} views of the input")));
     }
-    let threads = args.threads.map_or_else(cores, usize::from);
     let mut progress = ProgressView::new(show.quiet);
     let stop = StopToken::default();
     let interrupt = Interrupt::listen()?;
     let relay = interrupt.stops(&stop);
     let rows = tokio::task::block_in_place(|| {
         let solve = |index: usize| solve(index, &windows::cut(input, &ranges[index]), settings, &stop);
-        on_threads(ranges.len(), threads, &stop, &solve, &mut |event| tell(&mut progress, event, &ranges, input))
+        on_threads(ranges.len(), threads.count(), &stop, &solve, &mut |event| {
+            tell(&mut progress, event, &ranges, input)
+        })
     });
     relay.abort();
     progress.finish();

@@ -142,7 +142,14 @@ impl Config {
             0 => Err(Error::Value { key, found: "0".into(), right: "a number from 1 on" }),
             _ => Ok(()),
         };
-        at_least_one("server.max_message_bytes", self.server.max_message_bytes as u64)?;
+        if self.server.max_message_bytes < Server::LEAST_MESSAGE_BYTES {
+            let found = self.server.max_message_bytes.to_string();
+            return Err(Error::Value {
+                key: "server.max_message_bytes",
+                found,
+                right: "a number from 1049600 on (a chunk of an upload)",
+            });
+        }
         at_least_one("server.max_connections", self.server.max_connections as u64)?;
         at_least_one("engine.queue_capacity", self.engine.queue_capacity as u64)?;
         at_least_one("engine.queue_bytes", self.engine.queue_bytes)?;
@@ -155,6 +162,10 @@ impl Config {
         if self.engine.workers > Engine::MOST_WORKERS {
             let found = self.engine.workers.to_string();
             return Err(Error::Value { key: "engine.workers", found, right: "a number up to 1024" });
+        }
+        if self.compute.threads > Engine::MOST_WORKERS {
+            let found = self.compute.threads.to_string();
+            return Err(Error::Value { key: "compute.threads", found, right: "a number up to 1024" });
         }
         at_least_one("limits.max_views", self.limits.max_views as u64)?;
         at_least_one("limits.max_tracks", self.limits.max_tracks as u64)?;

@@ -11,6 +11,10 @@ use crate::engine;
 /// Seconds of each unit.
 const UNITS: [(char, u64); 4] = [('d', 86_400), ('h', 3_600), ('m', 60), ('s', 1)];
 
+/// Longest time to keep anything for, 1000 years of 365.25 days. The end of what is kept is told as a time of the
+/// calendar, which ends with the year 9999; who means longer means `forever`.
+const MOST_DAYS: u64 = 365_250;
+
 /// How long an ended job, or an upload, is kept; `None`: forever.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Retention(pub Option<Duration>);
@@ -34,7 +38,13 @@ impl FromStr for Retention {
         let split = |(unit, seconds)| text.strip_suffix(unit).map(|count| (count, seconds));
         let (count, seconds): (_, u64) = UNITS.into_iter().find_map(split).ok_or_else(wrong)?;
         let count: u64 = count.parse().map_err(|_| wrong())?;
-        let seconds = count.checked_mul(seconds).filter(|&seconds| seconds > 0).ok_or_else(wrong)?;
+        let seconds = count.saturating_mul(seconds);
+        if seconds == 0 {
+            return Err(wrong());
+        }
+        if seconds > MOST_DAYS * UNITS[0].1 {
+            return Err(format!("`{text}` is above {MOST_DAYS}d, a thousand years; right would be less, or `forever`"));
+        }
         Ok(Self(Some(Duration::from_secs(seconds))))
     }
 }
@@ -74,6 +84,11 @@ mod tests {
         assert_eq!(Retention(None).to_string(), "forever");
         for slip in ["", "30", "d", "0d", "-1d", "1.5h", "30 d", "30dd", "99999999999999999999d", "213503982334602d"] {
             assert!(slip.parse::<Retention>().is_err(), "{slip}");
+        }
+        for (longest, above) in [("365250d", "365251d"), ("31557600000s", "31557600001s")] {
+            assert!(longest.parse::<Retention>().is_ok(), "{longest}");
+            let error = above.parse::<Retention>().expect_err(above);
+            assert!(error.contains("365250d") && error.contains("`forever`"), "{error}");
         }
         assert_eq!(Retention::default().to_string(), "30d");
     }

@@ -1,7 +1,6 @@
 //! The sections of the configuration, one type each, with every default and its reason.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::num::NonZero;
 use std::path::PathBuf;
 
 use serde::de::IntoDeserializer;
@@ -9,6 +8,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use super::{Error, Retention};
 use crate::domain::Backend;
+use crate::parallel::Threads;
 use crate::rpc::keys::KeyRing;
 use crate::store::postgres::DatabaseUrl;
 use crate::telemetry::tracing::Format;
@@ -21,7 +21,7 @@ pub struct Server {
     /// Address and port to listen on; port 0 takes a free one.
     #[serde(deserialize_with = "address")]
     pub listen: SocketAddr,
-    /// Largest message taken or sent.
+    /// Largest message taken; at least [`Server::LEAST_MESSAGE_BYTES`].
     pub max_message_bytes: usize,
     /// Connections that speak at once; one more is refused. Those that say nothing yet are bounded apart.
     pub max_connections: usize,
@@ -36,6 +36,11 @@ pub struct Server {
     pub insecure: bool,
     /// Take keys without TLS on other addresses than loopback's: whoever listens in has them. For a proxy that ends TLS.
     pub plaintext_keys: bool,
+}
+
+impl Server {
+    /// Least that [`Server::max_message_bytes`] may be: uploads come in chunks of up to 1 MiB, as callers are told.
+    pub const LEAST_MESSAGE_BYTES: usize = rpc::inputs::MAX_MESSAGE_BYTES;
 }
 
 impl Default for Server {
@@ -130,7 +135,8 @@ impl Default for Metrics {
 pub struct Store {
     /// Folder of the embedded database; made if it does not exist. Not used with a `url`.
     pub data_dir: PathBuf,
-    /// How long ended jobs are kept, with input, events and result: `30d`, `12h`, `90m`, `45s` or `forever`.
+    /// How long ended jobs are kept, with input, events and result: `30d`, `12h`, `90m`, `45s` (1000 years at
+    /// most) or `forever`.
     pub retention: Retention,
     /// PostgreSQL database that several servers may share, `postgres://USER:PASSWORD@HOST:PORT/DATABASE`. None by
     /// default: one server needs no database beside it. Wherever the configuration is shown, the password is not.
@@ -191,13 +197,13 @@ impl Default for Engine {
 }
 
 impl Engine {
-    /// Threads that one server may be asked for: more is a slip, and the system refuses them one by one.
+    /// Threads that one server, or one job, may be asked for: more is a slip, and the system refuses them one by one.
     pub const MOST_WORKERS: usize = 1024;
 
     /// Worker threads to start: as configured, or one a core.
     pub fn worker_count(&self) -> usize {
         match self.workers {
-            0 => std::thread::available_parallelism().map_or(1, NonZero::get),
+            0 => Threads::one_a_core().count(),
             workers => workers,
         }
     }
@@ -212,10 +218,9 @@ pub struct Upload {
     /// Uploads of one tenant that may be begun and not finished.
     pub tenant_uploads: u64,
     /// Bytes of one tenant's uploads and uploaded inputs at most, as they were sent; one that was deleted counts while a
-    /// job has it. The store takes about 1.3 times as much (1.28 to 1.32 of fifteen tables of 2,000 to 50,000
-    /// observations).
+    /// job has it. The store takes about 1.3 times as much.
     pub tenant_bytes: u64,
-    /// How long an upload to which nothing comes is kept: `24h`, `90m`, `45s` or `forever`.
+    /// How long an upload to which nothing comes is kept: `24h`, `90m`, `45s` (1000 years at most) or `forever`.
     pub abandoned_after: Retention,
 }
 
@@ -224,7 +229,7 @@ impl Default for Upload {
     fn default() -> Self {
         let options = engine::UploadOptions::default();
         Self {
-            max_bytes: options.max_bytes,
+            max_bytes: options.bounds.max_bytes,
             tenant_uploads: options.bounds.max_tenant_uploads,
             tenant_bytes: options.bounds.max_tenant_bytes,
             abandoned_after: Retention(options.abandoned_after),
@@ -233,9 +238,12 @@ impl Default for Upload {
 }
 
 /// What the networks are and run on.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Compute {
+    /// Threads that one job may keep busy, its worker's among them; 0: one a core. The result is the same. Of use where
+    /// fewer long sequences wait than there are cores.
+    pub threads: usize,
     /// `flex` or `ndarray`; a job may ask for the other. Flex, because burn deprecates ndarray in its favour and it
     /// is the faster of the two.
     #[serde(deserialize_with = "word")]
@@ -244,6 +252,23 @@ pub struct Compute {
     /// store should ask the same.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub prior: Option<PathBuf>,
+}
+
+impl Default for Compute {
+    fn default() -> Self {
+        // Jobs side by side keep the cores busier than threads within one, and a worker a core leaves none for these.
+        Self { threads: 1, backend: Backend::default(), prior: None }
+    }
+}
+
+impl Compute {
+    /// Threads of one job: as configured, or one a core.
+    pub fn threads(&self) -> Threads {
+        match self.threads {
+            0 => Threads::one_a_core(),
+            threads => Threads::new(threads),
+        }
+    }
 }
 
 /// Log lines, on stderr.

@@ -2,7 +2,7 @@
 
 use std::io::Write;
 
-use super::{Config, Error};
+use super::{Config, Error, Server};
 use crate::domain::Backend;
 use crate::telemetry::tracing::Format;
 
@@ -143,6 +143,24 @@ fn errors_name_the_key_and_what_would_be_right() {
         }
         assert!(!message.contains("hunter2"), "{message}");
     }
+}
+
+#[test]
+fn bounds_are_refused_by_key_and_what_is_within_them_is_taken() {
+    let given = |name: &str, value: &str| Config::from_sources(None, variables(&[(name, value)]), &[]);
+    for (name, key) in
+        [("SCPSFM_STORE__RETENTION", "store.retention"), ("SCPSFM_UPLOAD__ABANDONED_AFTER", "upload.abandoned_after")]
+    {
+        let error = given(name, "3000000d").expect_err(key).to_string();
+        assert!(error.contains(key) && error.contains("365250d") && error.contains("`forever`"), "{error}");
+        assert!(given(name, "365250d").is_ok() && given(name, "forever").is_ok(), "{key}");
+    }
+    let least = Server::LEAST_MESSAGE_BYTES;
+    for small in ["0", "1", &(least - 1).to_string()] {
+        let error = given("SCPSFM_SERVER__MAX_MESSAGE_BYTES", small).expect_err(small).to_string();
+        assert!(error.contains("server.max_message_bytes") && error.contains(&least.to_string()), "{error}");
+    }
+    assert!(given("SCPSFM_SERVER__MAX_MESSAGE_BYTES", &least.to_string()).is_ok());
 }
 
 #[test]

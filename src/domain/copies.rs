@@ -118,16 +118,7 @@ impl Copies {
 
 /// The observations of each track, by view.
 fn ranges(input: &Input) -> Vec<Range<usize>> {
-    let mut ranges = vec![0..0; input.track_count()];
-    let mut start = 0;
-    for k in 0..input.observation_count() {
-        let track = input.track_of(k);
-        if k + 1 == input.observation_count() || input.track_of(k + 1) != track {
-            ranges[track] = start..k + 1;
-            start = k + 1;
-        }
-    }
-    ranges
+    input.track_ranges().windows(2).map(|ends| ends[0]..ends[1]).collect()
 }
 
 /// Some order of the observations of two tracks: equal where every view, coordinate and depth is.

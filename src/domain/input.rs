@@ -148,6 +148,18 @@ impl Input {
         self.depth.as_ref().map(|depth| depth[k])
     }
 
+    /// Where the observations of each track lie in sorted order: those of track `j` are `ranges[j]..ranges[j + 1]`.
+    pub fn track_ranges(&self) -> Vec<usize> {
+        let mut ends = vec![0; self.track_count() + 1];
+        for k in 0..self.observation_count() {
+            ends[self.track_of(k) + 1] += 1;
+        }
+        for track in 0..self.track_count() {
+            ends[track + 1] += ends[track];
+        }
+        ends
+    }
+
     /// Where observation `k` (sorted order) stood in the caller's arrays.
     pub fn caller_index(&self, k: usize) -> usize {
         self.caller_order[k] as usize

@@ -49,6 +49,48 @@ pub struct Losses {
     pub daq: f64,
 }
 
+/// What a stage does many times over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum Task {
+    /// Adjusting everything and triangulating it anew; steps are rounds.
+    Adjust,
+    /// Calibrating camera groups; steps are groups.
+    Cameras,
+    /// Asking windows of the sequence what focal length each sees; steps are windows.
+    Windows,
+    /// Judging; steps are verdicts, up to two a track.
+    Judge,
+}
+
+/// How far a [`Task`] is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Step {
+    pub task: Task,
+    /// The round, group or window that is worked on, from 1, or the verdicts so far.
+    pub step: u32,
+    /// How many there will be at most.
+    pub steps: u32,
+}
+
+/// Where a solve is on its way through the views of its input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Course {
+    /// The block of views that is tried, from 1, and how many are tried at most; 0 before the first.
+    pub block: u32,
+    pub blocks: u32,
+    /// The part that is built, from 0, in the order in which they are begun; the result numbers them by size. 0 again once
+    /// all are built.
+    pub part: u32,
+    /// Views that have a camera now. Falls where a block is given up for another, or views lose their support.
+    pub registered_views: u32,
+    /// Views in which anything is observed: so many can be registered.
+    pub views: u32,
+    /// None where the stage says it all.
+    pub step: Option<Step>,
+}
+
 /// The state of a running optimisation.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
@@ -69,6 +111,9 @@ pub struct Progress {
     pub best_score: Option<f64>,
     /// Seconds since the attempt began.
     pub elapsed_seconds: f64,
+    /// None of it in records that were stored before there was such a thing.
+    #[serde(default)]
+    pub course: Course,
 }
 
 /// Told of every iteration. Implementations must be quick: they run inside the optimisation.
@@ -90,4 +135,17 @@ pub struct Silent;
 
 impl Observer for Silent {
     fn progress(&mut self, _progress: &Progress) {}
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn records_of_before_there_was_a_course_are_read() {
+        let written = r#"{"stage": "REFINE", "fraction": 0.5, "iteration": 3, "losses": null, "inliers": 4,
+            "focal_px": null, "best_score": 0.25, "elapsed_seconds": 2.0}"#;
+        let read: Progress = serde_json::from_str(written).expect("a record");
+        assert_eq!((read.inliers, read.course), (4, Course::default()));
+    }
 }

@@ -31,6 +31,11 @@ impl StopToken {
         Self { flag: Arc::default(), deadline }
     }
 
+    /// Whether both are one token.
+    pub fn is(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.flag, &other.flag)
+    }
+
     /// Asks for a stop; later reasons are ignored.
     pub fn stop(&self, reason: StopReason) {
         let code = match reason {

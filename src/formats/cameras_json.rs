@@ -59,9 +59,9 @@ impl From<LeftOut> for ReasonJson {
     }
 }
 
-impl From<Warning> for ReasonJson {
-    fn from(warning: Warning) -> Self {
-        Self { code: warning.code.name(), detail: warning.detail }
+impl From<&Warning> for ReasonJson {
+    fn from(warning: &Warning) -> Self {
+        Self { code: warning.code.name(), detail: warning.detail.clone() }
     }
 }
 
@@ -69,7 +69,7 @@ impl CamerasJson {
     /// The cameras of a solution; without the input, views are numbered from 0.
     pub fn new(solution: &Solution, input: Option<&LabelledInput>) -> Self {
         let groups = groups_of_views(solution);
-        let reason = warnings::reason(solution, input).map(ReasonJson::from);
+        let reason = warnings::reason(solution).map(ReasonJson::from);
         let of_all = reason.as_ref().filter(|_| solution.status == Status::NoReconstruction);
         let camera = |(index, view): (usize, &ViewResult)| {
             let is_metric = view.rotation.is_some() && view.translation.is_some();

@@ -6,7 +6,7 @@ use std::path::Path;
 use super::{Label, LabelledInput};
 use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{
-    Calibration, Grade, LeftOut, Losses, Method, Prior, Progress, Solution, Stage, Status, Warning, WarningCode,
+    Calibration, Course, Grade, LeftOut, Losses, Method, Prior, Progress, Solution, Stage, Status, Warning, WarningCode,
 };
 use crate::synthetic::{Scene, SceneOptions, Sequence, SequenceOptions};
 
@@ -245,6 +245,7 @@ fn history(focal_px: f64) -> Vec<Progress> {
                     .then(|| focal_px * (1.0 + 0.1 * (1.0 - share) * (f64::from(iteration)).sin())),
                 best_score: (iteration > 10).then_some(1.0 - 0.5 * share),
                 elapsed_seconds: share * 1.5,
+                course: Course::default(),
             }
         })
         .collect()

@@ -86,13 +86,14 @@ impl Manifest {
         read().unwrap_or_default()
     }
 
-    /// Where the files are that stand as they were written. A run that was killed may have listed a file twice, as it was
-    /// and as it was to be: either will do. Of a folder below the directory, whose files make sense together, none is
-    /// removable once one was changed.
-    pub fn removable(&self, directory: &Path) -> Vec<PathBuf> {
+    /// Where the files are, but for those that were `replaced`, that stand as they were written. A run that was killed may
+    /// have listed a file twice, as it was and as it was to be: either will do. Of a folder below the directory, whose files
+    /// make sense together, none is removable once one was changed by others.
+    pub fn removable(&self, directory: &Path, replaced: &[PathBuf]) -> Vec<PathBuf> {
         let mut standing: BTreeMap<PathBuf, bool> = BTreeMap::new();
+        let is_there = |place: &PathBuf| !replaced.contains(place) && place.symlink_metadata().is_ok();
         for file in &self.files {
-            if let Some(place) = file.place(directory).filter(|place| place.symlink_metadata().is_ok()) {
+            if let Some(place) = file.place(directory).filter(is_there) {
                 *standing.entry(place).or_default() |= file.stands(directory);
             }
         }

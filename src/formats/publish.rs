@@ -90,15 +90,13 @@ impl<'a> Draft<'a> {
             remove(&mark)?;
         }
         self.sync();
+        let replaced: Vec<PathBuf> = self.files.iter().map(|(_, file)| file.target.clone()).collect();
         let complete = self.files.pop();
         for (_, file) in self.files.drain(..) {
             file.rename()?;
         }
-        for place in former.removable(self.directory) {
-            let replaced = own.iter().any(|file| file.place(self.directory).as_ref() == Some(&place));
-            if !replaced && !self.was_read(&place) {
-                self.take_away(&place)?;
-            }
+        for place in former.removable(self.directory, &replaced).into_iter().filter(|place| !self.was_read(place)) {
+            self.take_away(&place)?;
         }
         self.list(&Manifest { last: last.to_owned(), files: own })?;
         self.sync();

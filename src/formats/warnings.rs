@@ -25,13 +25,10 @@ pub fn named(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Warning>
     warnings
 }
 
-/// Why there is no calibration; `None` where there is one, or where nothing was said.
-pub fn reason(solution: &Solution, input: Option<&LabelledInput>) -> Option<Warning> {
-    // Looking for copies again would be for nothing: it is never why.
-    if solution.is_metric() || !solution.warnings.iter().any(|warning| warning.code.refuses()) {
-        return None;
-    }
-    named(solution, input).into_iter().find(|warning| warning.code.refuses())
+/// Why there is no calibration; `None` where there is one, or where nothing was said. No such warning names views or
+/// tracks.
+pub fn reason(solution: &Solution) -> Option<&Warning> {
+    solution.warnings.iter().find(|warning| warning.code.refuses() && !solution.is_metric())
 }
 
 #[cfg(test)]

@@ -89,7 +89,7 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
     // Where the first camera has no rank 3 the frame stays as it is: there is nothing metric to be consistent with.
     let cameras =
         to_first_view_frame(&consensus.cameras, &[]).map_or_else(|| consensus.cameras.clone(), |frame| frame.cameras);
-    let mut judged = judged(context, attempt, consensus, &cameras);
+    let mut judged = judged(context, attempt, consensus, &cameras, &mut recorder);
     if let Some(weights) = &attempt.weights_by_depths {
         judge_by_depths(attempt, weights, &cameras, context, &mut judged);
     }
@@ -142,7 +142,13 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
 }
 
 /// Every track and observation judged by the block's cameras.
-fn judged(context: &Context, attempt: &Attempt, consensus: &Consensus, local: &[Camera]) -> Judged {
+fn judged(
+    context: &Context,
+    attempt: &Attempt,
+    consensus: &Consensus,
+    local: &[Camera],
+    recorder: &mut Recorder,
+) -> Judged {
     let mut cameras = vec![None; context.input.view_count()];
     for (&view, camera) in attempt.block.views.iter().zip(local) {
         cameras[view] = Some(*camera);
@@ -154,10 +160,11 @@ fn judged(context: &Context, attempt: &Attempt, consensus: &Consensus, local: &[
         lenses: &[],
         linked: false,
         noise: consensus.noise,
-        outlier_density: judge::density_of_spread(super::portfolio::spread(&attempt.block.complete)),
+        outlier_density: judge::density_of_spread(attempt.spread),
         inlier_share: (consensus.inlier_count() as f64 + 1.0) / (attempt.block.tracks.len() as f64 + 2.0),
     };
-    judge::judge(context.input, context.ranges, &geometry, context.stop)
+    let mut told = |verdicts| recorder.judged(verdicts, context.input.track_count());
+    judge::judge(context.input, context.ranges, &geometry, context.threads, context.stop, &mut told)
 }
 
 /// Tracks of the block by image points and depths together, in place of image points alone.

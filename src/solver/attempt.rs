@@ -2,13 +2,14 @@
 
 use super::block::Block;
 use super::calibration::{self, Outcome};
+use super::chance::LN_ACCEPTABLE;
 use super::direct::{self, Decided};
 use super::grow::{self, Consensus, LEAST_INLIERS};
 use super::learned::Opinion;
 use super::portfolio::{self, Evidence, Portfolio};
 use super::recorder::Recorder;
 use super::{Context, Error};
-use super::{depths, extend, second};
+use super::{chance, crowds, depths, extend, likeliest, second};
 use crate::domain::result::PriorTime;
 use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View, Warning};
 
@@ -30,6 +31,9 @@ const PAPER_TRACKS: usize = 5_000;
 /// What became of one block.
 pub struct Attempt {
     pub block: Block,
+    /// Spread of the image points that were searched, see [`portfolio::spread`]: a crowd that joins later takes up little
+    /// of the image.
+    pub spread: f64,
     /// The consensus over the tracks of the block; `None` when nothing stands.
     pub consensus: Option<Consensus>,
     /// What the consensus was verified by.
@@ -40,6 +44,9 @@ pub struct Attempt {
     pub opinion: Option<Opinion>,
     /// Tracks that hold under one geometry, and how many of them count; `None` but where too few count.
     pub doubted: Option<(usize, usize)>,
+    /// Tracks that hold under one geometry and lie within the noise of each other, and how many of them count; `None` but
+    /// where too few count.
+    pub crowded: Option<(usize, usize)>,
     /// That the tracks left out agree on a motion of their own.
     pub second_structure: Option<Warning>,
     /// Probability of each track of the block to be right by image points and depths together; `None` where depths
@@ -53,6 +60,26 @@ pub struct Attempt {
 }
 
 impl Attempt {
+    /// Nothing found yet.
+    fn new(block: Block) -> Self {
+        Self {
+            spread: portfolio::spread(&block.complete),
+            block,
+            consensus: None,
+            evidence: Evidence::ImagePoints,
+            calibration: None,
+            winning_prior: None,
+            opinion: None,
+            doubted: None,
+            crowded: None,
+            second_structure: None,
+            weights_by_depths: None,
+            decided: None,
+            network_weights: Vec::new(),
+            prior_times: Vec::new(),
+        }
+    }
+
     /// Larger is better: solved before unsolved, then by grade, then by the certainty of the focal length.
     pub fn merit(&self) -> (u8, f64) {
         let Some(calibration) = &self.calibration else { return (u8::from(self.consensus.is_some()), 0.0) };
@@ -84,25 +111,15 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
         Method::Paper => PAPER_TRACKS,
         Method::Psfm => usize::MAX,
     };
-    let mut attempt = Attempt {
-        block: block.sample(most, context.settings.seed),
-        consensus: None,
-        evidence: Evidence::ImagePoints,
-        calibration: None,
-        winning_prior: None,
-        opinion: None,
-        doubted: None,
-        second_structure: None,
-        weights_by_depths: None,
-        decided: None,
-        network_weights: Vec::new(),
-        prior_times: Vec::new(),
-    };
     recorder.enter(Stage::Search);
-    match context.settings.method {
-        Method::Auto | Method::Geometry => search(&mut attempt, context, recorder)?,
-        Method::Paper | Method::Psfm => decide(&mut attempt, context, recorder)?,
-    }
+    let mut attempt = match context.settings.method {
+        Method::Auto | Method::Geometry => searched(&block, most, context, recorder)?,
+        Method::Paper | Method::Psfm => {
+            let mut attempt = Attempt::new(block.sample(most, context.settings.seed));
+            decide(&mut attempt, context, recorder)?;
+            attempt
+        }
+    };
     context.stopped()?;
     if let Some(consensus) = &attempt.consensus {
         recorder.enter(Stage::Calibrate);
@@ -113,6 +130,7 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
         if let Some(metric) = attempt.calibration.as_ref().and_then(|outcome| outcome.metric.as_ref()) {
             recorder.standing.focal_px = Some(metric.intrinsics.focal * context.scale_px);
         }
+        recorder.registered(attempt.block.views.len());
         recorder.tell(1.0);
     }
     Ok(attempt)
@@ -124,31 +142,49 @@ fn initial_noise(context: &Context) -> f64 {
     noise.clamp(grow::NOISE_BOUNDS.0, grow::NOISE_BOUNDS.1)
 }
 
-/// AUTO and GEOMETRY: the portfolio, its consensus refined.
+/// AUTO and GEOMETRY: a sample of the tracks without crowds, and where that holds nothing, one of all.
+fn searched(block: &Block, most: usize, context: &Context, recorder: &mut Recorder) -> Result<Attempt, Error> {
+    let seed = context.settings.seed;
+    if let Some(thinned) = crowds::thinned(block, most, initial_noise(context), seed) {
+        let mut attempt = Attempt::new(thinned);
+        search(&mut attempt, context, recorder)?;
+        if attempt.consensus.is_some() {
+            return Ok(attempt);
+        }
+        recorder.begin_again();
+    }
+    let (sample, opinion) = likeliest::sample(block, most, context)?;
+    let mut attempt = Attempt { opinion, ..Attempt::new(sample) };
+    search(&mut attempt, context, recorder)?;
+    Ok(attempt)
+}
+
+/// The portfolio, its consensus refined.
 fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> Result<(), Error> {
     let complete = &attempt.block.complete;
     let tracks = &attempt.block.tracks;
     let found = Portfolio::new(complete, context.settings, initial_noise(context), context.stop)
         .geometry_first(context.seeding)
+        .with_opinion(attempt.opinion.take())
         .run(recorder, &|weights| context.scatter(weights, tracks))
         .map_err(|error| Error::Internal(error.to_string()))?;
     context.stopped()?;
     attempt.winning_prior = found.winning_prior;
     attempt.opinion = found.opinion;
     attempt.doubted = found.doubted;
+    attempt.crowded = found.crowded;
     attempt.prior_times = found.prior_times;
     attempt.network_weights = found.network_weights;
     let Some(consensus) = found.consensus else { return Ok(()) };
     recorder.enter(Stage::Refine);
     attempt.evidence = found.evidence;
     if matches!(found.evidence, Evidence::Depths { .. }) {
-        attempt.weights_by_depths = found
-            .rigid
-            .and_then(|rigid| depths::weights(complete, &consensus, &rigid, portfolio::spread(complete), context.stop));
+        attempt.weights_by_depths =
+            found.rigid.and_then(|rigid| depths::weights(complete, &consensus, &rigid, attempt.spread, context.stop));
         attempt.consensus = Some(consensus);
         return Ok(());
     }
-    let refined = grow::refine(complete, &consensus, portfolio::spread(complete), context.stop);
+    let refined = grow::refine(complete, &consensus, attempt.spread, context.stop);
     recorder.standing.inliers = refined.inlier_count() as u32;
     recorder.standing.best_score = Some(refined.score);
     recorder.tell(1.0);
@@ -158,6 +194,10 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     };
     if counted < LEAST_INLIERS {
         attempt.doubted = (counted < refined.inlier_count()).then_some((refined.inlier_count(), counted));
+        return Ok(());
+    }
+    // Another noise and other inliers than those that were accepted.
+    if chance::ln_false_alarms(complete, &refined, attempt.spread, context.stop) >= LN_ACCEPTABLE {
         return Ok(());
     }
     attempt.second_structure = second::structure(complete, &refined, context.stop);
@@ -179,8 +219,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     if let (Some(rigid), Some(consensus)) = (&found.rigid, &attempt.consensus)
         && consensus.noise > depths::STRONG_NOISE
     {
-        attempt.weights_by_depths =
-            depths::weights(complete, consensus, rigid, portfolio::spread(complete), context.stop);
+        attempt.weights_by_depths = depths::weights(complete, consensus, rigid, attempt.spread, context.stop);
     }
     Ok(())
 }

@@ -39,18 +39,6 @@ pub struct Block {
     pub complete: CompleteBlock,
 }
 
-/// Observation range of every track: `ranges[j]..ranges[j + 1]`.
-pub fn track_ranges(input: &Input) -> Vec<usize> {
-    let mut ends = vec![0; input.track_count() + 1];
-    for k in 0..input.observation_count() {
-        ends[input.track_of(k) + 1] += 1;
-    }
-    for track in 0..input.track_count() {
-        ends[track + 1] += ends[track];
-    }
-    ends
-}
-
 /// The transform from pixels that the whole solve uses: principal points assumed in the image centres, lengths in
 /// units of the largest image side.
 pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
@@ -308,8 +296,13 @@ impl Block {
         chosen.extend((0..self.tracks.len()).filter(|&j| kept.binary_search(&self.tracks[j]).is_ok()));
         chosen.sort_unstable();
         chosen.dedup();
-        let complete = self.complete.select(&chosen);
-        Self { views: self.views, tracks: chosen.iter().map(|&j| self.tracks[j]).collect(), complete }
+        self.select(&chosen)
+    }
+
+    /// The block of these of its tracks, increasing.
+    pub fn select(&self, chosen: &[usize]) -> Self {
+        let tracks = chosen.iter().map(|&j| self.tracks[j]).collect();
+        Self { views: self.views.clone(), tracks, complete: self.complete.select(chosen) }
     }
 }
 
@@ -362,10 +355,10 @@ mod tests {
     #[test]
     fn complete_tracks_are_one_block_of_all_views() {
         let input = input(12, &vec![(0..12).collect(); 20]);
-        let ranges = track_ranges(&input);
+        let ranges = input.track_ranges();
         assert_eq!(candidate_views(&input, &ranges, &StopToken::default()), [(0..12).collect::<Vec<_>>()]);
         let long = self::input(100, &vec![(0..100).collect(); 20]);
-        let views = &candidate_views(&long, &track_ranges(&long), &StopToken::default())[0];
+        let views = &candidate_views(&long, &long.track_ranges(), &StopToken::default())[0];
         assert_eq!((views.len(), views[0], views[39]), (MOST_VIEWS_WHOLE, 0, 97));
     }
 
@@ -374,7 +367,7 @@ mod tests {
         let mut tracks = vec![(0..5).collect::<Vec<_>>(); 30];
         tracks.extend(vec![(3..8).collect::<Vec<_>>(); 60]);
         let input = input(8, &tracks);
-        let ranges = track_ranges(&input);
+        let ranges = input.track_ranges();
         let candidates = candidate_views(&input, &ranges, &StopToken::default());
         assert_eq!(candidates[0], [3, 4, 5, 6, 7]);
         let (normalization, warnings) = normalization(&input);
@@ -417,6 +410,6 @@ mod tests {
     #[test]
     fn views_that_share_nothing_make_no_block() {
         let input = input(4, &[vec![0, 1], vec![2, 3], vec![1, 2]]);
-        assert!(candidate_views(&input, &track_ranges(&input), &StopToken::default()).is_empty());
+        assert!(candidate_views(&input, &input.track_ranges(), &StopToken::default()).is_empty());
     }
 }

@@ -5,10 +5,11 @@
 //! tracks under the gate stands still. Then a polish: the gate inflated and tightened again, which frees consensuses
 //! that grew into a corner (mean F1 .90 -> 1.00 at 90 % outliers).
 
+use super::chance;
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, Loss, Observation, projective};
 use crate::geometry::measurement::CompleteBlock;
-use crate::geometry::statistics::{chi_square_gate, chi_square_median, ln_choose, median};
+use crate::geometry::statistics::{chi_square_gate, chi_square_median, median};
 use crate::geometry::{Camera, Point, triangulation};
 
 /// Tracks below which projective cameras of three views or more are not determined by image points:
@@ -23,7 +24,7 @@ const PATIENCE: usize = 3;
 /// Bundle adjustment iterations of the first rounds and of the later ones, which start close to the optimum.
 const ADJUSTMENTS: (usize, usize) = (12, 8);
 /// Refinement steps of a triangulated point.
-const POINT_STEPS: usize = 6;
+pub const POINT_STEPS: usize = 6;
 /// Scale of the Cauchy loss in units of the noise: residuals beyond it are on their way to being outliers.
 const CAUCHY_SCALE: f64 = 3.0;
 /// Supports up to this size are fitted without a robust loss: there is nothing to spare yet.
@@ -60,31 +61,15 @@ impl Consensus {
     pub fn inlier_count(&self) -> usize {
         self.inlier.iter().filter(|&&inlier| inlier).count()
     }
-
-    /// Natural logarithm of the number of such consensuses to be expected in data without structure (Moisan & Stival
-    /// 2004, a-contrario): all subsets of that size, times the probability that unstructured coordinates of standard
-    /// deviation `spread` leave residuals this small in all constraints that the model does not absorb.
-    pub fn ln_false_alarms(&self, spread: f64) -> f64 {
-        let (views, tracks) = (self.cameras.len(), self.inlier.len());
-        let inliers = self.inlier_count();
-        let constraints = constraint_count(views, inliers);
-        if constraints <= 0.0 {
-            return f64::INFINITY;
-        }
-        let cost: f64 = (0..tracks).filter(|&track| self.inlier[track]).map(|track| self.squared[track]).sum();
-        let rms = (cost / constraints).sqrt().max(f64::MIN_POSITIVE);
-        let ln_probability = 0.5 * constraints * (1.0 + 2.0 * (rms / spread).ln()).min(0.0);
-        ln_choose(tracks, inliers) + (tracks as f64).ln() + ln_probability
-    }
 }
 
 /// Constraints that `tracks` complete tracks in `views` views leave to a projective reconstruction.
-fn constraint_count(views: usize, tracks: usize) -> f64 {
+pub fn constraint_count(views: usize, tracks: usize) -> f64 {
     (2 * views * tracks) as f64 - (11 * views + 3 * tracks) as f64 + 15.0
 }
 
 /// Squared-residual gate of a complete track in units of the variance.
-fn gate(views: usize) -> f64 {
+pub fn gate(views: usize) -> f64 {
     chi_square_gate((2 * views) as f64 - 3.0)
 }
 
@@ -364,7 +349,7 @@ const SURELY_HIGH: f64 = 0.75;
 /// A consensus found at a noise that is too low has lost its worse tracks, and an estimate from those that remain stays
 /// too low; seen from higher up they come back. Of the outcomes the one least likely to be chance stands.
 ///
-/// * `spread`: see [`Consensus::ln_false_alarms`]
+/// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]
 pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> Consensus {
     let settle = |factor: f64| {
         let noise = (factor * consensus.noise).min(NOISE_BOUNDS.1);
@@ -377,7 +362,8 @@ pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &
     }
     for factor in HIGHER_NOISE {
         let settled = settle(factor);
-        if settled.ln_false_alarms(spread) < best.ln_false_alarms(spread) {
+        let certainty = |consensus: &Consensus| chance::ln_false_alarms(block, consensus, spread, stop);
+        if certainty(&settled) < certainty(&best) {
             best = settled;
         }
     }

@@ -30,7 +30,7 @@ const MANY: f64 = 1.0 / 3.0;
 const LEAST_LIKELY: usize = 4;
 
 /// Inliers from which on geometry needs no second opinion: twice what it needs for any.
-const SURELY_ENOUGH: usize = 2 * LEAST_INLIERS;
+pub const SURELY_ENOUGH: usize = 2 * LEAST_INLIERS;
 /// Odds against a track, in nats, at which it is held to be wrong: twenty to one.
 const DOUBT_NATS: f64 = 3.0;
 
@@ -92,6 +92,11 @@ impl Opinion {
     pub fn with_votes(&self, votes: &Votes) -> Self {
         let said = votes.with(&self.observations);
         Self { ln_odds: said.tracks, observations: said.observations }
+    }
+
+    /// Logarithms of the odds that each track is right.
+    pub fn ln_odds(&self) -> &[f64] {
+        &self.ln_odds
     }
 
     /// Logarithms of the odds that each observation is right, track by track.

@@ -3,23 +3,28 @@
 //! Depends on `network`, `geometry` and `domain`; knows nothing of jobs, transport or files.
 //!
 //! The way through: [`copies`] keeps one of the tracks that stand in the input several times; [`block`] chooses views whose
-//! tracks are complete; [`attempt`] solves one such block, by [`portfolio`] (priors, [`search`], [`grow`]; [`depths`] where
-//! those verify what image points cannot; [`extend`] to what a search leaves aside) or [`direct`], and [`calibration`]
-//! upgrades it; where tracks are not complete, [`sequence`] extends the best block to the other views; [`judge`] has the
-//! last word on every track and observation; [`assemble`] writes it down.
+//! tracks are complete; [`attempt`] solves one such block, by [`portfolio`] (priors, [`search`], [`grow`]; [`crowds`] are
+//! left aside, the [`likeliest`] of many tracks searched, [`chance`] verifies; [`depths`] where those verify what image
+//! points cannot; [`extend`] to what a search leaves aside) or [`direct`], and [`calibration`] upgrades it; where tracks
+//! are not complete, [`sequence`] extends the best block to the other views; [`judge`] has the last word on every track
+//! and observation; [`assemble`] writes it down.
 
 mod agreement;
 mod assemble;
 mod attempt;
 mod block;
 pub mod calibration;
+mod chance;
 mod copies;
+mod crowds;
 mod depths;
 mod direct;
 mod extend;
 mod grow;
 mod judge;
 mod learned;
+mod likeliest;
+mod per_track;
 mod portfolio;
 mod priors;
 mod recorder;
@@ -37,6 +42,7 @@ use crate::domain::{
     FocalPrior, Input, Observer, Solution, SolveSettings, Status, StopReason, StopToken, Warning, WarningCode,
 };
 use crate::geometry::measurement::Normalization;
+use crate::parallel::Threads;
 use attempt::Attempt;
 use recorder::Recorder;
 
@@ -51,9 +57,23 @@ pub enum Error {
     Internal(String),
 }
 
+/// Solves one input on the caller's thread; see [`solve_on`].
+///
+/// # Errors
+/// As [`solve_on`].
+pub fn solve(
+    input: &Input,
+    settings: &SolveSettings,
+    observer: &mut dyn Observer,
+    stop: &StopToken,
+) -> Result<Solution, Error> {
+    solve_on(Threads::ONE, input, settings, observer, stop)
+}
+
 /// Solves one input.
 ///
-/// Single-threaded and deterministic: the same input, settings and build give the same solution, but for times.
+/// Deterministic: the same input, settings and build give the same solution, but for times, on any number of threads.
+/// Further ones than the caller's help where a sequence is extended and tracks are judged.
 /// `observer` is told of every iteration; `stop` is asked at least every 50 ms or network iteration.
 ///
 /// Where tracks are complete over all views these are one block; of other inputs AUTO and GEOMETRY extend a block to every
@@ -64,17 +84,18 @@ pub enum Error {
 ///
 /// # Errors
 /// [`Error::Stopped`] when `stop` fired, [`Error::Internal`] for a defect.
-pub fn solve(
+pub fn solve_on(
+    threads: Threads,
     input: &Input,
     settings: &SolveSettings,
     observer: &mut dyn Observer,
     stop: &StopToken,
 ) -> Result<Solution, Error> {
     let mut solution = match Copies::of(input) {
-        None => solve_views(input, settings, observer, stop)?,
-        Some(found) => {
-            copies::solve_once(input, &found, observer, |rest, observer| solve_views(rest, settings, observer, stop))?
-        }
+        None => solve_views(threads, input, settings, observer, stop)?,
+        Some(found) => copies::solve_once(input, &found, observer, |rest, observer| {
+            solve_views(threads, rest, settings, observer, stop)
+        })?,
     };
     views::complete(&mut solution, input);
     solution.input_sha256 = Some(input.to_raw().sha256());
@@ -89,6 +110,7 @@ pub fn trained_network() -> String {
 
 /// The solution but for what [`views::complete`] says of the views.
 fn solve_views(
+    threads: Threads,
     input: &Input,
     settings: &SolveSettings,
     observer: &mut dyn Observer,
@@ -96,8 +118,8 @@ fn solve_views(
 ) -> Result<Solution, Error> {
     // A zoom has no constant calibration for the DAQ to ask for.
     let settings = &SolveSettings { use_daq: settings.use_daq && !settings.focal_per_view, ..settings.clone() };
-    let mut recorder = Recorder::new(observer);
-    let ranges = block::track_ranges(input);
+    let mut recorder = Recorder::new(observer, block::observed_views(input).len());
+    let ranges = input.track_ranges();
     let (normalization, mut warnings) = block::normalization(input);
     let scale_px = normalization.scale_px;
     let context = Context {
@@ -109,6 +131,7 @@ fn solve_views(
         seeding: false,
         merges_cameras: false,
         focal_prior: None,
+        threads,
         stop,
     };
     let sequence = sequence::applies(&context);
@@ -234,6 +257,7 @@ struct Context<'a> {
     merges_cameras: bool,
     /// What is known of the focal length beside what the views bring: what another part of the input said.
     focal_prior: Option<FocalPrior>,
+    threads: Threads,
     stop: &'a StopToken,
 }
 
@@ -280,6 +304,14 @@ fn why_unsolved(input: &Input, best: Option<&Attempt>) -> Warning {
             format!(
                 "{inliers} tracks hold under one geometry, but the trained network takes only {counted} of them to be \
                  right, and so few cameras can adapt to wrong ones; {} are needed. GEOMETRY does not ask the network",
+                grow::LEAST_INLIERS
+            ),
+        ),
+        Some(Attempt { crowded: Some((inliers, counted)), .. }) => Warning::new(
+            WarningCode::FewInliers,
+            format!(
+                "{inliers} tracks hold under one geometry, but lie within the noise of each other in every view: they \
+                 count as {counted}, and {} are needed",
                 grow::LEAST_INLIERS
             ),
         ),

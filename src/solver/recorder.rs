@@ -1,9 +1,9 @@
 //! Tells the observer where the solve stands and keeps what the result reports of its course.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crate::domain::result::StageTime;
-use crate::domain::{Losses, Observer, Progress, Solution, Stage};
+use crate::domain::{Course, Losses, Observer, Progress, Solution, Stage, Step, Task};
 
 /// Share of the whole that is done when each stage begins; the rest of each interval fills as the stage goes on.
 /// From the measured shares of time at 10 views, 200 tracks, 90 % outliers.
@@ -29,6 +29,12 @@ fn fraction_of_extension_at(stage: Stage) -> f64 {
         Stage::Judge => 0.95,
     }
 }
+
+/// Time between two signs of life within a stage: often enough for eyes, and nothing beside the work between them.
+const SIGN_PERIOD: Duration = Duration::from_millis(100);
+
+/// Verdicts that a track gets at most.
+const JUDGED_TIMES: usize = 2;
 
 /// State of the best hypothesis, as progress reports it.
 #[derive(Debug, Clone, Copy, Default)]
@@ -63,10 +69,13 @@ pub struct Recorder<'a> {
     stride: usize,
     records: usize,
     pub standing: Standing,
+    course: Course,
+    last_told: Instant,
 }
 
 impl<'a> Recorder<'a> {
-    pub fn new(observer: &'a mut dyn Observer) -> Self {
+    /// * `views`: how many can be registered
+    pub fn new(observer: &'a mut dyn Observer, views: usize) -> Self {
         let now = Instant::now();
         observer.stage(Stage::Prepare);
         Self {
@@ -86,14 +95,23 @@ impl<'a> Recorder<'a> {
             stride: 1,
             records: 0,
             standing: Standing::default(),
+            course: Course { views: views as u32, ..Course::default() },
+            last_told: now,
         }
     }
 
     /// Begins another block, `block` of at most `blocks`, counted from 0.
     pub fn begin_block(&mut self, block: usize, blocks: usize) {
+        let views = self.course.views;
+        self.course = Course { block: block as u32 + 1, blocks: blocks.max(1) as u32, views, ..Course::default() };
         self.block = block;
         self.extending = false;
         self.blocks = blocks.max(1);
+        self.begin_again();
+    }
+
+    /// Begins the search of a block anew: its course so far counts as work.
+    pub fn begin_again(&mut self) {
         self.earlier_iterations += self.standing.iteration;
         self.standing = Standing::default();
     }
@@ -109,7 +127,8 @@ impl<'a> Recorder<'a> {
     }
 
     /// Begins the block of a further part: its course counts as work, and moves the share done no further.
-    pub fn begin_part(&mut self) {
+    pub fn begin_part(&mut self, part: u32) {
+        self.course.part = part;
         self.earlier_iterations += self.standing.iteration;
         self.before_part = Some(std::mem::take(&mut self.standing));
     }
@@ -123,9 +142,22 @@ impl<'a> Recorder<'a> {
         self.enter(Stage::Extend);
     }
 
+    /// All parts there are to be are built.
+    pub fn end_parts(&mut self) {
+        self.course.part = 0;
+    }
+
+    /// So many views have a camera. What a block of a further part has counts once it is among the others.
+    pub fn registered(&mut self, views: usize) {
+        if self.before_part.is_none() {
+            self.course.registered_views = views as u32;
+        }
+    }
+
     /// Enters a stage, ending the one before.
     pub fn enter(&mut self, stage: Stage) {
         self.close_stage();
+        self.course.step = None;
         self.stage = stage;
         self.observer.stage(stage);
         self.tell(0.0);
@@ -133,8 +165,43 @@ impl<'a> Recorder<'a> {
 
     /// Tells the observer the current standing; `within` is the share of the stage that is done.
     pub fn tell(&mut self, within: f64) {
+        self.advance(within);
+        let progress = self.progress();
+        self.observer.progress(&progress);
+        self.last_told = Instant::now();
+        self.keep(progress);
+    }
+
+    /// Begins a step of a task, or tells how many are done; see [`Step`]. `within` as for [`Self::tell`].
+    pub fn step(&mut self, task: Task, step: usize, steps: usize, within: f64) {
+        self.course.step = Some(Step { task, step: step as u32, steps: steps as u32 });
+        self.advance(within);
+        self.sign_of_life();
+    }
+
+    /// Tells how many verdicts there are; `tracks`: how many are judged.
+    pub fn judged(&mut self, verdicts: usize, tracks: usize) {
+        let most = JUDGED_TIMES * tracks;
+        self.step(Task::Judge, verdicts, most, verdicts as f64 / most.max(1) as f64);
+    }
+
+    /// Tells the observer the current standing if it has heard nothing for a while.
+    ///
+    /// When that is depends on the machine, so that none of it goes into the history: one input has one answer.
+    pub fn sign_of_life(&mut self) {
+        if self.last_told.elapsed() >= SIGN_PERIOD {
+            let progress = self.progress();
+            self.observer.progress(&progress);
+            self.last_told = Instant::now();
+        }
+    }
+
+    fn advance(&mut self, within: f64) {
         self.fraction = self.fraction.max(self.fraction_done(within.clamp(0.0, 1.0)));
-        let progress = Progress {
+    }
+
+    fn progress(&self) -> Progress {
+        Progress {
             stage: self.stage,
             fraction: self.fraction,
             iteration: self.iteration(),
@@ -143,9 +210,8 @@ impl<'a> Recorder<'a> {
             focal_px: self.standing.focal_px,
             best_score: self.standing.best_score,
             elapsed_seconds: self.seconds(),
-        };
-        self.observer.progress(&progress);
-        self.keep(progress);
+            course: self.course,
+        }
     }
 
     fn fraction_done(&self, within: f64) -> f64 {
@@ -181,6 +247,7 @@ impl<'a> Recorder<'a> {
     /// Ends the last stage and gives back times and curves.
     pub fn finish(mut self) -> (Vec<StageTime>, Vec<Progress>) {
         self.fraction = 1.0;
+        self.course.step = None;
         self.tell(1.0);
         self.close_stage();
         (self.stages, self.history)
@@ -228,7 +295,7 @@ mod tests {
     #[test]
     fn fractions_never_decrease_and_history_is_bounded() {
         let mut seen = Fractions::default();
-        let mut recorder = Recorder::new(&mut seen);
+        let mut recorder = Recorder::new(&mut seen, 10);
         for block in 0..2 {
             recorder.begin_block(block, 2);
             for stage in [Stage::Search, Stage::Refine, Stage::Calibrate] {

@@ -1,7 +1,8 @@
 //! Whether the tracks left out agree on a motion of their own.
 
+use super::chance::{self, LN_DECISIVE};
 use super::grow::{self, Consensus};
-use super::portfolio::{self, LN_DECISIVE};
+use super::portfolio;
 use super::priors;
 use super::search::{affine, rigid};
 use crate::domain::{StopToken, Warning, WarningCode};
@@ -66,7 +67,8 @@ fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option
             return None;
         }
         let found = grow::polish(rest, rough, stop);
-        let is_decisive = found.inlier_count() >= grow::LEAST_INLIERS && found.ln_false_alarms(spread) < LN_DECISIVE;
+        let is_decisive = found.inlier_count() >= grow::LEAST_INLIERS
+            && chance::ln_false_alarms(rest, &found, spread, stop) < LN_DECISIVE;
         is_decisive.then(|| found.inlier_count())
     })
 }
@@ -90,7 +92,7 @@ mod tests {
         let input = Input::new(scene.input, &Limits::default(), "scene").expect("a valid scene");
         let views: Vec<usize> = (0..input.view_count()).collect();
         let (normalization, _) = block::normalization(&input);
-        let whole = block::extract(&input, &block::track_ranges(&input), &normalization, &views);
+        let whole = block::extract(&input, &input.track_ranges(), &normalization, &views);
         let wrong = |place: &usize| !scene.truth.inlier[whole.tracks[*place]];
         whole.complete.select(&(0..whole.tracks.len()).filter(wrong).collect::<Vec<_>>())
     }

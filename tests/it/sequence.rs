@@ -47,6 +47,66 @@ fn a_walk_is_registered_whole_and_a_server_gives_the_same_answer() {
     }
 }
 
+/// A client that watches sees how many views there are and how many stand, up to what the result says.
+#[test]
+fn whoever_watches_sees_the_views_rise() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let walk = directory.path().join("walk");
+    let scene = ["--sequence", "--views", "60", "--tracks", "1500", "--noise", "0.0005", "--outliers", "0.3"];
+    let made = run(["synth", "--out", text(&walk)].iter().chain(&scene));
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let server = Serving::start(&directory.path().join("data"));
+    let input = walk.join("observations.csv");
+    let size = ["--width", "1000", "--height", "1000", "--method", "geometry"];
+    let submit = ["submit", text(&input), "--server", &server.grpc, "--job-id", "walk"];
+    let submitted = run(submit.iter().chain(&size));
+    assert_eq!(submitted.code, Some(0), "{submitted:?}");
+    let watched = run(["watch", "walk", "--server", &server.grpc, "--json"]);
+    assert_eq!(watched.code, Some(0), "{watched:?}");
+
+    let events: Vec<Value> = watched.stdout.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+    let progress: Vec<&Value> = events.iter().map(|event| &event["progress"]).filter(|told| told.is_object()).collect();
+    let course = |told: &Value, key: &str| told["course"][key].as_u64().unwrap_or_else(|| panic!("{key} in {told}"));
+    // What a block had that was given up for the next counts no more.
+    for pair in progress.windows(2).filter(|pair| course(pair[0], "block") == course(pair[1], "block")) {
+        let registered = [0, 1].map(|k| course(pair[k], "registered_views"));
+        assert!(registered[0] <= registered[1], "{} {}", pair[0], pair[1]);
+    }
+    let last = progress.last().expect("progress at the end at least");
+    assert!(progress.iter().all(|told| course(told, "views") == 60), "{progress:?}");
+    let summary = events.iter().map(|event| &event["result"]).find(|result| result.is_object()).expect("a result");
+    assert_eq!(Some(course(last, "registered_views")), summary["registered_views"].as_u64(), "{last} {summary}");
+    assert!(course(last, "registered_views") > 50, "{last}");
+}
+
+#[test]
+fn threads_change_nothing_in_any_file_but_times() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let path = |name: &str| directory.path().join(name);
+    let walk = path("walk");
+    let scene = ["--sequence", "--views", "20", "--tracks", "1000", "--noise", "0.0005", "--outliers", "0.3"];
+    let made = run(["synth", "--out", text(&walk)].iter().chain(&scene));
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let input = walk.join("observations.csv");
+    let on = |threads: &str| {
+        let out = path(threads);
+        let size = ["--width", "1000", "--height", "1000", "--method", "geometry", "-q"];
+        let done = run(["solve", text(&input), "--out", text(&out), "--threads", threads].iter().chain(&size));
+        assert_eq!(done.code, Some(0), "{done:?}");
+        let mut result = json(&out.join("result.json"));
+        for timed in ["seconds", "stages", "prior_times"] {
+            assert!(result[timed].take() != Value::Null, "{timed}");
+        }
+        let files = ["tracks.csv", "observations.csv", "cameras.json", "points.ply"];
+        (result, files.map(|file| fs::read(out.join(file)).expect("a result file")))
+    };
+    let alone = on("1");
+    assert!(alone.0["registered_views"].as_u64() > Some(15), "{}", alone.0);
+    for threads in ["2", "3"] {
+        assert!(on(threads) == alone, "{threads} threads");
+    }
+}
+
 #[test]
 fn windows_are_solved_alone_and_alike_on_any_number_of_threads() {
     let directory = tempfile::tempdir().expect("a temporary directory");

@@ -46,6 +46,8 @@ pub fn all() -> Vec<Condition> {
         ("sphere, .95", SceneOptions { motion: Motion::Sphere, outliers: 0.95, ..paper() }),
         ("40 views, .95", SceneOptions { views: 40, outliers: 0.95, ..paper() }),
         ("3000 tracks, .98", SceneOptions { tracks: 3_000, outliers: 0.98, ..paper() }),
+        ("3000 tracks, all wrong", SceneOptions { tracks: 3_000, ..at(1.0) }),
+        ("500 x 20, .96", SceneOptions { views: 20, tracks: 500, noise: 0.006, ..at(0.96) }),
         ("distorted, .9", SceneOptions { radial_k1: -0.3, ..paper() }),
         ("zoom, .9", SceneOptions { zoom: 0.5, ..paper() }),
         ("all wrong", at(1.0)),

@@ -14,8 +14,8 @@ const MAX_LABELS: usize = 64;
 /// Longest label key and value in bytes; the key's bound is that of a resource id.
 const MAX_LABEL_KEY: usize = 63;
 const MAX_LABEL_VALUE: usize = 255;
-/// Priorities are a few classes with room between them.
-const MAX_PRIORITY: i32 = 1_000;
+/// Largest priority, and the smallest below 0: a few classes with room between them.
+pub const MAX_PRIORITY: i32 = 1_000;
 /// Longest request id: a UUID has 36 characters.
 const MAX_REQUEST_ID: usize = 128;
 

@@ -1,7 +1,7 @@
 //! Enums: the domain's and the wire's have the same variants, but for the wire's `UNSPECIFIED`.
 
 use crate::domain::job::{AttemptEnd, JobState};
-use crate::domain::{Backend, Grade, Method, Prior, Stage, Status, Violation, WarningCode};
+use crate::domain::{Backend, Grade, Method, Prior, Stage, Status, Task, Violation, WarningCode};
 use crate::rpc::proto;
 
 /// A domain enum that has a twin on the wire.
@@ -49,6 +49,7 @@ twins! {
     Method = Method { Auto, Paper, Geometry, Psfm }
     Backend = Backend { Flex, Ndarray }
     Stage = Stage { Prepare, Search, Refine, Calibrate, Extend, Judge }
+    Task = Task { Adjust, Cameras, Windows, Judge }
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
     Prior = Prior { Network, Irls, Consistency, Rigidity, Uniform, Learned }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::enums::{Twin, optional_to_wire};
-use super::{optional_time, progress, required, result, settings, time_from_wire};
+use super::{optional_time, progress, required, result, settings, tellable, time_from_wire};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Grade, InputName, InvalidInput, Prior, Status, Violation};
 use crate::rpc::proto;
@@ -29,7 +29,7 @@ pub fn to_wire(job: &Job) -> proto::Job {
         summary: job.summary.as_ref().map(summary_to_wire),
         error: job.failure.as_ref().map(failure_to_wire),
         cancel_requested: job.cancel_requested,
-        expire_time: job.expire_time.map(Into::into),
+        expire_time: tellable(job.expire_time),
         etag: job.etag(),
         input_name: job.input.as_ref().map(InputName::to_string).unwrap_or_default(),
     }
@@ -193,7 +193,7 @@ mod tests {
     use std::time::{Duration, SystemTime};
 
     use super::*;
-    use crate::domain::{Progress, SolveSettings, Stage, Warning, WarningCode};
+    use crate::domain::{Course, Progress, SolveSettings, Stage, Step, Task, Warning, WarningCode};
 
     fn name() -> JobName {
         JobName { tenant: "default".into(), job: "a-1".into() }
@@ -230,6 +230,14 @@ mod tests {
             focal_px: None,
             best_score: Some(0.0),
             elapsed_seconds: 2.0,
+            course: Course {
+                block: 1,
+                blocks: 4,
+                part: 1,
+                registered_views: 7,
+                views: 9,
+                step: Some(Step { task: Task::Windows, step: 2, steps: 3 }),
+            },
         }
     }
 
@@ -272,7 +280,10 @@ mod tests {
             expire_time: None,
             ..job
         };
-        assert_eq!(from_wire(to_wire(&bare)), Ok(bare));
+        assert_eq!(from_wire(to_wire(&bare)), Ok(bare.clone()));
+        // As a store may have it that is kept for longer than the calendar lasts.
+        let late = Job { expire_time: Some(time(3_000_000 * 86_400)), ..bare.clone() };
+        assert_eq!(from_wire(to_wire(&late)), Ok(bare));
     }
 
     #[test]

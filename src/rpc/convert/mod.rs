@@ -17,7 +17,7 @@ pub mod settings;
 mod time;
 pub mod upload;
 
-pub(crate) use time::{optional_time, positive_duration, time_from_wire};
+pub(crate) use time::{optional_time, positive_duration, tellable, time_from_wire};
 
 use crate::domain::Violation;
 

@@ -1,7 +1,7 @@
 //! Progress records.
 
 use super::enums::Twin;
-use crate::domain::{Losses, Progress, Stage, Violation};
+use crate::domain::{Course, Losses, Progress, Stage, Step, Task, Violation};
 use crate::rpc::proto;
 
 pub fn to_wire(progress: &Progress) -> proto::Progress {
@@ -14,6 +14,7 @@ pub fn to_wire(progress: &Progress) -> proto::Progress {
         focal_px: progress.focal_px,
         best_score: progress.best_score,
         elapsed_seconds: progress.elapsed_seconds,
+        course: Some(course_to_wire(&progress.course)),
     }
 }
 
@@ -29,5 +30,42 @@ pub fn from_wire(progress: &proto::Progress) -> Result<Progress, Violation> {
         focal_px: progress.focal_px,
         best_score: progress.best_score,
         elapsed_seconds: progress.elapsed_seconds,
+        course: progress.course.as_ref().map(course_from_wire).unwrap_or_default(),
     })
+}
+
+fn course_to_wire(course: &Course) -> proto::Course {
+    let Course { block, blocks, part, registered_views, views, step } = *course;
+    proto::Course {
+        block,
+        blocks,
+        part,
+        registered_views,
+        views,
+        task: super::enums::optional_to_wire(step.map(|step| step.task)),
+        step: step.map_or(0, |step| step.step),
+        steps: step.map_or(0, |step| step.steps),
+    }
+}
+
+/// A task that only a later version knows is none: a stage that does something new is no reason not to watch it.
+fn course_from_wire(course: &proto::Course) -> Course {
+    let proto::Course { block, blocks, part, registered_views, views, task, step, steps } = *course;
+    let task = Task::from_wire(task, "progress.course.task").ok().flatten();
+    Course { block, blocks, part, registered_views, views, step: task.map(|task| Step { task, step, steps }) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn servers_of_other_versions_are_understood() {
+        let stage = Stage::Extend.to_wire();
+        let older = from_wire(&proto::Progress { stage, fraction: 0.5, ..Default::default() }).expect("known");
+        assert_eq!(older.course, Course::default());
+        let course = proto::Course { registered_views: 3, task: 99, step: 1, steps: 2, ..Default::default() };
+        let newer = from_wire(&proto::Progress { stage, course: Some(course), ..Default::default() }).expect("known");
+        assert_eq!(newer.course, Course { registered_views: 3, ..Course::default() });
+    }
 }

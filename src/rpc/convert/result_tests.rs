@@ -3,7 +3,7 @@
 use prost::Message;
 
 use super::*;
-use crate::domain::{Losses, Progress};
+use crate::domain::{Course, Losses, Progress};
 
 fn name() -> JobName {
     JobName { tenant: "default".into(), job: "a".into() }
@@ -22,6 +22,7 @@ pub(super) fn rich() -> Solution {
         focal_px: Some(1200.5),
         best_score: Some(0.9),
         elapsed_seconds: 0.25,
+        course: Course { block: 1, blocks: 4, part: 1, registered_views: 7, views: 9, step: None },
     };
     Solution {
         status: Status::Solved,

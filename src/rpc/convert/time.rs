@@ -44,6 +44,12 @@ pub(crate) fn optional_time(time: Option<Timestamp>, field: &str) -> Result<Opti
     time.map(|time| time_from_wire(time, field)).transpose()
 }
 
+/// An optional time for the wire; left out where a `Timestamp` cannot tell it, since one such time would make a whole
+/// answer unreadable.
+pub(crate) fn tellable(time: Option<SystemTime>) -> Option<Timestamp> {
+    time.map(Timestamp::from).filter(|time| TIME_SECONDS.contains(&time.seconds))
+}
+
 /// A duration above 0 from the wire.
 ///
 /// # Errors
@@ -91,6 +97,16 @@ mod tests {
         }
         assert_eq!(Timestamp { seconds: *TIME_SECONDS.start(), nanos: 0 }.to_string(), "0001-01-01T00:00:00Z");
         assert_eq!(Timestamp { seconds: *TIME_SECONDS.end(), nanos: 0 }.to_string(), "9999-12-31T23:59:59Z");
+    }
+
+    #[test]
+    fn times_beyond_the_calendar_are_left_out() {
+        let last = UNIX_EPOCH + Duration::from_secs(TIME_SECONDS.end().unsigned_abs());
+        assert_eq!(tellable(Some(last)).map(|time| time.seconds), Some(*TIME_SECONDS.end()));
+        for beyond in [last + Duration::from_secs(1), UNIX_EPOCH + Duration::from_secs(3_000_000 * 86_400)] {
+            assert_eq!(tellable(Some(beyond)), None);
+        }
+        assert_eq!(tellable(None), None);
     }
 
     #[test]

@@ -163,6 +163,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
 /// length is known to be near a minimum, and others are looked for only where this one is not certain.
 ///
 /// * `problem`: the projective cameras and points of `metric`
+/// * `told`: called after each of its steps, of which a large problem takes some tenths of a second
 ///
 /// # Errors
 /// As [`calibrate`].
@@ -171,6 +172,7 @@ pub fn from_metric(
     metric: &Reconstruction,
     scale_px: f64,
     stop: &StopToken,
+    told: &mut dyn FnMut(),
 ) -> Result<Outcome, Stopped> {
     Stopped::check(stop)?;
     let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), ..*problem };
@@ -181,8 +183,10 @@ pub fn from_metric(
     }
     let (_, _, fit) = projectively_adjusted(problem, inliers, stop);
     Stopped::check(stop)?;
+    told();
     let critical = critical::find(problem, &fit, scale_px, stop);
     Stopped::check(stop)?;
+    told();
     if !critical.warnings.is_empty() {
         warnings.extend(critical.warnings);
         return Ok(Outcome::refused(warnings));
@@ -190,6 +194,7 @@ pub fn from_metric(
     let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);
     let choice = models::Choice { problem, prior: &prior, scale_px, stop };
     let minima = search::minima_near(metric, problem, &prior, stop)?;
+    told();
     if minima.is_empty() {
         warnings.push(no_start());
         return Ok(Outcome::refused(warnings));

@@ -15,12 +15,12 @@ use crate::domain::{Input, StopToken};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::{Normalization, Sighting};
 use crate::geometry::{Camera, Point, robust_triangulation, triangulation};
+use crate::parallel::Threads;
+use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 
 /// Observations that a track must retain, and the share of those it has in the registered views.
 const LEAST_RETAINED: usize = 3;
 const LEAST_RETAINED_SHARE: f64 = 0.6;
-/// Tracks between two looks at the stop token: a few milliseconds.
-const TRACKS_PER_LOOK: usize = 16;
 /// Refinement steps of a point.
 const POINT_STEPS: usize = 10;
 
@@ -68,6 +68,21 @@ struct Verdict {
     retained: Vec<bool>,
 }
 
+/// What was found of one track.
+struct Finding {
+    sightings: Vec<Sighting>,
+    /// Of the sightings, among the caller's observations.
+    places: Vec<usize>,
+    verdict: Verdict,
+    others: Vec<Other>,
+}
+
+/// A further point that a track joins, with the sightings that show it.
+struct Other {
+    verdict: Verdict,
+    sightings: Vec<usize>,
+}
+
 /// Every track and observation of the input, judged. Points stay homogeneous, projective and normalised.
 pub struct Judged {
     pub tracks: TrackResults,
@@ -96,12 +111,23 @@ pub struct SplitPoint {
 /// Twice: with a wide tail first, then with the tail that the tracks show which are right in all their observations.
 /// Where there is none, a wrong observation is told from a right one nearer by: at 8 to 9 core deviations instead of 12 at .3 % noise.
 ///
-/// Once `stop` fires the rest stays unjudged: nobody will look at the result.
-pub fn judge(input: &Input, ranges: &[usize], geometry: &Geometry, stop: &StopToken) -> Judged {
+/// Once `stop` fires the rest stays unjudged: nobody will look at the result. `told` hears how many verdicts there are,
+/// up to two a track. How many threads there are changes nothing.
+pub fn judge(
+    input: &Input,
+    ranges: &[usize],
+    geometry: &Geometry,
+    threads: Threads,
+    stop: &StopToken,
+    told: &mut dyn FnMut(usize),
+) -> Judged {
     let noise = NoiseModel::new(geometry.noise, geometry.outlier_density);
-    let judged = judge_under(input, ranges, geometry, noise, stop);
+    let judged = judge_under(input, ranges, geometry, noise, threads, stop, told);
     match noise.with_tail(&whole_tracks(input, ranges, geometry, &judged)) {
-        Some(noise) => judge_under(input, ranges, geometry, noise, stop),
+        Some(noise) => {
+            let mut told = |tracks| told(input.track_count() + tracks);
+            judge_under(input, ranges, geometry, noise, threads, stop, &mut told)
+        }
         None => judged,
     }
 }
@@ -118,27 +144,28 @@ fn whole_tracks(input: &Input, ranges: &[usize], geometry: &Geometry, judged: &J
         .collect()
 }
 
-fn judge_under(input: &Input, ranges: &[usize], geometry: &Geometry, noise: NoiseModel, stop: &StopToken) -> Judged {
+fn judge_under(
+    input: &Input,
+    ranges: &[usize],
+    geometry: &Geometry,
+    noise: NoiseModel,
+    threads: Threads,
+    stop: &StopToken,
+    told: &mut dyn FnMut(usize),
+) -> Judged {
     // Triangulation wants a slice; unregistered views are never sighted.
     let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
     let bench = Bench { cameras: &cameras, geometry, noise };
     let mut judged = Judged::nothing(input, noise);
-    for track in 0..input.track_count() {
-        if track.is_multiple_of(TRACKS_PER_LOOK) && stop.is_stopped() {
-            break;
-        }
-        let seen: Vec<usize> =
-            (ranges[track]..ranges[track + 1]).filter(|&k| geometry.judges(track, input.view_of(k))).collect();
-        if seen.len() < LEAST_RETAINED {
-            continue;
-        }
-        let sightings: Vec<Sighting> =
-            seen.iter().map(|&k| Sighting { view: input.view_of(k), xy: geometry.point(input, k) }).collect();
-        let places: Vec<usize> = seen.into_iter().map(|k| input.caller_index(k)).collect();
-        let verdict = bench.judge(&sightings);
-        bench.write(&mut judged, track, &places, &sightings, &verdict);
-        if geometry.linked && verdict.inlier {
-            bench.split(&mut judged, track, &places, &sightings, &verdict);
+    let threads = threads.if_worth(input.track_count() >= WORTH_A_THREAD);
+    for first in (0..input.track_count()).step_by(BATCH) {
+        let count = BATCH.min(input.track_count() - first);
+        let of_track = |k: usize| (!stop.is_stopped()).then(|| bench.find(input, ranges, first + k)).flatten();
+        let found = threads.map(count, TRACKS_A_RUN, of_track, &mut |tracks| told(first + tracks));
+        for (k, finding) in found.into_iter().enumerate() {
+            if let Some(finding) = finding {
+                bench.write(&mut judged, first + k, &finding);
+            }
         }
     }
     judged
@@ -173,6 +200,22 @@ struct Bench<'a> {
 }
 
 impl Bench<'_> {
+    /// Judges a track and, where tracks are linked and it is right, what it leaves; `None` where too few views see it.
+    fn find(&self, input: &Input, ranges: &[usize], track: usize) -> Option<Finding> {
+        let geometry = self.geometry;
+        let seen: Vec<usize> =
+            (ranges[track]..ranges[track + 1]).filter(|&k| geometry.judges(track, input.view_of(k))).collect();
+        if seen.len() < LEAST_RETAINED {
+            return None;
+        }
+        let sightings: Vec<Sighting> =
+            seen.iter().map(|&k| Sighting { view: input.view_of(k), xy: geometry.point(input, k) }).collect();
+        let places = seen.into_iter().map(|k| input.caller_index(k)).collect();
+        let verdict = self.judge(&sightings);
+        let others = if geometry.linked && verdict.inlier { self.others(&sightings, &verdict) } else { Vec::new() };
+        Some(Finding { sightings, places, verdict, others })
+    }
+
     /// Drops the worst observation as long as it is more likely wrong than right, then weighs what remains.
     fn judge(&self, sightings: &[Sighting]) -> Verdict {
         let gate = self.noise.gate();
@@ -217,8 +260,9 @@ impl Bench<'_> {
         triangulation::reprojection(&self.cameras[seen.view], point, &seen.xy).norm_squared()
     }
 
-    /// Enters the verdict on a track whose sightings have these places among the caller's observations.
-    fn write(&self, judged: &mut Judged, track: usize, places: &[usize], sightings: &[Sighting], verdict: &Verdict) {
+    /// Enters what was found of a track.
+    fn write(&self, judged: &mut Judged, track: usize, finding: &Finding) {
+        let Finding { sightings, places, verdict, others } = finding;
         judged.tracks.weight[track] = verdict.weight as f32;
         judged.tracks.inlier[track] = verdict.inlier;
         for ((&place, sighting), &retained) in places.iter().zip(sightings).zip(&verdict.retained) {
@@ -233,25 +277,29 @@ impl Bench<'_> {
             judged.retained[track] = retained.map(|(sighting, _)| *sighting).collect();
             judged.points[track] = Some(verdict.point);
         }
+        for (number, other) in (1..).zip(others) {
+            other.sightings.iter().for_each(|&k| judged.observations.split[places[k]] = number);
+            let Verdict { weight, point, .. } = other.verdict;
+            judged.splits.push(SplitPoint { track, number, weight, point });
+        }
     }
 
     /// Looks for the other points that a right track joins, among the observations that its own leaves.
-    fn split(&self, judged: &mut Judged, track: usize, places: &[usize], sightings: &[Sighting], verdict: &Verdict) {
+    fn others(&self, sightings: &[Sighting], verdict: &Verdict) -> Vec<Other> {
         let mut left: Vec<usize> = (0..sightings.len()).filter(|&k| !verdict.retained[k]).collect();
-        let mut number = 0;
+        let mut others = Vec::new();
         while left.len() >= LEAST_RETAINED {
-            let other = self.judge(&chosen(sightings, &left));
-            if !other.inlier {
+            let verdict = self.judge(&chosen(sightings, &left));
+            if !verdict.inlier {
                 break;
             }
-            number += 1;
-            let (of_other, rest): (Vec<_>, Vec<_>) = left.iter().zip(&other.retained).partition(|(_, kept)| **kept);
-            for (&k, _) in of_other {
-                judged.observations.split[places[k]] = number;
-            }
-            judged.splits.push(SplitPoint { track, number, weight: other.weight, point: other.point });
-            left = rest.into_iter().map(|(&k, _)| k).collect();
+            let (of_other, rest): (Vec<_>, Vec<_>) = left.iter().zip(&verdict.retained).partition(|(_, kept)| **kept);
+            let indices = |these: Vec<(&usize, &bool)>| these.into_iter().map(|(&k, _)| k).collect::<Vec<usize>>();
+            let (sightings, rest) = (indices(of_other), indices(rest));
+            others.push(Other { verdict, sightings });
+            left = rest;
         }
+        others
     }
 }
 
@@ -342,7 +390,9 @@ mod tests {
             let mut judged = Judged::nothing(&testing_input(), bench.noise);
             let verdict = bench.judge(sightings);
             assert!(verdict.inlier);
-            bench.split(&mut judged, 0, &(0..8).collect::<Vec<_>>(), sightings, &verdict);
+            let others = bench.others(sightings, &verdict);
+            let (sightings, places) = (sightings.to_vec(), (0..8).collect());
+            bench.write(&mut judged, 0, &Finding { sightings, places, verdict, others });
             (judged.observations.split, judged.splits.len())
         };
         let mut joined = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, 0.0, 0.0, 0.0]);

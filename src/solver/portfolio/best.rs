@@ -1,12 +1,9 @@
 //! The best consensus so far, and when it is good enough.
 
 use crate::domain::Prior;
+use crate::solver::chance::{LN_ACCEPTABLE, LN_DECISIVE};
 use crate::solver::grow::{Consensus, LEAST_INLIERS};
 
-/// Logarithm of the expected number of false alarms at which a consensus is decisive (e^-40: never by chance), and at
-/// which it may be accepted once the search has ended.
-pub const LN_DECISIVE: f64 = -40.0;
-const LN_ACCEPTABLE: f64 = -7.0;
 /// Gain in that logarithm below which two consensuses are the same: a single track more changes it by tens.
 pub const LN_MARGIN: f64 = 5.0;
 
@@ -66,6 +63,7 @@ impl Best {
             (Evidence::Depths { .. }, Evidence::ImagePoints) => self.is_acceptable() && !other.decides(),
             // What cannot be accepted keeps nothing out that can.
             _ if self.is_verified() != other.is_verified() => self.is_verified(),
+            _ if self.is_acceptable() != other.is_acceptable() => self.is_acceptable(),
             _ => self.ln_false_alarms < other.ln_false_alarms - LN_MARGIN,
         }
     }
@@ -94,6 +92,9 @@ mod tests {
         let (doubted, verified) = (best(7, -100.0), best(9, -50.0));
         assert!(verified.displaces(&doubted) && !doubted.displaces(&verified));
         assert!(verified.decides() && !doubted.decides() && !doubted.is_acceptable());
+        // As of cameras that admit any track.
+        let (vetoed, barely) = (best(9, -7.0), best(9, -8.0));
+        assert!(barely.displaces(&vetoed) && !vetoed.displaces(&barely));
         assert!(best(9, -60.0).displaces(&verified) && !best(9, -51.0).displaces(&verified));
     }
 }

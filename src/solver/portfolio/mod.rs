@@ -16,7 +16,7 @@ use std::time::Instant;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::grow::Consensus;
+use super::grow::{Consensus, LEAST_INLIERS};
 use super::learned::{self, Opinion};
 use super::priors;
 use super::recorder::Recorder;
@@ -28,7 +28,7 @@ use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::network::{NetworkSettings, PriorNetwork};
 use account::Account;
 use best::Best;
-pub use best::{Evidence, LN_DECISIVE};
+pub use best::Evidence;
 pub use spread::{MOST_SPREAD, spread};
 
 /// Network iterations between two verifications of its ranking.
@@ -40,6 +40,9 @@ const AFFINE_SAMPLES: (usize, usize) = (2_000, 6_000);
 const SUBSPACE_SAMPLES: (usize, usize) = (250, 1_000);
 /// Hypotheses a round and prior that are grown.
 const SHORTLIST: usize = 2;
+/// Consensuses that are crowds after which a search is over: whatever includes one of a crowd that large explains all of
+/// it, and outbids what is right.
+const MOST_CROWDS: usize = 4;
 /// Every other round grows at more noise than assumed, doubling up to sixteen times: a level that is twice too low
 /// loses the scene, and the caller may have given none.
 const NOISE_LADDER: [f64; 8] = [1.0, 2.0, 1.0, 4.0, 1.0, 8.0, 1.0, 16.0];
@@ -54,6 +57,8 @@ pub struct Found {
     pub winning_prior: Option<Prior>,
     /// Inliers of a consensus that the trained network keeps from being accepted, and how many of them count.
     pub doubted: Option<(usize, usize)>,
+    /// Inliers of the largest consensus that is a crowd, and how many of them count.
+    pub crowded: Option<(usize, usize)>,
     /// What the trained network says of the block; `None` where it was not asked.
     pub opinion: Option<Opinion>,
     /// The weights of the network that was trained beforehand, or where it was not asked the last ones of the paper's, one
@@ -81,6 +86,9 @@ pub struct Portfolio<'a> {
     rng: ChaCha8Rng,
     accounts: Vec<Account>,
     best: Option<Best>,
+    crowded: Option<(usize, usize)>,
+    /// Consensuses that were crowds.
+    crowds: usize,
     rigid: Option<Rigid>,
     opinion: Option<Opinion>,
     /// The scene's own statistics go first, whatever the trained network says.
@@ -106,6 +114,8 @@ impl<'a> Portfolio<'a> {
             rng: ChaCha8Rng::seed_from_u64(settings.seed),
             accounts: Prior::ALL.into_iter().map(Account::new).collect(),
             best: None,
+            crowded: None,
+            crowds: 0,
             rigid: None,
             opinion: None,
             geometry_first: false,
@@ -116,6 +126,11 @@ impl<'a> Portfolio<'a> {
     /// sequence, where it was measured to cost a seed a hundredth of F1 to hear the network first.
     pub fn geometry_first(self, geometry_first: bool) -> Self {
         Self { geometry_first, ..self }
+    }
+
+    /// What the trained network says of the block, where it was asked already.
+    pub fn with_opinion(self, opinion: Option<Opinion>) -> Self {
+        Self { opinion, ..self }
     }
 
     /// Runs the search; `spread_weights` maps the block's weights to the caller's tracks.
@@ -141,7 +156,7 @@ impl<'a> Portfolio<'a> {
             self.propose_rigid(round);
             self.propose_at_once(round);
             self.stand(recorder);
-            if uses_network && !self.is_decisive() && !self.stop.is_stopped() {
+            if uses_network && !self.is_over() && !self.stop.is_stopped() {
                 let network = match &mut network {
                     Some(network) => network,
                     none => none.insert(self.paper_network()?),
@@ -152,7 +167,7 @@ impl<'a> Portfolio<'a> {
             self.propose(Prior::Uniform, &vec![1.0; self.block.tracks()], None);
             self.stand(recorder);
             recorder.tell(f64::from(round + 1) / f64::from(rounds));
-            if self.is_decisive() || self.stop.is_stopped() {
+            if self.is_over() || self.stop.is_stopped() {
                 break;
             }
         }
@@ -177,7 +192,7 @@ impl<'a> Portfolio<'a> {
             return;
         }
         let begun = Instant::now();
-        self.opinion = Opinion::of(self.block);
+        self.opinion = self.opinion.take().or_else(|| Opinion::of(self.block));
         self.account(Prior::Learned).seconds += begun.elapsed().as_secs_f64();
         if let Some(opinion) = self.opinion.as_ref().filter(|_| self.settings.weights_every > 0) {
             recorder.weights(&spread_weights(&opinion.probabilities()));
@@ -224,6 +239,17 @@ impl<'a> Portfolio<'a> {
         self.opinion.as_ref().map_or(count, |opinion| opinion.counted(&consensus.inliers()))
     }
 
+    /// Notes inliers that lie within the noise of each other, where the noise is no more than assumed: more makes any
+    /// tracks one.
+    fn note_crowd(&mut self, consensus: &Consensus) {
+        let (inliers, distinct) = (consensus.inlier_count(), consensus.distinct_count());
+        let is_crowd = inliers >= LEAST_INLIERS && distinct < LEAST_INLIERS && self.noise <= self.assumed_noise;
+        self.crowds += usize::from(is_crowd);
+        if is_crowd && self.crowded.is_none_or(|(most, _)| inliers > most) {
+            self.crowded = Some((inliers, distinct));
+        }
+    }
+
     /// Keeps the better one.
     fn offer(&mut self, grown: Best) {
         if self.best.as_ref().is_none_or(|best| grown.displaces(best)) {
@@ -233,6 +259,13 @@ impl<'a> Portfolio<'a> {
 
     fn is_decisive(&self) -> bool {
         self.best.as_ref().is_some_and(Best::decides)
+    }
+
+    /// Whether nothing more is to be expected: something decisive stands, or crowds alone are found by image points and
+    /// there are no depths to go by.
+    fn is_over(&self) -> bool {
+        let nothing_else = !self.best.as_ref().is_some_and(Best::is_acceptable) && !self.block.has_depths();
+        self.is_decisive() || (nothing_else && self.crowds >= MOST_CROWDS)
     }
 
     /// Writes the best consensus into the progress.
@@ -251,7 +284,7 @@ impl<'a> Portfolio<'a> {
     fn finish(self, network: Option<PriorNetwork>) -> Found {
         let with_network = self.settings.method.uses_network();
         let with_depths = self.block.has_depths();
-        let Self { best, accounts, rigid, opinion, .. } = self;
+        let Self { best, crowded, accounts, rigid, opinion, .. } = self;
         let doubted = best.as_ref().filter(|best| !best.is_acceptable()).and_then(Best::doubted);
         let accepted = best.filter(Best::is_acceptable);
         let prior_times = accounts
@@ -268,6 +301,7 @@ impl<'a> Portfolio<'a> {
             rigid,
             winning_prior,
             doubted,
+            crowded,
             network_weights: match (&opinion, network) {
                 (Some(opinion), _) => opinion.probabilities(),
                 (None, Some(network)) => network.weights().to_vec(),

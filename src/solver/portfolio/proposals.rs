@@ -3,9 +3,10 @@
 use std::time::Instant;
 
 use super::best::Best;
-use super::{AFFINE_SAMPLES, Evidence, LN_DECISIVE, NOISE_LADDER, Portfolio, SHORTLIST, SUBSPACE_SAMPLES, Search};
+use super::{AFFINE_SAMPLES, Evidence, NOISE_LADDER, Portfolio, SHORTLIST, SUBSPACE_SAMPLES, Search};
 use crate::domain::Prior;
 use crate::geometry::statistics::median;
+use crate::solver::chance::{self, LN_DECISIVE};
 use crate::solver::learned::Opinion;
 use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid, subspace};
 use crate::solver::{depths, grow, priors};
@@ -13,7 +14,7 @@ use crate::solver::{depths, grow, priors};
 impl Portfolio<'_> {
     /// Whether this prior has anything left to say.
     fn is_wanted(&self, prior: Prior) -> bool {
-        !self.is_decisive() && !self.stop.is_stopped() && !self.settings.excluded_priors.contains(&prior)
+        !self.is_over() && !self.stop.is_stopped() && !self.settings.excluded_priors.contains(&prior)
     }
 
     /// Tracks whose distances stay the same, once a noise level: where depths are given and true up to one scale.
@@ -163,17 +164,17 @@ impl Portfolio<'_> {
         for seed in seeds {
             let begun = Instant::now();
             let grown = grow::grow(self.block, seed.cameras, seed.points, seed.support, self.noise, self.stop);
-            let spread = self.spread;
             let counted = grown.as_ref().map_or(0, |consensus| self.counted(consensus));
-            let account = self.account(prior);
-            account.seconds += begun.elapsed().as_secs_f64();
+            let ln_false_alarms = grown.as_ref().map_or(f64::INFINITY, |consensus| {
+                chance::ln_false_alarms(self.block, consensus, self.spread, self.stop)
+            });
+            self.account(prior).seconds += begun.elapsed().as_secs_f64();
             let Some(consensus) = grown else { continue };
-            let ln_false_alarms = consensus.ln_false_alarms(spread);
+            self.note_crowd(&consensus);
             let grown = Best { consensus, prior, ln_false_alarms, evidence: Evidence::ImagePoints, counted };
-            account.record(&grown);
-            let decisive = grown.decides();
+            self.account(prior).record(&grown);
             self.offer(grown);
-            if decisive || self.stop.is_stopped() {
+            if self.is_over() || self.stop.is_stopped() {
                 break;
             }
         }

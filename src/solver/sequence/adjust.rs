@@ -3,10 +3,11 @@
 use super::model::{Lens, Model, Scene};
 use super::parts::FIRST;
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
-use crate::geometry::bundle::sequence::{self, Free, Sequence, Sighting};
+use crate::geometry::bundle::sequence::{self, Free, Run, Sequence, Sighting};
 use crate::geometry::bundle::{Loss, Observation, Options};
 use crate::geometry::statistics::median;
 use crate::solver::calibration;
+use crate::solver::recorder::Recorder;
 
 /// Scale of the Cauchy loss in units of the core noise: detectors have tails that a wider one would follow.
 const CAUCHY_SCALE: f64 = 2.0;
@@ -97,7 +98,7 @@ impl Extract {
         (reconstruction, self.sightings.iter().map(observation).collect())
     }
 
-    fn adjust(&mut self, scene: &Scene, model: &Model, free: &Free, iterations: usize) {
+    fn adjust(&mut self, scene: &Scene, model: &Model, free: &Free, iterations: usize, recorder: &mut Recorder) {
         let options = Options {
             max_iterations: iterations,
             relative_tolerance: TOLERANCE,
@@ -106,7 +107,9 @@ impl Extract {
         };
         let priors: Vec<IntrinsicsPrior> =
             (0..scene.groups).map(|group| knowledge(scene, group, model.noise)).collect();
-        sequence::adjust(&mut self.sequence, &self.sightings, free, &priors, &options, scene.stop());
+        let mut told = || recorder.sign_of_life();
+        let run = Run { threads: scene.context.threads, stop: scene.stop(), told: &mut told };
+        sequence::adjust(&mut self.sequence, &self.sightings, free, &priors, &options, run);
     }
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
@@ -125,7 +128,7 @@ pub fn knowledge(scene: &Scene, group: usize, noise: f64) -> IntrinsicsPrior {
 
 /// Adjusts the views of a part with the landmarks that hold them best, while more are to come. The calibration of groups
 /// that the first part has is the first part's: the others are held to it until all are adjusted together.
-pub fn while_growing(scene: &Scene, model: &mut Model, part: u32) {
+pub fn while_growing(scene: &Scene, model: &mut Model, part: u32, recorder: &mut Recorder) {
     let views = model.of_part(part);
     let tracks = covering(scene, model, &views, OF_VIEW_WHILE_GROWING);
     let mut extract = Extract::new(scene, model, &views, &tracks);
@@ -135,13 +138,13 @@ pub fn while_growing(scene: &Scene, model: &mut Model, part: u32) {
     }
     let free = |(lens, held): (&Lens, &bool)| if *held { IntrinsicsModel::FIXED } else { lens.free };
     let models: Vec<IntrinsicsModel> = model.lenses.iter().zip(&is_held).map(free).collect();
-    extract.adjust(scene, model, &Free::all(&models), ITERATIONS_WHILE_GROWING);
+    extract.adjust(scene, model, &Free::all(&models), ITERATIONS_WHILE_GROWING, recorder);
     finish(scene, model, &extract);
 }
 
 /// Adjusts a new view and those that share most landmarks with it, all others held, and the calibration too unless the
 /// camera is new.
-pub fn around(scene: &Scene, model: &mut Model, view: usize, is_new_camera: bool) {
+pub fn around(scene: &Scene, model: &mut Model, view: usize, is_new_camera: bool, recorder: &mut Recorder) {
     let near = neighbours(scene, model, view);
     let tracks = covering(scene, model, &near, OF_VIEW_WHILE_GROWING);
     let mut views: Vec<usize> = tracks
@@ -159,7 +162,7 @@ pub fn around(scene: &Scene, model: &mut Model, view: usize, is_new_camera: bool
         models[scene.group_of[view]] = IntrinsicsModel::FOCAL;
     }
     let free = Free { models: &models, views: Some(&moves), points: None };
-    extract.adjust(scene, model, &free, ITERATIONS_AROUND);
+    extract.adjust(scene, model, &free, ITERATIONS_AROUND, recorder);
     if !scene.stop().is_stopped() {
         extract.write_back(model);
     }
@@ -180,12 +183,12 @@ fn neighbours(scene: &Scene, model: &Model, view: usize) -> Vec<usize> {
 }
 
 /// Adjusts all registered views and verified landmarks.
-pub fn all(scene: &Scene, model: &mut Model) {
+pub fn all(scene: &Scene, model: &mut Model, recorder: &mut Recorder) {
     let views = model.registered();
     let tracks = verified(model);
     let mut extract = Extract::new(scene, model, &views, &tracks);
     let models: Vec<IntrinsicsModel> = model.lenses.iter().map(|lens| lens.free).collect();
-    extract.adjust(scene, model, &Free::all(&models), ITERATIONS);
+    extract.adjust(scene, model, &Free::all(&models), ITERATIONS, recorder);
     finish(scene, model, &extract);
 }
 

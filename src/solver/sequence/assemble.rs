@@ -22,7 +22,7 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
     let grade = extended.grade();
     let Extended { seed, scene, model, calibrations, unregistered } = extended;
     let context = &scene.context;
-    let mut judged = judged(&scene, &model);
+    let mut judged = judged(&scene, &model, &mut recorder);
     let metric = grade != Grade::ProjectiveOnly;
     warnings.extend(told(&calibrations, &scene));
     warnings.extend(seed.second_structure.clone());
@@ -101,7 +101,7 @@ fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Cali
 }
 
 /// Every track and observation judged by all registered views.
-fn judged(scene: &Scene, model: &Model) -> Judged {
+fn judged(scene: &Scene, model: &Model, recorder: &mut Recorder) -> Judged {
     let context = &scene.context;
     let cameras = model.cameras(scene);
     let lenses: Vec<Intrinsics> = (0..cameras.len()).map(|view| *model.intrinsics_of(scene, view)).collect();
@@ -119,7 +119,8 @@ fn judged(scene: &Scene, model: &Model) -> Judged {
         outlier_density: scene.outlier_density,
         inlier_share: (verified as f64 + 1.0) / (tried.max(verified) as f64 + 2.0),
     };
-    judge::judge(context.input, context.ranges, &geometry, context.stop)
+    let mut told = |verdicts| recorder.judged(verdicts, scene.tracks());
+    judge::judge(context.input, context.ranges, &geometry, context.threads, context.stop, &mut told)
 }
 
 /// For each part the homography of its first view, see [`first_view_frame`].

@@ -5,10 +5,11 @@ use nalgebra::Vector4;
 use super::adjust::{self, Extract};
 use super::model::{Model, Scene};
 use super::windows;
-use crate::domain::{Warning, WarningCode};
+use crate::domain::{Task, Warning, WarningCode};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::solver::calibration::{self, Outcome};
+use crate::solver::recorder::Recorder;
 use crate::solver::{Context, Error, block};
 
 /// Views that a calibration is made from at most: the projective adjustment that it is compared with is cubic in them.
@@ -29,21 +30,33 @@ const LEAST_KEPT: usize = 3;
 ///
 /// # Errors
 /// [`Error::Stopped`].
-pub fn calibrate(scene: &Scene, model: &mut Model, context: &Context) -> Result<Vec<Outcome>, Error> {
+pub fn calibrate(
+    scene: &Scene,
+    model: &mut Model,
+    context: &Context,
+    recorder: &mut Recorder,
+) -> Result<Vec<Outcome>, Error> {
     let mut outcomes = Vec::with_capacity(scene.groups);
     for group in 0..scene.groups {
-        outcomes.push(of_group(scene, model, group, context)?);
+        recorder.step(Task::Cameras, group + 1, scene.groups, 0.0);
+        outcomes.push(of_group(scene, model, group, context, recorder)?);
     }
-    super::structure::triangulate(scene, model);
-    adjust::all(scene, model);
+    super::structure::triangulate(scene, model, recorder);
+    adjust::all(scene, model, recorder);
     for (group, outcome) in outcomes.iter_mut().enumerate() {
         admit_difference(model, group, outcome);
-        windows::reconcile(scene, model, group, context, outcome)?;
+        windows::reconcile(scene, model, group, outcome, recorder)?;
     }
     Ok(outcomes)
 }
 
-fn of_group(scene: &Scene, model: &mut Model, group: usize, context: &Context) -> Result<Outcome, Error> {
+fn of_group(
+    scene: &Scene,
+    model: &mut Model,
+    group: usize,
+    context: &Context,
+    recorder: &mut Recorder,
+) -> Result<Outcome, Error> {
     let registered = model.registered();
     let views: Vec<usize> = registered.iter().copied().filter(|&view| scene.group_of[view] == group).collect();
     if views.len() < block::LEAST_VIEWS {
@@ -67,7 +80,8 @@ fn of_group(scene: &Scene, model: &mut Model, group: usize, context: &Context) -
         focal_prior: scene.focal_priors[group],
         focal_per_view: false,
     };
-    let outcome = calibration::from_metric(&problem, &metric, context.scale_px, context.stop)?;
+    let outcome =
+        calibration::from_metric(&problem, &metric, context.scale_px, context.stop, &mut || recorder.sign_of_life())?;
     if let Some(metric) = &outcome.metric {
         let lens = &mut model.lenses[group];
         lens.free = outcome.model;

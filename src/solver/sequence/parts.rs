@@ -22,7 +22,7 @@ const PRIOR_SIGMA: f64 = 0.02;
 const VAGUE_SIGMA: f64 = 0.5;
 
 /// The model that a block begins.
-pub fn first(scene: &Scene, seed: &Attempt) -> Model {
+pub fn first(scene: &Scene, seed: &Attempt, recorder: &mut Recorder) -> Model {
     let metric = seed.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref());
     let noise = seed.consensus.as_ref().map_or(0.0, |consensus| consensus.noise);
     let intrinsics = metric.map_or_else(|| Intrinsics::from_focal(1.0), |metric| metric.intrinsics);
@@ -30,7 +30,7 @@ pub fn first(scene: &Scene, seed: &Attempt) -> Model {
     if let Some(metric) = metric {
         model.add_part(scene, FIRST, &seed.block.views, metric);
     }
-    structure::triangulate(scene, &mut model);
+    structure::triangulate(scene, &mut model, recorder);
     model
 }
 
@@ -58,7 +58,7 @@ pub fn others(
         let told = prior.filter(|_| scene.group_of[views[0]] == first_group);
         let context = Context { focal_prior: told, ..scene.context };
         let block = block::extract(context.input, context.ranges, context.normalization, &views);
-        recorder.begin_part();
+        recorder.begin_part(part);
         let attempt = attempt::solve_block(block, &context, recorder)?;
         recorder.end_part();
         // Whatever comes of it, a block is tried once.
@@ -68,9 +68,9 @@ pub fn others(
             continue;
         };
         model.add_part(scene, part, &attempt.block.views, metric);
-        structure::triangulate_seen(scene, model, &attempt.block.views);
+        structure::triangulate_seen(scene, model, &attempt.block.views, recorder);
         register::join(scene, model, part, trials, recorder)?;
-        drop_unsupported(scene, model, part);
+        drop_unsupported(scene, model, part, recorder);
         failures = if model.of_part(part).is_empty() { failures + 1 } else { 0 };
         for (open, pose) in open.iter_mut().zip(&model.poses) {
             *open &= pose.is_none();
@@ -102,7 +102,7 @@ fn prior_of(seed: &Attempt, model: &Model, group: usize, context: &Context) -> O
 
 /// Takes back the views of a part that see too few of its points to be held by them, and the whole part if too few are
 /// left.
-pub fn drop_unsupported(scene: &Scene, model: &mut Model, part: u32) {
+pub fn drop_unsupported(scene: &Scene, model: &mut Model, part: u32, recorder: &mut Recorder) {
     let unsupported = |&view: &usize| {
         let kept = scene.of_view[view].iter().filter(|&&k| {
             let k = k as usize;
@@ -116,7 +116,8 @@ pub fn drop_unsupported(scene: &Scene, model: &mut Model, part: u32) {
         dropped.clone_from(&views);
     }
     model.unregister(scene, &dropped);
-    structure::triangulate_seen(scene, model, &dropped);
+    structure::triangulate_seen(scene, model, &dropped, recorder);
+    recorder.registered(model.registered().len());
 }
 
 /// Numbers the parts anew, the one with most views first; of equals the one found first.

@@ -66,7 +66,7 @@ pub fn join(
     // Views that another part could not take may fit this one.
     trials.iter_mut().for_each(|trial| trial.count = 0);
     model.turn_to(scene, part);
-    settle(scene, model, part);
+    settle(scene, model, part, recorder);
     let mut adjusted_at = model.of_part(part).len();
     loop {
         scene.context.stopped()?;
@@ -75,22 +75,24 @@ pub fn join(
             if model.of_part(part).len() == adjusted_at {
                 break;
             }
-            settle(scene, model, part);
+            settle(scene, model, part, recorder);
             adjusted_at = model.of_part(part).len();
             continue;
         };
-        let (points, agreeing) = register(scene, model, part, view, &seen, &mut rng);
+        let (points, agreeing) = register(scene, model, part, view, &seen, &mut rng, recorder);
         let trial = &mut trials[view];
         *trial = Trial { count: trial.count + 1, seen: seen.len(), points, agreeing };
         let grown = model.of_part(part).len();
         if grown as f64 >= ADJUST_GROWTH * adjusted_at as f64 {
-            settle(scene, model, part);
+            settle(scene, model, part, recorder);
             adjusted_at = grown;
             recorder.standing.inliers = adjust::verified(model).len() as u32;
         }
         let focal = model.intrinsics_of(scene, view).focal;
         recorder.standing.focal_px = Some(focal * scene.context.scale_px);
-        recorder.tell(model.registered().len() as f64 / views);
+        let registered = model.registered().len();
+        recorder.registered(registered);
+        recorder.tell(super::SHARE_OF_REGISTERING * registered as f64 / views);
     }
     Ok(())
 }
@@ -105,10 +107,10 @@ pub fn left(scene: &Scene, model: &Model, trials: &[Trial]) -> Vec<Unregistered>
 }
 
 /// Adjusts a part and triangulates it anew.
-fn settle(scene: &Scene, model: &mut Model, part: u32) {
-    adjust::while_growing(scene, model, part);
+fn settle(scene: &Scene, model: &mut Model, part: u32, recorder: &mut Recorder) {
+    adjust::while_growing(scene, model, part, recorder);
     adjust::rescale(scene, model, part);
-    structure::triangulate_seen(scene, model, &model.of_part(part));
+    structure::triangulate_seen(scene, model, &model.of_part(part), recorder);
 }
 
 /// Observations of a view whose track has a point of the part that may support a pose.
@@ -144,6 +146,7 @@ fn register(
     view: usize,
     seen: &[usize],
     rng: &mut ChaCha8Rng,
+    recorder: &mut Recorder,
 ) -> (usize, usize) {
     let is_new_camera = !model.lenses[scene.group_of[view]].is_known;
     let step = seen.len().div_ceil(MOST_POINTS).max(1);
@@ -160,9 +163,9 @@ fn register(
     }
     model.lenses[scene.group_of[view]].intrinsics = intrinsics;
     model.register(scene, view, part, pose);
-    structure::triangulate_seen(scene, model, &[view]);
-    adjust::around(scene, model, view, is_new_camera);
-    structure::triangulate_seen(scene, model, &[view]);
+    structure::triangulate_seen(scene, model, &[view], recorder);
+    adjust::around(scene, model, view, is_new_camera, recorder);
+    structure::triangulate_seen(scene, model, &[view], recorder);
     (seen.len(), agreeing)
 }
 

@@ -5,6 +5,8 @@ use nalgebra::Vector3;
 use super::model::{Landmark, Model, Scene};
 use crate::geometry::measurement::Sighting;
 use crate::geometry::{Camera, Point, robust_triangulation};
+use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
+use crate::solver::recorder::Recorder;
 
 /// Observations that two views and one that verifies them make.
 const VERIFIED: usize = 3;
@@ -13,61 +15,76 @@ const VERIFIED: usize = 3;
 const LEAST_ANGLE: f64 = 0.005;
 /// The same for points that only two views see, which nothing verifies: a twenty-eighth.
 const LEAST_ANGLE_OF_TWO: f64 = 0.02;
-/// Tracks between two looks at the stop token.
-const TRACKS_PER_LOOK: usize = 64;
 
 /// Triangulates every track anew.
-pub fn triangulate(scene: &Scene, model: &mut Model) {
+pub fn triangulate(scene: &Scene, model: &mut Model, recorder: &mut Recorder) {
     let tracks: Vec<usize> = (0..scene.tracks()).collect();
-    triangulate_some(scene, model, &tracks);
+    triangulate_some(scene, model, &tracks, recorder);
 }
 
 /// Triangulates every track that these views see anew.
-pub fn triangulate_seen(scene: &Scene, model: &mut Model, views: &[usize]) {
+pub fn triangulate_seen(scene: &Scene, model: &mut Model, views: &[usize], recorder: &mut Recorder) {
     let seen = views.iter().flat_map(|&view| &scene.of_view[view]).map(|&k| scene.track_of(k as usize));
     let mut tracks: Vec<usize> = seen.collect();
     tracks.sort_unstable();
     tracks.dedup();
-    triangulate_some(scene, model, &tracks);
+    triangulate_some(scene, model, &tracks, recorder);
 }
 
 /// Triangulates these tracks anew from the registered views.
-pub fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize]) {
+fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize], recorder: &mut Recorder) {
     let cameras: Vec<Camera> =
         model.cameras(scene).into_iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
     let gate = model.gate(scene);
-    for (place, &track) in tracks.iter().enumerate() {
-        if place.is_multiple_of(TRACKS_PER_LOOK) && scene.stop().is_stopped() {
+    let threads = scene.context.threads.if_worth(tracks.len() >= WORTH_A_THREAD);
+    for batch in tracks.chunks(BATCH) {
+        // Of one track nothing depends on what becomes of another.
+        let standing = &*model;
+        let of_track = |place: usize| {
+            (!scene.stop().is_stopped()).then(|| landmark(scene, standing, &cameras, gate, batch[place])).flatten()
+        };
+        let found = threads.map(batch.len(), TRACKS_A_RUN, of_track, &mut |_| recorder.sign_of_life());
+        if scene.stop().is_stopped() {
             return;
         }
-        forget(scene, model, track);
-        let Some(part) = part_of_track(scene, model, track) else { continue };
-        let seen: Vec<(usize, Sighting)> = scene
-            .of_track(track)
-            .filter(|&k| model.part_of[scene.view_of(k)] == part)
-            .filter_map(|k| Some((k, model.sighting(scene, k)?)))
-            .collect();
-        if seen.len() < 2 {
-            continue;
-        }
-        let sightings: Vec<Sighting> = seen.iter().map(|(_, sighting)| *sighting).collect();
-        let Some(found) = robust_triangulation::robust(&cameras, &sightings, gate) else { continue };
-        let Some(position) = euclidean(&found.point) else { continue };
-        let rays = seen.iter().zip(&found.agrees).filter(|(_, agrees)| **agrees).filter_map(|((_, sighting), _)| {
-            let pose = model.poses[sighting.view]?;
-            Some((position + pose.rotation.tr_mul(&pose.translation)).normalize())
-        });
-        let landmark = Landmark {
-            position,
-            angle: widest_angle(&rays.collect::<Vec<_>>()),
-            part,
-            support: found.agrees.iter().filter(|&&agrees| agrees).count(),
-        };
-        model.set_landmark(scene, track, Some(landmark));
-        for ((k, _), agrees) in seen.iter().zip(found.agrees) {
-            model.kept[*k] = agrees;
+        for (&track, found) in batch.iter().zip(found) {
+            forget(scene, model, track);
+            if let Some((landmark, agreeing)) = found {
+                model.set_landmark(scene, track, Some(landmark));
+                agreeing.into_iter().for_each(|k| model.kept[k] = true);
+            }
         }
     }
+}
+
+/// The point of a track, with the observations that agree with it; `None` where there is none.
+fn landmark(
+    scene: &Scene,
+    model: &Model,
+    cameras: &[Camera],
+    gate: f64,
+    track: usize,
+) -> Option<(Landmark, Vec<usize>)> {
+    let part = part_of_track(scene, model, track)?;
+    let seen: Vec<(usize, Sighting)> = scene
+        .of_track(track)
+        .filter(|&k| model.part_of[scene.view_of(k)] == part)
+        .filter_map(|k| Some((k, model.sighting(scene, k)?)))
+        .collect();
+    if seen.len() < 2 {
+        return None;
+    }
+    let sightings: Vec<Sighting> = seen.iter().map(|(_, sighting)| *sighting).collect();
+    let found = robust_triangulation::robust(cameras, &sightings, gate)?;
+    let position = euclidean(&found.point)?;
+    let agreeing = || seen.iter().zip(&found.agrees).filter(|(_, agrees)| **agrees).map(|(seen, _)| seen);
+    let rays = agreeing().filter_map(|(_, sighting)| {
+        let pose = model.poses[sighting.view]?;
+        Some((position + pose.rotation.tr_mul(&pose.translation)).normalize())
+    });
+    let angle = widest_angle(&rays.collect::<Vec<_>>());
+    let agreeing: Vec<usize> = agreeing().map(|(k, _)| *k).collect();
+    Some((Landmark { position, angle, part, support: agreeing.len() }, agreeing))
 }
 
 /// Takes the point of a track away.

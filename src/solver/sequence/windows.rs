@@ -4,13 +4,14 @@
 //! motion that hardly turns moves windows apart by more than it admits. They are fused by information weight, with a
 //! common misfit that makes their chi-square what it should be (DerSimonian & Laird 1986).
 
-use super::adjust::{self, Extract};
+use super::adjust;
 use super::calibrate;
 use super::model::{Model, Scene};
-use crate::domain::{Warning, WarningCode};
+use crate::domain::{Task, Warning, WarningCode};
+use crate::solver::Error;
 use crate::solver::agreement::Estimate;
 use crate::solver::calibration::{self, Outcome, grade_of_sigma};
-use crate::solver::{Context, Error};
+use crate::solver::recorder::Recorder;
 
 /// Views of a window where there are many, and of the shortest one: below, a window says little of a focal length.
 const VIEWS: usize = 10;
@@ -39,11 +40,11 @@ pub fn reconcile(
     scene: &Scene,
     model: &Model,
     group: usize,
-    context: &Context,
     outcome: &mut Outcome,
+    recorder: &mut Recorder,
 ) -> Result<(), Error> {
     let Some(own) = outcome.sigma_log_focal else { return Ok(()) };
-    let estimates = estimates(scene, model, group, context)?;
+    let estimates = estimates(scene, model, group, recorder)?;
     let Some(fused) = fuse(&estimates) else { return Ok(()) };
     let apart = (fused.log_focal - model.lenses[group].intrinsics.focal.ln()).abs();
     let sigma = own.max(fused.sigma).max(apart);
@@ -67,21 +68,24 @@ pub fn reconcile(
 }
 
 /// What each window says by itself, the lens as the whole has it.
-fn estimates(scene: &Scene, model: &Model, group: usize, context: &Context) -> Result<Vec<Estimate>, Error> {
-    let mut found = Vec::new();
+fn estimates(scene: &Scene, model: &Model, group: usize, recorder: &mut Recorder) -> Result<Vec<Estimate>, Error> {
     let parts = model.part_of.iter().copied().max().unwrap_or(0);
     let of_group = |part: u32| -> Vec<usize> {
         model.of_part(part).into_iter().filter(|&view| scene.group_of[view] == group).collect()
     };
-    for views in windows(&(0..=parts).map(of_group).collect::<Vec<_>>()) {
-        context.stopped()?;
-        let extract = calibrate::core(scene, model, &views, OF_VIEW);
-        found.extend(estimate(scene, model, group, &extract, context));
-    }
-    Ok(found)
+    let windows = windows(&(0..=parts).map(of_group).collect::<Vec<_>>());
+    let of_window =
+        |k: usize| (!scene.stop().is_stopped()).then(|| estimate(scene, model, group, &windows[k])).flatten();
+    let mut told = |k: usize| {
+        recorder.step(Task::Windows, k + 1, windows.len(), k as f64 / windows.len() as f64);
+    };
+    let found = scene.context.threads.map(windows.len(), 1, of_window, &mut told);
+    scene.context.stopped()?;
+    Ok(found.into_iter().flatten().collect())
 }
 
-fn estimate(scene: &Scene, model: &Model, group: usize, extract: &Extract, context: &Context) -> Option<Estimate> {
+fn estimate(scene: &Scene, model: &Model, group: usize, views: &[usize]) -> Option<Estimate> {
+    let extract = calibrate::core(scene, model, views, OF_VIEW);
     let (metric, observations) = extract.constant();
     let (cameras, points) = calibrate::projective(&metric);
     let problem = calibration::Problem {
@@ -93,7 +97,7 @@ fn estimate(scene: &Scene, model: &Model, group: usize, extract: &Extract, conte
         focal_per_view: false,
     };
     let prior = adjust::knowledge(scene, group, model.noise);
-    let (log_focal, sigma) = calibration::focal_alone(&problem, &metric, &prior, context.stop)?;
+    let (log_focal, sigma) = calibration::focal_alone(&problem, &metric, &prior, scene.stop())?;
     Some(Estimate { log_focal, sigma })
 }
 

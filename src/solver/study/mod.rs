@@ -8,9 +8,10 @@ use std::time::Instant;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
+use super::chance::{self, LN_DECISIVE};
 use super::grow::{self, Consensus};
 use super::learned::Opinion;
-use super::portfolio::{LN_DECISIVE, spread};
+use super::portfolio::spread;
 use super::search::{Sampler, Shortlist, affine};
 use super::{block, priors};
 use crate::domain::{Input, Prior, StopToken};
@@ -47,7 +48,7 @@ pub struct Found {
 impl Study {
     /// The input's tracks that are complete over all its views, their depths left aside.
     pub fn new(input: &Input, stop: &StopToken) -> Self {
-        let ranges = block::track_ranges(input);
+        let ranges = input.track_ranges();
         let (normalization, _) = block::normalization(input);
         let views: Vec<usize> = (0..input.view_count()).collect();
         let block = block::extract(input, &ranges, &normalization, &views).complete;
@@ -101,7 +102,7 @@ impl Study {
         for seed in seeds {
             let grown = grow::grow(&self.block, seed.cameras, seed.points, seed.support, NOISE, &self.stop);
             let Some(consensus) = grown else { continue };
-            let certainty = consensus.ln_false_alarms(spread);
+            let certainty = chance::ln_false_alarms(&self.block, &consensus, spread, &self.stop);
             if best.as_ref().is_none_or(|(least, _)| certainty < *least) {
                 best = Some((certainty, consensus));
             }

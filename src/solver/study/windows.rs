@@ -36,7 +36,7 @@ pub struct WindowRankings {
 
 /// Every window of an input, those that show no tracks left out.
 pub fn windows(input: &Input) -> Vec<Window> {
-    let ranges = block::track_ranges(input);
+    let ranges = input.track_ranges();
     let (normalization, _) = block::normalization(input);
     let seen = |k: usize, first: usize| {
         let view = input.view_of(k);

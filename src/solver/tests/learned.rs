@@ -64,3 +64,15 @@ fn without_the_trained_network_the_search_stands_on_its_own() {
         assert_eq!(solution.trained_network, None);
     }
 }
+
+/// Of 3,000 tracks a search looks at 600; a random sample of these scenes has seven right ones, and geometry asks for eight.
+#[test]
+fn where_hardly_any_track_of_a_sample_is_right_the_likeliest_of_all_are_searched() {
+    for seed in [500_012, 500_031, 500_092] {
+        let (input, scene) = scene(SceneOptions { tracks: 3_000, outliers: 0.98, seed, ..SceneOptions::default() });
+        let solution = solved(&input, &SolveSettings::default());
+        let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
+        assert!(f1 > 0.95, "seed {seed}: F1 {f1}, {:?}", solution.warnings);
+        assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}");
+    }
+}

@@ -1,5 +1,6 @@
 //! Whole solves, from an input to a solution.
 
+mod chance;
 mod copies;
 mod learned;
 mod lenses;

@@ -201,9 +201,39 @@ impl Layout {
         self.coupling_starts[point]..self.coupling_starts[point + 1]
     }
 
+    /// Where the couplings of a run of points are.
+    pub fn couplings_of(&self, points: Range<usize>) -> Range<usize> {
+        self.coupling_starts[points.start]..self.coupling_starts[points.end]
+    }
+
     /// Values of all couplings.
     pub fn coupling_count(&self) -> usize {
         self.coupling_starts[self.point_count()]
+    }
+
+    /// Where the observations of a run of points are among all.
+    pub fn seen_range(&self, points: Range<usize>) -> Range<usize> {
+        self.seen_starts[points.start]..self.seen_starts[points.end]
+    }
+
+    /// Observations of each view, ascending: their starts and, one view after the other, where the observations are among
+    /// all.
+    pub fn seen_by_view(&self, views: usize) -> (Vec<usize>, Vec<u32>) {
+        let mut starts = vec![0; views + 1];
+        self.seen.iter().for_each(|seen| starts[seen.view + 1] += 1);
+        accumulate(&mut starts);
+        let mut next = starts.clone();
+        let mut by_view = vec![0; self.seen.len()];
+        for (k, seen) in self.seen.iter().enumerate() {
+            by_view[next[seen.view]] = k as u32;
+            next[seen.view] += 1;
+        }
+        (starts, by_view)
+    }
+
+    /// All observations, sorted by point.
+    pub fn all_seen(&self) -> &[Seen] {
+        &self.seen
     }
 
     /// Points that touch each block, ascending: their starts and, one block after the other, the points.

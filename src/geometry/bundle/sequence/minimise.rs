@@ -5,14 +5,14 @@ use nalgebra::{Rotation3, Vector3};
 use super::super::engine::{DAMPING_DOWN, DAMPING_UP, MAX_ATTEMPTS, UNDEFINED_SQUARED, usable_squared_norm};
 use super::super::metric::IntrinsicsPrior;
 use super::super::{Loss, Options, Report};
+use super::crew::Crew;
 use super::layout::{Layout, Seen};
 use super::normal::Normal;
 use super::pattern::Pattern;
 use super::reduced::{Reduced, substitute};
 use super::settle::settle_points;
 use super::solver::Solver;
-use super::{Free, Pace, Sequence, Sighting};
-use crate::domain::StopToken;
+use super::{Free, Pace, Run, Sequence, Sighting};
 
 /// Least damping, as a share of the diagonal. Lower than for a block: the weakest directions of a long chain of views
 /// would hardly move at a block's. Where rounding takes the system's definiteness, the attempt fails and is repeated
@@ -33,9 +33,10 @@ const SETTLE_WITHIN: f64 = 2.0;
 /// * `priors`: what is known of the intrinsics, one a group; nothing of a group beyond the slice
 ///
 /// The cost contains what the priors of groups with free intrinsics add, and never rises. What is held stays as it is,
-/// to the bit. One iteration costs time linear in the observations times the length of their tracks, and what the
-/// factorisation takes: linear in the views where each is connected with a bounded number of others. `stop` is asked
-/// every few milliseconds but not within a factorisation; a stopped, stuck or degenerate problem keeps its last good
+/// to the bit; what is found does not depend on the threads. One iteration costs time linear in the observations times
+/// the length of their tracks, and what the factorisation takes: linear in the views where each is connected with a
+/// bounded number of others. `run.stop` is asked every few milliseconds but not within a factorisation; a stopped, stuck
+/// or degenerate problem keeps its last good
 /// state. The costs of one that was stopped before they were known are infinite.
 ///
 /// # Pitfall
@@ -46,20 +47,22 @@ pub fn adjust(
     free: &Free,
     priors: &[IntrinsicsPrior],
     options: &Options,
-    stop: &StopToken,
+    run: Run,
 ) -> Report {
+    let Run { threads, stop, told } = run;
     let mut pace = Pace::new(stop);
     let unknown = Report { initial_cost: f64::INFINITY, cost: f64::INFINITY, iterations: 0 };
     let Some(layout) = Layout::new(sequence, sightings, free, &mut pace) else { return unknown };
-    let Some(initial_cost) = cost(sequence, &layout, priors, options.loss, &mut pace) else { return unknown };
+    let crew = Crew::new(&layout, threads, stop);
+    let Some(initial_cost) = cost(sequence, &layout, priors, options.loss, &crew) else { return unknown };
     let mut report = Report { initial_cost, cost: initial_cost, iterations: 0 };
     if layout.is_empty() || stop.is_stopped() {
         return report;
     }
-    let Some(mut descent) = Descent::new(sequence, &layout, priors, options, pace) else { return report };
+    let Some(mut descent) = Descent::new(sequence, &layout, priors, options, crew, &mut pace) else { return report };
     let mut trial = sequence.clone();
     while report.iterations < options.max_iterations && report.cost > 0.0 {
-        let Some(cost) = descent.step(sequence, &mut trial, report.cost) else { break };
+        let Some(cost) = descent.step(sequence, &mut trial, report.cost, told) else { break };
         std::mem::swap(sequence, &mut trial);
         let gain = report.cost - cost;
         report.cost = cost;
@@ -79,20 +82,15 @@ pub(super) fn pattern(sequence: &Sequence, layout: &Layout, pace: &mut Pace) -> 
 }
 
 /// Sum of the loss over the observations and of what the priors add; `None` when it was stopped.
-fn cost(sequence: &Sequence, layout: &Layout, priors: &[IntrinsicsPrior], loss: Loss, pace: &mut Pace) -> Option<f64> {
+fn cost(sequence: &Sequence, layout: &Layout, priors: &[IntrinsicsPrior], loss: Loss, crew: &Crew) -> Option<f64> {
     let mut sum = 0.0;
     for (group, (prior, intrinsics)) in priors.iter().zip(&sequence.intrinsics).enumerate() {
         for parameter in &layout.unknowns.parameters[group] {
             sum += prior.information[*parameter as usize] * prior.deviation(*parameter, intrinsics).powi(2);
         }
     }
-    for (point, position) in sequence.points.iter().enumerate() {
-        let seen = layout.seen(point);
-        if !pace.go_on(seen.len()) {
-            return None;
-        }
-        sum += cost_of_point(sequence, seen, position, loss);
-    }
+    let of_point = |point: usize| Some(cost_of_point(sequence, layout.seen(point), &sequence.points[point], loss));
+    crew.of_points(layout, of_point)?.into_iter().for_each(|cost| sum += cost);
     Some(sum)
 }
 
@@ -116,7 +114,7 @@ struct Descent<'a> {
     reduced: Reduced,
     solver: Solver,
     damping: f64,
-    pace: Pace<'a>,
+    crew: Crew<'a>,
 }
 
 impl<'a> Descent<'a> {
@@ -125,9 +123,10 @@ impl<'a> Descent<'a> {
         layout: &'a Layout,
         priors: &'a [IntrinsicsPrior],
         options: &Options,
-        mut pace: Pace<'a>,
+        crew: Crew<'a>,
+        pace: &mut Pace,
     ) -> Option<Self> {
-        let pattern = pattern(sequence, layout, &mut pace)?;
+        let pattern = pattern(sequence, layout, pace)?;
         Some(Self {
             layout,
             priors,
@@ -136,21 +135,22 @@ impl<'a> Descent<'a> {
             normal: Normal::new(layout, &pattern, sequence),
             reduced: Reduced::new(layout, pattern),
             damping: options.initial_damping.max(MIN_DAMPING),
-            pace,
+            crew,
         })
     }
 
     /// Linearises and raises the damping until `trial` costs less than `present`; its cost.
-    fn step(&mut self, sequence: &Sequence, trial: &mut Sequence, present: f64) -> Option<f64> {
-        if !self.normal.fill(sequence, self.layout, self.priors, self.loss, &mut self.pace) {
+    fn step(&mut self, sequence: &Sequence, trial: &mut Sequence, present: f64, told: &mut dyn FnMut()) -> Option<f64> {
+        if !self.normal.fill(sequence, self.layout, self.priors, self.loss, &self.crew) {
             return None;
         }
         let mut growth = DAMPING_UP;
         for _ in 0..MAX_ATTEMPTS {
-            if self.pace.stop.is_stopped() {
+            if self.crew.is_stopped() {
                 return None;
             }
             let lowered = self.attempt(sequence, trial, present);
+            told();
             if lowered.is_some() {
                 self.damping = (self.damping / DAMPING_DOWN).max(MIN_DAMPING);
                 return lowered;
@@ -163,8 +163,8 @@ impl<'a> Descent<'a> {
 
     /// Moves `trial` to where the damped step leads from `sequence`; its cost where that is less than `present`.
     fn attempt(&mut self, sequence: &Sequence, trial: &mut Sequence, present: f64) -> Option<f64> {
-        let Self { layout, normal, reduced, pace, .. } = self;
-        if !reduced.build(layout, normal, self.damping, pace) {
+        let Self { layout, normal, reduced, crew, .. } = self;
+        if !reduced.build(layout, normal, self.damping, crew) {
             return None;
         }
         reduced.damp(normal, self.damping);
@@ -173,10 +173,10 @@ impl<'a> Descent<'a> {
         }
         let step = &reduced.vector;
         let possible = retract(trial, sequence, layout, step);
-        if !possible || !substitute(trial, sequence, layout, normal, self.damping, step, pace) {
+        if !possible || !substitute(trial, sequence, layout, normal, self.damping, step, crew) {
             return None;
         }
-        let cost = cost(trial, layout, self.priors, self.loss, pace)?;
+        let cost = cost(trial, layout, self.priors, self.loss, crew)?;
         if cost < present {
             return Some(cost);
         }
@@ -184,7 +184,7 @@ impl<'a> Descent<'a> {
             return None;
         }
         // Cheaper than another system: most of what a long step spoils is the points' part of its curvature.
-        let cost = cost - settle_points(trial, layout, self.loss, pace)?;
+        let cost = cost - settle_points(trial, layout, self.loss, crew)?;
         (cost < present).then_some(cost)
     }
 }

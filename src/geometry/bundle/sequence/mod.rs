@@ -5,6 +5,7 @@
 //! Shares residuals, loss and damping with the dense adjustment of one block, `bundle::metric`. May depend on nothing
 //! of `geometry` but `bundle` and linear algebra.
 
+mod crew;
 mod layout;
 mod minimise;
 mod normal;
@@ -22,6 +23,7 @@ pub use self::minimise::adjust;
 use super::Observation;
 use super::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
 use crate::domain::StopToken;
+use crate::parallel::Threads;
 
 /// A metric reconstruction, up to a similarity, whose views share intrinsics in groups.
 #[derive(Debug, Clone, PartialEq)]
@@ -111,6 +113,15 @@ impl Sequence {
             && seen.weight > 0.0
             && seen.weight.is_finite()
     }
+}
+
+/// Who does an adjustment, who may end it, and who hears that it goes on.
+pub struct Run<'a> {
+    /// However many, they find the same, to the last bit.
+    pub threads: Threads,
+    pub stop: &'a StopToken,
+    /// Called after every attempt at a step.
+    pub told: &'a mut dyn FnMut(),
 }
 
 /// Observations' worth of work after which the stop token is asked: some milliseconds, 20 in builds for tests.

@@ -1,15 +1,19 @@
 //! The normal equations at one state: what poses and intrinsics have among themselves, their couplings with the
 //! points, and the blocks of the points.
 
+use std::ops::Range;
+
 use nalgebra::Vector3;
 
 use super::super::Loss;
 use super::super::engine::usable_squared_norm;
 use super::super::metric::{IntrinsicsPrior, POSE, Parameter};
+use super::crew::{Crew, split_off};
 use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
 use super::point::PointBlock;
 use super::{Pace, Sequence};
+use crate::parallel::even_cuts;
 
 /// Where a view's residuals go in the camera part of the normal equations.
 #[derive(Debug, Clone, Copy)]
@@ -23,6 +27,7 @@ struct ViewPlaces {
 }
 
 /// One observation's weighted residual and Jacobian, by rows.
+#[derive(Debug)]
 pub(super) struct Weighted {
     pub residual: [f64; 2],
     pose: [[f64; POSE]; 2],
@@ -66,6 +71,10 @@ pub(super) struct Cameras {
     pub values: Vec<f64>,
     /// Half the gradient of the cost.
     pub gradient: Vec<f64>,
+    /// Values and unknowns that belong to the poses before each view's, and to all of them: the groups' come after these.
+    before: Vec<(usize, usize)>,
+    /// Observations of each view: starts, and one view after the other where they are among all.
+    by_view: (Vec<usize>, Vec<u32>),
 }
 
 /// The normal equations `J' J dx = -J' r`.
@@ -75,6 +84,35 @@ pub(super) struct Normal {
     /// Couplings of poses and intrinsics with the points, `Jc' Jp`.
     pub couplings: Vec<f64>,
     pub points: Vec<PointBlock>,
+    /// Rows of the Jacobian of a batch of points.
+    rows: Vec<Option<Weighted>>,
+}
+
+/// Some points of a batch, to be linearised.
+struct Points<'a> {
+    range: Range<usize>,
+    rows: &'a mut [Option<Weighted>],
+    couplings: &'a mut [f64],
+    blocks: &'a mut [PointBlock],
+}
+
+/// What the rows of a batch are added to.
+enum Sums<'a> {
+    /// Blocks of some views' poses and theirs with the intrinsics.
+    Views { range: Range<usize>, values: &'a mut [f64], gradient: &'a mut [f64] },
+    /// Blocks of all groups' intrinsics.
+    Groups { values: &'a mut [f64], gradient: &'a mut [f64] },
+}
+
+/// What a batch adds, and where.
+struct Batch<'a> {
+    places: &'a [ViewPlaces],
+    before: &'a [(usize, usize)],
+    /// Free intrinsics of each group.
+    parameters: &'a [Vec<Parameter>],
+    /// Where the batch begins among all observations.
+    first: usize,
+    rows: &'a [Option<Weighted>],
 }
 
 impl Normal {
@@ -83,37 +121,81 @@ impl Normal {
             cameras: Cameras::new(layout, pattern, sequence),
             couplings: vec![0.0; layout.coupling_count()],
             points: vec![PointBlock::ZERO; layout.point_count()],
+            rows: Vec::new(),
         }
     }
 
     /// Linearises at this state; `false` when it was stopped.
+    ///
+    /// Batch by batch: first the rows of the Jacobian and what each point has to itself, then every view adds up its own
+    /// rows, in the order of the observations.
     pub fn fill(
         &mut self,
         sequence: &Sequence,
         layout: &Layout,
         priors: &[IntrinsicsPrior],
         loss: Loss,
-        pace: &mut Pace,
+        crew: &Crew,
     ) -> bool {
         self.cameras.values.fill(0.0);
         self.cameras.gradient.fill(0.0);
         self.cameras.believe(sequence, layout, priors);
-        for (point, position) in sequence.points.iter().enumerate() {
+        let mut begun = self.cameras.by_view.0.clone();
+        crew.batches().all(|points| {
+            self.linearise(sequence, layout, loss, crew, points.clone())
+                && self.cameras.add_batch(sequence, layout, crew, points, &self.rows, &mut begun)
+        })
+    }
+
+    fn linearise(
+        &mut self,
+        sequence: &Sequence,
+        layout: &Layout,
+        loss: Loss,
+        crew: &Crew,
+        points: Range<usize>,
+    ) -> bool {
+        let seen = layout.seen_range(points.clone()).len();
+        // What is left from another batch is written over before it is read.
+        self.rows.resize_with(self.rows.len().max(seen), || None);
+        let mut rows = self.rows.as_mut_slice();
+        let mut couplings = &mut self.couplings[layout.couplings_of(points.clone())];
+        let mut blocks = &mut self.points[points.clone()];
+        let cut = |ends: &[usize]| {
+            let range = ends[0]..ends[1];
+            Points {
+                rows: split_off(&mut rows, layout.seen_range(range.clone()).len()),
+                couplings: split_off(&mut couplings, layout.couplings_of(range.clone()).len()),
+                blocks: split_off(&mut blocks, range.len()),
+                range,
+            }
+        };
+        let pieces = crew.cut(layout, points).windows(2).map(cut).collect();
+        crew.threads.each(pieces, |piece: Points| piece.linearise(sequence, layout, loss, crew.pace()))
+    }
+}
+
+impl Points<'_> {
+    /// `false` when it was stopped.
+    fn linearise(self, sequence: &Sequence, layout: &Layout, loss: Loss, mut pace: Pace) -> bool {
+        let (mut rows, mut couplings) = (self.rows, self.couplings);
+        for (point, slot) in self.range.zip(self.blocks) {
             let seen = layout.seen(point);
             if !pace.go_on(seen.len()) {
                 return false;
             }
             let mut block = PointBlock::ZERO;
-            let couplings = &mut self.couplings[layout.couplings(point)];
+            let couplings = split_off(&mut couplings, layout.couplings(point).len());
             couplings.fill(0.0);
-            for seen in seen {
-                if let Some(row) = Weighted::new(sequence, position, seen, loss) {
+            for (seen, slot) in seen.iter().zip(split_off(&mut rows, seen.len())) {
+                *slot = Weighted::new(sequence, &sequence.points[point], seen, loss);
+                if let Some(row) = slot {
                     block.add(&row.point, row.residual);
                     let parameters = &layout.unknowns.parameters[sequence.group_of[seen.view]];
-                    self.cameras.add(seen, &row, parameters, couplings);
+                    row.couple(seen, parameters, couplings);
                 }
             }
-            self.points[point] = block;
+            *slot = block;
         }
         true
     }
@@ -131,7 +213,17 @@ impl Cameras {
                 cross: pose.zip(group).and_then(|(pose, group)| pattern.place(group, pose)),
             }
         };
+        let mut before = vec![(0, 0)];
+        for block in &unknowns.pose_block {
+            let (values, poses) = before[before.len() - 1];
+            before.push(match block {
+                Some(block) => (pattern.panels(0..block + 1).end, unknowns.range(*block).end),
+                None => (values, poses),
+            });
+        }
         Self {
+            before,
+            by_view: layout.seen_by_view(sequence.poses.len()),
             places: (0..sequence.poses.len()).map(places).collect(),
             diagonal: pattern.diagonal(),
             values: vec![0.0; pattern.value_count()],
@@ -151,38 +243,150 @@ impl Cameras {
         }
     }
 
-    /// Adds one observation, also to the couplings of its point.
-    #[inline]
-    fn add(&mut self, seen: &Seen, row: &Weighted, parameters: &[Parameter], couplings: &mut [f64]) {
-        let places = self.places[seen.view];
-        let point = [row.point[0].as_slice(), row.point[1].as_slice()];
-        let pose = [row.pose[0].as_slice(), row.pose[1].as_slice()];
-        if let Some((first, place)) = places.pose {
-            add_to_pose(&mut self.values, place, &row.pose, &row.pose);
-            add_gradient(&mut self.gradient[first..], pose, row.residual);
-            if let Some(start) = seen.pose_coupling {
-                add_to_pose(couplings, Place { start: start as usize, stride: POSE }, &row.pose, &point);
+    /// Adds the rows of a batch; `false` when it was stopped.
+    ///
+    /// * `begun`: how far the list of every view's observations is worked off
+    fn add_batch(
+        &mut self,
+        sequence: &Sequence,
+        layout: &Layout,
+        crew: &Crew,
+        points: Range<usize>,
+        rows: &[Option<Weighted>],
+        begun: &mut [usize],
+    ) -> bool {
+        let Self { places, values, gradient, before, by_view: (starts, by_view), .. } = self;
+        let seen = layout.seen_range(points);
+        let of_batch = |view: usize| {
+            let left = &by_view[begun[view]..starts[view + 1]];
+            &left[..left.partition_point(|&k| (k as usize) < seen.end)]
+        };
+        let weights = (0..places.len()).map(|view| of_batch(view).len());
+        let (mut values, mut gradient) = (values.as_mut_slice(), gradient.as_mut_slice());
+        let cut = |ends: &[usize]| {
+            let (first, last) = (before[ends[0]], before[ends[1]]);
+            Sums::Views {
+                range: ends[0]..ends[1],
+                values: split_off(&mut values, last.0 - first.0),
+                gradient: split_off(&mut gradient, last.1 - first.1),
+            }
+        };
+        let mut pieces: Vec<Sums> = even_cuts(crew.threads.pieces(), weights).windows(2).map(cut).collect();
+        // First, for nobody can share it.
+        pieces.insert(0, Sums::Groups { values, gradient });
+        let batch = Batch { places, before, parameters: &layout.unknowns.parameters, first: seen.start, rows };
+        let done = crew.threads.each(pieces, |piece: Sums| {
+            let mut pace = crew.pace();
+            match piece {
+                Sums::Views { range, values, gradient } => {
+                    batch.add_to_views(sequence, range, values, gradient, of_batch, &mut pace)
+                }
+                Sums::Groups { values, gradient } => {
+                    batch.add_to_groups(sequence, &layout.all_seen()[seen.clone()], values, gradient, &mut pace)
+                }
+            }
+        });
+        let ends: Vec<usize> = (0..places.len()).map(|view| begun[view] + of_batch(view).len()).collect();
+        begun[..ends.len()].copy_from_slice(&ends);
+        done
+    }
+}
+
+impl Batch<'_> {
+    /// Adds to the blocks of a run of views; `false` when it was stopped.
+    ///
+    /// * `values`, `gradient`: those of these views
+    /// * `seen`: observations of a view in this batch, ascending
+    fn add_to_views<'s>(
+        &self,
+        sequence: &Sequence,
+        views: Range<usize>,
+        values: &mut [f64],
+        gradient: &mut [f64],
+        seen: impl Fn(usize) -> &'s [u32],
+        pace: &mut Pace,
+    ) -> bool {
+        let (first_value, first_unknown) = self.before[views.start];
+        let within = |place: Place| Place { start: place.start - first_value, ..place };
+        for view in views {
+            let ViewPlaces { pose: Some((first, place)), cross, .. } = self.places[view] else { continue };
+            let gradient = &mut gradient[first - first_unknown..];
+            let parameters = &self.parameters[sequence.group_of[view]];
+            for &k in seen(view) {
+                if !pace.go_on(1) {
+                    return false;
+                }
+                let Some(row) = &self.rows[k as usize - self.first] else { continue };
+                let pose = [row.pose[0].as_slice(), row.pose[1].as_slice()];
+                add_to_pose(values, within(place), &row.pose, &row.pose);
+                add_gradient(gradient, pose, row.residual);
+                if let Some(cross) = cross {
+                    let free = row.free(parameters);
+                    add_product(values, within(cross), chosen(&free, parameters), pose);
+                }
             }
         }
-        if let Some((first, place)) = places.group {
-            let free = row.by_parameter.map(|by_parameter| {
-                let mut free = [0.0; Parameter::COUNT];
-                free.iter_mut()
-                    .zip(parameters)
-                    .for_each(|(value, parameter)| *value = by_parameter[*parameter as usize]);
-                free
-            });
-            let free = [&free[0][..parameters.len()], &free[1][..parameters.len()]];
-            add_product(&mut self.values, place, free, free);
-            add_gradient(&mut self.gradient[first..], free, row.residual);
-            if let Some(cross) = places.cross {
-                add_product(&mut self.values, cross, free, pose);
+        true
+    }
+
+    /// Adds to the blocks of all groups; `false` when it was stopped.
+    ///
+    /// * `values`, `gradient`: those of the groups
+    /// * `seen`: the observations of the batch
+    fn add_to_groups(
+        &self,
+        sequence: &Sequence,
+        seen: &[Seen],
+        values: &mut [f64],
+        gradient: &mut [f64],
+        pace: &mut Pace,
+    ) -> bool {
+        let Some(&(first_value, first_unknown)) = self.before.last() else { return true };
+        for (seen, row) in seen.iter().zip(self.rows) {
+            if !pace.go_on(1) {
+                return false;
             }
-            if let Some(start) = seen.group_coupling {
-                add_product(couplings, Place { start: start as usize, stride: parameters.len() }, free, point);
-            }
+            let (Some((first, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };
+            let parameters = &self.parameters[sequence.group_of[seen.view]];
+            let free = row.free(parameters);
+            let free = chosen(&free, parameters);
+            add_product(values, Place { start: place.start - first_value, ..place }, free, free);
+            add_gradient(&mut gradient[first - first_unknown..], free, row.residual);
+        }
+        true
+    }
+}
+
+impl Weighted {
+    /// Derivatives by the free intrinsics, in their order, and zeros behind them.
+    #[inline]
+    fn free(&self, parameters: &[Parameter]) -> [[f64; Parameter::COUNT]; 2] {
+        self.by_parameter.map(|by_parameter| {
+            let mut free = [0.0; Parameter::COUNT];
+            free.iter_mut().zip(parameters).for_each(|(value, parameter)| *value = by_parameter[*parameter as usize]);
+            free
+        })
+    }
+
+    /// Adds this observation to the couplings of its point.
+    #[inline]
+    fn couple(&self, seen: &Seen, parameters: &[Parameter], couplings: &mut [f64]) {
+        let point = [self.point[0].as_slice(), self.point[1].as_slice()];
+        if let Some(start) = seen.pose_coupling {
+            add_to_pose(couplings, Place { start: start as usize, stride: POSE }, &self.pose, &point);
+        }
+        if let Some(start) = seen.group_coupling {
+            let free = self.free(parameters);
+            let place = Place { start: start as usize, stride: parameters.len() };
+            add_product(couplings, place, chosen(&free, parameters), point);
         }
     }
+}
+
+/// What there is of the derivatives by the free intrinsics.
+#[inline]
+fn chosen<'f>(free: &'f [[f64; Parameter::COUNT]; 2], parameters: &[Parameter]) -> [&'f [f64]; 2] {
+    [&free[0][..parameters.len()], &free[1][..parameters.len()]]
 }
 
 /// Adds `rows' columns` to a block of six rows.

@@ -97,6 +97,11 @@ impl Pattern {
         self.offsets[block + 1] - self.offsets[block]
     }
 
+    /// Where the panels of a run of block columns are among the values.
+    pub fn panels(&self, columns: std::ops::Range<usize>) -> std::ops::Range<usize> {
+        self.panel_starts[columns.start]..self.panel_starts[columns.end]
+    }
+
     /// Rows of the panel of a block column.
     pub fn stride(&self, column: usize) -> usize {
         let last = self.column_starts[column + 1] - 1;

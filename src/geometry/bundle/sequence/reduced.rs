@@ -1,14 +1,18 @@
 //! The system of poses and intrinsics that is left when the points are eliminated: built point by point, damped, and
 //! solved.
 
+use std::ops::Range;
+
 use nalgebra::Vector3;
 
 use super::super::metric::{POINT, POSE};
-use super::layout::{Layout, Touch};
+use super::crew::{Crew, split_off};
+use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::{Column, Pattern};
 use super::solver::Solver;
 use super::{Pace, Sequence};
+use crate::parallel::even_cuts;
 
 /// Damping beside Marquardt's, as a share of the diagonal: holds the gauge (seven directions for every set of views
 /// that no point connects with another). Rounding leaves some 1e-15 of the diagonal in these directions; the weakest
@@ -22,73 +26,96 @@ pub(super) struct Reduced {
     pub values: Vec<f64>,
     /// Right-hand side, then solution.
     pub vector: Vec<f64>,
-    /// Couplings of one point times the inverse root of its block.
+    /// Points that touch each block, ascending: starts, and one block after the other the points.
+    touching: (Vec<usize>, Vec<u32>),
+    /// Couplings of a batch of points, each times the inverse root of its point's block.
     whitened: Vec<f64>,
+    /// Gradients of these points, whitened the same way.
+    pulls: Vec<Vector3<f64>>,
+}
+
+/// Some points of a batch, to be whitened.
+struct Points<'a> {
+    range: Range<usize>,
+    whitened: &'a mut [f64],
+    pulls: &'a mut [Vector3<f64>],
+}
+
+/// Some block columns of the system, for a batch to be subtracted from.
+struct Columns<'a> {
+    range: Range<usize>,
+    values: &'a mut [f64],
+    vector: &'a mut [f64],
 }
 
 impl Reduced {
     pub fn new(layout: &Layout, pattern: Pattern) -> Self {
-        let most = (0..layout.point_count()).map(|point| layout.couplings(point).len()).max().unwrap_or(0);
         Self {
             values: vec![0.0; pattern.value_count()],
             vector: vec![0.0; pattern.dimension()],
-            whitened: vec![0.0; most],
+            touching: layout.points_by_block(),
+            whitened: Vec::new(),
+            pulls: Vec::new(),
             pattern,
         }
     }
 
     /// Eliminates the points; `false` when a point's block cannot be factored, or it was stopped.
-    pub fn build(&mut self, layout: &Layout, normal: &Normal, damping: f64, pace: &mut Pace) -> bool {
+    ///
+    /// Batch by batch: first the points are whitened, each by itself, then every block column takes from them what they
+    /// subtract from it, in their order.
+    pub fn build(&mut self, layout: &Layout, normal: &Normal, damping: f64, crew: &Crew) -> bool {
         self.values.copy_from_slice(&normal.cameras.values);
         for (slot, gradient) in self.vector.iter_mut().zip(&normal.cameras.gradient) {
             *slot = -gradient;
         }
-        for (point, block) in normal.points.iter().enumerate() {
-            let touches = layout.touches(point);
-            if touches.is_empty() {
-                continue;
-            }
-            // Pairs cost what a sixth of an observation's linearisation does.
-            if !pace.go_on(touches.len() * (6 + touches.len()) / 6) {
-                return false;
-            }
-            let Some(factor) = block.factor(damping) else { return false };
-            let pull = factor.whiten(&block.gradient);
-            let couplings = &normal.couplings[layout.couplings(point)];
-            for touch in touches {
-                let size = self.pattern.size(touch.block as usize);
-                let range = touch.coupling as usize..touch.coupling as usize + POINT * size;
-                let whitened = &mut self.whitened[range.clone()];
-                factor.whiten_coupling(&couplings[range], whitened);
-                let first = self.pattern.offsets[touch.block as usize];
-                for (k, slot) in self.vector[first..first + size].iter_mut().enumerate() {
-                    *slot += whitened[k] * pull[0] + whitened[size + k] * pull[1] + whitened[2 * size + k] * pull[2];
-                }
-            }
-            self.subtract_pairs(touches);
-        }
-        true
+        let mut begun = self.touching.0.clone();
+        crew.batches().all(|points| {
+            self.whiten(layout, normal, damping, crew, points.clone())
+                && self.subtract(layout, crew, points, &mut begun)
+        })
     }
 
-    /// The blocks between all that touches one point, lower triangle.
-    fn subtract_pairs(&mut self, touches: &[Touch]) {
-        for (first, column) in touches.iter().enumerate() {
-            let size = self.pattern.size(column.block as usize);
-            let stride = self.pattern.stride(column.block as usize);
-            let mut places: Column = self.pattern.column(column.block as usize);
-            let right = &self.whitened[column.coupling as usize..][..POINT * size];
-            for row in &touches[first..] {
-                // Pattern and touches come from the same layout, so that there is a place.
-                let Some(start) = places.start_of(row.block) else { continue };
-                let height = self.pattern.size(row.block as usize);
-                let left = &self.whitened[row.coupling as usize..][..POINT * height];
-                let values = &mut self.values[start..];
-                match left.first_chunk::<{ POINT * POSE }>() {
-                    Some(left) if height == POSE => subtract_from_pose(values, stride, left, right),
-                    _ => subtract_product(values, stride, left, right),
-                }
-            }
-        }
+    fn whiten(&mut self, layout: &Layout, normal: &Normal, damping: f64, crew: &Crew, points: Range<usize>) -> bool {
+        let couplings = layout.couplings_of(points.clone());
+        // What is left from another batch is written over before it is read.
+        self.whitened.resize(self.whitened.len().max(couplings.len()), 0.0);
+        self.pulls.resize(self.pulls.len().max(points.len()), Vector3::zeros());
+        let (mut whitened, mut pulls) = (self.whitened.as_mut_slice(), self.pulls.as_mut_slice());
+        let cut = |ends: &[usize]| {
+            let range = ends[0]..ends[1];
+            let whitened = split_off(&mut whitened, layout.couplings_of(range.clone()).len());
+            Points { pulls: split_off(&mut pulls, range.len()), range, whitened }
+        };
+        let pieces = crew.cut(layout, points).windows(2).map(cut).collect();
+        crew.threads.each(pieces, |piece: Points| piece.whiten(layout, normal, damping, &self.pattern, crew.pace()))
+    }
+
+    /// * `begun`: how far the list of every block's points is worked off
+    fn subtract(&mut self, layout: &Layout, crew: &Crew, points: Range<usize>, begun: &mut [usize]) -> bool {
+        let Self { pattern, values, vector, touching: (starts, touching), whitened, pulls } = self;
+        let of_batch = |block: usize| {
+            let left = &touching[begun[block]..starts[block + 1]];
+            &left[..left.partition_point(|&point| (point as usize) < points.end)]
+        };
+        let weights = (0..pattern.block_count()).map(|block| of_batch(block).len());
+        let (mut values, mut vector) = (values.as_mut_slice(), vector.as_mut_slice());
+        let cut = |ends: &[usize]| {
+            let range = ends[0]..ends[1];
+            let values = split_off(&mut values, pattern.panels(range.clone()).len());
+            let unknowns = pattern.offsets[range.end] - pattern.offsets[range.start];
+            Columns { vector: split_off(&mut vector, unknowns), range, values }
+        };
+        let pieces = even_cuts(crew.threads.pieces(), weights).windows(2).map(cut).collect();
+        let batch =
+            Whitened { first: points.start, points: layout.couplings_of(points.clone()).start, whitened, pulls };
+        let done = crew.threads.each(pieces, |piece: Columns| {
+            let mut pace = crew.pace();
+            piece.subtract(layout, pattern, &batch, of_batch, &mut pace)
+        });
+        let ends: Vec<usize> = (0..pattern.block_count()).map(|block| begun[block] + of_batch(block).len()).collect();
+        begun[..ends.len()].copy_from_slice(&ends);
+        done
     }
 
     /// Marquardt's damping, and what holds the gauge.
@@ -107,6 +134,91 @@ impl Reduced {
     }
 }
 
+impl Points<'_> {
+    /// `false` when a block cannot be factored, or it was stopped.
+    fn whiten(self, layout: &Layout, normal: &Normal, damping: f64, pattern: &Pattern, mut pace: Pace) -> bool {
+        let base = layout.couplings_of(self.range.clone()).start;
+        for (point, pull) in self.range.zip(self.pulls) {
+            let touches = layout.touches(point);
+            if touches.is_empty() {
+                continue;
+            }
+            if !pace.go_on(touches.len()) {
+                return false;
+            }
+            let block = &normal.points[point];
+            let Some(factor) = block.factor(damping) else { return false };
+            *pull = factor.whiten(&block.gradient);
+            let range = layout.couplings(point);
+            let couplings = &normal.couplings[range.clone()];
+            let whitened = &mut self.whitened[range.start - base..range.end - base];
+            for touch in touches {
+                let range =
+                    touch.coupling as usize..touch.coupling as usize + POINT * pattern.size(touch.block as usize);
+                factor.whiten_coupling(&couplings[range.clone()], &mut whitened[range]);
+            }
+        }
+        true
+    }
+}
+
+/// What the points of a batch subtract is made of.
+struct Whitened<'a> {
+    /// The first point, and where its couplings are among all.
+    first: usize,
+    points: usize,
+    whitened: &'a [f64],
+    pulls: &'a [Vector3<f64>],
+}
+
+impl Columns<'_> {
+    /// Takes from these columns what the points that touch them subtract; `false` when it was stopped.
+    ///
+    /// * `touching`: points of the batch that touch a block, ascending
+    fn subtract<'t>(
+        self,
+        layout: &Layout,
+        pattern: &Pattern,
+        batch: &Whitened,
+        touching: impl Fn(usize) -> &'t [u32],
+        pace: &mut Pace,
+    ) -> bool {
+        let (first_value, first_unknown) =
+            (pattern.panels(self.range.clone()).start, pattern.offsets[self.range.start]);
+        for column in self.range {
+            let (size, stride) = (pattern.size(column), pattern.stride(column));
+            let vector = &mut self.vector[pattern.offsets[column] - first_unknown..][..size];
+            for point in touching(column).iter().map(|&point| point as usize) {
+                let touches = layout.touches(point);
+                // Pairs cost what a sixth of an observation's linearisation does.
+                if !pace.go_on(touches.len().div_ceil(6)) {
+                    return false;
+                }
+                let Ok(first) = touches.binary_search_by_key(&(column as u32), |touch| touch.block) else { continue };
+                let whitened = &batch.whitened[layout.couplings(point).start - batch.points..];
+                let right = &whitened[touches[first].coupling as usize..][..POINT * size];
+                let pull = &batch.pulls[point - batch.first];
+                for (k, slot) in vector.iter_mut().enumerate() {
+                    *slot += right[k] * pull[0] + right[size + k] * pull[1] + right[2 * size + k] * pull[2];
+                }
+                let mut places: Column = pattern.column(column);
+                for row in &touches[first..] {
+                    // Pattern and touches come from the same layout, so that there is a place.
+                    let Some(start) = places.start_of(row.block) else { continue };
+                    let height = pattern.size(row.block as usize);
+                    let left = &whitened[row.coupling as usize..][..POINT * height];
+                    let values = &mut self.values[start - first_value..];
+                    match left.first_chunk::<{ POINT * POSE }>() {
+                        Some(left) if height == POSE => subtract_from_pose(values, stride, left, right),
+                        _ => subtract_product(values, stride, left, right),
+                    }
+                }
+            }
+        }
+        true
+    }
+}
+
 /// Moves the points of `moved` to where they belong after the step of poses and intrinsics: from where they are in
 /// `from` by `-V^-1 (Jp' r + Jp' Jc dc)`. `false` when that is no number, or it was stopped.
 pub(super) fn substitute(
@@ -116,17 +228,14 @@ pub(super) fn substitute(
     normal: &Normal,
     damping: f64,
     step: &[f64],
-    pace: &mut Pace,
+    crew: &Crew,
 ) -> bool {
-    for (point, block) in normal.points.iter().enumerate() {
-        let seen = layout.seen(point).len();
-        if seen == 0 || !layout.free_points[point] {
-            continue;
+    let place = |point: usize| {
+        if layout.seen(point).is_empty() || !layout.free_points[point] {
+            return Some(from.points[point]);
         }
-        if !pace.go_on(seen) {
-            return false;
-        }
-        let Some(factor) = block.factor(damping) else { return false };
+        let block = &normal.points[point];
+        let factor = block.factor(damping)?;
         let mut gradient = block.gradient;
         let couplings = &normal.couplings[layout.couplings(point)];
         for touch in layout.touches(point) {
@@ -137,12 +246,15 @@ pub(super) fn substitute(
             }
         }
         let shift: Vector3<f64> = factor.unwhiten(&factor.whiten(&gradient));
-        if !shift.iter().all(|value| value.is_finite()) {
-            return false;
+        shift.iter().all(|value| value.is_finite()).then(|| from.points[point] - shift)
+    };
+    match crew.of_points(layout, place) {
+        Some(points) => {
+            moved.points = points;
+            true
         }
-        moved.points[point] = from.points[point] - shift;
+        None => false,
     }
-    true
 }
 
 #[inline]

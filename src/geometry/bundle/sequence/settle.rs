@@ -5,12 +5,15 @@
 //! across its axis and not along it, which costs by the square of the angle; points that are put where the moved cameras
 //! see them leave the third power.
 
+use nalgebra::Vector3;
+
 use super::super::Loss;
-use super::layout::Layout;
+use super::Sequence;
+use super::crew::Crew;
+use super::layout::{Layout, Seen};
 use super::minimise::cost_of_point;
 use super::normal::Weighted;
 use super::point::PointBlock;
-use super::{Pace, Sequence};
 
 /// Gauss-Newton steps of a point at most: they converge quadratically from nearby.
 const STEPS: usize = 3;
@@ -19,39 +22,41 @@ const WORTHWHILE: f64 = 1e-2;
 
 /// Moves every free point towards its minimum with the cameras as they are; by how much that lowers the cost. `None`
 /// when it was stopped.
-pub(super) fn settle_points(sequence: &mut Sequence, layout: &Layout, loss: Loss, pace: &mut Pace) -> Option<f64> {
+pub(super) fn settle_points(sequence: &mut Sequence, layout: &Layout, loss: Loss, crew: &Crew) -> Option<f64> {
+    let settled = crew.of_points(layout, |point| {
+        let (seen, position) = (layout.seen(point), sequence.points[point]);
+        let moves = !seen.is_empty() && layout.free_points[point];
+        Some(if moves { settle(sequence, seen, position, loss) } else { (position, 0.0) })
+    })?;
     let mut lowered = 0.0;
-    for point in 0..layout.point_count() {
-        let seen = layout.seen(point);
-        if seen.is_empty() || !layout.free_points[point] {
-            continue;
-        }
-        if !pace.go_on(STEPS * seen.len()) {
-            return None;
-        }
-        let mut position = sequence.points[point];
-        let initial_cost = cost_of_point(sequence, seen, &position, loss);
-        let mut cost = initial_cost;
-        for _ in 0..STEPS {
-            let mut block = PointBlock::ZERO;
-            for row in seen.iter().filter_map(|seen| Weighted::new(sequence, &position, seen, loss)) {
-                block.add(&row.point, row.residual);
-            }
-            let Some(factor) = block.factor(0.0) else { break };
-            let moved = position - factor.unwhiten(&factor.whiten(&block.gradient));
-            let moved_cost = cost_of_point(sequence, seen, &moved, loss);
-            let lower = moved_cost < cost && moved.iter().all(|value| value.is_finite());
-            if !lower {
-                break;
-            }
-            let gain = cost - moved_cost;
-            (position, cost) = (moved, moved_cost);
-            if gain < WORTHWHILE * cost {
-                break;
-            }
-        }
-        sequence.points[point] = position;
-        lowered += initial_cost - cost;
+    for (slot, (position, by)) in sequence.points.iter_mut().zip(settled) {
+        *slot = position;
+        lowered += by;
     }
     Some(lowered)
+}
+
+/// A point nearer its minimum, and by how much it costs less there.
+fn settle(sequence: &Sequence, seen: &[Seen], mut position: Vector3<f64>, loss: Loss) -> (Vector3<f64>, f64) {
+    let initial_cost = cost_of_point(sequence, seen, &position, loss);
+    let mut cost = initial_cost;
+    for _ in 0..STEPS {
+        let mut block = PointBlock::ZERO;
+        for row in seen.iter().filter_map(|seen| Weighted::new(sequence, &position, seen, loss)) {
+            block.add(&row.point, row.residual);
+        }
+        let Some(factor) = block.factor(0.0) else { break };
+        let moved = position - factor.unwhiten(&factor.whiten(&block.gradient));
+        let moved_cost = cost_of_point(sequence, seen, &moved, loss);
+        let lower = moved_cost < cost && moved.iter().all(|value| value.is_finite());
+        if !lower {
+            break;
+        }
+        let gain = cost - moved_cost;
+        (position, cost) = (moved, moved_cost);
+        if gain < WORTHWHILE * cost {
+            break;
+        }
+    }
+    (position, initial_cost - cost)
 }

@@ -155,7 +155,7 @@ fn calibrated_from_truth(scene: &TestScene) -> Outcome {
         focal_per_view: false,
     };
     let metric = Reconstruction { intrinsics, poses, points };
-    from_metric(&problem, &metric, SIDE_PX, &StopToken::default()).expect("nothing stops it")
+    from_metric(&problem, &metric, SIDE_PX, &StopToken::default(), &mut || ()).expect("nothing stops it")
 }
 
 /// The sigmas of the other intrinsics against their errors, over 100 scenes.

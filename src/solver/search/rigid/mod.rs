@@ -98,7 +98,7 @@ impl Rigid {
         (constraints > 0.0).then(|| (self.inlier_cost() / constraints).sqrt()).filter(|noise| noise.is_finite())
     }
 
-    /// Natural logarithm of the expected number of false alarms; see `Consensus::ln_false_alarms`. Depths count as
+    /// Natural logarithm of the expected number of false alarms; see `Consensus::ln_false_alarms_by_residuals`. Depths count as
     /// third coordinates.
     ///
     /// * `spread`: standard deviation of unstructured coordinates, image points and relative depths together
@@ -325,14 +325,14 @@ impl<'a> Search<'a> {
 mod tests {
     use super::*;
     use crate::domain::{Input, Limits};
-    use crate::solver::{block, portfolio};
+    use crate::solver::{block, chance, portfolio};
     use crate::synthetic::{Scene, SceneOptions};
 
     fn found(options: &SceneOptions) -> (Scene, Option<Rigid>, f64) {
         let scene = Scene::generate(options).expect("valid options");
         let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid scene");
         let (normalization, _) = block::normalization(&input);
-        let ranges = block::track_ranges(&input);
+        let ranges = input.track_ranges();
         let views: Vec<usize> = (0..options.views).collect();
         let block = block::extract(&input, &ranges, &normalization, &views);
         let spread = portfolio::spread(&block.complete);
@@ -349,7 +349,7 @@ mod tests {
             let options = SceneOptions { outliers: 0.98, with_depths: true, seed, ..SceneOptions::default() };
             let (scene, rigid, certainty) = found(&options);
             let rigid = rigid.expect("four rigid tracks");
-            assert!(certainty < portfolio::LN_DECISIVE, "seed {seed}: {certainty}");
+            assert!(certainty < chance::LN_DECISIVE, "seed {seed}: {certainty}");
             assert_eq!(rigid.inlier, scene.truth.inlier, "seed {seed}");
             let error = (rigid.focal * 1000.0 / scene.truth.focal_px).ln().abs();
             assert!(error < 0.1, "seed {seed}: {error}");
@@ -361,7 +361,7 @@ mod tests {
         for seed in 0..5 {
             let options = SceneOptions { outliers: 1.0, with_depths: true, seed, ..SceneOptions::default() };
             let (_, _, certainty) = found(&options);
-            assert!(certainty > portfolio::LN_DECISIVE / 4.0, "seed {seed}: {certainty}");
+            assert!(certainty > chance::LN_DECISIVE / 4.0, "seed {seed}: {certainty}");
         }
     }
 }

@@ -1,6 +1,8 @@
 //! Where adjustments end.
 
+use super::super::crew::BATCH;
 use super::*;
+use crate::geometry::bundle::Loss;
 use crate::geometry::bundle::metric::{self, Extension, Parameter};
 use crate::geometry::bundle::testing::{self, NOISE};
 use crate::geometry::bundle::zoom::Zooming;
@@ -23,7 +25,8 @@ fn one_group_ends_where_a_block_does() {
             let stop = StopToken::default();
             let dense = metric::adjust(&mut block, &scene.observations, model, &prior, &options, &stop);
             let mut sequence = start.clone();
-            let sparse = adjust(&mut sequence, &sightings, &Free::all(&[model]), &[prior], &options, &stop);
+            let sparse =
+                adjust(&mut sequence, &sightings, &Free::all(&[model]), &[prior], &options, quiet(&stop, &mut || ()));
             println!("seed {seed}, {views} views: {dense:?}, {sparse:?}");
             assert!((sparse.initial_cost / dense.initial_cost - 1.0).abs() < 1e-12, "seed {seed}");
             assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
@@ -140,7 +143,8 @@ fn what_is_held_stays_to_the_bit() {
         let free_points: Vec<bool> = (0..start.points.len()).map(|point| point % 4 != 0).collect();
         let free = Free { models: &[IntrinsicsModel::FIXED], views: Some(&free_views), points: Some(&free_points) };
         let mut sequence = start.clone();
-        let report = adjust(&mut sequence, &sightings, &free, &[], &thorough(), &StopToken::default());
+        let report =
+            adjust(&mut sequence, &sightings, &free, &[], &thorough(), quiet(&StopToken::default(), &mut || ()));
         assert!(report.cost < 0.9 * report.initial_cost, "{report:?}");
         assert_eq!(sequence.intrinsics, start.intrinsics);
         for (view, free) in free_views.iter().enumerate() {
@@ -151,7 +155,8 @@ fn what_is_held_stays_to_the_bit() {
         }
         // Points alone, which no system of cameras connects.
         let free = Free { models: &[], views: Some(&[]), points: None };
-        let report = adjust(&mut sequence, &sightings, &free, &[], &thorough(), &StopToken::default());
+        let report =
+            adjust(&mut sequence, &sightings, &free, &[], &thorough(), quiet(&StopToken::default(), &mut || ()));
         assert!(report.cost < report.initial_cost && report.iterations > 0, "{report:?}");
     }
 }
@@ -167,7 +172,7 @@ fn free_views_among_held_ones_find_the_truth() {
     for view in (0..20).filter(|view| !free_views[*view]) {
         start.poses[view] = truth.poses[view];
     }
-    adjust(&mut start, &sightings, &free, &[], &thorough(), &StopToken::default());
+    adjust(&mut start, &sightings, &free, &[], &thorough(), quiet(&StopToken::default(), &mut || ()));
     for (found, expected) in start.poses.iter().zip(&truth.poses) {
         let error = (found.rotation - expected.rotation).norm() + (found.translation - expected.translation).norm();
         assert!(error < 1e-8, "{error}");
@@ -193,4 +198,32 @@ fn a_weight_counts_like_so_many_observations() {
     assert!((focal / same_focal - 1.0).abs() < 1e-6, "{focal} {same_focal}");
     let (unweighted, _) = run(&sightings);
     assert!(cost > 1.1 * unweighted, "{cost} {unweighted}");
+}
+
+/// Several batches, groups, held views and points, a point twice in a view: sums come to the same, whoever adds them up.
+#[test]
+fn threads_change_nothing_to_the_last_bit() {
+    let (mut truth, mut sightings) = chain(5, 24, 180, 5, 0.002);
+    truth.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.9), Intrinsics::from_focal(1.3)];
+    truth.group_of = (0..24).map(|view| view % 3).collect();
+    observe(&truth, &mut sightings, 0.002, 5);
+    sightings.push(sightings[7]);
+    assert!(sightings.len() > BATCH, "{} make one batch", sightings.len());
+    let models = [IntrinsicsModel::FULL, IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL];
+    let (views, points): (Vec<bool>, Vec<bool>) =
+        ((0..24).map(|view| view != 9).collect(), (0..truth.points.len()).map(|point| point % 50 != 3).collect());
+    let free = Free { models: &models, views: Some(&views), points: Some(&points) };
+    let options = Options { max_iterations: 4, loss: Loss::Cauchy { scale: 0.004 }, ..Options::default() };
+    let on = |threads: usize| {
+        let (mut start, mut told) = (perturbed(&truth, 0.01, 5), 0);
+        let stop = StopToken::default();
+        let run = Run { threads: Threads::new(threads), stop: &stop, told: &mut || told += 1 };
+        let report = adjust(&mut start, &sightings, &free, &[], &options, run);
+        (start, report, told)
+    };
+    let alone = on(1);
+    assert!(alone.1.iterations == 4 && alone.2 >= 4 && alone.1.cost < 0.5 * alone.1.initial_cost, "{:?}", alone.1);
+    for threads in [2, 3, 7] {
+        assert!(on(threads) == alone, "{threads} threads");
+    }
 }

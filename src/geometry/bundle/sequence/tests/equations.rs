@@ -2,10 +2,12 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use super::super::Pace;
+use super::super::crew::BATCH;
+use super::super::crew::Crew;
 use super::super::layout::Layout;
 use super::super::minimise::{pattern, retract};
 use super::super::normal::Normal;
-use super::super::{Pace, WORK_BETWEEN_QUESTIONS};
 use super::*;
 use crate::domain::StopReason;
 use crate::geometry::bundle::Loss;
@@ -68,7 +70,7 @@ fn normal_equations_agree_with_finite_differences() {
     assert_eq!(cameras, 6 * 6 + 6 + 3, "six free views, six and three intrinsics");
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();
-    assert!(normal.fill(&sequence, &layout, &[], Loss::Squared, &mut Pace::new(&stop)));
+    assert!(normal.fill(&sequence, &layout, &[], Loss::Squared, &Crew::new(&layout, Threads::ONE, &stop)));
     let (residuals, jacobian) = differentiate(&sequence, &sightings, &layout);
     let information = jacobian.transpose() * &jacobian;
     let gradient = jacobian.transpose() * residuals;
@@ -118,7 +120,13 @@ fn what_is_known_beforehand_takes_part() {
     let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let with = |priors: &[IntrinsicsPrior]| {
         let mut normal = Normal::new(&layout, &pattern, &sequence);
-        assert!(normal.fill(&sequence, &layout, priors, Loss::Squared, &mut Pace::new(&StopToken::default())));
+        assert!(normal.fill(
+            &sequence,
+            &layout,
+            priors,
+            Loss::Squared,
+            &Crew::new(&layout, Threads::ONE, &StopToken::default())
+        ));
         let block = layout.unknowns.group_block[2].expect("free");
         let unknown = layout.unknowns.range(block).start;
         (normal.cameras.values[normal.cameras.diagonal[unknown]], normal.cameras.gradient[unknown])
@@ -132,7 +140,7 @@ fn what_is_known_beforehand_takes_part() {
 /// A stop is seen within the work that may pass between two questions, in the middle of a linearisation.
 #[test]
 fn a_stop_is_seen_within_one_linearisation() {
-    let (sequence, sightings) = chain(2, 10, 1 + WORK_BETWEEN_QUESTIONS / 20, 5, 0.001);
+    let (sequence, sightings) = chain(2, 10, 1 + BATCH / 20, 5, 0.001);
     let free = Free::all(&[IntrinsicsModel::FOCAL]);
     let going = StopToken::default();
     let mut pace = Pace::new(&going);
@@ -141,10 +149,14 @@ fn a_stop_is_seen_within_one_linearisation() {
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);
-    assert!(sightings.len() > WORK_BETWEEN_QUESTIONS);
-    assert!(!normal.fill(&sequence, &layout, &[], Loss::Squared, &mut Pace::new(&stop)));
+    assert!(sightings.len() > BATCH);
+    for threads in [1, 3] {
+        let crew = Crew::new(&layout, Threads::new(threads), &stop);
+        assert!(!normal.fill(&sequence, &layout, &[], Loss::Squared, &crew), "{threads} threads");
+        assert_eq!(crew.of_points(&layout, Some), None, "{threads} threads");
+    }
     let mut start = sequence.clone();
-    let report = adjust(&mut start, &sightings, &free, &[], &Options::default(), &stop);
+    let report = adjust(&mut start, &sightings, &free, &[], &Options::default(), quiet(&stop, &mut || ()));
     assert_eq!((report.iterations, report.cost), (0, report.initial_cost));
     assert_eq!(start, sequence);
 }

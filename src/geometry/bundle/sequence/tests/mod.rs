@@ -12,11 +12,16 @@ use rand_chacha::ChaCha8Rng;
 use super::super::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Pose, Reconstruction};
 use super::super::testing::{TestScene, normal, perturb};
 use super::super::{Options, Report};
-use super::{Free, Sequence, Sighting, adjust};
+use super::{Free, Run, Sequence, Sighting, adjust};
 use crate::domain::StopToken;
+use crate::parallel::Threads;
 
 /// Distance between the views of a chain, as a share of the depth of what they see about a tenth.
 const BASELINE: f64 = 0.4;
+
+fn quiet<'a>(stop: &'a StopToken, told: &'a mut dyn FnMut()) -> Run<'a> {
+    Run { threads: Threads::ONE, stop, told }
+}
 
 /// Views on a line that sways and turns, each track seen by `length` neighbours, `tracks_a_view` beginning in each.
 fn chain(seed: u64, views: usize, tracks_a_view: usize, length: usize, noise: f64) -> (Sequence, Vec<Sighting>) {
@@ -108,5 +113,5 @@ fn thorough() -> Options {
 
 fn adjusted(sequence: &mut Sequence, sightings: &[Sighting], models: &[IntrinsicsModel], options: &Options) -> Report {
     let priors = vec![IntrinsicsPrior::NONE; models.len()];
-    adjust(sequence, sightings, &Free::all(models), &priors, options, &StopToken::default())
+    adjust(sequence, sightings, &Free::all(models), &priors, options, quiet(&StopToken::default(), &mut || ()))
 }
