@@ -11,6 +11,7 @@ const EXAMPLES: &str = "\
 Examples:
   scpsfm list
   scpsfm list --state queued --state running
+  scpsfm list --filter 'state = QUEUED OR state = RUNNING AND labels.site = \"north\"'
   scpsfm list --filter 'labels.site = \"north\"' --json | jq -r .name";
 
 /// List jobs, the newest first
@@ -26,7 +27,8 @@ pub struct Args {
     #[arg(long = "state", value_enum, ignore_case = true)]
     pub states: Vec<StateArg>,
 
-    /// Only jobs that match, such as 'labels.site = "north"'; see the API for what it may say
+    /// Only jobs that match, such as 'labels.site = "north"' or 'state = FAILED OR state = EXPIRED': terms joined by AND,
+    /// states also by OR
     #[arg(long, default_value = "")]
     pub filter: String,
 

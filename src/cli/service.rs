@@ -34,7 +34,7 @@ impl Service {
         // Before the store is opened and its jobs begin: who cannot be let in is no reason to take them up.
         options.check_access().map_err(Failure::bad_config)?;
         let store = open_store(&config.store).await?;
-        let engine = Engine::start(engine_options(config), store, engine::default_solver())
+        let engine = Engine::start(engine_options(config), store, engine::solver_on(config.compute.threads()))
             .await
             .map_err(|error| Failure::internal(format_args!("cannot start the engine: {error}")))?;
         let server = Server::bind(options, engine.clone()).await.map_err(Failure::internal)?;
@@ -97,8 +97,8 @@ fn engine_options(config: &Config) -> engine::Options {
             max_tenant_bytes: bound_or_none(config.engine.tenant_queue_bytes),
         },
         uploads: engine::UploadOptions {
-            max_bytes: config.upload.max_bytes,
             bounds: engine::UploadBounds {
+                max_bytes: config.upload.max_bytes,
                 max_tenant_uploads: config.upload.tenant_uploads,
                 max_tenant_bytes: config.upload.tenant_bytes,
             },

@@ -1,7 +1,10 @@
 //! `scpsfm submit`: leaves a job with a server.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
+
+use clap::builder::NonEmptyStringValueParser;
 
 use super::args::{ReadingArgs, ServerArgs, SettingsArgs, tell_notes};
 use super::client::access::AccessArgs;
@@ -10,6 +13,7 @@ use super::exit::{Exit, Failure};
 use super::{job_view, print};
 use crate::domain::InputName;
 use crate::domain::job::JobName;
+use crate::rpc::convert::create::MAX_PRIORITY;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -49,8 +53,9 @@ pub struct Args {
     #[arg(long = "label", value_name = "KEY=VALUE", value_parser = parse_label)]
     pub labels: Vec<(String, String)>,
 
-    /// Larger is sooner
-    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true,
+        help = format!("Larger is sooner, from -{MAX_PRIORITY} to {MAX_PRIORITY}"),
+        value_parser = clap::value_parser!(i32).range(i64::from(-MAX_PRIORITY)..=i64::from(MAX_PRIORITY)))]
     pub priority: i32,
 
     /// Let the job expire when it has no result after this time
@@ -58,12 +63,12 @@ pub struct Args {
     pub time_limit: Option<Duration>,
 
     /// Last part of the job's name, for one input; the server chooses one otherwise
-    #[arg(long, value_name = "ID")]
+    #[arg(long, value_name = "ID", value_parser = NonEmptyStringValueParser::new())]
     pub job_id: Option<String>,
 
     /// Makes this command safe to repeat: the same id and job give the same job. Of several inputs, each job has this
     /// id with `-1`, `-2`, ... after it
-    #[arg(long, value_name = "ID")]
+    #[arg(long, value_name = "ID", value_parser = NonEmptyStringValueParser::new())]
     pub request_id: Option<String>,
 
     #[command(flatten)]
@@ -87,6 +92,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
             return Err(Failure::usage(format!("{flag} is for one input")));
         }
     }
+    let labels = labels(args.labels)?;
     let read = args.inputs.iter().map(|path| args.reading.read(path)).collect::<Result<Vec<_>, _>>()?;
     read.iter().for_each(tell_notes);
     let named = args.uploaded.iter().map(|given| given.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
@@ -94,7 +100,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let options = JobOptions {
         job_id: args.job_id,
         request_id: args.request_id,
-        labels: args.labels.into_iter().collect(),
+        labels,
         priority: args.priority,
         time_limit: args.time_limit,
     };
@@ -153,10 +159,37 @@ fn parse_label(text: &str) -> Result<(String, String), String> {
     }
 }
 
+/// A job's labels; a key has one value.
+fn labels(given: Vec<(String, String)>) -> Result<BTreeMap<String, String>, Failure> {
+    let mut labels = BTreeMap::new();
+    for (key, value) in given {
+        if let Some(before) = labels.insert(key.clone(), value.clone()) {
+            return Err(Failure::usage(format!("--label: {key:?} is given twice, as {before:?} and as {value:?}")));
+        }
+    }
+    Ok(labels)
+}
+
 fn parse_seconds(text: &str) -> Result<Duration, String> {
     let seconds: f64 = text.parse().map_err(|_| "is not a number of seconds".to_owned())?;
     match Duration::try_from_secs_f64(seconds) {
         Ok(duration) if duration > Duration::ZERO => Ok(duration),
         _ => Err("is not a positive number of seconds".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_label_that_is_given_twice_is_refused_by_its_key() {
+        let given = |texts: &[&str]| labels(texts.iter().map(|text| parse_label(text).expect(text)).collect());
+        let two = given(&["a=1", "b=1"]).expect("two keys");
+        assert_eq!(two, BTreeMap::from([("a".into(), "1".into()), ("b".into(), "1".into())]));
+        let refused = given(&["site=1", "b=1", "site=2"]).expect_err("one key");
+        assert_eq!(refused.exit, Exit::Usage);
+        assert!(refused.message.contains("\"site\""), "{refused}");
+        assert!(given(&["a=1", "a=1"]).is_err(), "the same twice is a slip too");
     }
 }

@@ -1,5 +1,6 @@
-//! One attempt at a job, from its claim to its end: feeds the worker, stores progress, keeps the lease.
+//! One attempt at a job, from its claim to its end: reads the input, feeds the worker, stores progress, keeps the lease.
 
+use std::collections::hash_map::Entry;
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -7,11 +8,12 @@ use std::time::{Duration, SystemTime};
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval_at, sleep, sleep_until, timeout_at};
-use tracing::Instrument;
+use tracing::{Instrument, Span};
 
+use super::ahead::{Ahead, Reserved};
 use super::observe::{self, Attempt, AttemptLost};
 use super::worker::{Assignment, Report, Verdict, Worker};
-use super::{Inner, locked};
+use super::{Inner, Options, locked};
 use crate::domain::job::{Failure, Job, JobName, JobState};
 use crate::domain::{Progress, StopReason, StopToken};
 use crate::store::{self, Claimed, Ending, Lease, Outcome, Store};
@@ -36,21 +38,80 @@ const RETRY_PAUSE: Duration = Duration::from_millis(500);
 /// `Failure::reason` of a defect of ours.
 const INTERNAL: &str = "INTERNAL";
 
-/// Makes one attempt at a claimed job. Returns once the worker is free again, with the task that commits what the
-/// attempt came to.
-pub(super) async fn run(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) -> JoinHandle<()> {
+/// A job that has all that a worker needs.
+pub(super) enum Ready {
+    /// It is leased.
+    Claimed(Box<Begun>),
+    /// It is to be, while it is solved already.
+    Foreseen(Box<Ahead>),
+}
+
+/// An attempt whose input is read.
+pub(super) struct Begun {
+    course: Course,
+    attempt: Attempt,
+    /// Or why there is nothing to solve.
+    input: Result<Vec<u8>, Verdict>,
+}
+
+/// Begins an attempt at a claimed job: reads its input.
+pub(super) async fn begin(inner: &Arc<Inner>, claimed: Claimed) -> Ready {
     let Claimed { job, lease, trace_parent, queue_time } = claimed;
-    let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref(), queue_time);
-    let span = attempt.span().clone();
+    let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref());
+    let wait = Wait { trace_parent, queue_time };
     // All of it inside the span, so that every line carries the job's name.
-    let (course, end) = async {
-        let mut course = Course::begin(inner.clone(), job, lease);
-        let end = course.run(worker, attempt).await;
-        (course, end)
+    let span = attempt.span().clone();
+    async {
+        let mut course = Course::begin(inner.clone(), job, lease, wait);
+        let input = course.prepare().await;
+        Ready::Claimed(Box::new(Begun { course, attempt, input }))
     }
-    .instrument(span.clone())
-    .await;
-    tokio::spawn(course.conclude(end).instrument(span))
+    .instrument(span)
+    .await
+}
+
+impl Ready {
+    /// Has the worker solve it, and returns once the worker is free again; `None` where the job was foreseen and is
+    /// another's by now, or nobody's.
+    pub(super) async fn run(self, worker: &Worker) -> Option<Done> {
+        match self {
+            Self::Claimed(begun) => {
+                let Begun { mut course, attempt, input } = *begun;
+                let span = attempt.span().clone();
+                let end = match input {
+                    Ok(input) => course.run(worker, attempt, input).instrument(span.clone()).await,
+                    Err(verdict) => End { verdict, latest: None, attempt: Some(attempt) },
+                };
+                Some(Done { course, end, span })
+            }
+            Self::Foreseen(ahead) => {
+                let inner = ahead.inner().clone();
+                if !ahead.reserved.holds() {
+                    return None;
+                }
+                let Ahead { claimed: Claimed { job, lease, trace_parent, queue_time }, input, reserved } = *ahead;
+                let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref());
+                let span = attempt.span().clone();
+                let mut course = Course::foreseen(inner, job, lease, Wait { trace_parent, queue_time }, reserved)?;
+                let end = course.run(worker, attempt, input).instrument(span.clone()).await;
+                course.leased.then_some(Done { course, end, span })
+            }
+        }
+    }
+}
+
+/// An attempt that is over, and that the store does not know of yet.
+pub(super) struct Done {
+    course: Course,
+    end: End,
+    span: Span,
+}
+
+impl Done {
+    /// Commits what it came to, on a task of its own.
+    pub(super) fn commit(self) -> JoinHandle<()> {
+        tokio::spawn(self.course.conclude(self.end).instrument(self.span))
+    }
 }
 
 /// Waits for the store no longer than the lease holds: a database that hangs must not keep the work going.
@@ -75,12 +136,24 @@ struct End {
     attempt: Option<Attempt>,
 }
 
+/// What a job had behind it when it was claimed.
+struct Wait {
+    trace_parent: Option<String>,
+    /// When it entered the queue.
+    queue_time: SystemTime,
+}
+
 /// An attempt under way.
-struct Course {
+pub(super) struct Course {
     inner: Arc<Inner>,
     job: Job,
     lease: Lease,
+    wait: Wait,
     stop: StopToken,
+    /// Until it is leased.
+    reserved: Option<Reserved>,
+    /// Whether it ever was.
+    leased: bool,
     /// Until then the lease holds for sure.
     leased_until: Instant,
     /// The lease is gone: nothing more is written.
@@ -94,42 +167,117 @@ struct Course {
 struct Running {
     inner: Arc<Inner>,
     lease: Lease,
+    stop: StopToken,
 }
 
 impl Running {
     fn list(inner: Arc<Inner>, lease: &Lease, stop: &StopToken) -> Self {
         locked(&inner.running).insert(lease.clone(), stop.clone());
-        Self { inner, lease: lease.clone() }
+        Self { inner, lease: lease.clone(), stop: stop.clone() }
+    }
+
+    /// The same, unless another slot has it.
+    fn list_new(inner: Arc<Inner>, lease: &Lease, stop: &StopToken) -> Option<Self> {
+        if let Entry::Vacant(place) = locked(&inner.running).entry(lease.clone()) {
+            place.insert(stop.clone());
+        } else {
+            return None;
+        }
+        Some(Self { inner, lease: lease.clone(), stop: stop.clone() })
     }
 }
 
 impl Drop for Running {
     fn drop(&mut self) {
-        locked(&self.inner.running).remove(&self.lease);
+        let mut running = locked(&self.inner.running);
+        // A slot that claimed what this one had only foreseen has its own there.
+        if running.get(&self.lease).is_some_and(|listed| listed.is(&self.stop)) {
+            running.remove(&self.lease);
+        }
     }
 }
 
+/// How a job is told to stop, which it does by itself at its deadline.
+fn stop_token(job: &Job) -> StopToken {
+    let left = job.deadline.map(|deadline| deadline.duration_since(SystemTime::now()).unwrap_or_default());
+    // A deadline beyond what the clock can express is none.
+    StopToken::with_deadline(left.and_then(|left| std::time::Instant::now().checked_add(left)))
+}
+
 impl Course {
-    fn begin(inner: Arc<Inner>, job: Job, lease: Lease) -> Self {
-        let left = job.deadline.map(|deadline| deadline.duration_since(SystemTime::now()).unwrap_or_default());
-        // A deadline beyond what the clock can express is none.
-        let stop = StopToken::with_deadline(left.and_then(|left| std::time::Instant::now().checked_add(left)));
+    /// Of a job that is leased.
+    fn begin(inner: Arc<Inner>, job: Job, lease: Lease, wait: Wait) -> Self {
+        let stop = stop_token(&job);
         let running = Running::list(inner.clone(), &lease, &stop);
-        let leased_until = Instant::now() + inner.options.lease;
-        inner.hub.wake(&job.name);
-        tracing::info!("attempt begins");
-        Self { inner, job, lease, stop, leased_until, lost: false, stored: None, _running: running }
+        let mut course = Self::new(inner, job, lease, wait, stop, running);
+        course.is_leased(Instant::now());
+        course
     }
 
-    /// Has the worker solve the job, and keeps the lease meanwhile.
-    async fn run(&mut self, worker: &Worker, attempt: Attempt) -> End {
-        let input = match self.prepare().await {
-            Ok(input) => input,
-            Err(verdict) => return End { verdict, latest: None, attempt: Some(attempt) },
-        };
+    /// Of a job that is to be leased; `None` where another slot has it.
+    fn foreseen(inner: Arc<Inner>, job: Job, lease: Lease, wait: Wait, reserved: Reserved) -> Option<Self> {
+        let stop = stop_token(&job);
+        let running = Running::list_new(inner.clone(), &lease, &stop)?;
+        Some(Self { reserved: Some(reserved), ..Self::new(inner, job, lease, wait, stop, running) })
+    }
+
+    fn new(inner: Arc<Inner>, job: Job, lease: Lease, wait: Wait, stop: StopToken, running: Running) -> Self {
+        let (leased, leased_until) = (false, Instant::now());
+        Self {
+            inner,
+            job,
+            lease,
+            wait,
+            stop,
+            reserved: None,
+            leased,
+            leased_until,
+            lost: false,
+            stored: None,
+            _running: running,
+        }
+    }
+
+    /// The job was leased at this time.
+    fn is_leased(&mut self, at: Instant) {
+        self.leased = true;
+        self.leased_until = at + self.inner.options.lease;
+        self.inner.hub.wake(&self.job.name);
+        observe::waited(&self.job.name, self.wait.trace_parent.as_deref(), self.wait.queue_time);
+        tracing::info!("attempt begins");
+    }
+
+    /// Leases a job that was foreseen; where that fails, nothing of this attempt is written.
+    async fn claim(&mut self) {
+        let sent = Instant::now();
+        let Options { worker_name, lease, .. } = &self.inner.options;
+        match self
+            .inner
+            .store
+            .claim_foreseen(&self.lease, self.job.create_time, worker_name, SystemTime::now(), *lease)
+            .await
+        {
+            Ok(Some(_)) => {
+                self.inner.queue_changed();
+                self.is_leased(sent);
+            }
+            Ok(None) => self.lapse(),
+            Err(error) => {
+                tracing::warn!(%error, "cannot claim a job");
+                self.lapse();
+            }
+        }
+        self.reserved = None;
+    }
+
+    /// Has the worker solve the job, and keeps the lease meanwhile, or gets it.
+    async fn run(&mut self, worker: &Worker, mut attempt: Attempt, input: Vec<u8>) -> End {
+        attempt.at_work();
         let subscription = self.inner.hub.subscribe(&self.job.name);
-        // Weights of an attempt before this one are nobody's any more.
-        subscription.topic().weights.send_replace(None);
+        if self.leased {
+            // Weights of an attempt before this one are nobody's any more.
+            subscription.topic().weights.send_replace(None);
+        }
         let (progress, reported) = watch::channel(None);
         let (reply, answer) = oneshot::channel();
         let assignment = Assignment {
@@ -144,6 +292,9 @@ impl Course {
             reply,
         };
         worker.assign(assignment).await;
+        if !self.leased {
+            self.claim().await;
+        }
         let (report, latest) = self.attend(answer, reported).await;
         match report {
             Some(Report { verdict, attempt }) => End { verdict, latest, attempt: Some(attempt) },

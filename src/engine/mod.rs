@@ -2,6 +2,7 @@
 //!
 //! Knows nothing of transport. Depends on `store`, `solver`, `telemetry` and `domain`; its channels never leave it.
 
+mod ahead;
 mod attempt;
 mod drain;
 mod error;
@@ -36,6 +37,7 @@ pub use watch::Watch;
 
 use crate::domain::job::{Job, JobName, JobState};
 use crate::domain::{Backend, Input, Observer, Solution, SolveSettings, StopToken};
+use crate::parallel::Threads;
 use crate::solver;
 use crate::store::{Lease, Store, payload};
 
@@ -43,9 +45,16 @@ use crate::store::{Lease, Store, payload};
 pub type Solver =
     Arc<dyn Fn(&Input, &SolveSettings, &mut dyn Observer, &StopToken) -> Result<Solution, solver::Error> + Send + Sync>;
 
-/// The real solver.
+/// The real solver, each job on its worker's thread alone.
 pub fn default_solver() -> Solver {
-    Arc::new(solver::solve)
+    solver_on(Threads::ONE)
+}
+
+/// The real solver, each job on its worker's thread and those that help it. What it finds is the same.
+pub fn solver_on(threads: Threads) -> Solver {
+    Arc::new(move |input: &Input, settings: &SolveSettings, observer: &mut dyn Observer, stop: &StopToken| {
+        solver::solve_on(threads, input, settings, observer, stop)
+    })
 }
 
 /// How an engine works.
@@ -65,6 +74,8 @@ pub struct Options {
     pub retention: Option<Duration>,
     /// What callers of a full queue are told to wait.
     pub retry_after: Duration,
+    /// Jobs that are solved in less than this are short: behind one the next is begun at once, and leased meanwhile.
+    pub short_job: Duration,
     /// Tells this process apart in the store.
     pub worker_name: String,
     /// Backend of jobs that name none; stored with the job, so that a restart under another one changes nothing.
@@ -89,6 +100,9 @@ impl Options {
     pub const MAX_LEASE: Duration = Duration::from_secs(24 * 60 * 60);
     /// A month: whoever wants a result has fetched it by then.
     pub const DEFAULT_RETENTION: Duration = Duration::from_secs(30 * 24 * 60 * 60);
+    /// What passes between two jobs, a commit of the store and a dozen wake-ups, takes some 3 ms: a large part of jobs
+    /// of 10 ms, and less than a thirtieth of those beyond.
+    pub const DEFAULT_SHORT_JOB: Duration = Duration::from_millis(100);
     /// About the time of one job.
     pub const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(3);
 }
@@ -97,7 +111,7 @@ impl Default for Options {
     /// One worker a core.
     fn default() -> Self {
         Self {
-            workers: std::thread::available_parallelism().map_or(1, usize::from),
+            workers: Threads::one_a_core().count(),
             queue: QueueBounds {
                 max_jobs: Self::DEFAULT_MAX_JOBS,
                 max_bytes: Self::DEFAULT_MAX_BYTES,
@@ -111,6 +125,7 @@ impl Default for Options {
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
             retention: Some(Self::DEFAULT_RETENTION),
             retry_after: Self::DEFAULT_RETRY_AFTER,
+            short_job: Self::DEFAULT_SHORT_JOB,
             worker_name: worker_name(),
             backend: Backend::default(),
         }
@@ -150,6 +165,8 @@ struct Inner {
     hub: Arc<hub::Hub>,
     /// Attempts that run in this process, for a cancel to reach them at once.
     running: Mutex<HashMap<Lease, StopToken>>,
+    /// Jobs that slots foresee to be theirs next.
+    foreseen: Mutex<HashMap<JobName, Arc<()>>>,
     /// Counts the reasons to look for a job to claim; slots wait for a change.
     work: channel::Sender<u64>,
     /// Wakes the task that counts the queue.
@@ -173,6 +190,7 @@ impl Engine {
             store,
             hub: Arc::default(),
             running: Mutex::default(),
+            foreseen: Mutex::default(),
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             phase: channel::Sender::new(Phase::Open),
@@ -336,6 +354,7 @@ impl Inner {
         let reply = self.store.request_cancel(name, etag, SystemTime::now()).await?;
         self.stop_attempts(name);
         if reply.ended_now {
+            locked(&self.foreseen).remove(name);
             self.ended(&reply.job);
         }
         Ok(self.dated(reply.job))

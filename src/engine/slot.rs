@@ -1,13 +1,16 @@
 //! The tasks that run beside the worker threads: one slot a worker, which claims jobs for it, and the sweeper.
 
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use tokio::task::JoinHandle;
-use tokio::time::Instant;
+use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
+use super::ahead::Ahead;
+use super::attempt::{self, Done, Ready};
 use super::worker::Worker;
-use super::{Inner, Phase, attempt, observe};
+use super::{Inner, Phase, locked, observe};
 use crate::store;
 
 /// How often a slot looks for work unasked: jobs of other processes and of a store that failed come without a wake-up.
@@ -25,40 +28,83 @@ const PURGE_BATCH: u32 = 32;
 
 /// Claims jobs for one worker, one after the other, until the engine drains. While what a job came to is committed, the
 /// next one is claimed, so that the worker waits for one commit of the store, not for two, and the store may make one
-/// of both.
+/// of both. After a short job it waits for none: see [`solve`].
 pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     let mut work = inner.work.subscribe();
     let mut phase = inner.phase.subscribe();
     let mut committing: Option<Committing> = None;
+    let mut ahead: Option<Ahead> = None;
     while *phase.borrow_and_update() == Phase::Open {
         // Before the look, so that a job that is stored during it is not missed.
         work.mark_unchanged();
-        let options = &inner.options;
-        match inner.store.claim(&options.worker_name, SystemTime::now(), options.lease).await {
-            Ok(Some(claimed)) => {
-                inner.queue_changed();
-                let next = Committing(attempt::run(&inner, &worker, claimed).await);
-                if let Some(before) = committing.replace(next) {
-                    // Results that the store cannot take must not pile up.
-                    before.done().await;
-                }
-                if worker.is_gone() {
-                    tracing::error!("a worker thread is gone, its slot ends");
-                    break;
-                }
-                continue;
+        let ready = match ahead.take() {
+            Some(ahead) => Some(Ready::Foreseen(Box::new(ahead))),
+            None => claim(&inner).await,
+        };
+        let Some(ready) = ready else {
+            tokio::select! {
+                _ = work.changed() => {}
+                _ = phase.changed() => {}
+                () = sleep(CLAIM_POLL) => {}
             }
-            Ok(None) => {}
-            Err(error) => tracing::warn!(%error, "cannot claim a job"),
+            continue;
+        };
+        let done;
+        (done, ahead) = solve(&inner, &worker, ready).await;
+        match done.map(|done| committing.replace(Committing(done.commit()))) {
+            // Results that the store cannot take must not pile up.
+            Some(Some(before)) => before.done().await,
+            Some(None) => {}
+            // What was begun could not be leased. Where the store takes no writes, the next claim says so, and waits.
+            None => ahead = None,
         }
-        tokio::select! {
-            _ = work.changed() => {}
-            _ = phase.changed() => {}
-            () = tokio::time::sleep(CLAIM_POLL) => {}
+        if worker.is_gone() {
+            tracing::error!("a worker thread is gone, its slot ends");
+            break;
         }
     }
     if let Some(last) = committing {
         last.done().await;
+    }
+}
+
+/// The next job, leased; `None` where none waits.
+async fn claim(inner: &Arc<Inner>) -> Option<Ready> {
+    let options = &inner.options;
+    match inner.store.claim(&options.worker_name, SystemTime::now(), options.lease).await {
+        Ok(claimed) => {
+            let claimed = claimed?;
+            // Whoever has foreseen it need not begin it.
+            locked(&inner.foreseen).remove(&claimed.job.name);
+            inner.queue_changed();
+            Some(attempt::begin(inner, claimed).await)
+        }
+        Err(error) => {
+            tracing::warn!(%error, "cannot claim a job");
+            None
+        }
+    }
+}
+
+/// Has a job solved. Returns what it came to; and where it was a short one, the job to begin with next before it is even
+/// leased, which is read while this one is solved.
+///
+/// Not where other processes take jobs from the same store: two would often begin the same one.
+async fn solve(inner: &Arc<Inner>, worker: &Worker, ready: Ready) -> (Option<Done>, Option<Ahead>) {
+    let mut looks = !inner.store.is_shared();
+    let mut ahead = None;
+    let too_long = Instant::now() + inner.options.short_job;
+    let mut solving = pin!(ready.run(worker));
+    // Let go once it takes too long: it holds one of the store's few readers.
+    let mut looking = pin!(async { timeout_at(too_long, Ahead::look(inner)).await.ok().flatten() });
+    loop {
+        tokio::select! {
+            biased;
+            done = &mut solving => return (done, ahead),
+            found = &mut looking, if looks => (looks, ahead) = (false, found),
+            // By the time that it ends others may have come, or this one gone.
+            () = sleep_until(too_long), if ahead.is_some() => ahead = None,
+        }
     }
 }
 
@@ -108,7 +154,7 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
 /// Waits until the queue is to be counted: it changed, and the last count is old enough.
 async fn due(inner: &Inner, counted: Instant) {
     inner.queue_changed.notified().await;
-    tokio::time::sleep_until(counted + COUNT_PERIOD).await;
+    sleep_until(counted + COUNT_PERIOD).await;
 }
 
 impl Inner {

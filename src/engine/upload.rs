@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::{Engine, Error, Inner, Phase, finished, observe};
-use crate::domain::{Input, InputName, Oversize, Quota};
+use crate::domain::{Input, InputName};
 use crate::store::{
     self, BegunUpload, InputPage, InputQuery, NewInput, NewUpload, StoredInput, UploadBounds, UploadLease,
     UploadStatus, payload,
@@ -13,8 +13,6 @@ use crate::store::{
 /// How much may be uploaded, and how long the unfinished is kept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct UploadOptions {
-    /// Of one upload.
-    pub max_bytes: u64,
     pub bounds: UploadBounds,
     /// How long an upload may lie without a new byte; `None`: for good.
     pub abandoned_after: Option<Duration>,
@@ -35,8 +33,8 @@ impl UploadOptions {
 impl Default for UploadOptions {
     fn default() -> Self {
         Self {
-            max_bytes: Self::DEFAULT_MAX_BYTES,
             bounds: UploadBounds {
+                max_bytes: Self::DEFAULT_MAX_BYTES,
                 max_tenant_uploads: Self::DEFAULT_TENANT_UPLOADS,
                 max_tenant_bytes: Self::DEFAULT_TENANT_BYTES,
             },
@@ -71,15 +69,7 @@ impl Engine {
     /// [`Error::UploadTooLarge`], [`Error::Draining`].
     pub async fn begin_upload(&self, new: NewUpload) -> Result<Begun, Error> {
         self.inner.check_open()?;
-        let UploadOptions { max_bytes, bounds, .. } = &self.inner.options.uploads;
-        if new.bytes > *max_bytes {
-            observe::upload_refused(observe::UploadRefusal::TooLarge(Quota::UploadBytes));
-            return Err(Error::UploadTooLarge(Oversize {
-                quota: Quota::UploadBytes,
-                asked: new.bytes,
-                max: *max_bytes,
-            }));
-        }
+        let bounds = &self.inner.options.uploads.bounds;
         match self.inner.store.begin_upload(&new, bounds, SystemTime::now()).await {
             Ok(BegunUpload::Finished(input)) => Ok(Begun::Finished(input)),
             Ok(BegunUpload::Open { lease, committed, sha256 }) => {

@@ -85,7 +85,7 @@ async fn next(messages: &mut Streaming<proto::SolveRequest>) -> Result<Option<pr
 
 fn upload_limits(options: &UploadOptions) -> proto::UploadLimits {
     proto::UploadLimits {
-        max_bytes: options.max_bytes,
+        max_bytes: options.bounds.max_bytes,
         max_chunk_bytes: MAX_CHUNK_BYTES as u64,
         max_tenant_uploads: options.bounds.max_tenant_uploads,
         max_tenant_bytes: options.bounds.max_tenant_bytes,

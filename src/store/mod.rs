@@ -146,6 +146,21 @@ pub trait Store: Send + Sync + 'static {
     /// deadline are left to [`Store::sweep`].
     async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error>;
 
+    /// The job that a claim would lease, but for those that are `passed` over, as its claim would return it. It is not
+    /// leased: see [`Store::claim_foreseen`].
+    async fn foresee(&self, passed: &[JobName], now: SystemTime) -> Result<Option<Claimed>, Error>;
+
+    /// Leases a job that was foreseen, `created` then; `None` where it is not queued any more, was attempted since, or is
+    /// another one of the same name.
+    async fn claim_foreseen(
+        &self,
+        foreseen: &Lease,
+        created: SystemTime,
+        worker: &str,
+        now: SystemTime,
+        lease_for: Duration,
+    ) -> Result<Option<Claimed>, Error>;
+
     /// The encoded input of a job, and whether its cancel has been asked for.
     ///
     /// # Errors

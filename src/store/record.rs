@@ -101,14 +101,19 @@ impl QueueBounds {
             whole.add(new);
             tenants.entry(&new.name.tenant).or_default().add(new);
         }
+        // One job that waits alone may be of any size.
+        let of_several = |load: &Load, amount| if load.queued > 1 { amount } else { 0 };
         let of_tenant = |load: &Load| {
-            load.over([(Quota::TenantJobs, self.max_tenant_jobs), (Quota::TenantBytes, self.max_tenant_bytes)])
+            first_broken([
+                (Quota::TenantJobs, load.queued, self.max_tenant_jobs),
+                (Quota::TenantBytes, of_several(load, load.queued_bytes), self.max_tenant_bytes),
+            ])
         };
         tenants.values().find_map(of_tenant).or_else(|| {
-            whole.over([
-                (Quota::Jobs, self.max_jobs),
-                (Quota::Bytes, self.max_bytes),
-                (Quota::Observations, self.max_observations),
+            first_broken([
+                (Quota::Jobs, whole.queued, self.max_jobs),
+                (Quota::Bytes, of_several(&whole, whole.queued_bytes), self.max_bytes),
+                (Quota::Observations, of_several(&whole, whole.queued_observations), self.max_observations),
             ])
         })
     }
@@ -205,21 +210,12 @@ impl Load {
         self.queued_bytes = self.queued_bytes.saturating_add(new.input.bytes());
         self.queued_observations = self.queued_observations.saturating_add(u64::from(new.observation_count));
     }
+}
 
-    /// The first of these bounds that the waiting jobs break. One that waits alone may be of any size.
-    fn over<const N: usize>(&self, bounds: [(Quota, u64); N]) -> Option<Oversize> {
-        let of_several = |amount| if self.queued > 1 { amount } else { 0 };
-        let over = |(quota, max)| {
-            let asked = match quota {
-                Quota::Jobs | Quota::TenantJobs => self.queued,
-                Quota::Bytes | Quota::TenantBytes => of_several(self.queued_bytes),
-                Quota::Observations => of_several(self.queued_observations),
-                Quota::UploadBytes | Quota::TenantUploads | Quota::TenantUploadBytes => 0,
-            };
-            (asked > max).then_some(Oversize { quota, asked, max })
-        };
-        bounds.into_iter().find_map(over)
-    }
+/// The first of these amounts, each with what is asked and what is allowed, that is more than allowed.
+fn first_broken<const N: usize>(amounts: [(Quota, u64, u64); N]) -> Option<Oversize> {
+    let broken = amounts.into_iter().find(|(_, asked, max)| asked > max);
+    broken.map(|(quota, asked, max)| Oversize { quota, asked, max })
 }
 
 /// The right to write to a running job. `attempt` is the fencing token: a later lease has a larger one.

@@ -58,6 +58,23 @@ impl<S: Store> Store for Timed<S> {
         self.0.claim(worker, now, lease_for).await
     }
 
+    async fn foresee(&self, passed: &[JobName], now: SystemTime) -> Result<Option<Claimed>, Error> {
+        let _timer = store_operation("foresee");
+        self.0.foresee(passed, now).await
+    }
+
+    async fn claim_foreseen(
+        &self,
+        foreseen: &Lease,
+        created: SystemTime,
+        worker: &str,
+        now: SystemTime,
+        lease_for: Duration,
+    ) -> Result<Option<Claimed>, Error> {
+        let _timer = store_operation("claim");
+        self.0.claim_foreseen(foreseen, created, worker, now, lease_for).await
+    }
+
     async fn work(&self, name: &JobName) -> Result<Work, Error> {
         let _timer = store_operation("work");
         self.0.work(name).await

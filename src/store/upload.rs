@@ -74,6 +74,8 @@ pub struct StoredInput {
 /// How much one tenant may upload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct UploadBounds {
+    /// Of one upload.
+    pub max_bytes: u64,
     /// Uploads that are begun and not finished.
     pub max_tenant_uploads: u64,
     /// Lengths of those as they were declared, and of the uploaded inputs that are kept as they were uploaded, also of
@@ -84,8 +86,10 @@ pub struct UploadBounds {
 impl UploadBounds {
     /// The bound that an upload of so many bytes breaks by itself, however little the tenant has: it never fits.
     pub fn never_takes(&self, bytes: u64) -> Option<Oversize> {
-        let max = self.max_tenant_bytes;
-        (bytes > max).then_some(Oversize { quota: Quota::TenantUploadBytes, asked: bytes, max })
+        [(Quota::UploadBytes, self.max_bytes), (Quota::TenantUploadBytes, self.max_tenant_bytes)]
+            .into_iter()
+            .find(|(_, max)| bytes > *max)
+            .map(|(quota, max)| Oversize { quota, asked: bytes, max })
     }
 
     /// The bound that one more upload would break, where so many are open and so many bytes are taken.

@@ -17,7 +17,7 @@ pub struct Attempt {
     span: Span,
     current: Option<CurrentStage>,
     spent: Vec<(Stage, Duration)>,
-    _busy: Held,
+    busy: Option<Held>,
 }
 
 #[derive(Debug)]
@@ -27,25 +27,33 @@ struct CurrentStage {
     _span: Span,
 }
 
+/// A job was leased that had entered the queue at `enqueued_at`. `traceparent` as for [`Attempt::begin`].
+pub fn waited(job: &JobName, traceparent: Option<&str>, enqueued_at: SystemTime) {
+    let claimed_at = SystemTime::now();
+    // A clock set back between the two gives no wait, not a panic.
+    metrics::queue_wait(claimed_at.duration_since(enqueued_at).unwrap_or_default());
+    queue_span(job, traceparent, enqueued_at.min(claimed_at), claimed_at);
+}
+
 impl Attempt {
-    /// A worker claimed the job, which had entered the queue at `enqueued_at`. `traceparent` is the one that the
-    /// job's record keeps.
-    pub fn begin(job: &JobName, attempt: u32, traceparent: Option<&str>, enqueued_at: SystemTime) -> Self {
-        let claimed_at = SystemTime::now();
-        // A clock set back between the two gives no wait, not a panic.
-        metrics::queue_wait(claimed_at.duration_since(enqueued_at).unwrap_or_default());
-        queue_span(job, traceparent, enqueued_at.min(claimed_at), claimed_at);
+    /// Work on the job begins. `traceparent` is the one that its record keeps.
+    pub fn begin(job: &JobName, attempt: u32, traceparent: Option<&str>) -> Self {
         Self {
             span: attempt_span(job, attempt, traceparent),
             current: None,
             spent: Vec::with_capacity(Stage::ALL.len()),
-            _busy: metrics::busy_worker(),
+            busy: None,
         }
     }
 
     /// The attempt's span. Log lines written inside it carry the job's name.
     pub fn span(&self) -> &Span {
         &self.span
+    }
+
+    /// A worker has the job in its hands.
+    pub fn at_work(&mut self) {
+        self.busy = Some(metrics::busy_worker());
     }
 
     /// The solver entered a stage; the one before is over.

@@ -9,5 +9,5 @@ pub mod server;
 mod silence;
 pub mod tracing;
 
-pub use attempt::Attempt;
+pub use attempt::{Attempt, waited};
 pub use server::Readiness;

@@ -38,9 +38,9 @@ fn several_inputs_are_several_jobs_or_none() {
     let refused = submit(&[&a, &twice]);
     assert_eq!(refused.code, Some(65), "{refused:?}");
     assert!(refused.stderr.contains("5.csv") && !refused.stderr.contains("3.csv"), "{refused:?}");
-    let by_flag = submit(&[&a, &b, "--priority", "99999"]);
+    let by_flag = submit(&[&a, &b, "--label", &format!("{}=x", "k".repeat(64))]);
     assert_eq!(by_flag.code, Some(2), "{by_flag:?}");
-    assert!(by_flag.stderr.contains("job.priority") && !by_flag.stderr.contains(".csv"), "{by_flag:?}");
+    assert!(by_flag.stderr.contains("job.labels") && !by_flag.stderr.contains(".csv"), "{by_flag:?}");
     for one_only in [&["--watch"][..], &["--job-id", "a"]] {
         let refused = submit(&[&[a.as_str(), b.as_str()], one_only].concat());
         assert_eq!(refused.code, Some(2), "{refused:?}");

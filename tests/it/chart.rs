@@ -65,7 +65,7 @@ fn sample(section: &str, key: &str, schema: &Value) -> String {
         _ => match (schema["enum"][0].as_str(), schema["type"].as_str()) {
             (Some(word), _) => word,
             (None, Some("boolean")) => return "true".into(),
-            (None, Some("integer")) => return "7".into(),
+            (None, Some("integer")) => return schema["minimum"].as_u64().unwrap_or(0).max(7).to_string(),
             _ => panic!("{section}.{key}: {schema}"),
         },
     };

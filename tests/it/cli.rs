@@ -109,12 +109,18 @@ fn wrong_usage_ends_with_2_and_does_nothing() {
     let directory = directory();
     let input = scene(directory.path());
     let (input, out) = (text(&input), directory.path().join("out"));
-    let cases: [&[&str]; 10] = [
+    let cases: [&[&str]; 16] = [
         &["solve", input],
         &["solve", input, "--out", text(&out), "--width", "100"],
         &["solve", input, "--out", text(&out), "--width", "0", "--height", "9"],
         &["solve", input, "--out", text(&out), "--iterations", "0"],
+        &["solve", input, "--out", text(&out), "--iterations", "10001"],
+        &["submit", input, "--server", NOBODY, "--priority", "1001"],
+        &["submit", input, "--server", NOBODY, "--request-id", ""],
+        &["submit", input, "--server", NOBODY, "--job-id", ""],
+        &["submit", input, "--server", NOBODY, "--label", "a=1", "--label", "a=2"],
         &["solve", input, "--out", text(&out), "--method", "magic"],
+        &["solve", input, "--out", text(&out), "--epipolar-depths"],
         &["synth", "--views", "1", "--out", text(&out)],
         &["evaluate", "--sweeps", "magic", "--out", text(&out)],
         &["evaluate", "--seeds", "0", "--out", text(&out)],
@@ -372,8 +378,7 @@ fn flags_that_only_a_server_can_refuse_are_wrong_usage() {
     let input = text(&input);
     let serving = Serving::start(&directory.path().join("data"));
     let long_key = format!("{}=x", "k".repeat(64));
-    let cases: [(&[&str], &str); 8] = [
-        (&["submit", input, "--priority", "99999"], "job.priority"),
+    let cases: [(&[&str], &str); 7] = [
         (&["submit", input, "--label", &long_key], "job.labels"),
         (&["submit", input, "--job-id", "A"], "job_id"),
         (&["submit", input, "--request-id", "a b"], "request_id"),

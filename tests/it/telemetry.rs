@@ -114,7 +114,7 @@ async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
 
     let name = created(&mut jobs, lasting(ENDLESS)).await;
     reaches(&mut jobs, &name, &[JobState::Running]).await;
-    assert_eq!(scrape(&server).value("scpsfm_workers_busy"), 1.0);
+    scrape_until(&server, |page| page.value("scpsfm_workers_busy") == 1.0).await;
     jobs.cancel_job(proto::CancelJobRequest { name: name.clone(), ..Default::default() }).await.expect("a cancel");
     reaches(&mut jobs, &name, &[JobState::Cancelled]).await;
     let cancelled =

@@ -13,11 +13,17 @@ const PAUSES_MS: [u64; 8] = [100, 200, 400, 800, 1_500, 3_000, 4_000, 5_000];
 /// What is left of the time for the last try, so that it is not over before it begins.
 const LAST_TRY: Duration = Duration::from_secs(1);
 
+/// A stream that lived this long ended the trouble before it, even where nothing came: a job that waits has no events.
+/// As long as the longest pause, so that a server whose streams break sooner is given up like one that is away.
+const LIVED: Duration = Duration::from_millis(PAUSES_MS[PAUSES_MS.len() - 1]);
+
 /// Counts tries that came to nothing, and the time since the first of them.
 #[derive(Debug, Default)]
 pub struct Backoff {
     tries: usize,
     trouble: Option<Trouble>,
+    /// When the server took the latest stream, of which nothing has come yet.
+    accepted: Option<Instant>,
 }
 
 /// A time of trouble.
@@ -38,6 +44,11 @@ impl Backoff {
         *self = Self::default();
     }
 
+    /// The server answered with a stream; what it was worth is told by how long it lives.
+    pub fn accepted(&mut self) {
+        self.accepted = Some(Instant::now());
+    }
+
     /// Makes a call, which in times of trouble may take no longer than the trouble is waited for.
     ///
     /// # Errors
@@ -49,6 +60,13 @@ impl Backoff {
 
     /// Notes what a try came to; returns whether it is the first of its trouble.
     pub fn failed(&mut self, status: &Status) -> bool {
+        let lived = self.accepted.take().map(|accepted| accepted.elapsed()).unwrap_or_default();
+        if lived >= LIVED {
+            self.reset();
+        } else if let Some(trouble) = &mut self.trouble {
+            // No time of trouble. How often it may go on so is bounded by the pauses.
+            trouble.end += lived;
+        }
         let first = self.trouble.is_none();
         let end = self.trouble.as_ref().map_or_else(|| Instant::now() + Self::TOTAL, |trouble| trouble.end);
         self.trouble = Some(Trouble { end, last: status.clone() });
@@ -105,6 +123,44 @@ mod tests {
                 }
             }
         })
+    }
+
+    fn some_time_ago(time: Duration) -> Instant {
+        Instant::now().checked_sub(time).expect("the machine has run for some seconds")
+    }
+
+    /// What a watch of a waiting job goes through when servers restart one after another.
+    #[test]
+    fn an_outage_after_a_stream_that_lived_is_a_new_one() {
+        let away = Status::unavailable("away");
+        let mut backoff = Backoff { tries: 7, ..Backoff::default() };
+        assert!(backoff.failed(&away) && !backoff.failed(&away), "the second try is of the same trouble");
+        let end = |backoff: &Backoff| backoff.trouble.as_ref().expect("trouble").end;
+        let first = end(&backoff);
+        backoff.accepted = Some(some_time_ago(LIVED));
+        assert!(backoff.failed(&away), "another trouble, which is told");
+        assert_eq!(backoff.tries, 0, "with all of its pauses");
+        assert!(end(&backoff) >= first && backoff.accepted.is_none());
+    }
+
+    #[test]
+    fn a_server_that_takes_every_stream_and_breaks_it_is_given_up() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().expect("a runtime");
+        let away = Status::unavailable("away");
+        let mut backoff = Backoff::default();
+        assert!(backoff.failed(&away));
+        let end = backoff.trouble.as_ref().expect("trouble").end;
+        for tries in 0..PAUSES_MS.len() {
+            backoff.accepted();
+            assert!(!backoff.failed(&away) && backoff.tries == tries, "the pauses go on growing");
+            // In the place of the pause.
+            backoff.tries += 1;
+        }
+        assert!(!runtime.block_on(backoff.pause()), "no pause is left");
+        // The time for which a stream lived is no time of trouble.
+        backoff.accepted = Some(some_time_ago(LIVED / 2));
+        assert!(!backoff.failed(&away));
+        assert!(backoff.trouble.as_ref().expect("trouble").end >= end + LIVED / 2);
     }
 
     #[test]

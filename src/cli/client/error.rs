@@ -70,14 +70,15 @@ impl Error {
         Error::Invalid(own.collect(), message.clone()).at_lines(input)
     }
 
-    /// From the status of a call to `server`.
-    pub(super) fn from_status(server: &str, status: &Status) -> Self {
+    /// From the status of a call to `server`, which has `answered` one before, or not.
+    pub(super) fn from_status(server: &str, status: &Status, answered: bool) -> Self {
         if let Some(words) = handshake::words(server, status) {
             return Error::NotLetIn(words);
         }
         if status.source().is_some() && status.get_details_error_info().is_none() {
             let cause = root_cause(status);
-            let hint = handshake::plain_hint(server, &cause);
+            // What has worked speaks what it is asked in.
+            let hint = if answered { "" } else { handshake::plain_hint(server, &cause) };
             return Error::Unavailable(format!("the connection to {server} broke: {cause}{hint}"));
         }
         let message = status.message().to_owned();
@@ -108,6 +109,16 @@ impl Error {
             }
             Code::Cancelled => Error::Cancelled,
             code => Error::Failed(format!("{server}: {message} ({code:?})")),
+        }
+    }
+
+    /// Says how to name a tenant, where the server knows no such one and the caller named none.
+    pub(super) fn or_no_tenant(self, status: &Status) -> Self {
+        match self {
+            Error::Refused(message) if reason(status).as_deref() == Some("TENANT_NOT_FOUND") => {
+                Error::Refused(format!("{message}; --tenant or SCPSFM_TENANT says whose jobs these are"))
+            }
+            other => other,
         }
     }
 }
@@ -218,13 +229,14 @@ impl From<Error> for Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::job::JobName;
     use crate::rpc::status;
 
     #[test]
     fn violations_come_back_with_field_and_index() {
         let sent = Violation::at("track_set.x", 17, "NaN is not a finite number");
         let status = status::invalid(&sent.clone().into());
-        let Error::Invalid(violations, message) = Error::from_status("http://a", &status) else {
+        let Error::Invalid(violations, message) = Error::from_status("http://a", &status, true) else {
             panic!("not invalid: {status}");
         };
         assert_eq!(violations, [sent]);
@@ -237,18 +249,36 @@ mod tests {
     fn an_answer_that_a_balancer_cut_short_is_a_broken_connection() {
         let cut = Status::unknown("stream was terminated without a final status");
         assert!(is_transient(&cut));
-        let error = Error::from_status("http://a", &cut);
+        let error = Error::from_status("http://a", &cut, true);
         assert_eq!(Failure::from(error.clone()).exit, Exit::Unavailable, "{error}");
         let defect = status::internal(&"a defect");
         assert!(!is_transient(&defect));
-        assert_eq!(Failure::from(Error::from_status("http://a", &defect)).exit, Exit::Internal);
+        assert_eq!(Failure::from(Error::from_status("http://a", &defect, true)).exit, Exit::Internal);
+    }
+
+    #[test]
+    fn tls_is_asked_for_only_where_no_call_was_ever_answered() {
+        let broke = || Status::from_error(Box::new(std::io::Error::other("stream closed because of a broken pipe")));
+        for (answered, asked) in [(false, true), (true, false)] {
+            let error = Error::from_status("http://a", &broke(), answered).to_string();
+            assert!(error.contains("broken pipe"), "{error}");
+            assert_eq!(error.contains("https://"), asked, "{error}");
+        }
+    }
+
+    #[test]
+    fn how_to_name_a_tenant_is_said_where_there_is_none() {
+        let words = |status: Status| Error::from_status("http://a", &status, true).or_no_tenant(&status).to_string();
+        assert!(words(status::tenant_not_found("default")).contains("; --tenant or SCPSFM_TENANT "));
+        let job = JobName::parse("tenants/default/jobs/a").expect("a name");
+        assert!(!words(status::job_not_found(&job)).contains("--tenant"));
     }
 
     #[test]
     fn fields_that_flags_set_are_wrong_usage_and_the_inputs_are_bad_input() {
         let exit = |field: &str| {
             let status = status::invalid(&Violation::of(field, "is wrong").into());
-            Failure::from(Error::from_status("http://a", &status)).exit
+            Failure::from(Error::from_status("http://a", &status, true)).exit
         };
         for flag in
             ["settings.alpha", "settings.backend", "job.labels", "job.time_limit", "job_id", "filter", "after_sequence"]

@@ -8,7 +8,7 @@ use tonic::{Status, Streaming};
 
 use super::backoff::Backoff;
 use super::{Client, Error};
-use crate::domain::job::{EventBody, Job, JobEvent, JobName};
+use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, RawInput, Solution, SolveSettings};
 use crate::rpc::convert;
 use crate::rpc::proto::{self, create_job_request::Input as JobInput};
@@ -198,12 +198,14 @@ pub(super) struct Told<'a> {
 }
 
 impl Told<'_> {
-    /// Follows one stream to its end. The inner error is worth another try; `None`: it ended without a terminal state.
+    /// Follows one stream, which the server has just taken, to its end. The inner error is worth another try; `None`: it
+    /// ended without a terminal state.
     pub(super) async fn follow(
         &mut self,
         mut events: Streaming<proto::JobEvent>,
         backoff: &mut Backoff,
     ) -> Result<Result<Option<JobEvent>, Status>, Error> {
+        backoff.accepted();
         loop {
             let event = match events.message().await {
                 Ok(Some(event)) => convert::job::event_from_wire(event)?,
@@ -220,6 +222,33 @@ impl Told<'_> {
                 return Ok(Ok(Some(event)));
             }
         }
+    }
+}
+
+/// `Ok` when a job's last event says that its result stands.
+///
+/// # Errors
+/// [`Error::Cancelled`], or [`Error::Failed`] with the reason.
+pub fn ended(last: &JobEvent) -> Result<(), Error> {
+    match &last.body {
+        EventBody::State { state, failure } => ended_as(&last.name, *state, failure.as_ref()),
+        _ => Err(Error::Failed(format!("{} did not succeed", last.name))),
+    }
+}
+
+/// The same of a job's state.
+///
+/// # Errors
+/// See [`ended`].
+pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> Result<(), Error> {
+    match (state, failure) {
+        (JobState::Succeeded, _) => Ok(()),
+        (JobState::Cancelled, _) => Err(Error::Cancelled),
+        (JobState::Expired, _) => {
+            Err(Error::Failed(format!("{name} expired: its deadline passed before a result stood")))
+        }
+        (_, Some(failure)) => Err(Error::Failed(format!("{name} failed: {} ({})", failure.message, failure.reason))),
+        _ => Err(Error::Failed(format!("{name} did not succeed"))),
     }
 }
 

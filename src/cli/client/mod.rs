@@ -6,6 +6,7 @@
 //! Here is the connection; its calls are in files of their own.
 
 pub mod access;
+mod answered;
 mod backoff;
 mod batch;
 mod error;
@@ -15,6 +16,8 @@ mod solve;
 pub mod upload;
 mod uploaded_inputs;
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use tonic::Status;
@@ -23,10 +26,11 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 
 pub use error::Error;
-pub use jobs::{JobOptions, Page};
-pub use solve::{ended, ended_as, solve};
+pub use jobs::{JobOptions, Page, ended, ended_as};
+pub use solve::solve;
 
 use self::access::{AccessArgs, Bearer};
+use self::answered::Answered;
 use self::backoff::Backoff;
 use crate::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use crate::rpc::proto::input_service_client::InputServiceClient;
@@ -42,7 +46,7 @@ const KEEPALIVE: Duration = Duration::from_secs(20);
 const MAX_MESSAGE_BYTES: usize = 64 << 20;
 
 /// A connection whose every call carries the API key, where there is one.
-type Keyed = InterceptedService<Channel, Bearer>;
+type Keyed = InterceptedService<Answered<Channel>, Bearer>;
 
 /// A connection to a server; reconnects by itself.
 #[derive(Debug, Clone)]
@@ -51,8 +55,12 @@ pub struct Client {
     calibration: CalibrationServiceClient<Keyed>,
     inputs: InputServiceClient<Keyed>,
     server: String,
+    /// Whether a call was ever answered.
+    answered: Arc<AtomicBool>,
     /// Whose jobs are created and listed.
     tenant: String,
+    /// Whether the caller said so; it is the default one otherwise.
+    is_tenant_given: bool,
 }
 
 impl Client {
@@ -84,7 +92,8 @@ impl Client {
         let bearer = access.bearer(&endpoint)?;
         let endpoint = access.secure(endpoint)?;
         let channel = endpoint.connect().await.map_err(|error| error::not_connected(server, &error))?;
-        let channel = InterceptedService::new(channel, bearer);
+        let answered = Arc::new(AtomicBool::new(false));
+        let channel = InterceptedService::new(Answered::new(channel, Arc::clone(&answered)), bearer);
         let jobs = JobServiceClient::new(channel.clone());
         let calibration = CalibrationServiceClient::new(channel.clone());
         Ok(Self {
@@ -96,7 +105,9 @@ impl Client {
             // Coordinates hardly become shorter by compression.
             inputs: InputServiceClient::new(channel),
             server: server.to_owned(),
+            answered,
             tenant,
+            is_tenant_given: access.tenant.is_some(),
         })
     }
 
@@ -110,7 +121,8 @@ impl Client {
     }
 
     fn error(&self, status: Status) -> Error {
-        Error::from_status(&self.server, &status)
+        let own_words = Error::from_status(&self.server, &status, self.answered.load(Ordering::Relaxed));
+        if self.is_tenant_given { own_words } else { own_words.or_no_tenant(&status) }
     }
 
     /// Waits before another try, or gives up: for good reason, or after too many. Says so once each trouble, on stderr:

@@ -6,10 +6,10 @@ use tokio_util::sync::CancellationToken;
 use tonic::Request;
 
 use super::backoff::Backoff;
-use super::jobs::{JobOptions, Told, create_request};
+use super::jobs::{JobOptions, Told, create_request, ended};
 use super::{Client, Error};
 use crate::cli::args::ServerArgs;
-use crate::domain::job::{EventBody, Failure, JobEvent, JobName, JobState};
+use crate::domain::job::JobEvent;
 use crate::domain::{RawInput, Solution, SolveSettings};
 use crate::rpc::convert;
 use crate::rpc::proto::{self, create_job_request::Input as JobInput};
@@ -77,33 +77,6 @@ impl Client {
                 Err(status) => self.pause(&mut backoff, status).await?,
             }
         }
-    }
-}
-
-/// `Ok` when a job's last event says that its result stands.
-///
-/// # Errors
-/// [`Error::Cancelled`], or [`Error::Failed`] with the reason.
-pub fn ended(last: &JobEvent) -> Result<(), Error> {
-    match &last.body {
-        EventBody::State { state, failure } => ended_as(&last.name, *state, failure.as_ref()),
-        _ => Err(Error::Failed(format!("{} did not succeed", last.name))),
-    }
-}
-
-/// The same of a job's state.
-///
-/// # Errors
-/// See [`ended`].
-pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> Result<(), Error> {
-    match (state, failure) {
-        (JobState::Succeeded, _) => Ok(()),
-        (JobState::Cancelled, _) => Err(Error::Cancelled),
-        (JobState::Expired, _) => {
-            Err(Error::Failed(format!("{name} expired: its deadline passed before a result stood")))
-        }
-        (_, Some(failure)) => Err(Error::Failed(format!("{name} failed: {} ({})", failure.message, failure.reason))),
-        _ => Err(Error::Failed(format!("{name} did not succeed"))),
     }
 }
 

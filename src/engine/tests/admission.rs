@@ -106,6 +106,8 @@ async fn a_hundred_jobs_of_twenty_callers_on_two_workers_all_end() {
                 let events = rest(&mut watch).await;
                 assert_contiguous(&events, 1);
                 assert_eq!(events.last().and_then(terminal), Some(JobState::Succeeded));
+                let running = EventBody::State { state: JobState::Running, failure: None };
+                assert_eq!(events.iter().filter(|event| event.body == running).count(), 1);
             }
             names
         })
@@ -117,7 +119,8 @@ async fn a_hundred_jobs_of_twenty_callers_on_two_workers_all_end() {
     names.sort();
     names.dedup();
     assert_eq!(names.len(), 100);
-    assert_eq!(bench.gate.calls.load(Ordering::SeqCst), 100);
+    // One that is foreseen while another slot claims it may be begun for nothing.
+    assert!(bench.gate.calls.load(Ordering::SeqCst) >= 100);
     assert_eq!(bench.engine.load().await.expect("counts"), crate::engine::Load::default());
     eventually(|| async { (bench.engine.inner.hub.topic_count() == 0).then_some(()) }).await;
 }

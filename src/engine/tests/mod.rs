@@ -1,6 +1,7 @@
 //! The engine over a real SQLite store and a solver that does as it is told.
 
 mod admission;
+mod ahead;
 mod lifecycle;
 mod sharing;
 mod survival;
@@ -16,7 +17,8 @@ use tempfile::TempDir;
 use super::{Engine, NewJob, Options, Solver};
 use crate::domain::job::{DEFAULT_TENANT, EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{
-    Input, Limits, Method, Observer, Progress, RawInput, Solution, SolveSettings, Stage, Status, StopToken, View,
+    Course, Input, Limits, Method, Observer, Progress, RawInput, Solution, SolveSettings, Stage, Status, StopToken,
+    View,
 };
 use crate::solver;
 use crate::store::Store;
@@ -107,6 +109,7 @@ fn progress(iteration: u32) -> Progress {
         focal_px: None,
         best_score: None,
         elapsed_seconds: 0.0,
+        course: Course::default(),
     }
 }
 

@@ -31,6 +31,46 @@ pub(in crate::store) async fn no_job_is_claimed_twice(store: &dyn Store) {
     assert_eq!(names.len(), 30);
 }
 
+pub(in crate::store) async fn a_foreseen_job_is_leased_unless_it_has_moved(store: &dyn Store) {
+    assert_eq!(store.foresee(&[], time(1)).await, Ok(None));
+    for (job, priority) in [("second", 0), ("first", 1), ("third", 0)] {
+        create(store, NewRecord { priority, ..record(job) }, 0).await;
+    }
+    create(store, NewRecord { deadline: Some(time(2)), priority: 9, ..record("late") }, 0).await;
+    let foreseen = store.foresee(&[], time(3)).await.expect("looks").expect("a job");
+    assert_eq!(foreseen.lease, Lease { name: record("first").name, attempt: 1 });
+    assert_eq!((foreseen.job.attempt, foreseen.queue_time, foreseen.job.create_time), (1, time(0), time(0)));
+    let next = store.foresee(std::slice::from_ref(&foreseen.lease.name), time(3)).await.expect("looks");
+    let second = next.expect("another").lease;
+    assert_eq!(second.name, record("second").name);
+    assert_eq!(story(store, &second.name).await, told(&[(1, 0, "QUEUED")]), "a look changes nothing");
+
+    let claimed = store.claim_foreseen(&foreseen.lease, time(0), "worker", time(4), LEASE).await.expect("claims");
+    let claimed = claimed.expect("is still there");
+    assert_eq!((claimed.job.state, claimed.job.start_time), (JobState::Running, Some(time(4))));
+    assert_eq!(claimed.lease, foreseen.lease);
+    assert_eq!(store.job(&claimed.job.name).await, Ok(claimed.job.clone()));
+    assert_eq!(story(store, &claimed.job.name).await, told(&[(1, 0, "QUEUED"), (2, 1, "RUNNING")]));
+
+    let again = async |lease: &Lease| store.claim_foreseen(lease, time(0), "other", time(5), LEASE).await;
+    assert_eq!(again(&foreseen.lease).await, Ok(None), "it runs");
+    store.release(&foreseen.lease, time(5)).await.expect("holds");
+    assert_eq!(again(&foreseen.lease).await, Ok(None), "that attempt is over");
+    let late = Lease { name: record("late").name, attempt: 1 };
+    assert_eq!(again(&late).await, Ok(None), "past its deadline");
+    store.request_cancel(&second.name, None, time(5)).await.expect("ends");
+    assert_eq!(again(&second).await, Ok(None), "it has ended");
+    assert_eq!(again(&Lease { name: record("none").name, attempt: 1 }).await, Ok(None));
+    store.delete_job(&second.name, None).await.expect("has ended");
+    create(store, record("second"), 6).await;
+    assert_eq!(again(&second).await, Ok(None), "it is another one of that name");
+    let both = futures_util::future::join_all((0..2).map(|_| {
+        let third = Lease { name: record("third").name, attempt: 1 };
+        async move { store.claim_foreseen(&third, time(0), "worker", time(6), LEASE).await.expect("claims") }
+    }));
+    assert_eq!(both.await.into_iter().flatten().count(), 1);
+}
+
 pub(in crate::store) async fn a_lease_that_was_taken_over_writes_nothing(store: &dyn Store) {
     let name = create(store, record("a"), 0).await.name;
     let old = claim(store, 0).await.lease;

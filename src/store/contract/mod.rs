@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt, Summary};
-use crate::domain::{Progress, SolveSettings, Stage, Status};
+use crate::domain::{Course, Progress, SolveSettings, Stage, Status, Step, Task};
 use crate::store::record::{Bound, NewRecord, QueueBounds, Request};
 use crate::store::{ATTEMPTS_EXHAUSTED, Claimed, Ending, Error, JobQuery, Lease, Order, Outcome, Store, payload};
 
@@ -27,6 +27,7 @@ macro_rules! store_contract {
             creation::admission_bounds_what_waits,
             leases::claims_go_by_priority_then_age,
             leases::no_job_is_claimed_twice,
+            leases::a_foreseen_job_is_leased_unless_it_has_moved,
             leases::a_lease_that_was_taken_over_writes_nothing,
             leases::a_success_stores_its_result_then_its_state,
             leases::progress_is_an_event_and_stands_in_the_job,
@@ -121,6 +122,12 @@ fn progress(iteration: u32) -> Progress {
         focal_px: Some(1234.5),
         best_score: Some(f64::INFINITY),
         elapsed_seconds: 0.25,
+        course: Course {
+            registered_views: 7,
+            views: 9,
+            step: Some(Step { task: Task::Adjust, step: 2, steps: 3 }),
+            ..Course::default()
+        },
     }
 }
 

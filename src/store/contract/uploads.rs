@@ -9,7 +9,7 @@ use crate::store::upload::{
 use crate::store::{InputPage, InputQuery};
 
 pub(in crate::store) const ROOMY: UploadBounds =
-    UploadBounds { max_tenant_uploads: u64::MAX, max_tenant_bytes: u64::MAX };
+    UploadBounds { max_bytes: u64::MAX, max_tenant_uploads: u64::MAX, max_tenant_bytes: u64::MAX };
 
 pub(in crate::store) fn name(input: &str) -> InputName {
     InputName { tenant: "t".into(), input: input.into() }
@@ -35,6 +35,21 @@ pub(in crate::store) async fn finished(store: &dyn Store, id: &str, payload: Vec
     let (lease, _) = begin(store, &new(id, 4), seconds).await;
     store.append_upload(&lease, 0, &[1; 4], time(seconds)).await.expect("appends");
     store.finish_upload(&lease, &input(payload), time(seconds)).await.expect("finishes")
+}
+
+/// Two jobs, one with an uploaded input; what [`know_their_inputs`] looks at.
+pub(in crate::store) async fn jobs_with_and_without(store: &dyn Store) {
+    finished(store, "a", vec![7; 10], 0).await;
+    let with = NewRecord { input: JobInput::Uploaded { input: "a".into(), bytes: 10 }, ..record("with") };
+    for new in [with, record("without")] {
+        store.create_job(new, &ROOM, time(1)).await.expect("created");
+    }
+}
+
+pub(in crate::store) async fn know_their_inputs(store: &dyn Store) {
+    let known = async |job: &str| store.job(&record(job).name).await.expect("kept").input;
+    assert_eq!(known("with").await, Some(name("a")));
+    assert_eq!(known("without").await, None);
 }
 
 async fn whole(store: &dyn Store, lease: &UploadLease) -> Vec<u8> {
@@ -142,7 +157,7 @@ pub(in crate::store) async fn an_upload_id_stands_for_one_length_and_hash(store:
 }
 
 pub(in crate::store) async fn a_tenants_uploads_are_bounded(store: &dyn Store) {
-    let bounds = UploadBounds { max_tenant_uploads: 2, max_tenant_bytes: 400 };
+    let bounds = UploadBounds { max_tenant_uploads: 2, max_tenant_bytes: 400, ..ROOMY };
     let begin_within = |new: NewUpload| async move { store.begin_upload(&new, &bounds, time(0)).await };
     let refused = async |new: NewUpload| match begin_within(new).await {
         Err(Error::UploadsFull(bound)) => bound,
@@ -297,10 +312,10 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
         store.purge_uploads(None, None).await.expect("clears away");
     }
     let taken = 4;
-    let tight = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: taken + 3 };
+    let tight = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: taken + 3, ..ROOMY };
     let refused = store.begin_upload(&new("shared", 4), &tight, time(3)).await;
     assert_eq!(refused, Err(Error::UploadsFull(UploadBound::Bytes { taken, asked: 4, max: taken + 3 })));
-    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: taken + 4 };
+    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: taken + 4, ..ROOMY };
     let again = store.begin_upload(&new("shared", 4), &bounds, time(3)).await.expect("room");
     let BegunUpload::Open { lease, committed: 0, .. } = again else { panic!("{again:?}") };
     store.append_upload(&lease, 0, &[1; 4], time(3)).await.expect("appends");
@@ -315,7 +330,7 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
         }
     }
     assert!(store.uploaded_input(&name("shared")).await.is_ok(), "the new one has nothing to do with them");
-    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: 4 + 4 };
+    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: 4 + 4, ..ROOMY };
     let room = store.begin_upload(&new("next", 4), &bounds, time(5)).await;
     let Ok(BegunUpload::Open { lease, .. }) = room else { panic!("only the new one counts: {room:?}") };
     store.give_up_upload(&lease).await.expect("gives up");

@@ -75,8 +75,7 @@ impl Postgres {
     ///
     /// # Errors
     /// [`Error::Unavailable`] where the database does not answer or refuses, or another server is at the schema for too
-    /// long, [`Error::Corrupt`] where its schema is of
-    /// a newer version.
+    /// long, [`Error::Corrupt`] where its schema is of a newer version.
     pub async fn open(url: &DatabaseUrl) -> Result<Self, Error> {
         let options = url.options().clone().options(SESSION);
         let pool = match pool_of(CONNECTIONS).connect_with(options.clone()).await {

@@ -103,6 +103,7 @@ mod tests {
     use super::super::tests::cluster;
     use super::super::url::DatabaseUrl;
     use super::*;
+    use crate::store::sql::Row;
 
     /// How a server that holds its statements to a bound reaches a database without a schema.
     async fn hasty(cluster: &cluster::Cluster) -> PgConnectOptions {
@@ -124,7 +125,7 @@ mod tests {
         migrate(&options, &[(1, "slow", sleep)], PATIENCE).await.expect("takes its time");
         let mut connection = connected(&options).await;
         let done = connection.rows(Statement::new("SELECT version FROM _sqlx_migrations")).await.expect("a table");
-        assert_eq!(done.iter().map(|row| sql::Row::integer(row, "version")).collect::<Vec<_>>(), [Ok(1)]);
+        assert_eq!(done.iter().map(|row| row.integer("version")).collect::<Vec<_>>(), [Ok(1)]);
     }
 
     #[tokio::test]
@@ -139,6 +140,14 @@ mod tests {
         // One that waits goes on once the other is through.
         let waiting = migrate(&options, &MIGRATIONS, PATIENCE);
         let unlocking = async {
+            let waiters = "SELECT COUNT(*) AS count FROM pg_locks WHERE locktype = 'advisory' AND NOT granted \
+                           AND database = (SELECT oid FROM pg_database WHERE datname = current_database())";
+            let look = async {
+                while other.row(Statement::new(waiters)).await.expect("counts").integer("count") != Ok(1) {
+                    tokio::time::sleep(Duration::from_millis(10)).await;
+                }
+            };
+            timeout(Duration::from_secs(60), look).await.expect("nobody waits");
             other.unlock().await.expect("unlocks");
         };
         let (migrated, ()) = tokio::join!(waiting, unlocking);

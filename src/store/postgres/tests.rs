@@ -55,6 +55,20 @@ async fn what_lives_elsewhere_is_not_taken_back_at_a_start() {
 }
 
 #[tokio::test]
+async fn jobs_of_before_learn_which_uploaded_input_they_have() {
+    let Some(fixture) = Fixture::open().await else { return };
+    // As a server left it that knew nothing of the column.
+    let former = ["ALTER TABLE jobs DROP COLUMN uploaded_input", "DELETE FROM _sqlx_migrations WHERE version = 8"];
+    contract::uploads::jobs_with_and_without(&*fixture).await;
+    for statement in former {
+        let mut connection = fixture.pool.acquire().await.expect("a connection");
+        Connection::execute(&mut *connection, Statement::new(statement)).await.expect("done");
+    }
+    let newer = Postgres::open(&fixture.url).await.expect("brings it up to date");
+    contract::uploads::know_their_inputs(&newer).await;
+}
+
+#[tokio::test]
 async fn a_server_whose_clock_is_wrong_takes_and_loses_nothing_early() {
     let Some(fixture) = Fixture::open().await else { return };
     let right = Postgres::open(&fixture.url).await.expect("a second server");

@@ -3,8 +3,8 @@
 use std::time::SystemTime;
 
 use super::rows::{
-    self, Departure, Standing, end_attempt, held, insert_event, integer, leave, micros, number, one_job, returning_job,
-    select_standing, standing,
+    self, Departure, Standing, end_attempt, held, insert_event, integer, leave, micros, number, returning_job,
+    select_jobs, select_standing, standing,
 };
 use super::{Change, Connection, Row, Statement, jobs, removal};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt};
@@ -34,7 +34,63 @@ pub(super) async fn claim<C: Connection>(
     ))
     .bind(micros(now))
     .then(C::SKIP_LOCKED);
-    let Some(row) = connection.optional_row(next).await? else { return Ok(None) };
+    lease(connection, next, worker, now, expires).await
+}
+
+/// The job that a claim would lease next, but for some; see [`crate::store::Store::foresee`].
+pub(super) async fn foresee<C: Connection>(
+    connection: &mut C,
+    passed: &[JobName],
+    now: SystemTime,
+) -> Result<Option<Claimed>, Error> {
+    let next = Statement::new(select_jobs!(
+        "WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) \
+         ORDER BY priority DESC, create_time, id LIMIT $2"
+    ))
+    .bind(micros(now))
+    .bind(integer(passed.len() as u64 + 1));
+    for row in connection.rows(next).await? {
+        let mut claimed = claimed(&row)?;
+        if !passed.contains(&claimed.job.name) {
+            claimed.lease.attempt += 1;
+            claimed.job.attempt = claimed.lease.attempt;
+            return Ok(Some(claimed));
+        }
+    }
+    Ok(None)
+}
+
+/// Leases a job that was foreseen; see [`crate::store::Store::claim_foreseen`].
+pub(super) async fn claim_foreseen<C: Connection>(
+    connection: &mut C,
+    foreseen: &Lease,
+    created: SystemTime,
+    worker: &str,
+    now: SystemTime,
+    expires: SystemTime,
+) -> Result<Option<Claimed>, Error> {
+    let same = Statement::new(select_standing!(
+        "WHERE tenant = $1 AND job = $2 AND attempt = $3 AND create_time = $4 AND state = 'QUEUED' \
+         AND (deadline IS NULL OR deadline > $5)"
+    ))
+    .bind(&foreseen.name.tenant)
+    .bind(&foreseen.name.job)
+    .bind(foreseen.attempt.saturating_sub(1))
+    .bind(micros(created))
+    .bind(micros(now))
+    .then(C::SKIP_LOCKED);
+    lease(connection, same, worker, now, expires).await
+}
+
+/// Leases the job of this row, if there is one.
+async fn lease<C: Connection>(
+    connection: &mut C,
+    standing: Statement,
+    worker: &str,
+    now: SystemTime,
+    expires: SystemTime,
+) -> Result<Option<Claimed>, Error> {
+    let Some(row) = connection.optional_row(standing).await? else { return Ok(None) };
     let job = Standing::from_row(&row)?;
     let (attempt, sequence) = (job.attempt + 1, job.last_sequence + 1);
     let lease = Statement::new(returning_job!(
@@ -56,14 +112,19 @@ pub(super) async fn claim<C: Connection>(
     let event = insert_event(job.id, sequence, attempt, &event, now)?;
     let rows = connection.batch(vec![lease, begin, event]).await?;
     connection.tell(Change::Events, &job.name).await?;
-    let claimed = one_job(&rows)?;
-    let row = &rows[0];
-    Ok(Some(Claimed {
-        lease: Lease { name: claimed.name.clone(), attempt },
-        job: claimed,
+    let changed = rows.first().ok_or_else(|| Error::Corrupt("a job that was just leased is not there".into()))?;
+    claimed(changed).map(Some)
+}
+
+/// A job with the lease of its latest attempt, from a row of `select_jobs!`.
+fn claimed(row: &impl Row) -> Result<Claimed, Error> {
+    let job = rows::job(row)?;
+    Ok(Claimed {
+        lease: Lease { name: job.name.clone(), attempt: job.attempt },
+        job,
         trace_parent: row.optional_text("trace_parent")?,
         queue_time: rows::time(row.integer("queue_time")?),
-    }))
+    })
 }
 
 /// Extends a lease until `expires`.

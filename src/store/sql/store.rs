@@ -106,6 +106,25 @@ impl<D: Database> Store for D {
         writes!(self, Size::Small, [worker], |connection| attempts::claim(connection, &worker, now, expires))
     }
 
+    async fn foresee(&self, passed: &[JobName], now: SystemTime) -> Result<Option<Claimed>, Error> {
+        reads!(self, Size::Small, |connection| attempts::foresee(connection, passed, now))
+    }
+
+    async fn claim_foreseen(
+        &self,
+        foreseen: &Lease,
+        created: SystemTime,
+        worker: &str,
+        now: SystemTime,
+        lease_for: Duration,
+    ) -> Result<Option<Claimed>, Error> {
+        let expires = self.lease_clock(now) + lease_for;
+        let worker = worker.to_owned();
+        writes!(self, Size::Small, [foreseen, worker], |connection| attempts::claim_foreseen(
+            connection, &foreseen, created, &worker, now, expires
+        ))
+    }
+
     async fn work(&self, name: &JobName) -> Result<Work, Error> {
         reads!(self, Size::Payload, |connection| jobs::work(connection, name))
     }

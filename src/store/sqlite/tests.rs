@@ -76,24 +76,16 @@ async fn everything_is_there_after_a_reopen_and_every_lease_is_a_dead_one() {
 
 #[tokio::test]
 async fn jobs_of_before_learn_which_uploaded_input_they_have() {
-    use crate::store::{JobInput, NewRecord};
     let directory = tempfile::tempdir().expect("a temporary directory");
     let store = Sqlite::open(directory.path()).await.expect("opens");
-    let uploaded = contract::uploads::finished(&store, "a", vec![7; 10], 0).await;
-    let of_it = JobInput::Uploaded { input: "a".into(), bytes: 10 };
-    let with = NewRecord { input: of_it, ..contract::record("with") };
-    for new in [with, contract::record("without")] {
-        store.create_job(new, &contract::ROOM, contract::time(1)).await.expect("created");
-    }
+    contract::uploads::jobs_with_and_without(&store).await;
     // As a server left it that knew nothing of the column.
     store.execute("ALTER TABLE jobs DROP COLUMN uploaded_input").await;
     store.execute("DELETE FROM _sqlx_migrations WHERE version = 9").await;
     store.close().await;
     drop(store);
     let store = Sqlite::open(directory.path()).await.expect("brings it up to date");
-    let input = async |job: &str| store.job(&contract::record(job).name).await.expect("kept").input;
-    assert_eq!(input("with").await, Some(uploaded.name));
-    assert_eq!(input("without").await, None);
+    contract::uploads::know_their_inputs(&store).await;
 }
 
 #[tokio::test]

@@ -12,7 +12,7 @@ use super::{
 };
 use crate::domain::Stage;
 use crate::domain::job::{JobName, JobState};
-use crate::telemetry::Attempt;
+use crate::telemetry::{Attempt, waited};
 
 const TRACE_ID: &str = "0af7651916cd43dd8448eb211c80319c";
 const CALLER_SPAN: &str = "b7ad6b7169203331";
@@ -53,7 +53,7 @@ fn write_lines_inside_a_job(format: Format, filter: &str) -> String {
     let writer = lines.clone();
     let (subscriber, _guard) = build(options(format, filter), move || writer.clone(), false).expect("subscriber");
     with_default(subscriber, || {
-        let attempt = Attempt::begin(&job(), 2, None, SystemTime::now());
+        let attempt = Attempt::begin(&job(), 2, None);
         attempt.span().in_scope(|| {
             tracing::info!("an info line");
             tracing::warn!(inliers = 20, "a warning");
@@ -114,10 +114,12 @@ fn run_a_job() -> SystemTime {
     let stored = traceparent_to_store(&submit, Some(&caller())).expect("traceparent");
     drop(submit);
     let enqueued_at = SystemTime::now() - Duration::from_secs(7);
-    let mut first = Attempt::begin(&job(), 1, Some(&stored), enqueued_at);
+    waited(&job(), Some(&stored), enqueued_at);
+    let mut first = Attempt::begin(&job(), 1, Some(&stored));
     first.stage(Stage::Prepare);
     drop(first);
-    let mut second = Attempt::begin(&job(), 2, Some(&stored), SystemTime::now());
+    waited(&job(), Some(&stored), SystemTime::now());
+    let mut second = Attempt::begin(&job(), 2, Some(&stored));
     second.stage(Stage::Search);
     second.stage(Stage::Refine);
     second.end(Some(JobState::Failed));

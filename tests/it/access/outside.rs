@@ -93,7 +93,8 @@ async fn commands_are_let_in_and_no_secret_is_told() {
     let south = [("SCPSFM_API_KEY", SOUTH), ("SCPSFM_TENANT", "south")];
     expect(run_with(with(&["get", "a"]), &south), 65, "there is no job tenants/south/jobs/a");
     expect(run_with(with(&["get", "tenants/north/jobs/a"]), &south), 65, "there is no job");
-    expect(run_with(with(&["list"]), &[("SCPSFM_API_KEY", SOUTH)]), 65, "no tenant tenants/default");
+    let hint = "no tenant tenants/default, or the caller's key is not of it; --tenant or SCPSFM_TENANT says";
+    expect(run_with(with(&["list"]), &[("SCPSFM_API_KEY", SOUTH)]), 65, hint);
     expect(run_with(with(&["list"]), &[]), 77, "--api-key-file");
     expect(run_with(with(&["list"]), &[("SCPSFM_API_KEY", UNKNOWN)]), 77, "not known");
     expect(run_with(with(&["list"]), &[("SCPSFM_API_KEY", &UNKNOWN[..20])]), 2, "fewer than 32");

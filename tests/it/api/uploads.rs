@@ -344,8 +344,7 @@ fn bounded(options: UploadOptions) -> engine::Options {
 #[tokio::test]
 async fn bounds_are_advertised_and_hold() {
     let uploads = UploadOptions {
-        max_bytes: 10_000,
-        bounds: UploadBounds { max_tenant_uploads: 2, max_tenant_bytes: 15_000 },
+        bounds: UploadBounds { max_bytes: 10_000, max_tenant_uploads: 2, max_tenant_bytes: 15_000 },
         abandoned_after: Some(Duration::from_secs(3_600)),
     };
     let server = TestServer::start_with(quick(), Options::default(), bounded(uploads)).await;
@@ -383,7 +382,7 @@ fn never_fits(status: &Status) -> (String, String) {
 
 #[tokio::test]
 async fn an_upload_above_all_that_a_tenant_may_have_is_refused_for_good() {
-    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: 4_000 };
+    let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: 4_000, ..UploadOptions::default().bounds };
     let uploads = UploadOptions { bounds, ..UploadOptions::default() };
     let server = TestServer::start_with(quick(), Options::default(), bounded(uploads)).await;
     let mut inputs = inputs(&server).await;
@@ -401,7 +400,7 @@ async fn an_upload_above_all_that_a_tenant_may_have_is_refused_for_good() {
 async fn the_bound_and_the_list_count_the_same_bytes() {
     let bytes = encoded(&raw(3, 40));
     let room = 2 * bytes.len() as u64;
-    let bounds = UploadBounds { max_tenant_uploads: 4, max_tenant_bytes: room };
+    let bounds = UploadBounds { max_tenant_uploads: 4, max_tenant_bytes: room, ..UploadOptions::default().bounds };
     let uploads = UploadOptions { bounds, ..UploadOptions::default() };
     let server = TestServer::start_with(quick(), Options::default(), bounded(uploads)).await;
     let mut inputs = inputs(&server).await;

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use scpsfm::domain::result::{ObservationResults, TrackResults, ViewResult};
 use scpsfm::domain::{
-    Grade, Input, Method, Observer, Prior, Progress, Solution, SolveSettings, Stage, Status, StopToken,
+    Course, Grade, Input, Method, Observer, Prior, Progress, Solution, SolveSettings, Stage, Status, StopToken,
 };
 use scpsfm::engine::Solver;
 use scpsfm::solver::Error;
@@ -69,6 +69,7 @@ fn progress(fraction: f64) -> Progress {
         focal_px: Some(1000.0),
         best_score: Some(0.5),
         elapsed_seconds: 0.0,
+        course: Course::default(),
     }
 }
 

@@ -1,0 +1,123 @@
+//! Jobs that are begun the moment a worker is free: read ahead, leased while they are solved, and nothing before.
+
+use std::time::SystemTime;
+
+use super::*;
+use crate::engine::{Drained, locked};
+use crate::store::Lease;
+
+/// Every job counts as short.
+const ALWAYS: Duration = Duration::from_secs(3_600);
+
+/// One worker on a job that runs until the gate opens, and another job that is foreseen behind it.
+async fn foreseen() -> (Bench, [JobName; 2]) {
+    let bench = Bench::start(Options { short_job: ALWAYS, ..workers(1) }).await;
+    let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
+    let created = bench.engine.submit_batch(both).await.expect("admitted");
+    let names = [created[0].name.clone(), created[1].name.clone()];
+    eventually(|| async { is_foreseen(&bench, &names[1]).then_some(()) }).await;
+    (bench, names)
+}
+
+fn is_foreseen(bench: &Bench, name: &JobName) -> bool {
+    locked(&bench.engine.inner.foreseen).contains_key(name)
+}
+
+/// The states that a job has been in.
+async fn states(bench: &Bench, name: &JobName) -> Vec<JobState> {
+    let events = bench.store.events_after(name, 0, 100).await.expect("events");
+    assert_contiguous(&events, 1);
+    let state = |event: &JobEvent| match event.body {
+        EventBody::State { state, .. } => Some(state),
+        _ => None,
+    };
+    events.iter().filter_map(state).collect()
+}
+
+#[tokio::test]
+async fn a_foreseen_job_waits_as_any_other_and_is_solved_next() {
+    let (bench, names) = foreseen().await;
+    let waiting = bench.engine.job(&names[1]).await.expect("exists");
+    assert_eq!((waiting.state, waiting.attempt, waiting.last_sequence), (JobState::Queued, 0, 1), "nothing is told");
+    bench.gate.open();
+    for name in &names {
+        let job = bench.ended(name).await;
+        assert_eq!((job.state, job.attempt), (JobState::Succeeded, 1));
+        assert_eq!(states(&bench, name).await, [JobState::Queued, JobState::Running, JobState::Succeeded]);
+        assert!(job.start_time >= Some(job.create_time) && job.start_time <= job.end_time);
+    }
+    assert_eq!(bench.gate.calls.load(Ordering::SeqCst), 2);
+    eventually(|| async { locked(&bench.engine.inner.foreseen).is_empty().then_some(()) }).await;
+    assert!(locked(&bench.engine.inner.running).is_empty());
+}
+
+#[tokio::test]
+async fn behind_a_job_that_turns_out_long_nothing_is_foreseen_any_more() {
+    let bench = Bench::start(Options { short_job: Duration::from_secs(2), ..workers(1) }).await;
+    let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
+    let created = bench.engine.submit_batch(both).await.expect("admitted");
+    let next = &created[1].name;
+    eventually(|| async { is_foreseen(&bench, next).then_some(()) }).await;
+    eventually(|| async { (!is_foreseen(&bench, next)).then_some(()) }).await;
+    assert_eq!(bench.engine.job(&created[0].name).await.expect("exists").state, JobState::Running);
+    assert_eq!(bench.engine.job(next).await.expect("exists").state, JobState::Queued);
+    bench.gate.open();
+    for job in &created {
+        assert_eq!(bench.ended(&job.name).await.state, JobState::Succeeded);
+    }
+}
+
+#[tokio::test]
+async fn cancelled_before_it_is_begun_it_ends_so_whatever_was_foreseen() {
+    let (bench, [solved, next]) = foreseen().await;
+    assert_eq!(bench.engine.cancel(&next).await.expect("exists").state, JobState::Cancelled);
+    let third = bench.submit(Script::Succeed).await;
+    bench.gate.open();
+    for name in [&solved, &third] {
+        assert_eq!(bench.ended(name).await.state, JobState::Succeeded);
+    }
+    assert_eq!(states(&bench, &next).await, [JobState::Queued, JobState::Cancelled]);
+    assert!(locked(&bench.engine.inner.running).is_empty());
+}
+
+#[tokio::test]
+async fn taken_by_another_process_it_stays_with_that() {
+    let (bench, [solved, next]) = foreseen().await;
+    let (now, lease_for) = (SystemTime::now(), Duration::from_secs(3_600));
+    let claimed = bench.store.claim("another", now, lease_for).await.expect("claims").expect("a job");
+    assert_eq!(claimed.job.name, next);
+    bench.gate.open();
+    assert_eq!(bench.ended(&solved).await.state, JobState::Succeeded);
+    let third = bench.submit(Script::Succeed).await;
+    assert_eq!(bench.ended(&third).await.state, JobState::Succeeded);
+    assert_eq!(states(&bench, &next).await, [JobState::Queued, JobState::Running], "nothing was written of it here");
+    bench.store.heartbeat(&Lease { name: next, attempt: 1 }, now, lease_for).await.expect("still its lease");
+}
+
+#[tokio::test]
+async fn a_drain_leaves_it_in_the_queue() {
+    let (bench, [solved, next]) = foreseen().await;
+    let engine = bench.engine.clone();
+    let drain = tokio::spawn(async move { engine.drain(Duration::from_secs(120)).await });
+    eventually(|| async { bench.engine.is_draining().then_some(()) }).await;
+    bench.gate.open();
+    assert_eq!(drain.await.expect("no panic"), Drained { finished: 1, given_back: 0 });
+    assert_eq!(bench.engine.job(&solved).await.expect("exists").state, JobState::Succeeded);
+    assert_eq!(states(&bench, &next).await, [JobState::Queued]);
+    let Bench { engine, store, gate, directory } = bench;
+    drop((engine, store));
+    let (engine, _store) = start(workers(1), &directory, &gate).await;
+    assert_eq!(ended(&engine, &next).await.attempt, 1);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_an_idle_worker_can_take_waits_for_no_other() {
+    let bench = Bench::start(Options { short_job: ALWAYS, ..workers(2) }).await;
+    for round in 1..=20 {
+        let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
+        let created = bench.engine.submit_batch(both).await.expect("admitted");
+        assert_eq!(bench.ended(&created[1].name).await.state, JobState::Succeeded, "round {round}");
+        bench.engine.cancel(&created[0].name).await.expect("exists");
+        bench.ended(&created[0].name).await;
+    }
+}
