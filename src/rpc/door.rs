@@ -41,22 +41,35 @@ pub const MAX_GREETED: usize = 1_024;
 /// while it is idle, and a file descriptor.
 pub const MAX_SPEAKING: usize = 4_096;
 
+/// How long a connection that is refused may take to its first call, which is what is refused: a client that is told
+/// before may close while that call is on its way through it, and some then never answer the call.
+const REFUSED_CALL_TIMEOUT: Duration = Duration::from_millis(500);
+
 /// How long a connection that is refused may take to hear of it.
 const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Connections that are being refused, at most: as many as may be about to speak. One more is closed without a word.
 const MAX_REFUSALS: usize = MAX_GREETED;
 
-/// What a connection is told for which there is no room: empty settings, and GOAWAY (RFC 9113, sections 6.5 and 6.8)
-/// after stream 0 with REFUSED_STREAM. No call of it was begun, so that a client may come again: gRPC calls that
+/// What every server says first: settings, here none (RFC 9113, section 6.5). Some clients wait for them before they call.
+const NO_SETTINGS: &[u8] = b"\0\0\0\x04\0\0\0\0\0";
+
+/// What a connection is told for which there is no room: GOAWAY (RFC 9113, section 6.8) after stream 0 with REFUSED_STREAM. No call of it was begun, so that a client may come again: gRPC calls that
 /// UNAVAILABLE, where ENHANCE_YOUR_CALM would be RESOURCE_EXHAUSTED.
-const NO_ROOM: &[u8] = b"\0\0\0\x04\0\0\0\0\0\0\0\x1c\x07\0\0\0\0\0\0\0\0\0\0\0\0\x07too many connections";
+const NO_ROOM: &[u8] = b"\0\0\x1c\x07\0\0\0\0\0\0\0\0\0\0\0\0\x07too many connections";
 
 /// Pause after a connection could not be taken, which is usually a lack of file descriptors: some free up meanwhile.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 
 /// What every client says first (RFC 9113, section 3.4).
 const PREFACE: &[u8; 24] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+
+/// Bytes before a frame's own: its length in three, type, flags, stream (RFC 9113, section 4.1).
+const FRAME_HEAD: usize = 9;
+/// Largest frame before a server has allowed larger ones (RFC 9113, section 4.2).
+const MAX_FRAME: u32 = 16_384;
+/// Type of the frame that begins a call (RFC 9113, section 6.2).
+const HEADERS: u8 = 1;
 
 /// How connections are let in.
 #[derive(Debug, Clone)]
@@ -166,7 +179,14 @@ impl Door {
         let Ok(place) = self.refusing_seats.clone().try_acquire_owned() else { return };
         tokio::spawn(async move {
             let _place = place;
-            let mut io = begun.io;
+            let Begun { mut io, early } = begun;
+            let called = async {
+                io.write_all(NO_SETTINGS).await?;
+                io.flush().await?;
+                if early == PREFACE[..] { first_call(&mut io).await } else { Ok(()) }
+            };
+            // Whoever does not call is told all the same.
+            let _ = tokio::time::timeout(REFUSED_CALL_TIMEOUT, called).await;
             let told = async {
                 io.write_all(NO_ROOM).await?;
                 io.shutdown().await?;
@@ -198,6 +218,19 @@ async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Resu
         early.extend_from_slice(&rest[..count]);
     }
     Ok(Begun { io, early: early.into() })
+}
+
+/// Reads what comes after the preface until a call begins, or what no server allows.
+async fn first_call(io: &mut dyn Io) -> io::Result<()> {
+    loop {
+        let mut head = [0; FRAME_HEAD];
+        io.read_exact(&mut head).await?;
+        let length = u32::from_be_bytes([0, head[0], head[1], head[2]]);
+        if head[3] == HEADERS || length > MAX_FRAME {
+            return Ok(());
+        }
+        tokio::io::copy(&mut (&mut *io).take(length.into()), &mut tokio::io::sink()).await?;
+    }
 }
 
 /// A connection that has said its first words.
@@ -293,13 +326,11 @@ mod tests {
             first_call: None,
         };
         let door = tokio::spawn(async move { Box::pin(incoming(listener, options)).next().await });
-        // A reset overtakes the answer in some of so many.
+        // A reset overtakes the answer in some of so many, and a client that is told too early loses its call.
         for attempt in 0..100 {
-            let Ok(mut client) = CalibrationServiceClient::connect(url.clone()).await else {
-                // Refused before the first call could be made.
-                continue;
-            };
-            let refused = client.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect_err("no room");
+            let mut client = CalibrationServiceClient::connect(url.clone()).await.expect("a connection");
+            let call = client.get_capabilities(proto::GetCapabilitiesRequest {});
+            let refused = tokio::time::timeout(HANDSHAKE_TIMEOUT, call).await.expect("an answer").expect_err("no room");
             assert_eq!(refused.code(), Code::Unavailable, "attempt {attempt}: {refused:?}");
         }
         door.abort();
