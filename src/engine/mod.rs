@@ -4,6 +4,7 @@
 
 mod ahead;
 mod attempt;
+mod course;
 mod drain;
 mod error;
 mod hints;
