@@ -147,7 +147,7 @@ pub fn cores() -> usize {
 /// Tells on stderr what reading changed or left out.
 pub fn tell_notes(input: &LabelledInput) {
     for note in &input.notes {
-        eprintln!("{}: {note}", input.file_name());
+        eprintln!("{}: {note}", input.display_path());
     }
 }
 

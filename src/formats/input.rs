@@ -36,9 +36,9 @@ impl LabelledInput {
         }
     }
 
-    /// The file's name as sentences about it begin.
-    pub fn file_name(&self) -> String {
-        display_name(&self.path)
+    /// The file as sentences about it begin.
+    pub fn display_path(&self) -> String {
+        display_path(&self.path)
     }
 
     /// Checks the input.
@@ -61,9 +61,9 @@ impl LabelledInput {
             problems.push(self.problem(violation));
         }
         problems.add_unlisted(unlisted);
-        match problems.into_result(&self.file_name()) {
+        match problems.into_result(&self.display_path()) {
             Err(error) => error,
-            Ok(()) => Error::whole(&self.file_name(), "was refused without a reason"),
+            Ok(()) => Error::whole(&self.display_path(), "was refused without a reason"),
         }
     }
 
@@ -118,11 +118,11 @@ impl LabelledInput {
             );
             problems.push(Problem::at_line(self.lines[later], "track", what));
         }
-        problems.into_result(&self.file_name())
+        problems.into_result(&self.display_path())
     }
 }
 
-/// Name of a file in sentences: its last component, or the whole path where it has none.
-pub(super) fn display_name(path: &Path) -> String {
-    path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
+/// Name of a file in sentences: as the caller gave it, so that of several files it tells the one.
+pub(super) fn display_path(path: &Path) -> String {
+    path.display().to_string()
 }

@@ -4,7 +4,7 @@ use std::io::BufRead;
 use std::path::Path;
 
 use super::error::{Error, Problem, Problems};
-use super::input::{LabelledInput, display_name};
+use super::input::{LabelledInput, display_path};
 use super::label::{Label, dense};
 use super::source::{OPENSFM_TRACKS, SQLITE_MAGIC};
 use super::text::{self, Lines, number, quote, whole};
@@ -55,7 +55,7 @@ struct Table {
 }
 
 fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: Option<ImageSize>) -> Result<LabelledInput, Error> {
-    let file = display_name(path);
+    let file = display_path(path);
     let one = |problem: Problem| Error::one(&file, problem);
     let mut lines = Lines::new(reader, text::MAX_TABLE_LINE_BYTES);
     let mut columns = None;

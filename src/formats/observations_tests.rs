@@ -74,45 +74,45 @@ fn puts_the_size_on_every_view() {
 #[test]
 fn names_the_line_of_every_bad_value() {
     let line_4 = |row: &str| bad(format!("view,track,x,y\n0,0,1,2\n1,0,1,2\n{row}\n"));
-    assert_eq!(line_4("0,1,NaN,2"), ["observations.csv, line 4: x: NaN is not a finite number"]);
-    assert_eq!(line_4("0,1,1,-inf"), ["observations.csv, line 4: y: -inf is not a finite number"]);
-    assert_eq!(line_4("0,1,abc,2"), ["observations.csv, line 4: x: `abc` is not a number"]);
-    assert_eq!(line_4("-1,1,1,2"), ["observations.csv, line 4: view: `-1` is not a whole number >= 0"]);
-    assert_eq!(line_4("0,1.5,1,2"), ["observations.csv, line 4: track: `1.5` is not a whole number >= 0"]);
+    assert_eq!(line_4("0,1,NaN,2"), ["dir/observations.csv, line 4: x: NaN is not a finite number"]);
+    assert_eq!(line_4("0,1,1,-inf"), ["dir/observations.csv, line 4: y: -inf is not a finite number"]);
+    assert_eq!(line_4("0,1,abc,2"), ["dir/observations.csv, line 4: x: `abc` is not a number"]);
+    assert_eq!(line_4("-1,1,1,2"), ["dir/observations.csv, line 4: view: `-1` is not a whole number >= 0"]);
+    assert_eq!(line_4("0,1.5,1,2"), ["dir/observations.csv, line 4: track: `1.5` is not a whole number >= 0"]);
     assert_eq!(
         line_4("0,18446744073709551616,1,2"),
-        ["observations.csv, line 4: track: `18446744073709551616` is not a whole number >= 0"]
+        ["dir/observations.csv, line 4: track: `18446744073709551616` is not a whole number >= 0"]
     );
     assert_eq!(
         line_4("0,1,,2"),
-        ["observations.csv, line 4: x: is empty; leave out the line of a point that was not observed"]
+        ["dir/observations.csv, line 4: x: is empty; leave out the line of a point that was not observed"]
     );
     assert_eq!(
         line_4("0,1,1"),
-        ["observations.csv, line 4: 3 fields where the header has 4; the file may be truncated"]
+        ["dir/observations.csv, line 4: 3 fields where the header has 4; the file may be truncated"]
     );
-    assert_eq!(line_4("0,1,1,2,3"), ["observations.csv, line 4: 5 fields where the header has 4"]);
+    assert_eq!(line_4("0,1,1,2,3"), ["dir/observations.csv, line 4: 5 fields where the header has 4"]);
     assert_eq!(
         line_4("0,1,1e9,2"),
-        ["observations.csv, line 4: x: 1000000000 px is beyond 1e7 px; coordinates are in pixels"]
+        ["dir/observations.csv, line 4: x: 1000000000 px is beyond 1e7 px; coordinates are in pixels"]
     );
     assert_eq!(
         line_4("1,0,5,6"),
-        ["observations.csv, line 4: track: track 0 is observed a second time in view 1 (first on line 3)"]
+        ["dir/observations.csv, line 4: track: track 0 is observed a second time in view 1 (first on line 3)"]
     );
 }
 
 #[test]
 fn a_blank_line_does_not_shift_the_lines_of_errors() {
     let text = "view,track,x,y\r\n\r\n0,0,1,2\r\n\r\n1,0,inf,2\r\n";
-    assert_eq!(bad(text), ["observations.csv, line 5: x: inf is not a finite number"]);
+    assert_eq!(bad(text), ["dir/observations.csv, line 5: x: inf is not a finite number"]);
 }
 
 #[test]
 fn bad_depths_are_named_too() {
     let with = |depth: &str| bad(format!("view,track,x,y,depth\n0,0,1,2,1\n1,0,1,2,{depth}\n"));
-    assert!(with("0")[0].starts_with("observations.csv, line 3: depth: 0 is not"), "{:?}", with("0"));
-    assert!(with("")[0].starts_with("observations.csv, line 3: depth: is empty"), "{:?}", with(""));
+    assert!(with("0")[0].starts_with("dir/observations.csv, line 3: depth: 0 is not"), "{:?}", with("0"));
+    assert!(with("")[0].starts_with("dir/observations.csv, line 3: depth: is empty"), "{:?}", with(""));
 }
 
 #[test]
@@ -121,7 +121,7 @@ fn files_that_are_no_table_are_called_what_they_are() {
         let sentences = bad(bytes);
         assert_eq!(sentences.len(), 1, "{sentences:?}");
         let sentence = &sentences[0];
-        assert!(sentence.starts_with(&format!("observations.csv{wanted}")), "{sentence}");
+        assert!(sentence.starts_with(&format!("dir/observations.csv{wanted}")), "{sentence}");
     };
     starts(b"", ": is empty");
     starts(b"\n\r\n", ": is empty");
@@ -141,17 +141,20 @@ fn files_that_are_no_table_are_called_what_they_are() {
 
 #[test]
 fn one_view_or_no_overlap_is_said_of_the_file() {
-    assert_eq!(bad("view,track,x,y\n4,0,1,2\n4,1,1,2\n"), ["observations.csv: 1 views given, at least 2 are needed"]);
+    assert_eq!(
+        bad("view,track,x,y\n4,0,1,2\n4,1,1,2\n"),
+        ["dir/observations.csv: 1 views given, at least 2 are needed"]
+    );
 }
 
 #[test]
 fn the_count_is_bounded_while_reading() {
     let limits = Limits { max_observations: 3, ..Limits::default() };
     let error = parsed(GOOD, &limits).expect_err("four observations");
-    assert_eq!(error.to_string(), "observations.csv, line 5: more observations than the limit of 3");
+    assert_eq!(error.to_string(), "dir/observations.csv, line 5: more observations than the limit of 3");
     let limits = Limits { max_tracks: 1, ..Limits::default() };
     let error = parsed(GOOD, &limits).expect_err("two tracks");
-    assert!(error.to_string().starts_with("observations.csv: 2 tracks are above"), "{error}");
+    assert!(error.to_string().starts_with("dir/observations.csv: 2 tracks are above"), "{error}");
 }
 
 #[test]
@@ -176,7 +179,7 @@ fn files_on_disk() {
     let path = directory.path().join("observations.csv");
     let refusal = |path: &Path, limits: &Limits| read(path, limits, None).expect_err("refused").to_string();
     let limits = Limits::default();
-    assert!(refusal(&path, &limits).starts_with("observations.csv: cannot be read: "));
+    assert!(refusal(&path, &limits).starts_with(&format!("{}: cannot be read: ", path.display())));
     std::fs::write(&path, GOOD).expect("written");
     assert_eq!(read(&path, &limits, None).expect("valid").lines.len(), 4);
     let tiny = Limits { max_observations: 0, ..limits.clone() };
@@ -188,10 +191,10 @@ fn files_on_disk() {
 fn violations_that_come_back_from_a_server_are_put_into_the_files_terms() {
     let input = good(GOOD);
     let sentence = |violation: Violation| input.explain_all(&[violation], 0).to_string();
-    assert_eq!(sentence(Violation::at("track_set.x", 2, "is odd")), "observations.csv, line 4: x: is odd");
-    assert_eq!(sentence(Violation::at("track_set.views", 1, "is odd")), "observations.csv: view 9: is odd");
-    assert_eq!(sentence(Violation::of("settings.alpha", "is odd")), "observations.csv: alpha: is odd");
-    assert_eq!(sentence(Violation::at("track_set.x", 99, "is odd")), "observations.csv: track_set.x[99]: is odd");
+    assert_eq!(sentence(Violation::at("track_set.x", 2, "is odd")), "dir/observations.csv, line 4: x: is odd");
+    assert_eq!(sentence(Violation::at("track_set.views", 1, "is odd")), "dir/observations.csv: view 9: is odd");
+    assert_eq!(sentence(Violation::of("settings.alpha", "is odd")), "dir/observations.csv: alpha: is odd");
+    assert_eq!(sentence(Violation::at("track_set.x", 99, "is odd")), "dir/observations.csv: track_set.x[99]: is odd");
 }
 
 #[test]

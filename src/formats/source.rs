@@ -5,7 +5,7 @@ use std::io::Read;
 use std::path::Path;
 
 use super::error::Error;
-use super::input::{LabelledInput, display_name};
+use super::input::{LabelledInput, display_path};
 use super::{colmap, observations, opensfm};
 use crate::domain::{ImageSize, Limits};
 
@@ -57,7 +57,7 @@ pub struct Reading {
 /// # Errors
 /// What is wrong with the file, by line, byte or row; a flag that the file needs or contradicts.
 pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledInput, Error> {
-    let whole = |description: String| Error::whole(&display_name(path), description);
+    let whole = |description: String| Error::whole(&display_path(path), description);
     let format = match reading.format {
         Some(format) => format,
         None => detect(path).map_err(whole)?,
@@ -84,7 +84,7 @@ fn detect(path: &Path) -> Result<Format, String> {
     if metadata.is_dir() {
         return if colmap::model::is_model(path) { Ok(Format::ColmapModel) } else { Err(what_a_directory_lacks(path)) };
     }
-    let name = display_name(path).to_lowercase();
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
     if colmap::model::is_part(&name) {
         return Err("is one file of a COLMAP model; give the directory that holds it".into());
     }
@@ -162,7 +162,7 @@ mod tests {
         };
         fs::write(&path, "OPENSFM_TRACKS_VERSION_v0\na.jpg\t1\t0\t0\t0\t1\t2\t3\n").expect("written");
         let words = refused(Reading::default());
-        assert!(words.starts_with("tracks.csv, line 2: image: ") && words.contains("--width and --height"), "{words}");
+        assert!(words.contains("/tracks.csv, line 2: image: ") && words.contains("--width and --height"), "{words}");
         let matches = Some(Matches::Raw);
         assert!(refused(Reading { matches, ..Reading::default() }).contains("leave out --matches"));
         let size = Some(ImageSize { width_px: 4, height_px: 3 });

@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
 use super::error::{Error, Problem};
-use super::input::display_name;
+use super::input::display_path;
 use crate::domain::Limits;
 
 /// Longest line of a table in bytes, extra columns included. No table of numbers comes near; a binary file passes it
@@ -23,7 +23,7 @@ const UTF16_BOMS: [&[u8]; 2] = [b"\xFF\xFE", b"\xFE\xFF"];
 /// # Errors
 /// A file that cannot be opened, is a directory or is larger than any table within `limits`.
 pub(super) fn open_table(path: &Path, limits: &Limits) -> Result<BufReader<File>, Error> {
-    let name = display_name(path);
+    let name = display_path(path);
     let cannot_read = |error: std::io::Error| Error::one(&name, Problem::unreadable(error));
     let metadata = std::fs::metadata(path).map_err(cannot_read)?;
     if metadata.is_dir() {

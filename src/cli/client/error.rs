@@ -7,6 +7,7 @@ use tonic_types::StatusExt;
 
 use super::handshake;
 use crate::cli::exit::{Exit, Failure};
+use crate::domain::job::DEFAULT_TENANT;
 use crate::domain::{InvalidInput, Violation};
 use crate::formats::LabelledInput;
 
@@ -112,14 +113,18 @@ impl Error {
         }
     }
 
-    /// Says how to name a tenant, where the server knows no such one and the caller named none.
+    /// Says how to name a tenant, where the server knows no such one, or nothing of this name of the default one's, and
+    /// the caller named none.
     pub(super) fn or_no_tenant(self, status: &Status) -> Self {
-        match self {
-            Error::Refused(message) if reason(status).as_deref() == Some("TENANT_NOT_FOUND") => {
-                Error::Refused(format!("{message}; --tenant or SCPSFM_TENANT says whose jobs these are"))
+        let Error::Refused(message) = self else { return self };
+        let hint = match reason(status).as_deref() {
+            Some("TENANT_NOT_FOUND") => "; --tenant or SCPSFM_TENANT says whose jobs these are",
+            Some("JOB_NOT_FOUND" | "INPUT_NOT_FOUND") if message.contains(&format!("tenants/{DEFAULT_TENANT}/")) => {
+                "; --tenant or SCPSFM_TENANT names another tenant"
             }
-            other => other,
-        }
+            _ => "",
+        };
+        Error::Refused(format!("{message}{hint}"))
     }
 }
 
@@ -270,8 +275,10 @@ mod tests {
     fn how_to_name_a_tenant_is_said_where_there_is_none() {
         let words = |status: Status| Error::from_status("http://a", &status, true).or_no_tenant(&status).to_string();
         assert!(words(status::tenant_not_found("default")).contains("; --tenant or SCPSFM_TENANT "));
-        let job = JobName::parse("tenants/default/jobs/a").expect("a name");
-        assert!(!words(status::job_not_found(&job)).contains("--tenant"));
+        for (name, said) in [("tenants/default/jobs/a", true), ("tenants/acme/jobs/a", false)] {
+            let job = JobName::parse(name).expect("a name");
+            assert_eq!(words(status::job_not_found(&job)).contains("--tenant"), said, "{name}");
+        }
     }
 
     #[test]

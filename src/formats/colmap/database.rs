@@ -14,7 +14,7 @@ use super::images::{Images, Observation};
 use super::tracks::{self, Match};
 use crate::domain::Limits;
 use crate::formats::error::{Error, Problem};
-use crate::formats::input::{LabelledInput, display_name};
+use crate::formats::input::{LabelledInput, display_path};
 use crate::formats::source::Matches;
 
 /// Reads the tracks of a database. Views are image names; tracks are numbered from 0, COLMAP has none yet.
@@ -27,7 +27,7 @@ use crate::formats::source::Matches;
 /// # Errors
 /// A file that is no such database, is being written to, is damaged (by table and row) or above `limits`.
 pub fn read(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<LabelledInput, Error> {
-    let file = display_name(path);
+    let file = display_path(path);
     let one = |problem: Problem| Error::one(&file, problem);
     refuse_unfinished(path).map_err(|what| Error::whole(&file, what))?;
     let contents = on_a_runtime_of_its_own(path, limits, matches).map_err(one)?;
@@ -93,8 +93,8 @@ fn refuse_unfinished(path: &Path) -> Result<(), String> {
             return Err(format!(
                 "{} beside it says that a change is under way or was broken off: let COLMAP end, or run \
                  `sqlite3 {} 'pragma wal_checkpoint(truncate)'`",
-                display_name(&journal),
-                display_name(path)
+                display_path(&journal),
+                display_path(path)
             ));
         }
     }

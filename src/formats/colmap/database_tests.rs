@@ -161,11 +161,12 @@ fn what_is_wrong_is_named_by_table_and_row() {
     let wrong = |statement: &'static str| {
         let (_directory, path) = database(&[statement]);
         add_matches(&path, "matches", &CHAIN[..1]);
-        refusal(&path, None)
+        // The folder is another one each time.
+        refusal(&path, None).split_once("database.db").map(|(_, words)| words.to_owned()).expect("the file's name")
     };
     assert_eq!(
         wrong("UPDATE keypoints SET rows = 4000000000000 WHERE image_id = 2"),
-        "database.db: table keypoints, row 2: data: has 48 bytes, 4000000000000 x 4 numbers of 4 are announced"
+        ": table keypoints, row 2: data: has 48 bytes, 4000000000000 x 4 numbers of 4 are announced"
     );
     assert!(wrong("UPDATE keypoints SET rows = -1").contains("table keypoints, row 1: rows: -1 is out of range"));
     assert!(wrong("UPDATE keypoints SET cols = 1, rows = 6").contains("has 1 columns, at least 2"));
@@ -206,7 +207,7 @@ fn files_that_are_no_finished_database_say_so() {
     let other = directory.path().join("other.db");
     fs::write(&other, "no database, but long enough to be taken for the header of one, if nobody looked: ".repeat(9))
         .expect("written");
-    assert!(refusal(&other, None).starts_with("other.db: cannot be"), "{}", refusal(&other, None));
+    assert!(refusal(&other, None).contains("other.db: cannot be"), "{}", refusal(&other, None));
     let half = fs::read(&path).expect("a file");
     fs::write(&other, &half[..half.len() / 2]).expect("written");
     assert!(refusal(&other, None).contains("cannot be read as a COLMAP database"), "{}", refusal(&other, None));

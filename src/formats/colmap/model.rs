@@ -13,7 +13,7 @@ use std::path::Path;
 use super::images::{Images, Observation};
 use crate::domain::Limits;
 use crate::formats::error::{Error, Problem};
-use crate::formats::input::LabelledInput;
+use crate::formats::input::{LabelledInput, display_path};
 
 /// COLMAP's id of no point in space, in binary files.
 const NO_POINT: u64 = u64::MAX;
@@ -42,44 +42,43 @@ fn extension(directory: &Path) -> Option<&'static str> {
 /// What is wrong with a file, by line or by byte; a model above `limits`.
 pub fn read(directory: &Path, limits: &Limits) -> Result<LabelledInput, Error> {
     let kind = extension(directory).ok_or_else(|| {
-        let name = crate::formats::input::display_name(directory);
-        Error::whole(&name, "is no COLMAP model: cameras and images, .bin or .txt, are needed")
+        Error::whole(&display_path(directory), "is no COLMAP model: cameras and images, .bin or .txt, are needed")
     })?;
     let mut images = Images::default();
-    let names = [format!("cameras.{kind}"), format!("images.{kind}")];
+    let paths = ["cameras", "images"].map(|table| directory.join(format!("{table}.{kind}")));
+    let [cameras_name, images_name] = [&paths[0], &paths[1]].map(|path| display_path(path));
     let observations = if kind == "bin" {
-        let (cameras, length) = open(directory, &names[0])?;
-        binary::cameras(cameras, &names[0], Some(length), &mut images)?;
-        let (reader, length) = open(directory, &names[1])?;
-        binary::images(reader, &names[1], Some(length), limits, &mut images)?
+        let (cameras, length) = open(&paths[0])?;
+        binary::cameras(cameras, &cameras_name, Some(length), &mut images)?;
+        let (reader, length) = open(&paths[1])?;
+        binary::images(reader, &images_name, Some(length), limits, &mut images)?
     } else {
-        text::cameras(open(directory, &names[0])?.0, &names[0], &mut images)?;
-        text::images(open(directory, &names[1])?.0, &names[1], limits, &mut images)?
+        text::cameras(open(&paths[0])?.0, &cameras_name, &mut images)?;
+        text::images(open(&paths[1])?.0, &images_name, limits, &mut images)?
     };
-    into_labelled(images, observations, directory, &names[1], limits)
+    into_labelled(images, observations, &paths[1], limits)
 }
 
 fn into_labelled(
     images: Images,
     observations: Vec<Observation>,
-    directory: &Path,
-    file: &str,
+    path: &Path,
     limits: &Limits,
 ) -> Result<LabelledInput, Error> {
     if observations.is_empty() {
         let what = format!("has {} images, and no keypoint of a point in space", images.len());
-        return Err(Error::whole(file, what));
+        return Err(Error::whole(&display_path(path), what));
     }
     // Lines are those of the images.
-    let labelled = images.into_labelled(observations, &directory.join(file), Vec::new());
+    let labelled = images.into_labelled(observations, path, Vec::new());
     labelled.check(limits)?;
     Ok(labelled)
 }
 
 /// Opens a file of a model; returns its length too.
-fn open(directory: &Path, name: &str) -> Result<(BufReader<File>, u64), Error> {
-    let opened = File::open(directory.join(name)).and_then(|file| Ok((file.metadata()?.len(), file)));
-    let (length, file) = opened.map_err(|error| Error::one(name, Problem::unreadable(error)))?;
+fn open(path: &Path) -> Result<(BufReader<File>, u64), Error> {
+    let opened = File::open(path).and_then(|file| Ok((file.metadata()?.len(), file)));
+    let (length, file) = opened.map_err(|error| Error::one(&display_path(path), Problem::unreadable(error)))?;
     Ok((BufReader::new(file), length))
 }
 

@@ -40,7 +40,7 @@ fn parsed(kind: &str, files: [&[u8]; 2]) -> Result<LabelledInput, String> {
         }
     };
     let observations = read(&mut images).map_err(|error| error.to_string())?;
-    into_labelled(images, observations, Path::new("model"), &names[1], &limits).map_err(|error| error.to_string())
+    into_labelled(images, observations, Path::new(&names[1]), &limits).map_err(|error| error.to_string())
 }
 
 #[test]

@@ -12,7 +12,7 @@ use super::frame;
 use super::sizes::Sizes;
 use crate::domain::{ImageSize, Limits, RawInput, View};
 use crate::formats::error::{Error, Problem, Problems};
-use crate::formats::input::{LabelledInput, display_name};
+use crate::formats::input::{LabelledInput, display_path};
 use crate::formats::label::{Label, dense};
 use crate::formats::text::{self, Lines, number, quote};
 
@@ -34,7 +34,7 @@ pub fn read(path: &Path, limits: &Limits, size: Option<ImageSize>) -> Result<Lab
 
 /// Reads the tracks from anything.
 fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: Option<ImageSize>) -> Result<LabelledInput, Error> {
-    let file = display_name(path);
+    let file = display_path(path);
     let one = |problem: Problem| Error::one(&file, problem);
     let mut lines = Lines::new(reader, text::MAX_TABLE_LINE_BYTES);
     let mut table = Table::new(Sizes::beside(path), size);

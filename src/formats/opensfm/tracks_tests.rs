@@ -56,18 +56,20 @@ fn ids_that_are_no_numbers_are_names() {
 #[test]
 fn what_is_wrong_is_named_by_line() {
     let second = |row: &str| bad(format!("a\t1\t0\t0\t0\t1\t2\t3\n{row}\nb\t1\t0\t0\t0\t1\t2\t3\n"));
-    assert_eq!(second("b\t2\t0\tabc\t0\t1\t2\t3"), "tracks.csv, line 2: x: `abc` is not a number");
-    assert_eq!(second("b\t2\t0\tnan\t0\t1\t2\t3"), "tracks.csv, line 2: x: NaN is not a finite number");
-    assert_eq!(second("\t2\t0\t0\t0\t1\t2\t3"), "tracks.csv, line 2: image: has no name");
-    assert!(second("b\x1b[31m\t2\t0\t0\t0\t1\t2\t3").starts_with("tracks.csv, line 2: image: the name `b\\u{1b}"));
+    assert_eq!(second("b\t2\t0\tabc\t0\t1\t2\t3"), "dir/tracks.csv, line 2: x: `abc` is not a number");
+    assert_eq!(second("b\t2\t0\tnan\t0\t1\t2\t3"), "dir/tracks.csv, line 2: x: NaN is not a finite number");
+    assert_eq!(second("\t2\t0\t0\t0\t1\t2\t3"), "dir/tracks.csv, line 2: image: has no name");
+    assert!(second("b\x1b[31m\t2\t0\t0\t0\t1\t2\t3").starts_with("dir/tracks.csv, line 2: image: the name `b\\u{1b}"));
     assert!(
         second("b\t2\t0").ends_with("3 fields where this version has 8, separated by tabs; the file may be truncated")
     );
     let twice = second("a\t1\t9\t0.1\t0\t1\t2\t3");
-    assert_eq!(twice, "tracks.csv, line 2: track: track 1 is observed a second time in view a (first on line 1)");
-    assert!(bad("OPENSFM_TRACKS_VERSION_v3\n").starts_with("tracks.csv, line 1: `OPENSFM_TRACKS_VERSION_v3` is not"));
-    assert_eq!(bad("OPENSFM_TRACKS_VERSION_v2\n"), "tracks.csv: has no observations");
-    assert_eq!(bad(b"\x89PNG\n"), "tracks.csv: is not a text file");
+    assert_eq!(twice, "dir/tracks.csv, line 2: track: track 1 is observed a second time in view a (first on line 1)");
+    assert!(
+        bad("OPENSFM_TRACKS_VERSION_v3\n").starts_with("dir/tracks.csv, line 1: `OPENSFM_TRACKS_VERSION_v3` is not")
+    );
+    assert_eq!(bad("OPENSFM_TRACKS_VERSION_v2\n"), "dir/tracks.csv: has no observations");
+    assert_eq!(bad(b"\x89PNG\n"), "dir/tracks.csv: is not a text file");
     assert!(bad(b"a\t1\t0\t0\t0\t1\t2\t3\n\xff\n").contains("line 2: is not text"));
     // Three columns of version 2 are not the eight of version 0.
     assert!(bad(as_version(2).replace("_v2", "_v0")).contains("line 2: 11 fields"));
@@ -93,13 +95,19 @@ fn every_image_has_the_size_and_the_camera_that_the_data_set_gives_it() {
     std::fs::write(&path, VERSION_0).expect("written");
     let read = |size| read(&path, &Limits::default(), size);
     let refused = read(None).expect_err("no size").to_string();
-    assert!(refused.starts_with("tracks.csv, line 1: image: no size is known of `b.jpg`"), "{refused}");
+    assert!(
+        refused.starts_with(&format!("{}, line 1: image: no size is known of `b.jpg`", path.display())),
+        "{refused}"
+    );
     assert_eq!(refused.lines().count(), 2, "once an image: {refused}");
     std::fs::create_dir(directory.path().join("exif")).expect("created");
     let exif = r#"{"width": 200, "height": 100, "camera": "wide"}"#;
     std::fs::write(directory.path().join("exif/b.jpg.exif"), exif).expect("written");
     let refused = read(None).expect_err("no size of a.jpg").to_string();
-    assert!(refused.starts_with("tracks.csv, line 2: image: no size is known of `a.jpg`"), "{refused}");
+    assert!(
+        refused.starts_with(&format!("{}, line 2: image: no size is known of `a.jpg`", path.display())),
+        "{refused}"
+    );
     let input = read(Some(SIZE)).expect("every size is known");
     let views: Vec<_> =
         input.raw.views.iter().map(|view| (view.size.map(|size| size.width_px), view.camera_group)).collect();
