@@ -168,8 +168,14 @@ pub(super) async fn finish<C: Connection>(
     let job = held(connection, lease).await?;
     let mut departure = match &ending.outcome {
         Outcome::Succeeded { summary, result } => {
-            insert_result(connection, job.id, result).await?;
-            Departure { summary: Some(summary), ..Departure::to(JobState::Succeeded) }
+            // The last one, which is the only one of most, goes with what follows.
+            let mut last = None;
+            for chunk in result_chunks(job.id, result) {
+                if let Some(before) = last.replace(chunk) {
+                    connection.execute(before).await?;
+                }
+            }
+            Departure { summary: Some(summary), last_chunk: last, ..Departure::to(JobState::Succeeded) }
         }
         Outcome::Failed(failure) => Departure { failure: Some(failure.clone()), ..Departure::to(JobState::Failed) },
         Outcome::Cancelled => Departure::to(JobState::Cancelled),
@@ -180,12 +186,12 @@ pub(super) async fn finish<C: Connection>(
     leave(connection, &job, departure, now).await
 }
 
-async fn insert_result<C: Connection>(connection: &mut C, id: i64, bytes: &[u8]) -> Result<(), Error> {
-    for (chunk, data) in (0_i64..).zip(bytes.chunks(payload::CHUNK_BYTES)) {
+/// What stores a result, chunk by chunk.
+fn result_chunks(id: i64, bytes: &[u8]) -> impl Iterator<Item = Statement> + Send {
+    (0_i64..).zip(bytes.chunks(payload::CHUNK_BYTES)).map(move |(chunk, data)| {
         let insert = Statement::new("INSERT INTO result_chunks (job_id, chunk, data) VALUES ($1, $2, $3)");
-        connection.execute(insert.bind(id).bind(chunk).bind(data)).await?;
-    }
-    Ok(())
+        insert.bind(id).bind(chunk).bind(data)
+    })
 }
 
 /// Gives a lease back.
