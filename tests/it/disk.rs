@@ -4,17 +4,22 @@ use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use scpsfm::rpc::proto::input_service_client::InputServiceClient;
+use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState};
 use scpsfm::store::Store;
 use scpsfm::store::sqlite::Sqlite;
+use scpsfm::synthetic::SceneOptions;
+use tonic::transport::Channel;
 use tonic::{Code, Status};
 
-use crate::support::live::{connected, created, is_served, reaches};
+use crate::support::live::{connected, created, is_served, reaches, scene_request};
 use crate::support::program::{Serving, run};
+use crate::support::server::soon;
 use crate::support::uploads::{DEFAULT, encoded, id, part, reason, whole};
-use crate::support::wire::{create_tracks, raw};
+use crate::support::wire::{create_raw, create_tracks, raw};
 
 /// Size of the disk: a few of the inputs below, each in the store and in its log.
 const DISK: &str = "size=96m";
@@ -72,6 +77,34 @@ fn is_full(status: &Status) {
     assert!(status.message().contains("space"), "{status:?}");
 }
 
+/// Creates small jobs until there is no room for one more, and returns their names.
+async fn created_until_full(jobs: &mut JobServiceClient<Channel>) -> Vec<String> {
+    let mut names = Vec::new();
+    let refused = loop {
+        match jobs.create_job(create_tracks()).await {
+            Ok(job) => names.push(job.into_inner().name),
+            Err(status) => break status,
+        }
+        assert!(names.len() < 10_000, "the disk never fills up");
+    };
+    is_full(&refused);
+    names
+}
+
+/// Creates a job, which is refused for want of room until the store has its reserve back.
+async fn created_once_there_is_room(jobs: &mut JobServiceClient<Channel>) -> String {
+    let created = async {
+        loop {
+            match jobs.create_job(create_tracks()).await {
+                Ok(job) => break job.into_inner().name,
+                Err(status) => is_full(&status),
+            }
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    };
+    soon(created).await
+}
+
 /// The end of an input's upload, or why there is none.
 async fn upload(server: &Serving, messages: Vec<proto::UploadInputRequest>) -> Result<proto::Input, Status> {
     let mut inputs = InputServiceClient::connect(server.grpc.clone()).await.expect("a connection");
@@ -95,15 +128,7 @@ async fn a_full_disk_is_told_and_loses_nothing_and_room_is_all_it_takes() {
     is_full(&upload(&server, whole(DEFAULT, &id(2), &bytes, 1 << 20)).await.expect_err("no room"));
     // Small jobs fit until they do not.
     disk.fill(0);
-    let mut acknowledged = Vec::new();
-    let refused = loop {
-        match jobs.create_job(create_tracks()).await {
-            Ok(job) => acknowledged.push(job.into_inner().name),
-            Err(status) => break status,
-        }
-        assert!(acknowledged.len() < 10_000, "the disk never fills up");
-    };
-    is_full(&refused);
+    let acknowledged = created_until_full(&mut jobs).await;
     println!("{} jobs fitted into what was left", acknowledged.len());
     // What is there can be read.
     is_served(&server.grpc).await;
@@ -113,7 +138,7 @@ async fn a_full_disk_is_told_and_loses_nothing_and_room_is_all_it_takes() {
     for name in &acknowledged {
         assert_eq!(reaches(&mut jobs, name, &[JobState::Succeeded, JobState::Failed]).await, JobState::Succeeded);
     }
-    let next = created(&mut jobs, create_tracks()).await;
+    let next = created_once_there_is_room(&mut jobs).await;
     assert_eq!(reaches(&mut jobs, &next, &[JobState::Succeeded]).await, JobState::Succeeded);
     let input = upload(&server, whole(DEFAULT, &id(3), &bytes, 1 << 20)).await.expect("an input");
     assert_eq!(input.size_bytes, bytes.len() as i64);
@@ -130,6 +155,46 @@ async fn a_full_disk_is_told_and_loses_nothing_and_room_is_all_it_takes() {
     let status = proto::GetUploadStatusRequest { parent: DEFAULT.into(), upload_id: id(1) };
     let status = inputs.get_upload_status(status).await.expect("the upload of the beginning").into_inner();
     assert_eq!(status.committed_bytes, 1 << 20);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn on_a_full_disk_a_server_starts_and_room_is_made_through_it() {
+    let Some(disk) = SmallDisk::mount("making room on a full disk") else { return };
+    let data_dir = disk.path().join("data");
+    let reserve = data_dir.join("scpsfm.reserve");
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    let ended = created(&mut jobs, create_tracks()).await;
+    assert_eq!(reaches(&mut jobs, &ended, &[JobState::Succeeded]).await, JobState::Succeeded);
+    // Nothing to be found, so that the one worker is busy for as long as this takes.
+    let hopeless = SceneOptions { views: 10, tracks: 3_000, outliers: 1.0, ..SceneOptions::default() };
+    let busy = created(&mut jobs, scene_request(&hopeless)).await;
+    let mut waiting = Vec::new();
+    for _ in 0..60 {
+        waiting.push(created(&mut jobs, create_raw(&raw(20, 2_000))).await);
+    }
+    assert!(reserve.exists());
+
+    // The index of the log, which is made anew at a start: without a byte left.
+    drop(server);
+    std::fs::remove_file(data_dir.join("scpsfm.db-shm")).expect("an index");
+    disk.fill(0);
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    waiting.extend(created_until_full(&mut jobs).await);
+    for name in waiting.iter().chain([&busy]) {
+        let request = proto::CancelJobRequest { name: name.clone(), etag: String::new() };
+        jobs.cancel_job(request).await.expect("to cancel takes no room");
+        assert_eq!(reaches(&mut jobs, name, &[JobState::Cancelled, JobState::Succeeded]).await, JobState::Cancelled);
+    }
+    for name in waiting.iter().chain([&busy, &ended]) {
+        let request = proto::DeleteJobRequest { name: name.clone(), etag: String::new() };
+        jobs.delete_job(request).await.expect("to delete takes no room");
+    }
+    // What was in the way is gone, and once there is a reserve again, new jobs come in by themselves.
+    let next = created_once_there_is_room(&mut jobs).await;
+    assert!(reserve.exists());
+    assert_eq!(reaches(&mut jobs, &next, &[JobState::Succeeded]).await, JobState::Succeeded);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -19,7 +19,7 @@ use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRo
 use tokio::sync::Mutex;
 use tokio::time::timeout;
 
-use super::sql::{self, Change, Connection, Database, Operation, Size, Statement};
+use super::sql::{self, Change, Connection, Database, Moves, Operation, Size, Statement};
 use super::{Error, Hint};
 use crate::domain::job::JobName;
 use clock::Clock;
@@ -168,7 +168,7 @@ impl Database for Postgres {
     async fn write<T: Send + 'static>(
         &self,
         size: Size,
-        _bytes: u64,
+        _moves: Moves,
         operation: Operation<PgConnection, T>,
     ) -> Result<T, Error> {
         let mut transaction = self.pool(size).begin().await?;

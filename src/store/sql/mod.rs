@@ -99,11 +99,11 @@ pub(super) trait Database: Send + Sync + 'static {
     fn reader(&self, size: Size) -> impl Future<Output = Result<PoolConnection<Self::Sqlx>, Error>> + Send;
 
     /// Runs an operation in a transaction, and answers once it is committed and durable. Where it is refused, nothing
-    /// of it is. `bytes`: about what it writes or removes.
+    /// of it is.
     fn write<T: Send + 'static>(
         &self,
         size: Size,
-        bytes: u64,
+        moves: Moves,
         operation: Operation<ConnectionOf<Self>, T>,
     ) -> impl Future<Output = Result<T, Error>> + Send;
 
@@ -145,6 +145,26 @@ pub(super) enum Size {
     Outcome,
 }
 
+/// What an operation does to the room on the disk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Moves {
+    /// It begins something that writes about so many bytes, now or later: on a full disk nothing new is begun.
+    Begins(u64),
+    /// It changes a few rows.
+    Little,
+    /// It removes about so many bytes, or writes them to bring to an end what was begun: on a full disk it goes first.
+    Ends(u64),
+}
+
+impl Moves {
+    pub(super) fn bytes(self) -> u64 {
+        match self {
+            Self::Begins(bytes) | Self::Ends(bytes) => bytes,
+            Self::Little => 0,
+        }
+    }
+}
+
 /// A migration: its version, its name and its SQL. Published ones are never edited.
 pub(super) type Step = (i64, &'static str, &'static str);
 
@@ -174,10 +194,11 @@ fn is_defect(code: Option<&str>) -> bool {
     code.is_some_and(|code| code.len() == 5 && ["22", "23", "42"].iter().any(|class| code.starts_with(class)))
 }
 
-/// SQLite's primary code is the low byte of the one that it gives (sqlite.org/rescode.html): 13, `SQLITE_FULL`.
-/// PostgreSQL's is the SQLSTATE 53100, `disk_full`.
+/// SQLite's primary code is the low byte of the one that it gives (sqlite.org/rescode.html): 13, `SQLITE_FULL`; the
+/// index of its log could not be made longer: `SQLITE_IOERR_SHMSIZE`, 10 | 19 << 8. PostgreSQL's is the SQLSTATE 53100,
+/// `disk_full`.
 fn is_no_space(code: &str) -> bool {
-    code == "53100" || sqlite_code(code) == Some(13)
+    code == "53100" || code == "4874" || sqlite_code(code) == Some(13)
 }
 
 /// SQLite's 11, `SQLITE_CORRUPT`, and 26, `SQLITE_NOTADB`; PostgreSQL's SQLSTATE class XX: its files, or its index, are
@@ -217,7 +238,7 @@ mod tests {
     #[test]
     fn codes_of_either_database_tell_a_full_disk_and_a_damaged_file() {
         // SQLITE_FULL; SQLITE_CORRUPT, SQLITE_CORRUPT_INDEX = 11 | 3 << 8 and SQLITE_NOTADB.
-        assert!(is_no_space("13") && is_no_space("53100"));
+        assert!(is_no_space("13") && is_no_space("4874") && is_no_space("53100"));
         assert!(is_damaged("11") && is_damaged("779") && is_damaged("26") && is_damaged("XX001"));
         // SQLITE_BUSY, SQLITE_IOERR_WRITE = 10 | 3 << 8, too many connections, a serialization failure; no code at all.
         for other in ["5", "778", "53300", "40001", ""] {

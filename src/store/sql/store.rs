@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 
 use futures_util::FutureExt;
 
-use super::{ConnectionOf, Database, Size, attempts, jobs, operation, removal, uploads};
+use super::{ConnectionOf, Database, Moves, Size, attempts, jobs, operation, removal, uploads};
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
@@ -49,20 +49,16 @@ macro_rules! reads {
 const ANY_BYTES: u64 = u64::MAX;
 
 /// Writes in one transaction, which has the values in brackets to itself: a caller that goes away leaves it whole. They
-/// are cloned for each run of it; what is large is in an [`Arc`]. Before them, the bytes that it moves, where that is
-/// more than a few rows.
+/// are cloned for each run of it; what is large is in an [`Arc`].
 macro_rules! writes {
-    ($database:expr, $size:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {
-        writes!($database, $size, 0, [$($owned),*], |$connection| $body)
-    };
-    ($database:expr, $size:expr, $bytes:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {{
-        let bytes: u64 = $bytes;
+    ($database:expr, $size:expr, $moves:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {{
+        let moves: Moves = $moves;
         $(let $owned = $owned.clone();)*
         let run = operation::<ConnectionOf<D>, _>(move |$connection| {
             $(let $owned = $owned.clone();)*
             async move { $body.await }.boxed()
         });
-        bounded($database, $size, $database.write($size, bytes, run)).await
+        bounded($database, $size, $database.write($size, moves, run)).await
     }};
 }
 
@@ -79,7 +75,7 @@ impl<D: Database> Store for D {
             JobInput::Inline(bytes) => bytes.len() as u64,
             JobInput::Uploaded { .. } => 0,
         });
-        writes!(self, Size::Payload, stored.sum(), [new, bounds], |connection| jobs::create(
+        writes!(self, Size::Payload, Moves::Begins(stored.sum()), [new, bounds], |connection| jobs::create(
             connection, &new, &bounds, now
         ))
     }
@@ -103,7 +99,9 @@ impl<D: Database> Store for D {
             return Ok(None);
         }
         let worker = worker.to_owned();
-        writes!(self, Size::Small, [worker], |connection| attempts::claim(connection, &worker, now, expires))
+        writes!(self, Size::Small, Moves::Begins(0), [worker], |connection| attempts::claim(
+            connection, &worker, now, expires
+        ))
     }
 
     async fn foresee(&self, passed: &[JobName], now: SystemTime) -> Result<Option<Claimed>, Error> {
@@ -120,7 +118,7 @@ impl<D: Database> Store for D {
     ) -> Result<Option<Claimed>, Error> {
         let expires = self.lease_clock(now) + lease_for;
         let worker = worker.to_owned();
-        writes!(self, Size::Small, [foreseen, worker], |connection| attempts::claim_foreseen(
+        writes!(self, Size::Small, Moves::Begins(0), [foreseen, worker], |connection| attempts::claim_foreseen(
             connection, &foreseen, created, &worker, now, expires
         ))
     }
@@ -131,38 +129,42 @@ impl<D: Database> Store for D {
 
     async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
         let expires = self.lease_clock(now) + lease_for;
-        writes!(self, Size::Small, [lease], |connection| attempts::heartbeat(connection, &lease, expires))
+        writes!(self, Size::Small, Moves::Ends(0), [lease], |connection| attempts::heartbeat(
+            connection, &lease, expires
+        ))
     }
 
     async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error> {
         let progress = *progress;
-        writes!(self, Size::Small, [lease], |connection| attempts::record(connection, &lease, &progress, now))
+        writes!(self, Size::Small, Moves::Little, [lease], |connection| attempts::record(
+            connection, &lease, &progress, now
+        ))
     }
 
     async fn finish(&self, lease: &Lease, ending: &Arc<Ending>, now: SystemTime) -> Result<Job, Error> {
         let bytes = match &ending.outcome {
             Outcome::Succeeded { result, .. } => result.len() as u64,
-            _ => 0,
+            Outcome::Failed(_) | Outcome::Cancelled | Outcome::Expired => 0,
         };
-        writes!(self, Size::Outcome, bytes, [lease, ending], |connection| {
+        writes!(self, Size::Outcome, Moves::Ends(bytes), [lease, ending], |connection| {
             attempts::finish(connection, &lease, &ending, now)
         })
     }
 
     async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
-        writes!(self, Size::Small, [lease], |connection| attempts::release(connection, &lease, now))
+        writes!(self, Size::Small, Moves::Ends(0), [lease], |connection| attempts::release(connection, &lease, now))
     }
 
     async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error> {
         let etag = etag.map(str::to_owned);
-        writes!(self, Size::Small, [name, etag], |connection| {
+        writes!(self, Size::Small, Moves::Ends(0), [name, etag], |connection| {
             attempts::request_cancel(connection, &name, etag.as_deref(), now)
         })
     }
 
     async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
         let etag = etag.map(str::to_owned);
-        writes!(self, Size::Payload, ANY_BYTES, [name, etag], |connection| {
+        writes!(self, Size::Payload, Moves::Ends(ANY_BYTES), [name, etag], |connection| {
             removal::delete(connection, &name, etag.as_deref())
         })
     }
@@ -171,7 +173,9 @@ impl<D: Database> Store for D {
         if !reads!(self, Size::Small, |connection| removal::needs_purge(connection, ended_by))? {
             return Ok(0);
         }
-        writes!(self, Size::Payload, ANY_BYTES, [], |connection| removal::purge(connection, ended_by, limit))
+        writes!(self, Size::Payload, Moves::Ends(ANY_BYTES), [], |connection| removal::purge(
+            connection, ended_by, limit
+        ))
     }
 
     async fn reclaim(&self) -> Result<(), Error> {
@@ -181,7 +185,12 @@ impl<D: Database> Store for D {
     async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {
         // Where no other process can be at work, every lease is a dead one's.
         let expired_at = D::SHARED.then(|| self.lease_clock(now));
-        writes!(self, Size::Small, [], |connection| attempts::take_back(connection, expired_at, now, max_attempts))
+        writes!(self, Size::Small, Moves::Ends(0), [], |connection| attempts::take_back(
+            connection,
+            expired_at,
+            now,
+            max_attempts
+        ))
     }
 
     async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
@@ -191,7 +200,7 @@ impl<D: Database> Store for D {
         if !reads!(self, Size::Small, |connection| attempts::needs_sweep(connection, expired_at, now))? {
             return Ok(Swept::default());
         }
-        writes!(self, Size::Small, [], |connection| async {
+        writes!(self, Size::Small, Moves::Ends(0), [], |connection| async {
             let lost = attempts::take_back(connection, Some(expired_at), now, max_attempts).await?;
             let expired = attempts::expire_queued(connection, now).await?;
             Ok::<_, Error>(Swept { lost, expired })
@@ -209,7 +218,7 @@ impl<D: Database> Store for D {
         now: SystemTime,
     ) -> Result<BegunUpload, Error> {
         let bounds = *bounds;
-        writes!(self, Size::Small, [new], |connection| uploads::begin(connection, &new, &bounds, now))
+        writes!(self, Size::Small, Moves::Begins(0), [new], |connection| uploads::begin(connection, &new, &bounds, now))
     }
 
     async fn append_upload(
@@ -220,7 +229,7 @@ impl<D: Database> Store for D {
         now: SystemTime,
     ) -> Result<(), Error> {
         let data: Arc<[u8]> = data.into();
-        writes!(self, Size::Payload, data.len() as u64, [lease, data], |connection| {
+        writes!(self, Size::Payload, Moves::Begins(data.len() as u64), [lease, data], |connection| {
             uploads::append(connection, &lease, at_byte, &data, now)
         })
     }
@@ -235,14 +244,14 @@ impl<D: Database> Store for D {
         new: &Arc<NewInput>,
         now: SystemTime,
     ) -> Result<StoredInput, Error> {
-        let bytes = new.payload.len() as u64;
-        writes!(self, Size::Payload, bytes, [lease, new], |connection| {
+        let moves = Moves::Begins(new.payload.len() as u64);
+        writes!(self, Size::Payload, moves, [lease, new], |connection| {
             uploads::finish(connection, &lease, &new, now)
         })
     }
 
     async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error> {
-        writes!(self, Size::Small, [lease], |connection| uploads::give_up(connection, &lease))
+        writes!(self, Size::Small, Moves::Ends(0), [lease], |connection| uploads::give_up(connection, &lease))
     }
 
     async fn upload(&self, name: &InputName) -> Result<UploadStatus, Error> {
@@ -258,7 +267,7 @@ impl<D: Database> Store for D {
     }
 
     async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
-        writes!(self, Size::Payload, ANY_BYTES, [name], |connection| uploads::delete(connection, &name))
+        writes!(self, Size::Payload, Moves::Ends(ANY_BYTES), [name], |connection| uploads::delete(connection, &name))
     }
 
     async fn purge_uploads(
@@ -269,7 +278,7 @@ impl<D: Database> Store for D {
         if !reads!(self, Size::Small, |connection| uploads::needs_purge(connection, abandoned_by, unused_since))? {
             return Ok(PurgedUploads::default());
         }
-        writes!(self, Size::Payload, ANY_BYTES, [], |connection| {
+        writes!(self, Size::Payload, Moves::Ends(ANY_BYTES), [], |connection| {
             uploads::purge(connection, abandoned_by, unused_since)
         })
     }

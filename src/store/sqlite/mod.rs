@@ -6,6 +6,7 @@
 
 #[cfg(test)]
 mod groups_tests;
+mod reserve;
 #[cfg(test)]
 mod tests;
 mod writer;
@@ -20,9 +21,10 @@ use sqlx::sqlite::{
     SqliteRow, SqliteSynchronous,
 };
 
-use super::sql::{self, Change, Connection, Database, Operation, Size, Statement, Step};
+use super::sql::{self, Change, Connection, Database, Moves, Operation, Size, Statement, Step};
 use super::{Error, Hint};
 use crate::domain::job::JobName;
+use reserve::Reserve;
 use writer::Writer;
 
 /// The database within the data directory.
@@ -40,9 +42,12 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 /// of a disk that has failed.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Hands pages back, 4,096 at a time, which are 16 MB: writers wait meanwhile.
-const VACUUM: &str = "PRAGMA incremental_vacuum(4096)";
-const VACUUM_BYTES: u64 = 16 << 20;
+/// Hands pages back, 1,024 at a time, which are 4 MB: writers wait meanwhile, and on a full disk it is the reserve that
+/// holds them in the log.
+const VACUUM: &str = "PRAGMA incremental_vacuum(1024)";
+const VACUUM_BYTES: u64 = 4 << 20;
+/// How often, each time that space is to be given back; others may write in between.
+const VACUUMS: u32 = 4;
 /// What the write-ahead log keeps of its length once it is written back, in bytes: a large result would leave it as
 /// long as itself.
 const LOG_BYTES: &str = "67108864";
@@ -85,9 +90,13 @@ impl Sqlite {
             create(directory, &database).await?;
         }
         let options = options(&database);
-        let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(&options).await?;
-        migrate(&mut connection).await?;
-        let writer = Writer::start(connection, options.clone(), group_time)?;
+        let mut reserve = Reserve::of(directory);
+        let connection = match connect(&options).await {
+            // To open it is to write, too: a log and its index. Where these cannot be made, not every system says why.
+            Err(Error::NoSpace(_) | Error::Unavailable(_)) if reserve.give_up() => connect(&options).await?,
+            connected => connected?,
+        };
+        let writer = Writer::start(connection, options.clone(), reserve, group_time)?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
         Ok(Self { writer, readers, _lock: lock })
     }
@@ -95,7 +104,7 @@ impl Sqlite {
     /// Runs a statement as it is on the writer's connection, for tests that need the database to misbehave.
     #[cfg(test)]
     pub(crate) async fn execute(&self, statement: &'static str) {
-        self.writer.run(0, statement).await.expect("a valid statement");
+        self.writer.run(Moves::Little, statement).await.expect("a valid statement");
     }
 }
 
@@ -111,6 +120,13 @@ fn options(database: &Path) -> SqliteConnectOptions {
         .foreign_keys(true)
         .pragma("journal_size_limit", LOG_BYTES)
         .busy_timeout(BUSY_TIMEOUT)
+}
+
+/// A connection to a database whose schema is up to date.
+async fn connect(options: &SqliteConnectOptions) -> Result<SqliteConnection, Error> {
+    let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(options).await?;
+    migrate(&mut connection).await?;
+    Ok(connection)
 }
 
 async fn migrate(connection: &mut SqliteConnection) -> Result<(), Error> {
@@ -153,8 +169,7 @@ async fn create(directory: &Path, database: &Path) -> Result<(), Error> {
         }
     }
     let new = options(&draft).create_if_missing(true);
-    let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(&new).await?;
-    migrate(&mut connection).await?;
+    let connection = connect(&new).await?;
     // Writes the log back into the file and removes it.
     sqlx::Connection::close(connection).await?;
     std::fs::rename(&draft, database)
@@ -226,10 +241,10 @@ impl Database for Sqlite {
     async fn write<T: Send + 'static>(
         &self,
         _size: Size,
-        bytes: u64,
+        moves: Moves,
         operation: Operation<SqliteConnection, T>,
     ) -> Result<T, Error> {
-        self.writer.write(bytes, operation).await
+        self.writer.write(moves, operation).await
     }
 
     fn bound(&self, _size: Size) -> Option<Duration> {
@@ -238,9 +253,12 @@ impl Database for Sqlite {
 
     /// Gives the file's free pages back, some at a time.
     async fn reclaim(&self) -> Result<(), Error> {
-        let free: i64 = sqlx::query_scalar("PRAGMA freelist_count").fetch_one(&self.readers).await?;
-        if free > 0 {
-            self.writer.run(VACUUM_BYTES, VACUUM).await?;
+        for _ in 0..VACUUMS {
+            let free: i64 = sqlx::query_scalar("PRAGMA freelist_count").fetch_one(&self.readers).await?;
+            if free == 0 {
+                break;
+            }
+            self.writer.run(Moves::Ends(VACUUM_BYTES), VACUUM).await?;
         }
         Ok(())
     }

@@ -38,7 +38,7 @@ impl std::ops::Deref for Fixture {
 impl Sqlite {
     /// What a pragma says on the connection that writes.
     async fn on_writer<T>(&self, pragma: &'static str, read: fn(&SqliteRow) -> Result<T, Error>) -> T {
-        let rows = self.writer.run(0, pragma).await.expect("an answer");
+        let rows = self.writer.run(Moves::Little, pragma).await.expect("an answer");
         read(&rows[0]).expect("a value")
     }
 }

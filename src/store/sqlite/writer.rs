@@ -17,8 +17,9 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteRow};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
+use super::reserve::Reserve;
 use crate::store::Error;
-use crate::store::sql::{self, Operation, Statement};
+use crate::store::sql::{self, Moves, Operation, Statement};
 use crate::telemetry::metrics;
 
 /// How long an operation waits for its turn; behind a queue of writes this long, the disk has failed.
@@ -54,8 +55,12 @@ trait Waiting: Send {
     /// Marks it as begun; `false` where its caller is gone, and nobody wants it any more.
     fn begins(&self) -> bool;
 
+    fn moves(&self) -> Moves;
+
     /// Whether it is to have a commit of its own.
-    fn is_large(&self) -> bool;
+    fn is_large(&self) -> bool {
+        self.moves().bytes() > LARGE_BYTES
+    }
 
     /// Runs it within the transaction and keeps its answer. It may be run again where the transaction came to nothing.
     fn run<'c>(&'c mut self, connection: &'c mut SqliteConnection) -> BoxFuture<'c, Result<(), Error>>;
@@ -90,7 +95,7 @@ impl Turn {
 
 struct Pending<T> {
     operation: Operation<SqliteConnection, T>,
-    large: bool,
+    moves: Moves,
     value: Option<T>,
     turn: Arc<Turn>,
     reply: oneshot::Sender<Result<T, Error>>,
@@ -101,8 +106,8 @@ impl<T: Send + 'static> Waiting for Pending<T> {
         self.turn.begin() && !self.reply.is_closed()
     }
 
-    fn is_large(&self) -> bool {
-        self.large
+    fn moves(&self) -> Moves {
+        self.moves
     }
 
     fn run<'c>(&'c mut self, connection: &'c mut SqliteConnection) -> BoxFuture<'c, Result<(), Error>> {
@@ -125,14 +130,15 @@ impl<T: Send + 'static> Waiting for Pending<T> {
 }
 
 impl Writer {
-    /// Starts the thread on a connection; `options` open another one when that is of no more use. A group goes on
-    /// taking operations for `group_time`.
+    /// Starts the thread on a connection; `options` open another one when that is of no more use. On a full disk
+    /// `reserve` is for what makes room. A group goes on taking operations for `group_time`.
     ///
     /// # Errors
     /// [`Error::Unavailable`] where the system has no thread to give.
     pub(super) fn start(
         connection: SqliteConnection,
         options: SqliteConnectOptions,
+        reserve: Reserve,
         group_time: Duration,
     ) -> Result<Self, Error> {
         let (inbox, messages) = mpsc::unbounded_channel();
@@ -140,21 +146,22 @@ impl Writer {
         // A runtime of its own: each statement is a round trip to SQLite's thread, and waking this one thread is
         // cheaper than finding one among those of the server.
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().map_err(failed)?;
-        let desk = Desk { connection: Some(connection), options, messages, group_time };
+        let connection = Some(connection);
+        let desk = Desk { connection, options, reserve, has_savepoint: false, messages, group_time };
         let work = move || runtime.block_on(desk.serve());
         thread::Builder::new().name("store-writer".into()).spawn(work).map_err(failed)?;
         Ok(Self { inbox, patience: PATIENCE })
     }
 
-    /// Runs an operation, which writes or removes about so many bytes, and answers once what it wrote is on the disk.
+    /// Runs an operation and answers once what it wrote is on the disk.
     pub(super) async fn write<T: Send + 'static>(
         &self,
-        bytes: u64,
+        moves: Moves,
         operation: Operation<SqliteConnection, T>,
     ) -> Result<T, Error> {
         let turn = Arc::new(Turn::default());
         let (reply, mut answer) = oneshot::channel();
-        let pending = Pending { operation, large: bytes > LARGE_BYTES, value: None, turn: turn.clone(), reply };
+        let pending = Pending { operation, moves, value: None, turn: turn.clone(), reply };
         let closed = || Error::Unavailable("the store is closed".into());
         self.inbox.send(Message::Write(Box::new(pending))).map_err(|_| closed())?;
         loop {
@@ -170,12 +177,12 @@ impl Writer {
         }
     }
 
-    /// Runs one statement without parameters, which moves about so many bytes, and returns its rows.
-    pub(super) async fn run(&self, bytes: u64, statement: &'static str) -> Result<Vec<SqliteRow>, Error> {
+    /// Runs one statement without parameters and returns its rows.
+    pub(super) async fn run(&self, moves: Moves, statement: &'static str) -> Result<Vec<SqliteRow>, Error> {
         let run = sql::operation(move |connection: &mut SqliteConnection| {
             async move { sql::Connection::rows(connection, Statement::new(statement)).await }.boxed()
         });
-        self.write(bytes, run).await
+        self.write(moves, run).await
     }
 
     /// Ends the thread after what is already waiting, and closes the connection.
@@ -193,6 +200,10 @@ struct Desk {
     /// `None`: the last one was of no more use.
     connection: Option<SqliteConnection>,
     options: SqliteConnectOptions,
+    reserve: Reserve,
+    /// Whether the savepoint of an operation that joined others is still there: it goes with the next one's, or with the
+    /// commit, which spares a round trip to SQLite's thread.
+    has_savepoint: bool,
     messages: mpsc::UnboundedReceiver<Message>,
     group_time: Duration,
 }
@@ -234,16 +245,20 @@ impl Desk {
         while let Some(mut operation) = next.take() {
             if operation.begins() {
                 let ran = match group.is_empty() {
-                    true => self.open(operation.as_mut()).await,
+                    true => self.open(operation.as_mut()).await.map(Ok),
                     false => self.join(operation.as_mut()).await,
                 };
                 match ran {
                     Ok(outcome) => group.push((operation, outcome)),
                     // Nothing of anyone else's is in the transaction, or has been seen in it.
-                    Err(error) if group.is_empty() => operation.answer(Err(error)),
-                    Err(_) => {
+                    Err(error) if group.is_empty() => {
+                        let helped = self.with_reserve(operation.as_mut(), error).await;
+                        operation.answer(helped);
+                    }
+                    Err(error) => {
+                        self.roll_back().await;
                         group.push((operation, Ok(())));
-                        self.each_alone(group).await;
+                        self.each_alone(group, error).await;
                         return None;
                     }
                 }
@@ -262,28 +277,33 @@ impl Desk {
     }
 
     /// Begins a transaction with this operation; without one where it is refused.
-    async fn open(&mut self, operation: &mut dyn Waiting) -> Result<Result<(), Error>, Error> {
-        let begun = self.control(BEGIN).await;
-        let ran = match begun {
-            Ok(()) => operation.run(self.connection().await?).await,
-            Err(error) => Err(error),
-        };
+    async fn open(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
+        self.has_savepoint = false;
+        let mut ran = self.control(BEGIN).await;
+        if ran.is_ok() {
+            ran = self.run(operation).await;
+        }
         if ran.is_err() {
             self.roll_back().await;
         }
-        ran.map(Ok)
+        ran
     }
 
     /// Runs an operation in the transaction of others, which stand whatever becomes of it. An error says that the
     /// transaction is lost.
     async fn join(&mut self, operation: &mut dyn Waiting) -> Result<Result<(), Error>, Error> {
-        self.control("SAVEPOINT one").await?;
-        let outcome = operation.run(self.connection().await?).await;
-        if outcome.is_err() {
-            // Where the disk is full, SQLite has rolled back everything by itself, and there is nothing to go back to.
+        let begin = if self.has_savepoint { "RELEASE one; SAVEPOINT one" } else { "SAVEPOINT one" };
+        self.control(begin).await?;
+        self.has_savepoint = true;
+        let outcome = self.run(operation).await;
+        if let Err(error) = &outcome {
+            // Where the disk is full, SQLite may have rolled back everything by itself, and there is nothing to go back
+            // to.
             self.control("ROLLBACK TO one").await?;
+            if self.can_help(operation, error) {
+                return Err(error.clone());
+            }
         }
-        self.control("RELEASE one").await?;
         Ok(outcome)
     }
 
@@ -293,30 +313,65 @@ impl Desk {
             return;
         }
         if let Err(error) = self.end(group.len()).await {
-            if group.len() > 1 {
-                return self.each_alone(group).await;
-            }
             self.roll_back().await;
-            group.into_iter().for_each(|(operation, _)| operation.answer(Err(error.clone())));
-            return;
+            return self.each_alone(group, error).await;
         }
         group.into_iter().for_each(|(operation, outcome)| operation.answer(outcome));
     }
 
-    /// Runs the operations of a group that came to nothing again, each in a transaction of its own: what one of them
-    /// broke is not held against the others.
-    async fn each_alone(&mut self, group: Vec<Ran>) {
-        self.roll_back().await;
+    /// Runs the operations of a group that came to nothing for this reason again, each in a transaction of its own: what
+    /// one of them broke is not held against the others.
+    async fn each_alone(&mut self, group: Vec<Ran>, error: Error) {
+        let one = group.len() == 1;
         for (mut operation, _) in group {
-            let mut committed = self.open(operation.as_mut()).await.and_then(|outcome| outcome);
-            if committed.is_ok() {
-                committed = self.end(1).await;
-                if committed.is_err() {
-                    self.roll_back().await;
-                }
+            let mut committed = if one { Err(error.clone()) } else { self.alone(operation.as_mut()).await };
+            if let Err(error) = committed {
+                committed = self.with_reserve(operation.as_mut(), error).await;
             }
             operation.answer(committed);
         }
+    }
+
+    /// Runs an operation in a transaction of its own.
+    async fn alone(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
+        self.open(operation).await?;
+        let committed = self.end(1).await;
+        if committed.is_err() {
+            self.roll_back().await;
+        }
+        committed
+    }
+
+    /// Gives the reserve up for an operation that came to nothing for this reason, where that may help, and runs it
+    /// again.
+    async fn with_reserve(&mut self, operation: &mut dyn Waiting, error: Error) -> Result<(), Error> {
+        match self.can_help(operation, &error) && self.reserve.give_up() {
+            true => self.alone(operation).await,
+            false => Err(error),
+        }
+    }
+
+    /// Whether the reserve may be what an operation lacks.
+    fn can_help(&self, operation: &dyn Waiting, error: &Error) -> bool {
+        let no_space = matches!(error, Error::NoSpace(_));
+        no_space && matches!(operation.moves(), Moves::Ends(_)) && self.reserve.is_whole()
+    }
+
+    /// Runs an operation in the transaction that is open. Without a reserve, what is left is for what ends what was begun:
+    /// an operation that begins something is refused, unless it finds that it has nothing to write.
+    async fn run(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
+        let is_bound = matches!(operation.moves(), Moves::Begins(_)) && !self.reserve.restore();
+        let before = if is_bound { self.changes().await? } else { 0 };
+        operation.run(self.connection().await?).await?;
+        match is_bound && self.changes().await? != before {
+            true => Err(self.reserve.refusal()),
+            false => Ok(()),
+        }
+    }
+
+    /// Rows that were changed over the connection.
+    async fn changes(&mut self) -> Result<i64, Error> {
+        Ok(sqlx::query_scalar("SELECT total_changes()").fetch_one(self.connection().await?).await?)
     }
 
     /// Commits what so many operations wrote: it is on the disk then.

@@ -42,6 +42,10 @@ pub fn create(input: Input) -> proto::CreateJobRequest {
     proto::CreateJobRequest { parent: "tenants/default".into(), input: Some(input), ..Default::default() }
 }
 
+pub fn create_raw(raw: &RawInput) -> proto::CreateJobRequest {
+    create(Input::TrackSet(convert::input::to_wire(raw)))
+}
+
 /// A valid request.
 pub fn create_tracks() -> proto::CreateJobRequest {
     create(Input::TrackSet(track_set()))

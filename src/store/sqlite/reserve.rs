@@ -1,0 +1,153 @@
+//! Room that is kept for a full disk: a file of nothing, given up so that what was begun ends and what frees more is
+//! written.
+//!
+//! To cancel and to delete is to write, too. On a disk without a byte left an operator could do neither, jobs would lose
+//! their leases with what they found, and a server that was restarted could not even open its store. Until there is a
+//! reserve again nothing new is begun: no job or upload is taken in, none that waits is claimed.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use crate::store::Error;
+
+/// The reserve within the data directory.
+const RESERVE_FILE: &str = "scpsfm.reserve";
+
+/// What is kept, in bytes: the log as long as it may grow before SQLite writes it back (1,000 pages, 4 MiB), the
+/// database grown by as much, one [`VACUUM`](super::VACUUM) and its pages in the log. The results of the jobs that run
+/// seldom have more.
+pub(super) const RESERVE_BYTES: u64 = 16 << 20;
+
+/// Between two attempts to have the reserve back: writers wait for each.
+const RETRY: Duration = Duration::from_secs(1);
+
+/// The file of a data directory.
+#[derive(Debug)]
+pub(super) struct Reserve {
+    path: PathBuf,
+    is_whole: bool,
+    /// When it was last tried to make it, and why there is none.
+    tried: Option<(Instant, String)>,
+}
+
+impl Reserve {
+    /// The one of this directory, made where there is none.
+    pub(super) fn of(directory: &Path) -> Self {
+        let path = directory.join(RESERVE_FILE);
+        let is_whole = std::fs::metadata(&path).is_ok_and(|file| file.len() == RESERVE_BYTES);
+        let mut reserve = Self { path, is_whole, tried: None };
+        if !reserve.restore() {
+            tracing::warn!(error = %reserve.refusal(), "nothing new is begun");
+        }
+        reserve
+    }
+
+    pub(super) fn is_whole(&self) -> bool {
+        self.is_whole
+    }
+
+    /// Whether there is a reserve, made anew where it was given up and there is room again.
+    pub(super) fn restore(&mut self) -> bool {
+        if self.is_whole || self.tried.as_ref().is_some_and(|(at, _)| at.elapsed() < RETRY) {
+            return self.is_whole;
+        }
+        match self.make() {
+            Ok(()) => {
+                self.is_whole = true;
+                if self.tried.take().is_some() {
+                    tracing::info!("room is kept for a full disk again");
+                }
+            }
+            Err(error) => self.tried = Some((Instant::now(), error.to_string())),
+        }
+        self.is_whole
+    }
+
+    /// Gives its room to others; `false` where there was none to give.
+    pub(super) fn give_up(&mut self) -> bool {
+        if !self.is_whole {
+            return false;
+        }
+        match std::fs::remove_file(&self.path) {
+            Ok(()) => {
+                self.is_whole = false;
+                tracing::warn!(
+                    "the disk is full: nothing new is begun, the room that was kept is for what ends or frees"
+                );
+            }
+            Err(error) => tracing::error!(%error, path = %self.path.display(), "cannot give up the room that is kept"),
+        }
+        !self.is_whole
+    }
+
+    /// Why nothing new is begun.
+    pub(super) fn refusal(&self) -> Error {
+        let cause = self.tried.as_ref().map_or("", |(_, error)| error);
+        let path = self.path.display();
+        Error::NoSpace(format!("{} MiB cannot be kept in {path} for a full disk: {cause}", RESERVE_BYTES >> 20))
+    }
+
+    /// Under its own name only once it is whole, so that its length tells.
+    fn make(&self) -> io::Result<()> {
+        let draft = self.path.with_extension("reserve.new");
+        let made = allocate(&draft).and_then(|()| std::fs::rename(&draft, &self.path));
+        if made.is_err() {
+            let _ = std::fs::remove_file(&draft);
+        }
+        made
+    }
+}
+
+/// Makes a file that has its room on the disk.
+fn allocate(path: &Path) -> io::Result<()> {
+    let mut file = File::create(path)?;
+    #[cfg(any(target_os = "linux", target_vendor = "apple"))]
+    match rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, RESERVE_BYTES) {
+        Ok(()) => return Ok(()),
+        // Not every file system can.
+        Err(rustix::io::Errno::OPNOTSUPP | rustix::io::Errno::NOSYS) => {}
+        Err(error) => return Err(error.into()),
+    }
+    // No zeros: a file system may keep none of them.
+    let block = [1; 65_536];
+    for _ in 0..RESERVE_BYTES / block.len() as u64 {
+        file.write_all(&block)?;
+    }
+    file.sync_all()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn length(reserve: &Reserve) -> Option<u64> {
+        std::fs::metadata(&reserve.path).ok().map(|file| file.len())
+    }
+
+    #[test]
+    fn what_was_given_up_is_made_again_once_there_is_room() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let mut reserve = Reserve::of(directory.path());
+        assert!(reserve.is_whole() && length(&reserve) == Some(RESERVE_BYTES));
+        assert!(reserve.give_up() && !reserve.is_whole() && length(&reserve).is_none());
+        assert!(!reserve.give_up(), "it was given already");
+        // Where its draft should stand is no room.
+        let draft = reserve.path.with_extension("reserve.new");
+        std::fs::create_dir(&draft).expect("a folder");
+        assert!(!reserve.restore() && !reserve.is_whole());
+        std::fs::remove_dir(&draft).expect("removed");
+        assert!(!reserve.restore(), "not tried again at once");
+        reserve.tried = None;
+        assert!(reserve.restore() && length(&reserve) == Some(RESERVE_BYTES) && !draft.exists());
+    }
+
+    #[test]
+    fn one_that_was_cut_off_is_made_whole() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        std::fs::write(directory.path().join(RESERVE_FILE), [1; 1_000]).expect("written");
+        let reserve = Reserve::of(directory.path());
+        assert!(reserve.is_whole() && length(&reserve) == Some(RESERVE_BYTES));
+    }
+}
