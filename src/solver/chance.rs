@@ -3,8 +3,9 @@
 //! Two bounds. Residuals are compared with the spread of the image points, as if the reconstructions of a set of tracks
 //! were a plane among their coordinates. That they are not: cameras bend it, and where the gate is as wide as a tenth of
 //! the image, random tracks in three views fit some cameras or other. So the cameras that were found are tried on random
-//! tracks too, and what share of those they admit bounds the probability that the inliers are admitted by chance. That
-//! bound is the coarser one, for it counts inliers and not how well they fit: it has a veto, and the other one ranks.
+//! tracks too: what share of those they admit bounds the probability that the inliers are admitted by chance, and what
+//! residuals they leave takes the place of the spread. These bounds are the coarser ones: they have a veto, where neither
+//! holds, and the other one ranks.
 //!
 //! Tracks that lie within the noise of each other in every view are one track for both: they tell nothing of the cameras
 //! that one of them does not.
@@ -91,7 +92,11 @@ fn by_cameras(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &
     if !random.try_until(RANDOM_TRACKS, stop) {
         return f64::INFINITY;
     }
-    at(random.ln_admitted())
+    // Where noise is strong the gate admits so many that their number tells nothing; how well they fit still does,
+    // compared with what random tracks leave to the same cameras.
+    let left_by_random = (random.measured() / constraints).sqrt();
+    let by_fit = consensus.ln_false_alarms_by_residuals(left_by_random) + NOISE_LEVELS.ln();
+    at(random.ln_admitted()).min(by_fit)
 }
 
 /// Constraints that a complete track leaves to cameras.
