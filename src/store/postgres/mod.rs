@@ -172,9 +172,14 @@ impl Database for Postgres {
         operation: Operation<PgConnection, T>,
     ) -> Result<T, Error> {
         let mut transaction = self.pool(size).begin().await?;
-        let value = operation(&mut transaction).await?;
-        transaction.commit().await?;
-        Ok(value)
+        let outcome = operation(&mut transaction).await;
+        match outcome {
+            Ok(_) => transaction.commit().await?,
+            // Dropped, it would be rolled back some time later: until then its locks hide rows from those who pass over
+            // what is locked. Where it fails, the connection is gone, and they with it.
+            Err(_) => drop(transaction.rollback().await),
+        }
+        outcome
     }
 
     fn bound(&self, size: Size) -> Option<Duration> {
