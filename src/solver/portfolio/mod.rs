@@ -242,7 +242,7 @@ impl<'a> Portfolio<'a> {
     /// Notes inliers that lie within the noise of each other, where the noise is no more than assumed: more makes any
     /// tracks one.
     fn note_crowd(&mut self, consensus: &Consensus) {
-        let (inliers, distinct) = (consensus.inlier_count(), consensus.distinct_count());
+        let (inliers, distinct) = (consensus.inlier_count(), consensus.distinct_count(self.spread));
         let is_crowd = inliers >= LEAST_INLIERS && distinct < LEAST_INLIERS && self.noise <= self.assumed_noise;
         self.crowds += usize::from(is_crowd);
         if is_crowd && self.crowded.is_none_or(|(most, _)| inliers > most) {

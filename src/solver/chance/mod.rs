@@ -3,22 +3,22 @@
 //! Two bounds. Residuals are compared with the spread of the image points, as if the reconstructions of a set of tracks
 //! were a plane among their coordinates. That they are not: cameras bend it, and where the gate is as wide as a tenth of
 //! the image, random tracks in three views fit some cameras or other. So the cameras that were found are tried on random
-//! tracks too: what share of those they admit bounds the probability that the inliers are admitted by chance, and what
-//! residuals they leave takes the place of the spread. These bounds are the coarser ones: they have a veto, where neither
-//! holds, and the other one ranks.
+//! tracks too: what residuals these leave takes the place of the spread. This bound is the coarser one: it has a veto,
+//! where it does not hold, and the other one ranks.
 //!
-//! Tracks that lie within the noise of each other in every view are one track for both: they tell nothing of the cameras
-//! that one of them does not.
+//! Tracks that lie within the noise of each other in every view are one track for both, where they are more than lie there
+//! by chance: they tell nothing of the cameras that one of them does not.
+
+mod random;
 
 use nalgebra::Vector2;
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 
 use super::grow::{self, Consensus, LEAST_INLIERS, LEAST_SUPPORT};
 use crate::domain::StopToken;
-use crate::geometry::measurement::{CompleteBlock, Sighting};
+use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::statistics::{chi_square_gate, ln_choose};
 use crate::geometry::triangulation;
+use random::{RandomTracks, Tail, constraints_of_track, gate};
 
 /// Logarithm of the expected number of false alarms at which a consensus is decisive (e^-40: never by chance), and at
 /// which it may be accepted once the search has ended.
@@ -30,9 +30,6 @@ pub const LN_ACCEPTABLE: f64 = -7.0;
 const LN_BY_CAMERAS: f64 = -10.0;
 /// Random tracks that cameras are tried on: some milliseconds at 10 views, for the few consensuses that may be accepted.
 const RANDOM_TRACKS: usize = 500;
-/// Share of them whose residual is measured; smaller ones are extrapolated from there. Of 500, a fiftieth is known to
-/// a third.
-const MEASURED_SHARE: f64 = 0.02;
 /// So many tell enough of most cameras: the smallest residual of these is above that of a fiftieth of all one time in
 /// fifty (.98^200), and the probability that follows from it is too large rather than too small.
 const FIRST_TRACKS: usize = 200;
@@ -43,8 +40,9 @@ const LEAST_MEASURED: f64 = 0.01;
 /// Noise levels that a consensus is grown and settled at, each a test of its own: five of the search, three of the
 /// refinement.
 const NOISE_LEVELS: f64 = 8.0;
-/// Where the random numbers begin: one consensus, one answer.
-const SEED: u64 = 0;
+/// Neighbours of a point that are no crowd: as many as of points anywhere in the image, and two standard deviations of
+/// their number (Poisson's).
+const USUAL_SIGMAS: f64 = 2.0;
 
 /// Natural logarithm of the number of such consensuses to be expected in data without structure: by residuals, and
 /// [`LN_ACCEPTABLE`] or more where the cameras say that it may be chance. They are asked only where the residuals would
@@ -61,25 +59,28 @@ pub fn ln_false_alarms(block: &CompleteBlock, consensus: &Consensus, spread: f64
 }
 
 /// The same by the cameras: a-contrario as by Moisan & Stival (2004, section 3). Of `k` inliers [`LEAST_SUPPORT`] determine
-/// the cameras, and each other one is admitted by chance with probability `a`: for every noise level and size of set,
+/// the cameras, and the others are admitted by chance and leave as little on average with a probability of `a` each: for
+/// every noise level and size of set,
 ///
 /// `C(m, k) C(k, 7) a^(k - 7)`
 ///
-/// The coordinates of a track without structure are independent and distributed like those of the block, view by view.
+/// `a` is the probability to be admitted at most, and less where the gate is so wide that it tells nothing: see
+/// [`RandomTracks::ln_as_good`].
 fn by_cameras(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> f64 {
-    let (tracks, inliers) = (consensus.inlier.len(), consensus.distinct_count());
+    let (tracks, inliers) = (consensus.inlier.len(), consensus.distinct_count(spread));
     if inliers < LEAST_INLIERS {
         return f64::INFINITY;
     }
     let tests = ln_choose(tracks, inliers) + ln_choose(inliers, LEAST_SUPPORT) + (tracks as f64 * NOISE_LEVELS).ln();
-    let at = |ln_admitted: f64| tests + (inliers - LEAST_SUPPORT) as f64 * ln_admitted;
+    let at = |ln_by_chance: f64| tests + (inliers - LEAST_SUPPORT) as f64 * ln_by_chance;
     let constraints = constraints_of_track(block);
-    let least_measured = LEAST_MEASURED * constraints * spread * spread;
-    let at_most = at(ln_below(constraints, gate(block, consensus), least_measured));
+    let variance = spread * spread;
+    let least = Tail { constraints, variance, measured: LEAST_MEASURED * constraints * variance };
+    let at_most = at(least.ln_below(gate(block, consensus)));
     if at_most < LN_BY_CAMERAS {
         return at_most;
     }
-    let mut random = RandomTracks::new(block, consensus);
+    let mut random = RandomTracks::new(block, consensus, spread);
     // To stop is to accept nothing.
     if !random.try_until(FIRST_TRACKS, stop) {
         return f64::INFINITY;
@@ -92,83 +93,7 @@ fn by_cameras(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &
     if !random.try_until(RANDOM_TRACKS, stop) {
         return f64::INFINITY;
     }
-    // Where noise is strong the gate admits so many that their number tells nothing; how well they fit still does,
-    // compared with what random tracks leave to the same cameras.
-    let left_by_random = (random.measured() / constraints).sqrt();
-    let by_fit = consensus.ln_false_alarms_by_residuals(left_by_random) + NOISE_LEVELS.ln();
-    at(random.ln_admitted()).min(by_fit)
-}
-
-/// Constraints that a complete track leaves to cameras.
-fn constraints_of_track(block: &CompleteBlock) -> f64 {
-    (2 * block.views()) as f64 - 3.0
-}
-
-/// Squared residual up to which the cameras of a consensus admit a track.
-fn gate(block: &CompleteBlock, consensus: &Consensus) -> f64 {
-    grow::gate(block.views()) * consensus.noise * consensus.noise
-}
-
-/// Natural logarithm of the probability of a squared residual below `gate`, where [`MEASURED_SHARE`] are below `measured`.
-///
-/// It falls with the power of the gate that a track leaves constraints.
-fn ln_below(constraints: f64, gate: f64, measured: f64) -> f64 {
-    MEASURED_SHARE.ln() + 0.5 * constraints * (gate / measured).ln()
-}
-
-/// Tracks without structure, as the cameras of a consensus see them.
-struct RandomTracks<'a> {
-    block: &'a CompleteBlock,
-    consensus: &'a Consensus,
-    rng: ChaCha8Rng,
-    /// Squared residuals, ascending.
-    squared: Vec<f64>,
-}
-
-impl<'a> RandomTracks<'a> {
-    fn new(block: &'a CompleteBlock, consensus: &'a Consensus) -> Self {
-        let squared = Vec::with_capacity(RANDOM_TRACKS);
-        Self { block, consensus, rng: ChaCha8Rng::seed_from_u64(SEED), squared }
-    }
-
-    /// Tries so many in all; `false` once it is to stop.
-    fn try_until(&mut self, tracks: usize, stop: &StopToken) -> bool {
-        let Self { block, consensus: Consensus { cameras, .. }, rng, squared } = self;
-        while squared.len() < tracks {
-            if stop.is_stopped() {
-                return false;
-            }
-            let of_view = |view| Sighting { view, xy: block.point(view, rng.random_range(0..block.tracks())) };
-            let track: Vec<Sighting> = (0..block.views()).map(of_view).collect();
-            let start = triangulation::linear(cameras, &track);
-            let (_, cost) = triangulation::refine(cameras, &track, start, grow::POINT_STEPS);
-            squared.push(if cost.is_finite() { cost } else { f64::MAX });
-        }
-        squared.sort_by(f64::total_cmp);
-        true
-    }
-
-    /// The residual that [`MEASURED_SHARE`] of those that were tried have at most.
-    fn measured(&self) -> f64 {
-        self.squared[(MEASURED_SHARE * self.squared.len() as f64) as usize]
-    }
-
-    /// No less than what [`ln_admitted`](Self::ln_admitted) is likely to say of more of them; `None` where some are
-    /// admitted.
-    fn ln_admitted_by_first(&self) -> Option<f64> {
-        let (gate, smallest) = (gate(self.block, self.consensus), self.squared[0]);
-        (smallest > gate).then(|| ln_below(constraints_of_track(self.block), gate, smallest))
-    }
-
-    /// Natural logarithm of the probability that the cameras admit a track without structure.
-    fn ln_admitted(&self) -> f64 {
-        let (gate, measured) = (gate(self.block, self.consensus), self.measured());
-        if measured > gate {
-            return ln_below(constraints_of_track(self.block), gate, measured);
-        }
-        let admitted = self.squared.partition_point(|&cost| cost < gate) as f64 / self.squared.len() as f64;
-        admitted.ln()
-    }
+    at(random.ln_as_good())
 }
 
 impl Consensus {
@@ -177,7 +102,7 @@ impl Consensus {
     /// deviation `spread` leave residuals this small in all constraints that the model does not absorb.
     pub fn ln_false_alarms_by_residuals(&self, spread: f64) -> f64 {
         let (views, tracks) = (self.cameras.len(), self.inlier.len());
-        let inliers = self.distinct_count();
+        let inliers = self.distinct_count(spread);
         let constraints = grow::constraint_count(views, inliers);
         let Some(rms) = self.rms() else { return f64::INFINITY };
         if constraints <= 0.0 {
@@ -195,26 +120,37 @@ impl Consensus {
         (constraints > 0.0).then(|| (cost / constraints).sqrt())
     }
 
-    /// How many inliers are images of points that the noise tells apart; of those that it does not, one counts.
+    /// How many inliers are images of points that the noise tells apart; of those that it does not, one counts, unless
+    /// no more of them are near each other than of points anywhere in the image.
     ///
     /// Two tracks of one point differ, as their points are projected, by the noise of two points: with 3 degrees of
     /// freedom, whatever the views. The noise is that of the inliers' own residuals: whatever it is that makes them
     /// differ from one point by no more than from the cameras, it says nothing of these.
-    pub fn distinct_count(&self) -> usize {
+    ///
+    /// * `spread`: standard deviation of the image points: what is near may be anywhere where noise is strong
+    pub fn distinct_count(&self, spread: f64) -> usize {
         let Some(rms) = self.rms() else { return self.inlier_count() };
         let near = 2.0 * rms * rms * chi_square_gate(3.0);
         let images = |track: usize| -> Vec<Vector2<f64>> {
             let image = |camera| triangulation::reprojection(camera, &self.points[track], &Vector2::zeros());
             self.cameras.iter().map(image).collect()
         };
-        let mut distinct: Vec<Vec<Vector2<f64>>> = Vec::new();
-        for track in self.inliers() {
-            let images = images(track);
-            if !distinct.iter().any(|other| are_near(&images, other, near)) {
-                distinct.push(images);
+        let images: Vec<Vec<Vector2<f64>>> = self.inliers().into_iter().map(images).collect();
+        let mut neighbours = vec![0; images.len()];
+        for (track, first) in images.iter().enumerate() {
+            for (other, second) in images.iter().enumerate().skip(track + 1) {
+                if are_near(first, second, near) {
+                    neighbours[track] += 1;
+                    neighbours[other] += 1;
+                }
             }
         }
-        distinct.len()
+        // Of normally distributed points in one view: those that are near in every view are fewer.
+        let by_chance = -(-near / (4.0 * spread * spread * self.cameras.len() as f64)).exp_m1();
+        let expected = by_chance * images.len() as f64;
+        let usual = expected + USUAL_SIGMAS * expected.sqrt();
+        let counted: f64 = neighbours.iter().map(|&count| 1.0 / (1.0 + (f64::from(count) - usual).max(0.0))).sum();
+        counted.round() as usize
     }
 }
 
@@ -229,6 +165,9 @@ fn are_near(a: &[Vector2<f64>], b: &[Vector2<f64>], most: f64) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
     use super::*;
     use crate::domain::{Input, Limits};
     use crate::geometry::{Camera, Point};
@@ -255,12 +194,12 @@ mod tests {
                     let Some(start) = affine::seed(&complete, (0..12).collect()) else { continue };
                     let grown = grow::grow(&complete, start.cameras, start.points, start.support, noise, &stop);
                     let Some(consensus) = grown else { continue };
-                    let mut random = RandomTracks::new(&complete, &consensus);
+                    let mut random = RandomTracks::new(&complete, &consensus, spread);
                     assert!(random.try_until(FIRST_TRACKS, &stop));
                     let by_first = random.ln_admitted_by_first();
                     assert!(random.try_until(RANDOM_TRACKS, &stop));
                     decided += usize::from(by_first.is_some());
-                    too_low += usize::from(by_first.is_some_and(|first| first < random.ln_admitted()));
+                    too_low += usize::from(by_first.is_some_and(|first| first < random.ln_as_good()));
                     let share = random.measured() / (constraints_of_track(&complete) * spread * spread);
                     assert!(share > LEAST_MEASURED, "{views} views, seed {seed}, outliers {outliers}: {share}");
                     (tried, least) = (tried + 1, share.min(least));
@@ -273,33 +212,48 @@ mod tests {
         assert!(decided > tried / 3 && too_low <= decided / 25, "{too_low} of {decided} of {tried}");
     }
 
-    #[test]
-    fn of_points_that_the_noise_does_not_tell_apart_one_counts() {
+    /// Five cameras on a line before these points, all of them inliers; the noise of their residuals, normalised units.
+    fn consensus_of(points: Vec<Point>, noise: f64) -> Consensus {
         let cameras: Vec<Camera> = (0..5)
             .map(|view| {
                 let t = f64::from(view);
                 Camera::new(1.2, 0.0, 0.0, 0.5 * t, 0.0, 1.2, 0.0, 0.2 * t, 0.0, 0.0, 1.0, 3.0)
             })
             .collect();
+        let tracks = points.len();
+        let squared = noise * noise * grow::constraint_count(cameras.len(), tracks) / tracks as f64;
+        Consensus {
+            cameras,
+            points,
+            squared: vec![squared; tracks],
+            inlier: vec![true; tracks],
+            noise: 5.0 * noise,
+            score: 0.5,
+        }
+    }
+
+    #[test]
+    fn of_points_that_the_noise_does_not_tell_apart_one_counts() {
         let noise = 1e-3;
         let count = |distance: f64| {
             let apart = (0..10).map(|k| Point::new(0.1 * f64::from(k), 0.0, 0.0, 1.0));
             let crowd = (0..30).map(|k| Point::new(0.5, 0.5 + distance * f64::from(k), 0.0, 1.0));
-            let points: Vec<Point> = apart.chain(crowd).collect();
-            let tracks = points.len();
-            let squared = noise * noise * grow::constraint_count(cameras.len(), tracks) / tracks as f64;
-            let consensus = Consensus {
-                cameras: cameras.clone(),
-                points,
-                squared: vec![squared; tracks],
-                inlier: vec![true; tracks],
-                noise: 5.0 * noise,
-                score: 0.5,
-            };
-            (consensus.distinct_count(), consensus.ln_false_alarms_by_residuals(0.3))
+            let consensus = consensus_of(apart.chain(crowd).collect(), noise);
+            (consensus.distinct_count(0.3), consensus.ln_false_alarms_by_residuals(0.3))
         };
         let (near, apart) = (count(0.1 * noise), count(20.0 * noise));
         assert_eq!((near.0, apart.0), (11, 40));
         assert!(near.1 > apart.1 && apart.1 < LN_DECISIVE, "{near:?} {apart:?}");
+    }
+
+    /// Where the noise is a tenth of the image, what is anywhere is near something.
+    #[test]
+    fn of_points_all_over_the_image_all_count_whatever_the_noise() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut anywhere = || Point::new(rng.random_range(-0.7..0.7), rng.random_range(-0.7..0.7), 0.0, 1.0);
+        let points: Vec<Point> = (0..20).map(|_| anywhere()).collect();
+        let counted: Vec<usize> =
+            [0.001, 0.03, 0.1].map(|noise| consensus_of(points.clone(), noise).distinct_count(0.25)).to_vec();
+        assert!(counted[0] == 20 && counted.iter().all(|&count| count >= 16), "{counted:?}");
     }
 }

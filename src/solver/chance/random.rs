@@ -1,0 +1,221 @@
+//! Tracks without structure, and what residuals they leave to the cameras of a consensus.
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::domain::StopToken;
+use crate::geometry::measurement::{CompleteBlock, Sighting};
+use crate::geometry::triangulation;
+use crate::solver::grow::{self, Consensus};
+
+/// Share of them whose residual is measured; smaller ones are extrapolated from there. Of 500, a fiftieth is known to
+/// a third.
+const MEASURED_SHARE: f64 = 0.02;
+/// Where the random numbers begin: one consensus, one answer.
+const SEED: u64 = 0;
+/// Residuals that stand for those of the smallest share, and the least of them as a share of what the inliers leave: what
+/// is smaller has next to no probability. Ratios of 1.02 to 1.3.
+const EXTRAPOLATED: i32 = 64;
+const LEAST_EXTRAPOLATED: f64 = 0.25;
+/// Bisections of the tilt of the distribution: three digits.
+const TILT_STEPS: usize = 12;
+
+/// Constraints that a complete track leaves to cameras.
+pub fn constraints_of_track(block: &CompleteBlock) -> f64 {
+    (2 * block.views()) as f64 - 3.0
+}
+
+/// Squared residual up to which the cameras of a consensus admit a track.
+pub fn gate(block: &CompleteBlock, consensus: &Consensus) -> f64 {
+    grow::gate(block.views()) * consensus.noise * consensus.noise
+}
+
+/// Distribution of the squared residuals of such tracks where few are so small that they could be counted: that of
+/// normally distributed coordinates (chi square), scaled to have [`MEASURED_SHARE`] of them below what was measured.
+#[derive(Debug, Clone, Copy)]
+pub struct Tail {
+    /// Constraints that a track leaves to the cameras.
+    pub constraints: f64,
+    /// Variance of the coordinates.
+    pub variance: f64,
+    /// The residual that [`MEASURED_SHARE`] of them have at most.
+    pub measured: f64,
+}
+
+impl Tail {
+    /// Natural logarithm of the probability of a squared residual of at most `x`, which is below what was measured.
+    ///
+    /// It falls with the power of `x` that a track leaves constraints, and is no less than that of a smaller one: the
+    /// incomplete gamma function has a factor `exp(-x / 2 variance)` beside the power.
+    pub fn ln_below(&self, x: f64) -> f64 {
+        // A larger residual than coordinates of this variance leave on average is none of a tail.
+        let variance = self.variance.max(self.measured / self.constraints);
+        let by_power = 0.5 * self.constraints * (x / self.measured).ln();
+        MEASURED_SHARE.ln() + by_power + 0.5 * (self.measured - x) / variance
+    }
+}
+
+/// Tracks without structure, as the cameras of a consensus see them: their coordinates are independent and distributed
+/// like those of the block, view by view.
+pub struct RandomTracks<'a> {
+    block: &'a CompleteBlock,
+    consensus: &'a Consensus,
+    /// Variance of the image points.
+    variance: f64,
+    rng: ChaCha8Rng,
+    /// Squared residuals, ascending.
+    squared: Vec<f64>,
+}
+
+impl<'a> RandomTracks<'a> {
+    /// * `spread`: standard deviation of the image points
+    pub fn new(block: &'a CompleteBlock, consensus: &'a Consensus, spread: f64) -> Self {
+        let rng = ChaCha8Rng::seed_from_u64(SEED);
+        Self { block, consensus, variance: spread * spread, rng, squared: Vec::new() }
+    }
+
+    /// Tries so many in all; `false` once it is to stop.
+    pub fn try_until(&mut self, tracks: usize, stop: &StopToken) -> bool {
+        let Self { block, consensus: Consensus { cameras, .. }, rng, squared, .. } = self;
+        while squared.len() < tracks {
+            if stop.is_stopped() {
+                return false;
+            }
+            let of_view = |view| Sighting { view, xy: block.point(view, rng.random_range(0..block.tracks())) };
+            let track: Vec<Sighting> = (0..block.views()).map(of_view).collect();
+            let start = triangulation::linear(cameras, &track);
+            let (_, cost) = triangulation::refine(cameras, &track, start, grow::POINT_STEPS);
+            squared.push(if cost.is_finite() { cost } else { f64::MAX });
+        }
+        squared.sort_by(f64::total_cmp);
+        true
+    }
+
+    /// The residual that [`MEASURED_SHARE`] of those that were tried have at most.
+    pub fn measured(&self) -> f64 {
+        self.squared[(MEASURED_SHARE * self.squared.len() as f64) as usize]
+    }
+
+    fn tail(&self, measured: f64) -> Tail {
+        Tail { constraints: constraints_of_track(self.block), variance: self.variance, measured }
+    }
+
+    /// No less than what [`ln_as_good`](Self::ln_as_good) is likely to say of more of them; `None` where some are
+    /// admitted.
+    pub fn ln_admitted_by_first(&self) -> Option<f64> {
+        let (gate, smallest) = (gate(self.block, self.consensus), self.squared[0]);
+        (smallest > gate).then(|| self.tail(smallest).ln_below(gate))
+    }
+
+    /// Natural logarithm of the probability `a` of which `a^n` bounds that `n` of them are all admitted and leave no more
+    /// on average than the inliers of the consensus do: see [`ln_as_small`].
+    pub fn ln_as_good(&self) -> f64 {
+        let tail = self.tail(self.measured());
+        // By the constraints of all inliers together: what they leave once the cameras are not fitted to them.
+        let mean = self.consensus.rms().map_or(f64::INFINITY, |rms| rms * rms * tail.constraints);
+        ln_as_small(&self.squared, &tail, gate(self.block, self.consensus), mean)
+    }
+}
+
+/// Chernoff's bound (1952), a track, on the probability that squared residuals are all below `gate` and at most `mean` on
+/// average: the least over `t >= 0` of
+///
+/// `ln E[exp(t (mean - x)); x <= gate]`
+///
+/// At `t` = 0 it is the probability to be below the gate.
+///
+/// * `squared`: what is known of the distribution; what is smaller than was measured the tail tells
+fn ln_as_small(squared: &[f64], tail: &Tail, gate: f64, mean: f64) -> f64 {
+    let largest = gate.min(tail.measured);
+    // The share of each step stands at its lower end, that of the last at none at all: never too small a bound.
+    let step = (LEAST_EXTRAPOLATED * (mean / largest).min(1.0)).powf(f64::from(EXTRAPOLATED).recip());
+    let end = |place: i32| largest * step.powi(place);
+    let below = |place: i32| tail.ln_below(end(place)).exp();
+    let at = |place: i32| match place < EXTRAPOLATED {
+        true => (end(place + 1), below(place) - below(place + 1)),
+        false => (0.0, below(place)),
+    };
+    let share = 1.0 / squared.len() as f64;
+    let tried = squared.iter().filter(|&&x| x > tail.measured && x <= gate).map(|&x| (x, share));
+    let residuals: Vec<(f64, f64)> = (0..=EXTRAPOLATED).map(at).chain(tried).collect();
+    // Of the tilted distribution the probability, and whether its mean is below that of the inliers.
+    let probability = |t: f64| residuals.iter().map(|(x, share)| share * (t * (mean - x)).exp()).sum::<f64>();
+    let is_below =
+        |t: f64| residuals.iter().map(|(x, share)| share * (t * (mean - x)).exp() * (x - mean)).sum::<f64>() <= 0.0;
+    // Any `t` gives a bound: the best one is where the tilted mean is that of the inliers, or at an end.
+    let (mut low, mut high) = (0.0, tail.constraints / mean);
+    for _ in 0..TILT_STEPS {
+        let middle = 0.5 * (low + high);
+        if is_below(middle) { high = middle } else { low = middle }
+    }
+    probability(low).min(probability(0.0)).ln()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Squared residuals of an even number of constraints, standard deviation 1.
+    fn chi_square(constraints: usize, count: usize, rng: &mut ChaCha8Rng) -> Vec<f64> {
+        // Two squared normal numbers are exponentially distributed.
+        let one = |_| (0..constraints / 2).map(|_| -2.0 * (1.0 - rng.random::<f64>()).ln()).sum();
+        (0..count).map(one).collect()
+    }
+
+    /// Many of them, ascending, and their tail.
+    fn distribution(constraints: usize, rng: &mut ChaCha8Rng) -> (Vec<f64>, Tail) {
+        let mut squared = chi_square(constraints, 20_000, rng);
+        squared.sort_by(f64::total_cmp);
+        let measured = squared[(MEASURED_SHARE * squared.len() as f64) as usize];
+        (squared, Tail { constraints: constraints as f64, variance: 1.0, measured })
+    }
+
+    #[test]
+    fn of_normal_residuals_it_is_the_bound_of_the_chi_square_distribution() {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        for constraints in [4, 16, 56] {
+            let (squared, tail) = distribution(constraints, &mut rng);
+            let freedom = constraints as f64;
+            for ratio in [0.05f64, 0.1, 0.4, 0.6, 0.8] {
+                let bound = ln_as_small(&squared, &tail, f64::INFINITY, ratio * freedom);
+                let exact = 0.5 * freedom * (1.0 - ratio + ratio.ln());
+                let within = 0.2 + 0.05 * exact.abs();
+                assert!((bound - exact).abs() < within, "{constraints} constraints, {ratio}: {bound}, not {exact}");
+            }
+            // What they leave on average is no surprise, and the gate then tells all.
+            assert!(ln_as_small(&squared, &tail, f64::INFINITY, freedom * 1.1).abs() < 1e-3);
+            let half = squared[squared.len() / 2];
+            assert!((ln_as_small(&squared, &tail, half, half) - 0.5f64.ln()).abs() < 0.01);
+            let low = squared[squared.len() / 200];
+            let by_gate = ln_as_small(&squared, &tail, low, low);
+            assert!((by_gate - 0.005f64.ln()).abs() < 0.2, "{constraints} constraints: {by_gate}");
+        }
+    }
+
+    /// Four that are all admitted and leave so little on average: as often as said at most, and not much more seldom.
+    #[test]
+    fn it_bounds_how_often_it_happens() {
+        let mut rng = ChaCha8Rng::seed_from_u64(11);
+        const COUNT: usize = 4;
+        for (constraints, shares) in [(4, &[0.3, 0.5, 0.8][..]), (8, &[0.5, 0.8])] {
+            let (squared, tail) = distribution(constraints, &mut rng);
+            let gate = squared[squared.len() / 2];
+            let sets: Vec<f64> = (0..40_000)
+                .map(|_| chi_square(constraints, COUNT, &mut rng))
+                .map(|set| if set.iter().all(|&x| x <= gate) { set.iter().sum() } else { f64::INFINITY })
+                .collect();
+            for share in shares {
+                let mean = share * gate;
+                let bound = COUNT as f64 * ln_as_small(&squared, &tail, gate, mean);
+                let often = sets.iter().filter(|&&sum| sum <= mean * COUNT as f64).count() as f64 / sets.len() as f64;
+                println!("{constraints} constraints, {share}: {often:e} of {:e}", bound.exp());
+                assert!(
+                    often > 0.0 && often <= 1.1 * bound.exp(),
+                    "{constraints}, {share}: {often} of {}",
+                    bound.exp()
+                );
+                assert!(bound.exp() < 30.0 * often, "{constraints}, {share}: {often} of {}", bound.exp());
+            }
+        }
+    }
+}
