@@ -16,7 +16,7 @@ use crate::store::Claimed;
 pub(super) enum Ready {
     /// It is leased.
     Claimed(Box<Begun>),
-    /// It is to be, while it is solved already.
+    /// It is to be, once the worker that has it begins.
     Foreseen(Box<Ahead>),
 }
 
@@ -59,15 +59,12 @@ impl Ready {
                 Some(Done { course, end, span })
             }
             Self::Foreseen(ahead) => {
-                let inner = ahead.inner().clone();
-                if !ahead.reserved.holds() {
-                    return None;
-                }
-                let Ahead { claimed: Claimed { job, lease, trace_parent, queue_time }, input, reserved } = *ahead;
-                let attempt = Attempt::begin(&job.name, job.attempt, trace_parent.as_deref());
-                let span = attempt.span().clone();
-                let mut course = Course::foreseen(inner, job, lease, Wait { trace_parent, queue_time }, reserved)?;
-                let end = course.run(worker, attempt, input).instrument(span.clone()).await;
+                let Ahead { job, lease, wait, reserved, stop, begun, heard } = *ahead;
+                let span = begun.await.ok()?;
+                // Where another slot has it by now, what the worker has begun is stopped.
+                let mut course = Course::foreseen(job, lease, wait, stop.token().clone(), reserved)?;
+                stop.keep();
+                let end = course.run_foreseen(heard).instrument(span.clone()).await;
                 course.was_leased().then_some(Done { course, end, span })
             }
         }

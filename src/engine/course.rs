@@ -6,12 +6,11 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use tokio::sync::{oneshot, watch};
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval_at, sleep, sleep_until, timeout_at};
 
 use super::ahead::Reserved;
 use super::observe::{self, Attempt, AttemptLost};
-use super::worker::{Assignment, Report, Verdict, Worker};
+use super::worker::{Assignment, Heard, Opening, Report, Verdict, Worker};
 use super::{Inner, Options, locked};
 use crate::domain::job::{Failure, Job, JobName, JobState};
 use crate::domain::{Progress, StopReason, StopToken};
@@ -74,7 +73,7 @@ pub(super) struct Course {
     wait: Wait,
     stop: StopToken,
     /// Until it is leased.
-    reserved: Option<Reserved>,
+    reserved: Option<Arc<Reserved>>,
     /// Whether it ever was.
     leased: bool,
     /// Until then the lease holds for sure.
@@ -121,7 +120,7 @@ impl Drop for Running {
 }
 
 /// How a job is told to stop, which it does by itself at its deadline.
-fn stop_token(job: &Job) -> StopToken {
+pub(super) fn stop_token(job: &Job) -> StopToken {
     let left = job.deadline.map(|deadline| deadline.duration_since(SystemTime::now()).unwrap_or_default());
     // A deadline beyond what the clock can express is none.
     StopToken::with_deadline(left.and_then(|left| std::time::Instant::now().checked_add(left)))
@@ -137,9 +136,17 @@ impl Course {
         course
     }
 
-    /// Of a job that is to be leased; `None` where another slot has it.
-    pub(super) fn foreseen(inner: Arc<Inner>, job: Job, lease: Lease, wait: Wait, reserved: Reserved) -> Option<Self> {
-        let stop = stop_token(&job);
+    /// Of a job that a worker has begun and that is to be leased; `None` where another slot has it.
+    ///
+    /// * `stop`: ends what the worker has begun
+    pub(super) fn foreseen(
+        job: Job,
+        lease: Lease,
+        wait: Wait,
+        stop: StopToken,
+        reserved: Arc<Reserved>,
+    ) -> Option<Self> {
+        let inner = reserved.inner().clone();
         let running = Running::list_new(inner.clone(), &lease, &stop)?;
         Some(Self { reserved: Some(reserved), ..Self::new(inner, job, lease, wait, stop, running) })
     }
@@ -198,36 +205,22 @@ impl Course {
         self.reserved = None;
     }
 
-    /// Has the worker solve the job, and keeps the lease meanwhile, or gets it.
-    pub(super) async fn run(&mut self, worker: &Worker, mut attempt: Attempt, input: Vec<u8>) -> End {
-        attempt.at_work();
+    /// Has the worker solve the job, and keeps the lease meanwhile.
+    pub(super) async fn run(&mut self, worker: &Worker, attempt: Attempt, input: Vec<u8>) -> End {
         let subscription = self.inner.hub.subscribe(&self.job.name);
-        if self.leased {
-            // Weights of an attempt before this one are nobody's any more.
-            subscription.topic().weights.send_replace(None);
-        }
-        let (progress, reported) = watch::channel(None);
-        let (reply, answer) = oneshot::channel();
-        let assignment = Assignment {
-            name: self.job.name.clone(),
-            number: self.lease.attempt,
-            input,
-            settings: self.job.settings.clone(),
-            stop: self.stop.clone(),
-            progress,
-            subscription,
-            attempt,
-            reply,
-        };
+        // Weights of an attempt before this one are nobody's any more.
+        subscription.topic().weights.send_replace(None);
+        let opening = Opening::Begun(attempt);
+        let (assignment, heard) =
+            Assignment::new(&self.job, self.lease.attempt, opening, input, self.stop.clone(), subscription);
         worker.assign(assignment).await;
-        if !self.leased {
-            self.claim().await;
-        }
-        let (report, latest) = self.attend(answer, reported).await;
-        match report {
-            Some(Report { verdict, attempt }) => End { verdict, latest, attempt: Some(attempt) },
-            None => End { verdict: Verdict::Stopped(StopReason::Interrupted), latest, attempt: None },
-        }
+        self.attend(heard).await
+    }
+
+    /// Leases a job that a worker has begun, and keeps the lease until it is solved.
+    pub(super) async fn run_foreseen(&mut self, heard: Heard) -> End {
+        self.claim().await;
+        self.attend(heard).await
     }
 
     /// Reads the input, and the cancel that may have come before the job was listed as running. A store that is out
@@ -267,13 +260,9 @@ impl Course {
         heartbeats
     }
 
-    /// Keeps the lease and stores progress until the worker reports. Returns the report, if the worker lived to give
-    /// one, and the latest progress.
-    async fn attend(
-        &mut self,
-        mut answer: oneshot::Receiver<Report>,
-        mut reported: watch::Receiver<Option<Progress>>,
-    ) -> (Option<Report>, Option<Progress>) {
+    /// Keeps the lease and stores progress until the worker reports, if it lives to do so.
+    async fn attend(&mut self, heard: Heard) -> End {
+        let Heard { progress: mut reported, report: mut answer } = heard;
         let mut heartbeats = self.heartbeats();
         let mut next_store = Instant::now() + FIRST_PROGRESS;
         let mut news = false;
@@ -298,7 +287,10 @@ impl Course {
             }
         };
         let latest = *reported.borrow();
-        (report, latest)
+        match report {
+            Some(Report { verdict, attempt }) => End { verdict, latest, attempt: Some(attempt) },
+            None => End { verdict: Verdict::Stopped(StopReason::Interrupted), latest, attempt: None },
+        }
     }
 
     async fn store_progress(&mut self, progress: Option<Progress>) {

@@ -86,8 +86,8 @@ async fn claim(inner: &Arc<Inner>) -> Option<Ready> {
     }
 }
 
-/// Has a job solved. Returns what it came to; and where it was a short one, the job to begin with next before it is even
-/// leased, which is read while this one is solved.
+/// Has a job solved. Returns what it came to; and where it was a short one, the next one, which the worker begins with
+/// by itself before it is even leased.
 ///
 /// Not where other processes take jobs from the same store: two would often begin the same one.
 async fn solve(inner: &Arc<Inner>, worker: &Worker, ready: Ready) -> (Option<Done>, Option<Ahead>) {
@@ -96,7 +96,7 @@ async fn solve(inner: &Arc<Inner>, worker: &Worker, ready: Ready) -> (Option<Don
     let too_long = Instant::now() + inner.options.short_job;
     let mut solving = pin!(ready.run(worker));
     // Let go once it takes too long: it holds one of the store's few readers.
-    let mut looking = pin!(async { timeout_at(too_long, Ahead::look(inner)).await.ok().flatten() });
+    let mut looking = pin!(async { timeout_at(too_long, Ahead::look(inner, worker)).await.ok().flatten() });
     loop {
         tokio::select! {
             biased;

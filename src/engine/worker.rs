@@ -8,11 +8,13 @@ use std::thread;
 use std::time::SystemTime;
 
 use tokio::sync::{mpsc, oneshot, watch};
+use tracing::Span;
 
 use super::Solver;
+use super::ahead::Reserved;
 use super::hub::Subscription;
 use super::observe::Attempt;
-use crate::domain::job::{EventBody, JobEvent, JobName, Summary};
+use crate::domain::job::{EventBody, Job, JobEvent, JobName, Summary};
 use crate::domain::{Input, Observer, Progress, Solution, SolveSettings, Stage, StopReason, StopToken};
 use crate::solver;
 use crate::store::payload;
@@ -22,16 +24,50 @@ const STACK_BYTES: usize = 8 << 20;
 
 /// One attempt's worth of work.
 pub(super) struct Assignment {
-    pub name: JobName,
-    pub number: u32,
+    name: JobName,
+    number: u32,
+    opening: Opening,
     /// Encoded input.
-    pub input: Vec<u8>,
-    pub settings: SolveSettings,
-    pub stop: StopToken,
-    pub progress: watch::Sender<Option<Progress>>,
-    pub subscription: Subscription,
-    pub attempt: Attempt,
-    pub reply: oneshot::Sender<Report>,
+    input: Vec<u8>,
+    settings: SolveSettings,
+    stop: StopToken,
+    progress: watch::Sender<Option<Progress>>,
+    subscription: Subscription,
+    reply: oneshot::Sender<Report>,
+}
+
+/// How an attempt is begun.
+pub(super) enum Opening {
+    /// It is, and its job is leased.
+    Begun(Attempt),
+    /// Once the worker is free, if the job is still to be had: the one who assigned it is told the attempt's span, and is
+    /// to lease it then.
+    Foreseen { reserved: Arc<Reserved>, trace_parent: Option<String>, begun: oneshot::Sender<Span> },
+}
+
+/// What the one who assigned an attempt hears of it.
+pub(super) struct Heard {
+    pub progress: watch::Receiver<Option<Progress>>,
+    /// Dropped unanswered where the thread is gone, or the attempt was never begun.
+    pub report: oneshot::Receiver<Report>,
+}
+
+impl Assignment {
+    /// Of this attempt at a job; `stop` ends it early.
+    pub(super) fn new(
+        job: &Job,
+        number: u32,
+        opening: Opening,
+        input: Vec<u8>,
+        stop: StopToken,
+        subscription: Subscription,
+    ) -> (Self, Heard) {
+        let (progress, heard_progress) = watch::channel(None);
+        let (reply, report) = oneshot::channel();
+        let (name, settings) = (job.name.clone(), job.settings.clone());
+        let assignment = Self { name, number, opening, input, settings, stop, progress, subscription, reply };
+        (assignment, Heard { progress: heard_progress, report })
+    }
 }
 
 /// What an attempt came to.
@@ -80,7 +116,7 @@ impl Worker {
         Ok((Self { assignments }, handle))
     }
 
-    /// Hands over work; the report comes through the assignment's `reply`, which is dropped if the thread is gone.
+    /// Hands over work, which is begun once what was handed over before is done; waits where that is not begun either.
     pub(super) async fn assign(&self, assignment: Assignment) {
         // A send that fails drops the assignment and its reply, which is the answer.
         let _ = self.assignments.send(assignment).await;
@@ -92,8 +128,26 @@ impl Worker {
     }
 }
 
+impl Opening {
+    /// The attempt that begins now; `None` where nobody wants it any more.
+    fn open(self, name: &JobName, number: u32) -> Option<Attempt> {
+        match self {
+            Self::Begun(attempt) => Some(attempt),
+            Self::Foreseen { reserved, trace_parent, begun } => {
+                if begun.is_closed() || !reserved.holds() {
+                    return None;
+                }
+                let attempt = Attempt::begin(name, number, trace_parent.as_deref());
+                begun.send(attempt.span().clone()).is_ok().then_some(attempt)
+            }
+        }
+    }
+}
+
 fn work(assignment: Assignment, solver: &Solver) {
-    let Assignment { name, number, input, settings, stop, progress, subscription, attempt, reply } = assignment;
+    let Assignment { name, number, opening, input, settings, stop, progress, subscription, reply } = assignment;
+    let Some(mut attempt) = opening.open(&name, number) else { return };
+    attempt.at_work();
     let span = attempt.span().clone();
     let _entered = span.enter();
     let mut reporter = Reporter { name, number, progress, subscription, attempt };

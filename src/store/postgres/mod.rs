@@ -138,15 +138,6 @@ impl Connection for PgConnection {
         sql::run::<sqlx::Postgres>(self, statement).await
     }
 
-    /// One after the other: the protocol takes one statement with parameters at a time.
-    async fn batch(&mut self, statements: Vec<Statement>) -> Result<Vec<PgRow>, Error> {
-        let mut rows = Vec::new();
-        for statement in statements {
-            rows.append(&mut self.rows(statement).await?);
-        }
-        Ok(rows)
-    }
-
     async fn lock_admission(&mut self) -> Result<(), Error> {
         self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(ADMISSION_LOCK)).await
     }
@@ -158,7 +149,9 @@ impl Connection for PgConnection {
 }
 
 impl Database for Postgres {
-    type Sqlx = sqlx::Postgres;
+    type Writing = PgConnection;
+    type Reading = PoolConnection<sqlx::Postgres>;
+
     const SHARED: bool = true;
 
     async fn reader(&self, size: Size) -> Result<PoolConnection<sqlx::Postgres>, Error> {

@@ -11,16 +11,16 @@ mod store;
 mod uploads;
 
 use std::future::Future;
+use std::ops::DerefMut;
 use std::time::{Duration, SystemTime};
 
 use futures_util::future::BoxFuture;
 use sqlx::SqlSafeStr;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
-use sqlx::pool::PoolConnection;
 
 use super::{Error, Hint};
 use crate::domain::job::JobName;
-pub(super) use statement::{Row, Statement, run};
+pub(super) use statement::{Row, Statement, Value, run};
 
 /// A connection to a database, within a transaction or not.
 pub(super) trait Connection: Send {
@@ -34,9 +34,6 @@ pub(super) trait Connection: Send {
 
     /// Runs a statement to its end and returns its rows.
     fn rows(&mut self, statement: Statement) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;
-
-    /// Runs statements in their order, of which none needs another's answer. Returns the rows of all of them.
-    fn batch(&mut self, statements: Vec<Statement>) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;
 
     /// Waits until no other transaction admits jobs, and keeps others from it until this one ends.
     fn lock_admission(&mut self) -> impl Future<Output = Result<(), Error>> + Send;
@@ -55,6 +52,17 @@ pub(super) trait Connection: Send {
     /// The first row, if there is any.
     fn optional_row(&mut self, statement: Statement) -> impl Future<Output = Result<Option<Self::Row>, Error>> + Send {
         async { Ok(self.rows(statement).await?.into_iter().next()) }
+    }
+
+    /// Runs statements in their order, of which none needs another's answer. Returns the rows of all of them.
+    fn batch(&mut self, statements: Vec<Statement>) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send {
+        async {
+            let mut rows = Vec::new();
+            for statement in statements {
+                rows.append(&mut self.rows(statement).await?);
+            }
+            Ok(rows)
+        }
     }
 
     /// Runs a statement that has no rows.
@@ -85,18 +93,18 @@ pub(super) fn operation<C, T>(
     Box::new(run)
 }
 
-/// The connection of a database.
-pub(super) type ConnectionOf<D> = <<D as Database>::Sqlx as sqlx::Database>::Connection;
-
 /// A database as a store uses it.
 pub(super) trait Database: Send + Sync + 'static {
-    type Sqlx: sqlx::Database<Connection: Connection>;
+    /// A connection that writes.
+    type Writing: Connection;
+    /// A connection that only reads, lent.
+    type Reading: DerefMut<Target: Connection + Sized> + Send;
 
     /// Whether other processes may hold leases and change jobs.
     const SHARED: bool;
 
     /// A connection that only reads.
-    fn reader(&self, size: Size) -> impl Future<Output = Result<PoolConnection<Self::Sqlx>, Error>> + Send;
+    fn reader(&self, size: Size) -> impl Future<Output = Result<Self::Reading, Error>> + Send;
 
     /// Runs an operation in a transaction, and answers once it is committed and durable. Where it is refused, nothing
     /// of it is.
@@ -104,7 +112,7 @@ pub(super) trait Database: Send + Sync + 'static {
         &self,
         size: Size,
         moves: Moves,
-        operation: Operation<ConnectionOf<Self>, T>,
+        operation: Operation<Self::Writing, T>,
     ) -> impl Future<Output = Result<T, Error>> + Send;
 
     /// How long an operation of this size may take; `None`: as long as it does.
@@ -212,14 +220,19 @@ fn sqlite_code(code: &str) -> Option<u32> {
     if code.len() >= 5 { None } else { code.parse::<u32>().ok().map(|code| code & 0xff) }
 }
 
+/// What a database's code says that is not just that it refuses; or the text as it came.
+pub(super) fn by_code(code: &str, text: String) -> Result<Error, String> {
+    if is_no_space(code) {
+        return Ok(Error::NoSpace(text));
+    }
+    if is_damaged(code) { Ok(Error::Corrupt(text)) } else { Err(text) }
+}
+
 impl From<sqlx::Error> for Error {
     fn from(error: sqlx::Error) -> Self {
         let code = error.as_database_error().and_then(|cause| cause.code()).unwrap_or_default();
-        if is_no_space(&code) {
-            return Error::NoSpace(error.to_string());
-        }
-        if is_damaged(&code) {
-            return Error::Corrupt(error.to_string());
+        if let Ok(error) = by_code(&code, error.to_string()) {
+            return error;
         }
         match error {
             sqlx::Error::ColumnDecode { .. } | sqlx::Error::ColumnNotFound(_) | sqlx::Error::Decode(_) => {

@@ -24,6 +24,15 @@ impl Statement {
         Self { sql: sql.into_sql_str(), values: Vec::new() }
     }
 
+    pub(in crate::store) fn sql(&self) -> &str {
+        self.sql.as_str()
+    }
+
+    /// Of its parameters, in their order.
+    pub(in crate::store) fn values(&self) -> &[Value] {
+        &self.values
+    }
+
     /// Gives the next parameter its value.
     pub(in crate::store) fn bind(mut self, value: impl Into<Value>) -> Self {
         self.values.push(value.into());
@@ -40,40 +49,12 @@ impl Statement {
         Self { sql: sqlx::AssertSqlSafe(text).into_sql_str(), ..self }
     }
 
-    /// Several as one, in their order, for a database that takes them so: each one's parameters are numbered on from
-    /// those before.
-    pub(in crate::store) fn joined(statements: Vec<Statement>) -> Self {
-        let (mut text, mut values) = (String::new(), Vec::new());
-        for mut statement in statements {
-            if !text.is_empty() {
-                text.push_str("; ");
-            }
-            append_renumbered(&mut text, statement.sql.as_str(), values.len());
-            values.append(&mut statement.values);
-        }
-        // Only constants come together here.
-        Self { sql: sqlx::AssertSqlSafe(text).into_sql_str(), values }
-    }
-
     /// A parameter at the end of the SQL, with its value.
     pub(in crate::store) fn then_bind(self, value: impl Into<Value>) -> Self {
         let mut statement = self.bind(value);
         let text = format!("{}${}", statement.sql.as_str(), statement.values.len());
         statement.sql = sqlx::AssertSqlSafe(text).into_sql_str();
         statement
-    }
-}
-
-/// Appends SQL whose parameters come after so many others.
-fn append_renumbered(text: &mut String, sql: &str, before: usize) {
-    let mut parts = sql.split('$');
-    text.extend(parts.next());
-    for part in parts {
-        let digits = part.bytes().take_while(u8::is_ascii_digit).count();
-        let (number, rest) = part.split_at(digits);
-        // A `$` begins a parameter and nothing else in the statements of this module.
-        let number = number.parse::<usize>().unwrap_or_default() + before;
-        text.push_str(&format!("${number}{rest}"));
     }
 }
 
@@ -170,20 +151,5 @@ where
 
     fn optional_bytes(&self, column: &str) -> Result<Option<Vec<u8>>, Error> {
         Ok(self.try_get(column)?)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn joined_statements_keep_their_values() {
-        let first = Statement::new("UPDATE a SET b = $1, c = $2 WHERE b = $1").bind(1).bind("two");
-        let second = Statement::new("DELETE FROM a WHERE b = $1").bind(3);
-        let joined = Statement::joined(vec![first, second]);
-        let expected = "UPDATE a SET b = $1, c = $2 WHERE b = $1; DELETE FROM a WHERE b = $3";
-        assert_eq!(joined.sql.as_str(), expected);
-        assert!(matches!(joined.values[..], [Value::Integer(Some(1)), Value::Text(_), Value::Integer(Some(3))]));
     }
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 
 use futures_util::FutureExt;
 
-use super::{ConnectionOf, Database, Moves, Size, attempts, jobs, operation, removal, uploads};
+use super::{Database, Moves, Size, attempts, jobs, operation, removal, uploads};
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
@@ -54,7 +54,7 @@ macro_rules! writes {
     ($database:expr, $size:expr, $moves:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {{
         let moves: Moves = $moves;
         $(let $owned = $owned.clone();)*
-        let run = operation::<ConnectionOf<D>, _>(move |$connection| {
+        let run = operation::<D::Writing, _>(move |$connection| {
             $(let $owned = $owned.clone();)*
             async move { $body.await }.boxed()
         });

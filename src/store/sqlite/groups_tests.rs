@@ -5,8 +5,6 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use futures_util::FutureExt;
 use futures_util::future::join_all;
-use tokio::sync::{oneshot, watch};
-use tokio::task::JoinHandle;
 
 use super::tests::Fixture;
 use super::*;
@@ -18,33 +16,10 @@ fn value(count: &Count) -> usize {
     count.load(Ordering::SeqCst)
 }
 
-/// Keeps the writer with an operation that has begun, until the sender is dropped.
-async fn hold(store: &Sqlite) -> (watch::Sender<()>, JoinHandle<Result<(), Error>>) {
-    let (go, gone) = watch::channel(());
-    let (tell, begun) = oneshot::channel();
-    let tell = std::sync::Mutex::new(Some(tell));
-    let wait = sql::operation(move |_: &mut SqliteConnection| {
-        let mut gone = gone.clone();
-        if let Some(tell) = tell.lock().expect("no panic").take() {
-            tell.send(()).expect("somebody waits");
-        }
-        // An error says that the sender was dropped, which is what is waited for.
-        async move {
-            let _ = gone.changed().await;
-            Ok(())
-        }
-        .boxed()
-    });
-    let writer = store.writer.clone();
-    let held = tokio::spawn(async move { writer.write(Moves::Little, wait).await });
-    begun.await.expect("it begins");
-    (go, held)
-}
-
 /// An operation that writes nothing and counts how often it was run.
-fn counting(runs: &Count) -> Operation<SqliteConnection, ()> {
+fn counting(runs: &Count) -> Operation<WriteConnection, ()> {
     let runs = runs.clone();
-    sql::operation(move |_: &mut SqliteConnection| {
+    sql::operation(move |_: &mut WriteConnection| {
         runs.fetch_add(1, Ordering::SeqCst);
         async { Ok(()) }.boxed()
     })
@@ -54,14 +29,15 @@ fn counting(runs: &Count) -> Operation<SqliteConnection, ()> {
 async fn commits(store: &Sqlite) -> Count {
     let commits = Count::default();
     let counted = commits.clone();
-    let hook = sql::operation(move |connection: &mut SqliteConnection| {
+    let hook = sql::operation(move |connection: &mut WriteConnection| {
         let counted = counted.clone();
         async move {
+            // `false`: not to be rolled back.
             let count = move || {
                 counted.fetch_add(1, Ordering::SeqCst);
-                true
+                false
             };
-            connection.lock_handle().await?.set_commit_hook(count);
+            connection.inner().commit_hook(Some(count))?;
             Ok(())
         }
         .boxed()
@@ -81,7 +57,7 @@ async fn what_waits_together_is_committed_together_and_each_is_told_what_became_
     fixture.create_job(contract::record("taken"), &contract::ROOM, contract::time(0)).await.expect("created");
     let commits = commits(&fixture).await;
     let before = value(&commits);
-    let (go, held) = hold(&fixture).await;
+    let (go, held) = fixture.hold().await;
     let names: Vec<String> = (0..20).map(|number| format!("job-{number}")).chain(["taken".into()]).collect();
     let creations = names
         .iter()
@@ -107,7 +83,7 @@ async fn one_that_breaks_the_transaction_of_all_costs_only_itself() {
         "CREATE TRIGGER breaks BEFORE INSERT ON inputs WHEN NEW.bytes = 13 BEGIN SELECT RAISE(ROLLBACK, 'broken'); END",
     )
     .await;
-    let (go, held) = hold(&fixture).await;
+    let (go, held) = fixture.hold().await;
     let runs = Count::default();
     let counted = fixture.writer.write(Moves::Little, counting(&runs));
     let creations = ["a", "b", "bad", "c"].map(|name| {
@@ -141,7 +117,7 @@ async fn what_is_large_is_committed_by_itself_and_costs_the_others_nothing() {
     };
     let commits = commits(&fixture).await;
     let before = value(&commits);
-    let (go, held) = hold(&fixture).await;
+    let (go, held) = fixture.hold().await;
     let (first, second) = (Count::default(), Count::default());
     let calls = async {
         tokio::join!(
@@ -162,8 +138,8 @@ async fn what_is_large_is_committed_by_itself_and_costs_the_others_nothing() {
 #[tokio::test]
 async fn an_operation_that_panics_costs_only_itself() {
     let fixture = Fixture::open().await.expect("opens");
-    let called = sql::operation(|_: &mut SqliteConnection| panic!("in the call"));
-    let awaited = sql::operation(|_: &mut SqliteConnection| async { panic!("in what it awaits") }.boxed());
+    let called = sql::operation(|_: &mut WriteConnection| panic!("in the call"));
+    let awaited = sql::operation(|_: &mut WriteConnection| async { panic!("in what it awaits") }.boxed());
     for operation in [called, awaited] {
         let outcome: Result<(), Error> = fixture.writer.write(Moves::Little, operation).await;
         assert!(matches!(outcome, Err(Error::Corrupt(_))), "{outcome:?}");
@@ -174,7 +150,7 @@ async fn an_operation_that_panics_costs_only_itself() {
 #[tokio::test]
 async fn of_a_caller_that_went_away_before_its_turn_nothing_is_written() {
     let fixture = Fixture::open().await.expect("opens");
-    let (go, held) = hold(&fixture).await;
+    let (go, held) = fixture.hold().await;
     // On its way with its first poll, and behind one that waits for the other side.
     let creating = fixture.create_job(contract::record("gone"), &contract::ROOM, contract::time(1));
     assert!(creating.now_or_never().is_none());
@@ -187,7 +163,7 @@ async fn of_a_caller_that_went_away_before_its_turn_nothing_is_written() {
 #[tokio::test]
 async fn what_is_told_not_to_have_had_its_turn_is_not_run() {
     let fixture = Fixture::open().await.expect("opens");
-    let (go, held) = hold(&fixture).await;
+    let (go, held) = fixture.hold().await;
     let mut impatient = fixture.writer.clone();
     impatient.patience = Duration::from_millis(1);
     let runs = Count::default();

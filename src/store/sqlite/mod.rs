@@ -4,6 +4,7 @@
 //! those that wait together are committed together. Reads have their own connections and, thanks to the write-ahead
 //! log, never wait for the writer.
 
+mod connection;
 #[cfg(test)]
 mod groups_tests;
 mod reserve;
@@ -24,6 +25,7 @@ use sqlx::sqlite::{
 use super::sql::{self, Change, Connection, Database, Moves, Operation, Size, Statement, Step};
 use super::{Error, Hint};
 use crate::domain::job::JobName;
+use connection::WriteConnection;
 use reserve::Reserve;
 use writer::Writer;
 
@@ -50,7 +52,7 @@ const VACUUM_BYTES: u64 = 4 << 20;
 const VACUUMS: u32 = 4;
 /// What the write-ahead log keeps of its length once it is written back, in bytes: a large result would leave it as
 /// long as itself.
-const LOG_BYTES: &str = "67108864";
+const LOG_BYTES: i64 = 67_108_864;
 
 const MIGRATIONS: [Step; 9] = [
     (1, "jobs", include_str!("../migrations/sqlite/0001_jobs.sql")),
@@ -91,20 +93,25 @@ impl Sqlite {
         }
         let options = options(&database);
         let mut reserve = Reserve::of(directory);
-        let connection = match connect(&options).await {
+        let connection = match bring_up_to_date(&options, &database).await {
             // To open it is to write, too: a log and its index. Where these cannot be made, not every system says why.
-            Err(Error::NoSpace(_) | Error::Unavailable(_)) if reserve.give_up() => connect(&options).await?,
-            connected => connected?,
+            Err(Error::NoSpace(_) | Error::Unavailable(_)) if reserve.give_up() => {
+                bring_up_to_date(&options, &database).await?
+            }
+            opened => opened?,
         };
-        let writer = Writer::start(connection, options.clone(), reserve, group_time)?;
+        let writer = Writer::start(connection, database, reserve, group_time)?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
         Ok(Self { writer, readers, _lock: lock })
     }
 
-    /// Runs a statement as it is on the writer's connection, for tests that need the database to misbehave.
+    /// Runs statements as they are on the writer's connection, for tests that need the database to misbehave.
     #[cfg(test)]
-    pub(crate) async fn execute(&self, statement: &'static str) {
-        self.writer.run(Moves::Little, statement).await.expect("a valid statement");
+    pub(crate) async fn execute(&self, statements: &'static str) {
+        let run = sql::operation(move |connection: &mut WriteConnection| {
+            Box::pin(async move { Ok(connection.inner().execute_batch(statements)?) })
+        });
+        self.writer.write(Moves::Little, run).await.expect("valid statements");
     }
 }
 
@@ -118,7 +125,7 @@ fn options(database: &Path) -> SqliteConnectOptions {
         // What was acknowledged survives a power cut, not only a crash of the process.
         .synchronous(SqliteSynchronous::Full)
         .foreign_keys(true)
-        .pragma("journal_size_limit", LOG_BYTES)
+        .pragma("journal_size_limit", LOG_BYTES.to_string())
         .busy_timeout(BUSY_TIMEOUT)
 }
 
@@ -126,6 +133,15 @@ fn options(database: &Path) -> SqliteConnectOptions {
 async fn connect(options: &SqliteConnectOptions) -> Result<SqliteConnection, Error> {
     let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(options).await?;
     migrate(&mut connection).await?;
+    Ok(connection)
+}
+
+/// Brings its schema up to date and opens it to write.
+async fn bring_up_to_date(options: &SqliteConnectOptions, database: &Path) -> Result<WriteConnection, Error> {
+    let migrating = connect(options).await?;
+    // Before the other one is closed: the last one to go writes the log back, which a full disk has no room for.
+    let connection = WriteConnection::open(database)?;
+    sqlx::Connection::close(migrating).await?;
     Ok(connection)
 }
 
@@ -215,11 +231,6 @@ impl Connection for SqliteConnection {
         sql::run::<sqlx::Sqlite>(self, statement).await
     }
 
-    /// In one round trip to SQLite's thread.
-    async fn batch(&mut self, statements: Vec<Statement>) -> Result<Vec<SqliteRow>, Error> {
-        sql::run::<sqlx::Sqlite>(self, Statement::joined(statements)).await
-    }
-
     async fn lock_admission(&mut self) -> Result<(), Error> {
         Ok(())
     }
@@ -230,7 +241,9 @@ impl Connection for SqliteConnection {
 }
 
 impl Database for Sqlite {
-    type Sqlx = sqlx::Sqlite;
+    type Writing = WriteConnection;
+    type Reading = PoolConnection<sqlx::Sqlite>;
+
     /// The lock on the directory says that no other process lives here.
     const SHARED: bool = false;
 
@@ -242,7 +255,7 @@ impl Database for Sqlite {
         &self,
         _size: Size,
         moves: Moves,
-        operation: Operation<SqliteConnection, T>,
+        operation: Operation<WriteConnection, T>,
     ) -> Result<T, Error> {
         self.writer.write(moves, operation).await
     }

@@ -1,6 +1,9 @@
 //! SQLite under the store's contract, and what is its own: the lock on the directory and its file.
 
+use futures_util::FutureExt;
 use tempfile::TempDir;
+use tokio::sync::{oneshot, watch};
+use tokio::task::JoinHandle;
 
 use super::*;
 use crate::domain::job::JobState;
@@ -36,8 +39,31 @@ impl std::ops::Deref for Fixture {
 }
 
 impl Sqlite {
+    /// Keeps the writer with an operation that has begun, until the sender is dropped.
+    pub(crate) async fn hold(&self) -> (watch::Sender<()>, JoinHandle<Result<(), Error>>) {
+        let (go, gone) = watch::channel(());
+        let (tell, begun) = oneshot::channel();
+        let tell = std::sync::Mutex::new(Some(tell));
+        let wait = sql::operation(move |_: &mut WriteConnection| {
+            let mut gone = gone.clone();
+            if let Some(tell) = tell.lock().expect("no panic").take() {
+                tell.send(()).expect("somebody waits");
+            }
+            // An error says that the sender was dropped, which is what is waited for.
+            async move {
+                let _ = gone.changed().await;
+                Ok(())
+            }
+            .boxed()
+        });
+        let writer = self.writer.clone();
+        let held = tokio::spawn(async move { writer.write(Moves::Little, wait).await });
+        begun.await.expect("it begins");
+        (go, held)
+    }
+
     /// What a pragma says on the connection that writes.
-    async fn on_writer<T>(&self, pragma: &'static str, read: fn(&SqliteRow) -> Result<T, Error>) -> T {
+    async fn on_writer<T>(&self, pragma: &'static str, read: fn(&connection::WrittenRow) -> Result<T, Error>) -> T {
         let rows = self.writer.run(Moves::Little, pragma).await.expect("an answer");
         read(&rows[0]).expect("a value")
     }

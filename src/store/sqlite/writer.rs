@@ -5,6 +5,7 @@
 //! is large is a group of its own.
 
 use std::panic::AssertUnwindSafe;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::thread;
@@ -12,11 +13,10 @@ use std::time::{Duration, Instant};
 
 use futures_util::FutureExt;
 use futures_util::future::BoxFuture;
-use sqlx::Connection;
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteRow};
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
+use super::connection::{WriteConnection, WrittenRow};
 use super::reserve::Reserve;
 use crate::store::Error;
 use crate::store::sql::{self, Moves, Operation, Statement};
@@ -63,7 +63,7 @@ trait Waiting: Send {
     }
 
     /// Runs it within the transaction and keeps its answer. It may be run again where the transaction came to nothing.
-    fn run<'c>(&'c mut self, connection: &'c mut SqliteConnection) -> BoxFuture<'c, Result<(), Error>>;
+    fn run<'c>(&'c mut self, connection: &'c mut WriteConnection) -> BoxFuture<'c, Result<(), Error>>;
 
     /// Answers its caller: with what it kept, or why nothing was written.
     fn answer(self: Box<Self>, committed: Result<(), Error>);
@@ -94,7 +94,7 @@ impl Turn {
 }
 
 struct Pending<T> {
-    operation: Operation<SqliteConnection, T>,
+    operation: Operation<WriteConnection, T>,
     moves: Moves,
     value: Option<T>,
     turn: Arc<Turn>,
@@ -110,7 +110,7 @@ impl<T: Send + 'static> Waiting for Pending<T> {
         self.moves
     }
 
-    fn run<'c>(&'c mut self, connection: &'c mut SqliteConnection) -> BoxFuture<'c, Result<(), Error>> {
+    fn run<'c>(&'c mut self, connection: &'c mut WriteConnection) -> BoxFuture<'c, Result<(), Error>> {
         Box::pin(async {
             // A defect in one operation must not cost the others their writer, be it in its call or in what it awaits.
             let run = async { (self.operation)(connection).await };
@@ -130,24 +130,23 @@ impl<T: Send + 'static> Waiting for Pending<T> {
 }
 
 impl Writer {
-    /// Starts the thread on a connection; `options` open another one when that is of no more use. On a full disk
+    /// Starts the thread on a connection to `database`, which it opens anew when that is of no more use. On a full disk
     /// `reserve` is for what makes room. A group goes on taking operations for `group_time`.
     ///
     /// # Errors
     /// [`Error::Unavailable`] where the system has no thread to give.
     pub(super) fn start(
-        connection: SqliteConnection,
-        options: SqliteConnectOptions,
+        connection: WriteConnection,
+        database: PathBuf,
         reserve: Reserve,
         group_time: Duration,
     ) -> Result<Self, Error> {
         let (inbox, messages) = mpsc::unbounded_channel();
         let failed = |error: std::io::Error| Error::Unavailable(format!("cannot start the writer's thread: {error}"));
-        // A runtime of its own: each statement is a round trip to SQLite's thread, and waking this one thread is
-        // cheaper than finding one among those of the server.
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().map_err(failed)?;
+        // A runtime of its own: what is awaited here is the next message and, within an operation, nothing but in tests.
+        let runtime = tokio::runtime::Builder::new_current_thread().build().map_err(failed)?;
         let connection = Some(connection);
-        let desk = Desk { connection, options, reserve, has_savepoint: false, messages, group_time };
+        let desk = Desk { connection, database, reserve, messages, group_time };
         let work = move || runtime.block_on(desk.serve());
         thread::Builder::new().name("store-writer".into()).spawn(work).map_err(failed)?;
         Ok(Self { inbox, patience: PATIENCE })
@@ -157,7 +156,7 @@ impl Writer {
     pub(super) async fn write<T: Send + 'static>(
         &self,
         moves: Moves,
-        operation: Operation<SqliteConnection, T>,
+        operation: Operation<WriteConnection, T>,
     ) -> Result<T, Error> {
         let turn = Arc::new(Turn::default());
         let (reply, mut answer) = oneshot::channel();
@@ -178,8 +177,8 @@ impl Writer {
     }
 
     /// Runs one statement without parameters and returns its rows.
-    pub(super) async fn run(&self, moves: Moves, statement: &'static str) -> Result<Vec<SqliteRow>, Error> {
-        let run = sql::operation(move |connection: &mut SqliteConnection| {
+    pub(super) async fn run(&self, moves: Moves, statement: &'static str) -> Result<Vec<WrittenRow>, Error> {
+        let run = sql::operation(move |connection: &mut WriteConnection| {
             async move { sql::Connection::rows(connection, Statement::new(statement)).await }.boxed()
         });
         self.write(moves, run).await
@@ -198,12 +197,9 @@ impl Writer {
 /// What the thread has.
 struct Desk {
     /// `None`: the last one was of no more use.
-    connection: Option<SqliteConnection>,
-    options: SqliteConnectOptions,
+    connection: Option<WriteConnection>,
+    database: PathBuf,
     reserve: Reserve,
-    /// Whether the savepoint of an operation that joined others is still there: it goes with the next one's, or with the
-    /// commit, which spares a round trip to SQLite's thread.
-    has_savepoint: bool,
     messages: mpsc::UnboundedReceiver<Message>,
     group_time: Duration,
 }
@@ -219,10 +215,7 @@ impl Desk {
             let left_over = match message {
                 Message::Write(first) => self.group(first).await,
                 Message::Close(done) => {
-                    if let Some(connection) = self.connection.take() {
-                        // What was acknowledged is durable without it.
-                        let _ = connection.close().await;
-                    }
+                    self.connection = None;
                     let _ = done.send(());
                     return;
                 }
@@ -256,7 +249,7 @@ impl Desk {
                         operation.answer(helped);
                     }
                     Err(error) => {
-                        self.roll_back().await;
+                        self.roll_back();
                         group.push((operation, Ok(())));
                         self.each_alone(group, error).await;
                         return None;
@@ -278,13 +271,12 @@ impl Desk {
 
     /// Begins a transaction with this operation; without one where it is refused.
     async fn open(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
-        self.has_savepoint = false;
-        let mut ran = self.control(BEGIN).await;
+        let mut ran = self.control(BEGIN);
         if ran.is_ok() {
             ran = self.run(operation).await;
         }
         if ran.is_err() {
-            self.roll_back().await;
+            self.roll_back();
         }
         ran
     }
@@ -292,18 +284,17 @@ impl Desk {
     /// Runs an operation in the transaction of others, which stand whatever becomes of it. An error says that the
     /// transaction is lost.
     async fn join(&mut self, operation: &mut dyn Waiting) -> Result<Result<(), Error>, Error> {
-        let begin = if self.has_savepoint { "RELEASE one; SAVEPOINT one" } else { "SAVEPOINT one" };
-        self.control(begin).await?;
-        self.has_savepoint = true;
+        self.control("SAVEPOINT one")?;
         let outcome = self.run(operation).await;
         if let Err(error) = &outcome {
             // Where the disk is full, SQLite may have rolled back everything by itself, and there is nothing to go back
             // to.
-            self.control("ROLLBACK TO one").await?;
+            self.control("ROLLBACK TO one")?;
             if self.can_help(operation, error) {
                 return Err(error.clone());
             }
         }
+        self.control("RELEASE one")?;
         Ok(outcome)
     }
 
@@ -312,8 +303,8 @@ impl Desk {
         if group.is_empty() {
             return;
         }
-        if let Err(error) = self.end(group.len()).await {
-            self.roll_back().await;
+        if let Err(error) = self.end(group.len()) {
+            self.roll_back();
             return self.each_alone(group, error).await;
         }
         group.into_iter().for_each(|(operation, outcome)| operation.answer(outcome));
@@ -335,9 +326,9 @@ impl Desk {
     /// Runs an operation in a transaction of its own.
     async fn alone(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
         self.open(operation).await?;
-        let committed = self.end(1).await;
+        let committed = self.end(1);
         if committed.is_err() {
-            self.roll_back().await;
+            self.roll_back();
         }
         committed
     }
@@ -361,43 +352,39 @@ impl Desk {
     /// an operation that begins something is refused, unless it finds that it has nothing to write.
     async fn run(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
         let is_bound = matches!(operation.moves(), Moves::Begins(_)) && !self.reserve.restore();
-        let before = if is_bound { self.changes().await? } else { 0 };
-        operation.run(self.connection().await?).await?;
-        match is_bound && self.changes().await? != before {
+        let connection = self.connection()?;
+        let before = connection.changes();
+        operation.run(connection).await?;
+        match is_bound && connection.changes() != before {
             true => Err(self.reserve.refusal()),
             false => Ok(()),
         }
     }
 
-    /// Rows that were changed over the connection.
-    async fn changes(&mut self) -> Result<i64, Error> {
-        Ok(sqlx::query_scalar("SELECT total_changes()").fetch_one(self.connection().await?).await?)
-    }
-
     /// Commits what so many operations wrote: it is on the disk then.
-    async fn end(&mut self, operations: usize) -> Result<(), Error> {
-        self.control("COMMIT").await?;
+    fn end(&mut self, operations: usize) -> Result<(), Error> {
+        self.control("COMMIT")?;
         metrics::store_commit(operations);
         Ok(())
     }
 
     /// Breaks the transaction off, if there is one. A connection that cannot even do that is given up.
-    async fn roll_back(&mut self) {
-        if self.control("ROLLBACK").await.is_err() {
+    fn roll_back(&mut self) {
+        if self.control("ROLLBACK").is_err() {
             self.connection = None;
         }
     }
 
-    async fn control(&mut self, statement: &'static str) -> Result<(), Error> {
-        sqlx::query(statement).execute(self.connection().await?).await?;
-        Ok(())
+    fn control(&mut self, statement: &'static str) -> Result<(), Error> {
+        self.connection()?.control(statement)
     }
 
-    async fn connection(&mut self) -> Result<&mut SqliteConnection, Error> {
-        if self.connection.is_none() {
-            self.connection = Some(SqliteConnection::connect_with(&self.options).await?);
-        }
-        self.connection.as_mut().ok_or_else(|| Error::Unavailable("no connection to the database".into()))
+    fn connection(&mut self) -> Result<&mut WriteConnection, Error> {
+        let connection = match self.connection.take() {
+            Some(connection) => connection,
+            None => WriteConnection::open(&self.database)?,
+        };
+        Ok(self.connection.insert(connection))
     }
 }
 

@@ -1,0 +1,173 @@
+//! The connection that writes: SQLite called on the writer's own thread.
+//!
+//! sqlx keeps a thread for each connection, and every statement is a message to it and an answer back. Beside busy
+//! solvers that is most of what a small job costs: a wake-up takes longer than a statement.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use rusqlite::types::Value as Cell;
+use rusqlite::{OpenFlags, Statement as Prepared};
+
+use super::{BUSY_TIMEOUT, LOG_BYTES};
+use crate::domain::job::JobName;
+use crate::store::Error;
+use crate::store::sql::{self, Change, Connection, Row, Statement, Value};
+
+/// Statements that stay prepared: more than there are.
+const PREPARED: usize = 128;
+
+/// A connection of rusqlite.
+pub(in crate::store) struct WriteConnection(rusqlite::Connection);
+
+impl WriteConnection {
+    /// Opens a database that is there, its schema up to date.
+    ///
+    /// # Errors
+    /// [`Error::Unavailable`], [`Error::NoSpace`] and [`Error::Corrupt`].
+    pub(super) fn open(database: &Path) -> Result<Self, Error> {
+        // One thread at a time has it: SQLite need not lock.
+        let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+        let connection = rusqlite::Connection::open_with_flags(database, flags)?;
+        connection.busy_timeout(BUSY_TIMEOUT)?;
+        connection.set_prepared_statement_cache_capacity(PREPARED);
+        // What was acknowledged survives a power cut, not only a crash of the process.
+        connection.pragma_update(None, "synchronous", "FULL")?;
+        connection.pragma_update(None, "foreign_keys", true)?;
+        // Answers with what it set, as the log mode does: the latter is the file's.
+        connection.pragma_update_and_check(None, "journal_size_limit", LOG_BYTES, |_| Ok(()))?;
+        Ok(Self(connection))
+    }
+
+    /// Runs one without parameters or rows.
+    pub(super) fn control(&mut self, statement: &'static str) -> Result<(), Error> {
+        Ok(self.0.prepare_cached(statement)?.raw_execute().map(drop)?)
+    }
+
+    /// Rows that were changed over it.
+    pub(super) fn changes(&self) -> u64 {
+        self.0.total_changes()
+    }
+
+    #[cfg(test)]
+    pub(super) fn inner(&mut self) -> &mut rusqlite::Connection {
+        &mut self.0
+    }
+
+    fn run(&mut self, statement: &Statement) -> Result<Vec<WrittenRow>, Error> {
+        let mut prepared = self.0.prepare_cached(statement.sql())?;
+        bind(&mut prepared, statement.values())?;
+        let columns: Arc<[String]> = prepared.column_names().into_iter().map(str::to_owned).collect();
+        let mut found = Vec::new();
+        let mut rows = prepared.raw_query();
+        while let Some(row) = rows.next()? {
+            let cells = (0..columns.len()).map(|place| row.get(place)).collect::<Result<_, _>>()?;
+            found.push(WrittenRow { columns: columns.clone(), cells });
+        }
+        Ok(found)
+    }
+}
+
+/// Gives the parameters `$1`, `$2`, ... their values. To SQLite these are names, numbered as they come.
+fn bind(prepared: &mut Prepared<'_>, values: &[Value]) -> Result<(), Error> {
+    for place in 1..=prepared.parameter_count() {
+        let number = prepared.parameter_name(place).and_then(|name| name.strip_prefix('$')?.parse::<usize>().ok());
+        let value = number.and_then(|number| values.get(number.checked_sub(1)?));
+        match value.ok_or_else(|| Error::Corrupt(format!("a statement's parameter {place} has no value")))? {
+            Value::Integer(value) => prepared.raw_bind_parameter(place, value)?,
+            Value::Text(value) => prepared.raw_bind_parameter(place, value)?,
+            Value::Bytes(value) => prepared.raw_bind_parameter(place, value)?,
+        }
+    }
+    Ok(())
+}
+
+impl Connection for WriteConnection {
+    type Row = WrittenRow;
+    // It has the database to itself.
+    const FOR_UPDATE: &'static str = "";
+    const SKIP_LOCKED: &'static str = "";
+    const WRITES_ALONE: bool = true;
+
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<WrittenRow>, Error> {
+        self.run(&statement)
+    }
+
+    async fn lock_admission(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
+
+    async fn tell(&mut self, _change: Change, _job: &JobName) -> Result<(), Error> {
+        Ok(())
+    }
+}
+
+/// A row of its answers.
+pub(in crate::store) struct WrittenRow {
+    columns: Arc<[String]>,
+    cells: Vec<Cell>,
+}
+
+impl WrittenRow {
+    fn cell(&self, column: &str) -> Result<&Cell, Error> {
+        let place = self.columns.iter().position(|name| name == column);
+        let cell = place.and_then(|place| self.cells.get(place));
+        cell.ok_or_else(|| Error::Corrupt(format!("no column {column}")))
+    }
+}
+
+/// The value of a cell as one of these types, by the variant that holds it.
+macro_rules! read_as {
+    ($row:expr, $column:expr, $variant:ident) => {
+        match $row.cell($column)? {
+            Cell::Null => Ok(None),
+            Cell::$variant(value) => Ok(Some(value.clone())),
+            other => Err(Error::Corrupt(format!("{} is {}", $column, other.data_type()))),
+        }
+    };
+}
+
+/// What must not be `NULL`.
+fn required<T>(column: &str, value: Option<T>) -> Result<T, Error> {
+    value.ok_or_else(|| Error::Corrupt(format!("{column} is NULL")))
+}
+
+impl Row for WrittenRow {
+    fn integer(&self, column: &str) -> Result<i64, Error> {
+        required(column, self.optional_integer(column)?)
+    }
+
+    fn optional_integer(&self, column: &str) -> Result<Option<i64>, Error> {
+        read_as!(self, column, Integer)
+    }
+
+    fn flag(&self, column: &str) -> Result<bool, Error> {
+        Ok(self.integer(column)? != 0)
+    }
+
+    fn text(&self, column: &str) -> Result<String, Error> {
+        required(column, self.optional_text(column)?)
+    }
+
+    fn optional_text(&self, column: &str) -> Result<Option<String>, Error> {
+        read_as!(self, column, Text)
+    }
+
+    fn bytes(&self, column: &str) -> Result<Vec<u8>, Error> {
+        required(column, self.optional_bytes(column)?)
+    }
+
+    fn optional_bytes(&self, column: &str) -> Result<Option<Vec<u8>>, Error> {
+        read_as!(self, column, Blob)
+    }
+}
+
+impl From<rusqlite::Error> for Error {
+    fn from(error: rusqlite::Error) -> Self {
+        let code = match &error {
+            rusqlite::Error::SqliteFailure(cause, _) => cause.extended_code.to_string(),
+            _ => String::new(),
+        };
+        sql::by_code(&code, error.to_string()).unwrap_or_else(Error::Unavailable)
+    }
+}
