@@ -48,7 +48,8 @@ impl Ahead {
         let reserved = Arc::new(Reserved::new(inner.clone(), &job.name)?);
         let work = inner.store.work(&job.name).await.ok()?;
         let (tell, begun) = oneshot::channel();
-        let opening = Opening::Foreseen { reserved: reserved.clone(), trace_parent: trace_parent.clone(), begun: tell };
+        let opening =
+            Opening::Foreseen { reserved: Arc::downgrade(&reserved), trace_parent: trace_parent.clone(), begun: tell };
         let stop = stop_token(&job);
         let subscription = inner.hub.subscribe(&job.name);
         let (assignment, heard) = Assignment::new(&job, lease.attempt, opening, work.input, stop.clone(), subscription);

@@ -3,7 +3,7 @@
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::thread;
 use std::time::SystemTime;
 
@@ -42,7 +42,7 @@ pub(super) enum Opening {
     Begun(Attempt),
     /// Once the worker is free, if the job is still to be had: the one who assigned it is told the attempt's span, and is
     /// to lease it then.
-    Foreseen { reserved: Arc<Reserved>, trace_parent: Option<String>, begun: oneshot::Sender<Span> },
+    Foreseen { reserved: Weak<Reserved>, trace_parent: Option<String>, begun: oneshot::Sender<Span> },
 }
 
 /// What the one who assigned an attempt hears of it.
@@ -134,7 +134,7 @@ impl Opening {
         match self {
             Self::Begun(attempt) => Some(attempt),
             Self::Foreseen { reserved, trace_parent, begun } => {
-                if begun.is_closed() || !reserved.holds() {
+                if !reserved.upgrade().is_some_and(|reserved| reserved.holds()) {
                     return None;
                 }
                 let attempt = Attempt::begin(name, number, trace_parent.as_deref());

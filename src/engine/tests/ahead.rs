@@ -1,6 +1,9 @@
 //! Jobs that are begun the moment a worker is free: read ahead, leased while they are solved, and nothing before.
 
+use std::pin::pin;
 use std::time::SystemTime;
+
+use futures_util::FutureExt;
 
 use super::*;
 use crate::engine::{Drained, locked};
@@ -78,6 +81,50 @@ async fn cancelled_before_it_is_begun_it_ends_so_whatever_was_foreseen() {
     }
     assert_eq!(states(&bench, &next).await, [JobState::Queued, JobState::Cancelled]);
     assert!(locked(&bench.engine.inner.running).is_empty());
+}
+
+/// The worker begins it, and solves it, while the claim waits behind the cancel.
+#[tokio::test]
+async fn cancelled_between_its_begin_and_its_lease_it_leaves_nothing() {
+    let (bench, [solved, next]) = foreseen().await;
+    let (go, held) = bench.store.hold().await;
+    let engine = bench.engine.clone();
+    let name = next.clone();
+    let mut cancelling = pin!(async move { engine.cancel(&name).await });
+    // Polled once, it is in the writer's queue.
+    assert!((&mut cancelling).now_or_never().is_none());
+    bench.gate.open();
+    eventually(|| async { (bench.gate.calls.load(Ordering::SeqCst) == 2).then_some(()) }).await;
+    drop(go);
+    held.await.expect("no panic").expect("held");
+    assert_eq!(cancelling.await.expect("exists").state, JobState::Cancelled);
+    assert_eq!(bench.ended(&solved).await.state, JobState::Succeeded);
+    let third = bench.submit(Script::Succeed).await;
+    assert_eq!(bench.ended(&third).await.state, JobState::Succeeded);
+    assert_eq!(states(&bench, &next).await, [JobState::Queued, JobState::Cancelled]);
+    assert!(bench.store.result(&next).await.expect("answers").is_none());
+    assert!(locked(&bench.engine.inner.running).is_empty());
+}
+
+#[tokio::test]
+async fn what_was_begun_and_cannot_be_leased_is_stopped_and_solved_later() {
+    let bench = Bench::start(Options { short_job: ALWAYS, ..workers(1) }).await;
+    let both = vec![new_job(Script::Wait), new_job(Script::Wait)];
+    let created = bench.engine.submit_batch(both).await.expect("admitted");
+    let [first, next] = [&created[0].name, &created[1].name];
+    eventually(|| async { is_foreseen(&bench, next).then_some(()) }).await;
+    let no_claims = "CREATE TRIGGER broken BEFORE UPDATE OF state ON jobs WHEN NEW.state = 'RUNNING' \
+                     BEGIN SELECT RAISE(ABORT, 'broken'); END";
+    bench.store.execute(no_claims).await;
+    bench.engine.cancel(first).await.expect("exists");
+    bench.gate.until_waiting(2).await;
+    eventually(|| async { locked(&bench.engine.inner.running).is_empty().then_some(()) }).await;
+    assert_eq!(bench.ended(first).await.state, JobState::Cancelled);
+    assert_eq!(states(&bench, next).await, [JobState::Queued]);
+    bench.store.execute("DROP TRIGGER broken").await;
+    bench.gate.open();
+    assert_eq!(bench.ended(next).await.attempt, 1);
+    assert_eq!(states(&bench, next).await, [JobState::Queued, JobState::Running, JobState::Succeeded]);
 }
 
 #[tokio::test]
