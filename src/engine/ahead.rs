@@ -1,25 +1,25 @@
 //! The job that a slot is to begin with next: read and handed to the worker while that solves another one.
 //!
-//! The worker begins it the moment that it is free, and it is leased while it is solved: between two short jobs a worker
-//! would else wait for a commit of the store and a dozen wake-ups beside busy solvers, some 3 ms, or for the slot to wake
-//! up at least. Until it is begun nothing is written of it: it stays in the queue, and whoever takes it first has it.
+//! The worker begins it the moment that it is free, and it is leased while it is solved: between two short jobs a
+//! worker would else wait for a commit of the store and a dozen wake-ups beside busy solvers, some 3 ms, or for the
+//! slot to wake up at least. Until it is begun nothing is written of it: it stays in the queue, and whoever takes it
+//! first has it.
 
 use std::collections::hash_map::Entry;
 use std::sync::Arc;
 use std::time::SystemTime;
 
 use tokio::sync::oneshot;
-use tracing::Span;
 
 use super::course::{Wait, stop_token};
-use super::worker::{Assignment, Heard, Opening, Worker};
+use super::worker::{Assignment, Begun, Heard, Opening, Worker};
 use super::{Inner, Phase, locked};
 use crate::domain::job::{Job, JobName};
 use crate::domain::{StopReason, StopToken};
 use crate::store::{Claimed, Lease};
 
-/// Observations of a job beyond which its input is not read ahead, some 2 MB of it: none that large is solved in the time
-/// that reading ahead is for.
+/// Observations of a job beyond which its input is not read ahead, some 2 MB of it: none that large is solved in the
+/// time that reading ahead is for.
 const MOST_AHEAD: u32 = 100_000;
 
 /// A job that is foreseen to be the next and in the hands of a worker. No other slot foresees it meanwhile. Dropped, it
@@ -31,13 +31,13 @@ pub(super) struct Ahead {
     pub reserved: Arc<Reserved>,
     pub stop: Revocable,
     /// Told once the worker begins; dropped where it finds that the job is another's by now, or nobody's.
-    pub begun: oneshot::Receiver<Span>,
+    pub begun: oneshot::Receiver<Begun>,
     pub heard: Heard,
 }
 
 impl Ahead {
-    /// Foresees the next job and hands it to the worker; `None` where none waits, or the store does not answer, which the
-    /// claim will tell.
+    /// Foresees the next job and hands it to the worker; `None` where none waits, or the store does not answer, which
+    /// the claim will tell.
     pub(super) async fn look(inner: &Arc<Inner>, worker: &Worker) -> Option<Self> {
         let passed: Vec<JobName> = locked(&inner.foreseen).keys().cloned().collect();
         let Claimed { job, lease, trace_parent, queue_time } =
@@ -49,7 +49,7 @@ impl Ahead {
         let work = inner.store.work(&job.name).await.ok()?;
         let (tell, begun) = oneshot::channel();
         let opening =
-            Opening::Foreseen { reserved: Arc::downgrade(&reserved), trace_parent: trace_parent.clone(), begun: tell };
+            Opening::Foreseen { reserved: Arc::downgrade(&reserved), trace_parent: trace_parent.clone(), tell };
         let stop = stop_token(&job);
         let subscription = inner.hub.subscribe(&job.name);
         let (assignment, heard) = Assignment::new(&job, lease.attempt, opening, work.input, stop.clone(), subscription);

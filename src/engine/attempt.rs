@@ -7,9 +7,9 @@ use tracing::{Instrument, Span};
 
 use super::Inner;
 use super::ahead::Ahead;
-use super::course::{Course, End, Wait};
+use super::course::{Course, End, Leasing, Wait};
 use super::observe::Attempt;
-use super::worker::{Verdict, Worker};
+use super::worker::{self, Verdict, Worker};
 use crate::store::Claimed;
 
 /// A job that has all that a worker needs.
@@ -44,10 +44,18 @@ pub(super) async fn begin(inner: &Arc<Inner>, claimed: Claimed) -> Ready {
     .await
 }
 
+/// What became of a job that a worker was to solve, once the worker is free again.
+pub(super) enum Ran {
+    Done(Box<Done>),
+    /// It was foreseen and is another's by now, or nobody's.
+    Gone,
+    /// It was foreseen, and the store took no claim.
+    NotLeased,
+}
+
 impl Ready {
-    /// Has the worker solve it, and returns once the worker is free again; `None` where the job was foreseen and is
-    /// another's by now, or nobody's.
-    pub(super) async fn run(self, worker: &Worker) -> Option<Done> {
+    /// Has the worker solve it.
+    pub(super) async fn run(self, worker: &Worker) -> Ran {
         match self {
             Self::Claimed(begun) => {
                 let Begun { mut course, attempt, input } = *begun;
@@ -56,16 +64,22 @@ impl Ready {
                     Ok(input) => course.run(worker, attempt, input).instrument(span.clone()).await,
                     Err(verdict) => End { verdict, latest: None, attempt: Some(attempt) },
                 };
-                Some(Done { course, end, span })
+                Ran::Done(Box::new(Done { course, end, span }))
             }
             Self::Foreseen(ahead) => {
                 let Ahead { job, lease, wait, reserved, stop, begun, heard } = *ahead;
-                let span = begun.await.ok()?;
+                let Ok(worker::Begun { span, at, time }) = begun.await else { return Ran::Gone };
                 // Where another slot has it by now, what the worker has begun is stopped.
-                let mut course = Course::foreseen(job, lease, wait, stop.token().clone(), reserved)?;
+                let Some(mut course) = Course::foreseen(job, lease, wait, stop.token().clone(), reserved) else {
+                    return Ran::Gone;
+                };
                 stop.keep();
-                let end = course.run_foreseen(heard).instrument(span.clone()).await;
-                course.was_leased().then_some(Done { course, end, span })
+                let (leasing, end) = course.run_foreseen(at, time, heard).instrument(span.clone()).await;
+                match leasing {
+                    Leasing::Leased => Ran::Done(Box::new(Done { course, end, span })),
+                    Leasing::Gone => Ran::Gone,
+                    Leasing::Failed => Ran::NotLeased,
+                }
             }
         }
     }

@@ -58,6 +58,16 @@ pub(super) struct End {
     pub attempt: Option<Attempt>,
 }
 
+/// What came of the claim of a job that a worker has begun.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Leasing {
+    Leased,
+    /// It is another's by now, or nobody's.
+    Gone,
+    /// The store did not take it.
+    Failed,
+}
+
 /// What a job had behind it when it was claimed.
 pub(super) struct Wait {
     pub trace_parent: Option<String>,
@@ -74,8 +84,6 @@ pub(super) struct Course {
     stop: StopToken,
     /// Until it is leased.
     reserved: Option<Arc<Reserved>>,
-    /// Whether it ever was.
-    leased: bool,
     /// Until then the lease holds for sure.
     leased_until: Instant,
     /// The lease is gone: nothing more is written.
@@ -132,7 +140,7 @@ impl Course {
         let stop = stop_token(&job);
         let running = Running::list(inner.clone(), &lease, &stop);
         let mut course = Self::new(inner, job, lease, wait, stop, running);
-        course.is_leased(Instant::now());
+        course.is_leased(Instant::now(), SystemTime::now());
         course
     }
 
@@ -152,7 +160,7 @@ impl Course {
     }
 
     fn new(inner: Arc<Inner>, job: Job, lease: Lease, wait: Wait, stop: StopToken, running: Running) -> Self {
-        let (leased, leased_until) = (false, Instant::now());
+        let leased_until = Instant::now();
         Self {
             inner,
             job,
@@ -160,7 +168,6 @@ impl Course {
             wait,
             stop,
             reserved: None,
-            leased,
             leased_until,
             lost: false,
             stored: None,
@@ -168,41 +175,35 @@ impl Course {
         }
     }
 
-    /// Whether the job was ever leased; of one that was not nothing is to be committed.
-    pub(super) fn was_leased(&self) -> bool {
-        self.leased
-    }
-
-    /// The job was leased at this time.
-    fn is_leased(&mut self, at: Instant) {
-        self.leased = true;
+    /// The job was leased, for work that began at this time.
+    fn is_leased(&mut self, at: Instant, time: SystemTime) {
         self.leased_until = at + self.inner.options.lease;
         self.inner.hub.wake(&self.job.name);
-        observe::waited(&self.job.name, self.wait.trace_parent.as_deref(), self.wait.queue_time);
+        observe::waited(&self.job.name, self.wait.trace_parent.as_deref(), self.wait.queue_time, time);
         tracing::info!("attempt begins");
     }
 
-    /// Leases a job that was foreseen; where that fails, nothing of this attempt is written.
-    async fn claim(&mut self) {
-        let sent = Instant::now();
+    /// Leases a job that a worker began with at this time; where that fails, nothing of this attempt is written.
+    async fn claim(&mut self, at: Instant, time: SystemTime) -> Leasing {
         let Options { worker_name, lease, .. } = &self.inner.options;
-        match self
-            .inner
-            .store
-            .claim_foreseen(&self.lease, self.job.create_time, worker_name, SystemTime::now(), *lease)
-            .await
-        {
-            Ok(Some(_)) => {
-                self.inner.queue_changed();
-                self.is_leased(sent);
-            }
-            Ok(None) => self.lapse(),
+        let claimed =
+            self.inner.store.claim_foreseen(&self.lease, self.job.create_time, worker_name, time, *lease).await;
+        let leasing = match claimed {
+            Ok(Some(_)) => Leasing::Leased,
+            Ok(None) => Leasing::Gone,
             Err(error) => {
                 tracing::warn!(%error, "cannot claim a job");
-                self.lapse();
+                Leasing::Failed
             }
+        };
+        if leasing == Leasing::Leased {
+            self.inner.queue_changed();
+            self.is_leased(at, time);
+        } else {
+            self.lapse();
         }
         self.reserved = None;
+        leasing
     }
 
     /// Has the worker solve the job, and keeps the lease meanwhile.
@@ -217,10 +218,10 @@ impl Course {
         self.attend(heard).await
     }
 
-    /// Leases a job that a worker has begun, and keeps the lease until it is solved.
-    pub(super) async fn run_foreseen(&mut self, heard: Heard) -> End {
-        self.claim().await;
-        self.attend(heard).await
+    /// Leases a job that a worker began with at this time, and keeps the lease until it is solved.
+    pub(super) async fn run_foreseen(&mut self, at: Instant, time: SystemTime, heard: Heard) -> (Leasing, End) {
+        let leasing = self.claim(at, time).await;
+        (leasing, self.attend(heard).await)
     }
 
     /// Reads the input, and the cancel that may have come before the job was listed as running. A store that is out

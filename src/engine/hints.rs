@@ -35,8 +35,8 @@ impl Inner {
         }
     }
 
-    /// Stops the attempts at a job that run here, if its cancel was asked for. One that a failing store hides comes with
-    /// the next heartbeat.
+    /// Stops the attempts at a job that run here, if its cancel was asked for. One that a failing store hides comes
+    /// with the next heartbeat.
     async fn look_for_cancel(&self, name: &JobName) {
         if !locked(&self.running).keys().any(|lease| lease.name == *name) {
             return;

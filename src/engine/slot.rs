@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, sleep, sleep_until, timeout_at};
+use tokio::time::{Instant, sleep, sleep_until, timeout, timeout_at};
 
 use super::ahead::Ahead;
-use super::attempt::{self, Done, Ready};
+use super::attempt::{self, Ran, Ready};
 use super::worker::Worker;
 use super::{Inner, Phase, locked, observe};
 use crate::store;
@@ -49,21 +49,30 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
             }
             continue;
         };
-        let done;
-        (done, ahead) = solve(&inner, &worker, ready).await;
-        match done.map(|done| committing.replace(Committing(done.commit()))) {
-            // Results that the store cannot take must not pile up.
-            Some(Some(before)) => before.done().await,
-            Some(None) => {}
-            // What was begun could not be leased. Where the store takes no writes, the next claim says so, and waits.
-            None => ahead = None,
+        let ran;
+        (ran, ahead) = solve(&inner, &worker, ready).await;
+        match ran {
+            Ran::Done(done) => {
+                if let Some(mut before) = committing.replace(Committing(done.commit())) {
+                    // Results that the store cannot take must not pile up, nor are jobs begun that it may not lease.
+                    if timeout(inner.options.short_job, before.done()).await.is_err() {
+                        ahead = None;
+                        before.done().await;
+                    }
+                }
+            }
+            Ran::Gone => {}
+            // Where the store takes no writes, the next claim says so, and waits.
+            Ran::NotLeased => ahead = None,
         }
         if worker.is_gone() {
             tracing::error!("a worker thread is gone, its slot ends");
             break;
         }
     }
-    if let Some(last) = committing {
+    // Nobody is going to lease it.
+    drop(ahead);
+    if let Some(mut last) = committing {
         last.done().await;
     }
 }
@@ -90,7 +99,7 @@ async fn claim(inner: &Arc<Inner>) -> Option<Ready> {
 /// by itself before it is even leased.
 ///
 /// Not where other processes take jobs from the same store: two would often begin the same one.
-async fn solve(inner: &Arc<Inner>, worker: &Worker, ready: Ready) -> (Option<Done>, Option<Ahead>) {
+async fn solve(inner: &Arc<Inner>, worker: &Worker, ready: Ready) -> (Ran, Option<Ahead>) {
     let mut looks = !inner.store.is_shared();
     let mut ahead = None;
     let too_long = Instant::now() + inner.options.short_job;
@@ -100,7 +109,7 @@ async fn solve(inner: &Arc<Inner>, worker: &Worker, ready: Ready) -> (Option<Don
     loop {
         tokio::select! {
             biased;
-            done = &mut solving => return (done, ahead),
+            ran = &mut solving => return (ran, ahead),
             found = &mut looking, if looks => (looks, ahead) = (false, found),
             // By the time that it ends others may have come, or this one gone.
             () = sleep_until(too_long), if ahead.is_some() => ahead = None,
@@ -112,7 +121,7 @@ async fn solve(inner: &Arc<Inner>, worker: &Worker, ready: Ready) -> (Option<Don
 struct Committing(JoinHandle<()>);
 
 impl Committing {
-    async fn done(mut self) {
+    async fn done(&mut self) {
         // It only breaks off by a panic, which has been reported; the lease runs out.
         let _ = (&mut self.0).await;
     }

@@ -1,5 +1,5 @@
-//! Worker threads: one job at a time through the solver. They compute and nothing else; the store is the business of
-//! the task that feeds them.
+//! Worker threads: one job at a time through the solver, and the next one that was handed over as soon as it is done.
+//! The store is the business of the task that feeds them.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -8,6 +8,7 @@ use std::thread;
 use std::time::SystemTime;
 
 use tokio::sync::{mpsc, oneshot, watch};
+use tokio::time::Instant;
 use tracing::Span;
 
 use super::Solver;
@@ -40,9 +41,17 @@ pub(super) struct Assignment {
 pub(super) enum Opening {
     /// It is, and its job is leased.
     Begun(Attempt),
-    /// Once the worker is free, if the job is still to be had: the one who assigned it is told the attempt's span, and is
-    /// to lease it then.
-    Foreseen { reserved: Weak<Reserved>, trace_parent: Option<String>, begun: oneshot::Sender<Span> },
+    /// Once the worker is free, if the job is still to be had: the one who assigned it is told, and is to lease it
+    /// then.
+    Foreseen { reserved: Weak<Reserved>, trace_parent: Option<String>, tell: oneshot::Sender<Begun> },
+}
+
+/// That a worker began with a job that was foreseen.
+pub(super) struct Begun {
+    /// The attempt's.
+    pub span: Span,
+    pub at: Instant,
+    pub time: SystemTime,
 }
 
 /// What the one who assigned an attempt hears of it.
@@ -133,12 +142,13 @@ impl Opening {
     fn open(self, name: &JobName, number: u32) -> Option<Attempt> {
         match self {
             Self::Begun(attempt) => Some(attempt),
-            Self::Foreseen { reserved, trace_parent, begun } => {
+            Self::Foreseen { reserved, trace_parent, tell } => {
                 if !reserved.upgrade().is_some_and(|reserved| reserved.holds()) {
                     return None;
                 }
                 let attempt = Attempt::begin(name, number, trace_parent.as_deref());
-                begun.send(attempt.span().clone()).is_ok().then_some(attempt)
+                let begun = Begun { span: attempt.span().clone(), at: Instant::now(), time: SystemTime::now() };
+                tell.send(begun).is_ok().then_some(attempt)
             }
         }
     }
@@ -153,6 +163,7 @@ fn work(assignment: Assignment, solver: &Solver) {
     let mut reporter = Reporter { name, number, progress, subscription, attempt };
     let verdict = catch_unwind(AssertUnwindSafe(|| solve(input, &settings, &mut reporter, &stop, solver)))
         .unwrap_or_else(|panic| Verdict::Broken(format!("the solver panicked: {}", panic_message(panic.as_ref()))));
+    reporter.attempt.at_rest();
     // Nobody listens any more when the engine went down with its runtime; the store then tells the next start.
     let _ = reply.send(Report { verdict, attempt: reporter.attempt });
 }

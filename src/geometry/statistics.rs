@@ -8,15 +8,21 @@ pub const DEVIATION_PER_MEDIAN: f64 = 1.4826;
 
 /// Chi-square quantile at the level of [`GATE_QUANTILE`] for `dof` degrees of freedom.
 ///
-/// Wilson & Hilferty's approximation (1931); within 2 % for `dof` >= 3.
+/// Within 2 % for `dof` >= 3.
 pub fn chi_square_gate(dof: f64) -> f64 {
-    let spread = 2.0 / (9.0 * dof);
-    dof * (1.0 - spread + GATE_QUANTILE * spread.sqrt()).powi(3)
+    chi_square_quantile(dof, GATE_QUANTILE)
 }
 
-/// Median of a chi-square variable of `dof` degrees of freedom, by the same approximation.
+/// Median of a chi-square variable of `dof` degrees of freedom.
 pub fn chi_square_median(dof: f64) -> f64 {
-    dof * (1.0 - 2.0 / (9.0 * dof)).powi(3)
+    chi_square_quantile(dof, 0.0)
+}
+
+/// Quantile of a chi-square variable of `dof` degrees of freedom, at the level of this one of the normal distribution:
+/// the approximation of Wilson & Hilferty (1931).
+pub fn chi_square_quantile(dof: f64, normal_quantile: f64) -> f64 {
+    let spread = 2.0 / (9.0 * dof);
+    dof * (1.0 - spread + normal_quantile * spread.sqrt()).max(0.0).powi(3)
 }
 
 /// Median of the values, which are reordered; the lower one of two. 0 for an empty slice.

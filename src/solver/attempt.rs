@@ -9,7 +9,7 @@ use super::learned::Opinion;
 use super::portfolio::{self, Evidence, Portfolio};
 use super::recorder::Recorder;
 use super::{Context, Error};
-use super::{chance, crowds, depths, extend, likeliest, second};
+use super::{crowds, depths, extend, likeliest, second};
 use crate::domain::result::PriorTime;
 use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View, Warning};
 
@@ -31,8 +31,8 @@ const PAPER_TRACKS: usize = 5_000;
 /// What became of one block.
 pub struct Attempt {
     pub block: Block,
-    /// Spread of the image points that were searched, see [`portfolio::spread`]: a crowd that joins later takes up little
-    /// of the image.
+    /// Spread of the image points that were searched, see [`portfolio::spread`]: a crowd that joins later takes up
+    /// little of the image.
     pub spread: f64,
     /// The consensus over the tracks of the block; `None` when nothing stands.
     pub consensus: Option<Consensus>,
@@ -44,8 +44,8 @@ pub struct Attempt {
     pub opinion: Option<Opinion>,
     /// Tracks that hold under one geometry, and how many of them count; `None` but where too few count.
     pub doubted: Option<(usize, usize)>,
-    /// Tracks that hold under one geometry and lie within the noise of each other, and how many of them count; `None` but
-    /// where too few count.
+    /// Tracks that hold under one geometry and lie within the noise of each other, and how many of them count; `None`
+    /// but where too few count.
     pub crowded: Option<(usize, usize)>,
     /// That the tracks left out agree on a motion of their own.
     pub second_structure: Option<Warning>,
@@ -184,7 +184,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         attempt.consensus = Some(consensus);
         return Ok(());
     }
-    let refined = grow::refine(complete, &consensus, attempt.spread, context.stop);
+    let (refined, ln_false_alarms) = grow::refine(complete, &consensus, attempt.spread, context.stop);
     recorder.standing.inliers = refined.inlier_count() as u32;
     recorder.standing.best_score = Some(refined.score);
     recorder.tell(1.0);
@@ -197,7 +197,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         return Ok(());
     }
     // Another noise and other inliers than those that were accepted.
-    if chance::ln_false_alarms(complete, &refined, attempt.spread, context.stop) >= LN_ACCEPTABLE {
+    if ln_false_alarms >= LN_ACCEPTABLE {
         return Ok(());
     }
     attempt.second_structure = second::structure(complete, &refined, context.stop);

@@ -102,11 +102,11 @@ pub fn judge(block: &CompleteBlock, cameras: Vec<Camera>, noise: f64, stop: &Sto
     Consensus { cameras, points, squared, inlier, noise, score }
 }
 
-/// Fits at one noise level, and where those ended that converged: the same support under the same loss ends there again,
-/// so that it is looked up instead.
+/// Fits at one noise level, and where those ended that converged: the same support under the same loss ends there
+/// again, so that it is looked up instead.
 ///
-/// Growing and polishing come back to a support that stands still several times each: with 100 right tracks in 11 views,
-/// 37 adjustments become 11.
+/// Growing and polishing come back to a support that stands still several times each: with 100 right tracks in 11
+/// views, 37 adjustments become 11.
 struct Fits<'a> {
     block: &'a CompleteBlock,
     noise: f64,
@@ -344,27 +344,34 @@ const HIGHER_NOISE: [f64; 2] = [2.0, 4.0];
 /// Settled noise, in units of that the consensus was found at, below which its gate was wide enough to lose nothing.
 const SURELY_HIGH: f64 = 0.75;
 
-/// The best of what settles from the consensus's noise and from higher ones.
+/// The best of what settles from the consensus's noise and from higher ones, with the logarithm of its false alarms.
 ///
 /// A consensus found at a noise that is too low has lost its worse tracks, and an estimate from those that remain stays
 /// too low; seen from higher up they come back. Of the outcomes the one least likely to be chance stands.
 ///
 /// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]
-pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> Consensus {
+pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> (Consensus, f64) {
     let settle = |factor: f64| {
         let noise = (factor * consensus.noise).min(NOISE_BOUNDS.1);
         let judged = judge(block, consensus.cameras.clone(), noise, stop);
         settle_noise(block, polish(block, judged, stop), stop)
     };
-    let mut best = settle(1.0);
-    if best.noise < SURELY_HIGH * consensus.noise {
+    let with_chance = |settled: Consensus| {
+        let ln_false_alarms = chance::ln_false_alarms(block, &settled, spread, stop);
+        (settled, ln_false_alarms)
+    };
+    let mut best = with_chance(settle(1.0));
+    if best.0.noise < SURELY_HIGH * consensus.noise {
         return best;
     }
     for factor in HIGHER_NOISE {
         let settled = settle(factor);
-        let certainty = |consensus: &Consensus| chance::ln_false_alarms(block, consensus, spread, stop);
-        if certainty(&settled) < certainty(&best) {
-            best = settled;
+        // Most settle where the best one is: to try cameras takes longer than to settle, and they can only veto.
+        if settled.ln_false_alarms_by_residuals(spread) < best.1 {
+            let settled = with_chance(settled);
+            if settled.1 < best.1 {
+                best = settled;
+            }
         }
     }
     best

@@ -1,4 +1,4 @@
-//! What is seen of one attempt at a job, from the claim to its end.
+//! What is seen of one attempt at a job, from its begin to its end.
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -27,12 +27,11 @@ struct CurrentStage {
     _span: Span,
 }
 
-/// A job was leased that had entered the queue at `enqueued_at`. `traceparent` as for [`Attempt::begin`].
-pub fn waited(job: &JobName, traceparent: Option<&str>, enqueued_at: SystemTime) {
-    let claimed_at = SystemTime::now();
+/// A job was begun at `begun_at` that had entered the queue at `enqueued_at`. `traceparent` as for [`Attempt::begin`].
+pub fn waited(job: &JobName, traceparent: Option<&str>, enqueued_at: SystemTime, begun_at: SystemTime) {
     // A clock set back between the two gives no wait, not a panic.
-    metrics::queue_wait(claimed_at.duration_since(enqueued_at).unwrap_or_default());
-    queue_span(job, traceparent, enqueued_at.min(claimed_at), claimed_at);
+    metrics::queue_wait(begun_at.duration_since(enqueued_at).unwrap_or_default());
+    queue_span(job, traceparent, enqueued_at.min(begun_at), begun_at);
 }
 
 impl Attempt {
@@ -54,6 +53,12 @@ impl Attempt {
     /// A worker has the job in its hands.
     pub fn at_work(&mut self) {
         self.busy = Some(metrics::busy_worker());
+    }
+
+    /// The worker is free again; what is left is to commit what it found.
+    pub fn at_rest(&mut self) {
+        self.leave_stage();
+        self.busy = None;
     }
 
     /// The solver entered a stage; the one before is over.

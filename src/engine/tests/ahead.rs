@@ -88,9 +88,7 @@ async fn cancelled_before_it_is_begun_it_ends_so_whatever_was_foreseen() {
 async fn cancelled_between_its_begin_and_its_lease_it_leaves_nothing() {
     let (bench, [solved, next]) = foreseen().await;
     let (go, held) = bench.store.hold().await;
-    let engine = bench.engine.clone();
-    let name = next.clone();
-    let mut cancelling = pin!(async move { engine.cancel(&name).await });
+    let mut cancelling = pin!(bench.engine.inner.cancel(&next, None));
     // Polled once, it is in the writer's queue.
     assert!((&mut cancelling).now_or_never().is_none());
     bench.gate.open();
@@ -118,13 +116,15 @@ async fn what_was_begun_and_cannot_be_leased_is_stopped_and_solved_later() {
     bench.store.execute(no_claims).await;
     bench.engine.cancel(first).await.expect("exists");
     bench.gate.until_waiting(2).await;
-    eventually(|| async { locked(&bench.engine.inner.running).is_empty().then_some(()) }).await;
+    // It is until its claim has failed.
+    eventually(|| async { (!is_foreseen(&bench, next)).then_some(()) }).await;
     assert_eq!(bench.ended(first).await.state, JobState::Cancelled);
     assert_eq!(states(&bench, next).await, [JobState::Queued]);
     bench.store.execute("DROP TRIGGER broken").await;
     bench.gate.open();
     assert_eq!(bench.ended(next).await.attempt, 1);
     assert_eq!(states(&bench, next).await, [JobState::Queued, JobState::Running, JobState::Succeeded]);
+    assert_eq!(bench.gate.calls.load(Ordering::SeqCst), 3);
 }
 
 #[tokio::test]

@@ -5,16 +5,19 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::domain::StopToken;
 use crate::geometry::measurement::{CompleteBlock, Sighting};
+use crate::geometry::statistics::chi_square_quantile;
 use crate::geometry::triangulation;
 use crate::solver::grow::{self, Consensus};
 
 /// Share of them whose residual is measured; smaller ones are extrapolated from there. Of 500, a fiftieth is known to
 /// a third.
 const MEASURED_SHARE: f64 = 0.02;
+/// The standard normal quantile of that share.
+const MEASURED_QUANTILE: f64 = -2.053_749;
 /// Where the random numbers begin: one consensus, one answer.
 const SEED: u64 = 0;
-/// Residuals that stand for those of the smallest share, and the least of them as a share of what the inliers leave: what
-/// is smaller has next to no probability. Ratios of 1.02 to 1.3.
+/// Residuals that stand for those of the smallest share, and the least of them as a share of what the inliers leave:
+/// what is smaller has next to no probability. Ratios of 1.02 to 1.3 where cameras may be doubted.
 const EXTRAPOLATED: i32 = 64;
 const LEAST_EXTRAPOLATED: f64 = 0.25;
 /// Bisections of the tilt of the distribution: three digits.
@@ -36,7 +39,7 @@ pub fn gate(block: &CompleteBlock, consensus: &Consensus) -> f64 {
 pub struct Tail {
     /// Constraints that a track leaves to the cameras.
     pub constraints: f64,
-    /// Variance of the coordinates.
+    /// Variance of the coordinates, that of the image points at most: cameras that bend leave less.
     pub variance: f64,
     /// The residual that [`MEASURED_SHARE`] of them have at most.
     pub measured: f64,
@@ -45,13 +48,15 @@ pub struct Tail {
 impl Tail {
     /// Natural logarithm of the probability of a squared residual of at most `x`, which is below what was measured.
     ///
-    /// It falls with the power of `x` that a track leaves constraints, and is no less than that of a smaller one: the
-    /// incomplete gamma function has a factor `exp(-x / 2 variance)` beside the power.
+    /// It falls with the power of `x` that a track leaves constraints; the incomplete gamma function has a factor
+    /// `exp(-x / 2 variance)` beside it. The variance is the smaller one of the image points' and of the one that has
+    /// as many residuals below what was measured: too large a one would make small residuals too improbable.
     pub fn ln_below(&self, x: f64) -> f64 {
-        // A larger residual than coordinates of this variance leave on average is none of a tail.
-        let variance = self.variance.max(self.measured / self.constraints);
-        let by_power = 0.5 * self.constraints * (x / self.measured).ln();
-        MEASURED_SHARE.ln() + by_power + 0.5 * (self.measured - x) / variance
+        // In units of the variance; beyond the mean of all it would be no tail.
+        let least = chi_square_quantile(self.constraints, MEASURED_QUANTILE).min(self.constraints);
+        let measured = (self.measured / self.variance).clamp(least, self.constraints);
+        let share = x / self.measured;
+        MEASURED_SHARE.ln() + 0.5 * self.constraints * share.ln() + 0.5 * measured * (1.0 - share)
     }
 }
 
@@ -81,8 +86,7 @@ impl<'a> RandomTracks<'a> {
             if stop.is_stopped() {
                 return false;
             }
-            let of_view = |view| Sighting { view, xy: block.point(view, rng.random_range(0..block.tracks())) };
-            let track: Vec<Sighting> = (0..block.views()).map(of_view).collect();
+            let track = random_track(block, rng);
             let start = triangulation::linear(cameras, &track);
             let (_, cost) = triangulation::refine(cameras, &track, start, grow::POINT_STEPS);
             squared.push(if cost.is_finite() { cost } else { f64::MAX });
@@ -107,8 +111,8 @@ impl<'a> RandomTracks<'a> {
         (smallest > gate).then(|| self.tail(smallest).ln_below(gate))
     }
 
-    /// Natural logarithm of the probability `a` of which `a^n` bounds that `n` of them are all admitted and leave no more
-    /// on average than the inliers of the consensus do: see [`ln_as_small`].
+    /// Natural logarithm of the probability `a` of which `a^n` bounds that `n` of them are all admitted and leave no
+    /// more on average than the inliers of the consensus do: see [`ln_as_small`].
     pub fn ln_as_good(&self) -> f64 {
         let tail = self.tail(self.measured());
         // By the constraints of all inliers together: what they leave once the cameras are not fitted to them.
@@ -117,14 +121,26 @@ impl<'a> RandomTracks<'a> {
     }
 }
 
-/// Chernoff's bound (1952), a track, on the probability that squared residuals are all below `gate` and at most `mean` on
-/// average: the least over `t >= 0` of
+/// A point of each view, of as many tracks as there are: points of one track have structure.
+fn random_track(block: &CompleteBlock, rng: &mut ChaCha8Rng) -> Vec<Sighting> {
+    let mut drawn: Vec<usize> = Vec::with_capacity(block.views());
+    while drawn.len() < block.views() {
+        let track = rng.random_range(0..block.tracks());
+        if drawn.len() >= block.tracks() || !drawn.contains(&track) {
+            drawn.push(track);
+        }
+    }
+    drawn.iter().enumerate().map(|(view, &track)| Sighting { view, xy: block.point(view, track) }).collect()
+}
+
+/// Chernoff's bound (1952), a track, on the probability that squared residuals are all below `gate` and at most `mean`
+/// on average: the least over `t >= 0` of
 ///
 /// `ln E[exp(t (mean - x)); x <= gate]`
 ///
 /// At `t` = 0 it is the probability to be below the gate.
 ///
-/// * `squared`: what is known of the distribution; what is smaller than was measured the tail tells
+/// * `squared`: what is known of the distribution, ascending; what is smaller than was measured the tail tells
 fn ln_as_small(squared: &[f64], tail: &Tail, gate: f64, mean: f64) -> f64 {
     let largest = gate.min(tail.measured);
     // The share of each step stands at its lower end, that of the last at none at all: never too small a bound.
@@ -135,8 +151,9 @@ fn ln_as_small(squared: &[f64], tail: &Tail, gate: f64, mean: f64) -> f64 {
         true => (end(place + 1), below(place) - below(place + 1)),
         false => (0.0, below(place)),
     };
-    let share = 1.0 / squared.len() as f64;
-    let tried = squared.iter().filter(|&&x| x > tail.measured && x <= gate).map(|&x| (x, share));
+    let counted = &squared[squared.partition_point(|&x| x <= tail.measured)..];
+    let share = (1.0 - MEASURED_SHARE) / counted.len() as f64;
+    let tried = counted.iter().take_while(|&&x| x <= gate).map(|&x| (x, share));
     let residuals: Vec<(f64, f64)> = (0..=EXTRAPOLATED).map(at).chain(tried).collect();
     // Of the tilted distribution the probability, and whether its mean is below that of the inliers.
     let probability = |t: f64| residuals.iter().map(|(x, share)| share * (t * (mean - x)).exp()).sum::<f64>();
@@ -144,6 +161,9 @@ fn ln_as_small(squared: &[f64], tail: &Tail, gate: f64, mean: f64) -> f64 {
         |t: f64| residuals.iter().map(|(x, share)| share * (t * (mean - x)).exp() * (x - mean)).sum::<f64>() <= 0.0;
     // Any `t` gives a bound: the best one is where the tilted mean is that of the inliers, or at an end.
     let (mut low, mut high) = (0.0, tail.constraints / mean);
+    if !f64::is_finite(high) {
+        return probability(0.0).ln();
+    }
     for _ in 0..TILT_STEPS {
         let middle = 0.5 * (low + high);
         if is_below(middle) { high = middle } else { low = middle }
@@ -182,8 +202,15 @@ mod tests {
                 let within = 0.2 + 0.05 * exact.abs();
                 assert!((bound - exact).abs() < within, "{constraints} constraints, {ratio}: {bound}, not {exact}");
             }
+            // Of cameras that bend the image points vary more than what the tracks leave.
+            for ratio in [0.1, 0.4] {
+                let bent = Tail { variance: 5.0, ..tail };
+                let bounds = [&tail, &bent].map(|tail| ln_as_small(&squared, tail, f64::INFINITY, ratio * freedom));
+                assert!((bounds[0] - bounds[1]).abs() < 0.1, "{constraints} constraints, {ratio}: {bounds:?}");
+            }
             // What they leave on average is no surprise, and the gate then tells all.
-            assert!(ln_as_small(&squared, &tail, f64::INFINITY, freedom * 1.1).abs() < 1e-3);
+            assert!(ln_as_small(&squared, &tail, f64::INFINITY, freedom * 1.1).abs() < 1e-9);
+            assert!(ln_as_small(&squared, &tail, 0.1 * freedom, 0.0).is_finite());
             let half = squared[squared.len() / 2];
             assert!((ln_as_small(&squared, &tail, half, half) - 0.5f64.ln()).abs() < 0.01);
             let low = squared[squared.len() / 200];

@@ -168,14 +168,10 @@ pub(super) async fn finish<C: Connection>(
     let job = held(connection, lease).await?;
     let mut departure = match &ending.outcome {
         Outcome::Succeeded { summary, result } => {
-            // The last one, which is the only one of most, goes with what follows.
-            let mut last = None;
             for chunk in result_chunks(job.id, result) {
-                if let Some(before) = last.replace(chunk) {
-                    connection.execute(before).await?;
-                }
+                connection.execute(chunk).await?;
             }
-            Departure { summary: Some(summary), last_chunk: last, ..Departure::to(JobState::Succeeded) }
+            Departure { summary: Some(summary), ..Departure::to(JobState::Succeeded) }
         }
         Outcome::Failed(failure) => Departure { failure: Some(failure.clone()), ..Departure::to(JobState::Failed) },
         Outcome::Cancelled => Departure::to(JobState::Cancelled),

@@ -3,12 +3,15 @@
 use std::collections::{HashMap, HashSet};
 use std::time::SystemTime;
 
-use super::rows::{self, integer, micros, number, one_job, returning_job, select_jobs};
+use super::rows::{self, integer, micros, number, returning_job, select_jobs};
 use super::{Change, Connection, Row, Statement, uploads};
 use crate::domain::InputName;
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::store::record::{Created, JobInput, Load, NewRecord, QueueBounds, Request, Work};
 use crate::store::{Error, JobPage, JobQuery, Order, payload};
+
+/// Number of a job's first event, which its row counts.
+const FIRST_EVENT: u64 = 1;
 
 /// Stores jobs, all or none; see [`crate::store::Store::create_jobs`].
 pub(super) async fn create<C: Connection>(
@@ -125,30 +128,26 @@ async fn enqueue<C: Connection>(
     input_id: i64,
     now: SystemTime,
 ) -> Result<Job, Error> {
-    let mut batch = vec![insert_job(new, input_id, now)?];
-    // The row's id is known to the database alone until all of it is written.
-    let of_job = |statement: Statement| {
-        let job = statement.then(" FROM jobs WHERE tenant = ").then_bind(&new.name.tenant);
-        job.then(" AND job = ").then_bind(&new.name.job)
-    };
+    let row = connection.row(insert_job(new, input_id, now)?).await?;
+    let id = row.integer("id")?;
     for (key, value) in &new.labels {
-        let insert = Statement::new("INSERT INTO job_labels (job_id, key, value) SELECT id, $1, $2");
-        batch.push(of_job(insert.bind(key).bind(value)));
+        let insert = Statement::new("INSERT INTO job_labels (job_id, key, value) VALUES ($1, $2, $3)");
+        connection.execute(insert.bind(id).bind(key).bind(value)).await?;
     }
     if let Some(request) = &new.request {
         let insert = Statement::new(
-            "INSERT INTO request_ids (job_id, tenant, request_id, digest, create_time) SELECT id, $1, $2, $3, $4",
+            "INSERT INTO request_ids (job_id, tenant, request_id, digest, create_time) VALUES ($1, $2, $3, $4, $5)",
         )
+        .bind(id)
         .bind(&new.name.tenant)
         .bind(&request.id)
         .bind(request.digest.as_slice())
         .bind(micros(now));
-        batch.push(of_job(insert));
+        connection.execute(insert).await?;
     }
     let event = EventBody::State { state: JobState::Queued, failure: None };
-    let insert = Statement::new("INSERT INTO events (job_id, sequence, attempt, time, body) SELECT id, 1, 0, $1, $2");
-    batch.push(of_job(insert.bind(micros(now)).bind(payload::encode(&event)?)));
-    let job = one_job(&connection.batch(batch).await?)?;
+    connection.execute(rows::insert_event(id, FIRST_EVENT, 0, &event, now)?).await?;
+    let job = rows::job(&row)?;
     connection.tell(Change::Events, &new.name).await?;
     connection.tell(Change::Queued, &new.name).await?;
     Ok(job)

@@ -196,8 +196,8 @@ pub(super) fn migration_failed(error: sqlx::migrate::MigrateError) -> Error {
     }
 }
 
-/// Whether a database refused for a reason that waiting does not mend: SQLSTATE classes 22 (data), 23 (integrity) and 42
-/// (syntax or access), which have five signs. SQLite's codes, numbers, are none of these.
+/// Whether a database refused for a reason that waiting does not mend: SQLSTATE classes 22 (data), 23 (integrity) and
+/// 42 (syntax or access), which have five signs. SQLite's codes, numbers, are none of these.
 fn is_defect(code: Option<&str>) -> bool {
     code.is_some_and(|code| code.len() == 5 && ["22", "23", "42"].iter().any(|class| code.starts_with(class)))
 }

@@ -229,8 +229,6 @@ pub(super) struct Departure<'a> {
     pub failure: Option<Failure>,
     /// Of a success: it has an event of its own.
     pub summary: Option<&'a Summary>,
-    /// Stores the end of its result.
-    pub last_chunk: Option<Statement>,
     /// The last progress, where it is newer than what is stored.
     pub progress: Option<&'a Progress>,
     /// How its attempt ended, where that is not noted yet.
@@ -240,7 +238,7 @@ pub(super) struct Departure<'a> {
 impl Departure<'_> {
     /// One that takes nothing along.
     pub(super) fn to(next: JobState) -> Self {
-        Self { next, failure: None, summary: None, last_chunk: None, progress: None, attempt_end: None }
+        Self { next, failure: None, summary: None, progress: None, attempt_end: None }
     }
 }
 
@@ -252,13 +250,13 @@ pub(super) async fn leave<C: Connection>(
     departure: Departure<'_>,
     now: SystemTime,
 ) -> Result<Job, Error> {
-    let Departure { next, failure, summary, last_chunk, progress, attempt_end } = departure;
+    let Departure { next, failure, summary, progress, attempt_end } = departure;
     if !job.state.may_become(next) || next == JobState::Running {
         let (from, to) = (job.state.name(), next.name());
         return Err(Error::Corrupt(format!("{} cannot go from {from} to {to} here", job.name)));
     }
     let end = attempt_end.map(|end| end_attempt(job, end, now));
-    let mut batch: Vec<Statement> = last_chunk.into_iter().chain(end).collect();
+    let mut batch: Vec<Statement> = end.into_iter().collect();
     let mut sequence = job.last_sequence;
     if let Some(summary) = summary {
         sequence += 1;

@@ -151,8 +151,8 @@ async fn open<C: Connection>(
         return Err(Error::UploadTooLarge(oversize));
     }
     // All of it in bytes as they were sent, which callers know and are shown. Of what was given up counts what has not
-    // been removed yet, and of what was deleted, what jobs still have: it lies on the disk all the same, and could else be
-    // uploaded and deleted again and again.
+    // been removed yet, and of what was deleted, what jobs still have: it lies on the disk all the same, and could else
+    // be uploaded and deleted again and again.
     let taken = Statement::new(
         "SELECT COUNT(upload) AS open, \
          CAST(COALESCE(SUM(CASE WHEN upload IS NULL THEN committed ELSE bytes END), 0) AS BIGINT) AS bytes, \

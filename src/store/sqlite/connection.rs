@@ -164,10 +164,15 @@ impl Row for WrittenRow {
 
 impl From<rusqlite::Error> for Error {
     fn from(error: rusqlite::Error) -> Self {
-        let code = match &error {
-            rusqlite::Error::SqliteFailure(cause, _) => cause.extended_code.to_string(),
-            _ => String::new(),
-        };
-        sql::by_code(&code, error.to_string()).unwrap_or_else(Error::Unavailable)
+        use rusqlite::Error::{FromSqlConversionFailure, InvalidColumnType, SqliteFailure, Utf8Error};
+        let text = error.to_string();
+        match &error {
+            SqliteFailure(cause, _) => {
+                sql::by_code(&cause.extended_code.to_string(), text).unwrap_or_else(Self::Unavailable)
+            }
+            // What is stored is not what was written.
+            FromSqlConversionFailure(..) | InvalidColumnType(..) | Utf8Error(..) => Self::Corrupt(text),
+            _ => Self::Unavailable(text),
+        }
     }
 }

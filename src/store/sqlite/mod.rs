@@ -115,7 +115,7 @@ impl Sqlite {
     }
 }
 
-/// How the database is opened, to write.
+/// How the database is opened to bring its schema up to date, and to read; see [`WriteConnection::open`].
 fn options(database: &Path) -> SqliteConnectOptions {
     SqliteConnectOptions::new()
         .filename(database)
@@ -222,7 +222,7 @@ fn lock(directory: &Path) -> Result<File, Error> {
 
 impl Connection for SqliteConnection {
     type Row = SqliteRow;
-    // The one writer has the database to itself.
+    // It only reads.
     const FOR_UPDATE: &'static str = "";
     const SKIP_LOCKED: &'static str = "";
     const WRITES_ALONE: bool = true;

@@ -1,9 +1,9 @@
 //! Room that is kept for a full disk: a file of nothing, given up so that what was begun ends and what frees more is
 //! written.
 //!
-//! To cancel and to delete is to write, too. On a disk without a byte left an operator could do neither, jobs would lose
-//! their leases with what they found, and a server that was restarted could not even open its store. Until there is a
-//! reserve again nothing new is begun: no job or upload is taken in, none that waits is claimed.
+//! To cancel and to delete is to write, too. On a disk without a byte left an operator could do neither, jobs would
+//! lose their leases with what they found, and a server that was restarted could not even open its store. Until there
+//! is a reserve again nothing new is begun: no job or upload is taken in, none that waits is claimed.
 
 use std::fs::File;
 use std::io::{self, Write};

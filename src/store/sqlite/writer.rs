@@ -143,7 +143,8 @@ impl Writer {
     ) -> Result<Self, Error> {
         let (inbox, messages) = mpsc::unbounded_channel();
         let failed = |error: std::io::Error| Error::Unavailable(format!("cannot start the writer's thread: {error}"));
-        // A runtime of its own: what is awaited here is the next message and, within an operation, nothing but in tests.
+        // A runtime of its own: what is awaited here is the next message and, within an operation, nothing but in
+        // tests.
         let runtime = tokio::runtime::Builder::new_current_thread().build().map_err(failed)?;
         let connection = Some(connection);
         let desk = Desk { connection, database, reserve, messages, group_time };
@@ -310,8 +311,8 @@ impl Desk {
         group.into_iter().for_each(|(operation, outcome)| operation.answer(outcome));
     }
 
-    /// Runs the operations of a group that came to nothing for this reason again, each in a transaction of its own: what
-    /// one of them broke is not held against the others.
+    /// Runs the operations of a group that came to nothing for this reason again, each in a transaction of its own:
+    /// what one of them broke is not held against the others.
     async fn each_alone(&mut self, group: Vec<Ran>, error: Error) {
         let one = group.len() == 1;
         for (mut operation, _) in group {
@@ -348,8 +349,8 @@ impl Desk {
         no_space && matches!(operation.moves(), Moves::Ends(_)) && self.reserve.is_whole()
     }
 
-    /// Runs an operation in the transaction that is open. Without a reserve, what is left is for what ends what was begun:
-    /// an operation that begins something is refused, unless it finds that it has nothing to write.
+    /// Runs an operation in the transaction that is open. Without a reserve, what is left is for what ends what was
+    /// begun: an operation that begins something is refused, unless it finds that it has nothing to write.
     async fn run(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
         let is_bound = matches!(operation.moves(), Moves::Begins(_)) && !self.reserve.restore();
         let connection = self.connection()?;

@@ -172,13 +172,13 @@ fn guards_give_back_what_they_took_and_a_dropped_call_is_cancelled() {
 fn an_attempt_tells_its_wait_its_worker_and_its_stages() {
     let page = page_after(|| {
         let name = JobName { tenant: "default".into(), job: "a".into() };
-        crate::telemetry::waited(&name, None, SystemTime::now());
+        crate::telemetry::waited(&name, None, SystemTime::now(), SystemTime::now());
         let mut attempt = crate::telemetry::Attempt::begin(&name, 1, None);
         attempt.at_work();
         attempt.stage(Stage::Prepare);
         attempt.stage(Stage::Search);
         attempt.end(Some(JobState::Cancelled));
-        crate::telemetry::waited(&name, None, SystemTime::now());
+        crate::telemetry::waited(&name, None, SystemTime::now(), SystemTime::now());
         drop(crate::telemetry::Attempt::begin(&name, 2, None));
     });
     let expected = [

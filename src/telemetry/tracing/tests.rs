@@ -114,11 +114,11 @@ fn run_a_job() -> SystemTime {
     let stored = traceparent_to_store(&submit, Some(&caller())).expect("traceparent");
     drop(submit);
     let enqueued_at = SystemTime::now() - Duration::from_secs(7);
-    waited(&job(), Some(&stored), enqueued_at);
+    waited(&job(), Some(&stored), enqueued_at, SystemTime::now());
     let mut first = Attempt::begin(&job(), 1, Some(&stored));
     first.stage(Stage::Prepare);
     drop(first);
-    waited(&job(), Some(&stored), SystemTime::now());
+    waited(&job(), Some(&stored), SystemTime::now(), SystemTime::now());
     let mut second = Attempt::begin(&job(), 2, Some(&stored));
     second.stage(Stage::Search);
     second.stage(Stage::Refine);
