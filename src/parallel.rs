@@ -14,8 +14,8 @@ const PIECES_A_THREAD: usize = 4;
 
 /// How many threads one solve may keep busy, its own among them.
 ///
-/// They live for one call of [`Self::map`] or [`Self::each`], some tens of microseconds to begin: work that is done sooner
-/// is better done alone.
+/// They live for one call of [`Self::map`] or [`Self::each`], some tens of microseconds to begin: work that is done
+/// sooner is better done alone.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Threads(NonZeroUsize);
 
@@ -85,8 +85,8 @@ impl Threads {
         done.into_iter().flat_map(|(_, results)| results).collect()
     }
 
-    /// Does `work` with each of the pieces, the first ones first; whether all of it succeeded. Once a piece has not, those
-    /// that are not begun are left.
+    /// Does `work` with each of the pieces, the first ones first; whether all of it succeeded. Once a piece has not,
+    /// those that are not begun are left.
     ///
     /// # Panics
     /// When `work` does.

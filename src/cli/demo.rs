@@ -42,7 +42,8 @@ code 1 when the inliers found agree badly with the truth (F1 below 0.9).";
 /// Show the whole thing: make a scene, solve it through a real server, compare with the truth
 ///
 /// Starts the server on a free loopback port with its store in a temporary directory, makes a contaminated scene,
-/// submits it over gRPC, shows the progress as it comes, prints what was found beside what is true, and writes a report.
+/// submits it over gRPC, shows the progress as it comes, prints what was found beside what is true, and writes a
+/// report.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {

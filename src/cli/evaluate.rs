@@ -27,7 +27,8 @@ use crate::formats::publish::{create_directory, pretty, write_atomically};
 /// Seeds of a full evaluation and of a quick one.
 const SEEDS: u64 = 20;
 const QUICK_SEEDS: u64 = 4;
-/// Observations of a scene up to which a quick evaluation solves it: a second or two each, with the paper's network too.
+/// Observations of a scene up to which a quick evaluation solves it: a second or two each, with the paper's network
+/// too.
 const QUICK_OBSERVATIONS: usize = 5_000;
 
 const EXAMPLES: &str = "\

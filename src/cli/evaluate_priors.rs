@@ -23,8 +23,8 @@ use crate::network::subspace;
 pub struct PriorArgs {
     /// Compare priors instead: each alone (ranking, searches of 600, 6,000 and 60,000 samples), and AUTO with and
     /// without the trained network; scenes without depths, of training's kinds and of others. Writes priors.json, and
-    /// priors.jsonl, with which it goes on where it was stopped. With --real: how well pairs of views, the trained network
-    /// and both together rank the observations of these sequences, window by window; writes windows.json
+    /// priors.jsonl, with which it goes on where it was stopped. With --real: how well pairs of views, the trained
+    /// network and both together rank the observations of these sequences, window by window; writes windows.json
     #[arg(long, conflicts_with_all = ["quick", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
     pub priors: bool,
 

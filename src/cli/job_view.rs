@@ -166,8 +166,8 @@ pub fn show_event(view: &mut ProgressView, event: &JobEvent) {
     }
 }
 
-/// Follows a job to its end and ends as it did; with `json` one event a line on stdout. Where nothing came after `after`
-/// any more, it says so.
+/// Follows a job to its end and ends as it did; with `json` one event a line on stdout. Where nothing came after
+/// `after` any more, it says so.
 pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json: bool) -> Result<Exit, Failure> {
     let mut view = ProgressView::new(json);
     let mut status = None;

@@ -27,8 +27,8 @@ pub struct Args {
     #[arg(long = "state", value_enum, ignore_case = true)]
     pub states: Vec<StateArg>,
 
-    /// Only jobs that match, such as 'labels.site = "north"' or 'state = FAILED OR state = EXPIRED': terms joined by AND,
-    /// states also by OR
+    /// Only jobs that match, such as 'labels.site = "north"' or 'state = FAILED OR state = EXPIRED': terms joined by
+    /// AND, states also by OR
     #[arg(long, default_value = "")]
     pub filter: String,
 

@@ -38,7 +38,8 @@ pub struct Args {
     #[command(flatten)]
     pub export: ExportArgs,
 
-    /// Directory for the result files; created, files of these names in it are replaced, and those of a former result go
+    /// Directory for the result files; created, files of these names in it are replaced, and those of a former result
+    /// go
     #[arg(long, value_name = "DIR", required_unless_present = "json")]
     pub out: Option<PathBuf>,
 

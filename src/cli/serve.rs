@@ -32,8 +32,8 @@ Examples:
 
 /// Run the server
 ///
-/// Takes jobs over gRPC (scpsfm.v1), keeps them in a data directory or a shared database and solves them on worker threads. A restart knows
-/// every job and takes up those that were queued or running.
+/// Takes jobs over gRPC (scpsfm.v1), keeps them in a data directory or a shared database and solves them on worker
+/// threads. A restart knows every job and takes up those that were queued or running.
 #[derive(Debug, clap::Args)]
 #[command(after_help = HELP)]
 pub struct Args {
@@ -110,14 +110,14 @@ pub struct Args {
     #[arg(long)]
     pub plaintext_keys: bool,
 
-    /// Print the configuration that would be used, as TOML, and exit. A password in store.url and auth.keys are left out,
-    /// which the file says
+    /// Print the configuration that would be used, as TOML, and exit. A password in store.url and auth.keys are left
+    /// out, which the file says
     #[arg(long)]
     pub print_config: bool,
 }
 
-/// An address as it was given, password included. Checked with the rest of the configuration, whose errors do not repeat
-/// it, as those of the command line would.
+/// An address as it was given, password included. Checked with the rest of the configuration, whose errors do not
+/// repeat it, as those of the command line would.
 #[derive(Clone)]
 pub struct GivenUrl(String);
 

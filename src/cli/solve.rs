@@ -51,7 +51,8 @@ pub struct Args {
     #[command(flatten)]
     pub access: AccessArgs,
 
-    /// Directory for the result files; created, files of these names in it are replaced, and those of a former result go
+    /// Directory for the result files; created, files of these names in it are replaced, and those of a former result
+    /// go
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
 
@@ -131,7 +132,8 @@ fn in_process(
     })
 }
 
-/// Solves on a server; Ctrl-C cancels the job there. Where the server is lost, the failure says how to find the job again.
+/// Solves on a server; Ctrl-C cancels the job there. Where the server is lost, the failure says how to find the job
+/// again.
 async fn on_server(
     server: &str,
     args: &Args,

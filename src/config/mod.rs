@@ -117,8 +117,8 @@ impl Config {
         Ok(config)
     }
 
-    /// The configuration as a TOML file that would give it, but for its secrets: of each that is left out a comment says
-    /// so, and a file whose store's password is missing is refused rather than misunderstood.
+    /// The configuration as a TOML file that would give it, but for its secrets: of each that is left out a comment
+    /// says so, and a file whose store's password is missing is refused rather than misunderstood.
     ///
     /// # Errors
     /// When a value has no form in TOML, such as a path that is not Unicode.

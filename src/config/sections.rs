@@ -25,16 +25,17 @@ pub struct Server {
     pub max_message_bytes: usize,
     /// Connections that speak at once; one more is refused. Those that say nothing yet are bounded apart.
     pub max_connections: usize,
-    /// Seconds that a connection may take to its first call with a key, or to its first call where none is asked for; then
-    /// it is closed. Health checks need no key and do not count where others do. 0: for ever.
+    /// Seconds that a connection may take to its first call with a key, or to its first call where none is asked for;
+    /// then it is closed. Health checks need no key and do not count where others do. 0: for ever.
     pub first_call_seconds: u64,
-    /// Whether callers may ask for the API's description (reflection). On, because it says what `proto/` says; with keys
-    /// it asks for one, as every call but a health check does.
+    /// Whether callers may ask for the API's description (reflection). On, because it says what `proto/` says; with
+    /// keys it asks for one, as every call but a health check does.
     pub reflection: bool,
     /// Listen on other addresses than loopback's with neither TLS nor keys: whoever reaches the port reads and cancels
     /// every job.
     pub insecure: bool,
-    /// Take keys without TLS on other addresses than loopback's: whoever listens in has them. For a proxy that ends TLS.
+    /// Take keys without TLS on other addresses than loopback's: whoever listens in has them. For a proxy that ends
+    /// TLS.
     pub plaintext_keys: bool,
 }
 
@@ -69,8 +70,8 @@ pub struct Tls {
     /// Its private key.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub key: Option<PathBuf>,
-    /// Certificates of authorities one of which must have signed a client's certificate (mTLS); without it, clients need
-    /// none.
+    /// Certificates of authorities one of which must have signed a client's certificate (mTLS); without it, clients
+    /// need none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub client_ca: Option<PathBuf>,
 }
@@ -217,8 +218,8 @@ pub struct Upload {
     pub max_bytes: u64,
     /// Uploads of one tenant that may be begun and not finished.
     pub tenant_uploads: u64,
-    /// Bytes of one tenant's uploads and uploaded inputs at most, as they were sent; one that was deleted counts while a
-    /// job has it. The store takes about 1.3 times as much.
+    /// Bytes of one tenant's uploads and uploaded inputs at most, as they were sent; one that was deleted counts while
+    /// a job has it. The store takes about 1.3 times as much.
     pub tenant_bytes: u64,
     /// How long an upload to which nothing comes is kept: `24h`, `90m`, `45s` (1000 years at most) or `forever`.
     pub abandoned_after: Retention,
@@ -248,8 +249,8 @@ pub struct Compute {
     /// is the faster of the two.
     #[serde(deserialize_with = "word")]
     pub backend: Backend,
-    /// A network written by `scpsfm train-prior`, asked instead of the one that the program carries. Servers that share a
-    /// store should ask the same.
+    /// A network written by `scpsfm train-prior`, asked instead of the one that the program carries. Servers that share
+    /// a store should ask the same.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub prior: Option<PathBuf>,
 }

@@ -1,8 +1,8 @@
 //! Tracks that are observed in the very same views at the very same points: one track that stands in the input several
 //! times.
 //!
-//! They come of detectors that report a point once an orientation, and of lists that were put together twice. Chance does
-//! not make two of them: coordinates are compared bit by bit.
+//! They come of detectors that report a point once an orientation, and of lists that were put together twice. Chance
+//! does not make two of them: coordinates are compared bit by bit.
 
 use std::cmp::Ordering;
 use std::collections::HashMap;

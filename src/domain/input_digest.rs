@@ -5,8 +5,8 @@ use sha2::{Digest, Sha256};
 use super::RawInput;
 
 impl RawInput {
-    /// SHA-256, hexadecimal, of what results refer to and are read by: sizes of the images, and view, track and pixels of
-    /// every observation in the caller's order.
+    /// SHA-256, hexadecimal, of what results refer to and are read by: sizes of the images, and view, track and pixels
+    /// of every observation in the caller's order.
     pub fn sha256(&self) -> String {
         let mut hash = Sha256::new();
         let count = |count: usize| (count as u64).to_le_bytes();

@@ -137,7 +137,8 @@ pub struct Summary {
 impl Summary {
     /// Warnings in a summary at most; a result seldom has more, unless it has many camera groups.
     pub const MAX_WARNINGS: usize = 8;
-    /// Longest detail of a warning in a summary, in characters: a page of a thousand jobs stays below a message's limit.
+    /// Longest detail of a warning in a summary, in characters: a page of a thousand jobs stays below a message's
+    /// limit.
     pub const MAX_DETAIL_CHARS: usize = 400;
 
     /// So much of a result's warnings as a summary holds.
@@ -250,8 +251,8 @@ pub struct Job {
 }
 
 impl Job {
-    /// Changes whenever the job does, but for its latest progress: another one after each event, and another job's of the
-    /// same name, which was created at another time, is another.
+    /// Changes whenever the job does, but for its latest progress: another one after each event, and another job's of
+    /// the same name, which was created at another time, is another.
     pub fn etag(&self) -> String {
         let created = self.create_time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_micros();
         format!("{created:x}-{:x}-{}", self.last_sequence, u8::from(self.cancel_requested))

@@ -80,8 +80,8 @@ pub struct Course {
     /// The block of views that is tried, from 1, and how many are tried at most; 0 before the first.
     pub block: u32,
     pub blocks: u32,
-    /// The part that is built, from 0, in the order in which they are begun; the result numbers them by size. 0 again once
-    /// all are built.
+    /// The part that is built, from 0, in the order in which they are begun; the result numbers them by size. 0 again
+    /// once all are built.
     pub part: u32,
     /// Views that have a camera now. Falls where a block is given up for another, or views lose their support.
     pub registered_views: u32,

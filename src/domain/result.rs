@@ -91,16 +91,15 @@ impl Prior {
 pub struct Calibration {
     /// Horizontal focal length; the geometric mean where every view has its own, see [`ViewResult::focal_px`].
     pub focal_px: f64,
-    /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable (infinite). Where every
-    /// view has its own, the root mean square over the views.
+    /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable (infinite). Where
+    /// every view has its own, the root mean square over the views.
     pub sigma_log_focal: Option<f64>,
     pub principal_point_px: [f64; 2],
     /// Vertical over horizontal focal length; 1 (square pixels) unless the data asked for more.
     #[serde(default = "square_pixels")]
     pub aspect: f64,
-    /// Radial distortion: a point at `(u, v, 1)` in camera coordinates is imaged at `x = f u s + px`,
-    /// `y = aspect f v s + py` with `s = 1 + k1 r^2 + k2 r^4`, `r^2 = u^2 + v^2`. 0 (a pinhole) unless the data asked for
-    /// more.
+    /// Radial distortion: a point at `(u, v, 1)` in camera coordinates is imaged at `x = f u s + px`, `y = aspect f v s
+    /// + py` with `s = 1 + k1 r^2 + k2 r^4`, `r^2 = u^2 + v^2`. 0 (a pinhole) unless the data asked for more.
     #[serde(default)]
     pub radial_k1: f64,
     /// The second coefficient, `k2`.
@@ -154,8 +153,8 @@ pub struct ViewResult {
     /// The view's own focal length; `None` where that of the calibration is every view's.
     #[serde(default)]
     pub focal_px: Option<f64>,
-    /// Which reconstruction the view belongs to, the largest first: views that share no tracks have frames and scales of
-    /// their own. 0 where there is one, and for views that are not registered.
+    /// Which reconstruction the view belongs to, the largest first: views that share no tracks have frames and scales
+    /// of their own. 0 where there is one, and for views that are not registered.
     #[serde(default)]
     pub part: u32,
     /// The view's camera group, by the input's number.
@@ -221,8 +220,8 @@ impl ObservationResults {
     }
 }
 
-/// A point beside its own that a track shows, where a wrong link joined two: at least three of its observations agree on
-/// it and on nothing else.
+/// A point beside its own that a track shows, where a wrong link joined two: at least three of its observations agree
+/// on it and on nothing else.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TrackSplit {
     /// Index of the track.

@@ -170,8 +170,8 @@ pub fn error_3d(found: &[Vector3<f64>], truth: &[Vector3<f64>]) -> Option<f64> {
     mean.is_finite().then_some(mean)
 }
 
-/// The points moved onto `truth` by the similarity of least squares (Umeyama 1991); `None` for fewer than three points, or
-/// where nothing finite comes of it.
+/// The points moved onto `truth` by the similarity of least squares (Umeyama 1991); `None` for fewer than three points,
+/// or where nothing finite comes of it.
 pub fn aligned(points: &[Vector3<f64>], truth: &[Vector3<f64>]) -> Option<Vec<Vector3<f64>>> {
     if points.len() < 3 || points.len() != truth.len() {
         return None;

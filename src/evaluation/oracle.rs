@@ -25,8 +25,8 @@ const ADJUSTMENT_TOLERANCE: f64 = 1e-10;
 /// Least noise that the gate assumes, as a share of the width: exact scenes have rounding.
 const LEAST_NOISE: f64 = 1e-9;
 
-/// Scores the oracle on a scene whose tracks are complete: the true cameras and the true noise gate every track, metric bundle
-/// adjustment of the true inliers, started at the truth, gives the rest.
+/// Scores the oracle on a scene whose tracks are complete: the true cameras and the true noise gate every track, metric
+/// bundle adjustment of the true inliers, started at the truth, gives the rest.
 ///
 /// Knows pinholes only: scenes with distortion or a zoom have no oracle.
 pub fn measure(scene: &Scene) -> Measures {

@@ -18,7 +18,8 @@ pub struct CamerasJson {
 }
 
 /// One view: `x ~ P X` in pixels, in the frame `P1 = [I|0]` of the first registered view of its part; `x ~ K (R X + t)`
-/// where the result is metric, before the radial distortion `radial_k1`, `radial_k2`. Matrices row by row; null where there is none.
+/// where the result is metric, before the radial distortion `radial_k1`, `radial_k2`. Matrices row by row; null where
+/// there is none.
 #[derive(Debug, Clone, Serialize)]
 #[allow(non_snake_case, reason = "the field's names for these matrices are capitals")]
 pub struct CameraJson {

@@ -2,7 +2,8 @@
 //! directory knows what it may take away.
 //!
 //! A file goes only if it still is what was written, to the last byte, and those of a model only together: a model that
-//! another program has refined, a table that somebody has edited, files of earlier versions, which kept no list, all stay.
+//! another program has refined, a table that somebody has edited, files of earlier versions, which kept no list, all
+//! stay.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -86,9 +87,9 @@ impl Manifest {
         read().unwrap_or_default()
     }
 
-    /// Where the files are, but for those that were `replaced`, that stand as they were written. A run that was killed may
-    /// have listed a file twice, as it was and as it was to be: either will do. Of a folder below the directory, whose files
-    /// make sense together, none is removable once one was changed by others.
+    /// Where the files are, but for those that were `replaced`, that stand as they were written. A run that was killed
+    /// may have listed a file twice, as it was and as it was to be: either will do. Of a folder below the directory,
+    /// whose files make sense together, none is removable once one was changed by others.
     pub fn removable(&self, directory: &Path, replaced: &[PathBuf]) -> Vec<PathBuf> {
         let mut standing: BTreeMap<PathBuf, bool> = BTreeMap::new();
         let is_there = |place: &PathBuf| !replaced.contains(place) && place.symlink_metadata().is_ok();

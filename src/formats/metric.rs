@@ -230,8 +230,8 @@ fn points(
     points
 }
 
-/// Which point an observation shows: the index of its track for the track's own, behind all tracks the position among the
-/// splits for another; `None`: none.
+/// Which point an observation shows: the index of its track for the track's own, behind all tracks the position among
+/// the splits for another; `None`: none.
 fn shown(solution: &Solution, input: &LabelledInput, k: usize) -> Option<usize> {
     let track = input.raw.track[k];
     if solution.observations.inlier.get(k) == Some(&true) {
@@ -261,8 +261,8 @@ fn point(solution: &Solution, input: &LabelledInput, place: usize) -> Option<Poi
     Some(Point { id: 0, label, number, position, colour: colour(weight), error_px: 0.0, seen: Vec::new() })
 }
 
-/// Ids of points: those of the tracks where all are numbers that COLMAP takes, else their positions from 1. A point that
-/// is not its track's own gets one behind those of all tracks, right or wrong.
+/// Ids of points: those of the tracks where all are numbers that COLMAP takes, else their positions from 1. A point
+/// that is not its track's own gets one behind those of all tracks, right or wrong.
 fn number(points: &mut [Point], input: &LabelledInput) {
     // COLMAP reads ids of text files as signed.
     const MOST: u64 = i64::MAX as u64;

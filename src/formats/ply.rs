@@ -9,9 +9,9 @@ use crate::domain::Solution;
 /// The points of a part as an ASCII PLY: text, so that results can be compared line by line.
 ///
 /// A vertex has `x y z` (metric where the result is metric, else dehomogenised in the frame of the projective cameras,
-/// which a comment tells), a colour from orange (weight 0) to blue
-/// (weight 1), the weight, the caller's id of the track, or where that is no number its place among the tracks, and which
-/// of the points that the track joins it is: 0 for its own, else the number in the column `split` of `observations.csv`.
+/// which a comment tells), a colour from orange (weight 0) to blue (weight 1), the weight, the caller's id of the
+/// track, or where that is no number its place among the tracks, and which of the points that the track joins it is: 0
+/// for its own, else the number in the column `split` of `observations.csv`.
 pub fn points(solution: &Solution, input: Option<&LabelledInput>, part: u32) -> String {
     let tracks = &solution.tracks;
     let of_part = |track: usize| tracks.part_of(track) == Some(part);

@@ -67,8 +67,8 @@ impl<'a> Draft<'a> {
         Ok(())
     }
 
-    /// Gives the files their names and takes away what a former run left beside them, as far as it still is what that run
-    /// wrote. The file that says that the others are there, `last`, goes before any other changes, and comes last.
+    /// Gives the files their names and takes away what a former run left beside them, as far as it still is what that
+    /// run wrote. The file that says that the others are there, `last`, goes before any other changes, and comes last.
     ///
     /// # Errors
     /// The first file that cannot be written or removed, named.
@@ -109,7 +109,8 @@ impl<'a> Draft<'a> {
 
     /// Brings the names of the directory to the disk in the order in which they were given, as far as the system can.
     fn sync(&self) {
-        // Where a directory cannot be opened as a file there is nothing to be done, and the files themselves are synced.
+        // Where a directory cannot be opened as a file there is nothing to be done, and the files themselves are
+        // synced.
         let _ = File::open(self.directory).and_then(|directory| directory.sync_all());
     }
 
@@ -133,8 +134,8 @@ impl<'a> Draft<'a> {
     }
 }
 
-/// A file that is on the disk under a temporary name, and is removed when dropped; after the rename there is nothing left
-/// to remove.
+/// A file that is on the disk under a temporary name, and is removed when dropped; after the rename there is nothing
+/// left to remove.
 struct TemporaryFile {
     temporary: PathBuf,
     target: PathBuf,

@@ -27,9 +27,10 @@ pub fn result_json(solution: &Solution, input: Option<&LabelledInput>) -> io::Re
     pretty(&ResultJson::new(solution, input))
 }
 
-/// Writes the result files, and what is asked for other programs, into `directory`, which is created. Without the input,
-/// indices stand for labels, there is no `observations.csv`, the report has no picture of the tracks, and nothing is
-/// written for other programs. What a former run left there and this one does not make goes: see [`manifest`].
+/// Writes the result files, and what is asked for other programs, into `directory`, which is created. Without the
+/// input, indices stand for labels, there is no `observations.csv`, the report has no picture of the tracks, and
+/// nothing is written for other programs. What a former run left there and this one does not make goes: see
+/// [`manifest`].
 ///
 /// Returns why nothing was written for other programs though it was asked for; that is no failure.
 ///
@@ -71,8 +72,8 @@ pub fn replaced(directory: &Path, exports: &[Export], input: &Path) -> Option<Pa
     })
 }
 
-/// Name of the file of a part's points: `points.ply` for the largest, `points-part-1.ply` for part 1 of `cameras.json` and
-/// `tracks.csv`.
+/// Name of the file of a part's points: `points.ply` for the largest, `points-part-1.ply` for part 1 of `cameras.json`
+/// and `tracks.csv`.
 pub fn points_of(part: u32) -> String {
     if part == 0 { POINTS.into() } else { format!("points-part-{part}.ply") }
 }
@@ -87,8 +88,8 @@ pub fn said(directory: &Path, solution: &Solution) -> String {
     format!("{}; {POINTS} holds the points of part 0, {others} those of the others", directory.display())
 }
 
-/// `track,weight,inlier`, `network_weight` where a network ran, and the `part` that the track has a point in, empty where it
-/// has none; one line a track.
+/// `track,weight,inlier`, `network_weight` where a network ran, and the `part` that the track has a point in, empty
+/// where it has none; one line a track.
 fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let tracks = &solution.tracks;
     let has_network = !tracks.network_weight.is_empty();
@@ -105,8 +106,8 @@ fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
     text
 }
 
-/// `view,track,inlier,residual_px,weight,split` in the order of the caller's file; an observation that was not judged has
-/// an empty residual, one that shows no other point of its track an empty split.
+/// `view,track,inlier,residual_px,weight,split` in the order of the caller's file; an observation that was not judged
+/// has an empty residual, one that shows no other point of its track an empty split.
 ///
 /// Where nothing was reconstructed there is no point that an observation could show: its weight is that of its track.
 fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {

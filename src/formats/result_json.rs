@@ -9,8 +9,8 @@ use super::{Label, LabelledInput, warnings};
 
 /// The summary of a result.
 ///
-/// Infinity is not JSON: where the focal length is unobservable, `sigma_log_focal` is null and `focal_unobservable`
-/// is true. That is so of every `PROJECTIVE_ONLY` result: it has no `focal_px`, no `principal_point_px`, no `aspect`, no
+/// Infinity is not JSON: where the focal length is unobservable, `sigma_log_focal` is null and `focal_unobservable` is
+/// true. That is so of every `PROJECTIVE_ONLY` result: it has no `focal_px`, no `principal_point_px`, no `aspect`, no
 /// radial distortion and no `plane_at_infinity` either. Where nothing was calibrated for another reason,
 /// `focal_unobservable` is null too.
 #[derive(Debug, Clone, Serialize)]
@@ -61,8 +61,8 @@ pub struct ResultJson {
     pub version: &'static str,
 }
 
-/// Intrinsics of one camera group. They are null where the group has no metric reconstruction: the result has none, or no
-/// view of the group is registered.
+/// Intrinsics of one camera group. They are null where the group has no metric reconstruction: the result has none, or
+/// no view of the group is registered.
 #[derive(Debug, Clone, Serialize)]
 pub struct CameraGroupJson {
     /// The input's number of the group.

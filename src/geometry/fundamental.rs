@@ -86,8 +86,8 @@ impl Fundamental {
         (squared > LEAST_SQUARED_SINE * to.norm_squared() && ratio.is_finite()).then_some(ratio)
     }
 
-    /// The matrix refitted to weighted matches, each weighted besides so that its algebraic error is its Sampson distance
-    /// under this matrix.
+    /// The matrix refitted to weighted matches, each weighted besides so that its algebraic error is its Sampson
+    /// distance under this matrix.
     ///
     /// * `weights`: one a match, not negative
     ///
@@ -185,7 +185,8 @@ pub fn robust(matches: &[Match], noise: f64, rng: &mut ChaCha8Rng, stop: &StopTo
     robust_within(matches, noise, MOST_SAMPLES, rng, stop)
 }
 
-/// The same with another bound on the samples: `n` of them are reliable down to a share of inliers of `(4.6 / n)^(1/8)`.
+/// The same with another bound on the samples: `n` of them are reliable down to a share of inliers of `(4.6 /
+/// n)^(1/8)`.
 pub fn robust_within(
     matches: &[Match],
     noise: f64,

@@ -111,13 +111,14 @@ fn positive_roots(quartic: &[f64; 5]) -> Vec<f64> {
     real.map(|root| polish(root.re)).filter(|root| *root > 0.0).collect()
 }
 
-/// The pose that most correspondences agree with, refined on those that do (LO-RANSAC with truncated squared distances).
+/// The pose that most correspondences agree with, refined on those that do (LO-RANSAC with truncated squared
+/// distances).
 ///
 /// * `seen`: images `(u, v)` at unit depth, distortion undone
 /// * `gate`: squared distance, in the same units, within which an image agrees
 ///
-/// Draws until [`CONFIDENCE`] is reached, [`MOST_SAMPLES`] at most; once `stop` fires, the best so far. Returns `None` for fewer than three correspondences or
-/// when no sample gives a pose.
+/// Draws until [`CONFIDENCE`] is reached, [`MOST_SAMPLES`] at most; once `stop` fires, the best so far. Returns `None`
+/// for fewer than three correspondences or when no sample gives a pose.
 pub fn robust(
     points: &[Vector3<f64>],
     seen: &[Vector2<f64>],

@@ -1,4 +1,5 @@
-//! Rigid motions between point sets: absolute orientation of two (Arun, Huang & Blostein 1987) and of many (Gower 1975).
+//! Rigid motions between point sets: absolute orientation of two (Arun, Huang & Blostein 1987) and of many (Gower
+//! 1975).
 
 use nalgebra::{Matrix3, Vector3};
 

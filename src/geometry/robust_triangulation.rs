@@ -1,8 +1,8 @@
 //! Points from tracks of which some observations are wrong.
 //!
-//! Tracks are linked from view to view: one wrong link parts a track into runs that are right each, so that neighbouring
-//! observations make the hypotheses. Dropping the worst observation of a common fit would fail: wrong links are far off
-//! and mask each other.
+//! Tracks are linked from view to view: one wrong link parts a track into runs that are right each, so that
+//! neighbouring observations make the hypotheses. Dropping the worst observation of a common fit would fail: wrong
+//! links are far off and mask each other.
 
 use super::measurement::Sighting;
 use super::{Camera, Point, triangulation};

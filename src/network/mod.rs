@@ -1,7 +1,7 @@
 //! The paper's network, optimised on each request's own measurement matrix: PointNet on burn, its three losses, Adam.
 //!
-//! May depend on `domain` and `simd` only (and, in tests, on `synthetic`); nothing else of ours sees burn. Everything in here
-//! runs on the calling thread: burn is built without its thread pool.
+//! May depend on `domain` and `simd` only (and, in tests, on `synthetic`); nothing else of ours sees burn. Everything
+//! in here runs on the calling thread: burn is built without its thread pool.
 //!
 //! # Where this departs from the paper, and why
 //! Experiments settled what the paper leaves open, or states in a form that does not work: ten scenes each of 10 views

@@ -1,11 +1,11 @@
 //! Forward and backward through the PointNet, written out.
 //!
-//! The products of matrices are burn's; what lies between them is one pass over each row, which stays in the first-level
-//! cache, where a tape would take a pass over the whole array for every operation (a test compares with burn's). Arrays
-//! are features x columns, row by row.
+//! The products of matrices are burn's; what lies between them is one pass over each row, which stays in the
+//! first-level cache, where a tape would take a pass over the whole array for every operation (a test compares with
+//! burn's). Arrays are features x columns, row by row.
 //!
-//! A normalised layer is `Y = max(0, s ⊙ R + b)` with `R = W X`, `s = gain / sqrt(var(R) + ε)`, all rows of X of mean 0.
-//! With `D` the derivative with respect to `s ⊙ R + b` (0 where the maximum is 0) and `p = Σ_j D_j R_j` along rows:
+//! A normalised layer is `Y = max(0, s ⊙ R + b)` with `R = W X`, `s = gain / sqrt(var(R) + ε)`, all rows of X of mean
+//! 0. With `D` the derivative with respect to `s ⊙ R + b` (0 where the maximum is 0) and `p = Σ_j D_j R_j` along rows:
 //! `db = Σ_j D_j`, `dgain = p / sqrt(var + ε)`, `dR = s ⊙ D - s p / (m (var + ε)) ⊙ R`, `dW = dR Xᵀ`, `dX = Wᵀ dR`.
 
 use burn::tensor::{Device, Tensor};
@@ -348,8 +348,8 @@ impl Normalised {
 impl Pooled {
     /// The same, from the derivatives with respect to the largest outputs.
     ///
-    /// `dR` is one entry a row less a multiple of the response, `dR = E - a ⊙ W X`. The widest layer of all is therefore
-    /// not multiplied with all columns again: `dW = E Xᵀ - a ⊙ W (X Xᵀ)` and `dX = Wᵀ E - (Wᵀ (a ⊙ W)) X`.
+    /// `dR` is one entry a row less a multiple of the response, `dR = E - a ⊙ W X`. The widest layer of all is
+    /// therefore not multiplied with all columns again: `dW = E Xᵀ - a ⊙ W (X Xᵀ)` and `dX = Wᵀ E - (Wᵀ (a ⊙ W)) X`.
     fn backward(self, slopes: &[f32], columns: usize, device: &Device) -> Result<(Arrays, Vec<f32>), Error> {
         let Statistics { deviation, scale, bias } = &self.statistics;
         let [rows, inputs] = self.weight.dims();

@@ -13,9 +13,9 @@ use crate::domain::{Backend, Losses};
 /// Share of the planned iterations after which L_DAQ acts on the weights. Earlier it pulls them into false minima: mean
 /// F1 .80 against .995 at 90 % outliers.
 pub const DAQ_ONSET: f64 = 0.6;
-/// Learning rate of log f as a multiple of the network's. Adam moves a parameter by about one rate a step, and log f may
-/// have to travel .6: at the network's own 1e-3 it does not arrive. Median focal error after 300 iterations at 50, 70
-/// and 90 % outliers (20 scenes each): 1.2, 1.9 and 6.0 % at the network's rate, .1, .2 and .5 % at five times, no
+/// Learning rate of log f as a multiple of the network's. Adam moves a parameter by about one rate a step, and log f
+/// may have to travel .6: at the network's own 1e-3 it does not arrive. Median focal error after 300 iterations at 50,
+/// 70 and 90 % outliers (20 scenes each): 1.2, 1.9 and 6.0 % at the network's rate, .1, .2 and .5 % at five times, no
 /// better at twenty.
 const FOCAL_RATE: f32 = 5.0;
 /// Weight of every track before the first step: the network's logits start near 0.
@@ -146,8 +146,8 @@ impl PriorNetwork {
 
     /// Forward, losses, backward; changes nothing but what the network was last seen to say.
     ///
-    /// The backward pass starts from the derivatives with respect to the network's outputs. The focal length is no output;
-    /// its derivative is passed on.
+    /// The backward pass starts from the derivatives with respect to the network's outputs. The focal length is no
+    /// output; its derivative is passed on.
     pub(super) fn differentiate(&mut self) -> Result<Slope, Error> {
         let daq_on_weights = self.daq_acts_on_weights();
         let pass = self.network.forward(&self.cloud, !daq_on_weights, &self.device)?;

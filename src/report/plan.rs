@@ -15,16 +15,17 @@ const MAX_POINTS: usize = 2_000;
 const MAX_CAMERAS: usize = 60;
 /// Levels of weight, one path each.
 const LEVELS: usize = 5;
-/// Interquartile ranges beyond the quartiles, along each axis, past which a point may fall outside (Tukey's fences): up to a
-/// quarter of the points may stand far off in a cluster of their own without shrinking the rest.
+/// Interquartile ranges beyond the quartiles, along each axis, past which a point may fall outside (Tukey's fences): up
+/// to a quarter of the points may stand far off in a cluster of their own without shrinking the rest.
 const FENCE: f64 = 1.5;
-/// How much longer the cameras' way must be along their vertical than across it for a part to be looked at from the side.
+/// How much longer the cameras' way must be along their vertical than across it for a part to be looked at from the
+/// side.
 const SIDEWAYS: f64 = 2.0;
 /// Length of a drawn camera as a share of the drawing.
 const CAMERA: f64 = 0.035;
 
-/// How a part is looked at: the directions to the right and down the page, the cameras' own axis that lies along the first,
-/// and that in words.
+/// How a part is looked at: the directions to the right and down the page, the cameras' own axis that lies along the
+/// first, and that in words.
 struct Look {
     across: Vector3<f64>,
     back: Vector3<f64>,
@@ -32,9 +33,9 @@ struct Look {
     words: &'static str,
 }
 
-/// The cameras' mean forward direction, made level, points up the page. Where the cameras have no common down or forward
-/// direction, axes stand in. Cameras that stand above each other, or took images that lie on their side, are looked at from
-/// the side: from above they would hide each other.
+/// The cameras' mean forward direction, made level, points up the page. Where the cameras have no common down or
+/// forward direction, axes stand in. Cameras that stand above each other, or took images that lie on their side, are
+/// looked at from the side: from above they would hide each other.
 fn look(cameras: &[Camera]) -> Look {
     let mean = |row: usize| cameras.iter().map(|camera| Vector3::from(camera.rotation[row])).sum::<Vector3<f64>>();
     let unit =
@@ -132,8 +133,8 @@ fn draw_points(svg: &mut String, part: &Part, points: &[Vector2<f64>], place: im
     }
 }
 
-/// The path through all centres, and some of the cameras on it as the triangles of their fields of view along one of their
-/// axes, 0 (right) or 1 (down).
+/// The path through all centres, and some of the cameras on it as the triangles of their fields of view along one of
+/// their axes, 0 (right) or 1 (down).
 fn draw_cameras(
     svg: &mut String,
     part: &Part,

@@ -124,8 +124,8 @@ fn bearer(headers: &HeaderMap) -> Result<&str, Status> {
     if scheme.eq_ignore_ascii_case("bearer") { Ok(key.trim()) } else { Err(status::no_key()) }
 }
 
-/// Notes that someone who may call does, so that the connection may stay. What is no call of gRPC says nothing of who it
-/// is.
+/// Notes that someone who may call does, so that the connection may stay. What is no call of gRPC says nothing of who
+/// it is.
 fn introduce(request: &Request<Body>) {
     let content_type = request.headers().get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let is_call = request.method() == Method::POST && content_type.is_some_and(|kind| kind.starts_with(GRPC));

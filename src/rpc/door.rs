@@ -51,11 +51,13 @@ const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 /// Connections that are being refused, at most: as many as may be about to speak. One more is closed without a word.
 const MAX_REFUSALS: usize = MAX_GREETED;
 
-/// What every server says first: settings, here none (RFC 9113, section 6.5). Some clients wait for them before they call.
+/// What every server says first: settings, here none (RFC 9113, section 6.5). Some clients wait for them before they
+/// call.
 const NO_SETTINGS: &[u8] = b"\0\0\0\x04\0\0\0\0\0";
 
-/// What a connection is told for which there is no room: GOAWAY (RFC 9113, section 6.8) after stream 0 with REFUSED_STREAM. No call of it was begun, so that a client may come again: gRPC calls that
-/// UNAVAILABLE, where ENHANCE_YOUR_CALM would be RESOURCE_EXHAUSTED.
+/// What a connection is told for which there is no room: GOAWAY (RFC 9113, section 6.8) after stream 0 with
+/// REFUSED_STREAM. No call of it was begun, so that a client may come again: gRPC calls that UNAVAILABLE, where
+/// ENHANCE_YOUR_CALM would be RESOURCE_EXHAUSTED.
 const NO_ROOM: &[u8] = b"\0\0\x1c\x07\0\0\0\0\0\0\0\0\0\0\0\0\x07too many connections";
 
 /// Pause after a connection could not be taken, which is usually a lack of file descriptors: some free up meanwhile.

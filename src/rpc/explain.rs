@@ -1,5 +1,5 @@
-//! Gives the transport's own refusals a reason. A message that is too large or cannot be decoded never reaches a service,
-//! so that no service can say with [`status`] what is wrong; this layer does, for all of them.
+//! Gives the transport's own refusals a reason. A message that is too large or cannot be decoded never reaches a
+//! service, so that no service can say with [`status`] what is wrong; this layer does, for all of them.
 
 use std::pin::Pin;
 use std::task::{Context, Poll};

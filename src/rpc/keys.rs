@@ -71,8 +71,8 @@ impl KeyRing {
         self.tenant_of_hash(&Hash::of(key))
     }
 
-    /// The tenant that the key of this hash stands for. Compares with every key, each to its last byte, so that the time
-    /// tells nothing.
+    /// The tenant that the key of this hash stands for. Compares with every key, each to its last byte, so that the
+    /// time tells nothing.
     pub fn tenant_of_hash(&self, key: &Hash) -> Option<&str> {
         let mut found = None;
         for (known, tenant) in &self.keys {

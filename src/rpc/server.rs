@@ -70,8 +70,8 @@ pub struct Options {
     pub max_silent_connections: usize,
     /// Connections that speak, at most; one more is refused.
     pub max_connections: usize,
-    /// How long a connection may take until someone calls over it who may: with a key, where keys are asked for. `None`:
-    /// for ever.
+    /// How long a connection may take until someone calls over it who may: with a key, where keys are asked for.
+    /// `None`: for ever.
     pub first_call_timeout: Option<Duration>,
     /// How long a connection may be silent before it is asked whether it lives.
     pub keepalive: Duration,

@@ -30,8 +30,8 @@
 //! | `INTERNAL` | `INTERNAL` | our defect; what it was is in the log only |
 //!
 //! Only what may fare better later has a `RetryInfo`. What is too large whatever the state of the server is
-//! `INVALID_ARGUMENT`, as `google.rpc.Code` has it: `FAILED_PRECONDITION` would be for a state that the caller can mend,
-//! and `RESOURCE_EXHAUSTED` is what polite clients repeat.
+//! `INVALID_ARGUMENT`, as `google.rpc.Code` has it: `FAILED_PRECONDITION` would be for a state that the caller can
+//! mend, and `RESOURCE_EXHAUSTED` is what polite clients repeat.
 
 use std::collections::HashMap;
 use std::time::Duration;

@@ -97,8 +97,8 @@ fn outside(input: &Input) -> Option<Warning> {
     })
 }
 
-/// Says so where the views of one solve come from several cameras or have several sizes; `cameras`: where each group has
-/// a calibration of its own, sizes alone matter, within a group.
+/// Says so where the views of one solve come from several cameras or have several sizes; `cameras`: where each group
+/// has a calibration of its own, sizes alone matter, within a group.
 pub fn merged_cameras(input: &Input, cameras: bool) -> Option<Warning> {
     let (group_of, groups) = camera_groups(input);
     let size = |view: &View| view.size.map(|size| (size.width_px, size.height_px));
@@ -195,8 +195,8 @@ pub fn candidate_views_among(input: &Input, ranges: &[usize], open: &[bool], sto
     Vec::new()
 }
 
-/// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of them,
-/// are seen in all of these. Padding, views and tracks without observations, changes nothing.
+/// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of
+/// them, are seen in all of these. Padding, views and tracks without observations, changes nothing.
 pub fn complete_views(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
     let views = observed_views(input);
     let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
@@ -260,7 +260,8 @@ fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, st
     diverse(found.into_iter().map(|(_, views)| views).collect())
 }
 
-/// The views that blocks are begun from: all that see something, or as many as are affordable, evenly along the sequence.
+/// The views that blocks are begun from: all that see something, or as many as are affordable, evenly along the
+/// sequence.
 fn first_views(tracks_of_view: &[Vec<usize>]) -> Vec<usize> {
     let seeing: Vec<usize> = (0..tracks_of_view.len()).filter(|&view| !tracks_of_view[view].is_empty()).collect();
     super::extend::evenly(&seeing, MOST_FIRST_VIEWS)

@@ -1,7 +1,7 @@
 //! Crowds: tracks that stand within a few pixels of each other in every view.
 //!
-//! A detector that fires many times on one blob, or a moving object of a few pixels, gives many tracks that say what one
-//! of them says. Where that one is wrong they outvote everything else: any four tracks of which one is of the crowd
+//! A detector that fires many times on one blob, or a moving object of a few pixels, gives many tracks that say what
+//! one of them says. Where that one is wrong they outvote everything else: any four tracks of which one is of the crowd
 //! explain all of it. A search therefore looks at one of each crowd; what it finds is then carried to the others.
 
 use super::block::Block;
@@ -15,8 +15,8 @@ const LEAST_REMAINING: usize = 2 * LEAST_INLIERS;
 /// Tracks that are compared with each other, for every one that is searched: the time is quadratic in them.
 const COMPARED: usize = 4;
 
-/// At most `most` tracks of the block, chosen at random among those that are left when of every crowd one is kept; `None`
-/// where there are no crowds, or too little beside them.
+/// At most `most` tracks of the block, chosen at random among those that are left when of every crowd one is kept;
+/// `None` where there are no crowds, or too little beside them.
 ///
 /// * `noise`: normalised units; tracks are near each other that differ by no more than two of this noise would on
 ///   average

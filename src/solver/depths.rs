@@ -34,7 +34,8 @@ pub fn seed(rigid: &Rigid) -> Seed {
     Seed { cameras: rigid.cameras(), points: support.iter().map(|&track| points[track]).collect(), support }
 }
 
-/// A rigid consensus as the rest of the solver knows one: inliers by image points and depths, residuals by image points.
+/// A rigid consensus as the rest of the solver knows one: inliers by image points and depths, residuals by image
+/// points.
 ///
 /// * `noise`: that it was found at
 pub fn consensus(block: &CompleteBlock, rigid: &Rigid, noise: f64) -> Consensus {
@@ -123,8 +124,9 @@ fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<Reconst
     Some(Reconstruction { intrinsics, poses, points })
 }
 
-/// Noise from which depths judge what image points have verified, normalised units: below, image points alone lose next to
-/// no track (mean F1 1.000 at 1 %, .997 at 2 %: `scpsfm evaluate --sweeps noise --depths none`), and the time is saved.
+/// Noise from which depths judge what image points have verified, normalised units: below, image points alone lose next
+/// to no track (mean F1 1.000 at 1 %, .997 at 2 %: `scpsfm evaluate --sweeps noise --depths none`), and the time is
+/// saved.
 pub const STRONG_NOISE: f64 = 0.015;
 /// Share of the consensus's inliers that must be rigid for depths to judge: of depths that are not true to one scale
 /// next to none are.

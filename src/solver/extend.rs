@@ -24,9 +24,9 @@ const ADJUSTMENTS: usize = 10;
 /// Rounds of judging, adjusting and estimating the noise, at most: those that judge wider, and as many again, of which
 /// two make the inliers stand still most of the time.
 const MOST_ROUNDS: usize = 7;
-/// Noise that the first rounds judge at, in units of what is estimated: the cameras were fitted to fewer tracks, and what
-/// they err adds to the residuals of the others. At the noise itself up to a third of the right ones stayed outside, and
-/// some for good.
+/// Noise that the first rounds judge at, in units of what is estimated: the cameras were fitted to fewer tracks, and
+/// what they err adds to the residuals of the others. At the noise itself up to a third of the right ones stayed
+/// outside, and some for good.
 const WIDENINGS: [f64; 3] = [2.0, 1.5, 1.2];
 /// Share of the searched inliers that must remain, or the extension is given up.
 const LEAST_KEPT: f64 = 0.8;

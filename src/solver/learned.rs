@@ -1,8 +1,8 @@
 //! What the trained network says of a block, in the forms that the search takes.
 //!
-//! The network knows thousands of scenes and nothing of this one but its image points: what it believes in, geometry must
-//! verify. What it disbelieves counts only where geometry has little to go by ([`Opinion::counted`]).
-//! What its odds are worth in the score of hypotheses comes from `scpsfm evaluate --priors --sweep`.
+//! The network knows thousands of scenes and nothing of this one but its image points: what it believes in, geometry
+//! must verify. What it disbelieves counts only where geometry has little to go by ([`Opinion::counted`]). What its
+//! odds are worth in the score of hypotheses comes from `scpsfm evaluate --priors --sweep`.
 
 use super::grow::LEAST_INLIERS;
 use crate::domain::{Method, Prior, SolveSettings};
@@ -87,8 +87,8 @@ impl Opinion {
     /// This opinion corrected by what pairs of views say: the odds of the observations enter the votes, and a track is
     /// right where all its observations are.
     ///
-    /// Nothing weighs the one against the other, both being logarithms of odds; with the network's halved or doubled, or
-    /// moved by 1.5 either way, the mean average precision over real windows changes by .002 at most.
+    /// Nothing weighs the one against the other, both being logarithms of odds; with the network's halved or doubled,
+    /// or moved by 1.5 either way, the mean average precision over real windows changes by .002 at most.
     pub fn with_votes(&self, votes: &Votes) -> Self {
         let said = votes.with(&self.observations);
         Self { ln_odds: said.tracks, observations: said.observations }
@@ -140,8 +140,8 @@ impl Opinion {
 
     /// How many of these inliers count towards those that geometry needs for a verification.
     ///
-    /// With few of them the cameras are flexible enough to take up a wrong one or two; then those that the network holds
-    /// to be wrong do not count. With many, geometry alone has the word.
+    /// With few of them the cameras are flexible enough to take up a wrong one or two; then those that the network
+    /// holds to be wrong do not count. With many, geometry alone has the word.
     pub fn counted(&self, inliers: &[usize]) -> usize {
         if inliers.len() >= SURELY_ENOUGH {
             return inliers.len();

@@ -1,8 +1,9 @@
-//! Which tracks a search looks at where there are more than it can: some at random, unless hardly any of those are right.
+//! Which tracks a search looks at where there are more than it can: some at random, unless hardly any of those are
+//! right.
 //!
 //! Of 3,000 tracks of which one in fifty is right, a random sample of 600 holds twelve right ones, and one sample in
-//! fourteen too few to verify anything. The trained network is linear in the tracks: it can be asked about all of them, and
-//! the search looks at those that it ranks first.
+//! fourteen too few to verify anything. The trained network is linear in the tracks: it can be asked about all of them,
+//! and the search looks at those that it ranks first.
 
 use super::block::Block;
 use super::learned::{self, Opinion, SURELY_ENOUGH};

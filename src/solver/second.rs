@@ -48,12 +48,12 @@ fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize
     (found.ln_false_alarms(search.spread()) < LN_DECISIVE).then(|| found.inlier_count())
 }
 
-/// Tracks of another projective reconstruction: one ranking, grown; a structure that takes more to be found is not worth
-/// the time that every solve would spend.
+/// Tracks of another projective reconstruction: one ranking, grown; a structure that takes more to be found is not
+/// worth the time that every solve would spend.
 ///
-/// Nothing is grown where the ranking holds fewer tracks than determine cameras. Any four tracks agree on affine cameras,
-/// and of wrong ones no fifth does (a test counts them); growing from those by chance took nearly as long as the rest of
-/// a solve.
+/// Nothing is grown where the ranking holds fewer tracks than determine cameras. Any four tracks agree on affine
+/// cameras, and of wrong ones no fifth does (a test counts them); growing from those by chance took nearly as long as
+/// the rest of a solve.
 fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize> {
     let ranking = priors::affine_irls(affine::Search::new(rest).centred(), stop)?;
     if agreeing(&ranking) < grow::LEAST_SUPPORT {

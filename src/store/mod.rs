@@ -150,8 +150,8 @@ pub trait Store: Send + Sync + 'static {
     /// leased: see [`Store::claim_foreseen`].
     async fn foresee(&self, passed: &[JobName], now: SystemTime) -> Result<Option<Claimed>, Error>;
 
-    /// Leases a job that was foreseen, `created` then; `None` where it is not queued any more, was attempted since, or is
-    /// another one of the same name.
+    /// Leases a job that was foreseen, `created` then; `None` where it is not queued any more, was attempted since, or
+    /// is another one of the same name.
     async fn claim_foreseen(
         &self,
         foreseen: &Lease,
@@ -290,8 +290,8 @@ pub trait Store: Send + Sync + 'static {
     /// [`Error::InputNotFound`].
     async fn delete_input(&self, name: &InputName) -> Result<(), Error>;
 
-    /// Gives up the uploads to which nothing came since `abandoned_by`, and removes some of the bytes of those that were
-    /// given up or finished, and some of the uploaded inputs that no job has and none was created with since
+    /// Gives up the uploads to which nothing came since `abandoned_by`, and removes some of the bytes of those that
+    /// were given up or finished, and some of the uploaded inputs that no job has and none was created with since
     /// `unused_since`. `None`: none.
     async fn purge_uploads(
         &self,

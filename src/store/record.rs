@@ -138,7 +138,8 @@ impl QueueBounds {
         if load.queued >= self.max_jobs {
             return Some(Bound::Jobs { waiting: load.queued, max: self.max_jobs });
         }
-        // A job alone in the queue always fits: what is too large for an empty queue is refused by the limits on inputs.
+        // A job alone in the queue always fits: what is too large for an empty queue is refused by the limits on
+        // inputs.
         if load.queued == 0 {
             None
         } else if load.queued_bytes.saturating_add(bytes) > self.max_bytes {

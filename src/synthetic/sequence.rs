@@ -11,7 +11,8 @@ use super::scene::{FOCAL_RANGE_PX, IMAGE_SIDE_PX, SceneOptions, normal, rows};
 use crate::domain::error::{InvalidInput, Violation, Violations};
 use crate::domain::{ImageSize, RawInput, View};
 
-/// Way from view to view, in the units of the depths below: over ten views the nearest points cross a third of the image.
+/// Way from view to view, in the units of the depths below: over ten views the nearest points cross a third of the
+/// image.
 const STEP: f64 = 0.15;
 /// Depths of the points, in the frame of the middle one of the views that see them.
 const DEPTH: (f64, f64) = (3.0, 9.0);
@@ -40,8 +41,8 @@ pub struct SequenceOptions {
     pub outliers: f64,
     /// Share of the observations of the other tracks that are anywhere in their image.
     pub wrong_observations: f64,
-    /// Share of the right tracks, of those that are long enough, that go over to another point on their way: one wrong link
-    /// joins two points.
+    /// Share of the right tracks, of those that are long enough, that go over to another point on their way: one wrong
+    /// link joins two points.
     pub joined: f64,
     /// Radial distortion, as in [`SceneOptions::radial_k1`].
     pub radial_k1: f64,
@@ -66,8 +67,8 @@ impl Default for SequenceOptions {
 }
 
 impl SequenceOptions {
-    /// Views that a track lives where nothing else is asked for: as feature matching gives them, and never more than there
-    /// are views.
+    /// Views that a track lives where nothing else is asked for: as feature matching gives them, and never more than
+    /// there are views.
     pub fn lifetime_within(views: usize) -> (usize, usize) {
         (3.min(views), 10.min(views))
     }
@@ -118,8 +119,8 @@ pub struct SequenceTruth {
     pub principal_point_px: [f64; 2],
     /// Whether a track is of one point, but for single wrong observations; one entry a track.
     pub inlier: Vec<bool>,
-    /// Whether an observation is that of its track's point; one entry an observation, in the input's order. A track that
-    /// joins two points has the one that it shows more often, the first of equals.
+    /// Whether an observation is that of its track's point; one entry an observation, in the input's order. A track
+    /// that joins two points has the one that it shows more often, the first of equals.
     pub observation_right: Vec<bool>,
     /// Whether an observation is that of the other point that its track joins.
     #[serde(default)]
@@ -138,7 +139,8 @@ pub struct Sequence {
     pub truth: SequenceTruth,
 }
 
-/// A point, the first view of its track and its exact images there and in the next ones, in image sides about the centre.
+/// A point, the first view of its track and its exact images there and in the next ones, in image sides about the
+/// centre.
 struct Track {
     point: Vector3<f64>,
     first: usize,

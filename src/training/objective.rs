@@ -3,8 +3,8 @@
 use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 
-/// Weight of the first block's tracks; the last one's is 1, linear between (deep supervision: early blocks learn to rank,
-/// later ones to refine).
+/// Weight of the first block's tracks; the last one's is 1, linear between (deep supervision: early blocks learn to
+/// rank, later ones to refine).
 const FIRST_BLOCK: f64 = 0.3;
 
 /// Where a network learns from.

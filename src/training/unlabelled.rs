@@ -2,8 +2,8 @@
 //!
 //! The weights of a scene's tracks are the sigmoids of their logits; the matrix is what the network itself made of the
 //! tracks: places in units of their view's spread, times the projective depths of its last block, holes filled.
-//! Derivatives are exact ([`rank_terms`]) and reach the network through the weights; the matrix counts as given, for the
-//! depths and the filled holes could otherwise be bent until wrong tracks fit.
+//! Derivatives are exact ([`rank_terms`]) and reach the network through the weights; the matrix counts as given, for
+//! the depths and the filled holes could otherwise be bent until wrong tracks fit.
 //!
 //! # What comes of it
 //! After 200, 400 and 600 steps (`train-prior --unlabelled --seed 0 --steps 600`) the average precision on unseen lessons

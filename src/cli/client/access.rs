@@ -16,7 +16,8 @@ use crate::rpc::{keys, tls};
 /// The variable that may hold the API key. No flag does: other users of the machine see flags.
 const KEY_VARIABLE: &str = "SCPSFM_API_KEY";
 
-/// Heading of the flags that say who calls. Given flag by flag: set for the whole, it would go on to flags of the command.
+/// Heading of the flags that say who calls. Given flag by flag: set for the whole, it would go on to flags of the
+/// command.
 const ACCESS: &str = "Access to the server";
 
 /// Who calls, and whom to trust.

@@ -1,4 +1,5 @@
-//! Remembers whether the server ever answered, so that a connection that worked is not asked whether it is the right one.
+//! Remembers whether the server ever answered, so that a connection that worked is not asked whether it is the right
+//! one.
 
 use std::pin::Pin;
 use std::sync::Arc;

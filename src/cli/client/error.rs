@@ -48,7 +48,8 @@ impl Error {
         }
     }
 
-    /// Tells what is wrong with the input by file and line: the server speaks of fields and indices, the user has lines.
+    /// Tells what is wrong with the input by file and line: the server speaks of fields and indices, the user has
+    /// lines.
     pub fn at_lines(self, input: &LabelledInput) -> Failure {
         match self.of_input() {
             [] => self.into(),

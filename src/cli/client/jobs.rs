@@ -198,8 +198,8 @@ pub(super) struct Told<'a> {
 }
 
 impl Told<'_> {
-    /// Follows one stream, which the server has just taken, to its end. The inner error is worth another try; `None`: it
-    /// ended without a terminal state.
+    /// Follows one stream, which the server has just taken, to its end. The inner error is worth another try; `None`:
+    /// it ended without a terminal state.
     pub(super) async fn follow(
         &mut self,
         mut events: Streaming<proto::JobEvent>,

@@ -1,8 +1,8 @@
 //! Running a program to its end, and measuring what it takes.
 //!
-//! On Linux from `/proc`: a child that has ended keeps its CPU time there until it is waited for, and the high-water mark
-//! of its memory until it ends. `wait4` would give both too, but its peak counts the memory of the process that started the
-//! child. Elsewhere CPU time and memory are not measured.
+//! On Linux from `/proc`: a child that has ended keeps its CPU time there until it is waited for, and the high-water
+//! mark of its memory until it ends. `wait4` would give both too, but its peak counts the memory of the process that
+//! started the child. Elsewhere CPU time and memory are not measured.
 
 use std::fs::{self, File};
 use std::io;
@@ -62,8 +62,8 @@ pub struct Limits<'a> {
     pub stop: &'a StopToken,
 }
 
-/// Runs `command` without input, its output thrown away; a file in `scratch` takes what it complains of. A program that is
-/// ended takes with it what it has started.
+/// Runs `command` without input, its output thrown away; a file in `scratch` takes what it complains of. A program that
+/// is ended takes with it what it has started.
 ///
 /// # Errors
 /// The program cannot be started or waited for.

@@ -91,9 +91,9 @@ pub struct Options {
     pub peer_timeout: Duration,
 }
 
-/// Runs every side on every sequence, one after the other; `on_start` hears of each beforehand and `on_row` of each row.
-/// A side that fails is a row with its reason. Stops between programs and ends a running one when `stop` says so; the
-/// rows so far are returned.
+/// Runs every side on every sequence, one after the other; `on_start` hears of each beforehand and `on_row` of each
+/// row. A side that fails is a row with its reason. Stops between programs and ends a running one when `stop` says so;
+/// the rows so far are returned.
 ///
 /// # Errors
 /// No directory for the programs' files can be made.

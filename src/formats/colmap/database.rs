@@ -21,8 +21,8 @@ use crate::formats::source::Matches;
 ///
 /// * `matches`: which to join; `None`: the verified where there are any, else the raw
 ///
-/// A note tells how many matches made the tracks, and how many were cut because they would have put two keypoints of one
-/// image into one track.
+/// A note tells how many matches made the tracks, and how many were cut because they would have put two keypoints of
+/// one image into one track.
 ///
 /// # Errors
 /// A file that is no such database, is being written to, is damaged (by table and row) or above `limits`.
@@ -101,8 +101,8 @@ fn refuse_unfinished(path: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// Runs the queries on a thread and a runtime of their own: this module is synchronous, its callers may be on a runtime,
-/// which must not be blocked on from within.
+/// Runs the queries on a thread and a runtime of their own: this module is synchronous, its callers may be on a
+/// runtime, which must not be blocked on from within.
 fn on_a_runtime_of_its_own(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<Contents, Problem> {
     let work = || {
         let runtime = tokio::runtime::Builder::new_current_thread()

@@ -20,7 +20,8 @@ const SCHEMA: &str = "
     CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY, rows INTEGER NOT NULL, cols INTEGER NOT NULL,
         data BLOB, config INTEGER NOT NULL);";
 
-/// A database of three images, 1 `c.jpg`, 2 `b.jpg` and 5 `a.jpg`, with three keypoints each, and the statements `more`.
+/// A database of three images, 1 `c.jpg`, 2 `b.jpg` and 5 `a.jpg`, with three keypoints each, and the statements
+/// `more`.
 fn database(more: &[&'static str]) -> (TempDir, PathBuf) {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let path = directory.path().join("database.db");

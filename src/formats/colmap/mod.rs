@@ -1,6 +1,7 @@
 //! COLMAP's files: a database of keypoints and matches or a sparse model in, a sparse model out.
 //!
-//! COLMAP's pixels begin at the corner of the image: the centre of its top-left pixel is (.5, .5), where ours is (0, 0).
+//! COLMAP's pixels begin at the corner of the image: the centre of its top-left pixel is (.5, .5), where ours is (0,
+//! 0).
 
 pub mod cameras;
 pub mod database;

@@ -1,7 +1,8 @@
 //! Reading a COLMAP sparse model: a directory with `cameras` and `images`, both `.bin` or both `.txt`.
 //!
 //! The images list their keypoints and the point in space that each belongs to, so the tracks are there whole;
-//! `points3D`, rigs and frames are not read. Poses, points and calibration are left alone: what is solved is the tracks.
+//! `points3D`, rigs and frames are not read. Poses, points and calibration are left alone: what is solved is the
+//! tracks.
 
 mod binary;
 mod text;

@@ -24,7 +24,8 @@ pub(super) struct Match {
 /// Tracks from matches.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Joined {
-    /// Keypoint and track of each observation: by track, then by keypoint; tracks in the order of their first keypoints.
+    /// Keypoint and track of each observation: by track, then by keypoint; tracks in the order of their first
+    /// keypoints.
     pub observations: Vec<(u32, u32)>,
     pub tracks: usize,
     /// Matches that were cut.

@@ -1,7 +1,7 @@
 //! Writing a COLMAP sparse model, text and binary (COLMAP, `reconstruction_io_{text,binary}.cc`).
 //!
-//! An image's keypoints are the input's observations of it, outliers too, in the order of the input; a point's colour is
-//! that of its weight. Rigs and frames are left out: COLMAP makes trivial ones of the cameras and images.
+//! An image's keypoints are the input's observations of it, outliers too, in the order of the input; a point's colour
+//! is that of its weight. Rigs and frames are left out: COLMAP makes trivial ones of the cameras and images.
 
 use std::fmt::Write;
 

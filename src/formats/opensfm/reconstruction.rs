@@ -11,8 +11,8 @@ const MIDDLE_PX: f64 = 1e-6;
 
 /// A list of reconstructions, one a part: cameras, shots and points.
 ///
-/// Lengths of cameras are in units of the larger image side, the origin is the middle of the image; a shot's rotation is
-/// an angle-axis vector, world to camera.
+/// Lengths of cameras are in units of the larger image side, the origin is the middle of the image; a shot's rotation
+/// is an angle-axis vector, world to camera.
 pub fn json(models: &[Model]) -> Value {
     models.iter().map(reconstruction).collect()
 }

@@ -1,8 +1,8 @@
 //! Reading OpenSfM's tracks.csv: one observation a line, columns separated by tabs.
 //!
 //! Version 0 has no header and the columns `image track feature x y r g b`; version 1 adds `scale` after `y`, version 2
-//! `segmentation instance` at the end (mapillary/OpenSfM, `opensfm/src/map/src/tracks_manager.cc`). Only image, track, x
-//! and y are used. x and y are relative to the image size, which the file does not hold.
+//! `segmentation instance` at the end (mapillary/OpenSfM, `opensfm/src/map/src/tracks_manager.cc`). Only image, track,
+//! x and y are used. x and y are relative to the image size, which the file does not hold.
 
 use std::collections::{BTreeSet, HashMap};
 use std::io::BufRead;

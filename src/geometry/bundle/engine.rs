@@ -154,8 +154,8 @@ fn cost<const G: usize, const C: usize, const P: usize>(
 
 /// Minimises the loss over all unknowns, starting from and ending in `problem`.
 ///
-/// The cost never rises. `stop` is asked before every damped solve; a stopped, stuck or degenerate problem keeps its last
-/// good state.
+/// The cost never rises. `stop` is asked before every damped solve; a stopped, stuck or degenerate problem keeps its
+/// last good state.
 pub(super) fn minimise<const G: usize, const C: usize, const P: usize>(
     problem: &mut impl Problem<G, C, P>,
     observations: &[Observation],

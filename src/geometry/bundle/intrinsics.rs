@@ -10,7 +10,8 @@ const UNDISTORT_STEPS: usize = 64;
 /// Relative change of the radius that ends them.
 const UNDISTORT_TOLERANCE: f64 = 4.0 * f64::EPSILON;
 /// How far beyond the distorted radius the undistorted one can lie where the image does not fold: then either neither
-/// coefficient is negative and the scale `1 + k1 r^2 + k2 r^4` is 1 at least, or `k1^2 < 20/9 k2` and it is 4/9 at least.
+/// coefficient is negative and the scale `1 + k1 r^2 + k2 r^4` is 1 at least, or `k1^2 < 20/9 k2` and it is 4/9 at
+/// least.
 const WIDEST_UNFOLDED: f64 = 9.0 / 4.0;
 
 /// Intrinsics in normalised image units, without skew: `x = f u s + px`, `y = a f v s + py` with
@@ -76,7 +77,8 @@ impl Intrinsics {
         ImageGradients { by_parameter, by_seen }
     }
 
-    /// Whether a point at this squared tangent of the angle from the optical axis lies before the fold, if there is one.
+    /// Whether a point at this squared tangent of the angle from the optical axis lies before the fold, if there is
+    /// one.
     pub fn images(&self, squared: f64) -> bool {
         self.fold().is_none_or(|fold| squared < fold)
     }

@@ -1,9 +1,9 @@
 //! The camera system that is left when the points are eliminated, accumulated point by point.
 //!
-//! With `V = Jp' Jp` damped and factored as `L L'`, and `Q = L^-1 Jp'`, the reduced system is
-//! `Jc' (I - Q' Q) Jc`: every pair of observations of a point adds `Jc_a' (d_ab I - Q_a' Q_b) Jc_b`, a product through
-//! 2x2 blocks. That costs half of what the product of the 12x4 blocks `Jc' Jp` costs and is linear in the points. Where
-//! most cameras see a point, that product (`Jc' Q'` times its transpose, see [`Panel`]) is nevertheless three times as fast.
+//! With `V = Jp' Jp` damped and factored as `L L'`, and `Q = L^-1 Jp'`, the reduced system is `Jc' (I - Q' Q) Jc`:
+//! every pair of observations of a point adds `Jc_a' (d_ab I - Q_a' Q_b) Jc_b`, a product through 2x2 blocks. That
+//! costs half of what the product of the 12x4 blocks `Jc' Jp` costs and is linear in the points. Where most cameras see
+//! a point, that product (`Jc' Q'` times its transpose, see [`Panel`]) is nevertheless three times as fast.
 
 use nalgebra::{Cholesky, Matrix2, SMatrix, SVector, Vector2};
 

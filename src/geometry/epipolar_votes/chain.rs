@@ -1,9 +1,9 @@
 //! Which observations of a track are right, given what is said of each and of pairs of them.
 //!
-//! Of a track with observations k the probability that exactly those with `b_k = 1` are right is proportional to
-//! `Π_k exp(b_k u_k) Π_{k,l} exp(b_k b_l r_kl)`: a pair speaks by its likelihood ratio where both are right, else not at
-//! all. As pairs reach no farther than two observations back, sums over all combinations are those of a chain whose state
-//! is the last two (the forward-backward algorithm, Rabiner 1989): exact, and linear in the observations.
+//! Of a track with observations k the probability that exactly those with `b_k = 1` are right is proportional to `Π_k
+//! exp(b_k u_k) Π_{k,l} exp(b_k b_l r_kl)`: a pair speaks by its likelihood ratio where both are right, else not at
+//! all. As pairs reach no farther than two observations back, sums over all combinations are those of a chain whose
+//! state is the last two (the forward-backward algorithm, Rabiner 1989): exact, and linear in the observations.
 
 /// Logarithms of the odds of a track and of its observations.
 #[derive(Debug, Clone, PartialEq)]

@@ -9,7 +9,8 @@
 //!    ([`residuals`]): one noise for all pairs, a share of right matches for each.
 //! 2. A pair whose agreement may be chance has no vote; of the others each match has a likelihood ratio, right against
 //!    anywhere.
-//! 3. The ratios of a track's pairs, and what else is known of its observations, give the odds of each of them and of the
+//! 3. The ratios of a track's pairs, and what else is known of its observations, give the odds of each of them and of
+//!   the
 //!    track ([`chain`]): one wrong observation spoils all pairs that it is in, and only those.
 //!
 //! # Pitfall
@@ -31,8 +32,9 @@ use residuals::{Residuals, noise_of};
 pub use tracks::Tracks;
 
 /// Distances between the two views of a pair, in views. Neighbours have most in common; the next but one closes
-/// triangles, so that a wrong observation disagrees with more than one. Wider pairs add nothing: with 3 the mean average
-/// precision over real windows of five views is .9551, without .9554 (and [`chain`] holds two observations back).
+/// triangles, so that a wrong observation disagrees with more than one. Wider pairs add nothing: with 3 the mean
+/// average precision over real windows of five views is .9551, without .9554 (and [`chain`] holds two observations
+/// back).
 const STRIDES: [usize; 2] = [1, 2];
 /// Matches that a fundamental matrix is estimated from at most, evenly taken.
 const MOST_MATCHES: usize = 500;

@@ -5,8 +5,8 @@ use std::f64::consts::{SQRT_2, TAU};
 use crate::geometry::fundamental::Match;
 use crate::geometry::statistics::ln_choose;
 
-/// Share of right matches in the tail of the noise, and its width in units of the core: feature detectors have tails that
-/// a Gaussian of their core would call impossible. A share of .2 ranks real matches no differently.
+/// Share of right matches in the tail of the noise, and its width in units of the core: feature detectors have tails
+/// that a Gaussian of their core would call impossible. A share of .2 ranks real matches no differently.
 const TAIL: (f64, f64) = (0.05, 3.0);
 /// Core noise below which residuals are rounding: a fiftieth of a pixel of an image of a thousand. Without a bound,
 /// exact matches would make a density without one.
@@ -67,8 +67,9 @@ impl Residuals {
         (weights, sums)
     }
 
-    /// Logarithm of the expected number of matrices with as many agreeing matches among wrong ones: Moisan & Stival 2004,
-    /// `(m - 8) C(m, k) C(k, 8) p^(k-8)` for k of m matches within a distance that a wrong one has with probability p.
+    /// Logarithm of the expected number of matrices with as many agreeing matches among wrong ones: Moisan & Stival
+    /// 2004, `(m - 8) C(m, k) C(k, 8) p^(k-8)` for k of m matches within a distance that a wrong one has with
+    /// probability p.
     pub fn ln_false_alarms(&self, noise: f64) -> f64 {
         let gate = AGREEING * noise;
         let (all, agreeing) =
@@ -115,7 +116,8 @@ fn densities(squared: f64, noise: f64) -> [f64; 2] {
 }
 
 /// Density of the signed Sampson distance of two unrelated points, each uniform over as wide a range as these matches:
-/// that of a coordinate across the line, `1 / (sqrt 12 spread)`, times `sqrt 2`, for the distance is shared by two views.
+/// that of a coordinate across the line, `1 / (sqrt 12 spread)`, times `sqrt 2`, for the distance is shared by two
+/// views.
 fn density_of_wrong(matches: &[Match]) -> f64 {
     let count = matches.len().max(1) as f64;
     let variance = |point: fn(&Match) -> nalgebra::Vector2<f64>| {

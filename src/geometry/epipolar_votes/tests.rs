@@ -67,8 +67,8 @@ fn wrong_observations_and_tracks_are_told_from_right_ones() {
         assert_eq!(votes.pairs, 2 * VIEWS - 3, "seed {seed}");
         assert!((0.7..1.4).contains(&(votes.noise / NOISE)), "seed {seed}: noise {}", votes.noise);
         assert!(precision > 0.995, "seed {seed}: {precision}");
-        // A pair with a wrong point agrees by chance in one case of seventy: of two hundred such pairs three do, and each
-        // speaks for two observations.
+        // A pair with a wrong point agrees by chance in one case of seventy: of two hundred such pairs three do, and
+        // each speaks for two observations.
         assert!(misjudged < truth.len() / 16, "seed {seed}: {misjudged} of {} are misjudged", truth.len());
         let whole: Vec<bool> = (0..TRACKS).map(|track| truth[tracks.range(track)].iter().all(|right| *right)).collect();
         let precision = average_precision(&found.tracks, &whole).expect("right ones");

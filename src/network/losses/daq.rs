@@ -20,7 +20,8 @@ pub struct Residual {
     pub grad_n_inf: Vector3<f64>,
 }
 
-/// `Σ_i | S_i/|S_i| - ω/|ω| |` with `S_i = (A_i - a_i nᵀ) ω (A_i - a_i nᵀ)ᵀ` and `ω = diag(f², f², 1)` (the paper's L_DAQ).
+/// `Σ_i | S_i/|S_i| - ω/|ω| |` with `S_i = (A_i - a_i nᵀ) ω (A_i - a_i nᵀ)ᵀ` and `ω = diag(f², f², 1)` (the paper's
+/// L_DAQ).
 ///
 /// The principal point is the origin and pixels are square: the units of the measurement matrix see to it.
 pub fn residual(cameras: &CanonicalCameras, log_focal: f64, n_inf: &Vector3<f64>) -> Residual {

@@ -53,8 +53,8 @@ pub const VARIANCE_FLOOR: f32 = 1e-3;
 pub const DEPTH_RANGE: (f32, f32) = (0.3, 3.0);
 /// Least mean depth of a track that its depths are divided by.
 pub const LEAST_MEAN_DEPTH: f32 = 0.1;
-/// Coordinates are kept within this of a view's median, in units of [`SPREAD_PER_DEVIATION`] deviations: beyond, a point
-/// is far out, and how far says no more.
+/// Coordinates are kept within this of a view's median, in units of [`SPREAD_PER_DEVIATION`] deviations: beyond, a
+/// point is far out, and how far says no more.
 pub const MOST_OFFSET: f32 = 5.0;
 /// Predictions of what is unobserved are kept within this, which leaves room beyond [`MOST_OFFSET`].
 pub const MOST_PREDICTED: f32 = 8.0;

@@ -1,5 +1,5 @@
-//! An uploaded input, decoded as its bytes come by. What is decoded never grows beyond the limits on inputs, whatever the
-//! bytes say: prost's own decoding would take fifteen times their length for the worst of them.
+//! An uploaded input, decoded as its bytes come by. What is decoded never grows beyond the limits on inputs, whatever
+//! the bytes say: prost's own decoding would take fifteen times their length for the worst of them.
 
 use prost::Message;
 use prost::bytes::Buf;

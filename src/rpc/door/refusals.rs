@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use tokio::time::{Instant, sleep_until};
 
-/// Between two lines that tell of refused connections: a minute is soon enough for whoever reads logs, and sixty lines an
-/// hour drown nothing.
+/// Between two lines that tell of refused connections: a minute is soon enough for whoever reads logs, and sixty lines
+/// an hour drown nothing.
 const TOLD_EVERY: Duration = Duration::from_secs(60);
 
 /// Counts connections that were refused and not told of yet.

@@ -202,8 +202,8 @@ pub fn from_metric(
     grading::grade(&choice, &fit, minima, warnings)
 }
 
-/// The log focal length that a metric reconstruction has by these observations alone, the rest of the lens held, and its
-/// standard deviation; `None` where that is not finite.
+/// The log focal length that a metric reconstruction has by these observations alone, the rest of the lens held, and
+/// its standard deviation; `None` where that is not finite.
 pub fn focal_alone(
     problem: &Problem,
     metric: &Reconstruction,

@@ -20,8 +20,8 @@ const RADIAL_SIGMA: f64 = 0.2;
 /// The same of `k2`: calibrations on boards give it the size of `k1`, with either sign.
 const SECOND_RADIAL_SIGMA: f64 = 0.2;
 /// Probability, before any observation, that a camera needs the extension. Principal points and distortion are as often
-/// in order (rectified, rendered) as not; pixels are square in all but old video. That of the second radial term is where
-/// there is a first.
+/// in order (rectified, rendered) as not; pixels are square in all but old video. That of the second radial term is
+/// where there is a first.
 fn probability(extension: Extension) -> f64 {
     match extension {
         Extension::PrincipalPoint | Extension::Radial | Extension::SecondRadial => 0.5,

@@ -36,8 +36,8 @@ pub(super) const FIRST_TOLERANCE: f64 = 1e-4;
 pub(super) const CONVERGED: usize = 3;
 const FINAL_ITERATIONS: usize = 60;
 const FINAL_TOLERANCE: f64 = 1e-9;
-/// Share of the cheapest minimum's cost that a start must get down to at its pace to be adjusted to convergence: a rival
-/// is within a few per cent, and one stuck at thirty times the cost took half the time of a calibration.
+/// Share of the cheapest minimum's cost that a start must get down to at its pace to be adjusted to convergence: a
+/// rival is within a few per cent, and one stuck at thirty times the cost took half the time of a calibration.
 const HOPELESS: f64 = 4.0;
 /// Adjusted starts this near in log focal, and within this share in cost, are the same minimum.
 const SAME_MINIMUM: f64 = 0.01;

@@ -15,11 +15,12 @@ const RMS_RATIO_LIMIT: f64 = 1.15;
 /// The same ratio from which the metric reconstruction is not to be used at all.
 const RMS_RATIO_REFUSAL: f64 = 3.0;
 /// Share of the observations that must lie in front of their cameras, or the reconstruction is not to be used: what was
-/// seen was not behind the camera. A forward-moving car gave 2.9 % behind, with a focal length of a quarter of the true.
+/// seen was not behind the camera. A forward-moving car gave 2.9 % behind, with a focal length of a quarter of the
+/// true.
 pub const CHEIRALITY_LIMIT: f64 = 0.99;
-/// Focal lengths that lenses have, in the longer image side: rectilinear ones end at a field of view of 135 degrees (.2),
-/// telescopes at half a degree. Beyond, a minimum is no camera: of windows of a forward-moving car one was taken for a
-/// lens of 170 degrees, at a sigma of 10 %.
+/// Focal lengths that lenses have, in the longer image side: rectilinear ones end at a field of view of 135 degrees
+/// (.2), telescopes at half a degree. Beyond, a minimum is no camera: of windows of a forward-moving car one was taken
+/// for a lens of 170 degrees, at a sigma of 10 %.
 const FOCAL_RANGE: (f64, f64) = (0.15, 120.0);
 
 /// The grade with the warnings that led to it.
@@ -103,8 +104,9 @@ impl Verdict {
         }
     }
 
-    /// The sigma that is told: not one that the fit contradicts. Whatever lowered the grade is worth at least the grade's
-    /// least, and a model that does not fit its most: wrong minima behind a distorting lens were off by 20 to 30 %.
+    /// The sigma that is told: not one that the fit contradicts. Whatever lowered the grade is worth at least the
+    /// grade's least, and a model that does not fit its most: wrong minima behind a distorting lens were off by 20 to
+    /// 30 %.
     pub fn told(&self, sigma: Option<f64>) -> Option<f64> {
         let least = match (self.grade, self.misfit) {
             (Grade::Weak, true) => WEAK_UP_TO,

@@ -16,8 +16,8 @@ use crate::geometry::metric::{cheirality, upgrade_zooming};
 
 /// Best quadrics that are adjusted, beside the reconstructions with a constant focal length.
 const STARTS: usize = 8;
-/// What a lens that is not estimated may add to the log focal lengths, one standard deviation: a k1 of -.03 moved them by 8
-/// %, one of -.05 by 14 %, and neither shows in the fit. No zoom is METRIC for it.
+/// What a lens that is not estimated may add to the log focal lengths, one standard deviation: a k1 of -.03 moved them
+/// by 8 %, one of -.05 by 14 %, and neither shows in the fit. No zoom is METRIC for it.
 const LENS_SIGMA: f64 = 0.05;
 /// Difference in the mean log focal length, and share of the cost, within which minima are the same.
 const SAME_MINIMUM: f64 = 0.01;

@@ -31,7 +31,8 @@ pub struct Geometry<'a> {
     /// Where views are in several frames: the frame of each view and the one that each track is judged in.
     pub parts: Option<(&'a [u32], &'a [u32])>,
     pub normalization: &'a Normalization,
-    /// The lens of each view, whose distortion is undone before the cameras, pinholes, are asked; empty: all are pinholes.
+    /// The lens of each view, whose distortion is undone before the cameras, pinholes, are asked; empty: all are
+    /// pinholes.
     pub lenses: &'a [Intrinsics],
     /// Whether tracks were linked from view to view, so that one wrong link joins two points: the observations that
     /// agree on one are looked for then, however few they are beside the others. The cameras must be metric. Otherwise
@@ -109,7 +110,8 @@ pub struct SplitPoint {
 /// residuals.
 ///
 /// Twice: with a wide tail first, then with the tail that the tracks show which are right in all their observations.
-/// Where there is none, a wrong observation is told from a right one nearer by: at 8 to 9 core deviations instead of 12 at .3 % noise.
+/// Where there is none, a wrong observation is told from a right one nearer by: at 8 to 9 core deviations instead of 12
+/// at .3 % noise.
 ///
 /// Once `stop` fires the rest stays unjudged: nobody will look at the result. `told` hears how many verdicts there are,
 /// up to two a track. How many threads there are changes nothing.
@@ -132,8 +134,8 @@ pub fn judge(
     }
 }
 
-/// Squared residuals, in core variances, of the tracks that are right as a whole: a track with a dropped observation may
-/// be wrong in others.
+/// Squared residuals, in core variances, of the tracks that are right as a whole: a track with a dropped observation
+/// may be wrong in others.
 fn whole_tracks(input: &Input, ranges: &[usize], geometry: &Geometry, judged: &Judged) -> Vec<f64> {
     (0..input.track_count())
         .filter(|&track| judged.tracks.inlier[track])
@@ -246,7 +248,8 @@ impl Bench<'_> {
         Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
     }
 
-    /// The sightings that a verdict begins with: all, or those that agree where links may be wrong; `None` where none do.
+    /// The sightings that a verdict begins with: all, or those that agree where links may be wrong; `None` where none
+    /// do.
     fn retained_at_first(&self, sightings: &[Sighting], gate: f64) -> Option<Vec<usize>> {
         if !self.geometry.linked {
             return Some((0..sightings.len()).collect());

@@ -3,8 +3,8 @@
 use nalgebra::Vector2;
 
 /// Share of right observations in the tail, before it is known, and the tail's width in units of the core. Feature
-/// detectors have a core of .1 to .3 px and tails that a Gaussian of that width would call impossible; together with the
-/// uniform outliers this puts the gate at 12 to 17 core deviations, where real sequences want it (15 to 20).
+/// detectors have a core of .1 to .3 px and tails that a Gaussian of that width would call impossible; together with
+/// the uniform outliers this puts the gate at 12 to 17 core deviations, where real sequences want it (15 to 20).
 const TAIL_SHARE: f64 = 0.05;
 const TAIL_WIDTH: f64 = 3.0;
 /// Bounds of the share that is estimated: noise without a tail still has a rare blunder that is no wrong match.
@@ -31,7 +31,8 @@ pub fn density_of_spread(spread: f64) -> f64 {
     1.0 / (12.0f64.sqrt() * spread)
 }
 
-/// Squared residual within which an observation is more likely right than wrong while nothing is known of the noise's tail.
+/// Squared residual within which an observation is more likely right than wrong while nothing is known of the noise's
+/// tail.
 pub fn working_gate(noise: f64, outlier_density: f64) -> f64 {
     NoiseModel::new(noise, outlier_density).gate()
 }
@@ -54,8 +55,8 @@ impl NoiseModel {
         Self { core, tail_share: TAIL_SHARE, outlier_density }
     }
 
-    /// The model with the tail that these squared residuals of right observations, in core variances, show: the share by
-    /// expectation and maximisation. `None` for too few of them.
+    /// The model with the tail that these squared residuals of right observations, in core variances, show: the share
+    /// by expectation and maximisation. `None` for too few of them.
     pub fn with_tail(self, squared: &[f64]) -> Option<Self> {
         if squared.len() < TAIL_OBSERVATIONS {
             return None;
@@ -74,8 +75,8 @@ impl NoiseModel {
         Some(Self { tail_share: share.clamp(TAIL_BOUNDS.0, TAIL_BOUNDS.1), ..self })
     }
 
-    /// Squared residual at which an observation is as likely wrong as right: by its core or by its tail, whichever reaches
-    /// farther. Strong noise has a core that reaches farther than a rare tail.
+    /// Squared residual at which an observation is as likely wrong as right: by its core or by its tail, whichever
+    /// reaches farther. Strong noise has a core that reaches farther than a rare tail.
     pub fn gate(&self) -> f64 {
         let wrong = WRONG_OBSERVATION * self.outlier_density.powi(2);
         let reach = |(share, width): (f64, f64)| {
@@ -98,8 +99,8 @@ impl NoiseModel {
         right / (right + wrong).max(f64::MIN_POSITIVE)
     }
 
-    /// Log of the odds that a track is right whose prior probability is `share`: the density of its residuals under core
-    /// and tail, over that of coordinates anywhere, times the price of every dropped observation.
+    /// Log of the odds that a track is right whose prior probability is `share`: the density of its residuals under
+    /// core and tail, over that of coordinates anywhere, times the price of every dropped observation.
     ///
     /// * `cost`: sum of the squared residuals of the `retained` observations about their point
     pub fn ln_odds(&self, cost: f64, retained: usize, dropped: usize, share: f64) -> f64 {

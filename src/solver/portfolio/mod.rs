@@ -1,10 +1,10 @@
 //! The portfolio: priors propose, guided search verifies, the best consensus stands.
 //!
 //! What is cheap goes first: rigid distances where depths are given, the opinion of the network that was trained
-//! beforehand, reweighting, consistency. Where they decide nothing, the paper's network is optimised a few iterations at
-//! a time; between, its ranking is verified by geometry, and so is uniform sampling, which needs no prior to be right. A
-//! decisive consensus ends the search: the paper's network would say nothing after it that anyone waits for, and its first
-//! iterations took as long as everything else. Each prior's own time is kept.
+//! beforehand, reweighting, consistency. Where they decide nothing, the paper's network is optimised a few iterations
+//! at a time; between, its ranking is verified by geometry, and so is uniform sampling, which needs no prior to be
+//! right. A decisive consensus ends the search: the paper's network would say nothing after it that anyone waits for,
+//! and its first iterations took as long as everything else. Each prior's own time is kept.
 
 mod account;
 mod best;
@@ -40,8 +40,8 @@ const AFFINE_SAMPLES: (usize, usize) = (2_000, 6_000);
 const SUBSPACE_SAMPLES: (usize, usize) = (250, 1_000);
 /// Hypotheses a round and prior that are grown.
 const SHORTLIST: usize = 2;
-/// Consensuses that are crowds after which a search is over: whatever includes one of a crowd that large explains all of
-/// it, and outbids what is right.
+/// Consensuses that are crowds after which a search is over: whatever includes one of a crowd that large explains all
+/// of it, and outbids what is right.
 const MOST_CROWDS: usize = 4;
 /// Every other round grows at more noise than assumed, doubling up to sixteen times: a level that is twice too low
 /// loses the scene, and the caller may have given none.
@@ -61,8 +61,8 @@ pub struct Found {
     pub crowded: Option<(usize, usize)>,
     /// What the trained network says of the block; `None` where it was not asked.
     pub opinion: Option<Opinion>,
-    /// The weights of the network that was trained beforehand, or where it was not asked the last ones of the paper's, one
-    /// a track of the block; empty without a network.
+    /// The weights of the network that was trained beforehand, or where it was not asked the last ones of the paper's,
+    /// one a track of the block; empty without a network.
     pub network_weights: Vec<f64>,
     pub prior_times: Vec<PriorTime>,
 }

@@ -126,8 +126,8 @@ pub fn knowledge(scene: &Scene, group: usize, noise: f64) -> IntrinsicsPrior {
     calibration::knowledge(noise, scene.focal_priors[group], scene.context.scale_px)
 }
 
-/// Adjusts the views of a part with the landmarks that hold them best, while more are to come. The calibration of groups
-/// that the first part has is the first part's: the others are held to it until all are adjusted together.
+/// Adjusts the views of a part with the landmarks that hold them best, while more are to come. The calibration of
+/// groups that the first part has is the first part's: the others are held to it until all are adjusted together.
 pub fn while_growing(scene: &Scene, model: &mut Model, part: u32, recorder: &mut Recorder) {
     let views = model.of_part(part);
     let tracks = covering(scene, model, &views, OF_VIEW_WHILE_GROWING);

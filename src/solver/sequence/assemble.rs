@@ -160,8 +160,8 @@ fn views(scene: &Scene, model: &Model, frames: &[Option<Matrix4<f64>>], metric: 
     model.poses.iter().enumerate().map(result).collect()
 }
 
-/// What takes the points of each part to where the caller has them: nowhere where the result is metric, else to the frame
-/// of the first view of their part.
+/// What takes the points of each part to where the caller has them: nowhere where the result is metric, else to the
+/// frame of the first view of their part.
 fn back(frames: &[Option<Matrix4<f64>>], metric: bool) -> Vec<Option<Matrix4<f64>>> {
     frames.iter().map(|frame| frame.filter(|_| !metric).and_then(|frame| frame.try_inverse())).collect()
 }

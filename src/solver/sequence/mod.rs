@@ -1,7 +1,7 @@
 //! From a calibrated block to the whole sequence.
 //!
-//! Tracks of real sequences live a few views: no block of complete tracks holds them all. A block that was solved is the
-//! seed; view after view is resected against the points that stand ([`register`]), its tracks are triangulated
+//! Tracks of real sequences live a few views: no block of complete tracks holds them all. A block that was solved is
+//! the seed; view after view is resected against the points that stand ([`register`]), its tracks are triangulated
 //! ([`structure`]), and bundle adjustment with the calibration free keeps the whole straight ([`adjust`]). Views that
 //! share no tracks with it become [`parts`] of their own under the same calibration. What the whole says of the
 //! calibration is graded anew ([`calibrate`]) and checked between its [`windows`], and every track and observation is

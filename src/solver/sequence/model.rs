@@ -98,7 +98,8 @@ pub struct Model {
     pub lenses: Vec<Lens>,
     /// One a view of the input.
     pub poses: Vec<Option<Pose>>,
-    /// Part of each registered view: views that share no tracks are reconstructions of their own, under one calibration.
+    /// Part of each registered view: views that share no tracks are reconstructions of their own, under one
+    /// calibration.
     pub part_of: Vec<u32>,
     /// One a track of the input.
     pub landmarks: Vec<Option<Landmark>>,
@@ -177,7 +178,8 @@ impl Model {
         }
     }
 
-    /// Adds the views of a metric block, all of one camera group, as a part; a camera that is not known yet is the block's.
+    /// Adds the views of a metric block, all of one camera group, as a part; a camera that is not known yet is the
+    /// block's.
     pub fn add_part(&mut self, scene: &Scene, part: u32, views: &[usize], metric: &Reconstruction) {
         if let Some(&view) = views.first() {
             let lens = &mut self.lenses[scene.group_of[view]];
@@ -229,7 +231,8 @@ impl Model {
         self.poses.iter().enumerate().map(camera).collect()
     }
 
-    /// Where the pinhole cameras see an observation; `None` where the view is not registered or the lens images nothing.
+    /// Where the pinhole cameras see an observation; `None` where the view is not registered or the lens images
+    /// nothing.
     pub fn sighting(&self, scene: &Scene, k: usize) -> Option<Sighting> {
         let view = scene.view_of(k);
         self.poses[view]?;

@@ -12,8 +12,8 @@ use crate::solver::{Context, Error, block};
 
 /// The part that the calibration comes from.
 pub const FIRST: u32 = 0;
-/// Blocks that are tried for parts at most, and how many may fail one after the other: the best come first, and an input
-/// without overlap has any number of hopeless ones.
+/// Blocks that are tried for parts at most, and how many may fail one after the other: the best come first, and an
+/// input without overlap has any number of hopeless ones.
 const MOST_PARTS: u32 = 100;
 const MOST_FAILURES: usize = 3;
 /// Deviation of the log focal length that other parts are told of, at least, where the first has one: parts differ by

@@ -18,12 +18,13 @@ pub const LEAST_POINTS: usize = 8;
 const LEAST_SHARE: f64 = 0.1;
 /// Points of a view beyond which a pose is not made better.
 const MOST_POINTS: usize = 2_000;
-/// Growth of the points that a view sees after which a failed one is tried again: fewer new ones hardly change its odds.
+/// Growth of the points that a view sees after which a failed one is tried again: fewer new ones hardly change its
+/// odds.
 const RETRY_GROWTH: f64 = 1.2;
 /// Trials of a view a part: by the last it sees some 1.7 times the points of the first.
 const MOST_TRIALS: usize = 4;
-/// Growth of the registered views after which all are adjusted; in between, only what is around each new one. A geometric
-/// growth keeps the cost of all adjustments together at six times that of the last.
+/// Growth of the registered views after which all are adjusted; in between, only what is around each new one. A
+/// geometric growth keeps the cost of all adjustments together at six times that of the last.
 const ADJUST_GROWTH: f64 = 1.2;
 /// Focal lengths that a view of a camera that is not known yet is tried with, as factors on the first camera's: a
 /// quarter of an octave apart, from a third to three times.
@@ -169,8 +170,8 @@ fn register(
     (seen.len(), agreeing)
 }
 
-/// Lenses to try a view with: its camera's own, or, of one that is not known yet, pinholes of what the input says, give or
-/// take its deviation, or of a scan.
+/// Lenses to try a view with: its camera's own, or, of one that is not known yet, pinholes of what the input says, give
+/// or take its deviation, or of a scan.
 fn guesses(scene: &Scene, model: &Model, view: usize) -> Vec<Intrinsics> {
     let lens = &model.lenses[scene.group_of[view]];
     if lens.is_known {

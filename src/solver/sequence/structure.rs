@@ -10,8 +10,8 @@ use crate::solver::recorder::Recorder;
 
 /// Observations that two views and one that verifies them make.
 const VERIFIED: usize = 3;
-/// Angle between the rays from which the depth of a point is known well enough to support a pose, radians: at .3 degrees
-/// half a pixel of a thousand in either ray leaves a seventh of the depth open.
+/// Angle between the rays from which the depth of a point is known well enough to support a pose, radians: at .3
+/// degrees half a pixel of a thousand in either ray leaves a seventh of the depth open.
 const LEAST_ANGLE: f64 = 0.005;
 /// The same for points that only two views see, which nothing verifies: a twenty-eighth.
 const LEAST_ANGLE_OF_TWO: f64 = 0.02;

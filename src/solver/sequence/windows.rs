@@ -1,7 +1,7 @@
 //! What windows of a sequence say of each other's focal length.
 //!
-//! The formal uncertainty of one adjustment knows noise and nothing else; distortion beyond the model, a wrong track or a
-//! motion that hardly turns moves windows apart by more than it admits. They are fused by information weight, with a
+//! The formal uncertainty of one adjustment knows noise and nothing else; distortion beyond the model, a wrong track or
+//! a motion that hardly turns moves windows apart by more than it admits. They are fused by information weight, with a
 //! common misfit that makes their chi-square what it should be (DerSimonian & Laird 1986).
 
 use super::adjust;

@@ -70,8 +70,8 @@ impl Study {
     }
 
     /// What the best hypothesis of so many samples under the trained network says of every track, larger where it is
-    /// more likely right, when a nat of the network's odds counts `per_nat` in the score of hypotheses; `None` where the
-    /// network has no answer.
+    /// more likely right, when a nat of the network's odds counts `per_nat` in the score of hypotheses; `None` where
+    /// the network has no answer.
     pub fn best_under(&self, per_nat: f64, samples: usize, seed: u64) -> Option<Vec<f64>> {
         let opinion = Opinion::of(&self.block)?;
         let truncations = opinion.truncations_at(per_nat);

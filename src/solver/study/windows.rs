@@ -27,8 +27,8 @@ pub struct WindowRankings {
     pub epipolar: Option<Vec<f64>>,
     /// The network that was trained beforehand.
     pub learned: Option<Vec<f64>>,
-    /// Both. No search is guided by it: on real sequences the scene's own statistics decide every seed, and hearing these
-    /// first took three of nine views from one sequence and gave none a better calibration.
+    /// Both. No search is guided by it: on real sequences the scene's own statistics decide every seed, and hearing
+    /// these first took three of nine views from one sequence and gave none a better calibration.
     pub together: Option<Vec<f64>>,
     /// Of asking the pairs, and of asking the network.
     pub seconds: [f64; 2],

@@ -65,7 +65,8 @@ fn without_the_trained_network_the_search_stands_on_its_own() {
     }
 }
 
-/// Of 3,000 tracks a search looks at 600; a random sample of these scenes has seven right ones, and geometry asks for eight.
+/// Of 3,000 tracks a search looks at 600; a random sample of these scenes has seven right ones, and geometry asks for
+/// eight.
 #[test]
 fn where_hardly_any_track_of_a_sample_is_right_the_likeliest_of_all_are_searched() {
     for seed in [500_012, 500_031, 500_092] {

@@ -388,7 +388,8 @@ fn a_stop_ends_the_solve_wherever_it_is() {
     }
 }
 
-/// More tracks than a search looks at: those that it left aside must join all, or the calibration stays that of a sample.
+/// More tracks than a search looks at: those that it left aside must join all, or the calibration stays that of a
+/// sample.
 #[test]
 fn all_right_tracks_calibrate_though_a_search_sees_some() {
     for seed in [10_002, 10_003, 10_010] {

@@ -1,7 +1,8 @@
 //! The shared store: PostgreSQL, which several servers use as one.
 //!
 //! Every write of a worker is conditioned on its lease under the job's row lock, so that of two servers that think they
-//! hold a job one is refused. Notifications carry the names of jobs and are hints: what they say is read from the tables.
+//! hold a job one is refused. Notifications carry the names of jobs and are hints: what they say is read from the
+//! tables.
 
 mod clock;
 mod listener;
@@ -32,8 +33,8 @@ const CONNECTIONS: u32 = 6;
 /// Connections for inputs and results of callers. Apart, since each may take half a minute, and no lease may be lost
 /// because its heartbeat waits behind uploads.
 const PAYLOAD_CONNECTIONS: u32 = 3;
-/// How long a caller waits for a connection. Callers are told soon that the database is away, before their patience or a
-/// worker's lease is over.
+/// How long a caller waits for a connection. Callers are told soon that the database is away, before their patience or
+/// a worker's lease is over.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(3);
 /// How long an operation on a few rows may take: what takes longer waits for a database that does not answer.
 const SMALL_BOUND: Duration = Duration::from_secs(5);

@@ -1,5 +1,5 @@
-//! Brings the schema up to date, over a connection of its own: what callers wait for is bounded by the session, and a step
-//! on a large table takes as long as it takes.
+//! Brings the schema up to date, over a connection of its own: what callers wait for is bounded by the session, and a
+//! step on a large table takes as long as it takes.
 
 use std::time::Duration;
 

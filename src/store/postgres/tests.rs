@@ -127,8 +127,8 @@ async fn many_servers_share_one_queue_and_one_set_of_request_ids() {
     }
 }
 
-/// What several servers told of jobs: each at most once. Not always each: an answer that came too late is not heard, though
-/// what it tells of was done.
+/// What several servers told of jobs: each at most once. Not always each: an answer that came too late is not heard,
+/// though what it tells of was done.
 fn told_once(mut names: Vec<JobName>) {
     let told = names.len();
     names.sort();

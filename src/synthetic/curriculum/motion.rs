@@ -18,8 +18,8 @@ const RETREAT_DEPTH: f64 = 0.5;
 const DRAWS: i32 = 40;
 const SHRINK: f64 = 0.93;
 
-/// Range of the largest angle of an orbit. Smooth motions of cameras that would orbit by more than [`TURNS_ABOUT_SCENE`]
-/// turn about the scene, the others about themselves.
+/// Range of the largest angle of an orbit. Smooth motions of cameras that would orbit by more than
+/// [`TURNS_ABOUT_SCENE`] turn about the scene, the others about themselves.
 const ORBIT_RAD: (f64, f64) = (0.3, 1.6);
 const TURNS_ABOUT_SCENE: f64 = 0.5;
 /// Orbits are mostly about the vertical: weights of the components of the axis.

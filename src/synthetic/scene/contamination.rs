@@ -32,10 +32,10 @@ pub enum OutlierKind {
     Permuted,
     /// Anywhere in the image, with the depth of a random track.
     Uniform,
-    /// Slid along the epipolar lines of view 0: in view 0 the track is right, and in every wrong view it is the image of
-    /// a point on the same ray of view 0, at another depth in each. Each view agrees with view 0, but no point agrees
-    /// with all views. Near an epipole (the middle of the image in forward motion) and in cameras near the first a slide
-    /// moves the image little, and what is called wrong may hide in the noise.
+    /// Slid along the epipolar lines of view 0: in view 0 the track is right, and in every wrong view it is the image
+    /// of a point on the same ray of view 0, at another depth in each. Each view agrees with view 0, but no point
+    /// agrees with all views. Near an epipole (the middle of the image in forward motion) and in cameras near the first
+    /// a slide moves the image little, and what is called wrong may hide in the noise.
     Slid,
     /// Taken for its like: shifted by one constant vector, the same in all views and tracks, of .1 to .2 of the width.
     /// Without a number of wrong views, half of a track's views are.

@@ -37,8 +37,8 @@ pub enum Motion {
     /// Around the scene about one axis, the vertical, at a distance of 3, the optical axes in one plane and through the
     /// centre: a turntable.
     Turntable,
-    /// One rotation for all views, translations uniform in `[-1, 1]^3`: images of the plane at infinity do not move, and
-    /// no more than an affine reconstruction exists. Critical.
+    /// One rotation for all views, translations uniform in `[-1, 1]^3`: images of the plane at infinity do not move,
+    /// and no more than an affine reconstruction exists. Critical.
     PureTranslation,
     /// Along the optical axis by at most 1 either way, without turning: critical as above, and with points near the
     /// axis that show no parallax.

@@ -40,9 +40,9 @@ pub struct SceneOptions {
     pub max_roll_rad: f64,
     /// Displacement of the principal point from the image's centre, right and down, as a share of the image width.
     pub principal_point: [f64; 2],
-    /// Radial distortion, `x_d = x_n (1 + k1 r^2)` with `x_n` and its length `r` in normalised camera coordinates (focal
-    /// lengths from the principal point); negative: a barrel. Cameras for which the image of the scene would fold are
-    /// drawn again.
+    /// Radial distortion, `x_d = x_n (1 + k1 r^2)` with `x_n` and its length `r` in normalised camera coordinates
+    /// (focal lengths from the principal point); negative: a barrel. Cameras for which the image of the scene would
+    /// fold are drawn again.
     pub radial_k1: f64,
     /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
     pub zoom: f64,

@@ -21,8 +21,8 @@ pub enum Shape {
     /// Uniform in `[-1, 1] x [-1, 1] x [2, 4]` (paper, section 5.1).
     #[default]
     Box,
-    /// Uniform in a square of side 2 about the centre of the box, tilted in a random direction: a homography relates any
-    /// two views, and no projective reconstruction is unique.
+    /// Uniform in a square of side 2 about the centre of the box, tilted in a random direction: a homography relates
+    /// any two views, and no projective reconstruction is unique.
     Plane,
 }
 

@@ -20,8 +20,8 @@ pub struct Run {
     pub stderr: String,
 }
 
-/// The program with these arguments, free of this shell's settings. `SCPSFM_PROGRAM` names another build of it, such as an
-/// optimised one where figures are wanted.
+/// The program with these arguments, free of this shell's settings. `SCPSFM_PROGRAM` names another build of it, such as
+/// an optimised one where figures are wanted.
 pub fn program<S: AsRef<std::ffi::OsStr>>(arguments: impl IntoIterator<Item = S>) -> Command {
     let path = std::env::var_os("SCPSFM_PROGRAM").unwrap_or_else(|| env!("CARGO_BIN_EXE_scpsfm").into());
     let mut command = Command::new(path);

@@ -3,8 +3,8 @@
 use std::io::Write;
 use std::process::Command;
 
-/// An interpreter that has these modules. Without one the test is skipped, loudly, unless `SCPSFM_REQUIRE_PYTHON` forbids
-/// it.
+/// An interpreter that has these modules. Without one the test is skipped, loudly, unless `SCPSFM_REQUIRE_PYTHON`
+/// forbids it.
 pub fn python(what: &str, modules: &str) -> Option<String> {
     let python = std::env::var("SCPSFM_PYTHON").unwrap_or_else(|_| "python3".into());
     let found = Command::new(&python).args(["-c", &format!("import {modules}")]).output();

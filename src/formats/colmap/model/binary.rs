@@ -37,8 +37,8 @@ pub(super) fn cameras(reader: impl BufRead, file: &str, length: Option<u64>, ima
     bytes.end()
 }
 
-/// Reads `images.bin`: id u32, rotation 4 f64, translation 3 f64, camera u32, name up to a zero, then each keypoint: x, y
-/// f64, point u64. Returns the keypoints that belong to a point.
+/// Reads `images.bin`: id u32, rotation 4 f64, translation 3 f64, camera u32, name up to a zero, then each keypoint: x,
+/// y f64, point u64. Returns the keypoints that belong to a point.
 pub(super) fn images(
     reader: impl BufRead,
     file: &str,

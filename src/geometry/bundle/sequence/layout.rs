@@ -135,8 +135,8 @@ impl Layout {
         layout.couple(sequence, pace).then_some(layout)
     }
 
-    /// Finds the blocks that each free point touches and gives them their places among the couplings; `false` when it was
-    /// stopped.
+    /// Finds the blocks that each free point touches and gives them their places among the couplings; `false` when it
+    /// was stopped.
     fn couple(&mut self, sequence: &Sequence, pace: &mut Pace) -> bool {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
@@ -216,8 +216,8 @@ impl Layout {
         self.seen_starts[points.start]..self.seen_starts[points.end]
     }
 
-    /// Observations of each view, ascending: their starts and, one view after the other, where the observations are among
-    /// all.
+    /// Observations of each view, ascending: their starts and, one view after the other, where the observations are
+    /// among all.
     pub fn seen_by_view(&self, views: usize) -> (Vec<usize>, Vec<u32>) {
         let mut starts = vec![0; views + 1];
         self.seen.iter().for_each(|seen| starts[seen.view + 1] += 1);

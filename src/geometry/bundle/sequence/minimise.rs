@@ -24,8 +24,8 @@ const MIN_DAMPING: f64 = 1e-14;
 const GROWTH_UP: f64 = 2.0;
 
 /// Factor by which a step may raise the cost for its points to be settled. A chain of 100 views bent by half a radian
-/// takes 14 steps with 2, 9 with 10; but from a start with cameras a quarter of the depth away, points settle into false
-/// places with 10 and do not with 2.
+/// takes 14 steps with 2, 9 with 10; but from a start with cameras a quarter of the depth away, points settle into
+/// false places with 10 and do not with 2.
 const SETTLE_WITHIN: f64 = 2.0;
 
 /// Minimises the reprojection error over what is free.
@@ -35,9 +35,9 @@ const SETTLE_WITHIN: f64 = 2.0;
 /// The cost contains what the priors of groups with free intrinsics add, and never rises. What is held stays as it is,
 /// to the bit; what is found does not depend on the threads. One iteration costs time linear in the observations times
 /// the length of their tracks, and what the factorisation takes: linear in the views where each is connected with a
-/// bounded number of others. `run.stop` is asked every few milliseconds but not within a factorisation; a stopped, stuck
-/// or degenerate problem keeps its last good
-/// state. The costs of one that was stopped before they were known are infinite.
+/// bounded number of others. `run.stop` is asked every few milliseconds but not within a factorisation; a stopped,
+/// stuck or degenerate problem keeps its last good state. The costs of one that was stopped before they were known are
+/// infinite.
 ///
 /// # Pitfall
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
@@ -191,8 +191,9 @@ impl<'a> Descent<'a> {
 
 /// Moves poses and intrinsics from where they are in `from`.
 ///
-/// Cameras turn about their own centres, `x -> dR x + dt` in camera coordinates: about the origin of the world, a camera
-/// far from it could turn only against the damping of its lever. `false` where a scale vanishes or nothing finite is left.
+/// Cameras turn about their own centres, `x -> dR x + dt` in camera coordinates: about the origin of the world, a
+/// camera far from it could turn only against the damping of its lever. `false` where a scale vanishes or nothing
+/// finite is left.
 pub(super) fn retract(moved: &mut Sequence, from: &Sequence, layout: &Layout, step: &[f64]) -> bool {
     let mut possible = true;
     let unknowns = &layout.unknowns;

@@ -71,7 +71,8 @@ pub(super) struct Cameras {
     pub values: Vec<f64>,
     /// Half the gradient of the cost.
     pub gradient: Vec<f64>,
-    /// Values and unknowns that belong to the poses before each view's, and to all of them: the groups' come after these.
+    /// Values and unknowns that belong to the poses before each view's, and to all of them: the groups' come after
+    /// these.
     before: Vec<(usize, usize)>,
     /// Observations of each view: starts, and one view after the other where they are among all.
     by_view: (Vec<usize>, Vec<u32>),
@@ -127,8 +128,8 @@ impl Normal {
 
     /// Linearises at this state; `false` when it was stopped.
     ///
-    /// Batch by batch: first the rows of the Jacobian and what each point has to itself, then every view adds up its own
-    /// rows, in the order of the observations.
+    /// Batch by batch: first the rows of the Jacobian and what each point has to itself, then every view adds up its
+    /// own rows, in the order of the observations.
     pub fn fill(
         &mut self,
         sequence: &Sequence,

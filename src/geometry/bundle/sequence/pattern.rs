@@ -29,7 +29,8 @@ pub(super) struct Place {
 }
 
 impl Pattern {
-    /// Blocks that a point touches together, and the pose of every view with the intrinsics of its group. `None` when it was stopped.
+    /// Blocks that a point touches together, and the pose of every view with the intrinsics of its group. `None` when
+    /// it was stopped.
     ///
     /// * `pairs`: pose block and group block of the views where both are free
     pub fn new(layout: &Layout, pairs: impl Iterator<Item = (usize, usize)>, pace: &mut Pace) -> Option<Self> {

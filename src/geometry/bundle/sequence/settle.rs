@@ -2,8 +2,8 @@
 //! Szeliski, Kweon 2012, "Pushing the envelope of modern methods for bundle adjustment").
 //!
 //! Long chains of views bend at next to no cost. Cameras and points that follow a bend along its tangent are stretched
-//! across its axis and not along it, which costs by the square of the angle; points that are put where the moved cameras
-//! see them leave the third power.
+//! across its axis and not along it, which costs by the square of the angle; points that are put where the moved
+//! cameras see them leave the third power.
 
 use nalgebra::Vector3;
 

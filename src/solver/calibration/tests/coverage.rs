@@ -6,8 +6,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::*;
 
-/// What is unknown of the lens, beside its focal length: largest displacement of a coordinate of the principal point, in
-/// image sides, and of `k1`.
+/// What is unknown of the lens, beside its focal length: largest displacement of a coordinate of the principal point,
+/// in image sides, and of `k1`.
 #[derive(Debug, Clone, Copy)]
 struct Lens {
     displaced: f64,

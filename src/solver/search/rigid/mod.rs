@@ -27,18 +27,18 @@ use crate::geometry::{Camera, Point};
 const PAIR_TOLERANCE: f64 = 3.0;
 /// The same as a share of the depth that the grid's steps leave to exact pairs.
 const GRID_TOLERANCE: f64 = 0.005;
-/// Spreads of relative depths that are believed: below, the scene is a plane that faces all cameras, which must not make
-/// chance look impossible; above, depths mean nothing.
+/// Spreads of relative depths that are believed: below, the scene is a plane that faces all cameras, which must not
+/// make chance look impossible; above, depths mean nothing.
 const DEPTH_SPREADS: (f64, f64) = (1e-3, 0.5);
-/// Best focal lengths and best-connected tracks of each that a consensus is grown from: the right one was among the first
-/// on every scene that was looked at; the others are for strong noise.
+/// Best focal lengths and best-connected tracks of each that a consensus is grown from: the right one was among the
+/// first on every scene that was looked at; the others are for strong noise.
 const FOCALS_GROWN: usize = 3;
 const CORES_GROWN: usize = 4;
 /// Noise that a core is grown at, in units of that its pairs were rigid at: strict pairs keep chance out of a core, a
 /// wide gate lets the right tracks in.
 const GROWN_NOISE: [f64; 3] = [1.0, 2.0, 4.0];
-/// Logarithm of the expected number of false alarms at which the search ends: far beyond what decides, for a better core
-/// costs little.
+/// Logarithm of the expected number of false alarms at which the search ends: far beyond what decides, for a better
+/// core costs little.
 const LN_NEVER_CHANCE: f64 = -100.0;
 /// Tracks that leave six unknowns a view determined, with one to verify.
 pub const LEAST_TRACKS: usize = 4;
@@ -82,7 +82,8 @@ impl Rigid {
         self.points.iter().map(|point| point.push(1.0)).collect()
     }
 
-    /// Constraints that the inliers leave over: three coordinates a view and track, less poses, points and focal length.
+    /// Constraints that the inliers leave over: three coordinates a view and track, less poses, points and focal
+    /// length.
     fn constraints(&self) -> f64 {
         let (views, inliers) = (self.poses.len(), self.inlier_count());
         (3 * views * inliers) as f64 - (6 * views + 3 * inliers) as f64 + 5.0
@@ -98,8 +99,8 @@ impl Rigid {
         (constraints > 0.0).then(|| (self.inlier_cost() / constraints).sqrt()).filter(|noise| noise.is_finite())
     }
 
-    /// Natural logarithm of the expected number of false alarms; see `Consensus::ln_false_alarms_by_residuals`. Depths count as
-    /// third coordinates.
+    /// Natural logarithm of the expected number of false alarms; see `Consensus::ln_false_alarms_by_residuals`. Depths
+    /// count as third coordinates.
     ///
     /// * `spread`: standard deviation of unstructured coordinates, image points and relative depths together
     pub fn ln_false_alarms(&self, spread: f64) -> f64 {

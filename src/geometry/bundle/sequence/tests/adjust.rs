@@ -200,7 +200,8 @@ fn a_weight_counts_like_so_many_observations() {
     assert!(cost > 1.1 * unweighted, "{cost} {unweighted}");
 }
 
-/// Several batches, groups, held views and points, a point twice in a view: sums come to the same, whoever adds them up.
+/// Several batches, groups, held views and points, a point twice in a view: sums come to the same, whoever adds them
+/// up.
 #[test]
 fn threads_change_nothing_to_the_last_bit() {
     let (mut truth, mut sightings) = chain(5, 24, 180, 5, 0.002);
