@@ -46,7 +46,7 @@ pub struct Tail {
 }
 
 impl Tail {
-    /// Natural logarithm of the probability of a squared residual of at most `x`, which is below what was measured.
+    /// Natural logarithm of the probability of a squared residual of at most `x`; 0, a bound, beyond what was measured.
     ///
     /// It falls with the power of `x` that a track leaves constraints; the incomplete gamma function has a factor
     /// `exp(-x / 2 variance)` beside it. The variance is the smaller one of the image points' and of the one that has
@@ -56,6 +56,9 @@ impl Tail {
         let least = chi_square_quantile(self.constraints, MEASURED_QUANTILE).min(self.constraints);
         let measured = (self.measured / self.variance).clamp(least, self.constraints);
         let share = x / self.measured;
+        if share > 1.0 {
+            return 0.0;
+        }
         MEASURED_SHARE.ln() + 0.5 * self.constraints * share.ln() + 0.5 * measured * (1.0 - share)
     }
 }
@@ -217,6 +220,13 @@ mod tests {
             let by_gate = ln_as_small(&squared, &tail, low, low);
             assert!((by_gate - 0.005f64.ln()).abs() < 0.2, "{constraints} constraints: {by_gate}");
         }
+    }
+
+    #[test]
+    fn beyond_what_was_measured_a_tail_is_no_bound_but_one() {
+        let tail = Tail { constraints: 3.0, variance: 1.0, measured: 0.03 };
+        assert_eq!(tail.ln_below(0.03), MEASURED_SHARE.ln());
+        assert!(tail.ln_below(0.02) < MEASURED_SHARE.ln() && tail.ln_below(0.04) == 0.0);
     }
 
     /// Four that are all admitted and leave so little on average: as often as said at most, and not much more seldom.
