@@ -4,8 +4,8 @@
 //! first-level cache, where a tape would take a pass over the whole array for every operation (a test compares with
 //! burn's). Arrays are features x columns, row by row.
 //!
-//! A normalised layer is `Y = max(0, s ⊙ R + b)` with `R = W X`, `s = gain / sqrt(var(R) + ε)`, all rows of X of mean
-//! 0. With `D` the derivative with respect to `s ⊙ R + b` (0 where the maximum is 0) and `p = Σ_j D_j R_j` along rows:
+//! A normalised layer is `Y = max(0, s ⊙ R + b)` with `R = W X`, `s = gain / sqrt(var(R) + ε)`, all rows of X of zero
+//! mean. With `D` the derivative with respect to `s ⊙ R + b` (0 where the maximum is 0) and `p = Σ_j D_j R_j` along rows:
 //! `db = Σ_j D_j`, `dgain = p / sqrt(var + ε)`, `dR = s ⊙ D - s p / (m (var + ε)) ⊙ R`, `dW = dR Xᵀ`, `dX = Wᵀ dR`.
 
 use burn::tensor::{Device, Tensor};

@@ -3,12 +3,10 @@
 //!
 //! * `observations.csv`: `view,track,x,y`, whole numbers from 0 as ids, pixels
 //! * `meta.json`: `width` and `height` (or `image_width` and `image_height`, or `image_size`: `[width, height]`) and
-//!   `K`, the
-//!   calibration in pixels: 3×3, or a list of such, one a view
+//!   `K`, the calibration in pixels: 3×3, or a list of such, one a view
 //! * `labels.csv`: a header with `view`, `track` and `inlier` (0 or 1) in any order, one line an observation
 //! * `cameras.json`, if there is one: `P`, a 3×4 matrix or null for each view, and `estimated`, true where they were
-//!   found
-//!   from these tracks rather than measured
+//!   found from these tracks rather than measured
 
 use std::collections::HashMap;
 use std::fs;

@@ -4,8 +4,7 @@
 //! * `focal`: in pixels, or null
 //! * `inlier`: 0 or 1 for each track id from 0 on; or `observation_inlier`: the same for each line of its input
 //! * where it has them: `sigma_log_focal`, `k1`, `reproj` (mean) and `rms` in pixels, `grade`, `warnings` (texts),
-//!   `centres`
-//!   (`[x, y, z]` or null for each view id from 0 on), `error` (a text, beside an empty answer)
+//!   `centres` (`[x, y, z]` or null for each view id from 0 on), `error` (a text, beside an empty answer)
 
 use std::collections::BTreeMap;
 use std::fs;

@@ -10,8 +10,7 @@
 //! 2. A pair whose agreement may be chance has no vote; of the others each match has a likelihood ratio, right against
 //!    anywhere.
 //! 3. The ratios of a track's pairs, and what else is known of its observations, give the odds of each of them and of
-//!   the
-//!    track ([`chain`]): one wrong observation spoils all pairs that it is in, and only those.
+//!    the track ([`chain`]): one wrong observation spoils all pairs that it is in, and only those.
 //!
 //! # Pitfall
 //! What slides along its epipolar lines has the votes of all pairs whose epipolar planes agree: with all centres on one
