@@ -12,7 +12,7 @@ use std::time::SystemTime;
 use tokio::sync::oneshot;
 
 use super::course::{Wait, stop_token};
-use super::worker::{Assignment, Begun, Heard, Opening, Worker};
+use super::worker::{Assignment, Began, Heard, Opening, Worker};
 use super::{Inner, Phase, locked};
 use crate::domain::job::{Job, JobName};
 use crate::domain::{StopReason, StopToken};
@@ -31,7 +31,7 @@ pub(super) struct Ahead {
     pub reserved: Arc<Reserved>,
     pub stop: Revocable,
     /// Told once the worker begins; dropped where it finds that the job is another's by now, or nobody's.
-    pub begun: oneshot::Receiver<Begun>,
+    pub begun: oneshot::Receiver<Began>,
     pub heard: Heard,
 }
 

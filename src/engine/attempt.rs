@@ -9,7 +9,7 @@ use super::Inner;
 use super::ahead::Ahead;
 use super::course::{Course, End, Leasing, Wait};
 use super::observe::Attempt;
-use super::worker::{self, Verdict, Worker};
+use super::worker::{Began, Verdict, Worker};
 use crate::store::Claimed;
 
 /// A job that has all that a worker needs.
@@ -68,7 +68,7 @@ impl Ready {
             }
             Self::Foreseen(ahead) => {
                 let Ahead { job, lease, wait, reserved, stop, begun, heard } = *ahead;
-                let Ok(worker::Begun { span, at, time }) = begun.await else { return Ran::Gone };
+                let Ok(Began { span, at, time }) = begun.await else { return Ran::Gone };
                 // Where another slot has it by now, what the worker has begun is stopped.
                 let Some(mut course) = Course::foreseen(job, lease, wait, stop.token().clone(), reserved) else {
                     return Ran::Gone;

@@ -43,11 +43,11 @@ pub(super) enum Opening {
     Begun(Attempt),
     /// Once the worker is free, if the job is still to be had: the one who assigned it is told, and is to lease it
     /// then.
-    Foreseen { reserved: Weak<Reserved>, trace_parent: Option<String>, tell: oneshot::Sender<Begun> },
+    Foreseen { reserved: Weak<Reserved>, trace_parent: Option<String>, tell: oneshot::Sender<Began> },
 }
 
 /// That a worker began with a job that was foreseen.
-pub(super) struct Begun {
+pub(super) struct Began {
     /// The attempt's.
     pub span: Span,
     pub at: Instant,
@@ -147,8 +147,8 @@ impl Opening {
                     return None;
                 }
                 let attempt = Attempt::begin(name, number, trace_parent.as_deref());
-                let begun = Begun { span: attempt.span().clone(), at: Instant::now(), time: SystemTime::now() };
-                tell.send(begun).is_ok().then_some(attempt)
+                let began = Began { span: attempt.span().clone(), at: Instant::now(), time: SystemTime::now() };
+                tell.send(began).is_ok().then_some(attempt)
             }
         }
     }

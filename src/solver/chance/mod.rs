@@ -51,11 +51,12 @@ const USUAL_SIGMAS: f64 = 2.0;
 ///
 /// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]
 pub fn ln_false_alarms(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> f64 {
-    let by_residuals = consensus.ln_false_alarms_by_residuals(spread);
+    let distinct = consensus.distinct_count(spread);
+    let by_residuals = consensus.ln_by_residuals(spread, distinct);
     if by_residuals >= LN_ACCEPTABLE {
         return by_residuals;
     }
-    let by_cameras = by_cameras(block, consensus, spread, stop);
+    let by_cameras = by_cameras(block, consensus, distinct, spread, stop);
     if by_cameras < LN_BY_CAMERAS { by_residuals } else { by_cameras.max(LN_ACCEPTABLE) }
 }
 
@@ -67,8 +68,10 @@ pub fn ln_false_alarms(block: &CompleteBlock, consensus: &Consensus, spread: f64
 ///
 /// `a` is the probability to be admitted at most, and less where the gate is so wide that it tells nothing: see
 /// [`RandomTracks::ln_as_good`].
-fn by_cameras(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> f64 {
-    let (tracks, inliers) = (consensus.inlier.len(), consensus.distinct_count(spread));
+///
+/// * `inliers`: that differ, see [`Consensus::distinct_count`]
+fn by_cameras(block: &CompleteBlock, consensus: &Consensus, inliers: usize, spread: f64, stop: &StopToken) -> f64 {
+    let tracks = consensus.inlier.len();
     if inliers < LEAST_INLIERS {
         return f64::INFINITY;
     }
@@ -102,8 +105,12 @@ impl Consensus {
     /// 2004, a-contrario): all subsets of that size, times the probability that unstructured coordinates of standard
     /// deviation `spread` leave residuals this small in all constraints that the model does not absorb.
     pub fn ln_false_alarms_by_residuals(&self, spread: f64) -> f64 {
+        self.ln_by_residuals(spread, self.distinct_count(spread))
+    }
+
+    /// The same, of so many inliers that differ.
+    fn ln_by_residuals(&self, spread: f64, inliers: usize) -> f64 {
         let (views, tracks) = (self.cameras.len(), self.inlier.len());
-        let inliers = self.distinct_count(spread);
         let constraints = grow::constraint_count(views, inliers);
         let Some(rms) = self.rms() else { return f64::INFINITY };
         if constraints <= 0.0 {

@@ -10,9 +10,8 @@ use rusqlite::types::Value as Cell;
 use rusqlite::{OpenFlags, Statement as Prepared};
 
 use super::{BUSY_TIMEOUT, LOG_BYTES};
-use crate::domain::job::JobName;
 use crate::store::Error;
-use crate::store::sql::{self, Change, Connection, Row, Statement, Value};
+use crate::store::sql::{self, Connection, Row, Statement, Value};
 
 /// Statements that stay prepared: more than there are.
 const PREPARED: usize = 128;
@@ -84,21 +83,9 @@ fn bind(prepared: &mut Prepared<'_>, values: &[Value]) -> Result<(), Error> {
 
 impl Connection for WriteConnection {
     type Row = WrittenRow;
-    // It has the database to itself.
-    const FOR_UPDATE: &'static str = "";
-    const SKIP_LOCKED: &'static str = "";
-    const WRITES_ALONE: bool = true;
 
     async fn rows(&mut self, statement: Statement) -> Result<Vec<WrittenRow>, Error> {
         self.run(&statement)
-    }
-
-    async fn lock_admission(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    async fn tell(&mut self, _change: Change, _job: &JobName) -> Result<(), Error> {
-        Ok(())
     }
 }
 

@@ -22,9 +22,8 @@ use sqlx::sqlite::{
     SqliteRow, SqliteSynchronous,
 };
 
-use super::sql::{self, Change, Connection, Database, Moves, Operation, Size, Statement, Step};
+use super::sql::{self, Connection, Database, Moves, Operation, Size, Statement, Step};
 use super::{Error, Hint};
-use crate::domain::job::JobName;
 use connection::WriteConnection;
 use reserve::Reserve;
 use writer::Writer;
@@ -122,7 +121,7 @@ fn options(database: &Path) -> SqliteConnectOptions {
         // Only takes effect in a new file; lets retention hand space back.
         .auto_vacuum(SqliteAutoVacuum::Incremental)
         .journal_mode(SqliteJournalMode::Wal)
-        // What was acknowledged survives a power cut, not only a crash of the process.
+        // As what is written afterwards.
         .synchronous(SqliteSynchronous::Full)
         .foreign_keys(true)
         .pragma("journal_size_limit", LOG_BYTES.to_string())
@@ -222,21 +221,9 @@ fn lock(directory: &Path) -> Result<File, Error> {
 
 impl Connection for SqliteConnection {
     type Row = SqliteRow;
-    // It only reads.
-    const FOR_UPDATE: &'static str = "";
-    const SKIP_LOCKED: &'static str = "";
-    const WRITES_ALONE: bool = true;
 
     async fn rows(&mut self, statement: Statement) -> Result<Vec<SqliteRow>, Error> {
         sql::run::<sqlx::Sqlite>(self, statement).await
-    }
-
-    async fn lock_admission(&mut self) -> Result<(), Error> {
-        Ok(())
-    }
-
-    async fn tell(&mut self, _change: Change, _job: &JobName) -> Result<(), Error> {
-        Ok(())
     }
 }
 
