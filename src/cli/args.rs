@@ -45,14 +45,23 @@ pub struct PageArgs {
     /// The page that follows another
     #[arg(long, value_name = "TOKEN", default_value = "")]
     pub page_token: String,
+
+    /// Every page from there on
+    #[arg(long)]
+    pub all: bool,
 }
 
 impl PageArgs {
-    /// Says on stderr how to ask for the next page, where there is one.
-    pub fn tell_next(next_page_token: &str) {
-        if !next_page_token.is_empty() {
-            eprintln!("more: --page-token {next_page_token}");
+    /// Goes on to the page after one, where it is wanted; says on stderr how to ask for it, where it is not.
+    pub fn next(&mut self, next_page_token: String) -> bool {
+        if next_page_token.is_empty() {
+            return false;
         }
+        if !self.all {
+            eprintln!("more: --page-token {next_page_token}, or --all");
+        }
+        self.page_token = next_page_token;
+        self.all
     }
 }
 

@@ -1,4 +1,4 @@
-//! `scpsfm cancel`: stops a job.
+//! `scpsfm cancel`: stops jobs.
 
 use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
@@ -7,31 +7,34 @@ use super::job_view::{self, GivenName};
 const EXAMPLES: &str = "\
 Examples:
   scpsfm cancel tenants/default/jobs/a1b2
-  scpsfm list --state queued --json | jq -r .name | xargs -n 1 scpsfm cancel";
+  scpsfm list --all --state queued --json | jq -r .name | xargs -r scpsfm cancel";
 
-/// Stop a job
+/// Stop jobs
 ///
 /// A queued job is cancelled at once, a running one within 200 ms or one network iteration; one that has ended stays as
-/// it is. Prints the job as it stands then.
+/// it is. Prints each job as it stands then. Stops at the first that cannot be cancelled.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
-    /// The job's name, or the last part of it
-    #[arg(value_name = "NAME", value_parser = GivenName::parse)]
-    pub name: GivenName,
+    /// The jobs' names, or the last parts of them
+    #[arg(value_name = "NAME", required = true, value_parser = GivenName::parse)]
+    pub names: Vec<GivenName>,
 
     #[command(flatten)]
     pub server: ServerArgs,
 
-    /// The job as JSON
+    /// Each job as JSON
     #[arg(long)]
     pub json: bool,
 }
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
-    let name = args.name.of(&args.server.access)?;
-    let job = args.server.connect().await?.cancel(&name).await?;
-    job_view::print_job(&job, args.json)?;
+    // All of them are named before the first is stopped.
+    let names = args.names.iter().map(|name| name.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
+    let mut client = args.server.connect().await?;
+    for name in names {
+        job_view::print_job(&client.cancel(&name).await?, args.json)?;
+    }
     Ok(Exit::Done)
 }

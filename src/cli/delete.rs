@@ -1,5 +1,8 @@
 //! `scpsfm delete`: removes jobs that have ended, and uploaded inputs.
 
+use std::collections::HashSet;
+use std::hash::Hash;
+
 use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
 use super::job_view::GivenName;
@@ -10,7 +13,7 @@ const EXAMPLES: &str = "\
 Examples:
   scpsfm delete a1b2 c3d4
   scpsfm delete --input 123e4567-e89b-42d3-a456-426614174000
-  scpsfm list --state failed --json | jq -r .name | xargs scpsfm delete";
+  scpsfm list --all --state failed --json | jq -r .name | xargs -r scpsfm delete";
 
 /// Delete jobs that have ended, and uploaded inputs
 ///
@@ -34,9 +37,11 @@ pub struct Args {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
-    // All of them are named before the first is gone.
-    let names = args.names.iter().map(|name| name.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
-    let inputs = args.inputs.iter().map(|given| given.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
+    // All of them are named before the first is gone, and one that is named twice goes once.
+    let mut names = args.names.iter().map(|name| name.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
+    let mut inputs = args.inputs.iter().map(|given| given.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
+    keep_first(&mut names);
+    keep_first(&mut inputs);
     let mut client = args.server.connect().await?;
     for name in names {
         client.delete(&name).await?;
@@ -47,4 +52,10 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         print(&name.to_string())?;
     }
     Ok(Exit::Done)
+}
+
+/// Leaves out what comes again.
+fn keep_first<T: Clone + Eq + Hash>(names: &mut Vec<T>) {
+    let mut seen = HashSet::new();
+    names.retain(|name| seen.insert(name.clone()));
 }

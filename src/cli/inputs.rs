@@ -10,11 +10,11 @@ use crate::rpc::proto;
 const EXAMPLES: &str = "\
 Examples:
   scpsfm inputs
-  scpsfm inputs --json | jq -r .name | xargs -n1 scpsfm delete --input";
+  scpsfm inputs --all --json | jq -r .name | xargs -n 1 scpsfm delete --input";
 
 /// List uploaded inputs, the newest first
 ///
-/// Prints one page; where there are more, the token of the next page goes to stderr. Uploads that are not finished are
+/// Prints one page, or all; where there are more, the token of the next page goes to stderr. Uploads that are not finished are
 /// not listed. Bytes are those that were uploaded, which count against what the server lets a tenant have.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
@@ -31,14 +31,17 @@ pub struct Args {
 }
 
 /// Runs the command.
-pub async fn run(args: Args) -> Result<Exit, Failure> {
+pub async fn run(mut args: Args) -> Result<Exit, Failure> {
     let mut client = args.server.connect().await?;
-    let page = client.list_inputs(args.page.page_size, &args.page.page_token).await?;
-    for input in &page.inputs {
-        print(&if args.json { as_json(input) } else { line(input) })?;
+    loop {
+        let page = client.list_inputs(args.page.page_size, &args.page.page_token).await?;
+        for input in &page.inputs {
+            print(&if args.json { as_json(input) } else { line(input) })?;
+        }
+        if !args.page.next(page.next_page_token) {
+            return Ok(Exit::Done);
+        }
     }
-    PageArgs::tell_next(&page.next_page_token);
-    Ok(Exit::Done)
 }
 
 fn created(input: &proto::Input) -> String {

@@ -12,11 +12,11 @@ Examples:
   scpsfm list
   scpsfm list --state queued --state running
   scpsfm list --filter 'state = QUEUED OR state = RUNNING AND labels.site = \"north\"'
-  scpsfm list --filter 'labels.site = \"north\"' --json | jq -r .name";
+  scpsfm list --all --filter 'labels.site = \"north\"' --json | jq -r .name";
 
 /// List jobs, the newest first
 ///
-/// Prints one page; where there are more, the token of the next page goes to stderr.
+/// Prints one page, or all; where there are more, the token of the next page goes to stderr.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
@@ -65,14 +65,17 @@ impl From<StateArg> for JobState {
 }
 
 /// Runs the command.
-pub async fn run(args: Args) -> Result<Exit, Failure> {
+pub async fn run(mut args: Args) -> Result<Exit, Failure> {
     let mut client = args.server.connect().await?;
-    let page = client.list(&filter(&args), args.page.page_size, &args.page.page_token).await?;
-    for job in &page.jobs {
-        print(&if args.json { job_view::job_json(job).to_string() } else { job_view::job_line(job) })?;
+    loop {
+        let page = client.list(&filter(&args), args.page.page_size, &args.page.page_token).await?;
+        for job in &page.jobs {
+            print(&if args.json { job_view::job_json(job).to_string() } else { job_view::job_line(job) })?;
+        }
+        if !args.page.next(page.next_page_token) {
+            return Ok(Exit::Done);
+        }
     }
-    PageArgs::tell_next(&page.next_page_token);
-    Ok(Exit::Done)
 }
 
 /// States and filter together.

@@ -465,6 +465,6 @@ fn submit_says_that_it_waits_for_a_server_that_drains_and_why() {
     };
     assert_eq!(
         told,
-        format!("waiting up to 15 s: {}: the server is draining; try another or come back\n", serving.grpc)
+        format!("waiting up to 30 s: {}: the server is draining; try another or come back\n", serving.grpc)
     );
 }

@@ -6,9 +6,11 @@ use std::time::Duration;
 use tokio::time::{Instant, timeout_at};
 use tonic::Status;
 
-/// The pauses, in milliseconds: a hiccup is over at once, a restart of a server takes some seconds, and after a quarter
-/// of a minute without a sign of life a person should know.
-const PAUSES_MS: [u64; 8] = [100, 200, 400, 800, 1_500, 3_000, 4_000, 5_000];
+use super::error;
+
+/// The pauses, in milliseconds: a hiccup is over at once, a server that is restarted drains for up to 20 s unless it is
+/// told otherwise, and after half a minute without a sign of life a person should know.
+const PAUSES_MS: [u64; 11] = [100, 200, 400, 800, 1_500, 3_000, 4_000, 5_000, 5_000, 5_000, 5_000];
 
 /// What is left of the time for the last try, so that it is not over before it begins.
 const LAST_TRY: Duration = Duration::from_secs(1);
@@ -31,6 +33,10 @@ pub struct Backoff {
 struct Trouble {
     /// When it counts as lasting.
     end: Instant,
+    /// What its first try came to.
+    first: Status,
+    /// Whether a try of it may have done what it was for, its answer lost.
+    may_be_done: bool,
     /// What the latest try came to.
     last: Status,
 }
@@ -68,9 +74,25 @@ impl Backoff {
             trouble.end += lived;
         }
         let first = self.trouble.is_none();
-        let end = self.trouble.as_ref().map_or_else(|| Instant::now() + Self::TOTAL, |trouble| trouble.end);
-        self.trouble = Some(Trouble { end, last: status.clone() });
+        let trouble = self.trouble.get_or_insert_with(|| Trouble {
+            end: Instant::now() + Self::TOTAL,
+            first: status.clone(),
+            may_be_done: false,
+            last: status.clone(),
+        });
+        trouble.last = status.clone();
+        trouble.may_be_done |= error::may_be_done(status);
         first
+    }
+
+    /// What the trouble began with.
+    pub fn first(&self) -> Option<&Status> {
+        self.trouble.as_ref().map(|trouble| &trouble.first)
+    }
+
+    /// Whether a call may have done what it was for, though every answer was lost.
+    pub fn may_be_done(&self) -> bool {
+        self.trouble.as_ref().is_some_and(|trouble| trouble.may_be_done)
     }
 
     /// Waits for the next try; `false` when there is none.
@@ -168,7 +190,7 @@ mod tests {
     fn tries_that_take_long_do_not_make_the_wait_longer_than_it_says() {
         let total = Backoff::TOTAL.as_secs_f64();
         let (seconds, tries) = given_up_after(Duration::ZERO);
-        assert!((0.9 * total..=total).contains(&seconds) && tries == 9, "{seconds} s, {tries} tries");
+        assert!((0.9 * total..=total).contains(&seconds) && tries == PAUSES_MS.len() + 1, "{seconds} s, {tries} tries");
         let (seconds, tries) = given_up_after(Duration::from_secs(3));
         assert!((0.9 * total..=total).contains(&seconds) && tries >= 3, "{seconds} s, {tries} tries");
     }

@@ -37,7 +37,7 @@ impl Client {
                     let jobs = created.into_inner().jobs.into_iter().map(convert::job::from_wire);
                     return Ok(jobs.collect::<Result<_, _>>()?);
                 }
-                Err(status) => self.pause(&mut backoff, status).await?,
+                Err(status) => self.pause_to_store(&mut backoff, status).await?,
             }
         }
     }

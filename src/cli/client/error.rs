@@ -1,6 +1,7 @@
 //! What can go wrong with a call, in sentences.
 
 use std::error::Error as _;
+use std::io;
 
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
@@ -114,6 +115,28 @@ impl Error {
         }
     }
 
+    /// Says what the trouble began with, where that is not what it ended with: a server that goes down says so once,
+    /// and afterwards the system says no more than that nobody is there.
+    pub(super) fn begun_with(self, first: &Error) -> Self {
+        match self {
+            Error::Unavailable(last) if *first != Error::Unavailable(last.clone()) => {
+                Error::Unavailable(format!("{last}; before that: {first}"))
+            }
+            same => same,
+        }
+    }
+
+    /// Says that jobs may have been stored, whose answer was lost.
+    pub(super) fn or_stored(self) -> Self {
+        match self {
+            Error::Unavailable(words) => Error::Unavailable(format!(
+                "{words}\nit may have been stored, the answer lost: `scpsfm list` shows it. With --request-id ID a \
+                 command can be repeated and stores once"
+            )),
+            same => same,
+        }
+    }
+
     /// Says how to name a tenant, where the server knows no such one, or nothing of this name of the default one's, and
     /// the caller named none.
     pub(super) fn or_no_tenant(self, status: &Status) -> Self {
@@ -153,6 +176,19 @@ fn broke_or_ends(status: &Status) -> bool {
 /// which our server never says.
 fn was_cut(status: &Status) -> bool {
     status.code() == Code::Unknown && status.get_details_error_info().is_none()
+}
+
+/// Whether a call may have been carried out, and only its answer was lost: not where the server refused it, or nobody
+/// took the connection.
+pub(super) fn may_be_done(status: &Status) -> bool {
+    let mut cause: Option<&dyn std::error::Error> = status.source();
+    let mut reached = was_cut(status) || cause.is_some() && status.get_details_error_info().is_none();
+    while let Some(here) = cause {
+        reached &=
+            here.downcast_ref::<io::Error>().is_none_or(|error| error.kind() != io::ErrorKind::ConnectionRefused);
+        cause = here.source();
+    }
+    reached
 }
 
 /// No connection to begin with.
@@ -249,6 +285,24 @@ mod tests {
         assert_eq!(message, "track_set.x[17]: NaN is not a finite number");
         let whole = violation("settings.alpha", "is wrong".into());
         assert_eq!(whole, Violation::of("settings.alpha", "is wrong"));
+    }
+
+    #[test]
+    fn a_call_whose_answer_was_lost_may_have_been_carried_out() {
+        let broken = |kind: io::ErrorKind| Status::from_error(Box::new(io::Error::new(kind, "trouble")));
+        assert!(may_be_done(&broken(io::ErrorKind::ConnectionReset)));
+        assert!(may_be_done(&Status::unknown("stream was terminated without a final status")));
+        assert!(!may_be_done(&broken(io::ErrorKind::ConnectionRefused)), "nobody was there");
+        assert!(!may_be_done(&status::from_engine(crate::engine::Error::Draining)), "it was refused");
+    }
+
+    #[test]
+    fn what_a_trouble_began_with_is_told_where_it_says_more() {
+        let unavailable = |words: &str| Error::Unavailable(words.into());
+        let last = unavailable("refused").begun_with(&unavailable("draining"));
+        assert_eq!(last.to_string(), "refused; before that: draining");
+        assert_eq!(unavailable("refused").begun_with(&unavailable("refused")).to_string(), "refused");
+        assert_eq!(Error::Cancelled.begun_with(&unavailable("draining")), Error::Cancelled);
     }
 
     #[test]

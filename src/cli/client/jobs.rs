@@ -70,7 +70,7 @@ impl Client {
         loop {
             match backoff.within(self.jobs.create_job(request.clone())).await {
                 Ok(job) => return Ok(convert::job::from_wire(job.into_inner())?),
-                Err(status) => self.pause(&mut backoff, status).await?,
+                Err(status) => self.pause_to_store(&mut backoff, status).await?,
             }
         }
     }

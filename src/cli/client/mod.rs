@@ -126,7 +126,7 @@ impl Client {
     }
 
     /// Waits before another try, or gives up: for good reason, or after too many. Says so once each trouble, on stderr:
-    /// a quarter of a minute of silence looks like a hang.
+    /// half a minute of silence looks like a hang.
     async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
         let transient = error::is_transient(&status);
         let first = transient && backoff.failed(&status);
@@ -134,6 +134,16 @@ impl Client {
         if first {
             eprintln!("waiting up to {} s: {error}", Backoff::TOTAL.as_secs());
         }
-        if transient && backoff.pause().await { Ok(()) } else { Err(error) }
+        if transient && backoff.pause().await {
+            return Ok(());
+        }
+        let before = backoff.first().map(|status| self.error(status.clone()));
+        Err(before.map_or(error.clone(), |before| error.begun_with(&before)))
+    }
+
+    /// The same of a call that stores jobs: where it is given up, it may have been carried out all the same.
+    async fn pause_to_store(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
+        let paused = self.pause(backoff, status).await;
+        paused.map_err(|error| if backoff.may_be_done() { error.or_stored() } else { error })
     }
 }
