@@ -82,7 +82,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let settings = SolveSettings::default();
     let outcome = client::solve(&server, &scene.input, &settings, &mut on_event, interrupt.token()).await;
     progress.finish();
-    service.stop().await?;
+    service.stop(std::future::pending()).await?;
     let solution = outcome?;
     let input = LabelledInput::unlabelled(scene.input.clone(), Path::new(result_files::OBSERVATIONS));
     result_files::write(&args.out, &solution, Some(&input), &[])?;

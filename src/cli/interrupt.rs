@@ -10,8 +10,8 @@ use super::exit::{Exit, Failure};
 use crate::domain::{StopReason, StopToken};
 
 /// Signals within this time of the first are the same request: `timeout` and some supervisors signal a process and its
-/// group, so that it arrives twice.
-const SAME_REQUEST: Duration = Duration::from_secs(1);
+/// group, so that it arrives twice, with nothing in between. Nobody presses keys as fast.
+const SAME_REQUEST: Duration = Duration::from_millis(100);
 
 /// While this lives, the first SIGINT or SIGTERM cancels its token, and the second ends the process.
 pub struct Interrupt {
@@ -75,7 +75,7 @@ impl Signals {
         Ok(Self { terminate: signal(SignalKind::terminate())?, interrupt: signal(SignalKind::interrupt())? })
     }
 
-    /// Waits for one that is a second request, to be called right after the first.
+    /// Waits for one that is another request, to be called right after the one before.
     pub async fn again(&mut self) {
         let first = Instant::now();
         loop {

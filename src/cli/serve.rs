@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::ValueEnum;
+use tokio_util::sync::CancellationToken;
 
 use super::args::BackendArg;
 use super::exit::{Exit, Failure};
@@ -17,7 +18,9 @@ Configuration: defaults, then the file, then the environment, then flags; later 
 may stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__WORKERS=4. --print-config shows all keys.
 
 When it serves, two lines on stdout say where: `grpc http://...` (or https) and `metrics http://...`. SIGTERM or Ctrl-C drains: \
-new jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start.
+new jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start; \
+a second signal gives them back now. That is a clean end (0); a third ends at once (130), and running jobs have lost an \
+attempt, of which they have engine.max_attempts.
 
 Without TLS and keys it listens on loopback only. A key is 32 or more random characters (`openssl rand -hex 32`) and \
 stands for a tenant; the file of keys has lines TENANT:KEY or TENANT:sha256:HEX. Certificates and keys are read again \
@@ -226,10 +229,22 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         () = signals.next() => {}
     }
     ready.set(false);
-    tracing::info!(bound_seconds = config.engine.drain_seconds, "draining; a second signal ends at once");
+    tracing::info!(
+        bound_seconds = config.engine.drain_seconds,
+        "draining; a second signal gives running jobs back now"
+    );
+    let hurry = CancellationToken::new();
+    let impatience = async {
+        signals.again().await;
+        tracing::info!("running jobs go back to the queue; a third signal ends at once");
+        hurry.cancel();
+        signals.again().await;
+    };
     let drained = tokio::select! {
-        drained = service.stop() => drained?,
-        () = signals.again() => return Err(Failure { exit: Exit::Interrupted, message: "ended before the drain did".into() }),
+        drained = service.stop(hurry.cancelled()) => drained?,
+        () = impatience => {
+            return Err(Failure::interrupted_with("ended before the drain did: its jobs begin again at the next start"));
+        }
     };
     tracing::info!(finished = drained.finished, given_back = drained.given_back, "drained");
     metrics.shutdown().await;

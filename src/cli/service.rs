@@ -1,6 +1,8 @@
 //! The service as `serve` and `demo` run it: store, engine and gRPC server, put together from a configuration.
 
+use std::future::Future;
 use std::net::SocketAddr;
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -59,13 +61,21 @@ impl Service {
         self.server.wait().await.map_err(Failure::internal)
     }
 
-    /// Drains: health says NOT_SERVING, running jobs get their time and then go back to the queue, calls end.
+    /// Drains: health says NOT_SERVING, running jobs get their time and then go back to the queue, calls end. Once
+    /// `hurry` is over, so is the jobs' time.
     ///
     /// # Errors
     /// Why the server had failed before.
-    pub async fn stop(self) -> Result<engine::Drained, Failure> {
+    pub async fn stop(self, hurry: impl Future<Output = ()>) -> Result<engine::Drained, Failure> {
         self.server.set_draining().await;
-        let drained = self.engine.drain(self.drain_bound).await;
+        let mut drain = pin!(self.engine.drain(self.drain_bound));
+        let drained = tokio::select! {
+            drained = &mut drain => drained,
+            () = hurry => {
+                self.engine.hurry();
+                drain.await
+            }
+        };
         self.server.shutdown(CALLS_BOUND).await.map_err(Failure::internal)?;
         Ok(drained)
     }

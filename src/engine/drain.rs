@@ -87,7 +87,8 @@ impl Inner {
             let others = [crew.sweeper.take(), crew.hints.take()];
             (slots, others, std::mem::take(&mut crew.threads), crew.threads_ended.take())
         };
-        if timeout(bound, all_ended(&mut slots)).await.is_err() {
+        let in_time = timeout(bound, all_ended(&mut slots));
+        if !matches!(self.hurried.run_until_cancelled(in_time).await, Some(Ok(()))) {
             for stop in locked(&self.running).values() {
                 stop.stop(StopReason::Interrupted);
             }

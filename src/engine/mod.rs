@@ -24,6 +24,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime};
 
 use tokio::sync::{Notify, watch as channel};
+use tokio_util::sync::CancellationToken;
 
 pub use crate::store::{
     InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, StoredInput, UploadBounds,
@@ -173,6 +174,8 @@ struct Inner {
     /// Wakes the task that counts the queue.
     queue_changed: Notify,
     phase: channel::Sender<Phase>,
+    /// Cancelled where a drain's bound is to be over at once.
+    hurried: CancellationToken,
     /// Whether the last sweep found the store.
     store_reachable: channel::Sender<bool>,
     crew: Mutex<drain::Crew>,
@@ -195,6 +198,7 @@ impl Engine {
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             phase: channel::Sender::new(Phase::Open),
+            hurried: CancellationToken::new(),
             store_reachable: channel::Sender::new(true),
             crew: Mutex::default(),
             options,
@@ -315,6 +319,11 @@ impl Engine {
     /// Whether a drain has begun.
     pub fn is_draining(&self) -> bool {
         self.inner.phase() != Phase::Open
+    }
+
+    /// Ends the wait of a drain, also of one that is still to come: what runs goes back to the queue now.
+    pub fn hurry(&self) {
+        self.inner.hurried.cancel();
     }
 
     /// Stops claiming, lets what runs finish within `bound`, gives the rest back to the queue, ends the workers and

@@ -9,6 +9,7 @@ use tonic::transport::Channel;
 
 use crate::support::live::{connected, created, lasting};
 use crate::support::program::Serving;
+use crate::support::scrape::Page;
 use crate::support::server::soon;
 use crate::support::wire::{all, state_of};
 
@@ -77,6 +78,13 @@ async fn a_job_whose_server_was_killed_is_finished_once_by_the_next() {
     let server = Serving::start(&data_dir);
     let mut jobs = connected(&server).await;
     assert_exactly_once(&mut jobs, &name, before).await;
+    assert_eq!(lost_attempts(&server), 1.0);
+}
+
+/// Attempts that this server found left behind.
+fn lost_attempts(server: &Serving) -> f64 {
+    let page = tokio::task::block_in_place(|| Page::parse(&server.page("/metrics")));
+    page.value("scpsfm_attempts_lost_total{reason=\"LEASE_EXPIRED\"}")
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -94,4 +102,31 @@ async fn a_server_that_is_sent_away_gives_its_job_back_and_the_next_finishes_it(
     let server = Serving::start(&data_dir);
     let mut jobs = connected(&server).await;
     assert_exactly_once(&mut jobs, &name, before).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_that_is_told_twice_gives_its_job_back_at_once_and_no_attempt_is_lost() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let data_dir = directory.path().join("data");
+    let patient = [("SCPSFM_ENGINE__DRAIN_SECONDS", "3600")];
+    let mut server = Serving::start_with(&data_dir, &patient, std::process::Stdio::null());
+    let mut jobs = connected(&server).await;
+    let name = created(&mut jobs, lasting(ITERATIONS)).await;
+    let before = until_optimising(watch(&mut jobs, &name, 0).await).await;
+    server.running.signal(Signal::TERM);
+    let drains = async {
+        while tokio::task::block_in_place(|| server.answer("/readyz").0).contains("200") {
+            tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+        }
+        // As fast as hands are.
+        tokio::time::sleep(std::time::Duration::from_millis(200)).await;
+    };
+    soon(drains).await;
+    server.running.signal(Signal::TERM);
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success(), "the end of a drain is a clean one");
+
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    assert_exactly_once(&mut jobs, &name, before).await;
+    assert_eq!(lost_attempts(&server), 0.0);
 }
