@@ -11,6 +11,7 @@ use super::interrupt::Signals;
 use super::service::Service;
 use super::{print, prior_file};
 use crate::config::Config;
+use crate::engine::StoreState;
 use crate::telemetry;
 
 const HELP: &str = "\
@@ -216,7 +217,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
             return Ok(Exit::Done);
         }
     };
-    follow_store(&ready, service.store_reachable());
+    follow_store(&ready, service.store_state());
     ready.set(true);
     let scheme = if config.tls.files().is_some() { "https" } else { "http" };
     print(&format!("grpc {scheme}://{}", service.address()))?;
@@ -262,13 +263,14 @@ fn raise_file_limit() {
     }
 }
 
-/// Keeps readiness true to whether the store answers, as long as the service lives.
-fn follow_store(ready: &telemetry::Readiness, mut reachable: tokio::sync::watch::Receiver<bool>) {
+/// Keeps readiness true to the store, as long as the service lives.
+fn follow_store(ready: &telemetry::Readiness, mut store: tokio::sync::watch::Receiver<StoreState>) {
     let ready = ready.clone();
     tokio::spawn(async move {
         loop {
-            ready.set_store(*reachable.borrow_and_update());
-            if reachable.changed().await.is_err() {
+            let state = *store.borrow_and_update();
+            ready.set_store(state == StoreState::Away, state == StoreState::Full);
+            if store.changed().await.is_err() {
                 return;
             }
         }

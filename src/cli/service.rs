@@ -48,9 +48,9 @@ impl Service {
         self.server.address()
     }
 
-    /// Whether the store answers.
-    pub fn store_reachable(&self) -> tokio::sync::watch::Receiver<bool> {
-        self.engine.store_reachable()
+    /// What can be done with the store.
+    pub fn store_state(&self) -> tokio::sync::watch::Receiver<engine::StoreState> {
+        self.engine.store_state()
     }
 
     /// Ends only when the server fails.

@@ -192,7 +192,7 @@ impl Course {
             Ok(Some(_)) => Leasing::Leased,
             Ok(None) => Leasing::Gone,
             Err(error) => {
-                tracing::warn!(%error, "cannot claim a job");
+                self.inner.not_claimed(&error);
                 Leasing::Failed
             }
         };

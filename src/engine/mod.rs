@@ -151,6 +151,16 @@ pub struct Engine {
     inner: Arc<Inner>,
 }
 
+/// What can be done with the store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StoreState {
+    Sound,
+    /// It can be read, and what was begun ends; there is no room to begin anything.
+    Full,
+    /// It is out of reach: the server can neither take on nor tell anything.
+    Away,
+}
+
 /// Whether new work is taken on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
@@ -176,8 +186,8 @@ struct Inner {
     phase: channel::Sender<Phase>,
     /// Cancelled where a drain's bound is to be over at once.
     hurried: CancellationToken,
-    /// Whether the last sweep found the store.
-    store_reachable: channel::Sender<bool>,
+    /// What the last sweep found.
+    store_state: channel::Sender<StoreState>,
     crew: Mutex<drain::Crew>,
 }
 
@@ -199,12 +209,12 @@ impl Engine {
             queue_changed: Notify::new(),
             phase: channel::Sender::new(Phase::Open),
             hurried: CancellationToken::new(),
-            store_reachable: channel::Sender::new(true),
+            store_state: channel::Sender::new(StoreState::Sound),
             crew: Mutex::default(),
             options,
         });
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
-        observe::store_reachable(true);
+        observe::store_state(StoreState::Sound);
         inner.taken_back(&recovered);
         inner.hire(solver)?;
         inner.queue_changed();
@@ -311,9 +321,9 @@ impl Engine {
         Ok(self.inner.store.load().await?)
     }
 
-    /// Whether the store answers, as of a look a second: without it this server can neither take on nor tell anything.
-    pub fn store_reachable(&self) -> channel::Receiver<bool> {
-        self.inner.store_reachable.subscribe()
+    /// What can be done with the store, as of a look a second.
+    pub fn store_state(&self) -> channel::Receiver<StoreState> {
+        self.inner.store_state.subscribe()
     }
 
     /// Whether a drain has begun.

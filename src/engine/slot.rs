@@ -10,7 +10,7 @@ use tokio::time::{Instant, sleep, sleep_until, timeout, timeout_at};
 use super::ahead::Ahead;
 use super::attempt::{self, Ran, Ready};
 use super::worker::Worker;
-use super::{Inner, Phase, locked, observe};
+use super::{Inner, Phase, StoreState, locked, observe};
 use crate::store;
 
 /// How often a slot looks for work unasked: jobs of other processes and of a store that failed come without a wake-up.
@@ -89,7 +89,7 @@ async fn claim(inner: &Arc<Inner>) -> Option<Ready> {
             Some(attempt::begin(inner, claimed).await)
         }
         Err(error) => {
-            tracing::warn!(%error, "cannot claim a job");
+            inner.not_claimed(&error);
             None
         }
     }
@@ -145,7 +145,7 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
             () = due(&inner, counted) => {}
             _ = ticks.tick() => {
                 inner.sweep().await;
-                if !*inner.store_reachable.borrow() {
+                if *inner.store_state.borrow() == StoreState::Away {
                     // Each further question would take its time to come to nothing, and the next look is due.
                     continue;
                 }
@@ -185,22 +185,37 @@ impl Inner {
         }
     }
 
-    /// Notes whether the store answers, for those who ask whether this server is of any use.
-    fn store_answers(&self, answers: bool) {
-        let changed =
-            self.store_reachable.send_if_modified(|reachable| std::mem::replace(reachable, answers) != answers);
-        if changed {
-            observe::store_reachable(answers);
-            match answers {
-                true => tracing::info!("the store is back, this server is ready again"),
-                false => tracing::error!("the store is out of reach, this server is not ready"),
-            }
+    /// Says why no job is begun. Of a full disk the store has told, once: here it would be told every second.
+    pub(super) fn not_claimed(&self, error: &store::Error) {
+        if self.store.has_room() {
+            tracing::warn!(%error, "cannot claim a job");
+        } else {
+            tracing::debug!(%error, "cannot claim a job");
+        }
+    }
+
+    /// Notes what became of the store, for those who ask whether this server is of any use.
+    fn store_is(&self, state: StoreState) {
+        let before = self.store_state.send_replace(state);
+        if before == state {
+            return;
+        }
+        observe::store_state(state);
+        // Of a full disk the store itself tells.
+        if state == StoreState::Away {
+            tracing::error!("the store is out of reach, this server is not ready");
+        } else if before == StoreState::Away {
+            tracing::info!("the store is back, this server is ready again");
         }
     }
 
     async fn sweep(&self) {
         let swept = self.store.sweep(SystemTime::now(), self.options.max_attempts).await;
-        self.store_answers(!matches!(swept, Err(store::Error::Unavailable(_))));
+        self.store_is(match &swept {
+            Err(store::Error::Unavailable(_)) => StoreState::Away,
+            _ if self.store.has_room() => StoreState::Sound,
+            _ => StoreState::Full,
+        });
         match swept {
             Ok(swept) => {
                 self.taken_back(&swept.lost);

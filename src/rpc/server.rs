@@ -29,7 +29,7 @@ use super::proto::job_service_server::JobServiceServer;
 use super::reload::{self, Current};
 use super::{door, tls};
 use crate::domain::Limits;
-use crate::engine::Engine;
+use crate::engine::{Engine, StoreState};
 
 /// Services whose health is told one by one; the empty name is the server's own.
 const HEALTH_NAMES: [&str; 4] = ["", "scpsfm.v1.CalibrationService", "scpsfm.v1.JobService", "scpsfm.v1.InputService"];
@@ -169,8 +169,8 @@ impl Server {
         let address = listener.local_addr().map_err(listen_error)?;
         let (reporter, health_service) = tonic_health::server::health_reporter();
         let health = Arc::new(Health { reporter, draining: Mutex::new(false) });
-        let mut reachable = engine.store_reachable();
-        health.tell(*reachable.borrow_and_update()).await;
+        let mut store = engine.store_state();
+        health.tell(is_of_use(*store.borrow_and_update())).await;
         let router = router(&options, engine, Authenticate::new(keys))?.add_service(health_service);
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
@@ -183,7 +183,7 @@ impl Server {
         };
         let incoming = door::incoming(listener, entrance);
         let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));
-        let follower = tokio::spawn(follow_store(Arc::clone(&health), reachable));
+        let follower = tokio::spawn(follow_store(Arc::clone(&health), store));
         Ok(Self { address, health, follower, stop, task })
     }
 
@@ -261,11 +261,16 @@ impl Health {
 }
 
 /// Tells health checks NOT_SERVING while the store is out of reach.
-async fn follow_store(health: Arc<Health>, mut reachable: watch::Receiver<bool>) {
-    while reachable.changed().await.is_ok() {
-        let reachable = *reachable.borrow_and_update();
-        health.tell(reachable).await;
+async fn follow_store(health: Arc<Health>, mut store: watch::Receiver<StoreState>) {
+    while store.changed().await.is_ok() {
+        let state = *store.borrow_and_update();
+        health.tell(is_of_use(state)).await;
     }
+}
+
+/// Whether anyone should call a server whose store is so: on one that is full results are read, and room is made.
+fn is_of_use(store: StoreState) -> bool {
+    store != StoreState::Away
 }
 
 /// The certificates, followed as their files change.

@@ -305,6 +305,10 @@ pub trait Store: Send + Sync + 'static {
     /// Whether other processes may be at work on the same jobs.
     fn is_shared(&self) -> bool;
 
+    /// Whether there was room to begin something at the last look, where the store looks: a shared one is for its own
+    /// operators to watch.
+    fn has_room(&self) -> bool;
+
     /// Waits for word of what another process changed. Words may be lost, repeated or stale: whoever heeds them looks
     /// into the store, and looks from time to time without one. Never answers where the store is not shared. For one
     /// caller at a time.

@@ -214,6 +214,10 @@ impl<S: Store> Store for Timed<S> {
         self.0.is_shared()
     }
 
+    fn has_room(&self) -> bool {
+        self.0.has_room()
+    }
+
     /// Not timed: it waits for others.
     async fn hint(&self) -> Hint {
         self.0.hint().await

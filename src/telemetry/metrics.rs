@@ -280,6 +280,11 @@ pub fn store_reachable(reachable: bool) {
     gauge!(STORE_REACHABLE.name).set(f64::from(u8::from(reachable)));
 }
 
+/// Tells whether the embedded store has no room left to begin anything.
+pub fn store_full(full: bool) {
+    gauge!(STORE_FULL.name).set(f64::from(u8::from(full)));
+}
+
 /// A worker claimed a job that had waited this long.
 pub fn queue_wait(waited: Duration) {
     histogram!(QUEUE_WAIT.name).record(waited.as_secs_f64());

@@ -8,7 +8,6 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::http::{StatusCode, header};
-use axum::response::IntoResponse;
 use axum::routing::get;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::net::TcpListener;
@@ -31,6 +30,7 @@ pub struct Readiness(Arc<State>);
 struct State {
     taking_work: AtomicBool,
     store_away: AtomicBool,
+    store_full: AtomicBool,
 }
 
 impl Readiness {
@@ -39,19 +39,23 @@ impl Readiness {
         self.0.taking_work.store(ready, Ordering::Relaxed);
     }
 
-    /// Says whether the store answers.
-    pub fn set_store(&self, reachable: bool) {
-        self.0.store_away.store(!reachable, Ordering::Relaxed);
+    /// Says whether the store is out of reach, and whether it is full.
+    pub fn set_store(&self, away: bool, full: bool) {
+        self.0.store_away.store(away, Ordering::Relaxed);
+        self.0.store_full.store(full, Ordering::Relaxed);
     }
 
-    /// Why the service cannot do its work, if it cannot.
-    fn obstacle(&self) -> Option<&'static str> {
+    /// Whether the service can do its work, and what keeps it from doing so.
+    fn answer(&self) -> (StatusCode, &'static str) {
         if !self.0.taking_work.load(Ordering::Relaxed) {
-            Some("not ready\n")
+            (StatusCode::SERVICE_UNAVAILABLE, "not ready\n")
         } else if self.0.store_away.load(Ordering::Relaxed) {
-            Some("not ready: the store is out of reach\n")
+            (StatusCode::SERVICE_UNAVAILABLE, "not ready: the store is out of reach\n")
+        } else if self.0.store_full.load(Ordering::Relaxed) {
+            // Results are read and room is made through this server: nobody is to be kept away from it.
+            (StatusCode::OK, "ready, but the store's disk is full: jobs are neither taken in nor begun\n")
         } else {
-            None
+            (StatusCode::OK, "ready\n")
         }
     }
 }
@@ -131,15 +135,7 @@ fn router(scrape: PrometheusHandle, ready: Readiness) -> Router {
     Router::new()
         .route("/metrics", get(move || async move { ([(header::CONTENT_TYPE, TEXT_FORMAT)], scrape.render()) }))
         .route("/healthz", get(|| async { "ok\n" }))
-        .route(
-            "/readyz",
-            get(move || async move {
-                match ready.obstacle() {
-                    None => (StatusCode::OK, "ready\n").into_response(),
-                    Some(obstacle) => (StatusCode::SERVICE_UNAVAILABLE, obstacle).into_response(),
-                }
-            }),
-        )
+        .route("/readyz", get(move || async move { ready.answer() }))
 }
 
 async fn keep_up(scrape: PrometheusHandle, stop: CancellationToken) {
@@ -179,11 +175,14 @@ mod tests {
         assert!(get(address, "/readyz").await.starts_with("HTTP/1.1 503"));
         ready.set(true);
         assert!(get(address, "/readyz").await.starts_with("HTTP/1.1 200"));
-        ready.set_store(false);
+        ready.set_store(true, false);
         let away = get(address, "/readyz").await;
         assert!(away.starts_with("HTTP/1.1 503") && away.contains("store"), "{away}");
-        ready.set_store(true);
-        assert!(get(address, "/readyz").await.starts_with("HTTP/1.1 200"));
+        ready.set_store(false, true);
+        let full = get(address, "/readyz").await;
+        assert!(full.starts_with("HTTP/1.1 200") && full.contains("full"), "{full}");
+        ready.set_store(false, false);
+        assert!(get(address, "/readyz").await.ends_with("\r\n\r\nready\n"));
         let page = get(address, "/metrics").await;
         assert!(page.contains("content-type: text/plain; version=0.0.4"), "{page}");
         assert!(page.contains("\nscpsfm_queue_depth "), "{page}");

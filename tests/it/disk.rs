@@ -17,6 +17,7 @@ use tonic::{Code, Status};
 
 use crate::support::live::{connected, created, is_served, reaches, scene_request};
 use crate::support::program::{Serving, run};
+use crate::support::scrape::Page;
 use crate::support::server::soon;
 use crate::support::uploads::{DEFAULT, encoded, id, part, reason, whole};
 use crate::support::wire::{create_raw, create_tracks, raw};
@@ -77,17 +78,20 @@ fn is_full(status: &Status) {
     assert!(status.message().contains("space"), "{status:?}");
 }
 
-/// Creates small jobs until there is no room for one more, and returns their names.
+/// Creates jobs of 32 kB, then small ones, until there is no room for one more, and returns their names. The store
+/// finds room of its own where it can, which small ones alone would take more of than a queue holds.
 async fn created_until_full(jobs: &mut JobServiceClient<Channel>) -> Vec<String> {
     let mut names = Vec::new();
-    let refused = loop {
-        match jobs.create_job(create_tracks()).await {
-            Ok(job) => names.push(job.into_inner().name),
-            Err(status) => break status,
-        }
-        assert!(names.len() < 10_000, "the disk never fills up");
-    };
-    is_full(&refused);
+    for request in [create_raw(&raw(20, 100)), create_tracks()] {
+        let refused = loop {
+            match jobs.create_job(request.clone()).await {
+                Ok(job) => names.push(job.into_inner().name),
+                Err(status) => break status,
+            }
+            assert!(names.len() < 10_000, "the disk never fills up");
+        };
+        is_full(&refused);
+    }
     names
 }
 
@@ -169,11 +173,14 @@ async fn on_a_full_disk_a_server_starts_and_room_is_made_through_it() {
     // Nothing to be found, so that the one worker is busy for as long as this takes.
     let hopeless = SceneOptions { views: 10, tracks: 3_000, outliers: 1.0, ..SceneOptions::default() };
     let busy = created(&mut jobs, scene_request(&hopeless)).await;
-    let mut waiting = Vec::new();
-    for _ in 0..60 {
-        waiting.push(created(&mut jobs, create_raw(&raw(20, 2_000))).await);
-    }
     assert!(reserve.exists());
+    // At once, so that the log is longer than the disk has room to write back.
+    let request = proto::BatchCreateJobsRequest {
+        parent: DEFAULT.into(),
+        requests: (0..60).map(|_| create_raw(&raw(20, 2_000))).collect(),
+    };
+    let batch = jobs.batch_create_jobs(request).await.expect("room for them").into_inner();
+    let mut waiting: Vec<String> = batch.jobs.into_iter().map(|job| job.name).collect();
 
     // The index of the log, which is made anew at a start: without a byte left.
     drop(server);
@@ -182,6 +189,8 @@ async fn on_a_full_disk_a_server_starts_and_room_is_made_through_it() {
     let server = Serving::start(&data_dir);
     let mut jobs = connected(&server).await;
     waiting.extend(created_until_full(&mut jobs).await);
+    soon(page_says(&server, "/readyz", "full")).await;
+    assert_eq!(told_full(&server), 1.0);
     for name in waiting.iter().chain([&busy]) {
         let request = proto::CancelJobRequest { name: name.clone(), etag: String::new() };
         jobs.cancel_job(request).await.expect("to cancel takes no room");
@@ -195,6 +204,20 @@ async fn on_a_full_disk_a_server_starts_and_room_is_made_through_it() {
     let next = created_once_there_is_room(&mut jobs).await;
     assert!(reserve.exists());
     assert_eq!(reaches(&mut jobs, &next, &[JobState::Succeeded]).await, JobState::Succeeded);
+    soon(page_says(&server, "/readyz", "ready\n")).await;
+    assert_eq!(told_full(&server), 0.0);
+}
+
+/// Waits until a page, which is there all the time, holds these words.
+async fn page_says(server: &Serving, path: &str, words: &str) {
+    while !tokio::task::block_in_place(|| server.page(path)).contains(words) {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// What the metrics say of the disk.
+fn told_full(server: &Serving) -> f64 {
+    tokio::task::block_in_place(|| Page::parse(&server.page("/metrics"))).value("scpsfm_store_full")
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -140,6 +140,11 @@ pub(super) trait Database: Send + Sync + 'static {
         async { Ok(()) }
     }
 
+    /// See [`crate::store::Store::has_room`].
+    fn has_room(&self) -> bool {
+        true
+    }
+
     /// See [`crate::store::Store::hint`].
     fn heard(&self) -> impl Future<Output = Hint> + Send;
 

@@ -291,6 +291,10 @@ impl<D: Database> Store for D {
         D::SHARED
     }
 
+    fn has_room(&self) -> bool {
+        Database::has_room(self)
+    }
+
     async fn hint(&self) -> Hint {
         self.heard().await
     }

@@ -3,9 +3,11 @@
 //! sqlx keeps a thread for each connection, and every statement is a message to it and an answer back. Beside busy
 //! solvers that is most of what a small job costs: a wake-up takes longer than a statement.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
+use rusqlite::config::DbConfig;
 use rusqlite::types::Value as Cell;
 use rusqlite::{OpenFlags, Statement as Prepared};
 
@@ -17,10 +19,13 @@ use crate::store::sql::{self, Connection, Row, Statement, Value};
 const PREPARED: usize = 128;
 
 /// A connection of rusqlite.
-pub(in crate::store) struct WriteConnection(rusqlite::Connection);
+pub(in crate::store) struct WriteConnection {
+    inner: rusqlite::Connection,
+    database: PathBuf,
+}
 
 impl WriteConnection {
-    /// Opens a database that is there, its schema up to date.
+    /// Opens a database that is there.
     ///
     /// # Errors
     /// [`Error::Unavailable`], [`Error::NoSpace`] and [`Error::Corrupt`].
@@ -35,26 +40,62 @@ impl WriteConnection {
         connection.pragma_update(None, "foreign_keys", true)?;
         // Answers with what it set, as the log mode does: the latter is the file's.
         connection.pragma_update_and_check(None, "journal_size_limit", LOG_BYTES, |_| Ok(()))?;
-        Ok(Self(connection))
+        // A page is in the log once, not each time that the cache is full; and not at all where the transaction gives it
+        // back, as on a full disk it must. What is written at a time is bounded by what one message may hold.
+        connection.pragma_update(None, "cache_spill", false)?;
+        // The writer does so itself: see `log`.
+        connection.pragma_update_and_check(None, "wal_autocheckpoint", 0, |_| Ok(()))?;
+        // Nor is it done by dropping this: see `close`.
+        connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)?;
+        // Only with the first look does it open the log, and keep others that close from being the last to go.
+        connection.query_row("PRAGMA schema_version", [], |_| Ok(()))?;
+        Ok(Self { inner: connection, database: database.to_owned() })
     }
 
     /// Runs one without parameters or rows.
     pub(super) fn control(&mut self, statement: &'static str) -> Result<(), Error> {
-        Ok(self.0.prepare_cached(statement)?.raw_execute().map(drop)?)
+        Ok(self.inner.prepare_cached(statement)?.raw_execute().map(drop)?)
+    }
+
+    /// What one without parameters says in its first row.
+    pub(super) fn first_row<T>(
+        &mut self,
+        statement: &'static str,
+        read: impl FnOnce(&rusqlite::Row<'_>) -> rusqlite::Result<T>,
+    ) -> Result<T, Error> {
+        Ok(self.inner.prepare_cached(statement)?.query_row([], read)?)
+    }
+
+    /// How long a statement waits for others on the file.
+    pub(super) fn set_patience(&mut self, patience: Duration) -> Result<(), Error> {
+        Ok(self.inner.busy_timeout(patience)?)
+    }
+
+    /// The file.
+    pub(super) fn database(&self) -> &Path {
+        &self.database
+    }
+
+    /// Closes it: as the last one to go it writes the log back, where there is room for it, and removes it.
+    pub(super) fn close(mut self) -> Result<(), Error> {
+        if self.log_lacks()? == 0 {
+            self.inner.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, false)?;
+        }
+        self.inner.close().map_err(|(_, error)| error.into())
     }
 
     /// Rows that were changed over it.
     pub(super) fn changes(&self) -> u64 {
-        self.0.total_changes()
+        self.inner.total_changes()
     }
 
     #[cfg(test)]
     pub(super) fn inner(&mut self) -> &mut rusqlite::Connection {
-        &mut self.0
+        &mut self.inner
     }
 
     fn run(&mut self, statement: &Statement) -> Result<Vec<WrittenRow>, Error> {
-        let mut prepared = self.0.prepare_cached(statement.sql())?;
+        let mut prepared = self.inner.prepare_cached(statement.sql())?;
         bind(&mut prepared, statement.values())?;
         let columns: Arc<[String]> = prepared.column_names().into_iter().map(str::to_owned).collect();
         let mut found = Vec::new();

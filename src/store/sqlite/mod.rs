@@ -7,6 +7,7 @@
 mod connection;
 #[cfg(test)]
 mod groups_tests;
+mod log;
 mod reserve;
 #[cfg(test)]
 mod tests;
@@ -25,7 +26,7 @@ use sqlx::sqlite::{
 use super::sql::{self, Connection, Database, Moves, Operation, Size, Statement, Step};
 use super::{Error, Hint};
 use connection::WriteConnection;
-use reserve::Reserve;
+use reserve::{Reserve, Room};
 use writer::Writer;
 
 /// The database within the data directory.
@@ -69,6 +70,7 @@ const MIGRATIONS: [Step; 9] = [
 #[derive(Debug)]
 pub struct Sqlite {
     writer: Writer,
+    has_room: Room,
     readers: SqlitePool,
     /// Unlocked when it is closed, also by the death of the process.
     _lock: File,
@@ -99,9 +101,10 @@ impl Sqlite {
             }
             opened => opened?,
         };
+        let has_room = reserve.room();
         let writer = Writer::start(connection, database, reserve, group_time)?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
-        Ok(Self { writer, readers, _lock: lock })
+        Ok(Self { writer, has_room, readers, _lock: lock })
     }
 
     /// Runs statements as they are on the writer's connection, for tests that need the database to misbehave.
@@ -118,13 +121,13 @@ impl Sqlite {
 fn options(database: &Path) -> SqliteConnectOptions {
     SqliteConnectOptions::new()
         .filename(database)
-        // Only takes effect in a new file; lets retention hand space back.
-        .auto_vacuum(SqliteAutoVacuum::Incremental)
         .journal_mode(SqliteJournalMode::Wal)
         // As what is written afterwards.
         .synchronous(SqliteSynchronous::Full)
         .foreign_keys(true)
         .pragma("journal_size_limit", LOG_BYTES.to_string())
+        // The writer writes the log back: see `log`.
+        .pragma("wal_autocheckpoint", "0")
         .busy_timeout(BUSY_TIMEOUT)
 }
 
@@ -137,9 +140,10 @@ async fn connect(options: &SqliteConnectOptions) -> Result<SqliteConnection, Err
 
 /// Brings its schema up to date and opens it to write.
 async fn bring_up_to_date(options: &SqliteConnectOptions, database: &Path) -> Result<WriteConnection, Error> {
-    let migrating = connect(options).await?;
-    // Before the other one is closed: the last one to go writes the log back, which a full disk has no room for.
+    // First, and there until the other one is closed, also by an error: the last one to go writes the log back, which a
+    // full disk has no room for.
     let connection = WriteConnection::open(database)?;
+    let migrating = connect(options).await?;
     sqlx::Connection::close(migrating).await?;
     Ok(connection)
 }
@@ -183,7 +187,8 @@ async fn create(directory: &Path, database: &Path) -> Result<(), Error> {
             let _ = std::fs::remove_file(directory.join(format!("{name}{suffix}")));
         }
     }
-    let new = options(&draft).create_if_missing(true);
+    // Only takes effect in a new file, and is a write in any other; lets retention hand space back.
+    let new = options(&draft).create_if_missing(true).auto_vacuum(SqliteAutoVacuum::Incremental);
     let connection = connect(&new).await?;
     // Writes the log back into the file and removes it.
     sqlx::Connection::close(connection).await?;
@@ -261,6 +266,10 @@ impl Database for Sqlite {
             self.writer.run(Moves::Ends(VACUUM_BYTES), VACUUM).await?;
         }
         Ok(())
+    }
+
+    fn has_room(&self) -> bool {
+        self.has_room.is_there()
     }
 
     async fn heard(&self) -> Hint {

@@ -8,6 +8,8 @@
 use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::store::Error;
@@ -20,8 +22,12 @@ const RESERVE_FILE: &str = "scpsfm.reserve";
 /// seldom have more.
 pub(super) const RESERVE_BYTES: u64 = 16 << 20;
 
+/// What must be free beside it, in bytes, where it is made: as long as the log may grow, so that what is begun again has
+/// room, and it is not given up again at once.
+const BESIDE_BYTES: u64 = 4 << 20;
+
 /// Between two attempts to have the reserve back: writers wait for each.
-const RETRY: Duration = Duration::from_secs(1);
+pub(super) const RETRY: Duration = Duration::from_secs(1);
 
 /// The file of a data directory.
 #[derive(Debug)]
@@ -30,6 +36,17 @@ pub(super) struct Reserve {
     is_whole: bool,
     /// When it was last tried to make it, and why there is none.
     tried: Option<(Instant, String)>,
+    has_room: Room,
+}
+
+/// Whether there is room to begin something, for those who ask from other threads.
+#[derive(Debug, Clone)]
+pub(super) struct Room(Arc<AtomicBool>);
+
+impl Room {
+    pub(super) fn is_there(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
 }
 
 impl Reserve {
@@ -37,20 +54,27 @@ impl Reserve {
     pub(super) fn of(directory: &Path) -> Self {
         let path = directory.join(RESERVE_FILE);
         let is_whole = std::fs::metadata(&path).is_ok_and(|file| file.len() == RESERVE_BYTES);
-        let mut reserve = Self { path, is_whole, tried: None };
-        if !reserve.restore() {
-            tracing::warn!(error = %reserve.refusal(), "nothing new is begun");
-        }
+        let mut reserve = Self { path, is_whole, tried: None, has_room: Room(Arc::new(AtomicBool::new(true))) };
+        reserve.restore();
         reserve
+    }
+
+    pub(super) fn room(&self) -> Room {
+        self.has_room.clone()
     }
 
     pub(super) fn is_whole(&self) -> bool {
         self.is_whole
     }
 
+    /// Whether it was given up and is to be had back.
+    pub(super) fn is_due(&self) -> bool {
+        !self.is_whole && self.tried.as_ref().is_none_or(|(at, _)| at.elapsed() >= RETRY)
+    }
+
     /// Whether there is a reserve, made anew where it was given up and there is room again.
     pub(super) fn restore(&mut self) -> bool {
-        if self.is_whole || self.tried.as_ref().is_some_and(|(at, _)| at.elapsed() < RETRY) {
+        if !self.is_due() {
             return self.is_whole;
         }
         match self.make() {
@@ -60,8 +84,17 @@ impl Reserve {
                     tracing::info!("room is kept for a full disk again");
                 }
             }
-            Err(error) => self.tried = Some((Instant::now(), error.to_string())),
+            Err(error) => {
+                let first = self.tried.replace((Instant::now(), error.to_string())).is_none();
+                if first {
+                    tracing::warn!(
+                        error = %self.refusal(),
+                        "the disk is full: nothing new is begun, what is left is for what ends or frees"
+                    );
+                }
+            }
         }
+        self.has_room.0.store(self.is_whole, Ordering::Relaxed);
         self.is_whole
     }
 
@@ -71,12 +104,7 @@ impl Reserve {
             return false;
         }
         match std::fs::remove_file(&self.path) {
-            Ok(()) => {
-                self.is_whole = false;
-                tracing::warn!(
-                    "the disk is full: nothing new is begun, the room that was kept is for what ends or frees"
-                );
-            }
+            Ok(()) => self.is_whole = false,
             Err(error) => tracing::error!(%error, path = %self.path.display(), "cannot give up the room that is kept"),
         }
         !self.is_whole
@@ -92,7 +120,9 @@ impl Reserve {
     /// Under its own name only once it is whole, so that its length tells.
     fn make(&self) -> io::Result<()> {
         let draft = self.path.with_extension("reserve.new");
-        let made = allocate(&draft).and_then(|()| std::fs::rename(&draft, &self.path));
+        let made = allocate(&draft, RESERVE_BYTES + BESIDE_BYTES)
+            .and_then(|file| file.set_len(RESERVE_BYTES))
+            .and_then(|()| std::fs::rename(&draft, &self.path));
         if made.is_err() {
             let _ = std::fs::remove_file(&draft);
         }
@@ -101,21 +131,22 @@ impl Reserve {
 }
 
 /// Makes a file that has its room on the disk.
-fn allocate(path: &Path) -> io::Result<()> {
+fn allocate(path: &Path, bytes: u64) -> io::Result<File> {
     let mut file = File::create(path)?;
     #[cfg(any(target_os = "linux", target_vendor = "apple"))]
-    match rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, RESERVE_BYTES) {
-        Ok(()) => return Ok(()),
+    match rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, bytes) {
+        Ok(()) => return Ok(file),
         // Not every file system can.
         Err(rustix::io::Errno::OPNOTSUPP | rustix::io::Errno::NOSYS) => {}
         Err(error) => return Err(error.into()),
     }
     // No zeros: a file system may keep none of them.
     let block = [1; 65_536];
-    for _ in 0..RESERVE_BYTES / block.len() as u64 {
+    for _ in 0..bytes / block.len() as u64 {
         file.write_all(&block)?;
     }
-    file.sync_all()
+    file.sync_all()?;
+    Ok(file)
 }
 
 #[cfg(test)]
@@ -136,11 +167,17 @@ mod tests {
         // Where its draft should stand is no room.
         let draft = reserve.path.with_extension("reserve.new");
         std::fs::create_dir(&draft).expect("a folder");
-        assert!(!reserve.restore() && !reserve.is_whole());
+        assert!(reserve.room().is_there(), "it may yet be had back");
+        assert!(reserve.is_due() && !reserve.restore() && !reserve.is_whole() && !reserve.room().is_there());
         std::fs::remove_dir(&draft).expect("removed");
-        assert!(!reserve.restore(), "not tried again at once");
+        assert!(!reserve.is_due() && !reserve.restore(), "not tried again at once");
         reserve.tried = None;
-        assert!(reserve.restore() && length(&reserve) == Some(RESERVE_BYTES) && !draft.exists());
+        assert!(
+            reserve.restore()
+                && reserve.room().is_there()
+                && length(&reserve) == Some(RESERVE_BYTES)
+                && !draft.exists()
+        );
     }
 
     #[test]

@@ -198,13 +198,41 @@ async fn of_a_deleted_input_nothing_is_left_once_its_jobs_are_gone() {
 }
 
 #[tokio::test]
-async fn after_a_full_disk_the_next_write_goes_through() {
+async fn a_write_that_finds_no_room_is_run_again_once_the_log_is_cut() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let store = Sqlite::open(directory.path()).await.expect("a store");
-    // As full as it is; the next connection knows nothing of the limit, as if room had been made.
+    let name =
+        store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created").job.name;
+    let log = directory.path().join(format!("{DATABASE_FILE}-wal"));
+    assert!(std::fs::metadata(&log).expect("a log").len() > 0);
+    // As full as it is; the next connection knows nothing of the limit, as if the log had made room.
     store.execute("PRAGMA max_page_count = 1").await;
-    let new = || crate::store::NewRecord { input: vec![7; 1 << 20].into(), ..contract::record("a") };
-    let refused = store.create_job(new(), &contract::ROOM, contract::time(0)).await.expect_err("no room");
-    assert!(matches!(refused, Error::NoSpace(_)), "{refused}");
-    store.create_job(new(), &contract::ROOM, contract::time(1)).await.expect("room again");
+    let new = crate::store::NewRecord { input: vec![7; 1 << 20].into(), ..contract::record("b") };
+    store.create_job(new, &contract::ROOM, contract::time(1)).await.expect("room is made");
+    let length = std::fs::metadata(&log).expect("a log").len();
+    assert!(length < 3 << 20, "the second write alone: {length} bytes");
+    assert!(directory.path().join("scpsfm.reserve").exists());
+    store.job(&name).await.expect("the first one");
+}
+
+#[tokio::test]
+async fn a_log_that_has_become_long_is_written_back() {
+    let fixture = Fixture::open().await.expect("opens");
+    let beside = rusqlite::Connection::open(fixture._directory.path().join(DATABASE_FILE)).expect("another reader");
+    let log = async || {
+        // The writer's next turn comes once it is done with the log.
+        fixture.on_writer("PRAGMA page_count", |row| row.integer("page_count")).await;
+        let pages = |row: &rusqlite::Row<'_>| Ok((row.get::<_, i64>(1)?, row.get::<_, i64>(2)?));
+        beside.query_row("PRAGMA wal_checkpoint(NOOP)", [], pages).expect("a log")
+    };
+    let create = async |job: &'static str, bytes: usize| {
+        let new = crate::store::NewRecord { input: vec![1; bytes].into(), ..contract::record(job) };
+        fixture.create_job(new, &contract::ROOM, contract::time(0)).await.expect("created");
+    };
+    create("a", 1 << 20).await;
+    let (pages, written) = log().await;
+    assert!(pages > 256 && written == 0, "a short one waits for more: {written} of {pages}");
+    create("b", 4 << 20).await;
+    let (pages, written) = log().await;
+    assert!(pages > 1_000 && written == pages, "{written} of {pages}");
 }

@@ -17,7 +17,8 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
 use super::connection::{WriteConnection, WrittenRow};
-use super::reserve::Reserve;
+use super::log::Log;
+use super::reserve::{RESERVE_BYTES, RETRY, Reserve};
 use crate::store::Error;
 use crate::store::sql::{self, Moves, Operation, Statement};
 use crate::telemetry::metrics;
@@ -147,7 +148,7 @@ impl Writer {
         // tests.
         let runtime = tokio::runtime::Builder::new_current_thread().build().map_err(failed)?;
         let connection = Some(connection);
-        let desk = Desk { connection, database, reserve, messages, group_time };
+        let desk = Desk { connection, database, reserve, log_stays: None, messages, group_time };
         let work = move || runtime.block_on(desk.serve());
         thread::Builder::new().name("store-writer".into()).spawn(work).map_err(failed)?;
         Ok(Self { inbox, patience: PATIENCE })
@@ -201,6 +202,8 @@ struct Desk {
     connection: Option<WriteConnection>,
     database: PathBuf,
     reserve: Reserve,
+    /// When the reserve was last given up for a log that the disk has no room to write back.
+    log_stays: Option<Instant>,
     messages: mpsc::UnboundedReceiver<Message>,
     group_time: Duration,
 }
@@ -214,9 +217,15 @@ impl Desk {
         let mut next = self.messages.recv().await;
         while let Some(message) = next {
             let left_over = match message {
-                Message::Write(first) => self.group(first).await,
+                Message::Write(first) => {
+                    let left_over = self.group(first).await;
+                    self.keep_log_short();
+                    left_over
+                }
                 Message::Close(done) => {
-                    self.connection = None;
+                    if let Some(Err(error)) = self.connection.take().map(WriteConnection::close) {
+                        tracing::debug!(%error, "the log is left to the next start");
+                    }
                     let _ = done.send(());
                     return;
                 }
@@ -272,6 +281,10 @@ impl Desk {
 
     /// Begins a transaction with this operation; without one where it is refused.
     async fn open(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
+        if self.reserve.is_due() {
+            self.cut_log();
+            self.reserve.restore();
+        }
         let mut ran = self.control(BEGIN);
         if ran.is_ok() {
             ran = self.run(operation).await;
@@ -291,7 +304,7 @@ impl Desk {
             // Where the disk is full, SQLite may have rolled back everything by itself, and there is nothing to go back
             // to.
             self.control("ROLLBACK TO one")?;
-            if self.can_help(operation, error) {
+            if self.can_help(error) {
                 return Err(error.clone());
             }
         }
@@ -334,19 +347,44 @@ impl Desk {
         committed
     }
 
-    /// Gives the reserve up for an operation that came to nothing for this reason, where that may help, and runs it
-    /// again.
+    /// Gives the reserve up for an operation that found no room, and runs it again: one that begins something only once
+    /// the log is cut and there is a reserve beside it again.
     async fn with_reserve(&mut self, operation: &mut dyn Waiting, error: Error) -> Result<(), Error> {
-        match self.can_help(operation, &error) && self.reserve.give_up() {
-            true => self.alone(operation).await,
-            false => Err(error),
+        if !self.can_help(&error) || !self.reserve.give_up() {
+            return Err(error);
         }
+        self.cut_log();
+        let begins = matches!(operation.moves(), Moves::Begins(_));
+        if begins && !self.reserve.restore() { Err(error) } else { self.alone(operation).await }
     }
 
     /// Whether the reserve may be what an operation lacks.
-    fn can_help(&self, operation: &dyn Waiting, error: &Error) -> bool {
-        let no_space = matches!(error, Error::NoSpace(_));
-        no_space && matches!(operation.moves(), Moves::Ends(_)) && self.reserve.is_whole()
+    fn can_help(&self, error: &Error) -> bool {
+        matches!(error, Error::NoSpace(_)) && self.reserve.is_whole()
+    }
+
+    /// Where it cannot be cut, nothing is lost: it is tried again.
+    fn cut_log(&mut self) {
+        if let Err(error) = self.connection().and_then(WriteConnection::cut_log) {
+            tracing::debug!(%error, "the log cannot be cut");
+        }
+    }
+
+    /// Writes a long log back. Where the disk has no room for that, the reserve may have: a log that is cut gives more
+    /// than it takes.
+    fn keep_log_short(&mut self) {
+        let kept = self.connection().and_then(WriteConnection::keep_log_short);
+        let tried_lately = self.log_stays.is_some_and(|at| at.elapsed() < RETRY);
+        match kept {
+            Ok(Log::Short) => self.log_stays = None,
+            Ok(Log::Lacks(bytes)) if bytes <= RESERVE_BYTES && !tried_lately && self.reserve.give_up() => {
+                self.cut_log();
+                self.reserve.restore();
+                self.log_stays = Some(Instant::now());
+            }
+            Ok(Log::Lacks(_)) => {}
+            Err(error) => tracing::debug!(%error, "the log cannot be written back"),
+        }
     }
 
     /// Runs an operation in the transaction that is open. Without a reserve, what is left is for what ends what was

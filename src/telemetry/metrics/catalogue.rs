@@ -199,6 +199,12 @@ pub const STORE_REACHABLE: Metric = Metric {
     labels: &[],
     help: "1 while the store answers; at 0 the server is not ready.",
 };
+pub const STORE_FULL: Metric = Metric {
+    name: "scpsfm_store_full",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "1 while the embedded store's disk is full: jobs are neither taken in nor begun.",
+};
 pub const FENCED_WRITES: Metric = Metric {
     name: "scpsfm_fenced_writes_total",
     kind: Kind::Counter,
@@ -228,7 +234,7 @@ pub const STRANGERS_CLOSED: Metric = Metric {
 };
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 32] = [
+pub const ALL: [Metric; 33] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -256,6 +262,7 @@ pub const ALL: [Metric; 32] = [
     STORE_DURATION,
     STORE_COMMIT_OPERATIONS,
     STORE_REACHABLE,
+    STORE_FULL,
     FENCED_WRITES,
     WATCHERS,
     CONNECTIONS,

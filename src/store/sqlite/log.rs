@@ -1,0 +1,88 @@
+//! The write-ahead log on its way back into the database: by the writer, between commits, and only where the disk has
+//! room for it.
+//!
+//! SQLite would do so by itself, within whichever commit makes the log long. On a disk that fills up it would write as
+//! much as fits and leave the log as long as it was: the room that is kept for what ends would be gone, and nothing
+//! won.
+
+use std::path::Path;
+use std::time::Duration;
+
+use super::BUSY_TIMEOUT;
+use super::connection::WriteConnection;
+use crate::store::Error;
+
+/// Pages at which the log is written back, as SQLite has it: 4 MB.
+const LONG_PAGES: i64 = 1_000;
+
+/// How long a log that is to be cut waits for its readers; writers wait meanwhile.
+const CUT_PATIENCE: Duration = Duration::from_millis(200);
+
+/// Pages of the log, and how many of them are in the database, too; nothing is moved.
+const LOOK: &str = "PRAGMA wal_checkpoint(NOOP)";
+/// Writes back what no reader keeps in the log, and waits for none.
+const WRITE_BACK: &str = "PRAGMA wal_checkpoint(PASSIVE)";
+/// Writes all of it back and cuts the file to nothing.
+const CUT: &str = "PRAGMA wal_checkpoint(TRUNCATE)";
+
+/// What became of a log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Log {
+    /// It is short, or as short as its readers let it be.
+    Short,
+    /// The disk lacks so many bytes for the pages that it would add to the database.
+    Lacks(u64),
+}
+
+impl WriteConnection {
+    /// Writes a log that has become long back into the database. Outside a transaction, as all of this.
+    pub(super) fn keep_log_short(&mut self) -> Result<Log, Error> {
+        let (pages, written): (i64, i64) = self.first_row(LOOK, |row| Ok((row.get(1)?, row.get(2)?)))?;
+        if pages < LONG_PAGES || written >= pages {
+            return Ok(Log::Short);
+        }
+        self.where_it_fits(|connection| connection.first_row(WRITE_BACK, |_| Ok(())))
+    }
+
+    /// Writes the log back and cuts it to nothing: its room is for others, too. Readers may keep it from that.
+    pub(super) fn cut_log(&mut self) -> Result<Log, Error> {
+        self.where_it_fits(|connection| {
+            connection.set_patience(CUT_PATIENCE)?;
+            let cut = connection.first_row(CUT, |_| Ok(()));
+            connection.set_patience(BUSY_TIMEOUT)?;
+            cut
+        })
+    }
+
+    fn where_it_fits(&mut self, write_back: impl FnOnce(&mut Self) -> Result<(), Error>) -> Result<Log, Error> {
+        match self.log_lacks()? {
+            0 => write_back(self).map(|()| Log::Short),
+            bytes => Ok(Log::Lacks(bytes)),
+        }
+    }
+
+    /// Bytes that the disk lacks for the database to grow by what the log adds to it.
+    pub(super) fn log_lacks(&mut self) -> Result<u64, Error> {
+        let number = |row: &rusqlite::Row<'_>| row.get::<_, u32>(0);
+        let page = u64::from(self.first_row("PRAGMA page_size", number)?);
+        let bytes = u64::from(self.first_row("PRAGMA page_count", number)?) * page;
+        let unknown = |error: std::io::Error| Error::Unavailable(format!("cannot look at the disk: {error}"));
+        let database = self.database();
+        let growth = bytes.saturating_sub(std::fs::metadata(database).map_err(unknown)?.len());
+        Ok(growth.saturating_sub(room_beside(database).map_err(unknown)?))
+    }
+}
+
+/// Bytes that are free on the disk of a file, as far as the system tells.
+fn room_beside(file: &Path) -> std::io::Result<u64> {
+    #[cfg(unix)]
+    {
+        let disk = rustix::fs::statvfs(file)?;
+        Ok(disk.f_bavail.saturating_mul(disk.f_frsize))
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = file;
+        Ok(u64::MAX)
+    }
+}
