@@ -1,6 +1,7 @@
 //! Arguments that several commands share.
 
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use clap::{Args, ValueEnum};
 
@@ -32,6 +33,25 @@ impl ServerArgs {
     /// See [`Client::connect`].
     pub async fn connect(&self) -> Result<Client, client::Error> {
         Client::connect(&self.server, &self.access).await
+    }
+}
+
+/// A whole number, with an error that says what it is not.
+///
+/// # Errors
+/// For anything else.
+pub fn parse_whole<T: FromStr>(text: &str) -> Result<T, String> {
+    text.parse().map_err(|_| {
+        let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+        if digits { "is too large a number".into() } else { "is not a whole number >= 0".into() }
+    })
+}
+
+/// A side of an image, in pixels.
+fn parse_side(text: &str) -> Result<u32, String> {
+    match parse_whole(text)? {
+        0 => Err("an image has at least one pixel".into()),
+        side => Ok(side),
     }
 }
 
@@ -103,11 +123,11 @@ const READING: &str = "How to read INPUT";
 pub struct ReadingArgs {
     /// Width of the images in pixels; without it the extent of the points stands in, with a warning. COLMAP's files
     /// carry their own sizes
-    #[arg(long, help_heading = READING, value_name = "PX", requires = "height", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, help_heading = READING, value_name = "PX", requires = "height", value_parser = parse_side)]
     pub width: Option<u32>,
 
     /// Height of the images in pixels
-    #[arg(long, help_heading = READING, value_name = "PX", requires = "width", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, help_heading = READING, value_name = "PX", requires = "width", value_parser = parse_side)]
     pub height: Option<u32>,
 
     /// What kind of file INPUT is [default: told from its name and content]
@@ -210,7 +230,7 @@ pub struct SettingsArgs {
     pub method: MethodArg,
 
     /// Seed of every random choice: one seed, one answer
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = parse_whole::<u64>)]
     pub seed: u64,
 
     #[arg(long, value_name = "N", default_value_t = SolveSettings::DEFAULT_ITERATIONS,

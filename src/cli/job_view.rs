@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 use super::client::access::AccessArgs;
 use super::client::{self, Client};
 use super::exit::{Exit, Failure};
+use super::interrupt::Signals;
 use super::print;
 use super::progress::ProgressView;
 use crate::domain::job::{EventBody, Failure as JobFailure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
@@ -195,12 +196,18 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
         reached = event.sequence.unwrap_or(reached);
         on_event(event);
     };
-    let watched = client.watch(name, after, &mut on_numbered).await;
+    let mut signals = Signals::listen()?;
+    let server = client.server().to_owned();
+    let watched = tokio::select! {
+        watched = client.watch(name, after, &mut on_numbered) => Some(watched),
+        () = signals.next() => None,
+    };
     view.finish();
-    let last = watched.map_err(|error| {
-        let server = client.server();
-        lost(error, &Lost { name, server, after: reached, files: " --out DIR" })
-    })?;
+    let job = Lost { name, server: &server, after: reached, files: " --out DIR" };
+    let Some(watched) = watched else {
+        return Err(Failure::interrupted_with(format!("interrupted; the job goes on\n{}", taken_up_again(&job))));
+    };
+    let last = watched.map_err(|error| lost(error, &job))?;
     unprinted?;
     if let Some(last) = &last {
         client::ended(last)?;
@@ -233,15 +240,20 @@ pub fn lost(error: client::Error, job: &Lost) -> Failure {
     if !matches!(error, client::Error::Unavailable(_)) {
         return error.into();
     }
+    let mut failure = Failure::from(error);
+    let commands = taken_up_again(job);
+    failure
+        .message
+        .push_str(&format!("\nthe job is {}; a server that comes back goes on with it:\n{commands}", job.name));
+    failure
+}
+
+/// The commands that take a job up again.
+fn taken_up_again(job: &Lost) -> String {
     let Lost { name, server, after, files } = job;
     let server = quoted(server);
     let after = if *after > 0 { format!(" --after {after}") } else { String::new() };
-    let mut failure = Failure::from(error);
-    failure.message.push_str(&format!(
-        "\nthe job is {name}; a server that comes back goes on with it:\n  \
-         scpsfm watch {name} --server {server}{after}\n  scpsfm result {name} --server {server}{files}"
-    ));
-    failure
+    format!("  scpsfm watch {name} --server {server}{after}\n  scpsfm result {name} --server {server}{files}")
 }
 
 /// A word as a shell reads it whole.

@@ -11,7 +11,7 @@ use crate::formats::{LabelledInput, result_files};
 
 const EXAMPLES: &str = "\
 Examples:
-  scpsfm result tenants/default/jobs/a1b2 --out answer --input tracks.csv
+  scpsfm result tenants/default/jobs/a1b2 --out answer --input tracks.csv --width 3072 --height 2048
   scpsfm result a1b2 --json | jq .focal_px";
 
 /// Read the result of a job
@@ -28,7 +28,8 @@ pub struct Args {
     #[command(flatten)]
     pub server: ServerArgs,
 
-    /// The file that the job was submitted with, for its ids and the files that need its points
+    /// The file that the job was submitted with, for its ids and the files that need its points; with the flags of the
+    /// submission that say how to read it
     #[arg(long, value_name = "INPUT", requires = "out")]
     pub input: Option<PathBuf>,
 

@@ -2,6 +2,7 @@
 
 use clap::{Args, ValueEnum};
 
+use super::args::parse_whole;
 use super::exit::Failure;
 use crate::domain::error::quoted;
 use crate::synthetic::{Motion, NoiseKind, OutlierKind, Scene, SceneOptions, Shape};
@@ -31,7 +32,7 @@ pub struct SceneArgs {
     pub rotation: f64,
 
     /// Seed of the scene: one seed, one scene
-    #[arg(long, default_value_t = 0)]
+    #[arg(long, default_value_t = 0, value_parser = parse_whole::<u64>)]
     pub seed: u64,
 }
 

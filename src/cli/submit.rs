@@ -31,7 +31,7 @@ Examples:
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
     /// Tracks, as `scpsfm solve` takes them
-    #[arg(value_name = "INPUT", required_unless_present = "uploaded", conflicts_with = "uploaded")]
+    #[arg(value_name = "INPUT", conflicts_with = "uploaded")]
     pub inputs: Vec<PathBuf>,
 
     /// Solve an input that was uploaded with `scpsfm upload`: its name, or the last part of it; may be given more than
@@ -86,7 +86,10 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
             reading.trim_start()
         )));
     }
-    let several = args.inputs.len() + args.uploaded.len() > 1;
+    let several = match args.inputs.len() + args.uploaded.len() {
+        0 => return Err(nothing()),
+        count => count > 1,
+    };
     for (given, flag) in [(args.watch, "--watch"), (args.job_id.is_some(), "--job-id")] {
         if several && given {
             return Err(Failure::usage(format!("{flag} is for one input")));
@@ -115,7 +118,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
             client.create(&input.raw, &settings, options).await.map_err(|error| error.at_lines(input))?
         }
         (None, Some(name)) => client.create_with(name, &settings, options).await?,
-        (None, None) => return Err(Failure::usage("neither INPUT nor --input says what to solve")),
+        (None, None) => return Err(nothing()),
     };
     print(&job.name.to_string())?;
     if args.watch { job_view::watch_to_end(&mut client, &job.name, 0, false).await } else { Ok(Exit::Done) }
@@ -150,6 +153,12 @@ impl GivenInput {
             Self::Id(input) => Ok(InputName { tenant: access.tenant()?, input: input.clone() }),
         }
     }
+}
+
+fn nothing() -> Failure {
+    Failure::usage(
+        "nothing says what to solve: give files of tracks (INPUT), or --input with the name of an uploaded input; see --help",
+    )
 }
 
 fn parse_label(text: &str) -> Result<(String, String), String> {

@@ -29,7 +29,8 @@ Examples:
 ///
 /// The generator of the paper's section 5.1: points in a box, cameras of one focal length around it, noise, and tracks
 /// whose image points are exchanged among each other; and departures from it, among them motions that no
-/// self-calibration survives. Writes observations.csv and truth.json; images are 1000 x 1000 px.
+/// self-calibration survives. Writes observations.csv and truth.json; images are 1000 x 1000 px, and points are where
+/// the cameras project them, many of them outside.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {

@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::args::parse_whole;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use crate::formats::publish::{create_directory, write_atomically};
@@ -43,7 +44,7 @@ pub struct Args {
     pub out: PathBuf,
 
     /// Seed of the first weights and of all scenes
-    #[arg(long, value_name = "SEED", default_value_t = 0)]
+    #[arg(long, value_name = "SEED", default_value_t = 0, value_parser = parse_whole::<u64>)]
     pub seed: u64,
 
     /// Steps, each on two batches of 2 to 24 scenes; the learning rate falls with the share that is done

@@ -201,7 +201,7 @@ fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String
     bound("track_count", raw.track_count, limits.max_tracks, "tracks");
     bound("x", raw.x.len(), limits.max_observations, "observations");
     if raw.views.len() < 2 {
-        found.push(Violation::of(field("views"), format!("{} views given, at least 2 are needed", raw.views.len())));
+        found.push(Violation::of(field("views"), too_few_views(raw.views.len())));
     }
     if raw.track_count == 0 {
         found.push(Violation::of(field("track_count"), "no tracks given, at least 1 is needed"));
@@ -224,6 +224,12 @@ fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String
             format!("has {} entries where x has {}; give one an observation or none", raw.depth.len(), raw.x.len()),
         ));
     }
+}
+
+/// What is wrong with fewer than two views.
+pub(crate) fn too_few_views(count: usize) -> String {
+    let given = if count == 1 { "1 view" } else { "no views" };
+    format!("{given} given, at least 2 are needed")
 }
 
 fn check_views(views: &[View], field: &impl Fn(&str) -> String, found: &mut Violations) {
@@ -282,7 +288,7 @@ fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &m
                 found.push(Violation::at(
                     field(name),
                     k,
-                    format!("{value} px is beyond {:e} px; coordinates are in pixels", Input::MAX_COORDINATE_PX),
+                    format!("{value:e} px is beyond {:e} px; coordinates are in pixels", Input::MAX_COORDINATE_PX),
                 ));
             }
         }
@@ -324,7 +330,7 @@ fn check_views_with_observations(raw: &RawInput, field: &impl Fn(&str) -> String
     }
     let count = seen.iter().filter(|&&seen| seen).count();
     if count < 2 {
-        found.push(Violation::of(field("view"), format!("observations lie in {count} view(s), at least 2 are needed")));
+        found.push(Violation::of(field("view"), "all observations lie in one view, at least 2 are needed"));
     }
 }
 

@@ -146,12 +146,15 @@ impl Columns {
     fn row(&self, text: &str) -> Result<Row, (&'static str, String)> {
         let fields: Vec<&str> = text.split(',').map(unquote).collect();
         if fields.len() != self.names.len() {
-            return Err((
-                "",
-                format!("{} fields where the header has {}{}", fields.len(), self.names.len(), {
-                    if fields.len() < self.names.len() { "; the file may be truncated" } else { "" }
-                }),
-            ));
+            let hint = match fields.len() {
+                count if count < self.names.len() => "; the file may be truncated",
+                // One more for each coordinate, and for a depth.
+                count if count == self.names.len() + 2 + usize::from(self.depth.is_some()) => {
+                    "; decimals are marked by a point, not a comma"
+                }
+                _ => "",
+            };
+            return Err(("", format!("{} fields where the header has {}{hint}", fields.len(), self.names.len())));
         }
         let [view, track, x, y] = self.required.map(|place| fields[place]);
         Ok(Row {

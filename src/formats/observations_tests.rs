@@ -81,7 +81,7 @@ fn names_the_line_of_every_bad_value() {
     assert_eq!(line_4("0,1.5,1,2"), ["dir/observations.csv, line 4: track: `1.5` is not a whole number >= 0"]);
     assert_eq!(
         line_4("0,18446744073709551616,1,2"),
-        ["dir/observations.csv, line 4: track: `18446744073709551616` is not a whole number >= 0"]
+        ["dir/observations.csv, line 4: track: `18446744073709551616` is too large a number"]
     );
     assert_eq!(
         line_4("0,1,,2"),
@@ -93,8 +93,12 @@ fn names_the_line_of_every_bad_value() {
     );
     assert_eq!(line_4("0,1,1,2,3"), ["dir/observations.csv, line 4: 5 fields where the header has 4"]);
     assert_eq!(
+        line_4("0,1,1,5,2,5"),
+        ["dir/observations.csv, line 4: 6 fields where the header has 4; decimals are marked by a point, not a comma"]
+    );
+    assert_eq!(
         line_4("0,1,1e9,2"),
-        ["dir/observations.csv, line 4: x: 1000000000 px is beyond 1e7 px; coordinates are in pixels"]
+        ["dir/observations.csv, line 4: x: 1e9 px is beyond 1e7 px; coordinates are in pixels"]
     );
     assert_eq!(
         line_4("1,0,5,6"),
@@ -143,7 +147,7 @@ fn files_that_are_no_table_are_called_what_they_are() {
 fn one_view_or_no_overlap_is_said_of_the_file() {
     assert_eq!(
         bad("view,track,x,y\n4,0,1,2\n4,1,1,2\n"),
-        ["dir/observations.csv: 1 views given, at least 2 are needed"]
+        ["dir/observations.csv: 1 view given, at least 2 are needed"]
     );
 }
 

@@ -121,6 +121,7 @@ pub(super) fn quote(value: &str) -> String {
 pub(super) fn whole<T: std::str::FromStr>(field: &str) -> Result<T, String> {
     field.parse().map_err(|_| match field {
         "" => "is empty".into(),
+        digits if digits.bytes().all(|byte| byte.is_ascii_digit()) => format!("{} is too large a number", quote(field)),
         _ => format!("{} is not a whole number >= 0", quote(field)),
     })
 }

@@ -86,6 +86,9 @@ impl Shared {
         if !self.ledger().is_abandoned(job, departure) {
             return;
         }
+        if self.engine.job(job).await.is_ok_and(|job| job.state.is_terminal()) {
+            return;
+        }
         tracing::info!(%job, "cancelling a job whose caller went away");
         if let Err(error) = self.engine.cancel(job).await {
             tracing::warn!(%job, %error, "cannot cancel a job whose caller went away");

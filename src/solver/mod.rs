@@ -286,7 +286,7 @@ fn why_unsolved(input: &Input, best: Option<&Attempt>) -> Warning {
         None => Warning::new(
             WarningCode::FewInliers,
             format!(
-                "no {} views share enough tracks: at least {} must be seen in all of them",
+                "no {} views share enough tracks: at least {}, of which none is another's copy, must be seen in all of them",
                 block::LEAST_VIEWS,
                 block::LEAST_TRACKS
             ),

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Instant;
@@ -109,8 +109,10 @@ fn wrong_usage_ends_with_2_and_does_nothing() {
     let directory = directory();
     let input = scene(directory.path());
     let (input, out) = (text(&input), directory.path().join("out"));
-    let cases: [&[&str]; 16] = [
+    let cases: [&[&str]; 18] = [
         &["solve", input],
+        &["solve", input, "--out", text(&out), "--seed", "-1"],
+        &["submit", "--server", NOBODY],
         &["solve", input, "--out", text(&out), "--width", "100"],
         &["solve", input, "--out", text(&out), "--width", "0", "--height", "9"],
         &["solve", input, "--out", text(&out), "--iterations", "0"],
@@ -352,6 +354,32 @@ fn ctrl_c_ends_a_solve_with_130_and_leaves_no_result() {
     running.signal(Signal::INT);
     assert_eq!(running.wait().code(), Some(130));
     assert!(!out.join("result.json").exists());
+}
+
+#[test]
+fn ctrl_c_ends_a_watch_with_130_and_tells_that_the_job_goes_on() {
+    let directory = directory();
+    let input = scene(directory.path());
+    let serving = Serving::start(&directory.path().join("data"));
+    let submit = ["submit", text(&input), "--method", "paper", "--iterations", "10000", "--watch"];
+    let mut child = program(submit.iter().chain(&["--server", &serving.grpc]))
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    let mut stderr = BufReader::new(child.stderr.take().expect("piped"));
+    let mut running = Running(child);
+    let mut told = String::new();
+    while !told.contains('%') {
+        assert!(stderr.read_line(&mut told).expect("progress") > 0, "{told:?}");
+    }
+    running.signal(Signal::INT);
+    assert_eq!(running.wait().code(), Some(130));
+    stderr.read_to_string(&mut told).expect("the rest");
+    assert!(told.contains("the job goes on\n  scpsfm watch tenants/default/jobs/"), "{told}");
+    let going_on = run(["list", "--state", "running", "--server", &serving.grpc]);
+    assert_eq!(going_on.stdout.lines().count(), 1, "{going_on:?}");
 }
 
 #[test]

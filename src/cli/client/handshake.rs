@@ -78,11 +78,15 @@ fn of_alert(server: &str, alert: AlertDescription) -> String {
     }
 }
 
-/// A question, where a connection without TLS broke as it does at a server with TLS: its alert reads as a frame of
-/// HTTP/2 that is too long, or the server closes before the call is written.
+/// What may be wrong with the address, where a connection without TLS broke as it does at a server with TLS, or at one
+/// that speaks something else: its first words read as a frame of HTTP/2 that is too long, or the server closes before
+/// the call is written.
 pub(super) fn plain_hint(server: &str, cause: &str) -> &'static str {
     let like_it = ["frame with invalid size", "broken pipe"].iter().any(|text| cause.contains(text));
-    if server.starts_with("http://") && like_it { "; does it speak TLS, at https://?" } else { "" }
+    match server.starts_with("http://") && like_it {
+        true => "; does it speak TLS, at https://, or is this another port than that of gRPC?",
+        false => "",
+    }
 }
 
 /// Alerts whose text may come without their type, as rustls writes them.

@@ -130,10 +130,13 @@ impl Client {
     async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
         let transient = error::is_transient(&status);
         let first = transient && backoff.failed(&status);
-        let error = self.error(status);
         if first {
-            eprintln!("waiting up to {} s: {error}", Backoff::TOTAL.as_secs());
+            // Whether it is the right server can be asked once it has gone on for so long: one that is ended breaks
+            // connections in the same way.
+            let trouble = Error::from_status(&self.server, &status, true);
+            eprintln!("waiting up to {} s: {trouble}", Backoff::TOTAL.as_secs());
         }
+        let error = self.error(status);
         if transient && backoff.pause().await {
             return Ok(());
         }

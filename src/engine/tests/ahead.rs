@@ -12,13 +12,15 @@ use crate::store::Lease;
 /// Every job counts as short.
 const ALWAYS: Duration = Duration::from_secs(3_600);
 
-/// One worker on a job that runs until the gate opens, and another job that is foreseen behind it.
+/// One worker on a job that runs until the gate opens, and another job that is in its hands behind it.
 async fn foreseen() -> (Bench, [JobName; 2]) {
     let bench = Bench::start(Options { short_job: ALWAYS, ..workers(1) }).await;
     let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
     let created = bench.engine.submit_batch(both).await.expect("admitted");
     let names = [created[0].name.clone(), created[1].name.clone()];
     eventually(|| async { is_foreseen(&bench, &names[1]).then_some(()) }).await;
+    // What follows an attempt begins with handing it over.
+    eventually(|| async { (bench.engine.inner.hub.topic_count() == 2).then_some(()) }).await;
     (bench, names)
 }
 

@@ -2,6 +2,7 @@
 
 use super::input::{view_from_wire, within};
 use crate::domain::error::Violations;
+use crate::domain::input::too_few_views;
 use crate::domain::{Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::rpc::proto;
 
@@ -63,7 +64,7 @@ fn check_shape(matrix: &proto::MeasurementMatrix) -> Result<(), InvalidInput> {
     let (n, m) = (matrix.view_count as usize, matrix.track_count as usize);
     let mut found = Violations::default();
     if n < 2 {
-        found.push(Violation::of(field("view_count"), format!("{n} views given, at least 2 are needed")));
+        found.push(Violation::of(field("view_count"), too_few_views(n)));
     }
     if m == 0 {
         found.push(Violation::of(field("track_count"), "no tracks given, at least 1 is needed"));
