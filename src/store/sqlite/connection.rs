@@ -11,7 +11,7 @@ use rusqlite::config::DbConfig;
 use rusqlite::types::Value as Cell;
 use rusqlite::{OpenFlags, Statement as Prepared};
 
-use super::{BUSY_TIMEOUT, LOG_BYTES};
+use super::{BUSY_TIMEOUT, SETTINGS};
 use crate::store::Error;
 use crate::store::sql::{self, Connection, Row, Statement, Value};
 
@@ -35,17 +35,13 @@ impl WriteConnection {
         let connection = rusqlite::Connection::open_with_flags(database, flags)?;
         connection.busy_timeout(BUSY_TIMEOUT)?;
         connection.set_prepared_statement_cache_capacity(PREPARED);
-        // What was acknowledged survives a power cut, not only a crash of the process.
-        connection.pragma_update(None, "synchronous", "FULL")?;
-        connection.pragma_update(None, "foreign_keys", true)?;
-        // Answers with what it set, as the log mode does: the latter is the file's.
-        connection.pragma_update_and_check(None, "journal_size_limit", LOG_BYTES, |_| Ok(()))?;
+        for (name, value) in SETTINGS {
+            connection.pragma_update(None, name, value)?;
+        }
         // A page is in the log once, not each time that the cache is full; and not at all where the transaction gives it
         // back, as on a full disk it must. What is written at a time is bounded by what one message may hold.
         connection.pragma_update(None, "cache_spill", false)?;
-        // The writer does so itself: see `log`.
-        connection.pragma_update_and_check(None, "wal_autocheckpoint", 0, |_| Ok(()))?;
-        // Nor is it done by dropping this: see `close`.
+        // Dropping this does not write the log back: see `close`.
         connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)?;
         // Only with the first look does it open the log, and keep others that close from being the last to go.
         connection.query_row("PRAGMA schema_version", [], |_| Ok(()))?;

@@ -13,7 +13,7 @@ use super::connection::WriteConnection;
 use crate::store::Error;
 
 /// Pages at which the log is written back, as SQLite has it: 4 MB.
-const LONG_PAGES: i64 = 1_000;
+pub(super) const LONG_PAGES: i64 = 1_000;
 
 /// How long a log that is to be cut waits for its readers; writers wait meanwhile.
 const CUT_PATIENCE: Duration = Duration::from_millis(200);
@@ -35,10 +35,10 @@ pub(super) enum Log {
 }
 
 impl WriteConnection {
-    /// Writes a log that has become long back into the database. Outside a transaction, as all of this.
-    pub(super) fn keep_log_short(&mut self) -> Result<Log, Error> {
+    /// Writes a log of so many pages at least back into the database. Outside a transaction, as all of this.
+    pub(super) fn write_log_back(&mut self, least_pages: i64) -> Result<Log, Error> {
         let (pages, written): (i64, i64) = self.first_row(LOOK, |row| Ok((row.get(1)?, row.get(2)?)))?;
-        if pages < LONG_PAGES || written >= pages {
+        if pages < least_pages || written >= pages {
             return Ok(Log::Short);
         }
         self.where_it_fits(|connection| connection.first_row(WRITE_BACK, |_| Ok(())))

@@ -14,13 +14,13 @@ mod tests;
 mod writer;
 
 use std::fs::{File, TryLockError};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{
     SqliteAutoVacuum, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions,
-    SqliteRow, SqliteSynchronous,
+    SqliteRow,
 };
 
 use super::sql::{self, Connection, Database, Moves, Operation, Size, Statement, Step};
@@ -44,15 +44,23 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 /// of a disk that has failed.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Hands pages back, 1,024 at a time, which are 4 MB: writers wait meanwhile, and on a full disk it is the reserve that
-/// holds them in the log.
+/// Hands pages back, 1,024 at a time, which are 4 MB: writers wait meanwhile, and where others have to move for them, on
+/// a full disk it is the reserve that holds these in the log.
 const VACUUM: &str = "PRAGMA incremental_vacuum(1024)";
 const VACUUM_BYTES: u64 = 4 << 20;
 /// How often, each time that space is to be given back; others may write in between.
 const VACUUMS: u32 = 4;
-/// What the write-ahead log keeps of its length once it is written back, in bytes: a large result would leave it as
-/// long as itself.
-const LOG_BYTES: i64 = 67_108_864;
+/// What every connection is told.
+const SETTINGS: [(&str, &str); 4] = [
+    // What was acknowledged survives a power cut, not only a crash of the process.
+    ("synchronous", "FULL"),
+    ("foreign_keys", "ON"),
+    // What the write-ahead log keeps of its length once it is written back, in bytes: a large result would leave it as
+    // long as itself.
+    ("journal_size_limit", "67108864"),
+    // The writer writes the log back: see `log`.
+    ("wal_autocheckpoint", "0"),
+];
 
 const MIGRATIONS: [Step; 9] = [
     (1, "jobs", include_str!("../migrations/sqlite/0001_jobs.sql")),
@@ -72,6 +80,7 @@ pub struct Sqlite {
     writer: Writer,
     has_room: Room,
     readers: SqlitePool,
+    database: PathBuf,
     /// Unlocked when it is closed, also by the death of the process.
     _lock: File,
 }
@@ -102,9 +111,15 @@ impl Sqlite {
             opened => opened?,
         };
         let has_room = reserve.room();
-        let writer = Writer::start(connection, database, reserve, group_time)?;
+        let writer = Writer::start(connection, database.clone(), reserve, group_time)?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
-        Ok(Self { writer, has_room, readers, _lock: lock })
+        Ok(Self { writer, has_room, readers, database, _lock: lock })
+    }
+
+    /// What a pragma says that counts something.
+    async fn pragma(&self, pragma: &'static str) -> Result<u64, Error> {
+        let count: i64 = sqlx::query_scalar(pragma).fetch_one(&self.readers).await?;
+        u64::try_from(count).map_err(|_| Error::Corrupt(format!("{pragma} is {count}")))
     }
 
     /// Runs statements as they are on the writer's connection, for tests that need the database to misbehave.
@@ -119,16 +134,8 @@ impl Sqlite {
 
 /// How the database is opened to bring its schema up to date, and to read; see [`WriteConnection::open`].
 fn options(database: &Path) -> SqliteConnectOptions {
-    SqliteConnectOptions::new()
-        .filename(database)
-        .journal_mode(SqliteJournalMode::Wal)
-        // As what is written afterwards.
-        .synchronous(SqliteSynchronous::Full)
-        .foreign_keys(true)
-        .pragma("journal_size_limit", LOG_BYTES.to_string())
-        // The writer writes the log back: see `log`.
-        .pragma("wal_autocheckpoint", "0")
-        .busy_timeout(BUSY_TIMEOUT)
+    let options = SqliteConnectOptions::new().filename(database).journal_mode(SqliteJournalMode::Wal);
+    SETTINGS.iter().fold(options.busy_timeout(BUSY_TIMEOUT), |options, &(name, value)| options.pragma(name, value))
 }
 
 /// A connection to a database whose schema is up to date.
@@ -256,14 +263,19 @@ impl Database for Sqlite {
         None
     }
 
-    /// Gives the file's free pages back, some at a time.
+    /// Gives the file's free pages back, some at a time. It becomes shorter as the log is written back, which tells it
+    /// to: such a log need not be long.
     async fn reclaim(&self) -> Result<(), Error> {
         for _ in 0..VACUUMS {
-            let free: i64 = sqlx::query_scalar("PRAGMA freelist_count").fetch_one(&self.readers).await?;
-            if free == 0 {
+            if self.pragma("PRAGMA freelist_count").await? == 0 {
                 break;
             }
             self.writer.run(Moves::Ends(VACUUM_BYTES), VACUUM).await?;
+        }
+        let bytes = self.pragma("PRAGMA page_count").await? * self.pragma("PRAGMA page_size").await?;
+        let unknown = |error: std::io::Error| Error::Unavailable(format!("cannot look at the database: {error}"));
+        if std::fs::metadata(&self.database).map_err(unknown)?.len() > bytes + VACUUM_BYTES {
+            self.writer.write_log_back().await?;
         }
         Ok(())
     }

@@ -17,7 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
 use super::connection::{WriteConnection, WrittenRow};
-use super::log::Log;
+use super::log::{LONG_PAGES, Log};
 use super::reserve::{RESERVE_BYTES, RETRY, Reserve};
 use crate::store::Error;
 use crate::store::sql::{self, Moves, Operation, Statement};
@@ -48,6 +48,7 @@ pub(super) struct Writer {
 
 enum Message {
     Write(Box<dyn Waiting>),
+    WriteLogBack(oneshot::Sender<()>),
     Close(oneshot::Sender<()>),
 }
 
@@ -186,13 +187,24 @@ impl Writer {
         self.write(moves, run).await
     }
 
+    /// Writes the log back into the database after what is already waiting, however short it is, as far as its readers
+    /// let it and the disk has room.
+    pub(super) async fn write_log_back(&self) -> Result<(), Error> {
+        self.send(Message::WriteLogBack).await
+    }
+
     /// Ends the thread after what is already waiting, and closes the connection.
     pub(super) async fn close(&self) {
-        let (done, closed) = oneshot::channel();
-        if self.inbox.send(Message::Close(done)).is_ok() {
-            // An error says that the thread is gone, which is what was wanted.
-            let _ = closed.await;
-        }
+        // An error says that the thread is gone, which is what was wanted.
+        let _ = self.send(Message::Close).await;
+    }
+
+    /// Has something done that answers when it is.
+    async fn send(&self, message: fn(oneshot::Sender<()>) -> Message) -> Result<(), Error> {
+        let closed = || Error::Unavailable("the store is closed".into());
+        let (done, answer) = oneshot::channel();
+        self.inbox.send(message(done)).map_err(|_| closed())?;
+        answer.await.map_err(|_| closed())
     }
 }
 
@@ -219,8 +231,13 @@ impl Desk {
             let left_over = match message {
                 Message::Write(first) => {
                     let left_over = self.group(first).await;
-                    self.keep_log_short();
+                    self.write_log_back(LONG_PAGES);
                     left_over
+                }
+                Message::WriteLogBack(done) => {
+                    self.write_log_back(1);
+                    let _ = done.send(());
+                    None
                 }
                 Message::Close(done) => {
                     if let Some(Err(error)) = self.connection.take().map(WriteConnection::close) {
@@ -370,12 +387,12 @@ impl Desk {
         }
     }
 
-    /// Writes a long log back. Where the disk has no room for that, the reserve may have: a log that is cut gives more
-    /// than it takes.
-    fn keep_log_short(&mut self) {
-        let kept = self.connection().and_then(WriteConnection::keep_log_short);
+    /// Writes a log of so many pages at least back. Where the disk has no room for that, the reserve may have: a log that
+    /// is cut gives more than it takes.
+    fn write_log_back(&mut self, least_pages: i64) {
+        let written = self.connection().and_then(|connection| connection.write_log_back(least_pages));
         let tried_lately = self.log_stays.is_some_and(|at| at.elapsed() < RETRY);
-        match kept {
+        match written {
             Ok(Log::Short) => self.log_stays = None,
             Ok(Log::Lacks(bytes)) if bytes <= RESERVE_BYTES && !tried_lately && self.reserve.give_up() => {
                 self.cut_log();
