@@ -10,7 +10,7 @@ use crate::rpc::proto;
 const EXAMPLES: &str = "\
 Examples:
   scpsfm inputs
-  scpsfm inputs --all --json | jq -r .name | xargs -n 1 scpsfm delete --input";
+  scpsfm inputs --all --json | jq -r .name | xargs -r -n 1 scpsfm delete --input";
 
 /// List uploaded inputs, the newest first
 ///

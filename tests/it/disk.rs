@@ -20,7 +20,7 @@ use crate::support::program::{Serving, run};
 use crate::support::scrape::Page;
 use crate::support::server::soon;
 use crate::support::uploads::{DEFAULT, encoded, id, part, reason, whole};
-use crate::support::wire::{create_raw, create_tracks, raw};
+use crate::support::wire::{all, create_raw, create_tracks, raw};
 
 /// Size of the disk: a few of the inputs below, each in the store and in its log.
 const DISK: &str = "size=96m";
@@ -206,6 +206,38 @@ async fn on_a_full_disk_a_server_starts_and_room_is_made_through_it() {
     assert_eq!(reaches(&mut jobs, &next, &[JobState::Succeeded]).await, JobState::Succeeded);
     soon(page_says(&server, "/readyz", "ready\n")).await;
     assert_eq!(told_full(&server), 0.0);
+}
+
+/// Bytes beside the reserve: fewer than a result, and enough for a reserve to be made anew once it is given up.
+const BESIDE: usize = 4_500_000;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_result_that_needs_the_reserve_has_it() {
+    let Some(disk) = SmallDisk::mount("a result on a nearly full disk") else { return };
+    let data_dir = disk.path().join("data");
+    let handing_back = [("SCPSFM_ENGINE__DRAIN_SECONDS", "0")];
+    let mut server = Serving::start_with(&data_dir, &handing_back, Stdio::null());
+    let mut jobs = connected(&server).await;
+    let large = SceneOptions { views: 20, tracks: 20_000, outliers: 0.3, ..SceneOptions::default() };
+    let mut request = scene_request(&large);
+    let settings = proto::SolveSettings { method: proto::Method::Geometry as i32, ..Default::default() };
+    request.job = Some(proto::Job { settings: Some(settings), ..Default::default() });
+    let name = created(&mut jobs, request).await;
+    assert_eq!(reaches(&mut jobs, &name, &[JobState::Running]).await, JobState::Running);
+    server.running.signal(rustix::process::Signal::TERM);
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success(), "a clean end, which writes the log back");
+    assert!(!data_dir.join("scpsfm.db-wal").exists() && data_dir.join("scpsfm.reserve").exists());
+
+    disk.fill(BESIDE);
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    let states = [JobState::Succeeded, JobState::Failed];
+    assert_eq!(reaches(&mut jobs, &name, &states).await, JobState::Succeeded);
+    let job = jobs.get_job(proto::GetJobRequest { name: name.clone() }).await.expect("the job").into_inner();
+    assert_eq!(job.attempt, 2, "the one that was given back, and the one that solved it");
+    let request = proto::ReadJobResultRequest { name, offset: 0 };
+    let (chunks, _) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
+    assert!(chunks[0].total_size > BESIDE as i64, "{} bytes", chunks[0].total_size);
 }
 
 /// Waits until a page, which is there all the time, holds these words.

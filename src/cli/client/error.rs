@@ -85,6 +85,11 @@ impl Error {
             return Error::Unavailable(format!("the connection to {server} broke: {cause}{hint}"));
         }
         let message = status.message().to_owned();
+        if message.contains("grpc-status header missing") {
+            return Error::Unavailable(format!(
+                "what answers at {server} speaks no gRPC: is this another port, such as that of the metrics? ({message})"
+            ));
+        }
         if was_cut(status) {
             return Error::Unavailable(format!("the connection to {server} broke: {message}"));
         }

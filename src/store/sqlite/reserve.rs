@@ -36,6 +36,8 @@ pub(super) struct Reserve {
     is_whole: bool,
     /// When it was last tried to make it, and why there is none.
     tried: Option<(Instant, String)>,
+    /// When its room was last given to others.
+    given_up: Option<Instant>,
     has_room: Room,
 }
 
@@ -54,7 +56,8 @@ impl Reserve {
     pub(super) fn of(directory: &Path) -> Self {
         let path = directory.join(RESERVE_FILE);
         let is_whole = std::fs::metadata(&path).is_ok_and(|file| file.len() == RESERVE_BYTES);
-        let mut reserve = Self { path, is_whole, tried: None, has_room: Room(Arc::new(AtomicBool::new(true))) };
+        let mut reserve =
+            Self { path, is_whole, tried: None, given_up: None, has_room: Room(Arc::new(AtomicBool::new(true))) };
         reserve.restore();
         reserve
     }
@@ -67,14 +70,20 @@ impl Reserve {
         self.is_whole
     }
 
-    /// Whether it was given up and is to be had back.
+    /// Whether it was given up and is to be had back: not at once, so that the operation that it was given up for has
+    /// its room.
     pub(super) fn is_due(&self) -> bool {
-        !self.is_whole && self.tried.as_ref().is_none_or(|(at, _)| at.elapsed() >= RETRY)
+        let rests = self.given_up.is_some_and(|at| at.elapsed() < RETRY);
+        !self.is_whole && !rests && !self.tried_lately()
+    }
+
+    fn tried_lately(&self) -> bool {
+        self.tried.as_ref().is_some_and(|(at, _)| at.elapsed() < RETRY)
     }
 
     /// Whether there is a reserve, made anew where it was given up and there is room again.
     pub(super) fn restore(&mut self) -> bool {
-        if !self.is_due() {
+        if self.is_whole || self.tried_lately() {
             return self.is_whole;
         }
         match self.make() {
@@ -104,7 +113,7 @@ impl Reserve {
             return false;
         }
         match std::fs::remove_file(&self.path) {
-            Ok(()) => self.is_whole = false,
+            Ok(()) => (self.is_whole, self.given_up) = (false, Some(Instant::now())),
             Err(error) => tracing::error!(%error, path = %self.path.display(), "cannot give up the room that is kept"),
         }
         !self.is_whole
@@ -168,6 +177,8 @@ mod tests {
         let draft = reserve.path.with_extension("reserve.new");
         std::fs::create_dir(&draft).expect("a folder");
         assert!(reserve.room().is_there(), "it may yet be had back");
+        assert!(!reserve.is_due(), "it is for whoever it was given up for");
+        reserve.given_up = None;
         assert!(reserve.is_due() && !reserve.restore() && !reserve.is_whole() && !reserve.room().is_there());
         std::fs::remove_dir(&draft).expect("removed");
         assert!(!reserve.is_due() && !reserve.restore(), "not tried again at once");
