@@ -220,7 +220,9 @@ async fn a_result_that_needs_the_reserve_has_it() {
     let mut jobs = connected(&server).await;
     let large = SceneOptions { views: 20, tracks: 20_000, outliers: 0.3, ..SceneOptions::default() };
     let mut request = scene_request(&large);
-    let settings = proto::SolveSettings { method: proto::Method::Geometry as i32, ..Default::default() };
+    // Seconds, in which the server is sent away.
+    let method = proto::Method::Paper as i32;
+    let settings = proto::SolveSettings { method, iterations: Some(60), ..Default::default() };
     request.job = Some(proto::Job { settings: Some(settings), ..Default::default() });
     let name = created(&mut jobs, request).await;
     assert_eq!(reaches(&mut jobs, &name, &[JobState::Running]).await, JobState::Running);
