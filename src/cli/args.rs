@@ -78,7 +78,7 @@ impl PageArgs {
             return false;
         }
         if !self.all {
-            eprintln!("more: --page-token {next_page_token}, or --all");
+            eprintln!("more: --page-token {next_page_token}");
         }
         self.page_token = next_page_token;
         self.all

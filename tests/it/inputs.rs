@@ -146,6 +146,10 @@ fn commands_list_and_delete_inputs() {
     let line: serde_json::Value = serde_json::from_str(&next.stdout).expect("one line of JSON");
     assert_eq!((line["name"].as_str(), line["tracks"].as_u64()), (Some(names[1].as_str()), Some(3)));
 
+    let all = run(["inputs", "--all", "--page-size", "1"].iter().chain(&to));
+    let listed: Vec<&str> = all.stdout.lines().filter_map(|line| line.split_whitespace().next()).collect();
+    assert!(listed == names && all.stderr.is_empty(), "{all:?}");
+
     // A job says which of them it was created with.
     let job = run(["submit", "--input", &names[0], "--method", "geometry"].iter().chain(&to)).stdout;
     let got = run(["get", job.trim()].iter().chain(&to));
