@@ -14,7 +14,7 @@ Examples:
 
 /// List uploaded inputs, the newest first
 ///
-/// Prints one page, or all; where there are more, the token of the next page goes to stderr. Uploads that are not finished are
+/// Prints one page, or all; where there are more, the token of the next page goes to stderr. Uploads not finished are
 /// not listed. Bytes are those that were uploaded, which count against what the server lets a tenant have.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]

@@ -20,7 +20,7 @@ may stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__
 
 When it serves, two lines on stdout say where: `grpc http://...` (or https) and `metrics http://...`. SIGTERM or Ctrl-C drains: \
 new jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start; \
-a second signal gives them back now. That is a clean end (0); a third ends at once (130), and running jobs have lost an \
+a second signal gives them back now. That is a clean end (0); a third ends at once (130), and jobs that still run lose an \
 attempt, of which they have engine.max_attempts.
 
 Without TLS and keys it listens on loopback only. A key is 32 or more random characters (`openssl rand -hex 32`) and \
@@ -244,7 +244,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let drained = tokio::select! {
         drained = service.stop(hurry.cancelled()) => drained?,
         () = impatience => {
-            return Err(Failure::interrupted_with("ended before the drain did: its jobs begin again at the next start"));
+            return Err(Failure::interrupted_with("ended before the drain did: jobs that still ran begin again at the next start"));
         }
     };
     tracing::info!(finished = drained.finished, given_back = drained.given_back, "drained");

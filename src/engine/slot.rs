@@ -196,8 +196,13 @@ impl Inner {
 
     /// Notes what became of the store, for those who ask whether this server is of any use.
     fn store_is(&self, state: StoreState) {
-        let before = self.store_state.send_replace(state);
-        if before == state {
+        let mut before = state;
+        // Those who follow it hear of changes alone: each would tell its own followers.
+        let changed = self.store_state.send_if_modified(|known| {
+            before = std::mem::replace(known, state);
+            before != state
+        });
+        if !changed {
             return;
         }
         observe::store_state(state);

@@ -58,10 +58,13 @@ impl Backoff {
     /// Makes a call, which in times of trouble may take no longer than the trouble is waited for.
     ///
     /// # Errors
-    /// The call's; that of the one before, where this one took too long.
-    pub async fn within<T>(&self, call: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
-        let Some(trouble) = &self.trouble else { return call.await };
-        timeout_at(trouble.end, call).await.unwrap_or_else(|_| Err(trouble.last.clone()))
+    /// The call's; that of the one before, where this one took too long, and may yet be carried out.
+    pub async fn within<T>(&mut self, call: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
+        let Some(trouble) = &mut self.trouble else { return call.await };
+        timeout_at(trouble.end, call).await.unwrap_or_else(|_| {
+            trouble.may_be_done = true;
+            Err(trouble.last.clone())
+        })
     }
 
     /// Notes what a try came to; returns whether it is the first of its trouble.

@@ -85,7 +85,8 @@ impl Error {
             return Error::Unavailable(format!("the connection to {server} broke: {cause}{hint}"));
         }
         let message = status.message().to_owned();
-        if message.contains("grpc-status header missing") {
+        // A page that is not found, as on the port of the metrics. Other pages are those of proxies.
+        if !answered && status.code() == Code::Unimplemented && message.contains("grpc-status header missing") {
             return Error::Unavailable(format!(
                 "what answers at {server} speaks no gRPC: is this another port, such as that of the metrics? ({message})"
             ));
@@ -135,8 +136,8 @@ impl Error {
     pub(super) fn or_stored(self) -> Self {
         match self {
             Error::Unavailable(words) => Error::Unavailable(format!(
-                "{words}\nit may have been stored, the answer lost: `scpsfm list` shows it. With --request-id ID a \
-                 command can be repeated and stores once"
+                "{words}\nit may have been stored, the answer lost: look with `scpsfm list` before it is sent again. A \
+                 command that had --request-id can be repeated as it is, and stores once"
             )),
             same => same,
         }
@@ -186,8 +187,12 @@ fn was_cut(status: &Status) -> bool {
 /// Whether a call may have been carried out, and only its answer was lost: not where the server refused it, or nobody
 /// took the connection.
 pub(super) fn may_be_done(status: &Status) -> bool {
+    if let Some(reason) = reason(status) {
+        // The store broke off, maybe within the commit. Anything else is a refusal.
+        return reason == "STORE_UNAVAILABLE";
+    }
     let mut cause: Option<&dyn std::error::Error> = status.source();
-    let mut reached = was_cut(status) || cause.is_some() && status.get_details_error_info().is_none();
+    let mut reached = broke_or_ends(status);
     while let Some(here) = cause {
         reached &=
             here.downcast_ref::<io::Error>().is_none_or(|error| error.kind() != io::ErrorKind::ConnectionRefused);
@@ -297,6 +302,8 @@ mod tests {
         let broken = |kind: io::ErrorKind| Status::from_error(Box::new(io::Error::new(kind, "trouble")));
         assert!(may_be_done(&broken(io::ErrorKind::ConnectionReset)));
         assert!(may_be_done(&Status::unknown("stream was terminated without a final status")));
+        assert!(may_be_done(&Status::unavailable("a proxy's page")));
+        assert!(may_be_done(&status::from_engine(crate::engine::Error::Unavailable("within a commit".into()))));
         assert!(!may_be_done(&broken(io::ErrorKind::ConnectionRefused)), "nobody was there");
         assert!(!may_be_done(&status::from_engine(crate::engine::Error::Draining)), "it was refused");
     }

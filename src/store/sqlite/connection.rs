@@ -15,6 +15,10 @@ use super::{BUSY_TIMEOUT, SETTINGS};
 use crate::store::Error;
 use crate::store::sql::{self, Connection, Row, Statement, Value};
 
+/// Pages of a transaction that are held in memory, 64 MiB: what one message may hold by default. Of more, the end of a
+/// long upload, some go to the log early.
+const SPILL_PAGES: i64 = 16_384;
+
 /// Statements that stay prepared: more than there are.
 const PREPARED: usize = 128;
 
@@ -39,8 +43,8 @@ impl WriteConnection {
             connection.pragma_update(None, name, value)?;
         }
         // A page is in the log once, not each time that the cache is full; and not at all where the transaction gives it
-        // back, as on a full disk it must. What is written at a time is bounded by what one message may hold.
-        connection.pragma_update(None, "cache_spill", false)?;
+        // back, as on a full disk it must.
+        connection.pragma_update(None, "cache_spill", SPILL_PAGES)?;
         // Dropping this does not write the log back: see `close`.
         connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)?;
         // Only with the first look does it open the log, and keep others that close from being the last to go.

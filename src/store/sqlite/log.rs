@@ -78,6 +78,10 @@ fn room_beside(file: &Path) -> std::io::Result<u64> {
     #[cfg(unix)]
     {
         let disk = rustix::fs::statvfs(file)?;
+        // Not every file system counts: what does not fit is found by trying.
+        if disk.f_blocks == 0 {
+            return Ok(u64::MAX);
+        }
         Ok(disk.f_bavail.saturating_mul(disk.f_frsize))
     }
     #[cfg(not(unix))]

@@ -17,7 +17,7 @@ use crate::store::Error;
 /// The reserve within the data directory.
 const RESERVE_FILE: &str = "scpsfm.reserve";
 
-/// What is kept, in bytes: the log as long as it may grow before SQLite writes it back (1,000 pages, 4 MiB), the
+/// What is kept, in bytes: the log as long as it may grow before it is written back (1,000 pages, 4 MiB), the
 /// database grown by as much, one [`VACUUM`](super::VACUUM) and its pages in the log. The results of the jobs that run
 /// seldom have more.
 pub(super) const RESERVE_BYTES: u64 = 16 << 20;
@@ -114,6 +114,10 @@ impl Reserve {
         }
         match std::fs::remove_file(&self.path) {
             Ok(()) => (self.is_whole, self.given_up) = (false, Some(Instant::now())),
+            // Somebody else did: there is room, and none that is kept.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                (self.is_whole, self.given_up) = (false, Some(Instant::now()));
+            }
             Err(error) => tracing::error!(%error, path = %self.path.display(), "cannot give up the room that is kept"),
         }
         !self.is_whole

@@ -255,8 +255,13 @@ impl Desk {
     }
 
     /// Runs operations until none waits, commits them together and answers them; a large one alone. Returns what it was
-    /// handed and is no part of the group: a large operation, or the close.
+    /// handed and is no part of the group: a large operation, or what is none.
     async fn group(&mut self, first: Box<dyn Waiting>) -> Option<Message> {
+        // Here, and not where one is run again, for which the reserve was given up.
+        if self.reserve.is_due() {
+            self.cut_log();
+            self.reserve.restore();
+        }
         let begun = Instant::now();
         let alone = first.is_large();
         let mut left_over = None;
@@ -298,10 +303,6 @@ impl Desk {
 
     /// Begins a transaction with this operation; without one where it is refused.
     async fn open(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
-        if self.reserve.is_due() {
-            self.cut_log();
-            self.reserve.restore();
-        }
         let mut ran = self.control(BEGIN);
         if ran.is_ok() {
             ran = self.run(operation).await;
