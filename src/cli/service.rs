@@ -6,6 +6,8 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::time::timeout;
+
 use super::exit::Failure;
 use crate::config::{self, Config};
 use crate::engine::{self, Engine};
@@ -19,8 +21,12 @@ use crate::store::{QueueBounds, Store};
 /// How long calls may outlast the engine's drain: their streams end with it, so this is for the network only.
 const CALLS_BOUND: Duration = Duration::from_secs(5);
 
+/// How long the store may take to close. What it does then, such as writing a log back, the next start does otherwise.
+const CLOSE_BOUND: Duration = Duration::from_secs(5);
+
 /// A running service.
 pub struct Service {
+    store: Arc<dyn Store>,
     engine: Engine,
     server: Server,
     drain_bound: Duration,
@@ -36,11 +42,11 @@ impl Service {
         // Before the store is opened and its jobs begin: who cannot be let in is no reason to take them up.
         options.check_access().map_err(Failure::bad_config)?;
         let store = open_store(&config.store).await?;
-        let engine = Engine::start(engine_options(config), store, engine::solver_on(config.compute.threads()))
+        let engine = Engine::start(engine_options(config), store.clone(), engine::solver_on(config.compute.threads()))
             .await
             .map_err(|error| Failure::internal(format_args!("cannot start the engine: {error}")))?;
         let server = Server::bind(options, engine.clone()).await.map_err(Failure::internal)?;
-        Ok(Self { engine, server, drain_bound: Duration::from_secs(config.engine.drain_seconds) })
+        Ok(Self { store, engine, server, drain_bound: Duration::from_secs(config.engine.drain_seconds) })
     }
 
     /// Where it listens.
@@ -61,8 +67,8 @@ impl Service {
         self.server.wait().await.map_err(Failure::internal)
     }
 
-    /// Drains: health says NOT_SERVING, running jobs get their time and then go back to the queue, calls end. Once
-    /// `hurry` is over, so is the jobs' time.
+    /// Drains: health says NOT_SERVING, running jobs get their time and then go back to the queue, calls end, the store
+    /// is closed. Once `hurry` is over, so is the jobs' time.
     ///
     /// # Errors
     /// Why the server had failed before.
@@ -76,8 +82,11 @@ impl Service {
                 drain.await
             }
         };
-        self.server.shutdown(CALLS_BOUND).await.map_err(Failure::internal)?;
-        Ok(drained)
+        let calls_ended = self.server.shutdown(CALLS_BOUND).await;
+        if timeout(CLOSE_BOUND, self.store.close()).await.is_err() {
+            tracing::warn!("the store does not close; nothing that was acknowledged is lost by that");
+        }
+        calls_ended.map(|()| drained).map_err(Failure::internal)
     }
 }
 
