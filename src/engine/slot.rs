@@ -214,7 +214,7 @@ impl Inner {
         }
     }
 
-    async fn sweep(&self) {
+    pub(super) async fn sweep(&self) {
         let swept = self.store.sweep(SystemTime::now(), self.options.max_attempts).await;
         self.store_is(match &swept {
             Err(store::Error::Unavailable(_)) => StoreState::Away,

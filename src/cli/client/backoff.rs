@@ -151,6 +151,23 @@ mod tests {
         })
     }
 
+    /// A call that is cut off was sent: nobody knows what became of it.
+    #[test]
+    fn what_is_refused_is_not_done_and_what_is_cut_off_may_be() {
+        let clock = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();
+        clock.expect("a runtime").block_on(async {
+            let mut backoff = Backoff::default();
+            assert!(!backoff.may_be_done());
+            backoff.failed(&Status::resource_exhausted("full"));
+            assert!(!backoff.may_be_done(), "the server refused it");
+            let silent = std::future::pending::<Result<(), Status>>();
+            let status = backoff.within(silent).await.expect_err("no answer");
+            assert_eq!(status.code(), tonic::Code::ResourceExhausted, "what is known");
+            backoff.failed(&status);
+            assert!(backoff.may_be_done(), "also once more has failed");
+        });
+    }
+
     fn some_time_ago(time: Duration) -> Instant {
         Instant::now().checked_sub(time).expect("the machine has run for some seconds")
     }

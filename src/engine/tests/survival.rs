@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 use tokio::runtime::Runtime;
 
 use super::*;
-use crate::engine::{Drained, Error, locked};
+use crate::engine::{Drained, Error, StoreState, locked};
 
 #[tokio::test]
 async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
@@ -22,6 +22,62 @@ async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
     assert_eq!(bench.engine.job(&running).await.expect("exists").state, JobState::Succeeded);
     assert_eq!(bench.engine.job(&queued).await.expect("exists").state, JobState::Queued);
     assert_eq!(bench.engine.drain(Duration::ZERO).await, Drained::default(), "once is enough");
+}
+
+#[tokio::test]
+async fn who_is_in_a_hurry_waits_for_no_drain() {
+    for before in [true, false] {
+        let bench = Bench::start(workers(1)).await;
+        let name = bench.submit(Script::Wait).await;
+        bench.gate.until_waiting(1).await;
+        if before {
+            bench.engine.hurry();
+        }
+        let engine = bench.engine.clone();
+        let drain = tokio::spawn(async move { engine.drain(Duration::from_secs(3600)).await });
+        eventually(|| async { bench.engine.is_draining().then_some(()) }).await;
+        if !before {
+            bench.engine.hurry();
+        }
+        let drained = tokio::time::timeout(Duration::from_secs(120), drain).await.expect("an end").expect("no panic");
+        assert_eq!(drained, Drained { finished: 0, given_back: 1 }, "before: {before}");
+        assert_eq!(bench.engine.job(&name).await.expect("exists").state, JobState::Queued);
+    }
+    let idle = Bench::start(workers(1)).await;
+    idle.engine.hurry();
+    assert_eq!(idle.engine.drain(Duration::from_secs(3600)).await, Drained::default(), "nothing runs");
+}
+
+#[tokio::test]
+async fn those_who_follow_the_store_hear_of_changes_alone() {
+    let bench = Bench::start(workers(1)).await;
+    let mut states = bench.engine.store_state();
+    let look = async || {
+        for _ in 0..3 {
+            bench.engine.inner.sweep().await;
+        }
+    };
+    assert_eq!(*states.borrow_and_update(), StoreState::Sound);
+    look().await;
+    assert!(!states.has_changed().expect("an engine"), "nothing happened");
+
+    // As on a full disk: a write finds no room, and where the reserve is made is none.
+    let in_the_way = bench.directory.path().join("scpsfm.reserve.new");
+    std::fs::create_dir(&in_the_way).expect("a folder");
+    bench.store.find_no_room().await;
+    assert!(matches!(bench.engine.submit(new_job(Script::Succeed)).await, Err(Error::NoSpace(_))));
+    look().await;
+    assert_eq!(*states.borrow_and_update(), StoreState::Full);
+    look().await;
+    assert!(!states.has_changed().expect("an engine"), "it is as full as before");
+
+    std::fs::remove_dir(&in_the_way).expect("removed");
+    let room = states.wait_for(|state| *state == StoreState::Sound);
+    tokio::time::timeout(Duration::from_secs(120), room).await.expect("room within two minutes").expect("an engine");
+    // The next connection knows nothing of the limit.
+    bench.store.execute("PRAGMA max_page_count = 1073741823").await;
+    let name = bench.submit(Script::Succeed).await;
+    assert_eq!(bench.ended(&name).await.state, JobState::Succeeded);
 }
 
 #[tokio::test]

@@ -63,14 +63,29 @@ impl WriteConnection {
 
     /// Bytes that the disk lacks for the database to grow by what the log adds to it.
     pub(super) fn log_lacks(&mut self) -> Result<u64, Error> {
+        let growth = self.bytes()?.saturating_sub(self.file_bytes()?);
+        Ok(growth.saturating_sub(room_beside(self.database()).map_err(cannot_look)?))
+    }
+
+    /// Bytes that the file gives back to the disk once the log, which says so, is written back.
+    pub(super) fn surplus(&mut self) -> Result<u64, Error> {
+        Ok(self.file_bytes()?.saturating_sub(self.bytes()?))
+    }
+
+    /// Bytes of the database, wherever its pages are.
+    fn bytes(&mut self) -> Result<u64, Error> {
         let number = |row: &rusqlite::Row<'_>| row.get::<_, u32>(0);
         let page = u64::from(self.first_row("PRAGMA page_size", number)?);
-        let bytes = u64::from(self.first_row("PRAGMA page_count", number)?) * page;
-        let unknown = |error: std::io::Error| Error::Unavailable(format!("cannot look at the disk: {error}"));
-        let database = self.database();
-        let growth = bytes.saturating_sub(std::fs::metadata(database).map_err(unknown)?.len());
-        Ok(growth.saturating_sub(room_beside(database).map_err(unknown)?))
+        Ok(u64::from(self.first_row("PRAGMA page_count", number)?) * page)
     }
+
+    fn file_bytes(&self) -> Result<u64, Error> {
+        Ok(std::fs::metadata(self.database()).map_err(cannot_look)?.len())
+    }
+}
+
+fn cannot_look(error: std::io::Error) -> Error {
+    Error::Unavailable(format!("cannot look at the disk: {error}"))
 }
 
 /// Bytes that are free on the disk of a file, as far as the system tells.

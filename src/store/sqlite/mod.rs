@@ -14,7 +14,7 @@ mod tests;
 mod writer;
 
 use std::fs::{File, TryLockError};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use sqlx::pool::PoolConnection;
@@ -80,7 +80,6 @@ pub struct Sqlite {
     writer: Writer,
     has_room: Room,
     readers: SqlitePool,
-    database: PathBuf,
     /// Unlocked when it is closed, also by the death of the process.
     _lock: File,
 }
@@ -111,15 +110,9 @@ impl Sqlite {
             opened => opened?,
         };
         let has_room = reserve.room();
-        let writer = Writer::start(connection, database.clone(), reserve, group_time)?;
+        let writer = Writer::start(connection, database, reserve, group_time)?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
-        Ok(Self { writer, has_room, readers, database, _lock: lock })
-    }
-
-    /// What a pragma says that counts something.
-    async fn pragma(&self, pragma: &'static str) -> Result<u64, Error> {
-        let count: i64 = sqlx::query_scalar(pragma).fetch_one(&self.readers).await?;
-        u64::try_from(count).map_err(|_| Error::Corrupt(format!("{pragma} is {count}")))
+        Ok(Self { writer, has_room, readers, _lock: lock })
     }
 
     /// Runs statements as they are on the writer's connection, for tests that need the database to misbehave.
@@ -138,11 +131,13 @@ fn options(database: &Path) -> SqliteConnectOptions {
     SETTINGS.iter().fold(options.busy_timeout(BUSY_TIMEOUT), |options, &(name, value)| options.pragma(name, value))
 }
 
-/// A connection to a database whose schema is up to date.
-async fn connect(options: &SqliteConnectOptions) -> Result<SqliteConnection, Error> {
+/// Brings the schema of a database up to date, over a connection of its own.
+async fn migrate(options: &SqliteConnectOptions) -> Result<(), Error> {
     let mut connection = <SqliteConnection as sqlx::Connection>::connect_with(options).await?;
-    migrate(&mut connection).await?;
-    Ok(connection)
+    let migrated = sql::migrator(&MIGRATIONS).run(&mut connection).await.map_err(sql::migration_failed);
+    // Also after an error: one that is only dropped goes at a time of its own.
+    let closed = sqlx::Connection::close(connection).await;
+    migrated.and(closed.map_err(Error::from))
 }
 
 /// Brings its schema up to date and opens it to write.
@@ -150,13 +145,8 @@ async fn bring_up_to_date(options: &SqliteConnectOptions, database: &Path) -> Re
     // First, and there until the other one is closed, also by an error: the last one to go writes the log back, which a
     // full disk has no room for.
     let connection = WriteConnection::open(database)?;
-    let migrating = connect(options).await?;
-    sqlx::Connection::close(migrating).await?;
+    migrate(options).await?;
     Ok(connection)
-}
-
-async fn migrate(connection: &mut SqliteConnection) -> Result<(), Error> {
-    sql::migrator(&MIGRATIONS).run(connection).await.map_err(sql::migration_failed)
 }
 
 /// Whether the database's file is there. One of no bytes is refused: no server leaves one behind, so that it is what is
@@ -196,9 +186,8 @@ async fn create(directory: &Path, database: &Path) -> Result<(), Error> {
     }
     // Only takes effect in a new file, and is a write in any other; lets retention hand space back.
     let new = options(&draft).create_if_missing(true).auto_vacuum(SqliteAutoVacuum::Incremental);
-    let connection = connect(&new).await?;
-    // Writes the log back into the file and removes it.
-    sqlx::Connection::close(connection).await?;
+    // As the only connection it writes the log back into the file and removes it.
+    migrate(&new).await?;
     std::fs::rename(&draft, database)
         .map_err(|error| Error::Unavailable(format!("cannot make {}: {error}", database.display())))
 }
@@ -267,17 +256,13 @@ impl Database for Sqlite {
     /// to: such a log need not be long.
     async fn reclaim(&self) -> Result<(), Error> {
         for _ in 0..VACUUMS {
-            if self.pragma("PRAGMA freelist_count").await? == 0 {
+            let free: i64 = sqlx::query_scalar("PRAGMA freelist_count").fetch_one(&self.readers).await?;
+            if free == 0 {
                 break;
             }
             self.writer.run(Moves::Ends(VACUUM_BYTES), VACUUM).await?;
         }
-        let bytes = self.pragma("PRAGMA page_count").await? * self.pragma("PRAGMA page_size").await?;
-        let unknown = |error: std::io::Error| Error::Unavailable(format!("cannot look at the database: {error}"));
-        if std::fs::metadata(&self.database).map_err(unknown)?.len() > bytes + VACUUM_BYTES {
-            self.writer.write_log_back().await?;
-        }
-        Ok(())
+        self.writer.shorten().await
     }
 
     fn has_room(&self) -> bool {

@@ -39,6 +39,15 @@ impl std::ops::Deref for Fixture {
 }
 
 impl Sqlite {
+    /// Lets the database grow no more, and has a write find that out. The writer's next connection knows nothing of the
+    /// limit.
+    pub(crate) async fn find_no_room(&self) {
+        self.execute("PRAGMA max_page_count = 1").await;
+        let large = crate::store::NewRecord { input: vec![7; 1 << 20].into(), ..contract::record("large") };
+        let refused = self.create_job(large, &contract::ROOM, contract::time(0)).await;
+        assert!(matches!(refused, Err(Error::NoSpace(_))), "{refused:?}");
+    }
+
     /// Keeps the writer with an operation that has begun, until the sender is dropped.
     pub(crate) async fn hold(&self) -> (watch::Sender<()>, JoinHandle<Result<(), Error>>) {
         let (go, gone) = watch::channel(());
@@ -203,16 +212,18 @@ async fn of_a_deleted_input_nothing_is_left_once_its_jobs_are_gone() {
 async fn a_write_that_finds_no_room_is_run_again_once_the_log_is_cut() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let store = Sqlite::open(directory.path()).await.expect("a store");
-    let name =
-        store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created").job.name;
+    // A log that is too short to be written back by itself.
+    let new = crate::store::NewRecord { input: vec![7; 3 << 20].into(), ..contract::record("a") };
+    let name = store.create_job(new, &contract::ROOM, contract::time(0)).await.expect("created").job.name;
     let log = directory.path().join(format!("{DATABASE_FILE}-wal"));
-    assert!(std::fs::metadata(&log).expect("a log").len() > 0);
+    let length = std::fs::metadata(&log).expect("a log").len();
+    assert!(length > 3 << 20, "{length} bytes");
     // As full as it is; the next connection knows nothing of the limit, as if the log had made room.
     store.execute("PRAGMA max_page_count = 1").await;
     let new = crate::store::NewRecord { input: vec![7; 1 << 20].into(), ..contract::record("b") };
     store.create_job(new, &contract::ROOM, contract::time(1)).await.expect("room is made");
     let length = std::fs::metadata(&log).expect("a log").len();
-    assert!(length < 3 << 20, "the second write alone: {length} bytes");
+    assert!(length < 2 << 20, "the second write alone: {length} bytes");
     assert!(directory.path().join("scpsfm.reserve").exists());
     store.job(&name).await.expect("the first one");
 }

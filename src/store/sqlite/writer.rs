@@ -16,6 +16,7 @@ use futures_util::future::BoxFuture;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
+use super::VACUUM_BYTES;
 use super::connection::{WriteConnection, WrittenRow};
 use super::log::{LONG_PAGES, Log};
 use super::reserve::{RESERVE_BYTES, RETRY, Reserve};
@@ -48,7 +49,7 @@ pub(super) struct Writer {
 
 enum Message {
     Write(Box<dyn Waiting>),
-    WriteLogBack(oneshot::Sender<()>),
+    Shorten(oneshot::Sender<()>),
     Close(oneshot::Sender<()>),
 }
 
@@ -149,7 +150,7 @@ impl Writer {
         // tests.
         let runtime = tokio::runtime::Builder::new_current_thread().build().map_err(failed)?;
         let connection = Some(connection);
-        let desk = Desk { connection, database, reserve, log_stays: None, messages, group_time };
+        let desk = Desk { connection, database, reserve, gave_for_log: None, messages, group_time };
         let work = move || runtime.block_on(desk.serve());
         thread::Builder::new().name("store-writer".into()).spawn(work).map_err(failed)?;
         Ok(Self { inbox, patience: PATIENCE })
@@ -187,10 +188,10 @@ impl Writer {
         self.write(moves, run).await
     }
 
-    /// Writes the log back into the database after what is already waiting, however short it is, as far as its readers
-    /// let it and the disk has room.
-    pub(super) async fn write_log_back(&self) -> Result<(), Error> {
-        self.send(Message::WriteLogBack).await
+    /// After what is already waiting, has the database's file give back what it has beyond its pages, where that is
+    /// worth it and its readers let it.
+    pub(super) async fn shorten(&self) -> Result<(), Error> {
+        self.send(Message::Shorten).await
     }
 
     /// Ends the thread after what is already waiting, and closes the connection.
@@ -214,8 +215,9 @@ struct Desk {
     connection: Option<WriteConnection>,
     database: PathBuf,
     reserve: Reserve,
-    /// When the reserve was last given up for a log that the disk has no room to write back.
-    log_stays: Option<Instant>,
+    /// When the reserve was last given up so that the log could be cut. For a while that is not tried again: it may
+    /// have won nothing.
+    gave_for_log: Option<Instant>,
     messages: mpsc::UnboundedReceiver<Message>,
     group_time: Duration,
 }
@@ -234,8 +236,8 @@ impl Desk {
                     self.write_log_back(LONG_PAGES);
                     left_over
                 }
-                Message::WriteLogBack(done) => {
-                    self.write_log_back(1);
+                Message::Shorten(done) => {
+                    self.shorten();
                     let _ = done.send(());
                     None
                 }
@@ -392,16 +394,28 @@ impl Desk {
     /// is cut gives more than it takes.
     fn write_log_back(&mut self, least_pages: i64) {
         let written = self.connection().and_then(|connection| connection.write_log_back(least_pages));
-        let tried_lately = self.log_stays.is_some_and(|at| at.elapsed() < RETRY);
+        let gave_lately = self.gave_for_log.is_some_and(|at| at.elapsed() < RETRY);
         match written {
-            Ok(Log::Short) => self.log_stays = None,
-            Ok(Log::Lacks(bytes)) if bytes <= RESERVE_BYTES && !tried_lately && self.reserve.give_up() => {
-                self.cut_log();
-                self.reserve.restore();
-                self.log_stays = Some(Instant::now());
+            Ok(Log::Short) => self.gave_for_log = None,
+            Ok(Log::Lacks(bytes)) if bytes <= RESERVE_BYTES && !gave_lately => {
+                if self.reserve.give_up() {
+                    self.gave_for_log = Some(Instant::now());
+                    self.cut_log();
+                    self.reserve.restore();
+                }
             }
             Ok(Log::Lacks(_)) => {}
             Err(error) => tracing::debug!(%error, "the log cannot be written back"),
+        }
+    }
+
+    /// Writes the log back, however short it is, where the file is longer than its pages by what one
+    /// [`VACUUM`](super::VACUUM) gives back at least.
+    fn shorten(&mut self) {
+        match self.connection().and_then(WriteConnection::surplus) {
+            Ok(bytes) if bytes > VACUUM_BYTES => self.write_log_back(1),
+            Ok(_) => {}
+            Err(error) => tracing::debug!(%error, "the database cannot be shortened"),
         }
     }
 
