@@ -1,161 +1,25 @@
-//! The only functions that touch the metrics of the [`catalogue`].
+//! The only code that touches the metrics of the [`catalogue`].
 //!
 //! The rest of the program says what happened through the typed functions below. Before [`install`] (and in a
 //! command that has no scrape port) they do nothing.
 
 mod catalogue;
+mod guards;
+mod labels;
 
 use std::sync::OnceLock;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use metrics::{counter, gauge, histogram};
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle, PrometheusRecorder};
 
 use crate::domain::job::{Job, JobState};
-use crate::domain::{Grade, Prior, Quota, Stage};
+use crate::domain::{Grade, Prior, Stage};
 
 pub use catalogue::*;
-
-/// Why a job was refused.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Refusal {
-    /// As much of this waits as may.
-    QueueFull(Quota),
-    /// The batch alone has more of this than may ever wait.
-    BatchTooLarge(Quota),
-    /// Input or settings broke a rule.
-    Invalid,
-    /// The input is above the advertised limits.
-    TooLarge,
-    /// The server is draining.
-    Draining,
-}
-
-impl Refusal {
-    fn all() -> impl Iterator<Item = Refusal> {
-        let by_bound =
-            Quota::OF_QUEUE.into_iter().flat_map(|quota| [Refusal::QueueFull(quota), Refusal::BatchTooLarge(quota)]);
-        by_bound.chain([Refusal::Invalid, Refusal::TooLarge, Refusal::Draining])
-    }
-
-    fn reason(self) -> &'static str {
-        match self {
-            Refusal::QueueFull(_) => "QUEUE_FULL",
-            Refusal::BatchTooLarge(_) => "BATCH_TOO_LARGE",
-            Refusal::Invalid => "INVALID",
-            Refusal::TooLarge => "TOO_LARGE",
-            Refusal::Draining => "DRAINING",
-        }
-    }
-
-    /// The bound of the queue that was hit; `NONE` where it was no bound.
-    fn bound(self) -> &'static str {
-        match self {
-            Refusal::QueueFull(quota) | Refusal::BatchTooLarge(quota) => quota.name(),
-            Refusal::Invalid | Refusal::TooLarge | Refusal::Draining => NONE,
-        }
-    }
-}
-
-/// Why an upload was refused.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum UploadRefusal {
-    /// The tenant has as much of this as it may.
-    Full(Quota),
-    /// The upload alone has more of this than may ever be.
-    TooLarge(Quota),
-}
-
-impl UploadRefusal {
-    const ALL: [UploadRefusal; 4] = [
-        UploadRefusal::Full(Quota::TenantUploads),
-        UploadRefusal::Full(Quota::TenantUploadBytes),
-        UploadRefusal::TooLarge(Quota::UploadBytes),
-        UploadRefusal::TooLarge(Quota::TenantUploadBytes),
-    ];
-
-    fn reason(self) -> &'static str {
-        match self {
-            UploadRefusal::Full(_) => "UPLOADS_FULL",
-            UploadRefusal::TooLarge(_) => "UPLOAD_TOO_LARGE",
-        }
-    }
-
-    fn bound(self) -> &'static str {
-        match self {
-            UploadRefusal::Full(quota) | UploadRefusal::TooLarge(quota) => quota.name(),
-        }
-    }
-}
-
-/// Why a job was deleted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Deletion {
-    /// Its owner asked for it.
-    Requested,
-    /// It was kept long enough.
-    Retention,
-}
-
-impl Deletion {
-    const ALL: [Deletion; 2] = [Deletion::Requested, Deletion::Retention];
-
-    fn name(self) -> &'static str {
-        match self {
-            Deletion::Requested => "REQUESTED",
-            Deletion::Retention => "RETENTION",
-        }
-    }
-}
-
-/// Why an upload was given up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum GivenUp {
-    /// Nothing came for too long.
-    Abandoned,
-    /// Its bytes do not have the SHA-256 that its caller named.
-    WrongHash,
-    /// Its bytes are no valid input.
-    Invalid,
-}
-
-impl GivenUp {
-    const ALL: [GivenUp; 3] = [GivenUp::Abandoned, GivenUp::WrongHash, GivenUp::Invalid];
-
-    fn name(self) -> &'static str {
-        match self {
-            GivenUp::Abandoned => "ABANDONED",
-            GivenUp::WrongHash => "WRONG_HASH",
-            GivenUp::Invalid => "INVALID",
-        }
-    }
-}
-
-/// How an attempt ended that did not end its job.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum AttemptLost {
-    /// Given back to the queue at a drain.
-    GivenBack,
-    /// Another worker took the lease over; the outcome was dropped.
-    Fenced,
-    /// The lease ran out without a heartbeat: the process that held it died.
-    LeaseExpired,
-}
-
-impl AttemptLost {
-    const ALL: [AttemptLost; 3] = [AttemptLost::GivenBack, AttemptLost::Fenced, AttemptLost::LeaseExpired];
-
-    fn name(self) -> &'static str {
-        match self {
-            AttemptLost::GivenBack => "GIVEN_BACK",
-            AttemptLost::Fenced => "FENCED",
-            AttemptLost::LeaseExpired => "LEASE_EXPIRED",
-        }
-    }
-}
-
-/// Label of a succeeded job without a reconstruction, of an attempt that ended no job, and of a refusal by no bound.
-const NONE: &str = "NONE";
+pub use guards::{Held, RpcCall, StoreTimer};
+pub use labels::{AttemptLost, Deletion, GivenUp, Refusal, UploadRefusal};
+use labels::{NONE, grade_name};
 
 /// Installs the process-wide recorder, once; later calls return the same handle.
 ///
@@ -247,15 +111,6 @@ fn create_known_series() {
     }
     for reason in AttemptLost::ALL {
         counter!(ATTEMPTS_LOST.name, "reason" => reason.name()).absolute(0);
-    }
-}
-
-fn grade_name(grade: Option<Grade>) -> &'static str {
-    match grade {
-        Some(Grade::Metric) => "METRIC",
-        Some(Grade::Weak) => "WEAK",
-        Some(Grade::ProjectiveOnly) => "PROJECTIVE_ONLY",
-        None => NONE,
     }
 }
 
@@ -356,24 +211,6 @@ pub fn attempt_lost(reason: AttemptLost) {
     counter!(ATTEMPTS_LOST.name, "reason" => reason.name()).increment(1);
 }
 
-/// Holds a gauge one higher for as long as it lives, whatever way its scope is left.
-#[must_use = "the gauge falls when this is dropped"]
-#[derive(Debug)]
-pub struct Held(metrics::Gauge);
-
-impl Held {
-    fn new(gauge: metrics::Gauge) -> Self {
-        gauge.increment(1.0);
-        Self(gauge)
-    }
-}
-
-impl Drop for Held {
-    fn drop(&mut self) {
-        self.0.decrement(1.0);
-    }
-}
-
 /// A worker is busy until the guard is dropped.
 pub fn busy_worker() -> Held {
     Held::new(gauge!(WORKERS_BUSY.name))
@@ -399,36 +236,6 @@ pub fn stranger_closed() {
     counter!(STRANGERS_CLOSED.name).increment(1);
 }
 
-/// A gRPC call that has begun. Dropping it without a code counts it as `CANCELLED`: the client went away.
-#[must_use = "the call ends when this is dropped"]
-pub struct RpcCall {
-    method: &'static str,
-    begun: Instant,
-    code: &'static str,
-    _in_flight: Held,
-}
-
-impl RpcCall {
-    /// A call begins. `method` is `package.Service/Method`, taken from a list that this server knows: the path that
-    /// a client sent would let it create series without end.
-    pub fn begin(method: &'static str) -> Self {
-        Self { method, begun: Instant::now(), code: "CANCELLED", _in_flight: Held::new(gauge!(RPC_IN_FLIGHT.name)) }
-    }
-
-    /// The call ended with this status code (`OK`, `NOT_FOUND`, ...).
-    pub fn finish(mut self, code: &'static str) {
-        self.code = code;
-    }
-}
-
-impl Drop for RpcCall {
-    fn drop(&mut self) {
-        let seconds = self.begun.elapsed().as_secs_f64();
-        counter!(RPC_REQUESTS.name, "method" => self.method, "code" => self.code).increment(1);
-        histogram!(RPC_DURATION.name, "method" => self.method, "code" => self.code).record(seconds);
-    }
-}
-
 /// Method label of a call to something that this server does not offer.
 pub const UNKNOWN_METHOD: &str = "unknown";
 
@@ -440,22 +247,9 @@ pub fn write_fenced(operation: &'static str) {
     counter!(FENCED_WRITES.name, "operation" => operation).increment(1);
 }
 
-/// Times a store operation from its creation to its drop.
-#[must_use = "the operation ends when this is dropped"]
-pub struct StoreTimer {
-    operation: &'static str,
-    begun: Instant,
-}
-
 /// A store operation begins; `operation` is the name of the trait's method.
 pub fn store_operation(operation: &'static str) -> StoreTimer {
-    StoreTimer { operation, begun: Instant::now() }
-}
-
-impl Drop for StoreTimer {
-    fn drop(&mut self) {
-        histogram!(STORE_DURATION.name, "operation" => self.operation).record(self.begun.elapsed().as_secs_f64());
-    }
+    StoreTimer::begin(operation)
 }
 
 /// So many operations were committed together.

@@ -1,0 +1,154 @@
+//! The values of labels that say why something happened.
+
+use crate::domain::{Grade, Quota};
+
+/// Label of a succeeded job without a reconstruction, of an attempt that ended no job, and of a refusal by no bound.
+pub(super) const NONE: &str = "NONE";
+
+/// Why a job was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refusal {
+    /// As much of this waits as may.
+    QueueFull(Quota),
+    /// The batch alone has more of this than may ever wait.
+    BatchTooLarge(Quota),
+    /// Input or settings broke a rule.
+    Invalid,
+    /// The input is above the advertised limits.
+    TooLarge,
+    /// The server is draining.
+    Draining,
+}
+
+impl Refusal {
+    pub(super) fn all() -> impl Iterator<Item = Refusal> {
+        let by_bound =
+            Quota::OF_QUEUE.into_iter().flat_map(|quota| [Refusal::QueueFull(quota), Refusal::BatchTooLarge(quota)]);
+        by_bound.chain([Refusal::Invalid, Refusal::TooLarge, Refusal::Draining])
+    }
+
+    pub(super) fn reason(self) -> &'static str {
+        match self {
+            Refusal::QueueFull(_) => "QUEUE_FULL",
+            Refusal::BatchTooLarge(_) => "BATCH_TOO_LARGE",
+            Refusal::Invalid => "INVALID",
+            Refusal::TooLarge => "TOO_LARGE",
+            Refusal::Draining => "DRAINING",
+        }
+    }
+
+    /// The bound of the queue that was hit; `NONE` where it was no bound.
+    pub(super) fn bound(self) -> &'static str {
+        match self {
+            Refusal::QueueFull(quota) | Refusal::BatchTooLarge(quota) => quota.name(),
+            Refusal::Invalid | Refusal::TooLarge | Refusal::Draining => NONE,
+        }
+    }
+}
+
+/// Why an upload was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum UploadRefusal {
+    /// The tenant has as much of this as it may.
+    Full(Quota),
+    /// The upload alone has more of this than may ever be.
+    TooLarge(Quota),
+}
+
+impl UploadRefusal {
+    pub(super) const ALL: [UploadRefusal; 4] = [
+        UploadRefusal::Full(Quota::TenantUploads),
+        UploadRefusal::Full(Quota::TenantUploadBytes),
+        UploadRefusal::TooLarge(Quota::UploadBytes),
+        UploadRefusal::TooLarge(Quota::TenantUploadBytes),
+    ];
+
+    pub(super) fn reason(self) -> &'static str {
+        match self {
+            UploadRefusal::Full(_) => "UPLOADS_FULL",
+            UploadRefusal::TooLarge(_) => "UPLOAD_TOO_LARGE",
+        }
+    }
+
+    pub(super) fn bound(self) -> &'static str {
+        match self {
+            UploadRefusal::Full(quota) | UploadRefusal::TooLarge(quota) => quota.name(),
+        }
+    }
+}
+
+/// Why a job was deleted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Deletion {
+    /// Its owner asked for it.
+    Requested,
+    /// It was kept long enough.
+    Retention,
+}
+
+impl Deletion {
+    pub(super) const ALL: [Deletion; 2] = [Deletion::Requested, Deletion::Retention];
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Deletion::Requested => "REQUESTED",
+            Deletion::Retention => "RETENTION",
+        }
+    }
+}
+
+/// Why an upload was given up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum GivenUp {
+    /// Nothing came for too long.
+    Abandoned,
+    /// Its bytes do not have the SHA-256 that its caller named.
+    WrongHash,
+    /// Its bytes are no valid input.
+    Invalid,
+}
+
+impl GivenUp {
+    pub(super) const ALL: [GivenUp; 3] = [GivenUp::Abandoned, GivenUp::WrongHash, GivenUp::Invalid];
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            GivenUp::Abandoned => "ABANDONED",
+            GivenUp::WrongHash => "WRONG_HASH",
+            GivenUp::Invalid => "INVALID",
+        }
+    }
+}
+
+/// How an attempt ended that did not end its job.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AttemptLost {
+    /// Given back to the queue at a drain.
+    GivenBack,
+    /// Another worker took the lease over; the outcome was dropped.
+    Fenced,
+    /// The lease ran out without a heartbeat: the process that held it died.
+    LeaseExpired,
+}
+
+impl AttemptLost {
+    pub(super) const ALL: [AttemptLost; 3] = [AttemptLost::GivenBack, AttemptLost::Fenced, AttemptLost::LeaseExpired];
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            AttemptLost::GivenBack => "GIVEN_BACK",
+            AttemptLost::Fenced => "FENCED",
+            AttemptLost::LeaseExpired => "LEASE_EXPIRED",
+        }
+    }
+}
+
+/// Label of the grade of a result.
+pub(super) fn grade_name(grade: Option<Grade>) -> &'static str {
+    match grade {
+        Some(Grade::Metric) => "METRIC",
+        Some(Grade::Weak) => "WEAK",
+        Some(Grade::ProjectiveOnly) => "PROJECTIVE_ONLY",
+        None => NONE,
+    }
+}
