@@ -63,9 +63,9 @@ pub struct Args {
 #[command(next_help_heading = "A sequence")]
 pub struct SequenceArgs {
     /// A camera that travels, whose tracks live a few views each; of the scene's options, --views, --tracks, --noise,
-    /// --outliers, --radial-k1 and --seed apply
+    /// --outliers, --radial-k1, --zoom and --seed apply
     #[arg(long, conflicts_with_all = ["depths", "shape", "motion", "outlier_kind", "wrong_views", "second_motion",
-        "noise_kind", "principal_point", "zoom", "rotation", "roll"])]
+        "noise_kind", "principal_point", "rotation", "roll"])]
     pub sequence: bool,
 
     /// Views that a track lives, at least and at most [default: 3,10; of fewer than 10 views all: 3,VIEWS]
@@ -104,6 +104,7 @@ impl Args {
             wrong_observations: self.sequence.wrong_observations,
             joined: self.sequence.joined,
             radial_k1: self.camera.radial_k1,
+            zoom: self.camera.zoom,
             seed: self.scene.seed,
         };
         Sequence::generate(&options).map_err(Failure::usage)
@@ -127,13 +128,13 @@ pub fn run(args: Args) -> Result<Exit, Failure> {
         write(&args.out, &sequence.input, &sequence.options, &sequence.truth)?;
         let right = sequence.truth.inlier.iter().filter(|&&inlier| inlier).count();
         eprintln!(
-            "{} views, {} observations, {} tracks of {} to {} views of which {right} are right, focal {:.1} px: {}",
+            "{} views, {} observations, {} tracks of {} to {} views of which {right} are right, {}: {}",
             args.scene.views,
             sequence.input.x.len(),
             args.scene.tracks,
             sequence.options.lifetime.0,
             sequence.options.lifetime.1,
-            sequence.truth.focal_px,
+            focal(sequence.truth.focal_px, sequence.options.zoom),
             args.out.display()
         );
         return Ok(Exit::Done);
@@ -147,11 +148,16 @@ pub fn run(args: Args) -> Result<Exit, Failure> {
 /// The scene in a line.
 pub fn describe(scene: &Scene) -> String {
     let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
-    let focal = match scene.options.zoom {
-        0.0 => format!("focal {:.1} px", scene.truth.focal_px),
-        zoom => format!("focal {:.1} px +- {:.0} %", scene.truth.focal_px, 100.0 * zoom),
-    };
+    let focal = focal(scene.truth.focal_px, scene.options.zoom);
     format!("{} views, {} tracks of which {right} are right, {focal}", scene.options.views, scene.options.tracks)
+}
+
+/// The focal length of a scene in words.
+fn focal(focal_px: f64, zoom: f64) -> String {
+    match zoom {
+        0.0 => format!("focal {focal_px:.1} px"),
+        zoom => format!("focal {focal_px:.1} px +- {:.0} %", 100.0 * zoom),
+    }
 }
 
 /// Writes observations.csv and truth.json.

@@ -91,9 +91,13 @@ impl Attempt {
         (grade, -calibration.sigma_log_focal.unwrap_or(f64::INFINITY))
     }
 
-    /// Whether no other block needs to be tried.
+    /// Whether no other block needs to be tried: it has the best grade that its camera can have, and no zoom is METRIC.
     pub fn is_good(&self) -> bool {
-        self.calibration.as_ref().is_some_and(|calibration| calibration.grade == Grade::Metric)
+        let is_good = |calibration: &Outcome| match calibration.focals {
+            Some(_) => calibration.grade != Grade::ProjectiveOnly,
+            None => calibration.grade == Grade::Metric,
+        };
+        self.calibration.as_ref().is_some_and(is_good)
     }
 }
 

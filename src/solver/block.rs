@@ -97,9 +97,14 @@ fn outside(input: &Input) -> Option<Warning> {
     })
 }
 
-/// Says so where the views of one solve come from several cameras or have several sizes; `cameras`: where each group
-/// has a calibration of its own, sizes alone matter, within a group.
-pub fn merged_cameras(input: &Input, cameras: bool) -> Option<Warning> {
+/// Says so where views of several cameras or sizes are given one focal length.
+///
+/// * `cameras`: each group has a calibration of its own, so that sizes alone matter, within a group
+/// * `zooms`: each view has a focal length of its own, so that nothing is merged
+pub fn merged_cameras(input: &Input, cameras: bool, zooms: bool) -> Option<Warning> {
+    if zooms {
+        return None;
+    }
     let (group_of, groups) = camera_groups(input);
     let size = |view: &View| view.size.map(|size| (size.width_px, size.height_px));
     let kinds: BTreeSet<_> =

@@ -138,7 +138,7 @@ fn solve_views(
     if sequence {
         return solve_sequence(&context, warnings, recorder);
     }
-    warnings.extend(block::merged_cameras(input, false));
+    warnings.extend(block::merged_cameras(input, false, settings.focal_per_view));
     let candidates = block::candidate_views(input, &ranges, stop);
     let mut best: Option<Attempt> = None;
     let mut others = Vec::new();
@@ -167,20 +167,22 @@ fn solve_views(
 /// Solves an input whose tracks live a few views.
 fn solve_sequence(context: &Context, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Result<Solution, Error> {
     let of_one = block::candidate_views_of_one_camera(context.input, context.ranges, context.stop);
-    // A group an image, say: what one camera alone cannot carry, all together may.
-    let merges_cameras = of_one.is_empty();
+    // A group an image, say: what one camera alone cannot carry, all together may. And where views share no focal
+    // length, groups part nothing.
+    let zooms = context.settings.focal_per_view;
+    let merges_cameras = of_one.is_empty() || zooms;
     let candidates =
         if merges_cameras { block::candidate_views(context.input, context.ranges, context.stop) } else { of_one };
     let context = &Context { merges_cameras, ..*context };
     match sequence::solve(&candidates, context, &mut recorder)? {
         sequence::Ended::Extended(extended) => {
-            warnings.extend(block::merged_cameras(context.input, !merges_cameras));
+            warnings.extend(block::merged_cameras(context.input, !merges_cameras, zooms));
             let solution = sequence::solved(*extended, warnings, recorder);
             context.stopped()?;
             Ok(verified(solution))
         }
         sequence::Ended::Block(best) => {
-            warnings.extend(block::merged_cameras(context.input, false));
+            warnings.extend(block::merged_cameras(context.input, false, zooms));
             // A seed is less than its block can give.
             let best = match best {
                 Some(seed) if seed.consensus.is_some() => {

@@ -24,6 +24,8 @@ const PERIOD_VIEWS: [f64; 3] = [17.0, 23.0, 31.0];
 const WEAVE: f64 = 0.3;
 /// Views that show either point of a track that joins two: three make a point that can be verified.
 const LEAST_SHOWN: usize = 3;
+/// Stream of the random numbers that the zoom is drawn from; the rest comes from the first.
+const ZOOM_STREAM: u64 = 1;
 /// Draws of one point before its views are called impossible.
 const MOST_DRAWS: usize = 1_000;
 
@@ -46,6 +48,9 @@ pub struct SequenceOptions {
     pub joined: f64,
     /// Radial distortion, as in [`SceneOptions::radial_k1`].
     pub radial_k1: f64,
+    /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
+    #[serde(default)]
+    pub zoom: f64,
     pub seed: u64,
 }
 
@@ -61,6 +66,7 @@ impl Default for SequenceOptions {
             wrong_observations: 0.05,
             joined: 0.0,
             radial_k1: 0.0,
+            zoom: 0.0,
             seed: 0,
         }
     }
@@ -108,6 +114,10 @@ impl SequenceOptions {
         if !(-limit..=limit).contains(&self.radial_k1) {
             found.push(Violation::of("radial_k1", format!("{} is not in -{limit}..={limit}", self.radial_k1)));
         }
+        if !(0.0..=SceneOptions::MAX_ZOOM).contains(&self.zoom) {
+            let reason = format!("{} is not a share in 0..={}", self.zoom, SceneOptions::MAX_ZOOM);
+            found.push(Violation::of("zoom", reason));
+        }
         found.into_result()
     }
 }
@@ -115,7 +125,11 @@ impl SequenceOptions {
 /// What a sequence was made of.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SequenceTruth {
+    /// The focal length of all views; with a zoom, the middle of its range.
     pub focal_px: f64,
+    /// One entry a view.
+    #[serde(default)]
+    pub focals_px: Vec<f64>,
     pub principal_point_px: [f64; 2],
     /// Whether a track is of one point, but for single wrong observations; one entry a track.
     pub inlier: Vec<bool>,
@@ -147,9 +161,11 @@ struct Track {
     images: Vec<Vector2<f64>>,
 }
 
-struct Pose {
+struct Camera {
     rotation: Matrix3<f64>,
     centre: Vector3<f64>,
+    /// In image sides.
+    focal: f64,
 }
 
 impl Sequence {
@@ -161,7 +177,13 @@ impl Sequence {
         options.validate()?;
         let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
         let focal_px = rng.random_range(FOCAL_RANGE_PX.0..FOCAL_RANGE_PX.1);
-        let poses: Vec<Pose> = (0..options.views).map(|view| pose(view, rng.random_range(-0.05..0.05))).collect();
+        let focal = focal_px / f64::from(IMAGE_SIDE_PX);
+        let mut cameras: Vec<Camera> =
+            (0..options.views).map(|view| camera(view, rng.random_range(-0.05..0.05), focal)).collect();
+        // A stream of its own: a zoom changes nothing else.
+        let mut zoom = ChaCha8Rng::seed_from_u64(options.seed);
+        zoom.set_stream(ZOOM_STREAM);
+        cameras.iter_mut().for_each(|camera| camera.focal *= 1.0 + options.zoom * zoom.random_range(-1.0..1.0));
         let centre_px = (f64::from(IMAGE_SIDE_PX) - 1.0) / 2.0;
         let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
         let mut input = RawInput {
@@ -171,20 +193,20 @@ impl Sequence {
         };
         let mut truth = SequenceTruth {
             focal_px,
+            focals_px: cameras.iter().map(|camera| camera.focal * f64::from(IMAGE_SIDE_PX)).collect(),
             principal_point_px: [centre_px; 2],
             inlier: Vec::with_capacity(options.tracks),
             observation_right: Vec::new(),
             observation_of_other: Vec::new(),
             points: Vec::with_capacity(options.tracks),
-            rotations: poses.iter().map(|pose| rows(&pose.rotation)).collect(),
-            translations: poses.iter().map(|pose| (-(pose.rotation * pose.centre)).into()).collect(),
+            rotations: cameras.iter().map(|camera| rows(&camera.rotation)).collect(),
+            translations: cameras.iter().map(|camera| (-(camera.rotation * camera.centre)).into()).collect(),
         };
-        let focal = focal_px / f64::from(IMAGE_SIDE_PX);
         for track in 0..options.tracks {
-            let mut drawn = draw_track(options, &poses, focal, &mut rng)?;
+            let mut drawn = draw_track(options, &cameras, &mut rng)?;
             let inlier = rng.random::<f64>() >= options.outliers;
             let joins = inlier && options.joined > 0.0 && rng.random::<f64>() < options.joined;
-            let other = if joins { drawn.join_another(options, &poses, focal, &mut rng) } else { 0..0 };
+            let other = if joins { drawn.join_another(options, &cameras, &mut rng) } else { 0..0 };
             let Track { point, first, images } = drawn;
             truth.inlier.push(inlier);
             truth.points.push(point.into());
@@ -205,24 +227,19 @@ impl Sequence {
     }
 }
 
-fn pose(view: usize, jitter: f64) -> Pose {
+fn camera(view: usize, jitter: f64, focal: f64) -> Camera {
     let at = |k: usize| SWING_RAD[k] * (TAU * view as f64 / PERIOD_VIEWS[k]).sin();
     let rotation = Rotation3::from_euler_angles(at(0), at(1) + jitter, at(2));
     let along = view as f64;
     let weave = |k: usize| WEAVE * (TAU * along / PERIOD_VIEWS[k]).cos();
-    Pose { rotation: *rotation.matrix(), centre: Vector3::new(STEP * along, weave(0), weave(1)) }
+    Camera { rotation: *rotation.matrix(), centre: Vector3::new(STEP * along, weave(0), weave(1)), focal }
 }
 
-fn draw_track(
-    options: &SequenceOptions,
-    poses: &[Pose],
-    focal: f64,
-    rng: &mut ChaCha8Rng,
-) -> Result<Track, InvalidInput> {
+fn draw_track(options: &SequenceOptions, cameras: &[Camera], rng: &mut ChaCha8Rng) -> Result<Track, InvalidInput> {
     for _ in 0..MOST_DRAWS {
         let length = rng.random_range(options.lifetime.0..=options.lifetime.1);
-        let first = rng.random_range(0..=poses.len() - length);
-        if let Some((point, images)) = draw_point(options, &poses[first..first + length], focal, rng) {
+        let first = rng.random_range(0..=cameras.len() - length);
+        if let Some((point, images)) = draw_point(options, &cameras[first..first + length], rng) {
             return Ok(Track { point, first, images });
         }
     }
@@ -232,22 +249,21 @@ fn draw_track(
 /// A point before the middle one of these views, with its exact images in them; `None` if one of them does not see it.
 fn draw_point(
     options: &SequenceOptions,
-    poses: &[Pose],
-    focal: f64,
+    cameras: &[Camera],
     rng: &mut ChaCha8Rng,
 ) -> Option<(Vector3<f64>, Vec<Vector2<f64>>)> {
-    let middle = &poses[poses.len() / 2];
-    let uv = anywhere(rng) / focal;
+    let middle = &cameras[cameras.len() / 2];
+    let uv = anywhere(rng) / middle.focal;
     let point = middle.centre + middle.rotation.tr_mul(&(uv.push(1.0) * rng.random_range(DEPTH.0..DEPTH.1)));
-    let image = |pose: &Pose| {
-        let seen = pose.rotation * (point - pose.centre);
+    let image = |camera: &Camera| {
+        let seen = camera.rotation * (point - camera.centre);
         let uv = seen.xy() / seen.z;
-        let image = focal * uv * (1.0 + options.radial_k1 * uv.norm_squared());
+        let image = camera.focal * uv * (1.0 + options.radial_k1 * uv.norm_squared());
         // Beyond the fold a lens images two points in one place.
         let one_to_one = 1.0 + 3.0 * options.radial_k1 * uv.norm_squared() > 0.0;
         (seen.z > DEPTH.0 / 2.0 && image.amax() < 0.5 && one_to_one).then_some(image)
     };
-    let images: Option<Vec<Vector2<f64>>> = poses.iter().map(image).collect();
+    let images: Option<Vec<Vector2<f64>>> = cameras.iter().map(image).collect();
     Some((point, images?))
 }
 
@@ -257,8 +273,7 @@ impl Track {
     fn join_another(
         &mut self,
         options: &SequenceOptions,
-        poses: &[Pose],
-        focal: f64,
+        cameras: &[Camera],
         rng: &mut ChaCha8Rng,
     ) -> std::ops::Range<usize> {
         let length = self.images.len();
@@ -266,8 +281,8 @@ impl Track {
             return 0..0;
         }
         let cut = rng.random_range(LEAST_SHOWN..=length - LEAST_SHOWN);
-        let later = &poses[self.first + cut..self.first + length];
-        let drawn = (0..MOST_DRAWS).find_map(|_| draw_point(options, later, focal, rng));
+        let later = &cameras[self.first + cut..self.first + length];
+        let drawn = (0..MOST_DRAWS).find_map(|_| draw_point(options, later, rng));
         let Some((other, images)) = drawn else { return 0..0 };
         self.images.truncate(cut);
         self.images.extend(images);
@@ -298,8 +313,14 @@ mod tests {
 
     #[test]
     fn tracks_live_as_long_as_asked_and_right_ones_reproject() {
-        let options =
-            SequenceOptions { views: 60, tracks: 500, radial_k1: -0.1, seed: 4, ..SequenceOptions::default() };
+        let options = SequenceOptions {
+            views: 60,
+            tracks: 500,
+            radial_k1: -0.1,
+            zoom: 0.2,
+            seed: 4,
+            ..SequenceOptions::default()
+        };
         let Sequence { input, truth, .. } = Sequence::generate(&options).expect("valid");
         assert_eq!(Sequence::generate(&options).expect("valid").input.x, input.x, "one seed, one sequence");
         let mut lengths = vec![0; 500];
@@ -313,7 +334,7 @@ mod tests {
             let rotation = Matrix3::from_fn(|row, column| truth.rotations[view][row][column]);
             let seen = rotation * Vector3::from(truth.points[track]) + Vector3::from(truth.translations[view]);
             let uv = seen.xy() / seen.z;
-            let image = truth.focal_px * uv * (1.0 + options.radial_k1 * uv.norm_squared())
+            let image = truth.focals_px[view] * uv * (1.0 + options.radial_k1 * uv.norm_squared())
                 + Vector2::from(truth.principal_point_px);
             right += 1.0;
             squared += (image - Vector2::new(input.x[k], input.y[k])).norm_squared();
@@ -339,6 +360,7 @@ mod tests {
             ("wrong_observations", SequenceOptions { wrong_observations: -0.1, ..default() }),
             ("joined", SequenceOptions { joined: 2.0, ..default() }),
             ("radial_k1", SequenceOptions { radial_k1: 2.0, ..default() }),
+            ("zoom", SequenceOptions { zoom: 1.0, ..default() }),
         ];
         for (name, options) in cases {
             let error = options.validate().expect_err(name);

@@ -10,6 +10,7 @@ use super::metric::{Intrinsics, POINT, Pose, Reconstruction};
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation, Options, Report};
 use crate::domain::StopToken;
+use crate::geometry::Camera;
 
 /// Unknowns of a view: rotation vector, translation, log focal length.
 const VIEW: usize = 7;
@@ -83,11 +84,20 @@ impl Zooming {
         minimise(self, observations, options, stop)
     }
 
+    /// Mean of the natural logarithms of the focal lengths.
+    pub fn mean_log_focal(&self) -> f64 {
+        self.focals.iter().map(|focal| focal.ln()).sum::<f64>() / self.focals.len().max(1) as f64
+    }
+
+    /// The cameras `K [R|t]`.
+    pub fn cameras(&self) -> Vec<Camera> {
+        self.poses.iter().zip(&self.focals).map(|(pose, focal)| pose.camera(&Intrinsics::from_focal(*focal))).collect()
+    }
+
     /// With one focal length for all views, their geometric mean: for what only asks for poses and points.
     pub fn at_mean_focal(&self) -> Reconstruction {
-        let mean = self.focals.iter().map(|focal| focal.ln()).sum::<f64>() / self.focals.len().max(1) as f64;
         Reconstruction {
-            intrinsics: Intrinsics::from_focal(mean.exp()),
+            intrinsics: Intrinsics::from_focal(self.mean_log_focal().exp()),
             poses: self.poses.clone(),
             points: self.points.clone(),
         }

@@ -17,6 +17,7 @@ use nalgebra::{Matrix3x4, Vector3, Vector4};
 
 use crate::domain::{FocalPrior, Grade, StopReason, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
+use crate::geometry::bundle::zoom::Zooming;
 use crate::geometry::bundle::{Observation, Options, projective};
 use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
 
@@ -174,6 +175,45 @@ pub fn from_metric(
     stop: &StopToken,
     told: &mut dyn FnMut(),
 ) -> Result<Outcome, Stopped> {
+    near(problem, scale_px, stop, told, |choice, fit, mut warnings, told| {
+        let minima = search::minima_near(metric, choice.problem, choice.prior, stop)?;
+        told();
+        if minima.is_empty() {
+            warnings.push(no_start());
+            return Ok(Outcome::refused(warnings));
+        }
+        grading::grade(choice, fit, minima, warnings)
+    })
+}
+
+/// The same with a focal length a view, whose priors are not looked at.
+///
+/// * `problem`: the projective cameras and points of `zooming`
+///
+/// # Errors
+/// As [`calibrate`].
+pub fn from_zooming(
+    problem: &Problem,
+    zooming: &Zooming,
+    scale_px: f64,
+    stop: &StopToken,
+    told: &mut dyn FnMut(),
+) -> Result<Outcome, Stopped> {
+    near(problem, scale_px, stop, told, |choice, fit, warnings, told| {
+        let outcome = zoom::calibrate_near(zooming, choice, fit, warnings)?;
+        told();
+        Ok(outcome)
+    })
+}
+
+/// Calibrates by `search` where the motion and the scene carry a calibration.
+fn near(
+    problem: &Problem,
+    scale_px: f64,
+    stop: &StopToken,
+    told: &mut dyn FnMut(),
+    search: impl FnOnce(&models::Choice, &Fit, Vec<Warning>, &mut dyn FnMut()) -> Result<Outcome, Stopped>,
+) -> Result<Outcome, Stopped> {
     Stopped::check(stop)?;
     let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), ..*problem };
     let mut warnings = Vec::new();
@@ -192,14 +232,13 @@ pub fn from_metric(
         return Ok(Outcome::refused(warnings));
     }
     let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);
-    let choice = models::Choice { problem, prior: &prior, scale_px, stop };
-    let minima = search::minima_near(metric, problem, &prior, stop)?;
-    told();
-    if minima.is_empty() {
-        warnings.push(no_start());
-        return Ok(Outcome::refused(warnings));
-    }
-    grading::grade(&choice, &fit, minima, warnings)
+    search(&models::Choice { problem, prior: &prior, scale_px, stop }, &fit, warnings, told)
+}
+
+/// The mean log focal length that a reconstruction with a focal length a view has by these observations alone, and the
+/// root mean square of their standard deviations, the lens left out; `None` where that is not finite.
+pub fn focals_alone(problem: &Problem, zooming: &Zooming, stop: &StopToken) -> Option<(f64, f64)> {
+    zoom::alone(problem, zooming, stop)
 }
 
 /// The log focal length that a metric reconstruction has by these observations alone, the rest of the lens held, and

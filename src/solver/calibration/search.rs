@@ -96,7 +96,7 @@ pub(super) fn converge() -> Options {
 
 /// Factors on the focal length of a reconstruction from which other minima are looked for: a forward motion has them
 /// half or twice as far.
-const OTHER_FOCALS: [f64; 4] = [0.5, 0.75, 1.33, 2.0];
+pub(super) const OTHER_FOCALS: [f64; 4] = [0.5, 0.75, 1.33, 2.0];
 /// Iterations in which poses and points follow a focal length that is held.
 const FOLLOWING: usize = 12;
 

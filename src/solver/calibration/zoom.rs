@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
 use super::fit::Fit;
 use super::models::{CHI_SQUARE_GAIN, Choice};
-use super::search::{self, CONVERGED, FIRST_ITERATIONS, FIRST_TOLERANCE, converge};
+use super::search::{self, CONVERGED, FIRST_ITERATIONS, FIRST_TOLERANCE, OTHER_FOCALS, converge};
 use super::verdict::{UNOBSERVABLE_ABOVE, Verdict};
 use super::{Outcome, Problem, Stopped, no_start};
 use crate::domain::{Grade, StopToken, Warning, WarningCode};
@@ -37,7 +37,7 @@ impl Minimum {
     }
 
     fn mean_log_focal(&self) -> f64 {
-        self.zooming.focals.iter().map(|focal| focal.ln()).sum::<f64>() / self.zooming.focals.len().max(1) as f64
+        self.zooming.mean_log_focal()
     }
 }
 
@@ -52,20 +52,57 @@ pub(super) fn calibrate(
     frame: &FirstViewFrame,
     choice: &Choice,
     fit: &Fit,
-    mut warnings: Vec<Warning>,
+    warnings: Vec<Warning>,
 ) -> Result<Outcome, Stopped> {
-    let Choice { problem, scale_px, stop, .. } = *choice;
-    let minima = minima(frame, problem, stop)?;
+    let minima = minima(frame, choice.problem, choice.stop)?;
+    Ok(grade(choice, fit, &minima, warnings))
+}
+
+/// The same of a reconstruction that is near a minimum.
+pub(super) fn calibrate_near(
+    zooming: &Zooming,
+    choice: &Choice,
+    fit: &Fit,
+    warnings: Vec<Warning>,
+) -> Result<Outcome, Stopped> {
+    let starts = std::iter::once(1.0).chain(OTHER_FOCALS).map(|factor| {
+        let focals = zooming.focals.iter().map(|focal| factor * focal).collect();
+        Zooming { focals, ..zooming.clone() }
+    });
+    let minima = converged(starts.collect(), choice.problem, choice.stop)?;
+    Ok(grade(choice, fit, &minima, warnings))
+}
+
+/// The mean log focal length that a reconstruction has by these observations alone, and the root mean square of the
+/// standard deviations of the log focal lengths; `None` where that is not finite.
+pub(super) fn alone(problem: &Problem, zooming: &Zooming, stop: &StopToken) -> Option<(f64, f64)> {
+    let minimum = Minimum::adjusted(zooming.clone(), problem, &converge(), stop);
+    let sigma = deviation(&minimum, fit_of(&minimum, problem).noise, problem)?;
+    let log_focal = minimum.mean_log_focal();
+    (log_focal.is_finite() && sigma > 0.0 && sigma.is_finite()).then_some((log_focal, sigma))
+}
+
+fn fit_of(minimum: &Minimum, problem: &Problem) -> Fit {
+    let unknowns = 7 * problem.cameras.len() + 3 * super::observed_points(problem);
+    Fit::new(minimum.cost, unknowns.saturating_sub(7), problem)
+}
+
+/// Root mean square of the standard deviations of the log focal lengths under this noise.
+fn deviation(minimum: &Minimum, noise: f64, problem: &Problem) -> Option<f64> {
+    let variances = minimum.zooming.log_focal_variances(problem.observations);
+    let sum: Option<f64> = variances.iter().copied().sum();
+    sum.map(|sum| (sum / variances.len().max(1) as f64).sqrt() * noise)
+}
+
+/// Grades the first of these minima, cheapest first.
+fn grade(choice: &Choice, fit: &Fit, minima: &[Minimum], mut warnings: Vec<Warning>) -> Outcome {
+    let Choice { problem, scale_px, .. } = *choice;
     let Some((best, others)) = minima.split_first() else {
         warnings.push(no_start());
-        return Ok(Outcome::refused(warnings));
+        return Outcome::refused(warnings);
     };
-    let inliers = super::observed_points(problem);
-    let unknowns = 7 * problem.cameras.len() + 3 * inliers;
-    let own = Fit::new(best.cost, unknowns.saturating_sub(7), problem);
-    let variances = best.zooming.log_focal_variances(problem.observations);
-    let sum: Option<f64> = variances.iter().copied().sum();
-    let sigma = sum.map(|sum| (sum / variances.len().max(1) as f64).sqrt() * own.noise);
+    let own = fit_of(best, problem);
+    let sigma = deviation(best, own.noise, problem);
     let sigma = sigma.map(|sigma| sigma.hypot(LENS_SIGMA)).filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
 
     let mut verdict = Verdict::new(warnings);
@@ -83,7 +120,7 @@ pub(super) fn calibrate(
     let in_front = cheirality(&metric, problem.observations);
     let rms_ratio = verdict.judge_fit(fit, &own, "a focal length a view", scale_px);
     verdict.judge_cheirality(in_front);
-    Ok(Outcome {
+    Outcome {
         sigma_log_focal: verdict.told(sigma),
         sigma_ratios: [None; Parameter::COUNT],
         grade: verdict.grade,
@@ -94,7 +131,7 @@ pub(super) fn calibrate(
         rms_ratio,
         metric: Some(metric),
         focals: Some(best.zooming.focals.clone()),
-    })
+    }
 }
 
 /// The plane at infinity of the caller's cameras that goes best with the reconstruction, in the frame that
@@ -128,6 +165,11 @@ fn minima(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken) -> Result
         .collect();
     let constant = search::minima(frame, problem, &IntrinsicsPrior::NONE, stop)?;
     starts.extend(constant.iter().map(|minimum| Zooming::from(&minimum.reconstruction)));
+    converged(starts, problem, stop)
+}
+
+/// The minima that these starts converge to, cheapest first.
+fn converged(starts: Vec<Zooming>, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
     let first = Options { max_iterations: FIRST_ITERATIONS, relative_tolerance: FIRST_TOLERANCE, ..Options::default() };
     let mut found = Vec::with_capacity(starts.len());
     for start in starts {

@@ -4,6 +4,7 @@ use super::model::{Lens, Model, Scene};
 use super::parts::FIRST;
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::sequence::{self, Free, Run, Sequence, Sighting};
+use crate::geometry::bundle::zoom::Zooming;
 use crate::geometry::bundle::{Loss, Observation, Options};
 use crate::geometry::statistics::median;
 use crate::solver::calibration;
@@ -55,7 +56,7 @@ impl Extract {
                 place[view] = extract.views.len();
                 extract.views.push(view);
                 extract.sequence.poses.push(pose);
-                extract.sequence.group_of.push(scene.group_of[view]);
+                extract.sequence.group_of.push(scene.lens_of[view]);
             }
         }
         for &track in tracks {
@@ -86,6 +87,13 @@ impl Extract {
         }
     }
 
+    /// The views with a focal length each, of lenses that have nothing else.
+    pub fn zooming(&self) -> (Zooming, Vec<Observation>) {
+        let focal = |lens: &usize| self.sequence.intrinsics[*lens].focal;
+        let (Reconstruction { poses, points, .. }, observations) = self.constant();
+        (Zooming { focals: self.sequence.group_of.iter().map(focal).collect(), poses, points }, observations)
+    }
+
     /// The views as if all were of one camera, the first one's.
     pub fn constant(&self) -> (Reconstruction, Vec<Observation>) {
         let group = self.sequence.group_of.first().copied().unwrap_or(0);
@@ -105,8 +113,7 @@ impl Extract {
             loss: Loss::Cauchy { scale: CAUCHY_SCALE * model.noise },
             ..Options::default()
         };
-        let priors: Vec<IntrinsicsPrior> =
-            (0..scene.groups).map(|group| knowledge(scene, group, model.noise)).collect();
+        let priors: Vec<IntrinsicsPrior> = (0..scene.lenses).map(|lens| knowledge(scene, lens, model.noise)).collect();
         let mut told = || recorder.sign_of_life();
         let run = Run { threads: scene.context.threads, stop: scene.stop(), told: &mut told };
         sequence::adjust(&mut self.sequence, &self.sightings, free, &priors, &options, run);
@@ -121,20 +128,20 @@ impl Extract {
     }
 }
 
-/// What is known of the intrinsics of a camera group before any observation.
-pub fn knowledge(scene: &Scene, group: usize, noise: f64) -> IntrinsicsPrior {
-    calibration::knowledge(noise, scene.focal_priors[group], scene.context.scale_px)
+/// What is known of the intrinsics of a lens before any observation.
+pub fn knowledge(scene: &Scene, lens: usize, noise: f64) -> IntrinsicsPrior {
+    calibration::knowledge(noise, scene.focal_priors[lens], scene.context.scale_px)
 }
 
-/// Adjusts the views of a part with the landmarks that hold them best, while more are to come. The calibration of
-/// groups that the first part has is the first part's: the others are held to it until all are adjusted together.
+/// Adjusts the views of a part with the landmarks that hold them best, while more are to come. Lenses that the first
+/// part has are the first part's: the others are held to them until all are adjusted together.
 pub fn while_growing(scene: &Scene, model: &mut Model, part: u32, recorder: &mut Recorder) {
     let views = model.of_part(part);
     let tracks = covering(scene, model, &views, OF_VIEW_WHILE_GROWING);
     let mut extract = Extract::new(scene, model, &views, &tracks);
-    let mut is_held = vec![false; scene.groups];
+    let mut is_held = vec![false; scene.lenses];
     if part != FIRST {
-        model.of_part(FIRST).into_iter().for_each(|view| is_held[scene.group_of[view]] = true);
+        model.of_part(FIRST).into_iter().for_each(|view| is_held[scene.lens_of[view]] = true);
     }
     let free = |(lens, held): (&Lens, &bool)| if *held { IntrinsicsModel::FIXED } else { lens.free };
     let models: Vec<IntrinsicsModel> = model.lenses.iter().zip(&is_held).map(free).collect();
@@ -143,8 +150,8 @@ pub fn while_growing(scene: &Scene, model: &mut Model, part: u32, recorder: &mut
 }
 
 /// Adjusts a new view and those that share most landmarks with it, all others held, and the calibration too unless the
-/// camera is new.
-pub fn around(scene: &Scene, model: &mut Model, view: usize, is_new_camera: bool, recorder: &mut Recorder) {
+/// lens is new.
+pub fn around(scene: &Scene, model: &mut Model, view: usize, is_new_lens: bool, recorder: &mut Recorder) {
     let near = neighbours(scene, model, view);
     let tracks = covering(scene, model, &near, OF_VIEW_WHILE_GROWING);
     let mut views: Vec<usize> = tracks
@@ -157,9 +164,9 @@ pub fn around(scene: &Scene, model: &mut Model, view: usize, is_new_camera: bool
     views.dedup();
     let mut extract = Extract::new(scene, model, &views, &tracks);
     let moves: Vec<bool> = extract.views.iter().map(|view| near.contains(view)).collect();
-    let mut models = vec![IntrinsicsModel::FIXED; scene.groups];
-    if is_new_camera {
-        models[scene.group_of[view]] = IntrinsicsModel::FOCAL;
+    let mut models = vec![IntrinsicsModel::FIXED; scene.lenses];
+    if is_new_lens {
+        models[scene.lens_of[view]] = IntrinsicsModel::FOCAL;
     }
     let free = Free { models: &models, views: Some(&moves), points: None };
     extract.adjust(scene, model, &free, ITERATIONS_AROUND, recorder);

@@ -67,7 +67,7 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
 /// What is to be said of the calibrations, each group's named where there are several.
 fn told(calibrations: &[Outcome], scene: &Scene) -> Vec<Warning> {
     let id_of = |group: usize| {
-        let view = scene.group_of.iter().position(|of| *of == group)?;
+        let view = scene.camera_of.iter().position(|of| *of == group)?;
         Some(scene.context.input.views()[view].camera_group)
     };
     let of_group = |(group, outcome): (usize, &Outcome)| -> Vec<Warning> {
@@ -85,12 +85,16 @@ fn told(calibrations: &[Outcome], scene: &Scene) -> Vec<Warning> {
     calibrations.iter().enumerate().flat_map(of_group).collect()
 }
 
-/// The calibration of each group in pixels, its principal point about the image centre of the group's first view.
+/// The calibration of each camera in pixels, its principal point about the image centre of the camera's first view; of
+/// a zoom the geometric mean of the focal lengths.
 fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Calibration> {
     let of_group = |(group, outcome): (usize, &Outcome)| {
-        let intrinsics = &model.lenses[group].intrinsics;
-        let view = scene.group_of.iter().position(|of| *of == group).unwrap_or(0);
-        pixel_calibration(intrinsics, outcome, &scene.context, view)
+        let intrinsics = match scene.zooms() {
+            true => Intrinsics::from_focal(model.log_focal(scene, group, &model.registered()).exp()),
+            false => model.lenses[group].intrinsics,
+        };
+        let view = scene.camera_of.iter().position(|of| *of == group).unwrap_or(0);
+        pixel_calibration(&intrinsics, outcome, &scene.context, view)
     };
     if scene.context.merges_cameras {
         // One calibration, told for each of the groups.
@@ -153,6 +157,8 @@ fn views(scene: &Scene, model: &Model, frames: &[Option<Matrix4<f64>>], metric: 
             rotation: metric
                 .then(|| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
             translation: metric.then(|| pose.translation.into()),
+            focal_px: (metric && scene.zooms())
+                .then(|| model.intrinsics_of(scene, view).focal * scene.context.scale_px),
             part: model.part_of[view],
             ..ViewResult::default()
         }

@@ -1,10 +1,10 @@
-//! What the whole sequence says of the calibration of each camera group.
+//! What the whole sequence says of the calibration of each camera.
 
 use nalgebra::Vector4;
 
 use super::adjust::{self, Extract};
 use super::model::{Model, Scene};
-use super::windows;
+use super::{windows, zoom};
 use crate::domain::{Task, Warning, WarningCode};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
@@ -25,8 +25,8 @@ const CORE_SQUARED: f64 = 13.8;
 /// Observations that a track must keep to take part.
 const LEAST_KEPT: usize = 3;
 
-/// Calibrates each group from the landmarks and observations that fit best, takes the models over, adjusts everything
-/// under them and asks the windows; one outcome a group.
+/// Calibrates each camera from the landmarks and observations that fit best, takes the models over, adjusts everything
+/// under them and asks the windows; one outcome a camera.
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -36,40 +36,45 @@ pub fn calibrate(
     context: &Context,
     recorder: &mut Recorder,
 ) -> Result<Vec<Outcome>, Error> {
-    let mut outcomes = Vec::with_capacity(scene.groups);
-    for group in 0..scene.groups {
-        recorder.step(Task::Cameras, group + 1, scene.groups, 0.0);
-        outcomes.push(of_group(scene, model, group, context, recorder)?);
+    let mut outcomes = Vec::with_capacity(scene.cameras);
+    for camera in 0..scene.cameras {
+        recorder.step(Task::Cameras, camera + 1, scene.cameras, 0.0);
+        let registered: Vec<usize> =
+            model.registered().into_iter().filter(|&view| scene.camera_of[view] == camera).collect();
+        let views = densest(scene, model, &registered);
+        let outcome = match views.len() < block::LEAST_VIEWS {
+            true => too_few(camera, views.len()),
+            false if scene.zooms() => zoom::of_camera(scene, model, &views, context, recorder)?,
+            false => of_camera(scene, model, camera, &views, context, recorder)?,
+        };
+        outcomes.push((views, outcome));
     }
     super::structure::triangulate(scene, model, recorder);
     adjust::all(scene, model, recorder);
-    for (group, outcome) in outcomes.iter_mut().enumerate() {
-        admit_difference(model, group, outcome);
-        windows::reconcile(scene, model, group, outcome, recorder)?;
+    for (camera, (views, outcome)) in outcomes.iter_mut().enumerate() {
+        admit_difference(model.log_focal(scene, camera, views), outcome);
+        windows::reconcile(scene, model, camera, outcome, recorder)?;
     }
-    Ok(outcomes)
+    Ok(outcomes.into_iter().map(|(_, outcome)| outcome).collect())
 }
 
-fn of_group(
+/// What is said of a camera of which fewer views are registered than a calibration needs.
+fn too_few(camera: usize, views: usize) -> Outcome {
+    let detail =
+        format!("{views} views of camera group {camera} are registered; a calibration needs {}", block::LEAST_VIEWS);
+    Outcome::refused(vec![Warning::new(WarningCode::UnobservableFocal, detail)])
+}
+
+/// The calibration of a camera whose views have one focal length, from these of them.
+fn of_camera(
     scene: &Scene,
     model: &mut Model,
-    group: usize,
+    camera: usize,
+    views: &[usize],
     context: &Context,
     recorder: &mut Recorder,
 ) -> Result<Outcome, Error> {
-    let registered = model.registered();
-    let views: Vec<usize> = registered.iter().copied().filter(|&view| scene.group_of[view] == group).collect();
-    if views.len() < block::LEAST_VIEWS {
-        let detail = format!(
-            "{} views of camera group {group} are registered; a calibration needs {}",
-            views.len(),
-            block::LEAST_VIEWS
-        );
-        return Ok(Outcome::refused(vec![Warning::new(WarningCode::UnobservableFocal, detail)]));
-    }
-    let views = densest(scene, model, &views);
-    let of_view = (OBSERVATIONS / views.len()).clamp(OF_VIEW.0, OF_VIEW.1);
-    let mut extract = core(scene, model, &views, of_view);
+    let mut extract = core(scene, model, views, of_view(views));
     let (metric, observations) = extract.constant();
     let (cameras, points) = projective(&metric);
     let problem = calibration::Problem {
@@ -77,19 +82,19 @@ fn of_group(
         points: &points,
         observations: &observations,
         noise: model.noise,
-        focal_prior: scene.focal_priors[group],
+        focal_prior: scene.focal_priors[camera],
         focal_per_view: false,
     };
     let outcome =
         calibration::from_metric(&problem, &metric, context.scale_px, context.stop, &mut || recorder.sign_of_life())?;
     if let Some(metric) = &outcome.metric {
-        let lens = &mut model.lenses[group];
+        let lens = &mut model.lenses[camera];
         lens.free = outcome.model;
         // What the model holds is as the calibration has it, not as the seed had it.
         lens.intrinsics = Intrinsics { focal: lens.intrinsics.focal, ..metric.intrinsics };
         // Some of the views alone would leave the frame of the others.
-        if extract.views.len() == registered.len() {
-            extract.sequence.intrinsics[group] = metric.intrinsics;
+        if extract.views.len() == model.registered().len() {
+            extract.sequence.intrinsics[camera] = metric.intrinsics;
             (extract.sequence.poses, extract.sequence.points) = (metric.poses.clone(), metric.points.clone());
             extract.write_back(model);
         }
@@ -97,10 +102,15 @@ fn of_group(
     Ok(outcome)
 }
 
+/// Observations of each of these views that a calibration is made from.
+pub fn of_view(views: &[usize]) -> usize {
+    (OBSERVATIONS / views.len()).clamp(OF_VIEW.0, OF_VIEW.1)
+}
+
 /// Raises sigma to what lies between the focal length that was graded and the one that all observations led to.
-fn admit_difference(model: &Model, group: usize, outcome: &mut Outcome) {
+fn admit_difference(log_focal: f64, outcome: &mut Outcome) {
     let (Some(metric), Some(sigma)) = (&outcome.metric, outcome.sigma_log_focal) else { return };
-    let difference = (model.lenses[group].intrinsics.focal / metric.intrinsics.focal).ln().abs();
+    let difference = (log_focal - metric.intrinsics.focal.ln()).abs();
     if difference > sigma {
         outcome.sigma_log_focal = Some(difference);
         outcome.grade = outcome.grade.worse(calibration::grade_of_sigma(Some(difference)));

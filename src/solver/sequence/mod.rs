@@ -15,6 +15,7 @@ mod parts;
 mod register;
 mod structure;
 mod windows;
+mod zoom;
 
 pub use assemble::solved;
 
@@ -41,7 +42,7 @@ pub struct Extended<'a> {
     seed: Attempt,
     scene: Scene<'a>,
     model: Model,
-    /// One a camera group.
+    /// One a camera of the scene.
     calibrations: Vec<Outcome>,
     /// Views that could not be registered, with the reason.
     unregistered: Vec<register::Unregistered>,
@@ -57,7 +58,6 @@ pub enum Ended<'a> {
 /// Whether an input is one that is extended beyond a block.
 pub fn applies(context: &Context) -> bool {
     matches!(context.settings.method, Method::Auto | Method::Geometry)
-        && !context.settings.focal_per_view
         && !context.input.has_depths()
         && block::complete_views(context.input, context.ranges).is_none()
 }
@@ -168,8 +168,8 @@ impl Extended<'_> {
     /// The worst of the cameras that have enough registered views to be calibrated: a few photographs of another camera
     /// take nothing from the rest.
     fn grade(&self) -> Grade {
-        let mut views = vec![0; self.scene.groups];
-        self.model.registered().into_iter().for_each(|view| views[self.scene.group_of[view]] += 1);
+        let mut views = vec![0; self.scene.cameras];
+        self.model.registered().into_iter().for_each(|view| views[self.scene.camera_of[view]] += 1);
         let grades = self.calibrations.iter().zip(views).filter(|(_, views)| *views >= block::LEAST_VIEWS);
         grades.map(|(outcome, _)| outcome.grade).reduce(Grade::worse).unwrap_or(Grade::ProjectiveOnly)
     }

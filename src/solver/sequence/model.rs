@@ -15,10 +15,14 @@ pub struct Scene<'a> {
     pub xy: Vec<Vector2<f64>>,
     /// Observations of each view.
     pub of_view: Vec<Vec<u32>>,
-    /// Camera group of each view, counted from 0 in rising order of the input's numbers.
-    pub group_of: Vec<usize>,
-    pub groups: usize,
-    /// What is known of the focal length of each group beforehand.
+    /// Camera of each view, each of which gets a calibration: the camera groups, counted from 0 in rising order of the
+    /// input's numbers, or one for all where they are merged or views zoom.
+    pub camera_of: Vec<usize>,
+    pub cameras: usize,
+    /// Lens of each view: its camera's, but one a view where views zoom.
+    pub lens_of: Vec<usize>,
+    pub lenses: usize,
+    /// What is known of the focal length of each lens beforehand.
     pub focal_priors: Vec<Option<FocalPrior>>,
     /// Density of a wrong coordinate; see [`judge::Geometry::outlier_density`].
     pub outlier_density: f64,
@@ -35,16 +39,24 @@ impl<'a> Scene<'a> {
             xy.push(context.normalization.normalize(view, input.point_px(k)));
         }
         let outlier_density = judge::outlier_density(&xy);
-        let (group_of, groups) = match context.merges_cameras {
+        let (camera_of, cameras) = match context.merges_cameras {
             true => (vec![0; input.view_count()], 1),
             false => block::camera_groups(input),
         };
-        let of_group = |group: usize| {
-            let views = input.views().iter().zip(&group_of).filter(|(_, of)| **of == group);
+        let of_camera = |camera: usize| {
+            let views = input.views().iter().zip(&camera_of).filter(|(_, of)| **of == camera);
             attempt::focal_prior(views.map(|(view, _)| view))
         };
-        let focal_priors = (0..groups).map(of_group).collect();
-        Self { context: *context, xy, of_view, group_of, groups, focal_priors, outlier_density }
+        let (lens_of, lenses, focal_priors) = match context.settings.focal_per_view {
+            true => ((0..input.view_count()).collect(), input.view_count(), vec![None; input.view_count()]),
+            false => (camera_of.clone(), cameras, (0..cameras).map(of_camera).collect()),
+        };
+        Self { context: *context, xy, of_view, camera_of, cameras, lens_of, lenses, focal_priors, outlier_density }
+    }
+
+    /// Whether every view has a focal length of its own.
+    pub fn zooms(&self) -> bool {
+        self.context.settings.focal_per_view
     }
 
     pub fn stop(&self) -> &'a StopToken {
@@ -81,7 +93,7 @@ pub struct Landmark {
     pub part: u32,
 }
 
-/// The camera of a group.
+/// What images the views of a camera, or one view where views zoom.
 #[derive(Debug, Clone, Copy)]
 pub struct Lens {
     pub intrinsics: Intrinsics,
@@ -94,7 +106,7 @@ pub struct Lens {
 /// A metric reconstruction under way.
 #[derive(Debug, Clone)]
 pub struct Model {
-    /// One a camera group.
+    /// See [`Scene::lens_of`].
     pub lenses: Vec<Lens>,
     /// One a view of the input.
     pub poses: Vec<Option<Pose>>,
@@ -129,7 +141,7 @@ impl Model {
         let views = scene.context.input.view_count();
         let lens = Lens { intrinsics, free: IntrinsicsModel::FOCAL, is_known: false };
         Self {
-            lenses: vec![lens; scene.groups],
+            lenses: vec![lens; scene.lenses],
             poses: vec![None; views],
             part_of: vec![0; views],
             landmarks: vec![None; scene.tracks()],
@@ -178,16 +190,23 @@ impl Model {
         }
     }
 
-    /// Adds the views of a metric block, all of one camera group, as a part; a camera that is not known yet is the
-    /// block's.
-    pub fn add_part(&mut self, scene: &Scene, part: u32, views: &[usize], metric: &Reconstruction) {
-        if let Some(&view) = views.first() {
-            let lens = &mut self.lenses[scene.group_of[view]];
+    /// Adds the views of a metric block, all of one camera, as a part; lenses that are not known yet are the block's.
+    ///
+    /// * `focals`: the focal length of each of these views, where views zoom
+    pub fn add_part(
+        &mut self,
+        scene: &Scene,
+        part: u32,
+        views: &[usize],
+        metric: &Reconstruction,
+        focals: Option<&[f64]>,
+    ) {
+        for (i, (&view, pose)) in views.iter().zip(&metric.poses).enumerate() {
+            let lens = &mut self.lenses[scene.lens_of[view]];
             if !lens.is_known {
-                lens.intrinsics = metric.intrinsics;
+                let own = focals.and_then(|focals| focals.get(i)).copied();
+                lens.intrinsics = Intrinsics { focal: own.unwrap_or(metric.intrinsics.focal), ..metric.intrinsics };
             }
-        }
-        for (&view, pose) in views.iter().zip(&metric.poses) {
             self.register(scene, view, part, *pose);
         }
     }
@@ -195,7 +214,7 @@ impl Model {
     pub fn register(&mut self, scene: &Scene, view: usize, part: u32, pose: Pose) {
         self.poses[view] = Some(pose);
         self.part_of[view] = part;
-        self.lenses[scene.group_of[view]].is_known = true;
+        self.lenses[scene.lens_of[view]].is_known = true;
     }
 
     /// Takes views back.
@@ -204,9 +223,9 @@ impl Model {
             self.poses[view] = None;
             self.part_of[view] = 0;
         }
-        for (group, lens) in self.lenses.iter_mut().enumerate() {
-            let has_view = |(pose, of): (&Option<Pose>, &usize)| pose.is_some() && *of == group;
-            lens.is_known = self.poses.iter().zip(&scene.group_of).any(has_view);
+        self.lenses.iter_mut().for_each(|lens| lens.is_known = false);
+        for view in self.registered() {
+            self.lenses[scene.lens_of[view]].is_known = true;
         }
     }
 
@@ -221,7 +240,16 @@ impl Model {
     }
 
     pub fn intrinsics_of(&self, scene: &Scene, view: usize) -> &Intrinsics {
-        &self.lenses[scene.group_of[view]].intrinsics
+        &self.lenses[scene.lens_of[view]].intrinsics
+    }
+
+    /// Logarithm of the focal length of a camera, the mean over these of its views where views zoom.
+    pub fn log_focal(&self, scene: &Scene, camera: usize, views: &[usize]) -> f64 {
+        if !scene.zooms() {
+            return self.lenses[camera].intrinsics.focal.ln();
+        }
+        let sum: f64 = views.iter().map(|&view| self.intrinsics_of(scene, view).focal.ln()).sum();
+        sum / views.len().max(1) as f64
     }
 
     /// Pinhole cameras of all views; `None` for those that are not registered.

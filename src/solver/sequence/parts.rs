@@ -28,7 +28,8 @@ pub fn first(scene: &Scene, seed: &Attempt, recorder: &mut Recorder) -> Model {
     let intrinsics = metric.map_or_else(|| Intrinsics::from_focal(1.0), |metric| metric.intrinsics);
     let mut model = Model::new(scene, intrinsics, noise);
     if let Some(metric) = metric {
-        model.add_part(scene, FIRST, &seed.block.views, metric);
+        let focals = seed.calibration.as_ref().and_then(|calibration| calibration.focals.as_deref());
+        model.add_part(scene, FIRST, &seed.block.views, metric, focals);
     }
     structure::triangulate(scene, &mut model, recorder);
     model
@@ -45,8 +46,8 @@ pub fn others(
     trials: &mut [Trial],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
-    let first_group = seed.block.views.first().map_or(0, |&view| scene.group_of[view]);
-    let prior = prior_of(seed, model, first_group, &scene.context);
+    let first_camera = seed.block.views.first().map_or(0, |&view| scene.camera_of[view]);
+    let prior = prior_of(scene, seed, model, first_camera);
     let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
     let mut failures = 0;
     for part in FIRST + 1..MOST_PARTS {
@@ -55,7 +56,7 @@ pub fn others(
             break;
         }
         let Some(views) = next_block(scene, &open) else { break };
-        let told = prior.filter(|_| scene.group_of[views[0]] == first_group);
+        let told = prior.filter(|_| scene.camera_of[views[0]] == first_camera);
         let context = Context { focal_prior: told, ..scene.context };
         let block = block::extract(context.input, context.ranges, context.normalization, &views);
         recorder.begin_part(part);
@@ -63,11 +64,13 @@ pub fn others(
         recorder.end_part();
         // Whatever comes of it, a block is tried once.
         views.iter().for_each(|&view| open[view] = false);
-        let Some(metric) = attempt.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref()) else {
+        let Some((calibration, metric)) =
+            attempt.calibration.as_ref().and_then(|calibration| Some((calibration, calibration.metric.as_ref()?)))
+        else {
             failures += 1;
             continue;
         };
-        model.add_part(scene, part, &attempt.block.views, metric);
+        model.add_part(scene, part, &attempt.block.views, metric, calibration.focals.as_deref());
         structure::triangulate_seen(scene, model, &attempt.block.views, recorder);
         register::join(scene, model, part, trials, recorder)?;
         drop_unsupported(scene, model, part, recorder);
@@ -79,24 +82,24 @@ pub fn others(
     Ok(())
 }
 
-/// The best block of open views of one camera group.
+/// The best block of open views of one camera.
 fn next_block(scene: &Scene, open: &[bool]) -> Option<Vec<usize>> {
     let context = &scene.context;
-    (0..scene.groups).find_map(|group| {
-        let of_group: Vec<bool> = open.iter().zip(&scene.group_of).map(|(open, of)| *open && *of == group).collect();
-        if of_group.iter().filter(|&&open| open).count() < block::LEAST_VIEWS || context.stop.is_stopped() {
+    (0..scene.cameras).find_map(|camera| {
+        let of_camera: Vec<bool> = open.iter().zip(&scene.camera_of).map(|(open, of)| *open && *of == camera).collect();
+        if of_camera.iter().filter(|&&open| open).count() < block::LEAST_VIEWS || context.stop.is_stopped() {
             return None;
         }
-        let found = block::candidate_views_among(context.input, context.ranges, &of_group, context.stop);
+        let found = block::candidate_views_among(context.input, context.ranges, &of_camera, context.stop);
         found.into_iter().next()
     })
 }
 
-/// What the first part says of the focal length of the others.
-fn prior_of(seed: &Attempt, model: &Model, group: usize, context: &Context) -> Option<FocalPrior> {
-    let calibration = seed.calibration.as_ref()?;
+/// What the first part says of the focal length of the others; nothing where views zoom.
+fn prior_of(scene: &Scene, seed: &Attempt, model: &Model, camera: usize) -> Option<FocalPrior> {
+    let calibration = seed.calibration.as_ref().filter(|_| !scene.zooms())?;
     let sigma = calibration.sigma_log_focal.filter(|_| calibration.grade != Grade::ProjectiveOnly);
-    let focal_px = model.lenses[group].intrinsics.focal * context.scale_px;
+    let focal_px = model.lenses[camera].intrinsics.focal * scene.context.scale_px;
     Some(FocalPrior { focal_px, sigma_log: sigma.map_or(VAGUE_SIGMA, |sigma| sigma.max(PRIOR_SIGMA)) })
 }
 

@@ -26,8 +26,8 @@ const MOST_TRIALS: usize = 4;
 /// Growth of the registered views after which all are adjusted; in between, only what is around each new one. A
 /// geometric growth keeps the cost of all adjustments together at six times that of the last.
 const ADJUST_GROWTH: f64 = 1.2;
-/// Focal lengths that a view of a camera that is not known yet is tried with, as factors on the first camera's: a
-/// quarter of an octave apart, from a third to three times.
+/// Focal lengths that a view of a lens that is not known yet is tried with, as factors on that of another one: a quarter
+/// of an octave apart, from a third to three times.
 const OTHER_FOCALS: std::ops::RangeInclusive<i32> = -6..=6;
 const FOCALS_PER_OCTAVE: f64 = 4.0;
 
@@ -149,7 +149,7 @@ fn register(
     rng: &mut ChaCha8Rng,
     recorder: &mut Recorder,
 ) -> (usize, usize) {
-    let is_new_camera = !model.lenses[scene.group_of[view]].is_known;
+    let is_new_lens = !model.lenses[scene.lens_of[view]].is_known;
     let step = seen.len().div_ceil(MOST_POINTS).max(1);
     let seen: Vec<usize> = seen.iter().copied().step_by(step).collect();
     let found = guesses(scene, model, view)
@@ -162,26 +162,28 @@ fn register(
     if agreeing < LEAST_POINTS || (agreeing as f64) < LEAST_SHARE * seen.len() as f64 {
         return (seen.len(), agreeing);
     }
-    model.lenses[scene.group_of[view]].intrinsics = intrinsics;
+    model.lenses[scene.lens_of[view]].intrinsics = intrinsics;
     model.register(scene, view, part, pose);
     structure::triangulate_seen(scene, model, &[view], recorder);
-    adjust::around(scene, model, view, is_new_camera, recorder);
+    adjust::around(scene, model, view, is_new_lens, recorder);
     structure::triangulate_seen(scene, model, &[view], recorder);
     (seen.len(), agreeing)
 }
 
 /// Lenses to try a view with: its camera's own, or, of one that is not known yet, pinholes of what the input says, give
-/// or take its deviation, or of a scan.
+/// or take its deviation, or of a scan. A zoom takes time: the scan is about the nearest view then.
 fn guesses(scene: &Scene, model: &Model, view: usize) -> Vec<Intrinsics> {
-    let lens = &model.lenses[scene.group_of[view]];
+    let lens = &model.lenses[scene.lens_of[view]];
     if lens.is_known {
         return vec![lens.intrinsics];
     }
-    if let Some(prior) = scene.context.input.views()[view].focal_prior {
+    if let Some(prior) = scene.context.input.views()[view].focal_prior.filter(|_| !scene.zooms()) {
         let focal = prior.focal_px / scene.context.scale_px;
         return [0.0, -1.0, 1.0].map(|by| Intrinsics::from_focal(focal * (by * prior.sigma_log).exp())).to_vec();
     }
-    let focal = |step: i32| lens.intrinsics.focal * (f64::from(step) / FOCALS_PER_OCTAVE).exp2();
+    let nearest = model.registered().into_iter().min_by_key(|other| other.abs_diff(view)).filter(|_| scene.zooms());
+    let about = nearest.map_or(lens, |nearest| &model.lenses[scene.lens_of[nearest]]).intrinsics.focal;
+    let focal = |step: i32| about * (f64::from(step) / FOCALS_PER_OCTAVE).exp2();
     OTHER_FOCALS.map(|step| Intrinsics::from_focal(focal(step))).collect()
 }
 

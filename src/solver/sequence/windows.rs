@@ -7,6 +7,7 @@
 use super::adjust;
 use super::calibrate;
 use super::model::{Model, Scene};
+use super::zoom;
 use crate::domain::{Task, Warning, WarningCode};
 use crate::solver::Error;
 use crate::solver::agreement::Estimate;
@@ -19,7 +20,7 @@ const LEAST_VIEWS: usize = 4;
 /// Windows at most, evenly spread over the sequence: a variance of 50 values is known to a fifth.
 const MOST_WINDOWS: usize = 50;
 /// Observations of a view that a window holds.
-const OF_VIEW: usize = 150;
+pub const OF_VIEW: usize = 150;
 /// Growth of sigma from which a warning says why, and the sigma from which anyone minds: a quarter of a METRIC one.
 const WORTH_A_WARNING: f64 = 3.0;
 const WORTH_MINDING: f64 = 0.005;
@@ -39,14 +40,14 @@ pub struct Fused {
 pub fn reconcile(
     scene: &Scene,
     model: &Model,
-    group: usize,
+    camera: usize,
     outcome: &mut Outcome,
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
     let Some(own) = outcome.sigma_log_focal else { return Ok(()) };
-    let estimates = estimates(scene, model, group, recorder)?;
+    let estimates = estimates(scene, model, camera, recorder)?;
     let Some(fused) = fuse(&estimates) else { return Ok(()) };
-    let apart = (fused.log_focal - model.lenses[group].intrinsics.focal.ln()).abs();
+    let apart = (fused.log_focal - model.log_focal(scene, camera, &of_camera(scene, model, camera))).abs();
     let sigma = own.max(fused.sigma).max(apart);
     outcome.sigma_log_focal = Some(sigma);
     outcome.grade = outcome.grade.worse(grade_of_sigma(Some(sigma)));
@@ -67,15 +68,25 @@ pub fn reconcile(
     Ok(())
 }
 
-/// What each window says by itself, the lens as the whole has it.
-fn estimates(scene: &Scene, model: &Model, group: usize, recorder: &mut Recorder) -> Result<Vec<Estimate>, Error> {
+/// Registered views of a camera, increasing.
+fn of_camera(scene: &Scene, model: &Model, camera: usize) -> Vec<usize> {
+    model.registered().into_iter().filter(|&view| scene.camera_of[view] == camera).collect()
+}
+
+/// What each window says by itself, the rest of the lens as the whole has it.
+fn estimates(scene: &Scene, model: &Model, camera: usize, recorder: &mut Recorder) -> Result<Vec<Estimate>, Error> {
+    let views = of_camera(scene, model, camera);
+    let whole = model.log_focal(scene, camera, &views);
     let parts = model.part_of.iter().copied().max().unwrap_or(0);
-    let of_group = |part: u32| -> Vec<usize> {
-        model.of_part(part).into_iter().filter(|&view| scene.group_of[view] == group).collect()
+    let of_part = |part: u32| views.iter().copied().filter(|&view| model.part_of[view] == part).collect();
+    let windows = windows(&(0..=parts).map(of_part).collect::<Vec<_>>());
+    let of_window = |k: usize| {
+        let views = windows.get(k).filter(|_| !scene.stop().is_stopped())?;
+        match scene.zooms() {
+            true => zoom::of_window(scene, model, views, whole),
+            false => estimate(scene, model, camera, views),
+        }
     };
-    let windows = windows(&(0..=parts).map(of_group).collect::<Vec<_>>());
-    let of_window =
-        |k: usize| (!scene.stop().is_stopped()).then(|| estimate(scene, model, group, &windows[k])).flatten();
     let mut told = |k: usize| {
         recorder.step(Task::Windows, k + 1, windows.len(), k as f64 / windows.len() as f64);
     };
@@ -84,7 +95,7 @@ fn estimates(scene: &Scene, model: &Model, group: usize, recorder: &mut Recorder
     Ok(found.into_iter().flatten().collect())
 }
 
-fn estimate(scene: &Scene, model: &Model, group: usize, views: &[usize]) -> Option<Estimate> {
+fn estimate(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
     let extract = calibrate::core(scene, model, views, OF_VIEW);
     let (metric, observations) = extract.constant();
     let (cameras, points) = calibrate::projective(&metric);
@@ -96,7 +107,7 @@ fn estimate(scene: &Scene, model: &Model, group: usize, views: &[usize]) -> Opti
         focal_prior: None,
         focal_per_view: false,
     };
-    let prior = adjust::knowledge(scene, group, model.noise);
+    let prior = adjust::knowledge(scene, camera, model.noise);
     let (log_focal, sigma) = calibration::focal_alone(&problem, &metric, &prior, scene.stop())?;
     Some(Estimate { log_focal, sigma })
 }

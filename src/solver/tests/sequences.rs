@@ -21,6 +21,16 @@ fn thinned(sequence: &Sequence, keep: impl Fn(usize) -> bool) -> RawInput {
     raw
 }
 
+/// The sequence without what its tracks show from a view on, where they begin before it: two parts without a link.
+fn parted(sequence: &Sequence, at: u32) -> RawInput {
+    let mut first = vec![u32::MAX; sequence.input.track_count];
+    for (&track, &view) in sequence.input.track.iter().zip(&sequence.input.view) {
+        let first = &mut first[track as usize];
+        *first = (*first).min(view);
+    }
+    thinned(sequence, |k| first[sequence.input.track[k] as usize] >= at || sequence.input.view[k] < at)
+}
+
 #[test]
 fn every_view_is_registered_and_every_observation_judged() {
     for (seed, outliers, radial_k1) in [(0, 0.3, 0.0), (1, 0.5, -0.1)] {
@@ -84,16 +94,7 @@ fn tracks_that_join_two_points_are_split() {
 fn what_shares_no_tracks_is_in_parts_of_one_calibration() {
     let options = SequenceOptions { views: 24, tracks: 1_000, seed: 2, ..SequenceOptions::default() };
     let sequence = Sequence::generate(&options).expect("valid");
-    // Tracks that cross from view 13 to 14 end there.
-    let first: Vec<u32> = {
-        let mut first = vec![u32::MAX; options.tracks];
-        for k in 0..sequence.input.x.len() {
-            let first = &mut first[sequence.input.track[k] as usize];
-            *first = (*first).min(sequence.input.view[k]);
-        }
-        first
-    };
-    let raw = thinned(&sequence, |k| first[sequence.input.track[k] as usize] >= 14 || sequence.input.view[k] < 14);
+    let raw = parted(&sequence, 14);
     let (views, tracks) = (raw.view.clone(), raw.track.clone());
     let solution =
         solved(&Input::new(raw, &Limits::default(), "sequence").expect("valid sequence"), &SolveSettings::default());
@@ -176,6 +177,48 @@ fn camera_groups_have_focal_lengths_of_their_own_unless_each_is_too_small() {
     let solution = solved(&grouped(&|view| 100 + view as u32), &SolveSettings::default());
     assert_eq!((solution.registered_views().len(), solution.calibrations.len()), (16, 16), "{:?}", solution.warnings);
     assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::CameraGroupsMerged));
+}
+
+#[test]
+fn a_sequence_whose_views_zoom_is_registered_whole() {
+    for seed in [5, 6] {
+        let options = SequenceOptions { views: 24, tracks: 1_200, zoom: 0.4, seed, ..SequenceOptions::default() };
+        let sequence = Sequence::generate(&options).expect("valid");
+        let mut raw = parted(&sequence, 14);
+        // Neither groups nor what is said of focal lengths means anything then.
+        for (view, of) in raw.views.iter_mut().enumerate() {
+            (of.camera_group, of.focal_prior) = (view as u32, Some(FocalPrior { focal_px: 300.0, sigma_log: 0.01 }));
+        }
+        let (views, tracks) = (raw.view.clone(), raw.track.clone());
+        let settings = SolveSettings { focal_per_view: true, ..SolveSettings::default() };
+        let solution = solved(&Input::new(raw, &Limits::default(), "sequence").expect("valid sequence"), &settings);
+        assert_eq!(solution.registered_views().len(), 24, "seed {seed}: {:?}", solution.warnings);
+        let parts: Vec<u32> = solution.views.iter().map(|view| view.part).collect();
+        assert_eq!(parts, [vec![0; 14], vec![1; 10]].concat(), "seed {seed}");
+        // No zoom is METRIC: its lens is not estimated.
+        assert_eq!(solution.grade, Some(Grade::Weak), "seed {seed}: {:?}", solution.warnings);
+        let sigma = solution.calibrations[0].sigma_log_focal.expect("WEAK has one");
+        let focals = solution.views.iter().map(|view| view.focal_px.expect("a focal length a view"));
+        let errors: Vec<f64> =
+            focals.zip(&sequence.truth.focals_px).map(|(found, focal)| (found / focal).ln()).collect();
+        let worst = errors.iter().fold(0.0f64, |worst, error| worst.max(error.abs()));
+        println!("seed {seed}: worst log focal length off by {worst:.4}, sigma {sigma:.4}");
+        assert!(worst < 3.0 * sigma && sigma < 0.1, "seed {seed}: {errors:?}");
+        let mean = sequence.truth.focals_px.iter().map(|focal| focal.ln()).sum::<f64>() / 24.0;
+        assert!(
+            (solution.calibrations[0].focal_px.ln() - mean).abs() < sigma,
+            "seed {seed}: {:?}",
+            solution.calibrations
+        );
+        let codes: Vec<WarningCode> = solution.warnings.iter().map(|warning| warning.code).collect();
+        assert!(!codes.contains(&WarningCode::CameraGroupsMerged), "seed {seed}: nothing is merged: {codes:?}");
+        let given = sequence.input.view.iter().zip(&sequence.input.track).zip(&sequence.truth.observation_right);
+        let right: std::collections::BTreeSet<_> = given.filter(|(_, right)| **right).map(|(of, _)| of).collect();
+        let truth: Vec<bool> = views.iter().zip(&tracks).map(|of| right.contains(&of)).collect();
+        let observations = agreement(&solution.observations.inlier, &truth);
+        println!("seed {seed}: observations {observations:?}");
+        assert!(observations.precision > 0.99 && observations.recall > 0.95, "seed {seed}");
+    }
 }
 
 /// What an observer hears.
