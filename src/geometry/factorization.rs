@@ -10,7 +10,14 @@ use super::{Camera, Point};
 ///
 /// Returns `None` when the decomposition does not converge or `rank` exceeds d: not to be expected of finite input.
 pub fn dominant_subspace(matrix: &DMatrix<f64>, rank: usize) -> Option<DMatrix<f64>> {
-    let gram = matrix * matrix.transpose();
+    dominant_eigenvectors(&(matrix * matrix.transpose()), rank)
+}
+
+/// Orthonormal eigenvectors of the `rank` largest eigenvalues of a symmetric matrix (d x d), d x rank, largest first;
+/// only the lower triangle is looked at.
+///
+/// Returns `None` where [`dominant_subspace`] does.
+pub fn dominant_eigenvectors(gram: &DMatrix<f64>, rank: usize) -> Option<DMatrix<f64>> {
     let order = gram.nrows();
     if rank > order || gram.iter().any(|entry| !entry.is_finite()) {
         return None;

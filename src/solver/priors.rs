@@ -2,10 +2,10 @@
 //!
 //! A prior is a non-negative weight per track, larger where the track is more likely right; only ratios matter.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 
 use crate::domain::StopToken;
-use crate::geometry::factorization::{dominant_subspace, subspace_residuals};
+use crate::geometry::factorization::{dominant_eigenvectors, dominant_subspace, subspace_residuals};
 use crate::geometry::statistics::median;
 
 /// Power that turns the consistency of a track into a sampling weight.
@@ -76,49 +76,62 @@ pub fn irls(matrix: &DMatrix<f64>, rank: usize, stop: &StopToken) -> Option<Vec<
 const AFFINE_SHRINK: f64 = 0.88;
 /// Floor of the residual, in units of a view's spread: what perspective adds to right tracks at moderate depths.
 const AFFINE_FLOOR: f64 = 0.08;
+/// Largest change of a weight in a round at the floor after which no other follows: what every track keeps anyway.
+const AFFINE_SETTLED: f64 = LEAST_WEIGHT;
+/// Dimension of what right tracks span under affine cameras, about their mean.
+const AFFINE_RANK: usize = 3;
 
 /// The same idea for image points without depths: a rank-3 affine subspace of the centred coordinates (2n x m) under
 /// graduated Geman-McClure weights. The floor is wide: perspective makes right tracks deviate from affine.
 ///
 /// Returns the weights of the last round; `None` when a decomposition fails or `stop` fires.
 pub fn affine_irls(centred: &DMatrix<f64>, stop: &StopToken) -> Option<Vec<f64>> {
-    let mut weights = vec![1.0f64; centred.ncols()];
+    let rows = centred.nrows() as f64;
+    let energy: Vec<f64> = centred.column_iter().map(|column| column.norm_squared()).collect();
+    let mut weights = DVector::from_element(centred.ncols(), 1.0f64);
+    let mut weighted = centred.clone();
     let mut scale = None;
     for _ in 0..IRLS_ROUNDS {
         if stop.is_stopped() {
             return None;
         }
-        let total: f64 = weights.iter().sum();
-        let mut mean = centred.column(0) * 0.0;
-        for (column, weight) in centred.column_iter().zip(&weights) {
-            mean += column * (weight / total);
+        let total = weights.sum();
+        let mean = centred * &weights / total;
+        for ((mut weighted, column), weight) in weighted.column_iter_mut().zip(centred.column_iter()).zip(&weights) {
+            weighted.zip_apply(&column, |scaled, entry| *scaled = weight.sqrt() * entry);
         }
-        let mut offset = centred.clone();
-        let mut weighted = centred.clone();
-        for (j, weight) in weights.iter().enumerate() {
-            let mut column = offset.column_mut(j);
-            column -= &mean;
-            weighted.set_column(j, &(&column * weight.sqrt()));
-        }
-        let basis = dominant_subspace(&weighted, 3)?;
-        let inside = basis.tr_mul(&offset);
-        let rows = centred.nrows() as f64;
-        let squared: Vec<f64> = offset
+        // About the mean: sum w (y - mean) (y - mean)' = sum w y y' - total mean mean'.
+        let mut scatter = &weighted * weighted.transpose();
+        scatter.ger(-total, &mean, &mean, 1.0);
+        let basis = dominant_eigenvectors(&scatter, AFFINE_RANK)?;
+        let (inside, along) = (basis.tr_mul(centred), centred.tr_mul(&mean));
+        let (mean_inside, mean_energy) = (basis.tr_mul(&mean), mean.norm_squared());
+        let squared: Vec<f64> = inside
             .column_iter()
-            .zip(inside.column_iter())
-            .map(|(column, inside)| (column.norm_squared() - inside.norm_squared()).max(0.0) / rows)
+            .zip(energy.iter().zip(&along))
+            .map(|(inside, (energy, along))| {
+                let offset = energy - 2.0 * along + mean_energy;
+                (offset - (inside - &mean_inside).norm_squared()).max(0.0) / rows
+            })
             .collect();
+        let floor = AFFINE_FLOOR.powi(2);
         let next: f64 = match scale {
             None => median(&mut squared.clone()),
-            Some(scale) => AFFINE_FLOOR.powi(2).max(AFFINE_SHRINK * scale),
+            Some(scale) => floor.max(AFFINE_SHRINK * scale),
         };
         let next = next.max(f64::MIN_POSITIVE);
-        scale = Some(next);
+        let mut moved = 0.0f64;
         for (weight, squared) in weights.iter_mut().zip(&squared) {
-            *weight = (next / (next + squared)).powi(2);
+            let reweighted = (next / (next + squared)).powi(2);
+            moved = moved.max((reweighted - *weight).abs());
+            *weight = reweighted;
         }
+        if scale == Some(floor) && moved < AFFINE_SETTLED {
+            break;
+        }
+        scale = Some(next);
     }
-    Some(weights.into_iter().map(|weight| weight + LEAST_WEIGHT).collect())
+    Some(weights.iter().map(|weight| weight + LEAST_WEIGHT).collect())
 }
 
 /// Floor of the network's weight as a prior: a track the network has given up is still drawn now and then.
