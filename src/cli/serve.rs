@@ -222,14 +222,18 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let scheme = if config.tls.files().is_some() { "https" } else { "http" };
     print(&format!("grpc {scheme}://{}", service.address()))?;
     print(&format!("metrics http://{}/metrics", metrics.address()))?;
-    tokio::select! {
+    let failed = tokio::select! {
         ended = service.wait() => {
-            ended?;
-            return Err(Failure::internal("the gRPC server ended without being asked to"));
+            Some(ended.err().unwrap_or_else(|| Failure::internal("the gRPC server ended without being asked to")))
         }
-        () = signals.next() => {}
-    }
+        () = signals.next() => None,
+    };
     ready.set(false);
+    if let Some(failure) = failed {
+        // Nobody can be served: what runs goes back to the queue at once.
+        service.abandon().await;
+        return Err(failure);
+    }
     tracing::info!(
         bound_seconds = config.engine.drain_seconds,
         "draining; a second signal gives running jobs back now"

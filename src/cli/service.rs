@@ -42,11 +42,24 @@ impl Service {
         // Before the store is opened and its jobs begin: who cannot be let in is no reason to take them up.
         options.check_access().map_err(Failure::bad_config)?;
         let store = open_store(&config.store).await?;
-        let engine = Engine::start(engine_options(config), store.clone(), engine::solver_on(config.compute.threads()))
-            .await
-            .map_err(|error| Failure::internal(format_args!("cannot start the engine: {error}")))?;
-        let server = Server::bind(options, engine.clone()).await.map_err(Failure::internal)?;
-        Ok(Self { store, engine, server, drain_bound: Duration::from_secs(config.engine.drain_seconds) })
+        let solver = engine::solver_on(config.compute.threads());
+        let engine = match Engine::start(engine_options(config), store.clone(), solver).await {
+            Ok(engine) => engine,
+            Err(error) => {
+                close(&*store).await;
+                return Err(Failure::internal(format_args!("cannot start the engine: {error}")));
+            }
+        };
+        match Server::bind(options, engine.clone()).await {
+            Ok(server) => {
+                Ok(Self { store, engine, server, drain_bound: Duration::from_secs(config.engine.drain_seconds) })
+            }
+            Err(error) => {
+                // Jobs that have begun by now are to lose no attempt by an address that is taken.
+                give_back(&engine, &*store).await;
+                Err(Failure::internal(error))
+            }
+        }
     }
 
     /// Where it listens.
@@ -59,7 +72,7 @@ impl Service {
         self.engine.store_state()
     }
 
-    /// Ends only when the server fails.
+    /// Ends only when the server fails; [`abandon`](Self::abandon) is what is left to do then.
     ///
     /// # Errors
     /// Why it failed.
@@ -83,10 +96,24 @@ impl Service {
             }
         };
         let calls_ended = self.server.shutdown(CALLS_BOUND).await;
-        if timeout(CLOSE_BOUND, self.store.close()).await.is_err() {
-            tracing::warn!("the store does not close; nothing that was acknowledged is lost by that");
-        }
+        close(&*self.store).await;
         calls_ended.map(|()| drained).map_err(Failure::internal)
+    }
+
+    /// Gives running jobs back at once and closes the store.
+    pub async fn abandon(self) {
+        give_back(&self.engine, &*self.store).await;
+    }
+}
+
+async fn give_back(engine: &Engine, store: &dyn Store) {
+    engine.drain(Duration::ZERO).await;
+    close(store).await;
+}
+
+async fn close(store: &dyn Store) {
+    if timeout(CLOSE_BOUND, store.close()).await.is_err() {
+        tracing::warn!("the store does not close; nothing that was acknowledged is lost by that");
     }
 }
 

@@ -8,7 +8,7 @@ use tonic::Streaming;
 use tonic::transport::Channel;
 
 use crate::support::live::{connected, created, lasting};
-use crate::support::program::Serving;
+use crate::support::program::{Serving, run};
 use crate::support::scrape::Page;
 use crate::support::server::soon;
 use crate::support::wire::{all, state_of};
@@ -128,5 +128,38 @@ async fn a_server_that_is_told_twice_gives_its_job_back_at_once_and_no_attempt_i
     let server = Serving::start(&data_dir);
     let mut jobs = connected(&server).await;
     assert_exactly_once(&mut jobs, &name, before).await;
+    assert_eq!(lost_attempts(&server), 0.0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_whose_address_is_taken_ends_cleanly_and_costs_its_jobs_nothing() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let data_dir = directory.path().join("data");
+    let impatient = [("SCPSFM_ENGINE__DRAIN_SECONDS", "0")];
+    let mut server = Serving::start_with(&data_dir, &impatient, std::process::Stdio::null());
+    let mut jobs = connected(&server).await;
+    let name = created(&mut jobs, lasting(ITERATIONS)).await;
+    let before = until_optimising(watch(&mut jobs, &name, 0).await).await;
+    server.running.signal(Signal::TERM);
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success(), "a drain is a clean end");
+
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let address = taken.local_addr().expect("bound").to_string();
+    let data = data_dir.display().to_string();
+    let arguments = ["serve", "--listen", &address, "--metrics-listen", "127.0.0.1:0", "--data-dir", &data];
+    for start in 1..=3 {
+        let ended = tokio::task::block_in_place(|| run(arguments));
+        assert_eq!(ended.code, Some(1), "{ended:?}");
+        assert!(ended.stderr.contains(&format!("cannot listen on {address}")), "{ended:?}");
+        // Its log is written back and gone where a store was closed, and left where a process was just over.
+        assert!(!data_dir.join("scpsfm.db-wal").exists(), "start {start} did not close the store");
+    }
+    let server = Serving::start(&data_dir);
+    let mut jobs = connected(&server).await;
+    let last = *sequences(&before).last().expect("sequenced events");
+    let (_, end) = soon(all(watch(&mut jobs, &name, last).await)).await;
+    end.expect("the watch ends with the job");
+    let job = jobs.get_job(proto::GetJobRequest { name }).await.expect("the job").into_inner();
+    assert_eq!(job.state(), JobState::Succeeded);
     assert_eq!(lost_attempts(&server), 0.0);
 }
