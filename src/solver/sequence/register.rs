@@ -89,11 +89,11 @@ pub fn join(
             adjusted_at = grown;
             recorder.standing.inliers = adjust::verified(model).len() as u32;
         }
-        let focal = model.intrinsics_of(scene, view).focal;
+        let registered = model.registered();
+        let focal = model.log_focal(scene, scene.camera_of[view], &registered).exp();
         recorder.standing.focal_px = Some(focal * scene.context.scale_px);
-        let registered = model.registered().len();
-        recorder.registered(registered);
-        recorder.tell(super::SHARE_OF_REGISTERING * registered as f64 / views);
+        recorder.registered(registered.len());
+        recorder.tell(super::SHARE_OF_REGISTERING * registered.len() as f64 / views);
     }
     Ok(())
 }
