@@ -116,6 +116,10 @@ impl SolveSettings {
     /// Adam moves every weight by about the rate at each step: above this nothing converges.
     pub const MAX_LEARNING_RATE: f64 = 1.0;
 
+    /// Noise in pixels above which another unit was meant: solvers assume a tenth of the image at most, and no image is
+    /// ten times as long.
+    pub const MAX_NOISE_PX: f64 = 10_000.0;
+
     /// Checks every field.
     ///
     /// # Errors
@@ -151,6 +155,12 @@ impl SolveSettings {
             found.push(Violation::of(
                 "settings.learning_rate",
                 format!("{} is above the largest rate {}", self.learning_rate, Self::MAX_LEARNING_RATE),
+            ));
+        }
+        if let Some(noise_px) = self.noise_px.filter(|noise_px| *noise_px > Self::MAX_NOISE_PX) {
+            found.push(Violation::of(
+                "settings.noise_px",
+                format!("{noise_px} is above the largest noise {}, in pixels", Self::MAX_NOISE_PX),
             ));
         }
         if self.iterations == 0 || self.iterations > Self::MAX_ITERATIONS {

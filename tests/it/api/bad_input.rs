@@ -93,6 +93,8 @@ async fn every_kind_is_refused_by_field_and_index_and_nothing_is_stored() {
         (set_up(|settings| settings.method = 42), "settings.method"),
         (set_up(|settings| settings.alpha = Some(f64::NAN)), "settings.alpha"),
         (set_up(|settings| settings.iterations = Some(0)), "settings.iterations"),
+        (set_up(|settings| settings.noise_px = Some(f64::INFINITY)), "settings.noise_px"),
+        (set_up(|settings| settings.noise_px = Some(1e20)), "settings.noise_px"),
         (described(|job| job.priority = i32::MAX), "job.priority"),
         (described(|job| job.deadline = deadline_time(1_800_000_000, 1_000_000_000)), "job.deadline_time"),
         (described(|job| job.deadline = deadline_time(i64::MAX, 0)), "job.deadline_time"),
