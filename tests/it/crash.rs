@@ -1,5 +1,7 @@
 //! A server that is killed in the middle of a job, and one that is sent away in the middle of one.
 
+use std::path::Path;
+
 use rustix::process::Signal;
 use scpsfm::rpc::proto::job_event::Body;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
@@ -87,17 +89,23 @@ fn lost_attempts(server: &Serving) -> f64 {
     page.value("scpsfm_attempts_lost_total{reason=\"LEASE_EXPIRED\"}")
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_server_that_is_sent_away_gives_its_job_back_and_the_next_finishes_it() {
-    let directory = tempfile::tempdir().expect("a temporary directory");
-    let data_dir = directory.path().join("data");
+/// A job that a server was sent away from in the middle, and what its watcher had seen by then.
+async fn given_back(data_dir: &Path) -> (String, Vec<proto::JobEvent>) {
     let impatient = [("SCPSFM_ENGINE__DRAIN_SECONDS", "0")];
-    let mut server = Serving::start_with(&data_dir, &impatient, std::process::Stdio::null());
+    let mut server = Serving::start_with(data_dir, &impatient, std::process::Stdio::null());
     let mut jobs = connected(&server).await;
     let name = created(&mut jobs, lasting(ITERATIONS)).await;
     let before = until_optimising(watch(&mut jobs, &name, 0).await).await;
     server.running.signal(Signal::TERM);
     assert!(tokio::task::block_in_place(|| server.running.wait()).success(), "a drain is a clean end");
+    (name, before)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_server_that_is_sent_away_gives_its_job_back_and_the_next_finishes_it() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let data_dir = directory.path().join("data");
+    let (name, before) = given_back(&data_dir).await;
 
     let server = Serving::start(&data_dir);
     let mut jobs = connected(&server).await;
@@ -135,13 +143,7 @@ async fn a_server_that_is_told_twice_gives_its_job_back_at_once_and_no_attempt_i
 async fn a_server_whose_address_is_taken_ends_cleanly_and_costs_its_jobs_nothing() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let data_dir = directory.path().join("data");
-    let impatient = [("SCPSFM_ENGINE__DRAIN_SECONDS", "0")];
-    let mut server = Serving::start_with(&data_dir, &impatient, std::process::Stdio::null());
-    let mut jobs = connected(&server).await;
-    let name = created(&mut jobs, lasting(ITERATIONS)).await;
-    let before = until_optimising(watch(&mut jobs, &name, 0).await).await;
-    server.running.signal(Signal::TERM);
-    assert!(tokio::task::block_in_place(|| server.running.wait()).success(), "a drain is a clean end");
+    let (name, before) = given_back(&data_dir).await;
 
     let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
     let address = taken.local_addr().expect("bound").to_string();
@@ -159,6 +161,7 @@ async fn a_server_whose_address_is_taken_ends_cleanly_and_costs_its_jobs_nothing
     let last = *sequences(&before).last().expect("sequenced events");
     let (_, end) = soon(all(watch(&mut jobs, &name, last).await)).await;
     end.expect("the watch ends with the job");
+    // However many attempts began and were given back, none was lost.
     let job = jobs.get_job(proto::GetJobRequest { name }).await.expect("the job").into_inner();
     assert_eq!(job.state(), JobState::Succeeded);
     assert_eq!(lost_attempts(&server), 0.0);
