@@ -18,10 +18,22 @@ async fn foreseen() -> (Bench, [JobName; 2]) {
     let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
     let created = bench.engine.submit_batch(both).await.expect("admitted");
     let names = [created[0].name.clone(), created[1].name.clone()];
-    eventually(|| async { is_foreseen(&bench, &names[1]).then_some(()) }).await;
-    // What follows an attempt begins with handing it over.
-    eventually(|| async { (bench.engine.inner.hub.topic_count() == 2).then_some(()) }).await;
+    handed_over(&bench, &names[1]).await;
     (bench, names)
+}
+
+/// Until the second of two jobs is in the hands of the worker that solves the first one.
+async fn handed_over(bench: &Bench, second: &JobName) {
+    eventually(|| async { is_foreseen(bench, second).then_some(()) }).await;
+    // It is foreseen before its input is read. What follows an attempt begins with handing it over.
+    eventually(|| async { (bench.engine.inner.hub.topic_count() == 2).then_some(()) }).await;
+}
+
+/// Until nothing is foreseen or running. A job's end is in the store a little before its attempt is off the list.
+async fn nothing_is_left(bench: &Bench) {
+    let inner = &bench.engine.inner;
+    eventually(|| async { (locked(&inner.foreseen).is_empty() && locked(&inner.running).is_empty()).then_some(()) })
+        .await;
 }
 
 fn is_foreseen(bench: &Bench, name: &JobName) -> bool {
@@ -52,8 +64,7 @@ async fn a_foreseen_job_waits_as_any_other_and_is_solved_next() {
         assert!(job.start_time >= Some(job.create_time) && job.start_time <= job.end_time);
     }
     assert_eq!(bench.gate.calls.load(Ordering::SeqCst), 2);
-    eventually(|| async { locked(&bench.engine.inner.foreseen).is_empty().then_some(()) }).await;
-    assert!(locked(&bench.engine.inner.running).is_empty());
+    nothing_is_left(&bench).await;
 }
 
 #[tokio::test]
@@ -82,7 +93,7 @@ async fn cancelled_before_it_is_begun_it_ends_so_whatever_was_foreseen() {
         assert_eq!(bench.ended(name).await.state, JobState::Succeeded);
     }
     assert_eq!(states(&bench, &next).await, [JobState::Queued, JobState::Cancelled]);
-    assert!(locked(&bench.engine.inner.running).is_empty());
+    nothing_is_left(&bench).await;
 }
 
 /// The worker begins it, and solves it, while the claim waits behind the cancel.
@@ -103,7 +114,7 @@ async fn cancelled_between_its_begin_and_its_lease_it_leaves_nothing() {
     assert_eq!(bench.ended(&third).await.state, JobState::Succeeded);
     assert_eq!(states(&bench, &next).await, [JobState::Queued, JobState::Cancelled]);
     assert!(bench.store.result(&next).await.expect("answers").is_none());
-    assert!(locked(&bench.engine.inner.running).is_empty());
+    nothing_is_left(&bench).await;
 }
 
 #[tokio::test]
@@ -112,7 +123,7 @@ async fn what_was_begun_and_cannot_be_leased_is_stopped_and_solved_later() {
     let both = vec![new_job(Script::Wait), new_job(Script::Wait)];
     let created = bench.engine.submit_batch(both).await.expect("admitted");
     let [first, next] = [&created[0].name, &created[1].name];
-    eventually(|| async { is_foreseen(&bench, next).then_some(()) }).await;
+    handed_over(&bench, next).await;
     let no_claims = "CREATE TRIGGER broken BEFORE UPDATE OF state ON jobs WHEN NEW.state = 'RUNNING' \
                      BEGIN SELECT RAISE(ABORT, 'broken'); END";
     bench.store.execute(no_claims).await;
