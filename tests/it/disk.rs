@@ -194,7 +194,11 @@ async fn on_a_full_disk_a_server_starts_and_room_is_made_through_it() {
         jobs.cancel_job(request).await.expect("to cancel takes no room");
         assert_eq!(reaches(&mut jobs, name, &[JobState::Cancelled, JobState::Succeeded]).await, JobState::Cancelled);
     }
-    for name in waiting.iter().chain([&busy, &ended]) {
+    for (place, name) in waiting.iter().chain([&busy, &ended]).enumerate() {
+        if place == waiting.len() / 2 {
+            // What gives space back comes round a few times, and must not take the room of those that are deleted next.
+            tokio::time::sleep(Duration::from_secs(4)).await;
+        }
         let request = proto::DeleteJobRequest { name: name.clone(), etag: String::new() };
         jobs.delete_job(request).await.expect("to delete takes no room");
     }

@@ -64,23 +64,32 @@ impl WriteConnection {
     /// Bytes that the disk lacks for the database to grow by what the log adds to it.
     pub(super) fn log_lacks(&mut self) -> Result<u64, Error> {
         let growth = self.bytes()?.saturating_sub(self.file_bytes()?);
-        Ok(growth.saturating_sub(room_beside(self.database()).map_err(cannot_look)?))
-    }
-
-    /// Bytes that the file gives back to the disk once the log, which says so, is written back.
-    pub(super) fn surplus(&mut self) -> Result<u64, Error> {
-        Ok(self.file_bytes()?.saturating_sub(self.bytes()?))
+        Ok(growth.saturating_sub(self.room()?))
     }
 
     /// Bytes of the database, wherever its pages are.
-    fn bytes(&mut self) -> Result<u64, Error> {
-        let number = |row: &rusqlite::Row<'_>| row.get::<_, u32>(0);
-        let page = u64::from(self.first_row("PRAGMA page_size", number)?);
-        Ok(u64::from(self.first_row("PRAGMA page_count", number)?) * page)
+    pub(super) fn bytes(&mut self) -> Result<u64, Error> {
+        Ok(self.number("PRAGMA page_count")? * self.page_bytes()?)
     }
 
-    fn file_bytes(&self) -> Result<u64, Error> {
+    /// Bytes of a page.
+    pub(super) fn page_bytes(&mut self) -> Result<u64, Error> {
+        self.number("PRAGMA page_size")
+    }
+
+    /// What a statement says that answers with one number of 32 bits.
+    pub(super) fn number(&mut self, statement: &'static str) -> Result<u64, Error> {
+        self.first_row(statement, |row| row.get::<_, u32>(0)).map(u64::from)
+    }
+
+    /// Bytes of the database's file.
+    pub(super) fn file_bytes(&self) -> Result<u64, Error> {
         Ok(std::fs::metadata(self.database()).map_err(cannot_look)?.len())
+    }
+
+    /// Bytes that are free on the disk, as far as the system tells.
+    pub(super) fn room(&self) -> Result<u64, Error> {
+        room_beside(self.database()).map_err(cannot_look)
     }
 }
 

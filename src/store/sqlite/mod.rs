@@ -11,6 +11,7 @@ mod log;
 mod reserve;
 #[cfg(test)]
 mod tests;
+mod vacuum;
 mod writer;
 
 use std::fs::{File, TryLockError};
@@ -27,6 +28,7 @@ use super::sql::{self, Connection, Database, Moves, Operation, Size, Statement, 
 use super::{Error, Hint};
 use connection::WriteConnection;
 use reserve::{Reserve, Room};
+use vacuum::{VACUUM, VACUUM_BYTES, VACUUMS};
 use writer::Writer;
 
 /// The database within the data directory.
@@ -44,12 +46,6 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(10);
 /// of a disk that has failed.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Hands pages back, 1,024 at a time, which are 4 MB: writers wait meanwhile, and where others have to move for them, on
-/// a full disk it is the reserve that holds these in the log.
-const VACUUM: &str = "PRAGMA incremental_vacuum(1024)";
-const VACUUM_BYTES: u64 = 4 << 20;
-/// How often, each time that space is to be given back; others may write in between.
-const VACUUMS: u32 = 4;
 /// What every connection is told.
 const SETTINGS: [(&str, &str); 4] = [
     // What was acknowledged survives a power cut, not only a crash of the process.
@@ -256,8 +252,7 @@ impl Database for Sqlite {
     /// to: such a log need not be long.
     async fn reclaim(&self) -> Result<(), Error> {
         for _ in 0..VACUUMS {
-            let free: i64 = sqlx::query_scalar("PRAGMA freelist_count").fetch_one(&self.readers).await?;
-            if free == 0 {
+            if !self.writer.vacuum_pays().await? {
                 break;
             }
             self.writer.run(Moves::Ends(VACUUM_BYTES), VACUUM).await?;

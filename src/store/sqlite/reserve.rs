@@ -18,7 +18,7 @@ use crate::store::Error;
 const RESERVE_FILE: &str = "scpsfm.reserve";
 
 /// What is kept, in bytes: the log as long as it may grow before it is written back (1,000 pages, 4 MiB), the
-/// database grown by as much, one [`VACUUM`](super::VACUUM) and its pages in the log. The results of the jobs that run
+/// database grown by as much, one [`VACUUM`](super::vacuum::VACUUM) and its pages in the log. The results of the jobs that run
 /// seldom have more.
 pub(super) const RESERVE_BYTES: u64 = 16 << 20;
 

@@ -16,10 +16,10 @@ use futures_util::future::BoxFuture;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
-use super::VACUUM_BYTES;
 use super::connection::{WriteConnection, WrittenRow};
 use super::log::{LONG_PAGES, Log};
 use super::reserve::{RESERVE_BYTES, RETRY, Reserve};
+use super::vacuum::VACUUM_BYTES;
 use crate::store::Error;
 use crate::store::sql::{self, Moves, Operation, Statement};
 use crate::telemetry::metrics;
@@ -49,6 +49,7 @@ pub(super) struct Writer {
 
 enum Message {
     Write(Box<dyn Waiting>),
+    VacuumPays(oneshot::Sender<bool>),
     Shorten(oneshot::Sender<()>),
     Close(oneshot::Sender<()>),
 }
@@ -188,6 +189,11 @@ impl Writer {
         self.write(moves, run).await
     }
 
+    /// Whether to give free pages back is worth the room that it takes.
+    pub(super) async fn vacuum_pays(&self) -> Result<bool, Error> {
+        self.send(Message::VacuumPays).await
+    }
+
     /// After what is already waiting, has the database's file give back what it has beyond its pages, where that is
     /// worth it and its readers let it.
     pub(super) async fn shorten(&self) -> Result<(), Error> {
@@ -201,7 +207,7 @@ impl Writer {
     }
 
     /// Has something done that answers when it is.
-    async fn send(&self, message: fn(oneshot::Sender<()>) -> Message) -> Result<(), Error> {
+    async fn send<T>(&self, message: fn(oneshot::Sender<T>) -> Message) -> Result<T, Error> {
         let closed = || Error::Unavailable("the store is closed".into());
         let (done, answer) = oneshot::channel();
         self.inbox.send(message(done)).map_err(|_| closed())?;
@@ -235,6 +241,10 @@ impl Desk {
                     let left_over = self.group(first).await;
                     self.write_log_back(LONG_PAGES);
                     left_over
+                }
+                Message::VacuumPays(reply) => {
+                    let _ = reply.send(self.vacuum_pays());
+                    None
                 }
                 Message::Shorten(done) => {
                     self.shorten();
@@ -409,8 +419,16 @@ impl Desk {
         }
     }
 
+    fn vacuum_pays(&mut self) -> bool {
+        let kept = if self.reserve.is_whole() { RESERVE_BYTES } else { 0 };
+        self.connection().and_then(|connection| connection.vacuum_pays(kept)).unwrap_or_else(|error| {
+            tracing::debug!(%error, "whether a vacuum pays cannot be told");
+            false
+        })
+    }
+
     /// Writes the log back, however short it is, where the file is longer than its pages by what one
-    /// [`VACUUM`](super::VACUUM) gives back at least.
+    /// [`VACUUM`](super::vacuum::VACUUM) gives back at least.
     fn shorten(&mut self) {
         match self.connection().and_then(WriteConnection::surplus) {
             Ok(bytes) if bytes > VACUUM_BYTES => self.write_log_back(1),
