@@ -183,7 +183,7 @@ fn whereabouts(progress: &Progress) -> String {
     match (step, progress.stage) {
         (Some(Step { task: Task::Adjust, step, steps }), _) => format!("adjusting: round {step} of {steps}, "),
         (Some(Step { task: Task::Cameras, step, steps }), _) if steps > 1 => {
-            format!("calibrating: camera {step} of {steps}, ")
+            format!("calibrating: {step} of {steps}, ")
         }
         (Some(Step { task: Task::Cameras, .. }), _) => String::new(),
         (Some(Step { task: Task::Windows, step, steps }), _) => format!("comparing: window {step} of {steps}, "),
@@ -273,7 +273,7 @@ mod tests {
         assert_eq!(said(Stage::Extend, Course { part: 1, ..walk }), "registering: 120 of 300 views, part 1, ");
         let step = |task: Task| Course { part: 1, step: Some(Step { task, step: 3, steps: 7 }), ..walk };
         assert_eq!(said(Stage::Extend, step(Task::Adjust)), "adjusting: round 3 of 7, ");
-        assert_eq!(said(Stage::Calibrate, step(Task::Cameras)), "calibrating: camera 3 of 7, ");
+        assert_eq!(said(Stage::Calibrate, step(Task::Cameras)), "calibrating: 3 of 7, ");
         assert_eq!(said(Stage::Calibrate, step(Task::Windows)), "comparing: window 3 of 7, ");
         assert_eq!(said(Stage::Judge, step(Task::Judge)), "judging: 3 of 7 verdicts, ");
         assert_eq!(said(Stage::Calibrate, walk), "");

@@ -79,6 +79,10 @@ pub struct SequenceArgs {
     /// Share of the right tracks of six views or more that go over to another point on their way
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, requires = "sequence")]
     pub joined: f64,
+
+    /// Views, the first ones, in which the camera does not turn; where it never turns, nothing can be calibrated
+    #[arg(long, value_name = "VIEWS", default_value_t = 0, requires = "sequence")]
+    pub straight: usize,
 }
 
 /// Reads two counts with a comma between them.
@@ -105,6 +109,7 @@ impl Args {
             joined: self.sequence.joined,
             radial_k1: self.camera.radial_k1,
             zoom: self.camera.zoom,
+            straight: self.sequence.straight,
             seed: self.scene.seed,
         };
         Sequence::generate(&options).map_err(Failure::usage)

@@ -55,7 +55,7 @@ pub struct Losses {
 pub enum Task {
     /// Adjusting everything and triangulating it anew; steps are rounds.
     Adjust,
-    /// Calibrating camera groups; steps are groups.
+    /// Calibrating camera groups, or runs of views that zoom; steps are these.
     Cameras,
     /// Asking windows of the sequence what focal length each sees; steps are windows.
     Windows,
@@ -67,7 +67,7 @@ pub enum Task {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Step {
     pub task: Task,
-    /// The round, group or window that is worked on, from 1, or the verdicts so far.
+    /// The round, group, run or window that is worked on, from 1, or the verdicts so far.
     pub step: u32,
     /// How many there will be at most.
     pub steps: u32,

@@ -92,7 +92,7 @@ pub struct Calibration {
     /// Horizontal focal length; the geometric mean where every view has its own, see [`ViewResult::focal_px`].
     pub focal_px: f64,
     /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable (infinite). Where
-    /// every view has its own, the root mean square over the views.
+    /// every view has its own, the root mean square over the views that have one.
     pub sigma_log_focal: Option<f64>,
     pub principal_point_px: [f64; 2],
     /// Vertical over horizontal focal length; 1 (square pixels) unless the data asked for more.
@@ -147,10 +147,11 @@ pub struct ViewResult {
     /// 3x4 projective camera in pixels, row by row, in the frame `P1 = [I|0]` of the first registered view of
     /// its part. `None`: the view is not registered.
     pub projection: Option<[[f64; 4]; 3]>,
-    /// Metric pose: `x ~ K (R X + t)`; row by row. `None` where there is no metric reconstruction.
+    /// Metric pose: `x ~ K (R X + t)`; row by row. `None` where there is no metric reconstruction, and for a view that
+    /// should have a focal length of its own and whose observations do not determine it.
     pub rotation: Option<[[f64; 3]; 3]>,
     pub translation: Option<[f64; 3]>,
-    /// The view's own focal length; `None` where that of the calibration is every view's.
+    /// The view's own focal length; `None` where that of the calibration is every view's, and where there is no pose.
     #[serde(default)]
     pub focal_px: Option<f64>,
     /// Which reconstruction the view belongs to, the largest first: views that share no tracks have frames and scales

@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, Matrix4};
 
 use super::Context;
 use super::attempt::Attempt;
-use super::calibration::Outcome;
+use super::calibration::{Outcome, ViewFocal};
 use super::direct::Decided;
 use super::grow::Consensus;
 use super::judge::{self, Geometry, Judged};
@@ -243,21 +243,23 @@ fn views(context: &Context, attempt: &Attempt, local: &[Camera], metric: Option<
     }
     for (i, &view) in attempt.block.views.iter().enumerate() {
         let projection = context.normalization.camera_px(view, &local[i]) * frame;
-        let pose = metric.map(|metric| &metric.poses[i]);
+        let focal = own_focal(attempt, i);
+        let is_determined = focal.is_none_or(|focal| focal.sigma_log.is_some());
+        let pose = metric.filter(|_| is_determined).map(|metric| &metric.poses[i]);
         views[view] = ViewResult {
             projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| projection[(row, column)]))),
             rotation: pose
                 .map(|pose| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
             translation: pose.map(|pose| pose.translation.into()),
-            focal_px: pose.and_then(|_| own_focal(attempt, i)).map(|focal| focal * context.scale_px),
+            focal_px: pose.and(focal).map(|own| own.focal * context.scale_px),
             ..ViewResult::default()
         };
     }
     views
 }
 
-/// Normalised focal length of the `i`-th view of the block, where every view has its own.
-fn own_focal(attempt: &Attempt, i: usize) -> Option<f64> {
+/// Focal length of the `i`-th view of the block, where every view has its own.
+fn own_focal(attempt: &Attempt, i: usize) -> Option<ViewFocal> {
     attempt.calibration.as_ref()?.focals.as_ref()?.get(i).copied()
 }
 
@@ -275,7 +277,7 @@ fn final_points(
     };
     let mut cameras = vec![Camera::zeros(); context.input.view_count()];
     for (i, &view) in attempt.block.views.iter().enumerate() {
-        let focal = own_focal(attempt, i).unwrap_or(metric.intrinsics.focal);
+        let focal = own_focal(attempt, i).map_or(metric.intrinsics.focal, |own| own.focal);
         cameras[view] = metric.poses[i].camera(&Intrinsics { focal, ..metric.intrinsics });
     }
     let triangulated = |sightings: &Vec<Sighting>| {

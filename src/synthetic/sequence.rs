@@ -51,6 +51,10 @@ pub struct SequenceOptions {
     /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
     #[serde(default)]
     pub zoom: f64,
+    /// Views, the first ones, in which the camera travels and does not turn: what they show is the same under a wrong
+    /// calibration.
+    #[serde(default)]
+    pub straight: usize,
     pub seed: u64,
 }
 
@@ -67,6 +71,7 @@ impl Default for SequenceOptions {
             joined: 0.0,
             radial_k1: 0.0,
             zoom: 0.0,
+            straight: 0,
             seed: 0,
         }
     }
@@ -109,6 +114,9 @@ impl SequenceOptions {
             if !(0.0..=1.0).contains(&share) {
                 found.push(Violation::of(name, format!("{share} is not a share in 0..=1")));
             }
+        }
+        if self.straight > self.views {
+            found.push(Violation::of("straight", format!("{} is not in 0..={}, the views", self.straight, self.views)));
         }
         let limit = SceneOptions::MAX_RADIAL_K1;
         if !(-limit..=limit).contains(&self.radial_k1) {
@@ -180,6 +188,10 @@ impl Sequence {
         let focal = focal_px / f64::from(IMAGE_SIDE_PX);
         let mut cameras: Vec<Camera> =
             (0..options.views).map(|view| camera(view, rng.random_range(-0.05..0.05), focal)).collect();
+        if let Some(last) = options.straight.checked_sub(1) {
+            let rotation = cameras[last].rotation;
+            cameras[..last].iter_mut().for_each(|camera| camera.rotation = rotation);
+        }
         // A stream of its own: a zoom changes nothing else.
         let mut zoom = ChaCha8Rng::seed_from_u64(options.seed);
         zoom.set_stream(ZOOM_STREAM);
@@ -348,6 +360,14 @@ mod tests {
     }
 
     #[test]
+    fn views_that_go_straight_do_not_turn() {
+        let options = SequenceOptions { straight: 12, ..SequenceOptions::default() };
+        let rotations = Sequence::generate(&options).expect("valid").truth.rotations;
+        assert!(rotations[..12].iter().all(|rotation| *rotation == rotations[0]));
+        assert!(rotations[11..].windows(2).all(|pair| pair[0] != pair[1]));
+    }
+
+    #[test]
     fn every_option_out_of_range_is_named() {
         let default = SequenceOptions::default;
         let cases = [
@@ -361,6 +381,7 @@ mod tests {
             ("joined", SequenceOptions { joined: 2.0, ..default() }),
             ("radial_k1", SequenceOptions { radial_k1: 2.0, ..default() }),
             ("zoom", SequenceOptions { zoom: 1.0, ..default() }),
+            ("straight", SequenceOptions { straight: 21, ..default() }),
         ];
         for (name, options) in cases {
             let error = options.validate().expect_err(name);

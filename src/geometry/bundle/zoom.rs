@@ -1,6 +1,8 @@
 //! Metric bundle adjustment of a camera that zooms: a focal length a view, else a pinhole with square pixels and the
 //! principal point where it was guessed.
 
+use std::ops::Range;
+
 use faer::{MatRef, Side};
 use nalgebra::{DMatrix, Rotation3, Vector2, Vector3};
 
@@ -106,10 +108,17 @@ impl Zooming {
     /// Variances of the log focal lengths, everything else marginalised, for observations with unit variance: multiply
     /// by the squared noise. `None` for a view whose focal length the observations do not determine.
     pub fn log_focal_variances(&self, observations: &[Observation]) -> Vec<Option<f64>> {
-        self.variances(observations).unwrap_or_else(|| vec![None; self.focals.len()])
+        let information = self.information(observations);
+        let variance = |view: usize| information.as_ref()?.variance(view..view + 1);
+        (0..self.focals.len()).map(variance).collect()
     }
 
-    fn variances(&self, observations: &[Observation]) -> Option<Vec<Option<f64>>> {
+    /// The same of the mean of the log focal lengths.
+    pub fn mean_log_focal_variance(&self, observations: &[Observation]) -> Option<f64> {
+        self.information(observations)?.variance(0..self.focals.len())
+    }
+
+    fn information(&self, observations: &[Observation]) -> Option<Information> {
         let views = self.poses.len();
         let n = VIEW * views;
         let layout = Layout::new(observations, views, self.points.len());
@@ -128,28 +137,44 @@ impl Zooming {
             return None;
         }
         let eigen = MatRef::from_column_major_slice(scaled.as_slice(), n, n).self_adjoint_eigen(Side::Lower).ok()?;
-        let largest = eigen.S()[n - 1];
-        let variance = |view: usize| {
-            let row = VIEW * view + VIEW - 1;
-            let mut sum = 0.0;
-            // Eigenvalues ascend; the first are the similarity's, which no focal length takes part in.
-            for k in GAUGE.min(n)..n {
-                let (value, share) = (eigen.S()[k], eigen.U()[(row, k)].powi(2));
-                if value > NULL_POSE * largest {
-                    sum += share / value;
-                } else if share > TAKES_PART {
-                    return None;
-                }
+        let values = (0..n).map(|k| eigen.S()[k]).collect();
+        Some(Information { scale, values, vectors: DMatrix::from_fn(n, n, |row, k| eigen.U()[(row, k)]) })
+    }
+}
+
+/// What observations say of the views, points marginalised: the eigenvalues of the reduced normal equations, ascending,
+/// and their vectors, both after unknown `k` was multiplied by the inverse of `scale[k]`.
+struct Information {
+    scale: Vec<f64>,
+    values: Vec<f64>,
+    vectors: DMatrix<f64>,
+}
+
+impl Information {
+    /// Variance of the mean log focal length of these views; `None` where it is not determined.
+    fn variance(&self, views: Range<usize>) -> Option<f64> {
+        let count = views.len().max(1) as f64;
+        let rows: Vec<(usize, f64)> =
+            views.map(|view| VIEW * view + VIEW - 1).map(|row| (row, self.scale[row] / count)).collect();
+        let norm_squared: f64 = rows.iter().map(|(_, factor)| factor * factor).sum();
+        let largest = self.values.last()?;
+        let mut sum = 0.0;
+        // Eigenvalues ascend; the first are the similarity's, which no focal length takes part in.
+        for (k, value) in self.values.iter().enumerate().skip(GAUGE) {
+            let along: f64 = rows.iter().map(|&(row, factor)| factor * self.vectors[(row, k)]).sum();
+            if *value > NULL_POSE * largest {
+                sum += along * along / value;
+            } else if along * along > TAKES_PART * norm_squared {
+                return None;
             }
-            Some(sum * scale[row] * scale[row])
-        };
-        Some((0..views).map(variance).collect())
+        }
+        Some(sum)
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::metric::Information;
+    use super::super::metric::Information as MetricInformation;
     use super::super::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter};
     use super::super::testing::{self, Motion, NOISE};
     use super::*;
@@ -170,21 +195,28 @@ mod tests {
     fn a_focal_length_a_view_is_less_certain_than_one_for_all() {
         for seed in 0..3 {
             let scene = testing::scene(seed, 10, 40, 0.0);
-            let constant = Information::new(&truth(&scene), &scene.observations)
+            let constant = MetricInformation::new(&truth(&scene), &scene.observations)
                 .map(|information| information.optimum(IntrinsicsModel::FOCAL, &IntrinsicsPrior::NONE))
                 .and_then(|optimum| optimum.variance_of(Parameter::LogFocal))
                 .expect("observable");
-            let variances = Zooming::from(&truth(&scene)).log_focal_variances(&scene.observations);
+            let zooming = Zooming::from(&truth(&scene));
+            let variances = zooming.log_focal_variances(&scene.observations);
             println!("seed {seed}: {constant:.3} for all, {variances:.2?}");
             assert_eq!(variances.len(), 10);
-            for variance in variances {
+            for variance in &variances {
                 assert!(variance.expect("observable") > constant, "seed {seed}");
             }
+            // Focal lengths that share a frame of points err together: their mean is no surer than one for all would be,
+            // nor less sure than each.
+            let mean = zooming.mean_log_focal_variance(&scene.observations).expect("observable");
+            let largest = variances.iter().flatten().fold(0.0f64, |largest, variance| largest.max(*variance));
+            assert!((constant..largest).contains(&mean), "seed {seed}: {mean:.3}");
         }
         let scene = testing::scene_of(1, 10, 40, 0.0, Motion::Translation, false);
         let variances = Zooming::from(&truth(&scene)).log_focal_variances(&scene.observations);
         // Null but for rounding: a sigma of several e-folds.
         let free = |variance: &Option<f64>| variance.is_none_or(|variance| variance.sqrt() * NOISE > 1.0);
         assert!(variances.iter().all(free), "{variances:?}");
+        assert!(free(&Zooming::from(&truth(&scene)).mean_log_focal_variance(&scene.observations)));
     }
 }

@@ -24,6 +24,7 @@ use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
 use fit::Fit;
 pub use models::knowledge;
 pub use verdict::{CHEIRALITY_LIMIT, grade_of_sigma};
+pub use zoom::{LEAST_DETERMINED, root_mean_square};
 
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
 /// caller has adjusted it before.
@@ -53,14 +54,25 @@ pub struct Problem<'a> {
     pub focal_per_view: bool,
 }
 
+/// The focal length of a view that zooms.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ViewFocal {
+    /// Normalised.
+    pub focal: f64,
+    /// One standard deviation of its natural logarithm, with what an unknown lens adds. `None`: the observations do not
+    /// determine it, and neither it nor the view's pose is to be told.
+    pub sigma_log: Option<f64>,
+}
+
 /// What came of it.
 #[derive(Debug, Clone)]
 pub struct Outcome {
     /// `None` when no metric reconstruction was found or looked for. With grade PROJECTIVE_ONLY it may stand but is
     /// not to be used as metric.
     pub metric: Option<Reconstruction>,
-    /// With a focal length a view: these, normalised; `metric` has their geometric mean.
-    pub focals: Option<Vec<f64>>,
+    /// With a focal length a view: these; `metric` has the geometric mean of those that
+    /// are determined.
+    pub focals: Option<Vec<ViewFocal>>,
     /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable.
     pub sigma_log_focal: Option<f64>,
     /// The standard deviation of each intrinsic that the model frees over that of the log focal length, indexed by
@@ -192,17 +204,9 @@ pub fn from_metric(
 ///
 /// # Errors
 /// As [`calibrate`].
-pub fn from_zooming(
-    problem: &Problem,
-    zooming: &Zooming,
-    scale_px: f64,
-    stop: &StopToken,
-    told: &mut dyn FnMut(),
-) -> Result<Outcome, Stopped> {
-    near(problem, scale_px, stop, told, |choice, fit, warnings, told| {
-        let outcome = zoom::calibrate_near(zooming, choice, fit, warnings)?;
-        told();
-        Ok(outcome)
+pub fn from_zooming(problem: &Problem, zooming: &Zooming, scale_px: f64, stop: &StopToken) -> Result<Outcome, Stopped> {
+    near(problem, scale_px, stop, &mut || {}, |choice, fit, warnings, _| {
+        zoom::calibrate_near(zooming, choice, fit, warnings)
     })
 }
 
@@ -235,8 +239,8 @@ fn near(
     search(&models::Choice { problem, prior: &prior, scale_px, stop }, &fit, warnings, told)
 }
 
-/// The mean log focal length that a reconstruction with a focal length a view has by these observations alone, and the
-/// root mean square of their standard deviations, the lens left out; `None` where that is not finite.
+/// The mean log focal length that a reconstruction with a focal length a view has by these observations alone, and its
+/// standard deviation, the lens left out; `None` where that is not finite.
 pub fn focals_alone(problem: &Problem, zooming: &Zooming, stop: &StopToken) -> Option<(f64, f64)> {
     zoom::alone(problem, zooming, stop)
 }

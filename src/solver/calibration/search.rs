@@ -98,7 +98,7 @@ pub(super) fn converge() -> Options {
 /// half or twice as far.
 pub(super) const OTHER_FOCALS: [f64; 4] = [0.5, 0.75, 1.33, 2.0];
 /// Iterations in which poses and points follow a focal length that is held.
-const FOLLOWING: usize = 12;
+pub(super) const FOLLOWING: usize = 12;
 
 /// Minima from a reconstruction that is metric already: its own, and those that other focal lengths lead to; cheapest
 /// first.

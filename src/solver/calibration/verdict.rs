@@ -84,7 +84,7 @@ impl Verdict {
 
     /// Asks whether there is a lens of this focal length, in the longer image side, unless the caller said so.
     pub fn judge_plausibility(&mut self, focal: f64, is_known: bool, scale_px: f64) {
-        if !is_known && !(FOCAL_RANGE.0..=FOCAL_RANGE.1).contains(&focal) {
+        if !is_known && !is_plausible(focal) {
             let detail = format!(
                 "a focal length of {:.1} px, {focal:.2} of the longer image side, is that of no lens",
                 focal * scale_px
@@ -115,6 +115,11 @@ impl Verdict {
         };
         sigma.map(|sigma| sigma.max(least))
     }
+}
+
+/// Whether there is a lens of this focal length, in the longer image side.
+pub(super) fn is_plausible(focal: f64) -> bool {
+    (FOCAL_RANGE.0..=FOCAL_RANGE.1).contains(&focal)
 }
 
 /// The grade that a standard deviation of the log focal length alone would give; `None`: unobservable.

@@ -4,48 +4,62 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
 use super::fit::Fit;
 use super::models::{CHI_SQUARE_GAIN, Choice};
-use super::search::{self, CONVERGED, FIRST_ITERATIONS, FIRST_TOLERANCE, OTHER_FOCALS, converge};
-use super::verdict::{UNOBSERVABLE_ABOVE, Verdict};
-use super::{Outcome, Problem, Stopped, no_start};
+use super::search::{self, CONVERGED, FIRST_ITERATIONS, FIRST_TOLERANCE, FOLLOWING, OTHER_FOCALS, converge};
+use super::verdict::{CHEIRALITY_LIMIT, UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO, is_plausible};
+use super::{Outcome, Problem, Stopped, ViewFocal, no_start};
 use crate::domain::{Grade, StopToken, Warning, WarningCode};
-use crate::geometry::bundle::Options;
-use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter};
+use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
 use crate::geometry::bundle::zoom::Zooming;
+use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::daq::{self, FirstViewFrame, to_first_view_frame};
 use crate::geometry::metric::{cheirality, upgrade_zooming};
+use crate::geometry::statistics::median;
 
 /// Best quadrics that are adjusted, beside the reconstructions with a constant focal length.
 const STARTS: usize = 8;
 /// What a lens that is not estimated may add to the log focal lengths, one standard deviation: a k1 of -.03 moved them
 /// by 8 %, one of -.05 by 14 %, and neither shows in the fit. No zoom is METRIC for it.
 const LENS_SIGMA: f64 = 0.05;
-/// Difference in the mean log focal length, and share of the cost, within which minima are the same.
+/// Difference in log focal length, and share of the cost, within which minima are the same.
 const SAME_MINIMUM: f64 = 0.01;
 const SAME_COST: f64 = 0.01;
+/// Difference in log focal length from which another minimum is another calibration.
+const OTHER_CALIBRATION: f64 = 0.02;
+/// Share of the views whose focal length must be determined: of fewer, what most of the images show says nothing of
+/// the camera.
+pub const LEAST_DETERMINED: f64 = 0.5;
 
 /// A converged reconstruction.
 #[derive(Debug, Clone)]
 struct Minimum {
     zooming: Zooming,
     cost: f64,
+    cheirality: f64,
 }
 
 impl Minimum {
     fn adjusted(mut zooming: Zooming, problem: &Problem, options: &Options, stop: &StopToken) -> Self {
         let report = zooming.adjust(problem.observations, options, stop);
-        Self { zooming, cost: report.cost }
+        let cheirality = cheirality(&zooming.at_mean_focal(), problem.observations);
+        Self { zooming, cost: report.cost, cheirality }
     }
 
     fn mean_log_focal(&self) -> f64 {
         self.zooming.mean_log_focal()
+    }
+
+    /// Difference in log focal length of a typical view: the mean would ask those that no observation determines.
+    fn apart(&self, other: &Self) -> f64 {
+        let focals = self.zooming.focals.iter().zip(&other.zooming.focals);
+        median(&mut focals.map(|(own, other)| (own / other).ln().abs()).collect::<Vec<f64>>())
     }
 }
 
 /// Calibrates with a focal length a view and grades the result; principal point in the centre, square pixels, no
 /// distortion, and priors on the focal length are not looked at.
 ///
-/// Sigma is the root mean square over the views of the standard deviations of their log focal lengths, with what an
-/// unknown lens adds.
+/// Sigma is the root mean square of the standard deviations of the log focal lengths, with what an unknown lens adds,
+/// over the views that determine theirs.
 ///
 /// * `fit`: of the projective cameras
 pub(super) fn calibrate(
@@ -65,19 +79,34 @@ pub(super) fn calibrate_near(
     fit: &Fit,
     warnings: Vec<Warning>,
 ) -> Result<Outcome, Stopped> {
-    let starts = std::iter::once(1.0).chain(OTHER_FOCALS).map(|factor| {
-        let focals = zooming.focals.iter().map(|focal| factor * focal).collect();
-        Zooming { focals, ..zooming.clone() }
-    });
-    let minima = converged(starts.collect(), choice.problem, choice.stop)?;
+    let mut starts = vec![zooming.clone()];
+    for factor in OTHER_FOCALS {
+        Stopped::check(choice.stop)?;
+        starts.push(scaled(zooming, factor, choice.problem.observations, choice.stop));
+    }
+    let minima = converged(starts, choice.problem, choice.stop)?;
     Ok(grade(choice, fit, &minima, warnings))
 }
 
-/// The mean log focal length that a reconstruction has by these observations alone, and the root mean square of the
-/// standard deviations of the log focal lengths; `None` where that is not finite.
+/// The reconstruction with other focal lengths, which its poses and points have followed: freed at once, these would
+/// only go back to where they were.
+fn scaled(zooming: &Zooming, factor: f64, observations: &[Observation], stop: &StopToken) -> Zooming {
+    let focals: Vec<f64> = zooming.focals.iter().map(|focal| factor * focal).collect();
+    // Of known focal lengths: all cameras see as one of focal length 1 does.
+    let in_rays = |seen: &Observation| Observation { xy: seen.xy / focals[seen.camera], ..*seen };
+    let rays: Vec<Observation> = observations.iter().map(in_rays).collect();
+    let mut calibrated = Reconstruction { intrinsics: Intrinsics::from_focal(1.0), ..zooming.at_mean_focal() };
+    let options = Options { max_iterations: FOLLOWING, ..Options::default() };
+    metric::adjust(&mut calibrated, &rays, IntrinsicsModel::FIXED, &IntrinsicsPrior::NONE, &options, stop);
+    Zooming { focals, poses: calibrated.poses, points: calibrated.points }
+}
+
+/// The mean log focal length that a reconstruction has by these observations alone, and its standard deviation; `None`
+/// where that is not finite.
 pub(super) fn alone(problem: &Problem, zooming: &Zooming, stop: &StopToken) -> Option<(f64, f64)> {
     let minimum = Minimum::adjusted(zooming.clone(), problem, &converge(), stop);
-    let sigma = deviation(&minimum, fit_of(&minimum, problem).noise, problem)?;
+    let variance = minimum.zooming.mean_log_focal_variance(problem.observations)?;
+    let sigma = variance.sqrt() * fit_of(&minimum, problem).noise;
     let log_focal = minimum.mean_log_focal();
     (log_focal.is_finite() && sigma > 0.0 && sigma.is_finite()).then_some((log_focal, sigma))
 }
@@ -87,39 +116,90 @@ fn fit_of(minimum: &Minimum, problem: &Problem) -> Fit {
     Fit::new(minimum.cost, unknowns.saturating_sub(7), problem)
 }
 
-/// Root mean square of the standard deviations of the log focal lengths under this noise.
-fn deviation(minimum: &Minimum, noise: f64, problem: &Problem) -> Option<f64> {
+/// What this noise leaves of each focal length.
+fn focals(minimum: &Minimum, noise: f64, problem: &Problem) -> Vec<ViewFocal> {
     let variances = minimum.zooming.log_focal_variances(problem.observations);
-    let sum: Option<f64> = variances.iter().copied().sum();
-    sum.map(|sum| (sum / variances.len().max(1) as f64).sqrt() * noise)
+    let of_view = |(&focal, variance): (&f64, Option<f64>)| {
+        let sigma = variance.map(|variance| (variance.sqrt() * noise).hypot(LENS_SIGMA));
+        ViewFocal { focal, sigma_log: sigma.filter(|_| is_plausible(focal)) }
+    };
+    minimum.zooming.focals.iter().zip(variances).map(of_view).collect()
+}
+
+/// Leaves those of the views undetermined that are, and says so; returns sigma. Where most are, that is their median,
+/// `None` if it is beyond all bounds.
+fn judge_focals(verdict: &mut Verdict, focals: &mut [ViewFocal]) -> Option<f64> {
+    let mut all: Vec<f64> = focals.iter().map(|view| view.sigma_log.unwrap_or(f64::INFINITY)).collect();
+    for view in focals.iter_mut() {
+        view.sigma_log = view.sigma_log.filter(|sigma| *sigma <= WEAK_UP_TO);
+    }
+    let determined: Vec<f64> = focals.iter().filter_map(|view| view.sigma_log).collect();
+    let sigma = root_mean_square(&determined);
+    if (determined.len() as f64) < LEAST_DETERMINED * focals.len() as f64 || sigma.is_none() {
+        let typical = Some(median(&mut all)).filter(|sigma| *sigma > WEAK_UP_TO && *sigma < UNOBSERVABLE_ABOVE);
+        verdict.judge_sigma(typical);
+        return typical;
+    }
+    if determined.len() < focals.len() {
+        verdict.cap(
+            Grade::Weak,
+            WarningCode::UnobservableFocal,
+            format!(
+                "the focal lengths of {} of {} views are not determined: these have neither focal length nor pose",
+                focals.len() - determined.len(),
+                focals.len()
+            ),
+        );
+    }
+    verdict.judge_sigma(sigma);
+    sigma
+}
+
+/// Geometric mean of those that are determined; `None` where none is.
+fn mean_focal(focals: &[ViewFocal]) -> Option<f64> {
+    let logs: Vec<f64> = focals.iter().filter(|view| view.sigma_log.is_some()).map(|view| view.focal.ln()).collect();
+    (!logs.is_empty()).then(|| (logs.iter().sum::<f64>() / logs.len() as f64).exp())
+}
+
+/// `None` for no values.
+pub fn root_mean_square(values: &[f64]) -> Option<f64> {
+    let mean = values.iter().map(|value| value * value).sum::<f64>() / values.len() as f64;
+    (!values.is_empty()).then(|| mean.sqrt())
 }
 
 /// Grades the first of these minima, cheapest first.
 fn grade(choice: &Choice, fit: &Fit, minima: &[Minimum], mut warnings: Vec<Warning>) -> Outcome {
     let Choice { problem, scale_px, .. } = *choice;
-    let Some((best, others)) = minima.split_first() else {
+    // The cheapest in front of the cameras, if the data do not tell it from the cheapest.
+    let in_front = |minimum: &Minimum| minimum.cheirality >= CHEIRALITY_LIMIT;
+    let near =
+        |of: &Minimum, minimum: &Minimum| minimum.cost - of.cost < CHI_SQUARE_GAIN * fit_of(of, problem).noise.powi(2);
+    let place = minima.iter().position(|minimum| in_front(minimum) && near(&minima[0], minimum)).unwrap_or(0);
+    let Some(best) = minima.get(place) else {
         warnings.push(no_start());
         return Outcome::refused(warnings);
     };
     let own = fit_of(best, problem);
-    let sigma = deviation(best, own.noise, problem);
-    let sigma = sigma.map(|sigma| sigma.hypot(LENS_SIGMA)).filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
-
+    let mut focals = focals(best, own.noise, problem);
     let mut verdict = Verdict::new(warnings);
-    verdict.judge_sigma(sigma);
-    let close = |other: &&Minimum| other.cost - best.cost < CHI_SQUARE_GAIN * own.noise.powi(2);
-    if let Some(rival) = others.iter().find(close) {
+    let sigma = judge_focals(&mut verdict, &mut focals);
+    let is_rival = |other: &&Minimum| {
+        other.apart(best) > OTHER_CALIBRATION && (in_front(other) || !in_front(best)) && near(best, other)
+    };
+    if let Some(rival) = minima.iter().find(is_rival) {
         let detail = format!(
             "focal lengths around {:.1} px instead of {:.1} px explain the data about as well",
             rival.mean_log_focal().exp() * scale_px,
             best.mean_log_focal().exp() * scale_px
         );
-        verdict.cap(Grade::ProjectiveOnly, WarningCode::SecondMinimum, detail);
+        let worst = if rival.apart(best) > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak };
+        verdict.cap(worst, WarningCode::SecondMinimum, detail);
     }
-    let metric = best.zooming.at_mean_focal();
-    let in_front = cheirality(&metric, problem.observations);
+    let focal = mean_focal(&focals).unwrap_or_else(|| best.mean_log_focal().exp());
+    let metric = Reconstruction { intrinsics: Intrinsics::from_focal(focal), ..best.zooming.at_mean_focal() };
     let rms_ratio = verdict.judge_fit(fit, &own, "a focal length a view", scale_px);
-    verdict.judge_cheirality(in_front);
+    verdict.judge_plausibility(focal, false, scale_px);
+    verdict.judge_cheirality(best.cheirality);
     Outcome {
         sigma_log_focal: verdict.told(sigma),
         sigma_ratios: [None; Parameter::COUNT],
@@ -127,10 +207,10 @@ fn grade(choice: &Choice, fit: &Fit, minima: &[Minimum], mut warnings: Vec<Warni
         warnings: verdict.warnings,
         model: IntrinsicsModel::FOCAL,
         plane_at_infinity: plane_at_infinity(problem, &best.zooming),
-        cheirality: in_front,
+        cheirality: best.cheirality,
         rms_ratio,
         metric: Some(metric),
-        focals: Some(best.zooming.focals.clone()),
+        focals: Some(focals),
     }
 }
 
@@ -192,12 +272,94 @@ fn distinct(mut found: Vec<Minimum>) -> Vec<Minimum> {
     let mut kept: Vec<Minimum> = Vec::with_capacity(found.len());
     for candidate in found {
         let repeats = kept.iter().any(|minimum| {
-            (candidate.mean_log_focal() - minimum.mean_log_focal()).abs() < SAME_MINIMUM
-                && candidate.cost < (1.0 + SAME_COST) * minimum.cost
+            candidate.apart(minimum) < SAME_MINIMUM && candidate.cost < (1.0 + SAME_COST) * minimum.cost
         });
         if !repeats {
             kept.push(candidate);
         }
     }
     kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::bundle::testing::{self, NOISE, TestScene};
+
+    fn truth(scene: &TestScene) -> Zooming {
+        let focals = vec![scene.intrinsics.focal; scene.poses.len()];
+        Zooming { focals, poses: scene.poses.clone(), points: scene.points.clone() }
+    }
+
+    fn of_scene<T>(scene: &TestScene, ask: impl FnOnce(&Choice, &Fit) -> T) -> T {
+        let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
+        let problem = Problem {
+            cameras: &cameras,
+            points: &points,
+            observations: &scene.observations,
+            noise: NOISE,
+            focal_prior: None,
+            focal_per_view: true,
+        };
+        let stop = StopToken::default();
+        let choice = Choice { problem: &problem, prior: &IntrinsicsPrior::NONE, scale_px: 1000.0, stop: &stop };
+        let minimum = Minimum::adjusted(truth(scene), &problem, &converge(), &stop);
+        ask(&choice, &fit_of(&minimum, &problem))
+    }
+
+    #[test]
+    fn another_minimum_that_explains_as_much_is_told() {
+        let scene = testing::scene(1, 10, 40, NOISE);
+        of_scene(&scene, |choice, fit| {
+            let best = Minimum::adjusted(truth(&scene), choice.problem, &converge(), choice.stop);
+            let graded = |factor: f64, cost: f64, cheirality: f64| {
+                let mut rival = best.clone();
+                rival.zooming.focals.iter_mut().for_each(|focal| *focal *= factor);
+                rival = Minimum { cost: cost * best.cost, cheirality, ..rival };
+                let outcome = grade(choice, fit, &[best.clone(), rival], Vec::new());
+                (outcome.grade, outcome.warnings.iter().any(|warning| warning.code == WarningCode::SecondMinimum))
+            };
+            assert_eq!(graded(1.5, 1.0001, 1.0), (Grade::ProjectiveOnly, true));
+            assert_eq!(graded(0.95, 1.0001, 1.0), (Grade::Weak, true));
+            // The same one, one that fits worse, and one of points behind the cameras.
+            assert_eq!(graded(1.001, 1.0001, 1.0), (Grade::Weak, false));
+            assert_eq!(graded(1.5, 2.0, 1.0), (Grade::Weak, false));
+            assert_eq!(graded(1.5, 1.0001, 0.5), (Grade::Weak, false));
+        });
+    }
+
+    #[test]
+    fn poses_and_points_follow_focal_lengths_that_are_held() {
+        let scene = testing::scene_turning(2, 40, NOISE, 0.1);
+        let stop = StopToken::default();
+        for factor in OTHER_FOCALS {
+            let start = truth(&scene);
+            let followed = scaled(&start, factor, &scene.observations, &stop);
+            let focals = followed.focals.iter().zip(&start.focals);
+            assert!(focals.clone().all(|(scaled, focal)| (scaled / focal - factor).abs() < 1e-12), "{factor}");
+            let cost = |zooming: &Zooming| {
+                let options = Options { max_iterations: 0, ..Options::default() };
+                zooming.clone().adjust(&scene.observations, &options, &stop).cost
+            };
+            let at_once = Zooming { focals: followed.focals.clone(), ..start };
+            println!("{factor}: {} at once, {} followed", cost(&at_once), cost(&followed));
+            assert!(cost(&followed) < 0.1 * cost(&at_once), "{factor}");
+        }
+    }
+
+    #[test]
+    fn the_calibration_is_found_from_wrong_focal_lengths_that_all_else_has_followed() {
+        for seed in 0..3 {
+            let scene = testing::scene(seed, 10, 40, NOISE);
+            of_scene(&scene, |choice, fit| {
+                for factor in OTHER_FOCALS {
+                    let wrong = scaled(&truth(&scene), factor, choice.problem.observations, choice.stop);
+                    let outcome = calibrate_near(&wrong, choice, fit, Vec::new()).expect("nothing stops it");
+                    let focal = outcome.metric.map_or(f64::NAN, |metric| metric.intrinsics.focal);
+                    let error = (focal / scene.intrinsics.focal).ln().abs();
+                    assert!(error < 0.02, "seed {seed}, from {factor}: off by {error}");
+                }
+            });
+        }
+    }
 }

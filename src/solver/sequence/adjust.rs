@@ -120,9 +120,10 @@ impl Extract {
     }
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
-    fn noise(&self) -> f64 {
+    fn noise(&self, scene: &Scene) -> f64 {
         let mut norms: Vec<f64> = self.sightings.iter().map(|seen| self.sequence.residual(seen).norm()).collect();
-        let unknowns = 6 * self.views.len() + 3 * self.tracks.len();
+        let of_view = if scene.zooms() { 7 } else { 6 };
+        let unknowns = of_view * self.views.len() + 3 * self.tracks.len();
         let freedom = 1.0 - unknowns as f64 / (2 * self.sightings.len()).max(1) as f64;
         median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(LEAST_FREEDOM).sqrt()
     }
@@ -204,7 +205,7 @@ fn finish(scene: &Scene, model: &mut Model, extract: &Extract) {
         return;
     }
     extract.write_back(model);
-    model.set_noise(scene, extract.noise());
+    model.set_noise(scene, extract.noise(scene));
 }
 
 /// Tracks with a verified landmark, increasing.

@@ -10,6 +10,7 @@ use crate::domain::{Calibration, Grade, LeftOut, Solution, Stage, Status, Warnin
 use crate::geometry::Point;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
 use crate::solver::assemble::{dehomogenise, network_weights, pixel_calibration, reprojection};
+use crate::solver::block;
 use crate::solver::calibration::Outcome;
 use crate::solver::judge::{self, Geometry, Judged, SplitPoint};
 use crate::solver::recorder::Recorder;
@@ -85,23 +86,24 @@ fn told(calibrations: &[Outcome], scene: &Scene) -> Vec<Warning> {
     calibrations.iter().enumerate().flat_map(of_group).collect()
 }
 
-/// The calibration of each camera in pixels, its principal point about the image centre of the camera's first view; of
-/// a zoom the geometric mean of the focal lengths.
+/// The calibration of each camera group in pixels, its principal point about the image centre of the group's first
+/// view; of a zoom the geometric mean of the focal lengths.
 fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Calibration> {
-    let of_group = |(group, outcome): (usize, &Outcome)| {
+    let (group_of, groups) = block::camera_groups(scene.context.input);
+    let determined = model.determined(scene);
+    let of_group = |group: usize| {
+        let view = group_of.iter().position(|of| *of == group)?;
+        // One for all where the groups are merged.
+        let camera = scene.camera_of[view];
+        let of_views: Vec<usize> = determined.iter().copied().filter(|&view| group_of[view] == group).collect();
+        let of_views = if of_views.is_empty() { &determined } else { &of_views };
         let intrinsics = match scene.zooms() {
-            true => Intrinsics::from_focal(model.log_focal(scene, group, &model.registered()).exp()),
-            false => model.lenses[group].intrinsics,
+            true => Intrinsics::from_focal(model.log_focal(scene, camera, of_views).exp()),
+            false => model.lenses[camera].intrinsics,
         };
-        let view = scene.camera_of.iter().position(|of| *of == group).unwrap_or(0);
-        pixel_calibration(&intrinsics, outcome, &scene.context, view)
+        Some(pixel_calibration(&intrinsics, calibrations.get(camera)?, &scene.context, view))
     };
-    if scene.context.merges_cameras {
-        // One calibration, told for each of the groups.
-        let (_, groups) = crate::solver::block::camera_groups(scene.context.input);
-        return calibrations.first().map_or_else(Vec::new, |outcome| vec![of_group((0, outcome)); groups]);
-    }
-    calibrations.iter().enumerate().map(of_group).collect()
+    (0..groups).filter_map(of_group).collect()
 }
 
 /// Every track and observation judged by all registered views.
@@ -152,6 +154,7 @@ fn views(scene: &Scene, model: &Model, frames: &[Option<Matrix4<f64>>], metric: 
         let (Some(pose), Some(frame)) = (pose, frame) else { return ViewResult::default() };
         let camera =
             scene.context.normalization.camera_px(view, &pose.camera(model.intrinsics_of(scene, view))) * frame;
+        let metric = metric && model.lenses[scene.lens_of[view]].is_determined;
         ViewResult {
             projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| camera[(row, column)]))),
             rotation: metric

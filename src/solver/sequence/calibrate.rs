@@ -14,7 +14,7 @@ use crate::solver::{Context, Error, block};
 
 /// Views that a calibration is made from at most: the projective adjustment that it is compared with is cubic in them.
 /// Of more, the stretch with most observations; the others speak through their windows.
-const MOST_VIEWS: usize = 40;
+pub const MOST_VIEWS: usize = 40;
 /// Observations that a calibration is made from, and of one view at least and at most: other errors than noise bound
 /// what more of them would give.
 const OBSERVATIONS: usize = 6_000;
@@ -36,6 +36,9 @@ pub fn calibrate(
     context: &Context,
     recorder: &mut Recorder,
 ) -> Result<Vec<Outcome>, Error> {
+    if scene.zooms() {
+        return zoom::calibrate(scene, model, context, recorder).map(|outcome| vec![outcome]);
+    }
     let mut outcomes = Vec::with_capacity(scene.cameras);
     for camera in 0..scene.cameras {
         recorder.step(Task::Cameras, camera + 1, scene.cameras, 0.0);
@@ -43,25 +46,23 @@ pub fn calibrate(
             model.registered().into_iter().filter(|&view| scene.camera_of[view] == camera).collect();
         let views = densest(scene, model, &registered);
         let outcome = match views.len() < block::LEAST_VIEWS {
-            true => too_few(camera, views.len()),
-            false if scene.zooms() => zoom::of_camera(scene, model, &views, context, recorder)?,
+            true => too_few(views.len()),
             false => of_camera(scene, model, camera, &views, context, recorder)?,
         };
-        outcomes.push((views, outcome));
+        outcomes.push(outcome);
     }
     super::structure::triangulate(scene, model, recorder);
     adjust::all(scene, model, recorder);
-    for (camera, (views, outcome)) in outcomes.iter_mut().enumerate() {
-        admit_difference(model.log_focal(scene, camera, views), outcome);
+    for (camera, outcome) in outcomes.iter_mut().enumerate() {
+        admit_difference(model.lenses[camera].intrinsics.focal.ln(), outcome);
         windows::reconcile(scene, model, camera, outcome, recorder)?;
     }
-    Ok(outcomes.into_iter().map(|(_, outcome)| outcome).collect())
+    Ok(outcomes)
 }
 
 /// What is said of a camera of which fewer views are registered than a calibration needs.
-fn too_few(camera: usize, views: usize) -> Outcome {
-    let detail =
-        format!("{views} views of camera group {camera} are registered; a calibration needs {}", block::LEAST_VIEWS);
+pub fn too_few(views: usize) -> Outcome {
+    let detail = format!("only {views} views are registered; a calibration needs {}", block::LEAST_VIEWS);
     Outcome::refused(vec![Warning::new(WarningCode::UnobservableFocal, detail)])
 }
 
@@ -121,7 +122,9 @@ fn admit_difference(log_focal: f64, outcome: &mut Outcome) {
 fn densest(scene: &Scene, model: &Model, views: &[usize]) -> Vec<usize> {
     let kept = |view: &usize| scene.of_view[*view].iter().filter(|&&k| model.kept[k as usize]).count();
     let counts: Vec<usize> = views.iter().map(kept).collect();
-    let runs = views.windows(MOST_VIEWS.min(views.len())).zip(counts.windows(MOST_VIEWS.min(views.len())));
+    // No views have no runs.
+    let length = views.len().clamp(1, MOST_VIEWS);
+    let runs = views.windows(length).zip(counts.windows(length));
     let densest =
         runs.enumerate().max_by_key(|(start, (_, counts))| (counts.iter().sum::<usize>(), std::cmp::Reverse(*start)));
     densest.map_or_else(Vec::new, |(_, (run, _))| run.to_vec())

@@ -6,6 +6,7 @@ use crate::domain::{FocalPrior, StopToken};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
 use crate::geometry::measurement::Sighting;
+use crate::solver::calibration::ViewFocal;
 use crate::solver::{Context, attempt, block, judge};
 
 /// An input as the extension sees it; observations keep the input's sorted order (track, view).
@@ -101,6 +102,8 @@ pub struct Lens {
     pub free: IntrinsicsModel,
     /// Whether a registered view has it; until then its focal length is a guess.
     pub is_known: bool,
+    /// Whether the observations determine it: where views zoom, some may have none that can be told.
+    pub is_determined: bool,
 }
 
 /// A metric reconstruction under way.
@@ -139,7 +142,7 @@ impl Model {
     /// A model of nothing yet, with this noise, all cameras like this one.
     pub fn new(scene: &Scene, intrinsics: Intrinsics, noise: f64) -> Self {
         let views = scene.context.input.view_count();
-        let lens = Lens { intrinsics, free: IntrinsicsModel::FOCAL, is_known: false };
+        let lens = Lens { intrinsics, free: IntrinsicsModel::FOCAL, is_known: false, is_determined: true };
         Self {
             lenses: vec![lens; scene.lenses],
             poses: vec![None; views],
@@ -199,12 +202,12 @@ impl Model {
         part: u32,
         views: &[usize],
         metric: &Reconstruction,
-        focals: Option<&[f64]>,
+        focals: Option<&[ViewFocal]>,
     ) {
         for (i, (&view, pose)) in views.iter().zip(&metric.poses).enumerate() {
             let lens = &mut self.lenses[scene.lens_of[view]];
             if !lens.is_known {
-                let own = focals.and_then(|focals| focals.get(i)).copied();
+                let own = focals.and_then(|focals| focals.get(i)).map(|own| own.focal);
                 lens.intrinsics = Intrinsics { focal: own.unwrap_or(metric.intrinsics.focal), ..metric.intrinsics };
             }
             self.register(scene, view, part, *pose);
@@ -232,6 +235,13 @@ impl Model {
     /// Registered views, increasing.
     pub fn registered(&self) -> Vec<usize> {
         (0..self.poses.len()).filter(|&view| self.poses[view].is_some()).collect()
+    }
+
+    /// Registered views whose focal length is determined, increasing.
+    pub fn determined(&self, scene: &Scene) -> Vec<usize> {
+        let mut views = self.registered();
+        views.retain(|&view| self.lenses[scene.lens_of[view]].is_determined);
+        views
     }
 
     /// Registered views of a part, increasing.

@@ -7,6 +7,7 @@ use super::structure;
 use crate::domain::{FocalPrior, Grade};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::solver::attempt::{self, Attempt};
+use crate::solver::calibration::Outcome;
 use crate::solver::recorder::Recorder;
 use crate::solver::{Context, Error, block};
 
@@ -64,8 +65,13 @@ pub fn others(
         recorder.end_part();
         // Whatever comes of it, a block is tried once.
         views.iter().for_each(|&view| open[view] = false);
-        let Some((calibration, metric)) =
-            attempt.calibration.as_ref().and_then(|calibration| Some((calibration, calibration.metric.as_ref()?)))
+        // What a zoom's own block does not determine, no other part can tell it.
+        let usable = |calibration: &&Outcome| !scene.zooms() || calibration.grade != Grade::ProjectiveOnly;
+        let Some((calibration, metric)) = attempt
+            .calibration
+            .as_ref()
+            .filter(usable)
+            .and_then(|calibration| Some((calibration, calibration.metric.as_ref()?)))
         else {
             failures += 1;
             continue;

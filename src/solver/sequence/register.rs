@@ -184,7 +184,10 @@ fn guesses(scene: &Scene, model: &Model, view: usize) -> Vec<Intrinsics> {
     let nearest = model.registered().into_iter().min_by_key(|other| other.abs_diff(view)).filter(|_| scene.zooms());
     let about = nearest.map_or(lens, |nearest| &model.lenses[scene.lens_of[nearest]]).intrinsics.focal;
     let focal = |step: i32| about * (f64::from(step) / FOCALS_PER_OCTAVE).exp2();
-    OTHER_FOCALS.map(|step| Intrinsics::from_focal(focal(step))).collect()
+    // Of equals the first counts: from the middle outwards.
+    let mut steps: Vec<i32> = OTHER_FOCALS.collect();
+    steps.sort_by_key(|step| (step.abs(), *step));
+    steps.into_iter().map(|step| Intrinsics::from_focal(focal(step))).collect()
 }
 
 /// The pose that most of these observations agree with, and how many do.

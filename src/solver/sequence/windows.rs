@@ -68,9 +68,9 @@ pub fn reconcile(
     Ok(())
 }
 
-/// Registered views of a camera, increasing.
+/// Views of a camera that say something of it, increasing.
 fn of_camera(scene: &Scene, model: &Model, camera: usize) -> Vec<usize> {
-    model.registered().into_iter().filter(|&view| scene.camera_of[view] == camera).collect()
+    model.determined(scene).into_iter().filter(|&view| scene.camera_of[view] == camera).collect()
 }
 
 /// What each window says by itself, the rest of the lens as the whole has it.

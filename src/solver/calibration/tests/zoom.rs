@@ -44,8 +44,8 @@ fn every_view_gets_its_focal_length() {
             let begun = std::time::Instant::now();
             let outcome = calibrated(&scene, seed, 0.001);
             let found = outcome.focals.as_deref().unwrap_or_default();
-            let errors: Vec<f64> = found.iter().zip(&focals).map(|(found, focal)| (found / focal).ln()).collect();
-            let rms = (errors.iter().map(|error| error * error).sum::<f64>() / errors.len() as f64).sqrt();
+            let errors: Vec<f64> = found.iter().zip(&focals).map(|(found, focal)| (found.focal / focal).ln()).collect();
+            let rms = root_mean_square(&errors).expect("ten views");
             let sigma = outcome.sigma_log_focal.unwrap_or(f64::INFINITY);
             println!(
                 "range {range}, seed {seed}: {:?}, errors {rms:.4} rms, sigma {sigma:.4}, rms ratio {:.2}, {:?} in {:?}",
@@ -93,9 +93,48 @@ fn the_plane_at_infinity_goes_with_the_zoom() {
     let plane_at_infinity = outcome.plane_at_infinity.expect("a plane");
     let focals = outcome.focals.expect("a focal length a view");
     let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
-    let daq = Daq::new(focals[0], plane_at_infinity);
+    let daq = Daq::new(focals[0].focal, plane_at_infinity);
     for (camera, focal) in frame.cameras.iter().zip(&focals) {
         let (found, cost) = daq::zoomed(camera, &daq).expect("a focal length");
-        assert!((found / focal - 1.0).abs() < 1e-3 && cost < 1e-5, "{found} {focal} {cost}");
+        assert!((found / focal.focal - 1.0).abs() < 1e-3 && cost < 1e-5, "{found} {focal:?} {cost}");
     }
+}
+
+#[test]
+fn a_view_that_shows_too_little_has_no_focal_length_and_takes_none_from_the_others() {
+    for seed in 0..3 {
+        let (mut scene, focals) = zooming(seed, 60, 0.001, 0.3);
+        // Three points determine less than the seven unknowns of a view.
+        scene.observations.retain(|seen| seen.camera != 4 || seen.point < 3);
+        let outcome = near_truth(&scene, &focals, 0.001);
+        let found = outcome.focals.as_deref().expect("a focal length a view");
+        println!("seed {seed}: {:?} {:?} {:?}", outcome.grade, outcome.sigma_log_focal, outcome.warnings);
+        assert_eq!(outcome.grade, Grade::Weak, "seed {seed}");
+        assert!(outcome.sigma_log_focal.is_some_and(|sigma| sigma < 0.1), "seed {seed}");
+        assert!(codes(&outcome).contains(&"UNOBSERVABLE_FOCAL"), "seed {seed}");
+        for (view, (found, focal)) in found.iter().zip(&focals).enumerate() {
+            assert_eq!(found.sigma_log.is_none(), view == 4, "seed {seed}, view {view}: {found:?}");
+            let error = (found.focal / focal).ln().abs();
+            assert!(view == 4 || error < 0.05, "seed {seed}, view {view}: {error}");
+        }
+        // Of all but four there is nothing to say.
+        scene.observations.retain(|seen| seen.camera < 4 || seen.point < 3);
+        let outcome = near_truth(&scene, &focals, 0.001);
+        assert_eq!(outcome.grade, Grade::ProjectiveOnly, "seed {seed}: {:?}", outcome.warnings);
+    }
+}
+
+/// What a reconstruction near the true one is calibrated to.
+fn near_truth(scene: &TestScene, focals: &[f64], noise: f64) -> Outcome {
+    let zooming = Zooming { focals: focals.to_vec(), poses: scene.poses.clone(), points: scene.points.clone() };
+    let points: Vec<Vector4<f64>> = zooming.points.iter().map(|point| point.push(1.0)).collect();
+    let problem = Problem {
+        cameras: &zooming.cameras(),
+        points: &points,
+        observations: &scene.observations,
+        noise,
+        focal_prior: None,
+        focal_per_view: true,
+    };
+    from_zooming(&problem, &zooming, SIDE_PX, &StopToken::default()).expect("nothing stops it")
 }
