@@ -74,7 +74,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let mut progress = ProgressView::new(args.quiet);
     progress.state(&format!("scene: {}", synth::describe(&scene)));
     let data = tempfile::tempdir()?;
-    let service = Service::start(&config(data.path())).await?;
+    let service = Service::start(&config(data.path()), std::future::pending()).await?;
+    let service = service.ok_or_else(|| Failure::internal("the service was ended before it had started"))?;
     let server = ServerArgs { server: format!("http://{}", service.address()), access: AccessArgs::default() };
     progress.state(&format!("server: {}, store in {}", server.server, data.path().display()));
     let interrupt = Interrupt::listen()?;

@@ -209,13 +209,9 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     .map_err(|error| {
         Failure::internal(format_args!("cannot listen on {} (metrics): {error}", config.metrics.listen))
     })?;
-    // The store may have its schema to bring up to date, or wait for another server that does.
-    let mut service = tokio::select! {
-        started = Service::start(&config) => started?,
-        () = signals.next() => {
-            tracing::info!("ended before it had started");
-            return Ok(Exit::Done);
-        }
+    let Some(mut service) = Service::start(&config, signals.next()).await? else {
+        tracing::info!("ended before it had started");
+        return Ok(Exit::Done);
     };
     follow_store(&ready, service.store_state());
     ready.set(true);
@@ -231,7 +227,10 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     ready.set(false);
     if let Some(failure) = failed {
         // Nobody can be served: what runs goes back to the queue at once.
-        service.abandon().await;
+        tokio::select! {
+            () = service.abandon() => {}
+            () = signals.next() => tracing::warn!("ended before jobs were given back: they begin again at the next start"),
+        }
         return Err(failure);
     }
     tracing::info!(

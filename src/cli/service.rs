@@ -33,15 +33,20 @@ pub struct Service {
 }
 
 impl Service {
-    /// Opens the store, takes up the jobs it holds and serves. When this returns, calls are answered.
+    /// Opens the store, takes up the jobs it holds and serves. When this returns, calls are answered. `None` where
+    /// `ended` was over before the store was open, which may have its schema to bring up to date or wait for another
+    /// server that does; from then on jobs have begun, and are not dropped.
     ///
     /// # Errors
     /// A data directory that cannot be used or an address that cannot be had.
-    pub async fn start(config: &Config) -> Result<Self, Failure> {
+    pub async fn start(config: &Config, ended: impl Future<Output = ()>) -> Result<Option<Self>, Failure> {
         let options = server_options(config);
         // Before the store is opened and its jobs begin: who cannot be let in is no reason to take them up.
         options.check_access().map_err(Failure::bad_config)?;
-        let store = open_store(&config.store).await?;
+        let store = tokio::select! {
+            store = open_store(&config.store) => store?,
+            () = ended => return Ok(None),
+        };
         let solver = engine::solver_on(config.compute.threads());
         let engine = match Engine::start(engine_options(config), store.clone(), solver).await {
             Ok(engine) => engine,
@@ -52,7 +57,8 @@ impl Service {
         };
         match Server::bind(options, engine.clone()).await {
             Ok(server) => {
-                Ok(Self { store, engine, server, drain_bound: Duration::from_secs(config.engine.drain_seconds) })
+                let drain_bound = Duration::from_secs(config.engine.drain_seconds);
+                Ok(Some(Self { store, engine, server, drain_bound }))
             }
             Err(error) => {
                 // Jobs that have begun by now are to lose no attempt by an address that is taken.

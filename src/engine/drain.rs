@@ -99,9 +99,10 @@ impl Inner {
             }
         }
         self.phase.send_replace(Phase::Closed);
-        for task in others.into_iter().flatten() {
-            // It only ends early by a panic, which has been reported.
-            let _ = task.await;
+        let mut others: Vec<JoinHandle<()>> = others.into_iter().flatten().collect();
+        if timeout(GIVE_BACK_GRACE, all_ended(&mut others)).await.is_err() {
+            // They wait for a store that hangs, and have nothing that another server or the next start would miss.
+            others.iter().for_each(JoinHandle::abort);
         }
         join(threads, threads_ended).await;
         locked(&self.crew).drained
@@ -111,7 +112,7 @@ impl Inner {
 /// Waits for the tasks that are left; dropping the future keeps those that have not ended.
 async fn all_ended(tasks: &mut Vec<JoinHandle<()>>) {
     while let Some(task) = tasks.last_mut() {
-        // A slot ends early only by a panic, which has been reported; its lease runs out.
+        // One ends early only by a panic, which has been reported; the lease of a slot runs out.
         let _ = task.await;
         tasks.pop();
     }
