@@ -42,8 +42,8 @@ impl WriteConnection {
         for (name, value) in SETTINGS {
             connection.pragma_update(None, name, value)?;
         }
-        // A page is in the log once, not each time that the cache is full; and not at all where the transaction gives it
-        // back, as on a full disk it must.
+        // Up to so many pages, each is in the log once, not each time that the cache is full; and not at all where the
+        // transaction gives it back, as on a full disk it must.
         connection.pragma_update(None, "cache_spill", SPILL_PAGES)?;
         // Dropping this does not write the log back: see `close`.
         connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)?;

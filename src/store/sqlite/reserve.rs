@@ -113,12 +113,11 @@ impl Reserve {
             return false;
         }
         match std::fs::remove_file(&self.path) {
-            Ok(()) => (self.is_whole, self.given_up) = (false, Some(Instant::now())),
-            // Somebody else did: there is room, and none that is kept.
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                (self.is_whole, self.given_up) = (false, Some(Instant::now()));
+            // That somebody else did so comes to the same: there is room, and none that is kept.
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                tracing::error!(%error, path = %self.path.display(), "cannot give up the room that is kept");
             }
-            Err(error) => tracing::error!(%error, path = %self.path.display(), "cannot give up the room that is kept"),
+            _ => (self.is_whole, self.given_up) = (false, Some(Instant::now())),
         }
         !self.is_whole
     }

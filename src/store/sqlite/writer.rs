@@ -172,8 +172,7 @@ impl Writer {
             match timeout(self.patience, &mut answer).await {
                 Ok(answered) => return answered.unwrap_or_else(|_| Err(closed())),
                 Err(_) if turn.give_up() => {
-                    let waited = self.patience.as_secs_f64();
-                    return Err(Error::Unavailable(format!("no turn to write came within {waited} s")));
+                    return Err(no_turn(self.patience));
                 }
                 // What has begun ends, sooner or later, and whether it came to anything is known only then.
                 Err(_) => {}
@@ -191,19 +190,27 @@ impl Writer {
 
     /// Whether to give free pages back is worth the room that it takes.
     pub(super) async fn vacuum_pays(&self) -> Result<bool, Error> {
-        self.send(Message::VacuumPays).await
+        self.ask(Message::VacuumPays).await
     }
 
     /// After what is already waiting, has the database's file give back what it has beyond its pages, where that is
     /// worth it and its readers let it.
     pub(super) async fn shorten(&self) -> Result<(), Error> {
-        self.send(Message::Shorten).await
+        self.ask(Message::Shorten).await
     }
 
     /// Ends the thread after what is already waiting, and closes the connection.
     pub(super) async fn close(&self) {
         // An error says that the thread is gone, which is what was wanted.
         let _ = self.send(Message::Close).await;
+    }
+
+    /// Has something done that can as well be done another time.
+    async fn ask<T>(&self, message: fn(oneshot::Sender<T>) -> Message) -> Result<T, Error> {
+        match timeout(self.patience, self.send(message)).await {
+            Ok(answer) => answer,
+            Err(_) => Err(no_turn(self.patience)),
+        }
     }
 
     /// Has something done that answers when it is.
@@ -213,6 +220,10 @@ impl Writer {
         self.inbox.send(message(done)).map_err(|_| closed())?;
         answer.await.map_err(|_| closed())
     }
+}
+
+fn no_turn(patience: Duration) -> Error {
+    Error::Unavailable(format!("no turn to write came within {} s", patience.as_secs_f64()))
 }
 
 /// What the thread has.
