@@ -1,4 +1,4 @@
-//! A server that vanishes under a command that waits for a job.
+//! A server that vanishes under a command that waits for a job, and one that was never there.
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -53,4 +53,14 @@ fn a_lost_server_leaves_the_commands_that_find_the_job_again() {
         };
         assert!(said.ends_with(&result), "{said}");
     }
+}
+
+/// What answers there is a server, and no trouble that passes: it is the wrong port.
+#[test]
+fn who_asks_the_port_of_the_metrics_is_told_so() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let serving = Serving::start(&directory.path().join("data"));
+    let asked = run(["list", "--server", &format!("http://{}", serving.metrics)]);
+    assert_eq!(asked.code, Some(69), "{asked:?}");
+    assert!(asked.stderr.contains("speaks no gRPC: is this another port"), "{asked:?}");
 }

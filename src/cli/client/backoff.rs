@@ -151,7 +151,7 @@ mod tests {
         })
     }
 
-    /// A call that is cut off was sent: nobody knows what became of it.
+    /// A call that is cut off may have been sent: nobody knows what became of it.
     #[test]
     fn what_is_refused_is_not_done_and_what_is_cut_off_may_be() {
         let clock = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();

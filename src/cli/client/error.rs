@@ -86,7 +86,7 @@ impl Error {
         }
         let message = status.message().to_owned();
         // A page that is not found, as on the port of the metrics. Other pages are those of proxies.
-        if !answered && status.code() == Code::Unimplemented && message.contains("grpc-status header missing") {
+        if !answered && status.code() == Code::Unimplemented && message.contains(NO_GRPC_STATUS) {
             return Error::Unavailable(format!(
                 "what answers at {server} speaks no gRPC: is this another port, such as that of the metrics? ({message})"
             ));
@@ -177,6 +177,9 @@ fn broke_or_ends(status: &Status) -> bool {
     let broke = status.source().is_some() && status.get_details_error_info().is_none();
     status.code() == Code::Unavailable || broke || was_cut(status)
 }
+
+/// What tonic says, under UNIMPLEMENTED, of a page that is not found.
+const NO_GRPC_STATUS: &str = "grpc-status header missing";
 
 /// Whether an answer ended without its status, as a balancer ends it whose server has died. That reads as UNKNOWN,
 /// which our server never says.
