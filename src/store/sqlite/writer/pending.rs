@@ -1,0 +1,132 @@
+//! An operation that waits for its turn, until its caller is answered or gives it up.
+
+use std::panic::AssertUnwindSafe;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
+
+use futures_util::FutureExt;
+use futures_util::future::BoxFuture;
+use tokio::sync::oneshot;
+
+use super::{LARGE_BYTES, WriteConnection};
+use crate::store::Error;
+use crate::store::sql::{Moves, Operation};
+
+/// An operation that waits for its turn, whatever it answers.
+pub(super) trait Waiting: Send {
+    /// Marks it as begun; `false` where its caller is gone, and nobody wants it any more.
+    fn begins(&self) -> bool;
+
+    fn moves(&self) -> Moves;
+
+    /// Whether it is to have a commit of its own.
+    fn is_large(&self) -> bool {
+        self.moves().bytes() > LARGE_BYTES
+    }
+
+    /// Runs it within the transaction and keeps its answer. It may be run again where the transaction came to nothing.
+    fn run<'c>(&'c mut self, connection: &'c mut WriteConnection) -> BoxFuture<'c, Result<(), Error>>;
+
+    /// Answers its caller: with what it kept, or why nothing was written.
+    fn answer(self: Box<Self>, committed: Result<(), Error>);
+}
+
+/// Whether an operation has begun, or its caller has given it up: whichever comes first.
+#[derive(Debug, Default)]
+pub(super) struct Turn(AtomicU8);
+
+impl Turn {
+    const WAITING: u8 = 0;
+    const BEGUN: u8 = 1;
+    const GIVEN_UP: u8 = 2;
+
+    /// `false` where its caller has given it up.
+    fn begin(&self) -> bool {
+        self.leave_waiting(Self::BEGUN)
+    }
+
+    /// `false` where it has begun.
+    pub(super) fn give_up(&self) -> bool {
+        self.leave_waiting(Self::GIVEN_UP)
+    }
+
+    fn leave_waiting(&self, to: u8) -> bool {
+        self.0.compare_exchange(Self::WAITING, to, Ordering::AcqRel, Ordering::Acquire).is_ok()
+    }
+}
+
+pub(super) struct Pending<T> {
+    operation: Operation<WriteConnection, T>,
+    moves: Moves,
+    value: Option<T>,
+    turn: Arc<Turn>,
+    reply: oneshot::Sender<Result<T, Error>>,
+}
+
+impl<T> Pending<T> {
+    /// With the turn that its caller may give up, and where its answer comes.
+    pub(super) fn new(
+        moves: Moves,
+        operation: Operation<WriteConnection, T>,
+    ) -> (Self, Arc<Turn>, oneshot::Receiver<Result<T, Error>>) {
+        let turn = Arc::new(Turn::default());
+        let (reply, answer) = oneshot::channel();
+        (Self { operation, moves, value: None, turn: turn.clone(), reply }, turn, answer)
+    }
+}
+
+impl<T: Send + 'static> Waiting for Pending<T> {
+    fn begins(&self) -> bool {
+        self.turn.begin() && !self.reply.is_closed()
+    }
+
+    fn moves(&self) -> Moves {
+        self.moves
+    }
+
+    fn run<'c>(&'c mut self, connection: &'c mut WriteConnection) -> BoxFuture<'c, Result<(), Error>> {
+        Box::pin(async {
+            // A defect in one operation must not cost the others their writer, be it in its call or in what it awaits.
+            let run = async { (self.operation)(connection).await };
+            let outcome = AssertUnwindSafe(run).catch_unwind().await;
+            let value = outcome.unwrap_or_else(|_| Err(Error::Corrupt("an operation of the store panicked".into())))?;
+            self.value = Some(value);
+            Ok(())
+        })
+    }
+
+    fn answer(self: Box<Self>, committed: Result<(), Error>) {
+        let Self { value, reply, .. } = *self;
+        let missing = || Error::Corrupt("an operation was committed without an answer".into());
+        // A caller that went away does not need to know.
+        let _ = reply.send(committed.and_then(|()| value.ok_or_else(missing)));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::thread;
+
+    use super::*;
+
+    #[test]
+    fn of_a_writer_and_a_caller_one_has_the_turn() {
+        let turn = || Arc::new(Turn::default());
+        let (begun, given_up) = (turn(), turn());
+        assert!(begun.begin() && !begun.give_up());
+        assert!(given_up.give_up() && !given_up.begin());
+        for round in 0..1_000 {
+            let (turn, both) = (turn(), Arc::new(std::sync::Barrier::new(2)));
+            let begins = thread::spawn({
+                let (turn, both) = (turn.clone(), both.clone());
+                move || {
+                    both.wait();
+                    turn.begin()
+                }
+            });
+            both.wait();
+            let given_up = turn.give_up();
+            assert_ne!(begins.join().expect("no panic"), given_up, "round {round}");
+        }
+    }
+}
