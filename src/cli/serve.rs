@@ -227,9 +227,14 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     ready.set(false);
     if let Some(failure) = failed {
         // Nobody can be served: what runs goes back to the queue at once.
+        let impatience = async {
+            // One that was on its way, and another request.
+            signals.next().await;
+            signals.again().await;
+        };
         tokio::select! {
             () = service.abandon() => {}
-            () = signals.next() => tracing::warn!("ended before jobs were given back: they begin again at the next start"),
+            () = impatience => tracing::warn!("ended before jobs were given back: they begin again at the next start"),
         }
         return Err(failure);
     }

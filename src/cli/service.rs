@@ -34,8 +34,8 @@ pub struct Service {
 
 impl Service {
     /// Opens the store, takes up the jobs it holds and serves. When this returns, calls are answered. `None` where
-    /// `ended` was over before the store was open, which may have its schema to bring up to date or wait for another
-    /// server that does; from then on jobs have begun, and are not dropped.
+    /// `ended` was over before the store was open and asked for its jobs, which may have its schema to bring up to date
+    /// or wait for another server that does; from then on jobs have begun, and are not dropped.
     ///
     /// # Errors
     /// A data directory that cannot be used or an address that cannot be had.
@@ -43,12 +43,22 @@ impl Service {
         let options = server_options(config);
         // Before the store is opened and its jobs begin: who cannot be let in is no reason to take them up.
         options.check_access().map_err(Failure::bad_config)?;
+        let mut ended = pin!(ended);
         let store = tokio::select! {
             store = open_store(&config.store) => store?,
-            () = ended => return Ok(None),
+            () = &mut ended => return Ok(None),
         };
         let solver = engine::solver_on(config.compute.threads());
-        let engine = match Engine::start(engine_options(config), store.clone(), solver).await {
+        let started = tokio::select! {
+            biased;
+            started = Engine::start(engine_options(config), store.clone(), solver) => started,
+            // It waits for the store, and for nothing once jobs begin.
+            () = ended => {
+                close(&*store).await;
+                return Ok(None);
+            }
+        };
+        let engine = match started {
             Ok(engine) => engine,
             Err(error) => {
                 close(&*store).await;

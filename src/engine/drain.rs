@@ -100,11 +100,12 @@ impl Inner {
         }
         self.phase.send_replace(Phase::Closed);
         let mut others: Vec<JoinHandle<()>> = others.into_iter().flatten().collect();
-        if timeout(GIVE_BACK_GRACE, all_ended(&mut others)).await.is_err() {
+        let (others_ended, ()) =
+            tokio::join!(timeout(GIVE_BACK_GRACE, all_ended(&mut others)), join(threads, threads_ended));
+        if others_ended.is_err() {
             // They wait for a store that hangs, and have nothing that another server or the next start would miss.
             others.iter().for_each(JoinHandle::abort);
         }
-        join(threads, threads_ended).await;
         locked(&self.crew).drained
     }
 }
