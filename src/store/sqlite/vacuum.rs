@@ -8,11 +8,12 @@ const PAGES: u64 = 1_024;
 /// Hands as many back. Where others have to move for them, it is the log that holds these until it is written back, on
 /// a full disk in the room that is kept.
 pub(super) const VACUUM: &str = "PRAGMA incremental_vacuum(1024)";
-/// What that is, in bytes.
-pub(super) const VACUUM_BYTES: u64 = 4 << 20;
+/// What that is, in bytes, of SQLite's pages.
+pub(super) const VACUUM_BYTES: u64 = PAGES * 4_096;
 /// How often, each time that space is to be given back; others may write in between.
 pub(super) const VACUUMS: u32 = 4;
-/// Of so many pages that move one more changes, which tells where they are: 30 of 1,024 were counted.
+/// Of so many pages that move one more changes, which tells where they are: 30 were counted beside 1,024, and twice that
+/// is reckoned with.
 const MOVED_A_POINTER: u64 = 16;
 
 /// The database in pages.
@@ -79,7 +80,7 @@ mod tests {
         assert!(!pays(10_000, 8_000, 40, 4_000));
         assert!(pays(10_000, 8_000, 40, 4_200));
         assert!(pays(10_000, 9_990, 40, 11));
-        // No room at all, and none needed: the end of the file is free.
+        // None is free; all are, and without any room.
         assert!(!pays(10_000, 0, 10_000, 4_096));
         assert!(pays(1_000, 1_000, 10, 0));
     }

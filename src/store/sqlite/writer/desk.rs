@@ -233,12 +233,9 @@ impl Desk {
         }
     }
 
-    fn vacuum_pays(&mut self) -> bool {
+    fn vacuum_pays(&mut self) -> Result<bool, Error> {
         let kept = if self.reserve.is_whole() { RESERVE_BYTES } else { 0 };
-        self.connection().and_then(|connection| connection.vacuum_pays(kept)).unwrap_or_else(|error| {
-            tracing::debug!(%error, "whether a vacuum pays cannot be told");
-            false
-        })
+        self.connection().and_then(|connection| connection.vacuum_pays(kept))
     }
 
     /// Writes the log back, however short it is, where the file is longer than its pages by what one

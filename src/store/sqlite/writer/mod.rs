@@ -45,7 +45,7 @@ pub(super) struct Writer {
 
 enum Message {
     Write(Box<dyn Waiting>),
-    VacuumPays(oneshot::Sender<bool>),
+    VacuumPays(oneshot::Sender<Result<bool, Error>>),
     Shorten(oneshot::Sender<()>),
     Close(oneshot::Sender<()>),
 }
@@ -104,7 +104,7 @@ impl Writer {
 
     /// Whether to give free pages back is worth the room that it takes.
     pub(super) async fn vacuum_pays(&self) -> Result<bool, Error> {
-        self.ask(Message::VacuumPays).await
+        self.ask(Message::VacuumPays).await?
     }
 
     /// After what is already waiting, has the database's file give back what it has beyond its pages, where that is
