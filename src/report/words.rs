@@ -34,7 +34,7 @@ pub fn warning(code: WarningCode) -> &'static str {
             "No image size was given, so the extent of the points stood in; the principal point may be off."
         }
         WarningCode::PointsOutsideImage => {
-            "Most points lie far outside the image size that was given; with a wrong size the calibration is wrong."
+            "Points lie outside the image size that was given; with a wrong size the calibration is wrong."
         }
         WarningCode::CameraGroupsMerged => "Views of different cameras or sizes were treated as one camera.",
         WarningCode::UnverifiedRanking => {

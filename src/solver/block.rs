@@ -77,8 +77,43 @@ pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
 /// that is three times too small shows.
 const MEDIAN_WITHIN: f64 = 1.0;
 
+/// Share of the points beyond the right or lower edge of their image, and none beyond the others, from which its size is
+/// doubted: that of a reduced copy leaves half of the points out, exchanged sides a fiftieth and more. Points of scenes
+/// that were made up lie beyond all edges.
+const BEYOND_TWO_EDGES: f64 = 0.01;
+/// How far beyond an edge a point may lie, in pixels: there are conventions that differ by half of one.
+const EDGE_PX: f64 = 1.0;
+
 /// Says so where the points do not lie in images of the size that was given: the calibration rests on its middle.
 fn outside(input: &Input) -> Option<Warning> {
+    beyond_two_edges(input).or_else(|| far_outside(input))
+}
+
+/// Points that fill an image from its upper left corner, and a larger one than the size that was given.
+fn beyond_two_edges(input: &Input) -> Option<Warning> {
+    let (mut sized, mut beyond) = (0usize, 0usize);
+    for k in 0..input.observation_count() {
+        let Some(size) = input.views()[input.view_of(k)].size else { continue };
+        let [x, y] = input.point_px(k);
+        if x.min(y) < -EDGE_PX {
+            return None;
+        }
+        sized += 1;
+        beyond += usize::from(x > f64::from(size.width_px) + EDGE_PX || y > f64::from(size.height_px) + EDGE_PX);
+    }
+    let share = beyond as f64 / sized.max(1) as f64;
+    (share > BEYOND_TWO_EDGES).then(|| {
+        let detail = format!(
+            "{:.0} % of the points lie beyond the right or lower edge of their image and none beyond the others: is the \
+             size that was given that of these images, and are width and height in their places?",
+            100.0 * share
+        );
+        Warning::new(WarningCode::PointsOutsideImage, detail)
+    })
+}
+
+/// Points that no image of such a size could show.
+fn far_outside(input: &Input) -> Option<Warning> {
     let of = |k: usize| {
         let size = input.views()[input.view_of(k)].size?;
         let offset = Vector2::from(input.point_px(k)) - image_centre(size);
@@ -402,8 +437,10 @@ mod tests {
             normalization(&input).1.iter().map(|warning| warning.code).collect::<Vec<_>>()
         };
         assert_eq!(codes(880, 600), []);
-        assert_eq!(codes(440, 300), []);
-        assert_eq!(codes(220, 150), [WarningCode::PointsOutsideImage]);
+        // A reduced copy, and exchanged sides.
+        for (width, height) in [(440, 300), (220, 150), (600, 880)] {
+            assert_eq!(codes(width, height), [WarningCode::PointsOutsideImage], "{width} x {height}");
+        }
     }
 
     #[test]
