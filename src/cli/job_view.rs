@@ -60,6 +60,9 @@ pub fn job_line(job: &Job) -> String {
     } else if let Some(progress) = job.progress.filter(|_| job.state == JobState::Running) {
         line.push_str(&format!("  {} {:.0} %", progress.stage.name(), 100.0 * progress.fraction));
     }
+    if job.cancel_requested && !job.state.is_terminal() {
+        line.push_str("  cancel requested");
+    }
     line
 }
 

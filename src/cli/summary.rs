@@ -26,6 +26,9 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
             }
         }
     }
+    if let Some((low, high)) = solution.view_focals_px() {
+        fact("of views", format!("{low:.1} to {high:.1} px, one each; above is their geometric mean"));
+    }
     let tracks = solution.tracks.inlier.len();
     let observations = solution.observations.inlier.len();
     fact(
@@ -146,6 +149,14 @@ mod tests {
         assert!(lines.contains("  camera 9     77.0 px +- 0.40 % (one sigma), 1 of 1 views, WEAK"), "{lines}");
         solution.views[4].projection = None;
         assert!(text(&solution, None).contains("camera 9     no calibration, 0 of 1 views"));
+    }
+
+    #[test]
+    fn tells_that_the_focal_length_is_a_mean_where_views_have_their_own() {
+        let (_, mut solution) = fixture::solved();
+        assert!(!text(&solution, None).contains("of views"));
+        (solution.views[0].focal_px, solution.views[2].focal_px) = (Some(678.0), Some(1127.0));
+        assert!(text(&solution, None).contains("of views     678.0 to 1127.0 px, one each"));
     }
 
     #[test]

@@ -296,6 +296,13 @@ pub struct Solution {
 }
 
 impl Solution {
+    /// The least and the largest focal length where every view has its own; `None` where none is told.
+    pub fn view_focals_px(&self) -> Option<(f64, f64)> {
+        let mut own = self.views.iter().filter_map(|view| view.focal_px).filter(|px| px.is_finite());
+        let first = own.next()?;
+        Some(own.fold((first, first), |(low, high), px| (low.min(px), high.max(px))))
+    }
+
     /// Whether there is a metric reconstruction. Without one (above all under [`Grade::ProjectiveOnly`]) no calibration
     /// and no pose is given, and the points are in the frame of the projective cameras.
     pub fn is_metric(&self) -> bool {

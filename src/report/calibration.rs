@@ -151,11 +151,7 @@ fn tick(px: f64, range: f64) -> String {
 
 /// Where every view has a focal length of its own, the range of them.
 fn own_focals(solution: &Solution) -> String {
-    let own = || solution.views.iter().filter_map(|view| view.focal_px).filter(|px| px.is_finite());
-    let (low, high) = own().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), px| (low.min(px), high.max(px)));
-    if low > high {
-        return String::new();
-    }
+    let Some((low, high)) = solution.view_focals_px() else { return String::new() };
     format!(
         "<p class=\"note\">Every view has a focal length of its own, {low:.1} to {high:.1} px; the table shows their geometric mean.</p>\n"
     )

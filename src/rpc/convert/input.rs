@@ -118,8 +118,7 @@ fn check_track_set_size(set: &proto::TrackSet, limits: &Limits) -> Result<(), In
 pub(super) fn within(prefix: &str, counts: &[(&str, usize, usize)]) -> Result<(), InvalidInput> {
     match counts.iter().find(|(_, count, limit)| count > limit) {
         Some((field, count, limit)) => {
-            Err(Violation::of(format!("{prefix}.{field}"), format!("{count} are above this server's limit of {limit}"))
-                .into())
+            Err(Violation::of(format!("{prefix}.{field}"), format!("{count} are above the limit of {limit}")).into())
         }
         None => Ok(()),
     }
@@ -287,7 +286,7 @@ mod tests {
         assert_eq!(draft.check_size(), Ok(()));
         draft.append_track_set(chunk).expect("a chunk");
         let error = draft.check_size().expect_err("12 of 10");
-        assert_eq!(error.to_string(), "track_set.y: 12 are above this server's limit of 10");
+        assert_eq!(error.to_string(), "track_set.y: 12 are above the limit of 10");
     }
 
     #[test]

@@ -143,7 +143,7 @@ fn check(field: &str, count: usize, max: usize) -> Result<(), InvalidInput> {
     if count <= max {
         return Ok(());
     }
-    Err(Violation::of(field, format!("{count} or more are above this server's limit of {max}")).into())
+    Err(Violation::of(field, format!("{count} or more are above the limit of {max}")).into())
 }
 
 fn doubles(buf: &mut impl Buf, values: &mut Vec<f64>, field: &str, max: usize) -> Result<(), InvalidInput> {
