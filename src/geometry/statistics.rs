@@ -34,6 +34,12 @@ pub fn median(values: &mut [f64]) -> f64 {
     *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
+/// `None` for no values.
+pub fn root_mean_square(values: &[f64]) -> Option<f64> {
+    let mean = values.iter().map(|value| value * value).sum::<f64>() / values.len() as f64;
+    (!values.is_empty()).then(|| mean.sqrt())
+}
+
 /// Natural logarithm of the binomial coefficient `C(n, k)`, by Stirling's series.
 pub fn ln_choose(n: usize, k: usize) -> f64 {
     if k > n {

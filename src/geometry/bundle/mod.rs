@@ -19,6 +19,7 @@ pub mod sequence;
 #[cfg(test)]
 pub(crate) mod testing;
 pub mod zoom;
+pub mod zoom_lens;
 
 use nalgebra::Vector2;
 

@@ -6,16 +6,16 @@ use std::ops::Range;
 use faer::{MatRef, Side};
 use nalgebra::{DMatrix, Rotation3, Vector2, Vector3};
 
-use super::covariance::{GAUGE, NULL_POSE};
+use super::covariance::NULL_POSE;
 use super::engine::{Jacobian, Layout, Problem, Sink, Step, minimise};
-use super::metric::{Intrinsics, POINT, Pose, Reconstruction};
+use super::metric::{Intrinsics, POINT, POSE, Pose, Reconstruction};
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation, Options, Report};
 use crate::domain::StopToken;
 use crate::geometry::Camera;
 
-/// Unknowns of a view: rotation vector, translation, log focal length.
-const VIEW: usize = 7;
+/// Unknowns of a view: those of its pose, then the log focal length.
+pub(super) const VIEW: usize = POSE + 1;
 /// Share of a log focal length in a null direction from which it counts as undetermined.
 const TAKES_PART: f64 = 1e-8;
 
@@ -49,34 +49,78 @@ impl Problem<0, VIEW, POINT> for Zooming {
     }
 
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, VIEW, POINT>) {
-        let (pose, focal) = (&self.poses[observation.camera], self.focals[observation.camera]);
-        let turned = pose.rotation * self.points[observation.point];
-        let seen = turned + pose.translation;
-        let scale = focal / seen.z;
-        let image = Vector2::new(seen.x * scale, seen.y * scale);
-        sink.take(image - observation.xy, || {
-            let by_seen = [Vector3::new(scale, 0.0, -image.x / seen.z), Vector3::new(0.0, scale, -image.y / seen.z)];
-            let mut jacobian = Jacobian::<0, VIEW, POINT>::zeros();
-            for (component, by_seen) in by_seen.iter().enumerate() {
-                jacobian.camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(by_seen));
-                jacobian.camera.fixed_view_mut::<3, 1>(3, component).copy_from(by_seen);
-                jacobian.camera[(6, component)] = image[component];
-                jacobian.point.set_column(component, &pose.rotation.tr_mul(by_seen));
+        let seen = Seen::new(self, observation);
+        sink.take(seen.image - observation.xy, || {
+            let mut jacobian = seen.jacobian::<VIEW>();
+            for component in 0..2 {
+                jacobian.camera[(POSE, component)] = seen.image[component];
             }
             jacobian
         });
     }
 
     fn retract(&mut self, from: &Self, step: &Step<0, VIEW, POINT>) {
-        for (view, step) in step.cameras.iter().enumerate() {
-            let turn = Rotation3::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
-            self.poses[view].rotation = turn * from.poses[view].rotation;
-            self.poses[view].translation = from.poses[view].translation + step.fixed_rows::<3>(3);
-            self.focals[view] = from.focals[view] * step[6].exp();
+        self.move_all_but_focals(from, step);
+        for ((focal, from), step) in self.focals.iter_mut().zip(&from.focals).zip(&step.cameras) {
+            *focal = from * step[POSE].exp();
         }
-        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
-            *point = from + step;
+    }
+}
+
+/// The same with the focal lengths as they are.
+#[derive(Debug, Clone)]
+struct Held(Zooming);
+
+impl Problem<0, POSE, POINT> for Held {
+    fn camera_count(&self) -> usize {
+        self.0.camera_count()
+    }
+
+    fn point_count(&self) -> usize {
+        self.0.point_count()
+    }
+
+    fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, POSE, POINT>) {
+        let seen = Seen::new(&self.0, observation);
+        sink.take(seen.image - observation.xy, || seen.jacobian());
+    }
+
+    fn retract(&mut self, from: &Self, step: &Step<0, POSE, POINT>) {
+        self.0.move_all_but_focals(&from.0, step);
+    }
+}
+
+/// A point as a view sees it.
+struct Seen<'a> {
+    pose: &'a Pose,
+    turned: Vector3<f64>,
+    /// In the frame of the camera.
+    at: Vector3<f64>,
+    /// Focal length over depth.
+    scale: f64,
+    image: Vector2<f64>,
+}
+
+impl<'a> Seen<'a> {
+    fn new(zooming: &'a Zooming, observation: &Observation) -> Self {
+        let (pose, focal) = (&zooming.poses[observation.camera], zooming.focals[observation.camera]);
+        let turned = pose.rotation * zooming.points[observation.point];
+        let at = turned + pose.translation;
+        let scale = focal / at.z;
+        Self { pose, turned, at, scale, image: Vector2::new(at.x * scale, at.y * scale) }
+    }
+
+    /// By pose, the first unknowns of a view, and point.
+    fn jacobian<const C: usize>(&self) -> Jacobian<0, C, POINT> {
+        let Self { pose, turned, at, scale, image } = self;
+        let by_seen = [Vector3::new(*scale, 0.0, -image.x / at.z), Vector3::new(0.0, *scale, -image.y / at.z)];
+        let mut jacobian = Jacobian::<0, C, POINT>::zeros();
+        for (component, by_seen) in by_seen.iter().enumerate() {
+            jacobian.camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(by_seen));
+            jacobian.camera.fixed_view_mut::<3, 1>(3, component).copy_from(by_seen);
+            jacobian.point.set_column(component, &pose.rotation.tr_mul(by_seen));
         }
+        jacobian
     }
 }
 
@@ -84,6 +128,25 @@ impl Zooming {
     /// Minimises the reprojection error over focal lengths, poses and points.
     pub fn adjust(&mut self, observations: &[Observation], options: &Options, stop: &StopToken) -> Report {
         minimise(self, observations, options, stop)
+    }
+
+    /// Minimises it over poses and points alone.
+    pub fn adjust_held(&mut self, observations: &[Observation], options: &Options, stop: &StopToken) -> Report {
+        let mut held = Held(self.clone());
+        let report = minimise(&mut held, observations, options, stop);
+        *self = held.0;
+        report
+    }
+
+    fn move_all_but_focals<const C: usize>(&mut self, from: &Self, step: &Step<0, C, POINT>) {
+        for ((pose, from), step) in self.poses.iter_mut().zip(&from.poses).zip(&step.cameras) {
+            let turn = Rotation3::from_scaled_axis(step.fixed_view::<3, 1>(0, 0).into_owned());
+            pose.rotation = turn * from.rotation;
+            pose.translation = from.translation + step.fixed_view::<3, 1>(3, 0);
+        }
+        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
+            *point = from + step;
+        }
     }
 
     /// Mean of the natural logarithms of the focal lengths.
@@ -159,8 +222,9 @@ impl Information {
         let norm_squared: f64 = rows.iter().map(|(_, factor)| factor * factor).sum();
         let largest = self.values.last()?;
         let mut sum = 0.0;
-        // Eigenvalues ascend; the first are the similarity's, which no focal length takes part in.
-        for (k, value) in self.values.iter().enumerate().skip(GAUGE) {
+        // Null directions are those of the similarity, which no focal length takes part in, and of views that see too
+        // little.
+        for (k, value) in self.values.iter().enumerate() {
             let along: f64 = rows.iter().map(|&(row, factor)| factor * self.vectors[(row, k)]).sum();
             if *value > NULL_POSE * largest {
                 sum += along * along / value;
@@ -168,7 +232,7 @@ impl Information {
                 return None;
             }
         }
-        Some(sum)
+        (sum > 0.0).then_some(sum)
     }
 }
 
@@ -189,6 +253,7 @@ mod tests {
         let mut zooming = Zooming::from(&truth(&scene));
         zooming.focals = vec![0.9, 1.0, 1.2, 1.5];
         testing::check_jacobian(&zooming, &scene.observations);
+        testing::check_jacobian(&Held(zooming), &scene.observations);
     }
 
     #[test]

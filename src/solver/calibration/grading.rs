@@ -1,6 +1,7 @@
 //! What a calibration is worth, and what to warn of.
 
 use super::fit::Fit;
+use super::lens::{self, Zoom};
 use super::models::{CHI_SQUARE_GAIN, Candidate, Choice};
 use super::search::Minimum;
 use super::verdict::{CHEIRALITY_LIMIT, UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO};
@@ -43,6 +44,14 @@ pub(super) fn grade(
         verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, choice.scale_px));
     }
     let rms_ratio = verdict.judge_fit(fit, &best.fit, &best.model.name(), choice.scale_px);
+    if verdict.is_misfit
+        && verdict.grade != Grade::ProjectiveOnly
+        && let Some(zoom) = lens::zoom(&best.minimum.reconstruction, &best.fit, choice)
+    {
+        // What the views' own differ from it by, one focal length for all is wrong by.
+        sigma = sigma.map(|sigma| sigma.max(zoom.shift));
+        verdict.doubt(sigma, zoom_words(&zoom, choice.scale_px));
+    }
     let is_known = choice.problem.focal_prior.is_some();
     verdict.judge_plausibility(best.minimum.log_focal().exp(), is_known, choice.scale_px);
     verdict.judge_cheirality(best.minimum.cheirality);
@@ -152,6 +161,14 @@ fn principal_point(best: &Candidate, prior: &IntrinsicsPrior, scale_px: f64) -> 
         .collect();
     let detail = format!("the tracks determine the principal point in {}", unknown.join(" and "));
     (!unknown.is_empty()).then(|| Warning::new(WarningCode::PrincipalPointUnobservable, detail))
+}
+
+fn zoom_words(zoom: &Zoom, scale_px: f64) -> String {
+    format!(
+        "with a focal length a view (focal_per_view) the images fit better, at {:.1} to {:.1} px",
+        zoom.range.0 * scale_px,
+        zoom.range.1 * scale_px
+    )
 }
 
 fn second_minimum(rival: &Minimum, best: &Candidate, scale_px: f64) -> String {

@@ -6,6 +6,7 @@
 mod critical;
 mod fit;
 mod grading;
+mod lens;
 mod models;
 mod search;
 #[cfg(test)]
@@ -24,7 +25,7 @@ use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
 use fit::Fit;
 pub use models::knowledge;
 pub use verdict::{CHEIRALITY_LIMIT, grade_of_sigma};
-pub use zoom::{LEAST_DETERMINED, root_mean_square};
+pub use zoom::LEAST_DETERMINED;
 
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
 /// caller has adjusted it before.
@@ -62,6 +63,13 @@ pub struct ViewFocal {
     /// One standard deviation of its natural logarithm, with what an unknown lens adds. `None`: the observations do not
     /// determine it, and neither it nor the view's pose is to be told.
     pub sigma_log: Option<f64>,
+}
+
+impl ViewFocal {
+    /// Whether this focal length, which other observations led to, may be told as that of the view.
+    pub fn stands_as(&self, told: f64) -> bool {
+        self.sigma_log.is_some() && verdict::is_plausible(told) && (told / self.focal).ln().abs() <= verdict::WEAK_UP_TO
+    }
 }
 
 /// What came of it.
@@ -204,9 +212,15 @@ pub fn from_metric(
 ///
 /// # Errors
 /// As [`calibrate`].
-pub fn from_zooming(problem: &Problem, zooming: &Zooming, scale_px: f64, stop: &StopToken) -> Result<Outcome, Stopped> {
-    near(problem, scale_px, stop, &mut || {}, |choice, fit, warnings, _| {
-        zoom::calibrate_near(zooming, choice, fit, warnings)
+pub fn from_zooming(
+    problem: &Problem,
+    zooming: &Zooming,
+    scale_px: f64,
+    stop: &StopToken,
+    told: &mut dyn FnMut(),
+) -> Result<Outcome, Stopped> {
+    near(problem, scale_px, stop, told, |choice, fit, warnings, told| {
+        zoom::calibrate_near(zooming, choice, fit, warnings, told)
     })
 }
 

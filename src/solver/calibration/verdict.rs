@@ -11,7 +11,7 @@ pub(super) const UNOBSERVABLE_ABOVE: f64 = 1.0;
 /// Ratio of the metric to the projective posterior noise that speaks of a wrong model; the paper's synthetic scenes
 /// stay within 1.05. With few degrees of freedom it exceeds its limit by chance: the loss of fit must also be more than
 /// [`MISFIT_DEVIATIONS`].
-const RMS_RATIO_LIMIT: f64 = 1.15;
+pub(super) const RMS_RATIO_LIMIT: f64 = 1.15;
 /// The same ratio from which the metric reconstruction is not to be used at all.
 const RMS_RATIO_REFUSAL: f64 = 3.0;
 /// Share of the observations that must lie in front of their cameras, or the reconstruction is not to be used: what was
@@ -28,13 +28,13 @@ pub(super) struct Verdict {
     pub grade: Grade,
     pub warnings: Vec<Warning>,
     /// Whether the metric model does not fit: its sigma says nothing then.
-    misfit: bool,
+    pub is_misfit: bool,
 }
 
 impl Verdict {
     /// Nothing speaks against it yet but these warnings.
     pub fn new(warnings: Vec<Warning>) -> Self {
-        Self { grade: Grade::Metric, warnings, misfit: false }
+        Self { grade: Grade::Metric, warnings, is_misfit: false }
     }
 
     /// Lowers the grade to this at most and says why.
@@ -77,9 +77,14 @@ impl Verdict {
                 projective.noise * scale_px,
             );
             self.cap(worst, WarningCode::ModelMismatch, detail);
-            self.misfit = true;
+            self.is_misfit = true;
         }
         ratio
+    }
+
+    /// Grades by a sigma that has grown for this reason.
+    pub fn doubt(&mut self, sigma: Option<f64>, detail: String) {
+        self.cap(grade_of_sigma(sigma), WarningCode::ModelMismatch, detail);
     }
 
     /// Asks whether there is a lens of this focal length, in the longer image side, unless the caller said so.
@@ -108,7 +113,7 @@ impl Verdict {
     /// grade's least, and a model that does not fit its most: wrong minima behind a distorting lens were off by 20 to
     /// 30 %.
     pub fn told(&self, sigma: Option<f64>) -> Option<f64> {
-        let least = match (self.grade, self.misfit) {
+        let least = match (self.grade, self.is_misfit) {
             (Grade::Weak, true) => WEAK_UP_TO,
             (Grade::Weak, false) => METRIC_BELOW,
             _ => 0.0,

@@ -87,7 +87,7 @@ fn told(calibrations: &[Outcome], scene: &Scene) -> Vec<Warning> {
 }
 
 /// The calibration of each camera group in pixels, its principal point about the image centre of the group's first
-/// view; of a zoom the geometric mean of the focal lengths.
+/// view; of a zoom the geometric mean of its focal lengths, that of all for one of which none is determined.
 fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Calibration> {
     let (group_of, groups) = block::camera_groups(scene.context.input);
     let determined = model.determined(scene);
@@ -96,12 +96,19 @@ fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Cali
         // One for all where the groups are merged.
         let camera = scene.camera_of[view];
         let of_views: Vec<usize> = determined.iter().copied().filter(|&view| group_of[view] == group).collect();
-        let of_views = if of_views.is_empty() { &determined } else { &of_views };
-        let intrinsics = match scene.zooms() {
-            true => Intrinsics::from_focal(model.log_focal(scene, camera, of_views).exp()),
-            false => model.lenses[camera].intrinsics,
-        };
-        Some(pixel_calibration(&intrinsics, calibrations.get(camera)?, &scene.context, view))
+        let outcome = calibrations.get(camera)?;
+        if !scene.zooms() {
+            return Some(pixel_calibration(&model.lenses[camera].intrinsics, outcome, &scene.context, view));
+        }
+        let own = Intrinsics::from_focal(
+            model.log_focal(scene, camera, if of_views.is_empty() { &determined } else { &of_views }).exp(),
+        );
+        let mut calibration = pixel_calibration(&own, outcome, &scene.context, view);
+        if of_views.is_empty() {
+            calibration.grade = Some(Grade::ProjectiveOnly);
+            calibration.sigma_log_focal = None;
+        }
+        Some(calibration)
     };
     (0..groups).filter_map(of_group).collect()
 }

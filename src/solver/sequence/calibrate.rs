@@ -13,7 +13,8 @@ use crate::solver::recorder::Recorder;
 use crate::solver::{Context, Error, block};
 
 /// Views that a calibration is made from at most: the projective adjustment that it is compared with is cubic in them.
-/// Of more, the stretch with most observations; the others speak through their windows.
+/// Of more with one focal length, the stretch with most observations, where the others speak through their windows; a
+/// zoom is asked stretch after stretch.
 pub const MOST_VIEWS: usize = 40;
 /// Observations that a calibration is made from, and of one view at least and at most: other errors than noise bound
 /// what more of them would give.

@@ -207,8 +207,10 @@ impl Model {
         for (i, (&view, pose)) in views.iter().zip(&metric.poses).enumerate() {
             let lens = &mut self.lenses[scene.lens_of[view]];
             if !lens.is_known {
-                let own = focals.and_then(|focals| focals.get(i)).map(|own| own.focal);
-                lens.intrinsics = Intrinsics { focal: own.unwrap_or(metric.intrinsics.focal), ..metric.intrinsics };
+                let own = focals.and_then(|focals| focals.get(i));
+                let focal = own.map_or(metric.intrinsics.focal, |own| own.focal);
+                lens.intrinsics = Intrinsics { focal, ..metric.intrinsics };
+                lens.is_determined = own.is_none_or(|own| own.sigma_log.is_some());
             }
             self.register(scene, view, part, *pose);
         }

@@ -181,7 +181,8 @@ fn guesses(scene: &Scene, model: &Model, view: usize) -> Vec<Intrinsics> {
         let focal = prior.focal_px / scene.context.scale_px;
         return [0.0, -1.0, 1.0].map(|by| Intrinsics::from_focal(focal * (by * prior.sigma_log).exp())).to_vec();
     }
-    let nearest = model.registered().into_iter().min_by_key(|other| other.abs_diff(view)).filter(|_| scene.zooms());
+    let nearest =
+        model.determined(scene).into_iter().min_by_key(|other| other.abs_diff(view)).filter(|_| scene.zooms());
     let about = nearest.map_or(lens, |nearest| &model.lenses[scene.lens_of[nearest]]).intrinsics.focal;
     let focal = |step: i32| about * (f64::from(step) / FOCALS_PER_OCTAVE).exp2();
     // Of equals the first counts: from the middle outwards.

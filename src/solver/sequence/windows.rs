@@ -78,8 +78,13 @@ fn estimates(scene: &Scene, model: &Model, camera: usize, recorder: &mut Recorde
     let views = of_camera(scene, model, camera);
     let whole = model.log_focal(scene, camera, &views);
     let parts = model.part_of.iter().copied().max().unwrap_or(0);
-    let of_part = |part: u32| views.iter().copied().filter(|&view| model.part_of[view] == part).collect();
-    let windows = windows(&(0..=parts).map(of_part).collect::<Vec<_>>());
+    // Views that say nothing are gaps: what lies on either side may share no track.
+    let of_part = |part: u32| -> Vec<Vec<usize>> {
+        let mut own = model.of_part(part);
+        own.retain(|&view| scene.camera_of[view] == camera);
+        own.split(|view| views.binary_search(view).is_err()).map(<[usize]>::to_vec).collect()
+    };
+    let windows = windows(&(0..=parts).flat_map(of_part).collect::<Vec<_>>());
     let of_window = |k: usize| {
         let views = windows.get(k).filter(|_| !scene.stop().is_stopped())?;
         match scene.zooms() {
@@ -112,7 +117,7 @@ fn estimate(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> Opt
     Some(Estimate { log_focal, sigma })
 }
 
-/// Runs of consecutive views of one part, not overlapping; one or none says nothing.
+/// Runs of each of these runs of consecutive views, not overlapping; one or none says nothing.
 fn windows(parts: &[Vec<usize>]) -> Vec<Vec<usize>> {
     let long: Vec<&Vec<usize>> = parts.iter().filter(|views| views.len() >= LEAST_VIEWS).collect();
     // One part is halved, so that there is something to compare; the halves of a short one overlap.

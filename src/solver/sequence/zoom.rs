@@ -9,8 +9,9 @@ use super::model::{Model, Scene};
 use super::{structure, windows};
 use crate::domain::{Grade, Task, Warning, WarningCode};
 use crate::geometry::bundle::zoom::Zooming;
+use crate::geometry::statistics::root_mean_square;
 use crate::solver::agreement::Estimate;
-use crate::solver::calibration::{self, LEAST_DETERMINED, Outcome, Problem, root_mean_square};
+use crate::solver::calibration::{self, LEAST_DETERMINED, Outcome, Problem};
 use crate::solver::recorder::Recorder;
 use crate::solver::{Context, Error, block};
 
@@ -26,15 +27,20 @@ pub fn calibrate(
 ) -> Result<Outcome, Error> {
     let registered = model.registered();
     let runs = runs(model);
-    let of_run = |k: usize| {
+    let of_run = |k: usize, told: &mut dyn FnMut()| {
         let extract = calibrate::core(scene, model, runs.get(k)?, calibrate::of_view(&runs[k]));
         let outcome = of_extract(&extract, model.noise, |problem, zooming| {
-            calibration::from_zooming(problem, zooming, context.scale_px, context.stop)
+            calibration::from_zooming(problem, zooming, context.scale_px, context.stop, told)
         });
         outcome.ok().map(|outcome| (extract, outcome))
     };
-    let mut told = |k: usize| recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
-    let found = scene.context.threads.map(runs.len(), 1, of_run, &mut told);
+    let found = if runs.len() == 1 {
+        recorder.step(Task::Cameras, 1, 1, 0.0);
+        vec![of_run(0, &mut || recorder.sign_of_life())]
+    } else {
+        let mut told = |k: usize| recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
+        scene.context.threads.map(runs.len(), 1, |k| of_run(k, &mut || {}), &mut told)
+    };
     scene.context.stopped()?;
     let mut found: Vec<(Extract, Outcome)> = found.into_iter().flatten().collect();
     if let [(extract, outcome)] = found.as_mut_slice()
@@ -87,13 +93,13 @@ fn combined(scene: &Scene, model: &mut Model, runs: Vec<(Extract, Outcome)>) -> 
         let mut differences = Vec::new();
         for (&view, own) in extract.views.iter().zip(focals.iter().flatten()) {
             let lens = &mut model.lenses[scene.lens_of[view]];
-            lens.is_determined = own.sigma_log.is_some();
+            lens.is_determined = own.stands_as(lens.intrinsics.focal);
             if lens.is_determined {
                 differences.push((lens.intrinsics.focal / own.focal).ln());
             }
         }
-        if let Some(difference) = root_mean_square(&differences) {
-            let sigma = outcome.sigma_log_focal.unwrap_or(0.0).max(difference);
+        if let (Some(difference), Some(own)) = (root_mean_square(&differences), outcome.sigma_log_focal) {
+            let sigma = own.max(difference);
             deviations.extend(differences.iter().map(|_| sigma));
             whole.grade = whole.grade.worse(outcome.grade);
             whole.cheirality = whole.cheirality.min(outcome.cheirality);
@@ -102,7 +108,10 @@ fn combined(scene: &Scene, model: &mut Model, runs: Vec<(Extract, Outcome)>) -> 
         whole.metric = whole.metric.or(outcome.metric);
         let named = |warning: Warning| match is_whole {
             true => warning,
-            false => Warning::new(warning.code, format!("{}: {}", span(&extract.views), warning.detail)),
+            false => {
+                let run = format!("in a run of {} views", extract.views.len());
+                Warning::new(warning.code, format!("{run}: {}", warning.detail))
+            }
         };
         whole.warnings.extend(outcome.warnings.into_iter().map(named));
     }
@@ -114,18 +123,10 @@ fn combined(scene: &Scene, model: &mut Model, runs: Vec<(Extract, Outcome)>) -> 
         whole.grade = Grade::ProjectiveOnly;
     }
     if !is_whole && deviations.len() < registered.len() {
-        let detail = format!("{} of {} views have a focal length and a pose", deviations.len(), registered.len());
+        let detail = format!("only {} of {} views determine their focal length", deviations.len(), registered.len());
         whole.warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
     }
     whole
-}
-
-/// A run of views in words.
-fn span(views: &[usize]) -> String {
-    match views {
-        [first, .., last] => format!("views {first} to {last}"),
-        _ => "no view".to_owned(),
-    }
 }
 
 /// What a window says by itself of the mean log focal length of the whole: that one, moved by as much as the window's

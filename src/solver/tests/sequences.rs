@@ -271,7 +271,7 @@ fn views_of_a_zoom_that_do_not_turn_have_no_focal_length() {
     }
     // A few that do not turn are held by those beside them that do.
     assert!((75..=95).contains(&told), "{told} of 120 views");
-    let said = format!("{told} of 120 views have a focal length and a pose");
+    let said = format!("only {told} of 120 views determine their focal length");
     assert!(solution.warnings.iter().any(|warning| warning.detail == said), "{:?}", solution.warnings);
 }
 
