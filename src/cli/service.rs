@@ -195,6 +195,16 @@ fn server_options(config: &Config) -> server::Options {
 mod tests {
     use super::*;
 
+    #[tokio::test]
+    async fn a_start_that_is_ended_before_the_store_is_open_is_no_service() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let mut config = Config::default();
+        config.store.data_dir = directory.path().join("data");
+        config.server.listen = "127.0.0.1:0".parse().expect("an address");
+        let ended = Service::start(&config, std::future::ready(())).await.expect("no failure");
+        assert!(ended.is_none());
+    }
+
     #[test]
     fn a_configuration_of_defaults_is_the_default_of_engine_and_server() {
         let config = Config::default();

@@ -103,7 +103,7 @@ struct Running {
 impl Running {
     fn list(inner: Arc<Inner>, lease: &Lease, stop: &StopToken) -> Self {
         locked(&inner.running).insert(lease.clone(), stop.clone());
-        Self { inner, lease: lease.clone(), stop: stop.clone() }
+        Self { inner, lease: lease.clone(), stop: stop.clone() }.unless_recalled()
     }
 
     /// The same, unless another slot has it.
@@ -113,7 +113,15 @@ impl Running {
         } else {
             return None;
         }
-        Some(Self { inner, lease: lease.clone(), stop: stop.clone() })
+        Some(Self { inner, lease: lease.clone(), stop: stop.clone() }.unless_recalled())
+    }
+
+    /// Stops what was claimed while a drain told those that were listed to stop.
+    fn unless_recalled(self) -> Self {
+        if self.inner.hurried.is_cancelled() {
+            self.stop.stop(StopReason::Interrupted);
+        }
+        self
     }
 }
 

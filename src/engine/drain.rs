@@ -89,6 +89,8 @@ impl Inner {
         };
         let in_time = timeout(bound, all_ended(&mut slots));
         if !matches!(self.hurried.run_until_cancelled(in_time).await, Some(Ok(()))) {
+            // Before the look: whoever is listed after it finds this.
+            self.hurried.cancel();
             for stop in locked(&self.running).values() {
                 stop.stop(StopReason::Interrupted);
             }

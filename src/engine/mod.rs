@@ -184,7 +184,7 @@ struct Inner {
     /// Wakes the task that counts the queue.
     queue_changed: Notify,
     phase: channel::Sender<Phase>,
-    /// Cancelled where a drain's bound is to be over at once.
+    /// Cancelled once what runs is to go back to the queue: at the end of a drain's bound, or before by a hurry.
     hurried: CancellationToken,
     /// What the last sweep found.
     store_state: channel::Sender<StoreState>,

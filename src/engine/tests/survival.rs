@@ -81,6 +81,21 @@ async fn those_who_follow_the_store_hear_of_changes_alone() {
 }
 
 #[tokio::test]
+async fn what_is_claimed_while_a_drain_gives_back_goes_back_too() {
+    // The claim is on its way to the store when the drain looks for what runs: after one of these turns, or some.
+    for turns in 0..8 {
+        let bench = Bench::start(workers(1)).await;
+        let name = bench.submit(Script::Wait).await;
+        for _ in 0..turns {
+            tokio::task::yield_now().await;
+        }
+        bench.engine.drain(Duration::ZERO).await;
+        let job = bench.engine.job(&name).await.expect("the job");
+        assert_eq!(job.state, JobState::Queued, "after {turns} turns");
+    }
+}
+
+#[tokio::test]
 async fn a_drain_gives_back_what_does_not_finish_and_the_next_engine_takes_it_up() {
     let bench = Bench::start(workers(2)).await;
     let names = [bench.submit(Script::Wait).await, bench.submit(Script::Wait).await, bench.submit(Script::Wait).await];
