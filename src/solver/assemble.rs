@@ -276,9 +276,12 @@ fn final_points(
         return judged.points.iter().map(moved).collect();
     };
     let mut cameras = vec![Camera::zeros(); context.input.view_count()];
+    let mut has_pose = vec![true; cameras.len()];
     for (i, &view) in attempt.block.views.iter().enumerate() {
-        let focal = own_focal(attempt, i).map_or(metric.intrinsics.focal, |own| own.focal);
+        let own = own_focal(attempt, i);
+        let focal = own.map_or(metric.intrinsics.focal, |own| own.focal);
         cameras[view] = metric.poses[i].camera(&Intrinsics { focal, ..metric.intrinsics });
+        has_pose[view] = own.is_none_or(|own| own.sigma_log.is_some());
     }
     let triangulated = |sightings: &Vec<Sighting>| {
         if sightings.is_empty() || context.stop.is_stopped() {
@@ -286,7 +289,7 @@ fn final_points(
         }
         // These cameras know no distortion.
         let undone = |seen: &Sighting| Some(Sighting { xy: metric.intrinsics.undistort(&seen.xy)?, ..*seen });
-        let sightings: Vec<Sighting> = sightings.iter().filter_map(undone).collect();
+        let sightings: Vec<Sighting> = sightings.iter().filter(|seen| has_pose[seen.view]).filter_map(undone).collect();
         if sightings.len() < LEAST_SIGHTINGS {
             return None;
         }
@@ -297,7 +300,7 @@ fn final_points(
 }
 
 /// Sightings that determine a point.
-const LEAST_SIGHTINGS: usize = 2;
+pub const LEAST_SIGHTINGS: usize = 2;
 /// Refinement steps of a final point.
 const POINT_STEPS: usize = 10;
 

@@ -45,7 +45,6 @@ pub(super) fn grade(
     }
     let rms_ratio = verdict.judge_fit(fit, &best.fit, &best.model.name(), choice.scale_px);
     if verdict.is_misfit
-        && verdict.grade != Grade::ProjectiveOnly
         && let Some(zoom) = lens::zoom(&best.minimum.reconstruction, &best.fit, choice)
     {
         // What the views' own differ from it by, one focal length for all is wrong by.

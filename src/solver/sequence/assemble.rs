@@ -9,7 +9,8 @@ use crate::domain::result::{TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, LeftOut, Solution, Stage, Status, Warning};
 use crate::geometry::Point;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
-use crate::solver::assemble::{dehomogenise, network_weights, pixel_calibration, reprojection};
+use crate::geometry::measurement::Sighting;
+use crate::solver::assemble::{LEAST_SIGHTINGS, dehomogenise, network_weights, pixel_calibration, reprojection};
 use crate::solver::block;
 use crate::solver::calibration::Outcome;
 use crate::solver::judge::{self, Geometry, Judged, SplitPoint};
@@ -29,7 +30,7 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
     warnings.extend(seed.second_structure.clone());
     let frames = frames(&scene, &model);
     let back = back(&frames, metric);
-    judged.tracks.point = points(&judged, &model, &back);
+    judged.tracks.point = points(&scene, &judged, &model, &back, metric);
     let splits = splits(&judged, &model, &back);
     judged.tracks.part = parts(&judged, &model);
     judged.tracks.network_weight = network_weights(&seed, context);
@@ -188,9 +189,19 @@ fn placed(point: &Point, track: usize, model: &Model, back: &[Option<Matrix4<f64
     dehomogenise(&back[part].map_or(*point, |back| back * point))
 }
 
-/// The points of the judged tracks.
-fn points(judged: &Judged, model: &Model, back: &[Option<Matrix4<f64>>]) -> Vec<Option<[f64; 3]>> {
-    let place = |(track, point): (usize, &Option<Point>)| point.and_then(|point| placed(&point, track, model, back));
+/// The points of the judged tracks; in a metric result of those that views with a pose hold.
+fn points(
+    scene: &Scene,
+    judged: &Judged,
+    model: &Model,
+    back: &[Option<Matrix4<f64>>],
+    metric: bool,
+) -> Vec<Option<[f64; 3]>> {
+    let has_pose = |seen: &&Sighting| model.lenses[scene.lens_of[seen.view]].is_determined;
+    let is_held = |track: usize| judged.retained[track].iter().filter(has_pose).count() >= LEAST_SIGHTINGS;
+    let place = |(track, point): (usize, &Option<Point>)| {
+        point.filter(|_| !metric || is_held(track)).and_then(|point| placed(&point, track, model, back))
+    };
     judged.points.iter().enumerate().map(place).collect()
 }
 

@@ -257,7 +257,8 @@ fn views_of_a_zoom_that_do_not_turn_have_no_focal_length() {
         SequenceOptions { views: 120, tracks: 2_600, zoom: 0.3, straight: 45, seed: 2, ..SequenceOptions::default() };
     let sequence = Sequence::generate(&options).expect("valid");
     let settings = SolveSettings { focal_per_view: true, ..SolveSettings::default() };
-    let solution = solved(&input_of(&sequence), &settings);
+    let input = input_of(&sequence);
+    let solution = solved(&input, &settings);
     assert_eq!(solution.grade, Some(Grade::Weak), "{:?}", solution.warnings);
     let mut told = 0;
     for (view, of) in solution.views.iter().enumerate() {
@@ -269,6 +270,14 @@ fn views_of_a_zoom_that_do_not_turn_have_no_focal_length() {
         assert!(error.abs() < 0.05, "view {view}: off by {error}");
         told += 1;
     }
+    // Nor have points that such views alone hold.
+    let mut held = vec![0; solution.tracks.point.len()];
+    for (k, inlier) in solution.observations.inlier.iter().enumerate() {
+        held[input.track_of(k)] += usize::from(*inlier && solution.views[input.view_of(k)].focal_px.is_some());
+    }
+    let points = || held.iter().zip(&solution.tracks.point);
+    assert!(points().all(|(views, point)| point.is_none() || *views >= 2));
+    assert!(points().filter(|(_, point)| point.is_some()).count() > 1_000);
     // A few that do not turn are held by those beside them that do.
     assert!((75..=95).contains(&told), "{told} of 120 views");
     let said = format!("only {told} of 120 views determine their focal length");
