@@ -60,10 +60,7 @@ impl Problem<0, VIEW, POINT> for Zooming {
     }
 
     fn retract(&mut self, from: &Self, step: &Step<0, VIEW, POINT>) {
-        self.move_all_but_focals(from, step);
-        for ((focal, from), step) in self.focals.iter_mut().zip(&from.focals).zip(&step.cameras) {
-            *focal = from * step[POSE].exp();
-        }
+        self.move_by(from, step);
     }
 }
 
@@ -138,7 +135,16 @@ impl Zooming {
         report
     }
 
-    fn move_all_but_focals<const C: usize>(&mut self, from: &Self, step: &Step<0, C, POINT>) {
+    /// Overwrites `self` with `from` moved by `step`, of which the globals are another's.
+    pub(super) fn move_by<const G: usize>(&mut self, from: &Self, step: &Step<G, VIEW, POINT>) {
+        self.move_all_but_focals(from, step);
+        for ((focal, from), step) in self.focals.iter_mut().zip(&from.focals).zip(&step.cameras) {
+            *focal = from * step[POSE].exp();
+        }
+    }
+
+    /// Moves poses, the first unknowns of a view, and points.
+    fn move_all_but_focals<const G: usize, const C: usize>(&mut self, from: &Self, step: &Step<G, C, POINT>) {
         for ((pose, from), step) in self.poses.iter_mut().zip(&from.poses).zip(&step.cameras) {
             let turn = Rotation3::from_scaled_axis(step.fixed_view::<3, 1>(0, 0).into_owned());
             pose.rotation = turn * from.rotation;

@@ -4,7 +4,7 @@
 //! It tells what a lens that is not as [`Zooming`] takes it moves, and whether focal lengths that were taken to be one
 //! are.
 
-use nalgebra::{Rotation3, SMatrix};
+use nalgebra::SMatrix;
 
 use super::engine::{Belief, Jacobian, Problem, Sink, Step, minimise};
 use super::intrinsics::ImageGradients;
@@ -82,16 +82,7 @@ impl Problem<SHARED_COUNT, VIEW, POINT> for LensZooming {
         for (parameter, by) in SHARED.iter().zip(step.globals.iter()) {
             self.lens.shift(*parameter, *by);
         }
-        let (moved, from) = (&mut self.zooming, &from.zooming);
-        for (view, step) in step.cameras.iter().enumerate() {
-            let turn = Rotation3::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
-            moved.poses[view].rotation = turn * from.poses[view].rotation;
-            moved.poses[view].translation = from.poses[view].translation + step.fixed_rows::<3>(3);
-            moved.focals[view] = from.focals[view] * step[POSE].exp();
-        }
-        for ((point, from), step) in moved.points.iter_mut().zip(&from.points).zip(&step.points) {
-            *point = from + step;
-        }
+        self.zooming.move_by(&from.zooming, step);
     }
 
     fn global_beliefs(&self) -> [Belief; SHARED_COUNT] {
