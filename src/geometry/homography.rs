@@ -16,19 +16,27 @@ const CAUCHY_SCALE: f64 = 3.0;
 const QUANTILE: f64 = 0.75;
 const RAYLEIGH_QUANTILE: f64 = 1.665_109_222_315_395_5;
 
-/// Median over the views of how far homographies to a reference view miss, in units of the noise.
+/// Median over the views of how far homographies to a reference view miss, in units of the noise, where that is less
+/// than `limit`.
 ///
 /// First, last and most observed view take their turn as reference, and the largest median counts: along a sequence,
 /// neighbours alone have too little baseline to tell. About 1.4 (the noise of two views) for a planar scene or a
 /// camera that only rotates; tens where there is parallax. `noise` is the standard deviation of a coordinate.
 ///
-/// Returns `None` when no pair of views has enough points in common.
-pub fn median_residual(observations: &[Observation], views: usize, noise: f64) -> Option<f64> {
+/// Returns `None` from the first reference on that reaches the limit, and when no pair of views has enough points in
+/// common.
+pub fn median_residual(observations: &[Observation], views: usize, noise: f64, limit: f64) -> Option<f64> {
     let seen = Correspondences::new(observations, views);
     let mut references = vec![0, seen.most_observed()?, views - 1];
     references.sort_unstable();
     references.dedup();
-    references.into_iter().filter_map(|reference| median_to(&seen, reference, noise)).reduce(f64::max)
+    references
+        .into_iter()
+        .filter_map(|reference| median_to(&seen, reference, noise))
+        .try_fold(None, |largest: Option<f64>, residual| {
+            (residual < limit).then(|| Some(largest.map_or(residual, |largest| largest.max(residual))))
+        })
+        .flatten()
 }
 
 /// Median over the other views of how far homographies to this reference miss.
@@ -151,7 +159,7 @@ mod tests {
         for seed in 0..10 {
             let residual = |motion, planar, tracks| {
                 let scene = testing::scene_of(seed, 10, tracks, NOISE, motion, planar);
-                median_residual(&scene.observations, 10, NOISE).expect("enough points")
+                median_residual(&scene.observations, 10, NOISE, f64::INFINITY).expect("enough points")
             };
             for tracks in [8, 20, 60] {
                 let plane = residual(Motion::General, true, tracks);
@@ -160,6 +168,9 @@ mod tests {
                 println!("seed {seed}, {tracks} tracks: plane {plane:.2} rotation {rotation:.2} general {general:.1}");
                 assert!(plane < 2.5 && rotation < 2.5, "seed {seed}, {tracks} tracks: {plane} {rotation}");
                 assert!(general > 4.0, "seed {seed}, {tracks} tracks: {general}");
+                let scene = testing::scene_of(seed, 10, tracks, NOISE, Motion::General, false);
+                let beyond = |limit: f64| median_residual(&scene.observations, 10, NOISE, limit).is_none();
+                assert!(beyond(general) && !beyond(1.01 * general), "seed {seed}, {tracks} tracks: {general}");
             }
         }
     }
@@ -170,19 +181,19 @@ mod tests {
         for seen in scene.observations.iter_mut().filter(|seen| seen.point == 3) {
             seen.xy += Vector2::new(0.3, 0.1 * seen.camera as f64);
         }
-        let residual = median_residual(&scene.observations, 10, NOISE).expect("enough points");
+        let residual = median_residual(&scene.observations, 10, NOISE, 3.0).expect("enough points");
         assert!(residual < 2.5, "{residual}");
     }
 
     #[test]
     fn too_little_or_hostile_input_says_nothing() {
-        assert_eq!(median_residual(&[], 0, NOISE), None);
+        assert_eq!(median_residual(&[], 0, NOISE, f64::INFINITY), None);
         let scene = testing::scene(1, 3, 5, NOISE);
-        assert_eq!(median_residual(&scene.observations, 3, NOISE), None);
+        assert_eq!(median_residual(&scene.observations, 3, NOISE, f64::INFINITY), None);
         let mut scene = testing::scene(1, 3, 10, NOISE);
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::zeros());
-        median_residual(&scene.observations, 3, NOISE);
+        median_residual(&scene.observations, 3, NOISE, f64::INFINITY);
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(f64::NAN, 1e200));
-        assert_eq!(median_residual(&scene.observations, 3, NOISE), None);
+        assert_eq!(median_residual(&scene.observations, 3, NOISE, f64::INFINITY), None);
     }
 }

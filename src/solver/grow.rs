@@ -349,23 +349,23 @@ const SURELY_HIGH: f64 = 0.75;
 /// A consensus found at a noise that is too low has lost its worse tracks, and an estimate from those that remain stays
 /// too low; seen from higher up they come back. Of the outcomes the one least likely to be chance stands.
 ///
+/// * `consensus`: polished at its own noise, as [`grow`] returns it
 /// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]
 pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> (Consensus, f64) {
-    let settle = |factor: f64| {
+    let higher = |factor: f64| {
         let noise = (factor * consensus.noise).min(NOISE_BOUNDS.1);
-        let judged = judge(block, consensus.cameras.clone(), noise, stop);
-        settle_noise(block, polish(block, judged, stop), stop)
+        polish(block, judge(block, consensus.cameras.clone(), noise, stop), stop)
     };
     let with_chance = |settled: Consensus| {
         let ln_false_alarms = chance::ln_false_alarms(block, &settled, spread, stop);
         (settled, ln_false_alarms)
     };
-    let mut best = with_chance(settle(1.0));
+    let mut best = with_chance(settle_noise(block, consensus.clone(), stop));
     if best.0.noise < SURELY_HIGH * consensus.noise {
         return best;
     }
     for factor in HIGHER_NOISE {
-        let settled = settle(factor);
+        let settled = settle_noise(block, higher(factor), stop);
         // Most settle where the best one is: to try cameras takes longer than to settle, and they can only veto.
         if settled.ln_false_alarms_by_residuals(spread) < best.1 {
             let settled = with_chance(settled);

@@ -78,6 +78,11 @@ const AFFINE_SHRINK: f64 = 0.88;
 const AFFINE_FLOOR: f64 = 0.08;
 /// Largest change of a weight in a round at the floor after which no other follows: what every track keeps anyway.
 const AFFINE_SETTLED: f64 = LEAST_WEIGHT;
+/// Weight from which a track agrees with the subspace: its residual is within the scale of the round.
+const AFFINE_AGREES: f64 = 0.25;
+/// Squared floors below which a scale tells who will agree: the tracks that do hold the subspace, others never did
+/// join them later.
+const CLEAR_FLOORS: f64 = 16.0;
 /// Dimension of what right tracks span under affine cameras, about their mean.
 const AFFINE_RANK: usize = 3;
 
@@ -86,6 +91,11 @@ const AFFINE_RANK: usize = 3;
 ///
 /// Returns the weights of the last round; `None` when a decomposition fails or `stop` fires.
 pub fn affine_irls(centred: &DMatrix<f64>, stop: &StopToken) -> Option<Vec<f64>> {
+    affine_irls_of(0, centred, stop)
+}
+
+/// The same, where at least so many tracks agree; `None` as soon as it is clear that fewer will.
+pub fn affine_irls_of(least: usize, centred: &DMatrix<f64>, stop: &StopToken) -> Option<Vec<f64>> {
     let rows = centred.nrows() as f64;
     let energy: Vec<f64> = centred.column_iter().map(|column| column.norm_squared()).collect();
     let mut weights = DVector::from_element(centred.ncols(), 1.0f64);
@@ -126,12 +136,20 @@ pub fn affine_irls(centred: &DMatrix<f64>, stop: &StopToken) -> Option<Vec<f64>>
             moved = moved.max((reweighted - *weight).abs());
             *weight = reweighted;
         }
+        if next < CLEAR_FLOORS * floor && agreeing(weights.as_slice()) < least {
+            return None;
+        }
         if scale == Some(floor) && moved < AFFINE_SETTLED {
             break;
         }
         scale = Some(next);
     }
     Some(weights.iter().map(|weight| weight + LEAST_WEIGHT).collect())
+}
+
+/// Tracks that agree with an affine ranking.
+pub fn agreeing(ranking: &[f64]) -> usize {
+    ranking.iter().filter(|weight| **weight > AFFINE_AGREES).count()
 }
 
 /// Floor of the network's weight as a prior: a track the network has given up is still drawn now and then.

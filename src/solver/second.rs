@@ -14,8 +14,6 @@ use crate::geometry::statistics::chi_square_gate;
 const FAR_GATES: f64 = 16.0;
 /// Tracks of a second structure, at least, as a share of the first: a handful that moves together is no second body.
 const LEAST_SHARE: f64 = 0.1;
-/// Weight of the affine ranking from which a track agrees with it: its residual is within the ranking's own scale.
-const AGREES: f64 = 0.25;
 
 /// Searches the tracks that a consensus leaves out for another.
 pub fn structure(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken) -> Option<Warning> {
@@ -55,10 +53,7 @@ fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize
 /// cameras, and of wrong ones no fifth does (a test counts them); growing from those by chance took nearly as long as
 /// the rest of a solve.
 fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize> {
-    let ranking = priors::affine_irls(affine::Search::new(rest).centred(), stop)?;
-    if agreeing(&ranking) < grow::LEAST_SUPPORT {
-        return None;
-    }
+    let ranking = priors::affine_irls_of(grow::LEAST_SUPPORT, affine::Search::new(rest).centred(), stop)?;
     let costs: Vec<f64> = ranking.iter().map(|weight| -weight).collect();
     let spread = portfolio::spread(rest);
     affine::seeds_from_ranking(rest, &costs).into_iter().find_map(|seed| {
@@ -71,11 +66,6 @@ fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option
             && chance::ln_false_alarms(rest, &found, spread, stop) < LN_DECISIVE;
         is_decisive.then(|| found.inlier_count())
     })
-}
-
-/// Tracks that agree with an affine ranking.
-fn agreeing(ranking: &[f64]) -> usize {
-    ranking.iter().filter(|weight| **weight > AGREES).count()
 }
 
 #[cfg(test)]
@@ -113,7 +103,14 @@ mod tests {
                 let count = |second_motion: f64| {
                     let rest = left_out(&SceneOptions { second_motion, seed, ..options.clone() });
                     let ranking = priors::affine_irls(affine::Search::new(&rest).centred(), &StopToken::default());
-                    agreeing(&ranking.expect("finite points"))
+                    let count = priors::agreeing(&ranking.expect("finite points"));
+                    let held = priors::affine_irls_of(
+                        grow::LEAST_SUPPORT,
+                        affine::Search::new(&rest).centred(),
+                        &StopToken::default(),
+                    );
+                    assert_eq!(held.is_some(), count >= grow::LEAST_SUPPORT, "{kind}, seed {seed}: {count}");
+                    count
                 };
                 let (chance, moved) = (count(0.0), count(0.3));
                 assert!(chance <= 4, "{kind}, seed {seed}: {chance} agree by chance");

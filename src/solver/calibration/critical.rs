@@ -44,8 +44,7 @@ pub(super) fn find(problem: &Problem, fit: &Fit, scale_px: f64, stop: &StopToken
     let points = problem.points.len();
     let translation = critical::fit_translation(observations, views, points, fit.noise, EPIPOLAR_LIMIT, stop)
         .filter(|found| !fit.refutes(&Fit::new(found.cost, found.unknowns, problem)));
-    let flat = homography::median_residual(observations, views, fit.noise)
-        .filter(|residual| *residual < HOMOGRAPHY_LIMIT)
+    let flat = homography::median_residual(observations, views, fit.noise, HOMOGRAPHY_LIMIT)
         .and_then(|residual| without_parallax(problem, fit, residual, translation.is_some(), scale_px, stop));
     if let Some(flat) = flat {
         return Critical { warnings: vec![flat], translation: None };
