@@ -55,6 +55,13 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if input.is_none() && !args.export.export.is_empty() {
         return Err(Failure::usage("--export needs --input, whose points and names it writes"));
     }
+    let reading = args.reading.flags();
+    if input.is_none() && !reading.is_empty() {
+        return Err(Failure::usage(format_args!(
+            "{} says how to read --input, which is not given",
+            reading.trim_start()
+        )));
+    }
     if let (Some(out), Some(path)) = (&args.out, &args.input) {
         args.export.check(out, path)?;
     }

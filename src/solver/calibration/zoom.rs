@@ -303,6 +303,7 @@ fn distinct(mut found: Vec<Minimum>, problem: &Problem) -> Vec<Minimum> {
 mod tests {
     use super::*;
     use crate::geometry::bundle::testing::{self, NOISE, TestScene};
+    use crate::solver::calibration::tests::of_one_lens;
 
     fn truth(scene: &TestScene) -> Zooming {
         let focals = vec![scene.intrinsics.focal; scene.poses.len()];
@@ -311,14 +312,7 @@ mod tests {
 
     fn of_scene<T>(scene: &TestScene, ask: impl FnOnce(&Choice, &Fit) -> T) -> T {
         let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
-        let problem = Problem {
-            cameras: &cameras,
-            points: &points,
-            observations: &scene.observations,
-            noise: NOISE,
-            focal_prior: None,
-            focal_per_view: true,
-        };
+        let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, NOISE) };
         let stop = StopToken::default();
         let choice = Choice { problem: &problem, prior: &IntrinsicsPrior::NONE, scale_px: 1000.0, stop: &stop };
         let minimum = Minimum::adjusted(truth(scene), &problem, &converge(), &stop);

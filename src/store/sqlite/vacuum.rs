@@ -9,7 +9,9 @@ const PAGES: u64 = 1_024;
 /// a full disk in the room that is kept.
 pub(super) const VACUUM: &str = "PRAGMA incremental_vacuum(1024)";
 /// What that is, in bytes, of SQLite's pages.
-pub(super) const VACUUM_BYTES: u64 = PAGES * 4_096;
+pub(super) const VACUUM_BYTES: u64 = PAGES * PAGE_BYTES;
+/// Size of a page of databases that are created without asking for another.
+const PAGE_BYTES: u64 = 4_096;
 /// How often, each time that space is to be given back; others may write in between.
 pub(super) const VACUUMS: u32 = 4;
 /// Of so many pages that move one more changes, which tells where they are: 30 were counted beside 1,024, and twice that

@@ -146,14 +146,8 @@ fn strange_lens(seed: u64) -> TestScene {
 fn calibrated_from_truth(scene: &TestScene) -> Outcome {
     let (intrinsics, poses, points) = (scene.intrinsics, scene.poses.clone(), scene.points.clone());
     let points_in_space: Vec<Vector4<f64>> = points.iter().map(|point| point.push(1.0)).collect();
-    let problem = Problem {
-        cameras: &scene.cameras(),
-        points: &points_in_space,
-        observations: &scene.observations,
-        noise: STRANGE_NOISE,
-        focal_prior: None,
-        focal_per_view: false,
-    };
+    let cameras = scene.cameras();
+    let problem = of_one_lens(&cameras, &points_in_space, &scene.observations, STRANGE_NOISE);
     let metric = Reconstruction { intrinsics, poses, points };
     from_metric(&problem, &metric, SIDE_PX, &StopToken::default(), &mut || ()).expect("nothing stops it")
 }

@@ -17,20 +17,23 @@ fn projective_problem(scene: &TestScene, seed: u64) -> (Vec<Matrix3x4<f64>>, Vec
     (cameras, points)
 }
 
+/// Nothing known beforehand, one focal length.
+pub fn of_one_lens<'a>(
+    cameras: &'a [Matrix3x4<f64>],
+    points: &'a [Vector4<f64>],
+    observations: &'a [Observation],
+    noise: f64,
+) -> Problem<'a> {
+    Problem { cameras, points, observations, noise, focal_prior: None, focal_per_view: false }
+}
+
 fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
     calibrated_knowing(scene, seed, noise, None)
 }
 
 fn calibrated_knowing(scene: &TestScene, seed: u64, noise: f64, focal_prior: Option<FocalPrior>) -> Outcome {
     let (cameras, points) = projective_problem(scene, seed);
-    let problem = Problem {
-        cameras: &cameras,
-        points: &points,
-        observations: &scene.observations,
-        noise,
-        focal_prior,
-        focal_per_view: false,
-    };
+    let problem = Problem { focal_prior, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
     calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
 }
 
@@ -145,14 +148,7 @@ fn three_views_are_graded_honestly() {
 fn the_plane_at_infinity_fits_the_callers_frame() {
     let scene = testing::scene(3, 10, 30, 1e-5);
     let (cameras, points) = projective_problem(&scene, 3);
-    let problem = Problem {
-        cameras: &cameras,
-        points: &points,
-        observations: &scene.observations,
-        noise: 1e-5,
-        focal_prior: None,
-        focal_per_view: false,
-    };
+    let problem = of_one_lens(&cameras, &points, &scene.observations, 1e-5);
     let outcome = calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it");
     let plane = outcome.plane_at_infinity.expect("a plane");
     let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
@@ -178,7 +174,7 @@ fn hostile_input_is_refused_without_panic() {
     let scene = testing::scene(1, 4, 12, NOISE);
     let (cameras, points) = projective_problem(&scene, 1);
     let run = |cameras: &[Matrix3x4<f64>], points: &[Vector4<f64>], observations: &[Observation], noise| {
-        let problem = Problem { cameras, points, observations, noise, focal_prior: None, focal_per_view: false };
+        let problem = of_one_lens(cameras, points, observations, noise);
         calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
     };
     let nothing = run(&[], &[], &[], NOISE);
@@ -199,14 +195,7 @@ fn hostile_input_is_refused_without_panic() {
 fn a_stopped_token_ends_it() {
     let scene = testing::scene(1, 4, 12, NOISE);
     let (cameras, points) = projective_problem(&scene, 1);
-    let problem = Problem {
-        cameras: &cameras,
-        points: &points,
-        observations: &scene.observations,
-        noise: NOISE,
-        focal_prior: None,
-        focal_per_view: false,
-    };
+    let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);
     assert_eq!(calibrate(&problem, SIDE_PX, &stop).map(|_| ()), Err(Stopped(StopReason::Cancelled)));

@@ -39,9 +39,7 @@ fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
 fn calibrated_as(focal_per_view: bool, scene: &TestScene, seed: u64, noise: f64) -> Outcome {
     // Any projective frame of any cameras near the truth is adjusted to the observations.
     let (cameras, points) = projective_problem(scene, seed);
-    let observations = &scene.observations;
-    let problem =
-        Problem { cameras: &cameras, points: &points, observations, noise, focal_prior: None, focal_per_view };
+    let problem = Problem { focal_per_view, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
     calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
 }
 
@@ -138,10 +136,7 @@ fn critical_motions_are_refused_with_a_focal_length_a_view_too() {
 fn the_plane_at_infinity_goes_with_the_zoom() {
     let (scene, _) = zooming(3, 60, 1e-5, 0.3);
     let (cameras, points) = projective_problem(&scene, 3);
-    let observations = &scene.observations;
-    let noise = 1e-5;
-    let problem =
-        Problem { cameras: &cameras, points: &points, observations, noise, focal_prior: None, focal_per_view: true };
+    let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, 1e-5) };
     let outcome = calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it");
     let plane_at_infinity = outcome.plane_at_infinity.expect("a plane");
     let focals = outcome.focals.expect("a focal length a view");
@@ -181,13 +176,7 @@ fn a_view_that_shows_too_little_has_no_focal_length_and_takes_none_from_the_othe
 fn near_truth(scene: &TestScene, focals: &[f64], noise: f64) -> Outcome {
     let zooming = Zooming { focals: focals.to_vec(), poses: scene.poses.clone(), points: scene.points.clone() };
     let points: Vec<Vector4<f64>> = zooming.points.iter().map(|point| point.push(1.0)).collect();
-    let problem = Problem {
-        cameras: &zooming.cameras(),
-        points: &points,
-        observations: &scene.observations,
-        noise,
-        focal_prior: None,
-        focal_per_view: true,
-    };
+    let cameras = zooming.cameras();
+    let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
     from_zooming(&problem, &zooming, SIDE_PX, &StopToken::default(), &mut || {}).expect("nothing stops it")
 }
