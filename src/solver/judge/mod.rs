@@ -104,6 +104,8 @@ pub struct SplitPoint {
     pub number: u32,
     pub weight: f64,
     pub point: Point,
+    /// The sightings that show it.
+    pub retained: Vec<Sighting>,
 }
 
 /// Judges every track that has three observations in registered views or more; the others have weight 0 and no
@@ -283,7 +285,8 @@ impl Bench<'_> {
         for (number, other) in (1..).zip(others) {
             other.sightings.iter().for_each(|&k| judged.observations.split[places[k]] = number);
             let Verdict { weight, point, .. } = other.verdict;
-            judged.splits.push(SplitPoint { track, number, weight, point });
+            let retained = chosen(sightings, &other.sightings);
+            judged.splits.push(SplitPoint { track, number, weight, point, retained });
         }
     }
 

@@ -30,8 +30,9 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
     warnings.extend(seed.second_structure.clone());
     let frames = frames(&scene, &model);
     let back = back(&frames, metric);
-    judged.tracks.point = points(&scene, &judged, &model, &back, metric);
-    let splits = splits(&judged, &model, &back);
+    let is_told = |retained: &[Sighting]| !metric || is_held(&scene, &model, retained);
+    judged.tracks.point = points(&judged, &model, &back, is_told);
+    let splits = splits(&judged, &model, &back, is_told);
     judged.tracks.part = parts(&judged, &model);
     judged.tracks.network_weight = network_weights(&seed, context);
     let (rms, mean) = reprojection(&judged.observations);
@@ -189,29 +190,37 @@ fn placed(point: &Point, track: usize, model: &Model, back: &[Option<Matrix4<f64
     dehomogenise(&back[part].map_or(*point, |back| back * point))
 }
 
-/// The points of the judged tracks; in a metric result of those that views with a pose hold.
+/// Whether views with a pose hold the point of these sightings: what others alone see is in no metric result.
+fn is_held(scene: &Scene, model: &Model, retained: &[Sighting]) -> bool {
+    let has_pose = |seen: &&Sighting| model.lenses[scene.lens_of[seen.view]].is_determined;
+    retained.iter().filter(has_pose).count() >= LEAST_SIGHTINGS
+}
+
+/// The points of the judged tracks whose retained sightings say so.
 fn points(
-    scene: &Scene,
     judged: &Judged,
     model: &Model,
     back: &[Option<Matrix4<f64>>],
-    metric: bool,
+    is_told: impl Fn(&[Sighting]) -> bool,
 ) -> Vec<Option<[f64; 3]>> {
-    let has_pose = |seen: &&Sighting| model.lenses[scene.lens_of[seen.view]].is_determined;
-    let is_held = |track: usize| judged.retained[track].iter().filter(has_pose).count() >= LEAST_SIGHTINGS;
     let place = |(track, point): (usize, &Option<Point>)| {
-        point.filter(|_| !metric || is_held(track)).and_then(|point| placed(&point, track, model, back))
+        point.filter(|_| is_told(&judged.retained[track])).and_then(|point| placed(&point, track, model, back))
     };
     judged.points.iter().enumerate().map(place).collect()
 }
 
-/// The other points of tracks that join several.
-fn splits(judged: &Judged, model: &Model, back: &[Option<Matrix4<f64>>]) -> Vec<TrackSplit> {
+/// The other points of tracks that join several, placed as these are.
+fn splits(
+    judged: &Judged,
+    model: &Model,
+    back: &[Option<Matrix4<f64>>],
+    is_told: impl Fn(&[Sighting]) -> bool,
+) -> Vec<TrackSplit> {
     let split = |split: &SplitPoint| TrackSplit {
         track: split.track as u32,
         number: split.number,
         weight: split.weight as f32,
-        point: placed(&split.point, split.track, model, back),
+        point: placed(&split.point, split.track, model, back).filter(|_| is_told(&split.retained)),
     };
     judged.splits.iter().map(split).collect()
 }
