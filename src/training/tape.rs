@@ -16,7 +16,7 @@ use nalgebra::DMatrix;
 use super::Error;
 use crate::network::subspace::{
     Block, DEPTH_RANGE, LEAST_MEAN_DEPTH, LEAVE_ONE_OUT_FLOOR, Layer, MOST_PREDICTED, RESIDUAL_FLOOR, SubspaceNet,
-    VARIANCE_FLOOR, inverse,
+    VARIANCE_FLOOR,
 };
 
 /// Lessons as the network sees them.
@@ -211,6 +211,13 @@ fn newton_step(scatter: Tensor<4>, dtype: DType) -> Result<Tensor<4>, Error> {
     let inverses = constant(inverses, [lessons, selections, rows, rows], dtype, &device);
     let correction = inverses.clone().matmul(scatter).matmul(inverses.clone());
     Ok(inverses.mul_scalar(2.0) - correction)
+}
+
+/// Inverse of a symmetric positive definite matrix; of one that rounding has made singular, zeros, which predict
+/// nothing.
+fn inverse(scatter: DMatrix<f64>) -> DMatrix<f64> {
+    let size = scatter.nrows();
+    scatter.cholesky().map_or_else(|| DMatrix::zeros(size, size), |factor| factor.inverse())
 }
 
 /// A constant tensor of a type from values row by row.

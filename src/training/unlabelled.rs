@@ -10,8 +10,9 @@
 //! is .884, .892 and .890; with labels, .956, .968 and .965 (the same steps of `train-prior --seed 0 --steps 7000`, which
 //! ends at .971). In the search (`evaluate --priors --prior FILE --scenes outliers --seeds 20`) it ranks with .999 at 95 %
 //! outliers (labels: 1.000), where 600 samples suffice with either. At 97 % it ranks with .988, and 600, 6,000 and 60,000
-//! samples alone reach a mean F1 of .353, .407 and .407; labels were not measured beside it there. L_num asks for the same number of tracks of every scene, also of those with fewer right
-//! ones: they are most of the loss (2,557 of it, L_proj .9, after 400 steps).
+//! samples alone reach a mean F1 of .353, .407 and .407; labels were not measured beside it there. L_num asks for the
+//! same number of tracks of every scene, also of those with fewer right ones: they are most of the loss (2,557 of it,
+//! L_proj .9, after 400 steps).
 //!
 //! L_DAQ has no part in it: it needs coordinates in which the principal point is known, and a lesson's points come with
 //! any origin. Observations have no loss of their own, so a network that learned this way ranks tracks only.

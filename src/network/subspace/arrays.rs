@@ -62,7 +62,7 @@ pub struct Shape {
 }
 
 impl Default for Shape {
-    /// The prototype's sizes: 30,205 numbers, 4.7 ms for 10 x 200.
+    /// The sizes that the curriculum was found with: 30,205 numbers, about 1.5 ms for 10 x 200.
     fn default() -> Self {
         Self { state: 32, selections: 4, blocks: 6, encoding: 16 }
     }

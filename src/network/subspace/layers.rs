@@ -1,6 +1,7 @@
 //! Linear layers and pooling over the views.
 
 use super::arrays::Layer;
+use super::rows::accumulate_products;
 
 /// Encodings pooled over the views: their mean over those that show the track, and their largest.
 pub struct Pool {
@@ -49,17 +50,12 @@ impl Layer<Vec<f32>> {
     /// `W X + b`, the rows of X in several pieces.
     #[inline(always)]
     pub fn affine(&self, inputs: &[&[f32]], tracks: usize) -> Vec<f32> {
-        let width = self.weight.len() / self.bias.len();
-        let mut output = Vec::with_capacity(self.bias.len() * tracks);
-        for (weights, &bias) in self.weight.chunks_exact(width).zip(&self.bias) {
-            let start = output.len();
-            output.resize(start + tracks, bias);
-            let output = &mut output[start..];
-            for (row, &weight) in inputs.iter().flat_map(|rows| rows.chunks_exact(tracks)).zip(weights) {
-                for (output, value) in output.iter_mut().zip(row) {
-                    *output += weight * value;
-                }
-            }
+        let rows: Vec<&[f32]> = inputs.iter().flat_map(|rows| rows.chunks_exact(tracks)).collect();
+        let mut output = vec![0.0; self.bias.len() * tracks];
+        let layers = self.weight.chunks_exact(self.weight.len() / self.bias.len()).zip(&self.bias);
+        for (output, (weights, &bias)) in output.chunks_exact_mut(tracks).zip(layers) {
+            output.fill(bias);
+            accumulate_products(output, weights, &rows);
         }
         output
     }

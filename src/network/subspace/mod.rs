@@ -40,7 +40,6 @@ pub use arrays::{Block, Layer, Shape, SubspaceNet};
 pub use cloud::Cloud;
 pub use file::{FileError, Origin, PriorFile};
 pub use forward::Scores;
-pub use ridge::inverse;
 pub use shipped::{current, current_checksum, install, shipped};
 
 /// Added to a squared residual before its logarithm is taken: residuals below .3 % of a view's spread are noise.
