@@ -9,6 +9,8 @@ const SHIFT: f64 = 1e-14;
 /// third of each other no caller minds which mixture of their directions it gets.
 const TOLERANCE: f64 = 1e-9;
 const MOST_ITERATIONS: usize = 60;
+/// Squarings of the inverse before: each doubles what an iteration does, for the price of two.
+const SQUARINGS: usize = 3;
 
 /// The unit eigenvector to the smallest eigenvalue of a symmetric positive semidefinite matrix, by inverse iteration
 /// (Golub & Van Loan, section 8.2.2). A sequence of 1,000 views took a quarter less time with it than with a full
@@ -21,13 +23,18 @@ pub fn null_vector(matrix: &Matrix4<f64>) -> Option<Vector4<f64>> {
         return None;
     }
     let factor = (matrix + Matrix4::from_diagonal_element(SHIFT * trace)).cholesky()?;
-    // One column of the inverse at least is not orthogonal to what is sought: the longest.
-    let inverse = factor.inverse();
-    let longest = (0..4).max_by(|&a, &b| inverse[(a, a)].total_cmp(&inverse[(b, b)]))?;
-    let mut vector = inverse.column(longest).normalize();
+    let mut power = factor.inverse();
+    for _ in 0..SQUARINGS {
+        // Of trace 1: its squares stay in range.
+        power /= power.trace();
+        power *= power;
+    }
+    // One column at least is not orthogonal to what is sought: the longest.
+    let longest = (0..4).max_by(|&a, &b| power[(a, a)].total_cmp(&power[(b, b)]))?;
+    let mut vector = power.column(longest).normalize();
     for _ in 0..MOST_ITERATIONS {
-        // The inverse is positive definite: the sign stays.
-        let next = (inverse * vector).normalize();
+        // The powers of the inverse are positive definite: the sign stays.
+        let next = (power * vector).normalize();
         let moved = (next - vector).norm_squared();
         vector = next;
         if moved < TOLERANCE * TOLERANCE {

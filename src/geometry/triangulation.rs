@@ -1,10 +1,11 @@
 //! Points from cameras and image points.
 
-use nalgebra::{Matrix2x4, Matrix4, RowVector4, Vector2};
+use nalgebra::{Matrix4, Vector2};
 
 use super::measurement::Sighting;
 use super::null_vector::null_vector;
 use super::{Camera, Point};
+use crate::simd::vectorised;
 
 /// Smallest homogeneous depth that is divided by; points nearer to the principal plane have no image.
 const MIN_DEPTH: f64 = 1e-9;
@@ -16,12 +17,14 @@ const INITIAL_DAMPING: f64 = 1e-3;
 /// # Pitfall
 /// A point on the camera's principal plane is projected as if it were [`MIN_DEPTH`] off it: the residual is then huge
 /// but finite, and its sign means nothing.
+#[inline(always)]
 pub fn reprojection(camera: &Camera, point: &Point, xy: &Vector2<f64>) -> Vector2<f64> {
     let image = camera * point;
     image.xy() / away_from_zero(image.z) - xy
 }
 
 /// Sum of squared reprojection residuals of a point over its sightings.
+#[inline(always)]
 pub fn squared_residual(cameras: &[Camera], point: &Point, sightings: &[Sighting]) -> f64 {
     sightings.iter().map(|sighting| reprojection(&cameras[sighting.view], point, &sighting.xy).norm_squared()).sum()
 }
@@ -31,38 +34,62 @@ pub fn squared_residual(cameras: &[Camera], point: &Point, sightings: &[Sighting
 ///
 /// Needs two sightings or more; with fewer the point returned is one of many.
 pub fn linear(cameras: &[Camera], sightings: &[Sighting]) -> Point {
-    let mut normal = Matrix4::zeros();
-    for sighting in sightings {
-        let camera = &cameras[sighting.view];
-        let third = camera.row(2).into_owned();
-        let weight = 1.0
-            / (third.fixed_columns::<3>(0).norm_squared() + f64::EPSILON * third.norm_squared()).max(f64::MIN_POSITIVE);
-        let mut accumulate = |row: RowVector4<f64>| normal += row.tr_mul(&row) * weight;
-        accumulate(third * sighting.xy.x - camera.row(0));
-        accumulate(third * sighting.xy.y - camera.row(1));
-    }
+    let normal = vectorised(
+        #[inline(always)]
+        || inconsistency(cameras, sightings),
+    );
     null_vector(&normal).unwrap_or(Point::new(0.0, 0.0, 0.0, 1.0))
+}
+
+/// The quadratic form whose least direction [`linear`] wants.
+#[inline(always)]
+fn inconsistency(cameras: &[Camera], sightings: &[Sighting]) -> Matrix4<f64> {
+    let mut normal = [[0.0; 4]; 4];
+    for sighting in sightings {
+        let columns: &[[f64; 3]; 4] = cameras[sighting.view].as_ref();
+        let third = columns.map(|column| column[2]);
+        let of_direction: f64 = third[..3].iter().map(|entry| entry * entry).sum();
+        let of_all = of_direction + third[3] * third[3];
+        let weight = 1.0 / (of_direction + f64::EPSILON * of_all).max(f64::MIN_POSITIVE);
+        for (axis, coordinate) in [sighting.xy.x, sighting.xy.y].into_iter().enumerate() {
+            let row = columns.map(|column| column[2] * coordinate - column[axis]);
+            accumulate(&mut normal, row.map(|entry| weight * entry), row);
+        }
+    }
+    Matrix4::from(normal)
 }
 
 /// Refines a point by Levenberg-Marquardt on its squared reprojection residuals, at most `iterations` steps.
 ///
 /// Returns the point, of unit norm, and its sum of squared residuals; never worse than the start.
 pub fn refine(cameras: &[Camera], sightings: &[Sighting], start: Point, iterations: usize) -> (Point, f64) {
+    vectorised(
+        #[inline(always)]
+        || descend(cameras, sightings, start, iterations),
+    )
+}
+
+#[inline(always)]
+fn descend(cameras: &[Camera], sightings: &[Sighting], start: Point, iterations: usize) -> (Point, f64) {
     let mut point = start.normalize();
     let mut cost = squared_residual(cameras, &point, sightings);
     let mut damping = INITIAL_DAMPING;
     for _ in 0..iterations {
-        let mut normal = Matrix4::zeros();
+        let mut normal = [[0.0; 4]; 4];
         let mut gradient = Point::zeros();
         for sighting in sightings {
             let camera = &cameras[sighting.view];
+            let columns: &[[f64; 3]; 4] = camera.as_ref();
             let image = camera * point;
-            let depth = away_from_zero(image.z);
-            let projected = image.xy() / depth;
-            let jacobian: Matrix2x4<f64> = (camera.fixed_rows::<2>(0) - projected * camera.row(2)) / depth;
-            normal += jacobian.tr_mul(&jacobian);
-            gradient += jacobian.tr_mul(&(projected - sighting.xy));
+            let nearness = away_from_zero(image.z).recip();
+            for axis in [0, 1] {
+                let projected = image[axis] * nearness;
+                let slope = columns.map(|column| (column[axis] - projected * column[2]) * nearness);
+                accumulate(&mut normal, slope, slope);
+                gradient += Point::from(slope) * (projected - sighting.xy[axis]);
+            }
         }
+        let mut normal = Matrix4::from(normal);
         // The scale of the homogeneous point is free: pin it.
         normal += point * point.transpose() * normal.trace();
         for k in 0..4 {
@@ -88,6 +115,17 @@ pub fn refine(cameras: &[Camera], sightings: &[Sighting], start: Point, iteratio
 /// Gain below which a refinement has arrived: ranking and gates do not see a part in a thousand.
 const RELATIVE_TOLERANCE: f64 = 1e-3;
 
+/// Adds the product of a column and a row.
+#[inline(always)]
+fn accumulate(sum: &mut [[f64; 4]; 4], column: [f64; 4], row: [f64; 4]) {
+    for (sums, factor) in sum.iter_mut().zip(column) {
+        for (sum, entry) in sums.iter_mut().zip(row) {
+            *sum += factor * entry;
+        }
+    }
+}
+
+#[inline(always)]
 fn away_from_zero(depth: f64) -> f64 {
     if depth.abs() < MIN_DEPTH { MIN_DEPTH.copysign(depth) } else { depth }
 }
