@@ -2,6 +2,7 @@
 
 use nalgebra::{SMatrix, SVector, Vector2};
 
+use super::mirrored::{self, Mirrored};
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation, Options, Report};
 use crate::domain::StopToken;
@@ -163,23 +164,40 @@ pub(super) fn minimise<const G: usize, const C: usize, const P: usize>(
     stop: &StopToken,
 ) -> Report {
     let layout = Layout::new(observations, problem.camera_count(), problem.point_count());
-    let initial_cost = cost(problem, &layout, options.loss);
+    if !mirrored::is_worth_it(problem, &layout) {
+        return descend(problem, &layout, options, stop);
+    }
+    let layout = mirrored::layout(&layout, problem.camera_count());
+    let mut mirrored = Mirrored(problem.clone());
+    let report = descend(&mut mirrored, &layout, options, stop);
+    *problem = mirrored.0;
+    report
+}
+
+/// The loop, eliminating what the problem calls points.
+pub(super) fn descend<const G: usize, const C: usize, const P: usize>(
+    problem: &mut impl Problem<G, C, P>,
+    layout: &Layout,
+    options: &Options,
+    stop: &StopToken,
+) -> Report {
+    let initial_cost = cost(problem, layout, options.loss);
     let mut report = Report { initial_cost, cost: initial_cost, iterations: 0 };
     if layout.observations.is_empty() {
         return report;
     }
-    let mut linearisation = Linearisation::new(&layout, problem.camera_count());
-    let mut reduced = Reduced::new(&layout, problem.camera_count());
+    let mut linearisation = Linearisation::new(layout, problem.camera_count());
+    let mut reduced = Reduced::new(layout, problem.camera_count());
     let mut step = Step::zeros(problem.camera_count(), problem.point_count());
     let mut trial = problem.clone();
     let mut damping = options.initial_damping.max(MIN_DAMPING);
     while report.iterations < options.max_iterations && report.cost > 0.0 && !stop.is_stopped() {
-        linearisation.fill(problem, &layout, options.loss);
+        linearisation.fill(problem, layout, options.loss);
         let accepted = (0..MAX_ATTEMPTS).take_while(|_| !stop.is_stopped()).find_map(|_| {
-            let lowered = (reduced.solve(problem, &layout, &linearisation, damping, &mut step) && step.is_finite())
+            let lowered = (reduced.solve(problem, layout, &linearisation, damping, &mut step) && step.is_finite())
                 .then(|| {
                     trial.retract(problem, &step);
-                    cost(&trial, &layout, options.loss)
+                    cost(&trial, layout, options.loss)
                 })
                 .filter(|cost| *cost < report.cost);
             damping = if lowered.is_some() { (damping / DAMPING_DOWN).max(MIN_DAMPING) } else { damping * DAMPING_UP };

@@ -1,4 +1,5 @@
-//! Bundle adjustment by Levenberg-Marquardt on the Schur complement of the points, projective and metric.
+//! Bundle adjustment by Levenberg-Marquardt on the Schur complement of the points, or of the cameras where the points are
+//! few; projective and metric.
 //!
 //! One engine serves both problems; what they share (observations, robust loss, options, report) lives here. May
 //! depend on nothing of `geometry`, only on linear algebra.
@@ -12,6 +13,7 @@ mod engine;
 mod intrinsics;
 mod intrinsics_model;
 pub mod metric;
+mod mirrored;
 mod panel;
 pub mod projective;
 mod reduced;

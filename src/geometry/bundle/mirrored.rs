@@ -1,0 +1,159 @@
+//! A problem whose cameras take the part of points and whose points that of cameras.
+//!
+//! Nothing in the engine knows which is which: what it calls points it eliminates, one small block each, and the system
+//! that is left has the size of the rest. Of eight points in ten views that rest has 32 unknowns where the cameras are
+//! eliminated, and 120 where the points are.
+
+use nalgebra::{SVector, Vector2};
+
+use super::Observation;
+use super::engine::{Belief, Jacobian, Layout, Problem, Sink, Step};
+
+/// Share of the unknowns of the cameras that those of the points may have at most: with as many of either, a camera's
+/// larger blocks cost more to eliminate.
+const MOST_SHARE: f64 = 0.5;
+
+/// Whether it is cheaper to eliminate the cameras than the points, and every camera has as many residuals as unknowns:
+/// one that has fewer has no block of its own to eliminate.
+pub(super) fn is_worth_it<const G: usize, const C: usize, const P: usize>(
+    problem: &impl Problem<G, C, P>,
+    layout: &Layout,
+) -> bool {
+    let (cameras, points) = (problem.camera_count(), problem.point_count());
+    if (P * points) as f64 > MOST_SHARE * (C * cameras) as f64 {
+        return false;
+    }
+    let mut residuals = vec![0; cameras];
+    layout.observations.iter().for_each(|seen| residuals[seen.camera] += 2);
+    residuals.iter().all(|&count| count >= C)
+}
+
+/// The layout of the mirrored problem.
+pub(super) fn layout(layout: &Layout, cameras: usize) -> Layout {
+    let observations: Vec<Observation> = layout.observations.iter().map(exchanged).collect();
+    Layout::new(&observations, layout.starts.len() - 1, cameras)
+}
+
+fn exchanged(seen: &Observation) -> Observation {
+    Observation { camera: seen.point, point: seen.camera, xy: seen.xy }
+}
+
+/// A problem, mirrored.
+#[derive(Clone)]
+pub(super) struct Mirrored<T>(pub T);
+
+/// Hands on what a problem says, mirrored.
+struct Exchanging<'a, S>(&'a mut S);
+
+impl<const G: usize, const C: usize, const P: usize, S: Sink<G, P, C>> Sink<G, C, P> for Exchanging<'_, S> {
+    #[inline]
+    fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+        self.0.take(residual, || {
+            let Jacobian { globals, camera, point } = jacobian();
+            Jacobian { globals, camera: point, point: camera }
+        });
+    }
+}
+
+impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Problem<G, P, C> for Mirrored<T> {
+    fn camera_count(&self) -> usize {
+        self.0.point_count()
+    }
+
+    fn point_count(&self) -> usize {
+        self.0.camera_count()
+    }
+
+    #[inline]
+    fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, P, C>) {
+        self.0.observe(&exchanged(observation), &mut Exchanging(sink));
+    }
+
+    fn retract(&mut self, from: &Self, step: &Step<G, P, C>) {
+        let Step { globals, cameras, points } = step;
+        self.0.retract(&from.0, &Step { globals: *globals, cameras: points.clone(), points: cameras.clone() });
+    }
+
+    fn global_beliefs(&self) -> [Belief; G] {
+        self.0.global_beliefs()
+    }
+
+    fn camera_gauge(&self, camera: usize) -> SVector<f64, P> {
+        self.0.point_gauge(camera)
+    }
+
+    fn point_gauge(&self, point: usize) -> SVector<f64, C> {
+        self.0.camera_gauge(point)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Options;
+    use super::super::engine::descend;
+    use super::super::metric::{IntrinsicsPrior, Parameter, Reconstruction};
+    use super::super::metric::{Metric, POINT, POSE};
+    use super::super::projective::Projective;
+    use super::super::testing::{self, NOISE};
+    use super::*;
+    use crate::domain::StopToken;
+
+    /// Adjusts a problem as it is and mirrored, from the same start.
+    fn both_end_at_the_same_cost<const G: usize, const C: usize, const P: usize>(
+        problem: &impl Problem<G, C, P>,
+        observations: &[Observation],
+        case: &str,
+    ) {
+        let straight = Layout::new(observations, problem.camera_count(), problem.point_count());
+        assert!(is_worth_it(problem, &straight), "{case}");
+        let options = Options::squared(100);
+        let expected = descend(&mut problem.clone(), &straight, &options, &StopToken::default());
+        let mirrored = layout(&straight, problem.camera_count());
+        let found = descend(&mut Mirrored(problem.clone()), &mirrored, &options, &StopToken::default());
+        let apart = |a: f64, b: f64| (a - b).abs() / b;
+        assert!(apart(found.initial_cost, expected.initial_cost) < 1e-12, "{case}");
+        assert!(expected.cost < 0.5 * expected.initial_cost, "{case}: {expected:?}");
+        assert!(apart(found.cost, expected.cost) < 1e-5, "{case}: {found:?} {expected:?}");
+    }
+
+    #[test]
+    fn mirrored_problems_end_where_problems_do() {
+        for seed in 0..10 {
+            for tracks in [8, 12] {
+                let case = format!("seed {seed}, {tracks} tracks");
+                let scene = testing::scene(seed, 10, tracks, NOISE);
+                let (cameras, points) = testing::projectively_transformed(&scene, seed);
+                let mut problem = Projective { cameras, points };
+                testing::perturb(problem.cameras.iter_mut().flat_map(|camera| camera.iter_mut()), 0.003, seed);
+                testing::perturb(problem.points.iter_mut().flat_map(|point| point.iter_mut()), 0.003, seed + 1);
+                both_end_at_the_same_cost::<0, 12, 4>(&problem, &scene.observations, &case);
+
+                let mut reconstruction = Reconstruction {
+                    intrinsics: scene.intrinsics,
+                    poses: scene.poses.clone(),
+                    points: scene.points.clone(),
+                };
+                testing::perturb(reconstruction.points.iter_mut().flat_map(|point| point.iter_mut()), 0.1, seed);
+                let few: Vec<Observation> = scene.observations.iter().filter(|seen| seen.point < 8).copied().collect();
+                reconstruction.points.truncate(8);
+                let problem = Metric { reconstruction, free: [Parameter::LogFocal], prior: IntrinsicsPrior::NONE };
+                both_end_at_the_same_cost::<1, POSE, POINT>(&problem, &few, &case);
+            }
+        }
+    }
+
+    #[test]
+    fn many_points_and_views_that_see_few_are_left_as_they_are() {
+        let scene = testing::scene(1, 10, 30, NOISE);
+        let (cameras, points) = testing::projectively_transformed(&scene, 1);
+        let problem = |count: usize| Projective { cameras: cameras.clone(), points: points[..count].to_vec() };
+        let is_mirrored = |problem: &Projective, observations: &[Observation]| {
+            is_worth_it(problem, &Layout::new(observations, problem.camera_count(), problem.point_count()))
+        };
+        assert!(is_mirrored(&problem(15), &scene.observations));
+        assert!(!is_mirrored(&problem(16), &scene.observations));
+        let blind = |seen: &&Observation| seen.camera != 3 || seen.point < 5;
+        let few: Vec<Observation> = scene.observations.iter().filter(blind).copied().collect();
+        assert!(!is_mirrored(&problem(15), &few));
+    }
+}
