@@ -49,7 +49,7 @@ pub fn text(rows: &Rows) -> String {
     for row in &rows.auto {
         let _ = writeln!(
             text,
-            "{:<18}{:<17}{:>5}{:>8.3}{:>8.3}{:>10}{:>8}{:>6}{:>9}{:>9.3}",
+            "{:<18}{:<17}{:>5}{:>8.3}{:>8.3}{:>10}{:>8}{:>6}{:>9}{:>9.4}",
             row.condition,
             if row.learned { "with learned" } else { "without learned" },
             row.seeds,
