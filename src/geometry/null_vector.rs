@@ -4,13 +4,13 @@ use nalgebra::{Matrix4, Vector4};
 
 /// What is added to the diagonal, as a share of the trace: it moves no eigenvector, and makes the factorisation of what
 /// rounding left singular or indefinite (1e-16 of the trace) safe.
-const SHIFT: f64 = 1e-14;
+pub(super) const SHIFT: f64 = 1e-14;
 /// Change of the unit vector between two iterations that ends them, and iterations at most. Of two eigenvalues within a
 /// third of each other no caller minds which mixture of their directions it gets.
-const TOLERANCE: f64 = 1e-9;
-const MOST_ITERATIONS: usize = 60;
+pub(super) const TOLERANCE: f64 = 1e-9;
+pub(super) const MOST_ITERATIONS: usize = 60;
 /// Squarings of the inverse before: each doubles what an iteration does, for the price of two.
-const SQUARINGS: usize = 3;
+pub(super) const SQUARINGS: usize = 3;
 
 /// The unit eigenvector to the smallest eigenvalue of a symmetric positive semidefinite matrix, by inverse iteration
 /// (Golub & Van Loan, section 8.2.2). A sequence of 1,000 views took a quarter less time with it than with a full

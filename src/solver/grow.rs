@@ -10,7 +10,8 @@ use crate::domain::StopToken;
 use crate::geometry::bundle::{self, Loss, Observation, projective};
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::statistics::{chi_square_gate, chi_square_median, median};
-use crate::geometry::{Camera, Point, triangulation};
+use crate::geometry::triangulation::batch::{Batch, LANES};
+use crate::geometry::{Camera, Point};
 
 /// Tracks below which projective cameras of three views or more are not determined by image points:
 /// `2nk > 11n + 3k - 15`.
@@ -31,8 +32,6 @@ const CAUCHY_SCALE: f64 = 3.0;
 const PLAIN_SUPPORT: usize = 8;
 /// Tracks whose linear residual is this many gates away are not refined: no refinement brings them back.
 const HOPELESS_GATES: f64 = 100.0;
-/// Tracks judged between two looks at the stop token: a few milliseconds at forty views.
-const TRACKS_PER_LOOK: usize = 16;
 /// Inflations of the gate while polishing.
 const POLISH_INFLATIONS: [f64; 6] = [8.0, 4.0, 2.0, 1.0, 1.0, 1.0];
 const POLISH_ROUNDS: usize = 2;
@@ -80,22 +79,19 @@ pub fn judge(block: &CompleteBlock, cameras: Vec<Camera>, noise: f64, stop: &Sto
     let gate = gate(block.views()) * noise * noise;
     let mut points = Vec::with_capacity(block.tracks());
     let mut squared = Vec::with_capacity(block.tracks());
-    for track in 0..block.tracks() {
-        if track.is_multiple_of(TRACKS_PER_LOOK) && stop.is_stopped() {
+    for first in (0..block.tracks()).step_by(LANES) {
+        if stop.is_stopped() {
             points.resize(block.tracks(), Point::new(0.0, 0.0, 0.0, 1.0));
             squared.resize(block.tracks(), f64::MAX);
             break;
         }
-        let sightings = block.track(track);
-        let start = triangulation::linear(&cameras, sightings);
-        let cost = triangulation::squared_residual(&cameras, &start, sightings);
-        let (point, cost) = if cost < HOPELESS_GATES * gate {
-            triangulation::refine(&cameras, sightings, start, POINT_STEPS)
-        } else {
-            (start, cost)
-        };
-        points.push(point);
-        squared.push(if cost.is_finite() { cost } else { f64::MAX });
+        let tracks: Vec<_> = (first..block.tracks().min(first + LANES)).map(|track| block.track(track)).collect();
+        let batch = Batch::new(&cameras, &tracks);
+        let start = batch.linear();
+        let found = batch.refine(start, |track| start.cost(track) < HOPELESS_GATES * gate, POINT_STEPS);
+        points.extend((0..batch.tracks()).map(|track| found.point(track)));
+        let finite = |cost: f64| if cost.is_finite() { cost } else { f64::MAX };
+        squared.extend((0..batch.tracks()).map(|track| finite(found.cost(track))));
     }
     let inlier: Vec<bool> = squared.iter().map(|&cost| cost < gate).collect();
     let score = squared.iter().map(|&cost| (cost / gate).min(1.0)).sum::<f64>() / block.tracks().max(1) as f64;

@@ -56,6 +56,9 @@ pub struct AutoRow {
     pub verified: usize,
     pub ranked: usize,
     pub none: usize,
+    /// The mean says what many solves take, the median what the usual one takes: without the trained network a few
+    /// searches take most of the time.
+    pub mean_seconds: f64,
     pub median_seconds: f64,
 }
 
@@ -232,6 +235,7 @@ fn prior_row(condition: &'static str, prior: Prior, alone: &[&Alone]) -> PriorRo
 
 fn auto_row(condition: &'static str, learned: bool, answers: &[&Answer]) -> AutoRow {
     let f1: Vec<f64> = answers.iter().map(|answer| answer.f1).collect();
+    let mut seconds: Vec<f64> = answers.iter().map(|answer| answer.seconds).collect();
     let count = |wanted: fn(&Answer) -> bool| answers.iter().filter(|answer| wanted(answer)).count();
     AutoRow {
         condition,
@@ -245,7 +249,8 @@ fn auto_row(condition: &'static str, learned: bool, answers: &[&Answer]) -> Auto
         verified: count(|answer| answer.solved),
         ranked: count(|answer| answer.ranked),
         none: count(|answer| !answer.solved && !answer.ranked),
-        median_seconds: median(&mut answers.iter().map(|answer| answer.seconds).collect::<Vec<_>>()),
+        mean_seconds: mean(&seconds).unwrap_or(0.0),
+        median_seconds: median(&mut seconds),
     }
 }
 

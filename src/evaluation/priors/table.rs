@@ -33,7 +33,7 @@ pub fn text(rows: &Rows) -> String {
     }
     let _ = writeln!(
         text,
-        "{}{:<18}{:<17}{:>5}{:>8}{:>8}{:>10}{:>8}{:>6}{:>9}{:>9}",
+        "{}{:<18}{:<17}{:>5}{:>8}{:>8}{:>10}{:>8}{:>6}{:>9}{:>10}{:>11}",
         if rows.priors.is_empty() { "" } else { "\n" },
         "scenes",
         "auto",
@@ -44,12 +44,13 @@ pub fn text(rows: &Rows) -> String {
         "ranked",
         "none",
         "AP rank",
-        "s"
+        "mean ms",
+        "median ms"
     );
     for row in &rows.auto {
         let _ = writeln!(
             text,
-            "{:<18}{:<17}{:>5}{:>8.3}{:>8.3}{:>10}{:>8}{:>6}{:>9}{:>9.4}",
+            "{:<18}{:<17}{:>5}{:>8.3}{:>8.3}{:>10}{:>8}{:>6}{:>9}{:>10.2}{:>11.2}",
             row.condition,
             if row.learned { "with learned" } else { "without learned" },
             row.seeds,
@@ -59,7 +60,8 @@ pub fn text(rows: &Rows) -> String {
             row.ranked,
             row.none,
             shown(row.average_precision_of_ranking),
-            row.median_seconds
+            1e3 * row.mean_seconds,
+            1e3 * row.median_seconds
         );
     }
     text.push_str(

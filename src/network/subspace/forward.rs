@@ -4,7 +4,9 @@ use super::arrays::{Block, SubspaceNet};
 use super::cloud::Cloud;
 use super::layers::Pool;
 use super::ridge::{inverse_scatter, product};
-use super::rows::{accumulate, halved, normalise_rows, rectify, row, row_mut, rows, softmax, softmin_over_rows};
+use super::rows::{
+    accumulate, halved, logarithm, normalise_rows, rectify, row, row_mut, rows, softmax, softmin_over_rows,
+};
 use super::{DEPTH_RANGE, LEAST_MEAN_DEPTH, LEAVE_ONE_OUT_FLOOR, MOST_PREDICTED, RESIDUAL_FLOOR};
 use crate::simd::vectorised;
 
@@ -172,13 +174,13 @@ impl<'a> State<'a> {
                 for j in 0..tracks {
                     let squared = x[j] * x[j] + y[j] * y[j] + w[j] * w[j];
                     of_track[j] += squared * visible[j];
-                    logarithms[j] = (squared + RESIDUAL_FLOOR).ln();
+                    logarithms[j] = logarithm(squared + RESIDUAL_FLOOR);
                 }
             }
             let leverage = row_mut(&mut found.leverages, tracks, selection);
             for j in 0..tracks {
-                of_track[j] = (of_track[j] / self.counts[j] + RESIDUAL_FLOOR).ln();
-                leverage[j] = (leverages[j] * ridge / views as f32 + RESIDUAL_FLOOR).ln();
+                of_track[j] = logarithm(of_track[j] / self.counts[j] + RESIDUAL_FLOOR);
+                leverage[j] = logarithm(leverages[j] * ridge / views as f32 + RESIDUAL_FLOOR);
             }
             found.left.push(left);
         }
@@ -292,8 +294,8 @@ impl<'a> State<'a> {
         for view in 0..views {
             for (selection, left) in residuals.left.iter().enumerate() {
                 let [x, y] = [0, 1].map(|k| row(left, tracks, 3 * view + k));
-                for (j, logarithm) in row_mut(&mut in_image, tracks, selection).iter_mut().enumerate() {
-                    *logarithm = 0.5 * (x[j] * x[j] + y[j] * y[j] + RESIDUAL_FLOOR).ln();
+                for (j, of_image) in row_mut(&mut in_image, tracks, selection).iter_mut().enumerate() {
+                    *of_image = 0.5 * logarithm(x[j] * x[j] + y[j] * y[j] + RESIDUAL_FLOOR);
                 }
             }
             let visible = row(self.cloud.visible(), tracks, view);

@@ -1,7 +1,7 @@
 //! Linear layers and pooling over the views.
 
 use super::arrays::Layer;
-use super::rows::accumulate_products;
+use super::rows;
 
 /// Encodings pooled over the views: their mean over those that show the track, and their largest.
 pub struct Pool {
@@ -51,12 +51,6 @@ impl Layer<Vec<f32>> {
     #[inline(always)]
     pub fn affine(&self, inputs: &[&[f32]], tracks: usize) -> Vec<f32> {
         let rows: Vec<&[f32]> = inputs.iter().flat_map(|rows| rows.chunks_exact(tracks)).collect();
-        let mut output = vec![0.0; self.bias.len() * tracks];
-        let layers = self.weight.chunks_exact(self.weight.len() / self.bias.len()).zip(&self.bias);
-        for (output, (weights, &bias)) in output.chunks_exact_mut(tracks).zip(layers) {
-            output.fill(bias);
-            accumulate_products(output, weights, &rows);
-        }
-        output
+        rows::affine(&self.weight, &self.bias, &rows, tracks)
     }
 }

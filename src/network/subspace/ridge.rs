@@ -1,6 +1,6 @@
 //! The linear algebra of the ridge regressions.
 
-use super::rows::{accumulate_products, row};
+use super::rows::{affine, row};
 use crate::network::lanes::dot;
 
 /// `(Y diag(shares) Yᵀ + ridge I)⁻¹`, row by row; of what rounding has made singular, zeros, which predict nothing.
@@ -59,11 +59,7 @@ fn invert(matrix: &mut [f64], rows: usize) -> bool {
 #[inline(always)]
 pub fn product(matrix: &[f32], columns: &[f32], tracks: usize) -> Vec<f32> {
     let rows: Vec<&[f32]> = columns.chunks_exact(tracks).collect();
-    let mut output = vec![0.0; columns.len()];
-    for (output, factors) in output.chunks_exact_mut(tracks).zip(matrix.chunks_exact(rows.len())) {
-        accumulate_products(output, factors, &rows);
-    }
-    output
+    affine(matrix, &vec![0.0; rows.len()], &rows, tracks)
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::domain::StopToken;
 use crate::geometry::measurement::{CompleteBlock, Sighting};
 use crate::geometry::statistics::chi_square_quantile;
-use crate::geometry::triangulation;
+use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::solver::grow::{self, Consensus};
 
 /// A share of random tracks whose residual is measured; smaller ones are extrapolated from there.
@@ -97,10 +97,13 @@ impl<'a> RandomTracks<'a> {
             if stop.is_stopped() {
                 return false;
             }
-            let track = random_track(block, rng);
-            let start = triangulation::linear(cameras, &track);
-            let (_, cost) = triangulation::refine(cameras, &track, start, grow::POINT_STEPS);
-            squared.push(if cost.is_finite() { cost } else { f64::MAX });
+            let some = LANES.min(tracks - squared.len());
+            let drawn: Vec<_> = (0..some).map(|_| random_track(block, rng)).collect();
+            let drawn: Vec<&[Sighting]> = drawn.iter().map(Vec::as_slice).collect();
+            let batch = Batch::new(cameras, &drawn);
+            let found = batch.refine(batch.linear(), |_| true, grow::POINT_STEPS);
+            let finite = |cost: f64| if cost.is_finite() { cost } else { f64::MAX };
+            squared.extend((0..batch.tracks()).map(|track| finite(found.cost(track))));
         }
         squared.sort_by(f64::total_cmp);
         true

@@ -4,6 +4,7 @@
 //! in the image. A track is judged by what it retains once observations that are more likely wrong than right are
 //! dropped, at a price for each.
 
+mod bench;
 mod noise;
 
 pub use noise::{NoiseModel, density_of_spread, outlier_density, working_gate};
@@ -14,15 +15,11 @@ use crate::domain::result::{ObservationResults, TrackResults};
 use crate::domain::{Input, StopToken};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::{Normalization, Sighting};
-use crate::geometry::{Camera, Point, robust_triangulation, triangulation};
+use crate::geometry::triangulation::batch::LANES;
+use crate::geometry::{Camera, Point};
 use crate::parallel::Threads;
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
-
-/// Observations that a track must retain, and the share of those it has in the registered views.
-const LEAST_RETAINED: usize = 3;
-const LEAST_RETAINED_SHARE: f64 = 0.6;
-/// Refinement steps of a point.
-const POINT_STEPS: usize = 10;
+use bench::Bench;
 
 /// The geometry to judge by.
 pub struct Geometry<'a> {
@@ -57,31 +54,6 @@ impl Geometry<'_> {
         let xy = self.normalization.normalize(input.view_of(k), input.point_px(k));
         self.lenses.get(input.view_of(k)).and_then(|lens| lens.undistort(&xy)).unwrap_or(xy)
     }
-}
-
-/// The verdict on one track.
-#[derive(Debug, Clone)]
-struct Verdict {
-    weight: f64,
-    inlier: bool,
-    point: Point,
-    /// One entry a sighting.
-    retained: Vec<bool>,
-}
-
-/// What was found of one track.
-struct Finding {
-    sightings: Vec<Sighting>,
-    /// Of the sightings, among the caller's observations.
-    places: Vec<usize>,
-    verdict: Verdict,
-    others: Vec<Other>,
-}
-
-/// A further point that a track joins, with the sightings that show it.
-struct Other {
-    verdict: Verdict,
-    sightings: Vec<usize>,
 }
 
 /// Every track and observation of the input, judged. Points stay homogeneous, projective and normalised.
@@ -163,14 +135,14 @@ fn judge_under(
     let mut judged = Judged::nothing(input, noise);
     let threads = threads.if_worth(input.track_count() >= WORTH_A_THREAD);
     for first in (0..input.track_count()).step_by(BATCH) {
-        let count = BATCH.min(input.track_count() - first);
-        let of_track = |k: usize| (!stop.is_stopped()).then(|| bench.find(input, ranges, first + k)).flatten();
-        let found = threads.map(count, TRACKS_A_RUN, of_track, &mut |tracks| told(first + tracks));
-        for (k, finding) in found.into_iter().enumerate() {
-            if let Some(finding) = finding {
-                bench.write(&mut judged, first + k, &finding);
-            }
-        }
+        let last = input.track_count().min(first + BATCH);
+        let side_by_side = |k: usize| match stop.is_stopped() {
+            true => Vec::new(),
+            false => bench.find(input, ranges, first + k * LANES..last.min(first + (k + 1) * LANES)),
+        };
+        let mut told = |batches| told(first + batches * LANES);
+        let found = threads.map((last - first).div_ceil(LANES), TRACKS_A_RUN / LANES, side_by_side, &mut told);
+        found.iter().flatten().for_each(|finding| bench.write(&mut judged, finding));
     }
     judged
 }
@@ -193,250 +165,5 @@ impl Judged {
             splits: Vec::new(),
             noise,
         }
-    }
-}
-
-/// What tracks are judged by.
-struct Bench<'a> {
-    cameras: &'a [Camera],
-    geometry: &'a Geometry<'a>,
-    noise: NoiseModel,
-}
-
-impl Bench<'_> {
-    /// Judges a track and, where tracks are linked and it is right, what it leaves; `None` where too few views see it.
-    fn find(&self, input: &Input, ranges: &[usize], track: usize) -> Option<Finding> {
-        let geometry = self.geometry;
-        let seen: Vec<usize> =
-            (ranges[track]..ranges[track + 1]).filter(|&k| geometry.judges(track, input.view_of(k))).collect();
-        if seen.len() < LEAST_RETAINED {
-            return None;
-        }
-        let sightings: Vec<Sighting> =
-            seen.iter().map(|&k| Sighting { view: input.view_of(k), xy: geometry.point(input, k) }).collect();
-        let places = seen.into_iter().map(|k| input.caller_index(k)).collect();
-        let verdict = self.judge(&sightings);
-        let others = if geometry.linked && verdict.inlier { self.others(&sightings, &verdict) } else { Vec::new() };
-        Some(Finding { sightings, places, verdict, others })
-    }
-
-    /// Drops the worst observation as long as it is more likely wrong than right, then weighs what remains.
-    fn judge(&self, sightings: &[Sighting]) -> Verdict {
-        let gate = self.noise.gate();
-        let retained = self.retained_at_first(sightings, gate);
-        let Some(mut retained) = retained else { return Verdict::wrong(self.cameras, sightings) };
-        let (mut point, mut cost) = triangulate(self.cameras, &chosen(sightings, &retained));
-        let share = if self.geometry.linked { 0.0 } else { LEAST_RETAINED_SHARE };
-        let least = LEAST_RETAINED.max((share * sightings.len() as f64).ceil() as usize);
-        // A track that cannot retain enough is wrong already.
-        while retained.len() >= least && retained.len() > LEAST_RETAINED {
-            let residuals = retained.iter().map(|&k| self.squared(&point, &sightings[k]));
-            let Some((place, worst)) = residuals.enumerate().max_by(|a, b| a.1.total_cmp(&b.1)) else { break };
-            if worst <= gate {
-                break;
-            }
-            retained.remove(place);
-            (point, cost) = triangulate(self.cameras, &chosen(sightings, &retained));
-        }
-        let dropped = sightings.len() - retained.len();
-        let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share);
-        let enough = retained.len() >= least;
-        let weight = if enough { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
-        let mut flags = vec![false; sightings.len()];
-        for k in retained {
-            flags[k] = self.squared(&point, &sightings[k]) <= gate;
-        }
-        let whole = flags.iter().filter(|&&flag| flag).count() >= LEAST_RETAINED;
-        Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
-    }
-
-    /// The sightings that a verdict begins with: all, or those that agree where links may be wrong; `None` where none
-    /// do.
-    fn retained_at_first(&self, sightings: &[Sighting], gate: f64) -> Option<Vec<usize>> {
-        if !self.geometry.linked {
-            return Some((0..sightings.len()).collect());
-        }
-        let found = robust_triangulation::robust(self.cameras, sightings, gate)?;
-        Some((0..sightings.len()).filter(|&k| found.agrees[k]).collect())
-    }
-
-    /// Squared residual of a sighting of a point.
-    fn squared(&self, point: &Point, seen: &Sighting) -> f64 {
-        triangulation::reprojection(&self.cameras[seen.view], point, &seen.xy).norm_squared()
-    }
-
-    /// Enters what was found of a track.
-    fn write(&self, judged: &mut Judged, track: usize, finding: &Finding) {
-        let Finding { sightings, places, verdict, others } = finding;
-        judged.tracks.weight[track] = verdict.weight as f32;
-        judged.tracks.inlier[track] = verdict.inlier;
-        for ((&place, sighting), &retained) in places.iter().zip(sightings).zip(&verdict.retained) {
-            let squared = self.squared(&verdict.point, sighting);
-            judged.observations.residual_px[place] =
-                Some(squared.sqrt() * self.geometry.normalization.scale_px).filter(|residual| residual.is_finite());
-            judged.observations.weight[place] = self.noise.weight(squared) as f32;
-            judged.observations.inlier[place] = verdict.inlier && retained;
-        }
-        if verdict.inlier {
-            let retained = sightings.iter().zip(&verdict.retained).filter(|(_, retained)| **retained);
-            judged.retained[track] = retained.map(|(sighting, _)| *sighting).collect();
-            judged.points[track] = Some(verdict.point);
-        }
-        for (number, other) in (1..).zip(others) {
-            other.sightings.iter().for_each(|&k| judged.observations.split[places[k]] = number);
-            let Verdict { weight, point, .. } = other.verdict;
-            let retained = chosen(sightings, &other.sightings);
-            judged.splits.push(SplitPoint { track, number, weight, point, retained });
-        }
-    }
-
-    /// Looks for the other points that a right track joins, among the observations that its own leaves.
-    fn others(&self, sightings: &[Sighting], verdict: &Verdict) -> Vec<Other> {
-        let mut left: Vec<usize> = (0..sightings.len()).filter(|&k| !verdict.retained[k]).collect();
-        let mut others = Vec::new();
-        while left.len() >= LEAST_RETAINED {
-            let verdict = self.judge(&chosen(sightings, &left));
-            if !verdict.inlier {
-                break;
-            }
-            let (of_other, rest): (Vec<_>, Vec<_>) = left.iter().zip(&verdict.retained).partition(|(_, kept)| **kept);
-            let indices = |these: Vec<(&usize, &bool)>| these.into_iter().map(|(&k, _)| k).collect::<Vec<usize>>();
-            let (sightings, rest) = (indices(of_other), indices(rest));
-            others.push(Other { verdict, sightings });
-            left = rest;
-        }
-        others
-    }
-}
-
-impl Verdict {
-    /// On a track of which no two observations agree on a point in front of their cameras.
-    fn wrong(cameras: &[Camera], sightings: &[Sighting]) -> Self {
-        let (point, _) = triangulate(cameras, sightings);
-        Self { weight: 0.0, inlier: false, point, retained: vec![false; sightings.len()] }
-    }
-}
-
-fn chosen(sightings: &[Sighting], which: &[usize]) -> Vec<Sighting> {
-    which.iter().map(|&k| sightings[k]).collect()
-}
-
-fn triangulate(cameras: &[Camera], sightings: &[Sighting]) -> (Point, f64) {
-    triangulation::refine(cameras, sightings, triangulation::linear(cameras, sightings), POINT_STEPS)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::domain::{Limits, RawInput, View};
-
-    fn cameras(views: usize) -> Vec<Camera> {
-        (0..views)
-            .map(|view| {
-                let t = view as f64;
-                Camera::new(1.2, 0.0, 0.0, 0.5 * t, 0.0, 1.2, 0.0, 0.2 * t, 0.0, 0.0, 1.0, 3.0)
-            })
-            .collect()
-    }
-
-    fn geometry<'a>(normalization: &'a Normalization) -> Geometry<'a> {
-        Geometry {
-            cameras: &[],
-            parts: None,
-            normalization,
-            lenses: &[],
-            linked: false,
-            noise: 0.001,
-            outlier_density: 2.0,
-            inlier_share: 0.3,
-        }
-    }
-
-    fn bench<'a>(cameras: &'a [Camera], geometry: &'a Geometry) -> Bench<'a> {
-        Bench { cameras, geometry, noise: NoiseModel::new(geometry.noise, geometry.outlier_density) }
-    }
-
-    fn sightings(cameras: &[Camera], shifts: &[f64]) -> Vec<Sighting> {
-        let point = Point::new(0.2, -0.1, 0.5, 1.0);
-        cameras
-            .iter()
-            .zip(shifts)
-            .enumerate()
-            .map(|(view, (camera, shift))| {
-                let image = camera * point;
-                Sighting { view, xy: image.xy() / image.z + Vector2::new(0.3 * shift, *shift) }
-            })
-            .collect()
-    }
-
-    #[test]
-    fn a_right_track_a_track_with_one_wrong_observation_and_a_wrong_track() {
-        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
-        let geometry = geometry(&normalization);
-        let cameras = cameras(6);
-        let bench = bench(&cameras, &geometry);
-        let verdict = |shifts: [f64; 6]| bench.judge(&sightings(&cameras, &shifts));
-        let right = verdict([0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001]);
-        assert!(right.inlier && right.weight > 0.999 && right.retained.iter().all(|&kept| kept));
-        let one_wrong = verdict([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]);
-        assert!(one_wrong.inlier);
-        assert_eq!(one_wrong.retained, [true, true, false, true, true, true]);
-        let wrong = verdict([0.1, -0.2, 0.15, -0.1, 0.3, -0.05]);
-        assert!(!wrong.inlier && wrong.weight < 0.01, "{}", wrong.weight);
-    }
-
-    /// A track that goes over to another point, and one wrong observation between the two.
-    #[test]
-    fn a_track_that_joins_two_points_is_split_and_one_that_strays_is_not() {
-        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
-        let geometry = Geometry { linked: true, ..geometry(&normalization) };
-        let cameras = cameras(8);
-        let bench = bench(&cameras, &geometry);
-        let split = |sightings: &[Sighting]| {
-            let mut judged = Judged::nothing(&testing_input(), bench.noise);
-            let verdict = bench.judge(sightings);
-            assert!(verdict.inlier);
-            let others = bench.others(sightings, &verdict);
-            let (sightings, places) = (sightings.to_vec(), (0..8).collect());
-            bench.write(&mut judged, 0, &Finding { sightings, places, verdict, others });
-            (judged.observations.split, judged.splits.len())
-        };
-        let mut joined = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, 0.0, 0.0, 0.0]);
-        let second = Point::new(-0.5, 0.4, 1.5, 1.0);
-        for seen in &mut joined[5..] {
-            let image = cameras[seen.view] * second;
-            seen.xy = image.xy() / image.z;
-        }
-        assert_eq!(split(&joined), (vec![0, 0, 0, 0, 0, 1, 1, 1], 1));
-        let astray = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, -0.22, 0.17, -0.4]);
-        assert_eq!(split(&astray), (vec![0; 8], 0));
-    }
-
-    /// One track in eight views.
-    fn testing_input() -> Input {
-        let raw = RawInput {
-            views: vec![View::default(); 8],
-            track_count: 1,
-            view: (0..8).collect(),
-            track: vec![0; 8],
-            x: (0..8).map(f64::from).collect(),
-            y: vec![0.0; 8],
-            ..RawInput::default()
-        };
-        Input::new(raw, &Limits::default(), "track").expect("valid")
-    }
-
-    #[test]
-    fn of_a_linked_track_the_right_run_is_kept_and_nothing_behind_the_cameras() {
-        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
-        let geometry = Geometry { linked: true, ..geometry(&normalization) };
-        let cameras = cameras(6);
-        let joined = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.2, -0.15, 0.31]);
-        let verdict = bench(&cameras, &geometry).judge(&joined);
-        assert!(verdict.inlier, "{}", verdict.weight);
-        assert_eq!(verdict.retained, [true, true, true, false, false, false]);
-        let behind: Vec<Camera> = cameras.iter().map(|camera| -camera).collect();
-        let verdict = bench(&behind, &geometry).judge(&sightings(&cameras, &[0.0; 6]));
-        assert!(!verdict.inlier && verdict.weight == 0.0, "{}", verdict.weight);
     }
 }

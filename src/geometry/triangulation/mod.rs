@@ -1,4 +1,7 @@
-//! Points from cameras and image points.
+//! Points from cameras and image points: of one track here, of many side by side in [`batch`].
+
+pub mod batch;
+mod lane;
 
 use nalgebra::{Matrix4, Vector2};
 
@@ -11,6 +14,9 @@ use crate::simd::vectorised;
 const MIN_DEPTH: f64 = 1e-9;
 /// Levenberg damping at the start of a refinement, relative to the diagonal.
 const INITIAL_DAMPING: f64 = 1e-3;
+/// Factors on the damping after a step that is taken, and after one that is not.
+const DAMPING_DOWN: f64 = 0.2;
+const DAMPING_UP: f64 = 10.0;
 
 /// Reprojection residual, projected minus observed, in the units of the image points.
 ///
@@ -101,12 +107,12 @@ fn descend(cameras: &[Camera], sightings: &[Sighting], start: Point, iterations:
         if candidate_cost < cost {
             let gain = (cost - candidate_cost) / cost;
             (point, cost) = (candidate, candidate_cost);
-            damping /= 5.0;
+            damping *= DAMPING_DOWN;
             if gain < RELATIVE_TOLERANCE {
                 break;
             }
         } else {
-            damping *= 10.0;
+            damping *= DAMPING_UP;
         }
     }
     (point, cost)

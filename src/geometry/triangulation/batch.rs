@@ -1,0 +1,378 @@
+//! Several tracks triangulated side by side.
+//!
+//! The equations are those of [`linear`](super::linear) and [`refine`](super::refine) for one track (a test compares).
+//! Tracks need not be seen by the same views: their `k`-th sightings stand side by side, whatever the cameras. What one
+//! comes to does not depend on its neighbours, to the last bit: a track that has arrived stands still while others go on.
+
+pub use super::lane::LANES;
+use super::lane::{DIAGONAL, Lane, Mask, Points, Symmetric, choose, dot, normalised};
+use super::{DAMPING_DOWN, DAMPING_UP, INITIAL_DAMPING, RELATIVE_TOLERANCE};
+use crate::geometry::measurement::Sighting;
+use crate::geometry::null_vector::{MOST_ITERATIONS, SHIFT, SQUARINGS, TOLERANCE};
+use crate::geometry::{Camera, Point};
+use crate::simd::vectorised;
+
+#[inline(always)]
+fn away_from_zero(depth: Lane) -> Lane {
+    depth.map(super::away_from_zero)
+}
+
+/// The `k`-th sighting of every track.
+#[derive(Clone, Copy)]
+struct Sighted {
+    /// The camera's columns, rows within.
+    camera: [[Lane; 3]; 4],
+    xy: [Lane; 2],
+    /// 0 where the track has no such sighting, or does without it; else 1.
+    weight: Lane,
+}
+
+impl Sighted {
+    /// The point's image, homogeneous.
+    #[inline(always)]
+    fn image(&self, point: &Points) -> [Lane; 3] {
+        let row = |r: usize| {
+            let [a, b, c, d] = &self.camera;
+            a[r] * point[0] + b[r] * point[1] + c[r] * point[2] + d[r] * point[3]
+        };
+        [row(0), row(1), row(2)]
+    }
+
+    #[inline(always)]
+    fn squared_residual(&self, point: &Points) -> Lane {
+        let [x, y, z] = self.image(point);
+        let nearness = away_from_zero(z).recip();
+        let (x, y) = (x * nearness - self.xy[0], y * nearness - self.xy[1]);
+        self.weight * (x * x + y * y)
+    }
+}
+
+/// Up to [`LANES`] tracks.
+pub struct Batch {
+    sighted: Vec<Sighted>,
+    tracks: usize,
+}
+
+/// A point for every track of a batch, and what it leaves.
+#[derive(Debug, Clone, Copy)]
+pub struct Triangulated {
+    points: Points,
+    costs: Lane,
+}
+
+impl Triangulated {
+    /// The point of the `track`-th of the batch, of unit norm.
+    pub fn point(&self, track: usize) -> Point {
+        Point::new(self.points[0].0[track], self.points[1].0[track], self.points[2].0[track], self.points[3].0[track])
+    }
+
+    /// Its sum of squared reprojection residuals.
+    pub fn cost(&self, track: usize) -> f64 {
+        self.costs.0[track]
+    }
+
+    /// These for the tracks of which `is_newer` says so, those before for the others.
+    pub fn or(self, is_newer: impl Fn(usize) -> bool, before: Self) -> Self {
+        let newer = std::array::from_fn(is_newer);
+        Self { points: choose(newer, self.points, before.points), costs: self.costs.or(newer, before.costs) }
+    }
+}
+
+impl Batch {
+    /// These tracks, [`LANES`] at most; what is beyond is left out.
+    pub fn new(cameras: &[Camera], tracks: &[&[Sighting]]) -> Self {
+        let longest = tracks.iter().map(|track| track.len()).max().unwrap_or(0);
+        let nothing = Sighted { camera: [[Lane::ZERO; 3]; 4], xy: [Lane::ZERO; 2], weight: Lane::ZERO };
+        let mut sighted = vec![nothing; longest];
+        for lane in 0..LANES {
+            // A lane without a track repeats the first one, and a place without a sighting the track's first: numbers
+            // that count nowhere, but are of a usual size.
+            let Some(track) = tracks.get(lane).or(tracks.first()) else { continue };
+            for (k, sighted) in sighted.iter_mut().enumerate() {
+                let Some(seen) = track.get(k).or(track.first()) else { continue };
+                let camera: &[[f64; 3]; 4] = cameras[seen.view].as_ref();
+                for (lanes, entries) in sighted.camera.iter_mut().zip(camera) {
+                    for (lanes, entry) in lanes.iter_mut().zip(entries) {
+                        lanes.0[lane] = *entry;
+                    }
+                }
+                sighted.xy[0].0[lane] = seen.xy.x;
+                sighted.xy[1].0[lane] = seen.xy.y;
+                sighted.weight.0[lane] = f64::from(u8::from(k < track.len()));
+            }
+        }
+        Self { sighted, tracks: tracks.len().min(LANES) }
+    }
+
+    pub fn tracks(&self) -> usize {
+        self.tracks
+    }
+
+    /// Does without the `k`-th sighting of a track from now on.
+    pub fn drop_sighting(&mut self, track: usize, k: usize) {
+        let Sighted { weight, xy, .. } = &mut self.sighted[k];
+        // However far out it was: nothing times what has no end would be no number.
+        (weight.0[track], xy[0].0[track], xy[1].0[track]) = (0.0, 0.0, 0.0);
+    }
+
+    /// As [`linear`](super::linear), every track.
+    pub fn linear(&self) -> Triangulated {
+        vectorised(
+            #[inline(always)]
+            || {
+                let points = self.null_vectors();
+                Triangulated { points, costs: self.costs(&points) }
+            },
+        )
+    }
+
+    /// As [`refine`](super::refine), the tracks of which `is_wanted` says so; the others stay where they are.
+    pub fn refine(&self, start: Triangulated, is_wanted: impl Fn(usize) -> bool, iterations: usize) -> Triangulated {
+        let going = std::array::from_fn(|track| track < self.tracks && is_wanted(track));
+        vectorised(
+            #[inline(always)]
+            || self.descend(start, going, iterations),
+        )
+    }
+
+    /// Squared reprojection residuals of the tracks' `k`-th sightings, for each `k`; 0 of those that they do without.
+    pub fn squared_residuals(&self, found: &Triangulated) -> Vec<[f64; LANES]> {
+        vectorised(
+            #[inline(always)]
+            || self.sighted.iter().map(|seen| seen.squared_residual(&found.points).0).collect(),
+        )
+    }
+
+    #[inline(always)]
+    fn costs(&self, points: &Points) -> Lane {
+        let mut costs = Lane::ZERO;
+        for seen in &self.sighted {
+            costs += seen.squared_residual(points);
+        }
+        costs
+    }
+
+    #[inline(always)]
+    fn null_vectors(&self) -> Points {
+        let mut normal = Symmetric::ZERO;
+        for seen in &self.sighted {
+            let [a, b, c, d] = seen.camera;
+            let of_direction = a[2] * a[2] + b[2] * b[2] + c[2] * c[2];
+            let of_all = of_direction + d[2] * d[2];
+            let weight = seen.weight / (of_direction + of_all * f64::EPSILON).map(|sum| sum.max(f64::MIN_POSITIVE));
+            let mut axis = 0;
+            while axis < 2 {
+                let coordinate = seen.xy[axis];
+                let row = [
+                    a[2] * coordinate - a[axis],
+                    b[2] * coordinate - b[axis],
+                    c[2] * coordinate - c[axis],
+                    d[2] * coordinate - d[axis],
+                ];
+                normal.add_square(weight, row);
+                axis += 1;
+            }
+        }
+        let shift = normal.trace() * SHIFT;
+        for diagonal in DIAGONAL {
+            normal.0[diagonal] += shift;
+        }
+        let mut power = normal.factor().inverse();
+        for _ in 0..SQUARINGS {
+            power = power.scaled(power.trace().recip()).squared();
+        }
+        let [first, others @ ..] = power.columns();
+        let (mut vector, mut longest) = (first, power.0[DIAGONAL[0]]);
+        for (column, place) in others.into_iter().zip(&DIAGONAL[1..]) {
+            let diagonal = power.0[*place];
+            let is_longer = diagonal.compare(longest, |a, b| a > b);
+            vector = choose(is_longer, column, vector);
+            longest = diagonal.or(is_longer, longest);
+        }
+        let mut vector = normalised(vector);
+        let mut going = [true; LANES];
+        for _ in 0..MOST_ITERATIONS {
+            let next = normalised(power.times(vector));
+            let moved = [next[0] - vector[0], next[1] - vector[1], next[2] - vector[2], next[3] - vector[3]];
+            vector = choose(going, next, vector);
+            let moves = dot(moved, moved);
+            let mut any = false;
+            for lane in 0..LANES {
+                // Not a number has arrived, too.
+                going[lane] &= moves.0[lane] >= TOLERANCE * TOLERANCE;
+                any |= going[lane];
+            }
+            if !any {
+                break;
+            }
+        }
+        let sum = dot(vector, vector);
+        let mut known = [false; LANES];
+        for lane in 0..LANES {
+            known[lane] = sum.0[lane].is_finite();
+        }
+        choose(known, vector, [Lane::ZERO, Lane::ZERO, Lane::ZERO, Lane::ONE])
+    }
+
+    #[inline(always)]
+    fn descend(&self, start: Triangulated, mut going: Mask, iterations: usize) -> Triangulated {
+        let mut points = normalised(start.points);
+        let mut costs = self.costs(&points);
+        let mut damping = Lane::ONE * INITIAL_DAMPING;
+        for _ in 0..iterations {
+            if going == [false; LANES] {
+                break;
+            }
+            let mut normal = Symmetric::ZERO;
+            let mut gradient = [Lane::ZERO; 4];
+            for seen in &self.sighted {
+                let image = seen.image(&points);
+                let nearness = away_from_zero(image[2]).recip();
+                let [a, b, c, d] = &seen.camera;
+                let mut axis = 0;
+                while axis < 2 {
+                    let projected = image[axis] * nearness;
+                    let slope = [
+                        (a[axis] - projected * a[2]) * nearness,
+                        (b[axis] - projected * b[2]) * nearness,
+                        (c[axis] - projected * c[2]) * nearness,
+                        (d[axis] - projected * d[2]) * nearness,
+                    ];
+                    normal.add_square(seen.weight, slope);
+                    let pull = seen.weight * (projected - seen.xy[axis]);
+                    gradient[0] += slope[0] * pull;
+                    gradient[1] += slope[1] * pull;
+                    gradient[2] += slope[2] * pull;
+                    gradient[3] += slope[3] * pull;
+                    axis += 1;
+                }
+            }
+            // The scale of the homogeneous point is free: pin it.
+            normal.add_square(normal.trace(), points);
+            for diagonal in DIAGONAL {
+                normal.0[diagonal] *= Lane::ONE + damping;
+            }
+            let step = normal.factor().solve(gradient);
+            let candidates =
+                normalised([points[0] - step[0], points[1] - step[1], points[2] - step[2], points[3] - step[3]]);
+            let candidate_costs = self.costs(&candidates);
+            let mut accepted = [false; LANES];
+            for lane in 0..LANES {
+                let (cost, candidate) = (costs.0[lane], candidate_costs.0[lane]);
+                accepted[lane] = going[lane] && candidate < cost;
+                damping.0[lane] *= if accepted[lane] { DAMPING_DOWN } else { DAMPING_UP };
+                // Not a number: the system has no solution.
+                going[lane] &= !candidate.is_nan() && !(accepted[lane] && cost - candidate < RELATIVE_TOLERANCE * cost);
+            }
+            points = choose(accepted, candidates, points);
+            costs = candidate_costs.or(accepted, costs);
+        }
+        Triangulated { points, costs }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector2;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::super::{linear, refine, reprojection, squared_residual};
+    use super::*;
+
+    const ITERATIONS: usize = 10;
+
+    /// Cameras, and tracks of them: in all views or some, right or anywhere.
+    fn tracks(count: usize, rng: &mut ChaCha8Rng) -> (Vec<Camera>, Vec<Vec<Sighting>>) {
+        let mut entry = || rng.random_range(-0.3..0.3);
+        let cameras: Vec<Camera> = (0..12)
+            .map(|_| {
+                let turned = Camera::from_fn(|_, _| entry());
+                turned + Camera::new(1.2, 0.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.0, 0.0, 0.0, 1.0, 3.0)
+            })
+            .collect();
+        let track = |_| {
+            let point = Point::from_fn(|k, _| if k < 3 { rng.random_range(-1.0..1.0) } else { 1.0 });
+            let (share, noise) = (rng.random_range(0.3..1.0), [0.0, 0.003, 0.5][rng.random_range(0..3)]);
+            let seen: Vec<usize> = (0..cameras.len()).filter(|_| rng.random::<f64>() < share).collect();
+            let mut shifted = || noise * rng.random_range(-1.0..1.0);
+            let sighting = |view: usize| {
+                let image = cameras[view] * point;
+                Sighting { view, xy: image.xy() / image.z + Vector2::new(shifted(), shifted()) }
+            };
+            seen.into_iter().map(sighting).collect::<Vec<_>>()
+        };
+        let tracks = (0..count).map(track).filter(|track: &Vec<Sighting>| track.len() >= 2).collect();
+        (cameras, tracks)
+    }
+
+    fn sliced(tracks: &[Vec<Sighting>]) -> Vec<&[Sighting]> {
+        tracks.iter().map(Vec::as_slice).collect()
+    }
+
+    #[test]
+    fn many_come_to_what_each_comes_to_alone() {
+        for seed in 0..10 {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let (cameras, tracks) = tracks(60, &mut rng);
+            for chunk in tracks.chunks(LANES) {
+                let batch = Batch::new(&cameras, &sliced(chunk));
+                let start = batch.linear();
+                let found = batch.refine(start, |track| track != 1, ITERATIONS);
+                let residuals = batch.squared_residuals(&found);
+                for (k, track) in chunk.iter().enumerate() {
+                    let alone = linear(&cameras, track);
+                    let expected = squared_residual(&cameras, &alone, track);
+                    let apart = |found: f64, expected: f64| (found - expected).abs() > 1e-6 * expected + 1e-18;
+                    assert!(!apart(start.cost(k), expected), "seed {seed}: {} {expected}", start.cost(k));
+                    let (refined, least) = refine(&cameras, track, alone, ITERATIONS);
+                    let expected = if k == 1 { expected } else { least };
+                    assert!(!apart(found.cost(k), expected), "seed {seed}: {} {expected}", found.cost(k));
+                    if k != 1 {
+                        assert!(found.point(k).dot(&refined).abs() > 1.0 - 1e-6, "seed {seed}");
+                    }
+                    for (seen, residuals) in track.iter().zip(&residuals) {
+                        let squared = reprojection(&cameras[seen.view], &found.point(k), &seen.xy).norm_squared();
+                        assert!(!apart(residuals[k], squared), "seed {seed}: {} {squared}", residuals[k]);
+                    }
+                }
+            }
+        }
+    }
+
+    /// To the last bit, and of what is dropped nothing is left.
+    #[test]
+    fn neighbours_and_dropped_sightings_change_nothing() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let (cameras, tracks) = tracks(LANES, &mut rng);
+        let triangulated = |batch: &Batch| batch.refine(batch.linear(), |_| true, ITERATIONS);
+        let together = triangulated(&Batch::new(&cameras, &sliced(&tracks)));
+        for (k, track) in tracks.iter().enumerate() {
+            let alone = triangulated(&Batch::new(&cameras, &[track]));
+            assert_eq!((alone.point(0), alone.cost(0)), (together.point(k), together.cost(k)));
+        }
+        let mut longer: Vec<Vec<Sighting>> = tracks.clone();
+        longer.iter_mut().for_each(|track| track.push(Sighting { view: 0, xy: Vector2::new(f64::MAX, 1e9) }));
+        let mut batch = Batch::new(&cameras, &sliced(&longer));
+        for (k, track) in tracks.iter().enumerate() {
+            batch.drop_sighting(k, track.len());
+        }
+        for (k, track) in tracks.iter().enumerate() {
+            let found = triangulated(&batch);
+            assert_eq!((found.point(k), found.cost(k)), (together.point(k), together.cost(k)), "{}", track.len());
+        }
+    }
+
+    #[test]
+    fn nothing_and_nonsense_have_some_point() {
+        let cameras = [Camera::zeros(), Camera::from_element(f64::NAN), Camera::identity()];
+        assert_eq!(Batch::new(&cameras, &[]).tracks(), 0);
+        assert!(Batch::new(&cameras, &[&[]]).linear().point(0).iter().all(|entry| entry.is_finite()));
+        let seen: Vec<Sighting> = (0..3).map(|view| Sighting { view, xy: Vector2::new(0.1, 0.2) }).collect();
+        for views in [&seen[..1], &seen[..2], &seen[2..], &seen[..]] {
+            let batch = Batch::new(&cameras, &[views]);
+            let found = batch.refine(batch.linear(), |_| true, ITERATIONS);
+            assert!(found.point(0).iter().all(|entry| entry.is_finite()), "{views:?}: {found:?}");
+        }
+    }
+}

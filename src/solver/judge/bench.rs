@@ -1,0 +1,342 @@
+//! Some tracks judged side by side: which observations each retains, and whether it is right by them.
+
+use std::ops::Range;
+
+use super::{Geometry, Judged, NoiseModel, SplitPoint};
+use crate::domain::Input;
+use crate::geometry::measurement::Sighting;
+use crate::geometry::triangulation::batch::Batch;
+use crate::geometry::{Camera, Point, robust_triangulation, triangulation};
+
+/// Observations that a track must retain, and the share of those it has in the registered views.
+const LEAST_RETAINED: usize = 3;
+const LEAST_RETAINED_SHARE: f64 = 0.6;
+/// Refinement steps of a point, and of one that only has to tell which observation is the worst.
+const POINT_STEPS: usize = 10;
+const DROPPING_STEPS: usize = 4;
+
+/// The verdict on one track.
+#[derive(Debug, Clone)]
+struct Verdict {
+    weight: f64,
+    inlier: bool,
+    point: Point,
+    /// One entry a sighting.
+    retained: Vec<bool>,
+}
+
+/// What was found of one track.
+pub struct Finding {
+    track: usize,
+    sightings: Vec<Sighting>,
+    /// Of the sightings, among the caller's observations.
+    places: Vec<usize>,
+    verdict: Verdict,
+    others: Vec<Other>,
+}
+
+/// A further point that a track joins, with the sightings that show it.
+struct Other {
+    verdict: Verdict,
+    sightings: Vec<usize>,
+}
+
+/// What tracks are judged by.
+pub struct Bench<'a> {
+    /// Of every view; those of views that are not registered are never asked.
+    pub cameras: &'a [Camera],
+    pub geometry: &'a Geometry<'a>,
+    pub noise: NoiseModel,
+}
+
+impl Bench<'_> {
+    /// Judges some tracks, no more than a [`Batch`] takes, and, of those that are linked and right, what they leave;
+    /// without those that too few views see.
+    pub fn find(&self, input: &Input, ranges: &[usize], tracks: Range<usize>) -> Vec<Finding> {
+        let geometry = self.geometry;
+        let seen = |track: usize| -> Vec<usize> {
+            (ranges[track]..ranges[track + 1]).filter(|&k| geometry.judges(track, input.view_of(k))).collect()
+        };
+        let sighting = |&k: &usize| Sighting { view: input.view_of(k), xy: geometry.point(input, k) };
+        let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) =
+            tracks.map(|track| (track, seen(track))).filter(|(_, seen)| seen.len() >= LEAST_RETAINED).unzip();
+        let sightings: Vec<Vec<Sighting>> = seen.iter().map(|seen| seen.iter().map(sighting).collect()).collect();
+        let verdicts = self.judge(&sightings.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        let found = tracks.into_iter().zip(seen).zip(sightings).zip(verdicts);
+        found
+            .map(|(((track, seen), sightings), verdict)| {
+                let places = seen.into_iter().map(|k| input.caller_index(k)).collect();
+                let others =
+                    if geometry.linked && verdict.inlier { self.others(&sightings, &verdict) } else { Vec::new() };
+                Finding { track, sightings, places, verdict, others }
+            })
+            .collect()
+    }
+
+    /// Drops the worst observation of each track as long as it is more likely wrong than right, then weighs what
+    /// remains. No more tracks than a [`Batch`] takes.
+    fn judge(&self, tracks: &[&[Sighting]]) -> Vec<Verdict> {
+        let gate = self.noise.gate();
+        let mut retained: Vec<Option<Vec<usize>>> =
+            tracks.iter().map(|sightings| self.retained_at_first(sightings, gate)).collect();
+        let mut batch = Batch::new(self.cameras, tracks);
+        for (lane, (sightings, retained)) in tracks.iter().zip(&retained).enumerate() {
+            let Some(retained) = retained else { continue };
+            (0..sightings.len()).filter(|k| !retained.contains(k)).for_each(|k| batch.drop_sighting(lane, k));
+        }
+        let mut found = batch.refine(batch.linear(), |_| true, DROPPING_STEPS);
+        loop {
+            let squared = batch.squared_residuals(&found);
+            let dropped: Vec<bool> = tracks
+                .iter()
+                .zip(&mut retained)
+                .enumerate()
+                .map(|(lane, (sightings, retained))| {
+                    let worst = retained.as_mut().and_then(|retained| {
+                        drop_worst(retained, self.least_retained(sightings), gate, |k| squared[k][lane])
+                    });
+                    worst.inspect(|&k| batch.drop_sighting(lane, k)).is_some()
+                })
+                .collect();
+            if !dropped.contains(&true) {
+                break;
+            }
+            let is_dropped = |lane: usize| dropped.get(lane) == Some(&true);
+            found = batch.refine(batch.linear(), is_dropped, DROPPING_STEPS).or(is_dropped, found);
+        }
+        let can_be_right = |lane: usize| {
+            let retained = retained.get(lane).and_then(Option::as_ref);
+            retained.is_some_and(|retained| retained.len() >= self.least_retained(tracks[lane]))
+        };
+        let found = batch.refine(found, can_be_right, POINT_STEPS);
+        let verdict = |(lane, (sightings, retained)): (usize, (&&[Sighting], Option<Vec<usize>>))| match retained {
+            Some(retained) => self.weigh(sightings, &retained, found.point(lane), found.cost(lane)),
+            None => Verdict::wrong(found.point(lane), sightings.len()),
+        };
+        tracks.iter().zip(retained).enumerate().map(verdict).collect()
+    }
+
+    /// Observations that a track must retain.
+    fn least_retained(&self, sightings: &[Sighting]) -> usize {
+        let share = if self.geometry.linked { 0.0 } else { LEAST_RETAINED_SHARE };
+        LEAST_RETAINED.max((share * sightings.len() as f64).ceil() as usize)
+    }
+
+    /// The verdict on a track by the observations that it retains.
+    fn weigh(&self, sightings: &[Sighting], retained: &[usize], point: Point, cost: f64) -> Verdict {
+        let gate = self.noise.gate();
+        let dropped = sightings.len() - retained.len();
+        let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share);
+        let enough = retained.len() >= self.least_retained(sightings);
+        let weight = if enough { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
+        let mut flags = vec![false; sightings.len()];
+        for &k in retained {
+            flags[k] = self.squared(&point, &sightings[k]) <= gate;
+        }
+        let whole = flags.iter().filter(|&&flag| flag).count() >= LEAST_RETAINED;
+        Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
+    }
+
+    /// The sightings that a verdict begins with: all, or those that agree where links may be wrong; `None` where none
+    /// do.
+    fn retained_at_first(&self, sightings: &[Sighting], gate: f64) -> Option<Vec<usize>> {
+        if !self.geometry.linked {
+            return Some((0..sightings.len()).collect());
+        }
+        let found = robust_triangulation::robust(self.cameras, sightings, gate)?;
+        Some((0..sightings.len()).filter(|&k| found.agrees[k]).collect())
+    }
+
+    /// Squared residual of a sighting of a point.
+    fn squared(&self, point: &Point, seen: &Sighting) -> f64 {
+        triangulation::reprojection(&self.cameras[seen.view], point, &seen.xy).norm_squared()
+    }
+
+    /// Enters what was found of a track.
+    pub fn write(&self, judged: &mut Judged, finding: &Finding) {
+        let Finding { track, sightings, places, verdict, others } = finding;
+        let track = *track;
+        judged.tracks.weight[track] = verdict.weight as f32;
+        judged.tracks.inlier[track] = verdict.inlier;
+        for ((&place, sighting), &retained) in places.iter().zip(sightings).zip(&verdict.retained) {
+            let squared = self.squared(&verdict.point, sighting);
+            judged.observations.residual_px[place] =
+                Some(squared.sqrt() * self.geometry.normalization.scale_px).filter(|residual| residual.is_finite());
+            judged.observations.weight[place] = self.noise.weight(squared) as f32;
+            judged.observations.inlier[place] = verdict.inlier && retained;
+        }
+        if verdict.inlier {
+            let retained = sightings.iter().zip(&verdict.retained).filter(|(_, retained)| **retained);
+            judged.retained[track] = retained.map(|(sighting, _)| *sighting).collect();
+            judged.points[track] = Some(verdict.point);
+        }
+        for (number, other) in (1..).zip(others) {
+            other.sightings.iter().for_each(|&k| judged.observations.split[places[k]] = number);
+            let Verdict { weight, point, .. } = other.verdict;
+            let retained = chosen(sightings, &other.sightings);
+            judged.splits.push(SplitPoint { track, number, weight, point, retained });
+        }
+    }
+
+    /// Looks for the other points that a right track joins, among the observations that its own leaves.
+    fn others(&self, sightings: &[Sighting], verdict: &Verdict) -> Vec<Other> {
+        let mut left: Vec<usize> = (0..sightings.len()).filter(|&k| !verdict.retained[k]).collect();
+        let mut others = Vec::new();
+        while left.len() >= LEAST_RETAINED {
+            let these = chosen(sightings, &left);
+            let Some(verdict) = self.judge(&[&these]).pop().filter(|verdict| verdict.inlier) else { break };
+            let (of_other, rest): (Vec<_>, Vec<_>) = left.iter().zip(&verdict.retained).partition(|(_, kept)| **kept);
+            let indices = |these: Vec<(&usize, &bool)>| these.into_iter().map(|(&k, _)| k).collect::<Vec<usize>>();
+            let (sightings, rest) = (indices(of_other), indices(rest));
+            others.push(Other { verdict, sightings });
+            left = rest;
+        }
+        others
+    }
+}
+
+impl Verdict {
+    /// On a track of which no two observations agree on a point in front of their cameras.
+    fn wrong(point: Point, sightings: usize) -> Self {
+        Self { weight: 0.0, inlier: false, point, retained: vec![false; sightings] }
+    }
+}
+
+/// Drops the observation of the largest squared residual, if that is beyond the gate, and says which it was. A track
+/// that cannot retain enough is wrong already and keeps the rest.
+fn drop_worst(retained: &mut Vec<usize>, least: usize, gate: f64, squared: impl Fn(usize) -> f64) -> Option<usize> {
+    if retained.len() < least.max(LEAST_RETAINED + 1) {
+        return None;
+    }
+    let residuals = retained.iter().map(|&k| squared(k)).enumerate();
+    let (place, worst) = residuals.max_by(|a, b| a.1.total_cmp(&b.1))?;
+    // Written so that what is no number is dropped.
+    (!(worst <= gate)).then(|| retained.remove(place))
+}
+
+fn chosen(sightings: &[Sighting], which: &[usize]) -> Vec<Sighting> {
+    which.iter().map(|&k| sightings[k]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector2;
+
+    use crate::domain::{Limits, RawInput, View};
+    use crate::geometry::measurement::Normalization;
+
+    fn cameras(views: usize) -> Vec<Camera> {
+        (0..views)
+            .map(|view| {
+                let t = view as f64;
+                Camera::new(1.2, 0.0, 0.0, 0.5 * t, 0.0, 1.2, 0.0, 0.2 * t, 0.0, 0.0, 1.0, 3.0)
+            })
+            .collect()
+    }
+
+    fn geometry<'a>(normalization: &'a Normalization) -> Geometry<'a> {
+        Geometry {
+            cameras: &[],
+            parts: None,
+            normalization,
+            lenses: &[],
+            linked: false,
+            noise: 0.001,
+            outlier_density: 2.0,
+            inlier_share: 0.3,
+        }
+    }
+
+    fn bench<'a>(cameras: &'a [Camera], geometry: &'a Geometry) -> Bench<'a> {
+        Bench { cameras, geometry, noise: NoiseModel::new(geometry.noise, geometry.outlier_density) }
+    }
+
+    fn judged(bench: &Bench, sightings: &[Sighting]) -> Verdict {
+        bench.judge(&[sightings]).pop().expect("a verdict")
+    }
+
+    fn sightings(cameras: &[Camera], shifts: &[f64]) -> Vec<Sighting> {
+        let point = Point::new(0.2, -0.1, 0.5, 1.0);
+        cameras
+            .iter()
+            .zip(shifts)
+            .enumerate()
+            .map(|(view, (camera, shift))| {
+                let image = camera * point;
+                Sighting { view, xy: image.xy() / image.z + Vector2::new(0.3 * shift, *shift) }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_right_track_a_track_with_one_wrong_observation_and_a_wrong_track() {
+        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
+        let geometry = geometry(&normalization);
+        let cameras = cameras(6);
+        let bench = bench(&cameras, &geometry);
+        let verdict = |shifts: [f64; 6]| judged(&bench, &sightings(&cameras, &shifts));
+        let right = verdict([0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001]);
+        assert!(right.inlier && right.weight > 0.999 && right.retained.iter().all(|&kept| kept));
+        let one_wrong = verdict([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]);
+        assert!(one_wrong.inlier);
+        assert_eq!(one_wrong.retained, [true, true, false, true, true, true]);
+        let wrong = verdict([0.1, -0.2, 0.15, -0.1, 0.3, -0.05]);
+        assert!(!wrong.inlier && wrong.weight < 0.01, "{}", wrong.weight);
+    }
+
+    /// A track that goes over to another point, and one wrong observation between the two.
+    #[test]
+    fn a_track_that_joins_two_points_is_split_and_one_that_strays_is_not() {
+        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
+        let geometry = Geometry { linked: true, ..geometry(&normalization) };
+        let cameras = cameras(8);
+        let bench = bench(&cameras, &geometry);
+        let split = |sightings: &[Sighting]| {
+            let mut all = Judged::nothing(&testing_input(), bench.noise);
+            let verdict = judged(&bench, sightings);
+            assert!(verdict.inlier);
+            let others = bench.others(sightings, &verdict);
+            let (sightings, places) = (sightings.to_vec(), (0..8).collect());
+            bench.write(&mut all, &Finding { track: 0, sightings, places, verdict, others });
+            (all.observations.split, all.splits.len())
+        };
+        let mut joined = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, 0.0, 0.0, 0.0]);
+        let second = Point::new(-0.5, 0.4, 1.5, 1.0);
+        for seen in &mut joined[5..] {
+            let image = cameras[seen.view] * second;
+            seen.xy = image.xy() / image.z;
+        }
+        assert_eq!(split(&joined), (vec![0, 0, 0, 0, 0, 1, 1, 1], 1));
+        let astray = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, -0.22, 0.17, -0.4]);
+        assert_eq!(split(&astray), (vec![0; 8], 0));
+    }
+
+    /// One track in eight views.
+    fn testing_input() -> Input {
+        let raw = RawInput {
+            views: vec![View::default(); 8],
+            track_count: 1,
+            view: (0..8).collect(),
+            track: vec![0; 8],
+            x: (0..8).map(f64::from).collect(),
+            y: vec![0.0; 8],
+            ..RawInput::default()
+        };
+        Input::new(raw, &Limits::default(), "track").expect("valid")
+    }
+
+    #[test]
+    fn of_a_linked_track_the_right_run_is_kept_and_nothing_behind_the_cameras() {
+        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
+        let geometry = Geometry { linked: true, ..geometry(&normalization) };
+        let cameras = cameras(6);
+        let joined = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.2, -0.15, 0.31]);
+        let verdict = judged(&bench(&cameras, &geometry), &joined);
+        assert!(verdict.inlier, "{}", verdict.weight);
+        assert_eq!(verdict.retained, [true, true, true, false, false, false]);
+        let behind: Vec<Camera> = cameras.iter().map(|camera| -camera).collect();
+        let verdict = judged(&bench(&behind, &geometry), &sightings(&cameras, &[0.0; 6]));
+        assert!(!verdict.inlier && verdict.weight == 0.0, "{}", verdict.weight);
+    }
+}
