@@ -3,7 +3,7 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::network::subspace::{Layer, Shape, SubspaceNet};
+use crate::network::subspace::{Block, Layer, PairLayers, Shape, SubspaceNet};
 use crate::network::{Parameter, standard_normal};
 
 /// Standard deviation of the selections' weights: enough for the selections to differ, too little for one track to be
@@ -15,6 +15,10 @@ const LOG_RIDGE: (f32, f32) = (-1.5, -4.5);
 const LOG_RIDGE_SPREAD: f32 = 0.3;
 /// Logit of the rate at which depths move at first: a quarter of the way.
 const DEPTH_RATE: f32 = -1.0;
+/// Logarithms of the squared distances at which a match has half its weight, of the first and the last block: from a
+/// seventh of a view's spread, which parts what is right from what lies anywhere, to a fiftieth, some standard
+/// deviations of common noise.
+const LOG_SCALE: (f32, f32) = (-4.0, -8.0);
 
 /// A network with freshly drawn weights: each uniform within one over the square root of its layer's inputs.
 pub fn initial(shape: Shape, seed: u64) -> SubspaceNet<Parameter> {
@@ -36,7 +40,7 @@ pub fn initial(shape: Shape, seed: u64) -> SubspaceNet<Parameter> {
         observation_logit: layer(&shapes.observation_logit),
     };
     for (number, block) in shapes.blocks.iter().enumerate() {
-        network.blocks.push(crate::network::subspace::Block {
+        network.blocks.push(Block {
             selection: layer(&block.selection),
             encoder: layer(&block.encoder),
             hidden: layer(&block.hidden),
@@ -44,6 +48,10 @@ pub fn initial(shape: Shape, seed: u64) -> SubspaceNet<Parameter> {
             logit: layer(&block.logit),
             log_ridge: log_ridges(number, shape),
             depth_rate: Parameter::constant([1, 1], DEPTH_RATE),
+            pairs: block.pairs.as_ref().map(|pairs| PairLayers {
+                trust: layer(&pairs.trust),
+                log_scale: Parameter::constant(pairs.log_scale, between(number, shape.blocks, LOG_SCALE)),
+            }),
         });
     }
     for (block, shapes) in network.blocks.iter_mut().zip(&shapes.blocks) {
@@ -56,11 +64,13 @@ pub fn initial(shape: Shape, seed: u64) -> SubspaceNet<Parameter> {
 
 /// The ridges of one block.
 fn log_ridges(block: usize, shape: Shape) -> Parameter {
-    let between = |place: usize, count: usize, (from, to): (f32, f32)| {
-        from + (to - from) * if count < 2 { 0.5 } else { place as f32 / (count - 1) as f32 }
-    };
     let middle = between(block, shape.blocks, LOG_RIDGE);
     let spread = (-LOG_RIDGE_SPREAD, LOG_RIDGE_SPREAD);
     let ridges = (0..shape.selections).map(|selection| middle + between(selection, shape.selections, spread));
     Parameter::new([shape.selections, 1], ridges.collect())
+}
+
+/// The value at one of several evenly spaced places.
+fn between(place: usize, count: usize, (from, to): (f32, f32)) -> f32 {
+    from + (to - from) * if count < 2 { 0.5 } else { place as f32 / (count - 1) as f32 }
 }

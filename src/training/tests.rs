@@ -8,7 +8,7 @@ use crate::network::Parameter;
 use crate::network::subspace::{Cloud, Shape, SubspaceNet};
 use crate::synthetic::curriculum::{self, Lesson};
 
-const SMALL: Shape = Shape { state: 6, selections: 3, blocks: 3, encoding: 5 };
+const SMALL: Shape = Shape { state: 6, selections: 3, blocks: 3, encoding: 5, strides: 0 };
 
 /// Some lessons with holes.
 fn lessons(seed: u64) -> Vec<Lesson> {

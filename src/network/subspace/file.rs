@@ -156,7 +156,10 @@ mod tests {
     use super::*;
 
     fn file() -> PriorFile {
-        let shape = Shape { state: 3, selections: 2, blocks: 2, encoding: 2 };
+        file_of(Shape { state: 3, selections: 2, blocks: 2, encoding: 2, strides: 0 })
+    }
+
+    fn file_of(shape: Shape) -> PriorFile {
         let mut next = 0.0;
         let network = shape.arrays().map(|[rows, columns]| {
             next += 1.0;
@@ -168,8 +171,9 @@ mod tests {
 
     #[test]
     fn a_file_reads_as_what_was_written() {
-        let file = file();
-        assert_eq!(PriorFile::read(&file.bytes()), Ok(file));
+        for file in [file(), file_of(Shape { strides: 1, ..file().shape })] {
+            assert_eq!(PriorFile::read(&file.bytes()), Ok(file));
+        }
     }
 
     #[test]

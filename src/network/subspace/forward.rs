@@ -3,6 +3,7 @@
 use super::arrays::{Block, SubspaceNet};
 use super::cloud::Cloud;
 use super::layers::Pool;
+use super::pairs::{PairFeatures, Pairs};
 use super::ridge::{inverse_scatter, product};
 use super::rows::{
     accumulate, halved, logarithm, normalise_rows, rectify, row, row_mut, rows, softmax, softmin_over_rows,
@@ -31,6 +32,7 @@ struct State<'a> {
     depths: Vec<f32>,
     /// The columns that subspaces are fitted to, 3n x m.
     columns: Vec<f32>,
+    pairs: Pairs<'a>,
 }
 
 /// What a block's selections leave of every track.
@@ -43,6 +45,8 @@ struct Residuals {
     of_tracks: Vec<f32>,
     /// H x m, logarithms.
     leverages: Vec<f32>,
+    /// What pairs of views say beside the selections.
+    of_pairs: PairFeatures,
 }
 
 impl SubspaceNet<Vec<f32>> {
@@ -74,6 +78,12 @@ impl SubspaceNet<Vec<f32>> {
             },
         )
     }
+
+    /// Views that the partners of a pair are apart at most; 0 where no pairs are asked.
+    fn strides(&self) -> usize {
+        let pairs = self.blocks.first().and_then(|block| block.pairs.as_ref());
+        pairs.map_or(0, |pairs| pairs.log_scale.len())
+    }
 }
 
 impl<'a> State<'a> {
@@ -102,6 +112,7 @@ impl<'a> State<'a> {
             tracks: Vec::new(),
             depths: vec![1.0; views * tracks],
             columns: vec![0.0; 3 * views * tracks],
+            pairs: Pairs::new(cloud, network.strides()),
         };
         state.encode_first(network);
         state.fill_first();
@@ -150,9 +161,9 @@ impl<'a> State<'a> {
         }
     }
 
-    /// Selections, ridge regressions and what they leave.
+    /// Selections, ridge regressions and what they leave; beside them, pairs.
     #[inline(always)]
-    fn residuals(&self, block: &Block<Vec<f32>>) -> Residuals {
+    fn residuals(&mut self, block: &Block<Vec<f32>>) -> Residuals {
         let (views, tracks) = (self.cloud.views(), self.cloud.tracks());
         let selections = block.log_ridge.len();
         let logits = block.selection.affine(&[&self.tracks], tracks);
@@ -161,6 +172,10 @@ impl<'a> State<'a> {
             of_observations: vec![0.0; views * selections * tracks],
             of_tracks: vec![0.0; selections * tracks],
             leverages: vec![0.0; selections * tracks],
+            of_pairs: match &block.pairs {
+                Some(layers) => self.pairs.ask(layers, &self.tracks),
+                None => PairFeatures::default(),
+            },
         };
         for selection in 0..selections {
             let ridge = block.log_ridge[selection].exp();
@@ -222,7 +237,8 @@ impl<'a> State<'a> {
             let visible = row(self.cloud.visible(), tracks, view);
             let logarithms = rows(&residuals.of_observations, tracks, view * selections, selections);
             let places = halved(rows(self.cloud.places(), tracks, 2 * view, 2));
-            pool.add(block.encoder.affine(&[logarithms, &places, visible], tracks), visible);
+            let inputs = [logarithms, &places, visible, residuals.of_pairs.of_view(view)];
+            pool.add(block.encoder.affine(&inputs, tracks), visible);
         }
         let pooled = pool.finish(&self.counts);
         let inputs = [&self.tracks[..], &pooled, &halved(&residuals.of_tracks), &halved(&residuals.leverages)];
@@ -301,7 +317,8 @@ impl<'a> State<'a> {
             let visible = row(self.cloud.visible(), tracks, view);
             let logarithms = rows(&residuals.of_observations, tracks, view * selections, selections);
             let places = halved(rows(self.cloud.places(), tracks, 2 * view, 2));
-            let inputs = [logarithms, &in_image, &places, visible, &mean, &self.tracks];
+            let of_pairs = residuals.of_pairs.of_view(view);
+            let inputs = [logarithms, &in_image, &places, visible, &mean, &self.tracks, of_pairs];
             let mut hidden = network.observation_hidden.affine(&inputs, tracks);
             rectify(&mut hidden);
             logits.extend(network.observation_logit.affine(&[&hidden], tracks));

@@ -18,25 +18,29 @@
 //! 5. The prediction `Y - R`, mixed over the selections by how well each fits, moves the depths towards what it implies
 //!    (projective factorisation with soft selections) and fills what is unobserved.
 //!
+//! A network may also ask [pairs](pairs) of neighbouring views: what these say of an observation joins its encoding in
+//! every block, and what its logit is read from.
+//!
 //! A linear layer reads a logit for every track after every block (training looks at all, the solver at the last) and
 //! another for every observation after the last block.
 //!
 //! Time and memory are linear in the tracks and, per track, quadratic in the views: `G` is 3n x 3n.
 //!
-//! Everything is f32 but the inverse of `G`, which is taken in f64.
+//! Everything is f32 but the inverse of `G`, which is taken in f64, and the fundamental matrices of pairs.
 
 mod arrays;
 mod cloud;
 mod file;
 mod forward;
 mod layers;
+pub mod pairs;
 mod ridge;
 mod rows;
 mod shipped;
 #[cfg(test)]
 mod tests;
 
-pub use arrays::{Block, Layer, Shape, SubspaceNet};
+pub use arrays::{Block, Layer, PAIR_FEATURES, PairLayers, Shape, SubspaceNet};
 pub use cloud::Cloud;
 pub use file::{FileError, Origin, PriorFile};
 pub use forward::Scores;

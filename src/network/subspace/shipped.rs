@@ -49,6 +49,11 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_shipped_network_is_written_as_it_was_read() {
+        assert!(shipped().bytes() == SHIPPED, "the layout of files without pairs has changed");
+    }
+
+    #[test]
     fn the_shipped_network_says_how_it_was_made() {
         let origin = &shipped().origin;
         assert!(origin.command.starts_with("scpsfm train-prior "), "{origin:?}");
