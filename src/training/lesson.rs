@@ -1,9 +1,9 @@
 //! Lessons as tensors, and the derivatives of their loss.
 
-use burn::tensor::{DType, Device, Tensor, TensorData};
+use burn::tensor::{DType, Device, Tensor};
 
 use super::labelled::{self, Labels};
-use super::tape::{Batch, constant};
+use super::tape::{Batch, constant, numbers};
 use super::{Error, Objective, unlabelled};
 use crate::network::Parameter;
 use crate::network::subspace::{Cloud, SubspaceNet};
@@ -92,7 +92,5 @@ pub fn tensors(lessons: &[Lesson], dtype: DType, device: &Device) -> (Batch, Lab
 
 /// The value of a loss.
 fn number(loss: &Tensor<1>) -> Result<f64, Error> {
-    let data: TensorData = loss.clone().inner().into_data().convert::<f64>();
-    let values: Vec<f64> = data.try_into_vec().map_err(|error| Error::Backend(format!("{error:?}")))?;
-    values.first().copied().ok_or_else(|| Error::Backend("a loss without a value".into()))
+    numbers(loss.clone())?.first().copied().ok_or_else(|| Error::Backend("a loss without a value".into()))
 }

@@ -11,6 +11,7 @@ mod initial;
 mod labelled;
 mod lesson;
 mod objective;
+mod pairs;
 mod tape;
 #[cfg(test)]
 mod tests;

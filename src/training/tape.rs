@@ -14,6 +14,7 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 use nalgebra::DMatrix;
 
 use super::Error;
+use super::pairs::Pairs;
 use crate::network::subspace::{
     Block, DEPTH_RANGE, LEAST_MEAN_DEPTH, LEAVE_ONE_OUT_FLOOR, Layer, MOST_PREDICTED, RESIDUAL_FLOOR, SubspaceNet,
     VARIANCE_FLOOR,
@@ -47,6 +48,8 @@ struct Residuals {
     of_tracks: Tensor<3>,
     /// Logarithms, B x H x m.
     leverages: Tensor<3>,
+    /// What pairs of views say beside the selections, B x n x 3 x m.
+    of_pairs: Option<Tensor<4>>,
 }
 
 /// Lessons on their way through the blocks.
@@ -69,6 +72,8 @@ struct State<'a> {
     depths: Tensor<4>,
     /// B x n x 3 x m
     columns: Tensor<4>,
+    /// Where they are asked.
+    pairs: Option<Pairs>,
 }
 
 impl SubspaceNet<Tensor<2>> {
@@ -77,7 +82,7 @@ impl SubspaceNet<Tensor<2>> {
     /// # Errors
     /// [`Error::Backend`] for a defect of burn.
     pub fn on_tape(&self, batch: &Batch, dtype: DType) -> Result<Output, Error> {
-        let mut state = State::new(self, batch, dtype);
+        let mut state = State::new(self, batch, dtype)?;
         let mut tracks = Vec::with_capacity(self.blocks.len());
         let mut last = None;
         for block in &self.blocks {
@@ -94,7 +99,7 @@ impl SubspaceNet<Tensor<2>> {
 }
 
 impl<'a> State<'a> {
-    fn new(network: &SubspaceNet<Tensor<2>>, batch: &'a Batch, dtype: DType) -> Self {
+    fn new(network: &SubspaceNet<Tensor<2>>, batch: &'a Batch, dtype: DType) -> Result<Self, Error> {
         let (places, visible) = (batch.places.clone(), batch.visible.clone());
         let [lessons, views, _, _] = places.dims();
         let share = visible.clone().sum_dim(1).clamp_min(1.0).recip();
@@ -113,10 +118,25 @@ impl<'a> State<'a> {
         let tracks = normalised(affine3(&network.first_state, pooled(encoded, &visible, &share)));
         let identity = DMatrix::<f64>::identity(3 * views, 3 * views).as_slice().to_vec();
         let identity = constant(identity, [1, 1, 3 * views, 3 * views], dtype, &columns.device());
-        Self { batch, identity, homogeneous, squared_lengths, hidden, share, context, tracks, depths: ones, columns }
+        let pairs = network.blocks.first().and_then(|block| block.pairs.as_ref());
+        let pairs = pairs.map(|layers| Pairs::new(batch, &homogeneous, layers, dtype)).transpose()?;
+        let depths = ones;
+        Ok(Self {
+            batch,
+            identity,
+            homogeneous,
+            squared_lengths,
+            hidden,
+            share,
+            context,
+            tracks,
+            depths,
+            columns,
+            pairs,
+        })
     }
 
-    fn residuals(&self, block: &Block<Tensor<2>>, dtype: DType) -> Result<Residuals, Error> {
+    fn residuals(&mut self, block: &Block<Tensor<2>>, dtype: DType) -> Result<Residuals, Error> {
         let [lessons, views, _, tracks] = self.columns.dims();
         let [selections, _] = block.log_ridge.dims();
         let rows = 3 * views;
@@ -134,16 +154,23 @@ impl<'a> State<'a> {
         let squared = squared.reshape([lessons, selections, views, tracks]).swap_dims(1, 2);
         let mean = (squared.clone() * self.batch.visible.clone()).sum_dim(1) * self.share.clone();
         let leverages = (leverages * ridge).div_scalar(views as f64).squeeze_dim(2);
+        let of_pairs = match (&mut self.pairs, &block.pairs) {
+            (Some(pairs), Some(layers)) => Some(pairs.ask(layers, &self.tracks)?),
+            _ => None,
+        };
         Ok(Residuals {
             left,
             of_observations: logarithm(squared),
             of_tracks: logarithm(mean).squeeze_dim(1),
             leverages: logarithm(leverages),
+            of_pairs,
         })
     }
 
     fn advance(&mut self, block: &Block<Tensor<2>>, residuals: &Residuals) {
-        let features = Tensor::cat(vec![residuals.of_observations.clone(), self.context.clone()], 2);
+        let mut features = vec![residuals.of_observations.clone(), self.context.clone()];
+        features.extend(residuals.of_pairs.clone());
+        let features = Tensor::cat(features, 2);
         let encoded = relu(affine4(&block.encoder, features));
         let pooled = pooled(encoded, &self.batch.visible, &self.share);
         let half = |logarithms: &Tensor<3>| logarithms.clone().mul_scalar(0.5);
@@ -181,7 +208,9 @@ impl<'a> State<'a> {
         let shared = Tensor::cat(vec![of_tracks, self.tracks], 1);
         let [_, features, _] = shared.dims();
         let shared = shared.reshape([lessons, 1, features, tracks]).expand([lessons, views, features, tracks]);
-        let features = Tensor::cat(vec![residuals.of_observations, in_image, self.context, shared], 2);
+        let mut features = vec![residuals.of_observations, in_image, self.context, shared];
+        features.extend(residuals.of_pairs);
+        let features = Tensor::cat(features, 2);
         affine4(&network.observation_logit, relu(affine4(&network.observation_hidden, features)))
     }
 }
@@ -197,14 +226,7 @@ fn pooled(encoded: Tensor<4>, visible: &Tensor<4>, share: &Tensor<4>) -> Tensor<
 fn newton_step(scatter: Tensor<4>, dtype: DType) -> Result<Tensor<4>, Error> {
     let device = scatter.device();
     let [lessons, selections, rows, _] = scatter.dims();
-    let values: Vec<f64> = scatter
-        .clone()
-        .inner()
-        .into_data()
-        .convert::<f64>()
-        .try_into_vec()
-        .map_err(|error| Error::Backend(format!("{error:?}")))?;
-    let inverses: Vec<f64> = values
+    let inverses: Vec<f64> = numbers(scatter.clone())?
         .chunks_exact(rows * rows)
         .flat_map(|scatter| inverse(DMatrix::from_row_slice(rows, rows, scatter)).as_slice().to_vec())
         .collect();
@@ -225,6 +247,12 @@ pub fn constant<const D: usize>(values: Vec<f64>, shape: [usize; D], dtype: DTyp
     Tensor::from_data(TensorData::new(values, shape), (device, dtype))
 }
 
+/// The values of a tensor row by row, off the tape.
+pub fn numbers<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f64>, Error> {
+    let data = tensor.inner().into_data().convert::<f64>();
+    data.try_into_vec().map_err(|error| Error::Backend(format!("{error:?}")))
+}
+
 fn logarithm<const D: usize>(squared: Tensor<D>) -> Tensor<D> {
     squared.add_scalar(f64::from(RESIDUAL_FLOOR)).log()
 }
@@ -237,7 +265,7 @@ fn normalised(values: Tensor<3>) -> Tensor<3> {
 }
 
 /// `W X + b`, B x F x m.
-fn affine3(layer: &Layer<Tensor<2>>, input: Tensor<3>) -> Tensor<3> {
+pub fn affine3(layer: &Layer<Tensor<2>>, input: Tensor<3>) -> Tensor<3> {
     let [outputs, inputs] = layer.weight.dims();
     let weight = layer.weight.clone().reshape([1, outputs, inputs]);
     weight.matmul(input) + layer.bias.clone().reshape([1, outputs, 1])

@@ -41,7 +41,8 @@ impl Settings {
             Objective::Labels => "",
             Objective::PaperLosses => " --unlabelled",
         };
-        format!("--seed {} --steps {}{objective}", self.seed, self.steps)
+        let pairs = if self.shape.strides > 0 { " --pairs" } else { "" };
+        format!("--seed {} --steps {}{objective}{pairs}", self.seed, self.steps)
     }
 
     /// Seed of the lessons that the training is validated on, which it never sees.

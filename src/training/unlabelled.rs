@@ -23,7 +23,7 @@ use nalgebra::DMatrix;
 
 use super::Error;
 use super::objective::{Loss, importance};
-use super::tape::{Output, constant};
+use super::tape::{Output, constant, numbers};
 use crate::network::NetworkSettings;
 use crate::network::losses::{LossSettings, rank_terms};
 
@@ -74,10 +74,4 @@ fn matrices(columns: &Tensor<4>) -> Result<Vec<DMatrix<f64>>, Error> {
         matrix
     };
     Ok(numbers(columns.clone())?.chunks_exact(rows * tracks).map(of_lesson).collect())
-}
-
-/// The values of a tensor, off the tape.
-fn numbers<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f64>, Error> {
-    let data = tensor.inner().into_data().convert::<f64>();
-    data.try_into_vec().map_err(|error| Error::Backend(format!("{error:?}")))
 }
