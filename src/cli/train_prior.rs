@@ -56,6 +56,10 @@ pub struct Args {
     #[arg(long)]
     pub unlabelled: bool,
 
+    /// Train a network that also asks neighbouring pairs of views for their epipolar geometry
+    #[arg(long)]
+    pub pairs: bool,
+
     /// Show no progress
     #[arg(long, short)]
     pub quiet: bool,
@@ -102,7 +106,8 @@ impl Files {
 fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
     let files = Files::new(&args.out)?;
     let objective = if args.unlabelled { Objective::PaperLosses } else { Objective::Labels };
-    let settings = Settings { seed: args.seed, steps: args.steps, shape: Shape::default(), objective };
+    let shape = if args.pairs { Shape::with_pairs() } else { Shape::default() };
+    let settings = Settings { seed: args.seed, steps: args.steps, shape, objective };
     let mut trainer = take_up(&files, settings)?;
     let view = View::new(args, objective, trainer.step());
     // At once, too: a folder that cannot be written to is better known before the work.

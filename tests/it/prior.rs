@@ -56,6 +56,28 @@ fn a_seed_gives_one_network_that_a_solve_asks() {
 }
 
 #[test]
+fn a_network_that_asks_pairs_is_trained_and_asked() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let at = |name: &str| directory.path().join(name);
+    let (file, scene, answer) = (at("pairs.prior"), at("scene"), at("answer"));
+    let trained = run(["train-prior", "--pairs", "--out", text(&file), "--seed", "3", "--steps", "2", "--quiet"]);
+    assert_eq!(trained.code, Some(0), "{trained:?}");
+    let bytes = fs::read(&file).expect("a network");
+    let header = String::from_utf8_lossy(&bytes[..bytes.len().min(400)]).into_owned();
+    assert!(header.contains("--seed 3 --steps 2 --pairs --out FILE") && header.contains("\"strides\":2"), "{header}");
+
+    let made =
+        run(["synth", "--views", "6", "--tracks", "60", "--outliers", "0.5", "--seed", "5", "--out", text(&scene)]);
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let input = scene.join("observations.csv");
+    let asked = ["--prior", text(&file), "--out", text(&answer), "--json", "--quiet"];
+    let solved = run(["solve", text(&input), "--width", "1000", "--height", "1000"].into_iter().chain(asked));
+    assert_eq!(solved.code, Some(0), "{solved:?}");
+    let result: Value = serde_json::from_str(&solved.stdout).expect("JSON");
+    assert_eq!(result["status"], "SOLVED", "{result}");
+}
+
+#[test]
 fn the_state_of_another_training_is_refused() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let out = directory.path().join("a.prior");
