@@ -196,21 +196,15 @@ impl Batch {
             let moved = [next[0] - vector[0], next[1] - vector[1], next[2] - vector[2], next[3] - vector[3]];
             vector = choose(going, next, vector);
             let moves = dot(moved, moved);
-            let mut any = false;
-            for lane in 0..LANES {
+            for (going, moved) in going.iter_mut().zip(moves.0) {
                 // Not a number has arrived, too.
-                going[lane] &= moves.0[lane] >= TOLERANCE * TOLERANCE;
-                any |= going[lane];
+                *going &= moved >= TOLERANCE * TOLERANCE;
             }
-            if !any {
+            if going == [false; LANES] {
                 break;
             }
         }
-        let sum = dot(vector, vector);
-        let mut known = [false; LANES];
-        for lane in 0..LANES {
-            known[lane] = sum.0[lane].is_finite();
-        }
+        let known = dot(vector, vector).0.map(f64::is_finite);
         choose(known, vector, [Lane::ZERO, Lane::ZERO, Lane::ZERO, Lane::ONE])
     }
 
@@ -261,8 +255,9 @@ impl Batch {
                 let (cost, candidate) = (costs.0[lane], candidate_costs.0[lane]);
                 accepted[lane] = going[lane] && candidate < cost;
                 damping.0[lane] *= if accepted[lane] { DAMPING_DOWN } else { DAMPING_UP };
+                let has_arrived = accepted[lane] && cost - candidate < RELATIVE_TOLERANCE * cost;
                 // Not a number: the system has no solution.
-                going[lane] &= !candidate.is_nan() && !(accepted[lane] && cost - candidate < RELATIVE_TOLERANCE * cost);
+                going[lane] &= !(has_arrived || candidate.is_nan());
             }
             points = choose(accepted, candidates, points);
             costs = candidate_costs.or(accepted, costs);

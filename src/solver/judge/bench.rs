@@ -210,8 +210,7 @@ fn drop_worst(retained: &mut Vec<usize>, least: usize, gate: f64, squared: impl 
     }
     let residuals = retained.iter().map(|&k| squared(k)).enumerate();
     let (place, worst) = residuals.max_by(|a, b| a.1.total_cmp(&b.1))?;
-    // Written so that what is no number is dropped.
-    (!(worst <= gate)).then(|| retained.remove(place))
+    (worst > gate || worst.is_nan()).then(|| retained.remove(place))
 }
 
 fn chosen(sightings: &[Sighting], which: &[usize]) -> Vec<Sighting> {

@@ -23,7 +23,7 @@ pub use scatter::{Matches, Scatter, UNKNOWNS, least_direction, trace};
 
 use super::arrays::{PAIR_FEATURES, PairLayers};
 use super::cloud::Cloud;
-use super::rows::{accumulate, row, row_mut, rows};
+use super::rows::{accumulate, logarithm, row, row_mut, rows};
 
 /// Added to a squared distance before its logarithm is taken: a thousandth of a view's spread is some tenths of a pixel,
 /// and what lies closer is right wherever it lies.
@@ -120,8 +120,8 @@ impl<'a> Pairs<'a> {
             let fundamental = least_direction(&matches.scatter()).unwrap_or(NOTHING_FITS);
             sampson(&fundamental.map(|value| value as f32), &matches, squared);
             let logarithms = &mut weights;
-            for (logarithm, squared) in logarithms.iter_mut().zip(&*squared) {
-                *logarithm = 0.5 * (squared + DISTANCE_FLOOR).ln();
+            for (heard, squared) in logarithms.iter_mut().zip(&*squared) {
+                *heard = 0.5 * logarithm(squared + DISTANCE_FLOOR);
             }
             features.add(pair.from, logarithms, seen);
             features.add(pair.to, logarithms, seen);
