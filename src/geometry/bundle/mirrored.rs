@@ -90,7 +90,7 @@ impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Proble
 #[cfg(test)]
 mod tests {
     use super::super::Options;
-    use super::super::engine::descend;
+    use super::super::engine::{descend, minimise};
     use super::super::metric::{IntrinsicsPrior, Parameter, Reconstruction};
     use super::super::metric::{Metric, POINT, POSE};
     use super::super::projective::Projective;
@@ -114,6 +114,11 @@ mod tests {
         assert!(apart(found.initial_cost, expected.initial_cost) < 1e-12, "{case}");
         assert!(expected.cost < 0.5 * expected.initial_cost, "{case}: {expected:?}");
         assert!(apart(found.cost, expected.cost) < 1e-5, "{case}: {found:?} {expected:?}");
+        let mut adjusted = problem.clone();
+        let chosen = minimise(&mut adjusted, observations, &options, &StopToken::default());
+        assert_eq!(chosen, found, "{case}");
+        let again = minimise(&mut adjusted, observations, &Options::squared(0), &StopToken::default());
+        assert!(apart(again.initial_cost, found.cost) < 1e-9, "{case}: what was found is not what is left");
     }
 
     #[test]

@@ -85,8 +85,8 @@ impl Batch {
         let nothing = Sighted { camera: [[Lane::ZERO; 3]; 4], xy: [Lane::ZERO; 2], weight: Lane::ZERO };
         let mut sighted = vec![nothing; longest];
         for lane in 0..LANES {
-            // A lane without a track repeats the first one, and a place without a sighting the track's first: numbers
-            // that count nowhere, but are of a usual size.
+            // A lane without a track repeats the first one, and a place without a sighting has the camera of the track's
+            // first: numbers that count nowhere, but are of a usual size.
             let Some(track) = tracks.get(lane).or(tracks.first()) else { continue };
             for (k, sighted) in sighted.iter_mut().enumerate() {
                 let Some(seen) = track.get(k).or(track.first()) else { continue };
@@ -96,9 +96,11 @@ impl Batch {
                         lanes.0[lane] = *entry;
                     }
                 }
-                sighted.xy[0].0[lane] = seen.xy.x;
-                sighted.xy[1].0[lane] = seen.xy.y;
-                sighted.weight.0[lane] = f64::from(u8::from(k < track.len()));
+                if k < track.len() {
+                    sighted.xy[0].0[lane] = seen.xy.x;
+                    sighted.xy[1].0[lane] = seen.xy.y;
+                    sighted.weight.0[lane] = 1.0;
+                }
             }
         }
         Self { sighted, tracks: tracks.len().min(LANES) }
@@ -210,8 +212,7 @@ impl Batch {
 
     #[inline(always)]
     fn descend(&self, start: Triangulated, mut going: Mask, iterations: usize) -> Triangulated {
-        let mut points = normalised(start.points);
-        let mut costs = self.costs(&points);
+        let Triangulated { mut points, mut costs } = start;
         let mut damping = Lane::ONE * INITIAL_DAMPING;
         for _ in 0..iterations {
             if going == [false; LANES] {
@@ -347,10 +348,11 @@ mod tests {
             assert_eq!((alone.point(0), alone.cost(0)), (together.point(k), together.cost(k)));
         }
         let mut longer: Vec<Vec<Sighting>> = tracks.clone();
-        longer.iter_mut().for_each(|track| track.push(Sighting { view: 0, xy: Vector2::new(f64::MAX, 1e9) }));
+        let far = Sighting { view: 0, xy: Vector2::new(f64::MAX, 1e9) };
+        longer.iter_mut().enumerate().for_each(|(k, track)| track.insert(if k == 0 { 0 } else { track.len() }, far));
         let mut batch = Batch::new(&cameras, &sliced(&longer));
         for (k, track) in tracks.iter().enumerate() {
-            batch.drop_sighting(k, track.len());
+            batch.drop_sighting(k, if k == 0 { 0 } else { track.len() });
         }
         for (k, track) in tracks.iter().enumerate() {
             let found = triangulated(&batch);

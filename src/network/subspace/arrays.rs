@@ -59,8 +59,8 @@ pub struct SubspaceNet<T> {
 pub const FIRST_FEATURES: usize = 7;
 /// Numbers beside the residuals that an observation's later encodings are made from: place and visible.
 pub const PLACE_FEATURES: usize = 3;
-/// Numbers that pairs of views say of an observation: the least and the mean logarithm of its distances, and the share
-/// of the pairs that it could be in.
+/// Numbers that pairs of views say of an observation: the least and the mean logarithm of its distances, and how many
+/// pairs it is in, as a share of those of a view in the middle.
 pub const PAIR_FEATURES: usize = 3;
 
 /// The sizes of a network.

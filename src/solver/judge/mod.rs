@@ -131,7 +131,7 @@ fn judge_under(
 ) -> Judged {
     // Triangulation wants a slice; unregistered views are never sighted.
     let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
-    let bench = Bench { cameras: &cameras, geometry, noise };
+    let bench = Bench { cameras: &cameras, geometry, noise, stop };
     let mut judged = Judged::nothing(input, noise);
     let threads = threads.if_worth(input.track_count() >= WORTH_A_THREAD);
     for first in (0..input.track_count()).step_by(BATCH) {

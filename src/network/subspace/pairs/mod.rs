@@ -153,7 +153,7 @@ impl PairFeatures {
         accumulate(count, seen);
     }
 
-    /// Sums to means and counts to shares of the pairs that an observation can be in.
+    /// Sums to means, and counts to shares of the most pairs that an observation can be in.
     #[inline(always)]
     fn finish(&mut self, most: usize) {
         let tracks = self.tracks;
