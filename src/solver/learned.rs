@@ -33,6 +33,9 @@ const LEAST_LIKELY: usize = 4;
 pub const SURELY_ENOUGH: usize = 2 * LEAST_INLIERS;
 /// Odds against a track, in nats, at which it is held to be wrong: twenty to one.
 const DOUBT_NATS: f64 = 3.0;
+/// Tracks below which its doubts do not count: lessons have no fewer, and of ten right tracks alone the network takes
+/// but a few to be right.
+const LEAST_JUDGED: usize = 50;
 
 /// Whether these settings let the search ask the network.
 pub fn may_be_asked(settings: &SolveSettings) -> bool {
@@ -141,9 +144,10 @@ impl Opinion {
     /// How many of these inliers count towards those that geometry needs for a verification.
     ///
     /// With few of them the cameras are flexible enough to take up a wrong one or two; then those that the network
-    /// holds to be wrong do not count. With many, geometry alone has the word.
+    /// holds to be wrong do not count. With many, or where there are fewer tracks than it has ever been shown, geometry
+    /// alone has the word.
     pub fn counted(&self, inliers: &[usize]) -> usize {
-        if inliers.len() >= SURELY_ENOUGH {
+        if inliers.len() >= SURELY_ENOUGH || self.ln_odds.len() < LEAST_JUDGED {
             return inliers.len();
         }
         inliers.iter().filter(|&&track| self.ln_odds[track] > -DOUBT_NATS).count()
@@ -169,7 +173,9 @@ mod tests {
         assert!((truncations[0] - 0.25).abs() < 1e-12 && truncations[1] == 1.0, "{truncations:?}");
         assert!((truncations[2] - 1.75).abs() < 1e-12 && truncations.iter().all(|cost| *cost > 0.0));
         assert_eq!(opinion.start(), [2, 3, 1, 0], "no more than there are");
-        assert_eq!((opinion.counted(&[0, 1, 3]), opinion.counted(&[0; SURELY_ENOUGH])), (2, SURELY_ENOUGH));
+        let doubts = of([opinion.ln_odds.clone(), vec![0.0; LEAST_JUDGED - 4]].concat());
+        assert_eq!((doubts.counted(&[0, 1, 3]), doubts.counted(&[0; SURELY_ENOUGH])), (2, SURELY_ENOUGH));
+        assert_eq!(opinion.counted(&[0, 1, 3]), 3, "of so few tracks it knows nothing");
         assert!(!opinion.ranks());
         assert!(of(vec![0.1; LEAST_LIKELY]).ranks());
     }

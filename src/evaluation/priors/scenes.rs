@@ -42,6 +42,8 @@ pub fn all() -> Vec<Condition> {
         ("slid .7", kind(OutlierKind::Slid)),
         ("repeated .7", kind(OutlierKind::Repeated)),
         ("turntable .9", SceneOptions { motion: Motion::Turntable, max_rotation_rad: QUARTER_TURN, ..paper() }),
+        ("12 tracks, .2", SceneOptions { tracks: 12, ..at(0.2) }),
+        ("30 tracks, .6", SceneOptions { tracks: 30, ..at(0.6) }),
         ("sphere, .9", SceneOptions { motion: Motion::Sphere, ..paper() }),
         ("sphere, .95", SceneOptions { motion: Motion::Sphere, outliers: 0.95, ..paper() }),
         ("40 views, .95", SceneOptions { views: 40, outliers: 0.95, ..paper() }),

@@ -77,3 +77,17 @@ fn where_hardly_any_track_of_a_sample_is_right_the_likeliest_of_all_are_searched
         assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}");
     }
 }
+
+/// The network has seen no scene of so few tracks, and takes a few of them to be right whatever they are.
+#[test]
+fn of_a_dozen_tracks_geometry_alone_has_the_word() {
+    for (seed, tracks) in [8, 10, 12, 14].into_iter().enumerate() {
+        let seed = 60 + seed as u64;
+        for (outliers, status) in [(0.0, Status::Solved), (1.0, Status::NoReconstruction)] {
+            let (input, scene) = scene(SceneOptions { tracks, outliers, seed, ..SceneOptions::default() });
+            let solution = solved(&input, &SolveSettings { iterations: 50, ..SolveSettings::default() });
+            assert_eq!(solution.status, status, "{tracks} tracks, seed {seed}: {:?}", solution.warnings);
+            assert_eq!(solution.tracks.inlier, scene.truth.inlier, "{tracks} tracks, seed {seed}");
+        }
+    }
+}
