@@ -163,7 +163,12 @@ fn assert_goes_on(shape: Shape, flag: &str) {
     let other = Settings { seed: 12, ..settings };
     let error = Trainer::resume(&whole.state().expect("a state"), other).expect_err("another training");
     assert_eq!(error.to_string(), format!("it belongs to a training with --seed 11 --steps 4{flag}"));
-    assert!(Trainer::resume(b"no state", settings).is_err());
+    assert!(Trainer::resume(b"no state", settings).is_err() && Trainer::resume(b"", settings).is_err());
+    let mut damaged = whole.state().expect("a state");
+    let middle = damaged.len() / 2;
+    damaged[middle] ^= 1;
+    let error = Trainer::resume(&damaged, settings).expect_err("a damaged state");
+    assert!(error.to_string().contains("checksum"), "{error}");
 }
 
 /// The plane that stands for the loss without labels: its derivative along the logits is that of the losses themselves.

@@ -1,6 +1,7 @@
 //! The training itself: steps, the average of the weights along the way, validation, and a state that can be put aside.
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use super::lesson::{Losses, Slope, differentiate};
 use super::{Error, Objective, adam, initial};
@@ -22,8 +23,11 @@ const MOST_PAST: f64 = 0.998;
 const MOST_REJECTED: u64 = 50;
 /// Version of this program.
 const PROGRAM: &str = env!("CARGO_PKG_VERSION");
-/// Layout of a saved state.
-const STATE_VERSION: u32 = 2;
+/// Bytes of the SHA-256 that a saved state begins with: of a damaged one another network would come, under the name of
+/// the one that was asked for.
+const DIGEST_BYTES: usize = 32;
+/// Layout of what follows.
+const STATE_VERSION: u32 = 3;
 
 /// What is trained, how long and from what.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -107,7 +111,13 @@ impl Trainer {
     /// # Errors
     /// [`Error::State`] for the state of another training, or of none.
     pub fn resume(state: &[u8], settings: Settings) -> Result<Self, Error> {
-        let trainer: Self = rmp_serde::from_slice(state)
+        let (digest, encoded) = state.split_at(state.len().min(DIGEST_BYTES));
+        if Sha256::digest(encoded).as_slice() != digest {
+            return Err(Error::State(
+                "it is damaged, or not the state of a training: its checksum does not fit".into(),
+            ));
+        }
+        let trainer: Self = rmp_serde::from_slice(encoded)
             .map_err(|error| Error::State(format!("it is not the state of a training: {error}")))?;
         if trainer.version != STATE_VERSION {
             let version = trainer.version;
@@ -138,7 +148,8 @@ impl Trainer {
     /// # Errors
     /// [`Error::State`] for a defect of the encoder.
     pub fn state(&self) -> Result<Vec<u8>, Error> {
-        rmp_serde::to_vec(self).map_err(|error| Error::State(error.to_string()))
+        let encoded = rmp_serde::to_vec(self).map_err(|error| Error::State(error.to_string()))?;
+        Ok([Sha256::digest(&encoded).as_slice(), &encoded].concat())
     }
 
     pub fn step(&self) -> u64 {
