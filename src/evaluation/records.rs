@@ -21,9 +21,9 @@ pub enum Error {
     /// Two processes would each lose what the other writes.
     #[error("{} is being written by another process: wait for it, or give another directory", path.display())]
     Busy { path: PathBuf },
-    /// Figures of two builds do not mix.
+    /// Figures of two builds, or of two networks, do not mix.
     #[error(
-        "{} was recorded by another build ({recorded}; this is {current}): remove it, or give another directory",
+        "{} was recorded by another build or with another network ({recorded}; this is {current}): remove it, or give another directory",
         path.display()
     )]
     OtherBuild { path: PathBuf, recorded: String, current: String },

@@ -34,7 +34,8 @@ pub fn structure(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken)
         WarningCode::SecondStructure,
         format!(
             "about {count} tracks that the search left out agree on another rigid motion: a second moving body, or a \
-             repeated structure; the result is that of the larger set, not of both"
+             repeated structure; the result is that of the set that was found first, {} tracks, not of both",
+            consensus.inlier_count()
         ),
     ))
 }
