@@ -75,7 +75,7 @@ pub fn irls(matrix: &DMatrix<f64>, rank: usize, stop: &StopToken) -> Option<Vec<
 /// Shrinking of the residual scale a round: from a view's spread to the floor in the first half of the rounds.
 const AFFINE_SHRINK: f64 = 0.88;
 /// The same where all that is asked is whether many agree, a second body say: the usual pace of graduated
-/// non-convexity (Yang, Antonante, Tzoumas & Carlone 2020, section IV: 1.4 a round). Of forty scenes with a second body
+/// non-convexity (Yang, Antonante, Tzoumas & Carlone 2020: 1.4 a round). Of forty scenes with a second body
 /// and forty without, the same are told apart as at the slow pace (a test), in half the rounds.
 const AFFINE_SHRINK_OF_MANY: f64 = 1.0 / 1.4;
 /// Floor of the residual, in units of a view's spread: what perspective adds to right tracks at moderate depths.

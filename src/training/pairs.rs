@@ -12,9 +12,8 @@
 //! Reweighting is a recurrence, and its derivative through all blocks explodes: after 1,000 steps the median length of a
 //! gradient was 91, nearly all of it from the first block's pairs, for .7 without pairs, and the loss of the tracks
 //! rose again from step 400 on. Therefore the distances in Cauchy's weights count as given, as they do in reweighted
-//! least squares, and
-//! [`LEAST_GAP`] bounds how far `f` turns. With both, lengths are those of a network without pairs. The last losses of
-//! tracks and observations are .058 and .150 with both, .104 and .193 with neither, .080 and .195 without pairs
+//! least squares, and [`LEAST_GAP`] bounds how far `f` turns. With both, lengths are those of a network without pairs.
+//! The last losses of tracks and observations are .058 and .150 with both, .104 and .193 with neither, .080 and .195 without pairs
 //! (`train-prior --seed 0 --steps 2000`, with `--pairs` and without).
 //!
 //! Shapes: `B` lessons, `P` pairs of `n` views, `m` tracks.
