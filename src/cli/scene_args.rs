@@ -96,6 +96,14 @@ pub struct OutlierArgs {
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub wrong_views: usize,
 
+    /// Observations of every right track that are anywhere in the image instead, in random views for each track
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub wrong_observations: usize,
+
+    /// Observations of every track that are left out, random ones for each track
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub deleted_observations: usize,
+
     /// Share of all tracks that belong to a second moving body; they count among the outliers
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     pub second_motion: f64,
@@ -107,6 +115,8 @@ impl OutlierArgs {
         SceneOptions {
             outlier_kind: self.outlier_kind.into(),
             wrong_views: self.wrong_views,
+            wrong_observations: self.wrong_observations,
+            deleted_observations: self.deleted_observations,
             second_motion: self.second_motion,
             ..options
         }

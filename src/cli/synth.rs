@@ -22,6 +22,7 @@ Examples:
   scpsfm synth --out scene --outliers 0.95 --tracks 400 --seed 3
   scpsfm synth --out scene --motion pure-translation --outliers 0.3   # no method can calibrate this
   scpsfm synth --out scene --wrong-views 2 --second-motion 0.3   # partly wrong tracks, two bodies
+  scpsfm synth --out scene --outliers 0.3 --wrong-observations 2   # right tracks that are wrong in 2 of 10 views
   scpsfm synth --out walk --sequence --views 100 --tracks 5000 --noise 0.0005 --outliers 0.5   # tracks of 3 to 10 views
   scpsfm solve scene/observations.csv --width 1000 --height 1000 --out answer";
 
@@ -64,8 +65,8 @@ pub struct Args {
 pub struct SequenceArgs {
     /// A camera that travels, whose tracks live a few views each; of the scene's options, --views, --tracks, --noise,
     /// --outliers, --radial-k1, --zoom and --seed apply
-    #[arg(long, conflicts_with_all = ["depths", "shape", "motion", "outlier_kind", "wrong_views", "second_motion",
-        "noise_kind", "principal_point", "rotation", "roll"])]
+    #[arg(long, conflicts_with_all = ["depths", "shape", "motion", "outlier_kind", "wrong_views", "wrong_observations",
+        "deleted_observations", "second_motion", "noise_kind", "principal_point", "rotation", "roll"])]
     pub sequence: bool,
 
     /// Views that a track lives, at least and at most [default: 3,10; of fewer than 10 views all: 3,VIEWS]
@@ -74,7 +75,7 @@ pub struct SequenceArgs {
 
     /// Share of the observations of right tracks that are wrong
     #[arg(long, value_name = "SHARE", default_value_t = 0.05, requires = "sequence")]
-    pub wrong_observations: f64,
+    pub wrong_share: f64,
 
     /// Share of the right tracks of six views or more that go over to another point on their way
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, requires = "sequence")]
@@ -105,7 +106,7 @@ impl Args {
             lifetime: self.sequence.lifetime.unwrap_or_else(|| SequenceOptions::lifetime_within(self.scene.views)),
             noise: self.scene.noise,
             outliers: self.scene.outliers,
-            wrong_observations: self.sequence.wrong_observations,
+            wrong_share: self.sequence.wrong_share,
             joined: self.sequence.joined,
             radial_k1: self.camera.radial_k1,
             zoom: self.camera.zoom,
@@ -259,13 +260,15 @@ mod tests {
     #[test]
     fn every_argument_reaches_its_option() {
         let base = args(Path::new("out"), &[]).generate().expect("valid options").options;
-        let cases: [(&[&str], SceneOptions); 11] = [
+        let cases: [(&[&str], SceneOptions); 13] = [
             (&["--shape", "plane"], SceneOptions { shape: Shape::Plane, ..base.clone() }),
             (&["--motion", "pure-rotation"], SceneOptions { motion: Motion::PureRotation, ..base.clone() }),
             (&["--motion", "sphere"], SceneOptions { motion: Motion::Sphere, ..base.clone() }),
             (&["--roll", "1.5"], SceneOptions { max_roll_rad: 1.5, ..base.clone() }),
             (&["--outlier-kind", "slid"], SceneOptions { outlier_kind: OutlierKind::Slid, ..base.clone() }),
             (&["--wrong-views", "2"], SceneOptions { wrong_views: 2, ..base.clone() }),
+            (&["--wrong-observations", "1"], SceneOptions { wrong_observations: 1, ..base.clone() }),
+            (&["--deleted-observations", "1"], SceneOptions { deleted_observations: 1, ..base.clone() }),
             (&["--second-motion", "0.3"], SceneOptions { second_motion: 0.3, ..base.clone() }),
             (&["--noise-kind", "heavy"], SceneOptions { noise_kind: NoiseKind::Heavy, ..base.clone() }),
             (&["--principal-point", "-0.05,0.1"], SceneOptions { principal_point: [-0.05, 0.1], ..base.clone() }),

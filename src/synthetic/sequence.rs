@@ -42,7 +42,8 @@ pub struct SequenceOptions {
     /// Share of the tracks that are wrong: each observation is anywhere in its image.
     pub outliers: f64,
     /// Share of the observations of the other tracks that are anywhere in their image.
-    pub wrong_observations: f64,
+    #[serde(alias = "wrong_observations")]
+    pub wrong_share: f64,
     /// Share of the right tracks, of those that are long enough, that go over to another point on their way: one wrong
     /// link joins two points.
     pub joined: f64,
@@ -67,7 +68,7 @@ impl Default for SequenceOptions {
             lifetime: Self::lifetime_within(20),
             noise: 0.0005,
             outliers: 0.3,
-            wrong_observations: 0.05,
+            wrong_share: 0.05,
             joined: 0.0,
             radial_k1: 0.0,
             zoom: 0.0,
@@ -107,7 +108,7 @@ impl SequenceOptions {
         let shares = [
             ("noise", self.noise),
             ("outliers", self.outliers),
-            ("wrong_observations", self.wrong_observations),
+            ("wrong_share", self.wrong_share),
             ("joined", self.joined),
         ];
         for (name, share) in shares {
@@ -223,7 +224,7 @@ impl Sequence {
             truth.inlier.push(inlier);
             truth.points.push(point.into());
             for (k, image) in images.iter().enumerate() {
-                let right = inlier && rng.random::<f64>() >= options.wrong_observations;
+                let right = inlier && rng.random::<f64>() >= options.wrong_share;
                 let of_other = other.contains(&k);
                 let seen = if right { image + options.noise * normals(&mut rng) } else { anywhere(&mut rng) };
                 let [x, y] = (seen * f64::from(IMAGE_SIDE_PX)).into();
@@ -377,7 +378,7 @@ mod tests {
             ("lifetime", SequenceOptions { lifetime: (3, 30), ..default() }),
             ("noise", SequenceOptions { noise: f64::NAN, ..default() }),
             ("outliers", SequenceOptions { outliers: 1.1, ..default() }),
-            ("wrong_observations", SequenceOptions { wrong_observations: -0.1, ..default() }),
+            ("wrong_share", SequenceOptions { wrong_share: -0.1, ..default() }),
             ("joined", SequenceOptions { joined: 2.0, ..default() }),
             ("radial_k1", SequenceOptions { radial_k1: 2.0, ..default() }),
             ("zoom", SequenceOptions { zoom: 1.0, ..default() }),

@@ -98,6 +98,7 @@ pub fn options(views: usize, tracks: usize, rng: &mut ChaCha8Rng) -> SceneOption
         zoom,
         with_depths: false,
         seed: rng.random(),
+        ..SceneOptions::default()
     }
 }
 

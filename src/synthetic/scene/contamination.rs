@@ -75,8 +75,11 @@ pub struct Contamination {
     second_body: Vec<bool>,
     /// The tracks that are wrong in each view, in ascending order; those of the second body are not listed.
     wrong: Vec<Vec<usize>>,
+    /// Views and tracks in which right tracks are wrong.
+    wrong_observations: Vec<Vec<bool>>,
     repeated_shift_px: [f64; 2],
     rng: ChaCha8Rng,
+    observation_rng: ChaCha8Rng,
 }
 
 impl Contamination {
@@ -99,14 +102,19 @@ impl Contamination {
                 wrong[view].push(track);
             }
         }
+        let mut observation_rng = Stream::WrongObservations.of(options.seed);
+        let mut wrong_observations = draw_observations(options, options.wrong_observations, &mut observation_rng);
+        wrong_observations.iter_mut().for_each(|of| outliers.iter().for_each(|&track| of[track] = false));
         Self {
             kind: options.outlier_kind,
             whole_tracks: options.wrong_views == 0,
             outliers,
             second_body,
             wrong,
+            wrong_observations,
             repeated_shift_px: [shift_px * direction.cos(), shift_px * direction.sin()],
             rng,
+            observation_rng,
         }
     }
 
@@ -141,7 +149,7 @@ impl Contamination {
                 exchange(image, &wrong, &permutation);
             }
             OutlierKind::Permuted => self.exchange_all(image, &wrong),
-            OutlierKind::Uniform => wrong.iter().for_each(|&track| self.scatter(image, track)),
+            OutlierKind::Uniform => wrong.iter().for_each(|&track| scatter(image, track, &mut self.rng)),
             OutlierKind::Slid => {
                 for &track in &wrong {
                     if let Some(slid) = slide(&cameras[0], &cameras[view], &points[track], &mut self.rng) {
@@ -156,6 +164,9 @@ impl Contamination {
                     image[track] = Observation { image: shifted, right: false, ..image[track] };
                 }
             }
+        }
+        for (track, _) in self.wrong_observations[view].iter().enumerate().filter(|(_, wrong)| **wrong) {
+            scatter(image, track, &mut self.observation_rng);
         }
     }
 
@@ -173,20 +184,29 @@ impl Contamination {
         exchange(image, &cycle, &next);
     }
 
-    /// Puts a track's point anywhere in the image; the noise of x and y is part of "anywhere".
-    fn scatter(&mut self, image: &mut [Observation], track: usize) {
-        let side_px = f64::from(IMAGE_SIDE_PX);
-        let [x, y] = std::array::from_fn(|_| self.rng.random_range(-0.5..side_px - 0.5));
-        let Observation { image: [.., depth], noise: [.., in_depth], .. } =
-            image[self.rng.random_range(0..image.len())];
-        image[track] = Observation { image: [x, y, depth], noise: [0.0, 0.0, in_depth], right: false };
-    }
-
     /// A random track other than this one; there are `count`, two or more.
     fn other_track(&mut self, track: usize, count: usize) -> usize {
         let other = self.rng.random_range(0..count - 1);
         other + usize::from(other >= track)
     }
+}
+
+/// Puts a track's point anywhere in the image; the noise of x and y is part of "anywhere".
+fn scatter(image: &mut [Observation], track: usize, rng: &mut ChaCha8Rng) {
+    let side_px = f64::from(IMAGE_SIDE_PX);
+    let [x, y] = std::array::from_fn(|_| rng.random_range(-0.5..side_px - 0.5));
+    let Observation { image: [.., depth], noise: [.., in_depth], .. } = image[rng.random_range(0..image.len())];
+    image[track] = Observation { image: [x, y, depth], noise: [0.0, 0.0, in_depth], right: false };
+}
+
+/// Chooses `count` observations of every track, by view and track.
+pub fn draw_observations(options: &SceneOptions, count: usize, rng: &mut ChaCha8Rng) -> Vec<Vec<bool>> {
+    let mut chosen = vec![vec![false; options.tracks]; options.views];
+    for track in 0..options.tracks {
+        let mut views: Vec<usize> = (0..options.views).collect();
+        views.partial_shuffle(rng, count).0.iter().for_each(|&view| chosen[view][track] = true);
+    }
+    chosen
 }
 
 /// The views in which one outlier track is wrong.

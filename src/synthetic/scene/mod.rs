@@ -64,7 +64,7 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Whether the observation of this track in this view is right.
+    /// Whether the observation of this track in this view is right, in a scene of which none was deleted.
     ///
     /// # Panics
     /// When there is no such view or track.
@@ -84,7 +84,8 @@ pub struct Scene {
 impl Scene {
     /// Generates the scene of these options; the same options give the same scene.
     ///
-    /// Every track is observed in every view, also where its point falls outside the image, as in the paper.
+    /// Every track is observed in every view, also where its point falls outside the image, as in the paper; but for the
+    /// observations that shall be deleted.
     ///
     /// # Errors
     /// Options out of range, or under which no camera sees the whole cloud.
@@ -99,6 +100,8 @@ impl Scene {
         let body_motions = second_body::draw_motions(options, &cameras, &points, &second_body)?;
 
         let mut input = RawInput { track_count: options.tracks, ..RawInput::default() };
+        let mut deleted_rng = Stream::DeletedObservations.of(options.seed);
+        let deleted = contamination::draw_observations(options, options.deleted_observations, &mut deleted_rng);
         let mut observation_right = Vec::with_capacity(options.views * options.tracks);
         for (view, (camera, motion)) in cameras.iter().zip(&body_motions).enumerate() {
             let observe = |(point, &second)| {
@@ -107,8 +110,10 @@ impl Scene {
             };
             let mut image: Vec<Observation> = points.iter().zip(&second_body).map(observe).collect();
             contamination.apply(view, &cameras, &points, &mut image, &mut rng);
-            observation_right.extend(image.iter().map(|observation| observation.right));
-            append(&mut input, image.iter().map(|observation| observation.noisy(options)), options.with_depths);
+            let kept = || image.iter().enumerate().filter(|&(track, _)| !deleted[view][track]);
+            observation_right.extend(kept().map(|(_, observation)| observation.right));
+            let noisy = kept().map(|(track, observation)| (track, observation.noisy(options)));
+            append(&mut input, noisy, options.with_depths);
         }
         let truth = Truth {
             focal_px,
@@ -150,12 +155,12 @@ fn draw_cameras(
     Ok(motion::draw_poses(options, points, lens, rng)?.into_iter().map(&mut pose_camera).collect())
 }
 
-/// Appends a view with its observations, one a track.
-fn append(input: &mut RawInput, image: impl Iterator<Item = [f64; 3]>, with_depths: bool) {
+/// Appends a view with its observations, each with its track.
+fn append(input: &mut RawInput, image: impl Iterator<Item = (usize, [f64; 3])>, with_depths: bool) {
     let view = input.views.len() as u32;
     let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
     input.views.push(View { size: Some(size), ..View::default() });
-    for (track, [x, y, depth]) in image.enumerate() {
+    for (track, [x, y, depth]) in image {
         input.view.push(view);
         input.track.push(track as u32);
         input.x.push(x);

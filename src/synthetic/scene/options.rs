@@ -25,6 +25,11 @@ pub struct SceneOptions {
     /// In how many views an outlier track is wrong, random ones for each track; 0: in all that the kind can spoil (half
     /// for [`OutlierKind::Repeated`]).
     pub wrong_views: usize,
+    /// How many observations of every right track are replaced by uniform points in the image, in random views for each
+    /// track, whose depth is that of a random track. The tracks stay right.
+    pub wrong_observations: usize,
+    /// How many observations of every track are left out, random ones for each track, whether right or wrong.
+    pub deleted_observations: usize,
     /// Share of all tracks that belong to a second rigid body, which in every view has a small random motion of its own
     /// (up to 0.2 rad about each axis and 0.3 along it). They count among the outliers; the outliers that are left are
     /// of the kind above.
@@ -62,6 +67,8 @@ impl Default for SceneOptions {
             outliers: 0.9,
             outlier_kind: OutlierKind::Permuted,
             wrong_views: 0,
+            wrong_observations: 0,
+            deleted_observations: 0,
             second_motion: 0.0,
             shape: Shape::Box,
             motion: Motion::General,
@@ -80,6 +87,8 @@ impl SceneOptions {
     /// Views and tracks that one scene may have, so that a slip of the finger does not fill the memory.
     pub const MAX_VIEWS: usize = 1_000;
     pub const MAX_TRACKS: usize = 100_000;
+    /// Right observations that every right track keeps: three make a point that can be verified.
+    pub const MIN_RIGHT_OBSERVATIONS: usize = 3;
     /// Farther from the centre the principal point would be outside the image.
     pub const MAX_DISPLACEMENT: f64 = 0.5;
     /// Stronger distortion is a fisheye's, which another model describes.
@@ -122,6 +131,22 @@ impl SceneOptions {
         }
         if self.wrong_views > 0 && self.outlier_kind == OutlierKind::Permuted && self.tracks == 1 {
             found.push(Violation::of("wrong_views", "1 track has no other to exchange points with, give 2 tracks"));
+        }
+        // Those that are deleted may all be right ones.
+        let most = self.views.saturating_sub(Self::MIN_RIGHT_OBSERVATIONS);
+        let counts =
+            [("wrong_observations", self.wrong_observations), ("deleted_observations", self.deleted_observations)];
+        let mut left = most;
+        for (name, count) in counts {
+            if count > left {
+                let reason = format!(
+                    "{count} is above {left}: of {} observations a track, {} shall be right and kept",
+                    self.views,
+                    Self::MIN_RIGHT_OBSERVATIONS
+                );
+                found.push(Violation::of(name, reason));
+            }
+            left = left.saturating_sub(count);
         }
         if self.outlier_kind == OutlierKind::Slid {
             if self.views == 2 {
@@ -186,6 +211,10 @@ mod tests {
             ("wrong_views", SceneOptions { wrong_views: 11, ..default() }),
             ("wrong_views", SceneOptions { wrong_views: 10, outlier_kind: OutlierKind::Slid, ..default() }),
             ("wrong_views", SceneOptions { wrong_views: 1, tracks: 1, ..default() }),
+            ("wrong_observations", SceneOptions { wrong_observations: 8, ..default() }),
+            ("wrong_observations", SceneOptions { views: 2, wrong_observations: 1, ..default() }),
+            ("deleted_observations", SceneOptions { deleted_observations: 8, ..default() }),
+            ("deleted_observations", SceneOptions { wrong_observations: 3, deleted_observations: 5, ..default() }),
             ("outlier_kind", SceneOptions { views: 2, outlier_kind: OutlierKind::Slid, ..default() }),
             (
                 "outlier_kind",

@@ -16,6 +16,8 @@ pub enum Stream {
     SecondBody = 4,
     Zoom = 5,
     Roll = 6,
+    WrongObservations = 7,
+    DeletedObservations = 8,
 }
 
 impl Stream {

@@ -230,3 +230,50 @@ fn what_is_wrong_leaves_the_rest_as_it_is() {
         }
     }
 }
+
+#[test]
+fn every_right_track_is_wrong_in_as_many_random_views_as_asked_for_and_the_rest_stays() {
+    for (wrong_observations, seed) in [1, 3, 7].into_iter().flat_map(|count| SEEDS.map(move |seed| (count, seed))) {
+        let base = SceneOptions { outliers: 0.5, ..exact(seed) };
+        let (clean, scene) = (generate(base.clone()), generate(SceneOptions { wrong_observations, ..base }));
+        assert_eq!(scene.truth.inlier, clean.truth.inlier);
+        let mut wrong_in = [0; 10];
+        for track in indices(&scene.truth.inlier, true) {
+            let wrong = wrong_views(&scene, track);
+            assert_eq!(wrong.len(), wrong_observations, "seed {seed}, track {track}");
+            wrong.iter().for_each(|&view| wrong_in[view] += 1);
+            for view in 0..10 {
+                let off = error_px(&scene, view, track);
+                assert_eq!(off < EXACT_PX, !wrong.contains(&view), "seed {seed}, {view}, {track}: {off} px");
+                let [x, y, _] = observed(&scene, view, track);
+                assert!(!wrong.contains(&view) || [x, y].iter().all(|xy| (-0.5..999.5).contains(xy)));
+            }
+        }
+        assert!(wrong_in.iter().all(|&count| count > 0 && count < 100), "{wrong_in:?}");
+        for track in indices(&scene.truth.inlier, false) {
+            assert_eq!(wrong_views(&scene, track), wrong_views(&clean, track));
+            assert!((0..10).all(|view| observed(&scene, view, track) == observed(&clean, view, track)));
+        }
+    }
+}
+
+#[test]
+fn deleted_observations_are_some_of_each_track_and_the_rest_stays() {
+    for seed in SEEDS {
+        let base = SceneOptions { outliers: 0.3, wrong_observations: 2, ..exact(seed) };
+        let complete = generate(base.clone());
+        let scene = generate(SceneOptions { deleted_observations: 3, ..base });
+        let (mut kept, mut wrong) = ([0; 200], 0);
+        for (k, (&view, &track)) in scene.input.view.iter().zip(&scene.input.track).enumerate() {
+            let (view, track) = (view as usize, track as usize);
+            kept[track] += 1;
+            let here = [scene.input.x[k], scene.input.y[k], scene.input.depth[k]];
+            assert_eq!(here, observed(&complete, view, track), "seed {seed}");
+            assert_eq!(scene.truth.observation_right[k], complete.truth.is_right(view, track), "seed {seed}");
+            wrong += usize::from(!scene.truth.observation_right[k] && scene.truth.inlier[track]);
+        }
+        assert_eq!((kept, scene.truth.observation_right.len()), ([7; 200], 1400));
+        // Of 280 wrong observations of right tracks, .7 stay: within four standard deviations.
+        assert!((165..=227).contains(&wrong), "seed {seed}: {wrong}");
+    }
+}
