@@ -10,7 +10,8 @@ use sha2::{Digest, Sha256};
 
 use super::args::cores;
 use super::evaluate_choices::{ContestantArg, DepthsArg, SweepArg};
-use super::evaluate_priors::{self, PriorArgs};
+use super::evaluate_observations::{self, ObservationArgs};
+use super::evaluate_priors::{self, PriorArgs, Work};
 use super::evaluate_real::{self, RealArgs};
 use super::exit::{self, Exit, Failure};
 use super::interrupt::Interrupt;
@@ -41,6 +42,7 @@ Examples:
   scpsfm evaluate --sweeps outliers --depths given,epipolar --methods paper,psfm --paper-width 1
   scpsfm evaluate --priors --seeds 20 --out priors
   scpsfm evaluate --priors --real sequences --out windows
+  scpsfm evaluate --observations --scenes complete --out observations
   scpsfm evaluate --real sequences --peer 'python peer.py' --out side-by-side
 
 Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
@@ -121,6 +123,9 @@ pub struct Args {
     pub priors: PriorArgs,
 
     #[command(flatten)]
+    pub observations: ObservationArgs,
+
+    #[command(flatten)]
     pub real: RealArgs,
 }
 
@@ -191,8 +196,13 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     }
     args.prior.install()?;
     let threads = args.threads.map_or_else(cores, usize::from);
+    let seeds = args.seeds.unwrap_or(SEEDS);
+    if args.observations.observations {
+        let work = Work { out: &args.out, threads, quiet: args.quiet };
+        let (scenes, peer) = (args.priors.scenes.as_deref(), args.real.peer_words()?);
+        return evaluate_observations::run(scenes, seeds, peer, &work, args.json);
+    }
     if args.priors.priors {
-        let seeds = args.seeds.unwrap_or(SEEDS);
         return evaluate_priors::run(&args.priors, &args.out, seeds, threads, args.json, args.quiet).await;
     }
     let plan = args.plan();

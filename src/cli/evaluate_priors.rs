@@ -25,7 +25,8 @@ pub struct PriorArgs {
     /// without the trained network; scenes without depths, of training's kinds and of others. Writes priors.json, and
     /// priors.jsonl, with which it goes on where it was stopped. With --real: how well pairs of views, the trained
     /// network and both together rank the observations of these sequences, window by window; writes windows.json
-    #[arg(long, conflicts_with_all = ["quick", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
+    #[arg(long, group = "suite",
+        conflicts_with_all = ["quick", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
     pub priors: bool,
 
     /// AUTO alone, without the searches of each prior
@@ -38,7 +39,7 @@ pub struct PriorArgs {
     pub sweep: bool,
 
     /// The scenes of this name, or all whose name holds this text [default: all]
-    #[arg(long, value_name = "TEXT", requires = "priors", conflicts_with = "real")]
+    #[arg(long, value_name = "TEXT", requires = "suite", conflicts_with = "real")]
     pub scenes: Option<String>,
 }
 
@@ -51,20 +52,7 @@ pub async fn run(
     json: bool,
     quiet: bool,
 ) -> Result<Exit, Failure> {
-    let mut conditions = scenes::all();
-    if let Some(text) = &args.scenes {
-        let names: Vec<&str> = conditions.iter().map(|condition| condition.name).collect();
-        let unknown = format!("--scenes {text}: no scenes have it in their name; there are {}", names.join("; "));
-        let exact = names.contains(&text.as_str());
-        conditions.retain(
-            |condition| {
-                if exact { condition.name == text } else { condition.name.contains(text.as_str()) }
-            },
-        );
-        if conditions.is_empty() {
-            return Err(Failure::usage(unknown));
-        }
-    }
+    let conditions = chosen(scenes::all(), |condition| condition.name, args.scenes.as_deref())?;
     create_directory(out)?;
     let work = Work { out, threads, quiet };
     if args.sweep {
@@ -88,16 +76,26 @@ pub async fn run(
     Ok(Exit::Done)
 }
 
+/// The conditions of this name, or all whose name holds this text.
+pub fn chosen<T>(mut all: Vec<T>, name: fn(&T) -> &str, text: Option<&str>) -> Result<Vec<T>, Failure> {
+    let Some(text) = text else { return Ok(all) };
+    let names: Vec<&str> = all.iter().map(name).collect();
+    let unknown = format!("--scenes {text}: no scenes have it in their name; there are {}", names.join("; "));
+    let exact = names.contains(&text);
+    all.retain(|condition| if exact { name(condition) == text } else { name(condition).contains(text) });
+    if all.is_empty() { Err(Failure::usage(unknown)) } else { Ok(all) }
+}
+
 /// Where and how runs are done.
-struct Work<'a> {
-    out: &'a Path,
-    threads: usize,
-    quiet: bool,
+pub struct Work<'a> {
+    pub out: &'a Path,
+    pub threads: usize,
+    pub quiet: bool,
 }
 
 impl Work<'_> {
     /// Does what the records of this name lack; where it was interrupted `so_far` shows what there is.
-    fn run<R, M>(
+    pub fn run<R, M>(
         &self,
         name: &str,
         runs: &[R],
@@ -151,7 +149,7 @@ pub async fn run_on_windows(directories: &[PathBuf], out: &Path, json: bool, qui
 }
 
 /// Writes rows with the version and the network that they are of; returns the JSON.
-fn written(out: &Path, name: &str, mut rows: serde_json::Value) -> Result<String, Failure> {
+pub fn written(out: &Path, name: &str, mut rows: serde_json::Value) -> Result<String, Failure> {
     let network = subspace::current();
     rows["version"] = json!(env!("CARGO_PKG_VERSION"));
     rows["network"] = json!({ "origin": network.origin, "sha256": subspace::current_checksum() });

@@ -37,12 +37,12 @@ centres ([x, y, z] or null for each view).";
 #[command(next_help_heading = "Real sequences")]
 pub struct RealArgs {
     /// Solve real sequences instead: a sequence folder, or a folder of such (see below); may be repeated
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["seeds", "quick", "threads", "sweeps", "beyond", "ablation",
+    #[arg(long, value_name = "DIR", group = "beside", conflicts_with_all = ["seeds", "quick", "threads", "sweeps", "beyond", "ablation",
         "depths", "methods", "paper_width"])]
     pub real: Vec<PathBuf>,
 
     /// Another program to run on the same sequences: one text, split at spaces, or one argument at a time, repeated
-    #[arg(long, value_name = "COMMAND", requires = "real", conflicts_with = "priors", allow_hyphen_values = true)]
+    #[arg(long, value_name = "COMMAND", requires = "beside", conflicts_with = "priors", allow_hyphen_values = true)]
     pub peer: Vec<String>,
 
     /// Seconds after which the peer is ended on a sequence
@@ -53,20 +53,24 @@ pub struct RealArgs {
 
 impl RealArgs {
     /// The peer's words: a single text is split at spaces.
-    fn peer_words(&self) -> Vec<String> {
-        match self.peer.as_slice() {
+    ///
+    /// # Errors
+    /// A text that names no program.
+    pub fn peer_words(&self) -> Result<Vec<String>, Failure> {
+        let words: Vec<String> = match self.peer.as_slice() {
             [one] => one.split_whitespace().map(str::to_owned).collect(),
             several => several.to_vec(),
+        };
+        if words.is_empty() && !self.peer.is_empty() {
+            return Err(Failure::usage("--peer names no program"));
         }
+        Ok(words)
     }
 }
 
 /// Runs the command; `out`, `json` and `quiet` are those of `evaluate`.
 pub async fn run(args: &RealArgs, out: &std::path::Path, json: bool, quiet: bool) -> Result<Exit, Failure> {
-    let peer = args.peer_words();
-    if peer.is_empty() && !args.peer.is_empty() {
-        return Err(Failure::usage("--peer names no program"));
-    }
+    let peer = args.peer_words()?;
     // All of them are read before the first is solved: what is wrong is said at once.
     let folders = folder::find(&args.real)?;
     let sequences: Vec<Sequence> = folders.iter().map(|folder| Sequence::read(folder)).collect::<Result<_, _>>()?;

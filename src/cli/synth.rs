@@ -1,6 +1,5 @@
 //! `scpsfm synth`: the paper's scenes as files.
 
-use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use super::exit::{Exit, Failure};
@@ -8,6 +7,7 @@ pub use super::scene_args::SceneArgs;
 use super::scene_args::{CameraArgs, GeometryArgs, OutlierArgs};
 use crate::domain::RawInput;
 use crate::domain::error::quoted;
+use crate::formats::observations;
 use crate::formats::publish::{create_directory, pretty, write_atomically};
 use crate::formats::result_files::OBSERVATIONS;
 pub use crate::synthetic::scene::IMAGE_SIDE_PX;
@@ -181,25 +181,10 @@ fn write<O: serde::Serialize, T: serde::Serialize>(
     truth: &T,
 ) -> Result<(), Failure> {
     create_directory(directory)?;
-    write_atomically(directory, OBSERVATIONS, observations_csv(input).as_bytes())?;
+    write_atomically(directory, OBSERVATIONS, observations::csv(input).as_bytes())?;
     let truth = TruthJson { options, image_width_px: IMAGE_SIDE_PX, image_height_px: IMAGE_SIDE_PX, truth };
     write_atomically(directory, TRUTH, pretty(&truth)?.as_bytes())?;
     Ok(())
-}
-
-/// `view,track,x,y[,depth]`; every number as short as it reads back exactly.
-pub fn observations_csv(input: &RawInput) -> String {
-    let has_depths = !input.depth.is_empty();
-    let mut text = String::from(if has_depths { "view,track,x,y,depth\n" } else { "view,track,x,y\n" });
-    for k in 0..input.x.len() {
-        // Writing to a String cannot fail.
-        let _ = write!(text, "{},{},{},{}", input.view[k], input.track[k], input.x[k], input.y[k]);
-        if has_depths {
-            let _ = write!(text, ",{}", input.depth[k]);
-        }
-        text.push('\n');
-    }
-    text
 }
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
-//! Reading `observations.csv`: `view,track,x,y[,depth]`, one observation a line.
+//! Reading and writing `observations.csv`: `view,track,x,y[,depth]`, one observation a line.
 
+use std::fmt::Write;
 use std::io::BufRead;
 use std::path::Path;
 
@@ -203,6 +204,21 @@ impl Table {
             ..LabelledInput::default()
         }
     }
+}
+
+/// `view,track,x,y[,depth]`; every number as short as it reads back exactly.
+pub fn csv(input: &RawInput) -> String {
+    let has_depths = !input.depth.is_empty();
+    let mut text = String::from(if has_depths { "view,track,x,y,depth\n" } else { "view,track,x,y\n" });
+    for k in 0..input.x.len() {
+        // Writing to a String cannot fail.
+        let _ = write!(text, "{},{},{},{}", input.view[k], input.track[k], input.x[k], input.y[k]);
+        if has_depths {
+            let _ = write!(text, ",{}", input.depth[k]);
+        }
+        text.push('\n');
+    }
+    text
 }
 
 #[cfg(test)]

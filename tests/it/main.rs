@@ -14,6 +14,7 @@ mod formats;
 mod inputs;
 mod load;
 mod lost;
+mod observations;
 mod prior;
 mod readme;
 mod real;

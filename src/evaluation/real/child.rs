@@ -38,6 +38,13 @@ pub struct Usage {
     pub peak_memory_mb: Option<f64>,
 }
 
+/// CPU time that the calling thread has taken; `None`: not measured.
+pub fn thread_cpu_seconds() -> Option<f64> {
+    // proc_pid_schedstat(5): nanoseconds on a CPU come first.
+    let text = fs::read_to_string("/proc/thread-self/schedstat").ok()?;
+    Some(text.split_whitespace().next()?.parse::<u64>().ok()? as f64 * 1e-9)
+}
+
 /// How a program ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ended {

@@ -125,7 +125,10 @@ pub fn run(
 fn run_side(sequence: &Sequence, side: Side, options: &Options, scratch: &Path, stop: &StopToken) -> Option<Row> {
     let (mut command, limit) = match side {
         Side::Scpsfm => (ours::command(&options.program, sequence, scratch), None),
-        Side::Peer => (peer::command(&options.peer, sequence, scratch), Some(options.peer_timeout)),
+        Side::Peer => {
+            let file = sequence.observations_file();
+            (peer::command(&options.peer, &file, sequence.size, scratch), Some(options.peer_timeout))
+        }
     };
     let limits = Limits { wall: limit, stop };
     let (answer, usage) = match child::run(&mut command, &limits, scratch) {

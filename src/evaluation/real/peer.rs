@@ -4,7 +4,8 @@
 //! * `focal`: in pixels, or null
 //! * `inlier`: 0 or 1 for each track id from 0 on; or `observation_inlier`: the same for each line of its input
 //! * where it has them: `sigma_log_focal`, `k1`, `reproj` (mean) and `rms` in pixels, `grade`, `warnings` (texts),
-//!   `centres` (`[x, y, z]` or null for each view id from 0 on), `error` (a text, beside an empty answer)
+//!   `centres` (`[x, y, z]` or null for each view id from 0 on), `error` (a text, beside an empty answer),
+//!   `observations` (`[view, track]` of those that it kept; used by `--observations` only)
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -17,16 +18,17 @@ use serde_json::Value;
 
 use super::Sequence;
 use super::measures::{Answer, Verdicts};
+use crate::domain::ImageSize;
 
 /// Bytes of an answer: verdicts and centres of the largest input take less than half.
 const MOST_BYTES: u64 = 1 << 28;
 
-/// The peer's call for a sequence; it writes to [`file`] of `scratch`.
-pub fn command(words: &[String], sequence: &Sequence, scratch: &Path) -> Command {
+/// The peer's call for observations; it writes to [`file`] of `scratch`.
+pub fn command(words: &[String], observations: &Path, size: ImageSize, scratch: &Path) -> Command {
     let (program, arguments) = words.split_first().map_or(("", &[][..]), |(first, rest)| (first.as_str(), rest));
     let mut command = Command::new(program);
-    command.args(arguments).arg(sequence.observations_file());
-    command.args([sequence.size.width_px.to_string(), sequence.size.height_px.to_string()]);
+    command.args(arguments).arg(observations);
+    command.args([size.width_px.to_string(), size.height_px.to_string()]);
     command.arg("-o").arg(file(scratch));
     command
 }
@@ -53,13 +55,16 @@ impl Verdict {
     }
 }
 
+/// What a peer writes.
 #[derive(Deserialize)]
-struct PeerFile {
-    views: usize,
-    focal: Option<f64>,
+pub struct PeerFile {
+    pub views: usize,
+    pub focal: Option<f64>,
     inlier: Option<Vec<Verdict>>,
     observation_inlier: Option<Vec<Verdict>>,
-    sigma_log_focal: Option<f64>,
+    /// View and track of the observations that it kept.
+    pub observations: Option<Vec<[u64; 2]>>,
+    pub sigma_log_focal: Option<f64>,
     k1: Option<f64>,
     reproj: Option<f64>,
     rms: Option<f64>,
@@ -70,11 +75,23 @@ struct PeerFile {
     error: Option<Value>,
 }
 
+impl PeerFile {
+    /// The verdict on a track; `None`: there is none.
+    pub fn keeps_track(&self, track: usize) -> Option<bool> {
+        self.inlier.as_ref()?.get(track).map(Verdict::holds)
+    }
+
+    /// The verdict on an observation of the input by its place; `None`: there is none.
+    pub fn keeps_observation(&self, place: usize) -> Option<bool> {
+        self.observation_inlier.as_ref()?.get(place).map(Verdict::holds)
+    }
+}
+
 /// Reads what a peer wrote that ended with `status`.
 ///
 /// # Errors
 /// Why there is no answer, in a sentence.
-pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint: &str) -> Result<Answer, String> {
+pub fn read(scratch: &Path, status: ExitStatus, complaint: &str) -> Result<PeerFile, String> {
     if !status.success() {
         return Err(format!("ended with {status}: {complaint}"));
     }
@@ -84,7 +101,15 @@ pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint
         return Err(format!("its answer has {length} bytes, more than {MOST_BYTES}"));
     }
     let text = fs::read_to_string(&file).map_err(|error| format!("its answer cannot be read: {error}"))?;
-    let said: PeerFile = serde_json::from_str(&text).map_err(|error| format!("its answer cannot be read: {error}"))?;
+    serde_json::from_str(&text).map_err(|error| format!("its answer cannot be read: {error}"))
+}
+
+/// The answer of a peer that ended with `status`.
+///
+/// # Errors
+/// Why there is no answer, in a sentence.
+pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint: &str) -> Result<Answer, String> {
+    let said = read(scratch, status, complaint)?;
     let (inlier, verdicts) = spread(sequence, &said)?;
     let mut warnings = said.warnings;
     match said.error {

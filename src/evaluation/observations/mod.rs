@@ -1,0 +1,321 @@
+//! Inputs that only an estimator which judges single observations can solve: this program, and another one beside it
+//! on the same files. [`conditions`] are the inputs, [`table`] shows the rows.
+
+pub mod conditions;
+mod solvers;
+pub mod table;
+
+use serde::{Deserialize, Serialize};
+
+use crate::domain::error::InvalidInput;
+use crate::domain::{Grade, RawInput, StopToken};
+use crate::evaluation::real::Side;
+use crate::evaluation::records;
+use crate::geometry::statistics::median;
+use crate::synthetic::metrics::agreement;
+use crate::synthetic::{Scene, SceneOptions, Sequence, SequenceOptions};
+pub use conditions::Condition;
+
+/// First seed: above those of the other evaluations.
+const FIRST_SEED: u64 = 700_000;
+/// A METRIC answer is wrong where its focal length is off by more than this, relatively, and by more standard
+/// deviations than this.
+const WRONG_FOCAL: f64 = 0.03;
+const WRONG_SIGMAS: f64 = 4.0;
+/// Standard deviations that a focal length shall be within.
+const COVERED_SIGMAS: f64 = 3.0;
+
+/// The file of the records.
+pub const RECORDS: &str = "observations.jsonl";
+
+/// The records of the comparison.
+pub type Records = records::Records<Run, Measured>;
+
+/// What makes an input.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Generator {
+    Scene(SceneOptions),
+    Sequence(SequenceOptions),
+}
+
+impl Generator {
+    /// The same with another seed.
+    fn with_seed(&self, seed: u64) -> Self {
+        match self {
+            Generator::Scene(options) => Generator::Scene(SceneOptions { seed, ..options.clone() }),
+            Generator::Sequence(options) => Generator::Sequence(SequenceOptions { seed, ..options.clone() }),
+        }
+    }
+
+    fn generate(&self) -> Result<Sample, InvalidInput> {
+        Ok(match self {
+            Generator::Scene(options) => {
+                let Scene { input, truth, .. } = Scene::generate(options)?;
+                Sample { input, inlier: truth.inlier, right: truth.observation_right, focals_px: truth.focals_px }
+            }
+            Generator::Sequence(options) => {
+                let Sequence { input, truth, .. } = Sequence::generate(options)?;
+                Sample { input, inlier: truth.inlier, right: truth.observation_right, focals_px: truth.focals_px }
+            }
+        })
+    }
+}
+
+/// An input and its truth.
+#[derive(Debug, Clone)]
+struct Sample {
+    input: RawInput,
+    /// Whether a track is right.
+    inlier: Vec<bool>,
+    /// Whether an observation is right.
+    right: Vec<bool>,
+    /// True focal length of each view.
+    focals_px: Vec<f64>,
+}
+
+/// How the cameras are declared to the solver.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Declared {
+    OneCamera,
+    FocalPerView,
+}
+
+/// One input given to one side.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Run {
+    generator: Generator,
+    declared: Declared,
+    /// The other program and its first arguments; empty: this program.
+    peer: Vec<String>,
+}
+
+/// A focal length of a metric answer against the true one.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct FocalError {
+    /// `ln(f / f_true)`
+    log_error: f64,
+    sigma: Option<f64>,
+}
+
+impl FocalError {
+    fn is_wrong(&self) -> bool {
+        self.log_error.abs() > WRONG_FOCAL.max(WRONG_SIGMAS * self.sigma.unwrap_or(0.0))
+    }
+
+    fn is_covered(&self) -> bool {
+        self.log_error.abs() <= COVERED_SIGMAS * self.sigma.unwrap_or(0.0)
+    }
+}
+
+/// One answer's measures.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Measured {
+    /// Of the tracks.
+    f1: f64,
+    /// Share of right ones among the observations that were kept.
+    precision: f64,
+    /// Share of kept ones among the right observations of right tracks.
+    recall: f64,
+    /// Share of the views in the largest reconstruction.
+    views: f64,
+    /// `None` without a reconstruction. A peer that gives a focal length counts as METRIC.
+    grade: Option<Grade>,
+    /// Of a METRIC or WEAK answer: one a camera group, or one a view where each has its own.
+    focals: Vec<FocalError>,
+    /// Whether the answer warns that the metric model does not fit.
+    mismatch: bool,
+    /// CPU time of the solve; of a peer its whole process, without what `--help` takes.
+    seconds: f64,
+    failure: Option<String>,
+}
+
+/// What either side says of an input.
+#[derive(Debug, Clone, Default)]
+struct Answer {
+    tracks: Vec<bool>,
+    observations: Vec<bool>,
+    /// Views in the largest reconstruction.
+    views: usize,
+    grade: Option<Grade>,
+    focals: Vec<FocalError>,
+    mismatch: bool,
+    seconds: f64,
+}
+
+impl Measured {
+    fn of(sample: &Sample, answer: Answer) -> Self {
+        let owned: Vec<bool> = sample
+            .right
+            .iter()
+            .zip(&sample.input.track)
+            .map(|(&right, &k)| right && sample.inlier[k as usize])
+            .collect();
+        Self {
+            f1: agreement(&answer.tracks, &sample.inlier).f1,
+            precision: agreement(&answer.observations, &sample.right).precision,
+            recall: agreement(&answer.observations, &owned).recall,
+            views: answer.views as f64 / sample.focals_px.len() as f64,
+            grade: answer.grade,
+            focals: answer.focals,
+            mismatch: answer.mismatch,
+            seconds: answer.seconds,
+            failure: None,
+        }
+    }
+
+    fn is_metric(&self) -> bool {
+        self.grade == Some(Grade::Metric)
+    }
+
+    fn observation_f1(&self) -> f64 {
+        let sum = self.precision + self.recall;
+        if sum > 0.0 { 2.0 * self.precision * self.recall / sum } else { 0.0 }
+    }
+}
+
+/// One condition, one side; means over the seeds unless said.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Row {
+    pub condition: String,
+    pub side: Side,
+    pub seeds: usize,
+    /// Of the tracks.
+    pub f1: f64,
+    /// Of the observations.
+    pub precision: f64,
+    pub recall: f64,
+    pub observation_f1: f64,
+    /// Share of the views in the largest reconstruction.
+    pub views: f64,
+    /// Answers with a calibration, METRIC or WEAK; those that are METRIC; and of these, those that warn that the metric
+    /// model does not fit.
+    pub calibrated: usize,
+    pub metric: usize,
+    pub mismatch: usize,
+    /// Relative focal errors of the METRIC ones.
+    pub median_focal_error: Option<f64>,
+    pub largest_focal_error: Option<f64>,
+    /// Share of these focal lengths within three standard deviations, and the median standard deviation.
+    pub covered: Option<f64>,
+    pub median_sigma: Option<f64>,
+    /// METRIC ones that are off by more than 3 % and 4 standard deviations.
+    pub wrong: usize,
+    pub seconds: f64,
+    pub failures: Vec<String>,
+    /// F1 of the tracks minus the peer's on the same inputs, and the half width of its 95 % interval.
+    pub f1_gain: Option<[f64; 2]>,
+}
+
+/// What to run.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    pub conditions: Vec<Condition>,
+    pub seeds: u64,
+    /// The other program and its first arguments; empty: none.
+    pub peer: Vec<String>,
+}
+
+impl Plan {
+    /// Every input, seed by seed, so that a stopped comparison has all conditions with fewer seeds.
+    pub fn runs(&self) -> Vec<Run> {
+        (0..self.seeds)
+            .flat_map(|seed| self.conditions.iter().map(move |condition| (condition, seed)))
+            .flat_map(|(condition, seed)| {
+                self.sides(condition).into_iter().map(move |side| self.run(condition, seed, side))
+            })
+            .collect()
+    }
+
+    /// Who answers: a peer is told of one camera and no more.
+    fn sides(&self, condition: &Condition) -> Vec<Side> {
+        match self.peer.is_empty() || condition.declared != Declared::OneCamera {
+            true => vec![Side::Scpsfm],
+            false => vec![Side::Scpsfm, Side::Peer],
+        }
+    }
+
+    fn run(&self, condition: &Condition, seed: u64, side: Side) -> Run {
+        Run {
+            generator: condition.generator.with_seed(FIRST_SEED + seed),
+            declared: condition.declared,
+            peer: if side == Side::Peer { self.peer.clone() } else { Vec::new() },
+        }
+    }
+
+    /// The rows of what is recorded.
+    pub fn rows(&self, records: &Records) -> Vec<Row> {
+        let mut rows = Vec::new();
+        for condition in &self.conditions {
+            let of = |seed, side| records.get(&self.run(condition, seed, side));
+            for side in self.sides(condition) {
+                let here: Vec<&Measured> = (0..self.seeds).filter_map(|seed| of(seed, side)).collect();
+                if here.is_empty() {
+                    continue;
+                }
+                let pair = |seed| Some(of(seed, Side::Scpsfm)?.f1 - of(seed, Side::Peer)?.f1);
+                let gains: Vec<f64> = (0..self.seeds).filter_map(pair).collect();
+                let f1_gain = if side == Side::Scpsfm && !self.peer.is_empty() { interval(&gains) } else { None };
+                rows.push(Row { f1_gain, ..row(&condition.name, side, &here) });
+            }
+        }
+        rows
+    }
+}
+
+/// One run; `None` where it was stopped. A peer that fails is an answer.
+///
+/// # Errors
+/// An input that cannot be made, or a defect of the solver, in words.
+pub fn measure(run: &Run, stop: &StopToken) -> Result<Option<Measured>, String> {
+    let sample = run.generator.generate().map_err(|error| error.to_string())?;
+    let answer = match run.peer.is_empty() {
+        true => solvers::ours(&sample, run.declared, stop)?.map(Ok),
+        false => solvers::peer(&sample, &run.peer, stop)?,
+    };
+    Ok(answer.map(|answer| match answer {
+        Ok(answer) => Measured::of(&sample, answer),
+        Err(failure) => Measured { failure: Some(failure), ..Measured::default() },
+    }))
+}
+
+fn row(condition: &str, side: Side, here: &[&Measured]) -> Row {
+    let mean =
+        |value: fn(&Measured) -> f64| here.iter().map(|measured| value(measured)).sum::<f64>() / here.len() as f64;
+    let count = |wanted: &dyn Fn(&Measured) -> bool| here.iter().filter(|measured| wanted(measured)).count();
+    let focals: Vec<FocalError> =
+        here.iter().filter(|measured| measured.is_metric()).flat_map(|measured| measured.focals.clone()).collect();
+    let mut errors: Vec<f64> = focals.iter().map(|focal| focal.log_error.abs()).collect();
+    let mut sigmas: Vec<f64> = focals.iter().filter_map(|focal| focal.sigma).collect();
+    let covered = focals.iter().filter(|focal| focal.is_covered()).count() as f64 / focals.len() as f64;
+    Row {
+        condition: condition.to_owned(),
+        side,
+        seeds: here.len(),
+        f1: mean(|measured| measured.f1),
+        precision: mean(|measured| measured.precision),
+        recall: mean(|measured| measured.recall),
+        observation_f1: mean(Measured::observation_f1),
+        views: mean(|measured| measured.views),
+        calibrated: count(&|measured| !measured.focals.is_empty()),
+        metric: count(&Measured::is_metric),
+        mismatch: count(&|measured| measured.is_metric() && measured.mismatch),
+        median_focal_error: (!errors.is_empty()).then(|| median(&mut errors)),
+        largest_focal_error: errors.iter().copied().reduce(f64::max),
+        covered: (!sigmas.is_empty()).then_some(covered),
+        median_sigma: (!sigmas.is_empty()).then(|| median(&mut sigmas)),
+        wrong: count(&|measured| measured.is_metric() && measured.focals.iter().any(FocalError::is_wrong)),
+        seconds: mean(|measured| measured.seconds),
+        failures: here.iter().filter_map(|measured| measured.failure.clone()).collect(),
+        f1_gain: None,
+    }
+}
+
+/// Mean and half width of its 95 % interval, normal; `None` for fewer than two.
+fn interval(values: &[f64]) -> Option<[f64; 2]> {
+    let count = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    let variance = values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (count - 1.0);
+    (values.len() > 1).then(|| [mean, 1.96 * (variance / count).sqrt()])
+}

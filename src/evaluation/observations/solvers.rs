@@ -1,0 +1,113 @@
+//! The two sides: this program in this process, and a peer in one of its own.
+
+use std::collections::HashSet;
+use std::process::Command;
+use std::time::Duration;
+
+use super::{Answer, Declared, FocalError, Sample};
+use crate::domain::{Grade, ImageSize, Input, Limits, Silent, Solution, SolveSettings, StopToken, WarningCode};
+use crate::evaluation::real::child::{self, Ended, Outcome};
+use crate::evaluation::real::peer;
+use crate::formats::observations;
+use crate::formats::result_files::OBSERVATIONS;
+use crate::solver;
+use crate::synthetic::scene::IMAGE_SIDE_PX;
+
+/// Wall time after which a peer is ended.
+const PEER_SECONDS: u64 = 600;
+
+/// This program's answer; `None` where it was stopped.
+pub fn ours(sample: &Sample, declared: Declared, stop: &StopToken) -> Result<Option<Answer>, String> {
+    let input = Input::new(sample.input.clone(), &Limits::default(), "scene").map_err(|error| error.to_string())?;
+    let settings = SolveSettings { focal_per_view: declared == Declared::FocalPerView, ..SolveSettings::default() };
+    let begun = child::thread_cpu_seconds();
+    let solution = match solver::solve(&input, &settings, &mut Silent, stop) {
+        Ok(solution) => solution,
+        Err(solver::Error::Stopped(_)) => return Ok(None),
+        Err(error) => return Err(error.to_string()),
+    };
+    let spent = begun.zip(child::thread_cpu_seconds()).map(|(begun, now)| now - begun);
+    let largest = (0..solution.part_count()).map(|part| views_of(&solution, part)).max();
+    Ok(Some(Answer {
+        views: largest.unwrap_or(0),
+        grade: solution.grade,
+        focals: focals(sample, &solution),
+        mismatch: solution.warnings.iter().any(|warning| warning.code == WarningCode::ModelMismatch),
+        seconds: spent.unwrap_or(solution.seconds),
+        tracks: solution.tracks.inlier,
+        observations: solution.observations.inlier,
+    }))
+}
+
+fn views_of(solution: &Solution, part: u32) -> usize {
+    solution.views.iter().filter(|view| view.projection.is_some() && view.part == part).count()
+}
+
+/// Every focal length that the answer gives: of views, or of camera groups (against each that its views have).
+fn focals(sample: &Sample, solution: &Solution) -> Vec<FocalError> {
+    let mut found = Vec::new();
+    for (group, calibration) in solution.cameras() {
+        let Some(calibration) = calibration else { continue };
+        let mut truths: Vec<(f64, f64)> = solution
+            .views
+            .iter()
+            .zip(&sample.focals_px)
+            .filter(|(view, _)| view.camera_group == group && view.rotation.is_some())
+            .map(|(view, &truth)| (view.focal_px.unwrap_or(calibration.focal_px), truth))
+            .collect();
+        truths.dedup();
+        let sigma = calibration.sigma_log_focal;
+        found.extend(truths.into_iter().map(|(focal, truth)| FocalError { log_error: (focal / truth).ln(), sigma }));
+    }
+    found
+}
+
+/// The answer of another program, or why there is none; `None` where it was stopped.
+pub fn peer(sample: &Sample, words: &[String], stop: &StopToken) -> Result<Option<Result<Answer, String>>, String> {
+    let scratch = tempfile::tempdir().map_err(|error| error.to_string())?;
+    let file = scratch.path().join(OBSERVATIONS);
+    std::fs::write(&file, observations::csv(&sample.input)).map_err(|error| error.to_string())?;
+    let run = |command: &mut Command| -> Result<Option<Outcome>, String> {
+        let limits = child::Limits { wall: Some(Duration::from_secs(PEER_SECONDS)), stop };
+        let outcome = child::run(command, &limits, scratch.path())
+            .map_err(|error| format!("cannot run {}: {error}", command.get_program().display()))?;
+        Ok((outcome.ended != Ended::Stopped).then_some(outcome))
+    };
+    // What the program takes to start, its imports above all.
+    let (program, arguments) = words.split_first().ok_or("the peer has no name")?;
+    let Some(start) = run(Command::new(program).args(arguments).arg("--help"))? else { return Ok(None) };
+    let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
+    let Some(outcome) = run(&mut peer::command(words, &file, size, scratch.path()))? else { return Ok(None) };
+    let Ended::Exited(status) = outcome.ended else {
+        return Ok(Some(Err(format!("ended after {PEER_SECONDS} s, its limit"))));
+    };
+    let seconds = |outcome: &Outcome| outcome.usage.cpu_seconds.unwrap_or(outcome.usage.wall_seconds);
+    let taken = (seconds(&outcome) - seconds(&start)).max(0.0);
+    let said = peer::read(scratch.path(), status, &outcome.complaint);
+    Ok(Some(said.map(|said| Answer { seconds: taken, ..peer_answer(sample, &said) })))
+}
+
+fn peer_answer(sample: &Sample, said: &peer::PeerFile) -> Answer {
+    let tracks: Vec<bool> = (0..sample.inlier.len()).map(|track| said.keeps_track(track).unwrap_or(false)).collect();
+    let kept: Option<HashSet<[u64; 2]>> = said.observations.as_ref().map(|kept| kept.iter().copied().collect());
+    let ids = sample.input.view.iter().zip(&sample.input.track);
+    let observations = ids
+        .enumerate()
+        .map(|(k, (&view, &track))| match &kept {
+            Some(kept) => kept.contains(&[view.into(), track.into()]),
+            None => said.keeps_observation(k).unwrap_or(tracks[track as usize]),
+        })
+        .collect();
+    let focal = said.focal.filter(|&focal| focal > 0.0);
+    Answer {
+        tracks,
+        observations,
+        views: said.views,
+        grade: focal.map(|_| Grade::Metric),
+        focals: focal
+            .map(|focal| FocalError { log_error: (focal / sample.focals_px[0]).ln(), sigma: said.sigma_log_focal })
+            .into_iter()
+            .collect(),
+        ..Answer::default()
+    }
+}
