@@ -96,6 +96,10 @@ pub struct OutlierArgs {
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub wrong_views: usize,
 
+    /// Views that observe a track, neighbours of each other; 0: all
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seen_views: usize,
+
     /// Observations of every right track that are anywhere in the image instead, in random views for each track
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub wrong_observations: usize,
@@ -115,6 +119,7 @@ impl OutlierArgs {
         SceneOptions {
             outlier_kind: self.outlier_kind.into(),
             wrong_views: self.wrong_views,
+            seen_views: self.seen_views,
             wrong_observations: self.wrong_observations,
             deleted_observations: self.deleted_observations,
             second_motion: self.second_motion,
@@ -195,6 +200,8 @@ pub enum MotionArg {
     PureTranslation,
     /// Along the optical axis, no rotation: no calibration
     Forward,
+    /// On a grid across the optical axis, no rotation: no calibration
+    Grid,
     /// Rotation about the camera centre: no depth
     PureRotation,
     /// Anywhere on a sphere around the scene, with any roll
@@ -209,6 +216,7 @@ impl From<MotionArg> for Motion {
             MotionArg::Turntable => Motion::Turntable,
             MotionArg::PureTranslation => Motion::PureTranslation,
             MotionArg::Forward => Motion::Forward,
+            MotionArg::Grid => Motion::Grid,
             MotionArg::PureRotation => Motion::PureRotation,
             MotionArg::Sphere => Motion::Sphere,
         }

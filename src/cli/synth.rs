@@ -65,7 +65,7 @@ pub struct Args {
 pub struct SequenceArgs {
     /// A camera that travels, whose tracks live a few views each; of the scene's options, --views, --tracks, --noise,
     /// --outliers, --radial-k1, --zoom and --seed apply
-    #[arg(long, conflicts_with_all = ["depths", "shape", "motion", "outlier_kind", "wrong_views", "wrong_observations",
+    #[arg(long, conflicts_with_all = ["depths", "shape", "motion", "outlier_kind", "wrong_views", "seen_views", "wrong_observations",
         "deleted_observations", "second_motion", "noise_kind", "principal_point", "rotation", "roll"])]
     pub sequence: bool,
 
@@ -80,6 +80,10 @@ pub struct SequenceArgs {
     /// Share of the right tracks of six views or more that go over to another point on their way
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, requires = "sequence")]
     pub joined: f64,
+
+    /// The focal length grows steadily over its range, f (1 +- SHARE of --zoom), instead of at random
+    #[arg(long, requires = "sequence")]
+    pub ramp: bool,
 
     /// Views, the first ones, in which the camera does not turn; where it never turns, nothing can be calibrated
     #[arg(long, value_name = "VIEWS", default_value_t = 0, requires = "sequence")]
@@ -110,6 +114,7 @@ impl Args {
             joined: self.sequence.joined,
             radial_k1: self.camera.radial_k1,
             zoom: self.camera.zoom,
+            ramp: self.sequence.ramp,
             straight: self.sequence.straight,
             seed: self.scene.seed,
         };
@@ -245,13 +250,15 @@ mod tests {
     #[test]
     fn every_argument_reaches_its_option() {
         let base = args(Path::new("out"), &[]).generate().expect("valid options").options;
-        let cases: [(&[&str], SceneOptions); 13] = [
+        let cases: [(&[&str], SceneOptions); 15] = [
             (&["--shape", "plane"], SceneOptions { shape: Shape::Plane, ..base.clone() }),
             (&["--motion", "pure-rotation"], SceneOptions { motion: Motion::PureRotation, ..base.clone() }),
             (&["--motion", "sphere"], SceneOptions { motion: Motion::Sphere, ..base.clone() }),
             (&["--roll", "1.5"], SceneOptions { max_roll_rad: 1.5, ..base.clone() }),
             (&["--outlier-kind", "slid"], SceneOptions { outlier_kind: OutlierKind::Slid, ..base.clone() }),
             (&["--wrong-views", "2"], SceneOptions { wrong_views: 2, ..base.clone() }),
+            (&["--motion", "grid"], SceneOptions { motion: Motion::Grid, ..base.clone() }),
+            (&["--seen-views", "3"], SceneOptions { seen_views: 3, ..base.clone() }),
             (&["--wrong-observations", "1"], SceneOptions { wrong_observations: 1, ..base.clone() }),
             (&["--deleted-observations", "1"], SceneOptions { deleted_observations: 1, ..base.clone() }),
             (&["--second-motion", "0.3"], SceneOptions { second_motion: 0.3, ..base.clone() }),

@@ -52,6 +52,9 @@ pub struct SequenceOptions {
     /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
     #[serde(default)]
     pub zoom: f64,
+    /// Whether the focal length grows steadily over that range instead.
+    #[serde(default)]
+    pub ramp: bool,
     /// Views, the first ones, in which the camera travels and does not turn: what they show is the same under a wrong
     /// calibration.
     #[serde(default)]
@@ -72,6 +75,7 @@ impl Default for SequenceOptions {
             joined: 0.0,
             radial_k1: 0.0,
             zoom: 0.0,
+            ramp: false,
             straight: 0,
             seed: 0,
         }
@@ -196,7 +200,11 @@ impl Sequence {
         // A stream of its own: a zoom changes nothing else.
         let mut zoom = ChaCha8Rng::seed_from_u64(options.seed);
         zoom.set_stream(ZOOM_STREAM);
-        cameras.iter_mut().for_each(|camera| camera.focal *= 1.0 + options.zoom * zoom.random_range(-1.0..1.0));
+        for (view, camera) in cameras.iter_mut().enumerate() {
+            let drawn = zoom.random_range(-1.0..1.0);
+            let along = 2.0 * view as f64 / (options.views - 1) as f64 - 1.0;
+            camera.focal *= 1.0 + options.zoom * if options.ramp { along } else { drawn };
+        }
         let centre_px = (f64::from(IMAGE_SIDE_PX) - 1.0) / 2.0;
         let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
         let mut input = RawInput {
@@ -358,6 +366,17 @@ mod tests {
         let inliers = truth.inlier.iter().filter(|&&inlier| inlier).count();
         assert!((320..=380).contains(&inliers), "{inliers} of 500 for a share of .7");
         assert!(Input::new(input, &Limits::default(), "sequence").is_ok());
+    }
+
+    #[test]
+    fn a_ramp_grows_steadily_over_the_range_and_leaves_the_rest() {
+        let options = SequenceOptions { zoom: 0.2, ramp: true, ..SequenceOptions::default() };
+        let truth = Sequence::generate(&options).expect("valid").truth;
+        let steps: Vec<f64> = truth.focals_px.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        assert!(steps.iter().all(|step| (step - 0.4 * truth.focal_px / 19.0).abs() < 1e-9), "{steps:?}");
+        assert!((truth.focals_px[19] / truth.focals_px[0] - 1.5).abs() < 1e-12);
+        let drawn = Sequence::generate(&SequenceOptions { ramp: false, ..options }).expect("valid").truth;
+        assert_eq!(drawn.rotations, truth.rotations);
     }
 
     #[test]

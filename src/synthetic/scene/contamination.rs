@@ -84,7 +84,9 @@ pub struct Contamination {
 
 impl Contamination {
     /// Chooses the outliers from `rng`, the paper's stream, and everything else from a stream of its own.
-    pub fn draw(options: &SceneOptions, rng: &mut ChaCha8Rng) -> Self {
+    ///
+    /// * `visible`: the views that observe each track
+    pub fn draw(options: &SceneOptions, visible: &[Vec<usize>], rng: &mut ChaCha8Rng) -> Self {
         let share = |share: f64| (share * options.tracks as f64).round() as usize;
         let mut outliers: Vec<usize> = (0..options.tracks).collect();
         outliers.shuffle(rng);
@@ -103,7 +105,8 @@ impl Contamination {
             }
         }
         let mut observation_rng = Stream::WrongObservations.of(options.seed);
-        let mut wrong_observations = draw_observations(options, options.wrong_observations, &mut observation_rng);
+        let mut wrong_observations =
+            draw_observations(options.views, visible, options.wrong_observations, &mut observation_rng);
         wrong_observations.iter_mut().for_each(|of| outliers.iter().for_each(|&track| of[track] = false));
         Self {
             kind: options.outlier_kind,
@@ -199,12 +202,11 @@ fn scatter(image: &mut [Observation], track: usize, rng: &mut ChaCha8Rng) {
     image[track] = Observation { image: [x, y, depth], noise: [0.0, 0.0, in_depth], right: false };
 }
 
-/// Chooses `count` observations of every track, by view and track.
-pub fn draw_observations(options: &SceneOptions, count: usize, rng: &mut ChaCha8Rng) -> Vec<Vec<bool>> {
-    let mut chosen = vec![vec![false; options.tracks]; options.views];
-    for track in 0..options.tracks {
-        let mut views: Vec<usize> = (0..options.views).collect();
-        views.partial_shuffle(rng, count).0.iter().for_each(|&view| chosen[view][track] = true);
+/// Chooses `count` observations of every track among the views that observe it; whether chosen, by view and track.
+pub fn draw_observations(views: usize, visible: &[Vec<usize>], count: usize, rng: &mut ChaCha8Rng) -> Vec<Vec<bool>> {
+    let mut chosen = vec![vec![false; visible.len()]; views];
+    for (track, seen) in visible.iter().enumerate() {
+        seen.clone().partial_shuffle(rng, count).0.iter().for_each(|&view| chosen[view][track] = true);
     }
     chosen
 }

@@ -1,6 +1,6 @@
 //! The generator: a random cloud, random cameras, noise, and wrong tracks. One file a subject: where the points lie
-//! (`shape`), how the cameras move (`motion`) and project (`camera`), what is wrong with the tracks (`contamination`,
-//! `second_body`), the noise.
+//! (`shape`), how the cameras move (`motion`) and project (`camera`), which views observe a track (`visibility`), what is
+//! wrong with the tracks (`contamination`, `second_body`), the noise.
 
 mod camera;
 mod contamination;
@@ -12,6 +12,7 @@ mod shape;
 mod stream;
 #[cfg(test)]
 mod tests;
+mod visibility;
 
 use nalgebra::Vector3;
 use rand::Rng;
@@ -37,6 +38,10 @@ use crate::domain::{ImageSize, RawInput, View};
 pub const IMAGE_SIDE_PX: u32 = 1000;
 /// Range of the focal length in pixels (paper, section 5.1).
 pub const FOCAL_RANGE_PX: (f64, f64) = (800.0, 1600.0);
+/// Where every view has a camera of its own: how far the principal points are from the common one along each axis, as a
+/// share of the width, and the distortions from the common one, relatively, as among copies of one camera.
+const OWN_PRINCIPAL_POINT: f64 = 0.02;
+const OWN_RADIAL_K1: f64 = 0.05;
 
 /// What a scene was made of.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -47,6 +52,11 @@ pub struct Truth {
     #[serde(default)]
     pub focals_px: Vec<f64>,
     pub principal_point_px: [f64; 2],
+    /// The same of each view, and its radial distortion: those of all, unless every view has its own camera.
+    #[serde(default)]
+    pub principal_points_px: Vec<[f64; 2]>,
+    #[serde(default)]
+    pub radial_k1: Vec<f64>,
     /// Whether a track is all right, one entry a track.
     pub inlier: Vec<bool>,
     /// Whether a track belongs to the second body, one entry a track; such a track is no inlier.
@@ -64,7 +74,7 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Whether the observation of this track in this view is right, in a scene of which none was deleted.
+    /// Whether the observation of this track in this view is right, in a scene whose tracks are complete.
     ///
     /// # Panics
     /// When there is no such view or track.
@@ -84,24 +94,27 @@ pub struct Scene {
 impl Scene {
     /// Generates the scene of these options; the same options give the same scene.
     ///
-    /// Every track is observed in every view, also where its point falls outside the image, as in the paper; but for the
-    /// observations that shall be deleted.
+    /// Unless asked for otherwise every track is observed in every view, also where its point falls outside the image, as
+    /// in the paper.
     ///
     /// # Errors
     /// Options out of range, or under which no camera sees the whole cloud.
     pub fn generate(options: &SceneOptions) -> Result<Self, InvalidInput> {
         options.validate()?;
         let mut rng = Stream::Paper.of(options.seed);
-        let focal_px = rng.random_range(FOCAL_RANGE_PX.0..FOCAL_RANGE_PX.1);
+        let focal_px = rng.random_range(options.focal_range_px.0..options.focal_range_px.1);
         let points = shape::draw_points(options, &mut rng);
         let cameras = draw_cameras(options, focal_px, &points, &mut rng)?;
-        let mut contamination = Contamination::draw(options, &mut rng);
+        let visible = visibility::draw_visibility(options, &cameras);
+        let mut contamination = Contamination::draw(options, &visible, &mut rng);
         let second_body = contamination.second_body().to_vec();
         let body_motions = second_body::draw_motions(options, &cameras, &points, &second_body)?;
 
         let mut input = RawInput { track_count: options.tracks, ..RawInput::default() };
         let mut deleted_rng = Stream::DeletedObservations.of(options.seed);
-        let deleted = contamination::draw_observations(options, options.deleted_observations, &mut deleted_rng);
+        let count = options.deleted_observations;
+        let deleted = contamination::draw_observations(options.views, &visible, count, &mut deleted_rng);
+        let is_kept = |view: usize, track: usize| visible[track].contains(&view) && !deleted[view][track];
         let mut observation_right = Vec::with_capacity(options.views * options.tracks);
         for (view, (camera, motion)) in cameras.iter().zip(&body_motions).enumerate() {
             let observe = |(point, &second)| {
@@ -110,7 +123,7 @@ impl Scene {
             };
             let mut image: Vec<Observation> = points.iter().zip(&second_body).map(observe).collect();
             contamination.apply(view, &cameras, &points, &mut image, &mut rng);
-            let kept = || image.iter().enumerate().filter(|&(track, _)| !deleted[view][track]);
+            let kept = || image.iter().enumerate().filter(|&(track, _)| is_kept(view, track));
             observation_right.extend(kept().map(|(_, observation)| observation.right));
             let noisy = kept().map(|(track, observation)| (track, observation.noisy(options)));
             append(&mut input, noisy, options.with_depths);
@@ -119,6 +132,8 @@ impl Scene {
             focal_px,
             focals_px: cameras.iter().map(|camera| camera.focal_px).collect(),
             principal_point_px: principal_point_px(options),
+            principal_points_px: cameras.iter().map(|camera| camera.principal_point_px).collect(),
+            radial_k1: cameras.iter().map(|camera| camera.lens.k1).collect(),
             inlier: contamination.inlier(),
             second_body,
             observation_right,
@@ -126,6 +141,9 @@ impl Scene {
             rotations: cameras.iter().map(|camera| rows(&camera.pose.rotation)).collect(),
             translations: cameras.iter().map(|camera| camera.pose.translation.into()).collect(),
         };
+        if options.own_cameras {
+            input.views.iter_mut().zip(0..).for_each(|(view, group)| view.camera_group = group);
+        }
         Ok(Self { options: options.clone(), input, truth })
     }
 }
@@ -135,7 +153,7 @@ fn principal_point_px(options: &SceneOptions) -> [f64; 2] {
     options.principal_point.map(|displacement| (side_px - 1.0) / 2.0 + displacement * side_px)
 }
 
-/// Draws the cameras, one a view; the zoom from a stream of its own.
+/// Draws the cameras, one a view; the zoom and what each has for itself from streams of their own.
 ///
 /// # Errors
 /// Options under which no camera sees the whole cloud.
@@ -148,7 +166,23 @@ fn draw_cameras(
     let lens = Lens { k1: options.radial_k1 };
     let principal_point_px = principal_point_px(options);
     let mut zoom_rng = Stream::Zoom.of(options.seed);
+    let mut own_rng = Stream::OwnCameras.of(options.seed);
+    let mut own = |pose| {
+        let focal_px = own_rng.random_range(options.focal_range_px.0..options.focal_range_px.1);
+        let mut shift = || own_rng.random_range(-1.0..1.0);
+        let [x, y, bend] = [shift(), shift(), shift()];
+        let shift_px = OWN_PRINCIPAL_POINT * f64::from(IMAGE_SIDE_PX);
+        Camera {
+            pose,
+            focal_px,
+            principal_point_px: [principal_point_px[0] + shift_px * x, principal_point_px[1] + shift_px * y],
+            lens: Lens { k1: options.radial_k1 * (1.0 + OWN_RADIAL_K1 * bend) },
+        }
+    };
     let mut pose_camera = |pose| {
+        if options.own_cameras {
+            return own(pose);
+        }
         let zoom = options.zoom * zoom_rng.random_range(-1.0..1.0);
         Camera { pose, focal_px: focal_px * (1.0 + zoom), principal_point_px, lens }
     };

@@ -43,6 +43,9 @@ pub enum Motion {
     /// Along the optical axis by at most 1 either way, without turning: critical as above, and with points near the
     /// axis that show no parallax.
     Forward,
+    /// Side by side without turning, on a square grid with sides of 2 across the optical axis, row by row: critical as
+    /// above.
+    Grid,
     /// Rotations about a camera centre that stays: a homography relates any two views, and depths do not show.
     PureRotation,
     /// Anywhere on a sphere about the scene, of radius 3, the optical axes through its centre: rotations uniform among
@@ -59,6 +62,7 @@ impl Motion {
             Motion::Turntable => "turntable",
             Motion::PureTranslation => "pure-translation",
             Motion::Forward => "forward",
+            Motion::Grid => "grid",
             Motion::PureRotation => "pure-rotation",
             Motion::Sphere => "sphere",
         }
@@ -119,16 +123,16 @@ pub fn draw_poses(
         Motion::PureTranslation => draw_rotation(max_rotation_rad, rng),
         _ => Matrix3::identity(),
     };
-    let mut draw = || {
+    let mut draw = |view| {
         for _ in 0..MAX_DRAWS {
-            let pose = propose(options.motion, max_rotation_rad, &common, rng);
+            let pose = propose(options, view, &common, rng);
             if points.iter().all(|point| lens.sees(&pose.apply(point))) {
                 return Ok(pose);
             }
         }
         Err(blind(options))
     };
-    let poses: Result<Vec<Pose>, InvalidInput> = (0..options.views).map(|_| draw()).collect();
+    let poses: Result<Vec<Pose>, InvalidInput> = (0..options.views).map(&mut draw).collect();
     let mut roll = Stream::Roll.of(options.seed);
     // A roll changes neither depths nor distances from the axis: what was seen still is.
     Ok(poses?.iter().map(|pose| pose.rolled(draw_angle(options.max_roll_rad, &mut roll))).collect())
@@ -145,8 +149,9 @@ fn blind(options: &SceneOptions) -> InvalidInput {
 }
 
 /// One pose of this motion, whatever it sees; `common` is the rotation of all views where they share one.
-fn propose(motion: Motion, max_rotation_rad: f64, common: &Matrix3<f64>, rng: &mut ChaCha8Rng) -> Pose {
-    match motion {
+fn propose(options: &SceneOptions, view: usize, common: &Matrix3<f64>, rng: &mut ChaCha8Rng) -> Pose {
+    let max_rotation_rad = options.max_rotation_rad;
+    match options.motion {
         Motion::General => {
             let rotation = draw_rotation(max_rotation_rad, rng);
             let translation = draw_translation(rng);
@@ -168,6 +173,12 @@ fn propose(motion: Motion, max_rotation_rad: f64, common: &Matrix3<f64>, rng: &m
         // About the centre, so that the scene stays in front whatever the common rotation.
         Motion::PureTranslation => Pose::about_centre(*common, draw_translation(rng)),
         Motion::Forward => Pose { rotation: *common, translation: Vector3::new(0.0, 0.0, rng.random_range(-1.0..1.0)) },
+        Motion::Grid => {
+            let columns = (options.views as f64).sqrt().ceil() as usize;
+            let place = |k: usize| 1.0 - 2.0 * k as f64 / (columns - 1) as f64;
+            let translation = Vector3::new(place(view % columns), place(view / columns), 0.0);
+            Pose { rotation: *common, translation }
+        }
         Motion::PureRotation => Pose { rotation: draw_rotation(max_rotation_rad, rng), translation: Vector3::zeros() },
         Motion::Sphere => Pose::about_centre(draw_any_rotation(rng), Vector3::zeros()),
     }

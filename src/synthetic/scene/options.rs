@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::FOCAL_RANGE_PX;
 use super::contamination::OutlierKind;
 use super::motion::Motion;
 use super::noise::NoiseKind;
@@ -25,6 +26,9 @@ pub struct SceneOptions {
     /// In how many views an outlier track is wrong, random ones for each track; 0: in all that the kind can spoil (half
     /// for [`OutlierKind::Repeated`]).
     pub wrong_views: usize,
+    /// How many views observe a track, those whose cameras are nearest to that of a random view; 0: all. An outlier that
+    /// is wrong in a number of views may be so where it is not observed.
+    pub seen_views: usize,
     /// How many observations of every right track are replaced by uniform points in the image, in random views for each
     /// track, whose depth is that of a random track. The tracks stay right.
     pub wrong_observations: usize,
@@ -43,6 +47,12 @@ pub struct SceneOptions {
     /// Largest roll: each camera is turned about its optical axis as well, uniform in `+-max_roll_rad`, whatever the
     /// motion.
     pub max_roll_rad: f64,
+    /// Range of the focal length in pixels.
+    pub focal_range_px: (f64, f64),
+    /// Whether every view has a camera of its own, and is a camera group: a focal length in that range, a principal point
+    /// up to .02 of the width off the common one along each axis, and a distortion within 5 % of the common one; a zoom
+    /// does not matter then.
+    pub own_cameras: bool,
     /// Displacement of the principal point from the image's centre, right and down, as a share of the image width.
     pub principal_point: [f64; 2],
     /// Radial distortion, `x_d = x_n (1 + k1 r^2)` with `x_n` and its length `r` in normalised camera coordinates
@@ -67,6 +77,7 @@ impl Default for SceneOptions {
             outliers: 0.9,
             outlier_kind: OutlierKind::Permuted,
             wrong_views: 0,
+            seen_views: 0,
             wrong_observations: 0,
             deleted_observations: 0,
             second_motion: 0.0,
@@ -74,6 +85,8 @@ impl Default for SceneOptions {
             motion: Motion::General,
             max_rotation_rad: 0.4,
             max_roll_rad: 0.0,
+            focal_range_px: FOCAL_RANGE_PX,
+            own_cameras: false,
             principal_point: [0.0, 0.0],
             radial_k1: 0.0,
             zoom: 0.0,
@@ -132,16 +145,19 @@ impl SceneOptions {
         if self.wrong_views > 0 && self.outlier_kind == OutlierKind::Permuted && self.tracks == 1 {
             found.push(Violation::of("wrong_views", "1 track has no other to exchange points with, give 2 tracks"));
         }
+        if self.seen_views == 1 || self.seen_views > self.views {
+            found.push(Violation::of("seen_views", format!("{} is not 0 or in 2..={}", self.seen_views, self.views)));
+        }
         // Those that are deleted may all be right ones.
-        let most = self.views.saturating_sub(Self::MIN_RIGHT_OBSERVATIONS);
+        let seen = if self.seen_views == 0 { self.views } else { self.seen_views };
         let counts =
             [("wrong_observations", self.wrong_observations), ("deleted_observations", self.deleted_observations)];
-        let mut left = most;
+        let mut left = seen.saturating_sub(Self::MIN_RIGHT_OBSERVATIONS);
         for (name, count) in counts {
             if count > left {
                 let reason = format!(
                     "{count} is above {left}: of {} observations a track, {} shall be right and kept",
-                    self.views,
+                    seen,
                     Self::MIN_RIGHT_OBSERVATIONS
                 );
                 found.push(Violation::of(name, reason));
@@ -176,6 +192,11 @@ impl SceneOptions {
     }
 
     fn check_camera(&self, found: &mut Violations) {
+        let (least, most) = self.focal_range_px;
+        if !(least > 0.0 && least < most && most.is_finite()) {
+            found
+                .push(Violation::of("focal_range_px", format!("{least} to {most} is not a range of positive numbers")));
+        }
         for (axis, displacement) in self.principal_point.into_iter().enumerate() {
             let most = Self::MAX_DISPLACEMENT;
             if !(-most..=most).contains(&displacement) {
@@ -211,6 +232,9 @@ mod tests {
             ("wrong_views", SceneOptions { wrong_views: 11, ..default() }),
             ("wrong_views", SceneOptions { wrong_views: 10, outlier_kind: OutlierKind::Slid, ..default() }),
             ("wrong_views", SceneOptions { wrong_views: 1, tracks: 1, ..default() }),
+            ("seen_views", SceneOptions { seen_views: 11, ..default() }),
+            ("seen_views", SceneOptions { seen_views: 1, ..default() }),
+            ("wrong_observations", SceneOptions { seen_views: 5, wrong_observations: 3, ..default() }),
             ("wrong_observations", SceneOptions { wrong_observations: 8, ..default() }),
             ("wrong_observations", SceneOptions { views: 2, wrong_observations: 1, ..default() }),
             ("deleted_observations", SceneOptions { deleted_observations: 8, ..default() }),
@@ -228,6 +252,7 @@ mod tests {
             ("principal_point", SceneOptions { principal_point: [0.0, 0.6], ..default() }),
             ("radial_k1", SceneOptions { radial_k1: f64::INFINITY, ..default() }),
             ("zoom", SceneOptions { zoom: 1.0, ..default() }),
+            ("focal_range_px", SceneOptions { focal_range_px: (500.0, 400.0), ..default() }),
         ];
         for (name, options) in cases {
             let error = options.validate().expect_err(name);

@@ -18,6 +18,8 @@ pub enum Stream {
     Roll = 6,
     WrongObservations = 7,
     DeletedObservations = 8,
+    Visibility = 9,
+    OwnCameras = 10,
 }
 
 impl Stream {

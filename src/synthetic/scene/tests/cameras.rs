@@ -106,3 +106,26 @@ fn noise_of_every_kind_has_its_size_in_pixels_and_in_depths() {
         assert!(found.iter().all(|&found| near(found, size)), "{noise_kind:?}: {found:?} instead of {size}");
     }
 }
+
+#[test]
+fn own_cameras_project_by_what_the_truth_says_of_each_view() {
+    for seed in SEEDS {
+        let options =
+            SceneOptions { own_cameras: true, focal_range_px: (600.0, 650.0), radial_k1: -0.2, ..exact(seed) };
+        let scene = generate(options);
+        let truth = &scene.truth;
+        for (view, track) in (0..10).flat_map(|view| (0..200).map(move |track| (view, track))) {
+            let ([x, y, _], uv) = (observed(&scene, view, track), seen(&scene, view, track));
+            let uv = uv.xy() / uv.z;
+            let scaled = truth.focals_px[view] * (1.0 + truth.radial_k1[view] * uv.norm_squared()) * uv;
+            let [px, py] = truth.principal_points_px[view];
+            assert!((scaled.x + px - x).hypot(scaled.y + py - y) < EXACT_PX, "seed {seed}, view {view}");
+        }
+        let groups: Vec<u32> = scene.input.views.iter().map(|view| view.camera_group).collect();
+        assert_eq!(groups, (0..10).collect::<Vec<u32>>());
+        assert!(truth.focals_px.windows(2).all(|pair| pair[0] != pair[1] && (600.0..650.0).contains(&pair[0])));
+        let points = truth.principal_points_px.iter().flatten();
+        assert!(points.into_iter().all(|xy| (xy - 499.5).abs() <= 20.0), "seed {seed}");
+        assert!(truth.radial_k1.iter().all(|k1| (k1 + 0.2).abs() <= 0.0101), "seed {seed}");
+    }
+}

@@ -4,12 +4,13 @@ use nalgebra::{Matrix3, SMatrix, Vector3};
 
 use super::*;
 
-const MOTIONS: [Motion; 7] = [
+const MOTIONS: [Motion; 8] = [
     Motion::General,
     Motion::Orbit,
     Motion::Turntable,
     Motion::PureTranslation,
     Motion::Forward,
+    Motion::Grid,
     Motion::PureRotation,
     Motion::Sphere,
 ];
@@ -193,5 +194,37 @@ fn a_roll_turns_each_image_about_its_centre_and_leaves_the_rest_of_the_scene() {
             }
         }
         assert!(largest > 0.5, "{motion:?} seed {seed}: rolled by {largest} at most");
+    }
+}
+
+#[test]
+fn a_grid_is_square_and_does_not_turn() {
+    let scene = generate(SceneOptions { motion: Motion::Grid, views: 9, ..exact(0) });
+    for view in 0..9 {
+        assert_eq!(rotation(&scene, view), Matrix3::identity());
+        let centre = -translation(&scene, view);
+        assert_eq!(centre, Vector3::new((view % 3) as f64 - 1.0, (view / 3) as f64 - 1.0, 0.0), "view {view}");
+    }
+}
+
+#[test]
+fn a_track_is_observed_by_neighbouring_views_and_the_rest_stays() {
+    for seed in SEEDS {
+        let base = SceneOptions { motion: Motion::Grid, views: 25, outliers: 0.3, ..exact(seed) };
+        let complete = generate(base.clone());
+        let scene = generate(SceneOptions { seen_views: 5, ..base });
+        let mut views = vec![Vec::new(); 200];
+        for (k, (&view, &track)) in scene.input.view.iter().zip(&scene.input.track).enumerate() {
+            views[track as usize].push(view as usize);
+            let here = [scene.input.x[k], scene.input.y[k], scene.input.depth[k]];
+            assert_eq!(here, observed(&complete, view as usize, track as usize), "seed {seed}");
+        }
+        let apart = |a: usize, b: usize| (translation(&scene, a) - translation(&scene, b)).norm();
+        for seen in &views {
+            assert_eq!(seen.len(), 5);
+            // Cameras half a unit apart: a middle one and its neighbours, or a block of the corner.
+            assert!(seen.iter().any(|&middle| seen.iter().all(|&view| apart(middle, view) < 1.01)), "{seen:?}");
+        }
+        assert!((0..25).all(|view| views.iter().any(|seen| seen.contains(&view))), "seed {seed}");
     }
 }
