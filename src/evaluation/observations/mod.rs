@@ -1,6 +1,7 @@
 //! Inputs that only an estimator which judges single observations can solve: this program, and another one beside it
 //! on the same files. [`conditions`] are the inputs, [`table`] shows the rows.
 
+mod bound;
 pub mod conditions;
 mod solvers;
 pub mod table;
@@ -51,12 +52,16 @@ impl Generator {
     fn generate(&self) -> Result<Sample, InvalidInput> {
         Ok(match self {
             Generator::Scene(options) => {
-                let Scene { input, truth, .. } = Scene::generate(options)?;
-                Sample { input, inlier: truth.inlier, right: truth.observation_right, focals_px: truth.focals_px }
+                let scene = Scene::generate(options)?;
+                let bounds = if options.own_cameras { bound::sigmas(&scene) } else { None };
+                let Scene { input, truth, .. } = scene;
+                let right = truth.observation_right;
+                Sample { input, inlier: truth.inlier, right, focals_px: truth.focals_px, bounds }
             }
             Generator::Sequence(options) => {
                 let Sequence { input, truth, .. } = Sequence::generate(options)?;
-                Sample { input, inlier: truth.inlier, right: truth.observation_right, focals_px: truth.focals_px }
+                let right = truth.observation_right;
+                Sample { input, inlier: truth.inlier, right, focals_px: truth.focals_px, bounds: None }
             }
         })
     }
@@ -72,6 +77,16 @@ struct Sample {
     right: Vec<bool>,
     /// True focal length of each view.
     focals_px: Vec<f64>,
+    /// Cramer-Rao bound of the standard deviation of each view's log focal length, where it is known.
+    bounds: Option<Vec<f64>>,
+}
+
+impl Sample {
+    /// True focal length of each view and the bound of its estimate.
+    fn focals(&self) -> impl Iterator<Item = (f64, Option<f64>)> {
+        let bound = |view: usize| self.bounds.as_ref().map(|bounds| bounds[view]);
+        self.focals_px.iter().enumerate().map(move |(view, &focal_px)| (focal_px, bound(view)))
+    }
 }
 
 /// How the cameras are declared to the solver.
@@ -79,6 +94,8 @@ struct Sample {
 #[serde(rename_all = "kebab-case")]
 pub enum Declared {
     OneCamera,
+    /// The camera groups are the generator's.
+    Groups,
     FocalPerView,
 }
 
@@ -97,6 +114,8 @@ pub struct FocalError {
     /// `ln(f / f_true)`
     log_error: f64,
     sigma: Option<f64>,
+    /// The least that `sigma` can be, where it is known.
+    bound: Option<f64>,
 }
 
 impl FocalError {
@@ -175,7 +194,7 @@ impl Measured {
     }
 }
 
-/// One condition, one side; means over the seeds unless said.
+/// One condition, one side; means over the seeds unless said, an answer that keeps nothing counting as 0.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
     pub condition: String,
@@ -200,6 +219,8 @@ pub struct Row {
     /// Share of these focal lengths within three standard deviations, and the median standard deviation.
     pub covered: Option<f64>,
     pub median_sigma: Option<f64>,
+    /// Median of the standard deviation over the Cramer-Rao bound, where that is known.
+    pub sigma_over_bound: Option<f64>,
     /// METRIC ones that are off by more than 3 % and 4 standard deviations.
     pub wrong: usize,
     pub seconds: f64,
@@ -269,7 +290,10 @@ impl Plan {
 /// # Errors
 /// An input that cannot be made, or a defect of the solver, in words.
 pub fn measure(run: &Run, stop: &StopToken) -> Result<Option<Measured>, String> {
-    let sample = run.generator.generate().map_err(|error| error.to_string())?;
+    let mut sample = run.generator.generate().map_err(|error| error.to_string())?;
+    if run.declared != Declared::Groups {
+        sample.input.views.iter_mut().for_each(|view| view.camera_group = 0);
+    }
     let answer = match run.peer.is_empty() {
         true => solvers::ours(&sample, run.declared, stop)?.map(Ok),
         false => solvers::peer(&sample, &run.peer, stop)?,
@@ -288,6 +312,7 @@ fn row(condition: &str, side: Side, here: &[&Measured]) -> Row {
         here.iter().filter(|measured| measured.is_metric()).flat_map(|measured| measured.focals.clone()).collect();
     let mut errors: Vec<f64> = focals.iter().map(|focal| focal.log_error.abs()).collect();
     let mut sigmas: Vec<f64> = focals.iter().filter_map(|focal| focal.sigma).collect();
+    let mut ratios: Vec<f64> = focals.iter().filter_map(|focal| Some(focal.sigma? / focal.bound?)).collect();
     let covered = focals.iter().filter(|focal| focal.is_covered()).count() as f64 / focals.len() as f64;
     Row {
         condition: condition.to_owned(),
@@ -304,6 +329,7 @@ fn row(condition: &str, side: Side, here: &[&Measured]) -> Row {
         median_focal_error: (!errors.is_empty()).then(|| median(&mut errors)),
         largest_focal_error: errors.iter().copied().reduce(f64::max),
         covered: (!sigmas.is_empty()).then_some(covered),
+        sigma_over_bound: (!ratios.is_empty()).then(|| median(&mut ratios)),
         median_sigma: (!sigmas.is_empty()).then(|| median(&mut sigmas)),
         wrong: count(&|measured| measured.is_metric() && measured.focals.iter().any(FocalError::is_wrong)),
         seconds: mean(|measured| measured.seconds),

@@ -48,16 +48,17 @@ fn focals(sample: &Sample, solution: &Solution) -> Vec<FocalError> {
     let mut found = Vec::new();
     for (group, calibration) in solution.cameras() {
         let Some(calibration) = calibration else { continue };
-        let mut truths: Vec<(f64, f64)> = solution
+        let mut truths: Vec<(f64, f64, Option<f64>)> = solution
             .views
             .iter()
-            .zip(&sample.focals_px)
+            .zip(sample.focals())
             .filter(|(view, _)| view.camera_group == group && view.rotation.is_some())
-            .map(|(view, &truth)| (view.focal_px.unwrap_or(calibration.focal_px), truth))
+            .map(|(view, (truth, bound))| (view.focal_px.unwrap_or(calibration.focal_px), truth, bound))
             .collect();
         truths.dedup();
         let sigma = calibration.sigma_log_focal;
-        found.extend(truths.into_iter().map(|(focal, truth)| FocalError { log_error: (focal / truth).ln(), sigma }));
+        let error = |(focal, truth, bound): (f64, f64, _)| FocalError { log_error: (focal / truth).ln(), sigma, bound };
+        found.extend(truths.into_iter().map(error));
     }
     found
 }
@@ -99,15 +100,11 @@ fn peer_answer(sample: &Sample, said: &peer::PeerFile) -> Answer {
         })
         .collect();
     let focal = said.focal.filter(|&focal| focal > 0.0);
-    Answer {
-        tracks,
-        observations,
-        views: said.views,
-        grade: focal.map(|_| Grade::Metric),
-        focals: focal
-            .map(|focal| FocalError { log_error: (focal / sample.focals_px[0]).ln(), sigma: said.sigma_log_focal })
-            .into_iter()
-            .collect(),
-        ..Answer::default()
-    }
+    let sigma = said.sigma_log_focal;
+    let mut truths: Vec<f64> = sample.focals_px.clone();
+    truths.dedup();
+    let errors = |focal: f64| truths.iter().map(move |truth| (focal / truth).ln());
+    let focals =
+        focal.into_iter().flat_map(errors).map(|log_error| FocalError { log_error, sigma, bound: None }).collect();
+    Answer { tracks, observations, views: said.views, grade: focal.map(|_| Grade::Metric), focals, ..Answer::default() }
 }

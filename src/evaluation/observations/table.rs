@@ -8,7 +8,7 @@ use super::Row;
 pub fn text(rows: &[Row]) -> String {
     let width = rows.iter().map(|row| row.condition.chars().count()).max().unwrap_or(0).max("input".len());
     let mut text = format!(
-        "{:<width$} {:<7}{:>4}{:>7}{:>7}{:>7}{:>8}{:>7}{:>7}{:>8}{:>9}{:>9}{:>8}{:>7}{:>8}{:>7}{:>8}{:>16}\n",
+        "{:<width$} {:<7}{:>4}{:>7}{:>7}{:>7}{:>8}{:>7}{:>7}{:>8}{:>9}{:>9}{:>8}{:>7}{:>8}{:>8}{:>7}{:>8}{:>16}\n",
         "input",
         "side",
         "n",
@@ -23,6 +23,7 @@ pub fn text(rows: &[Row]) -> String {
         "focal %",
         "most %",
         "sig %",
+        "/ bound",
         "in 3sg",
         "wrong",
         "CPU s",
@@ -33,7 +34,7 @@ pub fn text(rows: &[Row]) -> String {
         let gain = row.f1_gain.map_or_else(String::new, |[mean, half]| format!("{mean:+.3} +- {half:.3}"));
         let _ = writeln!(
             text,
-            "{:<width$} {:<7}{:>4}{:>7.3}{:>7.3}{:>7.3}{:>8.3}{:>7.3}{:>7}{:>8}{:>9}{:>9}{:>8}{:>7}{:>8}{:>7}{:>8.2}{gain:>16}",
+            "{:<width$} {:<7}{:>4}{:>7.3}{:>7.3}{:>7.3}{:>8.3}{:>7.3}{:>7}{:>8}{:>9}{:>9}{:>8}{:>7}{:>8}{:>8}{:>7}{:>8.2}{gain:>16}",
             row.condition,
             row.side.name(),
             row.seeds,
@@ -48,6 +49,7 @@ pub fn text(rows: &[Row]) -> String {
             percent(row.median_focal_error),
             percent(row.largest_focal_error),
             percent(row.median_sigma),
+            row.sigma_over_bound.map_or_else(|| "-".to_owned(), |ratio| format!("{ratio:.2}")),
             row.covered.map_or_else(|| "-".to_owned(), |share| format!("{share:.2}")),
             row.wrong,
             row.seconds
@@ -64,9 +66,11 @@ pub fn text(rows: &[Row]) -> String {
         );
     }
     text.push_str(
-        "F1: of tracks. obs P, R: precision over the observations that were kept, recall over the right ones of right tracks.\n\
+        "F1: of tracks. obs P, R: precision over the observations that were kept (0 where none was), recall over the right ones\n\
+         of right tracks.\n\
          views: share in the largest reconstruction. calib: answers with a focal length; mismatch: METRIC ones that warn of it.\n\
-         focal %, most %, sig %, in 3sg: of the METRIC ones, median and largest focal error, median sigma, share within 3 sigma.\n\
+         focal %, most %, sig %, in 3sg: of the METRIC ones, median and largest focal error, median sigma, share within 3 sigma;\n\
+         / bound: median of sigma over the Cramer-Rao bound, where every view has its own camera.\n\
          wrong: METRIC and off by more than 3 % and 4 sigma. CPU s: mean; a peer's without what its start takes.\n",
     );
     text
