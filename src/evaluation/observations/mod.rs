@@ -194,6 +194,35 @@ impl Measured {
     }
 }
 
+/// Some focal lengths against the true ones; relative.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Focals {
+    pub median_error: Option<f64>,
+    pub largest_error: Option<f64>,
+    pub median_sigma: Option<f64>,
+    /// Median of the standard deviation over the Cramer-Rao bound, where that is known.
+    pub sigma_over_bound: Option<f64>,
+    /// Share within three standard deviations.
+    pub covered: Option<f64>,
+}
+
+impl Focals {
+    fn of<'a>(focals: impl Iterator<Item = &'a FocalError>) -> Self {
+        let focals: Vec<&FocalError> = focals.collect();
+        let some = |mut values: Vec<f64>| (!values.is_empty()).then(|| median(&mut values));
+        let errors: Vec<f64> = focals.iter().map(|focal| focal.log_error.abs()).collect();
+        let sigmas: Vec<f64> = focals.iter().filter_map(|focal| focal.sigma).collect();
+        let covered = focals.iter().filter(|focal| focal.is_covered()).count() as f64 / focals.len() as f64;
+        Self {
+            largest_error: errors.iter().copied().reduce(f64::max),
+            median_error: some(errors),
+            covered: (!sigmas.is_empty()).then_some(covered),
+            median_sigma: some(sigmas),
+            sigma_over_bound: some(focals.iter().filter_map(|focal| Some(focal.sigma? / focal.bound?)).collect()),
+        }
+    }
+}
+
 /// One condition, one side; means over the seeds unless said, an answer that keeps nothing counting as 0.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
@@ -213,14 +242,9 @@ pub struct Row {
     pub calibrated: usize,
     pub metric: usize,
     pub mismatch: usize,
-    /// Relative focal errors of the METRIC ones.
-    pub median_focal_error: Option<f64>,
-    pub largest_focal_error: Option<f64>,
-    /// Share of these focal lengths within three standard deviations, and the median standard deviation.
-    pub covered: Option<f64>,
-    pub median_sigma: Option<f64>,
-    /// Median of the standard deviation over the Cramer-Rao bound, where that is known.
-    pub sigma_over_bound: Option<f64>,
+    /// Of the METRIC answers, and of all that have a calibration.
+    pub metric_focals: Focals,
+    pub calibrated_focals: Focals,
     /// METRIC ones that are off by more than 3 % and 4 standard deviations.
     pub wrong: usize,
     pub seconds: f64,
@@ -308,12 +332,6 @@ fn row(condition: &str, side: Side, here: &[&Measured]) -> Row {
     let mean =
         |value: fn(&Measured) -> f64| here.iter().map(|measured| value(measured)).sum::<f64>() / here.len() as f64;
     let count = |wanted: &dyn Fn(&Measured) -> bool| here.iter().filter(|measured| wanted(measured)).count();
-    let focals: Vec<FocalError> =
-        here.iter().filter(|measured| measured.is_metric()).flat_map(|measured| measured.focals.clone()).collect();
-    let mut errors: Vec<f64> = focals.iter().map(|focal| focal.log_error.abs()).collect();
-    let mut sigmas: Vec<f64> = focals.iter().filter_map(|focal| focal.sigma).collect();
-    let mut ratios: Vec<f64> = focals.iter().filter_map(|focal| Some(focal.sigma? / focal.bound?)).collect();
-    let covered = focals.iter().filter(|focal| focal.is_covered()).count() as f64 / focals.len() as f64;
     Row {
         condition: condition.to_owned(),
         side,
@@ -326,11 +344,8 @@ fn row(condition: &str, side: Side, here: &[&Measured]) -> Row {
         calibrated: count(&|measured| !measured.focals.is_empty()),
         metric: count(&Measured::is_metric),
         mismatch: count(&|measured| measured.is_metric() && measured.mismatch),
-        median_focal_error: (!errors.is_empty()).then(|| median(&mut errors)),
-        largest_focal_error: errors.iter().copied().reduce(f64::max),
-        covered: (!sigmas.is_empty()).then_some(covered),
-        sigma_over_bound: (!ratios.is_empty()).then(|| median(&mut ratios)),
-        median_sigma: (!sigmas.is_empty()).then(|| median(&mut sigmas)),
+        metric_focals: Focals::of(here.iter().filter(|measured| measured.is_metric()).flat_map(|one| &one.focals)),
+        calibrated_focals: Focals::of(here.iter().flat_map(|one| &one.focals)),
         wrong: count(&|measured| measured.is_metric() && measured.focals.iter().any(FocalError::is_wrong)),
         seconds: mean(|measured| measured.seconds),
         failures: here.iter().filter_map(|measured| measured.failure.clone()).collect(),
