@@ -1,0 +1,184 @@
+//! The Levenberg-Marquardt method (Madsen, Nielsen & Tingleff 2004, section 3.2): one loop, one damping policy.
+//!
+//! A problem says what a state costs, linearises, and solves its damped normal equations; [`Normal`] does the latter
+//! for problems of a few unknowns.
+
+use nalgebra::{SMatrix, SVector};
+
+use crate::domain::StopToken;
+
+/// Dampings tried for one step before the state is declared a minimum; they span 8^8 = 1.7e7.
+const MAX_ATTEMPTS: usize = 8;
+/// Factor on the damping after a rejected step.
+const DAMPING_UP: f64 = 8.0;
+/// Bounds of the factor after an accepted one: a step that gains what was predicted divides the damping by five, one
+/// that gains next to nothing doubles it.
+const ACCEPTED_FACTORS: (f64, f64) = (0.2, 2.0);
+/// Least damping: below it, rounding in the gauge directions would be amplified into the step.
+const MIN_DAMPING: f64 = 1e-10;
+
+/// What the loop asks of a sum of squares, or of a robust loss that is reweighted at every linearisation.
+pub(crate) trait Problem {
+    type State: Clone;
+
+    /// The cost of a state; infinite or not a number where it has none.
+    fn cost(&self, state: &Self::State) -> f64;
+
+    /// Builds the normal equations at a state.
+    fn linearise(&mut self, state: &Self::State);
+
+    /// Solves the normal equations, damped relative to their diagonal, and moves `from` by the solution into `to`.
+    ///
+    /// Returns the decrease of the cost that the linearisation predicts; `None` where the system has no solution.
+    fn step(&mut self, from: &Self::State, damping: f64, to: &mut Self::State) -> Option<f64>;
+}
+
+/// When to start and end.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Options {
+    /// Accepted steps at most.
+    pub max_iterations: usize,
+    /// Ends when a step lowers the cost by less than this share of it.
+    pub relative_tolerance: f64,
+    /// First damping, relative to the diagonal of the normal equations.
+    pub initial_damping: f64,
+}
+
+/// What the loop did.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Summary {
+    pub initial_cost: f64,
+    pub cost: f64,
+    /// Accepted steps.
+    pub iterations: usize,
+}
+
+/// Minimises the cost from `state`, which is replaced by the best one found.
+///
+/// The cost never rises. `stop` is asked before every damped solve.
+pub(crate) fn minimise<P: Problem>(
+    problem: &mut P,
+    state: &mut P::State,
+    options: &Options,
+    stop: &StopToken,
+) -> Summary {
+    let initial_cost = problem.cost(state);
+    let mut summary = Summary { initial_cost, cost: initial_cost, iterations: 0 };
+    let mut trial = state.clone();
+    let mut damping = options.initial_damping.max(MIN_DAMPING);
+    while summary.iterations < options.max_iterations && summary.cost > 0.0 && !stop.is_stopped() {
+        problem.linearise(state);
+        let accepted = (0..MAX_ATTEMPTS).take_while(|_| !stop.is_stopped()).find_map(|_| {
+            let lowered = problem.step(state, damping, &mut trial).and_then(|predicted| {
+                let cost = problem.cost(&trial);
+                // Written so that NaN fails.
+                (cost < summary.cost).then_some((cost, (summary.cost - cost) / predicted))
+            });
+            damping *= lowered.map_or(DAMPING_UP, |(_, gain_ratio)| factor_after(gain_ratio));
+            damping = damping.max(MIN_DAMPING);
+            lowered
+        });
+        let Some((cost, _)) = accepted else { break };
+        std::mem::swap(state, &mut trial);
+        let gain = summary.cost - cost;
+        summary.cost = cost;
+        summary.iterations += 1;
+        if gain < options.relative_tolerance * cost {
+            break;
+        }
+    }
+    summary
+}
+
+/// Nielsen's factor on the damping after a step that gained this share of what was predicted.
+fn factor_after(gain_ratio: f64) -> f64 {
+    let (least, most) = ACCEPTED_FACTORS;
+    (1.0 - (2.0 * gain_ratio - 1.0).powi(3)).max(least).min(most)
+}
+
+/// The normal equations of `N` unknowns.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Normal<const N: usize> {
+    pub matrix: SMatrix<f64, N, N>,
+    /// Half the gradient of the cost.
+    pub gradient: SVector<f64, N>,
+}
+
+impl<const N: usize> Normal<N> {
+    pub fn zeros() -> Self {
+        Self { matrix: SMatrix::zeros(), gradient: SVector::zeros() }
+    }
+
+    /// Adds a residual of this derivative.
+    #[inline]
+    pub fn add(&mut self, derivative: &SVector<f64, N>, residual: f64, weight: f64) {
+        self.matrix.ger(weight, derivative, derivative, 1.0);
+        self.gradient.axpy(weight * residual, derivative, 1.0);
+    }
+
+    /// The damped step and the decrease of the cost that it promises; `None` where the matrix is not positive definite.
+    pub fn solve(&self, damping: f64) -> Option<(SVector<f64, N>, f64)> {
+        let mut damped = self.matrix;
+        for k in 0..N {
+            damped[(k, k)] += damping * self.matrix[(k, k)] + f64::MIN_POSITIVE;
+        }
+        let step = damped.cholesky()?.solve(&-self.gradient);
+        let predicted = -step.dot(&(2.0 * self.gradient + self.matrix * step));
+        Some((step, predicted))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector2;
+
+    use super::*;
+
+    /// Rosenbrock's valley: `(10 (y - x²), 1 - x)`.
+    struct Valley(Normal<2>);
+
+    impl Problem for Valley {
+        type State = Vector2<f64>;
+
+        fn cost(&self, at: &Vector2<f64>) -> f64 {
+            (10.0 * (at.y - at.x * at.x)).powi(2) + (1.0 - at.x).powi(2)
+        }
+
+        fn linearise(&mut self, at: &Vector2<f64>) {
+            self.0 = Normal::zeros();
+            self.0.add(&Vector2::new(-20.0 * at.x, 10.0), 10.0 * (at.y - at.x * at.x), 1.0);
+            self.0.add(&Vector2::new(-1.0, 0.0), 1.0 - at.x, 1.0);
+        }
+
+        fn step(&mut self, from: &Vector2<f64>, damping: f64, to: &mut Vector2<f64>) -> Option<f64> {
+            let (step, predicted) = self.0.solve(damping)?;
+            *to = from + step;
+            Some(predicted)
+        }
+    }
+
+    const OPTIONS: Options = Options { max_iterations: 100, relative_tolerance: 1e-12, initial_damping: 1e-3 };
+
+    #[test]
+    fn the_minimum_of_a_curved_valley_is_found() {
+        let mut state = Vector2::new(-1.2, 1.0);
+        let summary = minimise(&mut Valley(Normal::zeros()), &mut state, &OPTIONS, &StopToken::default());
+        assert!((state - Vector2::new(1.0, 1.0)).norm() < 1e-6, "{state} {summary:?}");
+        assert!(summary.iterations < 40 && summary.cost < summary.initial_cost, "{summary:?}");
+    }
+
+    #[test]
+    fn a_state_without_a_cost_is_left_alone() {
+        let mut state = Vector2::new(f64::NAN, 1.0);
+        let summary = minimise(&mut Valley(Normal::zeros()), &mut state, &OPTIONS, &StopToken::default());
+        assert!(state.x.is_nan() && summary.iterations == 0);
+    }
+
+    #[test]
+    fn dampings_follow_the_gain() {
+        assert_eq!(factor_after(1.0), 0.2);
+        assert_eq!(factor_after(0.5), 1.0);
+        assert_eq!(factor_after(0.0), 2.0);
+        assert!(factor_after(f64::NAN).is_finite());
+    }
+}

@@ -1,0 +1,147 @@
+//! Robust estimation from contaminated data: one LO-MSAC loop (Torr & Zisserman 2000; Chum, Matas & Kittler 2003), with
+//! the minimal solvers as plug-ins.
+
+use rand::seq::index;
+use rand_chacha::ChaCha8Rng;
+
+use crate::domain::StopToken;
+
+/// Probability with which one sample without outliers is to be among those drawn.
+const CONFIDENCE: f64 = 0.99;
+/// Samples between two looks at the stop token: some milliseconds.
+const STOP_EVERY: usize = 32;
+
+/// A kind of model, and the data it is sought in.
+pub(crate) trait Estimator {
+    type Model: Clone;
+
+    /// Data that determine a model, up to a few solutions.
+    const SAMPLE: usize;
+    /// Gates within which a datum agrees with the model of a sample: what few noisy data determine is noisier than what
+    /// many do.
+    const SAMPLE_GATES: f64;
+
+    /// Number of data.
+    fn len(&self) -> usize;
+
+    /// The models that fit a sample of [`Self::SAMPLE`] distinct data.
+    fn minimal(&self, sample: &[usize]) -> impl IntoIterator<Item = Self::Model>;
+
+    /// Squared residual of a datum; infinite or not a number where it has none.
+    fn squared_residual(&self, model: &Self::Model, datum: usize) -> f64;
+
+    /// The model fitted to the data that are within about this squared residual of it; `None` where there are too few.
+    fn refined(&self, model: &Self::Model, gate: f64) -> Option<Self::Model>;
+}
+
+/// What most data agree on.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Robust<M> {
+    pub model: M,
+    /// One a datum: whether its squared residual is within the gate.
+    pub inlier: Vec<bool>,
+    /// Mean over the data of the squared residual in units of the gate, each 1 at most.
+    pub cost: f64,
+}
+
+impl<M> Robust<M> {
+    pub fn inlier_count(&self) -> usize {
+        self.inlier.iter().filter(|&&inlier| inlier).count()
+    }
+}
+
+/// The model of least truncated squared residuals.
+///
+/// * `gate`: squared residual within which a datum agrees
+/// * `start`: a model to begin with, as if a sample had given it
+///
+/// Draws until [`CONFIDENCE`] is reached for the share of inliers found, `most_samples` at most. Every sample that is
+/// better than those before is optimised: fitted to the data within [`Estimator::SAMPLE_GATES`] gates, then to those
+/// within one. Once `stop` fires, the best so far.
+///
+/// Returns `None` for too few data, no usable gate, or when no sample gives a model.
+pub(crate) fn estimate<E: Estimator>(
+    estimator: &E,
+    gate: f64,
+    start: Option<E::Model>,
+    most_samples: usize,
+    rng: &mut ChaCha8Rng,
+    stop: &StopToken,
+) -> Option<Robust<E::Model>> {
+    if estimator.len() < E::SAMPLE || !(gate > 0.0 && gate.is_finite()) {
+        return None;
+    }
+    let mut search = Search { estimator, gate, best: None, best_sample_cost: f64::INFINITY, wanted: most_samples };
+    start.into_iter().for_each(|start| search.offer(start));
+    let mut drawn = 0;
+    while drawn < search.wanted && !(drawn % STOP_EVERY == 0 && stop.is_stopped()) {
+        drawn += 1;
+        let sample = index::sample(rng, estimator.len(), E::SAMPLE).into_vec();
+        for model in estimator.minimal(&sample) {
+            search.offer(model);
+        }
+    }
+    let (model, cost) = search.best?;
+    let inlier = (0..estimator.len()).map(|datum| estimator.squared_residual(&model, datum) < gate).collect();
+    Some(Robust { model, inlier, cost: cost / estimator.len() as f64 })
+}
+
+struct Search<'a, E: Estimator> {
+    estimator: &'a E,
+    gate: f64,
+    best: Option<(E::Model, f64)>,
+    /// Least cost of a sample's model as it came, at the gate of samples.
+    best_sample_cost: f64,
+    /// Samples to draw.
+    wanted: usize,
+}
+
+impl<E: Estimator> Search<'_, E> {
+    /// Takes a sample's model where it is better than those before, and optimises it.
+    fn offer(&mut self, model: E::Model) {
+        let wide = E::SAMPLE_GATES * self.gate;
+        let Some(cost) = self.cost_below(&model, wide, self.best_sample_cost) else { return };
+        self.best_sample_cost = cost;
+        let near = self.estimator.refined(&model, wide);
+        let nearest = near.as_ref().and_then(|near| self.estimator.refined(near, self.gate));
+        let mut improved = false;
+        for candidate in [Some(model), near, nearest].into_iter().flatten() {
+            let to_beat = self.best.as_ref().map_or(f64::INFINITY, |(_, cost)| *cost);
+            if let Some(cost) = self.cost_below(&candidate, self.gate, to_beat) {
+                self.best = Some((candidate, cost));
+                improved = true;
+            }
+        }
+        if let Some((best, _)) = self.best.as_ref().filter(|_| improved) {
+            self.wanted = self.wanted.min(samples_wanted(self.inlier_count(best), self.estimator.len(), E::SAMPLE));
+        }
+    }
+
+    /// Sum of the squared residuals in units of a gate, each 1 at most; `None` as soon as it is not below `to_beat`.
+    fn cost_below(&self, model: &E::Model, gate: f64, to_beat: f64) -> Option<f64> {
+        let mut cost = 0.0;
+        for datum in 0..self.estimator.len() {
+            // What is not a number counts as an outlier.
+            cost += (self.estimator.squared_residual(model, datum) / gate).min(1.0);
+            if cost >= to_beat {
+                return None;
+            }
+        }
+        Some(cost)
+    }
+
+    fn inlier_count(&self, model: &E::Model) -> usize {
+        (0..self.estimator.len()).filter(|&datum| self.estimator.squared_residual(model, datum) < self.gate).count()
+    }
+}
+
+/// Samples of distinct data after which one without outliers was drawn with [`CONFIDENCE`].
+fn samples_wanted(inliers: usize, data: usize, sample: usize) -> usize {
+    let right: f64 = (0..sample).map(|k| inliers.saturating_sub(k) as f64 / (data - k) as f64).product();
+    ((1.0 - CONFIDENCE).ln() / (-right).ln_1p()).ceil() as usize
+}
+
+/// The items of a sample.
+pub(crate) fn chosen<T: Copy, const N: usize>(items: &[T], sample: &[usize]) -> [T; N] {
+    std::array::from_fn(|k| items[sample[k]])
+}
