@@ -3,8 +3,9 @@
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::fundamental::{self, Match, Robust};
+use super::fundamental::{self, Fundamental, Match};
 use super::measurement::CompleteBlock;
+use super::ransac::Robust;
 use super::statistics::median;
 use crate::domain::StopToken;
 
@@ -40,7 +41,7 @@ pub fn epipolar_depths(block: &CompleteBlock, noise: f64, seed: u64, stop: &Stop
     }
     let mut references = vec![0, views / 2, views - 1];
     references.dedup();
-    let mut best: Option<(usize, f64, Vec<Option<Robust>>)> = None;
+    let mut best: Option<(usize, f64, Vec<Option<Robust<Fundamental>>>)> = None;
     for reference in references {
         if let Some((cost, star)) = star(block, reference, noise, seed, stop)
             && best.as_ref().is_none_or(|(_, least, _)| cost < *least)
@@ -55,7 +56,7 @@ pub fn epipolar_depths(block: &CompleteBlock, noise: f64, seed: u64, stop: &Stop
     let mut depths = vec![1.0; views * block.tracks()];
     for (view, robust) in star.iter().enumerate() {
         let Some(robust) = robust else { continue };
-        for (track, depth) in depths_in_view(block, reference, view, robust, noise).into_iter().enumerate() {
+        for (track, depth) in depths_in_view(block, reference, view, &robust.model, noise).into_iter().enumerate() {
             depths[track * views + view] = depth;
         }
     }
@@ -69,7 +70,7 @@ fn star(
     noise: f64,
     seed: u64,
     stop: &StopToken,
-) -> Option<(f64, Vec<Option<Robust>>)> {
+) -> Option<(f64, Vec<Option<Robust<Fundamental>>>)> {
     let (mut cost, mut star) = (0.0, Vec::with_capacity(block.views()));
     for view in 0..block.views() {
         if view == reference {
@@ -94,8 +95,13 @@ fn match_of(block: &CompleteBlock, from: usize, to: usize, track: usize) -> Matc
 }
 
 /// Depths of all tracks in one view where those in the reference view are 1: median 1 over the matches that agree.
-fn depths_in_view(block: &CompleteBlock, reference: usize, view: usize, robust: &Robust, noise: f64) -> Vec<f64> {
-    let fundamental = &robust.fundamental;
+fn depths_in_view(
+    block: &CompleteBlock,
+    reference: usize,
+    view: usize,
+    fundamental: &Fundamental,
+    noise: f64,
+) -> Vec<f64> {
     let gate = fundamental::squared_gate(noise);
     let seen = |track| match_of(block, reference, view, track);
     let ratios: Vec<Option<f64>> = (0..block.tracks()).map(|track| fundamental.depth_ratio(&seen(track))).collect();

@@ -4,9 +4,9 @@
 //! of the centre of the camera `from`.
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
-use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 
+use super::ransac::{self, Estimator, Robust};
 use crate::domain::StopToken;
 
 /// Correspondences that determine a fundamental matrix linearly.
@@ -14,18 +14,12 @@ pub const LEAST_MATCHES: usize = 8;
 /// Samples of the robust estimate at most: enough where 43 % of the matches are right. At ninety per cent outliers
 /// 10⁸ would be, which nobody waits for.
 pub const MOST_SAMPLES: usize = 4_000;
-/// Probability with which one sample without outliers is to be among those drawn.
-const CONFIDENCE: f64 = 0.99;
 /// Chi-square quantile of .95 for one degree of freedom, which is what a Sampson distance has.
 const GATE: f64 = 3.841_459;
-/// Gates of the local optimisation, as multiples of the gate: eight noisy matches make a noisier matrix than many.
-const LOCAL_GATES: [f64; 4] = [4.0, 2.0, 1.0, 1.0];
-/// Rounds of the same at the end, while they help.
-const FINAL_ROUNDS: usize = 5;
+/// Refits to the matches within a gate, each of which changes them.
+const REFITS: usize = 3;
 /// Spread of points, as a share of their distance from the origin, below which they coincide but for rounding.
 const COINCIDENT: f64 = 1e-12;
-/// Samples between two looks at the stop token: well below 50 ms.
-const STOP_EVERY: usize = 128;
 /// Least squared sine of the angle between an image point and the epipole: at the epipole itself every depth fits.
 const LEAST_SQUARED_SINE: f64 = 1e-12;
 
@@ -162,108 +156,57 @@ pub fn squared_gate(noise: f64) -> f64 {
     GATE * noise * noise
 }
 
-/// What most matches of two views agree on.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Robust {
-    pub fundamental: Fundamental,
-    /// One a match: whether its Sampson distance is within the gate.
-    pub inlier: Vec<bool>,
-    /// Mean over the matches of the squared distance in units of the gate, 1 at most.
-    pub cost: f64,
-}
-
-/// LO-RANSAC (Chum, Matas & Kittler 2003): samples of eight, truncated squared Sampson distances, every new best
-/// refitted to the matches it explains.
+/// The matrix of least truncated squared Sampson distances, by samples of eight.
 ///
 /// * `noise`: standard deviation of a coordinate, in the units of the matches
 ///
-/// Draws until [`CONFIDENCE`] is reached for the share of inliers found, [`MOST_SAMPLES`] at most: reliable down to
-/// 43 % inliers. Once `stop` fires, the best so far.
-///
-/// Returns `None` for too few matches, no usable noise, or when no sample gives a matrix.
-pub fn robust(matches: &[Match], noise: f64, rng: &mut ChaCha8Rng, stop: &StopToken) -> Option<Robust> {
+/// Reliable down to 43 % inliers. Returns `None` for too few matches, no usable noise, or when no sample gives a matrix.
+pub(crate) fn robust(
+    matches: &[Match],
+    noise: f64,
+    rng: &mut ChaCha8Rng,
+    stop: &StopToken,
+) -> Option<Robust<Fundamental>> {
     robust_within(matches, noise, MOST_SAMPLES, rng, stop)
 }
 
 /// The same with another bound on the samples: `n` of them are reliable down to a share of inliers of `(4.6 /
 /// n)^(1/8)`.
-pub fn robust_within(
+pub(crate) fn robust_within(
     matches: &[Match],
     noise: f64,
     most_samples: usize,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
-) -> Option<Robust> {
-    let gate = squared_gate(noise);
-    if matches.len() < LEAST_MATCHES || !(gate > 0.0 && gate.is_finite()) {
-        return None;
-    }
-    let mut best: Option<(Fundamental, f64)> = None;
-    let (mut drawn, mut wanted) = (0, most_samples);
-    while drawn < wanted && !(drawn % STOP_EVERY == 0 && stop.is_stopped()) {
-        drawn += 1;
-        let sample: Vec<Match> =
-            index::sample(rng, matches.len(), LEAST_MATCHES).into_iter().map(|k| matches[k]).collect();
-        let Some(found) = eight_point(&sample, &[1.0; LEAST_MATCHES]) else { continue };
-        if !found.is_oriented(&sample) {
-            continue;
-        }
-        let to_beat = best.map_or(f64::INFINITY, |(_, cost)| cost);
-        if let Some(cost) = cost_below(&found, matches, gate, to_beat) {
-            let improved = optimise(found, cost, matches, gate);
-            wanted = samples_wanted(inlier_share(&improved.0, matches, gate)).min(most_samples);
-            best = Some(improved);
-        }
-    }
-    let (mut fundamental, mut cost) = best?;
-    for _ in 0..FINAL_ROUNDS {
-        let (refitted, lower) = optimise(fundamental, cost, matches, gate);
-        if lower >= cost {
-            break;
-        }
-        (fundamental, cost) = (refitted, lower);
-    }
-    let inlier = matches.iter().map(|seen| fundamental.sampson_squared(seen) < gate).collect();
-    Some(Robust { fundamental, inlier, cost: cost / matches.len() as f64 })
+) -> Option<Robust<Fundamental>> {
+    ransac::estimate(&matches, squared_gate(noise), None, most_samples, rng, stop)
 }
 
-/// Sum of the truncated squared distances in units of the gate; `None` as soon as it is not below `to_beat`.
-fn cost_below(fundamental: &Fundamental, matches: &[Match], gate: f64, to_beat: f64) -> Option<f64> {
-    let mut cost = 0.0;
-    for seen in matches {
-        // NaN counts as an outlier.
-        cost += (fundamental.sampson_squared(seen) / gate).min(1.0);
-        if cost >= to_beat {
-            return None;
-        }
+impl Estimator for &[Match] {
+    type Model = Fundamental;
+
+    const SAMPLE: usize = LEAST_MATCHES;
+    const SAMPLE_GATES: f64 = 4.0;
+
+    fn len(&self) -> usize {
+        <[Match]>::len(self)
     }
-    Some(cost)
-}
 
-/// Refits to the matches within shrinking gates, each weighted so that its algebraic error is its Sampson distance.
-fn optimise(start: Fundamental, cost: f64, matches: &[Match], gate: f64) -> (Fundamental, f64) {
-    let (mut current, mut best) = (start, (start, cost));
-    for wide in LOCAL_GATES {
-        let within = |seen: &Match| f64::from(u8::from(current.sampson_squared(seen) < wide * gate));
-        let weights: Vec<f64> = matches.iter().map(within).collect();
-        let Some(refitted) = current.refitted(matches, &weights) else { break };
-        current = refitted;
-        if let Some(cost) = cost_below(&current, matches, gate, best.1) {
-            best = (current, cost);
-        }
+    fn minimal(&self, sample: &[usize]) -> impl IntoIterator<Item = Fundamental> {
+        let sample: [Match; LEAST_MATCHES] = ransac::chosen(self, sample);
+        eight_point(&sample, &[1.0; LEAST_MATCHES]).filter(|found| found.is_oriented(&sample))
     }
-    best
-}
 
-fn inlier_share(fundamental: &Fundamental, matches: &[Match], gate: f64) -> f64 {
-    let inliers = matches.iter().filter(|seen| fundamental.sampson_squared(seen) < gate).count();
-    inliers as f64 / matches.len() as f64
-}
+    fn squared_residual(&self, fundamental: &Fundamental, datum: usize) -> f64 {
+        fundamental.sampson_squared(&self[datum])
+    }
 
-/// Samples after which one without outliers was drawn with [`CONFIDENCE`].
-fn samples_wanted(inlier_share: f64) -> usize {
-    let right = inlier_share.powi(LEAST_MATCHES as i32).clamp(f64::EPSILON, 1.0 - f64::EPSILON);
-    ((1.0 - CONFIDENCE).ln() / (1.0 - right).ln()).ceil() as usize
+    fn refined(&self, fundamental: &Fundamental, gate: f64) -> Option<Fundamental> {
+        (0..REFITS).try_fold(*fundamental, |fundamental, _| {
+            let within = |seen: &Match| f64::from(u8::from(fundamental.sampson_squared(seen) < gate));
+            fundamental.refitted(self, &self.iter().map(within).collect::<Vec<f64>>())
+        })
+    }
 }
 
 #[cfg(test)]

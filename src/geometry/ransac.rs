@@ -138,10 +138,25 @@ impl<E: Estimator> Search<'_, E> {
 /// Samples of distinct data after which one without outliers was drawn with [`CONFIDENCE`].
 fn samples_wanted(inliers: usize, data: usize, sample: usize) -> usize {
     let right: f64 = (0..sample).map(|k| inliers.saturating_sub(k) as f64 / (data - k) as f64).product();
-    ((1.0 - CONFIDENCE).ln() / (-right).ln_1p()).ceil() as usize
+    ((1.0 - CONFIDENCE).ln() / (-right).ln_1p()).ceil().max(1.0) as usize
 }
 
 /// The items of a sample.
 pub(crate) fn chosen<T: Copy, const N: usize>(items: &[T], sample: &[usize]) -> [T; N] {
     std::array::from_fn(|k| items[sample[k]])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_are_as_many_as_the_inliers_ask_for() {
+        assert_eq!(samples_wanted(100, 100, 8), 1);
+        // ln .01 / ln (1 - 2⁻⁸), of many data.
+        assert_eq!(samples_wanted(500_000, 1_000_000, 8), 1177);
+        // C(12, 6) / C(40, 6) of the samples are right.
+        assert_eq!(samples_wanted(12, 40, 6), 19_128);
+        assert!(samples_wanted(7, 100, 8) > 1_000_000);
+    }
 }

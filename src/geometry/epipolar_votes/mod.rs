@@ -25,7 +25,8 @@ mod tracks;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::fundamental::{self, Fundamental, Match, Robust};
+use super::fundamental::{self, Fundamental, Match};
+use super::ransac::Robust;
 use crate::domain::StopToken;
 use residuals::{Residuals, noise_of};
 pub use tracks::Tracks;
@@ -143,11 +144,11 @@ impl Pair {
     fn estimate(
         places: Vec<(usize, usize)>,
         matches: Vec<Match>,
-        robust: impl FnOnce(&[Match]) -> Option<Robust>,
+        robust: impl FnOnce(&[Match]) -> Option<Robust<Fundamental>>,
     ) -> Option<Self> {
         let count = matches.len().min(MOST_MATCHES);
         let sampled: Vec<Match> = (0..count).map(|k| matches[k * matches.len() / count]).collect();
-        let fundamental = robust(&sampled)?.fundamental;
+        let fundamental = robust(&sampled)?.model;
         let residuals = Residuals::new(&sampled, squared(&fundamental, &sampled));
         Some(Self { places, matches, fundamental, residuals, sampled })
     }

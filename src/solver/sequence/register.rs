@@ -203,5 +203,5 @@ fn robust_pose(
     let (points, rays): (Vec<_>, Vec<_>) = seen.iter().filter_map(pair).unzip();
     let gate = model.gate(scene) / intrinsics.focal.powi(2);
     let found = pose::robust(&points, &rays, gate, rng, scene.stop())?;
-    Some((found.pose, found.inlier.iter().filter(|&&inlier| inlier).count()))
+    Some((found.model, found.inlier_count()))
 }
