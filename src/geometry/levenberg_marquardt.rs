@@ -7,15 +7,17 @@ use nalgebra::{SMatrix, SVector};
 
 use crate::domain::StopToken;
 
-/// Dampings tried for one step before the state is declared a minimum; they span 8^8 = 1.7e7.
+/// Dampings tried for one step before the state is declared a minimum.
 const MAX_ATTEMPTS: usize = 8;
-/// Factor on the damping after a rejected step.
+/// Factor on the damping after the first rejected step, and its own factor with each further one: the attempts span
+/// 5e15, from the least damping to one that allows but a small step downhill.
 const DAMPING_UP: f64 = 8.0;
+const GROWTH_UP: f64 = 2.0;
 /// Bounds of the factor after an accepted one: a step that gains what was predicted divides the damping by five, one
 /// that gains next to nothing doubles it.
 const ACCEPTED_FACTORS: (f64, f64) = (0.2, 2.0);
-/// Least damping: below it, rounding in the gauge directions would be amplified into the step.
-const MIN_DAMPING: f64 = 1e-10;
+/// Least damping of dense problems: below it, rounding in the gauge directions would be amplified into the step.
+pub(crate) const MIN_DAMPING: f64 = 1e-10;
 
 /// What the loop asks of a sum of squares, or of a robust loss that is reweighted at every linearisation.
 pub(crate) trait Problem {
@@ -29,8 +31,23 @@ pub(crate) trait Problem {
 
     /// Solves the normal equations, damped relative to their diagonal, and moves `from` by the solution into `to`.
     ///
-    /// Returns the decrease of the cost that the linearisation predicts; `None` where the system has no solution.
+    /// Returns the decrease of the cost that the linearisation predicts, not a number where that is not known; `None`
+    /// where the system has no solution.
     fn step(&mut self, from: &Self::State, damping: f64, to: &mut Self::State) -> Option<f64>;
+
+    /// The same with what the state moved to costs; may improve on a step that does not cost less than `present`.
+    fn attempt(&mut self, from: &Self::State, damping: f64, _present: f64, to: &mut Self::State) -> Option<Attempt> {
+        let predicted = self.step(from, damping, to)?;
+        Some(Attempt { cost: self.cost(to), predicted })
+    }
+}
+
+/// A step that was tried.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Attempt {
+    pub cost: f64,
+    /// By how much the linearisation says that the cost is lower.
+    pub predicted: f64,
 }
 
 /// When to start and end.
@@ -42,11 +59,14 @@ pub(crate) struct Options {
     pub relative_tolerance: f64,
     /// First damping, relative to the diagonal of the normal equations.
     pub initial_damping: f64,
+    /// Least damping, see [`MIN_DAMPING`].
+    pub min_damping: f64,
 }
 
 /// What the loop did.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Summary {
+pub struct Report {
+    /// Before and after.
     pub initial_cost: f64,
     pub cost: f64,
     /// Accepted steps.
@@ -61,36 +81,39 @@ pub(crate) fn minimise<P: Problem>(
     state: &mut P::State,
     options: &Options,
     stop: &StopToken,
-) -> Summary {
+) -> Report {
     let initial_cost = problem.cost(state);
-    let mut summary = Summary { initial_cost, cost: initial_cost, iterations: 0 };
+    let mut report = Report { initial_cost, cost: initial_cost, iterations: 0 };
     let mut trial = state.clone();
-    let mut damping = options.initial_damping.max(MIN_DAMPING);
-    while summary.iterations < options.max_iterations && summary.cost > 0.0 && !stop.is_stopped() {
+    let mut damping = options.initial_damping.max(options.min_damping);
+    while report.iterations < options.max_iterations && report.cost > 0.0 && !stop.is_stopped() {
         problem.linearise(state);
+        let mut growth = DAMPING_UP;
         let accepted = (0..MAX_ATTEMPTS).take_while(|_| !stop.is_stopped()).find_map(|_| {
-            let lowered = problem.step(state, damping, &mut trial).and_then(|predicted| {
-                let cost = problem.cost(&trial);
-                // Written so that NaN fails.
-                (cost < summary.cost).then_some((cost, (summary.cost - cost) / predicted))
-            });
-            damping *= lowered.map_or(DAMPING_UP, |(_, gain_ratio)| factor_after(gain_ratio));
-            damping = damping.max(MIN_DAMPING);
+            let lowered = problem.attempt(state, damping, report.cost, &mut trial);
+            // Written so that NaN fails.
+            let lowered = lowered.filter(|attempt| attempt.cost < report.cost);
+            if lowered.is_none() {
+                damping *= growth;
+                growth *= GROWTH_UP;
+            }
             lowered
         });
-        let Some((cost, _)) = accepted else { break };
+        let Some(Attempt { cost, predicted }) = accepted else { break };
         std::mem::swap(state, &mut trial);
-        let gain = summary.cost - cost;
-        summary.cost = cost;
-        summary.iterations += 1;
+        let gain = report.cost - cost;
+        damping = (damping * factor_after(gain / predicted)).max(options.min_damping);
+        report.cost = cost;
+        report.iterations += 1;
         if gain < options.relative_tolerance * cost {
             break;
         }
     }
-    summary
+    report
 }
 
-/// Nielsen's factor on the damping after a step that gained this share of what was predicted.
+/// Nielsen's factor on the damping after a step that gained this share of what was predicted; the least where that is
+/// not a number.
 fn factor_after(gain_ratio: f64) -> f64 {
     let (least, most) = ACCEPTED_FACTORS;
     (1.0 - (2.0 * gain_ratio - 1.0).powi(3)).max(least).min(most)
@@ -157,21 +180,22 @@ mod tests {
         }
     }
 
-    const OPTIONS: Options = Options { max_iterations: 100, relative_tolerance: 1e-12, initial_damping: 1e-3 };
+    const OPTIONS: Options =
+        Options { max_iterations: 100, relative_tolerance: 1e-12, initial_damping: 1e-3, min_damping: MIN_DAMPING };
 
     #[test]
     fn the_minimum_of_a_curved_valley_is_found() {
         let mut state = Vector2::new(-1.2, 1.0);
-        let summary = minimise(&mut Valley(Normal::zeros()), &mut state, &OPTIONS, &StopToken::default());
-        assert!((state - Vector2::new(1.0, 1.0)).norm() < 1e-6, "{state} {summary:?}");
-        assert!(summary.iterations < 40 && summary.cost < summary.initial_cost, "{summary:?}");
+        let report = minimise(&mut Valley(Normal::zeros()), &mut state, &OPTIONS, &StopToken::default());
+        assert!((state - Vector2::new(1.0, 1.0)).norm() < 1e-6, "{state} {report:?}");
+        assert!(report.iterations < 40 && report.cost < report.initial_cost, "{report:?}");
     }
 
     #[test]
     fn a_state_without_a_cost_is_left_alone() {
         let mut state = Vector2::new(f64::NAN, 1.0);
-        let summary = minimise(&mut Valley(Normal::zeros()), &mut state, &OPTIONS, &StopToken::default());
-        assert!(state.x.is_nan() && summary.iterations == 0);
+        let report = minimise(&mut Valley(Normal::zeros()), &mut state, &OPTIONS, &StopToken::default());
+        assert!(state.x.is_nan() && report.iterations == 0);
     }
 
     #[test]
@@ -179,6 +203,6 @@ mod tests {
         assert_eq!(factor_after(1.0), 0.2);
         assert_eq!(factor_after(0.5), 1.0);
         assert_eq!(factor_after(0.0), 2.0);
-        assert!(factor_after(f64::NAN).is_finite());
+        assert_eq!(factor_after(f64::NAN), 0.2);
     }
 }

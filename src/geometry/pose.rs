@@ -14,8 +14,12 @@ const SAMPLE: usize = 3;
 /// Samples of the robust pose at most: enough where one correspondence in ten is right.
 const MOST_SAMPLES: usize = 5_000;
 /// The refinement of a pose that is nearly right.
-const REFINEMENT: levenberg_marquardt::Options =
-    levenberg_marquardt::Options { max_iterations: 10, relative_tolerance: 1e-6, initial_damping: 1e-4 };
+const REFINEMENT: levenberg_marquardt::Options = levenberg_marquardt::Options {
+    max_iterations: 10,
+    relative_tolerance: 1e-6,
+    initial_damping: 1e-4,
+    min_damping: levenberg_marquardt::MIN_DAMPING,
+};
 /// Imaginary part of a root, relative to the root, that rounding explains.
 const REAL: f64 = 1e-4;
 /// Iterations of the eigenvalue solver; four eigenvalues take a dozen.

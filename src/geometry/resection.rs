@@ -15,8 +15,12 @@ pub const LEAST_POINTS: usize = 6;
 /// Samples of the robust resection at most: enough where three images in ten are right, twelve of forty even.
 const MOST_SAMPLES: usize = 20_000;
 /// The refinement, from a camera that is nearly right.
-const REFINEMENT: levenberg_marquardt::Options =
-    levenberg_marquardt::Options { max_iterations: 10, relative_tolerance: 1e-6, initial_damping: 1e-4 };
+const REFINEMENT: levenberg_marquardt::Options = levenberg_marquardt::Options {
+    max_iterations: 10,
+    relative_tolerance: 1e-6,
+    initial_damping: 1e-4,
+    min_damping: levenberg_marquardt::MIN_DAMPING,
+};
 /// Gates beyond which an image weighs nothing in a refinement: a hundredth of its weight is left there.
 const WEIGHED_GATES: f64 = 9.0;
 

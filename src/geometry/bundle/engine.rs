@@ -1,4 +1,6 @@
-//! The Levenberg-Marquardt loop, and what a problem has to say for it to run.
+//! What a problem has to say for it to be adjusted, and its adjustment by dense normal equations.
+
+use std::marker::PhantomData;
 
 use nalgebra::{SMatrix, SVector, Vector2};
 
@@ -6,17 +8,11 @@ use super::mirrored::{self, Mirrored};
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation, Options, Report};
 use crate::domain::StopToken;
+use crate::geometry::levenberg_marquardt::{self, MIN_DAMPING};
 
 /// Squared residual at which an observation counts as undefined (depth zero or nearly so, not a number): a million
 /// image sides. It then costs just this and pulls at nothing, so that costs stay finite and comparable.
 pub(super) const UNDEFINED_SQUARED: f64 = 1e12;
-/// Dampings tried for one step before the state is declared a minimum; they span 8^8 = 1.7e7.
-pub(super) const MAX_ATTEMPTS: usize = 8;
-/// Factor on the damping after a rejected step, and its divisor after an accepted one.
-pub(super) const DAMPING_UP: f64 = 8.0;
-pub(super) const DAMPING_DOWN: f64 = 5.0;
-/// Least damping: below it, rounding in the gauge directions would be amplified into the step.
-const MIN_DAMPING: f64 = 1e-10;
 
 /// Derivatives of one residual, transposed: column `k` is the gradient of residual component `k`.
 #[derive(Debug, Clone)]
@@ -175,42 +171,49 @@ pub(super) fn minimise<const G: usize, const C: usize, const P: usize>(
 }
 
 /// The loop, eliminating what the problem calls points.
-pub(super) fn descend<const G: usize, const C: usize, const P: usize>(
-    problem: &mut impl Problem<G, C, P>,
+pub(super) fn descend<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>>(
+    problem: &mut T,
     layout: &Layout,
     options: &Options,
     stop: &StopToken,
 ) -> Report {
-    let initial_cost = cost(problem, layout, options.loss);
-    let mut report = Report { initial_cost, cost: initial_cost, iterations: 0 };
-    if layout.observations.is_empty() {
-        return report;
+    let mut dense = Dense {
+        layout,
+        loss: options.loss,
+        linearisation: Linearisation::new(layout, problem.camera_count()),
+        reduced: Reduced::new(layout, problem.camera_count()),
+        step: Step::zeros(problem.camera_count(), problem.point_count()),
+        problem: PhantomData,
+    };
+    levenberg_marquardt::minimise(&mut dense, problem, &options.of_loop(MIN_DAMPING), stop)
+}
+
+/// A problem with its normal equations, whose reduced system is dense.
+struct Dense<'a, const G: usize, const C: usize, const P: usize, T> {
+    layout: &'a Layout,
+    loss: Loss,
+    linearisation: Linearisation<G, C, P>,
+    reduced: Reduced<G, C, P>,
+    step: Step<G, C, P>,
+    problem: PhantomData<T>,
+}
+
+impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> levenberg_marquardt::Problem
+    for Dense<'_, G, C, P, T>
+{
+    type State = T;
+
+    fn cost(&self, problem: &T) -> f64 {
+        cost(problem, self.layout, self.loss)
     }
-    let mut linearisation = Linearisation::new(layout, problem.camera_count());
-    let mut reduced = Reduced::new(layout, problem.camera_count());
-    let mut step = Step::zeros(problem.camera_count(), problem.point_count());
-    let mut trial = problem.clone();
-    let mut damping = options.initial_damping.max(MIN_DAMPING);
-    while report.iterations < options.max_iterations && report.cost > 0.0 && !stop.is_stopped() {
-        linearisation.fill(problem, layout, options.loss);
-        let accepted = (0..MAX_ATTEMPTS).take_while(|_| !stop.is_stopped()).find_map(|_| {
-            let lowered = (reduced.solve(problem, layout, &linearisation, damping, &mut step) && step.is_finite())
-                .then(|| {
-                    trial.retract(problem, &step);
-                    cost(&trial, layout, options.loss)
-                })
-                .filter(|cost| *cost < report.cost);
-            damping = if lowered.is_some() { (damping / DAMPING_DOWN).max(MIN_DAMPING) } else { damping * DAMPING_UP };
-            lowered
-        });
-        let Some(cost) = accepted else { break };
-        std::mem::swap(problem, &mut trial);
-        let gain = report.cost - cost;
-        report.cost = cost;
-        report.iterations += 1;
-        if gain < options.relative_tolerance * cost {
-            break;
-        }
+
+    fn linearise(&mut self, problem: &T) {
+        self.linearisation.fill(problem, self.layout, self.loss);
     }
-    report
+
+    fn step(&mut self, from: &T, damping: f64, to: &mut T) -> Option<f64> {
+        let predicted = self.reduced.solve(from, self.layout, &self.linearisation, damping, &mut self.step)?;
+        self.step.is_finite().then(|| to.retract(from, &self.step))?;
+        Some(predicted)
+    }
 }

@@ -2,7 +2,7 @@
 //! few; projective and metric.
 //!
 //! One engine serves both problems; what they share (observations, robust loss, options, report) lives here. May
-//! depend on nothing of `geometry`, only on linear algebra.
+//! depend on nothing of `geometry` but `levenberg_marquardt`, and on linear algebra.
 //!
 //! Image coordinates are normalised throughout: pixels minus the guessed principal point, over the larger image side.
 
@@ -24,6 +24,9 @@ pub mod zoom;
 pub mod zoom_lens;
 
 use nalgebra::Vector2;
+
+use super::levenberg_marquardt;
+pub use super::levenberg_marquardt::Report;
 
 /// One image point, as indices into the slices of cameras and points that are adjusted together.
 ///
@@ -83,6 +86,12 @@ impl Options {
         Self { max_iterations, ..Self::default() }
     }
 
+    /// What the loop asks.
+    fn of_loop(&self, min_damping: f64) -> levenberg_marquardt::Options {
+        let Self { max_iterations, relative_tolerance, initial_damping, .. } = *self;
+        levenberg_marquardt::Options { max_iterations, relative_tolerance, initial_damping, min_damping }
+    }
+
     /// Cauchy loss of this scale (normalised image units) with these iterations.
     pub fn cauchy(scale: f64, max_iterations: usize) -> Self {
         Self { max_iterations, loss: Loss::Cauchy { scale }, ..Self::default() }
@@ -95,14 +104,4 @@ impl Default for Options {
     fn default() -> Self {
         Self { max_iterations: 30, relative_tolerance: 1e-7, initial_damping: 1e-4, loss: Loss::Squared }
     }
-}
-
-/// What an adjustment did.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Report {
-    /// Sum of the loss over the observations, before and after.
-    pub initial_cost: f64,
-    pub cost: f64,
-    /// Accepted steps.
-    pub iterations: usize,
 }

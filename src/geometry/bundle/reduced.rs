@@ -8,7 +8,7 @@
 use nalgebra::{Cholesky, Matrix2, SMatrix, SVector, Vector2};
 
 use super::cholesky::CholeskySolver;
-use super::engine::{Jacobian, Layout, Problem, Sink, Step, usable_squared_norm};
+use super::engine::{Belief, Jacobian, Layout, Problem, Sink, Step, usable_squared_norm};
 use super::panel::Panel;
 use super::{Loss, Observation};
 use crate::simd::vectorised;
@@ -109,6 +109,8 @@ pub(super) struct Reduced<const G: usize, const C: usize, const P: usize> {
     factors: Vec<Option<Cholesky<f64, nalgebra::Const<P>>>>,
     /// `Q_a = L^-1 Jp_a'` for the observations of one point.
     whitened: Vec<SMatrix<f64, P, 2>>,
+    /// Residuals of one point, linearised, after the cameras' part of a step.
+    moved: Vec<Vector2<f64>>,
     /// `None` where a point is seen by few of the cameras: pair by pair is then cheaper.
     panel: Option<Panel<C, P>>,
     solver: CholeskySolver,
@@ -124,12 +126,14 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
             vector: vec![0.0; dimension],
             factors: vec![None; layout.starts.len() - 1],
             whitened: Vec::with_capacity(longest),
+            moved: Vec::with_capacity(longest),
             panel: Panel::<C, P>::is_worth_it(layout, cameras).then(|| Panel::new(cameras)),
             solver: CholeskySolver::new(dimension),
         }
     }
 
-    /// Solves for the step at this damping; `false` when the system is not positive definite.
+    /// Solves for the step at this damping. Returns the decrease of the cost that the linearisation predicts; `None`
+    /// when the system is not positive definite.
     pub fn solve(
         &mut self,
         problem: &impl Problem<G, C, P>,
@@ -137,20 +141,24 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         linearisation: &Linearisation<G, C, P>,
         damping: f64,
         step: &mut Step<G, C, P>,
-    ) -> bool {
+    ) -> Option<f64> {
         if !self.build(problem, layout, linearisation, damping) {
-            return false;
+            return None;
         }
         self.damp(problem, linearisation, damping);
         if !self.solver.solve(&mut self.matrix, &mut self.vector) {
-            return false;
+            return None;
         }
         step.globals.copy_from_slice(&self.vector[..G]);
         for (camera, values) in step.cameras.iter_mut().zip(self.vector[G..].chunks_exact(C)) {
             camera.copy_from_slice(values);
         }
-        self.substitute_points(layout, linearisation, step);
-        true
+        let lowers = |(belief, by): (Belief, &f64)| {
+            belief.information * (belief.deviation.powi(2) - (belief.deviation + by).powi(2))
+        };
+        let of_beliefs = problem.global_beliefs().into_iter().zip(step.globals.iter()).map(lowers);
+        let of_beliefs: f64 = of_beliefs.sum();
+        Some(of_beliefs + self.substitute_points(layout, linearisation, step))
     }
 
     /// Eliminates the points; `false` when a point's block cannot be factored.
@@ -349,21 +357,36 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     }
 
     /// The points' part of the step, `-V^-1 Jp' (r + Jc dc + Jg dg)`.
-    fn substitute_points(&self, layout: &Layout, linearisation: &Linearisation<G, C, P>, step: &mut Step<G, C, P>) {
+    ///
+    /// Returns by how much the linearised residuals shrink under the whole step, `|r|^2 - |r + J d|^2`.
+    fn substitute_points(
+        &mut self,
+        layout: &Layout,
+        linearisation: &Linearisation<G, C, P>,
+        step: &mut Step<G, C, P>,
+    ) -> f64 {
+        let mut predicted = 0.0;
         for (point, factor) in self.factors.iter().enumerate() {
             let mut gradient = SVector::<f64, P>::zeros();
+            self.moved.clear();
             for k in layout.starts[point]..layout.starts[point + 1] {
                 let jacobian = &linearisation.jacobians[k];
                 let moved = linearisation.residuals[k]
                     + jacobian.globals.tr_mul(&step.globals)
                     + jacobian.camera.tr_mul(&step.cameras[layout.observations[k].camera]);
                 gradient -= jacobian.point * moved;
+                self.moved.push(moved);
             }
             if let Some(factor) = factor {
                 factor.solve_mut(&mut gradient);
             }
             step.points[point] = gradient;
+            for (k, moved) in (layout.starts[point]..).zip(&self.moved) {
+                let left = moved + linearisation.jacobians[k].point.tr_mul(&gradient);
+                predicted += linearisation.residuals[k].norm_squared() - left.norm_squared();
+            }
         }
+        predicted
     }
 }
 

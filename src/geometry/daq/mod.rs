@@ -13,19 +13,19 @@ pub use self::frame::{FirstViewFrame, to_first_view_frame};
 pub use self::starts::{linear, plane_from_second_view, scan, widest_views};
 pub use self::zoom::{zoom_starts, zoomed};
 use super::bundle::metric::Intrinsics;
+use super::levenberg_marquardt::{self, MIN_DAMPING, Normal, Problem};
+use crate::domain::StopToken;
 
 /// Unknowns of the refinement: log focal and the plane at infinity.
 const UNKNOWNS: usize = 4;
 /// Distinct entries of a symmetric 3x3 matrix.
 const ENTRIES: usize = 6;
-/// First damping of the refinement; its Jacobian is well scaled, so little is needed.
+/// First damping of the refinement, whose Jacobian is well scaled, so that little is needed; and the share of the
+/// residual by which a step has to lower it for another to follow.
 const INITIAL_DAMPING: f64 = 1e-3;
-/// Dampings tried for one step before the state is declared a minimum.
-const MAX_ATTEMPTS: usize = 8;
-const DAMPING_UP: f64 = 8.0;
-const DAMPING_DOWN: f64 = 5.0;
-/// Ends the refinement when a step lowers the residual by less than this share of it.
 const RELATIVE_TOLERANCE: f64 = 1e-8;
+/// Information beside what the views give, as a share of it: for directions that no view determines (pure rotation).
+const BESIDE: f64 = 1e-12;
 /// Focal lengths of the short scan that a hypothesis gets, and views it is tried from: the refinement pulls in starts
 /// that are a factor of 1.5 away.
 const HYPOTHESIS_FOCALS: usize = 8;
@@ -145,41 +145,50 @@ pub enum Free {
 ///
 /// Never worse than the start; not a number only if the start is.
 pub fn refine(cameras: &[Matrix3x4<f64>], start: Daq, free: Free, max_iterations: usize) -> (Daq, f64) {
+    let options = levenberg_marquardt::Options {
+        max_iterations,
+        relative_tolerance: RELATIVE_TOLERANCE,
+        initial_damping: INITIAL_DAMPING,
+        min_damping: MIN_DAMPING,
+    };
     let mut best = start;
-    let mut cost = residual(cameras, &best);
-    let mut damping = INITIAL_DAMPING;
-    for _ in 0..max_iterations {
-        let mut normal = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::zeros();
-        let mut gradient = SVector::<f64, UNKNOWNS>::zeros();
-        for (residual, mut jacobian) in cameras.iter().filter_map(|camera| linearise(camera, &best)) {
-            if free == Free::Plane {
+    let mut refinement = Refinement { cameras, free, normal: Normal::zeros() };
+    let report = levenberg_marquardt::minimise(&mut refinement, &mut best, &options, &StopToken::default());
+    (best, report.cost)
+}
+
+struct Refinement<'a> {
+    cameras: &'a [Matrix3x4<f64>],
+    free: Free,
+    normal: Normal<UNKNOWNS>,
+}
+
+impl Problem for Refinement<'_> {
+    type State = Daq;
+
+    fn cost(&self, daq: &Daq) -> f64 {
+        residual(self.cameras, daq)
+    }
+
+    fn linearise(&mut self, daq: &Daq) {
+        self.normal = Normal::zeros();
+        for (residual, mut jacobian) in self.cameras.iter().filter_map(|camera| linearise(camera, daq)) {
+            if self.free == Free::Plane {
                 jacobian.column_mut(0).fill(0.0);
             }
-            normal += jacobian.tr_mul(&jacobian);
-            gradient += jacobian.tr_mul(&residual);
+            // The cost is half the sum of the squares.
+            self.normal.matrix += 0.5 * jacobian.tr_mul(&jacobian);
+            self.normal.gradient += 0.5 * jacobian.tr_mul(&residual);
         }
-        let accepted = (0..MAX_ATTEMPTS).find_map(|_| {
-            let mut damped = normal;
-            // Beside Marquardt's part a constant one, for directions that no view determines (pure rotation).
-            for k in 0..UNKNOWNS {
-                damped[(k, k)] += damping * normal[(k, k)] + 1e-12 * (1.0 + normal.trace());
-            }
-            let lowered = damped.cholesky().and_then(|factor| {
-                let moved = best.moved(&-factor.solve(&gradient));
-                let lower = residual(cameras, &moved);
-                (lower < cost).then_some((moved, lower))
-            });
-            damping *= if lowered.is_some() { DAMPING_DOWN.recip() } else { DAMPING_UP };
-            lowered
-        });
-        let Some((moved, lower)) = accepted else { break };
-        let gain = cost - lower;
-        (best, cost) = (moved, lower);
-        if gain <= RELATIVE_TOLERANCE * cost {
-            break;
-        }
+        let beside = BESIDE * (1.0 + self.normal.matrix.trace());
+        self.normal.matrix += SMatrix::from_diagonal_element(beside);
     }
-    (best, cost)
+
+    fn step(&mut self, from: &Daq, damping: f64, to: &mut Daq) -> Option<f64> {
+        let (step, predicted) = self.normal.solve(damping)?;
+        *to = from.moved(&step);
+        Some(predicted)
+    }
 }
 
 /// How badly cameras can be those of one constant calibration: the least [`residual`] over focal length and plane at

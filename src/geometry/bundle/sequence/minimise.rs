@@ -1,8 +1,8 @@
-//! The Levenberg-Marquardt loop over a sequence.
+//! Levenberg-Marquardt over a sequence.
 
 use nalgebra::{Rotation3, Vector3};
 
-use super::super::engine::{DAMPING_DOWN, DAMPING_UP, MAX_ATTEMPTS, UNDEFINED_SQUARED, usable_squared_norm};
+use super::super::engine::{UNDEFINED_SQUARED, usable_squared_norm};
 use super::super::metric::IntrinsicsPrior;
 use super::super::{Loss, Options, Report};
 use super::crew::Crew;
@@ -13,15 +13,12 @@ use super::reduced::{Reduced, substitute};
 use super::settle::settle_points;
 use super::solver::Solver;
 use super::{Free, Pace, Run, Sequence, Sighting};
+use crate::geometry::levenberg_marquardt::{self, Attempt, Problem};
 
 /// Least damping, as a share of the diagonal. Lower than for a block: the weakest directions of a long chain of views
 /// would hardly move at a block's. Where rounding takes the system's definiteness, the attempt fails and is repeated
 /// with more.
 const MIN_DAMPING: f64 = 1e-14;
-
-/// Factor on the damping's factor with each rejected step: the attempts span 5e15, from the least damping to one that
-/// allows but a small step downhill.
-const GROWTH_UP: f64 = 2.0;
 
 /// Factor by which a step may raise the cost for its points to be settled. A chain of 100 views bent by half a radian
 /// takes 14 steps with 2, 9 with 10; but from a start with cameras a quarter of the depth away, points settle into
@@ -54,24 +51,15 @@ pub fn adjust(
     let unknown = Report { initial_cost: f64::INFINITY, cost: f64::INFINITY, iterations: 0 };
     let Some(layout) = Layout::new(sequence, sightings, free, &mut pace) else { return unknown };
     let crew = Crew::new(&layout, threads, stop);
-    let Some(initial_cost) = cost(sequence, &layout, priors, options.loss, &crew) else { return unknown };
-    let mut report = Report { initial_cost, cost: initial_cost, iterations: 0 };
-    if layout.is_empty() || stop.is_stopped() {
-        return report;
-    }
-    let Some(mut descent) = Descent::new(sequence, &layout, priors, options, crew, &mut pace) else { return report };
-    let mut trial = sequence.clone();
-    while report.iterations < options.max_iterations && report.cost > 0.0 {
-        let Some(cost) = descent.step(sequence, &mut trial, report.cost, told) else { break };
-        std::mem::swap(sequence, &mut trial);
-        let gain = report.cost - cost;
-        report.cost = cost;
-        report.iterations += 1;
-        if gain < options.relative_tolerance * cost {
-            break;
-        }
-    }
-    report
+    let descent = match layout.is_empty() {
+        true => None,
+        false => Descent::new(sequence, &layout, priors, options, &crew, told, &mut pace),
+    };
+    let Some(mut descent) = descent else {
+        let cost = cost(sequence, &layout, priors, options.loss, &crew).unwrap_or(f64::INFINITY);
+        return Report { initial_cost: cost, cost, iterations: 0 };
+    };
+    levenberg_marquardt::minimise(&mut descent, sequence, &options.of_loop(MIN_DAMPING), stop)
 }
 
 /// Pattern of the reduced system of a layout; `None` when it was stopped.
@@ -113,8 +101,8 @@ struct Descent<'a> {
     normal: Normal,
     reduced: Reduced,
     solver: Solver,
-    damping: f64,
-    crew: Crew<'a>,
+    crew: &'a Crew<'a>,
+    told: &'a mut dyn FnMut(),
 }
 
 impl<'a> Descent<'a> {
@@ -123,7 +111,8 @@ impl<'a> Descent<'a> {
         layout: &'a Layout,
         priors: &'a [IntrinsicsPrior],
         options: &Options,
-        crew: Crew<'a>,
+        crew: &'a Crew<'a>,
+        told: &'a mut dyn FnMut(),
         pace: &mut Pace,
     ) -> Option<Self> {
         let pattern = pattern(sequence, layout, pace)?;
@@ -134,58 +123,49 @@ impl<'a> Descent<'a> {
             solver: Solver::new(&pattern)?,
             normal: Normal::new(layout, &pattern, sequence),
             reduced: Reduced::new(layout, pattern),
-            damping: options.initial_damping.max(MIN_DAMPING),
             crew,
+            told,
         })
     }
+}
 
-    /// Linearises and raises the damping until `trial` costs less than `present`; its cost.
-    fn step(&mut self, sequence: &Sequence, trial: &mut Sequence, present: f64, told: &mut dyn FnMut()) -> Option<f64> {
-        if !self.normal.fill(sequence, self.layout, self.priors, self.loss, &self.crew) {
-            return None;
-        }
-        let mut growth = DAMPING_UP;
-        for _ in 0..MAX_ATTEMPTS {
-            if self.crew.is_stopped() {
-                return None;
-            }
-            let lowered = self.attempt(sequence, trial, present);
-            told();
-            if lowered.is_some() {
-                self.damping = (self.damping / DAMPING_DOWN).max(MIN_DAMPING);
-                return lowered;
-            }
-            self.damping *= growth;
-            growth *= GROWTH_UP;
-        }
-        None
+impl Problem for Descent<'_> {
+    type State = Sequence;
+
+    fn cost(&self, sequence: &Sequence) -> f64 {
+        cost(sequence, self.layout, self.priors, self.loss, self.crew).unwrap_or(f64::INFINITY)
     }
 
-    /// Moves `trial` to where the damped step leads from `sequence`; its cost where that is less than `present`.
-    fn attempt(&mut self, sequence: &Sequence, trial: &mut Sequence, present: f64) -> Option<f64> {
+    /// What is left unfinished when it is stopped is not used: no attempt follows.
+    fn linearise(&mut self, sequence: &Sequence) {
+        self.normal.fill(sequence, self.layout, self.priors, self.loss, self.crew);
+    }
+
+    fn step(&mut self, from: &Sequence, damping: f64, to: &mut Sequence) -> Option<f64> {
         let Self { layout, normal, reduced, crew, .. } = self;
-        if !reduced.build(layout, normal, self.damping, crew) {
+        if !reduced.build(layout, normal, damping, crew) {
             return None;
         }
-        reduced.damp(normal, self.damping);
+        reduced.damp(normal, damping);
         if !reduced.solve(&mut self.solver) {
             return None;
         }
         let step = &reduced.vector;
-        let possible = retract(trial, sequence, layout, step);
-        if !possible || !substitute(trial, sequence, layout, normal, self.damping, step, crew) {
-            return None;
-        }
-        let cost = cost(trial, layout, self.priors, self.loss, crew)?;
-        if cost < present {
-            return Some(cost);
-        }
-        if cost > SETTLE_WITHIN * present {
-            return None;
+        let possible = retract(to, from, layout, step) && substitute(to, from, layout, normal, damping, step, crew);
+        // The rows of the Jacobian are not kept: what they predict is not known.
+        possible.then_some(f64::NAN)
+    }
+
+    fn attempt(&mut self, from: &Sequence, damping: f64, present: f64, to: &mut Sequence) -> Option<Attempt> {
+        let moved = self.step(from, damping, to).map(|predicted| Attempt { cost: self.cost(to), predicted });
+        (self.told)();
+        let Attempt { cost, predicted } = moved?;
+        if cost < present || cost > SETTLE_WITHIN * present {
+            return Some(Attempt { cost, predicted });
         }
         // Cheaper than another system: most of what a long step spoils is the points' part of its curvature.
-        let cost = cost - settle_points(trial, layout, self.loss, crew)?;
-        (cost < present).then_some(cost)
+        let settled = settle_points(to, self.layout, self.loss, self.crew)?;
+        Some(Attempt { cost: cost - settled, predicted })
     }
 }
 
