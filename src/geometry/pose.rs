@@ -1,9 +1,9 @@
 //! The pose of a calibrated camera from known points and their images.
 
-use nalgebra::{Matrix4, Rotation3, RowVector4, SVector, Schur, Vector2, Vector3};
+use nalgebra::{Matrix4, RowVector4, Schur, Vector2, Vector3};
 use rand_chacha::ChaCha8Rng;
 
-use super::bundle::metric::Pose;
+use super::bundle::metric::{Intrinsics, Pose, Projection};
 use super::levenberg_marquardt::{self, Normal, Problem};
 use super::procrustes;
 use super::ransac::{self, Estimator, Robust};
@@ -155,41 +155,32 @@ impl Problem for Refinement<'_> {
         (0..self.data.len()).map(|datum| one(self.data.squared_residual(pose, datum))).sum()
     }
 
-    /// Rotation (on the left) first, then translation.
     fn linearise(&mut self, pose: &Pose) {
         self.normal = Normal::zeros();
+        let intrinsics = Intrinsics::from_focal(1.0);
         for (point, seen) in self.data.points.iter().zip(self.data.seen) {
-            let turned = pose.rotation * point;
-            let placed = turned + pose.translation;
-            if placed.z <= 0.0 {
+            let projection = Projection::new(&intrinsics, pose, point);
+            if projection.at.z <= 0.0 {
                 continue;
             }
-            let scale = placed.z.recip();
-            let uv = placed.xy() * scale;
-            let residual = uv - seen;
+            let residual = projection.image - seen;
             let weight = (self.gate / (residual.norm_squared() + self.gate)).powi(2);
-            let by_placed = [Vector3::new(scale, 0.0, -uv.x * scale), Vector3::new(0.0, scale, -uv.y * scale)];
-            for (component, by) in by_placed.iter().enumerate() {
-                let mut derivative = SVector::<f64, 6>::zeros();
-                derivative.fixed_rows_mut::<3>(0).copy_from(&turned.cross(by));
-                derivative.fixed_rows_mut::<3>(3).copy_from(by);
-                self.normal.add(&derivative, residual[component], weight);
+            for (component, by_pose) in projection.gradients().by_pose.into_iter().enumerate() {
+                self.normal.add(&by_pose.into(), residual[component], weight);
             }
         }
     }
 
     fn step(&mut self, from: &Pose, damping: f64, to: &mut Pose) -> Option<f64> {
         let (step, predicted) = self.normal.solve(damping)?;
-        *to = Pose {
-            rotation: Rotation3::from_scaled_axis(step.fixed_rows::<3>(0)) * from.rotation,
-            translation: from.translation + step.fixed_rows::<3>(3),
-        };
+        *to = from.moved(step.into());
         Some(predicted)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Rotation3;
     use rand::{Rng, SeedableRng};
 
     use super::super::bundle::testing;

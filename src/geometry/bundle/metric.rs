@@ -28,12 +28,82 @@ impl Pose {
         self.rotation * point + self.translation
     }
 
+    /// Turned about the camera's own centre and moved, `x -> dR x + dt` in camera coordinates, by a rotation vector and a
+    /// translation. About the origin of the world, a camera far from it could turn only against the damping of its
+    /// lever.
+    #[inline]
+    pub(crate) fn moved(&self, [a, b, c, x, y, z]: [f64; POSE]) -> Self {
+        let turn = Rotation3::from_scaled_axis(Vector3::new(a, b, c));
+        Self { rotation: turn * self.rotation, translation: turn * self.translation + Vector3::new(x, y, z) }
+    }
+
     /// The camera matrix `K [R|t]`.
     pub fn camera(&self, intrinsics: &Intrinsics) -> Matrix3x4<f64> {
         let mut camera = Matrix3x4::zeros();
         camera.fixed_columns_mut::<3>(0).copy_from(&self.rotation);
         camera.set_column(3, &self.translation);
         intrinsics.matrix() * camera
+    }
+}
+
+/// A point as a view sees it, `K [R|t] X` behind a lens.
+pub(crate) struct Projection<'a> {
+    intrinsics: &'a Intrinsics,
+    pose: &'a Pose,
+    /// In camera coordinates.
+    pub at: Vector3<f64>,
+    /// Infinite or not a number at depth zero.
+    pub image: Vector2<f64>,
+}
+
+/// Gradients of the two coordinates of an image point.
+pub(crate) struct ProjectionGradients {
+    /// By the intrinsics, in the order of [`Parameter`].
+    pub by_parameter: [[f64; Parameter::COUNT]; 2],
+    /// As [`Pose::moved`] moves the pose.
+    pub by_pose: [[f64; POSE]; 2],
+    pub by_point: [Vector3<f64>; 2],
+}
+
+impl<'a> Projection<'a> {
+    #[inline]
+    pub fn new(intrinsics: &'a Intrinsics, pose: &'a Pose, point: &Vector3<f64>) -> Self {
+        let at = pose.apply(point);
+        Self { intrinsics, pose, at, image: intrinsics.project(&at) }
+    }
+
+    #[inline]
+    pub fn gradients(&self) -> ProjectionGradients {
+        let ImageGradients { by_parameter, by_seen } = self.intrinsics.gradients(&self.at);
+        let by_pose = by_seen.map(|by_seen| {
+            let turn = self.at.cross(&by_seen);
+            [turn.x, turn.y, turn.z, by_seen.x, by_seen.y, by_seen.z]
+        });
+        ProjectionGradients {
+            by_parameter,
+            by_pose,
+            by_point: by_seen.map(|by_seen| self.pose.rotation.tr_mul(&by_seen)),
+        }
+    }
+}
+
+impl ProjectionGradients {
+    /// By these intrinsics, pose and point; of a view with further unknowns, which come after the pose, those by the
+    /// parameter `of_view`.
+    #[inline]
+    pub(super) fn jacobian<const G: usize, const C: usize>(
+        &self,
+        globals: &[Parameter; G],
+        of_view: Parameter,
+    ) -> Jacobian<G, C, POINT> {
+        Jacobian {
+            globals: SMatrix::from_fn(|k, component| self.by_parameter[component][globals[k] as usize]),
+            camera: SMatrix::from_fn(|k, component| match self.by_pose[component].get(k) {
+                Some(by_pose) => *by_pose,
+                None => self.by_parameter[component][of_view as usize],
+            }),
+            point: SMatrix::from_columns(&self.by_point),
+        }
     }
 }
 
@@ -74,22 +144,9 @@ impl<const G: usize> Problem<G, POSE, POINT> for Metric<G> {
 
     #[inline]
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, POSE, POINT>) {
-        let pose = &self.reconstruction.poses[observation.camera];
-        let turned = pose.rotation * self.reconstruction.points[observation.point];
-        let seen = turned + pose.translation;
-        let intrinsics = &self.reconstruction.intrinsics;
-        sink.take(intrinsics.project(&seen) - observation.xy, || {
-            let ImageGradients { by_parameter, by_seen } = intrinsics.gradients(&seen);
-            let mut camera = SMatrix::<f64, POSE, 2>::zeros();
-            let mut point = SMatrix::<f64, POINT, 2>::zeros();
-            for (component, by_seen) in by_seen.iter().enumerate() {
-                camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(by_seen));
-                camera.fixed_view_mut::<3, 1>(3, component).copy_from(by_seen);
-                point.set_column(component, &pose.rotation.tr_mul(by_seen));
-            }
-            let globals = SMatrix::from_fn(|k, component| by_parameter[component][self.free[k] as usize]);
-            Jacobian { globals, camera, point }
-        });
+        let Reconstruction { intrinsics, poses, points } = &self.reconstruction;
+        let seen = Projection::new(intrinsics, &poses[observation.camera], &points[observation.point]);
+        sink.take(seen.image - observation.xy, || seen.gradients().jacobian(&self.free, Parameter::LogFocal));
     }
 
     fn retract(&mut self, from: &Self, step: &Step<G, POSE, POINT>) {
@@ -99,9 +156,7 @@ impl<const G: usize> Problem<G, POSE, POINT> for Metric<G> {
             moved.intrinsics.shift(*parameter, *by);
         }
         for ((pose, from), step) in moved.poses.iter_mut().zip(&from.poses).zip(&step.cameras) {
-            let turn = Rotation3::from_scaled_axis(step.fixed_rows::<3>(0).into_owned());
-            pose.rotation = turn * from.rotation;
-            pose.translation = from.translation + step.fixed_rows::<3>(3);
+            *pose = from.moved((*step).into());
         }
         for ((point, from), step) in moved.points.iter_mut().zip(&from.points).zip(&step.points) {
             *point = from + step;

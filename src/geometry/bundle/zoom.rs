@@ -4,11 +4,11 @@
 use std::ops::Range;
 
 use faer::{MatRef, Side};
-use nalgebra::{DMatrix, Rotation3, Vector2, Vector3};
+use nalgebra::{DMatrix, Vector3};
 
 use super::covariance::NULL_POSE;
-use super::engine::{Jacobian, Layout, Problem, Sink, Step, minimise};
-use super::metric::{Intrinsics, POINT, POSE, Pose, Reconstruction};
+use super::engine::{Layout, Problem, Sink, Step, minimise};
+use super::metric::{Intrinsics, POINT, POSE, Parameter, Pose, Projection, Reconstruction};
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation, Options, Report};
 use crate::domain::StopToken;
@@ -49,14 +49,9 @@ impl Problem<0, VIEW, POINT> for Zooming {
     }
 
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, VIEW, POINT>) {
-        let seen = Seen::new(self, observation);
-        sink.take(seen.image - observation.xy, || {
-            let mut jacobian = seen.jacobian::<VIEW>();
-            for component in 0..2 {
-                jacobian.camera[(POSE, component)] = seen.image[component];
-            }
-            jacobian
-        });
+        let intrinsics = Intrinsics::from_focal(self.focals[observation.camera]);
+        let seen = Projection::new(&intrinsics, &self.poses[observation.camera], &self.points[observation.point]);
+        sink.take(seen.image - observation.xy, || seen.gradients().jacobian(&[], Parameter::LogFocal));
     }
 
     fn retract(&mut self, from: &Self, step: &Step<0, VIEW, POINT>) {
@@ -78,46 +73,14 @@ impl Problem<0, POSE, POINT> for Held {
     }
 
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, POSE, POINT>) {
-        let seen = Seen::new(&self.0, observation);
-        sink.take(seen.image - observation.xy, || seen.jacobian());
+        let Zooming { focals, poses, points } = &self.0;
+        let intrinsics = Intrinsics::from_focal(focals[observation.camera]);
+        let seen = Projection::new(&intrinsics, &poses[observation.camera], &points[observation.point]);
+        sink.take(seen.image - observation.xy, || seen.gradients().jacobian(&[], Parameter::LogFocal));
     }
 
     fn retract(&mut self, from: &Self, step: &Step<0, POSE, POINT>) {
         self.0.move_all_but_focals(&from.0, step);
-    }
-}
-
-/// A point as a view sees it.
-struct Seen<'a> {
-    pose: &'a Pose,
-    turned: Vector3<f64>,
-    /// In the frame of the camera.
-    at: Vector3<f64>,
-    /// Focal length over depth.
-    scale: f64,
-    image: Vector2<f64>,
-}
-
-impl<'a> Seen<'a> {
-    fn new(zooming: &'a Zooming, observation: &Observation) -> Self {
-        let (pose, focal) = (&zooming.poses[observation.camera], zooming.focals[observation.camera]);
-        let turned = pose.rotation * zooming.points[observation.point];
-        let at = turned + pose.translation;
-        let scale = focal / at.z;
-        Self { pose, turned, at, scale, image: Vector2::new(at.x * scale, at.y * scale) }
-    }
-
-    /// By pose, the first unknowns of a view, and point.
-    fn jacobian<const C: usize>(&self) -> Jacobian<0, C, POINT> {
-        let Self { pose, turned, at, scale, image } = self;
-        let by_seen = [Vector3::new(*scale, 0.0, -image.x / at.z), Vector3::new(0.0, *scale, -image.y / at.z)];
-        let mut jacobian = Jacobian::<0, C, POINT>::zeros();
-        for (component, by_seen) in by_seen.iter().enumerate() {
-            jacobian.camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(by_seen));
-            jacobian.camera.fixed_view_mut::<3, 1>(3, component).copy_from(by_seen);
-            jacobian.point.set_column(component, &pose.rotation.tr_mul(by_seen));
-        }
-        jacobian
     }
 }
 
@@ -146,9 +109,7 @@ impl Zooming {
     /// Moves poses, the first unknowns of a view, and points.
     fn move_all_but_focals<const G: usize, const C: usize>(&mut self, from: &Self, step: &Step<G, C, POINT>) {
         for ((pose, from), step) in self.poses.iter_mut().zip(&from.poses).zip(&step.cameras) {
-            let turn = Rotation3::from_scaled_axis(step.fixed_view::<3, 1>(0, 0).into_owned());
-            pose.rotation = turn * from.rotation;
-            pose.translation = from.translation + step.fixed_view::<3, 1>(3, 0);
+            *pose = from.moved(std::array::from_fn(|k| step[k]));
         }
         for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
             *point = from + step;

@@ -4,11 +4,8 @@
 //! It tells what a lens that is not as [`Zooming`] takes it moves, and whether focal lengths that were taken to be one
 //! are.
 
-use nalgebra::SMatrix;
-
-use super::engine::{Belief, Jacobian, Problem, Sink, Step, minimise};
-use super::intrinsics::ImageGradients;
-use super::metric::{Intrinsics, IntrinsicsPrior, POINT, POSE, Parameter, Reconstruction};
+use super::engine::{Belief, Problem, Sink, Step, minimise};
+use super::metric::{Intrinsics, IntrinsicsPrior, POINT, Parameter, Projection, Reconstruction};
 use super::zoom::{VIEW, Zooming};
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
@@ -59,22 +56,10 @@ impl Problem<SHARED_COUNT, VIEW, POINT> for LensZooming {
     }
 
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<SHARED_COUNT, VIEW, POINT>) {
-        let pose = &self.zooming.poses[observation.camera];
+        let Zooming { poses, points, .. } = &self.zooming;
         let intrinsics = self.intrinsics(observation.camera);
-        let turned = pose.rotation * self.zooming.points[observation.point];
-        let seen = turned + pose.translation;
-        sink.take(intrinsics.project(&seen) - observation.xy, || {
-            let ImageGradients { by_parameter, by_seen } = intrinsics.gradients(&seen);
-            let mut jacobian = Jacobian::<SHARED_COUNT, VIEW, POINT>::zeros();
-            for (component, by_seen) in by_seen.iter().enumerate() {
-                jacobian.camera.fixed_view_mut::<3, 1>(0, component).copy_from(&turned.cross(by_seen));
-                jacobian.camera.fixed_view_mut::<3, 1>(3, component).copy_from(by_seen);
-                jacobian.camera[(POSE, component)] = by_parameter[component][Parameter::LogFocal as usize];
-                jacobian.point.set_column(component, &pose.rotation.tr_mul(by_seen));
-            }
-            jacobian.globals = SMatrix::from_fn(|k, component| by_parameter[component][SHARED[k] as usize]);
-            jacobian
-        });
+        let seen = Projection::new(&intrinsics, &poses[observation.camera], &points[observation.point]);
+        sink.take(seen.image - observation.xy, || seen.gradients().jacobian(&SHARED, Parameter::LogFocal));
     }
 
     fn retract(&mut self, from: &Self, step: &Step<SHARED_COUNT, VIEW, POINT>) {

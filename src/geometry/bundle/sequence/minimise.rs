@@ -1,6 +1,6 @@
 //! Levenberg-Marquardt over a sequence.
 
-use nalgebra::{Rotation3, Vector3};
+use nalgebra::Vector3;
 
 use super::super::engine::{UNDEFINED_SQUARED, usable_squared_norm};
 use super::super::metric::IntrinsicsPrior;
@@ -169,11 +169,7 @@ impl Problem for Descent<'_> {
     }
 }
 
-/// Moves poses and intrinsics from where they are in `from`.
-///
-/// Cameras turn about their own centres, `x -> dR x + dt` in camera coordinates: about the origin of the world, a
-/// camera far from it could turn only against the damping of its lever. `false` where a scale vanishes or nothing
-/// finite is left.
+/// Moves poses and intrinsics from where they are in `from`; `false` where a scale vanishes or nothing finite is left.
 pub(super) fn retract(moved: &mut Sequence, from: &Sequence, layout: &Layout, step: &[f64]) -> bool {
     let mut possible = true;
     let unknowns = &layout.unknowns;
@@ -188,10 +184,8 @@ pub(super) fn retract(moved: &mut Sequence, from: &Sequence, layout: &Layout, st
     }
     for (view, block) in unknowns.pose_block.iter().enumerate() {
         let Some(block) = block else { continue };
-        if let &[a, b, c, x, y, z] = &step[unknowns.range(*block)] {
-            let turn = Rotation3::from_scaled_axis([a, b, c].into());
-            moved.poses[view].rotation = turn * from.poses[view].rotation;
-            moved.poses[view].translation = turn * from.poses[view].translation + Vector3::new(x, y, z);
+        if let Ok(step) = step[unknowns.range(*block)].try_into() {
+            moved.poses[view] = from.poses[view].moved(step);
             possible &= moved.poses[view].translation.iter().all(|value| value.is_finite());
         }
     }

@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 
 use super::super::Loss;
 use super::super::engine::usable_squared_norm;
-use super::super::metric::{IntrinsicsPrior, POSE, Parameter};
+use super::super::metric::{IntrinsicsPrior, POSE, Parameter, Projection, ProjectionGradients};
 use super::crew::{Crew, split_off};
 use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
@@ -39,23 +39,17 @@ impl Weighted {
     /// `None` where the observation is undefined.
     #[inline]
     pub fn new(sequence: &Sequence, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
-        let pose = &sequence.poses[seen.view];
         let intrinsics = &sequence.intrinsics[sequence.group_of[seen.view]];
-        let at = pose.apply(point);
-        let residual = intrinsics.project(&at) - seen.xy;
+        let projection = Projection::new(intrinsics, &sequence.poses[seen.view], point);
+        let residual = projection.image - seen.xy;
         let squared = usable_squared_norm(&residual)? * seen.weight;
         let root = seen.weight.sqrt() * loss.root_weight(squared);
-        let gradients = intrinsics.gradients(&at);
-        let by_seen = gradients.by_seen.map(|gradient| gradient * root);
-        let pose_row = |by_seen: &Vector3<f64>| {
-            let turn = at.cross(by_seen);
-            [turn.x, turn.y, turn.z, by_seen.x, by_seen.y, by_seen.z]
-        };
+        let ProjectionGradients { by_parameter, by_pose, by_point } = projection.gradients();
         Some(Self {
             residual: [residual.x * root, residual.y * root],
-            pose: [pose_row(&by_seen[0]), pose_row(&by_seen[1])],
-            point: [pose.rotation.tr_mul(&by_seen[0]), pose.rotation.tr_mul(&by_seen[1])],
-            by_parameter: gradients.by_parameter.map(|row| row.map(|value| value * root)),
+            pose: by_pose.map(|row| row.map(|value| value * root)),
+            point: by_point.map(|row| row * root),
+            by_parameter: by_parameter.map(|row| row.map(|value| value * root)),
         })
     }
 }
