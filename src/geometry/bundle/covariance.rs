@@ -1,22 +1,22 @@
 //! How well the intrinsics are determined, whatever the gauge.
 
-use faer::{MatRef, Side};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 
 use super::engine::Layout;
 use super::intrinsics::Intrinsics;
 use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior, Parameter};
-use super::metric::{Metric, POINT, POSE, Reconstruction};
+use super::metric::{Metric, POINT, POSE, Pose, Reconstruction};
 use super::reduced::{Linearisation, Reduced};
+use super::whitened::{WhitenedViews, centre};
 use super::{Loss, Observation};
 
 const PARAMETERS: usize = Parameter::COUNT;
-/// Dimensions of a similarity: directions of the poses that no observation can see.
-pub(super) const GAUGE: usize = 7;
-/// Eigenvalue of the poses' scaled information, relative to the largest, that counts as null beside the gauge:
-/// above what rounding leaves (1e-15 times the dimension), far below what weak but real parallax gives (1e-7).
-pub(super) const NULL_POSE: f64 = 1e-11;
-/// The same for the information on the intrinsics, scaled by what they would have with everything else known.
+/// Of every pair of intrinsics.
+type Coupled = SMatrix<f64, PARAMETERS, PARAMETERS>;
+/// Part of a parameter's information, as the root of a share, that a direction of the poses may take and still count as
+/// apart from the intrinsics: what rounding leaves where the two have nothing to do with each other.
+const APART: f64 = 1e-11;
+/// Information on the intrinsics, scaled by what they would have with everything else known, that counts as none.
 const NULL_INTRINSICS: f64 = 1e-10;
 
 /// What the observations say of all the intrinsics together, poses and points marginalised, at one reconstruction.
@@ -26,7 +26,7 @@ const NULL_INTRINSICS: f64 = 1e-10;
 #[derive(Debug, Clone, Copy)]
 pub struct Information {
     intrinsics: Intrinsics,
-    matrix: SMatrix<f64, PARAMETERS, PARAMETERS>,
+    matrix: Coupled,
     /// Half the downward gradient of the cost.
     pull: SVector<f64, PARAMETERS>,
     /// The matrix' diagonal were poses and points known.
@@ -67,8 +67,9 @@ impl Information {
             return None;
         }
         let layout = Layout::new(observations, poses, reconstruction.points.len());
-        let problem =
-            Metric { reconstruction: reconstruction.clone(), free: Parameter::ALL, prior: IntrinsicsPrior::NONE };
+        let mut centred = reconstruction.clone();
+        centre(&mut centred.poses, &mut centred.points);
+        let problem = Metric { reconstruction: centred, free: Parameter::ALL, prior: IntrinsicsPrior::NONE };
         let mut linearisation = Linearisation::<PARAMETERS, POSE, POINT>::new(&layout, poses);
         linearisation.fill(&problem, &layout, Loss::Squared);
         let known = std::array::from_fn(|k| linearisation.globals_diagonal()[k]);
@@ -76,7 +77,7 @@ impl Information {
         if !reduced.build(&problem, &layout, &linearisation, 0.0) {
             return None;
         }
-        let (matrix, pull) = without_poses(&reduced.matrix, &reduced.vector, POSE * poses)?;
+        let (matrix, pull) = without_poses(&reduced.matrix, &reduced.vector, &known, &problem.reconstruction.poses)?;
         let finite = matrix.iter().chain(pull.iter()).all(|value| value.is_finite());
         finite.then_some(Self { intrinsics: reconstruction.intrinsics, matrix, pull, known })
     }
@@ -136,45 +137,56 @@ fn scale_of(information: f64) -> f64 {
 }
 
 /// Eliminates the poses from the reduced system, whose first unknowns are the intrinsics; its lower triangle is given.
+///
+/// A direction of the poses on which rounding hides what the observations say, but which goes along with the
+/// intrinsics, is taken to be as free as it can be: the intrinsics have no information left along with it. Taken as
+/// known, it would make them certain.
 fn without_poses(
     matrix: &[f64],
     vector: &[f64],
-    n: usize,
-) -> Option<(SMatrix<f64, PARAMETERS, PARAMETERS>, SVector<f64, PARAMETERS>)> {
-    let dimension = PARAMETERS + n;
-    let full = DMatrix::from_column_slice(dimension, dimension, matrix);
-    let symmetric = |row: usize, column: usize| full[(row.max(column), row.min(column))];
-    let mut information = SMatrix::from_fn(symmetric);
+    known: &[f64; PARAMETERS],
+    poses: &[Pose],
+) -> Option<(Coupled, SVector<f64, PARAMETERS>)> {
+    let dimension = PARAMETERS + POSE * poses.len();
+    let at = |row: usize, column: usize| matrix[column * dimension + row];
+    let mut information = Coupled::from_fn(|row, column| at(row.max(column), row.min(column)));
     let mut pull = SVector::from_fn(|row, _| vector[row]);
-    // Unit diagonal, so that rotations and translations are compared alike.
-    let scale: Vec<f64> = (PARAMETERS..dimension).map(|k| full[(k, k)].max(f64::MIN_POSITIVE).sqrt().recip()).collect();
-    let scaled = DMatrix::from_fn(n, n, |row, column| {
-        symmetric(PARAMETERS + row, PARAMETERS + column) * scale[row] * scale[column]
-    });
-    if scaled.iter().any(|value| !value.is_finite()) {
-        return None;
+    let views = WhitenedViews::<POSE>::new(matrix, PARAMETERS, poses)?;
+    let of_view =
+        |view: usize, column: usize| SVector::<f64, POSE>::from_fn(|row, _| at(PARAMETERS + POSE * view + row, column));
+    let coupling: Vec<DVector<f64>> =
+        (0..PARAMETERS).map(|column| views.function(|view| of_view(view, column))).collect();
+    let gradient =
+        views.function(|view| SVector::<f64, POSE>::from_fn(|row, _| vector[PARAMETERS + POSE * view + row]));
+    let mut free = Vec::new();
+    for (value, direction) in views.directions() {
+        let along = SVector::<f64, PARAMETERS>::from_fn(|row, _| coupling[row].dot(&direction));
+        match value {
+            Some(value) => {
+                information -= along * along.transpose() / value;
+                pull -= along * (gradient.dot(&direction) / value);
+            }
+            None => free.push(along),
+        }
     }
-    let coupling = DMatrix::from_fn(n, PARAMETERS, |row, column| full[(PARAMETERS + row, column)] * scale[row]);
-    let gradient = DVector::from_fn(n, |row, _| vector[PARAMETERS + row] * scale[row]);
-    let eigen = MatRef::from_column_major_slice(scaled.as_slice(), n, n).self_adjoint_eigen(Side::Lower).ok()?;
-    // Eigenvalues come in ascending order.
-    let largest = eigen.S()[n - 1];
-    for k in GAUGE.min(n)..n {
-        let value = eigen.S()[k];
-        if value <= NULL_POSE * largest {
+    let scale = SVector::<f64, PARAMETERS>::from_fn(|row, _| scale_of(known[row]));
+    for along in free {
+        let along = along.component_mul(&scale);
+        if along.amax() <= APART {
             continue;
         }
-        let direction = DVector::from_fn(n, |row, _| eigen.U()[(row, k)]);
-        let along = SVector::<f64, PARAMETERS>::from_fn(|row, _| coupling.column(row).dot(&direction));
-        information -= along * along.transpose() / value;
-        pull -= along * (gradient.dot(&direction) / value);
+        // The most that leaves the information positive.
+        let scaled = Coupled::from_fn(|row, column| information[(row, column)] * scale[row] * scale[column]);
+        let Some(solved) = scaled.cholesky().map(|factor| factor.solve(&along)) else { continue };
+        let taken = along * along.transpose() / along.dot(&solved);
+        information -= Coupled::from_fn(|row, column| taken[(row, column)] / (scale[row] * scale[column]));
     }
     Some((information, pull))
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector2;
+    use nalgebra::{Matrix3, Vector2, Vector3};
 
     use super::super::Options;
     use super::super::metric::{Extension, adjust};
@@ -189,6 +201,58 @@ mod tests {
     fn optimum(scene: &TestScene, model: IntrinsicsModel) -> Optimum {
         let information = Information::new(&truth(scene), &scene.observations).expect("poses");
         information.optimum(model, &IntrinsicsPrior::NONE)
+    }
+
+    /// The same scene with the world's origin elsewhere and in another unit.
+    fn moved(scene: &TestScene, by: Vector3<f64>, unit: f64) -> TestScene {
+        let mut moved = scene.clone();
+        moved.points.iter_mut().for_each(|point| *point = (*point + by) * unit);
+        moved.poses.iter_mut().for_each(|pose| pose.translation = (pose.translation - pose.rotation * by) * unit);
+        moved
+    }
+
+    /// Far from the origin, a turn of a view and a shift of it are alike to a hundred billionth; taken as known, they
+    /// made the focal length certain.
+    #[test]
+    fn sigma_does_not_depend_on_where_the_origin_is() {
+        for seed in 0..5 {
+            let scene = testing::scene(seed, 10, 20, 0.0);
+            for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
+                let expected = optimum(&scene, model).variance;
+                for distance in [1e2, 1e4, 1e6] {
+                    let far = moved(&scene, Vector3::new(1.0, -0.5, 0.3) * distance, 1.0);
+                    let found = optimum(&far, model).variance;
+                    println!("seed {seed}, {distance:e} away: {found:.4?} for {expected:.4?}");
+                    for (found, expected) in found.iter().zip(&expected) {
+                        let (found, expected) = (found.expect("observable"), expected.expect("observable"));
+                        assert!((found - expected).abs() <= 0.01 * expected, "seed {seed}, {distance:e} away");
+                    }
+                }
+            }
+        }
+    }
+
+    /// One pose of which the observations say next to nothing but together with the focal length.
+    #[test]
+    fn a_pose_that_is_hidden_by_rounding_leaves_the_focal_length_free() {
+        // A turn of one view against the other is no similarity.
+        let pose = |x: f64| Pose { rotation: Matrix3::identity(), translation: Vector3::new(x, 0.0, 0.0) };
+        let dimension = PARAMETERS + 2 * POSE;
+        let system = |weak: f64, coupled: f64| {
+            let mut matrix = DMatrix::<f64>::identity(dimension, dimension);
+            let (first, second) = (PARAMETERS, PARAMETERS + POSE);
+            matrix[(second, first)] = 1.0 - weak;
+            matrix[(first, 0)] = coupled * (weak / 2.0).sqrt();
+            matrix[(second, 0)] = -matrix[(first, 0)];
+            let poses = [pose(0.0), pose(1.0)];
+            without_poses(matrix.as_slice(), &vec![0.0; dimension], &[1.0; PARAMETERS], &poses).expect("finite").0
+        };
+        for weak in [1e-4, 1e-9, 1e-15] {
+            let left = system(weak, 0.999)[(0, 0)];
+            println!("{weak:e}: {left}");
+            assert!(left < 0.01, "{weak:e}: {left}");
+        }
+        assert_eq!(system(1e-15, 0.0)[(0, 0)], 1.0, "what is apart from the poses is left alone");
     }
 
     #[test]

@@ -20,6 +20,7 @@ mod reduced;
 pub mod sequence;
 #[cfg(test)]
 pub(crate) mod testing;
+mod whitened;
 pub mod zoom;
 pub mod zoom_lens;
 

@@ -3,13 +3,12 @@
 
 use std::ops::Range;
 
-use faer::{MatRef, Side};
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::{SVector, Vector3};
 
-use super::covariance::NULL_POSE;
 use super::engine::{Layout, Problem, Sink, Step, minimise};
 use super::metric::{Intrinsics, POINT, POSE, Parameter, Pose, Projection, Reconstruction};
 use super::reduced::{Linearisation, Reduced};
+use super::whitened::{WhitenedViews, centre};
 use super::{Loss, Observation, Options, Report};
 use crate::domain::StopToken;
 use crate::geometry::Camera;
@@ -150,53 +149,42 @@ impl Zooming {
 
     fn information(&self, observations: &[Observation]) -> Option<Information> {
         let views = self.poses.len();
-        let n = VIEW * views;
         let layout = Layout::new(observations, views, self.points.len());
         let mut linearisation = Linearisation::<0, VIEW, POINT>::new(&layout, views);
-        linearisation.fill(self, &layout, Loss::Squared);
+        let mut centred = self.clone();
+        centre(&mut centred.poses, &mut centred.points);
+        linearisation.fill(&centred, &layout, Loss::Squared);
         let mut reduced = Reduced::new(&layout, views);
-        if n == 0 || !reduced.build(self, &layout, &linearisation, 0.0) {
+        if !reduced.build(&centred, &layout, &linearisation, 0.0) {
             return None;
         }
-        let full = DMatrix::from_column_slice(n, n, &reduced.matrix);
-        // Unit diagonal, so that rotations, translations and focal lengths are compared alike.
-        let scale: Vec<f64> = (0..n).map(|k| full[(k, k)].max(f64::MIN_POSITIVE).sqrt().recip()).collect();
-        let scaled =
-            DMatrix::from_fn(n, n, |row, column| full[(row.max(column), row.min(column))] * scale[row] * scale[column]);
-        if scaled.iter().any(|value| !value.is_finite()) {
-            return None;
-        }
-        let eigen = MatRef::from_column_major_slice(scaled.as_slice(), n, n).self_adjoint_eigen(Side::Lower).ok()?;
-        let values = (0..n).map(|k| eigen.S()[k]).collect();
-        Some(Information { scale, values, vectors: DMatrix::from_fn(n, n, |row, k| eigen.U()[(row, k)]) })
+        WhitenedViews::new(&reduced.matrix, 0, &centred.poses).map(Information)
     }
 }
 
-/// What observations say of the views, points marginalised: the eigenvalues of the reduced normal equations, ascending,
-/// and their vectors, both after unknown `k` was multiplied by the inverse of `scale[k]`.
-struct Information {
-    scale: Vec<f64>,
-    values: Vec<f64>,
-    vectors: DMatrix<f64>,
-}
+/// What observations say of the views, points marginalised.
+struct Information(WhitenedViews<VIEW>);
 
 impl Information {
     /// Variance of the mean log focal length of these views; `None` where it is not determined.
     fn variance(&self, views: Range<usize>) -> Option<f64> {
+        let Self(information) = self;
+        if views.clone().any(|view| information.unseen(view, POSE) > TAKES_PART) {
+            return None;
+        }
         let count = views.len().max(1) as f64;
-        let rows: Vec<(usize, f64)> =
-            views.map(|view| VIEW * view + VIEW - 1).map(|row| (row, self.scale[row] / count)).collect();
-        let norm_squared: f64 = rows.iter().map(|(_, factor)| factor * factor).sum();
-        let largest = self.values.last()?;
+        let mean = information.function(|view| {
+            let mut gradient = SVector::zeros();
+            gradient[POSE] = if views.contains(&view) { count.recip() } else { 0.0 };
+            gradient
+        });
         let mut sum = 0.0;
-        // Null directions are those of the similarity, which no focal length takes part in, and of views that see too
-        // little.
-        for (k, value) in self.values.iter().enumerate() {
-            let along: f64 = rows.iter().map(|&(row, factor)| factor * self.vectors[(row, k)]).sum();
-            if *value > NULL_POSE * largest {
-                sum += along * along / value;
-            } else if along * along > TAKES_PART * norm_squared {
-                return None;
+        for (value, direction) in information.directions() {
+            let along = mean.dot(&direction).powi(2);
+            match value {
+                Some(value) => sum += along / value,
+                None if along > TAKES_PART * mean.norm_squared() => return None,
+                None => {}
             }
         }
         (sum > 0.0).then_some(sum)
@@ -243,6 +231,21 @@ mod tests {
             let mean = zooming.mean_log_focal_variance(&scene.observations).expect("observable");
             let largest = variances.iter().flatten().fold(0.0f64, |largest, variance| largest.max(*variance));
             assert!((constant..largest).contains(&mean), "seed {seed}: {mean:.3}");
+        }
+        // Wherever the origin is.
+        let scene = testing::scene(1, 10, 40, 0.0);
+        let expected = Zooming::from(&truth(&scene)).log_focal_variances(&scene.observations);
+        for distance in [1e2, 1e4, 1e6] {
+            let by = Vector3::new(1.0, -0.5, 0.3) * distance;
+            let mut far = truth(&scene);
+            far.points.iter_mut().for_each(|point| *point += by);
+            far.poses.iter_mut().for_each(|pose| pose.translation -= pose.rotation * by);
+            let found = Zooming::from(&far).log_focal_variances(&scene.observations);
+            println!("{distance:e} away: {found:.3?} for {expected:.3?}");
+            for (found, expected) in found.iter().zip(&expected) {
+                let (found, expected) = (found.expect("observable"), expected.expect("observable"));
+                assert!((found - expected).abs() < 0.01 * expected, "{distance:e} away: {found} for {expected}");
+            }
         }
         let scene = testing::scene_of(1, 10, 40, 0.0, Motion::Translation, false);
         let variances = Zooming::from(&truth(&scene)).log_focal_variances(&scene.observations);
