@@ -232,6 +232,22 @@ mod tests {
         }
     }
 
+    #[test]
+    fn sigma_does_not_depend_on_the_unit_of_the_scene() {
+        for seed in 0..5 {
+            let scene = testing::scene(seed, 10, 20, 0.0);
+            let expected = optimum(&scene, IntrinsicsModel::FULL).variance;
+            for unit in [1e-6, 1e-3, 1e3, 1e6] {
+                let found = optimum(&moved(&scene, Vector3::zeros(), unit), IntrinsicsModel::FULL).variance;
+                println!("seed {seed}, unit {unit:e}: {found:.4?} for {expected:.4?}");
+                for (found, expected) in found.iter().zip(&expected) {
+                    let (found, expected) = (found.expect("observable"), expected.expect("observable"));
+                    assert!((found - expected).abs() <= 1e-4 * expected, "seed {seed}, unit {unit:e}");
+                }
+            }
+        }
+    }
+
     /// One pose of which the observations say next to nothing but together with the focal length.
     #[test]
     fn a_pose_that_is_hidden_by_rounding_leaves_the_focal_length_free() {

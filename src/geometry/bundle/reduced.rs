@@ -194,7 +194,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
             let mut block = linearisation.point_blocks[point];
             let trace = block.trace();
             for k in 0..P {
-                block[(k, k)] += damping * block[(k, k)] + POINT_DAMPING * (1.0 + trace);
+                block[(k, k)] += damping * block[(k, k)] + POINT_DAMPING * trace + f64::MIN_POSITIVE;
             }
             let gauge = problem.point_gauge(point);
             block += gauge * gauge.transpose() * trace;
