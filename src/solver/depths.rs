@@ -3,7 +3,7 @@
 //! Four complete tracks leave ten projective cameras undetermined; with depths and one focal length they leave fifty
 //! constraints over. What stands on fewer tracks than image points can verify is never graded METRIC.
 
-use super::calibration::{CHEIRALITY_LIMIT, Outcome, few_inliers, grade_of_sigma, plane_at_infinity};
+use super::calibration::{CHEIRALITY_LIMIT, Outcome, few_inliers, grade_of_sigma};
 use super::grow::{Consensus, LEAST_INLIERS, NOISE_BOUNDS};
 use super::search::Seed;
 use super::search::rigid::{Rigid, Search};
@@ -13,6 +13,7 @@ use crate::geometry::bundle::metric::{
 };
 use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::metric::plane_at_infinity;
 use crate::geometry::triangulation;
 
 /// Iterations of the metric adjustment, which starts within a few per cent.
@@ -100,7 +101,7 @@ pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop:
         let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - cheirality));
         return refused(outcome, WarningCode::Cheirality, detail);
     }
-    outcome.plane_at_infinity = plane_at_infinity(&consensus.cameras, &found);
+    outcome.plane_at_infinity = plane_at_infinity(&consensus.cameras, &found.cameras());
     outcome.grade = grade_of_sigma(sigma).worse(Grade::Weak);
     outcome.sigma_log_focal = sigma;
     outcome.cheirality = cheirality;

@@ -116,6 +116,11 @@ pub struct Reconstruction {
 }
 
 impl Reconstruction {
+    /// The cameras `K [R|t]`.
+    pub fn cameras(&self) -> Vec<Matrix3x4<f64>> {
+        self.poses.iter().map(|pose| pose.camera(&self.intrinsics)).collect()
+    }
+
     /// Predicted minus observed image point; infinite or not a number at depth zero.
     ///
     /// # Panics

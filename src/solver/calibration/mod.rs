@@ -20,7 +20,8 @@ use crate::domain::{FocalPrior, Grade, StopReason, StopToken, Warning, WarningCo
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
 use crate::geometry::bundle::zoom::Zooming;
 use crate::geometry::bundle::{Observation, Options, projective};
-use crate::geometry::daq::{self, Daq, Free, to_first_view_frame};
+use crate::geometry::daq::to_first_view_frame;
+use crate::geometry::metric::plane_at_infinity;
 
 use fit::Fit;
 pub use models::knowledge;
@@ -35,8 +36,6 @@ const PROJECTIVE_ITERATIONS: usize = 10;
 const LEAST_NOISE: f64 = 1e-5;
 /// Inlier tracks below which geometry cannot verify a consensus.
 const LEAST_INLIERS: usize = 8;
-/// Iterations that place the plane at infinity in the caller's frame.
-const PLANE_ITERATIONS: usize = 40;
 
 /// A projective reconstruction to calibrate; inliers only.
 #[derive(Debug, Clone, Copy)]
@@ -176,7 +175,8 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
         return Ok(Outcome::refused(warnings));
     }
     let mut outcome = grading::grade(&choice, &fit, minima, warnings)?;
-    outcome.plane_at_infinity = outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem.cameras, metric));
+    outcome.plane_at_infinity =
+        outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem.cameras, &metric.cameras()));
     Ok(outcome)
 }
 
@@ -310,20 +310,4 @@ fn observed_points(problem: &Problem) -> usize {
         }
     }
     seen.iter().filter(|seen| **seen).count()
-}
-
-/// The plane at infinity of the caller's cameras that goes best with the calibration found.
-pub fn plane_at_infinity(cameras: &[Matrix3x4<f64>], metric: &Reconstruction) -> Option<Vector3<f64>> {
-    let frame = to_first_view_frame(cameras, &[])?;
-    let starts = daq::widest_views(&frame.cameras)
-        .into_iter()
-        .take(4)
-        .filter_map(|view| daq::plane_from_second_view(&frame.cameras[view], metric.intrinsics.focal))
-        .flatten()
-        .map(|plane| Daq { intrinsics: metric.intrinsics, plane_at_infinity: plane });
-    starts
-        .map(|start| daq::refine(&frame.cameras, start, Free::Plane, PLANE_ITERATIONS))
-        .filter(|(daq, cost)| cost.is_finite() && daq.plane_at_infinity.iter().all(|value| value.is_finite()))
-        .min_by(|a, b| a.1.total_cmp(&b.1))
-        .map(|(daq, _)| daq.plane_at_infinity)
 }

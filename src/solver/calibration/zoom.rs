@@ -1,7 +1,5 @@
 //! Self-calibration with a focal length a view.
 
-use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
-
 use super::fit::Fit;
 use super::lens::{LENS_SIGMA, LensTrial};
 use super::models::{CHI_SQUARE_GAIN, Choice};
@@ -12,8 +10,8 @@ use crate::domain::{Grade, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
 use crate::geometry::bundle::zoom::Zooming;
 use crate::geometry::bundle::{Observation, Options};
-use crate::geometry::daq::{self, FirstViewFrame, to_first_view_frame};
-use crate::geometry::metric::{cheirality, upgrade_zooming};
+use crate::geometry::daq::{self, FirstViewFrame};
+use crate::geometry::metric::{cheirality, plane_at_infinity, upgrade_zooming};
 use crate::geometry::statistics::{median, root_mean_square};
 
 /// Best quadrics that are adjusted, beside the reconstructions with a constant focal length.
@@ -223,34 +221,12 @@ fn grade(choice: &Choice, fit: &Fit, minima: &[Minimum], mut warnings: Vec<Warni
         grade: verdict.grade,
         warnings: verdict.warnings,
         model: IntrinsicsModel::FOCAL,
-        plane_at_infinity: plane_at_infinity(problem, &best.zooming),
+        plane_at_infinity: plane_at_infinity(problem.cameras, &best.zooming.cameras()),
         cheirality: best.cheirality,
         rms_ratio,
         metric: Some(metric),
         focals: Some(focals),
     }
-}
-
-/// The plane at infinity of the caller's cameras that goes best with the reconstruction, in the frame that
-/// [`to_first_view_frame`] gives them: `A - a n' ~ K R K1^-1` for every `P = [A|a]`, linear in `n` and the scales.
-fn plane_at_infinity(problem: &Problem, zooming: &Zooming) -> Option<Vector3<f64>> {
-    let frame = to_first_view_frame(problem.cameras, &[])?;
-    let calibration = |focal: f64| Matrix3::from_diagonal(&Vector3::new(focal, focal, 1.0));
-    let back = zooming.poses.first()?.rotation.transpose() * calibration(*zooming.focals.first()?).try_inverse()?;
-    let (mut normal, mut target) = (Matrix3::zeros(), Vector3::zeros());
-    for ((camera, pose), focal) in frame.cameras.iter().zip(&zooming.poses).zip(&zooming.focals) {
-        let infinite = calibration(*focal) * pose.rotation * back;
-        let infinite = SVector::<f64, 9>::from_column_slice((infinite / infinite.norm()).as_slice());
-        // Entry (row, column) of `A` is at 3 column + row, and `a_row n_column` beside it.
-        let by_plane =
-            SMatrix::<f64, 9, 3>::from_fn(|k, column| if k / 3 == column { camera[(k % 3, 3)] } else { 0.0 });
-        let without_scale = by_plane - infinite * (infinite.transpose() * by_plane);
-        let left = SVector::<f64, 9>::from_column_slice(camera.fixed_columns::<3>(0).into_owned().as_slice());
-        normal += without_scale.transpose() * by_plane;
-        target += without_scale.transpose() * left;
-    }
-    let plane = normal.try_inverse()? * target;
-    plane.iter().all(|value| value.is_finite()).then_some(plane)
 }
 
 /// Reconstructions that different starts converge to, cheapest first.

@@ -7,6 +7,7 @@ mod zoom;
 
 use super::*;
 use crate::geometry::bundle::testing::{self, Motion, NOISE, TestScene};
+use crate::geometry::daq::{self, Daq};
 
 const SIDE_PX: f64 = 1000.0;
 
