@@ -45,8 +45,8 @@ pub fn reconcile(
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
     let Some(own) = outcome.sigma_log_focal else { return Ok(()) };
-    let estimates = estimates(scene, model, camera, recorder)?;
-    let Some(fused) = fuse(&estimates) else { return Ok(()) };
+    let (estimates, shared) = estimates(scene, model, camera, recorder)?;
+    let Some(fused) = fuse(&estimates, shared) else { return Ok(()) };
     let apart = (fused.log_focal - model.log_focal(scene, camera, &of_camera(scene, model, camera))).abs();
     let sigma = own.max(fused.sigma).max(apart);
     outcome.sigma_log_focal = Some(sigma);
@@ -73,8 +73,14 @@ fn of_camera(scene: &Scene, model: &Model, camera: usize) -> Vec<usize> {
     model.determined(scene).into_iter().filter(|&view| scene.camera_of[view] == camera).collect()
 }
 
-/// What each window says by itself, the rest of the lens as the whole has it.
-fn estimates(scene: &Scene, model: &Model, camera: usize, recorder: &mut Recorder) -> Result<Vec<Estimate>, Error> {
+/// What each window says by itself, the rest of the lens as the whole has it; and the share of its views that two of
+/// them have in common.
+fn estimates(
+    scene: &Scene,
+    model: &Model,
+    camera: usize,
+    recorder: &mut Recorder,
+) -> Result<(Vec<Estimate>, f64), Error> {
     let views = of_camera(scene, model, camera);
     let whole = model.log_focal(scene, camera, &views);
     let parts = model.part_of.iter().copied().max().unwrap_or(0);
@@ -97,7 +103,7 @@ fn estimates(scene: &Scene, model: &Model, camera: usize, recorder: &mut Recorde
     };
     let found = scene.context.threads.map(windows.len(), 1, of_window, &mut told);
     scene.context.stopped()?;
-    Ok(found.into_iter().flatten().collect())
+    Ok((found.into_iter().flatten().collect(), shared(&windows)))
 }
 
 fn estimate(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
@@ -117,7 +123,15 @@ fn estimate(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> Opt
     Some(Estimate { log_focal, sigma })
 }
 
-/// Runs of each of these runs of consecutive views, not overlapping; one or none says nothing.
+/// Share of its views that a window has in common with another. Only the halves of a short run overlap.
+fn shared(windows: &[Vec<usize>]) -> f64 {
+    let [first, second] = windows else { return 0.0 };
+    let common = first.iter().filter(|view| second.contains(view)).count();
+    common as f64 / first.len().max(second.len()).max(1) as f64
+}
+
+/// Runs of each of these runs of consecutive views, not overlapping but for the halves of a short one; one or none says
+/// nothing.
 fn windows(parts: &[Vec<usize>]) -> Vec<Vec<usize>> {
     let long: Vec<&Vec<usize>> = parts.iter().filter(|views| views.len() >= LEAST_VIEWS).collect();
     // One part is halved, so that there is something to compare; the halves of a short one overlap.
@@ -137,29 +151,40 @@ fn windows(parts: &[Vec<usize>]) -> Vec<Vec<usize>> {
     all.into_iter().step_by(step).collect()
 }
 
-/// `None` for fewer than two.
-pub fn fuse(estimates: &[Estimate]) -> Option<Fused> {
+/// Fuses estimates that have this share of their observations in common, and so err alike by as much; `None` for fewer
+/// than two.
+pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
     if estimates.len() < 2 {
         return None;
     }
     let weights = |misfit: f64| -> Vec<f64> {
         estimates.iter().map(|estimate| (estimate.sigma.powi(2) + misfit * misfit).recip()).collect()
     };
+    // Variance of the weighted sum: what two have in common adds up.
+    let variance_of_sum = |weight: &[f64], misfit: f64| -> f64 {
+        let own = |(weight, estimate): (&f64, &Estimate)| {
+            let squared = estimate.sigma.powi(2);
+            weight * weight * (squared * (1.0 - shared) + misfit * misfit)
+        };
+        let in_common: f64 = weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.sigma).sum();
+        weight.iter().zip(estimates).map(own).sum::<f64>() + shared * in_common * in_common
+    };
     let weight = weights(0.0);
     let total: f64 = weight.iter().sum();
     let mean = weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.log_focal).sum::<f64>() / total;
     let statistic: f64 =
         weight.iter().zip(estimates).map(|(weight, estimate)| weight * (estimate.log_focal - mean).powi(2)).sum();
-    let freedom = (estimates.len() - 1) as f64;
+    // What it is expected to be: the number of estimates less one, where they have nothing in common.
+    let expected = (estimates.len() as f64 - variance_of_sum(&weight, 0.0) / total).max(f64::MIN_POSITIVE);
     let scale = total - weight.iter().map(|weight| weight * weight).sum::<f64>() / total;
-    let misfit = ((statistic - freedom).max(0.0) / scale).sqrt();
+    let misfit = ((statistic - expected).max(0.0) / scale).sqrt();
     let weight = weights(misfit);
     let total: f64 = weight.iter().sum();
     let log_focal =
         weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.log_focal).sum::<f64>() / total;
-    let sigma = total.sqrt().recip();
+    let sigma = variance_of_sum(&weight, misfit).sqrt() / total;
     let usable = sigma.is_finite() && misfit.is_finite() && log_focal.is_finite();
-    usable.then_some(Fused { log_focal, sigma, misfit, chi_square: statistic / freedom })
+    usable.then_some(Fused { log_focal, sigma, misfit, chi_square: statistic / expected })
 }
 
 #[cfg(test)]
@@ -172,20 +197,38 @@ mod tests {
 
     #[test]
     fn estimates_that_agree_fuse_by_information() {
-        let fused = fuse(&estimates(&[(0.0, 0.01), (0.005, 0.01), (-0.003, 0.01), (0.002, 0.01)])).expect("four");
+        let fused = fuse(&estimates(&[(0.0, 0.01), (0.005, 0.01), (-0.003, 0.01), (0.002, 0.01)]), 0.0).expect("four");
         assert_eq!(fused.misfit, 0.0);
         assert!((fused.sigma - 0.005).abs() < 1e-12, "{fused:?}");
-        assert_eq!(fuse(&estimates(&[(0.0, 0.01)])), None);
+        assert_eq!(fuse(&estimates(&[(0.0, 0.01)]), 0.0), None);
     }
 
     #[test]
     fn estimates_that_differ_by_more_than_they_admit_raise_sigma() {
-        let fused = fuse(&estimates(&[(0.1, 0.001), (-0.1, 0.001), (0.1, 0.001), (-0.1, 0.001)])).expect("four");
+        let fused = fuse(&estimates(&[(0.1, 0.001), (-0.1, 0.001), (0.1, 0.001), (-0.1, 0.001)]), 0.0).expect("four");
         // Four values of standard deviation .115: their mean is known to half of that.
         assert!((fused.misfit - 0.1155).abs() < 1e-3 && (fused.sigma - 0.0577).abs() < 1e-3, "{fused:?}");
         // One that knows nothing refutes nothing.
-        let fused = fuse(&estimates(&[(0.0, 0.001), (0.5, 0.6)])).expect("two");
+        let fused = fuse(&estimates(&[(0.0, 0.001), (0.5, 0.6)]), 0.0).expect("two");
         assert_eq!(fused.misfit, 0.0);
+    }
+
+    /// Four views twice are no surer than four views, and two windows that share much and yet differ refute each other
+    /// sooner.
+    #[test]
+    fn what_windows_have_in_common_is_counted_once() {
+        let twice = estimates(&[(0.2, 0.01), (0.2, 0.01)]);
+        let of_run = |count: usize| shared(&windows(&[(0..count).collect()]));
+        assert_eq!([4, 5, 6, 7, 8, 12].map(of_run), [1.0, 0.75, 0.5, 0.25, 0.0, 0.0]);
+        let fused = |count: usize| fuse(&twice, of_run(count)).expect("two");
+        assert!((fused(4).sigma - 0.01).abs() < 1e-12, "{:?}", fused(4));
+        assert!((fused(6).sigma - 0.01 * 0.75f64.sqrt()).abs() < 1e-12, "{:?}", fused(6));
+        assert!((fused(8).sigma - 0.01 * 0.5f64.sqrt()).abs() < 1e-12, "{:?}", fused(8));
+        // Differences of independent estimates of .01 are .014, of those that share three quarters .007.
+        let apart = estimates(&[(0.0, 0.01), (0.01, 0.01)]);
+        let misfit = |count: usize| fuse(&apart, of_run(count)).expect("two").misfit;
+        assert_eq!(misfit(8), 0.0);
+        assert!((misfit(5) - 0.005).abs() < 1e-9, "{}", misfit(5));
     }
 
     #[test]
