@@ -167,3 +167,67 @@ fn the_same_result_makes_the_same_page_but_for_two_lines() {
     let differing = first.lines().zip(second.lines()).filter(|(a, b)| a != b).count();
     assert_eq!((first.lines().count(), differing), (second.lines().count(), 2));
 }
+
+/// A document that is just enough for the script of the images, which prints the strokes: opacity and points of each.
+const IMAGES_UNDER_NODE: &str = r#"
+const strokes = [];
+let points = [];
+const state = {}, calls = {
+  beginPath() { points = []; }, moveTo(...at) { points.push(at); }, lineTo(...at) { points.push(at); },
+  stroke() { strokes.push([state.globalAlpha, points.length]); },
+};
+const context = new Proxy(state, { get: (_, name) => calls[name] ?? (() => {}) });
+const element = { addEventListener() {}, add() {}, replaceChildren() {}, append() {}, style: {}, checked: true,
+  insertRow: () => element, getContext: () => context, textContent: "" };
+const elements = { "tracks-data": { textContent: DATA }, colour: { ...element, value: "inlier" },
+  view: { ...element, get value() { return VIEW; }, set value(_) {} } };
+const document = { getElementById: (id) => elements[id] ?? element, createElement: () => element };
+const getComputedStyle = () => ({ getPropertyValue: () => "" });
+const matchMedia = () => element, addEventListener = () => {}, devicePixelRatio = 1;
+const Option = class {};
+"#;
+
+/// Strokes with which the page joins the observations of a view to others of their tracks, those of accepted
+/// observations and the rest; `None` without node.
+fn flow_lines(input: &LabelledInput, solution: &Solution, view: usize) -> Option<[usize; 2]> {
+    let counts = counts::of_views(solution, Some(input));
+    let data = serde_json::to_string(&scene::tracks(solution, input, &counts).json.to_string()).expect("text");
+    let document = IMAGES_UNDER_NODE.replace("DATA", &data).replace("VIEW", &format!("\"{view}\""));
+    let scripts = [include_str!("script/common.js"), include_str!("script/images.js")].concat();
+    let program = format!("{document}{scripts}\nimages(); console.log(JSON.stringify(strokes));");
+    let Ok(output) = std::process::Command::new("node").args(["-e", &program]).output() else {
+        eprintln!("SKIPPED the flow lines of the report: no node");
+        return None;
+    };
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let strokes: Vec<(Option<f64>, usize)> = serde_json::from_slice(&output.stdout).expect("strokes");
+    let with = |opacity: f64| strokes.iter().filter(|(found, _)| *found == Some(opacity)).count();
+    Some([with(0.6), with(0.18)])
+}
+
+/// Of an inlier track, what was left out is on no line, and the accepted observations before and after it are joined.
+#[test]
+fn flow_lines_join_observations_of_one_point() {
+    let (input, mut solution) = fixture::solved();
+    let track = solution.tracks.inlier.iter().position(|inlier| *inlier).expect("an inlier");
+    let mut of_track = vec![0; 5];
+    for (k, view) in input.raw.view.iter().enumerate().filter(|(k, _)| input.raw.track[*k] as usize == track) {
+        of_track[*view as usize] = k;
+    }
+    let inliers = solution.inlier_track_count();
+    let outliers = solution.tracks.inlier.len() - inliers;
+    for (left_out, lines) in [
+        (vec![], [[0; 2]; 4]),
+        (vec![2], [[0, 0], [0, 0], [1, 0], [0, 0]]),
+        (vec![2, 3, 4], [[0, 0], [1, 0], [1, 0], [1, 0]]),
+    ] {
+        for (view, &k) in of_track.iter().enumerate() {
+            solution.observations.inlier[k] = !left_out.contains(&view);
+        }
+        for (view, fewer) in lines.into_iter().enumerate() {
+            let Some(found) = flow_lines(&input, &solution, view) else { return };
+            let expected = [inliers - fewer[0], outliers - fewer[1]];
+            assert_eq!(found, expected, "view {view}, {left_out:?} left out: accepted, others");
+        }
+    }
+}

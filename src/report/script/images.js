@@ -27,6 +27,17 @@ const images = () => {
   const weight = (track) => (tracks[2 * track + 1] & 0x7fff) / 1000;
   const inlier = (track) => (tracks[2 * track + 1] & INLIER) !== 0;
 
+  // The next observation of the same point: accepted ones follow accepted ones, those of another point each other. What
+  // was left out of an inlier track shows no point that the track has elsewhere.
+  const shows = (k) => kept(k) ? "point" : other(k) ? "other" : inlier(trackOf[k]) ? null : "outlier";
+  const following = (k) => {
+    const point = shows(k);
+    for (let next = k + 1; point !== null && next < trackOf.length && trackOf[next] === trackOf[k]; next++) {
+      if (shows(next) === point) return next;
+    }
+    return null;
+  };
+
   views.forEach(([label, registered], k) => view.add(new Option(label + (registered ? "" : " (not registered)"), k)));
   // Begin with the view that has the most inliers.
   view.value = views.reduce((best, entry, k) => entry[8] > views[best][8] ? k : best, 0);
@@ -84,9 +95,10 @@ const images = () => {
       if (kept(k) !== right || (!inlier(track) && !outliers.checked)) continue;
       const at = place(pixel(k));
       context.strokeStyle = context.fillStyle = paint(k, track);
-      if (flow.checked && trackOf[k + 1] === track) {
+      const next = flow.checked ? following(k) : null;
+      if (next !== null) {
         context.globalAlpha = right ? 0.6 : 0.18;
-        context.beginPath(); context.moveTo(...at); context.lineTo(...place(pixel(k + 1))); context.stroke();
+        context.beginPath(); context.moveTo(...at); context.lineTo(...place(pixel(next))); context.stroke();
       }
       context.globalAlpha = right ? 1 : 0.7;
       context.beginPath();
