@@ -147,6 +147,16 @@ impl<'a> Recorder<'a> {
         self.course.part = 0;
     }
 
+    /// Records what stands now instead of what the search found: after every step that changes it, and before
+    /// [`Self::finish`] with the numbers of the solution.
+    ///
+    /// * `inliers`: tracks
+    /// * `focal_px`: of the first camera that has one; `None` where the focal length is not determined
+    pub fn found(&mut self, inliers: usize, focal_px: Option<f64>) {
+        self.standing.inliers = inliers as u32;
+        self.standing.focal_px = focal_px;
+    }
+
     /// So many views have a camera. What a block of a further part has counts once it is among the others.
     pub fn registered(&mut self, views: usize) {
         if self.before_part.is_none() {
@@ -290,6 +300,17 @@ mod tests {
         fn progress(&mut self, progress: &Progress) {
             self.0.push(progress.fraction);
         }
+    }
+
+    #[test]
+    fn what_is_found_last_is_told_last() {
+        let mut silent = crate::domain::Silent;
+        let mut recorder = Recorder::new(&mut silent, 10);
+        (recorder.standing.inliers, recorder.standing.focal_px) = (20, Some(700.0));
+        recorder.enter(Stage::Calibrate);
+        recorder.found(180, Some(812.5));
+        let told = |history: &[Progress]| history.last().map(|record| (record.inliers, record.focal_px));
+        assert_eq!(told(&recorder.finish().1), Some((180, Some(812.5))));
     }
 
     #[test]

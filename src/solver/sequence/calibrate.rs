@@ -54,11 +54,23 @@ pub fn calibrate(
     }
     super::structure::triangulate(scene, model, recorder);
     adjust::all(scene, model, recorder);
+    report_found(scene, model, recorder);
     for (camera, outcome) in outcomes.iter_mut().enumerate() {
         admit_difference(model.lenses[camera].intrinsics.focal.ln(), outcome);
         windows::reconcile(scene, model, camera, outcome, recorder)?;
     }
     Ok(outcomes)
+}
+
+/// Reports the points and the focal length, a zoom's mean, of the first camera with registered views.
+pub fn report_found(scene: &Scene, model: &Model, recorder: &mut Recorder) {
+    let mut views = model.registered();
+    let first = views.first().map(|&view| scene.camera_of[view]);
+    let focal = first.map(|camera| {
+        views.retain(|&view| scene.camera_of[view] == camera);
+        model.log_focal(scene, camera, &views).exp() * scene.context.scale_px
+    });
+    recorder.found(adjust::verified(model).len(), focal.filter(|focal| focal.is_finite()));
 }
 
 /// What is said of a camera of which fewer views are registered than a calibration needs.

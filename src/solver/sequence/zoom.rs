@@ -50,6 +50,7 @@ pub fn calibrate(
     }
     structure::triangulate(scene, model, recorder);
     adjust::all(scene, model, recorder);
+    calibrate::report_found(scene, model, recorder);
     let mut outcome = match found.is_empty() {
         true => too_few(registered.len()),
         false => combined(scene, model, found),
