@@ -8,10 +8,10 @@ use super::Context;
 use super::attempt::Attempt;
 use super::calibration::{Outcome, ViewFocal};
 use super::direct::Decided;
-use super::grow::Consensus;
-use super::judge::{self, Geometry, Judged};
+use super::judge::{self, Geometry, Judged, SplitPoint};
 use super::recorder::Recorder;
-use crate::domain::result::{ObservationResults, Sigmas, TrackResults, ViewResult};
+use super::sequence::Projective;
+use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter, Reconstruction};
 use crate::geometry::daq::to_first_view_frame;
@@ -81,28 +81,38 @@ pub fn unsolved(
 ///
 /// With grade PROJECTIVE_ONLY nothing metric is in it, the focal length included: a number that must not be used is
 /// not given.
-pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Solution {
+pub fn solved(context: &Context, attempt: Attempt, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Solution {
     recorder.enter(Stage::Judge);
-    let (Some(consensus), Some(calibration)) = (&attempt.consensus, &attempt.calibration) else {
+    let mut attempt = attempt;
+    let already = attempt.judged.take();
+    let attempt = &attempt;
+    let (Some(projective), Some(calibration)) = (&attempt.projective, &attempt.calibration) else {
         return unsolved(context, Some(attempt), warnings, recorder);
     };
-    // Where the first camera has no rank 3 the frame stays as it is: there is nothing metric to be consistent with.
-    let cameras =
-        to_first_view_frame(&consensus.cameras, &[]).map_or_else(|| consensus.cameras.clone(), |frame| frame.cameras);
-    let mut judged = judged(context, attempt, consensus, &cameras, &mut recorder);
+    let mut judged = already.unwrap_or_else(|| judged(context, attempt, projective, &mut recorder));
     if let Some(weights) = &attempt.weights_by_depths {
-        judge_by_depths(attempt, weights, &cameras, context, &mut judged);
+        judge_by_depths(attempt, weights, &projective.cameras, context, &mut judged);
     }
     if let Some(decided) = &attempt.decided {
         mask(context, &attempt.block.tracks, decided, &mut judged);
     }
+    // Where the first camera has no rank 3 the frame stays as it is: there is nothing metric to be consistent with.
+    let frame = to_first_view_frame(&projective.cameras, &[]);
+    let back = frame.as_ref().and_then(|frame| frame.homography.try_inverse()).unwrap_or_else(Matrix4::identity);
+    judged.points.iter_mut().flatten().for_each(|point| *point = back * *point);
+    let splits = judged
+        .splits
+        .iter()
+        .map(|split| split_of(split, &back, &context.normalization.to_pixels(projective.views[0])))
+        .collect::<Vec<_>>();
+    let cameras = frame.map_or_else(|| projective.cameras.clone(), |frame| frame.cameras);
     let usable = calibration.metric.as_ref().filter(|_| calibration.grade != Grade::ProjectiveOnly);
     let groups: BTreeSet<u32> = context.input.views().iter().map(|view| view.camera_group).collect();
     let only = groups.first().copied().filter(|_| groups.len() == 1);
     warnings.extend(calibration.warnings.iter().cloned().map(|warning| Warning { camera_group: only, ..warning }));
     warnings.extend(attempt.second_structure.clone());
 
-    let first_px = context.normalization.to_pixels(attempt.block.views[0]);
+    let first_px = context.normalization.to_pixels(projective.views[0]);
     judged.tracks.point = final_points(context, attempt, usable, &judged, &first_px);
     judged.tracks.network_weight = network_weights(attempt, context);
     let (rms, mean) = reprojection(&judged.observations);
@@ -116,19 +126,18 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
         iterations,
         seed: context.settings.seed,
         calibrations: usable
-            .map(|metric| pixel_calibrations(metric, calibration, context, attempt.block.views[0]))
+            .map(|metric| pixel_calibrations(metric, calibration, context, projective.views[0]))
             .unwrap_or_default(),
         // Planes transform by the inverse transpose of what moves points: from normalised to pixels that is T1^-T.
         plane_at_infinity: calibration
             .plane_at_infinity
             .filter(|_| usable.is_some())
             .and_then(|plane| first_px.try_inverse().map(|inverse| (inverse.transpose() * plane).into())),
-        views: views(context, attempt, &cameras, usable),
+        views: views(context, attempt, projective, &cameras, usable),
         tracks: judged.tracks,
         observations: judged.observations,
-        // Tracks of a block that was solved alone are right in most of their observations or wrong.
-        splits: Vec::new(),
-        noise_px: Some(consensus.noise * context.scale_px),
+        splits,
+        noise_px: Some(projective.noise * context.scale_px),
         reprojection_rms_px: rms,
         reprojection_mean_px: mean,
         warnings,
@@ -141,16 +150,10 @@ pub fn solved(context: &Context, attempt: &Attempt, mut warnings: Vec<Warning>, 
     }
 }
 
-/// Every track and observation judged by the block's cameras.
-fn judged(
-    context: &Context,
-    attempt: &Attempt,
-    consensus: &Consensus,
-    local: &[Camera],
-    recorder: &mut Recorder,
-) -> Judged {
+/// Every track and observation judged by the projective cameras.
+pub fn judged(context: &Context, attempt: &Attempt, projective: &Projective, recorder: &mut Recorder) -> Judged {
     let mut cameras = vec![None; context.input.view_count()];
-    for (&view, camera) in attempt.block.views.iter().zip(local) {
+    for (&view, camera) in projective.views.iter().zip(&projective.cameras) {
         cameras[view] = Some(*camera);
     }
     let geometry = Geometry {
@@ -158,10 +161,10 @@ fn judged(
         parts: None,
         normalization: context.normalization,
         lenses: &[],
-        linked: false,
-        noise: consensus.noise,
+        linked: attempt.judges_observations(),
+        noise: projective.noise,
         outlier_density: judge::density_of_spread(attempt.spread),
-        inlier_share: (consensus.inlier_count() as f64 + 1.0) / (attempt.block.tracks.len() as f64 + 2.0),
+        inlier_share: (projective.tracks.len() as f64 + 1.0) / (projective.tried as f64 + 2.0),
     };
     let mut told = |verdicts| recorder.judged(verdicts, context.input.track_count());
     judge::judge(context.input, context.ranges, &geometry, context.threads, context.stop, &mut told)
@@ -233,15 +236,21 @@ fn mask(context: &Context, block_tracks: &[usize], decided: &Decided, judged: &m
     }
 }
 
-fn views(context: &Context, attempt: &Attempt, local: &[Camera], metric: Option<&Reconstruction>) -> Vec<ViewResult> {
+fn views(
+    context: &Context,
+    attempt: &Attempt,
+    projective: &Projective,
+    local: &[Camera],
+    metric: Option<&Reconstruction>,
+) -> Vec<ViewResult> {
     let mut views = vec![ViewResult::default(); context.input.view_count()];
-    let first = attempt.block.views[0];
+    let first = projective.views[0];
     // In pixels the frame moves with the first view's pixel transform, so that its camera stays [I|0].
     let mut frame = Matrix4::identity();
     if let Some(inverse) = context.normalization.to_pixels(first).try_inverse() {
         frame.fixed_view_mut::<3, 3>(0, 0).copy_from(&inverse);
     }
-    for (i, &view) in attempt.block.views.iter().enumerate() {
+    for (i, &view) in projective.views.iter().enumerate() {
         let projection = context.normalization.camera_px(view, &local[i]) * frame;
         let focal = own_focal(attempt, i);
         let is_determined = focal.is_none_or(|focal| focal.sigma_log.is_some());
@@ -277,7 +286,7 @@ fn final_points(
     };
     let mut cameras = vec![Camera::zeros(); context.input.view_count()];
     let mut has_pose = vec![true; cameras.len()];
-    for (i, &view) in attempt.block.views.iter().enumerate() {
+    for (i, &view) in attempt.views().iter().enumerate() {
         let own = own_focal(attempt, i);
         let focal = own.map_or(metric.intrinsics.focal, |own| own.focal);
         cameras[view] = metric.poses[i].camera(&Intrinsics { focal, ..metric.intrinsics });
@@ -303,6 +312,16 @@ fn final_points(
 pub const LEAST_SIGHTINGS: usize = 2;
 /// Refinement steps of a final point.
 const POINT_STEPS: usize = 10;
+
+/// A further point of a track, in the frame of the pixel cameras.
+fn split_of(split: &SplitPoint, back: &Matrix4<f64>, first_px: &Matrix3<f64>) -> TrackSplit {
+    TrackSplit {
+        track: split.track as u32,
+        number: split.number,
+        weight: split.weight as f32,
+        point: dehomogenise(&to_pixel_frame(&(back * split.point), first_px)),
+    }
+}
 
 /// The point in the frame of pixel cameras: `P_px = T P H` with `H = diag(T1^-1, 1)`, so points move by `diag(T1, 1)`.
 fn to_pixel_frame(point: &Point, first_px: &Matrix3<f64>) -> Point {

@@ -5,13 +5,16 @@ use super::calibration::{self, Outcome};
 use super::chance::LN_ACCEPTABLE;
 use super::direct::{self, Decided};
 use super::grow::{self, Consensus, LEAST_INLIERS};
+use super::judge::Judged;
 use super::learned::Opinion;
 use super::portfolio::{self, Evidence, Portfolio};
 use super::recorder::Recorder;
+use super::sequence::Projective;
 use super::{Context, Error};
-use super::{crowds, depths, extend, likeliest, second};
+use super::{crowds, depths, likeliest, second};
 use crate::domain::result::PriorTime;
-use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View, Warning};
+use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View, Warning, WarningCode};
+use crate::geometry::bundle::metric::Reconstruction;
 
 /// Noise that growing starts from when the caller gives none, as a share of the image side. High on purpose: twice too
 /// low loses the scene, ten times too high costs nothing.
@@ -28,6 +31,9 @@ const CALIBRATED_OBSERVATIONS: usize = 20_000;
 /// Tracks that PAPER optimises weights for: the network holds some 40 kB a track at full width.
 const PAPER_TRACKS: usize = 5_000;
 
+/// Merit of a WEAK attempt, see [`Attempt::merit`].
+pub const WEAK_MERIT: u8 = 3;
+
 /// What became of one block.
 pub struct Attempt {
     pub block: Block,
@@ -36,6 +42,10 @@ pub struct Attempt {
     pub spread: f64,
     /// The consensus over the tracks of the block; `None` when nothing stands.
     pub consensus: Option<Consensus>,
+    /// The consensus as a reconstruction of its inliers, or what that was extended to; `None` when nothing stands.
+    pub projective: Option<Projective>,
+    /// Every observation judged by `projective`, where that was done already.
+    pub judged: Option<Judged>,
     /// What the consensus was verified by.
     pub evidence: Evidence,
     pub calibration: Option<Outcome>,
@@ -66,6 +76,8 @@ impl Attempt {
             spread: portfolio::spread(&block.complete),
             block,
             consensus: None,
+            projective: None,
+            judged: None,
             evidence: Evidence::ImagePoints,
             calibration: None,
             winning_prior: None,
@@ -80,15 +92,47 @@ impl Attempt {
         }
     }
 
+    /// Views that have a camera, increasing.
+    pub fn views(&self) -> &[usize] {
+        self.projective.as_ref().map_or(&[], |projective| &projective.views)
+    }
+
+    /// Whether single observations are judged: where image points alone verify and the method decides nothing itself.
+    pub fn judges_observations(&self) -> bool {
+        matches!(self.evidence, Evidence::ImagePoints) && self.decided.is_none()
+    }
+
     /// Larger is better: solved before unsolved, then by grade, then by the certainty of the focal length.
     pub fn merit(&self) -> (u8, f64) {
         let Some(calibration) = &self.calibration else { return (u8::from(self.consensus.is_some()), 0.0) };
         let grade = match calibration.grade {
-            Grade::Metric => 4,
-            Grade::Weak => 3,
+            Grade::Metric => WEAK_MERIT + 1,
+            Grade::Weak => WEAK_MERIT,
             Grade::ProjectiveOnly => 2,
         };
         (grade, -calibration.sigma_log_focal.unwrap_or(f64::INFINITY))
+    }
+
+    /// Whether there is a metric reconstruction, whatever it is worth.
+    pub fn has_metric(&self) -> bool {
+        self.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some())
+    }
+
+    /// Whether the calibration has found a lens that distorts.
+    pub fn has_lens(&self) -> bool {
+        let distorts =
+            |metric: &Reconstruction| metric.intrinsics.radial != 0.0 || metric.intrinsics.second_radial != 0.0;
+        self.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref()).is_some_and(distorts)
+    }
+
+    /// Whether nothing says that observations within the tracks are wrong: a calibration that fits as well as
+    /// projective cameras do.
+    pub fn is_trusted(&self) -> bool {
+        let fits = |calibration: &Outcome| {
+            let is_misfit = |warning: &Warning| warning.code == WarningCode::ModelMismatch;
+            calibration.grade != Grade::ProjectiveOnly && !calibration.warnings.iter().any(is_misfit)
+        };
+        self.is_good() || self.calibration.as_ref().is_some_and(fits)
     }
 
     /// Whether no other block needs to be tried: it has the best grade that its camera can have, and no zoom is METRIC.
@@ -106,6 +150,16 @@ impl Attempt {
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> Result<Attempt, Error> {
+    let mut attempt = search_block(block, context, recorder)?;
+    calibrate(&mut attempt, context, recorder)?;
+    Ok(attempt)
+}
+
+/// Searches a block, or as many of its tracks as its method can afford, for a consensus.
+///
+/// # Errors
+/// As [`solve_block`].
+pub fn search_block(block: Block, context: &Context, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let most = match context.settings.method {
         Method::Auto | Method::Geometry if context.seeding => SEARCHED_TRACKS.1,
         Method::Auto | Method::Geometry => {
@@ -125,19 +179,31 @@ pub fn solve_block(block: Block, context: &Context, recorder: &mut Recorder) -> 
         }
     };
     context.stopped()?;
-    if let Some(consensus) = &attempt.consensus {
-        recorder.enter(Stage::Calibrate);
-        attempt.calibration = Some(match attempt.evidence {
-            Evidence::ImagePoints => calibrate(&attempt.block, consensus, context)?,
-            Evidence::Depths { focal } => depths::calibrate(&attempt.block.complete, consensus, focal, context.stop),
-        });
-        if let Some(metric) = attempt.calibration.as_ref().and_then(|outcome| outcome.metric.as_ref()) {
-            recorder.standing.focal_px = Some(metric.intrinsics.focal * context.scale_px);
-        }
-        recorder.registered(attempt.block.views.len());
-        recorder.tell(1.0);
-    }
+    let projective = attempt.consensus.as_ref().map(|consensus| Projective::of_block(&attempt.block, consensus));
+    attempt.projective = match attempt.judges_observations() {
+        true => projective.map(Projective::oriented),
+        false => projective,
+    };
     Ok(attempt)
+}
+
+/// Calibrates what stands of an attempt.
+///
+/// # Errors
+/// As [`solve_block`].
+pub fn calibrate(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> Result<(), Error> {
+    let (Some(consensus), Some(projective)) = (&attempt.consensus, &attempt.projective) else { return Ok(()) };
+    recorder.enter(Stage::Calibrate);
+    attempt.calibration = Some(match attempt.evidence {
+        Evidence::ImagePoints => calibrate_projective(projective, context)?,
+        Evidence::Depths { focal } => depths::calibrate(&attempt.block.complete, consensus, focal, context.stop),
+    });
+    if let Some(metric) = attempt.calibration.as_ref().and_then(|outcome| outcome.metric.as_ref()) {
+        recorder.standing.focal_px = Some(metric.intrinsics.focal * context.scale_px);
+    }
+    recorder.registered(projective.views.len());
+    recorder.tell(1.0);
+    Ok(())
 }
 
 /// The noise that a solve starts from, normalised units.
@@ -169,6 +235,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     let tracks = &attempt.block.tracks;
     let found = Portfolio::new(complete, context.settings, initial_noise(context), context.stop)
         .geometry_first(context.seeding)
+        .quickly(context.quick)
         .with_opinion(attempt.opinion.take())
         .run(recorder, &|weights| context.scatter(weights, tracks))
         .map_err(|error| Error::Internal(error.to_string()))?;
@@ -210,15 +277,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         attempt.consensus = Some(refined);
         return Ok(());
     }
-    let extended = extend::extend(&attempt.block, &refined, context);
-    context.stopped()?;
-    if let Some((block, consensus)) = extended {
-        attempt.network_weights = carry_over(&attempt.network_weights, &attempt.block, &block);
-        recorder.standing.inliers = consensus.inlier_count() as u32;
-        (attempt.block, attempt.consensus) = (block, Some(consensus));
-    } else {
-        attempt.consensus = Some(refined);
-    }
+    attempt.consensus = Some(refined);
     let complete = &attempt.block.complete;
     if let (Some(rigid), Some(consensus)) = (&found.rigid, &attempt.consensus)
         && consensus.noise > depths::STRONG_NOISE
@@ -226,15 +285,6 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         attempt.weights_by_depths = depths::weights(complete, consensus, rigid, attempt.spread, context.stop);
     }
     Ok(())
-}
-
-/// The network's weights of the searched tracks, for a larger block; 0 for tracks that it was not shown.
-fn carry_over(weights: &[f64], searched: &Block, block: &Block) -> Vec<f64> {
-    if weights.is_empty() {
-        return Vec::new();
-    }
-    let weight = |track: &usize| searched.tracks.binary_search(track).ok().map_or(0.0, |place| weights[place]);
-    block.tracks.iter().map(weight).collect()
 }
 
 /// PAPER and PSFM: the method's own set of tracks, reconstructed as it is.
@@ -257,21 +307,18 @@ fn decide(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     Ok(())
 }
 
-/// Calibrates from the inliers of a consensus.
-fn calibrate(block: &Block, consensus: &Consensus, context: &Context) -> Result<Outcome, Error> {
-    let most = MOST_CALIBRATED.min(CALIBRATED_OBSERVATIONS / block.views.len().max(1));
-    let inliers = extend::evenly(&consensus.inliers(), most);
-    let points: Vec<_> = inliers.iter().map(|&track| consensus.points[track]).collect();
-    let observations = grow::observations_of(&block.complete, &inliers);
+/// Calibrates from a reconstruction, or as much of it as a calibration takes.
+fn calibrate_projective(projective: &Projective, context: &Context) -> Result<Outcome, Error> {
+    let most = MOST_CALIBRATED.min(CALIBRATED_OBSERVATIONS / projective.views.len().max(1));
+    let some = projective.most_observed(most);
+    let views = projective.views.iter().map(|&view| &context.input.views()[view]);
     let problem = calibration::Problem {
-        cameras: &consensus.cameras,
-        points: &points,
-        observations: &observations,
-        noise: consensus.noise,
+        cameras: &some.cameras,
+        points: &some.points,
+        observations: &some.observations,
+        noise: some.noise,
         focal_per_view: context.settings.focal_per_view,
-        focal_prior: context
-            .focal_prior
-            .or_else(|| focal_prior(block.views.iter().map(|&view| &context.input.views()[view]))),
+        focal_prior: context.focal_prior.or_else(|| focal_prior(views)),
     };
     Ok(calibration::calibrate(&problem, context.scale_px, context.stop)?)
 }

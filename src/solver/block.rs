@@ -198,11 +198,15 @@ fn extent_of_unsized(input: &Input) -> [Vector2<f64>; 2] {
 ///
 /// Once `stop` fires the answer is whatever was found by then.
 pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec<Vec<usize>> {
-    if let Some(views) = complete_views(input, ranges) {
-        let count = views.len().min(MOST_VIEWS_WHOLE);
-        return vec![(0..count).map(|k| views[k * views.len() / count]).collect()];
+    if let Some(views) = whole(input, ranges) {
+        return vec![views];
     }
     candidate_views_among(input, ranges, &vec![true; input.view_count()], stop)
+}
+
+/// The views of the one block of an input whose tracks are complete; see [`complete_views`].
+pub fn whole(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
+    complete_views(input, ranges).map(|views| super::evenly(&views, MOST_VIEWS_WHOLE))
 }
 
 /// The same of incomplete tracks, each set of one camera group: those of the group with most observations first.
@@ -233,6 +237,33 @@ pub fn candidate_views_among(input: &Input, ranges: &[usize], open: &[bool], sto
         }
     }
     Vec::new()
+}
+
+/// Views of a subset, and how many subsets are tried of one set: of a track with three wrong observations of ten, four
+/// views are clean one time in six.
+const SUBSET_VIEWS: usize = 4;
+const SUBSETS: usize = 6;
+
+/// Small subsets of each of these sets of views: runs and combs in turn, spread over the set. A track with some wrong
+/// observations is clean in some of them.
+pub fn subsets(sets: &[Vec<usize>]) -> Vec<Vec<usize>> {
+    let of_set = |views: &Vec<usize>| -> Vec<Vec<usize>> {
+        let count = views.len();
+        if count <= SUBSET_VIEWS {
+            return Vec::new();
+        }
+        let longest = (count - 1) / (SUBSET_VIEWS - 1);
+        let subset = |k: usize| -> Vec<usize> {
+            let step = if k % 2 == 0 { 1 } else { longest };
+            let starts = count - (SUBSET_VIEWS - 1) * step;
+            let first = (k * starts / SUBSETS).min(starts - 1);
+            (0..SUBSET_VIEWS).map(|i| views[first + i * step]).collect()
+        };
+        let mut found: Vec<Vec<usize>> = (0..SUBSETS).map(subset).collect();
+        found.dedup();
+        found
+    };
+    sets.iter().flat_map(of_set).collect()
 }
 
 /// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of
@@ -304,7 +335,7 @@ fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, st
 /// sequence.
 fn first_views(tracks_of_view: &[Vec<usize>]) -> Vec<usize> {
     let seeing: Vec<usize> = (0..tracks_of_view.len()).filter(|&view| !tracks_of_view[view].is_empty()).collect();
-    super::extend::evenly(&seeing, MOST_FIRST_VIEWS)
+    super::evenly(&seeing, MOST_FIRST_VIEWS)
 }
 
 /// At most [`MOST_BLOCKS`] of the ranked sets: those that share at most half of their views with every better one

@@ -19,7 +19,6 @@ mod copies;
 mod crowds;
 mod depths;
 mod direct;
-mod extend;
 mod grow;
 mod judge;
 mod learned;
@@ -129,14 +128,14 @@ fn solve_views(
         normalization: &normalization,
         scale_px,
         seeding: false,
+        quick: false,
         merges_cameras: false,
         focal_prior: None,
         threads,
         stop,
     };
-    let sequence = sequence::applies(&context);
-    if sequence {
-        return solve_sequence(&context, warnings, recorder);
+    if sequence::applies(&context) {
+        return solve_by_observation(&context, warnings, recorder);
     }
     warnings.extend(block::merged_cameras(input, false, settings.focal_per_view));
     let candidates = block::candidate_views(input, &ranges, stop);
@@ -161,20 +160,38 @@ fn solve_views(
     if let Some(best) = &mut best {
         agreement::reconcile(best, &others);
     }
-    of_block(best.as_ref(), &context, warnings, recorder)
+    of_block(best, &context, warnings, recorder)
 }
 
-/// Solves an input whose tracks live a few views.
-fn solve_sequence(context: &Context, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Result<Solution, Error> {
-    let of_one = block::candidate_views_of_one_camera(context.input, context.ranges, context.stop);
+/// At most `most` of the items, evenly spread.
+fn evenly(items: &[usize], most: usize) -> Vec<usize> {
+    let count = items.len().min(most);
+    (0..count).map(|k| items[k * items.len() / count]).collect()
+}
+
+/// Solves an input by image points alone, each of which may be wrong by itself.
+fn solve_by_observation(
+    context: &Context,
+    mut warnings: Vec<Warning>,
+    mut recorder: Recorder,
+) -> Result<Solution, Error> {
+    let zooms = context.settings.focal_per_view;
+    let (_, groups) = block::camera_groups(context.input);
+    let whole = if groups == 1 { block::whole(context.input, context.ranges) } else { None };
+    let of_one = match &whole {
+        Some(_) => Vec::new(),
+        None => block::candidate_views_of_one_camera(context.input, context.ranges, context.stop),
+    };
     // A group an image, say: what one camera alone cannot carry, all together may. And where views share no focal
     // length, groups part nothing.
-    let zooms = context.settings.focal_per_view;
     let merges_cameras = of_one.is_empty() || zooms;
-    let candidates =
-        if merges_cameras { block::candidate_views(context.input, context.ranges, context.stop) } else { of_one };
+    let candidates = match &whole {
+        Some(_) => Vec::new(),
+        None if merges_cameras => block::candidate_views(context.input, context.ranges, context.stop),
+        None => of_one,
+    };
     let context = &Context { merges_cameras, ..*context };
-    match sequence::solve(&candidates, context, &mut recorder)? {
+    match sequence::solve(whole, &candidates, context, &mut recorder)? {
         sequence::Ended::Extended(extended) => {
             warnings.extend(block::merged_cameras(context.input, !merges_cameras, zooms));
             let solution = sequence::solved(*extended, warnings, recorder);
@@ -183,16 +200,7 @@ fn solve_sequence(context: &Context, mut warnings: Vec<Warning>, mut recorder: R
         }
         sequence::Ended::Block(best) => {
             warnings.extend(block::merged_cameras(context.input, false, zooms));
-            // A seed is less than its block can give.
-            let best = match best {
-                Some(seed) if seed.consensus.is_some() => {
-                    let views = &seed.block.views;
-                    let block = block::extract(context.input, context.ranges, context.normalization, views);
-                    Some(Box::new(attempt::solve_block(block, context, &mut recorder)?))
-                }
-                best => best,
-            };
-            of_block(best.as_deref(), context, warnings, recorder)
+            of_block(best.map(|best| *best), context, warnings, recorder)
         }
     }
 }
@@ -222,21 +230,21 @@ fn verified(mut solution: Solution) -> Solution {
 
 /// The solution that the best block gives.
 fn of_block(
-    best: Option<&Attempt>,
+    best: Option<Attempt>,
     context: &Context,
     mut warnings: Vec<Warning>,
     recorder: Recorder,
 ) -> Result<Solution, Error> {
     let solution = match best {
         Some(attempt) if attempt.consensus.is_some() => {
-            let solution = assemble::solved(context, attempt, warnings, recorder);
             // Depths verify fewer, and PAPER and PSFM keep what they keep.
-            let by_points = matches!(attempt.evidence, portfolio::Evidence::ImagePoints) && attempt.decided.is_none();
+            let by_points = attempt.judges_observations();
+            let solution = assemble::solved(context, attempt, warnings, recorder);
             if by_points { verified(solution) } else { solution }
         }
         best => {
-            warnings.push(why_unsolved(context.input, best));
-            assemble::unsolved(context, best, warnings, recorder)
+            warnings.push(why_unsolved(context.input, best.as_ref()));
+            assemble::unsolved(context, best.as_ref(), warnings, recorder)
         }
     };
     context.stopped()?;
@@ -255,6 +263,8 @@ struct Context<'a> {
     scale_px: f64,
     /// The block is the seed of a sequence: as much of it is solved as carries a calibration, and no more.
     seeding: bool,
+    /// Only what is cheap is searched.
+    quick: bool,
     /// Whether all views are taken to be of one camera, whatever their groups.
     merges_cameras: bool,
     /// What is known of the focal length beside what the views bring: what another part of the input said.

@@ -35,6 +35,8 @@ pub use spread::{MOST_SPREAD, spread};
 const ITERATIONS_PER_ROUND: u32 = 25;
 /// Rounds without a network: as many samples as the longest search with one.
 const ROUNDS_WITHOUT_NETWORK: u32 = 16;
+/// Rounds of a quick search: the noise as assumed, and twice that.
+const QUICK_ROUNDS: u32 = 2;
 /// Samples a round and prior, without depths (a sample costs microseconds) and with.
 const AFFINE_SAMPLES: (usize, usize) = (2_000, 6_000);
 const SUBSPACE_SAMPLES: (usize, usize) = (250, 1_000);
@@ -93,6 +95,8 @@ pub struct Portfolio<'a> {
     opinion: Option<Opinion>,
     /// The scene's own statistics go first, whatever the trained network says.
     geometry_first: bool,
+    /// Only what is cheap is tried.
+    is_quick: bool,
 }
 
 impl<'a> Portfolio<'a> {
@@ -119,6 +123,7 @@ impl<'a> Portfolio<'a> {
             rigid: None,
             opinion: None,
             geometry_first: false,
+            is_quick: false,
         }
     }
 
@@ -126,6 +131,11 @@ impl<'a> Portfolio<'a> {
     /// sequence, where it was measured to cost a seed a hundredth of F1 to hear the network first.
     pub fn geometry_first(self, geometry_first: bool) -> Self {
         Self { geometry_first, ..self }
+    }
+
+    /// Whether the search ends after [`QUICK_ROUNDS`], without the paper's network.
+    pub fn quickly(self, is_quick: bool) -> Self {
+        Self { is_quick, ..self }
     }
 
     /// What the trained network says of the block, where it was asked already.
@@ -144,8 +154,9 @@ impl<'a> Portfolio<'a> {
         recorder: &mut Recorder,
         spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
     ) -> Result<Found, crate::network::Error> {
-        let uses_network = self.settings.method.uses_network();
+        let uses_network = self.settings.method.uses_network() && !self.is_quick;
         let rounds = match uses_network {
+            false if self.is_quick => QUICK_ROUNDS,
             true => self.settings.iterations.div_ceil(ITERATIONS_PER_ROUND),
             false => ROUNDS_WITHOUT_NETWORK,
         };

@@ -11,21 +11,25 @@ mod adjust;
 mod assemble;
 mod calibrate;
 mod model;
+mod options;
 mod parts;
+mod projective;
 mod register;
 mod structure;
 mod windows;
 mod zoom;
 
 pub use assemble::solved;
+pub use projective::Projective;
 
 use super::attempt::{self, Attempt};
 use super::calibration::Outcome;
 use super::grow::LEAST_INLIERS;
 use super::recorder::Recorder;
-use super::{Context, Error, block};
+use super::{Context, Error, assemble as of_attempt, block};
 use crate::domain::{Grade, Method, Stage, Task, Warning, WarningCode};
 use model::{Model, Scene};
+use options::ProjectiveOptions;
 
 /// Rounds of adjusting everything and triangulating it anew that end an extension; the third moves nothing that a
 /// gate would see.
@@ -36,6 +40,10 @@ pub const SHARE_OF_REGISTERING: f64 = 0.7;
 /// Share of the views that an extension must register for no other seed to be tried: one that carries most of them is a
 /// part of whatever another would lead to.
 const ENOUGH_REGISTERED: f64 = 0.5;
+
+/// Growth of the retained observations, once each is judged by itself, from which a whole input is extended: with a
+/// tenth more of them sigma falls by a twentieth.
+const WORTH_EXTENDING: f64 = 1.1;
 
 /// A sequence that stands, with the block that it grew from.
 pub struct Extended<'a> {
@@ -57,21 +65,59 @@ pub enum Ended<'a> {
 
 /// Whether an input is one that is extended beyond a block.
 pub fn applies(context: &Context) -> bool {
-    matches!(context.settings.method, Method::Auto | Method::Geometry)
-        && !context.input.has_depths()
-        && block::complete_views(context.input, context.ranges).is_none()
+    matches!(context.settings.method, Method::Auto | Method::Geometry) && !context.input.has_depths()
 }
 
-/// Solves block after block until one carries an extension over most of the views; the best extension otherwise.
+/// Solves and extends block after block until one carries a reconstruction of most of the views.
+///
+/// In order of cost: the `whole` input as one block, where its tracks are complete; blocks that are calibrated and
+/// extended metrically; blocks and small subsets of them that are extended projectively and calibrated then; at last
+/// the whole again, with everything that a search can try.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve<'a>(
+    whole: Option<Vec<usize>>,
     candidates: &[Vec<usize>],
     context: &Context<'a>,
     recorder: &mut Recorder,
 ) -> Result<Ended<'a>, Error> {
     let seeding = Context { seeding: true, ..*context };
+    let extract = |views: &[usize]| block::extract(context.input, context.ranges, context.normalization, views);
+    let first = if let Some(views) = &whole {
+        let attempt = attempt::solve_block(extract(views), &Context { quick: true, ..*context }, recorder)?;
+        if attempt.is_trusted() {
+            return finished(attempt, &seeding, recorder);
+        }
+        Some(attempt)
+    } else {
+        match by_calibrated_blocks(candidates, &seeding, recorder)? {
+            Ended::Extended(extended) if extended.grade() != Grade::ProjectiveOnly => {
+                return Ok(Ended::Extended(extended));
+            }
+            Ended::Extended(extended) => Some(extended.seed),
+            Ended::Block(attempt) => attempt.map(|attempt| *attempt),
+        }
+    };
+    let sets = whole.as_ref().map_or(candidates, std::slice::from_ref);
+    let best = by_projective_extension(first, &block::subsets(sets), &seeding, recorder)?;
+    if let Some(best) = best.filter(|best| best.projective.is_some()) {
+        return metric_of(best, &seeding, recorder);
+    }
+    let Some(views) = whole else { return Ok(Ended::Block(None)) };
+    let attempt = attempt::solve_block(extract(&views), context, recorder)?;
+    match attempt.projective {
+        Some(_) => finished(attempt, &seeding, recorder),
+        None => Ok(Ended::Block(Some(Box::new(attempt)))),
+    }
+}
+
+/// Blocks that are calibrated and extended from there.
+fn by_calibrated_blocks<'a>(
+    candidates: &[Vec<usize>],
+    context: &Context<'a>,
+    recorder: &mut Recorder,
+) -> Result<Ended<'a>, Error> {
     let mut best: Option<Extended> = None;
     let mut unextended: Option<Attempt> = None;
     recorder.expect_extension();
@@ -79,9 +125,9 @@ pub fn solve<'a>(
         context.stopped()?;
         recorder.begin_block(k, candidates.len());
         let block = block::extract(context.input, context.ranges, context.normalization, views);
-        let attempt = attempt::solve_block(block, &seeding, recorder)?;
+        let attempt = attempt::solve_block(block, context, recorder)?;
         if attempt.is_good() {
-            let extended = extend(attempt, &seeding, recorder)?;
+            let extended = extend(attempt, context, recorder)?;
             if !extended.stands() {
                 unextended = better(unextended, extended.seed);
                 continue;
@@ -101,16 +147,102 @@ pub fn solve<'a>(
         return Ok(Ended::Extended(Box::new(best)));
     }
     match unextended {
-        Some(seed) if seed.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some()) => {
-            let extended = extend(seed, &seeding, recorder)?;
-            Ok(if extended.stands() {
-                Ended::Extended(Box::new(extended))
-            } else {
-                Ended::Block(Some(Box::new(extended.seed)))
-            })
-        }
+        Some(seed) if seed.has_metric() => metric_of(seed, context, recorder),
         unextended => Ok(Ended::Block(unextended.map(Box::new))),
     }
+}
+
+/// The best of an attempt and of those on these sets of views, each extended to all views without a calibration and
+/// calibrated then; the first that is METRIC.
+fn by_projective_extension(
+    first: Option<Attempt>,
+    sets: &[Vec<usize>],
+    context: &Context,
+    recorder: &mut Recorder,
+) -> Result<Option<Attempt>, Error> {
+    let scene = Scene::new(context);
+    let options = ProjectiveOptions::default();
+    let context = &Context { quick: true, ..*context };
+    let mut best: Option<Attempt> = None;
+    let mut unsolved = None;
+    let mut first = first;
+    let starts = usize::from(first.is_some()) + sets.len();
+    for k in 0..starts {
+        context.stopped()?;
+        let mut attempt = match first.take() {
+            Some(attempt) => attempt,
+            None => {
+                recorder.begin_block(k, starts);
+                let views = &sets[k - (starts - sets.len())];
+                let block = block::extract(context.input, context.ranges, context.normalization, views);
+                attempt::search_block(block, context, recorder)?
+            }
+        };
+        let Some(start) = attempt.projective.take() else {
+            unsolved = unsolved.or(Some(attempt));
+            continue;
+        };
+        recorder.enter(Stage::Extend);
+        let extended = projective::extend(&scene, start, &options, recorder)?;
+        if extended.views.len() < block::LEAST_VIEWS || extended.tracks.len() < LEAST_INLIERS {
+            continue;
+        }
+        attempt.projective = Some(extended);
+        attempt::calibrate(&mut attempt, context, recorder)?;
+        let rank = |attempt: &Attempt| {
+            let evidence = attempt.projective.as_ref().map_or(0.0, |found| found.evidence(scene.outlier_density));
+            (attempt.merit().0 >= attempt::WEAK_MERIT, evidence)
+        };
+        if best.as_ref().is_none_or(|best| rank(&attempt) > rank(best)) {
+            best = Some(attempt);
+        }
+        if best.as_ref().is_some_and(Attempt::is_good) {
+            break;
+        }
+    }
+    Ok(best.or(unsolved))
+}
+
+/// Extends an attempt metrically where it has a metric reconstruction and that stands.
+fn metric_of<'a>(attempt: Attempt, context: &Context<'a>, recorder: &mut Recorder) -> Result<Ended<'a>, Error> {
+    if !attempt.has_metric() {
+        return Ok(Ended::Block(Some(Box::new(attempt))));
+    }
+    let extended = extend(attempt, context, recorder)?;
+    Ok(if extended.stands() {
+        Ended::Extended(Box::new(extended))
+    } else {
+        Ended::Block(Some(Box::new(extended.seed)))
+    })
+}
+
+/// An attempt on the whole input as it is, where its tracks hold all their observations; extended where there is
+/// anything to gain.
+fn finished<'a>(mut attempt: Attempt, context: &Context<'a>, recorder: &mut Recorder) -> Result<Ended<'a>, Error> {
+    let Some(projective) = &attempt.projective else { return Ok(Ended::Block(Some(Box::new(attempt)))) };
+    let all_views = projective.views.len() == block::observed_views(context.input).len();
+    let all_tracks =
+        attempt.block.tracks.len() == context.ranges.windows(2).filter(|range| range[1] > range[0]).count();
+    if all_views && all_tracks && !attempt.has_lens() {
+        recorder.enter(Stage::Judge);
+        let judged = of_attempt::judged(context, &attempt, projective, recorder);
+        let retained: usize = judged.retained.iter().map(Vec::len).sum();
+        let gained = retained as f64 > WORTH_EXTENDING * projective.observations.len() as f64;
+        attempt.judged = Some(judged);
+        if !gained {
+            return Ok(Ended::Block(Some(Box::new(attempt))));
+        }
+    }
+    let scene = Scene::new(context);
+    if !attempt.has_metric()
+        && let Some(start) = attempt.projective.take()
+    {
+        recorder.enter(Stage::Extend);
+        attempt.projective = Some(projective::extend(&scene, start, &ProjectiveOptions::default(), recorder)?);
+        attempt::calibrate(&mut attempt, context, recorder)?;
+        attempt.judged = None;
+    }
+    metric_of(attempt, context, recorder)
 }
 
 /// The one of the two that has more merit, the first of equals.

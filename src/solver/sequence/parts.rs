@@ -25,12 +25,12 @@ const VAGUE_SIGMA: f64 = 0.5;
 /// The model that a block begins.
 pub fn first(scene: &Scene, seed: &Attempt, recorder: &mut Recorder) -> Model {
     let metric = seed.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref());
-    let noise = seed.consensus.as_ref().map_or(0.0, |consensus| consensus.noise);
+    let noise = seed.projective.as_ref().map_or(0.0, |found| found.noise);
     let intrinsics = metric.map_or_else(|| Intrinsics::from_focal(1.0), |metric| metric.intrinsics);
     let mut model = Model::new(scene, intrinsics, noise);
     if let Some(metric) = metric {
         let focals = seed.calibration.as_ref().and_then(|calibration| calibration.focals.as_deref());
-        model.add_part(scene, FIRST, &seed.block.views, metric, focals);
+        model.add_part(scene, FIRST, seed.views(), metric, focals);
     }
     structure::triangulate(scene, &mut model, recorder);
     model
@@ -76,8 +76,8 @@ pub fn others(
             failures += 1;
             continue;
         };
-        model.add_part(scene, part, &attempt.block.views, metric, calibration.focals.as_deref());
-        structure::triangulate_seen(scene, model, &attempt.block.views, recorder);
+        model.add_part(scene, part, attempt.views(), metric, calibration.focals.as_deref());
+        structure::triangulate_seen(scene, model, attempt.views(), recorder);
         register::join(scene, model, part, trials, recorder)?;
         drop_unsupported(scene, model, part, recorder);
         failures = if model.of_part(part).is_empty() { failures + 1 } else { 0 };
