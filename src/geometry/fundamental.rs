@@ -3,9 +3,10 @@
 //! One convention throughout: `x_toᵀ F x_from = 0`, and the epipole `e` is that of the view `to`, `eᵀ F = 0`: the image
 //! of the centre of the camera `from`.
 
-use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix4, SMatrix, SVector, Vector2, Vector3};
 use rand_chacha::ChaCha8Rng;
 
+use super::Camera;
 use super::ransac::{self, Estimator, Robust};
 use crate::domain::StopToken;
 
@@ -38,6 +39,29 @@ pub struct Fundamental {
     epipole: Vector3<f64>,
 }
 
+/// `x_toᵀ F x_from` and the squared norm of its gradient by the four coordinates: the square of the one over the other
+/// is the squared Sampson distance.
+pub fn algebraic(fundamental: &Matrix3<f64>, seen: &Match) -> (f64, f64) {
+    let (from, to) = (seen.from.push(1.0), seen.to.push(1.0));
+    let line = fundamental * from;
+    let back = fundamental.tr_mul(&to);
+    (to.dot(&line), line.xy().norm_squared() + back.xy().norm_squared())
+}
+
+/// `F` of two cameras, of any scale (Hartley & Zisserman, eq. 17.3): zero where their centres coincide.
+pub fn matrix_of_cameras(from: &Camera, to: &Camera) -> Matrix3<f64> {
+    Matrix3::from_fn(|of_to, of_from| {
+        let mut rows = Matrix4::zeros();
+        for (place, row) in (0..3).filter(|&row| row != of_from).enumerate() {
+            rows.set_row(place, &from.row(row));
+        }
+        for (place, row) in (0..3).filter(|&row| row != of_to).enumerate() {
+            rows.set_row(2 + place, &to.row(row));
+        }
+        if (of_to + of_from) % 2 == 0 { rows.determinant() } else { -rows.determinant() }
+    })
+}
+
 impl Fundamental {
     /// `F` of `x_toᵀ F x_from = 0`, unit norm.
     pub fn matrix(&self) -> &Matrix3<f64> {
@@ -56,12 +80,8 @@ impl Fundamental {
         if gradient_squared > f64::MIN_POSITIVE { error * error / gradient_squared } else { f64::INFINITY }
     }
 
-    /// `x_toᵀ F x_from` and the squared norm of its gradient by the four coordinates.
     fn algebraic(&self, seen: &Match) -> (f64, f64) {
-        let (from, to) = (seen.from.push(1.0), seen.to.push(1.0));
-        let line = self.matrix * from;
-        let back = self.matrix.tr_mul(&to);
-        (to.dot(&line), line.xy().norm_squared() + back.xy().norm_squared())
+        algebraic(&self.matrix, seen)
     }
 
     /// Projective depth of a match in the view `to` per unit of its depth in the view `from` (Sturm & Triggs 1996,

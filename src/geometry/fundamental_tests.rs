@@ -124,3 +124,22 @@ fn hostile_matches_give_none() {
     assert_eq!(at_epipole.depth_ratio(&seen), None);
     assert_eq!(at_epipole.sampson_squared(&seen), f64::INFINITY);
 }
+
+#[test]
+fn the_matrix_of_two_cameras_is_zero_on_images_of_one_point() {
+    let scene = testing::scene(7, 3, 20, 0.0);
+    let (cameras, points) = testing::projectively_transformed(&scene, 7);
+    let image = |view: usize, point: usize| {
+        let seen = cameras[view] * points[point];
+        seen.xy() / seen.z
+    };
+    let matrix = matrix_of_cameras(&cameras[0], &cameras[2]);
+    for point in 0..points.len() {
+        let (error, gradient_squared) = algebraic(&matrix, &Match { from: image(0, point), to: image(2, point) });
+        assert!(error * error < 1e-16 * gradient_squared, "point {point}: {error}");
+        let moved = Match { from: image(0, point), to: image(2, (point + 1) % points.len()) };
+        let (error, gradient_squared) = algebraic(&matrix, &moved);
+        assert!(error * error > 1e-8 * gradient_squared, "point {point}: {error}");
+    }
+    assert_eq!(matrix_of_cameras(&cameras[1], &cameras[1]), nalgebra::Matrix3::zeros());
+}

@@ -31,6 +31,10 @@ const CALIBRATED_OBSERVATIONS: usize = 20_000;
 /// Tracks that PAPER optimises weights for: the network holds some 40 kB a track at full width.
 const PAPER_TRACKS: usize = 5_000;
 
+/// What is said of motions and scenes that carry no calibration.
+const CRITICAL: [WarningCode; 4] =
+    [WarningCode::PureTranslation, WarningCode::PureRotation, WarningCode::PlanarScene, WarningCode::PlanarOrRotation];
+
 /// Merit of a WEAK attempt, see [`Attempt::merit`].
 pub const WEAK_MERIT: u8 = 3;
 
@@ -126,13 +130,14 @@ impl Attempt {
     }
 
     /// Whether nothing says that observations within the tracks are wrong: a calibration that fits as well as
-    /// projective cameras do.
+    /// projective cameras do, or a motion or scene found that carries none, which wrong observations would refute.
     pub fn is_trusted(&self) -> bool {
-        let fits = |calibration: &Outcome| {
-            let is_misfit = |warning: &Warning| warning.code == WarningCode::ModelMismatch;
-            calibration.grade != Grade::ProjectiveOnly && !calibration.warnings.iter().any(is_misfit)
-        };
-        self.is_good() || self.calibration.as_ref().is_some_and(fits)
+        self.calibration.as_ref().is_some_and(|calibration| {
+            let warns =
+                |codes: &[WarningCode]| calibration.warnings.iter().any(|warning| codes.contains(&warning.code));
+            let fits = calibration.grade != Grade::ProjectiveOnly && !warns(&[WarningCode::ModelMismatch]);
+            fits || self.is_good() || warns(&CRITICAL)
+        })
     }
 
     /// Whether no other block needs to be tried: it has the best grade that its camera can have, and no zoom is METRIC.

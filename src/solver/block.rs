@@ -239,31 +239,33 @@ pub fn candidate_views_among(input: &Input, ranges: &[usize], open: &[bool], sto
     Vec::new()
 }
 
-/// Views of a subset, and how many subsets are tried of one set: of a track with three wrong observations of ten, four
-/// views are clean one time in six.
+/// Views of a subset: of a track with three wrong observations of ten, four views are clean one time in six.
 const SUBSET_VIEWS: usize = 4;
-const SUBSETS: usize = 6;
+/// Subsets of one set, and of all sets together.
+const SUBSETS_OF_SET: usize = 6;
+const MOST_SUBSETS: usize = 8;
 
-/// Small subsets of each of these sets of views: runs and combs in turn, spread over the set. A track with some wrong
-/// observations is clean in some of them.
+/// Small subsets of these sets of views: runs and combs in turn, spread over the set; the first of each set first. A
+/// track with some wrong observations is clean in some of them.
 pub fn subsets(sets: &[Vec<usize>]) -> Vec<Vec<usize>> {
-    let of_set = |views: &Vec<usize>| -> Vec<Vec<usize>> {
-        let count = views.len();
-        if count <= SUBSET_VIEWS {
-            return Vec::new();
-        }
-        let longest = (count - 1) / (SUBSET_VIEWS - 1);
-        let subset = |k: usize| -> Vec<usize> {
-            let step = if k % 2 == 0 { 1 } else { longest };
-            let starts = count - (SUBSET_VIEWS - 1) * step;
-            let first = (k * starts / SUBSETS).min(starts - 1);
-            (0..SUBSET_VIEWS).map(|i| views[first + i * step]).collect()
-        };
-        let mut found: Vec<Vec<usize>> = (0..SUBSETS).map(subset).collect();
-        found.dedup();
-        found
+    let subset = |views: &[usize], k: usize| -> Vec<usize> {
+        let longest = (views.len() - 1) / (SUBSET_VIEWS - 1);
+        let step = if k.is_multiple_of(2) { 1 } else { longest };
+        let starts = views.len() - (SUBSET_VIEWS - 1) * step;
+        let first = (k * starts / SUBSETS_OF_SET).min(starts - 1);
+        (0..SUBSET_VIEWS).map(|i| views[first + i * step]).collect()
     };
-    sets.iter().flat_map(of_set).collect()
+    let mut found: Vec<Vec<usize>> = Vec::new();
+    for k in 0..SUBSETS_OF_SET {
+        for views in sets.iter().filter(|views| views.len() > SUBSET_VIEWS) {
+            let subset = subset(views, k);
+            if !found.contains(&subset) {
+                found.push(subset);
+            }
+        }
+    }
+    found.truncate(MOST_SUBSETS);
+    found
 }
 
 /// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of
@@ -450,6 +452,15 @@ mod tests {
         assert_eq!((sampled.tracks.len(), sampled.complete.tracks()), (7, 7));
         let place = block.tracks.iter().position(|&track| track == sampled.tracks[3]).expect("a track of the block");
         assert_eq!(sampled.complete.track(3), block.complete.track(place));
+    }
+
+    #[test]
+    fn subsets_are_runs_and_combs_of_each_set_in_turn() {
+        let found = subsets(&[(0..10).collect(), (20..26).collect(), (0..4).collect()]);
+        assert_eq!(found.len(), MOST_SUBSETS);
+        assert_eq!(found[..4], [[0, 1, 2, 3], [20, 21, 22, 23], [0, 3, 6, 9], [21, 22, 23, 24]]);
+        assert!(found.iter().all(|views| views.is_sorted()));
+        assert!(subsets(&[(0..4).collect()]).is_empty());
     }
 
     #[test]

@@ -5,8 +5,9 @@ use std::ops::Range;
 use super::{Geometry, Judged, NoiseModel, SplitPoint};
 use crate::domain::{Input, StopToken};
 use crate::geometry::measurement::Sighting;
+use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::triangulation::batch::{Batch, LANES};
-use crate::geometry::{Camera, Point, robust_triangulation, triangulation};
+use crate::geometry::{Camera, Point, triangulation};
 
 /// Observations that a track must retain, and the share of those it has in the registered views.
 const LEAST_RETAINED: usize = 3;
@@ -49,6 +50,7 @@ struct Other {
 pub struct Bench<'a> {
     /// Of every view; those of views that are not registered are never asked.
     pub cameras: &'a [Camera],
+    pub triangulator: Triangulator<'a>,
     pub geometry: &'a Geometry<'a>,
     pub noise: NoiseModel,
     /// Once it fires, verdicts mean nothing.
@@ -153,7 +155,7 @@ impl Bench<'_> {
         if !self.geometry.linked {
             return Some((0..sightings.len()).collect());
         }
-        let found = robust_triangulation::robust(self.cameras, sightings, gate)?;
+        let found = self.triangulator.robust(sightings, gate)?;
         Some((0..sightings.len()).filter(|&k| found.agrees[k]).collect())
     }
 
@@ -258,7 +260,7 @@ mod tests {
 
     fn bench<'a>(cameras: &'a [Camera], geometry: &'a Geometry) -> Bench<'a> {
         let noise = NoiseModel::new(geometry.noise, geometry.outlier_density);
-        Bench { cameras, geometry, noise, stop: Box::leak(Box::default()) }
+        Bench { cameras, triangulator: Triangulator::new(cameras), geometry, noise, stop: Box::leak(Box::default()) }
     }
 
     fn judged(bench: &Bench, sightings: &[Sighting]) -> Verdict {

@@ -15,6 +15,7 @@ use crate::domain::result::{ObservationResults, TrackResults};
 use crate::domain::{Input, StopToken};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::{Normalization, Sighting};
+use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::triangulation::batch::LANES;
 use crate::geometry::{Camera, Point};
 use crate::parallel::Threads;
@@ -131,7 +132,8 @@ fn judge_under(
 ) -> Judged {
     // Triangulation wants a slice; unregistered views are never sighted.
     let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
-    let bench = Bench { cameras: &cameras, geometry, noise, stop };
+    let triangulator = Triangulator::new(&cameras);
+    let bench = Bench { cameras: &cameras, triangulator, geometry, noise, stop };
     let mut judged = Judged::nothing(input, noise);
     let threads = threads.if_worth(input.track_count() >= WORTH_A_THREAD);
     for first in (0..input.track_count()).step_by(BATCH) {

@@ -35,8 +35,8 @@ pub use spread::{MOST_SPREAD, spread};
 const ITERATIONS_PER_ROUND: u32 = 25;
 /// Rounds without a network: as many samples as the longest search with one.
 const ROUNDS_WITHOUT_NETWORK: u32 = 16;
-/// Rounds of a quick search: the noise as assumed, and twice that.
-const QUICK_ROUNDS: u32 = 2;
+/// Rounds of a quick search: the noise as assumed, which is rather too high.
+const QUICK_ROUNDS: u32 = 1;
 /// Samples a round and prior, without depths (a sample costs microseconds) and with.
 const AFFINE_SAMPLES: (usize, usize) = (2_000, 6_000);
 const SUBSPACE_SAMPLES: (usize, usize) = (250, 1_000);

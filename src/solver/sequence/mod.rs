@@ -45,6 +45,9 @@ const ENOUGH_REGISTERED: f64 = 0.5;
 /// tenth more of them sigma falls by a twentieth.
 const WORTH_EXTENDING: f64 = 1.1;
 
+/// Subsets that are tried before the whole is searched at length.
+const FIRST_SUBSETS: usize = 3;
+
 /// A sequence that stands, with the block that it grew from.
 pub struct Extended<'a> {
     seed: Attempt,
@@ -100,16 +103,27 @@ pub fn solve<'a>(
         }
     };
     let sets = whole.as_ref().map_or(candidates, std::slice::from_ref);
-    let best = by_projective_extension(first, &block::subsets(sets), &seeding, recorder)?;
-    if let Some(best) = best.filter(|best| best.projective.is_some()) {
-        return metric_of(best, &seeding, recorder);
+    let subsets = block::subsets(sets);
+    // Where the whole can still be searched at length, that comes before the rest of its subsets.
+    let (cheap, rest) = subsets.split_at(subsets.len().min(if whole.is_some() { FIRST_SUBSETS } else { usize::MAX }));
+    let mut best = by_projective_extension(first, cheap, &seeding, recorder)?;
+    if let Some(views) = whole.filter(|_| !stands(&best)) {
+        let attempt = attempt::solve_block(extract(&views), context, recorder)?;
+        if attempt.projective.is_some() {
+            return finished(attempt, &seeding, recorder);
+        }
+        let others = by_projective_extension(None, rest, &seeding, recorder)?;
+        best = if stands(&others) { others } else { Some(attempt) };
     }
-    let Some(views) = whole else { return Ok(Ended::Block(None)) };
-    let attempt = attempt::solve_block(extract(&views), context, recorder)?;
-    match attempt.projective {
-        Some(_) => finished(attempt, &seeding, recorder),
-        None => Ok(Ended::Block(Some(Box::new(attempt)))),
+    match best {
+        Some(best) => metric_of(best, &seeding, recorder),
+        None => Ok(Ended::Block(None)),
     }
+}
+
+/// Whether there is a reconstruction.
+fn stands(attempt: &Option<Attempt>) -> bool {
+    attempt.as_ref().is_some_and(|attempt| attempt.projective.is_some())
 }
 
 /// Blocks that are calibrated and extended from there.

@@ -13,7 +13,7 @@ use super::options::ProjectiveOptions;
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, Loss, Observation};
 use crate::geometry::measurement::Sighting;
-use crate::geometry::robust_triangulation::{self, Robust};
+use crate::geometry::robust_triangulation::{Robust, Triangulator};
 use crate::geometry::statistics::median;
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::block::Block;
@@ -274,11 +274,12 @@ impl<'a> Growing<'a> {
             None => (0..scene.tracks()).collect(),
         };
         let cameras: Vec<Camera> = self.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+        let triangulator = Triangulator::new(&cameras);
         let gate = judge::working_gate(self.noise, scene.outlier_density);
         let threads = scene.context.threads.if_worth(tracks.len() >= WORTH_A_THREAD);
         for batch in tracks.chunks(BATCH) {
             let standing = &*self;
-            let point = |place: usize| standing.point(&cameras, gate, batch[place], scene.stop());
+            let point = |place: usize| standing.point(&triangulator, gate, batch[place], scene.stop());
             let found = threads.map(batch.len(), TRACKS_A_RUN, point, &mut |_| recorder.sign_of_life());
             if scene.stop().is_stopped() {
                 return;
@@ -298,7 +299,13 @@ impl<'a> Growing<'a> {
     }
 
     /// The point of a track, and the observations that it was looked for among.
-    fn point(&self, cameras: &[Camera], gate: f64, track: usize, stop: &StopToken) -> Option<(Robust, Vec<usize>)> {
+    fn point(
+        &self,
+        triangulator: &Triangulator,
+        gate: f64,
+        track: usize,
+        stop: &StopToken,
+    ) -> Option<(Robust, Vec<usize>)> {
         if stop.is_stopped() {
             return None;
         }
@@ -306,7 +313,7 @@ impl<'a> Growing<'a> {
         let seen: Vec<usize> = scene.of_track(track).filter(|&k| self.cameras[scene.view_of(k)].is_some()).collect();
         let sightings: Vec<Sighting> =
             seen.iter().map(|&k| Sighting { view: scene.view_of(k), xy: scene.xy[k] }).collect();
-        robust_triangulation::robust(cameras, &sightings, gate).map(|found| (found, seen))
+        triangulator.robust(&sightings, gate).map(|found| (found, seen))
     }
 
     /// The view to try next, the one that sees most verified points, with its observations of these; a view that failed

@@ -4,7 +4,8 @@ use nalgebra::Vector3;
 
 use super::model::{Landmark, Model, Scene};
 use crate::geometry::measurement::Sighting;
-use crate::geometry::{Camera, Point, robust_triangulation};
+use crate::geometry::robust_triangulation::Triangulator;
+use crate::geometry::{Camera, Point};
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 use crate::solver::recorder::Recorder;
 
@@ -35,13 +36,14 @@ pub fn triangulate_seen(scene: &Scene, model: &mut Model, views: &[usize], recor
 fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize], recorder: &mut Recorder) {
     let cameras: Vec<Camera> =
         model.cameras(scene).into_iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+    let triangulator = Triangulator::new(&cameras);
     let gate = model.gate(scene);
     let threads = scene.context.threads.if_worth(tracks.len() >= WORTH_A_THREAD);
     for batch in tracks.chunks(BATCH) {
         // Of one track nothing depends on what becomes of another.
         let standing = &*model;
         let of_track = |place: usize| {
-            (!scene.stop().is_stopped()).then(|| landmark(scene, standing, &cameras, gate, batch[place])).flatten()
+            (!scene.stop().is_stopped()).then(|| landmark(scene, standing, &triangulator, gate, batch[place])).flatten()
         };
         let found = threads.map(batch.len(), TRACKS_A_RUN, of_track, &mut |_| recorder.sign_of_life());
         if scene.stop().is_stopped() {
@@ -61,7 +63,7 @@ fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize], recorder
 fn landmark(
     scene: &Scene,
     model: &Model,
-    cameras: &[Camera],
+    triangulator: &Triangulator,
     gate: f64,
     track: usize,
 ) -> Option<(Landmark, Vec<usize>)> {
@@ -75,7 +77,7 @@ fn landmark(
         return None;
     }
     let sightings: Vec<Sighting> = seen.iter().map(|(_, sighting)| *sighting).collect();
-    let found = robust_triangulation::robust(cameras, &sightings, gate)?;
+    let found = triangulator.robust(&sightings, gate)?;
     let position = euclidean(&found.point)?;
     let agreeing = || seen.iter().zip(&found.agrees).filter(|(_, agrees)| **agrees).map(|(seen, _)| seen);
     let rays = agreeing().filter_map(|(_, sighting)| {

@@ -4,6 +4,7 @@ mod chance;
 mod copies;
 mod learned;
 mod lenses;
+mod observations;
 mod sequences;
 
 use super::*;
