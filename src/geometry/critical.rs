@@ -3,14 +3,16 @@
 //! Each fit is a maximum-likelihood one with its number of unknowns, so that it can be tested against projective
 //! cameras, of which it is a special case.
 
-use nalgebra::{Matrix3, SymmetricEigen, Vector2, Vector3};
+use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::bundle::critical::{
     Adjust, HOMOGRAPHIES_GAUGE, Homographies, ROTATING_GAUGE, Rotating, TRANSLATING_GAUGE, Translating,
 };
 use super::bundle::metric::Intrinsics;
 use super::bundle::{Observation, Options};
+use super::fundamental::{Fundamental, Match};
 use super::homography::{self, Correspondences};
+use super::null_vector::smallest_eigenvector;
 use super::statistics::median;
 use crate::domain::StopToken;
 
@@ -169,23 +171,14 @@ fn epipole(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Option<Vector3<f64>> {
         let line = from.push(1.0).cross(&to.push(1.0));
         normal += line * line.transpose();
     }
-    if pairs.len() < homography::LEAST_COMMON || normal.iter().any(|value| !value.is_finite()) {
-        return None;
-    }
-    let eigen = SymmetricEigen::new(normal);
-    Some(eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned())
+    if pairs.len() < homography::LEAST_COMMON { None } else { smallest_eigenvector(&normal) }
 }
 
-/// Median first-order distance from the epipolar constraint `to . (e x from) = 0` (Sampson).
+/// Median Sampson distance from the epipolar constraint `to . (e x from) = 0`.
 fn epipolar_residual(pairs: &[(Vector2<f64>, Vector2<f64>)], epipole: &Vector3<f64>) -> f64 {
-    let mut residuals: Vec<f64> = pairs
-        .iter()
-        .map(|(from, to)| {
-            let (line, back) = (epipole.cross(&from.push(1.0)), epipole.cross(&to.push(1.0)));
-            let gradient = (line.xy().norm_squared() + back.xy().norm_squared()).sqrt();
-            line.dot(&to.push(1.0)).abs() / gradient.max(f64::MIN_POSITIVE)
-        })
-        .collect();
+    let fundamental = Fundamental::of_translation(*epipole);
+    let distance = |&(from, to): &(Vector2<f64>, Vector2<f64>)| fundamental.sampson_squared(&Match { from, to }).sqrt();
+    let mut residuals: Vec<f64> = pairs.iter().map(distance).collect();
     median(&mut residuals)
 }
 

@@ -7,6 +7,7 @@ use nalgebra::{Matrix3, Matrix4, SMatrix, SVector, Vector2, Vector3};
 use rand_chacha::ChaCha8Rng;
 
 use super::Camera;
+use super::null_vector::smallest_eigenvector;
 use super::ransac::{self, Estimator, Robust};
 use crate::domain::StopToken;
 
@@ -63,6 +64,11 @@ pub fn matrix_of_cameras(from: &Camera, to: &Camera) -> Matrix3<f64> {
 }
 
 impl Fundamental {
+    /// That of two views that are not turned to each other, `[e]ₓ`.
+    pub(super) fn of_translation(epipole: Vector3<f64>) -> Self {
+        Self { matrix: epipole.cross_matrix(), epipole }
+    }
+
     /// `F` of `x_toᵀ F x_from = 0`, unit norm.
     pub fn matrix(&self) -> &Matrix3<f64> {
         &self.matrix
@@ -144,13 +150,7 @@ pub fn eight_point(matches: &[Match], weights: &[f64]) -> Option<Fundamental> {
         normal.syger(*weight, &equation, &equation, 1.0);
     }
     normal.fill_upper_triangle_with_lower_triangle();
-    // Before the decomposition, which would not end on what is no number.
-    let trace = normal.trace();
-    if !(trace > 0.0 && trace.is_finite()) || normal.iter().any(|entry| !entry.is_finite()) {
-        return None;
-    }
-    let eigen = (normal / trace).symmetric_eigen();
-    let solution = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+    let solution = smallest_eigenvector(&normal)?;
     let svd = Matrix3::from_row_slice(solution.as_slice()).svd(true, true);
     let (u, vt, mut singular) = (svd.u?, svd.v_t?, svd.singular_values);
     let smallest = singular.imin();

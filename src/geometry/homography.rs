@@ -4,6 +4,8 @@
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2};
 
 use super::bundle::Observation;
+use super::null_vector::smallest_eigenvector;
+use super::statistics::median;
 
 /// Common points that a pair of views needs: two more than the four that a homography always fits.
 pub const LEAST_COMMON: usize = 6;
@@ -45,8 +47,7 @@ fn median_to(seen: &Correspondences, reference: usize, noise: f64) -> Option<f64
         .filter(|&view| view != reference)
         .filter_map(|view| pair_residual(&seen.common(reference, view), noise))
         .collect();
-    residuals.sort_by(f64::total_cmp);
-    residuals.get(residuals.len() / 2).copied()
+    (!residuals.is_empty()).then(|| median(&mut residuals))
 }
 
 /// Image points by view, to find what two views have in common.
@@ -140,13 +141,8 @@ fn direct_linear_transform(pairs: &[(Vector2<f64>, Vector2<f64>)], weights: &[f6
             normal += equation * equation.transpose() * *weight;
         }
     }
-    // Before the decomposition, which would not end on what is no number.
-    let trace = normal.trace();
-    if !(trace > 0.0 && trace.is_finite()) {
-        return None;
-    }
-    let eigen = (normal / trace).symmetric_eigen();
-    Some(Matrix3::from_row_slice(eigen.eigenvectors.column(eigen.eigenvalues.imin()).as_slice()))
+    let entries = smallest_eigenvector(&normal)?;
+    Some(Matrix3::from_row_slice(entries.as_slice()))
 }
 
 #[cfg(test)]

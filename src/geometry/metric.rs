@@ -8,6 +8,7 @@ use super::bundle::critical::Translating;
 use super::bundle::metric::{Intrinsics, Pose, Reconstruction};
 use super::bundle::zoom::Zooming;
 use super::daq::{Daq, FirstViewFrame, to_first_view_frame, zoomed};
+use super::statistics::median;
 
 /// Distance at which points are held, in median depths: beyond it the depth of a point moves no observation, while a
 /// point at infinity would have no coordinates.
@@ -140,8 +141,7 @@ fn pose(left: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Pose> {
 /// Scales the scene to a median depth of 1 and holds far points at [`FARTHEST`].
 fn scale_to_median_depth(reconstruction: &mut Reconstruction, observations: &[Observation]) -> Option<()> {
     let mut depths: Vec<f64> = depths(reconstruction, observations).map(f64::abs).collect();
-    depths.sort_by(f64::total_cmp);
-    let median = *depths.get(depths.len() / 2)?;
+    let median = median(&mut depths);
     if !(median > f64::MIN_POSITIVE && median.is_finite()) {
         return None;
     }

@@ -1,6 +1,7 @@
 //! The direction that a small system of equations leaves nearly free.
 
-use nalgebra::{Matrix4, Vector4};
+use nalgebra::allocator::Allocator;
+use nalgebra::{Const, DefaultAllocator, DimDiff, DimSub, Matrix4, SMatrix, SVector, U1, Vector4};
 
 /// What is added to the diagonal, as a share of the trace: it moves no eigenvector, and makes the factorisation of what
 /// rounding left singular or indefinite (1e-16 of the trace) safe.
@@ -43,6 +44,21 @@ pub fn null_vector(matrix: &Matrix4<f64>) -> Option<Vector4<f64>> {
         }
     }
     vector.iter().all(|value| value.is_finite()).then_some(vector)
+}
+
+/// The same for any size, and down to the last bits, by a full decomposition.
+pub fn smallest_eigenvector<const N: usize>(matrix: &SMatrix<f64, N, N>) -> Option<SVector<f64, N>>
+where
+    Const<N>: DimSub<U1>,
+    DefaultAllocator: Allocator<DimDiff<Const<N>, U1>>,
+{
+    // Before the decomposition, which would not end on what is no number.
+    let trace = matrix.trace();
+    if !(trace > 0.0) || matrix.iter().any(|entry| !entry.is_finite()) {
+        return None;
+    }
+    let eigen = (matrix / trace).symmetric_eigen();
+    Some(eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned())
 }
 
 #[cfg(test)]

@@ -1,10 +1,10 @@
 //! Projective cameras from known points and their images.
 
-use nalgebra::{Matrix4, SMatrix, SVector, SymmetricEigen, Vector2};
+use nalgebra::{Matrix4, SMatrix, SVector, Vector2};
 use rand_chacha::ChaCha8Rng;
 
 use super::levenberg_marquardt::{self, Normal, Problem};
-use super::null_vector::null_vector;
+use super::null_vector::{null_vector, smallest_eigenvector};
 use super::ransac::{self, Estimator};
 use super::triangulation::reprojection;
 use super::{Camera, Point};
@@ -44,11 +44,7 @@ pub fn linear(points: &[Point], images: &[Vector2<f64>]) -> Option<Camera> {
             normal += row * row.transpose();
         }
     }
-    if normal.iter().any(|entry| !entry.is_finite()) {
-        return None;
-    }
-    let eigen = SymmetricEigen::new(normal);
-    let solution = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+    let solution = smallest_eigenvector(&normal)?;
     Some(Camera::from_fn(|row, column| solution[4 * row + column]))
 }
 

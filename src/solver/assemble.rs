@@ -16,6 +16,7 @@ use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, Warnin
 use crate::geometry::bundle::metric::{Intrinsics, Parameter, Reconstruction};
 use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::measurement::Sighting;
+use crate::geometry::statistics::root_mean_square;
 use crate::geometry::{Camera, Point, triangulation};
 
 /// The solution of a scene in which nothing could be reconstructed; the reason is among `warnings`.
@@ -388,10 +389,6 @@ pub fn reprojection(observations: &ObservationResults) -> (Option<f64>, Option<f
         .zip(&observations.residual_px)
         .filter_map(|(&inlier, residual)| residual.filter(|_| inlier))
         .collect();
-    if residuals.is_empty() {
-        return (None, None);
-    }
-    let count = residuals.len() as f64;
-    let rms = (residuals.iter().map(|residual| residual * residual).sum::<f64>() / count).sqrt();
-    (Some(rms), Some(residuals.iter().sum::<f64>() / count))
+    let rms = root_mean_square(&residuals);
+    (rms, rms.map(|_| residuals.iter().sum::<f64>() / residuals.len() as f64))
 }

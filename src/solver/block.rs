@@ -9,6 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::domain::{ImageSize, Input, StopToken, View, Warning, WarningCode};
 use crate::geometry::measurement::{CompleteBlock, Normalization};
+use crate::geometry::statistics::median;
 
 /// Tracks that a block should have: twice the eight that verification needs, for half of them may be wrong.
 const WANTED_TRACKS: usize = 16;
@@ -120,12 +121,7 @@ fn far_outside(input: &Input) -> Option<Warning> {
         Some(offset.amax() / f64::from(size.width_px.max(size.height_px)))
     };
     let mut offsets: Vec<f64> = (0..input.observation_count()).filter_map(of).collect();
-    let middle = offsets.len() / 2;
-    if offsets.is_empty() {
-        return None;
-    }
-    let (_, median, _) = offsets.select_nth_unstable_by(middle, f64::total_cmp);
-    (*median > MEDIAN_WITHIN).then(|| {
+    (median(&mut offsets) > MEDIAN_WITHIN).then(|| {
         let detail = "half of the points lie farther from the middle of their image than it is long: is the size that was \
                       given that of these images, or of a reduced copy?";
         Warning::new(WarningCode::PointsOutsideImage, detail)

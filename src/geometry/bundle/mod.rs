@@ -92,11 +92,6 @@ impl Options {
         let Self { max_iterations, relative_tolerance, initial_damping, .. } = *self;
         levenberg_marquardt::Options { max_iterations, relative_tolerance, initial_damping, min_damping }
     }
-
-    /// Cauchy loss of this scale (normalised image units) with these iterations.
-    pub fn cauchy(scale: f64, max_iterations: usize) -> Self {
-        Self { max_iterations, loss: Loss::Cauchy { scale }, ..Self::default() }
-    }
 }
 
 impl Default for Options {

@@ -7,7 +7,7 @@ mod frame;
 mod starts;
 mod zoom;
 
-use nalgebra::{Matrix3, Matrix3x4, Matrix4, SMatrix, SVector, Vector3};
+use nalgebra::{Matrix3, Matrix3x4, SMatrix, SVector, Vector3};
 
 pub use self::frame::{FirstViewFrame, to_first_view_frame};
 pub use self::starts::{linear, plane_from_second_view, scan, widest_views};
@@ -54,28 +54,11 @@ impl Daq {
         calibration * calibration.transpose()
     }
 
-    /// The 4x4 quadric `[w, -w n; -n' w, n' w n]`, positive semidefinite of rank 3; its null vector is `(n, 1)`.
-    pub fn matrix(&self) -> Matrix4<f64> {
-        let diac = self.diac();
-        let mut root = SMatrix::<f64, 4, 3>::identity();
-        root.set_row(3, &-self.plane_at_infinity.transpose());
-        root * diac * root.transpose()
-    }
-
     fn moved(&self, step: &SVector<f64, UNKNOWNS>) -> Self {
         let focal = self.intrinsics.focal * step[0].exp();
         let plane_at_infinity = self.plane_at_infinity + step.fixed_rows::<3>(1);
         Self { intrinsics: Intrinsics { focal, ..self.intrinsics }, plane_at_infinity }
     }
-}
-
-/// Dual image of the absolute conic in one view, `P Q P'` scaled to unit Frobenius norm (paper, eq. 7).
-///
-/// Returns `None` when the projection vanishes, i.e. the camera centre lies on every plane of the quadric.
-pub fn unit_diac(camera: &Matrix3x4<f64>, daq: &Daq) -> Option<Matrix3<f64>> {
-    let diac = camera * daq.matrix() * camera.transpose();
-    let norm = diac.norm();
-    (norm > f64::MIN_POSITIVE && norm.is_finite()).then(|| diac / norm)
 }
 
 /// The DAQ residual `1/2 sum_i |S_i/|S_i| - w/|w||^2` with `S_i = P_i Q P_i'` and `w = K K'`.
@@ -223,16 +206,6 @@ mod tests {
         let (cameras, points) = testing::projectively_transformed(&scene, seed);
         let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
         (frame.cameras, scene.intrinsics.focal)
-    }
-
-    #[test]
-    fn the_quadric_has_the_plane_at_infinity_as_null_vector() {
-        let daq = Daq::new(1.3, Vector3::new(0.2, -0.5, 0.7));
-        let null = daq.matrix() * daq.plane_at_infinity.push(1.0);
-        assert!(null.norm() < 1e-12);
-        let first = unit_diac(&Matrix3x4::identity(), &daq).expect("rank 3");
-        assert!((first - daq.diac() / daq.diac().norm()).norm() < 1e-12);
-        assert_eq!(unit_diac(&Matrix3x4::zeros(), &daq), None);
     }
 
     #[test]

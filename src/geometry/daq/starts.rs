@@ -3,6 +3,7 @@
 use nalgebra::{Matrix3, Matrix3x4, Matrix4, SMatrix, SVector, Vector3};
 
 use super::{Daq, residual};
+use crate::geometry::null_vector::smallest_eigenvector;
 
 /// Focal lengths of the scan, in image sides: from wider than any rectilinear lens (118 degrees) to a telephoto of
 /// 11 degrees.
@@ -43,11 +44,7 @@ pub fn linear(cameras: &[Matrix3x4<f64>]) -> Option<Daq> {
                 normal += row * row.transpose();
             }
         }
-        if normal.iter().any(|value| !value.is_finite()) {
-            return None;
-        }
-        let eigen = normal.symmetric_eigen();
-        quadric = nearest_of_rank_three(&symmetric(&eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned()));
+        quadric = nearest_of_rank_three(&symmetric(&smallest_eigenvector(&normal)?));
         for (scale, camera) in scales.iter_mut().zip(&scaled) {
             let row = camera.row(2);
             *scale = (row * quadric * row.transpose())[0].abs() + f64::EPSILON;

@@ -1,6 +1,6 @@
 //! The search for the metric reconstruction: many starts, few that converge.
 
-use nalgebra::{Matrix4, Vector3, Vector4};
+use nalgebra::Vector3;
 
 use super::models::Choice;
 use super::{Problem, Stopped};
@@ -9,7 +9,9 @@ use crate::geometry::bundle::critical::Translating;
 use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::daq::{self, Daq, FirstViewFrame, Free};
+use crate::geometry::measurement::Sighting;
 use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
+use crate::geometry::{Camera, triangulation};
 
 /// The scan of focal lengths: 40 in the range, from the 4 widest views.
 const SCAN_FOCALS: usize = 40;
@@ -261,25 +263,19 @@ const LEAST_POINTS_OF_A_VIEW: usize = 20;
 
 /// Triangulates the points that took no part in the search with the cameras it found.
 fn fill_points(minimum: &mut Minimum, chosen: &[bool], observations: &[Observation]) {
-    let reconstruction = &mut minimum.reconstruction;
-    let mut normals = vec![Matrix4::<f64>::zeros(); reconstruction.points.len()];
-    for seen in observations {
-        let (Some(pose), Some(normal)) = (reconstruction.poses.get(seen.camera), normals.get_mut(seen.point)) else {
-            continue;
-        };
-        let camera = pose.camera(&reconstruction.intrinsics);
-        for (row, target) in [seen.xy.x, seen.xy.y].into_iter().enumerate() {
-            let equation: Vector4<f64> = (camera.row(row) - camera.row(2) * target).transpose();
-            *normal += equation * equation.transpose();
+    let Reconstruction { intrinsics, poses, points } = &mut minimum.reconstruction;
+    let cameras: Vec<Camera> = poses.iter().map(|pose| pose.camera(intrinsics)).collect();
+    let mut sightings = vec![Vec::new(); points.len()];
+    for seen in observations.iter().filter(|seen| seen.camera < cameras.len()) {
+        if let Some(sightings) = sightings.get_mut(seen.point) {
+            sightings.push(Sighting { view: seen.camera, xy: seen.xy });
         }
     }
-    for ((point, normal), chosen) in reconstruction.points.iter_mut().zip(&normals).zip(chosen) {
-        let trace = normal.trace();
-        if *chosen || !(trace > 0.0 && trace.is_finite()) {
+    for ((point, sightings), chosen) in points.iter_mut().zip(&sightings).zip(chosen) {
+        if *chosen || sightings.is_empty() {
             continue;
         }
-        let eigen = normal.symmetric_eigen();
-        let homogeneous = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+        let homogeneous = triangulation::linear(&cameras, sightings);
         let position: Vector3<f64> = homogeneous.xyz() / homogeneous.w;
         if position.iter().all(|value| value.is_finite()) {
             *point = position;

@@ -36,10 +36,6 @@ impl<'a> Crew<'a> {
         Self { threads: threads.if_worth(observations >= WORTH_A_THREAD), stop, batches }
     }
 
-    pub fn is_stopped(&self) -> bool {
-        self.stop.is_stopped()
-    }
-
     /// For one piece of work: asks the stop token at once, and then now and then.
     pub fn pace(&self) -> Pace<'a> {
         Pace { stop: self.stop, left: 0 }

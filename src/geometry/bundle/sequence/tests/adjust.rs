@@ -16,7 +16,7 @@ fn one_group_ends_where_a_block_does() {
         let start = perturbed(&truth, 0.01, seed);
         let model = IntrinsicsModel::FOCAL.with(Extension::Radial);
         let prior = IntrinsicsPrior::NONE.knowing(Parameter::Radial, 0.0, 0.05, NOISE);
-        for options in [thorough(), Options { loss: Options::cauchy(NOISE, 1).loss, ..thorough() }] {
+        for options in [thorough(), Options { loss: Loss::Cauchy { scale: NOISE }, ..thorough() }] {
             let mut block = Reconstruction {
                 intrinsics: start.intrinsics[0],
                 poses: start.poses.clone(),
