@@ -3,11 +3,12 @@
 //! Depends on `network`, `geometry` and `domain`; knows nothing of jobs, transport or files.
 //!
 //! The way through: [`copies`] keeps one of the tracks that stand in the input several times; [`block`] chooses views
-//! whose tracks are complete; [`attempt`] solves one such block, by [`portfolio`] (priors, [`search`], [`grow`];
-//! [`crowds`] are left aside, the [`likeliest`] of many tracks searched, [`chance`] verifies; [`depths`] where those
-//! verify what image points cannot; [`extend`] to what a search leaves aside) or [`direct`], and [`calibration`]
-//! upgrades it; where tracks are not complete, [`sequence`] extends the best block to the other views; [`judge`] has
-//! the last word on every track and observation; [`assemble`] writes it down.
+//! whose tracks are complete: all of them, or a few; [`attempt`] searches such a block, by [`portfolio`] (priors,
+//! [`search`], [`grow`]; [`crowds`] are left aside, the [`likeliest`] of many tracks searched, [`chance`] verifies;
+//! [`depths`] where those verify what image points cannot) or [`direct`], and [`calibration`] upgrades it. By image
+//! points, [`sequence`] tries blocks in order of cost and extends what stands to the other views and tracks,
+//! projectively or metrically, observation by observation; [`judge`] has the last word on every track and observation;
+//! [`assemble`] writes it down.
 
 mod agreement;
 mod assemble;
@@ -72,12 +73,13 @@ pub fn solve(
 /// Solves one input.
 ///
 /// Deterministic: the same input, settings and build give the same solution, but for times, on any number of threads.
-/// Further ones than the caller's help where a sequence is extended and tracks are judged.
+/// Further ones than the caller's help where a reconstruction is extended and tracks are judged.
 /// `observer` is told of every iteration; `stop` is asked at least every 50 ms or network iteration.
 ///
-/// Where tracks are complete over all views these are one block; of other inputs AUTO and GEOMETRY extend a block to
-/// every view that can be registered. Where neither applies, the best block is solved, views outside it are left out
-/// with a warning, and blocks that disagree raise its uncertainty.
+/// AUTO and GEOMETRY judge every observation by itself and extend a block to every view that can be registered: all
+/// views at once where their tracks are complete and that decides quickly, else few of them. With depths, and by PAPER
+/// and PSFM, the best block is solved, views outside it are left out with a warning, and blocks that disagree raise its
+/// uncertainty.
 ///
 /// Tracks that are [copies](Copies) of another count once, whatever the method.
 ///

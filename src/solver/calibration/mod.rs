@@ -245,8 +245,11 @@ fn near(
     let critical = critical::find(problem, &fit, scale_px, stop);
     Stopped::check(stop)?;
     told();
-    if !critical.warnings.is_empty() {
-        warnings.extend(critical.warnings);
+    // A plane under tilted views determines a focal length (Triggs 1998): of a reconstruction that is metric already,
+    // sigma says how well, and the warning describes the scene.
+    let refused = critical.warnings.iter().any(|warning| warning.code != WarningCode::PlanarScene);
+    warnings.extend(critical.warnings);
+    if refused {
         return Ok(Outcome::refused(warnings));
     }
     let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);

@@ -1,11 +1,12 @@
-//! From a calibrated block to the whole sequence.
+//! From blocks of complete tracks to a reconstruction of all views.
 //!
-//! Tracks of real sequences live a few views: no block of complete tracks holds them all. A block that was solved is
-//! the seed; view after view is resected against the points that stand ([`register`]), its tracks are triangulated
-//! ([`structure`]), and bundle adjustment with the calibration free keeps the whole straight ([`adjust`]). Views that
-//! share no tracks with it become [`parts`] of their own under the same calibration. What the whole says of the
-//! calibration is graded anew ([`calibrate`]) and checked between its [`windows`], and every track and observation is
-//! judged by it ([`assemble`]).
+//! Tracks of real sequences live a few views, and a right track may hold wrong observations: no block of complete tracks
+//! holds them all. A block that was searched is the seed. Where it is calibrated, view after view is resected against
+//! the points that stand ([`register`]), its tracks are triangulated ([`structure`]), and bundle adjustment with the
+//! calibration free keeps the whole straight ([`adjust`]); where it is not, the same is done without a calibration
+//! ([`projective`]), and the whole is calibrated then. Views that share no tracks with it become [`parts`] of their own
+//! under the same calibration. What the whole says of the calibration is graded anew ([`calibrate`]) and checked between
+//! its [`windows`], and every track and observation is judged by it ([`assemble`]).
 
 mod adjust;
 mod assemble;
@@ -95,7 +96,8 @@ pub fn solve<'a>(
         Some(attempt)
     } else {
         match by_calibrated_blocks(candidates, &seeding, recorder)? {
-            Ended::Extended(extended) if extended.grade() != Grade::ProjectiveOnly => {
+            // Of one that holds most views, a projective reconstruction would say no more.
+            Ended::Extended(extended) if extended.merit().0 || extended.holds_most_views() => {
                 return Ok(Ended::Extended(extended));
             }
             Ended::Extended(extended) => Some(extended.seed),
@@ -334,8 +336,11 @@ impl Extended<'_> {
 
     /// Whether no other seed needs to be tried.
     fn is_firm(&self) -> bool {
-        let (calibrated, registered) = self.merit();
-        let views = registered + self.unregistered.len();
-        calibrated && registered as f64 >= ENOUGH_REGISTERED * views as f64
+        self.merit().0 && self.holds_most_views()
+    }
+
+    fn holds_most_views(&self) -> bool {
+        let registered = self.model.registered().len();
+        registered as f64 >= ENOUGH_REGISTERED * (registered + self.unregistered.len()) as f64
     }
 }
