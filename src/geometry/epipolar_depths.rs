@@ -41,7 +41,8 @@ pub fn epipolar_depths(block: &CompleteBlock, noise: f64, seed: u64, stop: &Stop
     }
     let mut references = vec![0, views / 2, views - 1];
     references.dedup();
-    let mut best: Option<(usize, f64, Vec<Option<Robust<Fundamental>>>)> = None;
+    type Star = Vec<Option<Robust<Fundamental>>>;
+    let mut best: Option<(usize, f64, Star)> = None;
     for reference in references {
         if let Some((cost, star)) = star(block, reference, noise, seed, stop)
             && best.as_ref().is_none_or(|(_, least, _)| cost < *least)

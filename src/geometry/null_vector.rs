@@ -54,7 +54,7 @@ where
 {
     // Before the decomposition, which would not end on what is no number.
     let trace = matrix.trace();
-    if !(trace > 0.0) || matrix.iter().any(|entry| !entry.is_finite()) {
+    if trace.is_nan() || trace <= 0.0 || matrix.iter().any(|entry| !entry.is_finite()) {
         return None;
     }
     let eigen = (matrix / trace).symmetric_eigen();

@@ -146,7 +146,8 @@ impl Problem for Refinement<'_> {
             let residual = reprojection(camera, point, image);
             let squared = residual.norm_squared();
             // Written so that NaN is left out.
-            if !(squared < WEIGHED_GATES * self.gate) {
+            let is_near = squared < WEIGHED_GATES * self.gate;
+            if !is_near {
                 continue;
             }
             let weight = (self.gate / (squared + self.gate)).powi(2);

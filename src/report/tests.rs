@@ -210,7 +210,7 @@ fn flow_lines(input: &LabelledInput, solution: &Solution, view: usize) -> Option
 fn flow_lines_join_observations_of_one_point() {
     let (input, mut solution) = fixture::solved();
     let track = solution.tracks.inlier.iter().position(|inlier| *inlier).expect("an inlier");
-    let mut of_track = vec![0; 5];
+    let mut of_track = [0; 5];
     for (k, view) in input.raw.view.iter().enumerate().filter(|(k, _)| input.raw.track[*k] as usize == track) {
         of_track[*view as usize] = k;
     }

@@ -151,6 +151,16 @@ pub fn solved(context: &Context, attempt: Attempt, mut warnings: Vec<Warning>, m
     }
 }
 
+/// Share of its observations that a complete track must retain: of 100 permuted tracks in ten views about one holds
+/// three observations of one point by chance.
+const LEAST_RETAINED_SHARE: f64 = 0.6;
+
+/// See [`Geometry::least_share`]: tracks of a sequence may be linked wrongly and hold several points.
+pub fn least_share(context: &Context) -> f64 {
+    let is_sequence = super::block::complete_views(context.input, context.ranges).is_none();
+    if is_sequence { 0.0 } else { LEAST_RETAINED_SHARE }
+}
+
 /// Every track and observation judged by the projective cameras.
 pub fn judged(context: &Context, attempt: &Attempt, projective: &Projective, recorder: &mut Recorder) -> Judged {
     let mut cameras = vec![None; context.input.view_count()];
@@ -163,6 +173,7 @@ pub fn judged(context: &Context, attempt: &Attempt, projective: &Projective, rec
         normalization: context.normalization,
         lenses: &[],
         linked: attempt.judges_observations(),
+        least_share: if attempt.judges_observations() { least_share(context) } else { LEAST_RETAINED_SHARE },
         noise: projective.noise,
         outlier_density: judge::density_of_spread(attempt.spread),
         inlier_share: (projective.tracks.len() as f64 + 1.0) / (projective.tried as f64 + 2.0),

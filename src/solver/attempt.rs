@@ -11,7 +11,7 @@ use super::portfolio::{self, Evidence, Portfolio};
 use super::recorder::Recorder;
 use super::sequence::Projective;
 use super::{Context, Error};
-use super::{crowds, depths, likeliest, second};
+use super::{crowds, depths, extend, likeliest, second};
 use crate::domain::result::PriorTime;
 use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View, Warning, WarningCode};
 use crate::geometry::bundle::metric::Reconstruction;
@@ -282,7 +282,15 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         attempt.consensus = Some(refined);
         return Ok(());
     }
-    attempt.consensus = Some(refined);
+    let extended = extend::extend(&attempt.block, &refined, context);
+    context.stopped()?;
+    if let Some((block, consensus)) = extended {
+        attempt.network_weights = carry_over(&attempt.network_weights, &attempt.block, &block);
+        recorder.standing.inliers = consensus.inlier_count() as u32;
+        (attempt.block, attempt.consensus) = (block, Some(consensus));
+    } else {
+        attempt.consensus = Some(refined);
+    }
     let complete = &attempt.block.complete;
     if let (Some(rigid), Some(consensus)) = (&found.rigid, &attempt.consensus)
         && consensus.noise > depths::STRONG_NOISE
@@ -290,6 +298,15 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
         attempt.weights_by_depths = depths::weights(complete, consensus, rigid, attempt.spread, context.stop);
     }
     Ok(())
+}
+
+/// The network's weights of the searched tracks, for a larger block; 0 for tracks that it was not shown.
+fn carry_over(weights: &[f64], searched: &Block, block: &Block) -> Vec<f64> {
+    if weights.is_empty() {
+        return Vec::new();
+    }
+    let weight = |track: &usize| searched.tracks.binary_search(track).ok().map_or(0.0, |place| weights[place]);
+    block.tracks.iter().map(weight).collect()
 }
 
 /// PAPER and PSFM: the method's own set of tracks, reconstructed as it is.

@@ -5,7 +5,8 @@
 //! The way through: [`copies`] keeps one of the tracks that stand in the input several times; [`block`] chooses views
 //! whose tracks are complete: all of them, or a few; [`attempt`] searches such a block, by [`portfolio`] (priors,
 //! [`search`], [`grow`]; [`crowds`] are left aside, the [`likeliest`] of many tracks searched, [`chance`] verifies;
-//! [`depths`] where those verify what image points cannot) or [`direct`], and [`calibration`] upgrades it. By image
+//! [`depths`] where those verify what image points cannot; [`extend`] to complete tracks and views that a search leaves
+//! aside) or [`direct`], and [`calibration`] upgrades it. By image
 //! points, [`sequence`] tries blocks in order of cost and extends what stands to the other views and tracks,
 //! projectively or metrically, observation by observation; [`judge`] has the last word on every track and observation;
 //! [`assemble`] writes it down.
@@ -14,12 +15,13 @@ mod agreement;
 mod assemble;
 mod attempt;
 mod block;
-pub mod calibration;
+pub(crate) mod calibration;
 mod chance;
 mod copies;
 mod crowds;
 mod depths;
 mod direct;
+mod extend;
 mod grow;
 mod judge;
 mod learned;
@@ -31,7 +33,7 @@ mod recorder;
 mod search;
 mod second;
 mod sequence;
-pub mod study;
+pub(crate) mod study;
 #[cfg(test)]
 mod tests;
 mod views;
@@ -163,12 +165,6 @@ fn solve_views(
         agreement::reconcile(best, &others);
     }
     of_block(best, &context, warnings, recorder)
-}
-
-/// At most `most` of the items, evenly spread.
-fn evenly(items: &[usize], most: usize) -> Vec<usize> {
-    let count = items.len().min(most);
-    (0..count).map(|k| items[k * items.len() / count]).collect()
 }
 
 /// Solves an input by image points alone, each of which may be wrong by itself.

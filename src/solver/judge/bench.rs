@@ -9,9 +9,8 @@ use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::geometry::{Camera, Point, triangulation};
 
-/// Observations that a track must retain, and the share of those it has in the registered views.
+/// Observations that a track must retain.
 const LEAST_RETAINED: usize = 3;
-const LEAST_RETAINED_SHARE: f64 = 0.6;
 /// Refinement steps of a point.
 const POINT_STEPS: usize = 10;
 /// The same before an observation far beyond the gate is dropped: which is the worst shows early, and of a wrong track
@@ -130,8 +129,7 @@ impl Bench<'_> {
 
     /// Observations that a track must retain.
     fn least_retained(&self, sightings: &[Sighting]) -> usize {
-        let share = if self.geometry.linked { 0.0 } else { LEAST_RETAINED_SHARE };
-        LEAST_RETAINED.max((share * sightings.len() as f64).ceil() as usize)
+        LEAST_RETAINED.max((self.geometry.least_share * sightings.len() as f64).ceil() as usize)
     }
 
     /// The verdict on a track by the observations that it retains.
@@ -252,6 +250,7 @@ mod tests {
             normalization,
             lenses: &[],
             linked: false,
+            least_share: 0.6,
             noise: 0.001,
             outlier_density: 2.0,
             inlier_share: 0.3,
@@ -302,7 +301,8 @@ mod tests {
         let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
         let cameras = cameras(10);
         for linked in [false, true] {
-            let geometry = Geometry { linked, ..geometry(&normalization) };
+            let least_share = if linked { 0.0 } else { 0.6 };
+            let geometry = Geometry { linked, least_share, ..geometry(&normalization) };
             let bench = bench(&cameras, &geometry);
             let shifts: [&[f64]; LANES] = [
                 &[0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001],
@@ -332,7 +332,7 @@ mod tests {
     #[test]
     fn a_track_that_joins_two_points_is_split_and_one_that_strays_is_not() {
         let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
-        let geometry = Geometry { linked: true, ..geometry(&normalization) };
+        let geometry = Geometry { linked: true, least_share: 0.0, ..geometry(&normalization) };
         let cameras = cameras(8);
         let bench = bench(&cameras, &geometry);
         let split = |sightings: &[Sighting]| {
@@ -372,7 +372,7 @@ mod tests {
     #[test]
     fn of_a_linked_track_the_right_run_is_kept_and_nothing_behind_the_cameras() {
         let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
-        let geometry = Geometry { linked: true, ..geometry(&normalization) };
+        let geometry = Geometry { linked: true, least_share: 0.0, ..geometry(&normalization) };
         let cameras = cameras(6);
         let joined = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.2, -0.15, 0.31]);
         let verdict = judged(&bench(&cameras, &geometry), &joined);

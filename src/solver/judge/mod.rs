@@ -33,9 +33,13 @@ pub struct Geometry<'a> {
     /// pinholes.
     pub lenses: &'a [Intrinsics],
     /// Whether tracks were linked from view to view, so that one wrong link joins two points: the observations that
-    /// agree on one are looked for then, however few they are beside the others. The cameras must be metric. Otherwise
-    /// a track is right in most of its observations or wrong.
+    /// agree on one are looked for then, however few they are beside the others. The cameras must be metric, or oriented
+    /// with the plane at infinity off the points. Otherwise the worst observation is dropped as long as it is too far
+    /// from the point of the others.
     pub linked: bool,
+    /// Share of its observations in registered views that a right track retains: none where links may be wrong, most of
+    /// them where tracks are complete.
+    pub least_share: f64,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
     /// Density of a wrong coordinate: one over the width of the points' distribution, normalised units.

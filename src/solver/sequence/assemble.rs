@@ -10,7 +10,9 @@ use crate::domain::{Calibration, Grade, LeftOut, Solution, Stage, Status, Warnin
 use crate::geometry::Point;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
 use crate::geometry::measurement::Sighting;
-use crate::solver::assemble::{LEAST_SIGHTINGS, dehomogenise, network_weights, pixel_calibration, reprojection};
+use crate::solver::assemble::{
+    LEAST_SIGHTINGS, dehomogenise, least_share, network_weights, pixel_calibration, reprojection,
+};
 use crate::solver::block;
 use crate::solver::calibration::Outcome;
 use crate::solver::judge::{self, Geometry, Judged, SplitPoint};
@@ -130,6 +132,7 @@ fn judged(scene: &Scene, model: &Model, recorder: &mut Recorder) -> Judged {
         normalization: context.normalization,
         lenses: &lenses,
         linked: true,
+        least_share: least_share(context),
         noise: model.noise,
         outlier_density: scene.outlier_density,
         inlier_share: (verified as f64 + 1.0) / (tried.max(verified) as f64 + 2.0),

@@ -232,33 +232,40 @@ fn metric_of<'a>(attempt: Attempt, context: &Context<'a>, recorder: &mut Recorde
     })
 }
 
-/// An attempt on the whole input as it is, where its tracks hold all their observations; extended where there is
-/// anything to gain.
+/// An attempt on the whole input, extended where it leaves views aside, a lens distorts, or observations are to be
+/// gained once each is judged by itself.
 fn finished<'a>(mut attempt: Attempt, context: &Context<'a>, recorder: &mut Recorder) -> Result<Ended<'a>, Error> {
-    let Some(projective) = &attempt.projective else { return Ok(Ended::Block(Some(Box::new(attempt)))) };
-    let all_views = projective.views.len() == block::observed_views(context.input).len();
-    let all_tracks =
-        attempt.block.tracks.len() == context.ranges.windows(2).filter(|range| range[1] > range[0]).count();
-    if all_views && all_tracks && !attempt.has_lens() {
-        recorder.enter(Stage::Judge);
-        let judged = of_attempt::judged(context, &attempt, projective, recorder);
-        let retained: usize = judged.retained.iter().map(Vec::len).sum();
-        let gained = retained as f64 > WORTH_EXTENDING * projective.observations.len() as f64;
+    let is_whole = attempt.views().len() == block::observed_views(context.input).len();
+    let Some(projective) = attempt.projective.as_ref().filter(|_| is_whole && !attempt.has_lens()) else {
+        return metric_of(attempt, context, recorder);
+    };
+    recorder.enter(Stage::Judge);
+    let judged = of_attempt::judged(context, &attempt, projective, recorder);
+    let of_block = |track: &usize| attempt.block.tracks.binary_search(track).is_ok();
+    let retained: usize = (0..judged.retained.len()).filter(of_block).map(|track| judged.retained[track].len()).sum();
+    if retained as f64 <= WORTH_EXTENDING * projective.observations.len() as f64 {
         attempt.judged = Some(judged);
-        if !gained {
-            return Ok(Ended::Block(Some(Box::new(attempt))));
-        }
+        return Ok(Ended::Block(Some(Box::new(attempt))));
     }
-    let scene = Scene::new(context);
     if !attempt.has_metric()
         && let Some(start) = attempt.projective.take()
     {
-        recorder.enter(Stage::Extend);
-        attempt.projective = Some(projective::extend(&scene, start, &ProjectiveOptions::default(), recorder)?);
-        attempt::calibrate(&mut attempt, context, recorder)?;
-        attempt.judged = None;
+        extend_projectively(&mut attempt, start, context, recorder)?;
     }
     metric_of(attempt, context, recorder)
+}
+
+/// Extends what an attempt starts from to all views and tracks, and calibrates it anew.
+fn extend_projectively(
+    attempt: &mut Attempt,
+    start: Projective,
+    context: &Context,
+    recorder: &mut Recorder,
+) -> Result<(), Error> {
+    recorder.enter(Stage::Extend);
+    attempt.projective =
+        Some(projective::extend(&Scene::new(context), start, &ProjectiveOptions::default(), recorder)?);
+    attempt::calibrate(attempt, context, recorder)
 }
 
 /// The one of the two that has more merit, the first of equals.

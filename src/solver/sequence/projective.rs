@@ -15,6 +15,7 @@ use crate::geometry::bundle::{self, Loss, Observation};
 use crate::geometry::measurement::Sighting;
 use crate::geometry::robust_triangulation::{Robust, Triangulator};
 use crate::geometry::statistics::median;
+use crate::geometry::triangulation::reprojection;
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::block::Block;
 use crate::solver::grow::Consensus;
@@ -74,7 +75,7 @@ impl Projective {
         let last = support[chosen[most - 1]];
         let sure: Vec<usize> = chosen.iter().copied().filter(|&k| support[k] > last).collect();
         let equal: Vec<usize> = chosen.iter().copied().filter(|&k| support[k] == last).collect();
-        let mut chosen = [sure.clone(), crate::solver::evenly(&equal, most - sure.len())].concat();
+        let mut chosen = [sure.clone(), crate::solver::extend::evenly(&equal, most - sure.len())].concat();
         chosen.sort_unstable();
         self.select(&chosen)
     }
@@ -408,12 +409,7 @@ impl<'a> Growing<'a> {
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise_of(&self, standing: &Projective) -> f64 {
         let residual = |seen: &Observation| {
-            crate::geometry::triangulation::reprojection(
-                &standing.cameras[seen.camera],
-                &standing.points[seen.point],
-                &seen.xy,
-            )
-            .norm()
+            reprojection(&standing.cameras[seen.camera], &standing.points[seen.point], &seen.xy).norm()
         };
         let mut norms: Vec<f64> = standing.observations.iter().map(residual).collect();
         let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();

@@ -31,7 +31,6 @@ pub struct Study {
 
 /// What a prior says of every track, larger where it is more likely right.
 pub struct Ranking {
-    pub prior: Prior,
     pub weights: Vec<f64>,
     pub seconds: f64,
     opinion: Option<Opinion>,
@@ -66,7 +65,7 @@ impl Study {
             Prior::Learned => opinion.insert(Opinion::of(&self.block)?).probabilities(),
             Prior::Network | Prior::Rigidity => return None,
         };
-        Some(Ranking { prior, weights, seconds: begun.elapsed().as_secs_f64(), opinion })
+        Some(Ranking { weights, seconds: begun.elapsed().as_secs_f64(), opinion })
     }
 
     /// What the best hypothesis of so many samples under the trained network says of every track, larger where it is
