@@ -10,26 +10,26 @@
 //! cli -> rpc -> engine -> { store, solver } -> { network, geometry } -> domain
 //! ```
 //!
-//! Beside them [`evaluation`] holds the methods against the truth of [`synthetic`] scenes.
+//! Beside them `evaluation` holds the methods against the truth of [`synthetic`] scenes.
 //!
 //! Only [`rpc`] (and the client side of [`cli`]) sees prost and tonic, only [`store`] sees SQL
-//! (but for [`formats`], which reads COLMAP's databases), only [`network`] sees burn; [`geometry`] is plain f64 linear
+//! (but for `formats`, which reads COLMAP's databases), only `network` sees burn; `geometry` is plain f64 linear
 //! algebra.
 
 pub mod cli;
 pub mod config;
 pub mod domain;
 pub mod engine;
-pub mod evaluation;
-pub mod formats;
-pub mod geometry;
-pub mod network;
-pub mod parallel;
-pub mod report;
+pub(crate) mod evaluation;
+pub(crate) mod formats;
+pub(crate) mod geometry;
+pub(crate) mod network;
+pub(crate) mod parallel;
+pub(crate) mod report;
 pub mod rpc;
 mod simd;
 pub mod solver;
 pub mod store;
 pub mod synthetic;
 pub mod telemetry;
-pub mod training;
+pub(crate) mod training;

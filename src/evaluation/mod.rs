@@ -20,6 +20,4 @@ pub mod runner;
 pub mod summary;
 pub mod sweeps;
 
-pub use measures::Measures;
-pub use plan::{Contestant, Depths, Run};
 pub use sweeps::Sweep;

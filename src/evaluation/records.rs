@@ -115,12 +115,9 @@ impl<R: Serialize + DeserializeOwned + Sync, M: Serialize + DeserializeOwned + C
     }
 
     /// Number of runs recorded, those of other plans included.
+    #[cfg(test)]
     pub fn len(&self) -> usize {
         self.by_key.len()
-    }
-
-    pub fn is_empty(&self) -> bool {
-        self.by_key.is_empty()
     }
 
     fn add(&mut self, record: &Record<&R, M>) -> Result<(), Error> {

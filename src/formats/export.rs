@@ -21,6 +21,7 @@ pub enum Export {
 }
 
 impl Export {
+    #[cfg(test)]
     pub const ALL: [Export; 3] = [Export::Colmap, Export::ColmapText, Export::OpenSfm];
 
     /// Directory below that of the result files.

@@ -69,16 +69,6 @@ impl Fundamental {
         Self { matrix: epipole.cross_matrix(), epipole }
     }
 
-    /// `F` of `x_toᵀ F x_from = 0`, unit norm.
-    pub fn matrix(&self) -> &Matrix3<f64> {
-        &self.matrix
-    }
-
-    /// The epipole in the view `to`, homogeneous, unit norm.
-    pub fn epipole(&self) -> &Vector3<f64> {
-        &self.epipole
-    }
-
     /// Squared Sampson distance of a match (Hartley & Zisserman, eq. 11.9): to first order its squared distance in the
     /// units of the coordinates from the nearest match that fits exactly.
     pub fn sampson_squared(&self, seen: &Match) -> f64 {

@@ -46,10 +46,11 @@ pub mod subspace;
 #[cfg(test)]
 mod tests;
 
-pub use losses::{Evaluation, LossSettings};
 pub use parameter::Parameter;
 pub use pointnet::standard_normal;
-pub use prior::{DAQ_ONSET, Iteration, PriorNetwork};
+pub use prior::PriorNetwork;
+#[cfg(test)]
+use prior::{DAQ_ONSET, Iteration};
 pub use settings::NetworkSettings;
 
 /// Why the network could not be built or could not go on.

@@ -120,6 +120,7 @@ impl PriorNetwork {
         self.log_focal().exp()
     }
 
+    #[cfg(test)]
     /// Plane at infinity of the latest step, in the gauge of [`losses::evaluate`].
     pub fn plane_at_infinity(&self) -> [f64; 3] {
         self.plane_at_infinity
@@ -130,6 +131,7 @@ impl PriorNetwork {
         self.iteration
     }
 
+    #[cfg(test)]
     /// Gradients so far that were not finite and counted as 0.
     pub fn replaced_gradients(&self) -> u64 {
         self.replaced_gradients

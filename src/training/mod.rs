@@ -18,7 +18,6 @@ mod tests;
 mod trainer;
 mod unlabelled;
 
-pub use lesson::Losses;
 pub use objective::Objective;
 pub use trainer::{Milestone, Settings, Trainer};
 

@@ -22,7 +22,7 @@ use serde::Serialize;
 use crate::domain::StopToken;
 use child::{Ended, Limits, Usage};
 pub use folder::Sequence;
-pub use measures::{Answer, Scores};
+pub use measures::Scores;
 
 /// What is wrong with a file of a sequence.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

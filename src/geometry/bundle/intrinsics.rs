@@ -79,6 +79,7 @@ impl Intrinsics {
 
     /// Whether a point at this squared tangent of the angle from the optical axis lies before the fold, if there is
     /// one.
+    #[cfg(test)]
     pub fn images(&self, squared: f64) -> bool {
         self.fold().is_none_or(|fold| squared < fold)
     }

@@ -69,6 +69,7 @@ pub struct IntrinsicsModel {
 impl IntrinsicsModel {
     pub const FIXED: Self = Self { focal: false, extensions: [false; Extension::ALL.len()] };
     pub const FOCAL: Self = Self { focal: true, extensions: [false; Extension::ALL.len()] };
+    #[cfg(test)]
     pub const FULL: Self = Self { focal: true, extensions: [true; Extension::ALL.len()] };
 
     /// Every combination of extensions with the focal length free, the simplest first.

@@ -10,7 +10,7 @@ mod zoom;
 use nalgebra::{Matrix3, Matrix3x4, SMatrix, SVector, Vector3};
 
 pub use self::frame::{FirstViewFrame, to_first_view_frame};
-pub use self::starts::{linear, plane_from_second_view, scan, widest_views};
+pub use self::starts::{linear, scan};
 pub use self::zoom::{zoom_starts, zoomed};
 use super::bundle::metric::Intrinsics;
 use super::levenberg_marquardt::{self, MIN_DAMPING, Normal, Problem};

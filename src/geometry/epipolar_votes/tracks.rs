@@ -45,10 +45,6 @@ impl Tracks {
         self.ranges.len() - 1
     }
 
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
     /// The observations of a track.
     pub fn range(&self, track: usize) -> Range<usize> {
         self.ranges[track]..self.ranges[track + 1]

@@ -40,11 +40,12 @@ mod shipped;
 #[cfg(test)]
 mod tests;
 
-pub use arrays::{Block, Layer, PAIR_FEATURES, PairLayers, Shape, SubspaceNet};
+pub use arrays::{Block, Layer, PairLayers, Shape, SubspaceNet};
 pub use cloud::Cloud;
-pub use file::{FileError, Origin, PriorFile};
-pub use forward::Scores;
-pub use shipped::{current, current_checksum, install, shipped};
+pub use file::{Origin, PriorFile};
+#[cfg(test)]
+use shipped::shipped;
+pub use shipped::{current, current_checksum, install};
 
 /// Added to a squared residual before its logarithm is taken: residuals below .3 % of a view's spread are noise.
 pub const RESIDUAL_FLOOR: f32 = 1e-5;
