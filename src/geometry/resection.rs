@@ -73,7 +73,7 @@ fn six_points(points: &[Point; LEAST_POINTS], images: &[Vector2<f64>; LEAST_POIN
 ///
 /// * `gate`: squared residual below which an image agrees, in squared units of the images
 ///
-/// Reliable down to three right images in ten. Returns the camera and which images agree; `None` when fewer than
+/// Reliable down to three right images in ten; once `stop` fires, the best so far. Returns the camera and which images agree; `None` when fewer than
 /// `least` do.
 pub fn robust(
     points: &[Point],
@@ -81,6 +81,7 @@ pub fn robust(
     gate: f64,
     least: usize,
     rng: &mut ChaCha8Rng,
+    stop: &StopToken,
 ) -> Option<(Camera, Vec<bool>)> {
     if points.len() != images.len() {
         return None;
@@ -88,7 +89,7 @@ pub fn robust(
     let resection = Resection { points: points.iter().map(|point| point.normalize()).collect(), images };
     // Most images are right as a rule: all together first.
     let all = linear(points, images);
-    let found = ransac::estimate(&resection, gate, all, MOST_SAMPLES, rng, &StopToken::default())?;
+    let found = ransac::estimate(&resection, gate, all, MOST_SAMPLES, rng, stop)?;
     (found.inlier_count() >= least.max(LEAST_POINTS)).then_some((found.model, found.inlier))
 }
 
@@ -197,7 +198,7 @@ mod tests {
                 let (truth, points, images) = problem(seed, wrong);
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 let gate = 13.8 * 0.001f64.powi(2);
-                let (camera, agreeing) = robust(&points, &images, gate, 10, &mut rng)
+                let (camera, agreeing) = robust(&points, &images, gate, 10, &mut rng, &StopToken::default())
                     .unwrap_or_else(|| panic!("seed {seed}, {wrong} wrong"));
                 assert!(agreeing[..wrong].iter().all(|&agrees| !agrees), "seed {seed}");
                 let right = agreeing[wrong..].iter().filter(|&&agrees| agrees).count();
@@ -232,7 +233,7 @@ mod tests {
                 let (points, images, truth) = contaminated(seed, count);
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 let start = std::time::Instant::now();
-                let robust = robust(&points, &images, 13.8 * 0.001f64.powi(2), 9, &mut rng);
+                let robust = robust(&points, &images, 13.8 * 0.001f64.powi(2), 9, &mut rng, &StopToken::default());
                 seconds += start.elapsed().as_secs_f64();
                 let Some((camera, agreeing)) = robust else { continue };
                 found += 1;
@@ -260,7 +261,7 @@ mod tests {
         let (_, mut points, images) = problem(1, 0);
         points[7] = Point::zeros();
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let (_, agreeing) = robust(&points, &images, 13.8e-6, 10, &mut rng).expect("a camera");
+        let (_, agreeing) = robust(&points, &images, 13.8e-6, 10, &mut rng, &StopToken::default()).expect("a camera");
         assert!(!agreeing[7] && agreeing.iter().filter(|&&agrees| agrees).count() >= 37);
     }
 
@@ -270,10 +271,10 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let scattered: Vec<Vector2<f64>> =
             (0..40).map(|k| Vector2::new((k as f64 * 1.7).sin(), (k as f64 * 2.9).cos())).collect();
-        assert!(robust(&points, &scattered, 1e-5, 10, &mut rng).is_none());
+        assert!(robust(&points, &scattered, 1e-5, 10, &mut rng, &StopToken::default()).is_none());
         assert!(linear(&points[..5], &images[..5]).is_none());
         assert!(linear(&[Point::zeros(); 8], &images[..8]).is_none());
         let nan = vec![Point::from_element(f64::NAN); 8];
-        assert!(robust(&nan, &images[..8], 1.0, 6, &mut rng).is_none());
+        assert!(robust(&nan, &images[..8], 1.0, 6, &mut rng, &StopToken::default()).is_none());
     }
 }

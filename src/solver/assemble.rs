@@ -82,9 +82,8 @@ pub fn unsolved(
 ///
 /// With grade PROJECTIVE_ONLY nothing metric is in it, the focal length included: a number that must not be used is
 /// not given.
-pub fn solved(context: &Context, attempt: Attempt, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Solution {
+pub fn solved(context: &Context, mut attempt: Attempt, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Solution {
     recorder.enter(Stage::Judge);
-    let mut attempt = attempt;
     let already = attempt.judged.take();
     let attempt = &attempt;
     let (Some(projective), Some(calibration)) = (&attempt.projective, &attempt.calibration) else {
@@ -101,11 +100,8 @@ pub fn solved(context: &Context, attempt: Attempt, mut warnings: Vec<Warning>, m
     let frame = to_first_view_frame(&projective.cameras, &[]);
     let back = frame.as_ref().and_then(|frame| frame.homography.try_inverse()).unwrap_or_else(Matrix4::identity);
     judged.points.iter_mut().flatten().for_each(|point| *point = back * *point);
-    let splits = judged
-        .splits
-        .iter()
-        .map(|split| split_of(split, &back, &context.normalization.to_pixels(projective.views[0])))
-        .collect::<Vec<_>>();
+    let first_px = context.normalization.to_pixels(projective.views[0]);
+    let splits = judged.splits.iter().map(|split| split_of(split, &back, &first_px)).collect();
     let cameras = frame.map_or_else(|| projective.cameras.clone(), |frame| frame.cameras);
     let usable = calibration.metric.as_ref().filter(|_| calibration.grade != Grade::ProjectiveOnly);
     let groups: BTreeSet<u32> = context.input.views().iter().map(|view| view.camera_group).collect();
@@ -113,7 +109,6 @@ pub fn solved(context: &Context, attempt: Attempt, mut warnings: Vec<Warning>, m
     warnings.extend(calibration.warnings.iter().cloned().map(|warning| Warning { camera_group: only, ..warning }));
     warnings.extend(attempt.second_structure.clone());
 
-    let first_px = context.normalization.to_pixels(projective.views[0]);
     judged.tracks.point = final_points(context, attempt, usable, &judged, &first_px);
     judged.tracks.network_weight = network_weights(attempt, context);
     let (rms, mean) = reprojection(&judged.observations);

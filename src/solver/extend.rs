@@ -121,7 +121,7 @@ fn register(block: &Block, consensus: &Consensus, whole: &Block, context: &Conte
             return None;
         }
         let images: Vec<_> = inliers.iter().map(|&(_, place)| whole.complete.point(i, place)).collect();
-        resection::robust(&points, &images, gate, least, &mut rng).map(|(camera, _)| camera)
+        resection::robust(&points, &images, gate, least, &mut rng, context.stop).map(|(camera, _)| camera)
     };
     whole.views.iter().enumerate().map(&mut camera).collect()
 }

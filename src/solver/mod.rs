@@ -6,10 +6,9 @@
 //! whose tracks are complete: all of them, or a few; [`attempt`] searches such a block, by [`portfolio`] (priors,
 //! [`search`], [`grow`]; [`crowds`] are left aside, the [`likeliest`] of many tracks searched, [`chance`] verifies;
 //! [`depths`] where those verify what image points cannot; [`extend`] to complete tracks and views that a search leaves
-//! aside) or [`direct`], and [`calibration`] upgrades it. By image
-//! points, [`sequence`] tries blocks in order of cost and extends what stands to the other views and tracks,
-//! projectively or metrically, observation by observation; [`judge`] has the last word on every track and observation;
-//! [`assemble`] writes it down.
+//! aside) or [`direct`], and [`calibration`] upgrades it. By image points, [`sequence`] tries blocks in order of cost and
+//! extends what stands to the other views and tracks, projectively or metrically, observation by observation; [`judge`]
+//! has the last word on every track and observation; [`assemble`] writes it down.
 
 mod agreement;
 mod assemble;

@@ -11,13 +11,13 @@ use crate::solver::calibration;
 use crate::solver::recorder::Recorder;
 
 /// Scale of the Cauchy loss in units of the core noise: detectors have tails that a wider one would follow.
-const CAUCHY_SCALE: f64 = 2.0;
+pub const CAUCHY_SCALE: f64 = 2.0;
 /// Iterations around a new view, while views are added, which start at what was adjusted before, and at the end.
 const ITERATIONS_AROUND: usize = 3;
 const ITERATIONS_WHILE_GROWING: usize = 6;
 const ITERATIONS: usize = 20;
 /// Cost gained by a step, as a share, below which an adjustment that will be repeated ends.
-const TOLERANCE: f64 = 1e-4;
+pub const TOLERANCE: f64 = 1e-4;
 /// Observations of a view that an adjustment while growing holds.
 const OF_VIEW_WHILE_GROWING: usize = 100;
 /// Views that are free in the adjustment around a new one: those that share most points with it.
@@ -121,12 +121,18 @@ impl Extract {
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise(&self, scene: &Scene) -> f64 {
-        let mut norms: Vec<f64> = self.sightings.iter().map(|seen| self.sequence.residual(seen).norm()).collect();
+        let norms: Vec<f64> = self.sightings.iter().map(|seen| self.sequence.residual(seen).norm()).collect();
         let of_view = if scene.zooms() { 7 } else { 6 };
         let unknowns = of_view * self.views.len() + 3 * self.tracks.len();
-        let freedom = 1.0 - unknowns as f64 / (2 * self.sightings.len()).max(1) as f64;
-        median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(LEAST_FREEDOM).sqrt()
+        core_noise(norms, unknowns)
     }
+}
+
+/// Core noise, one standard deviation of a coordinate, by the median of these norms of residuals, for what their freedom
+/// leaves of it.
+pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> f64 {
+    let freedom = 1.0 - unknowns as f64 / (2 * norms.len()).max(1) as f64;
+    median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(LEAST_FREEDOM).sqrt()
 }
 
 /// What is known of the intrinsics of a lens before any observation.

@@ -201,6 +201,9 @@ fn by_projective_extension(
         recorder.enter(Stage::Extend);
         let extended = projective::extend(&scene, start, &options, recorder)?;
         if extended.views.len() < block::LEAST_VIEWS || extended.tracks.len() < LEAST_INLIERS {
+            // The reason is that of an attempt without a consensus: nothing stands.
+            attempt.consensus = None;
+            unsolved = unsolved.or(Some(attempt));
             continue;
         }
         attempt.projective = Some(extended);

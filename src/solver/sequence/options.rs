@@ -1,4 +1,6 @@
-//! Every threshold of the extension, with its reason.
+//! The thresholds of the projective growth, with their reasons.
+
+use super::adjust::{CAUCHY_SCALE, TOLERANCE};
 
 /// How a projective reconstruction grows.
 #[derive(Debug, Clone, PartialEq)]
@@ -8,7 +10,7 @@ pub struct ProjectiveOptions {
     /// Points that a view must see and that must agree with its camera: six determine it, and each of the others agrees
     /// with a wrong one by chance in a few cases of a thousand.
     pub least_agreeing: usize,
-    /// Share of the points seen that must agree.
+    /// Share of the points seen that must agree: more than the three tenths down to which resection is reliable.
     pub least_share: f64,
     /// Points of a view beyond which its camera is not made better.
     pub most_resected: usize,
@@ -31,8 +33,6 @@ pub struct ProjectiveOptions {
     pub cauchy_scale: f64,
     /// Noise that may be found, in that of the start: without a bound wrong observations widen their own gates.
     pub noise_growth: f64,
-    /// Least share of the observations' freedom that is left to the residuals, however few points there are.
-    pub least_freedom: f64,
 }
 
 impl Default for ProjectiveOptions {
@@ -49,10 +49,9 @@ impl Default for ProjectiveOptions {
             growing_iterations: 6,
             final_iterations: 10,
             final_rounds: 3,
-            tolerance: 1e-4,
-            cauchy_scale: 2.0,
+            tolerance: TOLERANCE,
+            cauchy_scale: CAUCHY_SCALE,
             noise_growth: 4.0,
-            least_freedom: 0.2,
         }
     }
 }

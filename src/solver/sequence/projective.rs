@@ -8,13 +8,13 @@ use nalgebra::{Matrix4, Vector2, Vector4};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
+use super::adjust;
 use super::model::Scene;
 use super::options::ProjectiveOptions;
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, Loss, Observation};
 use crate::geometry::measurement::Sighting;
 use crate::geometry::robust_triangulation::{Robust, Triangulator};
-use crate::geometry::statistics::median;
 use crate::geometry::triangulation::reprojection;
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::block::Block;
@@ -24,8 +24,6 @@ use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, grow};
 
-/// Median of the norm of two independent normal coordinates (Rayleigh), in standard deviations.
-const RAYLEIGH_MEDIAN: f64 = 1.177_41;
 /// Unknowns of a projective camera.
 const CAMERA_UNKNOWNS: usize = 11;
 
@@ -62,7 +60,7 @@ impl Projective {
         }
     }
 
-    /// The tracks with most observations, about evenly over the views: a calibration takes no more than these.
+    /// The tracks with most observations, evenly among equals: a calibration takes no more than these.
     pub fn most_observed(&self, most: usize) -> Self {
         let mut support = vec![0usize; self.tracks.len()];
         self.observations.iter().for_each(|seen| support[seen.point] += 1);
@@ -75,7 +73,7 @@ impl Projective {
         let last = support[chosen[most - 1]];
         let sure: Vec<usize> = chosen.iter().copied().filter(|&k| support[k] > last).collect();
         let equal: Vec<usize> = chosen.iter().copied().filter(|&k| support[k] == last).collect();
-        let mut chosen = [sure.clone(), crate::solver::extend::evenly(&equal, most - sure.len())].concat();
+        let mut chosen = [crate::solver::extend::evenly(&equal, most - sure.len()), sure].concat();
         chosen.sort_unstable();
         self.select(&chosen)
     }
@@ -343,7 +341,9 @@ impl<'a> Growing<'a> {
             seen.iter().filter_map(|&k| Some((self.points[scene.track_of(k)]?, scene.xy[k]))).unzip();
         let gate = judge::working_gate(self.noise, scene.outlier_density);
         let least = self.options.least_agreeing.max((self.options.least_share * points.len() as f64).ceil() as usize);
-        let Some((camera, agrees)) = resection::robust(&points, &images, gate, least, rng) else { return false };
+        let Some((camera, agrees)) = resection::robust(&points, &images, gate, least, rng, scene.stop()) else {
+            return false;
+        };
         let depths = points.iter().zip(&agrees).filter(|(_, agrees)| **agrees);
         let sign: f64 = depths.map(|(point, _)| ((camera.row(2) * point).x * point.w).signum()).sum();
         self.cameras[view] = Some(if sign < 0.0 { -camera } else { camera });
@@ -411,10 +411,9 @@ impl<'a> Growing<'a> {
         let residual = |seen: &Observation| {
             reprojection(&standing.cameras[seen.camera], &standing.points[seen.point], &seen.xy).norm()
         };
-        let mut norms: Vec<f64> = standing.observations.iter().map(residual).collect();
+        let norms: Vec<f64> = standing.observations.iter().map(residual).collect();
         let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();
-        let freedom = 1.0 - unknowns as f64 / (2 * standing.observations.len()).max(1) as f64;
-        let noise = median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(self.options.least_freedom).sqrt();
+        let noise = adjust::core_noise(norms, unknowns);
         let (least, most) = grow::NOISE_BOUNDS;
         noise.clamp(least, (self.options.noise_growth * self.start_noise).min(most))
     }
