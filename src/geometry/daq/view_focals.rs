@@ -1,0 +1,76 @@
+//! The quadric where every view has a focal length of its own.
+
+use nalgebra::{Matrix3x4, Vector3};
+
+use super::starts::{SCAN_RANGE, linear, plane_from_focals, widest_views};
+use super::{Daq, infinite_homography};
+
+/// Focal lengths of the first view that are tried, views that the plane at infinity is taken from, and the ratios of the
+/// focal lengths of the two.
+const FOCALS: usize = 20;
+const VIEWS: usize = 4;
+const RATIOS: [f64; 5] = [0.5, 0.71, 1.0, 1.41, 2.0];
+
+/// Focal length that the quadric gives a view, and how far the view is from zero skew, square pixels and a principal
+/// point in the origin: a squared distance without unit.
+///
+/// Returns `None` where the quadric gives no focal length.
+pub fn view_focal(camera: &Matrix3x4<f64>, daq: &Daq) -> Option<(f64, f64)> {
+    let homography = infinite_homography(camera, daq);
+    let seen = homography * daq.diac() * homography.transpose();
+    let squared = 0.5 * (seen.m11 + seen.m22) / seen.m33;
+    let unit = 0.5 * (seen.m11 + seen.m22);
+    let skew = (seen.m12 / unit).powi(2) + (0.5 * (seen.m11 - seen.m22) / unit).powi(2);
+    let centre = (seen.m13 * seen.m13 + seen.m23 * seen.m23) / (unit * seen.m33).abs();
+    let usable = squared > 0.0 && squared.is_finite() && skew.is_finite() && centre.is_finite();
+    usable.then(|| (squared.sqrt(), skew + centre))
+}
+
+/// Quadrics to start from, best first: the linear one, which asks for no constant focal length, and the planes at
+/// infinity that pairs of focal lengths give in closed form. `daq.intrinsics` is the first view's.
+pub fn view_focal_starts(cameras: &[Matrix3x4<f64>]) -> Vec<(Daq, f64)> {
+    let cost =
+        |daq: &Daq| cameras.iter().map(|camera| view_focal(camera, daq).map_or(1.0, |(_, cost)| cost.min(1.0))).sum();
+    let mut found: Vec<(Daq, f64)> = linear(cameras).into_iter().map(|daq| (daq, cost(&daq))).collect();
+    let spacing = (SCAN_RANGE.1 / SCAN_RANGE.0).ln() / (FOCALS - 1) as f64;
+    for view in widest_views(cameras).into_iter().take(VIEWS) {
+        for step in 0..FOCALS {
+            let focal = SCAN_RANGE.0 * (spacing * step as f64).exp();
+            let planes = RATIOS.iter().filter_map(|ratio| plane_from_focals(&cameras[view], focal, ratio * focal));
+            for plane in planes.flatten().filter(|plane: &Vector3<f64>| plane.iter().all(|value| value.is_finite())) {
+                let daq = Daq::new(focal, plane);
+                found.push((daq, cost(&daq)));
+            }
+        }
+    }
+    found.sort_by(|a, b| a.1.total_cmp(&b.1));
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::bundle::metric::Intrinsics;
+    use super::super::super::bundle::testing;
+    use super::super::to_first_view_frame;
+    use super::*;
+
+    #[test]
+    fn a_start_is_near_every_focal_length() {
+        let mut near = 0;
+        for seed in 0..10 {
+            let scene = testing::scene(seed, 8, 20, 0.0);
+            let focals: Vec<f64> = (0..8).map(|view| 1.0 + 0.1 * view as f64).collect();
+            let camera = |(view, focal): (usize, &f64)| scene.poses[view].camera(&Intrinsics::from_focal(*focal));
+            let cameras: Vec<_> = focals.iter().enumerate().map(camera).collect();
+            let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
+            let (best, cost) = view_focal_starts(&frame.cameras)[0];
+            let worst = frame.cameras.iter().zip(&focals).map(|(camera, focal)| {
+                view_focal(camera, &best).map_or(f64::INFINITY, |(found, _)| (found / focal).ln().abs())
+            });
+            let worst = worst.fold(0.0, f64::max);
+            println!("seed {seed}: cost {cost:.2e}, worst focal length off by {worst:.3}");
+            near += usize::from(worst < 0.3);
+        }
+        assert!(near >= 8, "{near} of 10");
+    }
+}
