@@ -251,8 +251,8 @@ pub struct SettingsArgs {
     #[arg(long, value_name = "PX")]
     pub noise_px: Option<f64>,
 
-    /// A focal length a view (a zoom) instead of one for all: the grade is WEAK at best then, lens and priors are not
-    /// looked at
+    /// A focal length a view (a zoom) instead of one for all: the grade is WEAK at best then, all views share one lens,
+    /// and camera groups and priors are not looked at
     #[arg(long)]
     pub focal_per_view: bool,
 

@@ -55,7 +55,7 @@ pub struct Losses {
 pub enum Task {
     /// Adjusting everything and triangulating it anew; steps are rounds.
     Adjust,
-    /// Calibrating camera groups, or runs of views that zoom; steps are these.
+    /// Calibrating camera groups, or runs of views that each have a focal length of their own; steps are these.
     Cameras,
     /// Asking windows of the sequence what focal length each sees; steps are windows.
     Windows,

@@ -87,6 +87,10 @@ impl Prior {
 }
 
 /// Intrinsics of one camera group, with their uncertainty.
+///
+/// A point at `(u, v, 1)` in camera coordinates, with `r^2 = u^2 + v^2` and `s = 1 + k1 r^2 + k2 r^4 + k3 r^6`, is
+/// imaged at `x = f (u s + 2 p1 u v + p2 (r^2 + 2 u^2)) + px`, `y = aspect f (v s + p1 (r^2 + 2 v^2) + 2 p2 u v) + py`:
+/// Brown's model (1971) under OpenCV's names. A coefficient is 0 (all: a pinhole) unless the data asked for more.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// Horizontal focal length; the geometric mean where every view has its own, see [`ViewResult::focal_px`].
@@ -98,13 +102,21 @@ pub struct Calibration {
     /// Vertical over horizontal focal length; 1 (square pixels) unless the data asked for more.
     #[serde(default = "square_pixels")]
     pub aspect: f64,
-    /// Radial distortion: a point at `(u, v, 1)` in camera coordinates is imaged at `x = f u s + px`, `y = aspect f v s
-    /// + py` with `s = 1 + k1 r^2 + k2 r^4`, `r^2 = u^2 + v^2`. 0 (a pinhole) unless the data asked for more.
+    /// Radial distortion: the first coefficient, `k1`.
     #[serde(default)]
     pub radial_k1: f64,
     /// The second coefficient, `k2`.
     #[serde(default)]
     pub radial_k2: f64,
+    /// The third coefficient, `k3`.
+    #[serde(default)]
+    pub radial_k3: f64,
+    /// Tangential distortion: the first coefficient, `p1`.
+    #[serde(default)]
+    pub tangential_p1: f64,
+    /// The second coefficient, `p2`.
+    #[serde(default)]
+    pub tangential_p2: f64,
     /// How far the group's own calibration can be relied on; that of the result is the worst of its groups. `None`: an
     /// older server did not say.
     #[serde(default)]
@@ -127,13 +139,22 @@ pub struct Sigmas {
     pub aspect: Option<f64>,
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
+    pub radial_k3: Option<f64>,
+    pub tangential_p1: Option<f64>,
+    pub tangential_p2: Option<f64>,
 }
 
 impl Calibration {
-    /// What the lens makes of a point at this squared tangent of the angle from the optical axis: the scale `s` of
-    /// [`Self::radial_k1`].
-    pub fn radial_scale(&self, squared: f64) -> f64 {
-        1.0 + squared * (self.radial_k1 + squared * self.radial_k2)
+    /// Where the lens puts a point at `(u, v, 1)` in camera coordinates: the distorted point at unit depth, which focal
+    /// length, aspect and principal point then take to pixels.
+    pub fn distort(&self, u: f64, v: f64) -> [f64; 2] {
+        let squared = u * u + v * v;
+        let s = 1.0 + squared * (self.radial_k1 + squared * (self.radial_k2 + squared * self.radial_k3));
+        let (p1, p2) = (self.tangential_p1, self.tangential_p2);
+        [
+            u * s + 2.0 * p1 * u * v + p2 * (squared + 2.0 * u * u),
+            v * s + p1 * (squared + 2.0 * v * v) + 2.0 * p2 * u * v,
+        ]
     }
 }
 
@@ -366,5 +387,27 @@ mod tests {
         for grade in [Grade::Metric, Grade::Weak, Grade::ProjectiveOnly] {
             assert_eq!(serde_json::to_value(grade).expect("serialisable"), grade.name());
         }
+    }
+
+    #[test]
+    fn the_lens_is_browns() {
+        let pinhole: Calibration =
+            serde_json::from_str(r#"{"focal_px": 900, "sigma_log_focal": null, "principal_point_px": [450, 600]}"#)
+                .expect("a calibration of the first version");
+        assert_eq!(pinhole.distort(0.5, -0.25), [0.5, -0.25]);
+        let lens = Calibration {
+            radial_k1: 0.5,
+            radial_k2: -0.25,
+            radial_k3: 2.0,
+            tangential_p1: 0.125,
+            tangential_p2: -0.0625,
+            ..pinhole
+        };
+        // r^2 = 2 and s = 1 + 1 - 1 + 16 = 17. With v = 1 the shifts are .25 - .25 and .5 - .125, with v = -1 they are
+        // -.25 - .25 and .5 + .125.
+        assert_eq!(lens.distort(1.0, 1.0), [17.0, 17.375]);
+        assert_eq!(lens.distort(1.0, -1.0), [16.5, -16.375]);
+        // r^2 = 1 and s = 3.25: the shift along the axis is 3 p2, the one across it p1.
+        assert_eq!(lens.distort(1.0, 0.0), [3.0625, 0.125]);
     }
 }

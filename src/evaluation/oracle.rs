@@ -150,11 +150,7 @@ impl<'a> World<'a> {
             })
             .collect();
         let points = true_points(truth, &inliers);
-        let mut found = Reconstruction {
-            intrinsics: Intrinsics::from_focal(self.focal),
-            poses: self.poses.clone(),
-            points: points.clone(),
-        };
+        let mut found = Reconstruction::new(Intrinsics::from_focal(self.focal), self.poses.clone(), points.clone());
         let bound = Information::new(&found, &observations).and_then(|information| {
             information.optimum(IntrinsicsModel::FOCAL, &IntrinsicsPrior::NONE).variance_of(Parameter::LogFocal)
         });

@@ -18,8 +18,8 @@ pub struct CamerasJson {
 }
 
 /// One view: `x ~ P X` in pixels, in the frame `P1 = [I|0]` of the first registered view of its part; `x ~ K (R X + t)`
-/// where the result is metric, before the radial distortion `radial_k1`, `radial_k2`. Matrices row by row; null where
-/// there is none.
+/// where the result is metric, before the distortion `radial_k1` to `tangential_p2`, see [`Calibration`]. Matrices row
+/// by row; null where there is none.
 #[derive(Debug, Clone, Serialize)]
 #[allow(non_snake_case, reason = "the field's names for these matrices are capitals")]
 pub struct CameraJson {
@@ -34,6 +34,9 @@ pub struct CameraJson {
     pub t: Option<[f64; 3]>,
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
+    pub radial_k3: Option<f64>,
+    pub tangential_p1: Option<f64>,
+    pub tangential_p2: Option<f64>,
     /// The input's number of the view's camera; its calibration is among the `cameras` of `result.json`.
     pub camera_group: u32,
     /// One standard deviation of the log focal length of the group, for a view with a K; null there: unobservable.
@@ -43,6 +46,9 @@ pub struct CameraJson {
     pub sigma_aspect: Option<f64>,
     pub sigma_radial_k1: Option<f64>,
     pub sigma_radial_k2: Option<f64>,
+    pub sigma_radial_k3: Option<f64>,
+    pub sigma_tangential_p1: Option<f64>,
+    pub sigma_tangential_p2: Option<f64>,
     /// Why the view is not registered: where no view is, that of the whole.
     pub left_out: Option<ReasonJson>,
 }
@@ -86,12 +92,18 @@ impl CamerasJson {
                 t: view.translation.filter(|_| is_metric),
                 radial_k1: calibration.map(|calibration| calibration.radial_k1),
                 radial_k2: calibration.map(|calibration| calibration.radial_k2),
+                radial_k3: calibration.map(|calibration| calibration.radial_k3),
+                tangential_p1: calibration.map(|calibration| calibration.tangential_p1),
+                tangential_p2: calibration.map(|calibration| calibration.tangential_p2),
                 camera_group: view.camera_group,
                 sigma_log_focal: calibration.and_then(|calibration| calibration.sigma_log_focal),
                 sigma_principal_point_px: calibration.and_then(|calibration| calibration.sigmas.principal_point_px),
                 sigma_aspect: calibration.and_then(|calibration| calibration.sigmas.aspect),
                 sigma_radial_k1: calibration.and_then(|calibration| calibration.sigmas.radial_k1),
                 sigma_radial_k2: calibration.and_then(|calibration| calibration.sigmas.radial_k2),
+                sigma_radial_k3: calibration.and_then(|calibration| calibration.sigmas.radial_k3),
+                sigma_tangential_p1: calibration.and_then(|calibration| calibration.sigmas.tangential_p1),
+                sigma_tangential_p2: calibration.and_then(|calibration| calibration.sigmas.tangential_p2),
                 left_out: view.left_out.map(ReasonJson::from).or_else(|| of_all.cloned()),
             }
         };

@@ -57,10 +57,16 @@ fn worst_of_opensfm(json: &Value, input: &LabelledInput, solution: &Solution) ->
         let d = 1.0 + number(&camera["k1"]) * squared + number(&camera["k2"]) * squared * squared;
         let (u, v) = match camera["projection_type"].as_str() {
             Some("perspective") => (number(&camera["focal"]) * d * x, number(&camera["focal"]) * d * y),
-            Some("brown") => (
-                number(&camera["focal_x"]) * d * x + number(&camera["c_x"]),
-                number(&camera["focal_y"]) * d * y + number(&camera["c_y"]),
-            ),
+            Some("brown") => {
+                let d = d + number(&camera["k3"]) * squared.powi(3);
+                let (p1, p2) = (number(&camera["p1"]), number(&camera["p2"]));
+                let x_shift = 2.0 * p1 * x * y + p2 * (squared + 2.0 * x * x);
+                let y_shift = p1 * (squared + 2.0 * y * y) + 2.0 * p2 * x * y;
+                (
+                    number(&camera["focal_x"]) * (x * d + x_shift) + number(&camera["c_x"]),
+                    number(&camera["focal_y"]) * (y * d + y_shift) + number(&camera["c_y"]),
+                )
+            }
             other => panic!("{other:?} is not a type of ours"),
         };
         let (w, h) = (number(&camera["width"]), number(&camera["height"]));
@@ -84,16 +90,17 @@ fn scene_of(calibration: Calibration, size: ImageSize) -> (LabelledInput, Soluti
         let seen: [f64; 3] = std::array::from_fn(|row| {
             (0..3).map(|axis| rotation[row][axis] * point[axis]).sum::<f64>() + translation[row]
         });
-        let (u, v) = (seen[0] / seen[2], seen[1] / seen[2]);
-        let s = calibration.radial_scale(u * u + v * v);
+        let [x, y] = calibration.distort(seen[0] / seen[2], seen[1] / seen[2]);
         let [px, py] = calibration.principal_point_px;
-        input.raw.x[k] = calibration.focal_px * u * s + px;
-        input.raw.y[k] = calibration.aspect * calibration.focal_px * v * s + py;
+        input.raw.x[k] = calibration.focal_px * x + px;
+        input.raw.y[k] = calibration.aspect * calibration.focal_px * y + py;
     }
     (input, solution)
 }
 
-fn lens(aspect: f64, [radial_k1, radial_k2]: [f64; 2], principal_point_px: [f64; 2]) -> Calibration {
+/// * `coefficients`: `k1`, `k2`, `k3`, `p1`, `p2`
+fn lens(aspect: f64, coefficients: [f64; 5], principal_point_px: [f64; 2]) -> Calibration {
+    let [radial_k1, radial_k2, radial_k3, tangential_p1, tangential_p2] = coefficients;
     Calibration {
         focal_px: 900.0,
         sigma_log_focal: Some(0.01),
@@ -101,6 +108,9 @@ fn lens(aspect: f64, [radial_k1, radial_k2]: [f64; 2], principal_point_px: [f64;
         aspect,
         radial_k1,
         radial_k2,
+        radial_k3,
+        tangential_p1,
+        tangential_p2,
         grade: None,
         sigmas: Default::default(),
     }
@@ -111,9 +121,13 @@ fn opensfm_sees_the_points_where_they_were_observed() {
     let size = ImageSize { width_px: 900, height_px: 1200 };
     let middle = [449.5, 599.5];
     for (calibration, kind) in [
-        (lens(1.0, [-0.05, 0.01], middle), "perspective"),
-        (lens(1.0, [0.0, 0.0], [440.0, 610.0]), "brown"),
-        (lens(1.1, [-0.05, 0.01], [440.0, 610.0]), "brown"),
+        (lens(1.0, [-0.05, 0.01, 0.0, 0.0, 0.0], middle), "perspective"),
+        (lens(1.0, [0.0; 5], [440.0, 610.0]), "brown"),
+        (lens(1.1, [-0.05, 0.01, 0.0, 0.0, 0.0], [440.0, 610.0]), "brown"),
+        (lens(1.0, [-0.05, 0.01, 0.02, 0.0, 0.0], middle), "brown"),
+        (lens(1.0, [0.0, 0.0, 0.0, 0.01, 0.0], middle), "brown"),
+        (lens(1.0, [0.0, 0.0, 0.0, 0.0, 0.02], middle), "brown"),
+        (lens(1.1, [-0.05, 0.01, 0.02, 0.01, -0.02], [440.0, 610.0]), "brown"),
     ] {
         let (input, solution) = scene_of(calibration, size);
         let json = opensfm::reconstruction::json(&[model_of(&solution, &input)]);
@@ -132,17 +146,29 @@ fn opensfm_sees_the_points_where_they_were_observed() {
 #[test]
 fn colmap_gets_the_simplest_camera_that_says_the_same_half_a_pixel_on() {
     let size = ImageSize { width_px: 900, height_px: 1200 };
-    for (calibration, line) in [
-        (lens(1.0, [0.0, 0.0], [449.5, 599.5]), "1 SIMPLE_PINHOLE 900 1200 900 450 600"),
-        (lens(1.25, [0.0, 0.0], [449.5, 599.5]), "1 PINHOLE 900 1200 900 1125 450 600"),
-        (lens(1.0, [0.5, 0.0], [449.5, 599.5]), "1 SIMPLE_RADIAL 900 1200 900 450 600 0.5"),
-        (lens(1.0, [0.5, -0.25], [449.5, 599.5]), "1 RADIAL 900 1200 900 450 600 0.5 -0.25"),
-        (lens(1.25, [0.5, 0.25], [449.5, 599.5]), "1 OPENCV 900 1200 900 1125 450 600 0.5 0.25 0 0"),
+    for (aspect, coefficients, model, parameters) in [
+        (1.0, [0.0; 5], "SIMPLE_PINHOLE", "900 450 600"),
+        (1.25, [0.0; 5], "PINHOLE", "900 1125 450 600"),
+        (1.0, [0.5, 0.0, 0.0, 0.0, 0.0], "SIMPLE_RADIAL", "900 450 600 0.5"),
+        (1.0, [0.5, -0.25, 0.0, 0.0, 0.0], "RADIAL", "900 450 600 0.5 -0.25"),
+        (1.0, [0.0, -0.25, 0.0, 0.0, 0.0], "RADIAL", "900 450 600 0 -0.25"),
+        (1.25, [0.5, 0.25, 0.0, 0.0, 0.0], "OPENCV", "900 1125 450 600 0.5 0.25 0 0"),
+        (1.0, [0.5, 0.25, 0.0, 0.125, -0.0625], "OPENCV", "900 900 450 600 0.5 0.25 0.125 -0.0625"),
+        (1.0, [0.0, 0.0, 0.0, 0.0, 0.125], "OPENCV", "900 900 450 600 0 0 0 0.125"),
+        (1.0, [0.5, 0.25, 2.0, 0.0, 0.0], "FULL_OPENCV", "900 900 450 600 0.5 0.25 0 0 2 0 0 0"),
+        (1.25, [0.0, 0.0, 2.0, 0.125, -0.5], "FULL_OPENCV", "900 1125 450 600 0 0 0.125 -0.5 2 0 0 0"),
     ] {
-        let (input, solution) = scene_of(calibration, size);
-        let [cameras, ..] = colmap::write::text(&model_of(&solution, &input));
-        assert_eq!(cameras.lines().nth(1), Some(line));
+        let (input, solution) = scene_of(lens(aspect, coefficients, [449.5, 599.5]), size);
+        let of_result = model_of(&solution, &input);
+        let [cameras, ..] = colmap::write::text(&of_result);
+        assert_eq!(cameras.lines().nth(1), Some(format!("1 {model} 900 1200 {parameters}").as_str()));
         assert_eq!(cameras.lines().count(), 2);
+        // A count, the camera's id, the model's, two sides, and as many parameters as COLMAP expects of the model.
+        let [cameras, ..] = colmap::write::binary(&of_result);
+        let known = colmap::cameras::Model::of_name(model).expect("a model of COLMAP's");
+        assert_eq!(known.parameters, parameters.split(' ').count());
+        assert_eq!(cameras[12..16], (known.id as i32).to_le_bytes());
+        assert_eq!(cameras.len(), 8 + 4 + 4 + 16 + 8 * known.parameters);
     }
 }
 

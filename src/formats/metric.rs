@@ -33,7 +33,7 @@ pub struct Model {
     pub points: Vec<Point>,
 }
 
-/// Intrinsics: `x = f u s + px`, `y = aspect f v s + py` with `s` its radial scale.
+/// Intrinsics of images that share them, see [`Calibration`], and the images' size.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Camera {
     pub id: u32,
@@ -123,10 +123,9 @@ impl Image {
     /// Where a point is imaged, in pixels.
     fn project(&self, camera: &Camera, position: [f64; 3]) -> [f64; 2] {
         let seen = self.rotation * Vector3::from(position) + Vector3::from(self.translation);
-        let (u, v) = (seen.x / seen.z, seen.y / seen.z);
+        let [x, y] = camera.intrinsics.distort(seen.x / seen.z, seen.y / seen.z);
         let Calibration { focal_px, principal_point_px: [px, py], aspect, .. } = camera.intrinsics;
-        let s = camera.intrinsics.radial_scale(u * u + v * v);
-        [focal_px * u * s + px, aspect * focal_px * v * s + py]
+        [focal_px * x + px, aspect * focal_px * y + py]
     }
 }
 

@@ -47,10 +47,16 @@ fn the_fields_of_result_json_are_a_contract() {
         "aspect",
         "radial_k1",
         "radial_k2",
+        "radial_k3",
+        "tangential_p1",
+        "tangential_p2",
         "sigma_principal_point_px",
         "sigma_aspect",
         "sigma_radial_k1",
         "sigma_radial_k2",
+        "sigma_radial_k3",
+        "sigma_tangential_p1",
+        "sigma_tangential_p2",
         "cameras",
         "plane_at_infinity",
         "inlier_tracks",
@@ -114,9 +120,18 @@ fn a_projective_result_gives_no_calibration_and_says_why() {
     let result = json(&solution);
     assert_eq!((&result["status"], &result["grade"]), (&"SOLVED".into(), &"PROJECTIVE_ONLY".into()));
     assert_eq!(result["focal_unobservable"], true);
-    for field in
-        ["focal_px", "sigma_log_focal", "principal_point_px", "aspect", "radial_k1", "radial_k2", "plane_at_infinity"]
-    {
+    for field in [
+        "focal_px",
+        "sigma_log_focal",
+        "principal_point_px",
+        "aspect",
+        "radial_k1",
+        "radial_k2",
+        "radial_k3",
+        "tangential_p1",
+        "tangential_p2",
+        "plane_at_infinity",
+    ] {
         assert_eq!(result[field], Value::Null, "{field}");
     }
     assert_eq!((&result["registered_views"], &result["inlier_tracks"]), (&5.into(), &20.into()));
@@ -137,8 +152,18 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
         aspect: 1.25,
         radial_k1: 0.01,
         radial_k2: 0.002,
+        radial_k3: -0.0005,
+        tangential_p1: 0.0625,
+        tangential_p2: -0.125,
         grade: Some(Grade::ProjectiveOnly),
-        sigmas: Sigmas { principal_point_px: Some([3.0, 4.0]), radial_k1: Some(0.002), ..Sigmas::default() },
+        sigmas: Sigmas {
+            principal_point_px: Some([3.0, 4.0]),
+            radial_k1: Some(0.002),
+            radial_k3: Some(0.0004),
+            tangential_p1: Some(0.03),
+            tangential_p2: Some(0.04),
+            ..Sigmas::default()
+        },
     };
     solution.calibrations.push(second);
     solution.views[3].camera_group = 9;
@@ -161,10 +186,16 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
         "aspect",
         "radial_k1",
         "radial_k2",
+        "radial_k3",
+        "tangential_p1",
+        "tangential_p2",
         "sigma_principal_point_px",
         "sigma_aspect",
         "sigma_radial_k1",
         "sigma_radial_k2",
+        "sigma_radial_k3",
+        "sigma_tangential_p1",
+        "sigma_tangential_p2",
         "grade",
         "warnings",
     ];
@@ -191,6 +222,22 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     assert_eq!((&found[1]["sigma_aspect"], &found[0]["sigma_radial_k1"]), (&Value::Null, &Value::Null));
     assert_eq!((cameras.views[3].sigma_radial_k1, cameras.views[0].sigma_radial_k1), (Some(0.002), None));
     assert_eq!((cameras.views[0].radial_k1, cameras.views[3].radial_k1), (Some(-0.02), Some(0.01)));
+    let views = serde_json::to_value(&cameras).expect("serialisable");
+    for (field, value, sigma) in
+        [("radial_k3", -0.0005, 0.0004), ("tangential_p1", 0.0625, 0.03), ("tangential_p2", -0.125, 0.04)]
+    {
+        let error = format!("sigma_{field}");
+        assert_eq!((&found[0][field], &found[0][&error]), (&0.0.into(), &Value::Null), "{field}");
+        for of in [&found[1], &views["views"][3]] {
+            assert_eq!((&of[field], &of[&error]), (&value.into(), &sigma.into()), "{field}");
+        }
+    }
+    // The first group that has registered views is the summary's own.
+    solution.views.iter_mut().filter(|view| view.camera_group == 0).for_each(|view| view.projection = None);
+    let summary = json(&solution);
+    for field in keys(&found[1]).into_iter().filter(|field| field.contains("radial") || field.contains("tangential")) {
+        assert_eq!(summary[field], found[1][field], "{field}");
+    }
 }
 
 #[test]

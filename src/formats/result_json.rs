@@ -11,29 +11,34 @@ use super::{Label, LabelledInput, warnings};
 ///
 /// Infinity is not JSON: where the focal length is unobservable, `sigma_log_focal` is null and `focal_unobservable` is
 /// true. That is so of every `PROJECTIVE_ONLY` result: it has no `focal_px`, no `principal_point_px`, no `aspect`, no
-/// radial distortion and no `plane_at_infinity` either. Where nothing was calibrated for another reason,
+/// distortion and no `plane_at_infinity` either. Where nothing was calibrated for another reason,
 /// `focal_unobservable` is null too.
 #[derive(Debug, Clone, Serialize)]
 pub struct ResultJson {
     pub status: Status,
     pub grade: Option<Grade>,
-    /// Of the first camera group that has registered views, down to `sigma_radial_k2`; see `cameras` where there are
-    /// several.
+    /// Of the first camera group that has registered views, down to `sigma_tangential_p2`; see `cameras` where there
+    /// are several.
     pub focal_px: Option<f64>,
     pub sigma_log_focal: Option<f64>,
     pub focal_unobservable: Option<bool>,
     pub principal_point_px: Option<[f64; 2]>,
     /// Vertical over horizontal focal length.
     pub aspect: Option<f64>,
-    /// `x = f u s + px`, `y = aspect f v s + py` with `s = 1 + radial_k1 r^2 + radial_k2 r^4`, `r^2 = u^2 + v^2`, for a
-    /// point at `(u, v, 1)`.
+    /// Of the lens, see [`Calibration`] for the model.
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
+    pub radial_k3: Option<f64>,
+    pub tangential_p1: Option<f64>,
+    pub tangential_p2: Option<f64>,
     /// One standard deviation of each that was estimated, in its unit; null: it was not, or an older version solved it.
     pub sigma_principal_point_px: Option<[f64; 2]>,
     pub sigma_aspect: Option<f64>,
     pub sigma_radial_k1: Option<f64>,
     pub sigma_radial_k2: Option<f64>,
+    pub sigma_radial_k3: Option<f64>,
+    pub sigma_tangential_p1: Option<f64>,
+    pub sigma_tangential_p2: Option<f64>,
     /// One entry a camera group, ascending.
     pub cameras: Vec<CameraGroupJson>,
     /// `(n, 1)` in pixels, in the frame `P1 = [I|0]` of the first registered view.
@@ -78,11 +83,17 @@ pub struct CameraGroupJson {
     pub aspect: Option<f64>,
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
+    pub radial_k3: Option<f64>,
+    pub tangential_p1: Option<f64>,
+    pub tangential_p2: Option<f64>,
     /// One standard deviation of each that was estimated, in its unit; null: it was not, or an older version solved it.
     pub sigma_principal_point_px: Option<[f64; 2]>,
     pub sigma_aspect: Option<f64>,
     pub sigma_radial_k1: Option<f64>,
     pub sigma_radial_k2: Option<f64>,
+    pub sigma_radial_k3: Option<f64>,
+    pub sigma_tangential_p1: Option<f64>,
+    pub sigma_tangential_p2: Option<f64>,
     /// The group's own; that of the result is the worst of its groups that have enough views.
     pub grade: Option<Grade>,
     /// Codes of the warnings that are of this group, each once.
@@ -131,10 +142,16 @@ pub fn camera_groups(solution: &Solution) -> Vec<CameraGroupJson> {
             aspect: calibration.map(|of| of.aspect),
             radial_k1: calibration.map(|of| of.radial_k1),
             radial_k2: calibration.map(|of| of.radial_k2),
+            radial_k3: calibration.map(|of| of.radial_k3),
+            tangential_p1: calibration.map(|of| of.tangential_p1),
+            tangential_p2: calibration.map(|of| of.tangential_p2),
             sigma_principal_point_px: calibration.and_then(|of| of.sigmas.principal_point_px),
             sigma_aspect: calibration.and_then(|of| of.sigmas.aspect),
             sigma_radial_k1: calibration.and_then(|of| of.sigmas.radial_k1),
             sigma_radial_k2: calibration.and_then(|of| of.sigmas.radial_k2),
+            sigma_radial_k3: calibration.and_then(|of| of.sigmas.radial_k3),
+            sigma_tangential_p1: calibration.and_then(|of| of.sigmas.tangential_p1),
+            sigma_tangential_p2: calibration.and_then(|of| of.sigmas.tangential_p2),
             grade: calibration.map_or(solution.grade.filter(|_| !solution.is_metric()), |of| of.grade),
             warnings: codes,
         }
@@ -164,10 +181,16 @@ impl ResultJson {
             aspect: first.and_then(|camera| camera.aspect),
             radial_k1: first.and_then(|camera| camera.radial_k1),
             radial_k2: first.and_then(|camera| camera.radial_k2),
+            radial_k3: first.and_then(|camera| camera.radial_k3),
+            tangential_p1: first.and_then(|camera| camera.tangential_p1),
+            tangential_p2: first.and_then(|camera| camera.tangential_p2),
             sigma_principal_point_px: first.and_then(|camera| camera.sigma_principal_point_px),
             sigma_aspect: first.and_then(|camera| camera.sigma_aspect),
             sigma_radial_k1: first.and_then(|camera| camera.sigma_radial_k1),
             sigma_radial_k2: first.and_then(|camera| camera.sigma_radial_k2),
+            sigma_radial_k3: first.and_then(|camera| camera.sigma_radial_k3),
+            sigma_tangential_p1: first.and_then(|camera| camera.sigma_tangential_p1),
+            sigma_tangential_p2: first.and_then(|camera| camera.sigma_tangential_p2),
             plane_at_infinity: solution.plane_at_infinity,
             inlier_tracks: solution.inlier_track_count(),
             inlier_observations: solution.inlier_observation_count(),

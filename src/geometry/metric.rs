@@ -6,8 +6,7 @@ use super::Camera;
 use super::bundle::Observation;
 use super::bundle::critical::Translating;
 use super::bundle::metric::{Intrinsics, Pose, Reconstruction};
-use super::bundle::zoom::Zooming;
-use super::daq::{Daq, FirstViewFrame, to_first_view_frame, zoomed};
+use super::daq::{self, Daq, FirstViewFrame, to_first_view_frame};
 use super::statistics::median;
 
 /// Distance at which points are held, in median depths: beyond it the depth of a point moves no observation, while a
@@ -53,40 +52,32 @@ pub fn plane_at_infinity(projective: &[Camera], metric: &[Camera]) -> Option<Vec
 /// Upgrades a projective reconstruction: the nearest rotations, and of the two mirror images the one with more
 /// observations in front of their cameras. The median depth becomes 1.
 ///
-/// Returns `None` when a pose or the depth is not a number: a camera without rank, a DAQ without meaning.
-pub fn upgrade(frame: &FirstViewFrame, daq: &Daq, observations: &[Observation]) -> Option<Reconstruction> {
-    let homography = upgrading_homography(daq);
-    let back = homography.try_inverse()?;
-    let uncalibrate = daq.intrinsics.matrix().try_inverse()?;
-    let mut poses = Vec::with_capacity(frame.cameras.len());
-    for camera in &frame.cameras {
-        let upgraded = uncalibrate * camera * homography;
-        poses.push(pose(&upgraded.fixed_columns::<3>(0).into_owned(), &upgraded.column(3).into_owned())?);
-    }
-    let points = frame.points.iter().map(|point| euclidean(&(back * point)));
-    let reconstruction = Reconstruction { intrinsics: daq.intrinsics, poses, points: points.collect() };
-    oriented(reconstruction, observations)
-}
-
-/// The same for a camera that zooms: the quadric gives every view a focal length of its own.
+/// * `own_focals`: whether every view has the focal length that the quadric gives it, or all that of the quadric
 ///
-/// Returns `None` also where the quadric gives a view no focal length.
-pub fn upgrade_zooming(frame: &FirstViewFrame, daq: &Daq, observations: &[Observation]) -> Option<Zooming> {
+/// Returns `None` when a pose or the depth is not a number, a camera without rank, a DAQ without meaning; also where the
+/// quadric gives a view no focal length of its own.
+pub fn upgrade(
+    frame: &FirstViewFrame,
+    daq: &Daq,
+    own_focals: bool,
+    observations: &[Observation],
+) -> Option<Reconstruction> {
     let homography = upgrading_homography(daq);
     let back = homography.try_inverse()?;
-    let mut focals = Vec::with_capacity(frame.cameras.len());
-    let mut poses = Vec::with_capacity(frame.cameras.len());
-    for camera in &frame.cameras {
-        let (focal, _) = zoomed(camera, daq)?;
-        let uncalibrate = Matrix3::from_diagonal(&Vector3::new(focal.recip(), focal.recip(), 1.0));
+    let focals = match own_focals {
+        true => frame.cameras.iter().map(|camera| Some(daq::view_focal(camera, daq)?.0)).collect::<Option<Vec<_>>>()?,
+        false => Vec::new(),
+    };
+    let points = frame.points.iter().map(|point| euclidean(&(back * point))).collect();
+    let mut reconstruction = Reconstruction { intrinsics: daq.intrinsics, focals, poses: Vec::new(), points };
+    for (view, camera) in frame.cameras.iter().enumerate() {
+        let uncalibrate = reconstruction.intrinsics_of(view).matrix().try_inverse()?;
         let upgraded = uncalibrate * camera * homography;
-        poses.push(pose(&upgraded.fixed_columns::<3>(0).into_owned(), &upgraded.column(3).into_owned())?);
-        focals.push(focal);
+        let pose = pose(&upgraded.fixed_columns::<3>(0).into_owned(), &upgraded.column(3).into_owned())?;
+        reconstruction.poses.push(pose);
     }
-    let points = frame.points.iter().map(|point| euclidean(&(back * point)));
-    let reconstruction = Reconstruction { intrinsics: daq.intrinsics, poses, points: points.collect() };
-    let Reconstruction { poses, points, .. } = oriented(reconstruction, observations)?;
-    Some(Zooming { focals, poses, points })
+    reconstruction.average_focals();
+    oriented(reconstruction, observations)
 }
 
 /// A camera that moved without turning as a metric reconstruction, were this its focal length: mirrored and scaled as
@@ -101,11 +92,11 @@ pub fn upgrade_translation(
     let back = Vector3::new(focal.recip(), focal.recip(), 1.0);
     let pose = |moved: &Vector3<f64>| Pose { rotation: Matrix3::identity(), translation: moved.component_mul(&back) };
     let point = |point: &Vector3<f64>| euclidean(&point.xy().push(1.0).component_mul(&back).push(point.z));
-    let reconstruction = Reconstruction {
-        intrinsics: Intrinsics::from_focal(focal),
-        poses: translation.translations.iter().map(pose).collect(),
-        points: translation.points.iter().map(point).collect(),
-    };
+    let reconstruction = Reconstruction::new(
+        Intrinsics::from_focal(focal),
+        translation.translations.iter().map(pose).collect(),
+        translation.points.iter().map(point).collect(),
+    );
     oriented(reconstruction, observations)
 }
 
@@ -187,7 +178,7 @@ mod tests {
                 .take(8)
                 .map(|(start, _)| refine(&frame.cameras, start, Free::FocalAndPlane, 80));
             let (daq, _) = refined.min_by(|a, b| a.1.total_cmp(&b.1)).expect("starts");
-            let upgraded = upgrade(&frame, &daq, &scene.observations).expect("metric");
+            let upgraded = upgrade(&frame, &daq, false, &scene.observations).expect("metric");
             assert_eq!(cheirality(&upgraded, &scene.observations), 1.0, "seed {seed}");
             for seen in &scene.observations {
                 let error = upgraded.residual(seen).norm();
@@ -204,7 +195,7 @@ mod tests {
             let plane_at_infinity = plane_at_infinity(&cameras, &scene.cameras()).expect("views apart");
             let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
             let daq = Daq { intrinsics: scene.intrinsics, plane_at_infinity };
-            let upgraded = upgrade(&frame, &daq, &scene.observations).expect("metric");
+            let upgraded = upgrade(&frame, &daq, false, &scene.observations).expect("metric");
             let errors = scene.observations.iter().map(|seen| upgraded.residual(seen).norm());
             let worst = errors.fold(0.0, f64::max);
             assert!(worst < 1e-7, "seed {seed}: {worst:e}");
@@ -217,8 +208,8 @@ mod tests {
         let (cameras, points) = testing::projectively_transformed(&scene, 1);
         let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
         let nan = Daq::new(1.0, Vector3::from_element(f64::NAN));
-        assert!(upgrade(&frame, &nan, &scene.observations).is_none());
-        assert!(upgrade(&frame, &Daq::new(0.0, Vector3::zeros()), &scene.observations).is_none());
-        assert!(upgrade(&frame, &Daq::new(1.0, Vector3::zeros()), &[]).is_none());
+        assert!(upgrade(&frame, &nan, false, &scene.observations).is_none());
+        assert!(upgrade(&frame, &Daq::new(0.0, Vector3::zeros()), false, &scene.observations).is_none());
+        assert!(upgrade(&frame, &Daq::new(1.0, Vector3::zeros()), false, &[]).is_none());
     }
 }

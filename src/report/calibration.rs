@@ -10,6 +10,10 @@ use crate::formats::result_json::{CameraGroupJson, camera_groups};
 
 /// Camera groups drawn and listed; a page is read by a person.
 const MAX_GROUPS: usize = 100;
+/// The lens's coefficients, in the order of [`coefficients`].
+const COEFFICIENTS: [&str; 5] = ["k1", "k2", "k3", "p1", "p2"];
+/// The first of them, which have a column even where they are 0.
+const ALWAYS_SHOWN: usize = 2;
 
 /// The section: what the grade means, a row a group, and the focal lengths drawn.
 pub fn section(solution: &Solution) -> String {
@@ -22,28 +26,52 @@ pub fn section(solution: &Solution) -> String {
         html.push_str("<p class=\"note\">There is no calibration to show.</p>\n</section>\n");
         return html;
     }
-    html.push_str(
+    let shown = &groups[..groups.len().min(MAX_GROUPS)];
+    let columns = columns(shown);
+    let heads: String = columns.iter().map(|&column| format!("<th>{}</th>", COEFFICIENTS[column])).collect();
+    let _ = writeln!(
+        html,
         "<div class=\"table\"><table>\n<tr><th>camera group</th><th>views</th><th>focal length (px)</th>\
-         <th>principal point (px)</th><th>aspect</th><th>k1</th><th>k2</th><th>grade</th><th>warnings</th></tr>\n",
+         <th>principal point (px)</th><th>aspect</th>{heads}<th>grade</th><th>warnings</th></tr>"
     );
-    for group in groups.iter().take(MAX_GROUPS) {
-        html.push_str(&row(group));
+    for group in shown {
+        html.push_str(&row(group, &columns));
     }
     html.push_str("</table></div>\n");
     if groups.len() > MAX_GROUPS {
         let _ = writeln!(html, "<p class=\"note\">{MAX_GROUPS} of {} camera groups are shown.</p>", groups.len());
     }
-    let _ = writeln!(html, "<figure>{}</figure>", bars(&groups[..groups.len().min(MAX_GROUPS)]));
+    let _ = writeln!(html, "<figure>{}</figure>", bars(shown));
     html.push_str(
         "<p class=\"note\">Errors are one standard deviation; what has none was not estimated but taken to be in \
-         order, or an older version solved it, which did not tell. Aspect is vertical over horizontal focal length; k1 and k2 are the radial distortion, 0 for a pinhole.</p>\n",
+         order, or an older version solved it, which did not tell. Aspect is vertical over horizontal focal length; \
+         k1, k2 and k3 are the radial distortion, p1 and p2 the tangential one, all 0 for a pinhole. k3, p1 and p2 each \
+         have a column only where a group has a value other than 0.</p>\n",
     );
     html.push_str(&own_focals(solution));
     html.push_str("</section>\n");
     html
 }
 
-fn row(group: &CameraGroupJson) -> String {
+/// Value and standard deviation of each of a group's [`COEFFICIENTS`].
+fn coefficients(group: &CameraGroupJson) -> [(Option<f64>, Option<f64>); COEFFICIENTS.len()] {
+    [
+        (group.radial_k1, group.sigma_radial_k1),
+        (group.radial_k2, group.sigma_radial_k2),
+        (group.radial_k3, group.sigma_radial_k3),
+        (group.tangential_p1, group.sigma_tangential_p1),
+        (group.tangential_p2, group.sigma_tangential_p2),
+    ]
+}
+
+/// Which of the [`COEFFICIENTS`] have a column.
+fn columns(groups: &[CameraGroupJson]) -> Vec<usize> {
+    let is_used = |column: usize| groups.iter().any(|group| coefficients(group)[column].0.is_some_and(|k| k != 0.0));
+    (0..COEFFICIENTS.len()).filter(|&column| column < ALWAYS_SHOWN || is_used(column)).collect()
+}
+
+/// * `columns`: the coefficients to show
+fn row(group: &CameraGroupJson, columns: &[usize]) -> String {
     let focal = group.focal_px.map_or_else(
         || "none".to_owned(),
         |focal_px| match group.sigma_log_focal {
@@ -62,16 +90,17 @@ fn row(group: &CameraGroupJson) -> String {
         }
         None => format!("{x:.1}, {y:.1}"),
     };
+    let coefficients = coefficients(group);
+    let lens = columns.iter().map(|&column| coefficients[column]);
+    let lens: String = lens.map(|(value, sigma)| format!("<td>{}</td>", number(value, sigma))).collect();
     let codes: Vec<&str> = group.warnings.iter().map(|code| code.name()).collect();
     format!(
-        "<tr><td>{}</td><td>{} of {}</td><td>{focal}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>\n",
+        "<tr><td>{}</td><td>{} of {}</td><td>{focal}</td><td>{}</td><td>{}</td>{lens}<td>{}</td><td>{}</td></tr>\n",
         group.camera_group,
         group.registered_views,
         group.views,
         group.principal_point_px.map_or_else(|| "-".into(), point),
         number(group.aspect, group.sigma_aspect),
-        number(group.radial_k1, group.sigma_radial_k1),
-        number(group.radial_k2, group.sigma_radial_k2),
         group.grade.map_or("-", |grade| grade.name()),
         if codes.is_empty() { "none".into() } else { codes.join(", ") }
     )
@@ -175,12 +204,16 @@ mod tests {
             aspect: 1.002,
             radial_k1: -0.125,
             radial_k2: 0.25,
+            radial_k3: 0.0,
+            tangential_p1: 0.0,
+            tangential_p2: 0.0,
             grade: Some(Grade::Weak),
             sigmas: Sigmas {
                 principal_point_px: Some([2.5, 3.0]),
                 aspect: None,
                 radial_k1: Some(0.004),
                 radial_k2: Some(0.03),
+                ..Sigmas::default()
             },
         };
         solution.calibrations.push(second);
@@ -192,13 +225,31 @@ mod tests {
         assert!(html.contains(&format!("<tr><td>4</td><td>2 of 2</td><td>{sigma}</td>")), "{html}");
         let row = "<tr><td>9</td><td>2 of 3</td><td>2000.0 \u{b1} 20 (1 %)</td><td>640.0 \u{b1} 2.5, 480.5 \u{b1} 3</td><td>1.002</td>\
                    <td>-0.125 \u{b1} 0.004</td><td>0.25 \u{b1} 0.03</td><td>WEAK</td><td>CHEIRALITY</td></tr>";
-        assert!(html.contains(row), "{html}");
+        assert!(html.contains(row) && html.contains("<th>k2</th><th>grade</th>"), "{html}");
         assert_eq!(html.matches("<circle").count(), 2);
         solution.views[2].projection = None;
         solution.views[3].projection = None;
         let html = section(&solution);
         assert!(html.contains("<tr><td>9</td><td>0 of 3</td><td>none</td>"), "{html}");
         assert_eq!(html.matches("<circle").count(), 1, "a camera without registered views has no focal length");
+    }
+
+    #[test]
+    fn other_coefficients_have_a_column_where_a_group_has_them() {
+        let (_, mut solution) = fixture::solved();
+        let sigmas = Sigmas { tangential_p1: Some(0.0625), ..Sigmas::default() };
+        let second = Calibration { tangential_p1: -0.5, sigmas, ..solution.calibrations[0] };
+        solution.calibrations.push(second);
+        solution.views[4].camera_group = 9;
+        let html = section(&solution);
+        assert!(html.contains("<th>k1</th><th>k2</th><th>p1</th><th>grade</th>"), "{html}");
+        assert!(html.contains("<td>-0.02</td><td>0</td><td>0</td><td>METRIC</td>"), "{html}");
+        assert!(html.contains("<td>-0.02</td><td>0</td><td>-0.5 \u{b1} 0.0625</td><td>METRIC</td>"), "{html}");
+        let second = &mut solution.calibrations[1];
+        (second.radial_k3, second.tangential_p2) = (0.25, 0.125);
+        let html = section(&solution);
+        assert!(html.contains("<th>k2</th><th>k3</th><th>p1</th><th>p2</th><th>grade</th>"), "{html}");
+        assert!(html.contains("<td>0.25</td><td>-0.5 \u{b1} 0.0625</td><td>0.125</td><td>METRIC</td>"), "{html}");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use super::chart::{self, LineChart, Series};
 use super::html::{escape, short};
 use super::words;
 use crate::domain::result::PriorTime;
-use crate::domain::{Grade, Losses, Progress, Solution, Status};
+use crate::domain::{Calibration, Grade, Losses, Progress, Solution, Status};
 use crate::formats::LabelledInput;
 use crate::formats::warnings::named;
 
@@ -38,17 +38,8 @@ pub fn headline(solution: &Solution) -> String {
             several => format!("{note}; the first of {several} cameras, see Calibration"),
         };
         card("focal length", format!("{:.1} px", calibration.focal_px), note);
-        if calibration.radial_k1 != 0.0 {
-            let second = match calibration.radial_k2 {
-                0.0 => String::new(),
-                k2 => format!(", k2 {}", short(k2)),
-            };
-            let errors = [calibration.sigmas.radial_k1, calibration.sigmas.radial_k2];
-            let errors: Vec<String> =
-                errors.into_iter().flatten().map(|sigma| format!("\u{b1} {}", short(sigma))).collect();
-            let note =
-                if errors.is_empty() { "estimated".into() } else { format!("{} (one sigma)", errors.join(", ")) };
-            card("radial distortion", format!("k1 {}{second}", short(calibration.radial_k1)), note);
+        for (name, figure, note) in distortions(calibration) {
+            card(name, figure, note);
         }
     } else if solution.is_focal_unobservable() {
         card("focal length", "none".into(), "unobservable".into());
@@ -71,6 +62,34 @@ pub fn headline(solution: &Solution) -> String {
     card("time", format!("{:.2} s", solution.seconds), stage_times(solution));
     html.push_str("</dl>\n</header>\n");
     html
+}
+
+/// Name, figure and note of the lens's distortions that are not 0.
+fn distortions(calibration: &Calibration) -> Vec<(&'static str, String, String)> {
+    let sigmas = &calibration.sigmas;
+    let radial = [
+        ("k1", calibration.radial_k1, sigmas.radial_k1),
+        ("k2", calibration.radial_k2, sigmas.radial_k2),
+        ("k3", calibration.radial_k3, sigmas.radial_k3),
+    ];
+    let tangential = [
+        ("p1", calibration.tangential_p1, sigmas.tangential_p1),
+        ("p2", calibration.tangential_p2, sigmas.tangential_p2),
+    ];
+    let mut cards = Vec::new();
+    for (name, coefficients) in [("radial distortion", &radial[..]), ("tangential distortion", &tangential[..])] {
+        let (mut figures, mut errors) = (Vec::new(), Vec::new());
+        for (name, value, sigma) in coefficients.iter().filter(|(_, value, _)| *value != 0.0) {
+            figures.push(format!("{name} {}", short(*value)));
+            errors.extend(sigma.map(|sigma| format!("\u{b1} {}", short(sigma))));
+        }
+        if !figures.is_empty() {
+            let note =
+                if errors.is_empty() { "estimated".into() } else { format!("{} (one sigma)", errors.join(", ")) };
+            cards.push((name, figures.join(", "), note));
+        }
+    }
+    cards
 }
 
 fn stage_times(solution: &Solution) -> String {
@@ -222,6 +241,7 @@ pub fn footer(solution: &Solution) -> String {
 mod tests {
     use super::*;
     use crate::domain::Stage;
+    use crate::domain::result::Sigmas;
     use crate::formats::fixture;
 
     #[test]
@@ -236,6 +256,23 @@ mod tests {
         assert_eq!(iterations_in_all(&history), [25.0, 50.0, 75.0, 80.0]);
         assert_eq!(stage_starts(&history), [(0.0, "search"), (1.0, "refine"), (2.0, "search")]);
         assert!(iterations_in_all(&[]).is_empty() && stage_starts(&[]).is_empty());
+    }
+
+    #[test]
+    fn distortions_that_are_0_have_no_card() {
+        let (_, mut solution) = fixture::solved();
+        let html = headline(&solution);
+        assert!(html.contains("<dt>radial distortion</dt><dd>k1 -0.02</dd><p>estimated</p>"), "{html}");
+        assert!(!html.contains("tangential"), "{html}");
+        let calibration = &mut solution.calibrations[0];
+        (calibration.radial_k3, calibration.tangential_p1, calibration.tangential_p2) = (0.25, 0.5, -0.125);
+        calibration.sigmas = Sigmas { radial_k1: Some(0.004), radial_k3: Some(0.03), ..Sigmas::default() };
+        let html = headline(&solution);
+        assert!(html.contains("<dd>k1 -0.02, k3 0.25</dd><p>\u{b1} 0.004, \u{b1} 0.03 (one sigma)</p>"), "{html}");
+        assert!(html.contains("<dt>tangential distortion</dt><dd>p1 0.5, p2 -0.125</dd><p>estimated</p>"), "{html}");
+        solution.calibrations[0].radial_k1 = 0.0;
+        solution.calibrations[0].radial_k3 = 0.0;
+        assert!(!headline(&solution).contains("radial distortion"));
     }
 
     #[test]

@@ -368,8 +368,11 @@ pub fn pixel_calibration(intrinsics: &Intrinsics, outcome: &Outcome, context: &C
         sigma_log_focal: outcome.sigma_log_focal,
         principal_point_px: (context.normalization.centres_px[view] + offset).into(),
         aspect: intrinsics.aspect,
-        radial_k1: intrinsics.radial,
-        radial_k2: intrinsics.second_radial,
+        radial_k1: intrinsics.radial[0],
+        radial_k2: intrinsics.radial[1],
+        radial_k3: intrinsics.radial[2],
+        tangential_p1: intrinsics.tangential[0],
+        tangential_p2: intrinsics.tangential[1],
         grade: Some(outcome.grade),
         sigmas: sigmas(intrinsics, outcome, context.scale_px),
     }
@@ -382,8 +385,11 @@ fn sigmas(intrinsics: &Intrinsics, outcome: &Outcome, scale_px: f64) -> Sigmas {
         principal_point_px: centre.map(|(x, y)| [x * scale_px, y * scale_px]),
         // A small deviation of the logarithm is one of the ratio.
         aspect: outcome.sigma(Parameter::LogAspect).map(|sigma| sigma * intrinsics.aspect),
-        radial_k1: outcome.sigma(Parameter::Radial),
-        radial_k2: outcome.sigma(Parameter::SecondRadial),
+        radial_k1: outcome.sigma(Parameter::RadialK1),
+        radial_k2: outcome.sigma(Parameter::RadialK2),
+        radial_k3: outcome.sigma(Parameter::RadialK3),
+        tangential_p1: outcome.sigma(Parameter::TangentialP1),
+        tangential_p2: outcome.sigma(Parameter::TangentialP2),
     }
 }
 

@@ -18,7 +18,7 @@ use crate::geometry::bundle::metric::Reconstruction;
 
 /// Noise that growing starts from when the caller gives none, as a share of the image side. High on purpose: twice too
 /// low loses the scene, ten times too high costs nothing.
-const INITIAL_NOISE: f64 = 0.005;
+pub const INITIAL_NOISE: f64 = 0.005;
 /// Tracks that a search looks at, at most and where there are many views: bundle adjustment costs their number times
 /// the square of the views, and more tracks make a consensus neither easier to find nor much more exact.
 const SEARCHED_TRACKS: (usize, usize) = (600, 200);
@@ -124,8 +124,7 @@ impl Attempt {
 
     /// Whether the calibration has found a lens that distorts.
     pub fn has_lens(&self) -> bool {
-        let distorts =
-            |metric: &Reconstruction| metric.intrinsics.radial != 0.0 || metric.intrinsics.second_radial != 0.0;
+        let distorts = |metric: &Reconstruction| metric.intrinsics.distorts();
         self.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref()).is_some_and(distorts)
     }
 

@@ -122,7 +122,7 @@ fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<Reconst
         })
         .collect();
     let points = inliers.iter().map(|&track| consensus.points[track].xyz()).collect();
-    Some(Reconstruction { intrinsics, poses, points })
+    Some(Reconstruction::new(intrinsics, poses, points))
 }
 
 /// Noise from which depths judge what image points have verified, normalised units: below, image points alone lose next

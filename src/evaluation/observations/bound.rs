@@ -11,7 +11,7 @@ use crate::synthetic::scene::IMAGE_SIDE_PX;
 const VIEW: usize = 10;
 /// The intrinsics among them, in this order.
 const INTRINSICS: [Parameter; 4] =
-    [Parameter::LogFocal, Parameter::PrincipalX, Parameter::PrincipalY, Parameter::Radial];
+    [Parameter::LogFocal, Parameter::PrincipalX, Parameter::PrincipalY, Parameter::RadialK1];
 /// Step of the central differences, in units of about one.
 const STEP: f64 = 1e-5;
 /// Information on what fixes the frame: far above that of any observation, whose noise is 1e-4 or more.

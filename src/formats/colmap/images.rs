@@ -130,8 +130,8 @@ impl Images {
         let foreign = self.cameras.iter().find(|(id, camera)| used.contains(id) && camera.is_foreign())?;
         let name = foreign.1.model.map_or("an unknown model", |model| model.name);
         Some(format!(
-            "camera {} is of COLMAP's model {name}; its images are solved as those of a pinhole with at most one term \
-             of radial distortion",
+            "camera {} is of COLMAP's model {name}; its images are solved as those of a pinhole with radial and \
+             tangential distortion",
             foreign.0
         ))
     }

@@ -95,19 +95,24 @@ pub fn text(model: &Model) -> [String; 3] {
     [cameras, images, points]
 }
 
-/// Model and parameters of a camera: the model with the fewest that says the same. COLMAP's radial terms are those of
-/// our model.
+/// Model and parameters of a camera: the model with the fewest that says the same. COLMAP's coefficients are those of
+/// our model (`src/colmap/sensor/models.h`).
 fn parameters(camera: &Camera) -> (&'static str, Vec<f64>) {
     let intrinsics = &camera.intrinsics;
-    let (f, k1, k2) = (intrinsics.focal_px, intrinsics.radial_k1, intrinsics.radial_k2);
+    let (fx, fy) = (intrinsics.focal_px, intrinsics.aspect * intrinsics.focal_px);
     let [cx, cy] = intrinsics.principal_point_px.map(|centre| centre + FIRST_PIXEL);
-    let (is_pinhole, has_one_term) = (k1 == 0.0 && k2 == 0.0, k2 == 0.0);
-    match intrinsics.aspect == 1.0 {
-        true if is_pinhole => ("SIMPLE_PINHOLE", vec![f, cx, cy]),
-        true if has_one_term => ("SIMPLE_RADIAL", vec![f, cx, cy, k1]),
-        true => ("RADIAL", vec![f, cx, cy, k1, k2]),
-        false if is_pinhole => ("PINHOLE", vec![f, f * intrinsics.aspect, cx, cy]),
-        false => ("OPENCV", vec![f, f * intrinsics.aspect, cx, cy, k1, k2, 0.0, 0.0]),
+    let radial = [intrinsics.radial_k1, intrinsics.radial_k2, intrinsics.radial_k3];
+    let ([k1, k2, k3], p1, p2) = (radial, intrinsics.tangential_p1, intrinsics.tangential_p2);
+    let radial_terms = radial.iter().rposition(|term| *term != 0.0).map_or(0, |last| last + 1);
+    let (is_square, is_centred) = (intrinsics.aspect == 1.0, p1 == 0.0 && p2 == 0.0);
+    match radial_terms {
+        0 if is_centred && is_square => ("SIMPLE_PINHOLE", vec![fx, cx, cy]),
+        0 if is_centred => ("PINHOLE", vec![fx, fy, cx, cy]),
+        1 if is_centred && is_square => ("SIMPLE_RADIAL", vec![fx, cx, cy, k1]),
+        2 if is_centred && is_square => ("RADIAL", vec![fx, cx, cy, k1, k2]),
+        0..=2 => ("OPENCV", vec![fx, fy, cx, cy, k1, k2, p1, p2]),
+        // The last three are those of a denominator that our model does not have.
+        _ => ("FULL_OPENCV", vec![fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]),
     }
 }
 

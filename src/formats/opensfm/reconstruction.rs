@@ -38,7 +38,8 @@ fn camera_name(camera: &Camera) -> String {
     format!("scpsfm camera {}", camera.id)
 }
 
-/// `perspective` where the principal point is the middle and pixels are square, else `brown`.
+/// `perspective` where the principal point is the middle, pixels are square and two radial coefficients are all of the
+/// distortion, else `brown`, whose coefficients are those of our model.
 fn camera(camera: &Camera) -> Value {
     let intrinsics = &camera.intrinsics;
     let (middle_px, side_px) = frame(camera.size);
@@ -47,7 +48,8 @@ fn camera(camera: &Camera) -> Value {
     let offset_px = [x - middle_px[0], y - middle_px[1]];
     let is_middle = offset_px.iter().all(|offset| offset.abs() < MIDDLE_PX);
     let (width, height) = (camera.size.width_px, camera.size.height_px);
-    if is_middle && intrinsics.aspect == 1.0 {
+    let others = [intrinsics.radial_k3, intrinsics.tangential_p1, intrinsics.tangential_p2];
+    if is_middle && intrinsics.aspect == 1.0 && others == [0.0; 3] {
         return json!({
             "projection_type": "perspective", "width": width, "height": height,
             "focal": focal, "k1": intrinsics.radial_k1, "k2": intrinsics.radial_k2,
@@ -57,7 +59,8 @@ fn camera(camera: &Camera) -> Value {
         "projection_type": "brown", "width": width, "height": height,
         "focal_x": focal, "focal_y": focal * intrinsics.aspect,
         "c_x": offset_px[0] / side_px, "c_y": offset_px[1] / side_px,
-        "k1": intrinsics.radial_k1, "k2": intrinsics.radial_k2, "k3": 0.0, "p1": 0.0, "p2": 0.0,
+        "k1": intrinsics.radial_k1, "k2": intrinsics.radial_k2, "k3": intrinsics.radial_k3,
+        "p1": intrinsics.tangential_p1, "p2": intrinsics.tangential_p2,
     })
 }
 

@@ -1,11 +1,11 @@
 //! How well the intrinsics are determined, whatever the gauge.
 
-use nalgebra::{DMatrix, DVector, SMatrix, SVector};
+use nalgebra::{DMatrix, DVector, DVectorView, SMatrix, SVector};
 
 use super::engine::Layout;
 use super::intrinsics::Intrinsics;
 use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior, Parameter};
-use super::metric::{Metric, POINT, POSE, Pose, Reconstruction};
+use super::metric::{Metric, POINT, POSE, Pose, Reconstruction, VIEW};
 use super::reduced::{Linearisation, Reduced};
 use super::whitened::{WhitenedViews, centre};
 use super::{Loss, Observation};
@@ -19,11 +19,18 @@ const APART: f64 = 1e-11;
 /// Information on the intrinsics, scaled by what they would have with everything else known, that counts as none.
 const NULL_INTRINSICS: f64 = 1e-10;
 
+/// Share of a view's log focal length in a null direction from which it counts as undetermined.
+const TAKES_PART: f64 = 1e-8;
+/// Variance of a view's log focal length, over the least of any view, up to which it has a say in the mean: one that is
+/// known ten times less well says nothing of it.
+const COUNTS_WITHIN: f64 = 100.0;
+
 /// What the observations say of all the intrinsics together, poses and points marginalised, at one reconstruction.
 ///
 /// For observations with unit variance. From one linearisation it tells of every model at once where its minimum is,
-/// how low, and how well determined: a score test in place of an adjustment a model.
-#[derive(Debug, Clone, Copy)]
+/// how low, and how well determined: a score test in place of an adjustment a model. Where the reconstruction has focal
+/// lengths a view, these are free in every model, and what it tells of [`Parameter::LogFocal`] is told of their mean.
+#[derive(Debug, Clone)]
 pub struct Information {
     intrinsics: Intrinsics,
     matrix: Coupled,
@@ -31,6 +38,26 @@ pub struct Information {
     pull: SVector<f64, PARAMETERS>,
     /// The matrix' diagonal were poses and points known.
     known: [f64; PARAMETERS],
+    own_focals: Option<OwnFocals>,
+}
+
+/// Log focal lengths of which every view has its own.
+#[derive(Debug, Clone)]
+struct OwnFocals {
+    of_view: Vec<Function>,
+    /// Over the views that are determined about as well as any.
+    mean: Function,
+}
+
+/// A linear function of the unknowns of the views, with the intrinsics that they share held.
+#[derive(Debug, Clone, Copy)]
+struct Function {
+    /// `None`: not determined.
+    variance: Option<f64>,
+    /// By how much it falls where the shared intrinsics rise.
+    coupling: SVector<f64, PARAMETERS>,
+    /// What it is at the minimum minus what it is here.
+    shift: f64,
 }
 
 /// The minimum of the cost over the intrinsics of one model, to second order; indexed by [`Parameter`].
@@ -47,12 +74,23 @@ pub struct Optimum {
     pub rise: f64,
     /// Natural logarithm of the determinant of the information on what is free. Null directions count as barely known.
     pub log_determinant: f64,
+    /// Of the shared parameters that are free and determined.
+    covariance: Coupled,
 }
 
 impl Optimum {
     /// Variance of one parameter.
     pub fn variance_of(&self, parameter: Parameter) -> Option<f64> {
         self.variance[parameter as usize]
+    }
+
+    /// Variance and shift of a function of the views with the shared parameters free.
+    fn of(&self, function: &Function) -> (Option<f64>, f64) {
+        let undetermined = (0..PARAMETERS).any(|k| self.variance[k].is_none() && function.coupling[k] != 0.0);
+        let variance = function.variance.filter(|_| !undetermined);
+        let shared = function.coupling.dot(&(self.covariance * function.coupling));
+        let shift = SVector::<f64, PARAMETERS>::from(self.shift);
+        (variance.map(|own| own + shared), function.shift - function.coupling.dot(&shift))
     }
 }
 
@@ -62,6 +100,14 @@ impl Information {
     /// The seven directions of a similarity are projected out. Returns `None` without poses, or where the system
     /// holds what is no number.
     pub fn new(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
+        match reconstruction.has_own_focals() {
+            true => Self::of_views::<VIEW>(reconstruction, observations),
+            false => Self::of_views::<POSE>(reconstruction, observations),
+        }
+    }
+
+    /// * `C`: unknowns of a view
+    fn of_views<const C: usize>(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
         let poses = reconstruction.poses.len();
         if poses == 0 {
             return None;
@@ -69,17 +115,26 @@ impl Information {
         let layout = Layout::new(observations, poses, reconstruction.points.len());
         let mut centred = reconstruction.clone();
         centre(&mut centred.poses, &mut centred.points);
-        let problem = Metric { reconstruction: centred, free: Parameter::ALL, prior: IntrinsicsPrior::NONE };
-        let mut linearisation = Linearisation::<PARAMETERS, POSE, POINT>::new(&layout, poses);
+        let free = Parameter::ALL.map(Some);
+        let problem = Metric::<PARAMETERS, C> { reconstruction: centred, free, prior: IntrinsicsPrior::NONE };
+        let mut linearisation = Linearisation::<PARAMETERS, C, POINT>::new(&layout, poses);
         linearisation.fill(&problem, &layout, Loss::Squared);
         let known = std::array::from_fn(|k| linearisation.globals_diagonal()[k]);
         let mut reduced = Reduced::new(&layout, poses);
         if !reduced.build(&problem, &layout, &linearisation, 0.0) {
             return None;
         }
-        let (matrix, pull) = without_poses(&reduced.matrix, &reduced.vector, &known, &problem.reconstruction.poses)?;
+        let (matrix, pull, own_focals) =
+            without_views::<C>(&reduced.matrix, &reduced.vector, &known, &problem.reconstruction.poses)?;
         let finite = matrix.iter().chain(pull.iter()).all(|value| value.is_finite());
-        finite.then_some(Self { intrinsics: reconstruction.intrinsics, matrix, pull, known })
+        finite.then_some(Self { intrinsics: reconstruction.intrinsics, matrix, pull, known, own_focals })
+    }
+
+    /// Variance of the log focal length of each view that has its own under a model, and its value at the minimum of
+    /// the model minus its value here; `None` where the observations do not determine it.
+    pub fn own_focals(&self, optimum: &Optimum) -> Vec<(Option<f64>, f64)> {
+        let of_view = self.own_focals.iter().flat_map(|own| &own.of_view);
+        of_view.map(|function| optimum.of(function)).collect()
     }
 
     /// Where the cost of a model is least, how low it is there, and how well that is determined.
@@ -109,6 +164,7 @@ impl Information {
         // Of nothing there is no decomposition.
         let eigen = (!free.is_empty()).then(|| scaled.symmetric_eigen());
         let mut variance = [Some(0.0); PARAMETERS];
+        let mut covariance = Coupled::zeros();
         let mut log_determinant = -2.0 * scale.iter().map(|scale| scale.ln()).sum::<f64>();
         for (&value, vector) in
             eigen.iter().flat_map(|eigen| eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()))
@@ -120,6 +176,9 @@ impl Information {
                 if value > NULL_INTRINSICS {
                     shift[k] += scale[row] * vector[row] * along / value;
                     variance[k] = variance[k].map(|sum| sum + share / value * scale[row].powi(2));
+                    for (column, &l) in free.iter().enumerate() {
+                        covariance[(k, l)] += vector[row] * vector[column] / value * scale[row] * scale[column];
+                    }
                 } else if share > NULL_INTRINSICS {
                     variance[k] = None;
                 }
@@ -127,7 +186,12 @@ impl Information {
         }
         let believed: f64 = free.iter().map(|&k| prior.information[k] * (deviation[k] + shift[k]).powi(2)).sum();
         let rise = shift.dot(&(self.matrix * shift)) - 2.0 * self.pull.dot(&shift) + believed;
-        Optimum { shift: shift.into(), variance, rise, log_determinant }
+        let mut optimum = Optimum { shift: shift.into(), variance, rise, log_determinant, covariance };
+        if let Some(own) = &self.own_focals {
+            (optimum.variance[Parameter::LogFocal as usize], optimum.shift[Parameter::LogFocal as usize]) =
+                optimum.of(&own.mean);
+        }
+        optimum
     }
 }
 
@@ -136,38 +200,55 @@ fn scale_of(information: f64) -> f64 {
     if information > 0.0 { information.sqrt().recip() } else { 1.0 }
 }
 
-/// Eliminates the poses from the reduced system, whose first unknowns are the intrinsics; its lower triangle is given.
+/// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics; its
+/// lower triangle is given. With it what the views' own focal lengths are, where they have them.
 ///
-/// A direction of the poses on which rounding hides what the observations say, but which goes along with the
+/// A direction of the views on which rounding hides what the observations say, but which goes along with the
 /// intrinsics, is taken to be as free as it can be: the intrinsics have no information left along with it. Taken as
 /// known, it would make them certain.
-fn without_poses(
+fn without_views<const C: usize>(
     matrix: &[f64],
     vector: &[f64],
     known: &[f64; PARAMETERS],
     poses: &[Pose],
-) -> Option<(Coupled, SVector<f64, PARAMETERS>)> {
-    let dimension = PARAMETERS + POSE * poses.len();
+) -> Option<(Coupled, SVector<f64, PARAMETERS>, Option<OwnFocals>)> {
+    let dimension = PARAMETERS + C * poses.len();
     let at = |row: usize, column: usize| matrix[column * dimension + row];
     let mut information = Coupled::from_fn(|row, column| at(row.max(column), row.min(column)));
     let mut pull = SVector::from_fn(|row, _| vector[row]);
-    let views = WhitenedViews::<POSE>::new(matrix, PARAMETERS, poses)?;
+    let views = WhitenedViews::<C>::new(matrix, PARAMETERS, poses)?;
     let of_view =
-        |view: usize, column: usize| SVector::<f64, POSE>::from_fn(|row, _| at(PARAMETERS + POSE * view + row, column));
+        |view: usize, column: usize| SVector::<f64, C>::from_fn(|row, _| at(PARAMETERS + C * view + row, column));
     let coupling: Vec<DVector<f64>> =
         (0..PARAMETERS).map(|column| views.function(|view| of_view(view, column))).collect();
-    let gradient =
-        views.function(|view| SVector::<f64, POSE>::from_fn(|row, _| vector[PARAMETERS + POSE * view + row]));
+    let gradient = views.function(|view| SVector::<f64, C>::from_fn(|row, _| vector[PARAMETERS + C * view + row]));
+    let directions: Vec<Direction> = views
+        .directions()
+        .map(|(information, vector)| Direction {
+            information,
+            vector,
+            coupling: SVector::from_fn(|row, _| coupling[row].dot(&vector)),
+            pull: gradient.dot(&vector),
+        })
+        .collect();
     let mut free = Vec::new();
-    for (value, direction) in views.directions() {
-        let along = SVector::<f64, PARAMETERS>::from_fn(|row, _| coupling[row].dot(&direction));
+    for &Direction { information: value, coupling: along, pull: by_view, .. } in &directions {
         match value {
             Some(value) => {
                 information -= along * along.transpose() / value;
-                pull -= along * (gradient.dot(&direction) / value);
+                pull -= along * (by_view / value);
             }
             None => free.push(along),
         }
+    }
+    let own_focals = (C > POSE).then(|| own_focals(&views, &directions, poses.len()));
+    if own_focals.is_some() {
+        // A focal length for all is a direction of the views' own; with it the system would have none of its rank.
+        let shared = Parameter::LogFocal as usize;
+        information.row_mut(shared).fill(0.0);
+        information.column_mut(shared).fill(0.0);
+        information[(shared, shared)] = known[shared];
+        pull[shared] = 0.0;
     }
     let scale = SVector::<f64, PARAMETERS>::from_fn(|row, _| scale_of(known[row]));
     for along in free {
@@ -181,7 +262,56 @@ fn without_poses(
         let taken = along * along.transpose() / along.dot(&solved);
         information -= Coupled::from_fn(|row, column| taken[(row, column)] / (scale[row] * scale[column]));
     }
-    Some((information, pull))
+    Some((information, pull, own_focals))
+}
+
+/// An eigenvector of the information on the views.
+struct Direction<'a> {
+    /// `None`: rounding hides it.
+    information: Option<f64>,
+    vector: DVectorView<'a, f64>,
+    /// What it has in common with the shared intrinsics, and half the downward gradient along it.
+    coupling: SVector<f64, PARAMETERS>,
+    pull: f64,
+}
+
+/// The log focal lengths of the views, and their mean.
+fn own_focals<const C: usize>(views: &WhitenedViews<C>, directions: &[Direction], count: usize) -> OwnFocals {
+    let function = |weights: &[f64]| {
+        let is_unseen = |(view, weight): (usize, &f64)| *weight > 0.0 && views.unseen(view, POSE) > TAKES_PART;
+        let whitened = views.function(|view| {
+            let mut gradient = SVector::zeros();
+            gradient[POSE] = weights[view];
+            gradient
+        });
+        let mut found = Function { variance: Some(0.0), coupling: SVector::zeros(), shift: 0.0 };
+        for direction in directions {
+            let along = whitened.dot(&direction.vector);
+            match direction.information {
+                Some(value) => {
+                    found.variance = found.variance.map(|sum| sum + along * along / value);
+                    found.coupling += direction.coupling * (along / value);
+                    found.shift += direction.pull * along / value;
+                }
+                None if along * along > TAKES_PART * whitened.norm_squared() => found.variance = None,
+                None => {}
+            }
+        }
+        let is_undetermined = weights.iter().enumerate().any(is_unseen);
+        found.variance = found.variance.filter(|variance| !is_undetermined && *variance > 0.0);
+        // That of a focal length that all views share is no coupling with anything else.
+        found.coupling[Parameter::LogFocal as usize] = 0.0;
+        found
+    };
+    let of_view: Vec<Function> = (0..count)
+        .map(|view| function(&Vec::from_iter((0..count).map(|other| f64::from(u8::from(other == view))))))
+        .collect();
+    let least = of_view.iter().filter_map(|function| function.variance).fold(f64::INFINITY, f64::min);
+    let counts = |function: &Function| function.variance.is_some_and(|variance| variance <= COUNTS_WITHIN * least);
+    let counted = of_view.iter().filter(|function| counts(function)).count();
+    let weight = |function: &Function| if counts(function) { (counted as f64).recip() } else { 0.0 };
+    let mean = function(&of_view.iter().map(weight).collect::<Vec<_>>());
+    OwnFocals { of_view, mean }
 }
 
 #[cfg(test)]
@@ -195,7 +325,7 @@ mod tests {
     use crate::domain::StopToken;
 
     fn truth(scene: &TestScene) -> Reconstruction {
-        Reconstruction { intrinsics: scene.intrinsics, poses: scene.poses.clone(), points: scene.points.clone() }
+        Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone())
     }
 
     fn optimum(scene: &TestScene, model: IntrinsicsModel) -> Optimum {
@@ -261,7 +391,9 @@ mod tests {
             matrix[(first, 0)] = coupled * (weak / 2.0).sqrt();
             matrix[(second, 0)] = -matrix[(first, 0)];
             let poses = [pose(0.0), pose(1.0)];
-            without_poses(matrix.as_slice(), &vec![0.0; dimension], &[1.0; PARAMETERS], &poses).expect("finite").0
+            without_views::<POSE>(matrix.as_slice(), &vec![0.0; dimension], &[1.0; PARAMETERS], &poses)
+                .expect("finite")
+                .0
         };
         for weak in [1e-4, 1e-9, 1e-15] {
             let left = system(weak, 0.999)[(0, 0)];
@@ -302,13 +434,61 @@ mod tests {
         }
     }
 
+    /// Standard deviations of the views' own log focal lengths at the truth.
+    fn own_sigmas(scene: &TestScene, model: IntrinsicsModel) -> (Vec<Option<f64>>, Optimum) {
+        let information = Information::new(&truth(scene).with_own_focals(), &scene.observations).expect("poses");
+        let optimum = information.optimum(model, &IntrinsicsPrior::NONE);
+        let sigma = |(variance, _): (Option<f64>, f64)| variance.map(|variance| variance.sqrt() * NOISE);
+        (information.own_focals(&optimum).into_iter().map(sigma).collect(), optimum)
+    }
+
+    #[test]
+    fn a_focal_length_a_view_is_less_certain_than_one_for_all() {
+        let model = IntrinsicsModel::FOCAL_PER_VIEW;
+        for seed in 0..3 {
+            let scene = testing::scene(seed, 10, 40, 0.0);
+            let sigma =
+                |optimum: &Optimum| optimum.variance_of(Parameter::LogFocal).expect("observable").sqrt() * NOISE;
+            let constant = sigma(&optimum(&scene, IntrinsicsModel::FOCAL));
+            let (own, optimum) = own_sigmas(&scene, model);
+            let (behind_lens, _) = own_sigmas(&scene, model.with(Extension::RadialK1));
+            println!("seed {seed}: {constant:.5} for all, {own:.5?}, behind a lens {behind_lens:.5?}");
+            let own: Vec<f64> = own.into_iter().map(|sigma| sigma.expect("observable")).collect();
+            assert_eq!(own.len(), 10);
+            for (own, behind_lens) in own.iter().zip(behind_lens) {
+                assert!(*own > constant && behind_lens.is_some_and(|sigma| sigma >= *own), "seed {seed}");
+            }
+            // Focal lengths that share a frame of points err together: their mean is no surer than one for all would
+            // be, nor less sure than each.
+            let largest = own.iter().copied().fold(0.0, f64::max);
+            assert!((constant..largest).contains(&sigma(&optimum)), "seed {seed}: {}", sigma(&optimum));
+        }
+        // Wherever the origin is.
+        let scene = testing::scene(1, 10, 40, 0.0);
+        let (expected, _) = own_sigmas(&scene, model);
+        for distance in [1e2, 1e4, 1e6] {
+            let (found, _) = own_sigmas(&moved(&scene, Vector3::new(1.0, -0.5, 0.3) * distance, 1.0), model);
+            println!("{distance:e} away: {found:.5?} for {expected:.5?}");
+            for (found, expected) in found.iter().zip(&expected) {
+                let (found, expected) = (found.expect("observable"), expected.expect("observable"));
+                assert!((found - expected).abs() < 0.005 * expected, "{distance:e} away: {found} for {expected}");
+            }
+        }
+        // Null but for rounding: a sigma of several e-folds.
+        let scene = testing::scene_of(1, 10, 40, 0.0, Motion::Translation, false);
+        let (found, optimum) = own_sigmas(&scene, model);
+        let free = |sigma: Option<f64>| sigma.is_none_or(|sigma| sigma > 1.0);
+        assert!(found.iter().all(|sigma| free(*sigma)), "{found:?}");
+        assert!(free(optimum.variance_of(Parameter::LogFocal).map(|variance| variance.sqrt() * NOISE)));
+    }
+
     /// What one linearisation foretells of a richer model, an adjustment of that model finds.
     #[test]
     fn the_optimum_of_a_richer_model_is_foretold() {
         for seed in 0..5 {
             let mut scene = testing::scene(seed, 8, 40, 0.0);
             scene.intrinsics.principal_point = Vector2::new(0.002, -0.001);
-            scene.intrinsics.radial = 0.001;
+            scene.intrinsics.radial[0] = 0.001;
             scene.observe(0.0005, &mut rand::SeedableRng::seed_from_u64(seed));
             let adjusted = |start: &Reconstruction, model, prior: &IntrinsicsPrior| {
                 let mut start = start.clone();
@@ -321,8 +501,9 @@ mod tests {
             let mut pinhole = truth(&scene);
             pinhole.intrinsics = Intrinsics::from_focal(scene.intrinsics.focal);
             let (simple, cost) = adjusted(&pinhole, IntrinsicsModel::FOCAL, &prior);
+            let constant = simple.clone();
             let information = Information::new(&simple, &scene.observations).expect("poses");
-            for model in IntrinsicsModel::all() {
+            for model in IntrinsicsModel::FOCAL.with_any_extensions() {
                 let foretold = information.optimum(model, &prior);
                 let (found, found_cost) = adjusted(&simple, model, &prior);
                 let rise = found_cost - cost;
@@ -336,11 +517,28 @@ mod tests {
                 println!("seed {seed}, {}: chi-square off by {error:.3}", model.name());
                 assert!(error < 0.2, "seed {seed}, {}: {error}", model.name());
             }
-            // And back: from the richest model to the simple one.
-            let (rich, rich_cost) = adjusted(&simple, IntrinsicsModel::FULL, &prior);
+            // The same of focal lengths of which every view has its own.
+            let (simple, _) = adjusted(&simple.with_own_focals(), IntrinsicsModel::FOCAL_PER_VIEW, &prior);
+            let information = Information::new(&simple, &scene.observations).expect("poses");
+            for model in IntrinsicsModel::FOCAL_PER_VIEW.with_any_extensions() {
+                let foretold = information.own_focals(&information.optimum(model, &prior));
+                let (found, _) = adjusted(&simple, model, &prior);
+                assert_eq!(foretold.len(), 8);
+                for (view, (variance, shift)) in foretold.into_iter().enumerate() {
+                    let error = (shift - (found.focals[view] / simple.focals[view]).ln()).abs();
+                    let sigma = variance.expect("observable").sqrt() * 0.0005;
+                    assert!(error <= 0.1 * sigma + 1e-9, "seed {seed}, {}: view {view} off by {error}", model.name());
+                }
+            }
+            // And back: from a rich model to the simple one. Not from the richest: what three radial terms do to each
+            // other is beyond the second order.
+            let model = [Extension::PrincipalPoint, Extension::Aspect, Extension::RadialK1, Extension::RadialK2]
+                .into_iter()
+                .fold(IntrinsicsModel::FOCAL, IntrinsicsModel::with);
+            let (rich, rich_cost) = adjusted(&constant, model, &prior);
             let information = Information::new(&rich, &scene.observations).expect("poses");
             let back = information.optimum(IntrinsicsModel::FOCAL, &prior);
-            let believed = prior.cost(IntrinsicsModel::FULL, &rich.intrinsics);
+            let believed = prior.cost(model, &rich.intrinsics);
             let error = (back.rise - (cost - rich_cost + believed)).abs() / (0.0005 * 0.0005);
             assert!(error < 0.02 * (cost - rich_cost) / (0.0005 * 0.0005) + 0.2, "seed {seed}: {error}");
         }

@@ -9,15 +9,27 @@ pub enum Parameter {
     PrincipalX,
     PrincipalY,
     LogAspect,
-    Radial,
-    SecondRadial,
+    RadialK1,
+    RadialK2,
+    RadialK3,
+    TangentialP1,
+    TangentialP2,
 }
 
 impl Parameter {
-    pub const COUNT: usize = 6;
+    pub const COUNT: usize = 9;
     /// In the order of their discriminants.
-    pub const ALL: [Parameter; Self::COUNT] =
-        [Self::LogFocal, Self::PrincipalX, Self::PrincipalY, Self::LogAspect, Self::Radial, Self::SecondRadial];
+    pub const ALL: [Parameter; Self::COUNT] = [
+        Self::LogFocal,
+        Self::PrincipalX,
+        Self::PrincipalY,
+        Self::LogAspect,
+        Self::RadialK1,
+        Self::RadialK2,
+        Self::RadialK3,
+        Self::TangentialP1,
+        Self::TangentialP2,
+    ];
 }
 
 /// What may be freed beside the focal length.
@@ -25,17 +37,24 @@ impl Parameter {
 pub enum Extension {
     PrincipalPoint,
     Aspect,
-    Radial,
-    /// Only with [`Extension::Radial`]: the second term of a series without the first means nothing.
-    SecondRadial,
+    RadialK1,
+    /// Each of the next two only with the one before: a later term of a series without the first means nothing.
+    RadialK2,
+    RadialK3,
+    Tangential,
 }
 
 impl Extension {
-    pub const ALL: [Extension; 4] = [Self::PrincipalPoint, Self::Aspect, Self::Radial, Self::SecondRadial];
+    pub const ALL: [Extension; 6] =
+        [Self::PrincipalPoint, Self::Aspect, Self::RadialK1, Self::RadialK2, Self::RadialK3, Self::Tangential];
 
     /// What must be free for this one to be.
     pub fn needs(self) -> Option<Extension> {
-        (self == Extension::SecondRadial).then_some(Extension::Radial)
+        match self {
+            Extension::RadialK2 => Some(Extension::RadialK1),
+            Extension::RadialK3 => Some(Extension::RadialK2),
+            _ => None,
+        }
     }
 
     /// The parameters that it frees.
@@ -43,8 +62,10 @@ impl Extension {
         match self {
             Extension::PrincipalPoint => &[Parameter::PrincipalX, Parameter::PrincipalY],
             Extension::Aspect => &[Parameter::LogAspect],
-            Extension::Radial => &[Parameter::Radial],
-            Extension::SecondRadial => &[Parameter::SecondRadial],
+            Extension::RadialK1 => &[Parameter::RadialK1],
+            Extension::RadialK2 => &[Parameter::RadialK2],
+            Extension::RadialK3 => &[Parameter::RadialK3],
+            Extension::Tangential => &[Parameter::TangentialP1, Parameter::TangentialP2],
         }
     }
 
@@ -53,30 +74,53 @@ impl Extension {
         match self {
             Extension::PrincipalPoint => "principal point",
             Extension::Aspect => "aspect",
-            Extension::Radial => "radial distortion",
-            Extension::SecondRadial => "second radial term",
+            Extension::RadialK1 => "radial distortion",
+            Extension::RadialK2 => "second radial term",
+            Extension::RadialK3 => "third radial term",
+            Extension::Tangential => "tangential distortion",
         }
     }
 }
 
-/// Which intrinsics are free.
+/// How focal lengths are adjusted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+enum FocalLength {
+    Held,
+    /// One for all views.
+    Shared,
+    /// One of each view.
+    PerView,
+}
+
+/// Which intrinsics are free. All but the focal length are shared by the views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct IntrinsicsModel {
-    focal: bool,
+    focal: FocalLength,
     extensions: [bool; Extension::ALL.len()],
 }
 
 impl IntrinsicsModel {
-    pub const FIXED: Self = Self { focal: false, extensions: [false; Extension::ALL.len()] };
-    pub const FOCAL: Self = Self { focal: true, extensions: [false; Extension::ALL.len()] };
+    pub const FIXED: Self = Self { focal: FocalLength::Held, extensions: [false; Extension::ALL.len()] };
+    pub const FOCAL: Self = Self { focal: FocalLength::Shared, ..Self::FIXED };
+    pub const FOCAL_PER_VIEW: Self = Self { focal: FocalLength::PerView, ..Self::FIXED };
     #[cfg(test)]
-    pub const FULL: Self = Self { focal: true, extensions: [true; Extension::ALL.len()] };
+    pub const FULL: Self = Self { extensions: [true; Extension::ALL.len()], ..Self::FOCAL };
 
-    /// Every combination of extensions with the focal length free, the simplest first.
-    pub fn all() -> impl Iterator<Item = Self> {
+    /// The simplest model: a focal length for all views, or one of each view.
+    pub fn focal(per_view: bool) -> Self {
+        if per_view { Self::FOCAL_PER_VIEW } else { Self::FOCAL }
+    }
+
+    /// Every combination of extensions with focal lengths as this model has them, the simplest first.
+    pub fn with_any_extensions(self) -> impl Iterator<Item = Self> {
         (0..1usize << Extension::ALL.len())
-            .map(|mask| Self { focal: true, extensions: std::array::from_fn(|k| mask >> k & 1 == 1) })
+            .map(move |mask| Self { extensions: std::array::from_fn(|k| mask >> k & 1 == 1), ..self })
             .filter(|model| model.extensions().all(|extension| model.admits(extension)))
+    }
+
+    /// Whether every view has a focal length of its own that is free.
+    pub fn is_per_view(self) -> bool {
+        self.focal == FocalLength::PerView
     }
 
     /// Whether what an extension needs is free.
@@ -96,7 +140,7 @@ impl IntrinsicsModel {
 
     /// This model with the focal length held.
     pub fn without_focal(self) -> Self {
-        Self { focal: false, ..self }
+        Self { focal: FocalLength::Held, ..self }
     }
 
     /// Extensions that are free.
@@ -104,9 +148,9 @@ impl IntrinsicsModel {
         Extension::ALL.into_iter().filter(move |extension| self.contains(*extension))
     }
 
-    /// Free parameters, in the order of [`Parameter::ALL`].
+    /// Parameters that are free and shared by the views, in the order of [`Parameter::ALL`].
     pub fn parameters(self) -> Vec<Parameter> {
-        let focal = self.focal.then_some(Parameter::LogFocal);
+        let focal = (self.focal == FocalLength::Shared).then_some(Parameter::LogFocal);
         focal
             .into_iter()
             .chain(self.extensions().flat_map(|extension| extension.parameters().iter().copied()))
@@ -115,7 +159,12 @@ impl IntrinsicsModel {
 
     /// What is free, in words.
     pub fn name(self) -> String {
-        let mut names: Vec<&str> = self.focal.then_some("focal length").into_iter().collect();
+        let focal = match self.focal {
+            FocalLength::Held => None,
+            FocalLength::Shared => Some("focal length"),
+            FocalLength::PerView => Some("a focal length a view"),
+        };
+        let mut names: Vec<&str> = focal.into_iter().collect();
         names.extend(self.extensions().map(Extension::name));
         match names.as_slice() {
             [] => "nothing".to_owned(),
@@ -176,7 +225,7 @@ mod tests {
 
     #[test]
     fn models_count_and_name_what_they_free() {
-        let radial = IntrinsicsModel::FOCAL.with(Extension::PrincipalPoint).with(Extension::Radial);
+        let radial = IntrinsicsModel::FOCAL.with(Extension::PrincipalPoint).with(Extension::RadialK1);
         assert_eq!(radial.name(), "focal length, principal point and radial distortion");
         assert_eq!(radial.parameters().len(), 4);
         assert_eq!(
@@ -184,7 +233,12 @@ mod tests {
             ("nothing".to_owned(), vec![])
         );
         assert_eq!(IntrinsicsModel::FULL.parameters(), Parameter::ALL);
-        assert_eq!(IntrinsicsModel::all().count(), 12);
-        assert_eq!(IntrinsicsModel::all().next(), Some(IntrinsicsModel::FOCAL));
+        for simplest in [IntrinsicsModel::FOCAL, IntrinsicsModel::FOCAL_PER_VIEW] {
+            assert_eq!(simplest.with_any_extensions().count(), 32);
+            assert_eq!(simplest.with_any_extensions().next(), Some(simplest));
+        }
+        let own = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1);
+        assert_eq!(own.name(), "a focal length a view and radial distortion");
+        assert_eq!(own.parameters(), [Parameter::RadialK1]);
     }
 }

@@ -1,4 +1,5 @@
-//! Metric bundle adjustment: one calibration for all views, rotations, translations and Euclidean points.
+//! Metric bundle adjustment: intrinsics that the views share, but for focal lengths of their own where they have these,
+//! rotations, translations and Euclidean points.
 
 use nalgebra::{Matrix3, Matrix3x4, Rotation3, SMatrix, Vector2, Vector3};
 
@@ -10,8 +11,10 @@ pub use super::intrinsics_model::{Extension, IntrinsicsModel, IntrinsicsPrior, P
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
 
-/// Unknowns of a pose (rotation vector, then translation) and of a point.
+/// Unknowns of a pose (rotation vector, then translation), of a view with a focal length of its own, whose logarithm
+/// comes after its pose, and of a point.
 pub(super) const POSE: usize = 6;
+pub(super) const VIEW: usize = POSE + 1;
 pub(super) const POINT: usize = 3;
 
 /// World to camera: `x = R X + t`.
@@ -88,19 +91,20 @@ impl<'a> Projection<'a> {
 }
 
 impl ProjectionGradients {
-    /// By these intrinsics, pose and point; of a view with further unknowns, which come after the pose, those by the
-    /// parameter `of_view`.
+    /// By these intrinsics, pose and point; of a view with another unknown, which comes after the pose, by its log focal
+    /// length.
     #[inline]
     pub(super) fn jacobian<const G: usize, const C: usize>(
         &self,
-        globals: &[Parameter; G],
-        of_view: Parameter,
+        globals: &[Option<Parameter>; G],
     ) -> Jacobian<G, C, POINT> {
         Jacobian {
-            globals: SMatrix::from_fn(|k, component| self.by_parameter[component][globals[k] as usize]),
+            globals: SMatrix::from_fn(|k, component| {
+                globals[k].map_or(0.0, |parameter| self.by_parameter[component][parameter as usize])
+            }),
             camera: SMatrix::from_fn(|k, component| match self.by_pose[component].get(k) {
                 Some(by_pose) => *by_pose,
-                None => self.by_parameter[component][of_view as usize],
+                None => self.by_parameter[component][Parameter::LogFocal as usize],
             }),
             point: SMatrix::from_columns(&self.by_point),
         }
@@ -110,15 +114,59 @@ impl ProjectionGradients {
 /// A metric reconstruction, up to a similarity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Reconstruction {
+    /// Of all views; where they have focal lengths of their own, with the geometric mean of these.
     pub intrinsics: Intrinsics,
+    /// The focal length of each view; empty where all have that of `intrinsics`.
+    pub focals: Vec<f64>,
     pub poses: Vec<Pose>,
     pub points: Vec<Vector3<f64>>,
 }
 
 impl Reconstruction {
+    /// With one calibration for all views.
+    pub fn new(intrinsics: Intrinsics, poses: Vec<Pose>, points: Vec<Vector3<f64>>) -> Self {
+        Self { intrinsics, focals: Vec::new(), poses, points }
+    }
+
+    /// The same with a focal length of each view, all alike unless it has these already.
+    pub fn with_own_focals(mut self) -> Self {
+        if self.focals.is_empty() {
+            self.focals = vec![self.intrinsics.focal; self.poses.len()];
+        }
+        self
+    }
+
+    /// Whether every view has a focal length of its own.
+    pub fn has_own_focals(&self) -> bool {
+        !self.focals.is_empty()
+    }
+
+    /// Intrinsics of a view.
+    #[inline]
+    pub fn intrinsics_of(&self, view: usize) -> Intrinsics {
+        match self.focals.get(view) {
+            Some(&focal) => Intrinsics { focal, ..self.intrinsics },
+            None => self.intrinsics,
+        }
+    }
+
+    /// Multiplies all focal lengths.
+    pub fn scale_focals(&mut self, factor: f64) {
+        self.intrinsics.focal *= factor;
+        self.focals.iter_mut().for_each(|focal| *focal *= factor);
+    }
+
+    /// Takes the geometric mean of the views' own focal lengths as that of all.
+    pub fn average_focals(&mut self) {
+        if self.has_own_focals() {
+            let logs = self.focals.iter().map(|focal| focal.ln()).sum::<f64>();
+            self.intrinsics.focal = (logs / self.focals.len() as f64).exp();
+        }
+    }
+
     /// The cameras `K [R|t]`.
     pub fn cameras(&self) -> Vec<Matrix3x4<f64>> {
-        self.poses.iter().map(|pose| pose.camera(&self.intrinsics)).collect()
+        self.poses.iter().enumerate().map(|(view, pose)| pose.camera(&self.intrinsics_of(view))).collect()
     }
 
     /// Predicted minus observed image point; infinite or not a number at depth zero.
@@ -126,19 +174,20 @@ impl Reconstruction {
     /// # Panics
     /// When the observation's indices are out of range.
     pub fn residual(&self, seen: &Observation) -> Vector2<f64> {
-        self.intrinsics.project(&self.poses[seen.camera].apply(&self.points[seen.point])) - seen.xy
+        self.intrinsics_of(seen.camera).project(&self.poses[seen.camera].apply(&self.points[seen.point])) - seen.xy
     }
 }
 
-/// A reconstruction with these `G` intrinsics free.
+/// A reconstruction with these `G` shared intrinsics free, in a place without one nothing moves, and `C` unknowns of each
+/// view: [`POSE`], or [`VIEW`] where its own focal length is free.
 #[derive(Clone)]
-pub(super) struct Metric<const G: usize> {
+pub(super) struct Metric<const G: usize, const C: usize> {
     pub reconstruction: Reconstruction,
-    pub free: [Parameter; G],
+    pub free: [Option<Parameter>; G],
     pub prior: IntrinsicsPrior,
 }
 
-impl<const G: usize> Problem<G, POSE, POINT> for Metric<G> {
+impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
     fn camera_count(&self) -> usize {
         self.reconstruction.poses.len()
     }
@@ -148,20 +197,25 @@ impl<const G: usize> Problem<G, POSE, POINT> for Metric<G> {
     }
 
     #[inline]
-    fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, POSE, POINT>) {
-        let Reconstruction { intrinsics, poses, points } = &self.reconstruction;
-        let seen = Projection::new(intrinsics, &poses[observation.camera], &points[observation.point]);
-        sink.take(seen.image - observation.xy, || seen.gradients().jacobian(&self.free, Parameter::LogFocal));
+    fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, C, POINT>) {
+        let Reconstruction { poses, points, .. } = &self.reconstruction;
+        let intrinsics = self.reconstruction.intrinsics_of(observation.camera);
+        let seen = Projection::new(&intrinsics, &poses[observation.camera], &points[observation.point]);
+        sink.take(seen.image - observation.xy, || seen.gradients().jacobian(&self.free));
     }
 
-    fn retract(&mut self, from: &Self, step: &Step<G, POSE, POINT>) {
+    fn retract(&mut self, from: &Self, step: &Step<G, C, POINT>) {
         let (moved, from) = (&mut self.reconstruction, &from.reconstruction);
         moved.intrinsics = from.intrinsics;
         for (parameter, by) in self.free.iter().zip(step.globals.iter()) {
-            moved.intrinsics.shift(*parameter, *by);
+            parameter.iter().for_each(|parameter| moved.intrinsics.shift(*parameter, *by));
         }
         for ((pose, from), step) in moved.poses.iter_mut().zip(&from.poses).zip(&step.cameras) {
-            *pose = from.moved((*step).into());
+            *pose = from.moved(std::array::from_fn(|k| step[k]));
+        }
+        let shared = moved.intrinsics.focal / from.intrinsics.focal;
+        for ((focal, from), step) in moved.focals.iter_mut().zip(&from.focals).zip(&step.cameras) {
+            *focal = from * shared * step.get(POSE).map_or(1.0, |by| by.exp());
         }
         for ((point, from), step) in moved.points.iter_mut().zip(&from.points).zip(&step.points) {
             *point = from + step;
@@ -169,14 +223,19 @@ impl<const G: usize> Problem<G, POSE, POINT> for Metric<G> {
     }
 
     fn global_beliefs(&self) -> [Belief; G] {
-        self.free.map(|parameter| Belief {
-            information: self.prior.information[parameter as usize],
-            deviation: self.prior.deviation(parameter, &self.reconstruction.intrinsics),
+        self.free.map(|parameter| match parameter {
+            Some(parameter) => Belief {
+                information: self.prior.information[parameter as usize],
+                deviation: self.prior.deviation(parameter, &self.reconstruction.intrinsics),
+            },
+            // Known to be where it is.
+            None => Belief { information: 1.0, deviation: 0.0 },
         })
     }
 }
 
-/// Minimises the reprojection error over poses, points and the free intrinsics, of which `prior` knows something.
+/// Minimises the reprojection error over poses, points and the free intrinsics, of which `prior` knows something. Focal
+/// lengths a view are free only where the reconstruction has them.
 ///
 /// The cost contains what the prior adds.
 ///
@@ -191,16 +250,12 @@ pub fn adjust(
     stop: &StopToken,
 ) -> Report {
     let run = Run { observations, prior, options, stop };
-    match model.parameters().as_slice() {
-        [] => run.with([], reconstruction),
-        &[a] => run.with([a], reconstruction),
-        &[a, b] => run.with([a, b], reconstruction),
-        &[a, b, c] => run.with([a, b, c], reconstruction),
-        &[a, b, c, d] => run.with([a, b, c, d], reconstruction),
-        &[a, b, c, d, e] => run.with([a, b, c, d, e], reconstruction),
-        // The only model left is the one that frees them all.
-        _ => run.with(Parameter::ALL, reconstruction),
-    }
+    let report = match model.is_per_view() && reconstruction.has_own_focals() {
+        true => run.with::<VIEW>(model, reconstruction),
+        false => run.with::<POSE>(model, reconstruction),
+    };
+    reconstruction.average_focals();
+    report
 }
 
 /// What an adjustment works with, whatever is free.
@@ -212,8 +267,24 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    fn with<const G: usize>(&self, free: [Parameter; G], reconstruction: &mut Reconstruction) -> Report {
-        let mut problem = Metric { reconstruction: reconstruction.clone(), free, prior: *self.prior };
+    /// Few sizes, for each is compiled by itself: what a size is too large for has nothing in its last places.
+    fn with<const C: usize>(&self, model: IntrinsicsModel, reconstruction: &mut Reconstruction) -> Report {
+        let free = model.parameters();
+        match free.len() {
+            0 => self.sized::<0, C>(&free, reconstruction),
+            1 => self.sized::<1, C>(&free, reconstruction),
+            2 | 3 => self.sized::<3, C>(&free, reconstruction),
+            4 | 5 => self.sized::<5, C>(&free, reconstruction),
+            _ => self.sized::<{ Parameter::COUNT }, C>(&free, reconstruction),
+        }
+    }
+
+    fn sized<const G: usize, const C: usize>(&self, free: &[Parameter], reconstruction: &mut Reconstruction) -> Report {
+        let mut problem = Metric::<G, C> {
+            reconstruction: reconstruction.clone(),
+            free: std::array::from_fn(|k| free.get(k).copied()),
+            prior: *self.prior,
+        };
         let report = minimise(&mut problem, self.observations, self.options, self.stop);
         *reconstruction = problem.reconstruction;
         report
@@ -226,7 +297,7 @@ mod tests {
     use super::*;
 
     fn truth(scene: &TestScene) -> Reconstruction {
-        Reconstruction { intrinsics: scene.intrinsics, poses: scene.poses.clone(), points: scene.points.clone() }
+        Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone())
     }
 
     fn perturbed(scene: &TestScene, deviation: f64, seed: u64) -> Reconstruction {
@@ -247,16 +318,34 @@ mod tests {
         let mut start = perturbed(&scene, 0.01, 1);
         start.intrinsics.principal_point = Vector2::new(0.03, -0.02);
         start.intrinsics.aspect = 1.1;
-        for (radial, second_radial) in [(0.0, 0.0), (-0.1, 0.0), (-0.1, 0.07)] {
-            (start.intrinsics.radial, start.intrinsics.second_radial) = (radial, second_radial);
-            let with = |reconstruction: &Reconstruction| (reconstruction.clone(), IntrinsicsPrior::NONE);
-            let (reconstruction, prior) = with(&start);
-            testing::check_jacobian(&Metric { reconstruction, free: [], prior }, &scene.observations);
-            let (reconstruction, prior) = with(&start);
-            let free = [Parameter::LogFocal, Parameter::Radial];
-            testing::check_jacobian(&Metric { reconstruction, free, prior }, &scene.observations);
-            let (reconstruction, prior) = with(&start);
-            testing::check_jacobian(&Metric { reconstruction, free: Parameter::ALL, prior }, &scene.observations);
+        for (radial, tangential) in
+            [([0.0; 3], [0.0; 2]), ([-0.1, 0.0, 0.0], [0.01, 0.0]), ([-0.1, 0.07, -0.03], [0.01, -0.02])]
+        {
+            (start.intrinsics.radial, start.intrinsics.tangential) = (radial, tangential);
+            let mut own = start.clone();
+            own.focals = vec![0.9, 1.0, 1.2, 1.5];
+            for reconstruction in [start.clone(), own] {
+                check::<0, POSE>(&reconstruction, [], &scene);
+                check::<1, VIEW>(&reconstruction, [Some(Parameter::RadialK1)], &scene);
+                check::<3, POSE>(
+                    &reconstruction,
+                    [Some(Parameter::LogFocal), Some(Parameter::TangentialP1), None],
+                    &scene,
+                );
+                check::<{ Parameter::COUNT }, POSE>(&reconstruction, Parameter::ALL.map(Some), &scene);
+            }
+        }
+    }
+
+    /// Of a view's own focal length, which is there only where the reconstruction has it, with the shared one held.
+    fn check<const G: usize, const C: usize>(
+        reconstruction: &Reconstruction,
+        free: [Option<Parameter>; G],
+        scene: &TestScene,
+    ) {
+        if C == POSE || reconstruction.has_own_focals() {
+            let (reconstruction, prior) = (reconstruction.clone(), IntrinsicsPrior::NONE);
+            testing::check_jacobian(&Metric::<G, C> { reconstruction, free, prior }, &scene.observations);
         }
     }
 

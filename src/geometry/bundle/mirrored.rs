@@ -133,15 +133,13 @@ mod tests {
                 testing::perturb(problem.points.iter_mut().flat_map(|point| point.iter_mut()), 0.003, seed + 1);
                 both_end_at_the_same_cost::<0, 12, 4>(&problem, &scene.observations, &case);
 
-                let mut reconstruction = Reconstruction {
-                    intrinsics: scene.intrinsics,
-                    poses: scene.poses.clone(),
-                    points: scene.points.clone(),
-                };
+                let mut reconstruction =
+                    Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone());
                 testing::perturb(reconstruction.points.iter_mut().flat_map(|point| point.iter_mut()), 0.1, seed);
                 let few: Vec<Observation> = scene.observations.iter().filter(|seen| seen.point < 8).copied().collect();
                 reconstruction.points.truncate(8);
-                let problem = Metric { reconstruction, free: [Parameter::LogFocal], prior: IntrinsicsPrior::NONE };
+                let free = [Some(Parameter::LogFocal)];
+                let problem = Metric::<1, POSE> { reconstruction, free, prior: IntrinsicsPrior::NONE };
                 both_end_at_the_same_cost::<1, POSE, POINT>(&problem, &few, &case);
             }
         }

@@ -21,8 +21,6 @@ pub mod sequence;
 #[cfg(test)]
 pub(crate) mod testing;
 mod whitened;
-pub mod zoom;
-pub mod zoom_lens;
 
 use nalgebra::Vector2;
 

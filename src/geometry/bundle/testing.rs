@@ -125,8 +125,7 @@ impl TestScene {
         self.observations.retain(|seen| {
             let direction = poses[seen.camera].apply(&points[seen.point]);
             let squared = (direction.xy() / direction.z).norm_squared();
-            let slope = 1.0 + squared * (3.0 * intrinsics.radial + 5.0 * squared * intrinsics.second_radial);
-            seen.xy.amax() <= 0.5 && intrinsics.images(squared) && slope > 0.1
+            seen.xy.amax() <= 0.5 && intrinsics.images(squared) && intrinsics.radius_slope(squared) > 0.1
         });
         let mut count = vec![0; self.points.len()];
         self.observations.iter().for_each(|seen| count[seen.point] += 1);

@@ -5,13 +5,13 @@
 
 mod frame;
 mod starts;
-mod zoom;
+mod view_focals;
 
 use nalgebra::{Matrix3, Matrix3x4, SMatrix, SVector, Vector3};
 
 pub use self::frame::{FirstViewFrame, to_first_view_frame};
 pub use self::starts::{linear, scan};
-pub use self::zoom::{zoom_starts, zoomed};
+pub use self::view_focals::{view_focal, view_focal_starts};
 use super::bundle::metric::Intrinsics;
 use super::levenberg_marquardt::{self, MIN_DAMPING, Normal, Problem};
 use crate::domain::StopToken;

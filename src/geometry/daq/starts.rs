@@ -107,11 +107,11 @@ fn nearest_of_rank_three(quadric: &Matrix4<f64>) -> Matrix4<f64> {
 ///
 /// Two planes, one for each sign of the camera; none when the views share their centre.
 pub fn plane_from_second_view(camera: &Matrix3x4<f64>, focal: f64) -> Option<[Vector3<f64>; 2]> {
-    plane_from_zoomed_view(camera, focal, focal)
+    plane_from_focals(camera, focal, focal)
 }
 
 /// The same with a focal length of its own for each of the two views.
-pub(super) fn plane_from_zoomed_view(camera: &Matrix3x4<f64>, first: f64, second: f64) -> Option<[Vector3<f64>; 2]> {
+pub(super) fn plane_from_focals(camera: &Matrix3x4<f64>, first: f64, second: f64) -> Option<[Vector3<f64>; 2]> {
     let calibration = Matrix3::from_diagonal(&Vector3::new(first, first, 1.0));
     let uncalibrate = |focal: f64| Matrix3::from_diagonal(&Vector3::new(focal.recip(), focal.recip(), 1.0));
     let translation = uncalibrate(second) * camera.column(3);

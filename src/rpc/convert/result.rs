@@ -125,6 +125,12 @@ fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
         sigma_aspect: calibration.sigmas.aspect,
         sigma_radial_k1: calibration.sigmas.radial_k1,
         sigma_radial_k2: calibration.sigmas.radial_k2,
+        radial_k3: Some(calibration.radial_k3),
+        tangential_p1: Some(calibration.tangential_p1),
+        tangential_p2: Some(calibration.tangential_p2),
+        sigma_radial_k3: calibration.sigmas.radial_k3,
+        sigma_tangential_p1: calibration.sigmas.tangential_p1,
+        sigma_tangential_p2: calibration.sigmas.tangential_p2,
     }
 }
 
@@ -136,6 +142,9 @@ fn calibration_from_wire(calibration: &proto::Calibration) -> Result<Calibration
         aspect: calibration.aspect,
         radial_k1: calibration.radial_k1.unwrap_or(0.0),
         radial_k2: calibration.radial_k2.unwrap_or(0.0),
+        radial_k3: calibration.radial_k3.unwrap_or(0.0),
+        tangential_p1: calibration.tangential_p1.unwrap_or(0.0),
+        tangential_p2: calibration.tangential_p2.unwrap_or(0.0),
         grade: Grade::from_wire(calibration.grade, "calibrations.grade")?,
         sigmas: Sigmas {
             principal_point_px: calibration
@@ -145,6 +154,9 @@ fn calibration_from_wire(calibration: &proto::Calibration) -> Result<Calibration
             aspect: calibration.sigma_aspect,
             radial_k1: calibration.sigma_radial_k1,
             radial_k2: calibration.sigma_radial_k2,
+            radial_k3: calibration.sigma_radial_k3,
+            tangential_p1: calibration.sigma_tangential_p1,
+            tangential_p2: calibration.sigma_tangential_p2,
         },
     })
 }

@@ -1,6 +1,7 @@
 //! How well a model fits, and whether one that fits worse is refuted.
 
 use super::{LEAST_NOISE, Problem};
+use crate::geometry::bundle::metric::IntrinsicsModel;
 
 /// Degrees of freedom from which the posterior noise is believed; it is then known to 13 %.
 const ENOUGH_FREEDOM: usize = 30;
@@ -29,6 +30,14 @@ impl Fit {
     /// The fit of free projective cameras and points.
     pub fn projective(cost: f64, problem: &Problem, inliers: usize) -> Self {
         Self::new(cost, (11 * problem.cameras.len() + 3 * inliers).saturating_sub(15), problem)
+    }
+
+    /// The fit of metric cameras with these intrinsics free, and points.
+    pub fn metric(cost: f64, model: IntrinsicsModel, problem: &Problem) -> Self {
+        let of_view = if model.is_per_view() { 7 } else { 6 };
+        let inliers = super::observed_points(problem);
+        let unknowns = of_view * problem.cameras.len() + 3 * inliers + model.parameters().len();
+        Self::new(cost, unknowns.saturating_sub(7), problem)
     }
 
     /// How much worse a special case of this model fits than chance would have it, in standard deviations of the F

@@ -1,10 +1,10 @@
 //! What a calibration is worth, and what to warn of.
 
 use super::fit::Fit;
-use super::lens::{self, Zoom};
 use super::models::{CHI_SQUARE_GAIN, Candidate, Choice};
 use super::search::Minimum;
 use super::verdict::{CHEIRALITY_LIMIT, UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO};
+use super::view_focals::{self, Differing};
 use super::{Outcome, Problem, Stopped};
 use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
@@ -21,7 +21,7 @@ const PRIOR_CONTRADICTED: f64 = 3.0;
 /// Chooses among the minima and models, and says what the choice is worth.
 ///
 /// * `fit`: of the projective cameras
-/// * `minima`: not empty, cheapest first, with the focal length free
+/// * `minima`: not empty, cheapest first, with the focal length free, or that of each view
 pub(super) fn grade(
     choice: &Choice,
     fit: &Fit,
@@ -30,44 +30,63 @@ pub(super) fn grade(
 ) -> Result<Outcome, Stopped> {
     let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
     Stopped::check(choice.stop)?;
+    let has_own_focals = best.minimum.reconstruction.has_own_focals();
     let sigmas = choice.sigmas(&best);
-    let of_focal = sigmas[Parameter::LogFocal as usize];
-    let mut sigma = of_focal.filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
     let mut verdict = Verdict::new(warnings);
-    if let Some(focal_prior) = choice.problem.focal_prior {
-        weigh_prior(&mut verdict, &mut sigma, choice, &best, focal_prior);
-    }
-    verdict.judge_sigma(sigma);
-    if let Some(rival) = rival(&best, &others) {
-        let shift = (rival.log_focal() - best.minimum.log_focal()).abs();
+    let mut focals = view_focals::of(&best, &sigmas);
+    // What the ratios of the others' deviations are taken of, and the one that is told.
+    let (of_focal, mut sigma) = match has_own_focals {
+        true => {
+            let sigma = view_focals::judge(&mut verdict, &mut focals);
+            (sigma, sigma)
+        }
+        false => {
+            let of_focal = sigmas.parameters[Parameter::LogFocal as usize];
+            let mut sigma = of_focal.filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
+            if let Some(focal_prior) = choice.problem.focal_prior {
+                weigh_prior(&mut verdict, &mut sigma, choice, &best, focal_prior);
+            }
+            verdict.judge_sigma(sigma);
+            (of_focal, sigma)
+        }
+    };
+    let counts = |view: usize| focals[view].sigma_log.is_some();
+    if let Some((rival, shift)) = rival(&best, &others, counts) {
         let worst = if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak };
         verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, choice.scale_px));
     }
     let rms_ratio = verdict.judge_fit(fit, &best.fit, &best.model.name(), choice.scale_px);
-    if verdict.is_misfit
-        && let Some(zoom) = lens::zoom(&best.minimum.reconstruction, &best.fit, choice)
+    if verdict.is_misfit && has_own_focals {
+        // What a focal length a view behind one lens does not explain, nobody knows the reason of.
+        verdict.grade = Grade::ProjectiveOnly;
+    } else if verdict.is_misfit
+        && let Some(differing) = view_focals::differing(&best.minimum.reconstruction, &best.fit, choice)
     {
         // What the views' own differ from it by, one focal length for all is wrong by.
-        sigma = sigma.map(|sigma| sigma.max(zoom.shift));
-        verdict.doubt(sigma, zoom_words(&zoom, choice.scale_px));
+        sigma = sigma.map(|sigma| sigma.max(differing.shift));
+        verdict.doubt(sigma, differing_words(&differing, choice.scale_px));
     }
     let is_known = choice.problem.focal_prior.is_some();
-    verdict.judge_plausibility(best.minimum.log_focal().exp(), is_known, choice.scale_px);
+    if !has_own_focals {
+        verdict.judge_plausibility(best.minimum.log_focal().exp(), is_known, choice.scale_px);
+    }
     verdict.judge_cheirality(best.minimum.cheirality);
-    if verdict.grade != Grade::ProjectiveOnly {
+    if verdict.grade != Grade::ProjectiveOnly && !has_own_focals {
         verdict.warnings.extend(principal_point(&best, choice.prior, choice.scale_px));
     }
+    let mut metric = best.minimum.reconstruction;
+    metric.intrinsics.focal = view_focals::mean(&focals).unwrap_or(metric.intrinsics.focal);
     Ok(Outcome {
         sigma_log_focal: verdict.told(sigma),
-        sigma_ratios: sigmas.map(|sigma| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite())),
+        sigma_ratios: sigmas.parameters.map(|sigma| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite())),
         grade: verdict.grade,
         warnings: verdict.warnings,
         model: best.model,
         plane_at_infinity: None,
         cheirality: best.minimum.cheirality,
         rms_ratio,
-        metric: Some(best.minimum.reconstruction),
-        focals: None,
+        metric: Some(metric),
+        focals: has_own_focals.then_some(focals),
     })
 }
 
@@ -80,8 +99,9 @@ fn chosen(
 ) -> Result<(Candidate, Vec<Minimum>), Stopped> {
     let Choice { problem, prior, .. } = *choice;
     let first = minima.remove(best_in_front(&minima, problem, fit));
-    let mut best = choice.richest(Candidate::new(first, IntrinsicsModel::FOCAL, prior, problem), warnings)?;
-    if best.model == IntrinsicsModel::FOCAL {
+    let simplest = IntrinsicsModel::focal(first.reconstruction.has_own_focals());
+    let mut best = choice.richest(Candidate::new(first, simplest, prior, problem), warnings)?;
+    if best.model == simplest {
         return Ok((best, minima));
     }
     for minimum in &mut minima {
@@ -103,13 +123,17 @@ fn best_in_front(minima: &[Minimum], problem: &Problem, fit: &Fit) -> usize {
     minima.iter().position(|minimum| minimum.cheirality >= CHEIRALITY_LIMIT && near(minimum)).unwrap_or(0)
 }
 
-/// Another calibration that explains the data about as well.
-fn rival<'a>(best: &Candidate, others: &'a [Minimum]) -> Option<&'a Minimum> {
-    others.iter().find(|other| {
-        (other.log_focal() - best.minimum.log_focal()).abs() > OTHER_CALIBRATION
+/// Another calibration that explains the data about as well, and how far its log focal length is from the best one's.
+///
+/// * `counts`: which views do where they have focal lengths of their own
+fn rival<'a>(best: &Candidate, others: &'a [Minimum], counts: impl Fn(usize) -> bool) -> Option<(&'a Minimum, f64)> {
+    let apart = others.iter().map(|other| (other, other.apart(&best.minimum, &counts)));
+    let mut rivals = apart.filter(|(other, apart)| {
+        *apart > OTHER_CALIBRATION
             && other.cheirality >= CHEIRALITY_LIMIT.min(best.minimum.cheirality)
             && other.cost - best.minimum.cost < CHI_SQUARE_GAIN * best.fit.noise.powi(2)
-    })
+    });
+    rivals.next()
 }
 
 /// What a prior on the focal length may not do: contradict the observations unsaid, or make a calibration of nothing.
@@ -162,11 +186,11 @@ fn principal_point(best: &Candidate, prior: &IntrinsicsPrior, scale_px: f64) -> 
     (!unknown.is_empty()).then(|| Warning::new(WarningCode::PrincipalPointUnobservable, detail))
 }
 
-fn zoom_words(zoom: &Zoom, scale_px: f64) -> String {
+fn differing_words(differing: &Differing, scale_px: f64) -> String {
     format!(
         "with a focal length a view (focal_per_view) the images fit better, at {:.1} to {:.1} px",
-        zoom.range.0 * scale_px,
-        zoom.range.1 * scale_px
+        differing.range.0 * scale_px,
+        differing.range.1 * scale_px
     )
 }
 

@@ -6,19 +6,17 @@
 mod critical;
 mod fit;
 mod grading;
-mod lens;
 mod models;
 mod search;
 #[cfg(test)]
 mod tests;
 mod verdict;
-mod zoom;
+mod view_focals;
 
 use nalgebra::{Matrix3x4, Vector3, Vector4};
 
 use crate::domain::{FocalPrior, Grade, StopReason, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
-use crate::geometry::bundle::zoom::Zooming;
 use crate::geometry::bundle::{Observation, Options, projective};
 use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::metric::plane_at_infinity;
@@ -26,7 +24,7 @@ use crate::geometry::metric::plane_at_infinity;
 use fit::Fit;
 pub use models::knowledge;
 pub use verdict::{CHEIRALITY_LIMIT, grade_of_sigma};
-pub use zoom::LEAST_DETERMINED;
+pub use view_focals::LEAST_DETERMINED;
 
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
 /// caller has adjusted it before.
@@ -77,8 +75,7 @@ pub struct Outcome {
     /// `None` when no metric reconstruction was found or looked for. With grade PROJECTIVE_ONLY it may stand but is
     /// not to be used as metric.
     pub metric: Option<Reconstruction>,
-    /// With a focal length a view: these; `metric` has the geometric mean of those that
-    /// are determined.
+    /// With a focal length a view: these; the intrinsics of `metric` have the geometric mean of those that are determined.
     pub focals: Option<Vec<ViewFocal>>,
     /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable.
     pub sigma_log_focal: Option<f64>,
@@ -165,7 +162,6 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
         (Some(translation), Some(focal)) => search::known_focal(&translation, focal.focal_px / scale_px, &choice),
         _ if refused => return Ok(Outcome::refused(warnings)),
         _ => match to_first_view_frame(&cameras, &points) {
-            Some(frame) if problem.focal_per_view => return zoom::calibrate(&frame, &choice, &fit, warnings),
             Some(frame) => search::minima(&frame, problem, &prior, stop)?,
             None => Vec::new(),
         },
@@ -195,45 +191,9 @@ pub fn from_metric(
     stop: &StopToken,
     told: &mut dyn FnMut(),
 ) -> Result<Outcome, Stopped> {
-    near(problem, scale_px, stop, told, |choice, fit, mut warnings, told| {
-        let minima = search::minima_near(metric, choice.problem, choice.prior, stop)?;
-        told();
-        if minima.is_empty() {
-            warnings.push(no_start());
-            return Ok(Outcome::refused(warnings));
-        }
-        grading::grade(choice, fit, minima, warnings)
-    })
-}
-
-/// The same with a focal length a view, whose priors are not looked at.
-///
-/// * `problem`: the projective cameras and points of `zooming`
-///
-/// # Errors
-/// As [`calibrate`].
-pub fn from_zooming(
-    problem: &Problem,
-    zooming: &Zooming,
-    scale_px: f64,
-    stop: &StopToken,
-    told: &mut dyn FnMut(),
-) -> Result<Outcome, Stopped> {
-    near(problem, scale_px, stop, told, |choice, fit, warnings, told| {
-        zoom::calibrate_near(zooming, choice, fit, warnings, told)
-    })
-}
-
-/// Calibrates by `search` where the motion and the scene carry a calibration.
-fn near(
-    problem: &Problem,
-    scale_px: f64,
-    stop: &StopToken,
-    told: &mut dyn FnMut(),
-    search: impl FnOnce(&models::Choice, &Fit, Vec<Warning>, &mut dyn FnMut()) -> Result<Outcome, Stopped>,
-) -> Result<Outcome, Stopped> {
     Stopped::check(stop)?;
-    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), ..*problem };
+    let focal_prior = problem.focal_prior.filter(|_| !metric.has_own_focals());
+    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_prior, ..*problem };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < LEAST_INLIERS {
@@ -253,17 +213,16 @@ fn near(
         return Ok(Outcome::refused(warnings));
     }
     let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);
-    search(&models::Choice { problem, prior: &prior, scale_px, stop }, &fit, warnings, told)
+    let minima = search::minima_near(metric, problem, &prior, stop, told)?;
+    if minima.is_empty() {
+        warnings.push(no_start());
+        return Ok(Outcome::refused(warnings));
+    }
+    grading::grade(&models::Choice { problem, prior: &prior, scale_px, stop }, &fit, minima, warnings)
 }
 
-/// The mean log focal length that a reconstruction with a focal length a view has by these observations alone, and its
-/// standard deviation, the lens left out; `None` where that is not finite.
-pub fn focals_alone(problem: &Problem, zooming: &Zooming, stop: &StopToken) -> Option<(f64, f64)> {
-    zoom::alone(problem, zooming, stop)
-}
-
-/// The log focal length that a metric reconstruction has by these observations alone, the rest of the lens held, and
-/// its standard deviation; `None` where that is not finite.
+/// The log focal length that a metric reconstruction has by these observations alone, the mean of those of its views
+/// where each has its own, the rest of the lens held, and its standard deviation; `None` where that is not finite.
 pub fn focal_alone(
     problem: &Problem,
     metric: &Reconstruction,
@@ -272,7 +231,7 @@ pub fn focal_alone(
 ) -> Option<(f64, f64)> {
     let start = search::Minimum { reconstruction: metric.clone(), cost: f64::INFINITY, cheirality: 0.0 };
     let prior = prior.forgetting(Parameter::LogFocal);
-    let model = IntrinsicsModel::FOCAL;
+    let model = IntrinsicsModel::focal(metric.has_own_focals());
     let candidate =
         models::Candidate::new(start.adjusted(problem.observations, model, &prior, stop), model, &prior, problem);
     let sigma = candidate.sigma(Parameter::LogFocal, model, &prior)?;

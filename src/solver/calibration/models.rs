@@ -17,14 +17,18 @@ const PRINCIPAL_POINT_SIGMA: f64 = 0.05;
 const LOG_ASPECT_SIGMA: f64 = 0.1;
 /// The same of `k1`: phones and cameras have a few hundredths, wide lenses -.3.
 const RADIAL_SIGMA: f64 = 0.2;
-/// The same of `k2`: calibrations on boards give it the size of `k1`, with either sign.
-const SECOND_RADIAL_SIGMA: f64 = 0.2;
+/// The same of `k2` and `k3`: calibrations on boards give them the size of `k1`, with either sign.
+const LATER_RADIAL_SIGMA: f64 = 0.2;
+/// The same of `p1` and `p2`: calibrations on boards give some thousandths, and what a decentred lens mostly does is
+/// displace the principal point.
+const TANGENTIAL_SIGMA: f64 = 0.005;
 /// Probability, before any observation, that a camera needs the extension. Principal points and distortion are as often
-/// in order (rectified, rendered) as not; pixels are square in all but old video. That of the second radial term is
-/// where there is a first.
+/// in order (rectified, rendered) as not; pixels are square in all but old video. That of a second radial term is where
+/// there is a first; few lenses need a third, or are so far off centre that it shows.
 fn probability(extension: Extension) -> f64 {
     match extension {
-        Extension::PrincipalPoint | Extension::Radial | Extension::SecondRadial => 0.5,
+        Extension::PrincipalPoint | Extension::RadialK1 | Extension::RadialK2 => 0.5,
+        Extension::RadialK3 | Extension::Tangential => 0.2,
         Extension::Aspect => 0.05,
     }
 }
@@ -63,8 +67,11 @@ pub fn knowledge(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> Intrin
         .knowing(Parameter::PrincipalX, 0.0, PRINCIPAL_POINT_SIGMA, noise)
         .knowing(Parameter::PrincipalY, 0.0, PRINCIPAL_POINT_SIGMA, noise)
         .knowing(Parameter::LogAspect, 0.0, LOG_ASPECT_SIGMA, noise)
-        .knowing(Parameter::Radial, 0.0, RADIAL_SIGMA, noise)
-        .knowing(Parameter::SecondRadial, 0.0, SECOND_RADIAL_SIGMA, noise);
+        .knowing(Parameter::RadialK1, 0.0, RADIAL_SIGMA, noise)
+        .knowing(Parameter::RadialK2, 0.0, LATER_RADIAL_SIGMA, noise)
+        .knowing(Parameter::RadialK3, 0.0, LATER_RADIAL_SIGMA, noise)
+        .knowing(Parameter::TangentialP1, 0.0, TANGENTIAL_SIGMA, noise)
+        .knowing(Parameter::TangentialP2, 0.0, TANGENTIAL_SIGMA, noise);
     match focal {
         Some(prior) => lenses.knowing(Parameter::LogFocal, (prior.focal_px / scale_px).ln(), prior.sigma_log, noise),
         None => lenses,
@@ -82,10 +89,8 @@ pub(super) struct Candidate {
 
 impl Candidate {
     pub fn new(minimum: Minimum, model: IntrinsicsModel, prior: &IntrinsicsPrior, problem: &Problem) -> Self {
-        let inliers = super::observed_points(problem);
-        let unknowns = 6 * problem.cameras.len() + 3 * inliers + model.parameters().len();
         let believed = prior.cost(model, &minimum.reconstruction.intrinsics);
-        let fit = Fit::new(minimum.cost - believed, unknowns.saturating_sub(7), problem);
+        let fit = Fit::metric(minimum.cost - believed, model, problem);
         let information = Information::new(&minimum.reconstruction, problem.observations);
         Self { model, minimum, fit, information }
     }
@@ -105,6 +110,15 @@ impl Candidate {
     fn sigma_log_focal(&self, prior: &IntrinsicsPrior) -> Option<f64> {
         self.sigma(Parameter::LogFocal, self.model, prior)
     }
+}
+
+/// Standard deviations, the doubt about the model included.
+pub(super) struct Sigmas {
+    /// Of the intrinsics that the model frees, indexed by [`Parameter`], the log focal length's also where every view
+    /// has its own, then of their mean; `None`: unobservable or not free.
+    pub parameters: [Option<f64>; Parameter::COUNT],
+    /// Of the log focal length of each view that has its own; `None`: unobservable.
+    pub view_focals: Vec<Option<f64>>,
 }
 
 /// What the choice of a model works with.
@@ -192,21 +206,24 @@ impl Choice<'_> {
         Warning::new(WarningCode::ModelMismatch, detail)
     }
 
-    /// Standard deviations of the intrinsics that the model frees, the doubt about the model included, indexed by
-    /// [`Parameter`]; `None`: unobservable or not free.
+    /// Standard deviations under the best model and all doubt about it.
     ///
     /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
     /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights
     /// from Laplace's approximation of each model's evidence under [`knowledge`]. An extension that the data can
     /// neither confirm nor refute thus costs what it would move.
-    pub fn sigmas(&self, best: &Candidate) -> [Option<f64>; Parameter::COUNT] {
+    pub fn sigmas(&self, best: &Candidate) -> Sigmas {
         let own = best.sigma_log_focal(self.prior);
-        let (Some(own), Some(here)) = (own, best.optimum(best.model, self.prior)) else {
-            return [None; Parameter::COUNT];
+        let views = best.minimum.reconstruction.focals.len();
+        let (Some(own), Some(information), Some(here)) = (own, &best.information, best.optimum(best.model, self.prior))
+        else {
+            return Sigmas { parameters: [None; Parameter::COUNT], view_focals: vec![None; views] };
         };
         let profiled = self.profiled(own, best);
         let unit = best.fit.noise.powi(2);
-        let models: Vec<(f64, Optimum)> = IntrinsicsModel::all()
+        let models: Vec<(f64, Optimum)> = best
+            .model
+            .with_any_extensions()
             .filter_map(|model| {
                 let there = best.optimum(model, self.prior)?;
                 Some((self.log_weight(model, &here, &there, unit), there))
@@ -214,14 +231,14 @@ impl Choice<'_> {
             .collect();
         let highest = models.iter().map(|(weight, _)| *weight).fold(f64::NEG_INFINITY, f64::max);
         let total: f64 = models.iter().map(|(weight, _)| (weight - highest).exp()).sum();
-        let averaged = |index: usize| {
+        // Of what has this variance and shift under each model, and this shift under the best.
+        let averaged = |of_models: &dyn Fn(usize) -> (Option<f64>, f64), here: f64| {
             let mut squared = 0.0;
-            for (weight, there) in &models {
+            for (k, (weight, _)) in models.iter().enumerate() {
                 let weight = (weight - highest).exp() / total;
-                match there.variance[index] {
-                    Some(variance) => {
-                        squared += weight * (variance * unit + (there.shift[index] - here.shift[index]).powi(2))
-                    }
+                let (variance, shift) = of_models(k);
+                match variance {
+                    Some(variance) => squared += weight * (variance * unit + (shift - here).powi(2)),
                     None if weight > NEGLIGIBLE => return None,
                     None => {}
                 }
@@ -230,7 +247,16 @@ impl Choice<'_> {
             Some(squared.sqrt() * profiled / own).filter(|sigma| sigma.is_finite())
         };
         let free = best.model.parameters();
-        Parameter::ALL.map(|parameter| averaged(parameter as usize).filter(|_| free.contains(&parameter)))
+        let parameters = Parameter::ALL.map(|parameter| {
+            let index = parameter as usize;
+            let is_free = free.contains(&parameter) || (views > 0 && parameter == Parameter::LogFocal);
+            let of_models = |k: usize| (models[k].1.variance[index], models[k].1.shift[index]);
+            averaged(&of_models, here.shift[index]).filter(|_| is_free)
+        });
+        let here = information.own_focals(&here);
+        let there: Vec<_> = models.iter().map(|(_, there)| information.own_focals(there)).collect();
+        let of_view = |view: usize| averaged(&|k| there[k][view], here[view].1);
+        Sigmas { parameters, view_focals: (0..views).map(of_view).collect() }
     }
 
     /// Logarithm of prior probability times evidence, up to what all models share.
@@ -260,7 +286,7 @@ impl Choice<'_> {
         let model = best.model.without_focal();
         let side = |shift: f64| {
             let mut moved = best.minimum.reconstruction.clone();
-            moved.intrinsics.focal *= shift.exp();
+            moved.scale_focals(shift.exp());
             let options = Options::squared(PROFILE_ITERATIONS);
             let report = metric::adjust(&mut moved, self.problem.observations, model, self.prior, &options, self.stop);
             let deviation = self.prior.deviation(Parameter::LogFocal, &moved.intrinsics);
@@ -309,8 +335,7 @@ mod tests {
             let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
             let (prior, stop) = (knowledge(NOISE, None, 1000.0), StopToken::default());
             let choice = Choice { problem: &problem, prior: &prior, scale_px: 1000.0, stop: &stop };
-            let (intrinsics, poses, points) = (scene.intrinsics, scene.poses.clone(), scene.points.clone());
-            let reconstruction = Reconstruction { intrinsics, poses, points };
+            let reconstruction = Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone());
             let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 1.0 };
             for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
                 let minimum = start.adjusted(&scene.observations, model, &prior, &stop);

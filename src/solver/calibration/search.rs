@@ -2,16 +2,21 @@
 
 use nalgebra::Vector3;
 
+use super::fit::Fit;
 use super::models::Choice;
+use super::verdict::WEAK_UP_TO;
 use super::{Problem, Stopped};
 use crate::domain::StopToken;
 use crate::geometry::bundle::critical::Translating;
-use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Reconstruction};
+use crate::geometry::bundle::metric::{
+    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Reconstruction,
+};
 use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::daq::{self, Daq, FirstViewFrame, Free};
 use crate::geometry::measurement::Sighting;
 use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
-use crate::geometry::{Camera, triangulation};
+use crate::geometry::statistics::root_mean_square;
+use crate::geometry::triangulation;
 
 /// The scan of focal lengths: 40 in the range, from the 4 widest views.
 const SCAN_FOCALS: usize = 40;
@@ -32,10 +37,10 @@ const WINDOW_HALF_WIDTH: f64 = 0.15;
 /// Difference in log focal below which refined starts are the same.
 const SAME_START: f64 = 0.02;
 /// Iterations and tolerance of the first adjustment, which only has to rank the starts.
-pub(super) const FIRST_ITERATIONS: usize = 12;
-pub(super) const FIRST_TOLERANCE: f64 = 1e-4;
+const FIRST_ITERATIONS: usize = 12;
+const FIRST_TOLERANCE: f64 = 1e-4;
 /// Starts that are adjusted to convergence, and the iterations allowed.
-pub(super) const CONVERGED: usize = 3;
+const CONVERGED: usize = 3;
 const FINAL_ITERATIONS: usize = 60;
 const FINAL_TOLERANCE: f64 = 1e-9;
 /// Share of the cheapest minimum's cost that a start must get down to at its pace to be adjusted to convergence: a
@@ -58,8 +63,34 @@ pub(super) struct Minimum {
 }
 
 impl Minimum {
+    /// Of the geometric mean where views have their own.
     pub fn log_focal(&self) -> f64 {
         self.reconstruction.intrinsics.focal.ln()
+    }
+
+    /// Difference in log focal length; where views have their own, the root mean square over those that count.
+    pub fn apart(&self, other: &Self, counts: impl Fn(usize) -> bool) -> f64 {
+        let (own, others) = (&self.reconstruction.focals, &other.reconstruction.focals);
+        if own.is_empty() {
+            return (self.log_focal() - other.log_focal()).abs();
+        }
+        let pairs = own.iter().zip(others).enumerate().filter(|(view, _)| counts(*view));
+        let differences: Vec<f64> = pairs.map(|(_, (own, other))| (own / other).ln()).collect();
+        root_mean_square(&differences).unwrap_or(0.0)
+    }
+
+    /// Of which views the observations determine the focal length; all where they do of none.
+    fn determined(&self, problem: &Problem) -> Vec<bool> {
+        let views = self.reconstruction.focals.len();
+        let model = IntrinsicsModel::FOCAL_PER_VIEW;
+        let information = Information::new(&self.reconstruction, problem.observations);
+        let Some(information) = information.filter(|_| views > 0) else { return vec![true; views] };
+        let noise = Fit::metric(self.cost, model, problem).noise;
+        let sigmas = information.own_focals(&information.optimum(model, &IntrinsicsPrior::NONE)).into_iter();
+        let determined: Vec<bool> = sigmas
+            .map(|(variance, _)| variance.is_some_and(|variance| variance.sqrt() * noise <= WEAK_UP_TO))
+            .collect();
+        if determined.contains(&true) { determined } else { vec![true; views] }
     }
 
     /// Adjusts to convergence from here with this model.
@@ -100,34 +131,77 @@ pub(super) fn converge() -> Options {
 /// half or twice as far.
 pub(super) const OTHER_FOCALS: [f64; 4] = [0.5, 0.75, 1.33, 2.0];
 /// Iterations in which poses and points follow a focal length that is held.
-pub(super) const FOLLOWING: usize = 12;
+const FOLLOWING: usize = 12;
 
-/// Minima from a reconstruction that is metric already: its own, and those that other focal lengths lead to; cheapest
-/// first.
+/// Minima from a reconstruction that is metric already: its own, and those that other focal lengths lead to, which its
+/// poses and points have followed, for freed at once these would only go back to where they were; cheapest first.
+///
+/// * `told`: called after each
 pub(super) fn minima_near(
     metric: &Reconstruction,
     problem: &Problem,
     prior: &IntrinsicsPrior,
     stop: &StopToken,
+    told: &mut dyn FnMut(),
 ) -> Result<Vec<Minimum>, Stopped> {
+    let model = IntrinsicsModel::focal(metric.has_own_focals());
     let mut found = Vec::new();
     for factor in std::iter::once(1.0).chain(OTHER_FOCALS) {
         Stopped::check(stop)?;
         let mut reconstruction = metric.clone();
-        reconstruction.intrinsics = Intrinsics::from_focal(factor * metric.intrinsics.focal);
+        reconstruction.intrinsics = Intrinsics::from_focal(metric.intrinsics.focal);
+        reconstruction.scale_focals(factor);
         if factor != 1.0 {
             let options = Options { max_iterations: FOLLOWING, ..Options::default() };
             metric::adjust(&mut reconstruction, problem.observations, IntrinsicsModel::FIXED, prior, &options, stop);
         }
         let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
-        found.push(start.adjusted(problem.observations, IntrinsicsModel::FOCAL, prior, stop));
+        found.push(start.adjusted(problem.observations, model, prior, stop));
+        told();
     }
     Stopped::check(stop)?;
-    Ok(distinct(found))
+    Ok(distinct(found, problem))
 }
 
-/// Metric reconstructions with the focal length free that different starts converge to, cheapest first.
+/// Metric reconstructions with the focal length free, or one of each view, that different starts converge to, cheapest
+/// first.
 pub(super) fn minima(
+    frame: &FirstViewFrame,
+    problem: &Problem,
+    prior: &IntrinsicsPrior,
+    stop: &StopToken,
+) -> Result<Vec<Minimum>, Stopped> {
+    match problem.focal_per_view {
+        true => minima_per_view(frame, problem, stop),
+        false => minima_of_one(frame, problem, prior, stop),
+    }
+}
+
+/// With a focal length a view: from the quadrics that allow for that, and from what one for all leads to.
+fn minima_per_view(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
+    let (model, prior) = (IntrinsicsModel::FOCAL_PER_VIEW, IntrinsicsPrior::NONE);
+    let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(STARTS);
+    let mut starts: Vec<Reconstruction> =
+        quadrics.filter_map(|(daq, _)| upgrade(frame, &daq, true, problem.observations)).collect();
+    let of_one = minima_of_one(frame, problem, &prior, stop)?;
+    starts.extend(of_one.into_iter().map(|minimum| minimum.reconstruction.with_own_focals()));
+    let mut found = Vec::with_capacity(starts.len());
+    for reconstruction in starts {
+        Stopped::check(stop)?;
+        let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
+        found.push(start.adjusted_by(&first(), problem.observations, model, &prior, stop));
+    }
+    let mut found = distinct(found, problem);
+    found.truncate(CONVERGED);
+    for minimum in &mut found {
+        Stopped::check(stop)?;
+        *minimum = minimum.adjusted(problem.observations, model, &prior, stop);
+    }
+    Ok(distinct(found, problem))
+}
+
+/// With one focal length for all views.
+fn minima_of_one(
     frame: &FirstViewFrame,
     problem: &Problem,
     prior: &IntrinsicsPrior,
@@ -139,11 +213,11 @@ pub(super) fn minima(
     let mut found: Vec<Minimum> = Vec::new();
     for start in starts(frame) {
         Stopped::check(stop)?;
-        let Some(mut reconstruction) = upgrade(frame, &start, observations) else { continue };
+        let Some(mut reconstruction) = upgrade(frame, &start, false, observations) else { continue };
         let report = metric::adjust(&mut reconstruction, observations, model, prior, &first(), stop);
         found.push(Minimum { cheirality: 0.0, cost: report.cost, reconstruction });
     }
-    let mut found = distinct(found);
+    let mut found = distinct(found, problem);
     found.truncate(CONVERGED);
     let mut converged: Vec<Minimum> = Vec::with_capacity(found.len());
     let mut cheapest = f64::INFINITY;
@@ -166,7 +240,7 @@ pub(super) fn minima(
         converged.push(minimum);
     }
     Stopped::check(stop)?;
-    Ok(distinct(converged))
+    Ok(distinct(converged, problem))
 }
 
 /// The metric reconstruction of a camera that moved without turning, from a focal length that is known otherwise; empty
@@ -176,17 +250,18 @@ pub(super) fn known_focal(translation: &Translating, focal: f64, choice: &Choice
     let start = upgrade_translation(translation, focal, observations);
     let minimum = start.map(|reconstruction| Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 });
     let adjusted = minimum.map(|start| start.adjusted(observations, IntrinsicsModel::FOCAL, choice.prior, choice.stop));
-    distinct(adjusted.into_iter().collect())
+    distinct(adjusted.into_iter().collect(), choice.problem)
 }
 
 /// Cheapest first, without those that repeat a cheaper one.
-fn distinct(mut found: Vec<Minimum>) -> Vec<Minimum> {
+fn distinct(mut found: Vec<Minimum>, problem: &Problem) -> Vec<Minimum> {
     found.retain(|minimum| minimum.cost.is_finite() && minimum.log_focal().is_finite());
     found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+    let counts = found.first().map(|cheapest| cheapest.determined(problem)).unwrap_or_default();
     let mut kept: Vec<Minimum> = Vec::with_capacity(found.len());
     for candidate in found {
         let repeats = kept.iter().any(|minimum| {
-            (candidate.log_focal() - minimum.log_focal()).abs() < SAME_MINIMUM
+            candidate.apart(minimum, |view| counts[view]) < SAME_MINIMUM
                 && candidate.cost < (1.0 + SAME_COST) * minimum.cost
         });
         if !repeats {
@@ -263,8 +338,8 @@ const LEAST_POINTS_OF_A_VIEW: usize = 20;
 
 /// Triangulates the points that took no part in the search with the cameras it found.
 fn fill_points(minimum: &mut Minimum, chosen: &[bool], observations: &[Observation]) {
-    let Reconstruction { intrinsics, poses, points } = &mut minimum.reconstruction;
-    let cameras: Vec<Camera> = poses.iter().map(|pose| pose.camera(intrinsics)).collect();
+    let cameras = minimum.reconstruction.cameras();
+    let points = &mut minimum.reconstruction.points;
     let mut sightings = vec![Vec::new(); points.len()];
     for seen in observations.iter().filter(|seen| seen.camera < cameras.len()) {
         if let Some(sightings) = sightings.get_mut(seen.point) {

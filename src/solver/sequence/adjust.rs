@@ -4,7 +4,6 @@ use super::model::{Lens, Model, Scene};
 use super::parts::FIRST;
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::sequence::{self, Free, Run, Sequence, Sighting};
-use crate::geometry::bundle::zoom::Zooming;
 use crate::geometry::bundle::{Loss, Observation, Options};
 use crate::geometry::statistics::median;
 use crate::solver::calibration;
@@ -45,6 +44,7 @@ impl Extract {
             tracks: Vec::with_capacity(tracks.len()),
             sequence: Sequence {
                 intrinsics: model.lenses.iter().map(|lens| lens.intrinsics).collect(),
+                focals: Vec::new(),
                 group_of: Vec::with_capacity(views.len()),
                 poses: Vec::with_capacity(views.len()),
                 points: Vec::with_capacity(tracks.len()),
@@ -56,7 +56,8 @@ impl Extract {
                 place[view] = extract.views.len();
                 extract.views.push(view);
                 extract.sequence.poses.push(pose);
-                extract.sequence.group_of.push(scene.lens_of[view]);
+                extract.sequence.group_of.push(scene.camera_of[view]);
+                extract.sequence.focals.extend(model.own_focals.get(view).map(|own| own.focal));
             }
         }
         for &track in tracks {
@@ -77,6 +78,9 @@ impl Extract {
         for (lens, intrinsics) in model.lenses.iter_mut().zip(&self.sequence.intrinsics) {
             lens.intrinsics = *intrinsics;
         }
+        for (&view, focal) in self.views.iter().zip(&self.sequence.focals) {
+            model.own_focals[view].focal = *focal;
+        }
         for (&view, pose) in self.views.iter().zip(&self.sequence.poses) {
             model.poses[view] = Some(*pose);
         }
@@ -87,21 +91,16 @@ impl Extract {
         }
     }
 
-    /// The views with a focal length each, of lenses that have nothing else.
-    pub fn zooming(&self) -> (Zooming, Vec<Observation>) {
-        let focal = |lens: &usize| self.sequence.intrinsics[*lens].focal;
-        let (Reconstruction { poses, points, .. }, observations) = self.constant();
-        (Zooming { focals: self.sequence.group_of.iter().map(focal).collect(), poses, points }, observations)
-    }
-
     /// The views as if all were of one camera, the first one's.
-    pub fn constant(&self) -> (Reconstruction, Vec<Observation>) {
+    pub fn block(&self) -> (Reconstruction, Vec<Observation>) {
         let group = self.sequence.group_of.first().copied().unwrap_or(0);
-        let reconstruction = Reconstruction {
+        let mut reconstruction = Reconstruction {
             intrinsics: self.sequence.intrinsics[group],
+            focals: self.sequence.focals.clone(),
             poses: self.sequence.poses.clone(),
             points: self.sequence.points.clone(),
         };
+        reconstruction.average_focals();
         let observation = |seen: &Sighting| Observation { camera: seen.view, point: seen.point, xy: seen.xy };
         (reconstruction, self.sightings.iter().map(observation).collect())
     }
@@ -113,7 +112,8 @@ impl Extract {
             loss: Loss::Cauchy { scale: CAUCHY_SCALE * model.noise },
             ..Options::default()
         };
-        let priors: Vec<IntrinsicsPrior> = (0..scene.lenses).map(|lens| knowledge(scene, lens, model.noise)).collect();
+        let priors: Vec<IntrinsicsPrior> =
+            (0..scene.cameras).map(|camera| knowledge(scene, camera, model.noise)).collect();
         let mut told = || recorder.sign_of_life();
         let run = Run { threads: scene.context.threads, stop: scene.stop(), told: &mut told };
         sequence::adjust(&mut self.sequence, &self.sightings, free, &priors, &options, run);
@@ -122,7 +122,7 @@ impl Extract {
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise(&self, scene: &Scene) -> f64 {
         let norms: Vec<f64> = self.sightings.iter().map(|seen| self.sequence.residual(seen).norm()).collect();
-        let of_view = if scene.zooms() { 7 } else { 6 };
+        let of_view = if scene.has_own_focals() { 7 } else { 6 };
         let unknowns = of_view * self.views.len() + 3 * self.tracks.len();
         core_noise(norms, unknowns)
     }
@@ -135,9 +135,9 @@ pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> f64 {
     median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(LEAST_FREEDOM).sqrt()
 }
 
-/// What is known of the intrinsics of a lens before any observation.
-pub fn knowledge(scene: &Scene, lens: usize, noise: f64) -> IntrinsicsPrior {
-    calibration::knowledge(noise, scene.focal_priors[lens], scene.context.scale_px)
+/// What is known of the intrinsics of a camera before any observation.
+pub fn knowledge(scene: &Scene, camera: usize, noise: f64) -> IntrinsicsPrior {
+    calibration::knowledge(noise, scene.focal_priors[camera], scene.context.scale_px)
 }
 
 /// Adjusts the views of a part with the landmarks that hold them best, while more are to come. Lenses that the first
@@ -146,14 +146,20 @@ pub fn while_growing(scene: &Scene, model: &mut Model, part: u32, recorder: &mut
     let views = model.of_part(part);
     let tracks = covering(scene, model, &views, OF_VIEW_WHILE_GROWING);
     let mut extract = Extract::new(scene, model, &views, &tracks);
-    let mut is_held = vec![false; scene.lenses];
+    let mut is_held = vec![false; scene.cameras];
     if part != FIRST {
-        model.of_part(FIRST).into_iter().for_each(|view| is_held[scene.lens_of[view]] = true);
+        model.of_part(FIRST).into_iter().for_each(|view| is_held[scene.camera_of[view]] = true);
     }
-    let free = |(lens, held): (&Lens, &bool)| if *held { IntrinsicsModel::FIXED } else { lens.free };
+    let held = held(scene);
+    let free = |(lens, is_held): (&Lens, &bool)| if *is_held { held } else { lens.free };
     let models: Vec<IntrinsicsModel> = model.lenses.iter().zip(&is_held).map(free).collect();
     extract.adjust(scene, model, &Free::all(&models), ITERATIONS_WHILE_GROWING, recorder);
     finish(scene, model, &extract);
+}
+
+/// What is free of a camera whose lens is held: the focal lengths that are the views' own.
+fn held(scene: &Scene) -> IntrinsicsModel {
+    if scene.has_own_focals() { IntrinsicsModel::FOCAL_PER_VIEW } else { IntrinsicsModel::FIXED }
 }
 
 /// Adjusts a new view and those that share most landmarks with it, all others held, and the calibration too unless the
@@ -171,9 +177,9 @@ pub fn around(scene: &Scene, model: &mut Model, view: usize, is_new_lens: bool, 
     views.dedup();
     let mut extract = Extract::new(scene, model, &views, &tracks);
     let moves: Vec<bool> = extract.views.iter().map(|view| near.contains(view)).collect();
-    let mut models = vec![IntrinsicsModel::FIXED; scene.lenses];
+    let mut models = vec![IntrinsicsModel::FIXED; scene.cameras];
     if is_new_lens {
-        models[scene.lens_of[view]] = IntrinsicsModel::FOCAL;
+        models[scene.camera_of[view]] = IntrinsicsModel::focal(scene.has_own_focals());
     }
     let free = Free { models: &models, views: Some(&moves), points: None };
     extract.adjust(scene, model, &free, ITERATIONS_AROUND, recorder);

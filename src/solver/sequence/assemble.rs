@@ -32,7 +32,7 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
     warnings.extend(seed.second_structure.clone());
     let frames = frames(&scene, &model);
     let back = back(&frames, metric);
-    let is_told = |retained: &[Sighting]| !metric || is_held(&scene, &model, retained);
+    let is_told = |retained: &[Sighting]| !metric || is_held(&model, retained);
     judged.tracks.point = points(&judged, &model, &back, is_told);
     let splits = splits(&judged, &model, &back, is_told);
     judged.tracks.part = parts(&judged, &model);
@@ -91,23 +91,23 @@ fn told(calibrations: &[Outcome], scene: &Scene) -> Vec<Warning> {
 }
 
 /// The calibration of each camera group in pixels, its principal point about the image centre of the group's first
-/// view; of a zoom the geometric mean of its focal lengths, that of all for one of which none is determined.
+/// view; where views have their own focal lengths, with the geometric mean of the group's, or of all for one of which none
+/// is determined.
 fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Calibration> {
     let (group_of, groups) = block::camera_groups(scene.context.input);
-    let determined = model.determined(scene);
+    let determined = model.determined();
     let of_group = |group: usize| {
         let view = group_of.iter().position(|of| *of == group)?;
         // One for all where the groups are merged.
         let camera = scene.camera_of[view];
         let of_views: Vec<usize> = determined.iter().copied().filter(|&view| group_of[view] == group).collect();
         let outcome = calibrations.get(camera)?;
-        if !scene.zooms() {
+        if !scene.has_own_focals() {
             return Some(pixel_calibration(&model.lenses[camera].intrinsics, outcome, &scene.context, view));
         }
-        let own = Intrinsics::from_focal(
-            model.log_focal(scene, camera, if of_views.is_empty() { &determined } else { &of_views }).exp(),
-        );
-        let mut calibration = pixel_calibration(&own, outcome, &scene.context, view);
+        let counted = if of_views.is_empty() { &determined } else { &of_views };
+        let mean = Intrinsics { focal: model.log_focal(camera, counted).exp(), ..model.lenses[camera].intrinsics };
+        let mut calibration = pixel_calibration(&mean, outcome, &scene.context, view);
         if of_views.is_empty() {
             calibration.grade = Some(Grade::ProjectiveOnly);
             calibration.sigma_log_focal = None;
@@ -121,7 +121,7 @@ fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Cali
 fn judged(scene: &Scene, model: &Model, recorder: &mut Recorder) -> Judged {
     let context = &scene.context;
     let cameras = model.cameras(scene);
-    let lenses: Vec<Intrinsics> = (0..cameras.len()).map(|view| *model.intrinsics_of(scene, view)).collect();
+    let lenses: Vec<Intrinsics> = (0..cameras.len()).map(|view| model.intrinsics_of(scene, view)).collect();
     let tried = model.landmarks.iter().flatten().count();
     let verified = super::adjust::verified(model).len();
     let of_track: Vec<u32> =
@@ -165,14 +165,14 @@ fn views(scene: &Scene, model: &Model, frames: &[Option<Matrix4<f64>>], metric: 
         let frame = frames[model.part_of[view] as usize].as_ref();
         let (Some(pose), Some(frame)) = (pose, frame) else { return ViewResult::default() };
         let camera =
-            scene.context.normalization.camera_px(view, &pose.camera(model.intrinsics_of(scene, view))) * frame;
-        let metric = metric && model.lenses[scene.lens_of[view]].is_determined;
+            scene.context.normalization.camera_px(view, &pose.camera(&model.intrinsics_of(scene, view))) * frame;
+        let metric = metric && model.is_determined(view);
         ViewResult {
             projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| camera[(row, column)]))),
             rotation: metric
                 .then(|| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
             translation: metric.then(|| pose.translation.into()),
-            focal_px: (metric && scene.zooms())
+            focal_px: (metric && scene.has_own_focals())
                 .then(|| model.intrinsics_of(scene, view).focal * scene.context.scale_px),
             part: model.part_of[view],
             ..ViewResult::default()
@@ -194,8 +194,8 @@ fn placed(point: &Point, track: usize, model: &Model, back: &[Option<Matrix4<f64
 }
 
 /// Whether views with a pose hold the point of these sightings: what others alone see is in no metric result.
-fn is_held(scene: &Scene, model: &Model, retained: &[Sighting]) -> bool {
-    let has_pose = |seen: &&Sighting| model.lenses[scene.lens_of[seen.view]].is_determined;
+fn is_held(model: &Model, retained: &[Sighting]) -> bool {
+    let has_pose = |seen: &&Sighting| model.is_determined(seen.view);
     retained.iter().filter(has_pose).count() >= LEAST_SIGHTINGS
 }
 

@@ -4,7 +4,7 @@ use nalgebra::Vector4;
 
 use super::adjust::{self, Extract};
 use super::model::{Model, Scene};
-use super::{windows, zoom};
+use super::{own_focals, windows};
 use crate::domain::{Task, Warning, WarningCode};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
@@ -37,8 +37,8 @@ pub fn calibrate(
     context: &Context,
     recorder: &mut Recorder,
 ) -> Result<Vec<Outcome>, Error> {
-    if scene.zooms() {
-        return zoom::calibrate(scene, model, context, recorder).map(|outcome| vec![outcome]);
+    if scene.has_own_focals() {
+        return own_focals::calibrate(scene, model, context, recorder).map(|outcome| vec![outcome]);
     }
     let mut outcomes = Vec::with_capacity(scene.cameras);
     for camera in 0..scene.cameras {
@@ -62,13 +62,13 @@ pub fn calibrate(
     Ok(outcomes)
 }
 
-/// Reports the points and the focal length, a zoom's mean, of the first camera with registered views.
+/// Reports the points and the focal length, a mean where views have their own, of the first camera with registered views.
 pub fn report_found(scene: &Scene, model: &Model, recorder: &mut Recorder) {
     let mut views = model.registered();
     let first = views.first().map(|&view| scene.camera_of[view]);
     let focal = first.map(|camera| {
         views.retain(|&view| scene.camera_of[view] == camera);
-        model.log_focal(scene, camera, &views).exp() * scene.context.scale_px
+        model.log_focal(camera, &views).exp() * scene.context.scale_px
     });
     recorder.found(adjust::verified(model).len(), focal.filter(|focal| focal.is_finite()));
 }
@@ -89,31 +89,50 @@ fn of_camera(
     recorder: &mut Recorder,
 ) -> Result<Outcome, Error> {
     let mut extract = core(scene, model, views, of_view(views));
-    let (metric, observations) = extract.constant();
+    let outcome = of_extract(scene, &extract, model.noise, camera, context, &mut || recorder.sign_of_life())?;
+    take_over(model, &mut extract, camera, &outcome);
+    Ok(outcome)
+}
+
+/// The calibration of views of one camera.
+///
+/// * `told`: called now and then
+pub fn of_extract(
+    scene: &Scene,
+    extract: &Extract,
+    noise: f64,
+    camera: usize,
+    context: &Context,
+    told: &mut dyn FnMut(),
+) -> Result<Outcome, Error> {
+    let (metric, observations) = extract.block();
     let (cameras, points) = projective(&metric);
     let problem = calibration::Problem {
         cameras: &cameras,
         points: &points,
         observations: &observations,
-        noise: model.noise,
+        noise,
         focal_prior: scene.focal_priors[camera],
-        focal_per_view: false,
+        focal_per_view: metric.has_own_focals(),
     };
-    let outcome =
-        calibration::from_metric(&problem, &metric, context.scale_px, context.stop, &mut || recorder.sign_of_life())?;
-    if let Some(metric) = &outcome.metric {
-        let lens = &mut model.lenses[camera];
-        lens.free = outcome.model;
-        // What the model holds is as the calibration has it, not as the seed had it.
-        lens.intrinsics = Intrinsics { focal: lens.intrinsics.focal, ..metric.intrinsics };
-        // Some of the views alone would leave the frame of the others.
-        if extract.views.len() == model.registered().len() {
-            extract.sequence.intrinsics[camera] = metric.intrinsics;
-            (extract.sequence.poses, extract.sequence.points) = (metric.poses.clone(), metric.points.clone());
-            extract.write_back(model);
-        }
+    Ok(calibration::from_metric(&problem, &metric, context.scale_px, context.stop, told)?)
+}
+
+/// Has the model go on from the calibration of some views of a camera: its lens, and where these are all views that are
+/// registered, the rest too.
+pub fn take_over(model: &mut Model, extract: &mut Extract, camera: usize, outcome: &Outcome) {
+    let Some(metric) = &outcome.metric else { return };
+    let lens = &mut model.lenses[camera];
+    lens.free = outcome.model;
+    // What the model holds is as the calibration has it, not as the seed had it.
+    lens.intrinsics = Intrinsics { focal: lens.intrinsics.focal, ..metric.intrinsics };
+    // Some of the views alone would leave the frame of the others.
+    if extract.views.len() == model.registered().len() {
+        extract.sequence.intrinsics[camera] = metric.intrinsics;
+        extract.sequence.focals.clone_from(&metric.focals);
+        (extract.sequence.poses, extract.sequence.points) = (metric.poses.clone(), metric.points.clone());
+        extract.write_back(model);
     }
-    Ok(outcome)
 }
 
 /// Observations of each of these views that a calibration is made from.
@@ -145,8 +164,7 @@ fn densest(scene: &Scene, model: &Model, views: &[usize]) -> Vec<usize> {
 
 /// The cameras and points of a metric reconstruction without what makes it metric.
 pub fn projective(metric: &Reconstruction) -> (Vec<Camera>, Vec<Vector4<f64>>) {
-    let cameras = metric.poses.iter().map(|pose| pose.camera(&metric.intrinsics)).collect();
-    (cameras, metric.points.iter().map(|point| point.push(1.0)).collect())
+    (metric.cameras(), metric.points.iter().map(|point| point.push(1.0)).collect())
 }
 
 /// Landmarks that give every one of these registered views `of_view` observations, with the observations that the core

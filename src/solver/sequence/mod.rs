@@ -13,12 +13,12 @@ mod assemble;
 mod calibrate;
 mod model;
 mod options;
+mod own_focals;
 mod parts;
 mod projective;
 mod register;
 mod structure;
 mod windows;
-mod zoom;
 
 pub use assemble::solved;
 pub use projective::Projective;
@@ -88,6 +88,8 @@ pub fn solve<'a>(
 ) -> Result<Ended<'a>, Error> {
     let seeding = Context { seeding: true, ..*context };
     let extract = |views: &[usize]| block::extract(context.input, context.ranges, context.normalization, views);
+    // A calibrated reconstruction that another might be better than.
+    let mut metric: Option<Box<Extended>> = None;
     let first = if let Some(views) = &whole {
         let attempt = attempt::solve_block(extract(views), &Context { quick: true, ..*context }, recorder)?;
         if attempt.is_trusted() {
@@ -96,9 +98,10 @@ pub fn solve<'a>(
         Some(attempt)
     } else {
         match by_calibrated_blocks(candidates, &seeding, recorder)? {
-            // Of one that holds most views, a projective reconstruction would say no more.
-            Ended::Extended(extended) if extended.merit().0 || extended.holds_most_views() => {
-                return Ok(Ended::Extended(extended));
+            Ended::Extended(extended) if extended.is_settled() => return Ok(Ended::Extended(extended)),
+            Ended::Extended(extended) if extended.is_calibrated() => {
+                metric = Some(extended);
+                None
             }
             Ended::Extended(extended) => Some(extended.seed),
             Ended::Block(attempt) => attempt.map(|attempt| *attempt),
@@ -117,10 +120,15 @@ pub fn solve<'a>(
         let others = by_projective_extension(None, rest, &seeding, recorder)?;
         best = if stands(&others) { others } else { Some(attempt) };
     }
-    match best {
-        Some(best) => metric_of(best, &seeding, recorder),
-        None => Ok(Ended::Block(None)),
+    let Some(best) = best else { return Ok(metric.map_or(Ended::Block(None), Ended::Extended)) };
+    if metric.is_some() && !best.is_trusted() {
+        return Ok(metric.map_or(Ended::Block(None), Ended::Extended));
     }
+    Ok(match (metric_of(best, &seeding, recorder)?, metric) {
+        (Ended::Extended(found), Some(metric)) if found.rank() > metric.rank() => Ended::Extended(found),
+        (_, Some(metric)) => Ended::Extended(metric),
+        (found, None) => found,
+    })
 }
 
 /// Whether there is a reconstruction.
@@ -148,7 +156,7 @@ fn by_calibrated_blocks<'a>(
                 unextended = better(unextended, extended.seed);
                 continue;
             }
-            let enough = extended.is_firm();
+            let enough = extended.is_calibrated() && extended.holds_most_views();
             if best.as_ref().is_none_or(|best| extended.merit() > best.merit()) {
                 best = Some(extended);
             }
@@ -332,9 +340,30 @@ impl Extended<'_> {
         grades.map(|(outcome, _)| outcome.grade).reduce(Grade::worse).unwrap_or(Grade::ProjectiveOnly)
     }
 
+    fn is_calibrated(&self) -> bool {
+        self.grade() != Grade::ProjectiveOnly
+    }
+
     /// Larger is better: a calibration before none, then the number of views.
     fn merit(&self) -> (bool, usize) {
-        (self.grade() != Grade::ProjectiveOnly, self.model.registered().len())
+        (self.is_calibrated(), self.model.registered().len())
+    }
+
+    /// What decides between reconstructions that were found in different ways: a calibration that fits as well as
+    /// projective cameras before others, then how well the observations fit.
+    fn rank(&self) -> (bool, f64) {
+        let model = &self.model;
+        let verified = adjust::verified(model);
+        let observations = verified.iter().filter_map(|&track| model.landmarks[track]).map(|point| point.support).sum();
+        let unknowns = 6 * model.registered().len() + 3 * verified.len();
+        let evidence = projective::evidence(observations, unknowns, model.noise, self.scene.outlier_density);
+        (self.is_calibrated() && self.fits(), evidence)
+    }
+
+    /// Whether nothing says that projective cameras would fit better.
+    fn fits(&self) -> bool {
+        let mut warnings = self.calibrations.iter().flat_map(|outcome| &outcome.warnings);
+        warnings.all(|warning| warning.code != WarningCode::ModelMismatch)
     }
 
     /// Whether there is anything that geometry verifies: views that points hold, and enough points.
@@ -344,9 +373,10 @@ impl Extended<'_> {
             && self.calibrations.iter().any(|outcome| outcome.metric.is_some())
     }
 
-    /// Whether no other seed needs to be tried.
-    fn is_firm(&self) -> bool {
-        self.merit().0 && self.holds_most_views()
+    /// Whether nothing is to be gained by extending without a calibration: most views hold together so precisely that
+    /// wrong observations do not.
+    fn is_settled(&self) -> bool {
+        self.fits() && self.holds_most_views() && self.model.noise <= attempt::INITIAL_NOISE
     }
 
     fn holds_most_views(&self) -> bool {

@@ -17,13 +17,10 @@ pub struct Scene<'a> {
     /// Observations of each view.
     pub of_view: Vec<Vec<u32>>,
     /// Camera of each view, each of which gets a calibration: the camera groups, counted from 0 in rising order of the
-    /// input's numbers, or one for all where they are merged or views zoom.
+    /// input's numbers, or one for all where they are merged or views have focal lengths of their own.
     pub camera_of: Vec<usize>,
     pub cameras: usize,
-    /// Lens of each view: its camera's, but one a view where views zoom.
-    pub lens_of: Vec<usize>,
-    pub lenses: usize,
-    /// What is known of the focal length of each lens beforehand.
+    /// What is known of the focal length of each camera beforehand; nothing where views have their own.
     pub focal_priors: Vec<Option<FocalPrior>>,
     /// Density of a wrong coordinate; see [`judge::Geometry::outlier_density`].
     pub outlier_density: f64,
@@ -48,15 +45,13 @@ impl<'a> Scene<'a> {
             let views = input.views().iter().zip(&camera_of).filter(|(_, of)| **of == camera);
             attempt::focal_prior(views.map(|(view, _)| view))
         };
-        let (lens_of, lenses, focal_priors) = match context.settings.focal_per_view {
-            true => ((0..input.view_count()).collect(), input.view_count(), vec![None; input.view_count()]),
-            false => (camera_of.clone(), cameras, (0..cameras).map(of_camera).collect()),
-        };
-        Self { context: *context, xy, of_view, camera_of, cameras, lens_of, lenses, focal_priors, outlier_density }
+        let is_shared = !context.settings.focal_per_view;
+        let focal_priors = (0..cameras).map(|camera| of_camera(camera).filter(|_| is_shared)).collect();
+        Self { context: *context, xy, of_view, camera_of, cameras, focal_priors, outlier_density }
     }
 
     /// Whether every view has a focal length of its own.
-    pub fn zooms(&self) -> bool {
+    pub fn has_own_focals(&self) -> bool {
         self.context.settings.focal_per_view
     }
 
@@ -94,7 +89,7 @@ pub struct Landmark {
     pub part: u32,
 }
 
-/// What images the views of a camera, or one view where views zoom.
+/// What images the views of a camera.
 #[derive(Debug, Clone, Copy)]
 pub struct Lens {
     pub intrinsics: Intrinsics,
@@ -102,15 +97,24 @@ pub struct Lens {
     pub free: IntrinsicsModel,
     /// Whether a registered view has it; until then its focal length is a guess.
     pub is_known: bool,
-    /// Whether the observations determine it: where views zoom, some may have none that can be told.
+}
+
+/// The focal length of a view that has its own.
+#[derive(Debug, Clone, Copy)]
+pub struct OwnFocal {
+    /// Normalised; a guess until the view is registered.
+    pub focal: f64,
+    /// Whether the observations determine it.
     pub is_determined: bool,
 }
 
 /// A metric reconstruction under way.
 #[derive(Debug, Clone)]
 pub struct Model {
-    /// See [`Scene::lens_of`].
+    /// One a camera.
     pub lenses: Vec<Lens>,
+    /// One a view of the input where views have their own, else empty.
+    pub own_focals: Vec<OwnFocal>,
     /// One a view of the input.
     pub poses: Vec<Option<Pose>>,
     /// Part of each registered view: views that share no tracks are reconstructions of their own, under one
@@ -142,9 +146,12 @@ impl Model {
     /// A model of nothing yet, with this noise, all cameras like this one.
     pub fn new(scene: &Scene, intrinsics: Intrinsics, noise: f64) -> Self {
         let views = scene.context.input.view_count();
-        let lens = Lens { intrinsics, free: IntrinsicsModel::FOCAL, is_known: false, is_determined: true };
+        let free = IntrinsicsModel::focal(scene.has_own_focals());
+        let lens = Lens { intrinsics, free, is_known: false };
+        let own_focal = OwnFocal { focal: intrinsics.focal, is_determined: true };
         Self {
-            lenses: vec![lens; scene.lenses],
+            lenses: vec![lens; scene.cameras],
+            own_focals: if scene.has_own_focals() { vec![own_focal; views] } else { Vec::new() },
             poses: vec![None; views],
             part_of: vec![0; views],
             landmarks: vec![None; scene.tracks()],
@@ -195,7 +202,7 @@ impl Model {
 
     /// Adds the views of a metric block, all of one camera, as a part; lenses that are not known yet are the block's.
     ///
-    /// * `focals`: the focal length of each of these views, where views zoom
+    /// * `focals`: the focal length of each of these views, where views have their own
     pub fn add_part(
         &mut self,
         scene: &Scene,
@@ -205,12 +212,12 @@ impl Model {
         focals: Option<&[ViewFocal]>,
     ) {
         for (i, (&view, pose)) in views.iter().zip(&metric.poses).enumerate() {
-            let lens = &mut self.lenses[scene.lens_of[view]];
+            let lens = &mut self.lenses[scene.camera_of[view]];
             if !lens.is_known {
-                let own = focals.and_then(|focals| focals.get(i));
-                let focal = own.map_or(metric.intrinsics.focal, |own| own.focal);
-                lens.intrinsics = Intrinsics { focal, ..metric.intrinsics };
-                lens.is_determined = own.is_none_or(|own| own.sigma_log.is_some());
+                lens.intrinsics = metric.intrinsics;
+            }
+            if let (Some(own), Some(found)) = (self.own_focals.get_mut(view), focals.and_then(|focals| focals.get(i))) {
+                *own = OwnFocal { focal: found.focal, is_determined: found.sigma_log.is_some() };
             }
             self.register(scene, view, part, *pose);
         }
@@ -219,7 +226,24 @@ impl Model {
     pub fn register(&mut self, scene: &Scene, view: usize, part: u32, pose: Pose) {
         self.poses[view] = Some(pose);
         self.part_of[view] = part;
-        self.lenses[scene.lens_of[view]].is_known = true;
+        self.lenses[scene.camera_of[view]].is_known = true;
+    }
+
+    /// Whether the focal length of a view is not known before it is registered.
+    pub fn is_focal_unknown(&self, scene: &Scene, view: usize) -> bool {
+        !self.own_focals.is_empty() || !self.lenses[scene.camera_of[view]].is_known
+    }
+
+    /// Takes these intrinsics for a view: its focal length where it has its own, and all for its camera where no view had
+    /// that yet.
+    pub fn set_intrinsics(&mut self, scene: &Scene, view: usize, intrinsics: Intrinsics) {
+        if let Some(own) = self.own_focals.get_mut(view) {
+            own.focal = intrinsics.focal;
+        }
+        let lens = &mut self.lenses[scene.camera_of[view]];
+        if self.own_focals.is_empty() || !lens.is_known {
+            lens.intrinsics = intrinsics;
+        }
     }
 
     /// Takes views back.
@@ -230,7 +254,7 @@ impl Model {
         }
         self.lenses.iter_mut().for_each(|lens| lens.is_known = false);
         for view in self.registered() {
-            self.lenses[scene.lens_of[view]].is_known = true;
+            self.lenses[scene.camera_of[view]].is_known = true;
         }
     }
 
@@ -240,10 +264,16 @@ impl Model {
     }
 
     /// Registered views whose focal length is determined, increasing.
-    pub fn determined(&self, scene: &Scene) -> Vec<usize> {
+    pub fn determined(&self) -> Vec<usize> {
         let mut views = self.registered();
-        views.retain(|&view| self.lenses[scene.lens_of[view]].is_determined);
+        views.retain(|&view| self.is_determined(view));
         views
+    }
+
+    /// Whether the observations determine the focal length of a view: where views have their own, some may have none that
+    /// can be told.
+    pub fn is_determined(&self, view: usize) -> bool {
+        self.own_focals.get(view).is_none_or(|own| own.is_determined)
     }
 
     /// Registered views of a part, increasing.
@@ -251,23 +281,27 @@ impl Model {
         (0..self.poses.len()).filter(|&view| self.poses[view].is_some() && self.part_of[view] == part).collect()
     }
 
-    pub fn intrinsics_of(&self, scene: &Scene, view: usize) -> &Intrinsics {
-        &self.lenses[scene.lens_of[view]].intrinsics
+    pub fn intrinsics_of(&self, scene: &Scene, view: usize) -> Intrinsics {
+        let shared = self.lenses[scene.camera_of[view]].intrinsics;
+        match self.own_focals.get(view) {
+            Some(own) => Intrinsics { focal: own.focal, ..shared },
+            None => shared,
+        }
     }
 
-    /// Logarithm of the focal length of a camera, the mean over these of its views where views zoom.
-    pub fn log_focal(&self, scene: &Scene, camera: usize, views: &[usize]) -> f64 {
-        if !scene.zooms() {
+    /// Logarithm of the focal length of a camera, the mean over these of its views where views have their own.
+    pub fn log_focal(&self, camera: usize, views: &[usize]) -> f64 {
+        if self.own_focals.is_empty() {
             return self.lenses[camera].intrinsics.focal.ln();
         }
-        let sum: f64 = views.iter().map(|&view| self.intrinsics_of(scene, view).focal.ln()).sum();
+        let sum: f64 = views.iter().map(|&view| self.own_focals[view].focal.ln()).sum();
         sum / views.len().max(1) as f64
     }
 
     /// Pinhole cameras of all views; `None` for those that are not registered.
     pub fn cameras(&self, scene: &Scene) -> Vec<Option<Camera>> {
         let camera =
-            |(view, pose): (usize, &Option<Pose>)| pose.map(|pose| pose.camera(self.intrinsics_of(scene, view)));
+            |(view, pose): (usize, &Option<Pose>)| pose.map(|pose| pose.camera(&self.intrinsics_of(scene, view)));
         self.poses.iter().enumerate().map(camera).collect()
     }
 

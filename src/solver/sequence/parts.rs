@@ -65,8 +65,8 @@ pub fn others(
         recorder.end_part();
         // Whatever comes of it, a block is tried once.
         views.iter().for_each(|&view| open[view] = false);
-        // What a zoom's own block does not determine, no other part can tell it.
-        let usable = |calibration: &&Outcome| !scene.zooms() || calibration.grade != Grade::ProjectiveOnly;
+        // Focal lengths of views that their own block does not determine, no other part can tell.
+        let usable = |calibration: &&Outcome| !scene.has_own_focals() || calibration.grade != Grade::ProjectiveOnly;
         let Some((calibration, metric)) = attempt
             .calibration
             .as_ref()
@@ -101,9 +101,9 @@ fn next_block(scene: &Scene, open: &[bool]) -> Option<Vec<usize>> {
     })
 }
 
-/// What the first part says of the focal length of the others; nothing where views zoom.
+/// What the first part says of the focal length of the others; nothing where views have their own.
 fn prior_of(scene: &Scene, seed: &Attempt, model: &Model, camera: usize) -> Option<FocalPrior> {
-    let calibration = seed.calibration.as_ref().filter(|_| !scene.zooms())?;
+    let calibration = seed.calibration.as_ref().filter(|_| !scene.has_own_focals())?;
     let sigma = calibration.sigma_log_focal.filter(|_| calibration.grade != Grade::ProjectiveOnly);
     let focal_px = model.lenses[camera].intrinsics.focal * scene.context.scale_px;
     Some(FocalPrior { focal_px, sigma_log: sigma.map_or(VAGUE_SIGMA, |sigma| sigma.max(PRIOR_SIGMA)) })

@@ -24,8 +24,9 @@ use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, grow};
 
-/// Unknowns of a projective camera.
+/// Unknowns of a projective camera, and of the frame that none of them tells.
 const CAMERA_UNKNOWNS: usize = 11;
+const GAUGE_UNKNOWNS: usize = 15;
 
 /// Cameras and points up to a common projective transform, with the observations that agree with them.
 #[derive(Debug, Clone)]
@@ -94,17 +95,13 @@ impl Projective {
         }
     }
 
-    /// Logarithm of how much better the observations fit than points anywhere in the image would, summed over the
-    /// constraints that the unknowns leave: what one reconstruction of an input is preferred to another by.
-    ///
-    /// * `outlier_density`: see [`judge::Geometry::outlier_density`]
+    /// How much better the observations fit than points anywhere in the image would, see [`evidence`].
     pub fn evidence(&self, outlier_density: f64) -> f64 {
-        let unknowns = CAMERA_UNKNOWNS * self.views.len() + 3 * self.tracks.len();
-        let constraints = (2 * self.observations.len()) as f64 - unknowns as f64 + 15.0;
-        -constraints * (outlier_density * self.noise * (std::f64::consts::TAU * std::f64::consts::E).sqrt()).ln()
+        let unknowns = CAMERA_UNKNOWNS * self.views.len() + 3 * self.tracks.len() - GAUGE_UNKNOWNS;
+        evidence(self.observations.len(), unknowns, self.noise, outlier_density)
     }
 
-    /// The same in a frame in which "in front of the camera" means what it says: every camera and point at the sign at
+    /// The same reconstruction in a frame in which "in front of the camera" means what it says: every camera and point at the sign at
     /// which depths are positive, and the mean principal plane at infinity, so that no point is there (Hartley &
     /// Zisserman, chapter 21: a quasi-affine frame).
     pub fn oriented(mut self) -> Self {
@@ -142,6 +139,16 @@ impl Projective {
         }
         self
     }
+}
+
+/// Logarithm of how much better this many observations fit than points anywhere in the image would, summed over the
+/// constraints that the unknowns leave: what one reconstruction of an input is preferred to another by.
+///
+/// * `noise`: one standard deviation of a coordinate
+/// * `outlier_density`: see [`judge::Geometry::outlier_density`]
+pub fn evidence(observations: usize, unknowns: usize, noise: f64, outlier_density: f64) -> f64 {
+    let constraints = (2 * observations) as f64 - unknowns as f64;
+    -constraints * (outlier_density * noise * (std::f64::consts::TAU * std::f64::consts::E).sqrt()).ln()
 }
 
 /// Rounds after which every camera and point that observations join to the first has a sign.

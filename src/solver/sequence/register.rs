@@ -90,7 +90,7 @@ pub fn join(
             recorder.standing.inliers = adjust::verified(model).len() as u32;
         }
         let registered = model.registered();
-        let focal = model.log_focal(scene, scene.camera_of[view], &registered).exp();
+        let focal = model.log_focal(scene.camera_of[view], &registered).exp();
         recorder.standing.focal_px = Some(focal * scene.context.scale_px);
         recorder.registered(registered.len());
         recorder.tell(super::SHARE_OF_REGISTERING * registered.len() as f64 / views);
@@ -149,7 +149,7 @@ fn register(
     rng: &mut ChaCha8Rng,
     recorder: &mut Recorder,
 ) -> (usize, usize) {
-    let is_new_lens = !model.lenses[scene.lens_of[view]].is_known;
+    let is_new_lens = model.is_focal_unknown(scene, view);
     let step = seen.len().div_ceil(MOST_POINTS).max(1);
     let seen: Vec<usize> = seen.iter().copied().step_by(step).collect();
     let found = guesses(scene, model, view)
@@ -162,7 +162,7 @@ fn register(
     if agreeing < LEAST_POINTS || (agreeing as f64) < LEAST_SHARE * seen.len() as f64 {
         return (seen.len(), agreeing);
     }
-    model.lenses[scene.lens_of[view]].intrinsics = intrinsics;
+    model.set_intrinsics(scene, view, intrinsics);
     model.register(scene, view, part, pose);
     structure::triangulate_seen(scene, model, &[view], recorder);
     adjust::around(scene, model, view, is_new_lens, recorder);
@@ -171,24 +171,29 @@ fn register(
 }
 
 /// Lenses to try a view with: its camera's own, or, of one that is not known yet, pinholes of what the input says, give
-/// or take its deviation, or of a scan. A zoom takes time: the scan is about the nearest view then.
+/// or take its deviation, or of a scan. Where views have focal lengths of their own, the scan is about that of the nearest
+/// view, behind the lens that they share: a zoom takes time.
 fn guesses(scene: &Scene, model: &Model, view: usize) -> Vec<Intrinsics> {
-    let lens = &model.lenses[scene.lens_of[view]];
-    if lens.is_known {
+    let lens = &model.lenses[scene.camera_of[view]];
+    if !model.is_focal_unknown(scene, view) {
         return vec![lens.intrinsics];
     }
-    if let Some(prior) = scene.context.input.views()[view].focal_prior.filter(|_| !scene.zooms()) {
+    if let Some(prior) = scene.context.input.views()[view].focal_prior.filter(|_| !scene.has_own_focals()) {
         let focal = prior.focal_px / scene.context.scale_px;
         return [0.0, -1.0, 1.0].map(|by| Intrinsics::from_focal(focal * (by * prior.sigma_log).exp())).to_vec();
     }
-    let nearest =
-        model.determined(scene).into_iter().min_by_key(|other| other.abs_diff(view)).filter(|_| scene.zooms());
-    let about = nearest.map_or(lens, |nearest| &model.lenses[scene.lens_of[nearest]]).intrinsics.focal;
-    let focal = |step: i32| about * (f64::from(step) / FOCALS_PER_OCTAVE).exp2();
+    let nearest = model.determined().into_iter().min_by_key(|other| other.abs_diff(view));
+    let nearest = nearest.filter(|_| scene.has_own_focals());
+    let about = nearest.map_or(lens.intrinsics, |nearest| model.intrinsics_of(scene, nearest));
+    let focal = |step: i32| about.focal * (f64::from(step) / FOCALS_PER_OCTAVE).exp2();
     // Of equals the first counts: from the middle outwards.
     let mut steps: Vec<i32> = OTHER_FOCALS.collect();
     steps.sort_by_key(|step| (step.abs(), *step));
-    steps.into_iter().map(|step| Intrinsics::from_focal(focal(step))).collect()
+    let guess = |step: i32| match nearest {
+        Some(_) => Intrinsics { focal: focal(step), ..about },
+        None => Intrinsics::from_focal(focal(step)),
+    };
+    steps.into_iter().map(guess).collect()
 }
 
 /// The pose that most of these observations agree with, and how many do.

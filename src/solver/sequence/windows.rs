@@ -7,7 +7,6 @@
 use super::adjust;
 use super::calibrate;
 use super::model::{Model, Scene};
-use super::zoom;
 use crate::domain::{Task, Warning, WarningCode};
 use crate::solver::Error;
 use crate::solver::agreement::Estimate;
@@ -47,7 +46,7 @@ pub fn reconcile(
     let Some(own) = outcome.sigma_log_focal else { return Ok(()) };
     let (estimates, shared) = estimates(scene, model, camera, recorder)?;
     let Some(fused) = fuse(&estimates, shared) else { return Ok(()) };
-    let apart = (fused.log_focal - model.log_focal(scene, camera, &of_camera(scene, model, camera))).abs();
+    let apart = (fused.log_focal - model.log_focal(camera, &of_camera(scene, model, camera))).abs();
     let sigma = own.max(fused.sigma).max(apart);
     outcome.sigma_log_focal = Some(sigma);
     outcome.grade = outcome.grade.worse(grade_of_sigma(Some(sigma)));
@@ -70,7 +69,7 @@ pub fn reconcile(
 
 /// Views of a camera that say something of it, increasing.
 fn of_camera(scene: &Scene, model: &Model, camera: usize) -> Vec<usize> {
-    model.determined(scene).into_iter().filter(|&view| scene.camera_of[view] == camera).collect()
+    model.determined().into_iter().filter(|&view| scene.camera_of[view] == camera).collect()
 }
 
 /// What each window says by itself, the rest of the lens as the whole has it; and the share of its views that two of
@@ -82,7 +81,7 @@ fn estimates(
     recorder: &mut Recorder,
 ) -> Result<(Vec<Estimate>, f64), Error> {
     let views = of_camera(scene, model, camera);
-    let whole = model.log_focal(scene, camera, &views);
+    let whole = model.log_focal(camera, &views);
     let parts = model.part_of.iter().copied().max().unwrap_or(0);
     // Views that say nothing are gaps: what lies on either side may share no track.
     let of_part = |part: u32| -> Vec<Vec<usize>> {
@@ -93,10 +92,8 @@ fn estimates(
     let windows = windows(&(0..=parts).flat_map(of_part).collect::<Vec<_>>());
     let of_window = |k: usize| {
         let views = windows.get(k).filter(|_| !scene.stop().is_stopped())?;
-        match scene.zooms() {
-            true => zoom::of_window(scene, model, views, whole),
-            false => estimate(scene, model, camera, views),
-        }
+        let moved = moved_alone(scene, model, camera, views)?;
+        Some(Estimate { log_focal: whole + moved.log_focal, ..moved })
     };
     let mut told = |k: usize| {
         recorder.step(Task::Windows, k + 1, windows.len(), k as f64 / windows.len() as f64);
@@ -106,9 +103,10 @@ fn estimates(
     Ok((found.into_iter().flatten().collect(), shared(&windows)))
 }
 
-fn estimate(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
+/// By how much the log focal length of these views, their mean where each has its own, moves where they are alone.
+fn moved_alone(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
     let extract = calibrate::core(scene, model, views, OF_VIEW);
-    let (metric, observations) = extract.constant();
+    let (metric, observations) = extract.block();
     let (cameras, points) = calibrate::projective(&metric);
     let problem = calibration::Problem {
         cameras: &cameras,
@@ -116,11 +114,11 @@ fn estimate(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> Opt
         observations: &observations,
         noise: model.noise,
         focal_prior: None,
-        focal_per_view: false,
+        focal_per_view: metric.has_own_focals(),
     };
     let prior = adjust::knowledge(scene, camera, model.noise);
     let (log_focal, sigma) = calibration::focal_alone(&problem, &metric, &prior, scene.stop())?;
-    Some(Estimate { log_focal, sigma })
+    Some(Estimate { log_focal: log_focal - metric.intrinsics.focal.ln(), sigma })
 }
 
 /// Share of its views that a window has in common with another. Only the halves of a short run overlap.

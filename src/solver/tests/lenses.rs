@@ -62,9 +62,8 @@ fn a_distorting_lens_is_estimated_and_everything_reprojects_through_it() {
             let rotation = nalgebra::Matrix3::from_fn(|row, column| rows[row][column]);
             let seen = rotation * nalgebra::Vector3::from(point)
                 + nalgebra::Vector3::from(pose.translation.expect("a metric pose"));
-            let (u, v) = (seen.x / seen.z, seen.y / seen.z);
-            let scale = f * calibration.radial_scale(u * u + v * v);
-            residuals.push((scale * u + px - raw.x[k]).hypot(calibration.aspect * scale * v + py - raw.y[k]));
+            let [x, y] = calibration.distort(seen.x / seen.z, seen.y / seen.z);
+            residuals.push((f * x + px - raw.x[k]).hypot(calibration.aspect * f * y + py - raw.y[k]));
         }
         residuals.sort_by(f64::total_cmp);
         let median = residuals[residuals.len() / 2];

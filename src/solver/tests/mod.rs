@@ -302,9 +302,8 @@ fn without_image_sizes_the_reported_cameras_still_reproject() {
         let rotation = nalgebra::Matrix3::from_fn(|row, column| rows[row][column]);
         let seen = rotation * nalgebra::Vector3::from(point)
             + nalgebra::Vector3::from(pose.translation.expect("a metric pose"));
-        let (u, v) = (seen.x / seen.z, seen.y / seen.z);
-        let f = f * calibration.radial_scale(u * u + v * v);
-        let residual = (f * u + px - raw.x[k]).hypot(calibration.aspect * f * v + py - raw.y[k]);
+        let [x, y] = calibration.distort(seen.x / seen.z, seen.y / seen.z);
+        let residual = (f * x + px - raw.x[k]).hypot(calibration.aspect * f * y + py - raw.y[k]);
         // Noise of 3 px a coordinate, and what a principal point off by some pixels adds.
         assert!(residual < 30.0, "view {view}, track {track}: {residual} px");
     }

@@ -5,15 +5,14 @@ use std::ops::Range;
 use nalgebra::Vector2;
 
 use super::super::intrinsics_model::Parameter;
-use super::super::metric::{POINT, POSE};
+use super::super::metric::{POINT, POSE, VIEW};
 use super::{Free, Pace, Sequence, Sighting};
 
-/// The unknowns of views and groups, in blocks: the poses of the free views that see something, then the groups with
-/// free intrinsics.
+/// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free intrinsics.
 #[derive(Debug)]
 pub(super) struct Unknowns {
-    /// Block of a view's pose; `None` where it is held or sees nothing.
-    pub pose_block: Vec<Option<usize>>,
+    /// Block of a view: its pose, and its own focal length where that is free; `None` where it is held or sees nothing.
+    pub view_block: Vec<Option<usize>>,
     /// Block of a group's intrinsics; `None` where all are held.
     pub group_block: Vec<Option<usize>>,
     /// Free intrinsics of a group, in the order of its block.
@@ -30,20 +29,33 @@ impl Unknowns {
             offsets.push(offsets[block] + size);
             block
         };
-        let pose_block = (0..sequence.poses.len())
-            .map(|view| (sees[view] && is_free(free.views, view)).then(|| append(POSE)))
+        let own_focal = |view: usize| {
+            let model = sequence.group_of.get(view).and_then(|group| free.models.get(*group));
+            view < sequence.focals.len() && model.is_some_and(|model| model.is_per_view())
+        };
+        let view_block = (0..sequence.poses.len())
+            .map(|view| {
+                let unknowns = if own_focal(view) { VIEW } else { POSE };
+                (sees[view] && is_free(free.views, view)).then(|| append(unknowns))
+            })
             .collect();
         let groups = sequence.intrinsics.len();
         let parameters: Vec<Vec<Parameter>> = (0..groups)
             .map(|group| free.models.get(group).map(|model| model.parameters()).unwrap_or_default())
             .collect();
         let group_block = parameters.iter().map(|free| (!free.is_empty()).then(|| append(free.len()))).collect();
-        Self { pose_block, group_block, parameters, offsets }
+        Self { view_block, group_block, parameters, offsets }
     }
 
     /// Block of the intrinsics of a view.
     pub fn group_block_of_view(&self, sequence: &Sequence, view: usize) -> Option<usize> {
         *self.group_block.get(*sequence.group_of.get(view)?)?
+    }
+
+    /// Unknowns of a view that is free; 0 of one that is held.
+    #[inline]
+    pub fn of_view(&self, view: usize) -> usize {
+        self.view_block[view].map_or(0, |block| self.range(block).len())
     }
 
     pub fn block_count(&self) -> usize {
@@ -67,9 +79,8 @@ pub(super) struct Seen {
     pub view: usize,
     pub xy: Vector2<f64>,
     pub weight: f64,
-    /// Where the couplings of the view's pose and of its group's intrinsics with the point start; `None` where either
-    /// is held.
-    pub pose_coupling: Option<u32>,
+    /// Where the couplings of the view and of its group's intrinsics with the point start; `None` where either is held.
+    pub view_coupling: Option<u32>,
     pub group_coupling: Option<u32>,
 }
 
@@ -112,7 +123,7 @@ impl Layout {
             sees[sighting.view] = true;
         }
         accumulate(&mut seen_starts);
-        let nothing = Seen { view: 0, xy: Vector2::zeros(), weight: 0.0, pose_coupling: None, group_coupling: None };
+        let nothing = Seen { view: 0, xy: Vector2::zeros(), weight: 0.0, view_coupling: None, group_coupling: None };
         let mut seen = vec![nothing; seen_starts[points]];
         let mut next = seen_starts.clone();
         for sighting in usable() {
@@ -149,10 +160,10 @@ impl Layout {
             seen.sort_by_key(|seen| seen.view);
             if self.free_points[point] {
                 let first = self.touches.len();
-                let pose = |seen: &Seen| unknowns.pose_block[seen.view];
+                let view = |seen: &Seen| unknowns.view_block[seen.view];
                 let group = |seen: &Seen| unknowns.group_block_of_view(sequence, seen.view);
                 blocks.clear();
-                blocks.extend(seen.iter().filter_map(pose));
+                blocks.extend(seen.iter().filter_map(view));
                 blocks.extend(seen.iter().filter_map(group));
                 blocks.sort_unstable();
                 blocks.dedup();
@@ -167,7 +178,7 @@ impl Layout {
                     Some(touches[at].coupling)
                 };
                 for seen in seen {
-                    seen.pose_coupling = place(pose(seen));
+                    seen.view_coupling = place(view(seen));
                     seen.group_coupling = place(group(seen));
                 }
                 couplings += size;

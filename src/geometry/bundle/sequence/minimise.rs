@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::super::engine::{UNDEFINED_SQUARED, usable_squared_norm};
-use super::super::metric::IntrinsicsPrior;
+use super::super::metric::{IntrinsicsPrior, POSE};
 use super::super::{Loss, Options, Report};
 use super::crew::Crew;
 use super::layout::{Layout, Seen};
@@ -59,13 +59,15 @@ pub fn adjust(
         let cost = cost(sequence, &layout, priors, options.loss, &crew).unwrap_or(f64::INFINITY);
         return Report { initial_cost: cost, cost, iterations: 0 };
     };
-    levenberg_marquardt::minimise(&mut descent, sequence, &options.of_loop(MIN_DAMPING), stop)
+    let report = levenberg_marquardt::minimise(&mut descent, sequence, &options.of_loop(MIN_DAMPING), stop);
+    sequence.average_focals();
+    report
 }
 
 /// Pattern of the reduced system of a layout; `None` when it was stopped.
 pub(super) fn pattern(sequence: &Sequence, layout: &Layout, pace: &mut Pace) -> Option<Pattern> {
     let unknowns = &layout.unknowns;
-    let pair = |view: usize| unknowns.pose_block[view].zip(unknowns.group_block_of_view(sequence, view));
+    let pair = |view: usize| unknowns.view_block[view].zip(unknowns.group_block_of_view(sequence, view));
     Pattern::new(layout, (0..sequence.poses.len()).filter_map(pair), pace)
 }
 
@@ -182,11 +184,20 @@ pub(super) fn retract(moved: &mut Sequence, from: &Sequence, layout: &Layout, st
         possible &=
             [moved.intrinsics[group].focal, moved.intrinsics[group].aspect].iter().all(|scale| scale.is_normal());
     }
-    for (view, block) in unknowns.pose_block.iter().enumerate() {
+    // A focal length that a group moves, it moves of all its views.
+    let shared = |group: usize| Some(moved.intrinsics.get(group)?.focal / from.intrinsics.get(group)?.focal);
+    for ((own, from), &group) in moved.focals.iter_mut().zip(&from.focals).zip(&from.group_of) {
+        *own = from * shared(group).unwrap_or(1.0);
+    }
+    for (view, block) in unknowns.view_block.iter().enumerate() {
         let Some(block) = block else { continue };
-        if let Ok(step) = step[unknowns.range(*block)].try_into() {
-            moved.poses[view] = from.poses[view].moved(step);
+        if let Some((step, own_focal)) = step[unknowns.range(*block)].split_first_chunk::<POSE>() {
+            moved.poses[view] = from.poses[view].moved(*step);
             possible &= moved.poses[view].translation.iter().all(|value| value.is_finite());
+            if let [by] = own_focal {
+                moved.focals[view] *= by.exp();
+                possible &= moved.focals[view].is_normal();
+            }
         }
     }
     possible

@@ -1,4 +1,5 @@
-//! Metric bundle adjustment of whole sequences, cameras in groups of one calibration: cost and memory linear in the
+//! Metric bundle adjustment of whole sequences, cameras in groups of one calibration, but for focal lengths of their own
+//! where they have these: cost and memory linear in the
 //! observations, by a sparse Cholesky factorisation of the Schur complement of the points (Triggs et al. 2000, "Bundle
 //! adjustment - a modern synthesis", section 6).
 //!
@@ -28,8 +29,10 @@ use crate::parallel::Threads;
 /// A metric reconstruction, up to a similarity, whose views share intrinsics in groups.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sequence {
-    /// One a group.
+    /// One a group; where views have focal lengths of their own, all but these.
     pub intrinsics: Vec<Intrinsics>,
+    /// The focal length of each view; empty where views have that of their group.
+    pub focals: Vec<f64>,
     /// Group of each view.
     pub group_of: Vec<usize>,
     pub poses: Vec<Pose>,
@@ -70,12 +73,13 @@ impl<'a> Free<'a> {
 
 impl From<&Reconstruction> for Sequence {
     /// All views in one group.
-    fn from(constant: &Reconstruction) -> Self {
+    fn from(block: &Reconstruction) -> Self {
         Self {
-            intrinsics: vec![constant.intrinsics],
-            group_of: vec![0; constant.poses.len()],
-            poses: constant.poses.clone(),
-            points: constant.points.clone(),
+            intrinsics: vec![block.intrinsics],
+            focals: block.focals.clone(),
+            group_of: vec![0; block.poses.len()],
+            poses: block.poses.clone(),
+            points: block.points.clone(),
         }
     }
 }
@@ -92,8 +96,24 @@ impl Sequence {
     ///
     /// # Panics
     /// When the view or its group is out of range.
-    pub fn intrinsics_of(&self, view: usize) -> &Intrinsics {
-        &self.intrinsics[self.group_of[view]]
+    #[inline]
+    pub fn intrinsics_of(&self, view: usize) -> Intrinsics {
+        let shared = self.intrinsics[self.group_of[view]];
+        match self.focals.get(view) {
+            Some(&focal) => Intrinsics { focal, ..shared },
+            None => shared,
+        }
+    }
+
+    /// Takes the geometric mean of the views' own focal lengths as that of their group.
+    fn average_focals(&mut self) {
+        for (group, intrinsics) in self.intrinsics.iter_mut().enumerate() {
+            let of_group = self.focals.iter().zip(&self.group_of).filter(|(_, of)| **of == group);
+            let logs: Vec<f64> = of_group.map(|(focal, _)| focal.ln()).collect();
+            if !logs.is_empty() {
+                intrinsics.focal = (logs.iter().sum::<f64>() / logs.len() as f64).exp();
+            }
+        }
     }
 
     /// Predicted minus observed image point, unweighted; infinite or not a number at depth zero.

@@ -1,5 +1,5 @@
-//! The normal equations at one state: what poses and intrinsics have among themselves, their couplings with the
-//! points, and the blocks of the points.
+//! The normal equations at one state: what views and intrinsics have among themselves, their couplings with the points,
+//! and the blocks of the points.
 
 use std::ops::Range;
 
@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 
 use super::super::Loss;
 use super::super::engine::usable_squared_norm;
-use super::super::metric::{IntrinsicsPrior, POSE, Parameter, Projection, ProjectionGradients};
+use super::super::metric::{IntrinsicsPrior, POSE, Parameter, Projection, ProjectionGradients, VIEW};
 use super::crew::{Crew, split_off};
 use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
@@ -18,11 +18,11 @@ use crate::parallel::even_cuts;
 /// Where a view's residuals go in the camera part of the normal equations.
 #[derive(Debug, Clone, Copy)]
 struct ViewPlaces {
-    /// First unknown of the pose and its diagonal block.
-    pose: Option<(usize, Place)>,
-    /// The same of the intrinsics.
+    /// First unknown of the view, its unknowns and its diagonal block.
+    view: Option<(usize, usize, Place)>,
+    /// First unknown of the intrinsics and their diagonal block.
     group: Option<(usize, Place)>,
-    /// Block of intrinsics and pose.
+    /// Block of intrinsics and view.
     cross: Option<Place>,
 }
 
@@ -30,7 +30,8 @@ struct ViewPlaces {
 #[derive(Debug)]
 pub(super) struct Weighted {
     pub residual: [f64; 2],
-    pose: [[f64; POSE]; 2],
+    /// By pose and own focal length.
+    view: [[f64; VIEW]; 2],
     pub point: [Vector3<f64>; 2],
     by_parameter: [[f64; Parameter::COUNT]; 2],
 }
@@ -39,22 +40,25 @@ impl Weighted {
     /// `None` where the observation is undefined.
     #[inline]
     pub fn new(sequence: &Sequence, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
-        let intrinsics = &sequence.intrinsics[sequence.group_of[seen.view]];
-        let projection = Projection::new(intrinsics, &sequence.poses[seen.view], point);
+        let intrinsics = sequence.intrinsics_of(seen.view);
+        let projection = Projection::new(&intrinsics, &sequence.poses[seen.view], point);
         let residual = projection.image - seen.xy;
         let squared = usable_squared_norm(&residual)? * seen.weight;
         let root = seen.weight.sqrt() * loss.root_weight(squared);
         let ProjectionGradients { by_parameter, by_pose, by_point } = projection.gradients();
         Some(Self {
             residual: [residual.x * root, residual.y * root],
-            pose: by_pose.map(|row| row.map(|value| value * root)),
+            view: std::array::from_fn(|component| {
+                let [a, b, c, x, y, z] = by_pose[component];
+                [a, b, c, x, y, z, by_parameter[component][Parameter::LogFocal as usize]].map(|value| value * root)
+            }),
             point: by_point.map(|row| row * root),
             by_parameter: by_parameter.map(|row| row.map(|value| value * root)),
         })
     }
 }
 
-/// Poses and intrinsics among themselves.
+/// Views and intrinsics among themselves.
 #[derive(Debug)]
 pub(super) struct Cameras {
     /// One a view.
@@ -65,8 +69,7 @@ pub(super) struct Cameras {
     pub values: Vec<f64>,
     /// Half the gradient of the cost.
     pub gradient: Vec<f64>,
-    /// Values and unknowns that belong to the poses before each view's, and to all of them: the groups' come after
-    /// these.
+    /// Values and unknowns that belong to the views before each, and to all of them: the groups' come after these.
     before: Vec<(usize, usize)>,
     /// Observations of each view: starts, and one view after the other where they are among all.
     by_view: (Vec<usize>, Vec<u32>),
@@ -76,7 +79,7 @@ pub(super) struct Cameras {
 #[derive(Debug)]
 pub(super) struct Normal {
     pub cameras: Cameras,
-    /// Couplings of poses and intrinsics with the points, `Jc' Jp`.
+    /// Couplings of views and intrinsics with the points, `Jc' Jp`.
     pub couplings: Vec<f64>,
     pub points: Vec<PointBlock>,
     /// Rows of the Jacobian of a batch of points.
@@ -93,7 +96,7 @@ struct Points<'a> {
 
 /// What the rows of a batch are added to.
 enum Sums<'a> {
-    /// Blocks of some views' poses and theirs with the intrinsics.
+    /// Blocks of some views and theirs with the intrinsics.
     Views { range: Range<usize>, values: &'a mut [f64], gradient: &'a mut [f64] },
     /// Blocks of all groups' intrinsics.
     Groups { values: &'a mut [f64], gradient: &'a mut [f64] },
@@ -187,7 +190,7 @@ impl Points<'_> {
                 if let Some(row) = slot {
                     block.add(&row.point, row.residual);
                     let parameters = &layout.unknowns.parameters[sequence.group_of[seen.view]];
-                    row.couple(seen, parameters, couplings);
+                    row.couple(seen, layout.unknowns.of_view(seen.view), parameters, couplings);
                 }
             }
             *slot = block;
@@ -201,19 +204,21 @@ impl Cameras {
         let unknowns = &layout.unknowns;
         let diagonal = |block: usize| Some((unknowns.range(block).start, pattern.place(block, block)?));
         let places = |view: usize| {
-            let (pose, group) = (unknowns.pose_block[view], unknowns.group_block_of_view(sequence, view));
+            let (own, group) = (unknowns.view_block[view], unknowns.group_block_of_view(sequence, view));
+            let sized =
+                |block: usize| diagonal(block).map(|(first, place)| (first, unknowns.range(block).len(), place));
             ViewPlaces {
-                pose: pose.and_then(diagonal),
+                view: own.and_then(sized),
                 group: group.and_then(diagonal),
-                cross: pose.zip(group).and_then(|(pose, group)| pattern.place(group, pose)),
+                cross: own.zip(group).and_then(|(own, group)| pattern.place(group, own)),
             }
         };
         let mut before = vec![(0, 0)];
-        for block in &unknowns.pose_block {
-            let (values, poses) = before[before.len() - 1];
+        for block in &unknowns.view_block {
+            let (values, unknowns_before) = before[before.len() - 1];
             before.push(match block {
                 Some(block) => (pattern.panels(0..block + 1).end, unknowns.range(*block).end),
-                None => (values, poses),
+                None => (values, unknowns_before),
             });
         }
         Self {
@@ -304,7 +309,7 @@ impl Batch<'_> {
         let (first_value, first_unknown) = self.before[views.start];
         let within = |place: Place| Place { start: place.start - first_value, ..place };
         for view in views {
-            let ViewPlaces { pose: Some((first, place)), cross, .. } = self.places[view] else { continue };
+            let ViewPlaces { view: Some((first, unknowns, place)), cross, .. } = self.places[view] else { continue };
             let gradient = &mut gradient[first - first_unknown..];
             let parameters = &self.parameters[sequence.group_of[view]];
             for &k in seen(view) {
@@ -312,12 +317,12 @@ impl Batch<'_> {
                     return false;
                 }
                 let Some(row) = &self.rows[k as usize - self.first] else { continue };
-                let pose = [row.pose[0].as_slice(), row.pose[1].as_slice()];
-                add_to_pose(values, within(place), &row.pose, &row.pose);
-                add_gradient(gradient, pose, row.residual);
+                let own = [&row.view[0][..unknowns], &row.view[1][..unknowns]];
+                add_to_view(values, within(place), unknowns, &row.view, own);
+                add_gradient(gradient, own, row.residual);
                 if let Some(cross) = cross {
                     let free = row.free(parameters);
-                    add_product(values, within(cross), chosen(&free, parameters), pose);
+                    add_product(values, within(cross), chosen(&free, parameters), own);
                 }
             }
         }
@@ -365,10 +370,12 @@ impl Weighted {
 
     /// Adds this observation to the couplings of its point.
     #[inline]
-    fn couple(&self, seen: &Seen, parameters: &[Parameter], couplings: &mut [f64]) {
+    ///
+    /// * `unknowns`: of the view
+    fn couple(&self, seen: &Seen, unknowns: usize, parameters: &[Parameter], couplings: &mut [f64]) {
         let point = [self.point[0].as_slice(), self.point[1].as_slice()];
-        if let Some(start) = seen.pose_coupling {
-            add_to_pose(couplings, Place { start: start as usize, stride: POSE }, &self.pose, &point);
+        if let Some(start) = seen.view_coupling {
+            add_to_view(couplings, Place { start: start as usize, stride: unknowns }, unknowns, &self.view, point);
         }
         if let Some(start) = seen.group_coupling {
             let free = self.free(parameters);
@@ -384,20 +391,26 @@ fn chosen<'f>(free: &'f [[f64; Parameter::COUNT]; 2], parameters: &[Parameter]) 
     [&free[0][..parameters.len()], &free[1][..parameters.len()]]
 }
 
-/// Adds `rows' columns` to a block of six rows.
-///
+/// Adds `rows' columns` to a block of as many rows as a view has unknowns.
+#[inline]
+fn add_to_view(values: &mut [f64], place: Place, unknowns: usize, rows: &[[f64; VIEW]; 2], columns: [&[f64]; 2]) {
+    match unknowns {
+        POSE => add_rows::<POSE>(values, place, rows, columns),
+        _ => add_rows::<VIEW>(values, place, rows, columns),
+    }
+}
+
 /// Loops by hand over arrays, here and below: iterators cost several times as much in builds for tests, which barely
 /// optimise.
 #[inline]
-fn add_to_pose(values: &mut [f64], place: Place, rows: &[[f64; POSE]; 2], columns: &[impl AsRef<[f64]>; 2]) {
+fn add_rows<const R: usize>(values: &mut [f64], place: Place, rows: &[[f64; VIEW]; 2], [a, b]: [&[f64]; 2]) {
     let [first, second] = rows;
-    let [a, b] = [columns[0].as_ref(), columns[1].as_ref()];
     let b = &b[..a.len()];
     let mut k = 0;
     while k < a.len() {
-        if let Some(slots) = values[place.start + k * place.stride..].first_chunk_mut::<POSE>() {
+        if let Some(slots) = values[place.start + k * place.stride..].first_chunk_mut::<R>() {
             let mut r = 0;
-            while r < POSE {
+            while r < R {
                 slots[r] += first[r] * a[k] + second[r] * b[k];
                 r += 1;
             }

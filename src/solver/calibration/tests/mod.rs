@@ -3,7 +3,7 @@
 mod coverage;
 mod critical;
 mod models;
-mod zoom;
+mod view_focals;
 
 use super::*;
 use crate::geometry::bundle::testing::{self, Motion, NOISE, TestScene};

@@ -201,7 +201,10 @@ fn metric_of(scene: &TestScene, focals: &[f64]) -> Reconstruction {
     metric
 }
 
-fn with_choice<T>(scene: &TestScene, ask: impl FnOnce(&super::super::models::Choice, &Fit, &search::Minimum) -> T) -> T {
+fn with_choice<T>(
+    scene: &TestScene,
+    ask: impl FnOnce(&super::super::models::Choice, &Fit, &search::Minimum) -> T,
+) -> T {
     let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
     let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, NOISE) };
     let (prior, stop) = (super::super::models::knowledge(NOISE, None, SIDE_PX), StopToken::default());

@@ -5,7 +5,6 @@ use super::*;
 use crate::geometry::bundle::Loss;
 use crate::geometry::bundle::metric::{self, Extension, Parameter};
 use crate::geometry::bundle::testing::{self, NOISE};
-use crate::geometry::bundle::zoom::Zooming;
 
 /// Small systems go dense, large ones sparse: both end where the adjustment of one block does.
 #[test]
@@ -14,14 +13,10 @@ fn one_group_ends_where_a_block_does() {
         let scene = testing::scene(seed, views, tracks, NOISE);
         let (truth, sightings) = sequence_of(&scene);
         let start = perturbed(&truth, 0.01, seed);
-        let model = IntrinsicsModel::FOCAL.with(Extension::Radial);
-        let prior = IntrinsicsPrior::NONE.knowing(Parameter::Radial, 0.0, 0.05, NOISE);
+        let model = IntrinsicsModel::FOCAL.with(Extension::RadialK1);
+        let prior = IntrinsicsPrior::NONE.knowing(Parameter::RadialK1, 0.0, 0.05, NOISE);
         for options in [thorough(), Options { loss: Loss::Cauchy { scale: NOISE }, ..thorough() }] {
-            let mut block = Reconstruction {
-                intrinsics: start.intrinsics[0],
-                poses: start.poses.clone(),
-                points: start.points.clone(),
-            };
+            let mut block = Reconstruction::new(start.intrinsics[0], start.poses.clone(), start.points.clone());
             let stop = StopToken::default();
             let dense = metric::adjust(&mut block, &scene.observations, model, &prior, &options, &stop);
             let mut sequence = start.clone();
@@ -30,7 +25,7 @@ fn one_group_ends_where_a_block_does() {
             println!("seed {seed}, {views} views: {dense:?}, {sparse:?}");
             assert!((sparse.initial_cost / dense.initial_cost - 1.0).abs() < 1e-12, "seed {seed}");
             assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
-            for parameter in [Parameter::LogFocal, Parameter::Radial] {
+            for parameter in [Parameter::LogFocal, Parameter::RadialK1] {
                 let error = sequence.intrinsics[0].value(parameter) - block.intrinsics.value(parameter);
                 assert!(error.abs() < 1e-5, "seed {seed}: {parameter:?} off by {error}");
             }
@@ -44,11 +39,11 @@ fn two_groups_are_recovered() {
         let (mut truth, mut sightings) = chain(seed, 16, 12, 6, 0.0);
         truth.group_of = (0..16).map(|view| view % 2).collect();
         truth.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.8)];
-        truth.intrinsics[1].radial = -0.08;
+        truth.intrinsics[1].radial[0] = -0.08;
         observe(&truth, &mut sightings, 0.0, seed);
         let mut start = perturbed(&truth, 0.01, seed);
-        start.intrinsics[1].radial = 0.0;
-        let models = [IntrinsicsModel::FOCAL, IntrinsicsModel::FOCAL.with(Extension::Radial)];
+        start.intrinsics[1].radial[0] = 0.0;
+        let models = [IntrinsicsModel::FOCAL, IntrinsicsModel::FOCAL.with(Extension::RadialK1)];
         let report = adjusted(&mut start, &sightings, &models, &thorough());
         println!("seed {seed}: {report:?} {:?}", start.intrinsics);
         for (found, expected) in start.intrinsics.iter().zip(&truth.intrinsics) {
@@ -61,19 +56,23 @@ fn two_groups_are_recovered() {
 }
 
 #[test]
-fn a_focal_length_a_view_ends_where_a_zooming_block_does() {
+fn focal_lengths_a_view_behind_one_lens_end_where_those_of_a_block_do() {
     for seed in 0..3 {
         let scene = testing::scene(seed, 12, 40, NOISE);
-        let (mut start, sightings) = sequence_of(&scene);
-        start.intrinsics = vec![start.intrinsics[0]; 12];
-        start.group_of = (0..12).collect();
-        let mut zooming = Zooming::from(&reconstruction_of(&scene));
-        let dense = zooming.adjust(&scene.observations, &thorough(), &StopToken::default());
-        let sparse = adjusted(&mut start, &sightings, &[IntrinsicsModel::FOCAL; 12], &thorough());
-        println!("seed {seed}: {dense:?} {sparse:?}");
-        assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
-        for (intrinsics, focal) in start.intrinsics.iter().zip(&zooming.focals) {
-            assert!((intrinsics.focal / focal - 1.0).abs() < 1e-5, "seed {seed}: {} {focal}", intrinsics.focal);
+        for model in [IntrinsicsModel::FOCAL_PER_VIEW, IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1)] {
+            let mut block = reconstruction_of(&scene).with_own_focals();
+            let mut start = Sequence::from(&block);
+            let (_, sightings) = sequence_of(&scene);
+            let (prior, stop) = (IntrinsicsPrior::NONE, StopToken::default());
+            let dense = metric::adjust(&mut block, &scene.observations, model, &prior, &thorough(), &stop);
+            let sparse = adjusted(&mut start, &sightings, &[model], &thorough());
+            println!("seed {seed}, {}: {dense:?} {sparse:?}", model.name());
+            assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
+            for (found, expected) in start.focals.iter().zip(&block.focals) {
+                assert!((found / expected - 1.0).abs() < 1e-5, "seed {seed}: {found} {expected}");
+            }
+            assert!((start.intrinsics[0].focal / block.intrinsics.focal - 1.0).abs() < 1e-5, "seed {seed}");
+            assert!((start.intrinsics[0].radial[0] - block.intrinsics.radial[0]).abs() < 1e-5, "seed {seed}");
         }
     }
 }

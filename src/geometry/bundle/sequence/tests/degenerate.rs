@@ -4,7 +4,9 @@ use super::*;
 use crate::geometry::bundle::Loss;
 
 fn run(mut sequence: Sequence, sightings: &[Sighting]) -> Sequence {
-    for model in [IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
+    for model in
+        [IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL, IntrinsicsModel::FOCAL_PER_VIEW, IntrinsicsModel::FULL]
+    {
         for loss in [Loss::Squared, Loss::Cauchy { scale: 0.003 }] {
             let models = vec![model; sequence.intrinsics.len()];
             let options = Options { loss, ..Options::default() };
@@ -27,7 +29,7 @@ fn little_or_odd_input_neither_panics_nor_yields_nan() {
     for views in [6, 60] {
         let (truth, sightings) = chain(1, views, 4, 4, 0.001);
         assert!(is_finite(&run(truth.clone(), &[])));
-        let empty = Sequence { intrinsics: vec![], group_of: vec![], poses: vec![], points: vec![] };
+        let empty = Sequence { intrinsics: vec![], focals: vec![], group_of: vec![], poses: vec![], points: vec![] };
         run(empty, &sightings);
         // One view a track: nothing is determined.
         let alone: Vec<Sighting> = sightings.iter().filter(|seen| seen.view == seen.point % views).copied().collect();
@@ -76,6 +78,9 @@ fn what_is_no_number_or_out_of_range_is_left_alone() {
         let mut ungrouped = truth.clone();
         ungrouped.group_of[3] = 7;
         ungrouped.group_of.pop();
+        run(ungrouped.clone(), &sightings);
+        // And one without a focal length where views have their own.
+        ungrouped.focals = vec![1.1; views - 1];
         run(ungrouped, &sightings);
     }
 }

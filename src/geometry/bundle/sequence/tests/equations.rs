@@ -18,8 +18,8 @@ fn mixed() -> (Sequence, Vec<Sighting>, Vec<IntrinsicsModel>, Vec<bool>, Vec<boo
     let (mut sequence, mut sightings) = chain(1, 7, 3, 4, 0.003);
     sequence.group_of = vec![0, 0, 1, 1, 2, 2, 0];
     sequence.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.9), Intrinsics::from_focal(1.3)];
-    sequence.intrinsics[0].radial = -0.1;
-    sequence.intrinsics[0].second_radial = 0.05;
+    sequence.intrinsics[0].radial = [-0.1, 0.05, 0.02];
+    sequence.intrinsics[0].tangential = [0.01, -0.02];
     sequence.intrinsics[0].aspect = 1.1;
     observe(&sequence, &mut sightings, 0.003, 1);
     sightings.iter_mut().enumerate().for_each(|(k, seen)| seen.weight = 0.5 + 0.1 * (k % 7) as f64);
@@ -61,17 +61,43 @@ fn differentiate(sequence: &Sequence, sightings: &[Sighting], layout: &Layout) -
 #[test]
 fn normal_equations_agree_with_finite_differences() {
     let (sequence, sightings, models, views, points) = mixed();
-    let free = Free { models: &models, views: Some(&views), points: Some(&points) };
+    compare(
+        &sequence,
+        &sightings,
+        &models,
+        &views,
+        &points,
+        6 * 6 + 9 + 3,
+        "six free views, nine and three intrinsics",
+    );
+    // Two views with focal lengths of their own behind one lens.
+    let (mut sequence, mut sightings, mut models, views, points) = mixed();
+    sequence.focals = vec![1.0, 1.1, 0.9, 1.0, 1.2, 1.3, 1.1];
+    models[2] = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1);
+    observe(&sequence, &mut sightings, 0.003, 1);
+    compare(&sequence, &sightings, &models, &views, &points, 6 * 6 + 2 + 9 + 1, "two more unknowns of views");
+}
+
+fn compare(
+    sequence: &Sequence,
+    sightings: &[Sighting],
+    models: &[IntrinsicsModel],
+    views: &[bool],
+    points: &[bool],
+    unknowns: usize,
+    what: &str,
+) {
+    let free = Free { models, views: Some(views), points: Some(points) };
     let going = StopToken::default();
     let mut pace = Pace::new(&going);
-    let layout = Layout::new(&sequence, &sightings, &free, &mut pace).expect("goes on");
-    let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
+    let layout = Layout::new(sequence, sightings, &free, &mut pace).expect("goes on");
+    let pattern = pattern(sequence, &layout, &mut pace).expect("goes on");
     let cameras = pattern.dimension();
-    assert_eq!(cameras, 6 * 6 + 6 + 3, "six free views, six and three intrinsics");
-    let mut normal = Normal::new(&layout, &pattern, &sequence);
+    assert_eq!(cameras, unknowns, "{what}");
+    let mut normal = Normal::new(&layout, &pattern, sequence);
     let stop = StopToken::default();
-    assert!(normal.fill(&sequence, &layout, &[], Loss::Squared, &Crew::new(&layout, Threads::ONE, &stop)));
-    let (residuals, jacobian) = differentiate(&sequence, &sightings, &layout);
+    assert!(normal.fill(sequence, &layout, &[], Loss::Squared, &Crew::new(&layout, Threads::ONE, &stop)));
+    let (residuals, jacobian) = differentiate(sequence, sightings, &layout);
     let information = jacobian.transpose() * &jacobian;
     let gradient = jacobian.transpose() * residuals;
     let close = |found: f64, expected: f64, what: &str| {

@@ -69,11 +69,7 @@ fn time_against_a_block() {
         let scene = testing::scene(seed, 10, 200, NOISE);
         let (truth, sightings) = sequence_of(&scene);
         let mut start = perturbed(&truth, 0.01, seed);
-        let mut block = Reconstruction {
-            intrinsics: start.intrinsics[0],
-            poses: start.poses.clone(),
-            points: start.points.clone(),
-        };
+        let mut block = Reconstruction::new(start.intrinsics[0], start.poses.clone(), start.points.clone());
         let (model, prior, stop) = (IntrinsicsModel::FOCAL, IntrinsicsPrior::NONE, StopToken::default());
         let (seconds, dense) =
             timed(|| metric::adjust(&mut block, &scene.observations, model, &prior, &options(), &stop));

@@ -35,7 +35,7 @@ fn chain(seed: u64, views: usize, tracks_a_view: usize, length: usize, noise: f6
         })
         .collect();
     let mut sequence =
-        Sequence { intrinsics: vec![Intrinsics::from_focal(1.1)], group_of: vec![0; views], poses, points: vec![] };
+        Sequence::from(&Reconstruction { poses, ..Reconstruction::new(Intrinsics::from_focal(1.1), vec![], vec![]) });
     let mut sightings = Vec::new();
     for first in 0..=views - length {
         for _ in 0..tracks_a_view {
@@ -64,7 +64,7 @@ fn sequence_of(scene: &TestScene) -> (Sequence, Vec<Sighting>) {
 }
 
 fn reconstruction_of(scene: &TestScene) -> Reconstruction {
-    Reconstruction { intrinsics: scene.intrinsics, poses: scene.poses.clone(), points: scene.points.clone() }
+    Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone())
 }
 
 /// Moves points and poses by so much, focal lengths by ten times as much.

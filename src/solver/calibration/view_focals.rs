@@ -1,0 +1,89 @@
+//! What is told of focal lengths where every view has its own, and whether views have where they were taken to share one.
+
+use super::fit::Fit;
+use super::models::{Candidate, Choice, Sigmas, knowledge};
+use super::search::converge;
+use super::verdict::{UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO, is_plausible};
+use super::{Problem, ViewFocal};
+use crate::domain::{Grade, WarningCode};
+use crate::geometry::bundle::metric::{self, Extension, IntrinsicsModel, Reconstruction};
+use crate::geometry::statistics::{median, root_mean_square};
+
+/// What a lens may add to log focal lengths of which every view has its own, one standard deviation: few lenses have the
+/// same distortion and centre at every focal length, and one for all is what is estimated. No zoom is METRIC for it.
+const LENS_SIGMA: f64 = 0.05;
+/// Share of the views whose focal length must be determined: of fewer, what most of the images show says nothing of
+/// the camera.
+pub const LEAST_DETERMINED: f64 = 0.5;
+
+/// The focal length of each view, undetermined where it is.
+pub(super) fn of(best: &Candidate, sigmas: &Sigmas) -> Vec<ViewFocal> {
+    let focals = best.minimum.reconstruction.focals.iter().zip(&sigmas.view_focals);
+    let of_view = |(&focal, sigma): (&f64, &Option<f64>)| {
+        let sigma_log = sigma.map(|sigma| sigma.hypot(LENS_SIGMA)).filter(|_| is_plausible(focal));
+        ViewFocal { focal, sigma_log }
+    };
+    focals.map(of_view).collect()
+}
+
+/// Leaves those of the views undetermined that are, and says so; returns sigma, the root mean square of theirs. Where most
+/// are, that is the median of all, `None` if it is beyond all bounds.
+pub(super) fn judge(verdict: &mut Verdict, focals: &mut [ViewFocal]) -> Option<f64> {
+    let mut all: Vec<f64> = focals.iter().map(|view| view.sigma_log.unwrap_or(f64::INFINITY)).collect();
+    for view in focals.iter_mut() {
+        view.sigma_log = view.sigma_log.filter(|sigma| *sigma <= WEAK_UP_TO);
+    }
+    let determined: Vec<f64> = focals.iter().filter_map(|view| view.sigma_log).collect();
+    let sigma = root_mean_square(&determined);
+    if (determined.len() as f64) < LEAST_DETERMINED * focals.len() as f64 || sigma.is_none() {
+        let typical = Some(median(&mut all)).filter(|sigma| *sigma > WEAK_UP_TO && *sigma < UNOBSERVABLE_ABOVE);
+        verdict.judge_sigma(typical);
+        return typical;
+    }
+    if determined.len() < focals.len() {
+        verdict.cap(
+            Grade::Weak,
+            WarningCode::UnobservableFocal,
+            format!(
+                "the focal lengths of {} of {} views are not determined: these have neither focal length nor pose",
+                focals.len() - determined.len(),
+                focals.len()
+            ),
+        );
+    }
+    verdict.judge_sigma(sigma);
+    sigma
+}
+
+/// Geometric mean of those that are determined; `None` where none is.
+pub(super) fn mean(focals: &[ViewFocal]) -> Option<f64> {
+    let logs: Vec<f64> = focals.iter().filter(|view| view.sigma_log.is_some()).map(|view| view.focal.ln()).collect();
+    (!logs.is_empty()).then(|| (logs.iter().sum::<f64>() / logs.len() as f64).exp())
+}
+
+/// What the views' own focal lengths are where one for all is contradicted.
+pub(super) struct Differing {
+    /// Root mean square of what lies between the logarithms of theirs and of the one.
+    pub shift: f64,
+    /// The smallest and the largest, normalised.
+    pub range: (f64, f64),
+}
+
+/// Asks whether a focal length a view explains the observations better than one for all of `metric`, behind its lens,
+/// by more than chance; if so, what they are.
+///
+/// * `own`: the fit of `metric`
+pub(super) fn differing(metric: &Reconstruction, own: &Fit, choice: &Choice) -> Option<Differing> {
+    let problem: &Problem = choice.problem;
+    let prior = knowledge(own.noise, None, choice.scale_px);
+    let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint).with(Extension::RadialK1);
+    let mut freed = metric.clone().with_own_focals();
+    let report = metric::adjust(&mut freed, problem.observations, model, &prior, &converge(), choice.stop);
+    if !Fit::metric(report.cost, model, problem).refutes(own) {
+        return None;
+    }
+    let shifts: Vec<f64> = freed.focals.iter().map(|focal| (focal / metric.intrinsics.focal).ln()).collect();
+    let (least, most) =
+        freed.focals.iter().fold((f64::INFINITY, 0.0f64), |(low, high), focal| (low.min(*focal), high.max(*focal)));
+    root_mean_square(&shifts).map(|shift| Differing { shift, range: (least, most) })
+}
