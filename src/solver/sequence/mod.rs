@@ -376,7 +376,9 @@ impl Extended<'_> {
     /// Whether nothing is to be gained by extending without a calibration: most views hold together so precisely that
     /// wrong observations do not.
     fn is_settled(&self) -> bool {
-        self.fits() && self.holds_most_views() && self.model.noise <= attempt::INITIAL_NOISE
+        let is_precise = self.model.noise <= attempt::INITIAL_NOISE;
+        // Windows that differ a little are told as a mismatch of a METRIC one too.
+        is_precise && self.holds_most_views() && (self.fits() || self.grade() == Grade::Metric)
     }
 
     fn holds_most_views(&self) -> bool {
