@@ -73,8 +73,8 @@ fn six_points(points: &[Point; LEAST_POINTS], images: &[Vector2<f64>; LEAST_POIN
 ///
 /// * `gate`: squared residual below which an image agrees, in squared units of the images
 ///
-/// Reliable down to three right images in ten; once `stop` fires, the best so far. Returns the camera and which images agree; `None` when fewer than
-/// `least` do.
+/// Reliable down to three right images in ten; once `stop` fires, the best so far. Returns the camera and which images
+/// agree; `None` when fewer than `least` do.
 pub fn robust(
     points: &[Point],
     images: &[Vector2<f64>],

@@ -127,13 +127,12 @@ fn best_in_front(minima: &[Minimum], problem: &Problem, fit: &Fit) -> usize {
 ///
 /// * `counts`: which views do where they have focal lengths of their own
 fn rival<'a>(best: &Candidate, others: &'a [Minimum], counts: impl Fn(usize) -> bool) -> Option<(&'a Minimum, f64)> {
-    let apart = others.iter().map(|other| (other, other.apart(&best.minimum, &counts)));
-    let mut rivals = apart.filter(|(other, apart)| {
+    let mut apart = others.iter().map(|other| (other, other.apart(&best.minimum, &counts)));
+    apart.find(|(other, apart)| {
         *apart > OTHER_CALIBRATION
             && other.cheirality >= CHEIRALITY_LIMIT.min(best.minimum.cheirality)
             && other.cost - best.minimum.cost < CHI_SQUARE_GAIN * best.fit.noise.powi(2)
-    });
-    rivals.next()
+    })
 }
 
 /// What a prior on the focal length may not do: contradict the observations unsaid, or make a calibration of nothing.

@@ -101,9 +101,9 @@ impl Projective {
         evidence(self.observations.len(), unknowns, self.noise, outlier_density)
     }
 
-    /// The same reconstruction in a frame in which "in front of the camera" means what it says: every camera and point at the sign at
-    /// which depths are positive, and the mean principal plane at infinity, so that no point is there (Hartley &
-    /// Zisserman, chapter 21: a quasi-affine frame).
+    /// The same reconstruction in a frame in which "in front of the camera" means what it says: every camera and point
+    /// at the sign at which depths are positive, and the mean principal plane at infinity, so that no point is there
+    /// (Hartley & Zisserman, chapter 21: a quasi-affine frame).
     pub fn oriented(mut self) -> Self {
         let depth = |camera: &Camera, point: &Point| (camera.row(2) * point).x;
         let mut of_point = vec![0.0f64; self.points.len()];
