@@ -6,11 +6,11 @@ use nalgebra::{Matrix3, Matrix4, Rotation3, Vector2, Vector3, Vector4};
 
 use super::measures::{Measures, error_3d, true_image_px, true_points};
 use crate::domain::StopToken;
+use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
 };
-use crate::geometry::bundle::{Observation, Options};
-use crate::geometry::measurement::Sighting;
+use crate::geometry::observation::Observation;
 use crate::geometry::statistics::chi_square_gate;
 use crate::geometry::{Camera, triangulation};
 use crate::synthetic::Scene;
@@ -106,10 +106,10 @@ impl<'a> World<'a> {
         if self.scene.options.with_depths {
             return self.squared_with_depths(track) < chi_square_gate(3.0 * views - 4.0) * variance;
         }
-        let sightings: Vec<Sighting> =
-            (0..self.cameras.len()).map(|view| Sighting { view, xy: self.point(view, track) }).collect();
-        let start = triangulation::linear(&self.cameras, &sightings);
-        let (_, squared) = triangulation::refine(&self.cameras, &sightings, start, POINT_STEPS);
+        let observations: Vec<Observation> =
+            (0..self.cameras.len()).map(|view| Observation::new(view, track, self.point(view, track))).collect();
+        let start = triangulation::linear(&self.cameras, &observations);
+        let (_, squared) = triangulation::refine(&self.cameras, &observations, start, POINT_STEPS);
         squared < chi_square_gate(2.0 * views - 3.0) * variance
     }
 
@@ -146,7 +146,7 @@ impl<'a> World<'a> {
             .iter()
             .enumerate()
             .flat_map(|(point, &track)| {
-                (0..self.poses.len()).map(move |camera| Observation { camera, point, xy: self.point(camera, track) })
+                (0..self.poses.len()).map(move |view| Observation::new(view, point, self.point(view, track)))
             })
             .collect();
         let points = true_points(truth, &inliers);
@@ -172,7 +172,7 @@ impl<'a> World<'a> {
             .iter()
             .map(|seen| {
                 let noise_free =
-                    true_image_px(truth, seen.camera, inliers[seen.point]) - Vector2::from(truth.principal_point_px);
+                    true_image_px(truth, seen.view, inliers[seen.point]) - Vector2::from(truth.principal_point_px);
                 found.residual(&Observation { xy: noise_free / side, ..*seen }).norm_squared()
             })
             .sum();

@@ -5,14 +5,15 @@
 
 use nalgebra::{Matrix3, Vector2, Vector3};
 
+use super::bundle::Options;
 use super::bundle::critical::{
     Adjust, HOMOGRAPHIES_GAUGE, Homographies, ROTATING_GAUGE, Rotating, TRANSLATING_GAUGE, Translating,
 };
 use super::bundle::metric::Intrinsics;
-use super::bundle::{Observation, Options};
 use super::fundamental::{Fundamental, Match};
 use super::homography::{self, Correspondences};
 use super::null_vector::smallest_eigenvector;
+use super::observation::Observation;
 use super::statistics::median;
 use crate::domain::StopToken;
 
@@ -55,10 +56,10 @@ pub fn fit_without_parallax(
     let inverses: Vec<Matrix3<f64>> =
         homographies.iter().map(|homography| homography.try_inverse()).collect::<Option<_>>()?;
     let mut positions = vec![None; points];
-    for seen in observations.iter().filter(|seen| seen.camera < views && seen.point < points) {
+    for seen in observations.iter().filter(|seen| seen.view < views && seen.point < points) {
         let slot = &mut positions[seen.point];
-        if slot.is_none() || seen.camera == reference {
-            let back = inverses[seen.camera] * seen.xy.push(1.0);
+        if slot.is_none() || seen.view == reference {
+            let back = inverses[seen.view] * seen.xy.push(1.0);
             *slot = Some(back.xy() / back.z).filter(|position| position.iter().all(|value| value.is_finite()));
         }
     }
@@ -148,12 +149,11 @@ pub fn fit_translation(
     }
     let mut positions = vec![Vector3::new(0.0, 0.0, 1.0); points];
     let mut observed = vec![false; points];
-    let usable = |seen: &&Observation| {
-        seen.camera < views && seen.point < points && seen.xy.iter().all(|value| value.is_finite())
-    };
+    let usable =
+        |seen: &&Observation| seen.view < views && seen.point < points && seen.xy.iter().all(|value| value.is_finite());
     for seen in observations.iter().filter(usable) {
         let slot = &mut positions[seen.point];
-        if !observed[seen.point] || seen.camera == reference {
+        if !observed[seen.point] || seen.view == reference {
             (slot.x, slot.y) = (seen.xy.x, seen.xy.y);
         }
         observed[seen.point] = true;
@@ -186,7 +186,7 @@ fn epipolar_residual(pairs: &[(Vector2<f64>, Vector2<f64>)], epipole: &Vector3<f
 /// `x_i ~ x_0 + w_j s_i e_i`.
 fn alternate(model: &mut Translating, observations: &[Observation], reference: usize) {
     let in_range = |seen: &&Observation| {
-        seen.camera < model.translations.len() && seen.point < model.points.len() && seen.camera != reference
+        seen.view < model.translations.len() && seen.point < model.points.len() && seen.view != reference
     };
     // For each observation: view, point, w_j s_i and how well it is known.
     let products: Vec<(usize, usize, f64, f64)> = observations
@@ -194,10 +194,10 @@ fn alternate(model: &mut Translating, observations: &[Observation], reference: u
         .filter(in_range)
         .filter_map(|seen| {
             let here = seen.xy.push(1.0);
-            let along = here.cross(&model.translations[seen.camera]);
+            let along = here.cross(&model.translations[seen.view]);
             let weight = along.norm_squared();
             let product = -here.cross(&model.points[seen.point].xy().push(1.0)).dot(&along) / weight;
-            product.is_finite().then_some((seen.camera, seen.point, product, weight))
+            product.is_finite().then_some((seen.view, seen.point, product, weight))
         })
         .collect();
     let mut lengths = vec![0.0; model.translations.len()];
@@ -272,7 +272,7 @@ mod tests {
     #[test]
     fn missing_observations_are_carried_and_hostile_ones_give_none() {
         let mut scene = testing::scene_of(3, 8, 40, NOISE, Motion::Translation, false);
-        scene.observations.retain(|seen| (seen.camera + 3 * seen.point) % 4 != 0);
+        scene.observations.retain(|seen| (seen.view + 3 * seen.point) % 4 != 0);
         let fit = fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &StopToken::default()).expect("a fit");
         let ratio = fit.cost / (NOISE * NOISE * (2 * scene.observations.len() - fit.unknowns) as f64);
         assert!((0.6..1.4).contains(&ratio), "{ratio}");

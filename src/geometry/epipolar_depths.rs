@@ -136,7 +136,7 @@ mod tests {
     fn block(scene: &TestScene, views: usize, tracks: usize) -> CompleteBlock {
         let mut points = vec![Vector2::zeros(); views * tracks];
         for seen in &scene.observations {
-            points[seen.point * views + seen.camera] = seen.xy;
+            points[seen.point * views + seen.view] = seen.xy;
         }
         CompleteBlock::new(views, tracks, &points, None)
     }

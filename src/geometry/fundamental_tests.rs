@@ -9,7 +9,7 @@ const NOISE: f64 = 0.001;
 
 fn matches_of(scene: &TestScene) -> Vec<Match> {
     let point = |view: usize, track: usize| {
-        scene.observations.iter().find(|seen| (seen.camera, seen.point) == (view, track)).expect("complete").xy
+        scene.observations.iter().find(|seen| (seen.view, seen.point) == (view, track)).expect("complete").xy
     };
     (0..scene.points.len()).map(|track| Match { from: point(0, track), to: point(1, track) }).collect()
 }

@@ -3,8 +3,8 @@
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2};
 
-use super::bundle::Observation;
 use super::null_vector::smallest_eigenvector;
+use super::observation::Observation;
 use super::statistics::median;
 
 /// Common points that a pair of views needs: two more than the four that a homography always fits.
@@ -61,8 +61,8 @@ impl Correspondences {
     /// Sorts the observations; views out of range and what is no number are left out.
     pub fn new(observations: &[Observation], views: usize) -> Self {
         let mut by_view: Vec<Vec<(usize, Vector2<f64>)>> = vec![Vec::new(); views];
-        for seen in observations.iter().filter(|seen| seen.camera < views && seen.xy.iter().all(|x| x.is_finite())) {
-            by_view[seen.camera].push((seen.point, seen.xy));
+        for seen in observations.iter().filter(|seen| seen.view < views && seen.xy.iter().all(|x| x.is_finite())) {
+            by_view[seen.view].push((seen.point, seen.xy));
         }
         for view in &mut by_view {
             view.sort_by_key(|(point, _)| *point);
@@ -175,7 +175,7 @@ mod tests {
     fn a_wrong_track_does_not_hide_a_plane() {
         let mut scene = testing::scene_of(1, 10, 30, NOISE, Motion::General, true);
         for seen in scene.observations.iter_mut().filter(|seen| seen.point == 3) {
-            seen.xy += Vector2::new(0.3, 0.1 * seen.camera as f64);
+            seen.xy += Vector2::new(0.3, 0.1 * seen.view as f64);
         }
         let residual = median_residual(&scene.observations, 10, NOISE, 3.0).expect("enough points");
         assert!(residual < 2.5, "{residual}");

@@ -3,6 +3,7 @@
 use nalgebra::{DMatrix, Matrix3, Vector2};
 
 use super::Camera;
+use super::observation::Observation;
 
 /// One common similarity for all views of one camera: `x = (x_px - centre) / scale`.
 ///
@@ -35,22 +36,15 @@ impl Normalization {
     }
 }
 
-/// A track's image point in one view of a block, in normalised coordinates.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sighting {
-    pub view: usize,
-    pub xy: Vector2<f64>,
-}
-
 /// Tracks that are complete over a set of views, normalised.
 ///
-/// Stored track by track; `sightings[track * views + view]`.
+/// Stored track by track; `observations[track * views + view]`.
 #[derive(Debug, Clone)]
 pub struct CompleteBlock {
     views: usize,
     tracks: usize,
-    sightings: Vec<Sighting>,
-    /// Projective depths in the order of the sightings.
+    observations: Vec<Observation>,
+    /// Projective depths in the order of the observations.
     depths: Option<Vec<f64>>,
 }
 
@@ -62,8 +56,9 @@ impl CompleteBlock {
     pub fn new(views: usize, tracks: usize, points: &[Vector2<f64>], depths: Option<Vec<f64>>) -> Self {
         assert_eq!(points.len(), views * tracks, "a complete block has a point for every view and track");
         assert!(depths.as_ref().is_none_or(|depths| depths.len() == points.len()), "one depth a point");
-        let sightings = points.iter().enumerate().map(|(k, &xy)| Sighting { view: k % views, xy }).collect();
-        Self { views, tracks, sightings, depths }
+        let observations =
+            points.iter().enumerate().map(|(k, &xy)| Observation::new(k % views, k / views, xy)).collect();
+        Self { views, tracks, observations, depths }
     }
 
     pub fn views(&self) -> usize {
@@ -74,14 +69,14 @@ impl CompleteBlock {
         self.tracks
     }
 
-    /// The sightings of a track, one a view, in the order of the views.
-    pub fn track(&self, track: usize) -> &[Sighting] {
-        &self.sightings[track * self.views..(track + 1) * self.views]
+    /// The observations of a track, one a view, in the order of the views.
+    pub fn track(&self, track: usize) -> &[Observation] {
+        &self.observations[track * self.views..(track + 1) * self.views]
     }
 
     /// The image point of `track` in `view`.
     pub fn point(&self, view: usize, track: usize) -> Vector2<f64> {
-        self.sightings[track * self.views + view].xy
+        self.observations[track * self.views + view].xy
     }
 
     pub fn has_depths(&self) -> bool {
@@ -98,7 +93,7 @@ impl CompleteBlock {
     /// # Panics
     /// When the number of depths is not that of the points: a defect of the caller.
     pub fn with_depths(&self, depths: Vec<f64>) -> Self {
-        assert_eq!(depths.len(), self.sightings.len(), "one depth a point");
+        assert_eq!(depths.len(), self.observations.len(), "one depth a point");
         Self { depths: Some(depths), ..self.clone() }
     }
 
@@ -116,10 +111,10 @@ impl CompleteBlock {
     pub fn measurement_matrix(&self) -> DMatrix<f64> {
         let mut matrix = DMatrix::zeros(3 * self.views, self.tracks);
         for track in 0..self.tracks {
-            for (view, sighting) in self.track(track).iter().enumerate() {
+            for (view, observation) in self.track(track).iter().enumerate() {
                 let depth = self.depths.as_ref().map_or(1.0, |depths| depths[track * self.views + view]);
-                matrix[(3 * view, track)] = depth * sighting.xy.x;
-                matrix[(3 * view + 1, track)] = depth * sighting.xy.y;
+                matrix[(3 * view, track)] = depth * observation.xy.x;
+                matrix[(3 * view + 1, track)] = depth * observation.xy.y;
                 matrix[(3 * view + 2, track)] = depth;
             }
         }

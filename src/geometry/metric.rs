@@ -3,10 +3,10 @@
 use nalgebra::{Matrix3, Matrix4, SMatrix, SVector, Vector3, Vector4};
 
 use super::Camera;
-use super::bundle::Observation;
 use super::bundle::critical::Translating;
 use super::bundle::metric::{Intrinsics, Pose, Reconstruction};
 use super::daq::{self, Daq, FirstViewFrame, to_first_view_frame};
+use super::observation::Observation;
 use super::statistics::median;
 
 /// Distance at which points are held, in median depths: beyond it the depth of a point moves no observation, while a
@@ -149,7 +149,7 @@ fn scale_to_median_depth(reconstruction: &mut Reconstruction, observations: &[Ob
 
 fn depths<'a>(reconstruction: &'a Reconstruction, observations: &'a [Observation]) -> impl Iterator<Item = f64> + 'a {
     observations.iter().filter_map(|seen| {
-        let (pose, point) = (reconstruction.poses.get(seen.camera)?, reconstruction.points.get(seen.point)?);
+        let (pose, point) = (reconstruction.poses.get(seen.view)?, reconstruction.points.get(seen.point)?);
         Some(pose.apply(point).z)
     })
 }

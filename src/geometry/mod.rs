@@ -15,6 +15,7 @@ mod levenberg_marquardt;
 pub mod measurement;
 pub mod metric;
 mod null_vector;
+pub mod observation;
 pub mod pose;
 pub mod procrustes;
 mod ransac;

@@ -61,7 +61,7 @@ pub fn generalised(seen: &[Vec<Vector3<f64>>], weights: &[Vec<f64>]) -> Option<(
     Some((poses, shape))
 }
 
-/// Weighted mean of a point's sightings, each taken back from its view.
+/// Weighted mean of a point's observations, each taken back from its view.
 pub fn mean_position<'a>(
     poses: &[Pose],
     seen: impl Iterator<Item = &'a Vector3<f64>>,

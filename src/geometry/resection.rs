@@ -184,7 +184,7 @@ mod tests {
         let scene = testing::scene(seed, 3, 40, 0.001);
         let (cameras, points) = testing::projectively_transformed(&scene, seed);
         let mut images: Vec<Vector2<f64>> =
-            scene.observations.iter().filter(|seen| seen.camera == 2).map(|seen| seen.xy).collect();
+            scene.observations.iter().filter(|seen| seen.view == 2).map(|seen| seen.xy).collect();
         for (k, image) in images.iter_mut().take(wrong).enumerate() {
             *image += Vector2::new(0.1 + 0.01 * k as f64, -0.2);
         }
@@ -216,7 +216,7 @@ mod tests {
     fn contaminated(seed: u64, count: usize) -> (Vec<Point>, Vec<Vector2<f64>>, Camera) {
         let scene = testing::scene(seed, 3, count, 0.001);
         let (cameras, points) = testing::projectively_transformed(&scene, seed);
-        let of_last = scene.observations.iter().filter(|seen| seen.camera == 2);
+        let of_last = scene.observations.iter().filter(|seen| seen.view == 2);
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let images = of_last.map(|seen| match seen.point % 10 < 3 {
             true => seen.xy,

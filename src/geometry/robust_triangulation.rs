@@ -7,18 +7,18 @@
 use nalgebra::Matrix3;
 
 use super::fundamental::{Match, algebraic, matrix_of_cameras};
-use super::measurement::Sighting;
+use super::observation::Observation;
 use super::{Camera, Point, triangulation};
 
-/// Sightings that a hypothesis is made of.
+/// Observations that a hypothesis is made of.
 const RUNS: [usize; 2] = [3, 2];
 /// Hypotheses of one length that a track has at most: of longer tracks every other start, or fewer.
 const MOST_HYPOTHESES: usize = 30;
 /// Refinement steps of a point.
 const POINT_STEPS: usize = 8;
-/// Gates a sighting beyond which the point of all sightings is not refined: no refinement makes them all agree.
+/// Gates an observation beyond which the point of all observations is not refined: no refinement makes them all agree.
 const HOPELESS_GATES: f64 = 100.0;
-/// Gates within which the squared Sampson distance of two sightings must be for both to agree with a point: it is the
+/// Gates within which the squared Sampson distance of two observations must be for both to agree with a point: it is the
 /// least sum of their squared residuals, to first order.
 const PAIR_GATES: f64 = 2.0;
 
@@ -29,11 +29,11 @@ pub struct Triangulator<'a> {
     to_next: Vec<Matrix3<f64>>,
 }
 
-/// A point and the sightings that agree with it.
+/// A point and the observations that agree with it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Robust {
     pub point: Point,
-    /// One a sighting: within the gate and in front of the camera.
+    /// One an observation: within the gate and in front of the camera.
     pub agrees: Vec<bool>,
 }
 
@@ -46,56 +46,56 @@ impl<'a> Triangulator<'a> {
 
     /// The point of least truncated squared residuals, in front of its cameras.
     ///
-    /// * `gate`: squared residual within which a sighting agrees
+    /// * `gate`: squared residual within which an observation agrees
     ///
-    /// Returns `None` where no two sightings agree.
-    pub fn robust(&self, sightings: &[Sighting], gate: f64) -> Option<Robust> {
-        if sightings.len() < 2 {
+    /// Returns `None` where no two observations agree.
+    pub fn robust(&self, observations: &[Observation], gate: f64) -> Option<Robust> {
+        if observations.len() < 2 {
             return None;
         }
         let cameras = self.cameras;
-        let mut all = triangulation::linear(cameras, sightings);
-        let hopeless = HOPELESS_GATES * gate * sightings.len() as f64;
-        if triangulation::squared_residual(cameras, &all, sightings) < hopeless {
-            all = triangulation::refine(cameras, sightings, all, POINT_STEPS).0;
-            let agrees = agreeing(cameras, sightings, &all, gate);
+        let mut all = triangulation::linear(cameras, observations);
+        let hopeless = HOPELESS_GATES * gate * observations.len() as f64;
+        if triangulation::squared_residual(cameras, &all, observations) < hopeless {
+            all = triangulation::refine(cameras, observations, all, POINT_STEPS).0;
+            let agrees = agreeing(cameras, observations, &all, gate);
             if agrees.iter().all(|&agrees| agrees) {
                 return Some(Robust { point: all, agrees });
             }
         }
-        let start = self.best_hypothesis(sightings, all, gate);
-        let right = chosen(sightings, &agreeing(cameras, sightings, &start, gate));
+        let start = self.best_hypothesis(observations, all, gate);
+        let right = chosen(observations, &agreeing(cameras, observations, &start, gate));
         if right.len() < 2 {
             return None;
         }
         let (point, _) = triangulation::refine(cameras, &right, start, POINT_STEPS);
-        let agrees = agreeing(cameras, sightings, &point, gate);
+        let agrees = agreeing(cameras, observations, &point, gate);
         (agrees.iter().filter(|&&agrees| agrees).count() >= 2).then_some(Robust { point, agrees })
     }
 
-    /// The cheapest of the point of all sightings, of those of its runs and of that of its ends.
+    /// The cheapest of the point of all observations, of those of its runs and of that of its ends.
     ///
     /// A run of which two neighbours lie off each other's epipolar lines has no point: it is not triangulated.
-    fn best_hypothesis(&self, sightings: &[Sighting], all: Point, gate: f64) -> Point {
-        let mut best = (all, truncated(self.cameras, sightings, &all, gate, f64::INFINITY));
-        let mut offer = |some: &[Sighting]| {
+    fn best_hypothesis(&self, observations: &[Observation], all: Point, gate: f64) -> Point {
+        let mut best = (all, truncated(self.cameras, observations, &all, gate, f64::INFINITY));
+        let mut offer = |some: &[Observation]| {
             let point = triangulation::linear(self.cameras, some);
-            let cost = truncated(self.cameras, sightings, &point, gate, best.1);
+            let cost = truncated(self.cameras, observations, &point, gate, best.1);
             if cost < best.1 {
                 best = (point, cost);
             }
         };
         let meets: Vec<bool> =
-            sightings.windows(2).map(|pair| self.are_epipolar(&pair[0], &pair[1], PAIR_GATES * gate)).collect();
+            observations.windows(2).map(|pair| self.are_epipolar(&pair[0], &pair[1], PAIR_GATES * gate)).collect();
         for run in RUNS {
-            let starts = (sightings.len() + 1).saturating_sub(run);
+            let starts = (observations.len() + 1).saturating_sub(run);
             for start in (0..starts).step_by(starts.div_ceil(MOST_HYPOTHESES).max(1)) {
                 if meets[start..start + run - 1].iter().all(|&meets| meets) {
-                    offer(&sightings[start..start + run]);
+                    offer(&observations[start..start + run]);
                 }
             }
         }
-        if let [first, .., last] = sightings
+        if let [first, .., last] = observations
             && self.are_epipolar(first, last, PAIR_GATES * gate)
         {
             offer(&[*first, *last]);
@@ -103,8 +103,8 @@ impl<'a> Triangulator<'a> {
         best.0
     }
 
-    /// Whether two sightings may be of one point.
-    fn are_epipolar(&self, from: &Sighting, to: &Sighting, gate: f64) -> bool {
+    /// Whether two observations may be of one point.
+    fn are_epipolar(&self, from: &Observation, to: &Observation, gate: f64) -> bool {
         let matrix = match to.view == from.view + 1 {
             true => self.to_next[from.view],
             false => matrix_of_cameras(&self.cameras[from.view], &self.cameras[to.view]),
@@ -115,26 +115,26 @@ impl<'a> Triangulator<'a> {
     }
 }
 
-fn chosen(sightings: &[Sighting], which: &[bool]) -> Vec<Sighting> {
-    sightings.iter().zip(which).filter(|(_, chosen)| **chosen).map(|(sighting, _)| *sighting).collect()
+fn chosen(observations: &[Observation], which: &[bool]) -> Vec<Observation> {
+    observations.iter().zip(which).filter(|(_, chosen)| **chosen).map(|(observation, _)| *observation).collect()
 }
 
-fn agreeing(cameras: &[Camera], sightings: &[Sighting], point: &Point, gate: f64) -> Vec<bool> {
-    sightings.iter().map(|sighting| squared_in_front(cameras, sighting, point) < gate).collect()
+fn agreeing(cameras: &[Camera], observations: &[Observation], point: &Point, gate: f64) -> Vec<bool> {
+    observations.iter().map(|observation| squared_in_front(cameras, observation, point) < gate).collect()
 }
 
 /// Squared residual, infinite behind the camera.
-fn squared_in_front(cameras: &[Camera], sighting: &Sighting, point: &Point) -> f64 {
-    let camera = &cameras[sighting.view];
+fn squared_in_front(cameras: &[Camera], observation: &Observation, point: &Point) -> f64 {
+    let camera = &cameras[observation.view];
     let depth = (camera.row(2) * point).x * point.w.signum();
-    if depth > 0.0 { triangulation::reprojection(camera, point, &sighting.xy).norm_squared() } else { f64::INFINITY }
+    if depth > 0.0 { triangulation::reprojection(camera, point, &observation.xy).norm_squared() } else { f64::INFINITY }
 }
 
 /// Squared residuals, each of the gate at most; given up once they reach `to_beat`.
-fn truncated(cameras: &[Camera], sightings: &[Sighting], point: &Point, gate: f64, to_beat: f64) -> f64 {
+fn truncated(cameras: &[Camera], observations: &[Observation], point: &Point, gate: f64, to_beat: f64) -> f64 {
     let mut cost = 0.0;
-    for sighting in sightings {
-        cost += squared_in_front(cameras, sighting, point).min(gate);
+    for observation in observations {
+        cost += squared_in_front(cameras, observation, point).min(gate);
         if cost >= to_beat {
             break;
         }
@@ -156,13 +156,13 @@ mod tests {
     }
 
     /// Observations of one point, some of them moved far away.
-    fn sightings(scene: &testing::TestScene, point: usize, wrong: &[usize]) -> Vec<Sighting> {
+    fn observations(scene: &testing::TestScene, point: usize, wrong: &[usize]) -> Vec<Observation> {
         let of_point = scene.observations.iter().filter(|seen| seen.point == point);
-        let mut sightings: Vec<Sighting> = of_point.map(|seen| Sighting { view: seen.camera, xy: seen.xy }).collect();
+        let mut observations: Vec<Observation> = of_point.copied().collect();
         for &k in wrong {
-            sightings[k].xy += Vector2::new(0.2 + 0.05 * k as f64, -0.15 - 0.07 * k as f64);
+            observations[k].xy += Vector2::new(0.2 + 0.05 * k as f64, -0.15 - 0.07 * k as f64);
         }
-        sightings
+        observations
     }
 
     #[test]
@@ -171,8 +171,8 @@ mod tests {
             let scene = testing::scene(seed, 8, 10, 1e-3);
             let cameras = cameras(&scene);
             for wrong in [vec![], vec![3], vec![0, 1], vec![0, 1, 5, 6, 7]] {
-                let sightings = sightings(&scene, seed as usize % 10, &wrong);
-                let found = Triangulator::new(&cameras).robust(&sightings, GATE).expect("a point");
+                let observations = observations(&scene, seed as usize % 10, &wrong);
+                let found = Triangulator::new(&cameras).robust(&observations, GATE).expect("a point");
                 let expected: Vec<bool> = (0..8).map(|k| !wrong.contains(&k)).collect();
                 assert_eq!(found.agrees, expected, "seed {seed}, wrong {wrong:?}");
             }
@@ -180,12 +180,12 @@ mod tests {
     }
 
     #[test]
-    fn what_no_two_sightings_agree_on_is_no_point() {
+    fn what_no_two_observations_agree_on_is_no_point() {
         let scene = testing::scene(3, 2, 10, 0.0);
         let cameras = cameras(&scene);
-        assert_eq!(Triangulator::new(&cameras).robust(&sightings(&scene, 0, &[])[..1], GATE), None);
+        assert_eq!(Triangulator::new(&cameras).robust(&observations(&scene, 0, &[])[..1], GATE), None);
         // A point behind both cameras.
         let behind: Vec<Camera> = cameras.iter().map(|camera| -camera).collect();
-        assert_eq!(Triangulator::new(&behind).robust(&sightings(&scene, 0, &[]), GATE), None);
+        assert_eq!(Triangulator::new(&behind).robust(&observations(&scene, 0, &[]), GATE), None);
     }
 }

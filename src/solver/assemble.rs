@@ -15,7 +15,7 @@ use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter, Reconstruction};
 use crate::geometry::daq::to_first_view_frame;
-use crate::geometry::measurement::Sighting;
+use crate::geometry::observation::Observation;
 use crate::geometry::statistics::root_mean_square;
 use crate::geometry::{Camera, Point, triangulation};
 
@@ -190,19 +190,22 @@ fn judge_by_depths(attempt: &Attempt, weights: &[f64], local: &[Camera], context
         if context.stop.is_stopped() {
             return;
         }
-        let sightings = attempt.block.complete.track(j);
-        let start = triangulation::linear(local, sightings);
-        let point = triangulation::refine(local, sightings, start, POINT_STEPS).0;
+        let observations = attempt.block.complete.track(j);
+        let start = triangulation::linear(local, observations);
+        let point = triangulation::refine(local, observations, start, POINT_STEPS).0;
         judged.points[track] = inlier.then_some(point);
         judged.retained[track] = if inlier {
-            sightings.iter().map(|seen| Sighting { view: attempt.block.views[seen.view], xy: seen.xy }).collect()
+            observations
+                .iter()
+                .map(|seen| Observation { view: attempt.block.views[seen.view], point: track, ..*seen })
+                .collect()
         } else {
             Vec::new()
         };
         for k in context.ranges[track]..context.ranges[track + 1] {
             let Ok(view) = attempt.block.views.binary_search(&input.view_of(k)) else { continue };
             let place = input.caller_index(k);
-            let residual = triangulation::reprojection(&local[view], &point, &sightings[view].xy).norm();
+            let residual = triangulation::reprojection(&local[view], &point, &observations[view].xy).norm();
             judged.observations.inlier[place] = inlier;
             judged.observations.weight[place] = judged.noise.weight(residual * residual) as f32;
             judged.observations.residual_px[place] =
@@ -299,23 +302,24 @@ fn final_points(
         cameras[view] = metric.poses[i].camera(&Intrinsics { focal, ..metric.intrinsics });
         has_pose[view] = own.is_none_or(|own| own.sigma_log.is_some());
     }
-    let triangulated = |sightings: &Vec<Sighting>| {
-        if sightings.is_empty() || context.stop.is_stopped() {
+    let triangulated = |observations: &Vec<Observation>| {
+        if observations.is_empty() || context.stop.is_stopped() {
             return None;
         }
         // These cameras know no distortion.
-        let undone = |seen: &Sighting| Some(Sighting { xy: metric.intrinsics.undistort(&seen.xy)?, ..*seen });
-        let sightings: Vec<Sighting> = sightings.iter().filter(|seen| has_pose[seen.view]).filter_map(undone).collect();
-        if sightings.len() < LEAST_SIGHTINGS {
+        let undone = |seen: &Observation| Some(Observation { xy: metric.intrinsics.undistort(&seen.xy)?, ..*seen });
+        let observations: Vec<Observation> =
+            observations.iter().filter(|seen| has_pose[seen.view]).filter_map(undone).collect();
+        if observations.len() < LEAST_SIGHTINGS {
             return None;
         }
-        let start = triangulation::linear(&cameras, &sightings);
-        dehomogenise(&triangulation::refine(&cameras, &sightings, start, POINT_STEPS).0)
+        let start = triangulation::linear(&cameras, &observations);
+        dehomogenise(&triangulation::refine(&cameras, &observations, start, POINT_STEPS).0)
     };
     judged.retained.iter().map(triangulated).collect()
 }
 
-/// Sightings that determine a point.
+/// Observations that determine a point.
 pub const LEAST_SIGHTINGS: usize = 2;
 /// Refinement steps of a final point.
 const POINT_STEPS: usize = 10;

@@ -8,12 +8,13 @@ use super::grow::{Consensus, LEAST_INLIERS, NOISE_BOUNDS};
 use super::search::Seed;
 use super::search::rigid::{Rigid, Search};
 use crate::domain::{Grade, StopToken, Warning, WarningCode};
+use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
 };
-use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::metric::plane_at_infinity;
+use crate::geometry::observation::Observation;
 use crate::geometry::triangulation;
 
 /// Iterations of the metric adjustment, which starts within a few per cent.

@@ -7,8 +7,9 @@
 
 use super::chance;
 use crate::domain::StopToken;
-use crate::geometry::bundle::{self, Loss, Observation, projective};
+use crate::geometry::bundle::{self, Loss, projective};
 use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::observation::Observation;
 use crate::geometry::statistics::{chi_square_gate, chi_square_median, median};
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::geometry::{Camera, Point};
@@ -156,14 +157,12 @@ impl<'a> Fits<'a> {
     }
 }
 
-/// The sightings of some tracks as observations; point `k` is `support[k]`.
+/// The observations of some tracks; point `k` is `support[k]`.
 pub fn observations_of(block: &CompleteBlock, support: &[usize]) -> Vec<Observation> {
     support
         .iter()
         .enumerate()
-        .flat_map(|(point, &track)| {
-            block.track(track).iter().map(move |sighting| Observation { camera: sighting.view, point, xy: sighting.xy })
-        })
+        .flat_map(|(point, &track)| block.track(track).iter().map(move |seen| Observation { point, ..*seen }))
         .collect()
 }
 

@@ -66,9 +66,11 @@ impl Opinion {
         let mut points = vec![[0.0; 2]; views * count];
         let mut visible = vec![false; views * count];
         let places: Vec<usize> = (0..count)
-            .flat_map(|track| tracks.sightings()[tracks.range(track)].iter().map(move |seen| seen.view * count + track))
+            .flat_map(|track| {
+                tracks.observations()[tracks.range(track)].iter().map(move |seen| seen.view * count + track)
+            })
             .collect();
-        for (&place, seen) in places.iter().zip(tracks.sightings()) {
+        for (&place, seen) in places.iter().zip(tracks.observations()) {
             (points[place], visible[place]) = (seen.xy.into(), true);
         }
         let scores = subspace::current().network.forward(&Cloud::new(views, count, &points, &visible));

@@ -59,7 +59,7 @@ impl Problem<0, 9, 2> for Homographies {
     }
 
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, 9, 2>) {
-        let homography = &self.views[observation.camera];
+        let homography = &self.views[observation.view];
         let point = self.points[observation.point].push(1.0);
         let (image, by_seen) = image(&(homography * point));
         sink.take(image - observation.xy, || {
@@ -99,7 +99,7 @@ impl Problem<3, 3, 2> for Rotating {
     }
 
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<3, 3, 2>) {
-        let rotation = &self.rotations[observation.camera];
+        let rotation = &self.rotations[observation.view];
         let turned = rotation * self.points[observation.point].push(1.0);
         let (direction, by_turned) = image(&turned);
         let Intrinsics { focal, principal_point, .. } = self.intrinsics;
@@ -139,7 +139,7 @@ impl Problem<0, 3, 3> for Translating {
     }
 
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, 3, 3>) {
-        let translation = &self.translations[observation.camera];
+        let translation = &self.translations[observation.view];
         let point = &self.points[observation.point];
         let (image, by_seen) = image(&(point.xy().push(1.0) + translation * point.z));
         sink.take(image - observation.xy, || {

@@ -99,12 +99,9 @@ pub(super) struct Layout {
 
 impl Layout {
     pub fn new(observations: &[Observation], cameras: usize, points: usize) -> Self {
-        let mut kept: Vec<Observation> = observations
-            .iter()
-            .filter(|seen| seen.camera < cameras && seen.point < points && seen.xy.iter().all(|x| x.is_finite()))
-            .copied()
-            .collect();
-        kept.sort_by_key(|seen| (seen.point, seen.camera));
+        let mut kept: Vec<Observation> =
+            observations.iter().filter(|seen| seen.is_usable(cameras, points)).copied().collect();
+        kept.sort_by_key(|seen| (seen.point, seen.view));
         let mut starts = vec![0; points + 1];
         for seen in &kept {
             starts[seen.point + 1] += 1;
@@ -126,13 +123,15 @@ pub(super) fn usable_squared_norm(residual: &Vector2<f64>) -> Option<f64> {
 /// Sums the loss.
 struct Cost {
     loss: Loss,
+    /// Of the observation.
+    weight: f64,
     sum: f64,
 }
 
 impl<const G: usize, const C: usize, const P: usize> Sink<G, C, P> for Cost {
     #[inline]
     fn take(&mut self, residual: Vector2<f64>, _jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
-        self.sum += self.loss.cost(usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
+        self.sum += self.loss.cost(self.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
     }
 }
 
@@ -141,8 +140,9 @@ fn cost<const G: usize, const C: usize, const P: usize>(
     layout: &Layout,
     loss: Loss,
 ) -> f64 {
-    let mut total = Cost { loss, sum: 0.0 };
+    let mut total = Cost { loss, weight: 1.0, sum: 0.0 };
     for seen in &layout.observations {
+        total.weight = seen.weight;
         problem.observe(seen, &mut total);
     }
     let beliefs = problem.global_beliefs();

@@ -69,6 +69,11 @@ impl Extension {
         }
     }
 
+    /// Whether it bends rays, which no pinhole does.
+    pub fn is_of_lens(self) -> bool {
+        !matches!(self, Extension::PrincipalPoint | Extension::Aspect)
+    }
+
     /// What it frees, in words.
     pub fn name(self) -> &'static str {
         match self {
@@ -141,6 +146,12 @@ impl IntrinsicsModel {
     /// This model with the focal length held.
     pub fn without_focal(self) -> Self {
         Self { focal: FocalLength::Held, ..self }
+    }
+
+    /// This model of a pinhole.
+    pub fn without_lens(mut self) -> Self {
+        Extension::ALL.into_iter().filter(|one| one.is_of_lens()).for_each(|one| self.extensions[one as usize] = false);
+        self
     }
 
     /// Extensions that are free.

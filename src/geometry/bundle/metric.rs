@@ -174,7 +174,7 @@ impl Reconstruction {
     /// # Panics
     /// When the observation's indices are out of range.
     pub fn residual(&self, seen: &Observation) -> Vector2<f64> {
-        self.intrinsics_of(seen.camera).project(&self.poses[seen.camera].apply(&self.points[seen.point])) - seen.xy
+        self.intrinsics_of(seen.view).project(&self.poses[seen.view].apply(&self.points[seen.point])) - seen.xy
     }
 }
 
@@ -199,8 +199,8 @@ impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
     #[inline]
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, C, POINT>) {
         let Reconstruction { poses, points, .. } = &self.reconstruction;
-        let intrinsics = self.reconstruction.intrinsics_of(observation.camera);
-        let seen = Projection::new(&intrinsics, &poses[observation.camera], &points[observation.point]);
+        let intrinsics = self.reconstruction.intrinsics_of(observation.view);
+        let seen = Projection::new(&intrinsics, &poses[observation.view], &points[observation.point]);
         sink.take(seen.image - observation.xy, || seen.gradients().jacobian(&self.free));
     }
 
@@ -434,8 +434,7 @@ mod tests {
         // Depth zero, far away, and a camera that sees a single point.
         odd.points[0] = odd.poses[0].rotation.tr_mul(&-odd.poses[0].translation);
         odd.points[1] *= 1e9;
-        let few: Vec<_> =
-            scene.observations.iter().filter(|seen| seen.camera != 2 || seen.point == 3).copied().collect();
+        let few: Vec<_> = scene.observations.iter().filter(|seen| seen.view != 2 || seen.point == 3).copied().collect();
         let odd = run(odd, &few);
         assert!(odd.intrinsics.focal.is_finite() && odd.points.iter().all(|point| point.norm().is_finite()));
         let mut broken = truth(&scene);

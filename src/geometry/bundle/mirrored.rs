@@ -24,7 +24,7 @@ pub(super) fn is_worth_it<const G: usize, const C: usize, const P: usize>(
         return false;
     }
     let mut residuals = vec![0; cameras];
-    layout.observations.iter().for_each(|seen| residuals[seen.camera] += 2);
+    layout.observations.iter().for_each(|seen| residuals[seen.view] += 2);
     residuals.iter().all(|&count| count >= C)
 }
 
@@ -35,7 +35,7 @@ pub(super) fn layout(layout: &Layout, cameras: usize) -> Layout {
 }
 
 fn exchanged(seen: &Observation) -> Observation {
-    Observation { camera: seen.point, point: seen.camera, xy: seen.xy }
+    Observation { view: seen.point, point: seen.view, ..*seen }
 }
 
 /// A problem, mirrored.
@@ -155,7 +155,7 @@ mod tests {
         };
         assert!(is_mirrored(&problem(15), &scene.observations));
         assert!(!is_mirrored(&problem(16), &scene.observations));
-        let blind = |seen: &&Observation| seen.camera != 3 || seen.point < 5;
+        let blind = |seen: &&Observation| seen.view != 3 || seen.point < 5;
         let few: Vec<Observation> = scene.observations.iter().filter(blind).copied().collect();
         assert!(!is_mirrored(&problem(15), &few));
     }

@@ -2,7 +2,7 @@
 //! few; projective and metric.
 //!
 //! One engine serves both problems; what they share (observations, robust loss, options, report) lives here. May
-//! depend on nothing of `geometry` but `levenberg_marquardt`, and on linear algebra.
+//! depend on nothing of `geometry` but `levenberg_marquardt` and `observation`, and on linear algebra.
 //!
 //! Image coordinates are normalised throughout: pixels minus the guessed principal point, over the larger image side.
 
@@ -22,21 +22,9 @@ pub mod sequence;
 pub(crate) mod testing;
 mod whitened;
 
-use nalgebra::Vector2;
-
 use super::levenberg_marquardt;
 pub use super::levenberg_marquardt::Report;
-
-/// One image point, as indices into the slices of cameras and points that are adjusted together.
-///
-/// Observations with an index out of range or a coordinate that is not finite are ignored.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Observation {
-    pub camera: usize,
-    pub point: usize,
-    /// Normalised image coordinates.
-    pub xy: Vector2<f64>,
-}
+use super::observation::Observation;
 
 /// What a residual costs, as a function of its norm `r` in normalised image units.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -54,7 +54,7 @@ impl<const C: usize, const P: usize> Panel<C, P> {
             let mut k = 0;
             while k < P {
                 let (x, y) = (whitened[(k, 0)], whitened[(k, 1)]);
-                let start = first + k * self.rows + C * seen.camera;
+                let start = first + k * self.rows + C * seen.view;
                 if let Some(slots) = self.values[start..].first_chunk_mut::<C>() {
                     let mut r = 0;
                     while r < C {

@@ -27,7 +27,7 @@ impl Problem<0, CAMERA, POINT> for Projective {
 
     #[inline]
     fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, CAMERA, POINT>) {
-        let camera = &self.cameras[observation.camera];
+        let camera = &self.cameras[observation.view];
         let point = &self.points[observation.point];
         let seen = camera * point;
         let image = Vector2::new(seen.x / seen.z, seen.y / seen.z);
@@ -148,7 +148,7 @@ mod tests {
             let options = Options { loss, ..Options::default() };
             adjust(&mut cameras, &mut points, &observations, &options, &StopToken::default());
             let squared = observations.iter().enumerate().filter(|(k, _)| *k != 7).map(|(_, seen)| {
-                let y = cameras[seen.camera] * points[seen.point];
+                let y = cameras[seen.view] * points[seen.point];
                 (Vector2::new(y.x / y.z, y.y / y.z) - seen.xy).norm_squared()
             });
             (squared.sum::<f64>() / (2.0 * (observations.len() - 1) as f64)).sqrt()
@@ -160,7 +160,7 @@ mod tests {
     #[test]
     fn missing_and_duplicate_observations_are_carried() {
         let (mut problem, mut observations) = start(4, 0.002);
-        observations.retain(|seen| (seen.camera + seen.point) % 3 != 0);
+        observations.retain(|seen| (seen.view + seen.point) % 3 != 0);
         observations.push(observations[5]);
         let report = adjust(
             &mut problem.cameras,
@@ -202,11 +202,11 @@ mod tests {
         odd.points[2] = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
         odd.cameras[3] = Matrix3x4::zeros();
         let mut few = observations.clone();
-        few.retain(|seen| seen.camera != 4 || seen.point == 6);
+        few.retain(|seen| seen.view != 4 || seen.point == 6);
         assert!(all_finite(&run(odd, &few)));
         // Indices out of range and coordinates that are no numbers.
         let mut hostile = observations.clone();
-        hostile[0].camera = 99;
+        hostile[0].view = 99;
         hostile[1].point = usize::MAX;
         hostile[2].xy.x = f64::NAN;
         hostile[3].xy.y = 1e300;

@@ -31,6 +31,8 @@ pub(super) struct Linearisation<const G: usize, const C: usize, const P: usize> 
 /// Writes one observation's weighted residual and Jacobian in place; an undefined one becomes zero.
 struct Entry<'a, const G: usize, const C: usize, const P: usize> {
     loss: Loss,
+    /// Of the observation.
+    weight: f64,
     residual: &'a mut Vector2<f64>,
     jacobian: &'a mut Jacobian<G, C, P>,
 }
@@ -40,7 +42,7 @@ impl<const G: usize, const C: usize, const P: usize> Sink<G, C, P> for Entry<'_,
     fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
         match usable_squared_norm(&residual) {
             Some(squared) => {
-                let weight = self.loss.root_weight(squared);
+                let weight = self.weight.sqrt() * self.loss.root_weight(self.weight * squared);
                 *self.residual = residual * weight;
                 *self.jacobian = jacobian();
                 if weight != 1.0 {
@@ -87,12 +89,12 @@ impl<const G: usize, const C: usize, const P: usize> Linearisation<G, C, P> {
         self.point_blocks.fill(SMatrix::zeros());
         for (k, seen) in layout.observations.iter().enumerate() {
             let (residual, jacobian) = (&mut self.residuals[k], &mut self.jacobians[k]);
-            problem.observe(seen, &mut Entry { loss, residual, jacobian });
+            problem.observe(seen, &mut Entry { loss, weight: seen.weight, residual, jacobian });
             for component in 0..2 {
                 let globals = jacobian.globals.column(component);
                 self.globals_diagonal += globals.component_mul(&globals);
                 let camera = jacobian.camera.column(component);
-                self.camera_diagonals[seen.camera] += camera.component_mul(&camera);
+                self.camera_diagonals[seen.view] += camera.component_mul(&camera);
             }
             self.point_blocks[seen.point] += jacobian.point * jacobian.point.transpose();
         }
@@ -233,7 +235,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     #[inline(always)]
     fn add_cameras(&mut self, observations: &[Observation], jacobians: &[Jacobian<G, C, P>]) {
         for (seen, jacobian) in observations.iter().zip(jacobians) {
-            self.add_block(seen.camera, seen.camera, &jacobian.camera, &Matrix2::identity(), &jacobian.camera);
+            self.add_block(seen.view, seen.view, &jacobian.camera, &Matrix2::identity(), &jacobian.camera);
         }
     }
 
@@ -253,7 +255,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         }
         for (k, (seen, jacobian)) in observations.iter().zip(jacobians).enumerate() {
             let left = residuals[k] - self.whitened[k].tr_mul(&pull);
-            let first = G + C * seen.camera;
+            let first = G + C * seen.view;
             let gradient = jacobian.camera * left;
             for (slot, value) in self.vector[first..first + C].iter_mut().zip(gradient.iter()) {
                 *slot -= value;
@@ -289,7 +291,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
                 if a == b {
                     through += Matrix2::identity();
                 }
-                let (row, column) = (observations[a].camera, observations[b].camera);
+                let (row, column) = (observations[a].view, observations[b].view);
                 self.add_block(row, column, &jacobians[a].camera, &through, &jacobians[b].camera);
                 // Two observations of one point in one view: the mirrored pair falls into the same block.
                 if a != b && row == column {
@@ -373,7 +375,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
                 let jacobian = &linearisation.jacobians[k];
                 let moved = linearisation.residuals[k]
                     + jacobian.globals.tr_mul(&step.globals)
-                    + jacobian.camera.tr_mul(&step.cameras[layout.observations[k].camera]);
+                    + jacobian.camera.tr_mul(&step.cameras[layout.observations[k].view]);
                 gradient -= jacobian.point * moved;
                 self.moved.push(moved);
             }
@@ -401,7 +403,7 @@ mod tests {
     fn panels_and_pairs_build_the_same_system() {
         let scene = testing::scene(1, 5, 150, testing::NOISE);
         let mut seen: Vec<Observation> =
-            scene.observations.iter().copied().filter(|seen| (seen.point + seen.camera) % 7 != 0).collect();
+            scene.observations.iter().copied().filter(|seen| (seen.point + seen.view) % 7 != 0).collect();
         seen.push(Observation { xy: seen[0].xy + Vector2::new(0.01, 0.0), ..seen[0] });
         let cameras = scene.poses.iter().map(|pose| pose.camera(&scene.intrinsics)).collect();
         let problem = Projective { cameras, points: scene.points.iter().map(|point| point.push(1.0)).collect() };

@@ -113,7 +113,7 @@ impl TestScene {
             for (point, position) in self.points.iter().enumerate() {
                 let image = self.intrinsics.project(&(pose.rotation * position + pose.translation));
                 let xy = image + noise * Vector2::new(normal(rng), normal(rng));
-                self.observations.push(Observation { camera, point, xy });
+                self.observations.push(Observation::new(camera, point, xy));
             }
         }
     }
@@ -123,7 +123,7 @@ impl TestScene {
     pub fn crop(&mut self) {
         let (intrinsics, poses, points) = (self.intrinsics, &self.poses, &self.points);
         self.observations.retain(|seen| {
-            let direction = poses[seen.camera].apply(&points[seen.point]);
+            let direction = poses[seen.view].apply(&points[seen.point]);
             let squared = (direction.xy() / direction.z).norm_squared();
             seen.xy.amax() <= 0.5 && intrinsics.images(squared) && intrinsics.radius_slope(squared) > 0.1
         });
@@ -231,7 +231,7 @@ pub(super) fn check_jacobian<const G: usize, const C: usize, const P: usize>(
             compare(row(jacobian.globals.as_slice(), G, k), numeric, "global", k);
         }
         for k in 0..C {
-            let numeric = difference(&|step, width| step.cameras[seen.camera][k] = width);
+            let numeric = difference(&|step, width| step.cameras[seen.view][k] = width);
             compare(row(jacobian.camera.as_slice(), C, k), numeric, "camera", k);
         }
         for k in 0..P {

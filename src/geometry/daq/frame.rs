@@ -87,7 +87,7 @@ mod tests {
         let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
         assert_eq!(frame.cameras[0], Matrix3x4::identity());
         for seen in &scene.observations {
-            let image = frame.cameras[seen.camera] * frame.points[seen.point];
+            let image = frame.cameras[seen.view] * frame.points[seen.point];
             assert!((image.xy() / image.z - seen.xy).norm() < 1e-9);
         }
         let squares: f64 = frame.cameras[1..].iter().map(|camera| camera.column(3).norm_squared() / 3.0).sum();

@@ -104,7 +104,7 @@ impl Votes {
         if pairs.is_empty() {
             return None;
         }
-        let mut ratios = vec![[0.0; 2]; tracks.sightings().len()];
+        let mut ratios = vec![[0.0; 2]; tracks.observations().len()];
         for pair in &pairs {
             for (&(observation, back), seen) in pair.places.iter().zip(&pair.matches) {
                 let ratio = pair.residuals.ln_ratio(pair.fundamental.sampson_squared(seen), noise);
@@ -164,12 +164,12 @@ type Placed = (Vec<(usize, usize)>, Vec<Match>);
 /// The matches of every pair.
 fn matched(tracks: &Tracks) -> Vec<Placed> {
     let mut pairs = vec![(Vec::new(), Vec::new()); STRIDES.len() * tracks.views()];
-    let sightings = tracks.sightings();
+    let observations = tracks.observations();
     for track in 0..tracks.len() {
         let range = tracks.range(track);
         for later in range.clone() {
             for back in 0..STRIDES.len().min(later - range.start) {
-                let (to, from) = (sightings[later], sightings[later - 1 - back]);
+                let (to, from) = (observations[later], observations[later - 1 - back]);
                 let Some(stride) = STRIDES.iter().position(|stride| from.view + stride == to.view) else { continue };
                 let (places, matches) = &mut pairs[STRIDES.len() * from.view + stride];
                 places.push((later, back));

@@ -5,7 +5,7 @@ use rand::Rng;
 
 use super::*;
 use crate::geometry::bundle::testing::{self, normal};
-use crate::geometry::measurement::Sighting;
+use crate::geometry::observation::Observation;
 use crate::synthetic::metrics::average_precision;
 
 const NOISE: f64 = 0.001;
@@ -27,10 +27,10 @@ fn scene(
     let mut tracks = vec![Vec::new(); TRACKS];
     let mut truth = vec![Vec::new(); TRACKS];
     for view in 0..VIEWS {
-        for seen in scene.observations.iter().filter(|seen| seen.camera == view) {
+        for seen in scene.observations.iter().filter(|seen| seen.view == view) {
             let instead = wrong(view, seen.point, seen.xy, &mut rng);
             truth[seen.point].push(instead.is_none());
-            tracks[seen.point].push(Sighting { view, xy: instead.unwrap_or(seen.xy) });
+            tracks[seen.point].push(Observation { xy: instead.unwrap_or(seen.xy), ..*seen });
         }
     }
     (Tracks::new(VIEWS, tracks), truth.concat())
@@ -101,7 +101,7 @@ fn what_is_known_beside_the_votes_counts() {
     let alone = votes.alone();
     // One observation of a right track: its own odds enter as they are, and say nothing of other tracks.
     let (track, about) = (50, tracks.range(50).start + 2);
-    let mut known = vec![0.0; tracks.sightings().len()];
+    let mut known = vec![0.0; tracks.observations().len()];
     known[about] = -2.0;
     let together = votes.with(&known);
     assert!((together.observations[about] - alone.observations[about] + 2.0).abs() < 1e-9);
@@ -114,11 +114,11 @@ fn what_is_known_beside_the_votes_counts() {
 #[test]
 fn tracks_with_holes_are_voted_on() {
     let (complete, truth) = contaminated(2);
-    // Every view of the fourth is missing from every other track, and single sightings remain.
+    // Every view of the fourth is missing from every other track, and single observations remain.
     let kept = |track: usize, view: usize| (track.is_multiple_of(2) || view != 3) && (track != 40 || view == 2);
-    let holed: Vec<Vec<Sighting>> = (0..TRACKS)
+    let holed: Vec<Vec<Observation>> = (0..TRACKS)
         .map(|track| {
-            let seen = &complete.sightings()[complete.range(track)];
+            let seen = &complete.observations()[complete.range(track)];
             seen.iter().filter(|seen| kept(track, seen.view)).copied().collect()
         })
         .collect();
@@ -126,11 +126,11 @@ fn tracks_with_holes_are_voted_on() {
     let found = votes(&tracks, 2).expect("votes").alone();
     let truth: Vec<bool> = (0..TRACKS)
         .flat_map(|track| complete.range(track).map(move |k| (track, k)))
-        .filter(|&(track, k)| kept(track, complete.sightings()[k].view))
+        .filter(|&(track, k)| kept(track, complete.observations()[k].view))
         .map(|(_, k)| truth[k])
         .collect();
     assert!(average_precision(&found.observations, &truth).expect("right ones") > 0.99);
-    assert_eq!(found.observations[tracks.range(40)], [0.0], "nothing speaks of a single sighting");
+    assert_eq!(found.observations[tracks.range(40)], [0.0], "nothing speaks of a single observation");
 }
 
 #[test]
@@ -146,11 +146,11 @@ fn where_pairs_agree_by_chance_or_not_at_all_there_are_no_votes() {
         assert_eq!(votes(&tracks, seed), None, "seed {seed}");
     }
     let (tracks, _) = contaminated(0);
-    let few = |count: usize| (0..count).map(|track| tracks.sightings()[tracks.range(60 + track)].to_vec());
+    let few = |count: usize| (0..count).map(|track| tracks.observations()[tracks.range(60 + track)].to_vec());
     assert_eq!(votes(&Tracks::new(VIEWS, few(7)), 0), None);
     // Eight matches are fitted by some matrix whatever they are.
     assert_eq!(votes(&Tracks::new(VIEWS, few(8)), 0), None);
-    assert_eq!(votes(&Tracks::new(0, Vec::<Vec<Sighting>>::new()), 0), None);
+    assert_eq!(votes(&Tracks::new(0, Vec::<Vec<Observation>>::new()), 0), None);
     let stop = StopToken::default();
     stop.stop(crate::domain::StopReason::Cancelled);
     assert_eq!(Votes::ask(&tracks, ASSUMED, SAMPLES, 0, &stop), None);
@@ -159,7 +159,7 @@ fn where_pairs_agree_by_chance_or_not_at_all_there_are_no_votes() {
 #[test]
 fn pairs_are_linear_in_the_views() {
     let views = 200;
-    let track = || (0..views).map(|view| Sighting { view, xy: Vector2::zeros() });
+    let track = || (0..views).map(|view| Observation::new(view, 0, Vector2::zeros()));
     let pairs = matched(&Tracks::new(views, [track(), track()]));
     assert_eq!(pairs.iter().filter(|(places, _)| !places.is_empty()).count(), 2 * views - 3);
     assert!(pairs.iter().all(|(places, matches)| places.len() == matches.len() && places.len() <= 2));

@@ -2,7 +2,8 @@
 
 use std::ops::Range;
 
-use crate::geometry::measurement::{CompleteBlock, Sighting};
+use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::observation::Observation;
 
 /// Tracks of several views, each seen in some of them.
 #[derive(Debug, Clone, PartialEq)]
@@ -10,25 +11,25 @@ pub struct Tracks {
     views: usize,
     /// Observations of track `j`: `ranges[j]..ranges[j + 1]`.
     ranges: Vec<usize>,
-    sightings: Vec<Sighting>,
+    observations: Vec<Observation>,
 }
 
 impl Tracks {
-    /// * `tracks`: the sightings of each, views increasing and below `views`, normalised units
+    /// * `tracks`: the observations of each, views increasing and below `views`, normalised units
     ///
     /// # Panics
     /// Where the views do not increase or are too many: a defect of the caller.
-    pub fn new<T: IntoIterator<Item = Sighting>>(views: usize, tracks: impl IntoIterator<Item = T>) -> Self {
-        let (mut ranges, mut sightings) = (vec![0], Vec::new());
+    pub fn new<T: IntoIterator<Item = Observation>>(views: usize, tracks: impl IntoIterator<Item = T>) -> Self {
+        let (mut ranges, mut observations) = (vec![0], Vec::new());
         for track in tracks {
-            let first = sightings.len();
-            sightings.extend(track);
-            let seen: &[Sighting] = &sightings[first..];
+            let first = observations.len();
+            observations.extend(track);
+            let seen: &[Observation] = &observations[first..];
             assert!(seen.is_sorted_by(|a, b| a.view < b.view), "the views of a track increase");
             assert!(seen.last().is_none_or(|last| last.view < views), "views are below their number");
-            ranges.push(sightings.len());
+            ranges.push(observations.len());
         }
-        Self { views, ranges, sightings }
+        Self { views, ranges, observations }
     }
 
     /// The tracks of a block, which are complete.
@@ -51,7 +52,7 @@ impl Tracks {
     }
 
     /// All observations, track by track.
-    pub fn sightings(&self) -> &[Sighting] {
-        &self.sightings
+    pub fn observations(&self) -> &[Observation] {
+        &self.observations
     }
 }

@@ -1,14 +1,14 @@
 //! Several tracks triangulated side by side.
 //!
 //! The equations are those of [`linear`](super::linear) and [`refine`](super::refine) for one track (a test compares).
-//! Tracks need not be seen by the same views: their `k`-th sightings stand side by side, whatever the cameras. What one
+//! Tracks need not be seen by the same views: their `k`-th observations stand side by side, whatever the cameras. What one
 //! comes to does not depend on its neighbours, to the last bit: a track that has arrived stands still while others go on.
 
 pub use super::lane::LANES;
 use super::lane::{DIAGONAL, Lane, Mask, Points, Symmetric, choose, dot, normalised};
 use super::{DAMPING_DOWN, DAMPING_UP, INITIAL_DAMPING, RELATIVE_TOLERANCE};
-use crate::geometry::measurement::Sighting;
 use crate::geometry::null_vector::{MOST_ITERATIONS, SHIFT, SQUARINGS, TOLERANCE};
+use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point};
 use crate::simd::vectorised;
 
@@ -17,13 +17,13 @@ fn away_from_zero(depth: Lane) -> Lane {
     depth.map(super::away_from_zero)
 }
 
-/// The `k`-th sighting of every track.
+/// The `k`-th observation of every track.
 #[derive(Clone, Copy)]
 struct Sighted {
     /// The camera's columns, rows within.
     camera: [[Lane; 3]; 4],
     xy: [Lane; 2],
-    /// 0 where the track has no such sighting, or does without it; else 1.
+    /// 0 where the track has no such observation, or does without it; else 1.
     weight: Lane,
 }
 
@@ -80,12 +80,12 @@ impl Triangulated {
 
 impl Batch {
     /// These tracks, [`LANES`] at most; what is beyond is left out.
-    pub fn new(cameras: &[Camera], tracks: &[&[Sighting]]) -> Self {
+    pub fn new(cameras: &[Camera], tracks: &[&[Observation]]) -> Self {
         let longest = tracks.iter().map(|track| track.len()).max().unwrap_or(0);
         let nothing = Sighted { camera: [[Lane::ZERO; 3]; 4], xy: [Lane::ZERO; 2], weight: Lane::ZERO };
         let mut sighted = vec![nothing; longest];
         for lane in 0..LANES {
-            // A lane without a track repeats the first one, and a place without a sighting has the camera of the track's
+            // A lane without a track repeats the first one, and a place without an observation has the camera of the track's
             // first: numbers that count nowhere, but are of a usual size.
             let Some(track) = tracks.get(lane).or(tracks.first()) else { continue };
             for (k, sighted) in sighted.iter_mut().enumerate() {
@@ -110,8 +110,8 @@ impl Batch {
         self.tracks
     }
 
-    /// Does without the `k`-th sighting of a track from now on.
-    pub fn drop_sighting(&mut self, track: usize, k: usize) {
+    /// Does without the `k`-th observation of a track from now on.
+    pub fn drop_observation(&mut self, track: usize, k: usize) {
         let Sighted { weight, xy, .. } = &mut self.sighted[k];
         // However far out it was: nothing times what has no end would be no number.
         (weight.0[track], xy[0].0[track], xy[1].0[track]) = (0.0, 0.0, 0.0);
@@ -137,7 +137,7 @@ impl Batch {
         )
     }
 
-    /// Squared reprojection residuals of the tracks' `k`-th sightings, for each `k`; 0 of those that they do without.
+    /// Squared reprojection residuals of the tracks' `k`-th observations, for each `k`; 0 of those that they do without.
     pub fn squared_residuals(&self, found: &Triangulated) -> Vec<[f64; LANES]> {
         vectorised(
             #[inline(always)]
@@ -279,7 +279,7 @@ mod tests {
     const ITERATIONS: usize = 10;
 
     /// Cameras, and tracks of them: in all views or some, right or anywhere.
-    fn tracks(count: usize, rng: &mut ChaCha8Rng) -> (Vec<Camera>, Vec<Vec<Sighting>>) {
+    fn tracks(count: usize, rng: &mut ChaCha8Rng) -> (Vec<Camera>, Vec<Vec<Observation>>) {
         let mut entry = || rng.random_range(-0.3..0.3);
         let cameras: Vec<Camera> = (0..12)
             .map(|_| {
@@ -292,17 +292,17 @@ mod tests {
             let (share, noise) = (rng.random_range(0.3..1.0), [0.0, 0.003, 0.5][rng.random_range(0..3)]);
             let seen: Vec<usize> = (0..cameras.len()).filter(|_| rng.random::<f64>() < share).collect();
             let mut shifted = || noise * rng.random_range(-1.0..1.0);
-            let sighting = |view: usize| {
+            let observation = |view: usize| {
                 let image = cameras[view] * point;
-                Sighting { view, xy: image.xy() / image.z + Vector2::new(shifted(), shifted()) }
+                Observation::new(view, 0, image.xy() / image.z + Vector2::new(shifted(), shifted()))
             };
-            seen.into_iter().map(sighting).collect::<Vec<_>>()
+            seen.into_iter().map(observation).collect::<Vec<_>>()
         };
-        let tracks = (0..count).map(track).filter(|track: &Vec<Sighting>| track.len() >= 2).collect();
+        let tracks = (0..count).map(track).filter(|track: &Vec<Observation>| track.len() >= 2).collect();
         (cameras, tracks)
     }
 
-    fn sliced(tracks: &[Vec<Sighting>]) -> Vec<&[Sighting]> {
+    fn sliced(tracks: &[Vec<Observation>]) -> Vec<&[Observation]> {
         tracks.iter().map(Vec::as_slice).collect()
     }
 
@@ -338,7 +338,7 @@ mod tests {
 
     /// To the last bit, and of what is dropped nothing is left.
     #[test]
-    fn neighbours_and_dropped_sightings_change_nothing() {
+    fn neighbours_and_dropped_observations_change_nothing() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let (cameras, tracks) = tracks(LANES, &mut rng);
         let triangulated = |batch: &Batch| batch.refine(batch.linear(), |_| true, ITERATIONS);
@@ -347,12 +347,12 @@ mod tests {
             let alone = triangulated(&Batch::new(&cameras, &[track]));
             assert_eq!((alone.point(0), alone.cost(0)), (together.point(k), together.cost(k)));
         }
-        let mut longer: Vec<Vec<Sighting>> = tracks.clone();
-        let far = Sighting { view: 0, xy: Vector2::new(f64::MAX, 1e9) };
+        let mut longer: Vec<Vec<Observation>> = tracks.clone();
+        let far = Observation::new(0, 0, Vector2::new(f64::MAX, 1e9));
         longer.iter_mut().enumerate().for_each(|(k, track)| track.insert(if k == 0 { 0 } else { track.len() }, far));
         let mut batch = Batch::new(&cameras, &sliced(&longer));
         for (k, track) in tracks.iter().enumerate() {
-            batch.drop_sighting(k, if k == 0 { 0 } else { track.len() });
+            batch.drop_observation(k, if k == 0 { 0 } else { track.len() });
         }
         for (k, track) in tracks.iter().enumerate() {
             let found = triangulated(&batch);
@@ -365,7 +365,7 @@ mod tests {
         let cameras = [Camera::zeros(), Camera::from_element(f64::NAN), Camera::identity()];
         assert_eq!(Batch::new(&cameras, &[]).tracks(), 0);
         assert!(Batch::new(&cameras, &[&[]]).linear().point(0).iter().all(|entry| entry.is_finite()));
-        let seen: Vec<Sighting> = (0..3).map(|view| Sighting { view, xy: Vector2::new(0.1, 0.2) }).collect();
+        let seen: Vec<Observation> = (0..3).map(|view| Observation::new(view, 0, Vector2::new(0.1, 0.2))).collect();
         for views in [&seen[..1], &seen[..2], &seen[2..], &seen[..]] {
             let batch = Batch::new(&cameras, &[views]);
             let found = batch.refine(batch.linear(), |_| true, ITERATIONS);

@@ -5,8 +5,8 @@ mod lane;
 
 use nalgebra::{Matrix4, Vector2};
 
-use super::measurement::Sighting;
 use super::null_vector::null_vector;
+use super::observation::Observation;
 use super::{Camera, Point};
 use crate::simd::vectorised;
 
@@ -29,35 +29,38 @@ pub fn reprojection(camera: &Camera, point: &Point, xy: &Vector2<f64>) -> Vector
     image.xy() / away_from_zero(image.z) - xy
 }
 
-/// Sum of squared reprojection residuals of a point over its sightings.
+/// Sum of squared reprojection residuals of a point over its observations.
 #[inline(always)]
-pub fn squared_residual(cameras: &[Camera], point: &Point, sightings: &[Sighting]) -> f64 {
-    sightings.iter().map(|sighting| reprojection(&cameras[sighting.view], point, &sighting.xy).norm_squared()).sum()
+pub fn squared_residual(cameras: &[Camera], point: &Point, observations: &[Observation]) -> f64 {
+    observations
+        .iter()
+        .map(|observation| reprojection(&cameras[observation.view], point, &observation.xy).norm_squared())
+        .sum()
 }
 
 /// Linear triangulation (Hartley & Zisserman, section 12.2): the unit 4-vector that is least inconsistent with
-/// `x (P3 X) = P1 X`, `y (P3 X) = P2 X` over all sightings, each camera's rows scaled by the norm of its third.
+/// `x (P3 X) = P1 X`, `y (P3 X) = P2 X` over all observations, each camera's rows scaled by the norm of its third.
 ///
-/// Needs two sightings or more; with fewer the point returned is one of many.
-pub fn linear(cameras: &[Camera], sightings: &[Sighting]) -> Point {
+/// Needs two observations or more; with fewer the point returned is one of many.
+pub fn linear(cameras: &[Camera], observations: &[Observation]) -> Point {
     let normal = vectorised(
         #[inline(always)]
-        || inconsistency(cameras, sightings),
+        || inconsistency(cameras, observations),
     );
     null_vector(&normal).unwrap_or(Point::new(0.0, 0.0, 0.0, 1.0))
 }
 
 /// The quadratic form whose least direction [`linear`] wants.
 #[inline(always)]
-fn inconsistency(cameras: &[Camera], sightings: &[Sighting]) -> Matrix4<f64> {
+fn inconsistency(cameras: &[Camera], observations: &[Observation]) -> Matrix4<f64> {
     let mut normal = [[0.0; 4]; 4];
-    for sighting in sightings {
-        let columns: &[[f64; 3]; 4] = cameras[sighting.view].as_ref();
+    for observation in observations {
+        let columns: &[[f64; 3]; 4] = cameras[observation.view].as_ref();
         let third = columns.map(|column| column[2]);
         let of_direction: f64 = third[..3].iter().map(|entry| entry * entry).sum();
         let of_all = of_direction + third[3] * third[3];
         let weight = 1.0 / (of_direction + f64::EPSILON * of_all).max(f64::MIN_POSITIVE);
-        for (axis, coordinate) in [sighting.xy.x, sighting.xy.y].into_iter().enumerate() {
+        for (axis, coordinate) in [observation.xy.x, observation.xy.y].into_iter().enumerate() {
             let row = columns.map(|column| column[2] * coordinate - column[axis]);
             accumulate(&mut normal, row.map(|entry| weight * entry), row);
         }
@@ -68,23 +71,23 @@ fn inconsistency(cameras: &[Camera], sightings: &[Sighting]) -> Matrix4<f64> {
 /// Refines a point by Levenberg-Marquardt on its squared reprojection residuals, at most `iterations` steps.
 ///
 /// Returns the point, of unit norm, and its sum of squared residuals; never worse than the start.
-pub fn refine(cameras: &[Camera], sightings: &[Sighting], start: Point, iterations: usize) -> (Point, f64) {
+pub fn refine(cameras: &[Camera], observations: &[Observation], start: Point, iterations: usize) -> (Point, f64) {
     vectorised(
         #[inline(always)]
-        || descend(cameras, sightings, start, iterations),
+        || descend(cameras, observations, start, iterations),
     )
 }
 
 #[inline(always)]
-fn descend(cameras: &[Camera], sightings: &[Sighting], start: Point, iterations: usize) -> (Point, f64) {
+fn descend(cameras: &[Camera], observations: &[Observation], start: Point, iterations: usize) -> (Point, f64) {
     let mut point = start.normalize();
-    let mut cost = squared_residual(cameras, &point, sightings);
+    let mut cost = squared_residual(cameras, &point, observations);
     let mut damping = INITIAL_DAMPING;
     for _ in 0..iterations {
         let mut normal = [[0.0; 4]; 4];
         let mut gradient = Point::zeros();
-        for sighting in sightings {
-            let camera = &cameras[sighting.view];
+        for observation in observations {
+            let camera = &cameras[observation.view];
             let columns: &[[f64; 3]; 4] = camera.as_ref();
             let image = camera * point;
             let nearness = away_from_zero(image.z).recip();
@@ -92,7 +95,7 @@ fn descend(cameras: &[Camera], sightings: &[Sighting], start: Point, iterations:
                 let projected = image[axis] * nearness;
                 let slope = columns.map(|column| (column[axis] - projected * column[2]) * nearness);
                 accumulate(&mut normal, slope, slope);
-                gradient += Point::from(slope) * (projected - sighting.xy[axis]);
+                gradient += Point::from(slope) * (projected - observation.xy[axis]);
             }
         }
         let mut normal = Matrix4::from(normal);
@@ -103,7 +106,7 @@ fn descend(cameras: &[Camera], sightings: &[Sighting], start: Point, iterations:
         }
         let Some(step) = normal.cholesky().map(|factor| factor.solve(&gradient)) else { break };
         let candidate = (point - step).normalize();
-        let candidate_cost = squared_residual(cameras, &candidate, sightings);
+        let candidate_cost = squared_residual(cameras, &candidate, observations);
         if candidate_cost < cost {
             let gain = (cost - candidate_cost) / cost;
             (point, cost) = (candidate, candidate_cost);
@@ -149,14 +152,14 @@ mod tests {
             .collect()
     }
 
-    fn sightings(cameras: &[Camera], point: &Point, shift: f64) -> Vec<Sighting> {
+    fn observations(cameras: &[Camera], point: &Point, shift: f64) -> Vec<Observation> {
         cameras
             .iter()
             .enumerate()
             .map(|(view, camera)| {
                 let image = camera * point;
                 let wobble = Vector2::new((view as f64 * 2.1).sin(), (view as f64 * 3.7).cos()) * shift;
-                Sighting { view, xy: image.xy() / image.z + wobble }
+                Observation::new(view, 0, image.xy() / image.z + wobble)
             })
             .collect()
     }
@@ -165,7 +168,7 @@ mod tests {
     fn exact_points_are_found_exactly_also_at_infinity() {
         let cameras = cameras();
         for truth in [Point::new(0.3, -0.4, 1.0, 1.0), Point::new(0.1, 0.2, 1.0, 0.0)] {
-            let seen = sightings(&cameras, &truth, 0.0);
+            let seen = observations(&cameras, &truth, 0.0);
             let found = linear(&cameras, &seen);
             assert!(squared_residual(&cameras, &found, &seen) < 1e-18);
         }
@@ -174,7 +177,7 @@ mod tests {
     #[test]
     fn refinement_reaches_a_stationary_point_and_never_gets_worse() {
         let cameras = cameras();
-        let seen = sightings(&cameras, &Point::new(0.3, -0.4, 1.0, 1.0), 0.01);
+        let seen = observations(&cameras, &Point::new(0.3, -0.4, 1.0, 1.0), 0.01);
         let start = linear(&cameras, &seen);
         let (point, cost) = refine(&cameras, &seen, start, 20);
         assert!(cost <= squared_residual(&cameras, &start, &seen));
@@ -188,7 +191,7 @@ mod tests {
     #[test]
     fn degenerate_cameras_give_finite_points() {
         let flat = vec![Camera::zeros(); 3];
-        let seen: Vec<Sighting> = (0..3).map(|view| Sighting { view, xy: Vector2::new(0.1, 0.2) }).collect();
+        let seen: Vec<Observation> = (0..3).map(|view| Observation::new(view, 0, Vector2::new(0.1, 0.2))).collect();
         let (point, cost) = refine(&flat, &seen, linear(&flat, &seen), 5);
         assert!(point.iter().all(|entry| entry.is_finite()) && cost.is_finite());
     }

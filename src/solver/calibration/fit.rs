@@ -28,8 +28,10 @@ impl Fit {
     }
 
     /// The fit of free projective cameras and points.
-    pub fn projective(cost: f64, problem: &Problem, inliers: usize) -> Self {
-        Self::new(cost, (11 * problem.cameras.len() + 3 * inliers).saturating_sub(15), problem)
+    ///
+    /// * `others`: parameters that the points were made with
+    pub fn projective(cost: f64, problem: &Problem, inliers: usize, others: usize) -> Self {
+        Self::new(cost, (11 * problem.cameras.len() + 3 * inliers + others).saturating_sub(15), problem)
     }
 
     /// The fit of metric cameras with these intrinsics free, and points.
@@ -45,9 +47,18 @@ impl Fit {
     ///
     /// * `freedom`: of the special case
     pub fn loss_deviations(&self, cost: f64, freedom: usize) -> f64 {
-        let added = freedom.saturating_sub(self.freedom).max(1) as f64;
-        let statistic = (cost - self.cost) / added / (self.noise * self.noise);
-        (statistic - 1.0) / (2.0 / added + 2.0 / self.freedom.max(1) as f64).sqrt()
+        let added = self.added(freedom);
+        (self.statistic(cost, freedom) - 1.0) / (2.0 / added + 2.0 / self.freedom.max(1) as f64).sqrt()
+    }
+
+    /// The F statistic of a special case of this model: what each degree of freedom that it has more adds to the cost, over
+    /// what noise would add.
+    pub fn statistic(&self, cost: f64, freedom: usize) -> f64 {
+        (cost - self.cost) / self.added(freedom) / (self.noise * self.noise)
+    }
+
+    fn added(&self, freedom: usize) -> f64 {
+        freedom.saturating_sub(self.freedom).max(1) as f64
     }
 
     /// Whether a special case of this model fits worse than chance explains.

@@ -1,13 +1,14 @@
 //! What a calibration is worth, and what to warn of.
 
 use super::fit::Fit;
+use super::misfit::Comparison;
 use super::models::{CHI_SQUARE_GAIN, Candidate, Choice};
 use super::search::Minimum;
 use super::verdict::{CHEIRALITY_LIMIT, UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO};
 use super::view_focals::{self, Differing};
 use super::{Outcome, Problem, Stopped};
 use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
-use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
+use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, Parameter};
 
 /// Difference in log focal from which another minimum is another calibration.
 const OTHER_CALIBRATION: f64 = 0.02;
@@ -31,7 +32,8 @@ pub(super) fn grade(
     let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
     Stopped::check(choice.stop)?;
     let has_own_focals = best.minimum.reconstruction.has_own_focals();
-    let sigmas = choice.sigmas(&best);
+    let comparison = Comparison::of(&best, fit, choice);
+    let sigmas = choice.sigmas(&best, comparison.inflation());
     let mut verdict = Verdict::new(warnings);
     let mut focals = view_focals::of(&best, &sigmas);
     // What the ratios of the others' deviations are taken of, and the one that is told.
@@ -55,7 +57,7 @@ pub(super) fn grade(
         let worst = if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak };
         verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, choice.scale_px));
     }
-    let rms_ratio = verdict.judge_fit(fit, &best.fit, &best.model.name(), choice.scale_px);
+    verdict.judge_fit(&comparison, &best.model.name(), choice.scale_px);
     if verdict.is_misfit && has_own_focals {
         // What a focal length a view behind one lens does not explain, nobody knows the reason of.
         verdict.grade = Grade::ProjectiveOnly;
@@ -72,7 +74,7 @@ pub(super) fn grade(
     }
     verdict.judge_cheirality(best.minimum.cheirality);
     if verdict.grade != Grade::ProjectiveOnly && !has_own_focals {
-        verdict.warnings.extend(principal_point(&best, choice.prior, choice.scale_px));
+        verdict.warnings.extend(principal_point(&best, choice.scale_px));
     }
     let mut metric = best.minimum.reconstruction;
     metric.intrinsics.focal = view_focals::mean(&focals).unwrap_or(metric.intrinsics.focal);
@@ -84,7 +86,7 @@ pub(super) fn grade(
         model: best.model,
         plane_at_infinity: None,
         cheirality: best.minimum.cheirality,
-        rms_ratio,
+        rms_ratio: comparison.ratio,
         metric: Some(metric),
         focals: has_own_focals.then_some(focals),
     })
@@ -97,19 +99,19 @@ fn chosen(
     mut minima: Vec<Minimum>,
     warnings: &mut Vec<Warning>,
 ) -> Result<(Candidate, Vec<Minimum>), Stopped> {
-    let Choice { problem, prior, .. } = *choice;
+    let problem = choice.problem;
     let first = minima.remove(best_in_front(&minima, problem, fit));
     let simplest = IntrinsicsModel::focal(first.reconstruction.has_own_focals());
-    let mut best = choice.richest(Candidate::new(first, simplest, prior, problem), warnings)?;
+    let mut best = choice.richest(Candidate::new(first, simplest, choice.prior(fit.noise), problem), warnings)?;
     if best.model == simplest {
         return Ok((best, minima));
     }
     for minimum in &mut minima {
         Stopped::check(choice.stop)?;
-        *minimum = minimum.adjusted(problem.observations, best.model, prior, choice.stop);
+        *minimum = minimum.adjusted(problem.observations, best.model, &best.prior, choice.stop);
         // A model that is wrong may rank the minima wrongly.
         if minimum.cost < best.minimum.cost && minimum.cheirality >= CHEIRALITY_LIMIT.min(best.minimum.cheirality) {
-            let better = Candidate::new(minimum.clone(), best.model, prior, problem);
+            let better = Candidate::new(minimum.clone(), best.model, best.prior, problem);
             *minimum = std::mem::replace(&mut best, better).minimum;
         }
     }
@@ -146,7 +148,7 @@ fn weigh_prior(
     best: &Candidate,
     focal_prior: FocalPrior,
 ) {
-    let alone = choice.prior.forgetting(Parameter::LogFocal);
+    let alone = best.prior.forgetting(Parameter::LogFocal);
     let of_data = best.sigma(Parameter::LogFocal, best.model, &alone);
     // It lifts the grade by one step at most.
     if of_data.is_none_or(|of_data| of_data > WEAK_UP_TO) {
@@ -154,7 +156,7 @@ fn weigh_prior(
     }
     let (Some(of_data), Some(optimum)) = (of_data, best.optimum(best.model, &alone)) else { return };
     let shift = optimum.shift[Parameter::LogFocal as usize];
-    let difference = choice.prior.deviation(Parameter::LogFocal, &best.minimum.reconstruction.intrinsics) + shift;
+    let difference = best.prior.deviation(Parameter::LogFocal, &best.minimum.reconstruction.intrinsics) + shift;
     let deviations = difference.abs() / of_data.hypot(focal_prior.sigma_log);
     if deviations > PRIOR_CONTRADICTED {
         let detail = format!(
@@ -169,8 +171,8 @@ fn weigh_prior(
 }
 
 /// Says so where the observations do not determine the principal point.
-fn principal_point(best: &Candidate, prior: &IntrinsicsPrior, scale_px: f64) -> Option<Warning> {
-    let alone = prior.forgetting(Parameter::PrincipalX).forgetting(Parameter::PrincipalY);
+fn principal_point(best: &Candidate, scale_px: f64) -> Option<Warning> {
+    let alone = best.prior.forgetting(Parameter::PrincipalX).forgetting(Parameter::PrincipalY);
     let model = best.model.with(Extension::PrincipalPoint);
     let names = [("x", Parameter::PrincipalX), ("y", Parameter::PrincipalY)];
     let unknown: Vec<String> = names

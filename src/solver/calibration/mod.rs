@@ -6,6 +6,7 @@
 mod critical;
 mod fit;
 mod grading;
+mod misfit;
 mod models;
 mod search;
 #[cfg(test)]
@@ -17,9 +18,10 @@ use nalgebra::{Matrix3x4, Vector3, Vector4};
 
 use crate::domain::{FocalPrior, Grade, StopReason, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
-use crate::geometry::bundle::{Observation, Options, projective};
+use crate::geometry::bundle::{Options, projective};
 use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::metric::plane_at_infinity;
+use crate::geometry::observation::Observation;
 
 use fit::Fit;
 pub use models::knowledge;
@@ -156,10 +158,12 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     Stopped::check(stop)?;
     let refused = !critical.warnings.is_empty();
     warnings.extend(critical.warnings);
-    let prior = models::knowledge(fit.noise, focal_prior, scale_px);
-    let choice = models::Choice { problem, prior: &prior, scale_px, stop };
+    let choice = models::Choice { problem, scale_px, stop };
+    let prior = choice.prior(fit.noise);
     let minima = match (critical.translation, focal_prior) {
-        (Some(translation), Some(focal)) => search::known_focal(&translation, focal.focal_px / scale_px, &choice),
+        (Some(translation), Some(focal)) => {
+            search::known_focal(&translation, focal.focal_px / scale_px, problem, &prior, stop)
+        }
         _ if refused => return Ok(Outcome::refused(warnings)),
         _ => match to_first_view_frame(&cameras, &points) {
             Some(frame) => search::minima(&frame, problem, &prior, stop)?,
@@ -212,13 +216,13 @@ pub fn from_metric(
     if refused {
         return Ok(Outcome::refused(warnings));
     }
-    let prior = models::knowledge(fit.noise, problem.focal_prior, scale_px);
-    let minima = search::minima_near(metric, problem, &prior, stop, told)?;
+    let choice = models::Choice { problem, scale_px, stop };
+    let minima = search::minima_near(metric, problem, &choice.prior(fit.noise), stop, told)?;
     if minima.is_empty() {
         warnings.push(no_start());
         return Ok(Outcome::refused(warnings));
     }
-    grading::grade(&models::Choice { problem, prior: &prior, scale_px, stop }, &fit, minima, warnings)
+    grading::grade(&choice, &fit, minima, warnings)
 }
 
 /// The log focal length that a metric reconstruction has by these observations alone, the mean of those of its views
@@ -233,7 +237,7 @@ pub fn focal_alone(
     let prior = prior.forgetting(Parameter::LogFocal);
     let model = IntrinsicsModel::focal(metric.has_own_focals());
     let candidate =
-        models::Candidate::new(start.adjusted(problem.observations, model, &prior, stop), model, &prior, problem);
+        models::Candidate::new(start.adjusted(problem.observations, model, &prior, stop), model, prior, problem);
     let sigma = candidate.sigma(Parameter::LogFocal, model, &prior)?;
     let log_focal = candidate.minimum.log_focal();
     (log_focal.is_finite() && sigma > 0.0).then_some((log_focal, sigma))
@@ -260,7 +264,7 @@ fn projectively_adjusted(
     let (mut cameras, mut points) = (problem.cameras.to_vec(), problem.points.to_vec());
     let options = Options::squared(PROJECTIVE_ITERATIONS);
     let report = projective::adjust(&mut cameras, &mut points, problem.observations, &options, stop);
-    (cameras, points, Fit::projective(report.cost, problem, inliers))
+    (cameras, points, Fit::projective(report.cost, problem, inliers, 0))
 }
 
 /// Points with an observation.

@@ -46,6 +46,11 @@ pub(super) const CHI_SQUARE_GAIN: f64 = 13.8;
 /// Share of the significant gain that a linearisation must foretell for an adjustment to be tried: it is off where the
 /// richer model is far.
 const WORTH_A_TRIAL: f64 = 0.5;
+/// Share of the noise that a prior was weighed by, below which what is left makes it worth weighing anew. A prior that is
+/// weighed by a misfit's noise is too strong: a third radial term of .4 was held near 0, eleven sigma off.
+const SAME_NOISE: f64 = 0.9;
+/// How often it is: the noise falls by the misfit at once, and by little after.
+const NOISE_ROUNDS: usize = 4;
 /// How much a richer model may raise the standard deviation of the log focal length and still be taken: beyond, it
 /// fits by giving up what was to be found.
 const SIGMA_INFLATION: f64 = 3.0;
@@ -81,6 +86,8 @@ pub fn knowledge(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> Intrin
 /// A metric reconstruction under one model, with what the observations say of the intrinsics there.
 pub(super) struct Candidate {
     pub model: IntrinsicsModel,
+    /// What it was adjusted with.
+    pub prior: IntrinsicsPrior,
     pub minimum: Minimum,
     /// Of the observations alone, without what the prior costs.
     pub fit: Fit,
@@ -88,11 +95,12 @@ pub(super) struct Candidate {
 }
 
 impl Candidate {
-    pub fn new(minimum: Minimum, model: IntrinsicsModel, prior: &IntrinsicsPrior, problem: &Problem) -> Self {
+    /// * `minimum`: of this model with this prior
+    pub fn new(minimum: Minimum, model: IntrinsicsModel, prior: IntrinsicsPrior, problem: &Problem) -> Self {
         let believed = prior.cost(model, &minimum.reconstruction.intrinsics);
         let fit = Fit::metric(minimum.cost - believed, model, problem);
         let information = Information::new(&minimum.reconstruction, problem.observations);
-        Self { model, minimum, fit, information }
+        Self { model, prior, minimum, fit, information }
     }
 
     /// What a model makes of the observations, to second order.
@@ -107,8 +115,8 @@ impl Candidate {
     }
 
     /// Standard deviation of the log focal length if the model is right.
-    fn sigma_log_focal(&self, prior: &IntrinsicsPrior) -> Option<f64> {
-        self.sigma(Parameter::LogFocal, self.model, prior)
+    fn sigma_log_focal(&self) -> Option<f64> {
+        self.sigma(Parameter::LogFocal, self.model, &self.prior)
     }
 }
 
@@ -124,12 +132,36 @@ pub(super) struct Sigmas {
 /// What the choice of a model works with.
 pub(super) struct Choice<'a> {
     pub problem: &'a Problem<'a>,
-    pub prior: &'a IntrinsicsPrior,
     pub scale_px: f64,
     pub stop: &'a StopToken,
 }
 
 impl Choice<'_> {
+    /// What is known of the intrinsics beforehand, weighed by this noise.
+    pub fn prior(&self, noise: f64) -> IntrinsicsPrior {
+        knowledge(noise, self.problem.focal_prior, self.scale_px)
+    }
+
+    /// The minimum of a model from here, with the prior weighed by the noise that this leaves.
+    ///
+    /// * `noise`: to begin with
+    fn adjusted(&self, from: &Minimum, model: IntrinsicsModel, mut noise: f64) -> Candidate {
+        let adjusted = |from: &Minimum, noise: f64| {
+            let prior = self.prior(noise);
+            let minimum = from.adjusted(self.problem.observations, model, &prior, self.stop);
+            Candidate::new(minimum, model, prior, self.problem)
+        };
+        let mut found = adjusted(from, noise);
+        for _ in 1..NOISE_ROUNDS {
+            if found.fit.noise >= SAME_NOISE * noise {
+                break;
+            }
+            noise = found.fit.noise;
+            found = adjusted(&found.minimum, noise);
+        }
+        found
+    }
+
     /// Frees extension after extension, the most significant first, as long as the data ask for one and still determine
     /// the focal length.
     pub fn richest(&self, simple: Candidate, warnings: &mut Vec<Warning>) -> Result<Candidate, Stopped> {
@@ -152,9 +184,9 @@ impl Choice<'_> {
 
     /// Extensions that the linearisation foretells to be significant, with the gain beyond what is, largest first.
     fn promising(&self, best: &Candidate) -> Vec<(Extension, f64)> {
-        let Some(here) = best.optimum(best.model, self.prior) else { return Vec::new() };
+        let Some(here) = best.optimum(best.model, &best.prior) else { return Vec::new() };
         let beyond = |extension: Extension| {
-            let there = best.optimum(best.model.with(extension), self.prior)?;
+            let there = best.optimum(best.model.with(extension), &best.prior)?;
             let left = (best.fit.cost + there.rise).max(0.0) / best.fit.cost.max(f64::MIN_POSITIVE);
             let gain = (here.rise - there.rise) / (best.fit.noise.powi(2) * left.max(f64::EPSILON));
             let needed = significant_gain(extension);
@@ -172,13 +204,14 @@ impl Choice<'_> {
     /// The candidate with this extension, if that is significant and leaves the focal length observable.
     fn extended(&self, best: &Candidate, extension: Extension, warnings: &mut Vec<Warning>) -> Option<Candidate> {
         let model = best.model.with(extension);
-        let minimum = best.minimum.adjusted(self.problem.observations, model, self.prior, self.stop);
-        let richer = Candidate::new(minimum, model, self.prior, self.problem);
-        let gain = (best.minimum.cost - richer.minimum.cost) / richer.fit.noise.powi(2);
+        let richer = self.adjusted(&best.minimum, model, best.fit.noise);
+        // What the simpler model costs with the same prior.
+        let simple = best.fit.cost + best.optimum(best.model, &richer.prior)?.rise;
+        let gain = (simple - richer.minimum.cost) / richer.fit.noise.powi(2);
         if gain <= significant_gain(extension) {
             return None;
         }
-        let (simple_sigma, rich_sigma) = (best.sigma_log_focal(self.prior), richer.sigma_log_focal(self.prior));
+        let (simple_sigma, rich_sigma) = (best.sigma_log_focal(), richer.sigma_log_focal());
         let observable = match (simple_sigma, rich_sigma) {
             (Some(simple), Some(rich)) => rich <= METRIC_BELOW.max(SIGMA_INFLATION * simple),
             (None, rich) => rich.is_some(),
@@ -212,10 +245,13 @@ impl Choice<'_> {
     /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights
     /// from Laplace's approximation of each model's evidence under [`knowledge`]. An extension that the data can
     /// neither confirm nor refute thus costs what it would move.
-    pub fn sigmas(&self, best: &Candidate) -> Sigmas {
-        let own = best.sigma_log_focal(self.prior);
+    ///
+    /// * `inflation`: factor on all of them, for what the calibration does not fit
+    pub fn sigmas(&self, best: &Candidate, inflation: f64) -> Sigmas {
+        let own = best.sigma_log_focal();
         let views = best.minimum.reconstruction.focals.len();
-        let (Some(own), Some(information), Some(here)) = (own, &best.information, best.optimum(best.model, self.prior))
+        let (Some(own), Some(information), Some(here)) =
+            (own, &best.information, best.optimum(best.model, &best.prior))
         else {
             return Sigmas { parameters: [None; Parameter::COUNT], view_focals: vec![None; views] };
         };
@@ -225,8 +261,8 @@ impl Choice<'_> {
             .model
             .with_any_extensions()
             .filter_map(|model| {
-                let there = best.optimum(model, self.prior)?;
-                Some((self.log_weight(model, &here, &there, unit), there))
+                let there = best.optimum(model, &best.prior)?;
+                Some((self.log_weight(best, model, &here, &there), there))
             })
             .collect();
         let highest = models.iter().map(|(weight, _)| *weight).fold(f64::NEG_INFINITY, f64::max);
@@ -244,7 +280,7 @@ impl Choice<'_> {
                 }
             }
             // What the profile adds to the chosen model's own deviation, it adds to the whole.
-            Some(squared.sqrt() * profiled / own).filter(|sigma| sigma.is_finite())
+            Some(squared.sqrt() * profiled / own * inflation).filter(|sigma| sigma.is_finite())
         };
         let free = best.model.parameters();
         let parameters = Parameter::ALL.map(|parameter| {
@@ -260,17 +296,17 @@ impl Choice<'_> {
     }
 
     /// Logarithm of prior probability times evidence, up to what all models share.
-    fn log_weight(&self, model: IntrinsicsModel, here: &Optimum, there: &Optimum, unit: f64) -> f64 {
+    fn log_weight(&self, best: &Candidate, model: IntrinsicsModel, here: &Optimum, there: &Optimum) -> f64 {
         let of = |extension: Extension| match model.contains(extension) {
             true => {
-                let believed = |parameter: &Parameter| self.prior.information[*parameter as usize].ln();
+                let believed = |parameter: &Parameter| best.prior.information[*parameter as usize].ln();
                 probability(extension).ln() + 0.5 * extension.parameters().iter().map(believed).sum::<f64>()
             }
             false if model.admits(extension) => (1.0 - probability(extension)).ln(),
             false => 0.0,
         };
         let prior: f64 = Extension::ALL.into_iter().map(of).sum();
-        prior - 0.5 * (there.rise - here.rise) / unit - 0.5 * there.log_determinant
+        prior - 0.5 * (there.rise - here.rise) / best.fit.noise.powi(2) - 0.5 * there.log_determinant
     }
 
     /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
@@ -288,9 +324,9 @@ impl Choice<'_> {
             let mut moved = best.minimum.reconstruction.clone();
             moved.scale_focals(shift.exp());
             let options = Options::squared(PROFILE_ITERATIONS);
-            let report = metric::adjust(&mut moved, self.problem.observations, model, self.prior, &options, self.stop);
-            let deviation = self.prior.deviation(Parameter::LogFocal, &moved.intrinsics);
-            let believed = self.prior.information[Parameter::LogFocal as usize] * deviation.powi(2);
+            let report = metric::adjust(&mut moved, self.problem.observations, model, &best.prior, &options, self.stop);
+            let deviation = best.prior.deviation(Parameter::LogFocal, &moved.intrinsics);
+            let believed = best.prior.information[Parameter::LogFocal as usize] * deviation.powi(2);
             (report.cost + believed - best.minimum.cost).max(0.0) / best.fit.noise.powi(2)
         };
         let rise = side(shift).min(side(-shift));
@@ -313,7 +349,7 @@ mod tests {
     fn banded(seed: u64, views: usize) -> TestScene {
         let mut scene = testing::scene(seed, views, 10 * views, NOISE);
         let first = |point: usize| point % (views - 4);
-        scene.observations.retain(|seen| (first(seen.point)..first(seen.point) + 5).contains(&seen.camera));
+        scene.observations.retain(|seen| (first(seen.point)..first(seen.point) + 5).contains(&seen.view));
         scene
     }
 
@@ -334,13 +370,13 @@ mod tests {
             let cameras = scene.cameras();
             let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
             let (prior, stop) = (knowledge(NOISE, None, 1000.0), StopToken::default());
-            let choice = Choice { problem: &problem, prior: &prior, scale_px: 1000.0, stop: &stop };
+            let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
             let reconstruction = Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone());
             let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 1.0 };
             for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
                 let minimum = start.adjusted(&scene.observations, model, &prior, &stop);
-                let best = Candidate::new(minimum, model, &prior, &problem);
-                let sigma = best.sigma_log_focal(&prior).expect("observable");
+                let best = Candidate::new(minimum, model, prior, &problem);
+                let sigma = best.sigma_log_focal().expect("observable");
                 let profiled = choice.profiled(sigma, &best);
                 let shift = (PROFILE_DEVIATIONS * sigma).min(PROFILE_LONGEST);
                 let mut rise = |shift: f64| {

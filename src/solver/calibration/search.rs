@@ -3,18 +3,17 @@
 use nalgebra::Vector3;
 
 use super::fit::Fit;
-use super::models::Choice;
 use super::verdict::WEAK_UP_TO;
 use super::{Problem, Stopped};
 use crate::domain::StopToken;
+use crate::geometry::bundle::Options;
 use crate::geometry::bundle::critical::Translating;
 use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Reconstruction,
 };
-use crate::geometry::bundle::{Observation, Options};
 use crate::geometry::daq::{self, Daq, FirstViewFrame, Free};
-use crate::geometry::measurement::Sighting;
 use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
+use crate::geometry::observation::Observation;
 use crate::geometry::statistics::root_mean_square;
 use crate::geometry::triangulation;
 
@@ -245,12 +244,18 @@ fn minima_of_one(
 
 /// The metric reconstruction of a camera that moved without turning, from a focal length that is known otherwise; empty
 /// where there is none.
-pub(super) fn known_focal(translation: &Translating, focal: f64, choice: &Choice) -> Vec<Minimum> {
-    let observations = choice.problem.observations;
+pub(super) fn known_focal(
+    translation: &Translating,
+    focal: f64,
+    problem: &Problem,
+    prior: &IntrinsicsPrior,
+    stop: &StopToken,
+) -> Vec<Minimum> {
+    let observations = problem.observations;
     let start = upgrade_translation(translation, focal, observations);
     let minimum = start.map(|reconstruction| Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 });
-    let adjusted = minimum.map(|start| start.adjusted(observations, IntrinsicsModel::FOCAL, choice.prior, choice.stop));
-    distinct(adjusted.into_iter().collect(), choice.problem)
+    let adjusted = minimum.map(|start| start.adjusted(observations, IntrinsicsModel::FOCAL, prior, stop));
+    distinct(adjusted.into_iter().collect(), problem)
 }
 
 /// Cheapest first, without those that repeat a cheaper one.
@@ -320,12 +325,12 @@ fn subsample(frame: &FirstViewFrame, observations: &[Observation]) -> (Option<Ve
     (0..SEARCH_POINTS).for_each(|k| chosen[k * points / SEARCH_POINTS] = true);
     // A view that would be left with too few points keeps all of its own.
     let mut left = vec![0usize; frame.cameras.len()];
-    let in_range = |seen: &&Observation| seen.camera < frame.cameras.len() && seen.point < points;
+    let in_range = |seen: &&Observation| seen.view < frame.cameras.len() && seen.point < points;
     for seen in observations.iter().filter(in_range) {
-        left[seen.camera] += usize::from(chosen[seen.point]);
+        left[seen.view] += usize::from(chosen[seen.point]);
     }
     for seen in observations.iter().filter(in_range) {
-        if left[seen.camera] < LEAST_POINTS_OF_A_VIEW {
+        if left[seen.view] < LEAST_POINTS_OF_A_VIEW {
             chosen[seen.point] = true;
         }
     }
@@ -340,17 +345,17 @@ const LEAST_POINTS_OF_A_VIEW: usize = 20;
 fn fill_points(minimum: &mut Minimum, chosen: &[bool], observations: &[Observation]) {
     let cameras = minimum.reconstruction.cameras();
     let points = &mut minimum.reconstruction.points;
-    let mut sightings = vec![Vec::new(); points.len()];
-    for seen in observations.iter().filter(|seen| seen.camera < cameras.len()) {
-        if let Some(sightings) = sightings.get_mut(seen.point) {
-            sightings.push(Sighting { view: seen.camera, xy: seen.xy });
+    let mut of_point = vec![Vec::new(); points.len()];
+    for seen in observations.iter().filter(|seen| seen.view < cameras.len()) {
+        if let Some(of_point) = of_point.get_mut(seen.point) {
+            of_point.push(*seen);
         }
     }
-    for ((point, sightings), chosen) in points.iter_mut().zip(&sightings).zip(chosen) {
-        if *chosen || sightings.is_empty() {
+    for ((point, of_point), chosen) in points.iter_mut().zip(&of_point).zip(chosen) {
+        if *chosen || of_point.is_empty() {
             continue;
         }
-        let homogeneous = triangulation::linear(&cameras, sightings);
+        let homogeneous = triangulation::linear(&cameras, of_point);
         let position: Vector3<f64> = homogeneous.xyz() / homogeneous.w;
         if position.iter().all(|value| value.is_finite()) {
             *point = position;

@@ -1,6 +1,6 @@
 //! The grade, and the warnings that lower it.
 
-use super::fit::{Fit, MISFIT_DEVIATIONS, posterior_noise};
+use super::misfit::Comparison;
 use crate::domain::{Grade, Warning, WarningCode};
 
 /// Standard deviations of the log focal length that bound the grades.
@@ -14,6 +14,8 @@ pub(super) const UNOBSERVABLE_ABOVE: f64 = 1.0;
 pub(super) const RMS_RATIO_LIMIT: f64 = 1.15;
 /// The same ratio from which the metric reconstruction is not to be used at all.
 const RMS_RATIO_REFUSAL: f64 = 3.0;
+/// Factor on sigma by a misfit from which it is told: more than half of the sigma comes of it.
+const INFLATION_LIMIT: f64 = 2.0;
 /// Share of the observations that must lie in front of their cameras, or the reconstruction is not to be used: what was
 /// seen was not behind the camera. A forward-moving car gave 2.9 % behind, with a focal length of a quarter of the
 /// true.
@@ -63,23 +65,29 @@ impl Verdict {
         self.warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
     }
 
-    /// Asks whether the metric reconstruction fits as well as the projective one; returns the ratio of their noises.
+    /// Asks whether the metric reconstruction fits as well as the projective one.
     ///
     /// * `free`: what the metric one leaves free, in words
-    pub fn judge_fit(&mut self, projective: &Fit, metric: &Fit, free: &str, scale_px: f64) -> f64 {
-        let ratio = posterior_noise(metric.cost, metric.freedom) / projective.noise;
-        if ratio > RMS_RATIO_LIMIT && projective.loss_deviations(metric.cost, metric.freedom) > MISFIT_DEVIATIONS {
+    pub fn judge_fit(&mut self, comparison: &Comparison, free: &str, scale_px: f64) {
+        let Comparison { ratio, noise, .. } = *comparison;
+        if ratio > RMS_RATIO_LIMIT && comparison.is_significant() {
             let worst = if ratio > RMS_RATIO_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
             let detail = format!(
                 "the metric reconstruction fits {ratio:.2} times worse than the projective one ({:.2} px against \
                  {:.2} px) with {free} free: distortion, a zoom or wrong tracks",
-                ratio * projective.noise * scale_px,
-                projective.noise * scale_px,
+                ratio * noise * scale_px,
+                noise * scale_px,
             );
             self.cap(worst, WarningCode::ModelMismatch, detail);
             self.is_misfit = true;
+        } else if comparison.inflation() > INFLATION_LIMIT {
+            let detail = format!(
+                "with {free} free the tracks violate the calibration {:.1} times as much as their noise explains; \
+                 sigma is as much larger",
+                comparison.inflation()
+            );
+            self.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
         }
-        ratio
     }
 
     /// Grades by a sigma that has grown for this reason.

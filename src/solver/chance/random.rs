@@ -4,7 +4,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::domain::StopToken;
-use crate::geometry::measurement::{CompleteBlock, Sighting};
+use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::observation::Observation;
 use crate::geometry::statistics::chi_square_quantile;
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::solver::grow::{self, Consensus};
@@ -99,7 +100,7 @@ impl<'a> RandomTracks<'a> {
             }
             let some = LANES.min(tracks - squared.len());
             let drawn: Vec<_> = (0..some).map(|_| random_track(block, rng)).collect();
-            let drawn: Vec<&[Sighting]> = drawn.iter().map(Vec::as_slice).collect();
+            let drawn: Vec<&[Observation]> = drawn.iter().map(Vec::as_slice).collect();
             let batch = Batch::new(cameras, &drawn);
             let found = batch.refine(batch.linear(), |_| true, grow::POINT_STEPS);
             let finite = |cost: f64| if cost.is_finite() { cost } else { f64::MAX };
@@ -138,7 +139,7 @@ impl<'a> RandomTracks<'a> {
 }
 
 /// A point of each view, of as many tracks as there are: points of one track have structure.
-fn random_track(block: &CompleteBlock, rng: &mut ChaCha8Rng) -> Vec<Sighting> {
+fn random_track(block: &CompleteBlock, rng: &mut ChaCha8Rng) -> Vec<Observation> {
     let mut drawn: Vec<usize> = Vec::with_capacity(block.views());
     while drawn.len() < block.views() {
         let track = rng.random_range(0..block.tracks());
@@ -146,7 +147,7 @@ fn random_track(block: &CompleteBlock, rng: &mut ChaCha8Rng) -> Vec<Sighting> {
             drawn.push(track);
         }
     }
-    drawn.iter().enumerate().map(|(view, &track)| Sighting { view, xy: block.point(view, track) }).collect()
+    drawn.iter().enumerate().map(|(view, &track)| Observation::new(view, track, block.point(view, track))).collect()
 }
 
 /// Chernoff's bound (1952), a track, on the probability that squared residuals are all below `gate` and at most `mean`

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use super::{Geometry, Judged, NoiseModel, SplitPoint};
 use crate::domain::{Input, StopToken};
-use crate::geometry::measurement::Sighting;
+use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::geometry::{Camera, Point, triangulation};
@@ -25,24 +25,24 @@ struct Verdict {
     weight: f64,
     inlier: bool,
     point: Point,
-    /// One entry a sighting.
+    /// One entry an observation.
     retained: Vec<bool>,
 }
 
 /// What was found of one track.
 pub struct Finding {
     track: usize,
-    sightings: Vec<Sighting>,
-    /// Of the sightings, among the caller's observations.
+    observations: Vec<Observation>,
+    /// Of the observations, among the caller's observations.
     places: Vec<usize>,
     verdict: Verdict,
     others: Vec<Other>,
 }
 
-/// A further point that a track joins, with the sightings that show it.
+/// A further point that a track joins, with the observations that show it.
 struct Other {
     verdict: Verdict,
-    sightings: Vec<usize>,
+    observations: Vec<usize>,
 }
 
 /// What tracks are judged by.
@@ -64,33 +64,34 @@ impl Bench<'_> {
         let seen = |track: usize| -> Vec<usize> {
             (ranges[track]..ranges[track + 1]).filter(|&k| geometry.judges(track, input.view_of(k))).collect()
         };
-        let sighting = |&k: &usize| Sighting { view: input.view_of(k), xy: geometry.point(input, k) };
+        let observation = |&k: &usize| geometry.observation(input, k);
         let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) =
             tracks.map(|track| (track, seen(track))).filter(|(_, seen)| seen.len() >= LEAST_RETAINED).unzip();
-        let sightings: Vec<Vec<Sighting>> = seen.iter().map(|seen| seen.iter().map(sighting).collect()).collect();
-        let verdicts = self.judge(&sightings.iter().map(Vec::as_slice).collect::<Vec<_>>());
-        let found = tracks.into_iter().zip(seen).zip(sightings).zip(verdicts);
+        let observations: Vec<Vec<Observation>> =
+            seen.iter().map(|seen| seen.iter().map(observation).collect()).collect();
+        let verdicts = self.judge(&observations.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        let found = tracks.into_iter().zip(seen).zip(observations).zip(verdicts);
         found
-            .map(|(((track, seen), sightings), verdict)| {
+            .map(|(((track, seen), observations), verdict)| {
                 let places = seen.into_iter().map(|k| input.caller_index(k)).collect();
                 let others =
-                    if geometry.linked && verdict.inlier { self.others(&sightings, &verdict) } else { Vec::new() };
-                Finding { track, sightings, places, verdict, others }
+                    if geometry.linked && verdict.inlier { self.others(&observations, &verdict) } else { Vec::new() };
+                Finding { track, observations, places, verdict, others }
             })
             .collect()
     }
 
     /// Drops the worst observation of each track as long as it is more likely wrong than right, then weighs what
     /// remains. No more tracks than a [`Batch`] takes.
-    fn judge(&self, tracks: &[&[Sighting]]) -> Vec<Verdict> {
+    fn judge(&self, tracks: &[&[Observation]]) -> Vec<Verdict> {
         let gate = self.noise.gate();
         let mut retained: Vec<Option<Vec<usize>>> =
-            tracks.iter().map(|sightings| self.retained_at_first(sightings, gate)).collect();
+            tracks.iter().map(|observations| self.retained_at_first(observations, gate)).collect();
         let mut batch = Batch::new(self.cameras, tracks);
-        for (lane, (sightings, retained)) in tracks.iter().zip(&retained).enumerate() {
+        for (lane, (observations, retained)) in tracks.iter().zip(&retained).enumerate() {
             let Some(retained) = retained else { continue };
             let is_left = |k: &usize| retained.binary_search(k).is_err();
-            (0..sightings.len()).filter(is_left).for_each(|k| batch.drop_sighting(lane, k));
+            (0..observations.len()).filter(is_left).for_each(|k| batch.drop_observation(lane, k));
         }
         let mut found = batch.refine(batch.linear(), |_| true, DROPPING_STEPS);
         while !self.stop.is_stopped() {
@@ -109,7 +110,7 @@ impl Bench<'_> {
             }
             for (lane, (retained, dropped)) in retained.iter_mut().zip(dropped).enumerate() {
                 if let (Some(retained), Some(place)) = (retained, dropped) {
-                    batch.drop_sighting(lane, retained.remove(place));
+                    batch.drop_observation(lane, retained.remove(place));
                 }
             }
             let is_dropped = |lane: usize| dropped[lane].is_some();
@@ -120,85 +121,86 @@ impl Bench<'_> {
             retained.is_some_and(|retained| retained.len() >= self.least_retained(tracks[lane]))
         };
         let found = batch.refine(found, can_be_right, POINT_STEPS);
-        let verdict = |(lane, (sightings, retained)): (usize, (&&[Sighting], Option<Vec<usize>>))| match retained {
-            Some(retained) => self.weigh(sightings, &retained, found.point(lane), found.cost(lane)),
-            None => Verdict::wrong(found.point(lane), sightings.len()),
+        let verdict = |(lane, (observations, retained)): (usize, (&&[Observation], Option<Vec<usize>>))| match retained
+        {
+            Some(retained) => self.weigh(observations, &retained, found.point(lane), found.cost(lane)),
+            None => Verdict::wrong(found.point(lane), observations.len()),
         };
         tracks.iter().zip(retained).enumerate().map(verdict).collect()
     }
 
     /// Observations that a track must retain.
-    fn least_retained(&self, sightings: &[Sighting]) -> usize {
-        LEAST_RETAINED.max((self.geometry.least_share * sightings.len() as f64).ceil() as usize)
+    fn least_retained(&self, observations: &[Observation]) -> usize {
+        LEAST_RETAINED.max((self.geometry.least_share * observations.len() as f64).ceil() as usize)
     }
 
     /// The verdict on a track by the observations that it retains.
-    fn weigh(&self, sightings: &[Sighting], retained: &[usize], point: Point, cost: f64) -> Verdict {
+    fn weigh(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> Verdict {
         let gate = self.noise.gate();
-        let dropped = sightings.len() - retained.len();
+        let dropped = observations.len() - retained.len();
         let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share);
-        let enough = retained.len() >= self.least_retained(sightings);
+        let enough = retained.len() >= self.least_retained(observations);
         let weight = if enough { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
-        let mut flags = vec![false; sightings.len()];
+        let mut flags = vec![false; observations.len()];
         for &k in retained {
-            flags[k] = self.squared(&point, &sightings[k]) <= gate;
+            flags[k] = self.squared(&point, &observations[k]) <= gate;
         }
         let whole = flags.iter().filter(|&&flag| flag).count() >= LEAST_RETAINED;
         Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
     }
 
-    /// The sightings that a verdict begins with: all, or those that agree where links may be wrong; `None` where none
+    /// The observations that a verdict begins with: all, or those that agree where links may be wrong; `None` where none
     /// do.
-    fn retained_at_first(&self, sightings: &[Sighting], gate: f64) -> Option<Vec<usize>> {
+    fn retained_at_first(&self, observations: &[Observation], gate: f64) -> Option<Vec<usize>> {
         if !self.geometry.linked {
-            return Some((0..sightings.len()).collect());
+            return Some((0..observations.len()).collect());
         }
-        let found = self.triangulator.robust(sightings, gate)?;
-        Some((0..sightings.len()).filter(|&k| found.agrees[k]).collect())
+        let found = self.triangulator.robust(observations, gate)?;
+        Some((0..observations.len()).filter(|&k| found.agrees[k]).collect())
     }
 
-    /// Squared residual of a sighting of a point.
-    fn squared(&self, point: &Point, seen: &Sighting) -> f64 {
+    /// Squared residual of an observation of a point.
+    fn squared(&self, point: &Point, seen: &Observation) -> f64 {
         triangulation::reprojection(&self.cameras[seen.view], point, &seen.xy).norm_squared()
     }
 
     /// Enters what was found of a track.
     pub fn write(&self, judged: &mut Judged, finding: &Finding) {
-        let Finding { track, sightings, places, verdict, others } = finding;
+        let Finding { track, observations, places, verdict, others } = finding;
         let track = *track;
         judged.tracks.weight[track] = verdict.weight as f32;
         judged.tracks.inlier[track] = verdict.inlier;
-        for ((&place, sighting), &retained) in places.iter().zip(sightings).zip(&verdict.retained) {
-            let squared = self.squared(&verdict.point, sighting);
+        for ((&place, observation), &retained) in places.iter().zip(observations).zip(&verdict.retained) {
+            let squared = self.squared(&verdict.point, observation);
             judged.observations.residual_px[place] =
                 Some(squared.sqrt() * self.geometry.normalization.scale_px).filter(|residual| residual.is_finite());
             judged.observations.weight[place] = self.noise.weight(squared) as f32;
             judged.observations.inlier[place] = verdict.inlier && retained;
         }
         if verdict.inlier {
-            let retained = sightings.iter().zip(&verdict.retained).filter(|(_, retained)| **retained);
-            judged.retained[track] = retained.map(|(sighting, _)| *sighting).collect();
+            let retained = observations.iter().zip(&verdict.retained).filter(|(_, retained)| **retained);
+            judged.retained[track] = retained.map(|(observation, _)| *observation).collect();
             judged.points[track] = Some(verdict.point);
         }
         for (number, other) in (1..).zip(others) {
-            other.sightings.iter().for_each(|&k| judged.observations.split[places[k]] = number);
+            other.observations.iter().for_each(|&k| judged.observations.split[places[k]] = number);
             let Verdict { weight, point, .. } = other.verdict;
-            let retained = chosen(sightings, &other.sightings);
+            let retained = chosen(observations, &other.observations);
             judged.splits.push(SplitPoint { track, number, weight, point, retained });
         }
     }
 
     /// Looks for the other points that a right track joins, among the observations that its own leaves.
-    fn others(&self, sightings: &[Sighting], verdict: &Verdict) -> Vec<Other> {
-        let mut left: Vec<usize> = (0..sightings.len()).filter(|&k| !verdict.retained[k]).collect();
+    fn others(&self, observations: &[Observation], verdict: &Verdict) -> Vec<Other> {
+        let mut left: Vec<usize> = (0..observations.len()).filter(|&k| !verdict.retained[k]).collect();
         let mut others = Vec::new();
         while left.len() >= LEAST_RETAINED && !self.stop.is_stopped() {
-            let these = chosen(sightings, &left);
+            let these = chosen(observations, &left);
             let Some(verdict) = self.judge(&[&these]).pop().filter(|verdict| verdict.inlier) else { break };
             let (of_other, rest): (Vec<_>, Vec<_>) = left.iter().zip(&verdict.retained).partition(|(_, kept)| **kept);
             let indices = |these: Vec<(&usize, &bool)>| these.into_iter().map(|(&k, _)| k).collect::<Vec<usize>>();
-            let (sightings, rest) = (indices(of_other), indices(rest));
-            others.push(Other { verdict, sightings });
+            let (observations, rest) = (indices(of_other), indices(rest));
+            others.push(Other { verdict, observations });
             left = rest;
         }
         others
@@ -207,8 +209,8 @@ impl Bench<'_> {
 
 impl Verdict {
     /// On a track of which no two observations agree on a point in front of their cameras.
-    fn wrong(point: Point, sightings: usize) -> Self {
-        Self { weight: 0.0, inlier: false, point, retained: vec![false; sightings] }
+    fn wrong(point: Point, observations: usize) -> Self {
+        Self { weight: 0.0, inlier: false, point, retained: vec![false; observations] }
     }
 }
 
@@ -222,8 +224,8 @@ fn worst_beyond(retained: &[usize], least: usize, gate: f64, squared: impl Fn(us
     residuals.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, worst)| *worst > gate || worst.is_nan())
 }
 
-fn chosen(sightings: &[Sighting], which: &[usize]) -> Vec<Sighting> {
-    which.iter().map(|&k| sightings[k]).collect()
+fn chosen(observations: &[Observation], which: &[usize]) -> Vec<Observation> {
+    which.iter().map(|&k| observations[k]).collect()
 }
 
 #[cfg(test)]
@@ -262,11 +264,11 @@ mod tests {
         Bench { cameras, triangulator: Triangulator::new(cameras), geometry, noise, stop: Box::leak(Box::default()) }
     }
 
-    fn judged(bench: &Bench, sightings: &[Sighting]) -> Verdict {
-        bench.judge(&[sightings]).pop().expect("a verdict")
+    fn judged(bench: &Bench, observations: &[Observation]) -> Verdict {
+        bench.judge(&[observations]).pop().expect("a verdict")
     }
 
-    fn sightings(cameras: &[Camera], shifts: &[f64]) -> Vec<Sighting> {
+    fn observations(cameras: &[Camera], shifts: &[f64]) -> Vec<Observation> {
         let point = Point::new(0.2, -0.1, 0.5, 1.0);
         cameras
             .iter()
@@ -274,7 +276,7 @@ mod tests {
             .enumerate()
             .map(|(view, (camera, shift))| {
                 let image = camera * point;
-                Sighting { view, xy: image.xy() / image.z + Vector2::new(0.3 * shift, *shift) }
+                Observation::new(view, 0, image.xy() / image.z + Vector2::new(0.3 * shift, *shift))
             })
             .collect()
     }
@@ -285,7 +287,7 @@ mod tests {
         let geometry = geometry(&normalization);
         let cameras = cameras(6);
         let bench = bench(&cameras, &geometry);
-        let verdict = |shifts: [f64; 6]| judged(&bench, &sightings(&cameras, &shifts));
+        let verdict = |shifts: [f64; 6]| judged(&bench, &observations(&cameras, &shifts));
         let right = verdict([0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001]);
         assert!(right.inlier && right.weight > 0.999 && right.retained.iter().all(|&kept| kept));
         let one_wrong = verdict([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]);
@@ -314,7 +316,7 @@ mod tests {
                 &[0.02, 0.0, 0.0, 0.001, 0.0, -0.001, 0.0, 0.0, 0.0],
                 &[0.1, -0.3, 0.2],
             ];
-            let tracks = shifts.map(|shifts| sightings(&cameras, shifts));
+            let tracks = shifts.map(|shifts| observations(&cameras, shifts));
             let together = bench.judge(&tracks.each_ref().map(Vec::as_slice));
             assert_eq!(together.len(), tracks.len());
             let mut right = 0;
@@ -335,23 +337,23 @@ mod tests {
         let geometry = Geometry { linked: true, least_share: 0.0, ..geometry(&normalization) };
         let cameras = cameras(8);
         let bench = bench(&cameras, &geometry);
-        let split = |sightings: &[Sighting]| {
+        let split = |observations: &[Observation]| {
             let mut all = Judged::nothing(&testing_input(), bench.noise);
-            let verdict = judged(&bench, sightings);
+            let verdict = judged(&bench, observations);
             assert!(verdict.inlier);
-            let others = bench.others(sightings, &verdict);
-            let (sightings, places) = (sightings.to_vec(), (0..8).collect());
-            bench.write(&mut all, &Finding { track: 0, sightings, places, verdict, others });
+            let others = bench.others(observations, &verdict);
+            let (observations, places) = (observations.to_vec(), (0..8).collect());
+            bench.write(&mut all, &Finding { track: 0, observations, places, verdict, others });
             (all.observations.split, all.splits.len())
         };
-        let mut joined = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, 0.0, 0.0, 0.0]);
+        let mut joined = observations(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, 0.0, 0.0, 0.0]);
         let second = Point::new(-0.5, 0.4, 1.5, 1.0);
         for seen in &mut joined[5..] {
             let image = cameras[seen.view] * second;
             seen.xy = image.xy() / image.z;
         }
         assert_eq!(split(&joined), (vec![0, 0, 0, 0, 0, 1, 1, 1], 1));
-        let astray = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, -0.22, 0.17, -0.4]);
+        let astray = observations(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, -0.22, 0.17, -0.4]);
         assert_eq!(split(&astray), (vec![0; 8], 0));
     }
 
@@ -374,12 +376,12 @@ mod tests {
         let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
         let geometry = Geometry { linked: true, least_share: 0.0, ..geometry(&normalization) };
         let cameras = cameras(6);
-        let joined = sightings(&cameras, &[0.0, 0.0005, -0.0005, 0.2, -0.15, 0.31]);
+        let joined = observations(&cameras, &[0.0, 0.0005, -0.0005, 0.2, -0.15, 0.31]);
         let verdict = judged(&bench(&cameras, &geometry), &joined);
         assert!(verdict.inlier, "{}", verdict.weight);
         assert_eq!(verdict.retained, [true, true, true, false, false, false]);
         let behind: Vec<Camera> = cameras.iter().map(|camera| -camera).collect();
-        let verdict = judged(&bench(&behind, &geometry), &sightings(&cameras, &[0.0; 6]));
+        let verdict = judged(&bench(&behind, &geometry), &observations(&cameras, &[0.0; 6]));
         assert!(!verdict.inlier && verdict.weight == 0.0, "{}", verdict.weight);
     }
 }

@@ -9,12 +9,11 @@ mod noise;
 
 pub use noise::{NoiseModel, density_of_spread, outlier_density, working_gate};
 
-use nalgebra::Vector2;
-
 use crate::domain::result::{ObservationResults, TrackResults};
 use crate::domain::{Input, StopToken};
 use crate::geometry::bundle::metric::Intrinsics;
-use crate::geometry::measurement::{Normalization, Sighting};
+use crate::geometry::measurement::Normalization;
+use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::triangulation::batch::LANES;
 use crate::geometry::{Camera, Point};
@@ -54,10 +53,12 @@ impl Geometry<'_> {
         self.cameras[view].is_some() && self.parts.is_none_or(|(of_view, of_track)| of_view[view] == of_track[track])
     }
 
-    /// Where a pinhole would see observation `k`; what a lens images nowhere stays where it is, far from any point.
-    fn point(&self, input: &Input, k: usize) -> Vector2<f64> {
-        let xy = self.normalization.normalize(input.view_of(k), input.point_px(k));
-        self.lenses.get(input.view_of(k)).and_then(|lens| lens.undistort(&xy)).unwrap_or(xy)
+    /// Observation `k` where a pinhole would see it; what a lens images nowhere stays where it is, far from any point.
+    fn observation(&self, input: &Input, k: usize) -> Observation {
+        let view = input.view_of(k);
+        let xy = self.normalization.normalize(view, input.point_px(k));
+        let undone = self.lenses.get(view).and_then(|lens| lens.undistort(&xy));
+        Observation::new(view, input.track_of(k), undone.unwrap_or(xy))
     }
 }
 
@@ -65,8 +66,8 @@ impl Geometry<'_> {
 pub struct Judged {
     pub tracks: TrackResults,
     pub observations: ObservationResults,
-    /// Retained sightings of each inlier track, with views of the input.
-    pub retained: Vec<Vec<Sighting>>,
+    /// Retained observations of each inlier track, with views of the input.
+    pub retained: Vec<Vec<Observation>>,
     pub points: Vec<Option<Point>>,
     /// The other points that linked tracks join, by track.
     pub splits: Vec<SplitPoint>,
@@ -81,8 +82,8 @@ pub struct SplitPoint {
     pub number: u32,
     pub weight: f64,
     pub point: Point,
-    /// The sightings that show it.
-    pub retained: Vec<Sighting>,
+    /// The observations that show it.
+    pub retained: Vec<Observation>,
 }
 
 /// Judges every track that has three observations in registered views or more; the others have weight 0 and no

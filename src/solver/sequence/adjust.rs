@@ -3,8 +3,9 @@
 use super::model::{Lens, Model, Scene};
 use super::parts::FIRST;
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
-use crate::geometry::bundle::sequence::{self, Free, Run, Sequence, Sighting};
-use crate::geometry::bundle::{Loss, Observation, Options};
+use crate::geometry::bundle::sequence::{self, Free, Run, Sequence};
+use crate::geometry::bundle::{Loss, Options};
+use crate::geometry::observation::Observation;
 use crate::geometry::statistics::median;
 use crate::solver::calibration;
 use crate::solver::recorder::Recorder;
@@ -32,7 +33,7 @@ pub struct Extract {
     pub views: Vec<usize>,
     pub tracks: Vec<usize>,
     pub sequence: Sequence,
-    pub sightings: Vec<Sighting>,
+    pub observations: Vec<Observation>,
 }
 
 impl Extract {
@@ -49,7 +50,7 @@ impl Extract {
                 poses: Vec::with_capacity(views.len()),
                 points: Vec::with_capacity(tracks.len()),
             },
-            sightings: Vec::new(),
+            observations: Vec::new(),
         };
         for &view in views {
             if let Some(pose) = model.poses[view] {
@@ -65,7 +66,7 @@ impl Extract {
             let point = extract.tracks.len();
             for k in scene.of_track(track).filter(|&k| model.kept[k] && place[scene.view_of(k)] != usize::MAX) {
                 let view = place[scene.view_of(k)];
-                extract.sightings.push(Sighting { view, point, xy: scene.xy[k], weight: 1.0 });
+                extract.observations.push(Observation { view, point, ..scene.observation(k) });
             }
             extract.tracks.push(track);
             extract.sequence.points.push(landmark.position);
@@ -101,8 +102,7 @@ impl Extract {
             points: self.sequence.points.clone(),
         };
         reconstruction.average_focals();
-        let observation = |seen: &Sighting| Observation { camera: seen.view, point: seen.point, xy: seen.xy };
-        (reconstruction, self.sightings.iter().map(observation).collect())
+        (reconstruction, self.observations.clone())
     }
 
     fn adjust(&mut self, scene: &Scene, model: &Model, free: &Free, iterations: usize, recorder: &mut Recorder) {
@@ -116,12 +116,12 @@ impl Extract {
             (0..scene.cameras).map(|camera| knowledge(scene, camera, model.noise)).collect();
         let mut told = || recorder.sign_of_life();
         let run = Run { threads: scene.context.threads, stop: scene.stop(), told: &mut told };
-        sequence::adjust(&mut self.sequence, &self.sightings, free, &priors, &options, run);
+        sequence::adjust(&mut self.sequence, &self.observations, free, &priors, &options, run);
     }
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise(&self, scene: &Scene) -> f64 {
-        let norms: Vec<f64> = self.sightings.iter().map(|seen| self.sequence.residual(seen).norm()).collect();
+        let norms: Vec<f64> = self.observations.iter().map(|seen| self.sequence.residual(seen).norm()).collect();
         let of_view = if scene.has_own_focals() { 7 } else { 6 };
         let unknowns = of_view * self.views.len() + 3 * self.tracks.len();
         core_noise(norms, unknowns)
@@ -213,7 +213,7 @@ pub fn all(scene: &Scene, model: &mut Model, recorder: &mut Recorder) {
 }
 
 fn finish(scene: &Scene, model: &mut Model, extract: &Extract) {
-    if scene.stop().is_stopped() || extract.sightings.is_empty() {
+    if scene.stop().is_stopped() || extract.observations.is_empty() {
         return;
     }
     extract.write_back(model);

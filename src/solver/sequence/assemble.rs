@@ -9,7 +9,7 @@ use crate::domain::result::{TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, LeftOut, Solution, Stage, Status, Warning};
 use crate::geometry::Point;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
-use crate::geometry::measurement::Sighting;
+use crate::geometry::observation::Observation;
 use crate::solver::assemble::{
     LEAST_SIGHTINGS, dehomogenise, least_share, network_weights, pixel_calibration, reprojection,
 };
@@ -32,7 +32,7 @@ pub fn solved(extended: Extended, mut warnings: Vec<Warning>, mut recorder: Reco
     warnings.extend(seed.second_structure.clone());
     let frames = frames(&scene, &model);
     let back = back(&frames, metric);
-    let is_told = |retained: &[Sighting]| !metric || is_held(&model, retained);
+    let is_told = |retained: &[Observation]| !metric || is_held(&model, retained);
     judged.tracks.point = points(&judged, &model, &back, is_told);
     let splits = splits(&judged, &model, &back, is_told);
     judged.tracks.part = parts(&judged, &model);
@@ -193,18 +193,18 @@ fn placed(point: &Point, track: usize, model: &Model, back: &[Option<Matrix4<f64
     dehomogenise(&back[part].map_or(*point, |back| back * point))
 }
 
-/// Whether views with a pose hold the point of these sightings: what others alone see is in no metric result.
-fn is_held(model: &Model, retained: &[Sighting]) -> bool {
-    let has_pose = |seen: &&Sighting| model.is_determined(seen.view);
+/// Whether views with a pose hold the point of these observations: what others alone see is in no metric result.
+fn is_held(model: &Model, retained: &[Observation]) -> bool {
+    let has_pose = |seen: &&Observation| model.is_determined(seen.view);
     retained.iter().filter(has_pose).count() >= LEAST_SIGHTINGS
 }
 
-/// The points of the judged tracks whose retained sightings say so.
+/// The points of the judged tracks whose retained observations say so.
 fn points(
     judged: &Judged,
     model: &Model,
     back: &[Option<Matrix4<f64>>],
-    is_told: impl Fn(&[Sighting]) -> bool,
+    is_told: impl Fn(&[Observation]) -> bool,
 ) -> Vec<Option<[f64; 3]>> {
     let place = |(track, point): (usize, &Option<Point>)| {
         point.filter(|_| is_told(&judged.retained[track])).and_then(|point| placed(&point, track, model, back))
@@ -217,7 +217,7 @@ fn splits(
     judged: &Judged,
     model: &Model,
     back: &[Option<Matrix4<f64>>],
-    is_told: impl Fn(&[Sighting]) -> bool,
+    is_told: impl Fn(&[Observation]) -> bool,
 ) -> Vec<TrackSplit> {
     let split = |split: &SplitPoint| TrackSplit {
         track: split.track as u32,

@@ -174,12 +174,12 @@ pub fn core(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -> Ex
     let mut extract = Extract::new(scene, model, views, &tracks);
     let limit = CORE_SQUARED * model.noise * model.noise;
     let fits: Vec<bool> =
-        extract.sightings.iter().map(|seen| extract.sequence.residual(seen).norm_squared() < limit).collect();
+        extract.observations.iter().map(|seen| extract.sequence.residual(seen).norm_squared() < limit).collect();
     let mut kept = vec![0usize; extract.tracks.len()];
-    for (seen, fits) in extract.sightings.iter().zip(&fits) {
+    for (seen, fits) in extract.observations.iter().zip(&fits) {
         kept[seen.point] += usize::from(*fits);
     }
     let mut fits = fits.into_iter();
-    extract.sightings.retain(|seen| fits.next().unwrap_or(false) && kept[seen.point] >= LEAST_KEPT);
+    extract.observations.retain(|seen| fits.next().unwrap_or(false) && kept[seen.point] >= LEAST_KEPT);
     extract
 }

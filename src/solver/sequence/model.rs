@@ -5,7 +5,7 @@ use nalgebra::{Vector2, Vector3};
 use crate::domain::{FocalPrior, StopToken};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
-use crate::geometry::measurement::Sighting;
+use crate::geometry::observation::Observation;
 use crate::solver::calibration::ViewFocal;
 use crate::solver::{Context, attempt, block, judge};
 
@@ -65,6 +65,10 @@ impl<'a> Scene<'a> {
 
     pub fn view_of(&self, k: usize) -> usize {
         self.context.input.view_of(k)
+    }
+
+    pub fn observation(&self, k: usize) -> Observation {
+        Observation::new(self.view_of(k), self.track_of(k), self.xy[k])
     }
 
     pub fn track_of(&self, k: usize) -> usize {
@@ -307,10 +311,11 @@ impl Model {
 
     /// Where the pinhole cameras see an observation; `None` where the view is not registered or the lens images
     /// nothing.
-    pub fn sighting(&self, scene: &Scene, k: usize) -> Option<Sighting> {
+    pub fn observation(&self, scene: &Scene, k: usize) -> Option<Observation> {
         let view = scene.view_of(k);
         self.poses[view]?;
-        Some(Sighting { view, xy: self.intrinsics_of(scene, view).undistort(&scene.xy[k])? })
+        let seen = scene.observation(k);
+        Some(Observation { xy: self.intrinsics_of(scene, view).undistort(&seen.xy)?, ..seen })
     }
 
     /// Squared residual, normalised units, within which an observation agrees with its landmark.

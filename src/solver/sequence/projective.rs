@@ -12,8 +12,8 @@ use super::adjust;
 use super::model::Scene;
 use super::options::ProjectiveOptions;
 use crate::domain::StopToken;
-use crate::geometry::bundle::{self, Loss, Observation};
-use crate::geometry::measurement::Sighting;
+use crate::geometry::bundle::{self, Loss};
+use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{Robust, Triangulator};
 use crate::geometry::triangulation::reprojection;
 use crate::geometry::{Camera, Point, resection};
@@ -111,7 +111,7 @@ impl Projective {
         let signs: Vec<f64> = self
             .observations
             .iter()
-            .map(|seen| depth(&self.cameras[seen.camera], &self.points[seen.point]).signum())
+            .map(|seen| depth(&self.cameras[seen.view], &self.points[seen.point]).signum())
             .collect();
         // The first camera decides; signs spread over what they share points with.
         if let Some(first) = of_camera.first_mut() {
@@ -120,11 +120,11 @@ impl Projective {
         for _ in 0..ORIENTATION_ROUNDS {
             vote(
                 &mut of_point,
-                self.observations.iter().zip(&signs).map(|(seen, sign)| (seen.point, sign * of_camera[seen.camera])),
+                self.observations.iter().zip(&signs).map(|(seen, sign)| (seen.point, sign * of_camera[seen.view])),
             );
             vote(
                 &mut of_camera,
-                self.observations.iter().zip(&signs).map(|(seen, sign)| (seen.camera, sign * of_point[seen.point])),
+                self.observations.iter().zip(&signs).map(|(seen, sign)| (seen.view, sign * of_point[seen.point])),
             );
         }
         let sign = |sign: f64| if sign < 0.0 { -1.0 } else { 1.0 };
@@ -317,9 +317,8 @@ impl<'a> Growing<'a> {
         }
         let scene = self.scene;
         let seen: Vec<usize> = scene.of_track(track).filter(|&k| self.cameras[scene.view_of(k)].is_some()).collect();
-        let sightings: Vec<Sighting> =
-            seen.iter().map(|&k| Sighting { view: scene.view_of(k), xy: scene.xy[k] }).collect();
-        triangulator.robust(&sightings, gate).map(|found| (found, seen))
+        let observations: Vec<Observation> = seen.iter().map(|&k| scene.observation(k)).collect();
+        triangulator.robust(&observations, gate).map(|found| (found, seen))
     }
 
     /// The view to try next, the one that sees most verified points, with its observations of these; a view that failed
@@ -377,7 +376,8 @@ impl<'a> Growing<'a> {
         tracks.sort_unstable();
         let observations = tracks.iter().enumerate().flat_map(|(point, &track)| {
             let kept = scene.of_track(track).filter(|&k| self.kept[k]);
-            kept.map(|k| Observation { camera: place[scene.view_of(k)], point, xy: scene.xy[k] }).collect::<Vec<_>>()
+            kept.map(|k| Observation { view: place[scene.view_of(k)], point, ..scene.observation(k) })
+                .collect::<Vec<_>>()
         });
         Projective {
             cameras: views.iter().filter_map(|&view| self.cameras[view]).collect(),
@@ -416,7 +416,7 @@ impl<'a> Growing<'a> {
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise_of(&self, standing: &Projective) -> f64 {
         let residual = |seen: &Observation| {
-            reprojection(&standing.cameras[seen.camera], &standing.points[seen.point], &seen.xy).norm()
+            reprojection(&standing.cameras[seen.view], &standing.points[seen.point], &seen.xy).norm()
         };
         let norms: Vec<f64> = standing.observations.iter().map(residual).collect();
         let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::model::{Landmark, Model, Scene};
-use crate::geometry::measurement::Sighting;
+use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::{Camera, Point};
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
@@ -68,20 +68,20 @@ fn landmark(
     track: usize,
 ) -> Option<(Landmark, Vec<usize>)> {
     let part = part_of_track(scene, model, track)?;
-    let seen: Vec<(usize, Sighting)> = scene
+    let seen: Vec<(usize, Observation)> = scene
         .of_track(track)
         .filter(|&k| model.part_of[scene.view_of(k)] == part)
-        .filter_map(|k| Some((k, model.sighting(scene, k)?)))
+        .filter_map(|k| Some((k, model.observation(scene, k)?)))
         .collect();
     if seen.len() < 2 {
         return None;
     }
-    let sightings: Vec<Sighting> = seen.iter().map(|(_, sighting)| *sighting).collect();
-    let found = triangulator.robust(&sightings, gate)?;
+    let observations: Vec<Observation> = seen.iter().map(|(_, observation)| *observation).collect();
+    let found = triangulator.robust(&observations, gate)?;
     let position = euclidean(&found.point)?;
     let agreeing = || seen.iter().zip(&found.agrees).filter(|(_, agrees)| **agrees).map(|(seen, _)| seen);
-    let rays = agreeing().filter_map(|(_, sighting)| {
-        let pose = model.poses[sighting.view]?;
+    let rays = agreeing().filter_map(|(_, observation)| {
+        let pose = model.poses[observation.view]?;
         Some((position + pose.rotation.tr_mul(&pose.translation)).normalize())
     });
     let angle = widest_angle(&rays.collect::<Vec<_>>());

@@ -6,7 +6,7 @@ use super::NOISE;
 use crate::domain::{Input, StopToken};
 use crate::geometry::epipolar_votes::{Tracks, Votes};
 use crate::geometry::fundamental::MOST_SAMPLES;
-use crate::geometry::measurement::Sighting;
+use crate::geometry::observation::Observation;
 use crate::solver::block;
 use crate::solver::learned::Opinion;
 
@@ -40,7 +40,7 @@ pub fn windows(input: &Input) -> Vec<Window> {
     let (normalization, _) = block::normalization(input);
     let seen = |k: usize, first: usize| {
         let view = input.view_of(k);
-        Sighting { view: view - first, xy: normalization.normalize(view, input.point_px(k)) }
+        Observation::new(view - first, input.track_of(k), normalization.normalize(view, input.point_px(k)))
     };
     let window = |first: usize| {
         let inside = |track: usize| -> Vec<usize> {

@@ -6,7 +6,7 @@ use nalgebra::Vector2;
 
 use super::super::intrinsics_model::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
-use super::{Free, Pace, Sequence, Sighting};
+use super::{Free, Observation, Pace, Sequence};
 
 /// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free intrinsics.
 #[derive(Debug)]
@@ -110,27 +110,27 @@ impl Layout {
     /// is not positive are left out.
     ///
     /// Returns `None` when it was stopped.
-    pub fn new(sequence: &Sequence, sightings: &[Sighting], free: &Free, pace: &mut Pace) -> Option<Self> {
+    pub fn new(sequence: &Sequence, observations: &[Observation], free: &Free, pace: &mut Pace) -> Option<Self> {
         let points = sequence.points.len();
-        let usable = || sightings.iter().filter(|sighting| sequence.holds(sighting));
+        let usable = || observations.iter().filter(|observation| sequence.holds(observation));
         let mut seen_starts = vec![0; points + 1];
         let mut sees = vec![false; sequence.poses.len()];
-        for sighting in usable() {
+        for observation in usable() {
             if !pace.go_on(1) {
                 return None;
             }
-            seen_starts[sighting.point + 1] += 1;
-            sees[sighting.view] = true;
+            seen_starts[observation.point + 1] += 1;
+            sees[observation.view] = true;
         }
         accumulate(&mut seen_starts);
         let nothing = Seen { view: 0, xy: Vector2::zeros(), weight: 0.0, view_coupling: None, group_coupling: None };
         let mut seen = vec![nothing; seen_starts[points]];
         let mut next = seen_starts.clone();
-        for sighting in usable() {
+        for observation in usable() {
             if !pace.go_on(1) {
                 return None;
             }
-            let Sighting { view, point, xy, weight } = *sighting;
+            let Observation { view, point, xy, weight } = *observation;
             seen[next[point]] = Seen { view, xy, weight, ..nothing };
             next[point] += 1;
         }

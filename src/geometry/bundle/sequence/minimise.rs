@@ -12,7 +12,7 @@ use super::pattern::Pattern;
 use super::reduced::{Reduced, substitute};
 use super::settle::settle_points;
 use super::solver::Solver;
-use super::{Free, Pace, Run, Sequence, Sighting};
+use super::{Free, Observation, Pace, Run, Sequence};
 use crate::geometry::levenberg_marquardt::{self, Attempt, Problem};
 
 /// Least damping, as a share of the diagonal. Lower than for a block: the weakest directions of a long chain of views
@@ -40,7 +40,7 @@ const SETTLE_WITHIN: f64 = 2.0;
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
 pub fn adjust(
     sequence: &mut Sequence,
-    sightings: &[Sighting],
+    observations: &[Observation],
     free: &Free,
     priors: &[IntrinsicsPrior],
     options: &Options,
@@ -49,7 +49,7 @@ pub fn adjust(
     let Run { threads, stop, told } = run;
     let mut pace = Pace::new(stop);
     let unknown = Report { initial_cost: f64::INFINITY, cost: f64::INFINITY, iterations: 0 };
-    let Some(layout) = Layout::new(sequence, sightings, free, &mut pace) else { return unknown };
+    let Some(layout) = Layout::new(sequence, observations, free, &mut pace) else { return unknown };
     let crew = Crew::new(&layout, threads, stop);
     let descent = match layout.is_empty() {
         true => None,

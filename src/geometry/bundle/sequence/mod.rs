@@ -39,20 +39,6 @@ pub struct Sequence {
     pub points: Vec<Vector3<f64>>,
 }
 
-/// One image point.
-///
-/// Sightings with an index out of range, a coordinate that is not finite or a weight that is not finite and positive
-/// are ignored.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sighting {
-    pub view: usize,
-    pub point: usize,
-    /// Normalised image coordinates.
-    pub xy: Vector2<f64>,
-    /// Factor on the squared residual, before the loss: `(sigma / own sigma)^2`, 1 for an observation as noisy as most.
-    pub weight: f64,
-}
-
 /// What may move. What a mask is too short for is held.
 #[derive(Debug, Clone, Copy)]
 pub struct Free<'a> {
@@ -81,13 +67,6 @@ impl From<&Reconstruction> for Sequence {
             poses: block.poses.clone(),
             points: block.points.clone(),
         }
-    }
-}
-
-impl From<&Observation> for Sighting {
-    /// As noisy as most.
-    fn from(seen: &Observation) -> Self {
-        Self { view: seen.camera, point: seen.point, xy: seen.xy, weight: 1.0 }
     }
 }
 
@@ -120,18 +99,14 @@ impl Sequence {
     ///
     /// # Panics
     /// When an index is out of range.
-    pub fn residual(&self, seen: &Sighting) -> Vector2<f64> {
+    pub fn residual(&self, seen: &Observation) -> Vector2<f64> {
         self.intrinsics_of(seen.view).project(&self.poses[seen.view].apply(&self.points[seen.point])) - seen.xy
     }
 
-    /// Whether a sighting can be used.
-    fn holds(&self, seen: &Sighting) -> bool {
-        seen.view < self.poses.len()
-            && self.group_of.get(seen.view).is_some_and(|group| *group < self.intrinsics.len())
-            && seen.point < self.points.len()
-            && seen.xy.iter().all(|x| x.is_finite())
-            && seen.weight > 0.0
-            && seen.weight.is_finite()
+    /// Whether an observation can be used.
+    fn holds(&self, seen: &Observation) -> bool {
+        let has_intrinsics = |group: &usize| *group < self.intrinsics.len();
+        seen.is_usable(self.poses.len(), self.points.len()) && self.group_of.get(seen.view).is_some_and(has_intrinsics)
     }
 }
 

@@ -8,6 +8,7 @@ mod view_focals;
 use super::*;
 use crate::geometry::bundle::testing::{self, Motion, NOISE, TestScene};
 use crate::geometry::daq::{self, Daq};
+use crate::geometry::observation::Observation;
 
 const SIDE_PX: f64 = 1000.0;
 

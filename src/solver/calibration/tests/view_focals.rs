@@ -24,8 +24,8 @@ fn zooming_behind(radial: f64, seed: u64, tracks: usize, noise: f64, range: f64)
         })
         .collect();
     for seen in &mut scene.observations {
-        let intrinsics = Intrinsics { radial: [radial, 0.0, 0.0], ..Intrinsics::from_focal(focals[seen.camera]) };
-        let image = intrinsics.project(&scene.poses[seen.camera].apply(&scene.points[seen.point]));
+        let intrinsics = Intrinsics { radial: [radial, 0.0, 0.0], ..Intrinsics::from_focal(focals[seen.view]) };
+        let image = intrinsics.project(&scene.poses[seen.view].apply(&scene.points[seen.point]));
         let mut noisy = || noise * testing::normal(&mut rng);
         seen.xy = image + nalgebra::Vector2::new(noisy(), noisy());
     }
@@ -163,7 +163,7 @@ fn a_view_that_shows_too_little_has_no_focal_length_and_takes_none_from_the_othe
     for seed in 0..3 {
         let (mut scene, focals) = zooming(seed, 60, 0.001, 0.3);
         // Three points determine less than the seven unknowns of a view.
-        scene.observations.retain(|seen| seen.camera != 4 || seen.point < 3);
+        scene.observations.retain(|seen| seen.view != 4 || seen.point < 3);
         let outcome = near_truth(&scene, &focals, 0.001);
         let found = outcome.focals.as_deref().expect("a focal length a view");
         println!("seed {seed}: {:?} {:?} {:?}", outcome.grade, outcome.sigma_log_focal, outcome.warnings);
@@ -176,7 +176,7 @@ fn a_view_that_shows_too_little_has_no_focal_length_and_takes_none_from_the_othe
             assert!(view == 4 || error < 0.05, "seed {seed}, view {view}: {error}");
         }
         // Of all but four there is nothing to say.
-        scene.observations.retain(|seen| seen.camera < 4 || seen.point < 3);
+        scene.observations.retain(|seen| seen.view < 4 || seen.point < 3);
         let outcome = near_truth(&scene, &focals, 0.001);
         assert_eq!(outcome.grade, Grade::ProjectiveOnly, "seed {seed}: {:?}", outcome.warnings);
     }
@@ -208,7 +208,7 @@ fn with_choice<T>(
     let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
     let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, NOISE) };
     let (prior, stop) = (super::super::models::knowledge(NOISE, None, SIDE_PX), StopToken::default());
-    let choice = super::super::models::Choice { problem: &problem, prior: &prior, scale_px: SIDE_PX, stop: &stop };
+    let choice = super::super::models::Choice { problem: &problem, scale_px: SIDE_PX, stop: &stop };
     let start = metric_of(scene, &vec![scene.intrinsics.focal; scene.poses.len()]);
     let start = search::Minimum { reconstruction: start, cost: f64::INFINITY, cheirality: 0.0 };
     let best = start.adjusted(&scene.observations, IntrinsicsModel::FOCAL_PER_VIEW, &prior, &stop);

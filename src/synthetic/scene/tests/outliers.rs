@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3x4, Vector2, Vector3};
 
 use super::*;
-use crate::geometry::measurement::Sighting;
+use crate::geometry::observation::Observation;
 use crate::geometry::triangulation;
 
 const KINDS: [OutlierKind; 4] = [OutlierKind::Permuted, OutlierKind::Uniform, OutlierKind::Slid, OutlierKind::Repeated];
@@ -36,15 +36,15 @@ fn cameras(scene: &Scene) -> Vec<Matrix3x4<f64>> {
 /// Root mean square reprojection error in pixels of the point that explains a track best.
 fn triangulation_error_px(scene: &Scene, track: usize) -> f64 {
     let cameras = cameras(scene);
-    let sighting = |view| {
+    let observation = |view| {
         let [x, y, _] = observed(scene, view, track);
         let ray = calibration(scene, view).try_inverse().expect("regular") * Vector3::new(x, y, 1.0);
-        Sighting { view, xy: Vector2::new(ray.x, ray.y) }
+        Observation::new(view, 0, Vector2::new(ray.x, ray.y))
     };
-    let sightings: Vec<Sighting> = (0..cameras.len()).map(sighting).collect();
-    let start = triangulation::linear(&cameras, &sightings);
-    let (_, cost) = triangulation::refine(&cameras, &sightings, start, 50);
-    (cost / sightings.len() as f64).sqrt() * scene.truth.focal_px
+    let observations: Vec<Observation> = (0..cameras.len()).map(observation).collect();
+    let start = triangulation::linear(&cameras, &observations);
+    let (_, cost) = triangulation::refine(&cameras, &observations, start, 50);
+    (cost / observations.len() as f64).sqrt() * scene.truth.focal_px
 }
 
 #[test]

@@ -11,7 +11,7 @@ use crate::geometry::bundle::testing::{self, NOISE};
 fn one_group_ends_where_a_block_does() {
     for (seed, views, tracks) in [(1, 8, 40), (2, 10, 60), (3, 48, 30)] {
         let scene = testing::scene(seed, views, tracks, NOISE);
-        let (truth, sightings) = sequence_of(&scene);
+        let (truth, observations) = sequence_of(&scene);
         let start = perturbed(&truth, 0.01, seed);
         let model = IntrinsicsModel::FOCAL.with(Extension::RadialK1);
         let prior = IntrinsicsPrior::NONE.knowing(Parameter::RadialK1, 0.0, 0.05, NOISE);
@@ -20,8 +20,14 @@ fn one_group_ends_where_a_block_does() {
             let stop = StopToken::default();
             let dense = metric::adjust(&mut block, &scene.observations, model, &prior, &options, &stop);
             let mut sequence = start.clone();
-            let sparse =
-                adjust(&mut sequence, &sightings, &Free::all(&[model]), &[prior], &options, quiet(&stop, &mut || ()));
+            let sparse = adjust(
+                &mut sequence,
+                &observations,
+                &Free::all(&[model]),
+                &[prior],
+                &options,
+                quiet(&stop, &mut || ()),
+            );
             println!("seed {seed}, {views} views: {dense:?}, {sparse:?}");
             assert!((sparse.initial_cost / dense.initial_cost - 1.0).abs() < 1e-12, "seed {seed}");
             assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
@@ -36,15 +42,15 @@ fn one_group_ends_where_a_block_does() {
 #[test]
 fn two_groups_are_recovered() {
     for seed in 0..3 {
-        let (mut truth, mut sightings) = chain(seed, 16, 12, 6, 0.0);
+        let (mut truth, mut observations) = chain(seed, 16, 12, 6, 0.0);
         truth.group_of = (0..16).map(|view| view % 2).collect();
         truth.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.8)];
         truth.intrinsics[1].radial[0] = -0.08;
-        observe(&truth, &mut sightings, 0.0, seed);
+        observe(&truth, &mut observations, 0.0, seed);
         let mut start = perturbed(&truth, 0.01, seed);
         start.intrinsics[1].radial[0] = 0.0;
         let models = [IntrinsicsModel::FOCAL, IntrinsicsModel::FOCAL.with(Extension::RadialK1)];
-        let report = adjusted(&mut start, &sightings, &models, &thorough());
+        let report = adjusted(&mut start, &observations, &models, &thorough());
         println!("seed {seed}: {report:?} {:?}", start.intrinsics);
         for (found, expected) in start.intrinsics.iter().zip(&truth.intrinsics) {
             for parameter in Parameter::ALL {
@@ -62,10 +68,10 @@ fn focal_lengths_a_view_behind_one_lens_end_where_those_of_a_block_do() {
         for model in [IntrinsicsModel::FOCAL_PER_VIEW, IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1)] {
             let mut block = reconstruction_of(&scene).with_own_focals();
             let mut start = Sequence::from(&block);
-            let (_, sightings) = sequence_of(&scene);
+            let (_, observations) = sequence_of(&scene);
             let (prior, stop) = (IntrinsicsPrior::NONE, StopToken::default());
             let dense = metric::adjust(&mut block, &scene.observations, model, &prior, &thorough(), &stop);
-            let sparse = adjusted(&mut start, &sightings, &[model], &thorough());
+            let sparse = adjusted(&mut start, &observations, &[model], &thorough());
             println!("seed {seed}, {}: {dense:?} {sparse:?}", model.name());
             assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
             for (found, expected) in start.focals.iter().zip(&block.focals) {
@@ -80,10 +86,10 @@ fn focal_lengths_a_view_behind_one_lens_end_where_those_of_a_block_do() {
 #[test]
 fn a_chain_converges_to_the_noise_floor() {
     for seed in 0..3 {
-        let (truth, sightings) = chain(seed, 60, 8, 5, 0.001);
+        let (truth, observations) = chain(seed, 60, 8, 5, 0.001);
         let mut start = perturbed(&truth, 0.02, seed);
-        let report = adjusted(&mut start, &sightings, &[IntrinsicsModel::FOCAL], &thorough());
-        let freedom = 2 * sightings.len() - (6 * 60 + 3 * truth.points.len() - 7 + 1);
+        let report = adjusted(&mut start, &observations, &[IntrinsicsModel::FOCAL], &thorough());
+        let freedom = 2 * observations.len() - (6 * 60 + 3 * truth.points.len() - 7 + 1);
         let ratio = report.cost / (freedom as f64 * 0.001 * 0.001);
         let focal_error = start.intrinsics[0].focal / truth.intrinsics[0].focal - 1.0;
         println!("seed {seed}: {report:?}, chi2 per degree of freedom {ratio:.3}, focal off by {focal_error:.5}");
@@ -97,11 +103,11 @@ fn a_chain_converges_to_the_noise_floor() {
 #[test]
 fn drift_is_undone_in_few_steps() {
     for seed in 1..3 {
-        let (truth, sightings) = chain(seed, 100, 20, 5, 0.001);
+        let (truth, observations) = chain(seed, 100, 20, 5, 0.001);
         let models = [IntrinsicsModel::FOCAL];
-        let best = adjusted(&mut truth.clone(), &sightings, &models, &thorough());
+        let best = adjusted(&mut truth.clone(), &observations, &models, &thorough());
         let mut start = bent(&truth, 0.5);
-        let report = adjusted(&mut start, &sightings, &models, &Options::default());
+        let report = adjusted(&mut start, &observations, &models, &Options::default());
         println!("seed {seed}: least {best:?}, from a bend {report:?}");
         assert!(report.initial_cost > 50.0 * best.cost, "seed {seed}: {report:?}");
         assert!(report.cost / best.cost - 1.0 < 1e-6, "seed {seed}: {report:?} {best:?}");
@@ -110,7 +116,7 @@ fn drift_is_undone_in_few_steps() {
 
 #[test]
 fn disconnected_chains_converge_together() {
-    let (mut truth, mut sightings) = chain(5, 30, 8, 5, 0.0);
+    let (mut truth, mut observations) = chain(5, 30, 8, 5, 0.0);
     let mut start = perturbed(&truth, 0.01, 5);
     // A second copy far away, which shares nothing but the intrinsics.
     let (views, points) = (truth.poses.len(), truth.points.len());
@@ -124,26 +130,26 @@ fn disconnected_chains_converge_together() {
         sequence.points.extend_from_within(..);
         sequence.points[points..].iter_mut().for_each(|point| *point += shift);
     }
-    let second = |seen: &Sighting| Sighting { view: seen.view + views, point: seen.point + points, ..*seen };
-    sightings.extend(sightings.clone().iter().map(second));
-    observe(&truth, &mut sightings, 0.0, 5);
-    let report = adjusted(&mut start, &sightings, &[IntrinsicsModel::FOCAL], &thorough());
+    let second = |seen: &Observation| Observation { view: seen.view + views, point: seen.point + points, ..*seen };
+    observations.extend(observations.clone().iter().map(second));
+    observe(&truth, &mut observations, 0.0, 5);
+    let report = adjusted(&mut start, &observations, &[IntrinsicsModel::FOCAL], &thorough());
     println!("{report:?}");
-    assert!(report.cost < 1e-18 * sightings.len() as f64, "{report:?}");
+    assert!(report.cost < 1e-18 * observations.len() as f64, "{report:?}");
     assert!((start.intrinsics[0].focal / truth.intrinsics[0].focal - 1.0).abs() < 1e-6);
 }
 
 #[test]
 fn what_is_held_stays_to_the_bit() {
     for views in [16, 60] {
-        let (truth, sightings) = chain(6, views, 6, 5, 0.001);
+        let (truth, observations) = chain(6, views, 6, 5, 0.001);
         let start = perturbed(&truth, 0.005, 6);
         let free_views: Vec<bool> = (0..views).map(|view| view % 3 == 1).collect();
         let free_points: Vec<bool> = (0..start.points.len()).map(|point| point % 4 != 0).collect();
         let free = Free { models: &[IntrinsicsModel::FIXED], views: Some(&free_views), points: Some(&free_points) };
         let mut sequence = start.clone();
         let report =
-            adjust(&mut sequence, &sightings, &free, &[], &thorough(), quiet(&StopToken::default(), &mut || ()));
+            adjust(&mut sequence, &observations, &free, &[], &thorough(), quiet(&StopToken::default(), &mut || ()));
         assert!(report.cost < 0.9 * report.initial_cost, "{report:?}");
         assert_eq!(sequence.intrinsics, start.intrinsics);
         for (view, free) in free_views.iter().enumerate() {
@@ -155,7 +161,7 @@ fn what_is_held_stays_to_the_bit() {
         // Points alone, which no system of cameras connects.
         let free = Free { models: &[], views: Some(&[]), points: None };
         let report =
-            adjust(&mut sequence, &sightings, &free, &[], &thorough(), quiet(&StopToken::default(), &mut || ()));
+            adjust(&mut sequence, &observations, &free, &[], &thorough(), quiet(&StopToken::default(), &mut || ()));
         assert!(report.cost < report.initial_cost && report.iterations > 0, "{report:?}");
     }
 }
@@ -163,7 +169,7 @@ fn what_is_held_stays_to_the_bit() {
 /// A local adjustment agrees with one in which all that is held is taken as it is: what moves is at a minimum.
 #[test]
 fn free_views_among_held_ones_find_the_truth() {
-    let (truth, sightings) = chain(7, 20, 8, 5, 0.0);
+    let (truth, observations) = chain(7, 20, 8, 5, 0.0);
     let free_views: Vec<bool> = (0..20).map(|view| (8..12).contains(&view)).collect();
     let free = Free { models: &[IntrinsicsModel::FIXED], views: Some(&free_views), points: None };
     let mut start = perturbed(&truth, 0.01, 7);
@@ -171,7 +177,7 @@ fn free_views_among_held_ones_find_the_truth() {
     for view in (0..20).filter(|view| !free_views[*view]) {
         start.poses[view] = truth.poses[view];
     }
-    adjust(&mut start, &sightings, &free, &[], &thorough(), quiet(&StopToken::default(), &mut || ()));
+    adjust(&mut start, &observations, &free, &[], &thorough(), quiet(&StopToken::default(), &mut || ()));
     for (found, expected) in start.poses.iter().zip(&truth.poses) {
         let error = (found.rotation - expected.rotation).norm() + (found.translation - expected.translation).norm();
         assert!(error < 1e-8, "{error}");
@@ -180,22 +186,22 @@ fn free_views_among_held_ones_find_the_truth() {
 
 #[test]
 fn a_weight_counts_like_so_many_observations() {
-    let (truth, sightings) = chain(8, 10, 6, 5, 0.002);
+    let (truth, observations) = chain(8, 10, 6, 5, 0.002);
     let start = perturbed(&truth, 0.005, 8);
-    let twice = |seen: &Sighting| seen.point.is_multiple_of(3);
-    let weighted: Vec<Sighting> =
-        sightings.iter().map(|seen| Sighting { weight: if twice(seen) { 2.0 } else { 1.0 }, ..*seen }).collect();
-    let repeated: Vec<Sighting> =
-        sightings.iter().chain(sightings.iter().filter(|seen| twice(seen))).copied().collect();
-    let run = |sightings: &[Sighting]| {
+    let twice = |seen: &Observation| seen.point.is_multiple_of(3);
+    let weighted: Vec<Observation> =
+        observations.iter().map(|seen| Observation { weight: if twice(seen) { 2.0 } else { 1.0 }, ..*seen }).collect();
+    let repeated: Vec<Observation> =
+        observations.iter().chain(observations.iter().filter(|seen| twice(seen))).copied().collect();
+    let run = |observations: &[Observation]| {
         let mut sequence = start.clone();
-        let report = adjusted(&mut sequence, sightings, &[IntrinsicsModel::FOCAL], &thorough());
+        let report = adjusted(&mut sequence, observations, &[IntrinsicsModel::FOCAL], &thorough());
         (report.cost, sequence.intrinsics[0].focal)
     };
     let ((cost, focal), (same_cost, same_focal)) = (run(&weighted), run(&repeated));
     assert!((cost / same_cost - 1.0).abs() < 1e-10, "{cost} {same_cost}");
     assert!((focal / same_focal - 1.0).abs() < 1e-6, "{focal} {same_focal}");
-    let (unweighted, _) = run(&sightings);
+    let (unweighted, _) = run(&observations);
     assert!(cost > 1.1 * unweighted, "{cost} {unweighted}");
 }
 
@@ -203,12 +209,12 @@ fn a_weight_counts_like_so_many_observations() {
 /// up.
 #[test]
 fn threads_change_nothing_to_the_last_bit() {
-    let (mut truth, mut sightings) = chain(5, 24, 180, 5, 0.002);
+    let (mut truth, mut observations) = chain(5, 24, 180, 5, 0.002);
     truth.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.9), Intrinsics::from_focal(1.3)];
     truth.group_of = (0..24).map(|view| view % 3).collect();
-    observe(&truth, &mut sightings, 0.002, 5);
-    sightings.push(sightings[7]);
-    assert!(sightings.len() > BATCH, "{} make one batch", sightings.len());
+    observe(&truth, &mut observations, 0.002, 5);
+    observations.push(observations[7]);
+    assert!(observations.len() > BATCH, "{} make one batch", observations.len());
     let models = [IntrinsicsModel::FULL, IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL];
     let (views, points): (Vec<bool>, Vec<bool>) =
         ((0..24).map(|view| view != 9).collect(), (0..truth.points.len()).map(|point| point % 50 != 3).collect());
@@ -218,7 +224,7 @@ fn threads_change_nothing_to_the_last_bit() {
         let (mut start, mut told) = (perturbed(&truth, 0.01, 5), 0);
         let stop = StopToken::default();
         let run = Run { threads: Threads::new(threads), stop: &stop, told: &mut || told += 1 };
-        let report = adjust(&mut start, &sightings, &free, &[], &options, run);
+        let report = adjust(&mut start, &observations, &free, &[], &options, run);
         (start, report, told)
     };
     let alone = on(1);

@@ -14,32 +14,35 @@ use crate::geometry::bundle::Loss;
 use crate::geometry::bundle::metric::{Extension, Parameter};
 
 /// Three groups, one of them held, a held view and a held point, unequal weights.
-fn mixed() -> (Sequence, Vec<Sighting>, Vec<IntrinsicsModel>, Vec<bool>, Vec<bool>) {
-    let (mut sequence, mut sightings) = chain(1, 7, 3, 4, 0.003);
+fn mixed() -> (Sequence, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>, Vec<bool>) {
+    let (mut sequence, mut observations) = chain(1, 7, 3, 4, 0.003);
     sequence.group_of = vec![0, 0, 1, 1, 2, 2, 0];
     sequence.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.9), Intrinsics::from_focal(1.3)];
     sequence.intrinsics[0].radial = [-0.1, 0.05, 0.02];
     sequence.intrinsics[0].tangential = [0.01, -0.02];
     sequence.intrinsics[0].aspect = 1.1;
-    observe(&sequence, &mut sightings, 0.003, 1);
-    sightings.iter_mut().enumerate().for_each(|(k, seen)| seen.weight = 0.5 + 0.1 * (k % 7) as f64);
+    observe(&sequence, &mut observations, 0.003, 1);
+    observations.iter_mut().enumerate().for_each(|(k, seen)| seen.weight = 0.5 + 0.1 * (k % 7) as f64);
     // The same point a second time in one view.
-    sightings.push(sightings[5]);
+    observations.push(observations[5]);
     let models =
         vec![IntrinsicsModel::FULL, IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL.with(Extension::PrincipalPoint)];
     let views = (0..7).map(|view| view != 3).collect();
     let points = (0..sequence.points.len()).map(|point| point != 4).collect();
-    (sequence, sightings, models, views, points)
+    (sequence, observations, models, views, points)
 }
 
 /// Weighted residuals and their derivatives by central differences through the retraction: unknowns of the cameras,
 /// then of the free points.
-fn differentiate(sequence: &Sequence, sightings: &[Sighting], layout: &Layout) -> (DVector<f64>, DMatrix<f64>) {
+fn differentiate(sequence: &Sequence, observations: &[Observation], layout: &Layout) -> (DVector<f64>, DMatrix<f64>) {
     const WIDTH: f64 = 1e-6;
     let cameras = layout.unknowns.offsets[layout.unknowns.block_count()];
     let residuals = |sequence: &Sequence| {
-        let weighted = |seen: &Sighting| sequence.residual(seen) * seen.weight.sqrt();
-        DVector::from_iterator(2 * sightings.len(), sightings.iter().flat_map(|seen| <[f64; 2]>::from(weighted(seen))))
+        let weighted = |seen: &Observation| sequence.residual(seen) * seen.weight.sqrt();
+        DVector::from_iterator(
+            2 * observations.len(),
+            observations.iter().flat_map(|seen| <[f64; 2]>::from(weighted(seen))),
+        )
     };
     let moved = |unknown: usize, by: f64| {
         let mut moved = sequence.clone();
@@ -60,10 +63,10 @@ fn differentiate(sequence: &Sequence, sightings: &[Sighting], layout: &Layout) -
 
 #[test]
 fn normal_equations_agree_with_finite_differences() {
-    let (sequence, sightings, models, views, points) = mixed();
+    let (sequence, observations, models, views, points) = mixed();
     compare(
         &sequence,
-        &sightings,
+        &observations,
         &models,
         &views,
         &points,
@@ -71,16 +74,16 @@ fn normal_equations_agree_with_finite_differences() {
         "six free views, nine and three intrinsics",
     );
     // Two views with focal lengths of their own behind one lens.
-    let (mut sequence, mut sightings, mut models, views, points) = mixed();
+    let (mut sequence, mut observations, mut models, views, points) = mixed();
     sequence.focals = vec![1.0, 1.1, 0.9, 1.0, 1.2, 1.3, 1.1];
     models[2] = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1);
-    observe(&sequence, &mut sightings, 0.003, 1);
-    compare(&sequence, &sightings, &models, &views, &points, 6 * 6 + 2 + 9 + 1, "two more unknowns of views");
+    observe(&sequence, &mut observations, 0.003, 1);
+    compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 2 + 9 + 1, "two more unknowns of views");
 }
 
 fn compare(
     sequence: &Sequence,
-    sightings: &[Sighting],
+    observations: &[Observation],
     models: &[IntrinsicsModel],
     views: &[bool],
     points: &[bool],
@@ -90,14 +93,14 @@ fn compare(
     let free = Free { models, views: Some(views), points: Some(points) };
     let going = StopToken::default();
     let mut pace = Pace::new(&going);
-    let layout = Layout::new(sequence, sightings, &free, &mut pace).expect("goes on");
+    let layout = Layout::new(sequence, observations, &free, &mut pace).expect("goes on");
     let pattern = pattern(sequence, &layout, &mut pace).expect("goes on");
     let cameras = pattern.dimension();
     assert_eq!(cameras, unknowns, "{what}");
     let mut normal = Normal::new(&layout, &pattern, sequence);
     let stop = StopToken::default();
     assert!(normal.fill(sequence, &layout, &[], Loss::Squared, &Crew::new(&layout, Threads::ONE, &stop)));
-    let (residuals, jacobian) = differentiate(sequence, sightings, &layout);
+    let (residuals, jacobian) = differentiate(sequence, observations, &layout);
     let information = jacobian.transpose() * &jacobian;
     let gradient = jacobian.transpose() * residuals;
     let close = |found: f64, expected: f64, what: &str| {
@@ -138,11 +141,11 @@ fn compare(
 
 #[test]
 fn what_is_known_beforehand_takes_part() {
-    let (sequence, sightings, models, ..) = mixed();
+    let (sequence, observations, models, ..) = mixed();
     let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, 0.2, 0.1, 0.01);
     let going = StopToken::default();
     let mut pace = Pace::new(&going);
-    let layout = Layout::new(&sequence, &sightings, &Free::all(&models), &mut pace).expect("goes on");
+    let layout = Layout::new(&sequence, &observations, &Free::all(&models), &mut pace).expect("goes on");
     let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let with = |priors: &[IntrinsicsPrior]| {
         let mut normal = Normal::new(&layout, &pattern, &sequence);
@@ -166,23 +169,23 @@ fn what_is_known_beforehand_takes_part() {
 /// A stop is seen within the work that may pass between two questions, in the middle of a linearisation.
 #[test]
 fn a_stop_is_seen_within_one_linearisation() {
-    let (sequence, sightings) = chain(2, 10, 1 + BATCH / 20, 5, 0.001);
+    let (sequence, observations) = chain(2, 10, 1 + BATCH / 20, 5, 0.001);
     let free = Free::all(&[IntrinsicsModel::FOCAL]);
     let going = StopToken::default();
     let mut pace = Pace::new(&going);
-    let layout = Layout::new(&sequence, &sightings, &free, &mut pace).expect("goes on");
+    let layout = Layout::new(&sequence, &observations, &free, &mut pace).expect("goes on");
     let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);
-    assert!(sightings.len() > BATCH);
+    assert!(observations.len() > BATCH);
     for threads in [1, 3] {
         let crew = Crew::new(&layout, Threads::new(threads), &stop);
         assert!(!normal.fill(&sequence, &layout, &[], Loss::Squared, &crew), "{threads} threads");
         assert_eq!(crew.of_points(&layout, Some), None, "{threads} threads");
     }
     let mut start = sequence.clone();
-    let report = adjust(&mut start, &sightings, &free, &[], &Options::default(), quiet(&stop, &mut || ()));
+    let report = adjust(&mut start, &observations, &free, &[], &Options::default(), quiet(&stop, &mut || ()));
     assert_eq!((report.iterations, report.cost), (0, report.initial_cost));
     assert_eq!(start, sequence);
 }

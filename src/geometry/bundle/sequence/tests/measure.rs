@@ -31,7 +31,7 @@ fn time_against_observations() {
     let mut logs = Vec::new();
     for (views, tracks) in [(20, 2_000), (200, 20_000), (1000, 200_000)] {
         for each_its_own in [false, true] {
-            let (mut truth, sightings) = chain(1, views, tracks / (views - 4), 5, 0.001);
+            let (mut truth, observations) = chain(1, views, tracks / (views - 4), 5, 0.001);
             if each_its_own {
                 truth.intrinsics = vec![truth.intrinsics[0]; views];
                 truth.group_of = (0..views).collect();
@@ -41,14 +41,14 @@ fn time_against_observations() {
             let stop = StopToken::default();
             let mut pace = Pace::new(&stop);
             let (layout_seconds, layout) =
-                timed(|| Layout::new(&truth, &sightings, &Free::all(&models), &mut pace).expect("goes on"));
+                timed(|| Layout::new(&truth, &observations, &Free::all(&models), &mut pace).expect("goes on"));
             let (analysis_seconds, _) = timed(|| {
                 let pattern = pattern(&truth, &layout, &mut pace).expect("goes on");
                 Solver::new(&pattern).expect("memory")
             });
             drop(layout);
-            let (seconds, report) = timed(|| adjusted(&mut start, &sightings, &models, &options()));
-            let (seconds, n) = (seconds / report.iterations as f64, sightings.len());
+            let (seconds, report) = timed(|| adjusted(&mut start, &observations, &models, &options()));
+            let (seconds, n) = (seconds / report.iterations as f64, observations.len());
             let (groups, each) = (models.len(), 1e6 * seconds / n as f64);
             println!("{n} observations, {views} views, {groups} groups: layout {layout_seconds:.3} s, analysis");
             println!("    {analysis_seconds:.3} s, iteration {seconds:.4} s, {each:.2} us an observation; {report:?}");
@@ -67,14 +67,14 @@ fn time_against_a_block() {
     let (mut block_seconds, mut sequence_seconds) = (0.0, 0.0);
     for seed in 0..REPEATS {
         let scene = testing::scene(seed, 10, 200, NOISE);
-        let (truth, sightings) = sequence_of(&scene);
+        let (truth, observations) = sequence_of(&scene);
         let mut start = perturbed(&truth, 0.01, seed);
         let mut block = Reconstruction::new(start.intrinsics[0], start.poses.clone(), start.points.clone());
         let (model, prior, stop) = (IntrinsicsModel::FOCAL, IntrinsicsPrior::NONE, StopToken::default());
         let (seconds, dense) =
             timed(|| metric::adjust(&mut block, &scene.observations, model, &prior, &options(), &stop));
         block_seconds += seconds / dense.iterations as f64;
-        let (seconds, sparse) = timed(|| adjusted(&mut start, &sightings, &[model], &options()));
+        let (seconds, sparse) = timed(|| adjusted(&mut start, &observations, &[model], &options()));
         sequence_seconds += seconds / sparse.iterations as f64;
     }
     let [block, sequence] = [block_seconds, sequence_seconds].map(|seconds| 1e3 * seconds / REPEATS as f64);

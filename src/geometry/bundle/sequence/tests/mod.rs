@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Pose, Reconstruction};
 use super::super::testing::{TestScene, normal, perturb};
 use super::super::{Options, Report};
-use super::{Free, Run, Sequence, Sighting, adjust};
+use super::{Free, Observation, Run, Sequence, adjust};
 use crate::domain::StopToken;
 use crate::parallel::Threads;
 
@@ -24,7 +24,7 @@ fn quiet<'a>(stop: &'a StopToken, told: &'a mut dyn FnMut()) -> Run<'a> {
 }
 
 /// Views on a line that sways and turns, each track seen by `length` neighbours, `tracks_a_view` beginning in each.
-fn chain(seed: u64, views: usize, tracks_a_view: usize, length: usize, noise: f64) -> (Sequence, Vec<Sighting>) {
+fn chain(seed: u64, views: usize, tracks_a_view: usize, length: usize, noise: f64) -> (Sequence, Vec<Observation>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut uniform = |range: f64| rng.random_range(-range..range);
     let poses: Vec<Pose> = (0..views)
@@ -36,31 +36,31 @@ fn chain(seed: u64, views: usize, tracks_a_view: usize, length: usize, noise: f6
         .collect();
     let mut sequence =
         Sequence::from(&Reconstruction { poses, ..Reconstruction::new(Intrinsics::from_focal(1.1), vec![], vec![]) });
-    let mut sightings = Vec::new();
+    let mut observations = Vec::new();
     for first in 0..=views - length {
         for _ in 0..tracks_a_view {
             let middle = BASELINE * (first as f64 + 0.5 * (length as f64 - 1.0));
             let point = sequence.points.len();
             sequence.points.push(Vector3::new(middle + uniform(1.0), uniform(1.0), 4.0 + uniform(1.5)));
-            let see = |view| Sighting { view, point, xy: Vector2::zeros(), weight: 1.0 };
-            sightings.extend((first..first + length).map(see));
+            let see = |view| Observation { view, point, xy: Vector2::zeros(), weight: 1.0 };
+            observations.extend((first..first + length).map(see));
         }
     }
-    observe(&sequence, &mut sightings, noise, seed);
-    (sequence, sightings)
+    observe(&sequence, &mut observations, noise, seed);
+    (sequence, observations)
 }
 
 /// Draws the image points anew.
-fn observe(sequence: &Sequence, sightings: &mut [Sighting], noise: f64, seed: u64) {
+fn observe(sequence: &Sequence, observations: &mut [Observation], noise: f64, seed: u64) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
-    for seen in sightings {
+    for seen in observations {
         seen.xy = Vector2::zeros();
         seen.xy = sequence.residual(seen) + noise * Vector2::new(normal(&mut rng), normal(&mut rng));
     }
 }
 
-fn sequence_of(scene: &TestScene) -> (Sequence, Vec<Sighting>) {
-    (Sequence::from(&reconstruction_of(scene)), scene.observations.iter().map(Sighting::from).collect())
+fn sequence_of(scene: &TestScene) -> (Sequence, Vec<Observation>) {
+    (Sequence::from(&reconstruction_of(scene)), scene.observations.clone())
 }
 
 fn reconstruction_of(scene: &TestScene) -> Reconstruction {
@@ -111,7 +111,12 @@ fn thorough() -> Options {
     Options { max_iterations: 100, relative_tolerance: 1e-14, ..Options::default() }
 }
 
-fn adjusted(sequence: &mut Sequence, sightings: &[Sighting], models: &[IntrinsicsModel], options: &Options) -> Report {
+fn adjusted(
+    sequence: &mut Sequence,
+    observations: &[Observation],
+    models: &[IntrinsicsModel],
+    options: &Options,
+) -> Report {
     let priors = vec![IntrinsicsPrior::NONE; models.len()];
-    adjust(sequence, sightings, &Free::all(models), &priors, options, quiet(&StopToken::default(), &mut || ()))
+    adjust(sequence, observations, &Free::all(models), &priors, options, quiet(&StopToken::default(), &mut || ()))
 }
