@@ -88,13 +88,13 @@ impl PageArgs {
 /// Which tracks to solve.
 #[derive(Debug, Clone, Args)]
 pub struct InputArgs {
-    /// Tracks: a CSV with a header `view,track,x,y[,depth]`, OpenSfM's tracks.csv, COLMAP's database.db, or the
+    /// Tracks: a CSV with a header `view,track,x,y[,depth][,sigma]`, OpenSfM's tracks.csv, COLMAP's database.db, or the
     /// directory of a COLMAP sparse model (.bin or .txt)
     ///
     /// The kind is told from the name and the first bytes; --format overrides.
     ///
-    /// In the CSV, a line is an observation, in pixels; the centre of the top-left pixel is (0, 0). Ids are any whole
-    /// numbers, other columns are ignored. OpenSfM's coordinates are relative to the image size, which is read from
+    /// In the CSV, a line is an observation, in pixels; the centre of the top-left pixel is (0, 0); sigma is one
+    /// standard deviation of a coordinate. Ids are any whole numbers, other columns are ignored. OpenSfM's coordinates are relative to the image size, which is read from
     /// exif/IMAGE.exif beside the file; --width and --height give that of images without one. Of a database, matches
     /// are joined into tracks; a match that would put two keypoints of one image into one track is cut. A model gives
     /// its tracks; its poses, points and calibration are not used.

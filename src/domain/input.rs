@@ -51,6 +51,8 @@ pub struct RawInput {
     pub y: Vec<f64>,
     /// Projective depths, all or none; empty: none.
     pub depth: Vec<f64>,
+    /// Standard deviation of a coordinate of each observation in pixels, all or none; empty: all are as noisy.
+    pub sigma: Vec<f64>,
 }
 
 /// A checked input: every number finite, every index in range, no observation twice, something in at least two views.
@@ -68,6 +70,9 @@ pub struct Input {
     depth: Option<Vec<f64>>,
     /// Position of each observation in the caller's order.
     caller_order: Vec<u32>,
+    /// Last, and absent from inputs that were stored before it was.
+    #[serde(default)]
+    sigma: Option<Vec<f64>>,
 }
 
 impl Input {
@@ -76,6 +81,10 @@ impl Input {
 
     /// Sizes that a projective depth may have: its scale is free, and squares of these stay far from overflow.
     pub const DEPTH_RANGE: (f64, f64) = (1e-30, 1e30);
+
+    /// Standard deviations that an observation may have, pixels: their squares weigh observations against each other, and
+    /// a computer tells no more than 1e16 from 1.
+    pub const SIGMA_RANGE: (f64, f64) = (1e-4, 1e4);
 
     /// Checks a raw input and sorts its observations.
     ///
@@ -101,6 +110,7 @@ impl Input {
             x: pick(&raw.x),
             y: pick(&raw.y),
             depth: (!raw.depth.is_empty()).then(|| pick(&raw.depth)),
+            sigma: (!raw.sigma.is_empty()).then(|| pick(&raw.sigma)),
             views: raw.views,
             track_count: raw.track_count,
             caller_order: order,
@@ -148,6 +158,16 @@ impl Input {
         self.depth.as_ref().map(|depth| depth[k])
     }
 
+    /// Whether standard deviations of the observations were given.
+    pub fn has_sigmas(&self) -> bool {
+        self.sigma.is_some()
+    }
+
+    /// Standard deviation of a coordinate of observation `k` (sorted order) in pixels, if these were given.
+    pub fn sigma_px(&self, k: usize) -> Option<f64> {
+        self.sigma.as_ref().map(|sigma| sigma[k])
+    }
+
     /// Where the observations of each track lie in sorted order: those of track `j` are `ranges[j]..ranges[j + 1]`.
     pub fn track_ranges(&self) -> Vec<usize> {
         let mut ends = vec![0; self.track_count() + 1];
@@ -176,6 +196,7 @@ impl Input {
             x: vec![0.0; count],
             y: vec![0.0; count],
             depth: if self.has_depths() { vec![0.0; count] } else { Vec::new() },
+            sigma: if self.sigma.is_some() { vec![0.0; count] } else { Vec::new() },
         };
         for k in 0..count {
             let to = self.caller_index(k);
@@ -185,6 +206,9 @@ impl Input {
             raw.y[to] = self.y[k];
             if let Some(depth) = &self.depth {
                 raw.depth[to] = depth[k];
+            }
+            if let Some(sigma) = &self.sigma {
+                raw.sigma[to] = sigma[k];
             }
         }
         raw
@@ -218,11 +242,13 @@ fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String
             ));
         }
     }
-    if !raw.depth.is_empty() && raw.depth.len() != raw.x.len() {
-        found.push(Violation::of(
-            field("depth"),
-            format!("has {} entries where x has {}; give one an observation or none", raw.depth.len(), raw.x.len()),
-        ));
+    for (name, values) in [("depth", &raw.depth), ("sigma", &raw.sigma)] {
+        if !values.is_empty() && values.len() != raw.x.len() {
+            found.push(Violation::of(
+                field(name),
+                format!("has {} entries where x has {}; give one an observation or none", values.len(), raw.x.len()),
+            ));
+        }
     }
 }
 
@@ -302,6 +328,13 @@ fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &m
                 format!("{depth} is not of a size within {least:e}..={most:e}; leave an unobserved point out"),
             ));
         }
+        let (least, most) = Input::SIGMA_RANGE;
+        if let Some(sigma) = raw.sigma.get(k)
+            && !(least..=most).contains(sigma)
+        {
+            let what = format!("{sigma} px is no standard deviation within {least:e}..={most:e} px");
+            found.push(Violation::at(field("sigma"), k, what));
+        }
     }
 }
 
@@ -348,6 +381,7 @@ pub(super) mod tests {
             x: vec![3.0, 2.0, 0.0, 1.0],
             y: vec![30.0, 20.0, 0.0, 10.0],
             depth: Vec::new(),
+            sigma: Vec::new(),
         }
     }
 
@@ -381,6 +415,11 @@ pub(super) mod tests {
         assert_eq!(with(&|raw| raw.track[1] = 0), ["track_set.track[2]"]);
         assert_eq!(with(&|raw| raw.depth = vec![1.0, 0.0, 1.0, 1.0]), ["track_set.depth[1]"]);
         assert_eq!(with(&|raw| raw.depth = vec![1.0]), ["track_set.depth"]);
+        assert_eq!(
+            with(&|raw| raw.sigma = vec![1.0, 0.5, f64::NAN, 0.0]),
+            ["track_set.sigma[2]", "track_set.sigma[3]"]
+        );
+        assert_eq!(with(&|raw| raw.sigma = vec![1.0]), ["track_set.sigma"]);
         assert_eq!(with(&|raw| raw.y.truncate(3)), ["track_set.y"]);
         assert_eq!(with(&|raw| raw.track_count = 0), ["track_set.track_count"]);
         assert_eq!(with(&|raw| raw.views.truncate(1)), ["track_set.views"]);

@@ -152,7 +152,7 @@ impl<'a> World<'a> {
         let points = true_points(truth, &inliers);
         let mut found = Reconstruction::new(Intrinsics::from_focal(self.focal), self.poses.clone(), points.clone());
         let bound = Information::new(&found, &observations).and_then(|information| {
-            information.optimum(IntrinsicsModel::FOCAL, &IntrinsicsPrior::NONE).variance_of(Parameter::LogFocal)
+            information.optimum(IntrinsicsModel::FOCAL, &[IntrinsicsPrior::NONE]).variance_of(0, Parameter::LogFocal)
         });
         let options = Options {
             max_iterations: ADJUSTMENT_ITERATIONS,
@@ -163,7 +163,7 @@ impl<'a> World<'a> {
             &mut found,
             &observations,
             IntrinsicsModel::FOCAL,
-            &IntrinsicsPrior::NONE,
+            &[IntrinsicsPrior::NONE],
             &options,
             &StopToken::default(),
         );
@@ -176,7 +176,7 @@ impl<'a> World<'a> {
                 found.residual(&Observation { xy: noise_free / side, ..*seen }).norm_squared()
             })
             .sum();
-        let log_focal_error = (found.intrinsics.focal / self.focal).ln();
+        let log_focal_error = (found.intrinsics[0].focal / self.focal).ln();
         log_focal_error.is_finite().then(|| Calibrated {
             log_focal_error,
             bound: bound.map(|variance| variance.sqrt() * self.noise),

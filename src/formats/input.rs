@@ -71,7 +71,7 @@ impl LabelledInput {
     fn problem(&self, violation: &Violation) -> Problem {
         let column = violation.field.rsplit('.').next().unwrap_or_default();
         let place = violation.index.and_then(|index| match column {
-            "view" | "track" | "x" | "y" | "depth" => self.place(index, column),
+            "view" | "track" | "x" | "y" | "depth" | "sigma" => self.place(index, column),
             "views" => self.view_labels.get(index).map(|label| (Place::File, format!("view {label}"))),
             _ => None,
         });

@@ -1,4 +1,4 @@
-//! Reading and writing `observations.csv`: `view,track,x,y[,depth]`, one observation a line.
+//! Reading and writing `observations.csv`: `view,track,x,y[,depth][,sigma]`, one observation a line.
 
 use std::fmt::Write;
 use std::io::BufRead;
@@ -14,6 +14,7 @@ use crate::domain::{ImageSize, Limits, RawInput, View};
 /// Columns that must be there, in the order in which they are looked for.
 const REQUIRED: [&str; 4] = ["view", "track", "x", "y"];
 const DEPTH: &str = "depth";
+const SIGMA: &str = "sigma";
 
 /// Reads the observations of a file and checks what only the file can tell: syntax, ids, duplicates.
 ///
@@ -33,6 +34,7 @@ struct Columns {
     names: Vec<String>,
     required: [usize; 4],
     depth: Option<usize>,
+    sigma: Option<usize>,
 }
 
 /// What one line says.
@@ -42,6 +44,7 @@ struct Row {
     x: f64,
     y: f64,
     depth: Option<f64>,
+    sigma: Option<f64>,
 }
 
 /// Observations as they are read, ids not yet dense.
@@ -52,6 +55,7 @@ struct Table {
     x: Vec<f64>,
     y: Vec<f64>,
     depth: Vec<f64>,
+    sigma: Vec<f64>,
     lines: Vec<u64>,
 }
 
@@ -138,8 +142,7 @@ fn header(text: &str) -> Result<Columns, String> {
             }
         })?;
     }
-    let depth = find(DEPTH)?;
-    Ok(Columns { required, depth, names })
+    Ok(Columns { required, depth: find(DEPTH)?, sigma: find(SIGMA)?, names })
 }
 
 impl Columns {
@@ -149,8 +152,8 @@ impl Columns {
         if fields.len() != self.names.len() {
             let hint = match fields.len() {
                 count if count < self.names.len() => "; the file may be truncated",
-                // One more for each coordinate, and for a depth.
-                count if count == self.names.len() + 2 + usize::from(self.depth.is_some()) => {
+                // One more for each coordinate, a depth and a standard deviation.
+                count if count == self.names.len() + 2 + self.depth.iter().chain(&self.sigma).count() => {
                     "; decimals are marked by a point, not a comma"
                 }
                 _ => "",
@@ -164,6 +167,7 @@ impl Columns {
             x: number(x).map_err(|what| ("x", what))?,
             y: number(y).map_err(|what| ("y", what))?,
             depth: self.depth.map(|place| number(fields[place])).transpose().map_err(|what| (DEPTH, what))?,
+            sigma: self.sigma.map(|place| number(fields[place])).transpose().map_err(|what| (SIGMA, what))?,
         })
     }
 }
@@ -180,6 +184,7 @@ impl Table {
         self.x.push(row.x);
         self.y.push(row.y);
         self.depth.extend(row.depth);
+        self.sigma.extend(row.sigma);
         self.lines.push(line);
     }
 
@@ -196,6 +201,7 @@ impl Table {
                 x: self.x,
                 y: self.y,
                 depth: self.depth,
+                sigma: self.sigma,
             },
             view_labels: view_labels.into_iter().map(Label::Number).collect(),
             track_labels: track_labels.into_iter().map(Label::Number).collect(),
@@ -206,15 +212,20 @@ impl Table {
     }
 }
 
-/// `view,track,x,y[,depth]`; every number as short as it reads back exactly.
+/// `view,track,x,y[,depth][,sigma]`; every number as short as it reads back exactly.
 pub fn csv(input: &RawInput) -> String {
-    let has_depths = !input.depth.is_empty();
-    let mut text = String::from(if has_depths { "view,track,x,y,depth\n" } else { "view,track,x,y\n" });
+    let more: Vec<(&str, &[f64])> = [(DEPTH, input.depth.as_slice()), (SIGMA, input.sigma.as_slice())]
+        .into_iter()
+        .filter(|(_, values)| !values.is_empty())
+        .collect();
+    let mut text = REQUIRED.join(",");
+    more.iter().for_each(|(name, _)| text.extend([",", name]));
+    text.push('\n');
     for k in 0..input.x.len() {
         // Writing to a String cannot fail.
         let _ = write!(text, "{},{},{},{}", input.view[k], input.track[k], input.x[k], input.y[k]);
-        if has_depths {
-            let _ = write!(text, ",{}", input.depth[k]);
+        for (_, values) in &more {
+            let _ = write!(text, ",{}", values[k]);
         }
         text.push('\n');
     }

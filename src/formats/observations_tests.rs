@@ -65,6 +65,19 @@ fn reads_depths() {
 }
 
 #[test]
+fn reads_and_writes_what_is_known_of_the_noise() {
+    let text = "view,track,x,y,depth,sigma\n0,0,1,2,3.5,0.5\n1,0,1,2,-4,2\n";
+    assert_eq!(good(text).raw.sigma, [0.5, 2.0]);
+    assert_eq!(csv(&good(text).raw), text);
+    let alone = "view,track,x,y,sigma\n0,0,1,2,0.5\n1,0,1,2,2\n";
+    assert_eq!(csv(&good(alone).raw), alone);
+    for wrong in ["0", "-1", "inf", "1e9"] {
+        let problems = bad(alone.replace("0.5", wrong));
+        assert!(problems[0].contains("line 2: sigma: "), "{wrong}: {problems:?}");
+    }
+}
+
+#[test]
 fn puts_the_size_on_every_view() {
     let size = ImageSize { width_px: 640, height_px: 480 };
     let input = parse(Cursor::new(GOOD), Path::new("o.csv"), &Limits::default(), Some(size)).expect("valid");

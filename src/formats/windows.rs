@@ -41,6 +41,7 @@ pub fn cut(input: &LabelledInput, range: &Range<usize>) -> LabelledInput {
         cut.raw.x.push(raw.x[k]);
         cut.raw.y.push(raw.y[k]);
         cut.raw.depth.extend(raw.depth.get(k));
+        cut.raw.sigma.extend(raw.sigma.get(k));
         cut.lines.extend(input.lines.get(k));
     }
     cut

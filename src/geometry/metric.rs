@@ -69,7 +69,13 @@ pub fn upgrade(
         false => Vec::new(),
     };
     let points = frame.points.iter().map(|point| euclidean(&(back * point))).collect();
-    let mut reconstruction = Reconstruction { intrinsics: daq.intrinsics, focals, poses: Vec::new(), points };
+    let mut reconstruction = Reconstruction {
+        intrinsics: vec![daq.intrinsics],
+        group_of: vec![0; frame.cameras.len()],
+        focals,
+        poses: Vec::new(),
+        points,
+    };
     for (view, camera) in frame.cameras.iter().enumerate() {
         let uncalibrate = reconstruction.intrinsics_of(view).matrix().try_inverse()?;
         let upgraded = uncalibrate * camera * homography;

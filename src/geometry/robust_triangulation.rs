@@ -46,7 +46,7 @@ impl<'a> Triangulator<'a> {
 
     /// The point of least truncated squared residuals, in front of its cameras.
     ///
-    /// * `gate`: squared residual within which an observation agrees
+    /// * `gate`: weighted squared residual within which an observation agrees
     ///
     /// Returns `None` where no two observations agree.
     pub fn robust(&self, observations: &[Observation], gate: f64) -> Option<Robust> {
@@ -123,11 +123,11 @@ fn agreeing(cameras: &[Camera], observations: &[Observation], point: &Point, gat
     observations.iter().map(|observation| squared_in_front(cameras, observation, point) < gate).collect()
 }
 
-/// Squared residual, infinite behind the camera.
+/// Weighted squared residual, infinite behind the camera.
 fn squared_in_front(cameras: &[Camera], observation: &Observation, point: &Point) -> f64 {
     let camera = &cameras[observation.view];
     let depth = (camera.row(2) * point).x * point.w.signum();
-    if depth > 0.0 { triangulation::reprojection(camera, point, &observation.xy).norm_squared() } else { f64::INFINITY }
+    if depth > 0.0 { triangulation::weighted_squared(camera, point, observation) } else { f64::INFINITY }
 }
 
 /// Squared residuals, each of the gate at most; given up once they reach `to_beat`.

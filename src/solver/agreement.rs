@@ -22,7 +22,7 @@ impl Estimate {
     fn of(attempt: &Attempt) -> Option<Self> {
         // Blocks of a zoom hold other views, and their focal lengths differ as they may.
         let calibration = attempt.calibration.as_ref().filter(|calibration| calibration.focals.is_none())?;
-        let focal = calibration.metric.as_ref()?.intrinsics.focal;
+        let focal = calibration.intrinsics()?.focal;
         let sigma = calibration.sigma_log_focal?;
         let claims = calibration.grade != Grade::ProjectiveOnly && focal > 0.0;
         claims.then(|| Self { log_focal: focal.ln(), sigma })

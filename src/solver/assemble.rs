@@ -122,7 +122,7 @@ pub fn solved(context: &Context, mut attempt: Attempt, mut warnings: Vec<Warning
         iterations,
         seed: context.settings.seed,
         calibrations: usable
-            .map(|metric| pixel_calibrations(metric, calibration, context, projective.views[0]))
+            .map(|metric| pixel_calibrations(&attempt, metric, calibration, context, projective.views[0]))
             .unwrap_or_default(),
         // Planes transform by the inverse transpose of what moves points: from normalised to pixels that is T1^-T.
         plane_at_infinity: calibration
@@ -167,6 +167,7 @@ pub fn judged(context: &Context, attempt: &Attempt, projective: &Projective, rec
         parts: None,
         normalization: context.normalization,
         lenses: &[],
+        weights: &super::block::weights(context.input),
         linked: attempt.judges_observations(),
         least_share: if attempt.judges_observations() { least_share(context) } else { LEAST_RETAINED_SHARE },
         noise: projective.noise,
@@ -295,11 +296,13 @@ fn final_points(
         return judged.points.iter().map(moved).collect();
     };
     let mut cameras = vec![Camera::zeros(); context.input.view_count()];
+    let mut lenses = vec![metric.intrinsics[0]; cameras.len()];
     let mut has_pose = vec![true; cameras.len()];
     for (i, &view) in attempt.views().iter().enumerate() {
         let own = own_focal(attempt, i);
-        let focal = own.map_or(metric.intrinsics.focal, |own| own.focal);
-        cameras[view] = metric.poses[i].camera(&Intrinsics { focal, ..metric.intrinsics });
+        let shared = metric.intrinsics[metric.group_of[i]];
+        lenses[view] = Intrinsics { focal: own.map_or(shared.focal, |own| own.focal), ..shared };
+        cameras[view] = metric.poses[i].camera(&lenses[view]);
         has_pose[view] = own.is_none_or(|own| own.sigma_log.is_some());
     }
     let triangulated = |observations: &Vec<Observation>| {
@@ -307,7 +310,7 @@ fn final_points(
             return None;
         }
         // These cameras know no distortion.
-        let undone = |seen: &Observation| Some(Observation { xy: metric.intrinsics.undistort(&seen.xy)?, ..*seen });
+        let undone = |seen: &Observation| Some(Observation { xy: lenses[seen.view].undistort(&seen.xy)?, ..*seen });
         let observations: Vec<Observation> =
             observations.iter().filter(|seen| has_pose[seen.view]).filter_map(undone).collect();
         if observations.len() < LEAST_SIGHTINGS {
@@ -349,12 +352,16 @@ pub fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
 /// The calibration in pixels: one for all views, or, where the input has several camera groups, one a group in rising
 /// order, their principal points about the image centre of the group's first view.
 fn pixel_calibrations(
+    attempt: &Attempt,
     metric: &Reconstruction,
     outcome: &Outcome,
     context: &Context,
     first_view: usize,
 ) -> Vec<Calibration> {
-    let about = |view: usize| pixel_calibration(&metric.intrinsics, outcome, context, view);
+    let about = |view: usize| {
+        let group = attempt.views().binary_search(&view).map_or(0, |place| metric.group_of[place]);
+        pixel_calibration(&metric.intrinsics[group], outcome, context, view)
+    };
     let (group_of, groups) = super::block::camera_groups(context.input);
     match groups {
         1 => vec![about(first_view)],

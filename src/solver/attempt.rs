@@ -14,7 +14,7 @@ use super::{Context, Error};
 use super::{crowds, depths, extend, likeliest, second};
 use crate::domain::result::PriorTime;
 use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View, Warning, WarningCode};
-use crate::geometry::bundle::metric::Reconstruction;
+use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 
 /// Noise that growing starts from when the caller gives none, as a share of the image side. High on purpose: twice too
 /// low loses the scene, ten times too high costs nothing.
@@ -122,9 +122,14 @@ impl Attempt {
         self.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some())
     }
 
+    /// Whether there is a calibration that may be used.
+    pub fn is_calibrated(&self) -> bool {
+        self.merit().0 >= WEAK_MERIT
+    }
+
     /// Whether the calibration has found a lens that distorts.
     pub fn has_lens(&self) -> bool {
-        let distorts = |metric: &Reconstruction| metric.intrinsics.distorts();
+        let distorts = |metric: &Reconstruction| metric.intrinsics.iter().any(Intrinsics::distorts);
         self.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref()).is_some_and(distorts)
     }
 
@@ -202,8 +207,8 @@ pub fn calibrate(attempt: &mut Attempt, context: &Context, recorder: &mut Record
         Evidence::ImagePoints => calibrate_projective(projective, context)?,
         Evidence::Depths { focal } => depths::calibrate(&attempt.block.complete, consensus, focal, context.stop),
     });
-    if let Some(metric) = attempt.calibration.as_ref().and_then(|outcome| outcome.metric.as_ref()) {
-        recorder.standing.focal_px = Some(metric.intrinsics.focal * context.scale_px);
+    if let Some(intrinsics) = attempt.calibration.as_ref().and_then(Outcome::intrinsics) {
+        recorder.standing.focal_px = Some(intrinsics.focal * context.scale_px);
     }
     recorder.registered(projective.views.len());
     recorder.tell(1.0);
@@ -328,20 +333,28 @@ fn decide(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     Ok(())
 }
 
-/// Calibrates from a reconstruction, or as much of it as a calibration takes.
+/// Calibrates from a reconstruction, or as much of it as a calibration takes; the worst of its camera groups.
 fn calibrate_projective(projective: &Projective, context: &Context) -> Result<Outcome, Error> {
     let most = MOST_CALIBRATED.min(CALIBRATED_OBSERVATIONS / projective.views.len().max(1));
     let some = projective.most_observed(most);
-    let views = projective.views.iter().map(|&view| &context.input.views()[view]);
+    let (group_of, groups) = context.camera_groups_of(&projective.views);
+    let of_group = |group: usize| {
+        let views = projective.views.iter().zip(&group_of).filter(|(_, of)| **of == group);
+        focal_prior(views.map(|(&view, _)| &context.input.views()[view]))
+    };
+    let told = context.focal_prior.filter(|_| groups == 1);
+    let focal_priors: Vec<Option<FocalPrior>> = (0..groups).map(|group| told.or_else(|| of_group(group))).collect();
     let problem = calibration::Problem {
         cameras: &some.cameras,
         points: &some.points,
         observations: &some.observations,
         noise: some.noise,
         focal_per_view: context.settings.focal_per_view,
-        focal_prior: context.focal_prior.or_else(|| focal_prior(views)),
+        group_of: &group_of,
+        focal_priors: &focal_priors,
     };
-    Ok(calibration::calibrate(&problem, context.scale_px, context.stop)?)
+    let outcomes = calibration::calibrate(&problem, context.scale_px, context.stop)?;
+    Ok(Outcome::worst(outcomes).unwrap_or_else(|| Outcome::refused(Vec::new())))
 }
 
 /// What is known beforehand of the one focal length of these views; `None` where nothing is.

@@ -164,6 +164,15 @@ pub fn camera_groups(input: &Input) -> (Vec<usize>, usize) {
     (input.views().iter().map(of).collect(), numbers.len())
 }
 
+/// Weight of each observation: the squared ratio of the median standard deviation of all to its own; 1 where none are
+/// given.
+pub fn weights(input: &Input) -> Vec<f64> {
+    let count = input.observation_count();
+    let mut sigmas: Vec<f64> = (0..count).filter_map(|k| input.sigma_px(k)).collect();
+    let typical = median(&mut sigmas);
+    (0..count).map(|k| input.sigma_px(k).map_or(1.0, |sigma| (typical / sigma).powi(2))).collect()
+}
+
 /// Centre of an image whose top-left pixel's centre is (0, 0).
 fn image_centre(size: ImageSize) -> Vector2<f64> {
     Vector2::new((f64::from(size.width_px) - 1.0) / 2.0, (f64::from(size.height_px) - 1.0) / 2.0)
@@ -447,7 +456,7 @@ mod tests {
         let sampled = block.clone().sample(7, 1);
         assert_eq!((sampled.tracks.len(), sampled.complete.tracks()), (7, 7));
         let place = block.tracks.iter().position(|&track| track == sampled.tracks[3]).expect("a track of the block");
-        assert_eq!(sampled.complete.track(3), block.complete.track(place));
+        assert_eq!(sampled.complete.point(2, 3), block.complete.point(2, place));
     }
 
     #[test]

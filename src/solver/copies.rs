@@ -38,6 +38,7 @@ fn without(input: &Input, copies: &Copies) -> Result<(Input, Vec<usize>), Error>
         x: kept.iter().map(|&k| input.point_px(k)[0]).collect(),
         y: kept.iter().map(|&k| input.point_px(k)[1]).collect(),
         depth: kept.iter().filter_map(|&k| input.depth(k)).collect(),
+        sigma: kept.iter().filter_map(|&k| input.sigma_px(k)).collect(),
     };
     let limits = Limits { max_views: usize::MAX, max_tracks: usize::MAX, max_observations: usize::MAX };
     let rest = Input::new(raw, &limits, "input").map_err(|error| Error::Internal(error.to_string()))?;

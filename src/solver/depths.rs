@@ -85,15 +85,17 @@ pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop:
         relative_tolerance: ADJUSTMENT_TOLERANCE,
         ..Options::default()
     };
-    let report = metric::adjust(&mut found, &observations, model, &IntrinsicsPrior::NONE, &options, stop);
+    let report = metric::adjust(&mut found, &observations, model, &[IntrinsicsPrior::NONE], &options, stop);
     let noise = consensus.noise.max((report.cost / freedom as f64).sqrt());
     let sigma = Information::new(&found, &observations)
-        .and_then(|information| information.optimum(model, &IntrinsicsPrior::NONE).variance_of(Parameter::LogFocal))
+        .and_then(|information| {
+            information.optimum(model, &[IntrinsicsPrior::NONE]).variance_of(0, Parameter::LogFocal)
+        })
         .map(|variance| variance.sqrt() * noise)
         .filter(|sigma| sigma.is_finite());
     let cheirality = crate::geometry::metric::cheirality(&found, &observations);
     // Image points and depths tell one story, or there is none.
-    let strayed = (found.intrinsics.focal / focal).ln().abs();
+    let strayed = (found.intrinsics[0].focal / focal).ln().abs();
     if strayed.is_nan() || strayed > MOST_STRAYED.max(STRAYED_SIGMAS * sigma.unwrap_or(0.0)) {
         let detail = format!("image points alone give a focal length that differs by a factor of {:.2}", strayed.exp());
         return refused(outcome, WarningCode::ModelMismatch, detail);

@@ -132,7 +132,8 @@ fn solve_views(
         scale_px,
         seeding: false,
         quick: false,
-        merges_cameras: false,
+        // What is solved as one block has one calibration.
+        merges_cameras: true,
         focal_prior: None,
         threads,
         stop,
@@ -172,31 +173,27 @@ fn solve_by_observation(
     mut warnings: Vec<Warning>,
     mut recorder: Recorder,
 ) -> Result<Solution, Error> {
-    let zooms = context.settings.focal_per_view;
-    let (_, groups) = block::camera_groups(context.input);
-    let whole = if groups == 1 { block::whole(context.input, context.ranges) } else { None };
-    let of_one = match &whole {
-        Some(_) => Vec::new(),
-        None => block::candidate_views_of_one_camera(context.input, context.ranges, context.stop),
-    };
-    // A group an image, say: what one camera alone cannot carry, all together may. And where views share no focal
-    // length, groups part nothing.
-    let merges_cameras = of_one.is_empty() || zooms;
-    let candidates = match &whole {
-        Some(_) => Vec::new(),
-        None if merges_cameras => block::candidate_views(context.input, context.ranges, context.stop),
-        None => of_one,
-    };
+    // Where views share no focal length, groups part nothing.
+    let merges_cameras = context.settings.focal_per_view;
+    let whole = block::whole(context.input, context.ranges);
+    let mut candidates = Vec::new();
+    if whole.is_none() && !merges_cameras {
+        candidates = block::candidate_views_of_one_camera(context.input, context.ranges, context.stop);
+    }
+    // A group an image, say: what no camera alone carries, all together may.
+    if whole.is_none() && candidates.is_empty() {
+        candidates = block::candidate_views(context.input, context.ranges, context.stop);
+    }
     let context = &Context { merges_cameras, ..*context };
     match sequence::solve(whole, &candidates, context, &mut recorder)? {
         sequence::Ended::Extended(extended) => {
-            warnings.extend(block::merged_cameras(context.input, !merges_cameras, zooms));
+            warnings.extend(block::merged_cameras(context.input, !merges_cameras, merges_cameras));
             let solution = sequence::solved(*extended, warnings, recorder);
             context.stopped()?;
             Ok(verified(solution))
         }
         sequence::Ended::Block(best) => {
-            warnings.extend(block::merged_cameras(context.input, false, zooms));
+            warnings.extend(block::merged_cameras(context.input, !merges_cameras, merges_cameras));
             of_block(best.map(|best| *best), context, warnings, recorder)
         }
     }
@@ -274,6 +271,18 @@ impl Context<'_> {
     /// `Err` once the token asks for a stop.
     fn stopped(&self) -> Result<(), Error> {
         self.stop.reason().map_or(Ok(()), |reason| Err(Error::Stopped(reason)))
+    }
+
+    /// Camera group of each of these views, counted among them, and how many there are.
+    fn camera_groups_of(&self, views: &[usize]) -> (Vec<usize>, usize) {
+        if self.merges_cameras {
+            return (vec![0; views.len()], 1);
+        }
+        let (group_of, _) = block::camera_groups(self.input);
+        let mut groups: Vec<usize> = views.iter().map(|&view| group_of[view]).collect();
+        groups.sort_unstable();
+        groups.dedup();
+        (views.iter().map(|&view| groups.partition_point(|group| *group < group_of[view])).collect(), groups.len())
     }
 
     /// Weights of some tracks as weights of all, 0 elsewhere.

@@ -167,6 +167,7 @@ mod tests {
             x: vec![x, 2.0],
             y: vec![1.0, 2.0],
             depth: Vec::new(),
+            sigma: Vec::new(),
         };
         let id = |x| Encoded::new(&raw(x)).upload_id();
         assert_eq!(id(1.0), id(1.0));

@@ -150,6 +150,7 @@ fn input() -> Input {
         x: vec![1.0, 2.0, 3.0, 4.0],
         y: vec![5.0, 6.0, 7.0, 8.0],
         depth: Vec::new(),
+        sigma: Vec::new(),
     };
     Input::new(raw, &Limits::default(), "test").expect("valid")
 }

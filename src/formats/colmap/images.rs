@@ -99,6 +99,7 @@ impl Images {
                 x: observations.iter().map(|observation| observation.x - FIRST_PIXEL).collect(),
                 y: observations.iter().map(|observation| observation.y - FIRST_PIXEL).collect(),
                 depth: Vec::new(),
+                sigma: Vec::new(),
             },
             view_labels,
             track_labels: track_labels.into_iter().map(Label::Number).collect(),

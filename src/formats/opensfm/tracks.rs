@@ -200,6 +200,7 @@ impl Table {
                 x: self.x,
                 y: self.y,
                 depth: Vec::new(),
+                sigma: Vec::new(),
             },
             view_labels,
             track_labels,

@@ -1,18 +1,16 @@
 //! How well the intrinsics are determined, whatever the gauge.
 
-use nalgebra::{DMatrix, DVector, DVectorView, SMatrix, SVector};
+use nalgebra::{DMatrix, DVector, DVectorView, SVector};
 
-use super::engine::Layout;
+use super::engine::{Layout, Problem};
 use super::intrinsics::Intrinsics;
 use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior, Parameter};
-use super::metric::{Metric, POINT, POSE, Pose, Reconstruction, VIEW};
+use super::metric::{Metric, OWN_CAMERA, POINT, POSE, Pose, Reconstruction, VIEW};
 use super::reduced::{Linearisation, Reduced};
 use super::whitened::{WhitenedViews, centre};
 use super::{Loss, Observation};
 
 const PARAMETERS: usize = Parameter::COUNT;
-/// Of every pair of intrinsics.
-type Coupled = SMatrix<f64, PARAMETERS, PARAMETERS>;
 /// Part of a parameter's information, as the root of a share, that a direction of the poses may take and still count as
 /// apart from the intrinsics: what rounding leaves where the two have nothing to do with each other.
 const APART: f64 = 1e-11;
@@ -25,19 +23,31 @@ const TAKES_PART: f64 = 1e-8;
 /// known ten times less well says nothing of it.
 const COUNTS_WITHIN: f64 = 100.0;
 
-/// What the observations say of all the intrinsics together, poses and points marginalised, at one reconstruction.
+/// Place of an intrinsic of a camera group among all.
+fn place(group: usize, parameter: Parameter) -> usize {
+    PARAMETERS * group + parameter as usize
+}
+
+/// What the observations say of the intrinsics of all camera groups together, poses and points marginalised, at one
+/// reconstruction.
 ///
 /// For observations with unit variance. From one linearisation it tells of every model at once where its minimum is,
 /// how low, and how well determined: a score test in place of an adjustment a model. Where the reconstruction has focal
 /// lengths a view, these are free in every model, and what it tells of [`Parameter::LogFocal`] is told of their mean.
 #[derive(Debug, Clone)]
 pub struct Information {
-    intrinsics: Intrinsics,
-    matrix: Coupled,
-    /// Half the downward gradient of the cost.
-    pull: SVector<f64, PARAMETERS>,
+    intrinsics: Vec<Intrinsics>,
+    reduced: WithoutViews,
     /// The matrix' diagonal were poses and points known.
-    known: [f64; PARAMETERS],
+    known: Vec<f64>,
+}
+
+/// Normal equations of the intrinsics with the views eliminated; each group's in the order of [`Parameter`].
+#[derive(Debug, Clone)]
+struct WithoutViews {
+    matrix: DMatrix<f64>,
+    /// Half the downward gradient of the cost.
+    negative_gradient: DVector<f64>,
     own_focals: Option<OwnFocals>,
 }
 
@@ -45,52 +55,55 @@ pub struct Information {
 #[derive(Debug, Clone)]
 struct OwnFocals {
     of_view: Vec<Function>,
-    /// Over the views that are determined about as well as any.
-    mean: Function,
+    /// Of each camera group, over the views that are determined about as well as any of it.
+    mean: Vec<Function>,
 }
 
 /// A linear function of the unknowns of the views, with the intrinsics that they share held.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct Function {
     /// `None`: not determined.
     variance: Option<f64>,
     /// By how much it falls where the shared intrinsics rise.
-    coupling: SVector<f64, PARAMETERS>,
+    coupling: DVector<f64>,
     /// What it is at the minimum minus what it is here.
     shift: f64,
 }
 
-/// The minimum of the cost over the intrinsics of one model, to second order; indexed by [`Parameter`].
+/// The minimum of the cost over the intrinsics of one model, to second order.
 ///
 /// Parameters that the model does not free are where a pinhole has them, a focal length that it does not free stays.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Optimum {
-    /// Value there minus value here.
-    pub shift: [f64; PARAMETERS],
-    /// Variances for observations with unit variance; multiply by the squared noise. `None`: the observations do not
-    /// determine it (the variance is infinite). What is not free has variance 0.
-    pub variance: [Option<f64>; PARAMETERS],
+    shift: DVector<f64>,
+    variance: Vec<Option<f64>>,
     /// Cost there, prior included, minus the cost of the observations here.
-    pub rise: f64,
+    pub delta_cost: f64,
     /// Natural logarithm of the determinant of the information on what is free. Null directions count as barely known.
     pub log_determinant: f64,
     /// Of the shared parameters that are free and determined.
-    covariance: Coupled,
+    covariance: DMatrix<f64>,
 }
 
 impl Optimum {
-    /// Variance of one parameter.
-    pub fn variance_of(&self, parameter: Parameter) -> Option<f64> {
-        self.variance[parameter as usize]
+    /// Variance of a parameter of a camera group for observations with unit variance; multiply by the squared noise.
+    /// `None`: the observations do not determine it (the variance is infinite). What is not free has variance 0.
+    pub fn variance_of(&self, group: usize, parameter: Parameter) -> Option<f64> {
+        self.variance[place(group, parameter)]
+    }
+
+    /// Value there minus value here.
+    pub fn shift_of(&self, group: usize, parameter: Parameter) -> f64 {
+        self.shift[place(group, parameter)]
     }
 
     /// Variance and shift of a function of the views with the shared parameters free.
     fn of(&self, function: &Function) -> (Option<f64>, f64) {
-        let undetermined = (0..PARAMETERS).any(|k| self.variance[k].is_none() && function.coupling[k] != 0.0);
+        let undetermined =
+            self.variance.iter().zip(function.coupling.iter()).any(|(known, along)| known.is_none() && *along != 0.0);
         let variance = function.variance.filter(|_| !undetermined);
-        let shared = function.coupling.dot(&(self.covariance * function.coupling));
-        let shift = SVector::<f64, PARAMETERS>::from(self.shift);
-        (variance.map(|own| own + shared), function.shift - function.coupling.dot(&shift))
+        let shared = function.coupling.dot(&(&self.covariance * &function.coupling));
+        (variance.map(|own| own + shared), function.shift - function.coupling.dot(&self.shift))
     }
 }
 
@@ -100,71 +113,111 @@ impl Information {
     /// The seven directions of a similarity are projected out. Returns `None` without poses, or where the system
     /// holds what is no number.
     pub fn new(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
-        match reconstruction.has_own_focals() {
-            true => Self::of_views::<VIEW>(reconstruction, observations),
-            false => Self::of_views::<POSE>(reconstruction, observations),
+        match (reconstruction.intrinsics.len(), reconstruction.has_own_focals()) {
+            (1, true) => Self::of_one_group::<VIEW>(reconstruction, observations),
+            (1, false) => Self::of_one_group::<POSE>(reconstruction, observations),
+            (_, true) => Self::of_groups::<VIEW>(reconstruction, observations),
+            (_, false) => Self::of_groups::<POSE>(reconstruction, observations),
         }
     }
 
     /// * `C`: unknowns of a view
-    fn of_views<const C: usize>(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
-        let poses = reconstruction.poses.len();
-        if poses == 0 {
-            return None;
+    fn of_one_group<const C: usize>(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
+        let (metric, [matrix, vector], known) =
+            linearised::<PARAMETERS, C>(reconstruction, Parameter::ALL.map(Some), observations)?;
+        Self::without_views::<C>(metric, &matrix, &vector, known)
+    }
+
+    /// The same of several camera groups: of views with intrinsics of their own, which those of each group share.
+    fn of_groups<const C: usize>(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
+        let (metric, [own, own_vector], _) = linearised::<0, OWN_CAMERA>(reconstruction, [], observations)?;
+        let views = metric.poses.len();
+        let first = PARAMETERS * metric.intrinsics.len();
+        let (from, to) = (OWN_CAMERA * views, first + C * views);
+        // Where an unknown of a view with its own intrinsics goes: its pose, and its own focal length, stay its own.
+        let places = |k: usize| {
+            let (view, unknown) = (k / OWN_CAMERA, k % OWN_CAMERA);
+            let of_view = (unknown < C).then_some(first + C * view + unknown);
+            let parameter = unknown.checked_sub(POSE);
+            [of_view, parameter.map(|parameter| PARAMETERS * metric.group_of[view] + parameter)]
+        };
+        let (mut matrix, mut vector, mut known) = (vec![0.0; to * to], vec![0.0; to], vec![0.0; first]);
+        for column in 0..from {
+            places(column).into_iter().flatten().for_each(|to| vector[to] += own_vector[column]);
+            for row in 0..from {
+                let value = own[row.min(column) * from + row.max(column)];
+                for to_column in places(column).into_iter().flatten() {
+                    for to_row in places(row).into_iter().flatten().filter(|to_row| *to_row >= to_column) {
+                        matrix[to_column * to + to_row] += value;
+                    }
+                }
+            }
         }
-        let layout = Layout::new(observations, poses, reconstruction.points.len());
-        let mut centred = reconstruction.clone();
-        centre(&mut centred.poses, &mut centred.points);
-        let free = Parameter::ALL.map(Some);
-        let problem = Metric::<PARAMETERS, C> { reconstruction: centred, free, prior: IntrinsicsPrior::NONE };
-        let mut linearisation = Linearisation::<PARAMETERS, C, POINT>::new(&layout, poses);
-        linearisation.fill(&problem, &layout, Loss::Squared);
-        let known = std::array::from_fn(|k| linearisation.globals_diagonal()[k]);
-        let mut reduced = Reduced::new(&layout, poses);
-        if !reduced.build(&problem, &layout, &linearisation, 0.0) {
-            return None;
+        for (k, known) in known.iter_mut().enumerate() {
+            *known = matrix[k * to + k];
         }
-        let (matrix, pull, own_focals) =
-            without_views::<C>(&reduced.matrix, &reduced.vector, &known, &problem.reconstruction.poses)?;
-        let finite = matrix.iter().chain(pull.iter()).all(|value| value.is_finite());
-        finite.then_some(Self { intrinsics: reconstruction.intrinsics, matrix, pull, known, own_focals })
+        Self::without_views::<C>(metric, &matrix, &vector, known)
+    }
+
+    /// * `metric`: about its middle
+    fn without_views<const C: usize>(
+        metric: Reconstruction,
+        matrix: &[f64],
+        vector: &[f64],
+        known: Vec<f64>,
+    ) -> Option<Self> {
+        let reduced = WithoutViews::new::<C>(matrix, vector, &known, &metric.group_of, &metric.poses)?;
+        let finite = reduced.matrix.iter().chain(reduced.negative_gradient.iter()).all(|value| value.is_finite());
+        finite.then_some(Self { intrinsics: metric.intrinsics, reduced, known })
     }
 
     /// Variance of the log focal length of each view that has its own under a model, and its value at the minimum of
     /// the model minus its value here; `None` where the observations do not determine it.
     pub fn own_focals(&self, optimum: &Optimum) -> Vec<(Option<f64>, f64)> {
-        let of_view = self.own_focals.iter().flat_map(|own| &own.of_view);
+        let of_view = self.reduced.own_focals.iter().flat_map(|own| &own.of_view);
         of_view.map(|function| optimum.of(function)).collect()
     }
 
-    /// Where the cost of a model is least, how low it is there, and how well that is determined.
+    /// Where the cost of a model, the same of every camera group, is least, how low it is there, and how well that is
+    /// determined.
     ///
     /// A null direction of the information makes every parameter that takes part in it infinitely uncertain, rather
     /// than vanish in a pseudo-inverse.
-    pub fn optimum(&self, model: IntrinsicsModel, prior: &IntrinsicsPrior) -> Optimum {
-        let free: Vec<usize> = model.parameters().into_iter().map(|parameter| parameter as usize).collect();
-        let mut shift = SVector::<f64, PARAMETERS>::zeros();
-        for parameter in Parameter::ALL {
-            if parameter != Parameter::LogFocal && !free.contains(&(parameter as usize)) {
-                shift[parameter as usize] = -self.intrinsics.value(parameter);
+    ///
+    /// * `priors`: one a camera group
+    pub fn optimum(&self, model: IntrinsicsModel, priors: &[IntrinsicsPrior]) -> Optimum {
+        let WithoutViews { matrix, negative_gradient, own_focals } = &self.reduced;
+        let parameters = model.parameters();
+        let groups = self.intrinsics.len();
+        let free: Vec<usize> =
+            (0..groups).flat_map(|group| parameters.iter().map(move |parameter| place(group, *parameter))).collect();
+        let mut shift = DVector::zeros(PARAMETERS * groups);
+        let (mut information, mut deviation) = (shift.clone(), shift.clone());
+        for (group, (intrinsics, prior)) in self.intrinsics.iter().zip(priors).enumerate() {
+            for parameter in Parameter::ALL {
+                let k = place(group, parameter);
+                information[k] = prior.information[parameter as usize];
+                deviation[k] = prior.deviation(parameter, intrinsics);
+                if parameter != Parameter::LogFocal && !parameters.contains(&parameter) {
+                    shift[k] = -intrinsics.value(parameter);
+                }
             }
         }
-        let deviation = Parameter::ALL.map(|parameter| prior.deviation(parameter, &self.intrinsics));
-        let pull = self.pull - self.matrix * shift;
-        let scale: Vec<f64> = free.iter().map(|&k| scale_of(self.known[k] + prior.information[k])).collect();
+        let gradient = negative_gradient - matrix * &shift;
+        let scale: Vec<f64> = free.iter().map(|&k| scale_of(self.known[k] + information[k])).collect();
         let scaled = DMatrix::from_fn(free.len(), free.len(), |row, column| {
             let (k, l) = (free[row], free[column]);
-            let believed = if k == l { prior.information[k] } else { 0.0 };
-            (self.matrix[(k, l)] + believed) * scale[row] * scale[column]
+            let believed = if k == l { information[k] } else { 0.0 };
+            (matrix[(k, l)] + believed) * scale[row] * scale[column]
         });
         let target = DVector::from_fn(free.len(), |row, _| {
             let k = free[row];
-            (pull[k] - prior.information[k] * deviation[k]) * scale[row]
+            (gradient[k] - information[k] * deviation[k]) * scale[row]
         });
         // Of nothing there is no decomposition.
         let eigen = (!free.is_empty()).then(|| scaled.symmetric_eigen());
-        let mut variance = [Some(0.0); PARAMETERS];
-        let mut covariance = Coupled::zeros();
+        let mut variance = vec![Some(0.0); shift.len()];
+        let mut covariance = DMatrix::zeros(shift.len(), shift.len());
         let mut log_determinant = -2.0 * scale.iter().map(|scale| scale.ln()).sum::<f64>();
         for (&value, vector) in
             eigen.iter().flat_map(|eigen| eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()))
@@ -184,15 +237,39 @@ impl Information {
                 }
             }
         }
-        let believed: f64 = free.iter().map(|&k| prior.information[k] * (deviation[k] + shift[k]).powi(2)).sum();
-        let rise = shift.dot(&(self.matrix * shift)) - 2.0 * self.pull.dot(&shift) + believed;
-        let mut optimum = Optimum { shift: shift.into(), variance, rise, log_determinant, covariance };
-        if let Some(own) = &self.own_focals {
-            (optimum.variance[Parameter::LogFocal as usize], optimum.shift[Parameter::LogFocal as usize]) =
-                optimum.of(&own.mean);
+        let believed: f64 = free.iter().map(|&k| information[k] * (deviation[k] + shift[k]).powi(2)).sum();
+        let delta_cost = shift.dot(&(matrix * &shift)) - 2.0 * negative_gradient.dot(&shift) + believed;
+        let mut optimum = Optimum { shift, variance, delta_cost, log_determinant, covariance };
+        for (group, mean) in own_focals.iter().flat_map(|own| &own.mean).enumerate() {
+            let k = place(group, Parameter::LogFocal);
+            (optimum.variance[k], optimum.shift[k]) = optimum.of(mean);
         }
         optimum
     }
+}
+
+/// The reconstruction about its middle, its reduced system and the diagonal of the shared intrinsics were all else known.
+type Linearised = (Reconstruction, [Vec<f64>; 2], Vec<f64>);
+
+/// Eliminates the points; `None` without poses.
+fn linearised<const G: usize, const C: usize>(
+    reconstruction: &Reconstruction,
+    free: [Option<Parameter>; G],
+    observations: &[Observation],
+) -> Option<Linearised> {
+    let mut reconstruction = reconstruction.clone();
+    if reconstruction.poses.is_empty() {
+        return None;
+    }
+    centre(&mut reconstruction.poses, &mut reconstruction.points);
+    let problem = Metric::<G, C> { reconstruction, free, prior: IntrinsicsPrior::NONE };
+    let layout = Layout::new(observations, problem.camera_count(), problem.point_count());
+    let mut linearisation = Linearisation::<G, C, POINT>::new(&layout, problem.camera_count());
+    linearisation.fill(&problem, &layout, Loss::Squared);
+    let known = linearisation.globals_diagonal().iter().copied().collect();
+    let mut reduced = Reduced::new(&layout, problem.camera_count());
+    let possible = reduced.build(&problem, &layout, &linearisation, 0.0);
+    possible.then_some((problem.reconstruction, [reduced.matrix, reduced.vector], known))
 }
 
 /// Unit information for a parameter of which something is known.
@@ -200,69 +277,75 @@ fn scale_of(information: f64) -> f64 {
     if information > 0.0 { information.sqrt().recip() } else { 1.0 }
 }
 
-/// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics; its
-/// lower triangle is given. With it what the views' own focal lengths are, where they have them.
-///
-/// A direction of the views on which rounding hides what the observations say, but which goes along with the
-/// intrinsics, is taken to be as free as it can be: the intrinsics have no information left along with it. Taken as
-/// known, it would make them certain.
-fn without_views<const C: usize>(
-    matrix: &[f64],
-    vector: &[f64],
-    known: &[f64; PARAMETERS],
-    poses: &[Pose],
-) -> Option<(Coupled, SVector<f64, PARAMETERS>, Option<OwnFocals>)> {
-    let dimension = PARAMETERS + C * poses.len();
-    let at = |row: usize, column: usize| matrix[column * dimension + row];
-    let mut information = Coupled::from_fn(|row, column| at(row.max(column), row.min(column)));
-    let mut pull = SVector::from_fn(|row, _| vector[row]);
-    let views = WhitenedViews::<C>::new(matrix, PARAMETERS, poses)?;
-    let of_view =
-        |view: usize, column: usize| SVector::<f64, C>::from_fn(|row, _| at(PARAMETERS + C * view + row, column));
-    let coupling: Vec<DVector<f64>> =
-        (0..PARAMETERS).map(|column| views.function(|view| of_view(view, column))).collect();
-    let gradient = views.function(|view| SVector::<f64, C>::from_fn(|row, _| vector[PARAMETERS + C * view + row]));
-    let directions: Vec<Direction> = views
-        .directions()
-        .map(|(information, vector)| Direction {
-            information,
-            vector,
-            coupling: SVector::from_fn(|row, _| coupling[row].dot(&vector)),
-            pull: gradient.dot(&vector),
-        })
-        .collect();
-    let mut free = Vec::new();
-    for &Direction { information: value, coupling: along, pull: by_view, .. } in &directions {
-        match value {
-            Some(value) => {
-                information -= along * along.transpose() / value;
-                pull -= along * (by_view / value);
+impl WithoutViews {
+    /// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics; its
+    /// lower triangle is given. With it what the views' own focal lengths are, where they have them.
+    ///
+    /// A direction of the views on which rounding hides what the observations say, but which goes along with the
+    /// intrinsics, is taken to be as free as it can be: the intrinsics have no information left along with it. Taken as
+    /// known, it would make them certain.
+    fn new<const C: usize>(
+        matrix: &[f64],
+        vector: &[f64],
+        known: &[f64],
+        group_of: &[usize],
+        poses: &[Pose],
+    ) -> Option<Self> {
+        let first = known.len();
+        let dimension = first + C * poses.len();
+        let at = |row: usize, column: usize| matrix[column * dimension + row];
+        let mut information = DMatrix::from_fn(first, first, |row, column| at(row.max(column), row.min(column)));
+        let mut negative_gradient = DVector::from_column_slice(&vector[..first]);
+        let views = WhitenedViews::<C>::new(matrix, first, poses)?;
+        let of_view =
+            |view: usize, column: usize| SVector::<f64, C>::from_fn(|row, _| at(first + C * view + row, column));
+        let coupling: Vec<DVector<f64>> =
+            (0..first).map(|column| views.function(|view| of_view(view, column))).collect();
+        let gradient = views.function(|view| SVector::<f64, C>::from_fn(|row, _| vector[first + C * view + row]));
+        let directions: Vec<Direction> = views
+            .directions()
+            .map(|(information, vector)| Direction {
+                information,
+                vector,
+                coupling: DVector::from_fn(first, |row, _| coupling[row].dot(&vector)),
+                gradient: gradient.dot(&vector),
+            })
+            .collect();
+        let mut free = Vec::new();
+        for direction in &directions {
+            let along = &direction.coupling;
+            match direction.information {
+                Some(value) => {
+                    information.ger(-value.recip(), along, along, 1.0);
+                    negative_gradient.axpy(-direction.gradient / value, along, 1.0);
+                }
+                None => free.push(along.clone()),
             }
-            None => free.push(along),
         }
-    }
-    let own_focals = (C > POSE).then(|| own_focals(&views, &directions, poses.len()));
-    if own_focals.is_some() {
-        // A focal length for all is a direction of the views' own; with it the system would have none of its rank.
-        let shared = Parameter::LogFocal as usize;
-        information.row_mut(shared).fill(0.0);
-        information.column_mut(shared).fill(0.0);
-        information[(shared, shared)] = known[shared];
-        pull[shared] = 0.0;
-    }
-    let scale = SVector::<f64, PARAMETERS>::from_fn(|row, _| scale_of(known[row]));
-    for along in free {
-        let along = along.component_mul(&scale);
-        if along.amax() <= APART {
-            continue;
+        let groups = first / PARAMETERS;
+        let own_focals = (C > POSE).then(|| OwnFocals::new(&views, &directions, group_of, groups));
+        for shared in (0..groups).filter(|_| own_focals.is_some()).map(|group| place(group, Parameter::LogFocal)) {
+            // A focal length for all is a direction of the views' own; with it the system would have none of its rank.
+            information.row_mut(shared).fill(0.0);
+            information.column_mut(shared).fill(0.0);
+            information[(shared, shared)] = known[shared];
+            negative_gradient[shared] = 0.0;
         }
-        // The most that leaves the information positive.
-        let scaled = Coupled::from_fn(|row, column| information[(row, column)] * scale[row] * scale[column]);
-        let Some(solved) = scaled.cholesky().map(|factor| factor.solve(&along)) else { continue };
-        let taken = along * along.transpose() / along.dot(&solved);
-        information -= Coupled::from_fn(|row, column| taken[(row, column)] / (scale[row] * scale[column]));
+        let scale = DVector::from_fn(first, |row, _| scale_of(known[row]));
+        for along in free {
+            let along = along.component_mul(&scale);
+            if along.amax() <= APART {
+                continue;
+            }
+            // The most that leaves the information positive.
+            let scaled =
+                DMatrix::from_fn(first, first, |row, column| information[(row, column)] * scale[row] * scale[column]);
+            let Some(solved) = scaled.cholesky().map(|factor| factor.solve(&along)) else { continue };
+            let unscaled = along.component_div(&scale);
+            information.ger(-along.dot(&solved).recip(), &unscaled, &unscaled, 1.0);
+        }
+        Some(Self { matrix: information, negative_gradient, own_focals })
     }
-    Some((information, pull, own_focals))
 }
 
 /// An eigenvector of the information on the views.
@@ -271,47 +354,69 @@ struct Direction<'a> {
     information: Option<f64>,
     vector: DVectorView<'a, f64>,
     /// What it has in common with the shared intrinsics, and half the downward gradient along it.
-    coupling: SVector<f64, PARAMETERS>,
-    pull: f64,
+    coupling: DVector<f64>,
+    gradient: f64,
 }
 
-/// The log focal lengths of the views, and their mean.
-fn own_focals<const C: usize>(views: &WhitenedViews<C>, directions: &[Direction], count: usize) -> OwnFocals {
-    let function = |weights: &[f64]| {
-        let is_unseen = |(view, weight): (usize, &f64)| *weight > 0.0 && views.unseen(view, POSE) > TAKES_PART;
+impl OwnFocals {
+    fn new<const C: usize>(
+        views: &WhitenedViews<C>,
+        directions: &[Direction],
+        group_of: &[usize],
+        groups: usize,
+    ) -> Self {
+        let count = group_of.len();
+        let function = |weight: &dyn Fn(usize) -> f64| Function::new(views, directions, count, weight);
+        let of_view: Vec<Function> =
+            (0..count).map(|view| function(&|other| if other == view { 1.0 } else { 0.0 })).collect();
+        let mean = |group: usize| {
+            let of_group = || (0..count).filter(|view| group_of[*view] == group);
+            let least = of_group().filter_map(|view| of_view[view].variance).fold(f64::INFINITY, f64::min);
+            let counts = |view: usize| {
+                let is_known = |variance: f64| variance <= COUNTS_WITHIN * least;
+                group_of[view] == group && of_view[view].variance.is_some_and(is_known)
+            };
+            let counted = of_group().filter(|view| counts(*view)).count();
+            function(&|view| if counts(view) { (counted as f64).recip() } else { 0.0 })
+        };
+        let mean = (0..groups).map(mean).collect();
+        Self { of_view, mean }
+    }
+}
+
+impl Function {
+    /// A weighted sum of the log focal lengths of so many views.
+    fn new<const C: usize>(
+        views: &WhitenedViews<C>,
+        directions: &[Direction],
+        count: usize,
+        weight: &dyn Fn(usize) -> f64,
+    ) -> Self {
         let whitened = views.function(|view| {
             let mut gradient = SVector::zeros();
-            gradient[POSE] = weights[view];
+            gradient[POSE] = weight(view);
             gradient
         });
-        let mut found = Function { variance: Some(0.0), coupling: SVector::zeros(), shift: 0.0 };
+        let shared = directions.first().map_or(0, |direction| direction.coupling.len());
+        let mut found = Self { variance: Some(0.0), coupling: DVector::zeros(shared), shift: 0.0 };
         for direction in directions {
             let along = whitened.dot(&direction.vector);
             match direction.information {
                 Some(value) => {
                     found.variance = found.variance.map(|sum| sum + along * along / value);
-                    found.coupling += direction.coupling * (along / value);
-                    found.shift += direction.pull * along / value;
+                    found.coupling.axpy(along / value, &direction.coupling, 1.0);
+                    found.shift += direction.gradient * along / value;
                 }
                 None if along * along > TAKES_PART * whitened.norm_squared() => found.variance = None,
                 None => {}
             }
         }
-        let is_undetermined = weights.iter().enumerate().any(is_unseen);
+        let is_undetermined = (0..count).any(|view| weight(view) > 0.0 && views.unseen(view, POSE) > TAKES_PART);
         found.variance = found.variance.filter(|variance| !is_undetermined && *variance > 0.0);
-        // That of a focal length that all views share is no coupling with anything else.
-        found.coupling[Parameter::LogFocal as usize] = 0.0;
+        // That of a focal length that all views of a group share is no coupling with anything else.
+        found.coupling.iter_mut().step_by(PARAMETERS).for_each(|along| *along = 0.0);
         found
-    };
-    let of_view: Vec<Function> = (0..count)
-        .map(|view| function(&Vec::from_iter((0..count).map(|other| f64::from(u8::from(other == view))))))
-        .collect();
-    let least = of_view.iter().filter_map(|function| function.variance).fold(f64::INFINITY, f64::min);
-    let counts = |function: &Function| function.variance.is_some_and(|variance| variance <= COUNTS_WITHIN * least);
-    let counted = of_view.iter().filter(|function| counts(function)).count();
-    let weight = |function: &Function| if counts(function) { (counted as f64).recip() } else { 0.0 };
-    let mean = function(&of_view.iter().map(weight).collect::<Vec<_>>());
-    OwnFocals { of_view, mean }
+    }
 }
 
 #[cfg(test)]
@@ -330,7 +435,7 @@ mod tests {
 
     fn optimum(scene: &TestScene, model: IntrinsicsModel) -> Optimum {
         let information = Information::new(&truth(scene), &scene.observations).expect("poses");
-        information.optimum(model, &IntrinsicsPrior::NONE)
+        information.optimum(model, &[IntrinsicsPrior::NONE])
     }
 
     /// The same scene with the world's origin elsewhere and in another unit.
@@ -391,9 +496,9 @@ mod tests {
             matrix[(first, 0)] = coupled * (weak / 2.0).sqrt();
             matrix[(second, 0)] = -matrix[(first, 0)];
             let poses = [pose(0.0), pose(1.0)];
-            without_views::<POSE>(matrix.as_slice(), &vec![0.0; dimension], &[1.0; PARAMETERS], &poses)
+            WithoutViews::new::<POSE>(matrix.as_slice(), &vec![0.0; dimension], &[1.0; PARAMETERS], &[0; 2], &poses)
                 .expect("finite")
-                .0
+                .matrix
         };
         for weak in [1e-4, 1e-9, 1e-15] {
             let left = system(weak, 0.999)[(0, 0)];
@@ -410,7 +515,7 @@ mod tests {
                 let scene = testing::scene_of(seed, 10, 20, 0.0, motion, false);
                 let optimum = optimum(&scene, IntrinsicsModel::FOCAL);
                 println!("{motion:?} seed {seed}: {optimum:?}");
-                assert_eq!(optimum.variance_of(Parameter::LogFocal), None, "{motion:?} seed {seed}");
+                assert_eq!(optimum.variance_of(0, Parameter::LogFocal), None, "{motion:?} seed {seed}");
             }
         }
     }
@@ -422,7 +527,7 @@ mod tests {
             let deviation = |model| {
                 let optimum = optimum(&scene, model);
                 assert!(optimum.variance.iter().all(Option::is_some), "seed {seed}: {optimum:?}");
-                optimum.variance_of(Parameter::LogFocal).expect("observable").sqrt() * NOISE
+                optimum.variance_of(0, Parameter::LogFocal).expect("observable").sqrt() * NOISE
             };
             let model = IntrinsicsModel::FOCAL.with(Extension::PrincipalPoint);
             let chain = [IntrinsicsModel::FOCAL, model, model.with(Extension::Aspect), IntrinsicsModel::FULL];
@@ -437,7 +542,7 @@ mod tests {
     /// Standard deviations of the views' own log focal lengths at the truth.
     fn own_sigmas(scene: &TestScene, model: IntrinsicsModel) -> (Vec<Option<f64>>, Optimum) {
         let information = Information::new(&truth(scene).with_own_focals(), &scene.observations).expect("poses");
-        let optimum = information.optimum(model, &IntrinsicsPrior::NONE);
+        let optimum = information.optimum(model, &[IntrinsicsPrior::NONE]);
         let sigma = |(variance, _): (Option<f64>, f64)| variance.map(|variance| variance.sqrt() * NOISE);
         (information.own_focals(&optimum).into_iter().map(sigma).collect(), optimum)
     }
@@ -448,7 +553,7 @@ mod tests {
         for seed in 0..3 {
             let scene = testing::scene(seed, 10, 40, 0.0);
             let sigma =
-                |optimum: &Optimum| optimum.variance_of(Parameter::LogFocal).expect("observable").sqrt() * NOISE;
+                |optimum: &Optimum| optimum.variance_of(0, Parameter::LogFocal).expect("observable").sqrt() * NOISE;
             let constant = sigma(&optimum(&scene, IntrinsicsModel::FOCAL));
             let (own, optimum) = own_sigmas(&scene, model);
             let (behind_lens, _) = own_sigmas(&scene, model.with(Extension::RadialK1));
@@ -479,7 +584,7 @@ mod tests {
         let (found, optimum) = own_sigmas(&scene, model);
         let free = |sigma: Option<f64>| sigma.is_none_or(|sigma| sigma > 1.0);
         assert!(found.iter().all(|sigma| free(*sigma)), "{found:?}");
-        assert!(free(optimum.variance_of(Parameter::LogFocal).map(|variance| variance.sqrt() * NOISE)));
+        assert!(free(optimum.variance_of(0, Parameter::LogFocal).map(|variance| variance.sqrt() * NOISE)));
     }
 
     /// What one linearisation foretells of a richer model, an adjustment of that model finds.
@@ -494,26 +599,27 @@ mod tests {
                 let mut start = start.clone();
                 let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
                 let stop = StopToken::default();
-                let report = adjust(&mut start, &scene.observations, model, prior, &options, &stop);
+                let report =
+                    adjust(&mut start, &scene.observations, model, std::slice::from_ref(prior), &options, &stop);
                 (start, report.cost)
             };
             let prior = IntrinsicsPrior::NONE.knowing(Parameter::PrincipalX, 0.001, 0.01, 0.0005);
             let mut pinhole = truth(&scene);
-            pinhole.intrinsics = Intrinsics::from_focal(scene.intrinsics.focal);
+            pinhole.intrinsics = vec![Intrinsics::from_focal(scene.intrinsics.focal)];
             let (simple, cost) = adjusted(&pinhole, IntrinsicsModel::FOCAL, &prior);
             let constant = simple.clone();
             let information = Information::new(&simple, &scene.observations).expect("poses");
             for model in IntrinsicsModel::FOCAL.with_any_extensions() {
-                let foretold = information.optimum(model, &prior);
+                let foretold = information.optimum(model, &[prior]);
                 let (found, found_cost) = adjusted(&simple, model, &prior);
                 let rise = found_cost - cost;
                 for parameter in Parameter::ALL {
-                    let shift = found.intrinsics.value(parameter) - simple.intrinsics.value(parameter);
-                    let sigma = foretold.variance_of(parameter).expect("observable").sqrt() * 0.0005;
-                    let error = (foretold.shift[parameter as usize] - shift).abs();
+                    let shift = found.intrinsics[0].value(parameter) - simple.intrinsics[0].value(parameter);
+                    let sigma = foretold.variance_of(0, parameter).expect("observable").sqrt() * 0.0005;
+                    let error = (foretold.shift_of(0, parameter) - shift).abs();
                     assert!(error <= 0.1 * sigma + 1e-9, "seed {seed}, {}: {parameter:?} off by {error}", model.name());
                 }
-                let error = (foretold.rise - rise).abs() / (0.0005 * 0.0005);
+                let error = (foretold.delta_cost - rise).abs() / (0.0005 * 0.0005);
                 println!("seed {seed}, {}: chi-square off by {error:.3}", model.name());
                 assert!(error < 0.2, "seed {seed}, {}: {error}", model.name());
             }
@@ -521,7 +627,7 @@ mod tests {
             let (simple, _) = adjusted(&simple.with_own_focals(), IntrinsicsModel::FOCAL_PER_VIEW, &prior);
             let information = Information::new(&simple, &scene.observations).expect("poses");
             for model in IntrinsicsModel::FOCAL_PER_VIEW.with_any_extensions() {
-                let foretold = information.own_focals(&information.optimum(model, &prior));
+                let foretold = information.own_focals(&information.optimum(model, &[prior]));
                 let (found, _) = adjusted(&simple, model, &prior);
                 assert_eq!(foretold.len(), 8);
                 for (view, (variance, shift)) in foretold.into_iter().enumerate() {
@@ -537,10 +643,57 @@ mod tests {
                 .fold(IntrinsicsModel::FOCAL, IntrinsicsModel::with);
             let (rich, rich_cost) = adjusted(&constant, model, &prior);
             let information = Information::new(&rich, &scene.observations).expect("poses");
-            let back = information.optimum(IntrinsicsModel::FOCAL, &prior);
-            let believed = prior.cost(model, &rich.intrinsics);
-            let error = (back.rise - (cost - rich_cost + believed)).abs() / (0.0005 * 0.0005);
+            let back = information.optimum(IntrinsicsModel::FOCAL, &[prior]);
+            let believed = prior.cost(model, &rich.intrinsics[0]);
+            let error = (back.delta_cost - (cost - rich_cost + believed)).abs() / (0.0005 * 0.0005);
             assert!(error < 0.02 * (cost - rich_cost) / (0.0005 * 0.0005) + 0.2, "seed {seed}: {error}");
+        }
+    }
+
+    /// What several camera groups are told, one is told too; and what is foretold of several, an adjustment finds.
+    #[test]
+    fn camera_groups_are_told_as_one_is_and_as_an_adjustment_finds() {
+        let model = IntrinsicsModel::FOCAL.with(Extension::RadialK1);
+        for seed in 0..3 {
+            println!("seed {seed}");
+            let scene = testing::scene(seed, 8, 40, NOISE);
+            for start in [truth(&scene), truth(&scene).with_own_focals()] {
+                let [one, several] = match start.has_own_focals() {
+                    true => [Information::of_one_group::<VIEW>, Information::of_groups::<VIEW>],
+                    false => [Information::of_one_group::<POSE>, Information::of_groups::<POSE>],
+                }
+                .map(|linearised| linearised(&start, &scene.observations).expect("poses"));
+                let prior = [IntrinsicsPrior::NONE];
+                let (expected, found) = (one.optimum(model, &prior), several.optimum(model, &prior));
+                for parameter in model.parameters() {
+                    let variances = [&expected, &found].map(|optimum| optimum.variance_of(0, parameter));
+                    let [expected, found] = variances.map(|variance| variance.expect("observable"));
+                    assert!((found / expected - 1.0).abs() < 1e-6, "{parameter:?}: {found} for {expected}");
+                }
+                let owns = [one.own_focals(&expected), several.own_focals(&found)];
+                for ((expected, _), (found, _)) in owns[0].iter().zip(&owns[1]) {
+                    let [expected, found] = [expected, found].map(|variance| variance.expect("observable"));
+                    assert!((found / expected - 1.0).abs() < 1e-6, "{found} for {expected}");
+                }
+            }
+            let adjusted = |mut start: Reconstruction, model: IntrinsicsModel| {
+                let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
+                let priors = [IntrinsicsPrior::NONE; 2];
+                adjust(&mut start, &scene.observations, model, &priors, &options, &StopToken::default());
+                start
+            };
+            let simple = adjusted(truth(&scene).in_groups(&[0, 0, 0, 0, 1, 1, 1, 1], 2), IntrinsicsModel::FOCAL);
+            let rich = adjusted(simple.clone(), model);
+            let information = Information::new(&simple, &scene.observations).expect("poses");
+            let foretold = information.optimum(model, &[IntrinsicsPrior::NONE; 2]);
+            for (group, parameter) in
+                [0, 1].into_iter().flat_map(|group| model.parameters().into_iter().map(move |p| (group, p)))
+            {
+                let [from, to] = [&simple, &rich].map(|found| found.intrinsics[group].value(parameter));
+                let sigma = foretold.variance_of(group, parameter).expect("observable").sqrt() * NOISE;
+                let error = (to - from - foretold.shift_of(group, parameter)).abs() / sigma;
+                assert!(error < 0.2, "group {group}, {parameter:?}: off by {error} sigma");
+            }
         }
     }
 }

@@ -222,6 +222,11 @@ impl IntrinsicsPrior {
         }
     }
 
+    /// What the parameters of a model of each camera group cost where they are.
+    pub fn cost_of(priors: &[Self], model: IntrinsicsModel, intrinsics: &[Intrinsics]) -> f64 {
+        priors.iter().zip(intrinsics).map(|(prior, intrinsics)| prior.cost(model, intrinsics)).sum()
+    }
+
     /// What the parameters of a model cost where they are.
     pub fn cost(&self, model: IntrinsicsModel, intrinsics: &Intrinsics) -> f64 {
         let cost =

@@ -8,13 +8,16 @@ use super::engine::{Belief, Jacobian, Problem, Sink, Step, minimise};
 use super::intrinsics::ImageGradients;
 pub use super::intrinsics::Intrinsics;
 pub use super::intrinsics_model::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
-use super::{Observation, Options, Report};
+use super::{Observation, Options, Report, sequence};
 use crate::domain::StopToken;
+use crate::parallel::Threads;
 
 /// Unknowns of a pose (rotation vector, then translation), of a view with a focal length of its own, whose logarithm
 /// comes after its pose, and of a point.
 pub(super) const POSE: usize = 6;
 pub(super) const VIEW: usize = POSE + 1;
+/// The same of a view with intrinsics of its own, which come after its pose.
+pub(super) const OWN_CAMERA: usize = POSE + Parameter::COUNT;
 pub(super) const POINT: usize = 3;
 
 /// World to camera: `x = R X + t`.
@@ -91,8 +94,8 @@ impl<'a> Projection<'a> {
 }
 
 impl ProjectionGradients {
-    /// By these intrinsics, pose and point; of a view with another unknown, which comes after the pose, by its log focal
-    /// length.
+    /// By these intrinsics, pose and point; of a view with more unknowns, which come after the pose, by its own
+    /// intrinsics in the order of [`Parameter`], of which the log focal length is the first.
     #[inline]
     pub(super) fn jacobian<const G: usize, const C: usize>(
         &self,
@@ -104,7 +107,7 @@ impl ProjectionGradients {
             }),
             camera: SMatrix::from_fn(|k, component| match self.by_pose[component].get(k) {
                 Some(by_pose) => *by_pose,
-                None => self.by_parameter[component][Parameter::LogFocal as usize],
+                None => self.by_parameter[component][k - POSE],
             }),
             point: SMatrix::from_columns(&self.by_point),
         }
@@ -114,9 +117,12 @@ impl ProjectionGradients {
 /// A metric reconstruction, up to a similarity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Reconstruction {
-    /// Of all views; where they have focal lengths of their own, with the geometric mean of these.
-    pub intrinsics: Intrinsics,
-    /// The focal length of each view; empty where all have that of `intrinsics`.
+    /// One a camera group, whose views share it; where they have focal lengths of their own, with the geometric mean of
+    /// these.
+    pub intrinsics: Vec<Intrinsics>,
+    /// Camera group of each view.
+    pub group_of: Vec<usize>,
+    /// The focal length of each view; empty where views have that of their group.
     pub focals: Vec<f64>,
     pub poses: Vec<Pose>,
     pub points: Vec<Vector3<f64>>,
@@ -125,14 +131,26 @@ pub struct Reconstruction {
 impl Reconstruction {
     /// With one calibration for all views.
     pub fn new(intrinsics: Intrinsics, poses: Vec<Pose>, points: Vec<Vector3<f64>>) -> Self {
-        Self { intrinsics, focals: Vec::new(), poses, points }
+        Self { intrinsics: vec![intrinsics], group_of: vec![0; poses.len()], focals: Vec::new(), poses, points }
     }
 
-    /// The same with a focal length of each view, all alike unless it has these already.
+    /// The same with a focal length of each view, that of its group unless it has these already.
     pub fn with_own_focals(mut self) -> Self {
         if self.focals.is_empty() {
-            self.focals = vec![self.intrinsics.focal; self.poses.len()];
+            self.focals = (0..self.poses.len()).map(|view| self.intrinsics_of(view).focal).collect();
         }
+        self
+    }
+
+    /// The same of camera groups, each with the geometric mean of its views' focal lengths.
+    ///
+    /// * `group_of`: the group of each view
+    pub fn in_groups(mut self, group_of: &[usize], groups: usize) -> Self {
+        self = self.with_own_focals();
+        self.intrinsics = vec![self.intrinsics[0]; groups];
+        self.group_of = group_of.to_vec();
+        self.average_focals();
+        self.focals.clear();
         self
     }
 
@@ -142,26 +160,39 @@ impl Reconstruction {
     }
 
     /// Intrinsics of a view.
+    ///
+    /// # Panics
+    /// When the view or its group is out of range.
     #[inline]
     pub fn intrinsics_of(&self, view: usize) -> Intrinsics {
+        let shared = self.intrinsics[self.group_of[view]];
         match self.focals.get(view) {
-            Some(&focal) => Intrinsics { focal, ..self.intrinsics },
-            None => self.intrinsics,
+            Some(&focal) => Intrinsics { focal, ..shared },
+            None => shared,
         }
     }
 
     /// Multiplies all focal lengths.
     pub fn scale_focals(&mut self, factor: f64) {
-        self.intrinsics.focal *= factor;
+        self.intrinsics.iter_mut().for_each(|intrinsics| intrinsics.focal *= factor);
         self.focals.iter_mut().for_each(|focal| *focal *= factor);
     }
 
-    /// Takes the geometric mean of the views' own focal lengths as that of all.
+    /// Takes the geometric mean of the views' own focal lengths as that of their group.
     pub fn average_focals(&mut self) {
-        if self.has_own_focals() {
-            let logs = self.focals.iter().map(|focal| focal.ln()).sum::<f64>();
-            self.intrinsics.focal = (logs / self.focals.len() as f64).exp();
+        for (group, intrinsics) in self.intrinsics.iter_mut().enumerate() {
+            let of_group = self.focals.iter().zip(&self.group_of).filter(|(_, of)| **of == group);
+            let logs: Vec<f64> = of_group.map(|(focal, _)| focal.ln()).collect();
+            if !logs.is_empty() {
+                intrinsics.focal = (logs.iter().sum::<f64>() / logs.len() as f64).exp();
+            }
         }
+    }
+
+    /// Logarithm of the focal length, the mean over the camera groups.
+    pub fn log_focal(&self) -> f64 {
+        let logs = self.intrinsics.iter().map(|intrinsics| intrinsics.focal.ln());
+        logs.sum::<f64>() / self.intrinsics.len() as f64
     }
 
     /// The cameras `K [R|t]`.
@@ -169,7 +200,7 @@ impl Reconstruction {
         self.poses.iter().enumerate().map(|(view, pose)| pose.camera(&self.intrinsics_of(view))).collect()
     }
 
-    /// Predicted minus observed image point; infinite or not a number at depth zero.
+    /// Predicted minus observed image point, unweighted; infinite or not a number at depth zero.
     ///
     /// # Panics
     /// When the observation's indices are out of range.
@@ -178,7 +209,7 @@ impl Reconstruction {
     }
 }
 
-/// A reconstruction with these `G` shared intrinsics free, in a place without one nothing moves, and `C` unknowns of each
+/// A reconstruction of one camera group with these `G` shared intrinsics free, in a place without one nothing moves, and `C` unknowns of each
 /// view: [`POSE`], or [`VIEW`] where its own focal length is free.
 #[derive(Clone)]
 pub(super) struct Metric<const G: usize, const C: usize> {
@@ -206,14 +237,14 @@ impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
 
     fn retract(&mut self, from: &Self, step: &Step<G, C, POINT>) {
         let (moved, from) = (&mut self.reconstruction, &from.reconstruction);
-        moved.intrinsics = from.intrinsics;
+        moved.intrinsics.copy_from_slice(&from.intrinsics);
         for (parameter, by) in self.free.iter().zip(step.globals.iter()) {
-            parameter.iter().for_each(|parameter| moved.intrinsics.shift(*parameter, *by));
+            parameter.iter().for_each(|parameter| moved.intrinsics[0].shift(*parameter, *by));
         }
         for ((pose, from), step) in moved.poses.iter_mut().zip(&from.poses).zip(&step.cameras) {
             *pose = from.moved(std::array::from_fn(|k| step[k]));
         }
-        let shared = moved.intrinsics.focal / from.intrinsics.focal;
+        let shared = moved.intrinsics[0].focal / from.intrinsics[0].focal;
         for ((focal, from), step) in moved.focals.iter_mut().zip(&from.focals).zip(&step.cameras) {
             *focal = from * shared * step.get(POSE).map_or(1.0, |by| by.exp());
         }
@@ -226,7 +257,7 @@ impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
         self.free.map(|parameter| match parameter {
             Some(parameter) => Belief {
                 information: self.prior.information[parameter as usize],
-                deviation: self.prior.deviation(parameter, &self.reconstruction.intrinsics),
+                deviation: self.prior.deviation(parameter, &self.reconstruction.intrinsics[0]),
             },
             // Known to be where it is.
             None => Belief { information: 1.0, deviation: 0.0 },
@@ -234,10 +265,10 @@ impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
     }
 }
 
-/// Minimises the reprojection error over poses, points and the free intrinsics, of which `prior` knows something. Focal
-/// lengths a view are free only where the reconstruction has them.
+/// Minimises the reprojection error over poses, points and the free intrinsics, the same of every camera group, of which
+/// `priors`, one a group, know something. Focal lengths a view are free only where the reconstruction has them.
 ///
-/// The cost contains what the prior adds.
+/// The cost contains what the priors add.
 ///
 /// # Pitfall
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
@@ -245,10 +276,15 @@ pub fn adjust(
     reconstruction: &mut Reconstruction,
     observations: &[Observation],
     model: IntrinsicsModel,
-    prior: &IntrinsicsPrior,
+    priors: &[IntrinsicsPrior],
     options: &Options,
     stop: &StopToken,
 ) -> Report {
+    let [prior] = priors else {
+        let models = vec![model; reconstruction.intrinsics.len()];
+        let run = sequence::Run { threads: Threads::ONE, stop, told: &mut || () };
+        return sequence::adjust(reconstruction, observations, &sequence::Free::all(&models), priors, options, run);
+    };
     let run = Run { observations, prior, options, stop };
     let report = match model.is_per_view() && reconstruction.has_own_focals() {
         true => run.with::<VIEW>(model, reconstruction),
@@ -258,7 +294,7 @@ pub fn adjust(
     report
 }
 
-/// What an adjustment works with, whatever is free.
+/// What an adjustment of one camera group works with, whatever is free.
 struct Run<'a> {
     observations: &'a [Observation],
     prior: &'a IntrinsicsPrior,
@@ -302,7 +338,7 @@ mod tests {
 
     fn perturbed(scene: &TestScene, deviation: f64, seed: u64) -> Reconstruction {
         let mut start = truth(scene);
-        testing::perturb(std::iter::once(&mut start.intrinsics.focal), 10.0 * deviation, seed);
+        testing::perturb(std::iter::once(&mut start.intrinsics[0].focal), 10.0 * deviation, seed);
         testing::perturb(start.points.iter_mut().flat_map(|point| point.iter_mut()), deviation, seed + 1);
         testing::perturb(start.poses.iter_mut().flat_map(|pose| pose.translation.iter_mut()), deviation, seed + 2);
         for (k, pose) in start.poses.iter_mut().enumerate() {
@@ -316,12 +352,12 @@ mod tests {
     fn jacobians_of_all_models_agree_with_finite_differences() {
         let scene = testing::scene(1, 4, 8, NOISE);
         let mut start = perturbed(&scene, 0.01, 1);
-        start.intrinsics.principal_point = Vector2::new(0.03, -0.02);
-        start.intrinsics.aspect = 1.1;
+        start.intrinsics[0].principal_point = Vector2::new(0.03, -0.02);
+        start.intrinsics[0].aspect = 1.1;
         for (radial, tangential) in
             [([0.0; 3], [0.0; 2]), ([-0.1, 0.0, 0.0], [0.01, 0.0]), ([-0.1, 0.07, -0.03], [0.01, -0.02])]
         {
-            (start.intrinsics.radial, start.intrinsics.tangential) = (radial, tangential);
+            (start.intrinsics[0].radial, start.intrinsics[0].tangential) = (radial, tangential);
             let mut own = start.clone();
             own.focals = vec![0.9, 1.0, 1.2, 1.5];
             for reconstruction in [start.clone(), own] {
@@ -358,13 +394,13 @@ mod tests {
                 &mut start,
                 &scene.observations,
                 IntrinsicsModel::FOCAL,
-                &IntrinsicsPrior::NONE,
+                &[IntrinsicsPrior::NONE],
                 &Options { max_iterations: 60, ..Options::default() },
                 &StopToken::default(),
             );
             let freedom = 2 * scene.observations.len() - (6 * 8 + 3 * 30 - 7 + 1);
             let ratio = report.cost / (freedom as f64 * NOISE * NOISE);
-            let focal_error = start.intrinsics.focal / scene.intrinsics.focal - 1.0;
+            let focal_error = start.intrinsics[0].focal / scene.intrinsics.focal - 1.0;
             println!("seed {seed}: {report:?}, chi2 per degree of freedom {ratio:.3}, focal off by {focal_error:.4}");
             assert!((0.7..1.3).contains(&ratio), "seed {seed}: {ratio}");
             assert!(focal_error.abs() < 0.03, "seed {seed}: {focal_error}");
@@ -382,16 +418,22 @@ mod tests {
         let adjusted = |prior: &IntrinsicsPrior| {
             let mut start = truth(&scene);
             let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::default() };
-            let report =
-                adjust(&mut start, &scene.observations, IntrinsicsModel::FOCAL, prior, &options, &StopToken::default());
-            (start.intrinsics.focal.ln(), report.cost)
+            let report = adjust(
+                &mut start,
+                &scene.observations,
+                IntrinsicsModel::FOCAL,
+                std::slice::from_ref(prior),
+                &options,
+                &StopToken::default(),
+            );
+            (start.intrinsics[0].focal.ln(), report.cost)
         };
         let (free, cost) = adjusted(&IntrinsicsPrior::NONE);
         let mut reconstruction = truth(&scene);
-        reconstruction.intrinsics.focal = free.exp();
+        reconstruction.intrinsics[0].focal = free.exp();
         let information = Information::new(&reconstruction, &scene.observations).expect("poses");
-        let optimum = information.optimum(IntrinsicsModel::FOCAL, &IntrinsicsPrior::NONE);
-        let variance = optimum.variance_of(Parameter::LogFocal).expect("observable");
+        let optimum = information.optimum(IntrinsicsModel::FOCAL, &[IntrinsicsPrior::NONE]);
+        let variance = optimum.variance_of(0, Parameter::LogFocal).expect("observable");
         let sigma = variance.sqrt() * NOISE;
         // As well known as the data say, one sigma away: it pulls half the way, and costs half a chi-square.
         let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, free + sigma, sigma, NOISE);
@@ -405,10 +447,10 @@ mod tests {
     fn fixed_intrinsics_stay_fixed() {
         let scene = testing::scene(2, 4, 12, NOISE);
         let mut start = perturbed(&scene, 0.01, 2);
-        let before = start.intrinsics;
+        let before = start.intrinsics.clone();
         let options = Options::default();
         let (model, prior) = (IntrinsicsModel::FIXED, IntrinsicsPrior::NONE);
-        let report = adjust(&mut start, &scene.observations, model, &prior, &options, &StopToken::default());
+        let report = adjust(&mut start, &scene.observations, model, &[prior], &options, &StopToken::default());
         assert!(report.iterations > 0);
         assert_eq!(start.intrinsics, before);
     }
@@ -420,15 +462,15 @@ mod tests {
             let options = Options::default();
             for model in [IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
                 let prior = IntrinsicsPrior::NONE;
-                let report = adjust(&mut start, observations, model, &prior, &options, &StopToken::default());
+                let report = adjust(&mut start, observations, model, &[prior], &options, &StopToken::default());
                 assert!(report.cost.is_finite() && report.cost <= report.initial_cost, "{report:?}");
                 if let Some(information) = Information::new(&start, observations) {
-                    information.optimum(model, &prior);
+                    information.optimum(model, &[prior]);
                 }
             }
             start
         };
-        run(Reconstruction { poses: vec![], points: vec![], ..truth(&scene) }, &scene.observations);
+        run(Reconstruction::new(scene.intrinsics, vec![], vec![]), &scene.observations);
         run(truth(&scene), &[]);
         let mut odd = truth(&scene);
         // Depth zero, far away, and a camera that sees a single point.
@@ -436,7 +478,7 @@ mod tests {
         odd.points[1] *= 1e9;
         let few: Vec<_> = scene.observations.iter().filter(|seen| seen.view != 2 || seen.point == 3).copied().collect();
         let odd = run(odd, &few);
-        assert!(odd.intrinsics.focal.is_finite() && odd.points.iter().all(|point| point.norm().is_finite()));
+        assert!(odd.intrinsics[0].focal.is_finite() && odd.points.iter().all(|point| point.norm().is_finite()));
         let mut broken = truth(&scene);
         broken.poses[1].translation.fill(f64::NAN);
         run(broken, &scene.observations);

@@ -23,7 +23,7 @@ struct Sighted {
     /// The camera's columns, rows within.
     camera: [[Lane; 3]; 4],
     xy: [Lane; 2],
-    /// 0 where the track has no such observation, or does without it; else 1.
+    /// That of the observation; 0 where the track has none, or does without it.
     weight: Lane,
 }
 
@@ -66,7 +66,7 @@ impl Triangulated {
         Point::new(self.points[0].0[track], self.points[1].0[track], self.points[2].0[track], self.points[3].0[track])
     }
 
-    /// Its sum of squared reprojection residuals.
+    /// Its weighted sum of squared reprojection residuals.
     pub fn cost(&self, track: usize) -> f64 {
         self.costs.0[track]
     }
@@ -99,7 +99,7 @@ impl Batch {
                 if k < track.len() {
                     sighted.xy[0].0[lane] = seen.xy.x;
                     sighted.xy[1].0[lane] = seen.xy.y;
-                    sighted.weight.0[lane] = 1.0;
+                    sighted.weight.0[lane] = seen.weight;
                 }
             }
         }
@@ -137,7 +137,7 @@ impl Batch {
         )
     }
 
-    /// Squared reprojection residuals of the tracks' `k`-th observations, for each `k`; 0 of those that they do without.
+    /// Weighted squared reprojection residuals of the tracks' `k`-th observations, for each `k`; 0 of those that they do without.
     pub fn squared_residuals(&self, found: &Triangulated) -> Vec<[f64; LANES]> {
         vectorised(
             #[inline(always)]

@@ -29,13 +29,16 @@ pub fn reprojection(camera: &Camera, point: &Point, xy: &Vector2<f64>) -> Vector
     image.xy() / away_from_zero(image.z) - xy
 }
 
-/// Sum of squared reprojection residuals of a point over its observations.
+/// Squared reprojection residual, by the observation's weight.
+#[inline(always)]
+pub fn weighted_squared(camera: &Camera, point: &Point, seen: &Observation) -> f64 {
+    seen.weight * reprojection(camera, point, &seen.xy).norm_squared()
+}
+
+/// Weighted sum of squared reprojection residuals of a point over its observations.
 #[inline(always)]
 pub fn squared_residual(cameras: &[Camera], point: &Point, observations: &[Observation]) -> f64 {
-    observations
-        .iter()
-        .map(|observation| reprojection(&cameras[observation.view], point, &observation.xy).norm_squared())
-        .sum()
+    observations.iter().map(|seen| weighted_squared(&cameras[seen.view], point, seen)).sum()
 }
 
 /// Linear triangulation (Hartley & Zisserman, section 12.2): the unit 4-vector that is least inconsistent with
@@ -59,7 +62,7 @@ fn inconsistency(cameras: &[Camera], observations: &[Observation]) -> Matrix4<f6
         let third = columns.map(|column| column[2]);
         let of_direction: f64 = third[..3].iter().map(|entry| entry * entry).sum();
         let of_all = of_direction + third[3] * third[3];
-        let weight = 1.0 / (of_direction + f64::EPSILON * of_all).max(f64::MIN_POSITIVE);
+        let weight = observation.weight / (of_direction + f64::EPSILON * of_all).max(f64::MIN_POSITIVE);
         for (axis, coordinate) in [observation.xy.x, observation.xy.y].into_iter().enumerate() {
             let row = columns.map(|column| column[2] * coordinate - column[axis]);
             accumulate(&mut normal, row.map(|entry| weight * entry), row);
@@ -68,7 +71,7 @@ fn inconsistency(cameras: &[Camera], observations: &[Observation]) -> Matrix4<f6
     Matrix4::from(normal)
 }
 
-/// Refines a point by Levenberg-Marquardt on its squared reprojection residuals, at most `iterations` steps.
+/// Refines a point by Levenberg-Marquardt on its weighted squared reprojection residuals, at most `iterations` steps.
 ///
 /// Returns the point, of unit norm, and its sum of squared residuals; never worse than the start.
 pub fn refine(cameras: &[Camera], observations: &[Observation], start: Point, iterations: usize) -> (Point, f64) {
@@ -94,8 +97,9 @@ fn descend(cameras: &[Camera], observations: &[Observation], start: Point, itera
             for axis in [0, 1] {
                 let projected = image[axis] * nearness;
                 let slope = columns.map(|column| (column[axis] - projected * column[2]) * nearness);
-                accumulate(&mut normal, slope, slope);
-                gradient += Point::from(slope) * (projected - observation.xy[axis]);
+                let weighted = slope.map(|entry| observation.weight * entry);
+                accumulate(&mut normal, weighted, slope);
+                gradient += Point::from(weighted) * (projected - observation.xy[axis]);
             }
         }
         let mut normal = Matrix4::from(normal);

@@ -91,10 +91,7 @@ impl Draft {
     /// Every violation found, by field and index.
     pub fn finish(self) -> Result<Input, InvalidInput> {
         match self.body {
-            Body::TrackSet(set) => {
-                check_sigma(&set)?;
-                Input::new(track_set_to_raw(set), &self.limits, TRACK_SET)
-            }
+            Body::TrackSet(set) => Input::new(track_set_to_raw(set), &self.limits, TRACK_SET),
             Body::Matrix(matrix) => matrix::to_input(matrix, &self.limits),
         }
     }
@@ -124,26 +121,6 @@ pub(super) fn within(prefix: &str, counts: &[(&str, usize, usize)]) -> Result<()
     }
 }
 
-/// The noise of single observations is not used yet, but what is wrong today is wrong tomorrow.
-fn check_sigma(set: &proto::TrackSet) -> Result<(), InvalidInput> {
-    if !set.sigma.is_empty() && set.sigma.len() != set.x.len() {
-        return Err(Violation::of(
-            "track_set.sigma",
-            format!("has {} entries where x has {}; give one an observation or none", set.sigma.len(), set.x.len()),
-        )
-        .into());
-    }
-    match set.sigma.iter().position(|&sigma| !(sigma.is_finite() && sigma > 0.0)) {
-        Some(index) => Err(Violation::at(
-            "track_set.sigma",
-            index,
-            format!("{} is not a positive finite number of pixels", set.sigma[index]),
-        )
-        .into()),
-        None => Ok(()),
-    }
-}
-
 fn track_set_to_raw(set: proto::TrackSet) -> RawInput {
     RawInput {
         views: set.views.iter().map(view_from_wire).collect(),
@@ -153,6 +130,7 @@ fn track_set_to_raw(set: proto::TrackSet) -> RawInput {
         x: set.x,
         y: set.y,
         depth: set.depth,
+        sigma: set.sigma,
     }
 }
 
@@ -194,6 +172,7 @@ pub fn to_wire(raw: &RawInput) -> proto::TrackSet {
         x: raw.x.clone(),
         y: raw.y.clone(),
         depth: raw.depth.clone(),
+        sigma: raw.sigma.clone(),
         ..head_to_wire(raw)
     }
 }
@@ -206,7 +185,7 @@ pub fn chunks<R: Borrow<RawInput>>(raw: R) -> impl Iterator<Item = proto::TrackS
     }
     let longest = {
         let raw = raw.borrow();
-        let lengths = [raw.view.len(), raw.track.len(), raw.x.len(), raw.y.len(), raw.depth.len()];
+        let lengths = [raw.view.len(), raw.track.len(), raw.x.len(), raw.y.len(), raw.depth.len(), raw.sigma.len()];
         lengths.into_iter().max().unwrap_or(0)
     };
     (0..longest).step_by(CHUNK_OBSERVATIONS).map(move |from| {
@@ -216,7 +195,7 @@ pub fn chunks<R: Borrow<RawInput>>(raw: R) -> impl Iterator<Item = proto::TrackS
             track: slice(&raw.track, from),
             x: slice(&raw.x, from),
             y: slice(&raw.y, from),
-            sigma: Vec::new(),
+            sigma: slice(&raw.sigma, from),
             depth: slice(&raw.depth, from),
         }
     })
@@ -256,6 +235,7 @@ mod tests {
             x: (0..observations).map(|k| k as f64 / 3.0).collect(),
             y: (0..observations).map(|k| -(k as f64)).collect(),
             depth: (0..observations).map(|k| 1.0 + k as f64).collect(),
+            sigma: (0..observations).map(|k| 0.5 + (k % 7) as f64).collect(),
         }
     }
 

@@ -189,6 +189,7 @@ mod tests {
             x: (0..observations).map(f64::from).collect(),
             y: (0..observations).map(|k| -f64::from(k)).collect(),
             depth: Vec::new(),
+            sigma: Vec::new(),
         }
     }
 

@@ -34,11 +34,11 @@ impl Fit {
         Self::new(cost, (11 * problem.cameras.len() + 3 * inliers + others).saturating_sub(15), problem)
     }
 
-    /// The fit of metric cameras with these intrinsics free, and points.
+    /// The fit of metric cameras with these intrinsics of each group free, and points.
     pub fn metric(cost: f64, model: IntrinsicsModel, problem: &Problem) -> Self {
         let of_view = if model.is_per_view() { 7 } else { 6 };
         let inliers = super::observed_points(problem);
-        let unknowns = of_view * problem.cameras.len() + 3 * inliers + model.parameters().len();
+        let unknowns = of_view * problem.cameras.len() + 3 * inliers + model.parameters().len() * problem.groups();
         Self::new(cost, unknowns.saturating_sub(7), problem)
     }
 

@@ -19,7 +19,7 @@ const PRINCIPAL_POINT_UNOBSERVABLE_ABOVE: f64 = 0.05;
 /// two does not survive.
 const PRIOR_CONTRADICTED: f64 = 3.0;
 
-/// Chooses among the minima and models, and says what the choice is worth.
+/// Chooses among the minima and models, and says what the choice is worth for each camera group.
 ///
 /// * `fit`: of the projective cameras
 /// * `minima`: not empty, cheapest first, with the focal length free, or that of each view
@@ -28,68 +28,83 @@ pub(super) fn grade(
     fit: &Fit,
     minima: Vec<Minimum>,
     mut warnings: Vec<Warning>,
-) -> Result<Outcome, Stopped> {
+) -> Result<Vec<Outcome>, Stopped> {
     let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
     Stopped::check(choice.stop)?;
+    let comparison = Comparison::new(&best, fit, choice);
+    let sigmas = choice.sigmas(&best, comparison.inflation);
     let has_own_focals = best.minimum.reconstruction.has_own_focals();
-    let comparison = Comparison::of(&best, fit, choice);
-    let sigmas = choice.sigmas(&best, comparison.inflation());
-    let mut verdict = Verdict::new(warnings);
     let mut focals = view_focals::of(&best, &sigmas);
-    // What the ratios of the others' deviations are taken of, and the one that is told.
-    let (of_focal, mut sigma) = match has_own_focals {
-        true => {
-            let sigma = view_focals::judge(&mut verdict, &mut focals);
-            (sigma, sigma)
-        }
-        false => {
-            let of_focal = sigmas.parameters[Parameter::LogFocal as usize];
-            let mut sigma = of_focal.filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
-            if let Some(focal_prior) = choice.problem.focal_prior {
-                weigh_prior(&mut verdict, &mut sigma, choice, &best, focal_prior);
+    let determined: Vec<bool> = focals.iter().map(view_focals::is_determined).collect();
+    let rival = rival(&best, &others, |view| determined[view]);
+    let grade_group = |group: usize| -> Outcome {
+        let mut verdict = Verdict::new(warnings.clone());
+        // What the ratios of the others' deviations are taken of, and the one that is told.
+        let (of_focal, mut sigma) = match has_own_focals {
+            true => {
+                let sigma = view_focals::judge(&mut verdict, &focals);
+                (sigma, sigma)
             }
-            verdict.judge_sigma(sigma);
-            (of_focal, sigma)
+            false => {
+                let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
+                let mut sigma = of_focal.filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
+                if let Some(focal_prior) = choice.problem.focal_priors[group] {
+                    weigh_prior(&mut verdict, &mut sigma, choice, &best, group, focal_prior);
+                }
+                verdict.judge_sigma(sigma);
+                (of_focal, sigma)
+            }
+        };
+        if let Some((rival, shift)) = rival {
+            let worst = if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak };
+            verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, choice.scale_px));
+        }
+        verdict.judge_fit(&comparison, &best.model.name(), choice.scale_px);
+        if verdict.is_misfit && has_own_focals {
+            // What a focal length a view behind one lens does not explain, nobody knows the reason of.
+            verdict.grade = Grade::ProjectiveOnly;
+        } else if verdict.is_misfit
+            && let Some(differing) = view_focals::differing(&best.minimum.reconstruction, &best.fit, choice)
+        {
+            // What the views' own differ from it by, one focal length for all is wrong by.
+            sigma = sigma.map(|sigma| sigma.max(differing.shift));
+            verdict.doubt(sigma, differing_words(&differing, choice.scale_px));
+        }
+        let focal = best.minimum.reconstruction.intrinsics[group].focal;
+        if !has_own_focals {
+            let is_known = choice.problem.focal_priors[group].is_some();
+            verdict.judge_plausibility(focal, is_known, choice.scale_px);
+        }
+        verdict.judge_cheirality(best.minimum.cheirality);
+        if verdict.grade != Grade::ProjectiveOnly && !has_own_focals {
+            verdict.warnings.extend(principal_point(&best, group, choice.scale_px));
+        }
+        let ratio = |sigma: Option<f64>| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite());
+        Outcome {
+            group,
+            sigma_log_focal: verdict.told(sigma),
+            sigma_ratios: sigmas.of_group[group].map(ratio),
+            grade: verdict.grade,
+            warnings: verdict.warnings,
+            model: best.model,
+            plane_at_infinity: None,
+            cheirality: best.minimum.cheirality,
+            rms_ratio: comparison.ratio,
+            metric: None,
+            focals: None,
         }
     };
-    let counts = |view: usize| focals[view].sigma_log.is_some();
-    if let Some((rival, shift)) = rival(&best, &others, counts) {
-        let worst = if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak };
-        verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, choice.scale_px));
-    }
-    verdict.judge_fit(&comparison, &best.model.name(), choice.scale_px);
-    if verdict.is_misfit && has_own_focals {
-        // What a focal length a view behind one lens does not explain, nobody knows the reason of.
-        verdict.grade = Grade::ProjectiveOnly;
-    } else if verdict.is_misfit
-        && let Some(differing) = view_focals::differing(&best.minimum.reconstruction, &best.fit, choice)
-    {
-        // What the views' own differ from it by, one focal length for all is wrong by.
-        sigma = sigma.map(|sigma| sigma.max(differing.shift));
-        verdict.doubt(sigma, differing_words(&differing, choice.scale_px));
-    }
-    let is_known = choice.problem.focal_prior.is_some();
-    if !has_own_focals {
-        verdict.judge_plausibility(best.minimum.log_focal().exp(), is_known, choice.scale_px);
-    }
-    verdict.judge_cheirality(best.minimum.cheirality);
-    if verdict.grade != Grade::ProjectiveOnly && !has_own_focals {
-        verdict.warnings.extend(principal_point(&best, choice.scale_px));
-    }
+    let mut outcomes: Vec<Outcome> = (0..choice.problem.groups()).map(grade_group).collect();
+    focals.iter_mut().for_each(view_focals::forget_undetermined);
     let mut metric = best.minimum.reconstruction;
-    metric.intrinsics.focal = view_focals::mean(&focals).unwrap_or(metric.intrinsics.focal);
-    Ok(Outcome {
-        sigma_log_focal: verdict.told(sigma),
-        sigma_ratios: sigmas.parameters.map(|sigma| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite())),
-        grade: verdict.grade,
-        warnings: verdict.warnings,
-        model: best.model,
-        plane_at_infinity: None,
-        cheirality: best.minimum.cheirality,
-        rms_ratio: comparison.ratio,
-        metric: Some(metric),
-        focals: has_own_focals.then_some(focals),
-    })
+    if let ([lens], Some(mean)) = (metric.intrinsics.as_mut_slice(), view_focals::mean(&focals)) {
+        lens.focal = mean;
+    }
+    for outcome in &mut outcomes {
+        outcome.metric = Some(metric.clone());
+        outcome.focals = has_own_focals.then(|| focals.clone());
+    }
+    Ok(outcomes)
 }
 
 /// The best minimum under the richest model that the data carry, and the others under the same model.
@@ -102,16 +117,16 @@ fn chosen(
     let problem = choice.problem;
     let first = minima.remove(best_in_front(&minima, problem, fit));
     let simplest = IntrinsicsModel::focal(first.reconstruction.has_own_focals());
-    let mut best = choice.richest(Candidate::new(first, simplest, choice.prior(fit.noise), problem), warnings)?;
+    let mut best = choice.richest(Candidate::new(first, simplest, choice.priors(fit.noise), problem), warnings)?;
     if best.model == simplest {
         return Ok((best, minima));
     }
     for minimum in &mut minima {
         Stopped::check(choice.stop)?;
-        *minimum = minimum.adjusted(problem.observations, best.model, &best.prior, choice.stop);
+        *minimum = minimum.adjusted(problem.observations, best.model, &best.priors, choice.stop);
         // A model that is wrong may rank the minima wrongly.
         if minimum.cost < best.minimum.cost && minimum.cheirality >= CHEIRALITY_LIMIT.min(best.minimum.cheirality) {
-            let better = Candidate::new(minimum.clone(), best.model, best.prior, problem);
+            let better = Candidate::new(minimum.clone(), best.model, best.priors.clone(), problem);
             *minimum = std::mem::replace(&mut best, better).minimum;
         }
     }
@@ -146,23 +161,26 @@ fn weigh_prior(
     sigma: &mut Option<f64>,
     choice: &Choice,
     best: &Candidate,
+    group: usize,
     focal_prior: FocalPrior,
 ) {
-    let alone = best.prior.forgetting(Parameter::LogFocal);
-    let of_data = best.sigma(Parameter::LogFocal, best.model, &alone);
+    let mut alone = best.priors.clone();
+    alone[group] = alone[group].forgetting(Parameter::LogFocal);
+    let of_data = best.sigma(group, Parameter::LogFocal, best.model, &alone);
     // It lifts the grade by one step at most.
     if of_data.is_none_or(|of_data| of_data > WEAK_UP_TO) {
         verdict.grade = verdict.grade.worse(Grade::Weak);
     }
     let (Some(of_data), Some(optimum)) = (of_data, best.optimum(best.model, &alone)) else { return };
-    let shift = optimum.shift[Parameter::LogFocal as usize];
-    let difference = best.prior.deviation(Parameter::LogFocal, &best.minimum.reconstruction.intrinsics) + shift;
+    let shift = optimum.shift_of(group, Parameter::LogFocal);
+    let intrinsics = &best.minimum.reconstruction.intrinsics[group];
+    let difference = best.priors[group].deviation(Parameter::LogFocal, intrinsics) + shift;
     let deviations = difference.abs() / of_data.hypot(focal_prior.sigma_log);
     if deviations > PRIOR_CONTRADICTED {
         let detail = format!(
             "the tracks alone give a focal length of {:.1} px, {deviations:.1} standard deviations from the {:.1} px \
              known beforehand",
-            best.minimum.reconstruction.intrinsics.focal * shift.exp() * choice.scale_px,
+            intrinsics.focal * shift.exp() * choice.scale_px,
             focal_prior.focal_px
         );
         verdict.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
@@ -171,13 +189,14 @@ fn weigh_prior(
 }
 
 /// Says so where the observations do not determine the principal point.
-fn principal_point(best: &Candidate, scale_px: f64) -> Option<Warning> {
-    let alone = best.prior.forgetting(Parameter::PrincipalX).forgetting(Parameter::PrincipalY);
+fn principal_point(best: &Candidate, group: usize, scale_px: f64) -> Option<Warning> {
+    let mut alone = best.priors.clone();
+    alone[group] = alone[group].forgetting(Parameter::PrincipalX).forgetting(Parameter::PrincipalY);
     let model = best.model.with(Extension::PrincipalPoint);
     let names = [("x", Parameter::PrincipalX), ("y", Parameter::PrincipalY)];
     let unknown: Vec<String> = names
         .into_iter()
-        .filter_map(|(name, parameter)| match best.sigma(parameter, model, &alone) {
+        .filter_map(|(name, parameter)| match best.sigma(group, parameter, model, &alone) {
             Some(sigma) if sigma <= PRINCIPAL_POINT_UNOBSERVABLE_ABOVE => None,
             Some(sigma) => Some(format!("{name} only to {:.0} px", sigma * scale_px)),
             None => Some(format!("{name} not at all")),
@@ -199,8 +218,8 @@ fn second_minimum(rival: &Minimum, best: &Candidate, scale_px: f64) -> String {
     format!(
         "a focal length of {:.1} px instead of {:.1} px explains the data about as well: chi-square larger by {:.1} \
          of {} degrees of freedom",
-        rival.reconstruction.intrinsics.focal * scale_px,
-        best.minimum.reconstruction.intrinsics.focal * scale_px,
+        rival.log_focal().exp() * scale_px,
+        best.minimum.log_focal().exp() * scale_px,
         ((rival.cost - best.minimum.cost) / best.fit.noise.powi(2)).max(0.0),
         best.fit.freedom
     )

@@ -17,7 +17,7 @@ mod view_focals;
 use nalgebra::{Matrix3x4, Vector3, Vector4};
 
 use crate::domain::{FocalPrior, Grade, StopReason, StopToken, Warning, WarningCode};
-use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
+use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::daq::to_first_view_frame;
 use crate::geometry::metric::plane_at_infinity;
@@ -48,10 +48,19 @@ pub struct Problem<'a> {
     pub observations: &'a [Observation],
     /// Assumed standard deviation of a coordinate, in normalised units.
     pub noise: f64,
-    /// What is known of the focal length beforehand.
-    pub focal_prior: Option<FocalPrior>,
+    /// Camera group of each camera; the views of a group share their intrinsics.
+    pub group_of: &'a [usize],
+    /// What is known of the focal length of each group beforehand.
+    pub focal_priors: &'a [Option<FocalPrior>],
     /// Whether every view has a focal length of its own.
     pub focal_per_view: bool,
+}
+
+impl Problem<'_> {
+    /// Camera groups.
+    pub fn groups(&self) -> usize {
+        self.focal_priors.len()
+    }
 }
 
 /// The focal length of a view that zooms.
@@ -71,10 +80,12 @@ impl ViewFocal {
     }
 }
 
-/// What came of it.
+/// What came of it, for one of the camera groups.
 #[derive(Debug, Clone)]
 pub struct Outcome {
-    /// `None` when no metric reconstruction was found or looked for. With grade PROJECTIVE_ONLY it may stand but is
+    /// Among those that were calibrated together.
+    pub group: usize,
+    /// Of all groups. `None` when no metric reconstruction was found or looked for. With grade PROJECTIVE_ONLY it may stand but is
     /// not to be used as metric.
     pub metric: Option<Reconstruction>,
     /// With a focal length a view: these; the intrinsics of `metric` have the geometric mean of those that are determined.
@@ -97,6 +108,21 @@ pub struct Outcome {
 }
 
 impl Outcome {
+    /// The intrinsics of its group.
+    pub fn intrinsics(&self) -> Option<Intrinsics> {
+        self.metric.as_ref().map(|metric| metric.intrinsics[self.group])
+    }
+
+    /// The worst of those that were calibrated together, the first of equals; none where there is none.
+    pub fn worst(outcomes: Vec<Self>) -> Option<Self> {
+        let doubt = |outcome: &Self| outcome.sigma_log_focal.unwrap_or(f64::INFINITY);
+        let is_worse = |one: &Self, other: &Self| {
+            let worse = one.grade.worse(other.grade);
+            worse != other.grade || (one.grade == other.grade && doubt(one) > doubt(other))
+        };
+        outcomes.into_iter().reduce(|worst, outcome| if is_worse(&outcome, &worst) { outcome } else { worst })
+    }
+
     /// One standard deviation of an intrinsic in the form in which it is adjusted; `None`: not free, or unobservable.
     pub fn sigma(&self, parameter: Parameter) -> Option<f64> {
         Some(self.sigma_ratios[parameter as usize]? * self.sigma_log_focal?)
@@ -105,6 +131,7 @@ impl Outcome {
     /// An outcome without a calibration, for these reasons.
     pub fn refused(warnings: Vec<Warning>) -> Self {
         Self {
+            group: 0,
             metric: None,
             focals: None,
             sigma_log_focal: None,
@@ -136,17 +163,22 @@ impl From<Stopped> for super::Error {
     }
 }
 
-/// Calibrates a projective reconstruction and grades the result.
+/// Calibrates a projective reconstruction and grades the result, one a camera group.
 ///
 /// `scale_px` is the length of a normalised unit in pixels, for the words of the warnings.
 ///
 /// # Errors
 /// [`Stopped`] when `stop` fired; what stands by then is not worth returning.
-pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<Outcome, Stopped> {
+pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Stopped> {
     Stopped::check(stop)?;
+    let nothing = vec![None; problem.groups()];
     // What is known of one focal length says nothing of a zoom.
-    let focal_prior = problem.focal_prior.filter(|_| !problem.focal_per_view);
-    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_prior, ..*problem };
+    let focal_priors = if problem.focal_per_view { &nothing } else { problem.focal_priors };
+    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_priors, ..*problem };
+    let refused = |warnings: Vec<Warning>| {
+        let outcome = Outcome::refused(warnings);
+        (0..problem.groups()).map(|group| Outcome { group, ..outcome.clone() }).collect()
+    };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < LEAST_INLIERS {
@@ -156,28 +188,30 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<O
     Stopped::check(stop)?;
     let critical = critical::find(problem, &fit, scale_px, stop);
     Stopped::check(stop)?;
-    let refused = !critical.warnings.is_empty();
+    let is_critical = !critical.warnings.is_empty();
     warnings.extend(critical.warnings);
     let choice = models::Choice { problem, scale_px, stop };
-    let prior = choice.prior(fit.noise);
-    let minima = match (critical.translation, focal_prior) {
-        (Some(translation), Some(focal)) => {
-            search::known_focal(&translation, focal.focal_px / scale_px, problem, &prior, stop)
+    let priors = choice.priors(fit.noise);
+    let minima = match (critical.translation, problem.focal_priors) {
+        (Some(translation), [Some(focal)]) => {
+            search::known_focal(&translation, focal.focal_px / scale_px, problem, &priors, stop)
         }
-        _ if refused => return Ok(Outcome::refused(warnings)),
+        _ if is_critical => return Ok(refused(warnings)),
         _ => match to_first_view_frame(&cameras, &points) {
-            Some(frame) => search::minima(&frame, problem, &prior, stop)?,
+            Some(frame) => search::minima(&frame, problem, &priors, stop)?,
             None => Vec::new(),
         },
     };
     if minima.is_empty() {
         warnings.push(no_start());
-        return Ok(Outcome::refused(warnings));
+        return Ok(refused(warnings));
     }
-    let mut outcome = grading::grade(&choice, &fit, minima, warnings)?;
-    outcome.plane_at_infinity =
-        outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem.cameras, &metric.cameras()));
-    Ok(outcome)
+    let mut outcomes = grading::grade(&choice, &fit, minima, warnings)?;
+    for outcome in &mut outcomes {
+        outcome.plane_at_infinity =
+            outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem.cameras, &metric.cameras()));
+    }
+    Ok(outcomes)
 }
 
 /// Calibrates a reconstruction that is metric already, as a sequence is that grew from a calibrated block: its focal
@@ -194,10 +228,15 @@ pub fn from_metric(
     scale_px: f64,
     stop: &StopToken,
     told: &mut dyn FnMut(),
-) -> Result<Outcome, Stopped> {
+) -> Result<Vec<Outcome>, Stopped> {
     Stopped::check(stop)?;
-    let focal_prior = problem.focal_prior.filter(|_| !metric.has_own_focals());
-    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_prior, ..*problem };
+    let nothing = vec![None; problem.groups()];
+    let focal_priors = if metric.has_own_focals() { &nothing } else { problem.focal_priors };
+    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_priors, ..*problem };
+    let refused = |warnings: Vec<Warning>| {
+        let outcome = Outcome::refused(warnings);
+        (0..problem.groups()).map(|group| Outcome { group, ..outcome.clone() }).collect()
+    };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < LEAST_INLIERS {
@@ -211,16 +250,16 @@ pub fn from_metric(
     told();
     // A plane under tilted views determines a focal length (Triggs 1998): of a reconstruction that is metric already,
     // sigma says how well, and the warning describes the scene.
-    let refused = critical.warnings.iter().any(|warning| warning.code != WarningCode::PlanarScene);
+    let is_critical = critical.warnings.iter().any(|warning| warning.code != WarningCode::PlanarScene);
     warnings.extend(critical.warnings);
-    if refused {
-        return Ok(Outcome::refused(warnings));
+    if is_critical {
+        return Ok(refused(warnings));
     }
     let choice = models::Choice { problem, scale_px, stop };
-    let minima = search::minima_near(metric, problem, &choice.prior(fit.noise), stop, told)?;
+    let minima = search::minima_near(metric, problem, &choice.priors(fit.noise), stop, told)?;
     if minima.is_empty() {
         warnings.push(no_start());
-        return Ok(Outcome::refused(warnings));
+        return Ok(refused(warnings));
     }
     grading::grade(&choice, &fit, minima, warnings)
 }
@@ -234,11 +273,11 @@ pub fn focal_alone(
     stop: &StopToken,
 ) -> Option<(f64, f64)> {
     let start = search::Minimum { reconstruction: metric.clone(), cost: f64::INFINITY, cheirality: 0.0 };
-    let prior = prior.forgetting(Parameter::LogFocal);
+    let priors = vec![prior.forgetting(Parameter::LogFocal)];
     let model = IntrinsicsModel::focal(metric.has_own_focals());
-    let candidate =
-        models::Candidate::new(start.adjusted(problem.observations, model, &prior, stop), model, prior, problem);
-    let sigma = candidate.sigma(Parameter::LogFocal, model, &prior)?;
+    let minimum = start.adjusted(problem.observations, model, &priors, stop);
+    let candidate = models::Candidate::new(minimum, model, priors, problem);
+    let sigma = candidate.sigma(0, Parameter::LogFocal, model, &candidate.priors)?;
     let log_focal = candidate.minimum.log_focal();
     (log_focal.is_finite() && sigma > 0.0).then_some((log_focal, sigma))
 }

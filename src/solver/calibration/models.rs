@@ -7,7 +7,7 @@ use super::{Problem, Stopped};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
-    self, Extension, Information, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter,
+    self, Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter,
 };
 
 /// How far the principal point of a lens may be expected from the image centre, one standard deviation of each
@@ -33,11 +33,16 @@ fn probability(extension: Extension) -> f64 {
     }
 }
 
-/// Gain in chi-square at which an extension is taken: the .999 quantile for its degrees of freedom.
-fn significant_gain(extension: Extension) -> f64 {
-    match extension.parameters().len() {
+/// Gain in chi-square at which an extension of so many groups is taken: the .999 quantile for its degrees of freedom, by
+/// Wilson & Hilferty (1931) where there are many.
+fn significant_gain(extension: Extension, groups: usize) -> f64 {
+    match groups * extension.parameters().len() {
         1 => 10.8,
-        _ => CHI_SQUARE_GAIN,
+        2 => CHI_SQUARE_GAIN,
+        many => {
+            let variance = 2.0 / (9.0 * many as f64);
+            many as f64 * (1.0 - variance + 3.09 * variance.sqrt()).powi(3)
+        }
     }
 }
 
@@ -86,8 +91,8 @@ pub fn knowledge(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> Intrin
 /// A metric reconstruction under one model, with what the observations say of the intrinsics there.
 pub(super) struct Candidate {
     pub model: IntrinsicsModel,
-    /// What it was adjusted with.
-    pub prior: IntrinsicsPrior,
+    /// What it was adjusted with, one a camera group.
+    pub priors: Vec<IntrinsicsPrior>,
     pub minimum: Minimum,
     /// Of the observations alone, without what the prior costs.
     pub fit: Fit,
@@ -95,36 +100,43 @@ pub(super) struct Candidate {
 }
 
 impl Candidate {
-    /// * `minimum`: of this model with this prior
-    pub fn new(minimum: Minimum, model: IntrinsicsModel, prior: IntrinsicsPrior, problem: &Problem) -> Self {
-        let believed = prior.cost(model, &minimum.reconstruction.intrinsics);
+    /// * `minimum`: of this model with these priors
+    pub fn new(minimum: Minimum, model: IntrinsicsModel, priors: Vec<IntrinsicsPrior>, problem: &Problem) -> Self {
+        let believed = IntrinsicsPrior::cost_of(&priors, model, &minimum.reconstruction.intrinsics);
         let fit = Fit::metric(minimum.cost - believed, model, problem);
         let information = Information::new(&minimum.reconstruction, problem.observations);
-        Self { model, prior, minimum, fit, information }
+        Self { model, priors, minimum, fit, information }
     }
 
     /// What a model makes of the observations, to second order.
-    pub fn optimum(&self, model: IntrinsicsModel, prior: &IntrinsicsPrior) -> Option<Optimum> {
-        self.information.as_ref().map(|information| information.optimum(model, prior))
+    pub fn optimum(&self, model: IntrinsicsModel, priors: &[IntrinsicsPrior]) -> Option<Optimum> {
+        self.information.as_ref().map(|information| information.optimum(model, priors))
     }
 
-    /// Standard deviation of a parameter under a model; `None`: unobservable.
-    pub fn sigma(&self, parameter: Parameter, model: IntrinsicsModel, prior: &IntrinsicsPrior) -> Option<f64> {
-        let variance = self.optimum(model, prior)?.variance_of(parameter)?;
+    /// Standard deviation of a parameter of a group under a model; `None`: unobservable.
+    pub fn sigma(
+        &self,
+        group: usize,
+        parameter: Parameter,
+        model: IntrinsicsModel,
+        priors: &[IntrinsicsPrior],
+    ) -> Option<f64> {
+        let variance = self.optimum(model, priors)?.variance_of(group, parameter)?;
         Some(variance.sqrt() * self.fit.noise).filter(|sigma| sigma.is_finite())
     }
 
-    /// Standard deviation of the log focal length if the model is right.
+    /// Standard deviation of the log focal length if the model is right, the largest of the groups that have one.
     fn sigma_log_focal(&self) -> Option<f64> {
-        self.sigma(Parameter::LogFocal, self.model, &self.prior)
+        let of_group = |group: usize| self.sigma(group, Parameter::LogFocal, self.model, &self.priors);
+        (0..self.priors.len()).filter_map(of_group).reduce(f64::max)
     }
 }
 
 /// Standard deviations, the doubt about the model included.
 pub(super) struct Sigmas {
-    /// Of the intrinsics that the model frees, indexed by [`Parameter`], the log focal length's also where every view
-    /// has its own, then of their mean; `None`: unobservable or not free.
-    pub parameters: [Option<f64>; Parameter::COUNT],
+    /// Of each group's intrinsics that the model frees, indexed by [`Parameter`], the log focal length's also where every
+    /// view has its own, then of their mean; `None`: unobservable or not free.
+    pub of_group: Vec<[Option<f64>; Parameter::COUNT]>,
     /// Of the log focal length of each view that has its own; `None`: unobservable.
     pub view_focals: Vec<Option<f64>>,
 }
@@ -137,9 +149,10 @@ pub(super) struct Choice<'a> {
 }
 
 impl Choice<'_> {
-    /// What is known of the intrinsics beforehand, weighed by this noise.
-    pub fn prior(&self, noise: f64) -> IntrinsicsPrior {
-        knowledge(noise, self.problem.focal_prior, self.scale_px)
+    /// What is known of the intrinsics of each group beforehand, weighed by this noise.
+    pub fn priors(&self, noise: f64) -> Vec<IntrinsicsPrior> {
+        let of_group = |focal: &Option<FocalPrior>| knowledge(noise, *focal, self.scale_px);
+        self.problem.focal_priors.iter().map(of_group).collect()
     }
 
     /// The minimum of a model from here, with the prior weighed by the noise that this leaves.
@@ -147,9 +160,9 @@ impl Choice<'_> {
     /// * `noise`: to begin with
     fn adjusted(&self, from: &Minimum, model: IntrinsicsModel, mut noise: f64) -> Candidate {
         let adjusted = |from: &Minimum, noise: f64| {
-            let prior = self.prior(noise);
-            let minimum = from.adjusted(self.problem.observations, model, &prior, self.stop);
-            Candidate::new(minimum, model, prior, self.problem)
+            let priors = self.priors(noise);
+            let minimum = from.adjusted(self.problem.observations, model, &priors, self.stop);
+            Candidate::new(minimum, model, priors, self.problem)
         };
         let mut found = adjusted(from, noise);
         for _ in 1..NOISE_ROUNDS {
@@ -184,12 +197,12 @@ impl Choice<'_> {
 
     /// Extensions that the linearisation foretells to be significant, with the gain beyond what is, largest first.
     fn promising(&self, best: &Candidate) -> Vec<(Extension, f64)> {
-        let Some(here) = best.optimum(best.model, &best.prior) else { return Vec::new() };
+        let Some(here) = best.optimum(best.model, &best.priors) else { return Vec::new() };
         let beyond = |extension: Extension| {
-            let there = best.optimum(best.model.with(extension), &best.prior)?;
-            let left = (best.fit.cost + there.rise).max(0.0) / best.fit.cost.max(f64::MIN_POSITIVE);
-            let gain = (here.rise - there.rise) / (best.fit.noise.powi(2) * left.max(f64::EPSILON));
-            let needed = significant_gain(extension);
+            let there = best.optimum(best.model.with(extension), &best.priors)?;
+            let left = (best.fit.cost + there.delta_cost).max(0.0) / best.fit.cost.max(f64::MIN_POSITIVE);
+            let gain = (here.delta_cost - there.delta_cost) / (best.fit.noise.powi(2) * left.max(f64::EPSILON));
+            let needed = significant_gain(extension, self.problem.groups());
             (gain > WORTH_A_TRIAL * needed).then_some((extension, gain - needed))
         };
         let mut found: Vec<(Extension, f64)> = Extension::ALL
@@ -206,9 +219,9 @@ impl Choice<'_> {
         let model = best.model.with(extension);
         let richer = self.adjusted(&best.minimum, model, best.fit.noise);
         // What the simpler model costs with the same prior.
-        let simple = best.fit.cost + best.optimum(best.model, &richer.prior)?.rise;
+        let simple = best.fit.cost + best.optimum(best.model, &richer.priors)?.delta_cost;
         let gain = (simple - richer.minimum.cost) / richer.fit.noise.powi(2);
-        if gain <= significant_gain(extension) {
+        if gain <= significant_gain(extension, self.problem.groups()) {
             return None;
         }
         let (simple_sigma, rich_sigma) = (best.sigma_log_focal(), richer.sigma_log_focal());
@@ -228,7 +241,7 @@ impl Choice<'_> {
     }
 
     fn not_taken(&self, best: &Candidate, richer: &Candidate, extension: Extension, deviations: f64) -> Warning {
-        let focal_px = |candidate: &Candidate| candidate.minimum.reconstruction.intrinsics.focal * self.scale_px;
+        let focal_px = |candidate: &Candidate| candidate.minimum.log_focal().exp() * self.scale_px;
         let detail = format!(
             "the data ask for a free {}, which moves the focal length from {:.1} to {:.1} px, {deviations:.1} standard \
              deviations, but leaves it too uncertain",
@@ -251,9 +264,10 @@ impl Choice<'_> {
         let own = best.sigma_log_focal();
         let views = best.minimum.reconstruction.focals.len();
         let (Some(own), Some(information), Some(here)) =
-            (own, &best.information, best.optimum(best.model, &best.prior))
+            (own, &best.information, best.optimum(best.model, &best.priors))
         else {
-            return Sigmas { parameters: [None; Parameter::COUNT], view_focals: vec![None; views] };
+            let of_group = vec![[None; Parameter::COUNT]; self.problem.groups()];
+            return Sigmas { of_group, view_focals: vec![None; views] };
         };
         let profiled = self.profiled(own, best);
         let unit = best.fit.noise.powi(2);
@@ -261,7 +275,7 @@ impl Choice<'_> {
             .model
             .with_any_extensions()
             .filter_map(|model| {
-                let there = best.optimum(model, &best.prior)?;
+                let there = best.optimum(model, &best.priors)?;
                 Some((self.log_weight(best, model, &here, &there), there))
             })
             .collect();
@@ -283,30 +297,34 @@ impl Choice<'_> {
             Some(squared.sqrt() * profiled / own * inflation).filter(|sigma| sigma.is_finite())
         };
         let free = best.model.parameters();
-        let parameters = Parameter::ALL.map(|parameter| {
-            let index = parameter as usize;
+        let of_parameter = |group: usize, parameter: Parameter| {
             let is_free = free.contains(&parameter) || (views > 0 && parameter == Parameter::LogFocal);
-            let of_models = |k: usize| (models[k].1.variance[index], models[k].1.shift[index]);
-            averaged(&of_models, here.shift[index]).filter(|_| is_free)
-        });
+            let of_models =
+                |k: usize| (models[k].1.variance_of(group, parameter), models[k].1.shift_of(group, parameter));
+            averaged(&of_models, here.shift_of(group, parameter)).filter(|_| is_free)
+        };
+        let groups = 0..self.problem.groups();
+        let of_group = groups.map(|group| Parameter::ALL.map(|parameter| of_parameter(group, parameter))).collect();
         let here = information.own_focals(&here);
         let there: Vec<_> = models.iter().map(|(_, there)| information.own_focals(there)).collect();
         let of_view = |view: usize| averaged(&|k| there[k][view], here[view].1);
-        Sigmas { parameters, view_focals: (0..views).map(of_view).collect() }
+        Sigmas { of_group, view_focals: (0..views).map(of_view).collect() }
     }
 
     /// Logarithm of prior probability times evidence, up to what all models share.
     fn log_weight(&self, best: &Candidate, model: IntrinsicsModel, here: &Optimum, there: &Optimum) -> f64 {
         let of = |extension: Extension| match model.contains(extension) {
             true => {
-                let believed = |parameter: &Parameter| best.prior.information[*parameter as usize].ln();
-                probability(extension).ln() + 0.5 * extension.parameters().iter().map(believed).sum::<f64>()
+                let of_group = |prior: &IntrinsicsPrior| -> f64 {
+                    extension.parameters().iter().map(|parameter| prior.information[*parameter as usize].ln()).sum()
+                };
+                probability(extension).ln() + 0.5 * best.priors.iter().map(of_group).sum::<f64>()
             }
             false if model.admits(extension) => (1.0 - probability(extension)).ln(),
             false => 0.0,
         };
         let prior: f64 = Extension::ALL.into_iter().map(of).sum();
-        prior - 0.5 * (there.rise - here.rise) / best.fit.noise.powi(2) - 0.5 * there.log_determinant
+        prior - 0.5 * (there.delta_cost - here.delta_cost) / best.fit.noise.powi(2) - 0.5 * there.log_determinant
     }
 
     /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
@@ -324,9 +342,13 @@ impl Choice<'_> {
             let mut moved = best.minimum.reconstruction.clone();
             moved.scale_focals(shift.exp());
             let options = Options::squared(PROFILE_ITERATIONS);
-            let report = metric::adjust(&mut moved, self.problem.observations, model, &best.prior, &options, self.stop);
-            let deviation = best.prior.deviation(Parameter::LogFocal, &moved.intrinsics);
-            let believed = best.prior.information[Parameter::LogFocal as usize] * deviation.powi(2);
+            let report =
+                metric::adjust(&mut moved, self.problem.observations, model, &best.priors, &options, self.stop);
+            let of_group = |(prior, intrinsics): (&IntrinsicsPrior, &Intrinsics)| {
+                let deviation = prior.deviation(Parameter::LogFocal, intrinsics);
+                prior.information[Parameter::LogFocal as usize] * deviation.powi(2)
+            };
+            let believed: f64 = best.priors.iter().zip(&moved.intrinsics).map(of_group).sum();
             (report.cost + believed - best.minimum.cost).max(0.0) / best.fit.noise.powi(2)
         };
         let rise = side(shift).min(side(-shift));
@@ -369,22 +391,22 @@ mod tests {
             let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
             let cameras = scene.cameras();
             let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
-            let (prior, stop) = (knowledge(NOISE, None, 1000.0), StopToken::default());
+            let (priors, stop) = (vec![knowledge(NOISE, None, 1000.0)], StopToken::default());
             let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
             let reconstruction = Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone());
             let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 1.0 };
             for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
-                let minimum = start.adjusted(&scene.observations, model, &prior, &stop);
-                let best = Candidate::new(minimum, model, prior, &problem);
+                let minimum = start.adjusted(&scene.observations, model, &priors, &stop);
+                let best = Candidate::new(minimum, model, priors.clone(), &problem);
                 let sigma = best.sigma_log_focal().expect("observable");
                 let profiled = choice.profiled(sigma, &best);
                 let shift = (PROFILE_DEVIATIONS * sigma).min(PROFILE_LONGEST);
                 let mut rise = |shift: f64| {
                     let mut moved = best.minimum.reconstruction.clone();
-                    moved.intrinsics.focal *= shift.exp();
+                    moved.scale_focals(shift.exp());
                     let options = Options { max_iterations: 5000, relative_tolerance: 1e-13, ..Options::default() };
                     let model = model.without_focal();
-                    let report = metric::adjust(&mut moved, &scene.observations, model, &prior, &options, &stop);
+                    let report = metric::adjust(&mut moved, &scene.observations, model, &priors, &options, &stop);
                     longest = longest.max(report.iterations);
                     (report.cost - best.minimum.cost) / best.fit.noise.powi(2)
                 };

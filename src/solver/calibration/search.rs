@@ -62,19 +62,22 @@ pub(super) struct Minimum {
 }
 
 impl Minimum {
-    /// Of the geometric mean where views have their own.
+    /// Of the geometric mean where views or groups have their own.
     pub fn log_focal(&self) -> f64 {
-        self.reconstruction.intrinsics.focal.ln()
+        self.reconstruction.log_focal()
     }
 
-    /// Difference in log focal length; where views have their own, the root mean square over those that count.
+    /// Difference in log focal length, the root mean square over the groups; where views have their own, over those that
+    /// count.
     pub fn apart(&self, other: &Self, counts: impl Fn(usize) -> bool) -> f64 {
-        let (own, others) = (&self.reconstruction.focals, &other.reconstruction.focals);
-        if own.is_empty() {
-            return (self.log_focal() - other.log_focal()).abs();
-        }
-        let pairs = own.iter().zip(others).enumerate().filter(|(view, _)| counts(*view));
-        let differences: Vec<f64> = pairs.map(|(_, (own, other))| (own / other).ln()).collect();
+        let (own, others) = (&self.reconstruction, &other.reconstruction);
+        let differences: Vec<f64> = if own.focals.is_empty() {
+            let pairs = own.intrinsics.iter().zip(&others.intrinsics);
+            pairs.map(|(own, other)| (own.focal / other.focal).ln()).collect()
+        } else {
+            let pairs = own.focals.iter().zip(&others.focals).enumerate().filter(|(view, _)| counts(*view));
+            pairs.map(|(_, (own, other))| (own / other).ln()).collect()
+        };
         root_mean_square(&differences).unwrap_or(0.0)
     }
 
@@ -85,7 +88,9 @@ impl Minimum {
         let information = Information::new(&self.reconstruction, problem.observations);
         let Some(information) = information.filter(|_| views > 0) else { return vec![true; views] };
         let noise = Fit::metric(self.cost, model, problem).noise;
-        let sigmas = information.own_focals(&information.optimum(model, &IntrinsicsPrior::NONE)).into_iter();
+        let sigmas = information
+            .own_focals(&information.optimum(model, &vec![IntrinsicsPrior::NONE; problem.groups()]))
+            .into_iter();
         let determined: Vec<bool> = sigmas
             .map(|(variance, _)| variance.is_some_and(|variance| variance.sqrt() * noise <= WEAK_UP_TO))
             .collect();
@@ -97,10 +102,10 @@ impl Minimum {
         &self,
         observations: &[Observation],
         model: IntrinsicsModel,
-        prior: &IntrinsicsPrior,
+        priors: &[IntrinsicsPrior],
         stop: &StopToken,
     ) -> Self {
-        self.adjusted_by(&converge(), observations, model, prior, stop)
+        self.adjusted_by(&converge(), observations, model, priors, stop)
     }
 
     fn adjusted_by(
@@ -108,11 +113,11 @@ impl Minimum {
         options: &Options,
         observations: &[Observation],
         model: IntrinsicsModel,
-        prior: &IntrinsicsPrior,
+        priors: &[IntrinsicsPrior],
         stop: &StopToken,
     ) -> Self {
         let mut reconstruction = self.reconstruction.clone();
-        let report = metric::adjust(&mut reconstruction, observations, model, prior, options, stop);
+        let report = metric::adjust(&mut reconstruction, observations, model, priors, options, stop);
         let cheirality = cheirality(&reconstruction, observations);
         Self { reconstruction, cost: report.cost, cheirality }
     }
@@ -139,7 +144,7 @@ const FOLLOWING: usize = 12;
 pub(super) fn minima_near(
     metric: &Reconstruction,
     problem: &Problem,
-    prior: &IntrinsicsPrior,
+    priors: &[IntrinsicsPrior],
     stop: &StopToken,
     told: &mut dyn FnMut(),
 ) -> Result<Vec<Minimum>, Stopped> {
@@ -148,14 +153,17 @@ pub(super) fn minima_near(
     for factor in std::iter::once(1.0).chain(OTHER_FOCALS) {
         Stopped::check(stop)?;
         let mut reconstruction = metric.clone();
-        reconstruction.intrinsics = Intrinsics::from_focal(metric.intrinsics.focal);
+        reconstruction
+            .intrinsics
+            .iter_mut()
+            .for_each(|intrinsics| *intrinsics = Intrinsics::from_focal(intrinsics.focal));
         reconstruction.scale_focals(factor);
         if factor != 1.0 {
             let options = Options { max_iterations: FOLLOWING, ..Options::default() };
-            metric::adjust(&mut reconstruction, problem.observations, IntrinsicsModel::FIXED, prior, &options, stop);
+            metric::adjust(&mut reconstruction, problem.observations, IntrinsicsModel::FIXED, priors, &options, stop);
         }
         let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
-        found.push(start.adjusted(problem.observations, model, prior, stop));
+        found.push(start.adjusted(problem.observations, model, priors, stop));
         told();
     }
     Stopped::check(stop)?;
@@ -167,34 +175,52 @@ pub(super) fn minima_near(
 pub(super) fn minima(
     frame: &FirstViewFrame,
     problem: &Problem,
-    prior: &IntrinsicsPrior,
+    priors: &[IntrinsicsPrior],
     stop: &StopToken,
 ) -> Result<Vec<Minimum>, Stopped> {
     match problem.focal_per_view {
         true => minima_per_view(frame, problem, stop),
-        false => minima_of_one(frame, problem, prior, stop),
+        false if problem.groups() > 1 => minima_of_groups(frame, problem, priors, stop),
+        false => minima_of_one(frame, problem, priors, stop),
     }
+}
+
+/// With a focal length a camera group: from what one of each view leads to.
+fn minima_of_groups(
+    frame: &FirstViewFrame,
+    problem: &Problem,
+    priors: &[IntrinsicsPrior],
+    stop: &StopToken,
+) -> Result<Vec<Minimum>, Stopped> {
+    let alone = Problem { group_of: &vec![0; frame.cameras.len()], focal_priors: &[None], ..*problem };
+    let mut found = minima_per_view(frame, &alone, stop)?;
+    for minimum in &mut found {
+        Stopped::check(stop)?;
+        minimum.reconstruction = minimum.reconstruction.clone().in_groups(problem.group_of, problem.groups());
+        *minimum = minimum.adjusted(problem.observations, IntrinsicsModel::FOCAL, priors, stop);
+    }
+    Ok(distinct(found, problem))
 }
 
 /// With a focal length a view: from the quadrics that allow for that, and from what one for all leads to.
 fn minima_per_view(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
-    let (model, prior) = (IntrinsicsModel::FOCAL_PER_VIEW, IntrinsicsPrior::NONE);
+    let (model, priors) = (IntrinsicsModel::FOCAL_PER_VIEW, [IntrinsicsPrior::NONE]);
     let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(STARTS);
     let mut starts: Vec<Reconstruction> =
         quadrics.filter_map(|(daq, _)| upgrade(frame, &daq, true, problem.observations)).collect();
-    let of_one = minima_of_one(frame, problem, &prior, stop)?;
+    let of_one = minima_of_one(frame, problem, &priors, stop)?;
     starts.extend(of_one.into_iter().map(|minimum| minimum.reconstruction.with_own_focals()));
     let mut found = Vec::with_capacity(starts.len());
     for reconstruction in starts {
         Stopped::check(stop)?;
         let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
-        found.push(start.adjusted_by(&first(), problem.observations, model, &prior, stop));
+        found.push(start.adjusted_by(&first(), problem.observations, model, &priors, stop));
     }
     let mut found = distinct(found, problem);
     found.truncate(CONVERGED);
     for minimum in &mut found {
         Stopped::check(stop)?;
-        *minimum = minimum.adjusted(problem.observations, model, &prior, stop);
+        *minimum = minimum.adjusted(problem.observations, model, &priors, stop);
     }
     Ok(distinct(found, problem))
 }
@@ -203,7 +229,7 @@ fn minima_per_view(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken) 
 fn minima_of_one(
     frame: &FirstViewFrame,
     problem: &Problem,
-    prior: &IntrinsicsPrior,
+    priors: &[IntrinsicsPrior],
     stop: &StopToken,
 ) -> Result<Vec<Minimum>, Stopped> {
     let model = IntrinsicsModel::FOCAL;
@@ -213,7 +239,7 @@ fn minima_of_one(
     for start in starts(frame) {
         Stopped::check(stop)?;
         let Some(mut reconstruction) = upgrade(frame, &start, false, observations) else { continue };
-        let report = metric::adjust(&mut reconstruction, observations, model, prior, &first(), stop);
+        let report = metric::adjust(&mut reconstruction, observations, model, priors, &first(), stop);
         found.push(Minimum { cheirality: 0.0, cost: report.cost, reconstruction });
     }
     let mut found = distinct(found, problem);
@@ -223,18 +249,18 @@ fn minima_of_one(
     for mut start in found {
         Stopped::check(stop)?;
         if start.cost > HOPELESS * cheapest {
-            let tried = start.adjusted_by(&first(), observations, model, prior, stop);
+            let tried = start.adjusted_by(&first(), observations, model, priors, stop);
             let pace = (tried.cost / start.cost).powf(FINAL_ITERATIONS as f64 / FIRST_ITERATIONS as f64);
             if pace * tried.cost > HOPELESS * cheapest {
                 continue;
             }
             start = tried;
         }
-        let mut minimum = start.adjusted(observations, model, prior, stop);
+        let mut minimum = start.adjusted(observations, model, priors, stop);
         cheapest = cheapest.min(minimum.cost);
         if let Some(chosen) = &chosen {
             fill_points(&mut minimum, chosen, problem.observations);
-            minimum = minimum.adjusted(problem.observations, model, prior, stop);
+            minimum = minimum.adjusted(problem.observations, model, priors, stop);
         }
         converged.push(minimum);
     }
@@ -248,13 +274,13 @@ pub(super) fn known_focal(
     translation: &Translating,
     focal: f64,
     problem: &Problem,
-    prior: &IntrinsicsPrior,
+    priors: &[IntrinsicsPrior],
     stop: &StopToken,
 ) -> Vec<Minimum> {
     let observations = problem.observations;
     let start = upgrade_translation(translation, focal, observations);
     let minimum = start.map(|reconstruction| Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 });
-    let adjusted = minimum.map(|start| start.adjusted(observations, IntrinsicsModel::FOCAL, prior, stop));
+    let adjusted = minimum.map(|start| start.adjusted(observations, IntrinsicsModel::FOCAL, priors, stop));
     distinct(adjusted.into_iter().collect(), problem)
 }
 

@@ -70,7 +70,7 @@ impl Verdict {
     /// * `free`: what the metric one leaves free, in words
     pub fn judge_fit(&mut self, comparison: &Comparison, free: &str, scale_px: f64) {
         let Comparison { ratio, noise, .. } = *comparison;
-        if ratio > RMS_RATIO_LIMIT && comparison.is_significant() {
+        if ratio > RMS_RATIO_LIMIT && comparison.is_significant {
             let worst = if ratio > RMS_RATIO_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
             let detail = format!(
                 "the metric reconstruction fits {ratio:.2} times worse than the projective one ({:.2} px against \
@@ -80,11 +80,11 @@ impl Verdict {
             );
             self.cap(worst, WarningCode::ModelMismatch, detail);
             self.is_misfit = true;
-        } else if comparison.inflation() > INFLATION_LIMIT {
+        } else if comparison.inflation > INFLATION_LIMIT {
             let detail = format!(
                 "with {free} free the tracks violate the calibration {:.1} times as much as their noise explains; \
                  sigma is as much larger",
-                comparison.inflation()
+                comparison.inflation
             );
             self.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
         }

@@ -26,14 +26,22 @@ pub(super) fn of(best: &Candidate, sigmas: &Sigmas) -> Vec<ViewFocal> {
     focals.map(of_view).collect()
 }
 
-/// Leaves those of the views undetermined that are, and says so; returns sigma, the root mean square of theirs. Where most
-/// are, that is the median of all, `None` if it is beyond all bounds.
-pub(super) fn judge(verdict: &mut Verdict, focals: &mut [ViewFocal]) -> Option<f64> {
+/// Whether the observations determine the focal length of a view.
+pub(super) fn is_determined(view: &ViewFocal) -> bool {
+    view.sigma_log.is_some_and(|sigma| sigma <= WEAK_UP_TO)
+}
+
+/// Leaves what is not determined without a sigma.
+pub(super) fn forget_undetermined(view: &mut ViewFocal) {
+    view.sigma_log = view.sigma_log.filter(|sigma| *sigma <= WEAK_UP_TO);
+}
+
+/// Says which of the views are undetermined; returns sigma, the root mean square of that of the others. Where most are,
+/// that is the median of all, `None` if it is beyond all bounds.
+pub(super) fn judge(verdict: &mut Verdict, focals: &[ViewFocal]) -> Option<f64> {
     let mut all: Vec<f64> = focals.iter().map(|view| view.sigma_log.unwrap_or(f64::INFINITY)).collect();
-    for view in focals.iter_mut() {
-        view.sigma_log = view.sigma_log.filter(|sigma| *sigma <= WEAK_UP_TO);
-    }
-    let determined: Vec<f64> = focals.iter().filter_map(|view| view.sigma_log).collect();
+    let determined: Vec<f64> =
+        focals.iter().filter(|view| is_determined(view)).filter_map(|view| view.sigma_log).collect();
     let sigma = root_mean_square(&determined);
     if (determined.len() as f64) < LEAST_DETERMINED * focals.len() as f64 || sigma.is_none() {
         let typical = Some(median(&mut all)).filter(|sigma| *sigma > WEAK_UP_TO && *sigma < UNOBSERVABLE_ABOVE);
@@ -75,14 +83,15 @@ pub(super) struct Differing {
 /// * `own`: the fit of `metric`
 pub(super) fn differing(metric: &Reconstruction, own: &Fit, choice: &Choice) -> Option<Differing> {
     let problem: &Problem = choice.problem;
-    let prior = knowledge(own.noise, None, choice.scale_px);
+    let priors = vec![knowledge(own.noise, None, choice.scale_px); problem.groups()];
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint).with(Extension::RadialK1);
     let mut freed = metric.clone().with_own_focals();
-    let report = metric::adjust(&mut freed, problem.observations, model, &prior, &converge(), choice.stop);
+    let report = metric::adjust(&mut freed, problem.observations, model, &priors, &converge(), choice.stop);
     if !Fit::metric(report.cost, model, problem).refutes(own) {
         return None;
     }
-    let shifts: Vec<f64> = freed.focals.iter().map(|focal| (focal / metric.intrinsics.focal).ln()).collect();
+    let shift = |(view, focal): (usize, &f64)| (focal / metric.intrinsics_of(view).focal).ln();
+    let shifts: Vec<f64> = freed.focals.iter().enumerate().map(shift).collect();
     let (least, most) =
         freed.focals.iter().fold((f64::INFINITY, 0.0f64), |(low, high), focal| (low.min(*focal), high.max(*focal)));
     root_mean_square(&shifts).map(|shift| Differing { shift, range: (least, most) })

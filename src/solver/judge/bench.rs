@@ -159,9 +159,9 @@ impl Bench<'_> {
         Some((0..observations.len()).filter(|&k| found.agrees[k]).collect())
     }
 
-    /// Squared residual of an observation of a point.
+    /// Weighted squared residual of an observation of a point.
     fn squared(&self, point: &Point, seen: &Observation) -> f64 {
-        triangulation::reprojection(&self.cameras[seen.view], point, &seen.xy).norm_squared()
+        triangulation::weighted_squared(&self.cameras[seen.view], point, seen)
     }
 
     /// Enters what was found of a track.
@@ -173,7 +173,8 @@ impl Bench<'_> {
         for ((&place, observation), &retained) in places.iter().zip(observations).zip(&verdict.retained) {
             let squared = self.squared(&verdict.point, observation);
             judged.observations.residual_px[place] =
-                Some(squared.sqrt() * self.geometry.normalization.scale_px).filter(|residual| residual.is_finite());
+                Some((squared / observation.weight).sqrt() * self.geometry.normalization.scale_px)
+                    .filter(|residual| residual.is_finite());
             judged.observations.weight[place] = self.noise.weight(squared) as f32;
             judged.observations.inlier[place] = verdict.inlier && retained;
         }
@@ -251,6 +252,7 @@ mod tests {
             parts: None,
             normalization,
             lenses: &[],
+            weights: &[],
             linked: false,
             least_share: 0.6,
             noise: 0.001,

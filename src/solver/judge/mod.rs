@@ -31,6 +31,8 @@ pub struct Geometry<'a> {
     /// The lens of each view, whose distortion is undone before the cameras, pinholes, are asked; empty: all are
     /// pinholes.
     pub lenses: &'a [Intrinsics],
+    /// Weight of each observation; see [`Observation::weight`]. Empty: all have 1.
+    pub weights: &'a [f64],
     /// Whether tracks were linked from view to view, so that one wrong link joins two points: the observations that
     /// agree on one are looked for then, however few they are beside the others. The cameras must be metric, or oriented
     /// with the plane at infinity off the points. Otherwise the worst observation is dropped as long as it is too far
@@ -58,7 +60,12 @@ impl Geometry<'_> {
         let view = input.view_of(k);
         let xy = self.normalization.normalize(view, input.point_px(k));
         let undone = self.lenses.get(view).and_then(|lens| lens.undistort(&xy));
-        Observation::new(view, input.track_of(k), undone.unwrap_or(xy))
+        let seen = Observation::new(view, input.track_of(k), undone.unwrap_or(xy));
+        Observation { weight: self.weight(k), ..seen }
+    }
+
+    fn weight(&self, k: usize) -> f64 {
+        self.weights.get(k).copied().unwrap_or(1.0)
     }
 }
 
@@ -114,15 +121,15 @@ pub fn judge(
     }
 }
 
-/// Squared residuals, in core variances, of the tracks that are right as a whole: a track with a dropped observation
+/// Weighted squared residuals, in core variances, of the tracks that are right as a whole: a track with a dropped observation
 /// may be wrong in others.
 fn whole_tracks(input: &Input, ranges: &[usize], geometry: &Geometry, judged: &Judged) -> Vec<f64> {
     (0..input.track_count())
         .filter(|&track| judged.tracks.inlier[track])
         .filter(|&track| judged.retained[track].len() == ranges[track + 1] - ranges[track])
         .flat_map(|track| ranges[track]..ranges[track + 1])
-        .filter_map(|k| judged.observations.residual_px[input.caller_index(k)])
-        .map(|residual| (residual / geometry.normalization.scale_px / geometry.noise).powi(2))
+        .filter_map(|k| Some((geometry.weight(k), judged.observations.residual_px[input.caller_index(k)]?)))
+        .map(|(weight, residual)| weight * (residual / geometry.normalization.scale_px / geometry.noise).powi(2))
         .collect()
 }
 

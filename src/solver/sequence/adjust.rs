@@ -3,7 +3,7 @@
 use super::model::{Lens, Model, Scene};
 use super::parts::FIRST;
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
-use crate::geometry::bundle::sequence::{self, Free, Run, Sequence};
+use crate::geometry::bundle::sequence::{self, Free, Run};
 use crate::geometry::bundle::{Loss, Options};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::median;
@@ -32,7 +32,7 @@ pub struct Extract {
     /// Views and tracks of the input, in the order of the sequence's poses and points.
     pub views: Vec<usize>,
     pub tracks: Vec<usize>,
-    pub sequence: Sequence,
+    pub sequence: Reconstruction,
     pub observations: Vec<Observation>,
 }
 
@@ -43,7 +43,7 @@ impl Extract {
         let mut extract = Self {
             views: Vec::with_capacity(views.len()),
             tracks: Vec::with_capacity(tracks.len()),
-            sequence: Sequence {
+            sequence: Reconstruction {
                 intrinsics: model.lenses.iter().map(|lens| lens.intrinsics).collect(),
                 focals: Vec::new(),
                 group_of: Vec::with_capacity(views.len()),
@@ -92,17 +92,18 @@ impl Extract {
         }
     }
 
-    /// The views as if all were of one camera, the first one's.
-    pub fn block(&self) -> (Reconstruction, Vec<Observation>) {
-        let group = self.sequence.group_of.first().copied().unwrap_or(0);
-        let mut reconstruction = Reconstruction {
-            intrinsics: self.sequence.intrinsics[group],
-            focals: self.sequence.focals.clone(),
-            poses: self.sequence.poses.clone(),
-            points: self.sequence.points.clone(),
-        };
+    /// The reconstruction with the groups of its views alone, and the cameras of the scene that these are.
+    pub fn block(&self) -> (Reconstruction, Vec<usize>) {
+        let mut reconstruction = self.sequence.clone();
+        let mut cameras = reconstruction.group_of.clone();
+        cameras.sort_unstable();
+        cameras.dedup();
+        reconstruction.intrinsics = cameras.iter().map(|&camera| self.sequence.intrinsics[camera]).collect();
+        for group in &mut reconstruction.group_of {
+            *group = cameras.partition_point(|camera| camera < group);
+        }
         reconstruction.average_focals();
-        (reconstruction, self.observations.clone())
+        (reconstruction, cameras)
     }
 
     fn adjust(&mut self, scene: &Scene, model: &Model, free: &Free, iterations: usize, recorder: &mut Recorder) {
@@ -121,7 +122,8 @@ impl Extract {
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise(&self, scene: &Scene) -> f64 {
-        let norms: Vec<f64> = self.observations.iter().map(|seen| self.sequence.residual(seen).norm()).collect();
+        let norms: Vec<f64> =
+            self.observations.iter().map(|seen| seen.weight.sqrt() * self.sequence.residual(seen).norm()).collect();
         let of_view = if scene.has_own_focals() { 7 } else { 6 };
         let unknowns = of_view * self.views.len() + 3 * self.tracks.len();
         core_noise(norms, unknowns)

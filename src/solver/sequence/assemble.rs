@@ -131,6 +131,7 @@ fn judged(scene: &Scene, model: &Model, recorder: &mut Recorder) -> Judged {
         parts: Some((&model.part_of, &of_track)),
         normalization: context.normalization,
         lenses: &lenses,
+        weights: &scene.weights,
         linked: true,
         least_share: least_share(context),
         noise: model.noise,

@@ -5,7 +5,7 @@ use nalgebra::Vector4;
 use super::adjust::{self, Extract};
 use super::model::{Model, Scene};
 use super::{own_focals, windows};
-use crate::domain::{Task, Warning, WarningCode};
+use crate::domain::{FocalPrior, Task, Warning, WarningCode};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::solver::calibration::{self, Outcome};
@@ -40,17 +40,26 @@ pub fn calibrate(
     if scene.has_own_focals() {
         return own_focals::calibrate(scene, model, context, recorder).map(|outcome| vec![outcome]);
     }
-    let mut outcomes = Vec::with_capacity(scene.cameras);
-    for camera in 0..scene.cameras {
-        recorder.step(Task::Cameras, camera + 1, scene.cameras, 0.0);
-        let registered: Vec<usize> =
-            model.registered().into_iter().filter(|&view| scene.camera_of[view] == camera).collect();
-        let views = densest(scene, model, &registered);
-        let outcome = match views.len() < block::LEAST_VIEWS {
-            true => too_few(views.len()),
-            false => of_camera(scene, model, camera, &views, context, recorder)?,
+    let registered = model.registered();
+    // All cameras together where one calibration takes all views, else each by itself.
+    let runs: Vec<Vec<usize>> = match registered.len() <= MOST_VIEWS {
+        true => vec![registered],
+        false => (0..scene.cameras)
+            .map(|camera| {
+                let own: Vec<usize> =
+                    registered.iter().copied().filter(|&view| scene.camera_of[view] == camera).collect();
+                densest(scene, model, &own)
+            })
+            .collect(),
+    };
+    let mut outcomes: Vec<Outcome> = (0..scene.cameras).map(|_| too_few(0)).collect();
+    for (k, views) in runs.iter().enumerate() {
+        recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
+        let found = match views.len() < block::LEAST_VIEWS {
+            true => views.iter().map(|&view| (scene.camera_of[view], too_few(views.len()))).collect(),
+            false => of_cameras(scene, model, views, context, recorder)?,
         };
-        outcomes.push(outcome);
+        found.into_iter().for_each(|(camera, outcome)| outcomes[camera] = outcome);
     }
     super::structure::triangulate(scene, model, recorder);
     adjust::all(scene, model, recorder);
@@ -79,56 +88,60 @@ pub fn too_few(views: usize) -> Outcome {
     Outcome::refused(vec![Warning::new(WarningCode::UnobservableFocal, detail)])
 }
 
-/// The calibration of a camera whose views have one focal length, from these of them.
-fn of_camera(
+/// The calibrations of the cameras of these views, whose views have one focal length each.
+fn of_cameras(
     scene: &Scene,
     model: &mut Model,
-    camera: usize,
     views: &[usize],
     context: &Context,
     recorder: &mut Recorder,
-) -> Result<Outcome, Error> {
+) -> Result<Vec<(usize, Outcome)>, Error> {
     let mut extract = core(scene, model, views, of_view(views));
-    let outcome = of_extract(scene, &extract, model.noise, camera, context, &mut || recorder.sign_of_life())?;
-    take_over(model, &mut extract, camera, &outcome);
-    Ok(outcome)
+    let found = of_extract(scene, &extract, model.noise, context, &mut || recorder.sign_of_life())?;
+    take_over(model, &mut extract, &found);
+    Ok(found)
 }
 
-/// The calibration of views of one camera.
+/// The calibrations of the cameras of some views.
 ///
 /// * `told`: called now and then
 pub fn of_extract(
     scene: &Scene,
     extract: &Extract,
     noise: f64,
-    camera: usize,
     context: &Context,
     told: &mut dyn FnMut(),
-) -> Result<Outcome, Error> {
-    let (metric, observations) = extract.block();
+) -> Result<Vec<(usize, Outcome)>, Error> {
+    let (metric, of_group) = extract.block();
     let (cameras, points) = projective(&metric);
+    let focal_priors: Vec<Option<FocalPrior>> = of_group.iter().map(|&camera| scene.focal_priors[camera]).collect();
     let problem = calibration::Problem {
         cameras: &cameras,
         points: &points,
-        observations: &observations,
+        observations: &extract.observations,
         noise,
-        focal_prior: scene.focal_priors[camera],
+        group_of: &metric.group_of,
+        focal_priors: &focal_priors,
         focal_per_view: metric.has_own_focals(),
     };
-    Ok(calibration::from_metric(&problem, &metric, context.scale_px, context.stop, told)?)
+    let outcomes = calibration::from_metric(&problem, &metric, context.scale_px, context.stop, told)?;
+    Ok(of_group.into_iter().zip(outcomes).collect())
 }
 
-/// Has the model go on from the calibration of some views of a camera: its lens, and where these are all views that are
-/// registered, the rest too.
-pub fn take_over(model: &mut Model, extract: &mut Extract, camera: usize, outcome: &Outcome) {
-    let Some(metric) = &outcome.metric else { return };
-    let lens = &mut model.lenses[camera];
-    lens.free = outcome.model;
-    // What the model holds is as the calibration has it, not as the seed had it.
-    lens.intrinsics = Intrinsics { focal: lens.intrinsics.focal, ..metric.intrinsics };
+/// Has the model go on from the calibrations of the cameras of some views: their lenses, and where these are all views
+/// that are registered, the rest too.
+pub fn take_over(model: &mut Model, extract: &mut Extract, found: &[(usize, Outcome)]) {
+    for (camera, outcome) in found {
+        let Some(intrinsics) = outcome.intrinsics() else { return };
+        let lens = &mut model.lenses[*camera];
+        lens.free = outcome.model;
+        // What the model holds is as the calibration has it, not as the seed had it.
+        lens.intrinsics = Intrinsics { focal: lens.intrinsics.focal, ..intrinsics };
+        extract.sequence.intrinsics[*camera] = intrinsics;
+    }
+    let Some(metric) = found.first().and_then(|(_, outcome)| outcome.metric.as_ref()) else { return };
     // Some of the views alone would leave the frame of the others.
     if extract.views.len() == model.registered().len() {
-        extract.sequence.intrinsics[camera] = metric.intrinsics;
         extract.sequence.focals.clone_from(&metric.focals);
         (extract.sequence.poses, extract.sequence.points) = (metric.poses.clone(), metric.points.clone());
         extract.write_back(model);
@@ -142,8 +155,8 @@ pub fn of_view(views: &[usize]) -> usize {
 
 /// Raises sigma to what lies between the focal length that was graded and the one that all observations led to.
 fn admit_difference(log_focal: f64, outcome: &mut Outcome) {
-    let (Some(metric), Some(sigma)) = (&outcome.metric, outcome.sigma_log_focal) else { return };
-    let difference = (log_focal - metric.intrinsics.focal.ln()).abs();
+    let (Some(intrinsics), Some(sigma)) = (outcome.intrinsics(), outcome.sigma_log_focal) else { return };
+    let difference = (log_focal - intrinsics.focal.ln()).abs();
     if difference > sigma {
         outcome.sigma_log_focal = Some(difference);
         outcome.grade = outcome.grade.worse(calibration::grade_of_sigma(Some(difference)));
@@ -173,8 +186,11 @@ pub fn core(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -> Ex
     let tracks = adjust::covering(scene, model, views, of_view);
     let mut extract = Extract::new(scene, model, views, &tracks);
     let limit = CORE_SQUARED * model.noise * model.noise;
-    let fits: Vec<bool> =
-        extract.observations.iter().map(|seen| extract.sequence.residual(seen).norm_squared() < limit).collect();
+    let fits: Vec<bool> = extract
+        .observations
+        .iter()
+        .map(|seen| seen.weight * extract.sequence.residual(seen).norm_squared() < limit)
+        .collect();
     let mut kept = vec![0usize; extract.tracks.len()];
     for (seen, fits) in extract.observations.iter().zip(&fits) {
         kept[seen.point] += usize::from(*fits);

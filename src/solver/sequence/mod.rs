@@ -90,22 +90,26 @@ pub fn solve<'a>(
     let extract = |views: &[usize]| block::extract(context.input, context.ranges, context.normalization, views);
     // A calibrated reconstruction that another might be better than.
     let mut metric: Option<Box<Extended>> = None;
-    let first = if let Some(views) = &whole {
+    let by_calibration = if let Some(views) = &whole {
         let attempt = attempt::solve_block(extract(views), &Context { quick: true, ..*context }, recorder)?;
         if attempt.is_trusted() {
             return finished(attempt, &seeding, recorder);
         }
-        Some(attempt)
-    } else {
-        match by_calibrated_blocks(candidates, &seeding, recorder)? {
-            Ended::Extended(extended) if extended.is_settled() => return Ok(Ended::Extended(extended)),
-            Ended::Extended(extended) if extended.is_calibrated() => {
-                metric = Some(extended);
-                None
-            }
-            Ended::Extended(extended) => Some(extended.seed),
-            Ended::Block(attempt) => attempt.map(|attempt| *attempt),
+        match attempt.is_calibrated() {
+            true => metric_of(attempt, &seeding, recorder)?,
+            false => Ended::Block(Some(Box::new(attempt))),
         }
+    } else {
+        by_calibrated_blocks(candidates, &seeding, recorder)?
+    };
+    let first = match by_calibration {
+        Ended::Extended(extended) if extended.is_settled() => return Ok(Ended::Extended(extended)),
+        Ended::Extended(extended) if extended.is_calibrated() => {
+            metric = Some(extended);
+            None
+        }
+        Ended::Extended(extended) => Some(extended.seed),
+        Ended::Block(attempt) => attempt.map(|attempt| *attempt),
     };
     let sets = whole.as_ref().map_or(candidates, std::slice::from_ref);
     let subsets = block::subsets(sets);
@@ -243,11 +247,13 @@ fn metric_of<'a>(attempt: Attempt, context: &Context<'a>, recorder: &mut Recorde
     })
 }
 
-/// An attempt on the whole input, extended where it leaves views aside, a lens distorts, or observations are to be
-/// gained once each is judged by itself.
+/// An attempt on the whole input, extended where it leaves views aside, where several cameras or a lens that distorts take
+/// part, where observations are not equally noisy, and where some are to be gained once each is judged by itself.
 fn finished<'a>(mut attempt: Attempt, context: &Context<'a>, recorder: &mut Recorder) -> Result<Ended<'a>, Error> {
     let is_whole = attempt.views().len() == block::observed_views(context.input).len();
-    let Some(projective) = attempt.projective.as_ref().filter(|_| is_whole && !attempt.has_lens()) else {
+    let is_one_pinhole = !attempt.has_lens() && context.camera_groups_of(attempt.views()).1 == 1;
+    let is_done = is_whole && is_one_pinhole && !context.input.has_sigmas();
+    let Some(projective) = attempt.projective.as_ref().filter(|_| is_done) else {
         return metric_of(attempt, context, recorder);
     };
     recorder.enter(Stage::Judge);
@@ -331,13 +337,16 @@ fn refuse(outcome: &mut Outcome, model: &Model, context: &Context) {
 }
 
 impl Extended<'_> {
-    /// The worst of the cameras that have enough registered views to be calibrated: a few photographs of another camera
-    /// take nothing from the rest.
+    /// The worst of the cameras that have enough registered views to be calibrated by themselves: a few photographs of
+    /// another camera take nothing from the rest. Of all cameras where none has.
     fn grade(&self) -> Grade {
         let mut views = vec![0; self.scene.cameras];
         self.model.registered().into_iter().for_each(|view| views[self.scene.camera_of[view]] += 1);
-        let grades = self.calibrations.iter().zip(views).filter(|(_, views)| *views >= block::LEAST_VIEWS);
-        grades.map(|(outcome, _)| outcome.grade).reduce(Grade::worse).unwrap_or(Grade::ProjectiveOnly)
+        let worst = |least: usize| {
+            let grades = self.calibrations.iter().zip(&views).filter(|(_, views)| **views >= least);
+            grades.map(|(outcome, _)| outcome.grade).reduce(Grade::worse)
+        };
+        worst(block::LEAST_VIEWS).or_else(|| worst(1)).unwrap_or(Grade::ProjectiveOnly)
     }
 
     fn is_calibrated(&self) -> bool {

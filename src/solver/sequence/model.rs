@@ -14,6 +14,8 @@ pub struct Scene<'a> {
     pub context: Context<'a>,
     /// Normalised image points, one an observation.
     pub xy: Vec<Vector2<f64>>,
+    /// See [`Observation::weight`]; one an observation.
+    pub weights: Vec<f64>,
     /// Observations of each view.
     pub of_view: Vec<Vec<u32>>,
     /// Camera of each view, each of which gets a calibration: the camera groups, counted from 0 in rising order of the
@@ -47,7 +49,16 @@ impl<'a> Scene<'a> {
         };
         let is_shared = !context.settings.focal_per_view;
         let focal_priors = (0..cameras).map(|camera| of_camera(camera).filter(|_| is_shared)).collect();
-        Self { context: *context, xy, of_view, camera_of, cameras, focal_priors, outlier_density }
+        Self {
+            context: *context,
+            xy,
+            weights: block::weights(input),
+            of_view,
+            camera_of,
+            cameras,
+            focal_priors,
+            outlier_density,
+        }
     }
 
     /// Whether every view has a focal length of its own.
@@ -68,7 +79,7 @@ impl<'a> Scene<'a> {
     }
 
     pub fn observation(&self, k: usize) -> Observation {
-        Observation::new(self.view_of(k), self.track_of(k), self.xy[k])
+        Observation { weight: self.weights[k], ..Observation::new(self.view_of(k), self.track_of(k), self.xy[k]) }
     }
 
     pub fn track_of(&self, k: usize) -> usize {
@@ -204,7 +215,7 @@ impl Model {
         }
     }
 
-    /// Adds the views of a metric block, all of one camera, as a part; lenses that are not known yet are the block's.
+    /// Adds the views of a metric block as a part; lenses that are not known yet are the block's.
     ///
     /// * `focals`: the focal length of each of these views, where views have their own
     pub fn add_part(
@@ -218,7 +229,7 @@ impl Model {
         for (i, (&view, pose)) in views.iter().zip(&metric.poses).enumerate() {
             let lens = &mut self.lenses[scene.camera_of[view]];
             if !lens.is_known {
-                lens.intrinsics = metric.intrinsics;
+                lens.intrinsics = metric.intrinsics[metric.group_of[i]];
             }
             if let (Some(own), Some(found)) = (self.own_focals.get_mut(view), focals.and_then(|focals| focals.get(i))) {
                 *own = OwnFocal { focal: found.focal, is_determined: found.sigma_log.is_some() };

@@ -30,8 +30,8 @@ pub fn calibrate(
     let runs = runs(model);
     let of_run = |k: usize, told: &mut dyn FnMut()| {
         let extract = calibrate::core(scene, model, runs.get(k)?, calibrate::of_view(&runs[k]));
-        let outcome = calibrate::of_extract(scene, &extract, model.noise, CAMERA, context, told);
-        outcome.ok().map(|outcome| (extract, outcome))
+        let found = calibrate::of_extract(scene, &extract, model.noise, context, told).ok()?;
+        found.into_iter().next().map(|(_, outcome)| (extract, outcome))
     };
     let found = if runs.len() == 1 {
         recorder.step(Task::Cameras, 1, 1, 0.0);
@@ -45,7 +45,7 @@ pub fn calibrate(
     // The lens that all runs share is that of the one that knows its focal lengths best.
     let sigma = |outcome: &Outcome| outcome.sigma_log_focal.unwrap_or(f64::INFINITY);
     if let Some((extract, outcome)) = found.iter_mut().min_by(|a, b| sigma(&a.1).total_cmp(&sigma(&b.1))) {
-        calibrate::take_over(model, extract, CAMERA, outcome);
+        calibrate::take_over(model, extract, &[(CAMERA, outcome.clone())]);
     }
     structure::triangulate(scene, model, recorder);
     adjust::all(scene, model, recorder);

@@ -26,7 +26,7 @@ const VAGUE_SIGMA: f64 = 0.5;
 pub fn first(scene: &Scene, seed: &Attempt, recorder: &mut Recorder) -> Model {
     let metric = seed.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref());
     let noise = seed.projective.as_ref().map_or(0.0, |found| found.noise);
-    let intrinsics = metric.map_or_else(|| Intrinsics::from_focal(1.0), |metric| metric.intrinsics);
+    let intrinsics = metric.map_or_else(|| Intrinsics::from_focal(1.0), |metric| metric.intrinsics[0]);
     let mut model = Model::new(scene, intrinsics, noise);
     if let Some(metric) = metric {
         let focals = seed.calibration.as_ref().and_then(|calibration| calibration.focals.as_deref());

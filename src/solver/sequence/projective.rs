@@ -15,7 +15,7 @@ use crate::domain::StopToken;
 use crate::geometry::bundle::{self, Loss};
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{Robust, Triangulator};
-use crate::geometry::triangulation::reprojection;
+use crate::geometry::triangulation::weighted_squared;
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::block::Block;
 use crate::solver::grow::Consensus;
@@ -416,7 +416,7 @@ impl<'a> Growing<'a> {
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise_of(&self, standing: &Projective) -> f64 {
         let residual = |seen: &Observation| {
-            reprojection(&standing.cameras[seen.view], &standing.points[seen.point], &seen.xy).norm()
+            weighted_squared(&standing.cameras[seen.view], &standing.points[seen.point], seen).sqrt()
         };
         let norms: Vec<f64> = standing.observations.iter().map(residual).collect();
         let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();

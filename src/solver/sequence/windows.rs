@@ -106,19 +106,20 @@ fn estimates(
 /// By how much the log focal length of these views, their mean where each has its own, moves where they are alone.
 fn moved_alone(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
     let extract = calibrate::core(scene, model, views, OF_VIEW);
-    let (metric, observations) = extract.block();
+    let (metric, _) = extract.block();
     let (cameras, points) = calibrate::projective(&metric);
     let problem = calibration::Problem {
         cameras: &cameras,
         points: &points,
-        observations: &observations,
+        observations: &extract.observations,
         noise: model.noise,
-        focal_prior: None,
+        group_of: &metric.group_of,
+        focal_priors: &[None],
         focal_per_view: metric.has_own_focals(),
     };
     let prior = adjust::knowledge(scene, camera, model.noise);
     let (log_focal, sigma) = calibration::focal_alone(&problem, &metric, &prior, scene.stop())?;
-    Some(Estimate { log_focal: log_focal - metric.intrinsics.focal.ln(), sigma })
+    Some(Estimate { log_focal: log_focal - metric.log_focal(), sigma })
 }
 
 /// Share of its views that a window has in common with another. Only the halves of a short run overlap.

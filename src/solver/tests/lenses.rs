@@ -94,3 +94,37 @@ fn a_zoom_gets_a_focal_length_a_view() {
     let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
     assert!(f1 > 0.98, "F1 {f1}");
 }
+
+/// Four cameras of one view each, behind strong lenses: what none carries alone, all carry together.
+#[test]
+fn cameras_of_one_view_each_are_calibrated_together() {
+    let (mut beyond, mut calibrated) = (0, 0);
+    for seed in 0..5 {
+        let options = SceneOptions {
+            views: 4,
+            tracks: 450,
+            noise: 0.0005,
+            outliers: 0.3,
+            own_cameras: true,
+            focal_range_px: (609.0, 659.0),
+            radial_k1: -0.28,
+            seed,
+            ..SceneOptions::default()
+        };
+        let (input, scene) = scene(options);
+        let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+        println!("seed {seed}: {:?} {:?}", solution.grade, solution.warnings);
+        assert_eq!(solution.calibrations.len(), 4, "seed {seed}");
+        calibrated += usize::from(solution.grade != Some(Grade::ProjectiveOnly));
+        for (found, focal_px) in solution.calibrations.iter().zip(&scene.truth.focals_px) {
+            let error = (found.focal_px / focal_px).ln().abs();
+            println!(
+                "  {:.1} px for {focal_px:.1}, k1 {:.3}, {error:.4} at {:?}",
+                found.focal_px, found.radial_k1, found.sigma_log_focal
+            );
+            beyond += usize::from(error > 3.0 * found.sigma_log_focal.unwrap_or(f64::INFINITY));
+        }
+    }
+    println!("{calibrated} of 5 calibrated, {beyond} of 20 focal lengths beyond 3 sigma");
+    assert!(calibrated >= 4 && beyond <= 1, "{calibrated} {beyond}");
+}

@@ -265,6 +265,7 @@ fn two_views_and_tracks_that_share_nothing_are_refused_with_the_reason() {
         x: vec![1.0, 2.0, 3.0, 4.0],
         y: vec![1.0, 2.0, 3.0, 4.0],
         depth: Vec::new(),
+        sigma: Vec::new(),
     };
     let sparse = Input::new(raw, &Limits::default(), "scene").expect("valid input");
     let solution = solved(&sparse, &SolveSettings::default());

@@ -16,6 +16,7 @@ pub fn raw(views: usize, tracks: usize) -> RawInput {
         x: each().map(|(view, track)| f64::from(10 * track + view)).collect(),
         y: each().map(|(view, track)| f64::from(track) - f64::from(view)).collect(),
         depth: Vec::new(),
+        sigma: Vec::new(),
     }
 }
 

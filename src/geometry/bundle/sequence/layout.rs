@@ -6,7 +6,7 @@ use nalgebra::Vector2;
 
 use super::super::intrinsics_model::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
-use super::{Free, Observation, Pace, Sequence};
+use super::{Free, Observation, Pace, Reconstruction, holds};
 
 /// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free intrinsics.
 #[derive(Debug)]
@@ -22,7 +22,7 @@ pub(super) struct Unknowns {
 }
 
 impl Unknowns {
-    fn new(sequence: &Sequence, free: &Free, sees: &[bool]) -> Self {
+    fn new(sequence: &Reconstruction, free: &Free, sees: &[bool]) -> Self {
         let mut offsets = vec![0];
         let mut append = |size: usize| {
             let block = offsets.len() - 1;
@@ -48,7 +48,7 @@ impl Unknowns {
     }
 
     /// Block of the intrinsics of a view.
-    pub fn group_block_of_view(&self, sequence: &Sequence, view: usize) -> Option<usize> {
+    pub fn group_block_of_view(&self, sequence: &Reconstruction, view: usize) -> Option<usize> {
         *self.group_block.get(*sequence.group_of.get(view)?)?
     }
 
@@ -110,9 +110,9 @@ impl Layout {
     /// is not positive are left out.
     ///
     /// Returns `None` when it was stopped.
-    pub fn new(sequence: &Sequence, observations: &[Observation], free: &Free, pace: &mut Pace) -> Option<Self> {
+    pub fn new(sequence: &Reconstruction, observations: &[Observation], free: &Free, pace: &mut Pace) -> Option<Self> {
         let points = sequence.points.len();
-        let usable = || observations.iter().filter(|observation| sequence.holds(observation));
+        let usable = || observations.iter().filter(|seen| holds(sequence, seen));
         let mut seen_starts = vec![0; points + 1];
         let mut sees = vec![false; sequence.poses.len()];
         for observation in usable() {
@@ -148,7 +148,7 @@ impl Layout {
 
     /// Finds the blocks that each free point touches and gives them their places among the couplings; `false` when it
     /// was stopped.
-    fn couple(&mut self, sequence: &Sequence, pace: &mut Pace) -> bool {
+    fn couple(&mut self, sequence: &Reconstruction, pace: &mut Pace) -> bool {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
         let mut couplings = 0;

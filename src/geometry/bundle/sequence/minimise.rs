@@ -12,7 +12,7 @@ use super::pattern::Pattern;
 use super::reduced::{Reduced, substitute};
 use super::settle::settle_points;
 use super::solver::Solver;
-use super::{Free, Observation, Pace, Run, Sequence};
+use super::{Free, Observation, Pace, Reconstruction, Run};
 use crate::geometry::levenberg_marquardt::{self, Attempt, Problem};
 
 /// Least damping, as a share of the diagonal. Lower than for a block: the weakest directions of a long chain of views
@@ -39,7 +39,7 @@ const SETTLE_WITHIN: f64 = 2.0;
 /// # Pitfall
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
 pub fn adjust(
-    sequence: &mut Sequence,
+    sequence: &mut Reconstruction,
     observations: &[Observation],
     free: &Free,
     priors: &[IntrinsicsPrior],
@@ -65,14 +65,20 @@ pub fn adjust(
 }
 
 /// Pattern of the reduced system of a layout; `None` when it was stopped.
-pub(super) fn pattern(sequence: &Sequence, layout: &Layout, pace: &mut Pace) -> Option<Pattern> {
+pub(super) fn pattern(sequence: &Reconstruction, layout: &Layout, pace: &mut Pace) -> Option<Pattern> {
     let unknowns = &layout.unknowns;
     let pair = |view: usize| unknowns.view_block[view].zip(unknowns.group_block_of_view(sequence, view));
     Pattern::new(layout, (0..sequence.poses.len()).filter_map(pair), pace)
 }
 
 /// Sum of the loss over the observations and of what the priors add; `None` when it was stopped.
-fn cost(sequence: &Sequence, layout: &Layout, priors: &[IntrinsicsPrior], loss: Loss, crew: &Crew) -> Option<f64> {
+fn cost(
+    sequence: &Reconstruction,
+    layout: &Layout,
+    priors: &[IntrinsicsPrior],
+    loss: Loss,
+    crew: &Crew,
+) -> Option<f64> {
     let mut sum = 0.0;
     for (group, (prior, intrinsics)) in priors.iter().zip(&sequence.intrinsics).enumerate() {
         for parameter in &layout.unknowns.parameters[group] {
@@ -85,7 +91,7 @@ fn cost(sequence: &Sequence, layout: &Layout, priors: &[IntrinsicsPrior], loss: 
 }
 
 /// Sum of the loss over the observations of one point, were it at this position.
-pub(super) fn cost_of_point(sequence: &Sequence, seen: &[Seen], position: &Vector3<f64>, loss: Loss) -> f64 {
+pub(super) fn cost_of_point(sequence: &Reconstruction, seen: &[Seen], position: &Vector3<f64>, loss: Loss) -> f64 {
     let mut sum = 0.0;
     for seen in seen {
         let at = sequence.poses[seen.view].apply(position);
@@ -109,7 +115,7 @@ struct Descent<'a> {
 
 impl<'a> Descent<'a> {
     fn new(
-        sequence: &Sequence,
+        sequence: &Reconstruction,
         layout: &'a Layout,
         priors: &'a [IntrinsicsPrior],
         options: &Options,
@@ -132,18 +138,18 @@ impl<'a> Descent<'a> {
 }
 
 impl Problem for Descent<'_> {
-    type State = Sequence;
+    type State = Reconstruction;
 
-    fn cost(&self, sequence: &Sequence) -> f64 {
+    fn cost(&self, sequence: &Reconstruction) -> f64 {
         cost(sequence, self.layout, self.priors, self.loss, self.crew).unwrap_or(f64::INFINITY)
     }
 
     /// What is left unfinished when it is stopped is not used: no attempt follows.
-    fn linearise(&mut self, sequence: &Sequence) {
+    fn linearise(&mut self, sequence: &Reconstruction) {
         self.normal.fill(sequence, self.layout, self.priors, self.loss, self.crew);
     }
 
-    fn step(&mut self, from: &Sequence, damping: f64, to: &mut Sequence) -> Option<f64> {
+    fn step(&mut self, from: &Reconstruction, damping: f64, to: &mut Reconstruction) -> Option<f64> {
         let Self { layout, normal, reduced, crew, .. } = self;
         if !reduced.build(layout, normal, damping, crew) {
             return None;
@@ -158,7 +164,13 @@ impl Problem for Descent<'_> {
         possible.then_some(f64::NAN)
     }
 
-    fn attempt(&mut self, from: &Sequence, damping: f64, present: f64, to: &mut Sequence) -> Option<Attempt> {
+    fn attempt(
+        &mut self,
+        from: &Reconstruction,
+        damping: f64,
+        present: f64,
+        to: &mut Reconstruction,
+    ) -> Option<Attempt> {
         let moved = self.step(from, damping, to).map(|predicted| Attempt { cost: self.cost(to), predicted });
         (self.told)();
         let Attempt { cost, predicted } = moved?;
@@ -172,7 +184,7 @@ impl Problem for Descent<'_> {
 }
 
 /// Moves poses and intrinsics from where they are in `from`; `false` where a scale vanishes or nothing finite is left.
-pub(super) fn retract(moved: &mut Sequence, from: &Sequence, layout: &Layout, step: &[f64]) -> bool {
+pub(super) fn retract(moved: &mut Reconstruction, from: &Reconstruction, layout: &Layout, step: &[f64]) -> bool {
     let mut possible = true;
     let unknowns = &layout.unknowns;
     for (group, block) in unknowns.group_block.iter().enumerate() {

@@ -12,7 +12,7 @@ use super::crew::{Crew, split_off};
 use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
 use super::point::PointBlock;
-use super::{Pace, Sequence};
+use super::{Pace, Reconstruction};
 use crate::parallel::even_cuts;
 
 /// Where a view's residuals go in the camera part of the normal equations.
@@ -39,7 +39,7 @@ pub(super) struct Weighted {
 impl Weighted {
     /// `None` where the observation is undefined.
     #[inline]
-    pub fn new(sequence: &Sequence, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
+    pub fn new(sequence: &Reconstruction, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
         let intrinsics = sequence.intrinsics_of(seen.view);
         let projection = Projection::new(&intrinsics, &sequence.poses[seen.view], point);
         let residual = projection.image - seen.xy;
@@ -114,7 +114,7 @@ struct Batch<'a> {
 }
 
 impl Normal {
-    pub fn new(layout: &Layout, pattern: &Pattern, sequence: &Sequence) -> Self {
+    pub fn new(layout: &Layout, pattern: &Pattern, sequence: &Reconstruction) -> Self {
         Self {
             cameras: Cameras::new(layout, pattern, sequence),
             couplings: vec![0.0; layout.coupling_count()],
@@ -129,7 +129,7 @@ impl Normal {
     /// own rows, in the order of the observations.
     pub fn fill(
         &mut self,
-        sequence: &Sequence,
+        sequence: &Reconstruction,
         layout: &Layout,
         priors: &[IntrinsicsPrior],
         loss: Loss,
@@ -147,7 +147,7 @@ impl Normal {
 
     fn linearise(
         &mut self,
-        sequence: &Sequence,
+        sequence: &Reconstruction,
         layout: &Layout,
         loss: Loss,
         crew: &Crew,
@@ -175,7 +175,7 @@ impl Normal {
 
 impl Points<'_> {
     /// `false` when it was stopped.
-    fn linearise(self, sequence: &Sequence, layout: &Layout, loss: Loss, mut pace: Pace) -> bool {
+    fn linearise(self, sequence: &Reconstruction, layout: &Layout, loss: Loss, mut pace: Pace) -> bool {
         let (mut rows, mut couplings) = (self.rows, self.couplings);
         for (point, slot) in self.range.zip(self.blocks) {
             let seen = layout.seen(point);
@@ -200,7 +200,7 @@ impl Points<'_> {
 }
 
 impl Cameras {
-    fn new(layout: &Layout, pattern: &Pattern, sequence: &Sequence) -> Self {
+    fn new(layout: &Layout, pattern: &Pattern, sequence: &Reconstruction) -> Self {
         let unknowns = &layout.unknowns;
         let diagonal = |block: usize| Some((unknowns.range(block).start, pattern.place(block, block)?));
         let places = |view: usize| {
@@ -232,7 +232,7 @@ impl Cameras {
     }
 
     /// What is known of the intrinsics beforehand.
-    fn believe(&mut self, sequence: &Sequence, layout: &Layout, priors: &[IntrinsicsPrior]) {
+    fn believe(&mut self, sequence: &Reconstruction, layout: &Layout, priors: &[IntrinsicsPrior]) {
         for (group, prior) in priors.iter().enumerate().take(sequence.intrinsics.len()) {
             let Some(block) = layout.unknowns.group_block[group] else { continue };
             for (index, parameter) in layout.unknowns.range(block).zip(&layout.unknowns.parameters[group]) {
@@ -248,7 +248,7 @@ impl Cameras {
     /// * `begun`: how far the list of every view's observations is worked off
     fn add_batch(
         &mut self,
-        sequence: &Sequence,
+        sequence: &Reconstruction,
         layout: &Layout,
         crew: &Crew,
         points: Range<usize>,
@@ -299,7 +299,7 @@ impl Batch<'_> {
     /// * `seen`: observations of a view in this batch, ascending
     fn add_to_views<'s>(
         &self,
-        sequence: &Sequence,
+        sequence: &Reconstruction,
         views: Range<usize>,
         values: &mut [f64],
         gradient: &mut [f64],
@@ -335,7 +335,7 @@ impl Batch<'_> {
     /// * `seen`: the observations of the batch
     fn add_to_groups(
         &self,
-        sequence: &Sequence,
+        sequence: &Reconstruction,
         seen: &[Seen],
         values: &mut [f64],
         gradient: &mut [f64],

@@ -11,7 +11,7 @@ use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::{Column, Pattern};
 use super::solver::Solver;
-use super::{Pace, Sequence};
+use super::{Pace, Reconstruction};
 use crate::parallel::even_cuts;
 
 /// Damping beside Marquardt's, as a share of the diagonal: holds the gauge (seven directions for every set of views
@@ -222,8 +222,8 @@ impl Columns<'_> {
 /// Moves the points of `moved` to where they belong after the step of poses and intrinsics: from where they are in
 /// `from` by `-V^-1 (Jp' r + Jp' Jc dc)`. `false` when that is no number, or it was stopped.
 pub(super) fn substitute(
-    moved: &mut Sequence,
-    from: &Sequence,
+    moved: &mut Reconstruction,
+    from: &Reconstruction,
     layout: &Layout,
     normal: &Normal,
     damping: f64,

@@ -8,7 +8,7 @@
 use nalgebra::Vector3;
 
 use super::super::Loss;
-use super::Sequence;
+use super::Reconstruction;
 use super::crew::Crew;
 use super::layout::{Layout, Seen};
 use super::minimise::cost_of_point;
@@ -22,7 +22,7 @@ const WORTHWHILE: f64 = 1e-2;
 
 /// Moves every free point towards its minimum with the cameras as they are; by how much that lowers the cost. `None`
 /// when it was stopped.
-pub(super) fn settle_points(sequence: &mut Sequence, layout: &Layout, loss: Loss, crew: &Crew) -> Option<f64> {
+pub(super) fn settle_points(sequence: &mut Reconstruction, layout: &Layout, loss: Loss, crew: &Crew) -> Option<f64> {
     let settled = crew.of_points(layout, |point| {
         let (seen, position) = (layout.seen(point), sequence.points[point]);
         let moves = !seen.is_empty() && layout.free_points[point];
@@ -37,7 +37,7 @@ pub(super) fn settle_points(sequence: &mut Sequence, layout: &Layout, loss: Loss
 }
 
 /// A point nearer its minimum, and by how much it costs less there.
-fn settle(sequence: &Sequence, seen: &[Seen], mut position: Vector3<f64>, loss: Loss) -> (Vector3<f64>, f64) {
+fn settle(sequence: &Reconstruction, seen: &[Seen], mut position: Vector3<f64>, loss: Loss) -> (Vector3<f64>, f64) {
     let initial_cost = cost_of_point(sequence, seen, &position, loss);
     let mut cost = initial_cost;
     for _ in 0..STEPS {

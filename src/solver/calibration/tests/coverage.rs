@@ -50,7 +50,7 @@ impl Coverage {
             if outcome.grade != Grade::Metric {
                 continue;
             }
-            let found = outcome.metric.as_ref().expect("metric").intrinsics.focal;
+            let found = outcome.intrinsics().expect("metric").focal;
             let deviation = (found / scene.intrinsics.focal).ln() / outcome.sigma_log_focal.expect("graded");
             if deviation.abs() > 3.0 {
                 println!(
@@ -159,7 +159,7 @@ fn calibrated_from_truth(scene: &TestScene) -> Outcome {
     let cameras = scene.cameras();
     let problem = of_one_lens(&cameras, &points_in_space, &scene.observations, STRANGE_NOISE);
     let metric = Reconstruction::new(intrinsics, poses, points);
-    from_metric(&problem, &metric, SIDE_PX, &StopToken::default(), &mut || ()).expect("nothing stops it")
+    only(from_metric(&problem, &metric, SIDE_PX, &StopToken::default(), &mut || ()))
 }
 
 /// The sigmas of the other intrinsics against their errors, over 100 scenes.
@@ -175,7 +175,7 @@ fn sigmas_of_the_other_intrinsics_are_about_their_errors() {
             println!("seed {seed}: {:?} {:?} {:?}", outcome.grade, outcome.sigma_log_focal, codes(&outcome));
             continue;
         }
-        let found = outcome.metric.as_ref().expect("metric").intrinsics;
+        let found = outcome.intrinsics().expect("metric");
         for (parameter, coverage) in &mut deviations {
             let Some(sigma) = outcome.sigma(*parameter) else { continue };
             coverage.deviations.push((found.value(*parameter) - scene.intrinsics.value(*parameter)) / sigma);

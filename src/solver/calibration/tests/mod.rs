@@ -26,7 +26,8 @@ pub fn of_one_lens<'a>(
     observations: &'a [Observation],
     noise: f64,
 ) -> Problem<'a> {
-    Problem { cameras, points, observations, noise, focal_prior: None, focal_per_view: false }
+    let group_of = &[0; 64][..cameras.len()];
+    Problem { cameras, points, observations, noise, group_of, focal_priors: &[None], focal_per_view: false }
 }
 
 fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
@@ -35,13 +36,21 @@ fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
 
 fn calibrated_knowing(scene: &TestScene, seed: u64, noise: f64, focal_prior: Option<FocalPrior>) -> Outcome {
     let (cameras, points) = projective_problem(scene, seed);
-    let problem = Problem { focal_prior, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
-    calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
+    let focal_priors = &[focal_prior];
+    let problem = Problem { focal_priors, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
+    only(calibrate(&problem, SIDE_PX, &StopToken::default()))
+}
+
+/// The outcome of the only camera group.
+fn only(outcomes: Result<Vec<Outcome>, Stopped>) -> Outcome {
+    let mut outcomes = outcomes.expect("nothing stops it");
+    assert_eq!(outcomes.len(), 1);
+    outcomes.remove(0)
 }
 
 fn focal_error(outcome: &Outcome, scene: &TestScene) -> f64 {
-    let metric = outcome.metric.as_ref().expect("a metric reconstruction");
-    (metric.intrinsics.focal / scene.intrinsics.focal - 1.0).abs()
+    let found = outcome.intrinsics().expect("a metric reconstruction");
+    (found.focal / scene.intrinsics.focal - 1.0).abs()
 }
 
 fn codes(outcome: &Outcome) -> Vec<&'static str> {
@@ -151,10 +160,10 @@ fn the_plane_at_infinity_fits_the_callers_frame() {
     let scene = testing::scene(3, 10, 30, 1e-5);
     let (cameras, points) = projective_problem(&scene, 3);
     let problem = of_one_lens(&cameras, &points, &scene.observations, 1e-5);
-    let outcome = calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it");
+    let outcome = only(calibrate(&problem, SIDE_PX, &StopToken::default()));
     let plane = outcome.plane_at_infinity.expect("a plane");
     let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
-    let intrinsics = outcome.metric.expect("a metric reconstruction").intrinsics;
+    let intrinsics = outcome.intrinsics().expect("a metric reconstruction");
     let residual = daq::residual(&frame.cameras, &Daq { intrinsics, plane_at_infinity: plane });
     assert!(residual < 1e-5, "{residual}");
 }
@@ -177,7 +186,7 @@ fn hostile_input_is_refused_without_panic() {
     let (cameras, points) = projective_problem(&scene, 1);
     let run = |cameras: &[Matrix3x4<f64>], points: &[Vector4<f64>], observations: &[Observation], noise| {
         let problem = of_one_lens(cameras, points, observations, noise);
-        calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
+        only(calibrate(&problem, SIDE_PX, &StopToken::default()))
     };
     let nothing = run(&[], &[], &[], NOISE);
     assert_eq!(nothing.grade, Grade::ProjectiveOnly);

@@ -13,7 +13,7 @@ fn a_displaced_principal_point_is_found_and_a_central_one_is_left_alone() {
         let mut rng = rand::SeedableRng::seed_from_u64(seed);
         scene.observe(0.001, &mut rng);
         let outcome = calibrated(&scene, seed, 0.001);
-        let found = outcome.metric.as_ref().expect("a metric reconstruction").intrinsics;
+        let found = outcome.intrinsics().expect("a metric reconstruction");
         println!("seed {seed}: {found:?}, true {:?}, {:?}", scene.intrinsics, codes(&outcome));
         assert!(outcome.model.contains(Extension::PrincipalPoint), "seed {seed}");
         assert!((found.principal_point - scene.intrinsics.principal_point).norm() < 0.01, "seed {seed}");
@@ -45,7 +45,7 @@ fn radial_distortion_is_found_with_a_displaced_principal_point_too() {
             let outcome = calibrated(&scene, seed, 0.001);
             let error = focal_error(&outcome, &scene);
             let sigma = outcome.sigma_log_focal.unwrap_or(f64::INFINITY);
-            let found = outcome.metric.as_ref().expect("metric").intrinsics;
+            let found = outcome.intrinsics().expect("metric");
             println!(
                 "k1 {radial}, seed {seed}: error {error:.5}, {:.1} sigma of {sigma:.5}, {:?}, k1 {:.4}, pp off by {:.4}, {} {:?} {:.2} in {:?}",
                 error / sigma,
@@ -76,7 +76,7 @@ fn a_second_radial_term_is_taken_where_the_lens_has_one_and_only_there() {
             scene.crop();
             let outcome = calibrated(&scene, seed, 0.0005);
             let (error, sigma) = (focal_error(&outcome, &scene), outcome.sigma_log_focal.unwrap_or(f64::INFINITY));
-            let found = outcome.metric.as_ref().expect("metric").intrinsics;
+            let found = outcome.intrinsics().expect("metric");
             println!(
                 "seed {seed}, k2 {second_radial}: {} k1 {:.4} k2 {:.4}, error {error:.5}, {:.1} sigma, {:?}",
                 outcome.model.name(),
@@ -117,7 +117,7 @@ fn tangential_distortion_and_a_third_radial_term_are_taken_only_where_the_lens_h
             scene.observe(0.0003, &mut rand::SeedableRng::seed_from_u64(seed));
             scene.crop();
             let outcome = calibrated(&scene, seed, 0.0003);
-            let found = outcome.metric.as_ref().expect("metric").intrinsics;
+            let found = outcome.intrinsics().expect("metric");
             let deviations = Parameter::ALL.map(|parameter| {
                 let error = found.value(parameter) - scene.intrinsics.value(parameter);
                 outcome.sigma(parameter).map_or(0.0, |sigma| error.abs() / sigma)
@@ -138,7 +138,7 @@ fn a_lens_without_distortion_is_left_without() {
     for seed in 0..10 {
         let scene = through_a_lens(seed, 0.0, Vector2::zeros(), 0.001);
         let outcome = calibrated(&scene, seed, 0.001);
-        let found = outcome.metric.as_ref().expect("metric").intrinsics;
+        let found = outcome.intrinsics().expect("metric");
         println!("seed {seed}: {} {:?}", outcome.model.name(), codes(&outcome));
         assert_eq!(found.radial[0], 0.0, "seed {seed}");
     }

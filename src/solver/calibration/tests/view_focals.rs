@@ -44,7 +44,7 @@ fn calibrated_as(focal_per_view: bool, scene: &TestScene, seed: u64, noise: f64)
     // Any projective frame of any cameras near the truth is adjusted to the observations.
     let (cameras, points) = projective_problem(scene, seed);
     let problem = Problem { focal_per_view, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
-    calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it")
+    only(calibrate(&problem, SIDE_PX, &StopToken::default()))
 }
 
 #[test]
@@ -91,7 +91,7 @@ fn a_shared_lens_is_found_beside_focal_lengths_of_views() {
             let views = found.unwrap_or_default().iter().zip(&focals);
             let deviations: Vec<f64> =
                 views.filter_map(|(found, focal)| Some((found.focal / focal).ln().abs() / found.sigma_log?)).collect();
-            let lens = outcome.metric.as_ref().map_or(f64::NAN, |metric| metric.intrinsics.radial[0]);
+            let lens = outcome.intrinsics().map_or(f64::NAN, |found| found.radial[0]);
             println!(
                 "k1 {radial}, range {range}, seed {seed}: {:?}, k1 {lens:.3}, {deviations:.1?} sigma, {:?}",
                 outcome.grade,
@@ -115,7 +115,7 @@ fn a_zoom_that_is_taken_for_one_focal_length_is_not_told_as_one() {
         for seed in 0..5 {
             let (scene, focals) = zooming(seed, 200, 0.0005, range);
             let outcome = calibrated_as(false, &scene, seed, 0.0005);
-            let focal = outcome.metric.as_ref().map_or(f64::NAN, |metric| metric.intrinsics.focal);
+            let focal = outcome.intrinsics().map_or(f64::NAN, |found| found.focal);
             let errors: Vec<f64> = focals.iter().map(|own| (focal / own).ln()).collect();
             let error = root_mean_square(&errors).expect("ten views");
             let sigma = outcome.sigma_log_focal.unwrap_or(f64::INFINITY);
@@ -147,7 +147,7 @@ fn the_plane_at_infinity_goes_with_the_zoom() {
     let (scene, _) = zooming(3, 60, 1e-5, 0.3);
     let (cameras, points) = projective_problem(&scene, 3);
     let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, 1e-5) };
-    let outcome = calibrate(&problem, SIDE_PX, &StopToken::default()).expect("nothing stops it");
+    let outcome = only(calibrate(&problem, SIDE_PX, &StopToken::default()));
     let plane_at_infinity = outcome.plane_at_infinity.expect("a plane");
     let focals = outcome.focals.expect("a focal length a view");
     let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
@@ -188,7 +188,7 @@ fn near_truth(scene: &TestScene, focals: &[f64], noise: f64) -> Outcome {
     let points: Vec<Vector4<f64>> = metric.points.iter().map(|point| point.push(1.0)).collect();
     let cameras = metric.cameras();
     let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
-    from_metric(&problem, &metric, SIDE_PX, &StopToken::default(), &mut || {}).expect("nothing stops it")
+    only(from_metric(&problem, &metric, SIDE_PX, &StopToken::default(), &mut || {}))
 }
 
 /// The true reconstruction with these focal lengths.
@@ -211,7 +211,7 @@ fn with_choice<T>(
     let choice = super::super::models::Choice { problem: &problem, scale_px: SIDE_PX, stop: &stop };
     let start = metric_of(scene, &vec![scene.intrinsics.focal; scene.poses.len()]);
     let start = search::Minimum { reconstruction: start, cost: f64::INFINITY, cheirality: 0.0 };
-    let best = start.adjusted(&scene.observations, IntrinsicsModel::FOCAL_PER_VIEW, &prior, &stop);
+    let best = start.adjusted(&scene.observations, IntrinsicsModel::FOCAL_PER_VIEW, &[prior], &stop);
     let fit = Fit::metric(best.cost, IntrinsicsModel::FOCAL_PER_VIEW, &problem);
     ask(&choice, &fit, &best)
 }
@@ -224,7 +224,7 @@ fn another_minimum_that_explains_as_much_is_told() {
             let mut rival = best.clone();
             rival.reconstruction.focals.iter_mut().take(views).for_each(|focal| *focal *= factor);
             rival = search::Minimum { cost: cost * best.cost, cheirality, ..rival };
-            let outcome = grading::grade(choice, fit, vec![best.clone(), rival], Vec::new()).expect("nothing stops it");
+            let outcome = only(grading::grade(choice, fit, vec![best.clone(), rival], Vec::new()));
             (outcome.grade, codes(&outcome).contains(&"SECOND_MINIMUM"))
         };
         let graded = |factor: f64, cost: f64, cheirality: f64| graded_in(10, factor, cost, cheirality);
@@ -246,7 +246,7 @@ fn the_calibration_is_found_from_wrong_focal_lengths() {
         let scene = testing::scene(seed, 10, 40, NOISE);
         for factor in [0.5, 0.75, 1.33, 2.0] {
             let outcome = near_truth(&scene, &[factor * scene.intrinsics.focal; 10], NOISE);
-            let focal = outcome.metric.map_or(f64::NAN, |metric| metric.intrinsics.focal);
+            let focal = outcome.intrinsics().map_or(f64::NAN, |found| found.focal);
             let error = (focal / scene.intrinsics.focal).ln().abs();
             assert!(error < 0.02, "seed {seed}, from {factor}: off by {error}");
         }

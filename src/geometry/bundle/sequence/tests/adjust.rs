@@ -18,7 +18,7 @@ fn one_group_ends_where_a_block_does() {
         for options in [thorough(), Options { loss: Loss::Cauchy { scale: NOISE }, ..thorough() }] {
             let mut block = Reconstruction::new(start.intrinsics[0], start.poses.clone(), start.points.clone());
             let stop = StopToken::default();
-            let dense = metric::adjust(&mut block, &scene.observations, model, &prior, &options, &stop);
+            let dense = metric::adjust(&mut block, &scene.observations, model, &[prior], &options, &stop);
             let mut sequence = start.clone();
             let sparse = adjust(
                 &mut sequence,
@@ -32,7 +32,7 @@ fn one_group_ends_where_a_block_does() {
             assert!((sparse.initial_cost / dense.initial_cost - 1.0).abs() < 1e-12, "seed {seed}");
             assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
             for parameter in [Parameter::LogFocal, Parameter::RadialK1] {
-                let error = sequence.intrinsics[0].value(parameter) - block.intrinsics.value(parameter);
+                let error = sequence.intrinsics[0].value(parameter) - block.intrinsics[0].value(parameter);
                 assert!(error.abs() < 1e-5, "seed {seed}: {parameter:?} off by {error}");
             }
         }
@@ -67,18 +67,18 @@ fn focal_lengths_a_view_behind_one_lens_end_where_those_of_a_block_do() {
         let scene = testing::scene(seed, 12, 40, NOISE);
         for model in [IntrinsicsModel::FOCAL_PER_VIEW, IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1)] {
             let mut block = reconstruction_of(&scene).with_own_focals();
-            let mut start = Sequence::from(&block);
+            let mut start = block.clone();
             let (_, observations) = sequence_of(&scene);
             let (prior, stop) = (IntrinsicsPrior::NONE, StopToken::default());
-            let dense = metric::adjust(&mut block, &scene.observations, model, &prior, &thorough(), &stop);
+            let dense = metric::adjust(&mut block, &scene.observations, model, &[prior], &thorough(), &stop);
             let sparse = adjusted(&mut start, &observations, &[model], &thorough());
             println!("seed {seed}, {}: {dense:?} {sparse:?}", model.name());
             assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
             for (found, expected) in start.focals.iter().zip(&block.focals) {
                 assert!((found / expected - 1.0).abs() < 1e-5, "seed {seed}: {found} {expected}");
             }
-            assert!((start.intrinsics[0].focal / block.intrinsics.focal - 1.0).abs() < 1e-5, "seed {seed}");
-            assert!((start.intrinsics[0].radial[0] - block.intrinsics.radial[0]).abs() < 1e-5, "seed {seed}");
+            assert!((start.intrinsics[0].focal / block.intrinsics[0].focal - 1.0).abs() < 1e-5, "seed {seed}");
+            assert!((start.intrinsics[0].radial[0] - block.intrinsics[0].radial[0]).abs() < 1e-5, "seed {seed}");
         }
     }
 }

@@ -14,7 +14,7 @@ use crate::geometry::bundle::Loss;
 use crate::geometry::bundle::metric::{Extension, Parameter};
 
 /// Three groups, one of them held, a held view and a held point, unequal weights.
-fn mixed() -> (Sequence, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>, Vec<bool>) {
+fn mixed() -> (Reconstruction, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>, Vec<bool>) {
     let (mut sequence, mut observations) = chain(1, 7, 3, 4, 0.003);
     sequence.group_of = vec![0, 0, 1, 1, 2, 2, 0];
     sequence.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.9), Intrinsics::from_focal(1.3)];
@@ -34,10 +34,14 @@ fn mixed() -> (Sequence, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>, Vec<
 
 /// Weighted residuals and their derivatives by central differences through the retraction: unknowns of the cameras,
 /// then of the free points.
-fn differentiate(sequence: &Sequence, observations: &[Observation], layout: &Layout) -> (DVector<f64>, DMatrix<f64>) {
+fn differentiate(
+    sequence: &Reconstruction,
+    observations: &[Observation],
+    layout: &Layout,
+) -> (DVector<f64>, DMatrix<f64>) {
     const WIDTH: f64 = 1e-6;
     let cameras = layout.unknowns.offsets[layout.unknowns.block_count()];
-    let residuals = |sequence: &Sequence| {
+    let residuals = |sequence: &Reconstruction| {
         let weighted = |seen: &Observation| sequence.residual(seen) * seen.weight.sqrt();
         DVector::from_iterator(
             2 * observations.len(),
@@ -82,7 +86,7 @@ fn normal_equations_agree_with_finite_differences() {
 }
 
 fn compare(
-    sequence: &Sequence,
+    sequence: &Reconstruction,
     observations: &[Observation],
     models: &[IntrinsicsModel],
     views: &[bool],

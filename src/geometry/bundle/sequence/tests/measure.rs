@@ -72,7 +72,7 @@ fn time_against_a_block() {
         let mut block = Reconstruction::new(start.intrinsics[0], start.poses.clone(), start.points.clone());
         let (model, prior, stop) = (IntrinsicsModel::FOCAL, IntrinsicsPrior::NONE, StopToken::default());
         let (seconds, dense) =
-            timed(|| metric::adjust(&mut block, &scene.observations, model, &prior, &options(), &stop));
+            timed(|| metric::adjust(&mut block, &scene.observations, model, &[prior], &options(), &stop));
         block_seconds += seconds / dense.iterations as f64;
         let (seconds, sparse) = timed(|| adjusted(&mut start, &observations, &[model], &options()));
         sequence_seconds += seconds / sparse.iterations as f64;

@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Pose, Reconstruction};
 use super::super::testing::{TestScene, normal, perturb};
 use super::super::{Options, Report};
-use super::{Free, Observation, Run, Sequence, adjust};
+use super::{Free, Observation, Run, adjust};
 use crate::domain::StopToken;
 use crate::parallel::Threads;
 
@@ -24,7 +24,13 @@ fn quiet<'a>(stop: &'a StopToken, told: &'a mut dyn FnMut()) -> Run<'a> {
 }
 
 /// Views on a line that sways and turns, each track seen by `length` neighbours, `tracks_a_view` beginning in each.
-fn chain(seed: u64, views: usize, tracks_a_view: usize, length: usize, noise: f64) -> (Sequence, Vec<Observation>) {
+fn chain(
+    seed: u64,
+    views: usize,
+    tracks_a_view: usize,
+    length: usize,
+    noise: f64,
+) -> (Reconstruction, Vec<Observation>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut uniform = |range: f64| rng.random_range(-range..range);
     let poses: Vec<Pose> = (0..views)
@@ -34,8 +40,7 @@ fn chain(seed: u64, views: usize, tracks_a_view: usize, length: usize, noise: f6
             Pose { rotation, translation: -rotation * centre }
         })
         .collect();
-    let mut sequence =
-        Sequence::from(&Reconstruction { poses, ..Reconstruction::new(Intrinsics::from_focal(1.1), vec![], vec![]) });
+    let mut sequence = Reconstruction::new(Intrinsics::from_focal(1.1), poses, vec![]);
     let mut observations = Vec::new();
     for first in 0..=views - length {
         for _ in 0..tracks_a_view {
@@ -51,7 +56,7 @@ fn chain(seed: u64, views: usize, tracks_a_view: usize, length: usize, noise: f6
 }
 
 /// Draws the image points anew.
-fn observe(sequence: &Sequence, observations: &mut [Observation], noise: f64, seed: u64) {
+fn observe(sequence: &Reconstruction, observations: &mut [Observation], noise: f64, seed: u64) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
     for seen in observations {
         seen.xy = Vector2::zeros();
@@ -59,8 +64,8 @@ fn observe(sequence: &Sequence, observations: &mut [Observation], noise: f64, se
     }
 }
 
-fn sequence_of(scene: &TestScene) -> (Sequence, Vec<Observation>) {
-    (Sequence::from(&reconstruction_of(scene)), scene.observations.clone())
+fn sequence_of(scene: &TestScene) -> (Reconstruction, Vec<Observation>) {
+    (reconstruction_of(scene), scene.observations.clone())
 }
 
 fn reconstruction_of(scene: &TestScene) -> Reconstruction {
@@ -68,7 +73,7 @@ fn reconstruction_of(scene: &TestScene) -> Reconstruction {
 }
 
 /// Moves points and poses by so much, focal lengths by ten times as much.
-fn perturbed(truth: &Sequence, deviation: f64, seed: u64) -> Sequence {
+fn perturbed(truth: &Reconstruction, deviation: f64, seed: u64) -> Reconstruction {
     let mut start = truth.clone();
     perturb(start.intrinsics.iter_mut().map(|intrinsics| &mut intrinsics.focal), 10.0 * deviation, seed);
     perturb(start.points.iter_mut().flat_map(|point| point.iter_mut()), deviation, seed + 1);
@@ -82,7 +87,7 @@ fn perturbed(truth: &Sequence, deviation: f64, seed: u64) -> Sequence {
 }
 
 /// The chain bent to an arc of so many radians, as a reconstruction drifts that grows view by view.
-fn bent(straight: &Sequence, angle: f64) -> Sequence {
+fn bent(straight: &Reconstruction, angle: f64) -> Reconstruction {
     let length = BASELINE * straight.poses.len() as f64;
     let radius = length / angle;
     // Rotation and shift of what is so far along the line.
@@ -112,7 +117,7 @@ fn thorough() -> Options {
 }
 
 fn adjusted(
-    sequence: &mut Sequence,
+    sequence: &mut Reconstruction,
     observations: &[Observation],
     models: &[IntrinsicsModel],
     options: &Options,
