@@ -26,7 +26,7 @@ pub struct Drained {
 
 /// Those who work for an engine, and what they did since its drain began.
 #[derive(Debug, Default)]
-pub(super) struct Crew {
+pub(super) struct WorkerPool {
     slots: Vec<JoinHandle<()>>,
     sweeper: Option<JoinHandle<()>>,
     /// Heeds what other processes tell, where there are any.
@@ -41,32 +41,32 @@ impl Inner {
     /// Starts worker threads, their slots and the sweeper.
     pub(super) fn hire(self: &Arc<Self>, solver: Solver) -> Result<(), Error> {
         let (alive, threads_ended) = mpsc::channel(1);
-        let mut crew = Crew { threads_ended: Some(threads_ended), ..Crew::default() };
+        let mut pool = WorkerPool { threads_ended: Some(threads_ended), ..WorkerPool::default() };
         let mut workers = Vec::new();
         for index in 0..self.options.workers.max(1) {
             let (worker, thread) = Worker::start(index, solver.clone(), alive.clone())
                 .map_err(|error| Error::Internal(format!("cannot start worker thread {index}: {error}")))?;
             workers.push(worker);
-            crew.threads.push(thread);
+            pool.threads.push(thread);
         }
-        crew.slots = workers.into_iter().map(|worker| tokio::spawn(slot::run(self.clone(), worker))).collect();
-        crew.sweeper = Some(tokio::spawn(slot::sweep(self.clone())));
+        pool.slots = workers.into_iter().map(|worker| tokio::spawn(slot::run(self.clone(), worker))).collect();
+        pool.sweeper = Some(tokio::spawn(slot::sweep(self.clone())));
         if self.store.is_shared() {
-            crew.hints = Some(tokio::spawn(super::hints::run(self.clone())));
+            pool.hints = Some(tokio::spawn(super::hints::run(self.clone())));
         }
-        *locked(&self.crew) = crew;
+        *locked(&self.pool) = pool;
         Ok(())
     }
 
     pub(super) fn crew_finished_one(&self) {
         if self.phase() != Phase::Open {
-            locked(&self.crew).drained.finished += 1;
+            locked(&self.pool).drained.finished += 1;
         }
     }
 
     pub(super) fn crew_gave_one_back(&self) {
         if self.phase() != Phase::Open {
-            locked(&self.crew).drained.given_back += 1;
+            locked(&self.pool).drained.given_back += 1;
         }
     }
 
@@ -82,10 +82,10 @@ impl Inner {
             return Drained::default();
         }
         let (mut slots, others, threads, threads_ended) = {
-            let mut crew = locked(&self.crew);
-            let slots = std::mem::take(&mut crew.slots);
-            let others = [crew.sweeper.take(), crew.hints.take()];
-            (slots, others, std::mem::take(&mut crew.threads), crew.threads_ended.take())
+            let mut pool = locked(&self.pool);
+            let slots = std::mem::take(&mut pool.slots);
+            let others = [pool.sweeper.take(), pool.hints.take()];
+            (slots, others, std::mem::take(&mut pool.threads), pool.threads_ended.take())
         };
         let in_time = timeout(bound, all_ended(&mut slots));
         if !matches!(self.hurried.run_until_cancelled(in_time).await, Some(Ok(()))) {
@@ -108,7 +108,7 @@ impl Inner {
             // They wait for a store that hangs, and have nothing that another server or the next start would miss.
             others.iter().for_each(JoinHandle::abort);
         }
-        locked(&self.crew).drained
+        locked(&self.pool).drained
     }
 }
 

@@ -188,7 +188,7 @@ struct Inner {
     hurried: CancellationToken,
     /// What the last sweep found.
     store_state: channel::Sender<StoreState>,
-    crew: Mutex<drain::Crew>,
+    pool: Mutex<drain::WorkerPool>,
 }
 
 impl Engine {
@@ -210,7 +210,7 @@ impl Engine {
             phase: channel::Sender::new(Phase::Open),
             hurried: CancellationToken::new(),
             store_state: channel::Sender::new(StoreState::Sound),
-            crew: Mutex::default(),
+            pool: Mutex::default(),
             options,
         });
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);

@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Matrix4, SMatrix, SVector, Vector3, Vector4};
 use super::Camera;
 use super::bundle::critical::Translating;
 use super::bundle::metric::{Intrinsics, Pose, Reconstruction};
-use super::daq::{self, Daq, FirstViewFrame, to_first_view_frame};
+use super::daq::{self, CanonicalFrame, Daq, to_canonical_frame};
 use super::observation::Observation;
 use super::statistics::median;
 
@@ -23,7 +23,7 @@ pub fn upgrading_homography(daq: &Daq) -> Matrix4<f64> {
 }
 
 /// The plane at infinity of projective cameras that goes best with what they are as metric ones, `n` of `(n, 1)` in the
-/// frame that [`to_first_view_frame`] gives them.
+/// frame that [`to_canonical_frame`] gives them.
 ///
 /// For every projective `P = [A|a]` there and metric `K [R|t]`, `A - a n' ~ K R (K1 R1)^-1` is the homography of the
 /// plane at infinity between the first view and this one (Hartley & Zisserman 2004, chapter 19): linear in `n` and the
@@ -31,7 +31,7 @@ pub fn upgrading_homography(daq: &Daq) -> Matrix4<f64> {
 ///
 /// Returns `None` where the first camera has no rank 3, or the cameras have one centre.
 pub fn plane_at_infinity(projective: &[Camera], metric: &[Camera]) -> Option<Vector3<f64>> {
-    let frame = to_first_view_frame(projective, &[])?;
+    let frame = to_canonical_frame(projective, &[])?;
     let back = metric.first()?.fixed_columns::<3>(0).into_owned().try_inverse()?;
     let (mut normal, mut target) = (Matrix3::zeros(), Vector3::zeros());
     for (projective, metric) in frame.cameras.iter().zip(metric) {
@@ -57,7 +57,7 @@ pub fn plane_at_infinity(projective: &[Camera], metric: &[Camera]) -> Option<Vec
 /// Returns `None` when a pose or the depth is not a number, a camera without rank, a DAQ without meaning; also where the
 /// quadric gives a view no focal length of its own.
 pub fn upgrade(
-    frame: &FirstViewFrame,
+    frame: &CanonicalFrame,
     daq: &Daq,
     own_focals: bool,
     observations: &[Observation],
@@ -178,7 +178,7 @@ mod tests {
         for seed in 0..5 {
             let scene = testing::scene(seed, 8, 20, 0.0);
             let (cameras, points) = testing::projectively_transformed(&scene, seed);
-            let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
+            let frame = to_canonical_frame(&cameras, &points).expect("rank 3");
             let refined = scan(&frame.cameras, 40, 4)
                 .into_iter()
                 .take(8)
@@ -199,7 +199,7 @@ mod tests {
             let scene = testing::scene(seed, 8, 20, 0.0);
             let (cameras, points) = testing::projectively_transformed(&scene, seed);
             let plane_at_infinity = plane_at_infinity(&cameras, &scene.cameras()).expect("views apart");
-            let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
+            let frame = to_canonical_frame(&cameras, &points).expect("rank 3");
             let daq = Daq { intrinsics: scene.intrinsics, plane_at_infinity };
             let upgraded = upgrade(&frame, &daq, false, &scene.observations).expect("metric");
             let errors = scene.observations.iter().map(|seen| upgraded.residual(seen).norm());
@@ -212,7 +212,7 @@ mod tests {
     fn a_meaningless_quadric_or_scene_gives_none() {
         let scene = testing::scene(1, 4, 8, 0.0);
         let (cameras, points) = testing::projectively_transformed(&scene, 1);
-        let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
+        let frame = to_canonical_frame(&cameras, &points).expect("rank 3");
         let nan = Daq::new(1.0, Vector3::from_element(f64::NAN));
         assert!(upgrade(&frame, &nan, false, &scene.observations).is_none());
         assert!(upgrade(&frame, &Daq::new(0.0, Vector3::zeros()), false, &scene.observations).is_none());

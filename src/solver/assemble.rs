@@ -6,15 +6,15 @@ use nalgebra::{Matrix3, Matrix4};
 
 use super::Context;
 use super::attempt::Attempt;
+use super::baselines::Decided;
 use super::calibration::{Outcome, ViewFocal};
-use super::direct::Decided;
 use super::judge::{self, Geometry, Judged, SplitPoint};
 use super::recorder::Recorder;
 use super::sequence::Projective;
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter, Reconstruction};
-use crate::geometry::daq::to_first_view_frame;
+use crate::geometry::daq::to_canonical_frame;
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::root_mean_square;
 use crate::geometry::{Camera, Point, triangulation};
@@ -41,13 +41,13 @@ pub fn unsolved(
         if let Some(decided) = &attempt.decided {
             own_verdicts(&attempt.block.tracks, decided, &mut tracks);
         }
-        if let Some(opinion) = attempt.opinion.as_ref().filter(|opinion| opinion.ranks()) {
-            let probabilities = opinion.probabilities();
+        if let Some(track_scores) = attempt.track_scores.as_ref().filter(|track_scores| track_scores.ranks()) {
+            let probabilities = track_scores.probabilities();
             tracks.weight = context.scatter(&probabilities, &attempt.block.tracks);
-            let likely = opinion.likely();
+            let likely = track_scores.likely();
             let detail = format!(
                 "{likely} tracks look right to the trained network and geometry verifies none: `weight` of the \
-                 tracks is its opinion, nothing has checked it"
+                 tracks is its track_scores, nothing has checked it"
             );
             warnings.push(Warning::new(WarningCode::UnverifiedRanking, detail));
         }
@@ -97,7 +97,7 @@ pub fn solved(context: &Context, mut attempt: Attempt, mut warnings: Vec<Warning
         mask(context, &attempt.block.tracks, decided, &mut judged);
     }
     // Where the first camera has no rank 3 the frame stays as it is: there is nothing metric to be consistent with.
-    let frame = to_first_view_frame(&projective.cameras, &[]);
+    let frame = to_canonical_frame(&projective.cameras, &[]);
     let back = frame.as_ref().and_then(|frame| frame.homography.try_inverse()).unwrap_or_else(Matrix4::identity);
     judged.points.iter_mut().flatten().for_each(|point| *point = back * *point);
     let first_px = context.normalization.to_pixels(projective.views[0]);

@@ -1,17 +1,17 @@
 //! One block of views solved from search to calibration.
 
+use super::baselines::{self, Decided};
 use super::block::Block;
 use super::calibration::{self, Outcome};
 use super::chance::LN_ACCEPTABLE;
-use super::direct::{self, Decided};
 use super::grow::{self, Consensus, LEAST_INLIERS};
 use super::judge::Judged;
-use super::learned::Opinion;
-use super::portfolio::{self, Evidence, Portfolio};
+use super::learned::TrackScores;
+use super::portfolio::{self, Portfolio, VerifiedBy};
 use super::recorder::Recorder;
 use super::sequence::Projective;
 use super::{Context, Error};
-use super::{crowds, depths, extend, likeliest, second};
+use super::{depths, extend, near_duplicates, second_structures, track_sampling};
 use crate::domain::result::PriorTime;
 use crate::domain::{FocalPrior, Grade, Method, Prior, Stage, View, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
@@ -51,11 +51,11 @@ pub struct Attempt {
     /// Every observation judged by `projective`, where that was done already.
     pub judged: Option<Judged>,
     /// What the consensus was verified by.
-    pub evidence: Evidence,
+    pub verified_by: VerifiedBy,
     pub calibration: Option<Outcome>,
     pub winning_prior: Option<Prior>,
     /// What the trained network says of the tracks that were searched; `None` where it was not asked.
-    pub opinion: Option<Opinion>,
+    pub track_scores: Option<TrackScores>,
     /// Tracks that hold under one geometry, and how many of them count; `None` but where too few count.
     pub doubted: Option<(usize, usize)>,
     /// Tracks that hold under one geometry and lie within the noise of each other, and how many of them count; `None`
@@ -82,10 +82,10 @@ impl Attempt {
             consensus: None,
             projective: None,
             judged: None,
-            evidence: Evidence::ImagePoints,
+            verified_by: VerifiedBy::ImagePoints,
             calibration: None,
             winning_prior: None,
-            opinion: None,
+            track_scores: None,
             doubted: None,
             crowded: None,
             second_structure: None,
@@ -103,7 +103,7 @@ impl Attempt {
 
     /// Whether single observations are judged: where image points alone verify and the method decides nothing itself.
     pub fn judges_observations(&self) -> bool {
-        matches!(self.evidence, Evidence::ImagePoints) && self.decided.is_none()
+        matches!(self.verified_by, VerifiedBy::ImagePoints) && self.decided.is_none()
     }
 
     /// Larger is better: solved before unsolved, then by grade, then by the certainty of the focal length.
@@ -203,9 +203,9 @@ pub fn search_block(block: Block, context: &Context, recorder: &mut Recorder) ->
 pub fn calibrate(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> Result<(), Error> {
     let (Some(consensus), Some(projective)) = (&attempt.consensus, &attempt.projective) else { return Ok(()) };
     recorder.enter(Stage::Calibrate);
-    attempt.calibration = Some(match attempt.evidence {
-        Evidence::ImagePoints => calibrate_projective(projective, context)?,
-        Evidence::Depths { focal } => depths::calibrate(&attempt.block.complete, consensus, focal, context.stop),
+    attempt.calibration = Some(match attempt.verified_by {
+        VerifiedBy::ImagePoints => calibrate_projective(projective, context)?,
+        VerifiedBy::Depths { focal } => depths::calibrate(&attempt.block.complete, consensus, focal, context.stop),
     });
     if let Some(intrinsics) = attempt.calibration.as_ref().and_then(Outcome::intrinsics) {
         recorder.standing.focal_px = Some(intrinsics.focal * context.scale_px);
@@ -224,7 +224,7 @@ fn initial_noise(context: &Context) -> f64 {
 /// AUTO and GEOMETRY: a sample of the tracks without crowds, and where that holds nothing, one of all.
 fn searched(block: &Block, most: usize, context: &Context, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let seed = context.settings.seed;
-    if let Some(thinned) = crowds::thinned(block, most, initial_noise(context), seed) {
+    if let Some(thinned) = near_duplicates::thinned(block, most, initial_noise(context), seed) {
         let mut attempt = Attempt::new(thinned);
         search(&mut attempt, context, recorder)?;
         if attempt.consensus.is_some() {
@@ -232,8 +232,8 @@ fn searched(block: &Block, most: usize, context: &Context, recorder: &mut Record
         }
         recorder.begin_again();
     }
-    let (sample, opinion) = likeliest::sample(block, most, context)?;
-    let mut attempt = Attempt { opinion, ..Attempt::new(sample) };
+    let (sample, track_scores) = track_sampling::sample(block, most, context)?;
+    let mut attempt = Attempt { track_scores, ..Attempt::new(sample) };
     search(&mut attempt, context, recorder)?;
     Ok(attempt)
 }
@@ -245,20 +245,20 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     let found = Portfolio::new(complete, context.settings, initial_noise(context), context.stop)
         .geometry_first(context.seeding)
         .quickly(context.quick)
-        .with_opinion(attempt.opinion.take())
+        .with_track_scores(attempt.track_scores.take())
         .run(recorder, &|weights| context.scatter(weights, tracks))
         .map_err(|error| Error::Internal(error.to_string()))?;
     context.stopped()?;
     attempt.winning_prior = found.winning_prior;
-    attempt.opinion = found.opinion;
+    attempt.track_scores = found.track_scores;
     attempt.doubted = found.doubted;
     attempt.crowded = found.crowded;
     attempt.prior_times = found.prior_times;
     attempt.network_weights = found.network_weights;
     let Some(consensus) = found.consensus else { return Ok(()) };
     recorder.enter(Stage::Refine);
-    attempt.evidence = found.evidence;
-    if matches!(found.evidence, Evidence::Depths { .. }) {
+    attempt.verified_by = found.verified_by;
+    if matches!(found.verified_by, VerifiedBy::Depths { .. }) {
         attempt.weights_by_depths =
             found.rigid.and_then(|rigid| depths::weights(complete, &consensus, &rigid, attempt.spread, context.stop));
         attempt.consensus = Some(consensus);
@@ -268,8 +268,8 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     recorder.standing.inliers = refined.inlier_count() as u32;
     recorder.standing.best_score = Some(refined.score);
     recorder.tell(1.0);
-    let counted = match &attempt.opinion {
-        Some(opinion) => opinion.counted(&refined.inliers()),
+    let counted = match &attempt.track_scores {
+        Some(track_scores) => track_scores.counted(&refined.inliers()),
         None => refined.inlier_count(),
     };
     if counted < LEAST_INLIERS {
@@ -280,7 +280,7 @@ fn search(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> 
     if ln_false_alarms >= LN_ACCEPTABLE {
         return Ok(());
     }
-    attempt.second_structure = second::structure(complete, &refined, context.stop);
+    attempt.second_structure = second_structures::find(complete, &refined, context.stop);
     context.stopped()?;
     if context.seeding {
         attempt.consensus = Some(refined);
@@ -316,18 +316,18 @@ fn carry_over(weights: &[f64], searched: &Block, block: &Block) -> Vec<f64> {
 /// PAPER and PSFM: the method's own set of tracks, reconstructed as it is.
 fn decide(attempt: &mut Attempt, context: &Context, recorder: &mut Recorder) -> Result<(), Error> {
     let noise = initial_noise(context);
-    let completed = direct::with_epipolar_depths(&attempt.block.complete, context, noise);
+    let completed = baselines::with_epipolar_depths(&attempt.block.complete, context, noise);
     context.stopped()?;
     let complete = completed.as_ref().unwrap_or(&attempt.block.complete);
     let decided = match context.settings.method {
-        Method::Psfm => direct::psfm(complete, noise),
-        _ => direct::paper(complete, &attempt.block.tracks, context, recorder)
+        Method::Psfm => baselines::psfm(complete, noise),
+        _ => baselines::paper(complete, &attempt.block.tracks, context, recorder)
             .map_err(|error| Error::Internal(error.to_string()))?,
     };
     context.stopped()?;
     recorder.enter(Stage::Refine);
     attempt.network_weights = decided.network_weights.clone();
-    attempt.consensus = direct::reconstruct(complete, &decided.inlier, noise, context.stop);
+    attempt.consensus = baselines::reconstruct(complete, &decided.inlier, noise, context.stop);
     attempt.decided = Some(decided);
     recorder.tell(1.0);
     Ok(())

@@ -1,7 +1,7 @@
 //! What the trained network says of a block, in the forms that the search takes.
 //!
 //! The network knows thousands of scenes and nothing of this one but its image points: what it believes in, geometry
-//! must verify. What it disbelieves counts only where geometry has little to go by ([`Opinion::counted`]). What its
+//! must verify. What it disbelieves counts only where geometry has little to go by ([`TrackScores::counted`]). What its
 //! odds are worth in the score of hypotheses comes from `scpsfm evaluate --priors --sweep`.
 
 use super::grow::LEAST_INLIERS;
@@ -29,7 +29,7 @@ const MANY: f64 = 1.0 / 3.0;
 /// to three by chance.
 const LEAST_LIKELY: usize = 4;
 
-/// Inliers from which on geometry needs no second opinion: twice what it needs for any.
+/// Inliers from which on geometry needs no second track_scores: twice what it needs for any.
 pub const SURELY_ENOUGH: usize = 2 * LEAST_INLIERS;
 /// Odds against a track, in nats, at which it is held to be wrong: twenty to one.
 const DOUBT_NATS: f64 = 3.0;
@@ -42,16 +42,16 @@ pub fn may_be_asked(settings: &SolveSettings) -> bool {
     settings.method == Method::Auto && !settings.excluded_priors.contains(&Prior::Learned)
 }
 
-/// The network's opinion of some tracks.
+/// The network's track_scores of some tracks.
 #[derive(Debug, Clone)]
-pub struct Opinion {
+pub struct TrackScores {
     /// Natural logarithms of the odds that a track is right.
     ln_odds: Vec<f64>,
     /// The same of each observation, track by track.
     observations: Vec<f64>,
 }
 
-impl Opinion {
+impl TrackScores {
     /// Asks the network; `None` where there are more views than it is asked about, or it has no finite answer.
     pub fn of(block: &CompleteBlock) -> Option<Self> {
         Self::of_tracks(&Tracks::of_block(block))
@@ -75,12 +75,17 @@ impl Opinion {
         }
         let scores = subspace::current().network.forward(&Cloud::new(views, count, &points, &visible));
         let ln_odds = |&logit: &f32| f64::from(logit) - EVEN_LOGIT;
-        let opinion = Self {
+        let track_scores = Self {
             ln_odds: scores.tracks.iter().map(ln_odds).collect(),
             observations: places.iter().map(|&place| ln_odds(&scores.observations[place])).collect(),
         };
         // A network of finite numbers may still overflow; one that says nothing is not asked.
-        opinion.ln_odds.iter().chain(&opinion.observations).all(|odds| odds.is_finite()).then_some(opinion)
+        track_scores
+            .ln_odds
+            .iter()
+            .chain(&track_scores.observations)
+            .all(|odds| odds.is_finite())
+            .then_some(track_scores)
     }
 
     /// What pairs of views say by themselves.
@@ -89,7 +94,7 @@ impl Opinion {
         Self { ln_odds: said.tracks, observations: said.observations }
     }
 
-    /// This opinion corrected by what pairs of views say: the odds of the observations enter the votes, and a track is
+    /// This track_scores corrected by what pairs of views say: the odds of the observations enter the votes, and a track is
     /// right where all its observations are.
     ///
     /// Nothing weighs the one against the other, both being logarithms of odds; with the network's halved or doubled,
@@ -167,18 +172,18 @@ mod tests {
 
     #[test]
     fn an_opinion_is_told_in_every_form() {
-        let of = |ln_odds: Vec<f64>| Opinion { ln_odds, observations: Vec::new() };
-        let opinion = of(vec![-20.0, 0.0, 20.0, 1.0]);
-        let probabilities = opinion.probabilities();
+        let of = |ln_odds: Vec<f64>| TrackScores { ln_odds, observations: Vec::new() };
+        let track_scores = of(vec![-20.0, 0.0, 20.0, 1.0]);
+        let probabilities = track_scores.probabilities();
         assert!(probabilities[0] < 1e-8 && probabilities[1] == 0.5 && probabilities[2] > 1.0 - 1e-8);
-        let truncations = opinion.truncations();
+        let truncations = track_scores.truncations();
         assert!((truncations[0] - 0.25).abs() < 1e-12 && truncations[1] == 1.0, "{truncations:?}");
         assert!((truncations[2] - 1.75).abs() < 1e-12 && truncations.iter().all(|cost| *cost > 0.0));
-        assert_eq!(opinion.start(), [2, 3, 1, 0], "no more than there are");
-        let doubts = of([opinion.ln_odds.clone(), vec![0.0; LEAST_JUDGED - 4]].concat());
+        assert_eq!(track_scores.start(), [2, 3, 1, 0], "no more than there are");
+        let doubts = of([track_scores.ln_odds.clone(), vec![0.0; LEAST_JUDGED - 4]].concat());
         assert_eq!((doubts.counted(&[0, 1, 3]), doubts.counted(&[0; SURELY_ENOUGH])), (2, SURELY_ENOUGH));
-        assert_eq!(opinion.counted(&[0, 1, 3]), 3, "of so few tracks it knows nothing");
-        assert!(!opinion.ranks());
+        assert_eq!(track_scores.counted(&[0, 1, 3]), 3, "of so few tracks it knows nothing");
+        assert!(!track_scores.ranks());
         assert!(of(vec![0.1; LEAST_LIKELY]).ranks());
     }
 }

@@ -4,37 +4,37 @@
 //!
 //! The way through: [`copies`] keeps one of the tracks that stand in the input several times; [`block`] chooses views
 //! whose tracks are complete: all of them, or a few; [`attempt`] searches such a block, by [`portfolio`] (priors,
-//! [`search`], [`grow`]; [`crowds`] are left aside, the [`likeliest`] of many tracks searched, [`chance`] verifies;
+//! [`search`], [`grow`]; [`near_duplicates`] are left aside, the [`track_sampling`] of many tracks searched, [`chance`] verifies;
 //! [`depths`] where those verify what image points cannot; [`extend`] to complete tracks and views that a search leaves
-//! aside) or [`direct`], and [`calibration`] upgrades it. By image points, [`sequence`] tries blocks in order of cost and
+//! aside) or [`baselines`], and [`calibration`] upgrades it. By image points, [`sequence`] tries blocks in order of cost and
 //! extends what stands to the other views and tracks, projectively or metrically, observation by observation; [`judge`]
 //! has the last word on every track and observation; [`assemble`] writes it down.
 
-mod agreement;
 mod assemble;
 mod attempt;
+mod baselines;
+mod between_block_variance;
 mod block;
 pub(crate) mod calibration;
 mod chance;
 mod copies;
-mod crowds;
 mod depths;
-mod direct;
 mod extend;
 mod grow;
 mod judge;
 mod learned;
-mod likeliest;
+mod near_duplicates;
 mod per_track;
 mod portfolio;
 mod priors;
 mod recorder;
 mod search;
-mod second;
+mod second_structures;
 mod sequence;
 pub(crate) mod study;
 #[cfg(test)]
 mod tests;
+mod track_sampling;
 mod views;
 
 use crate::domain::copies::Copies;
@@ -155,14 +155,14 @@ fn solve_views(
         } else {
             others.push(attempt);
         }
-        // A good block is still asked for a second opinion.
+        // A good block is still asked for a second track_scores.
         if k > 0 && best.as_ref().is_some_and(Attempt::is_good) {
             break;
         }
     }
     context.stopped()?;
     if let Some(best) = &mut best {
-        agreement::reconcile(best, &others);
+        between_block_variance::reconcile(best, &others);
     }
     of_block(best, &context, warnings, recorder)
 }

@@ -186,7 +186,7 @@ impl<'a> Recorder<'a> {
     pub fn step(&mut self, task: Task, step: usize, steps: usize, within: f64) {
         self.course.step = Some(Step { task, step: step as u32, steps: steps as u32 });
         self.advance(within);
-        self.sign_of_life();
+        self.heartbeat();
     }
 
     /// Tells how many verdicts there are; `tracks`: how many are judged.
@@ -198,7 +198,7 @@ impl<'a> Recorder<'a> {
     /// Tells the observer the current standing if it has heard nothing for a while.
     ///
     /// When that is depends on the machine, so that none of it goes into the history: one input has one answer.
-    pub fn sign_of_life(&mut self) {
+    pub fn heartbeat(&mut self) {
         if self.last_told.elapsed() >= SIGN_PERIOD {
             let progress = self.progress();
             self.observer.progress(&progress);

@@ -1,4 +1,4 @@
-//! The only code that touches the metrics of the [`catalogue`].
+//! The only code that incident_blocks the metrics of the [`catalogue`].
 //!
 //! The rest of the program says what happened through the typed functions below. Before [`install`] (and in a
 //! command that has no scrape port) they do nothing.

@@ -160,14 +160,14 @@ fn new_job(script: Script) -> NewJob {
 }
 
 /// An engine over a store in a directory of its own.
-struct Bench {
+struct TrackClassifier {
     engine: Engine,
     store: Arc<Sqlite>,
     gate: Arc<Gate>,
     directory: TempDir,
 }
 
-impl Bench {
+impl TrackClassifier {
     async fn start(options: Options) -> Self {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let gate = Arc::new(Gate::default());

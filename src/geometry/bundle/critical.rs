@@ -6,7 +6,7 @@
 
 use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
-use super::engine::{Jacobian, Problem, Sink, Step, minimise};
+use super::engine::{Jacobian, Problem, ResidualVisitor, Step, minimise};
 use super::metric::Intrinsics;
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
@@ -58,7 +58,7 @@ impl Problem<0, 9, 2> for Homographies {
         self.points.len()
     }
 
-    fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, 9, 2>) {
+    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<0, 9, 2>) {
         let homography = &self.views[observation.view];
         let point = self.points[observation.point].push(1.0);
         let (image, by_seen) = image(&(homography * point));
@@ -98,7 +98,7 @@ impl Problem<3, 3, 2> for Rotating {
         self.points.len()
     }
 
-    fn observe(&self, observation: &Observation, sink: &mut impl Sink<3, 3, 2>) {
+    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<3, 3, 2>) {
         let rotation = &self.rotations[observation.view];
         let turned = rotation * self.points[observation.point].push(1.0);
         let (direction, by_turned) = image(&turned);
@@ -138,7 +138,7 @@ impl Problem<0, 3, 3> for Translating {
         self.points.len()
     }
 
-    fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, 3, 3>) {
+    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<0, 3, 3>) {
         let translation = &self.translations[observation.view];
         let point = &self.points[observation.point];
         let (image, by_seen) = image(&(point.xy().push(1.0) + translation * point.z));

@@ -4,7 +4,7 @@ use std::marker::PhantomData;
 
 use nalgebra::{SMatrix, SVector, Vector2};
 
-use super::mirrored::{self, Mirrored};
+use super::camera_elimination::{self, CameraElimination};
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation, Options, Report};
 use crate::domain::StopToken;
@@ -26,7 +26,7 @@ pub(super) struct Jacobian<const G: usize, const C: usize, const P: usize> {
 ///
 /// A problem writes residual and Jacobian once; the cost, the normal equations and the test by finite differences
 /// are sinks of the same code.
-pub(super) trait Sink<const G: usize, const C: usize, const P: usize> {
+pub(super) trait ResidualVisitor<const G: usize, const C: usize, const P: usize> {
     fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>);
 }
 
@@ -57,14 +57,14 @@ impl<const G: usize, const C: usize, const P: usize> Step<G, C, P> {
 
 /// What is known of a global unknown beforehand.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Belief {
+pub(super) struct GaussianPrior {
     /// What a squared deviation costs.
     pub information: f64,
     /// Present minus expected value.
     pub deviation: f64,
 }
 
-impl Belief {
+impl GaussianPrior {
     pub const NONE: Self = Self { information: 0.0, deviation: 0.0 };
 }
 
@@ -73,12 +73,12 @@ pub(super) trait Problem<const G: usize, const C: usize, const P: usize>: Clone 
     fn camera_count(&self) -> usize;
     fn point_count(&self) -> usize;
     /// Hands the residual of one observation, and its Jacobian on demand, to `sink`.
-    fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, C, P>);
+    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<G, C, P>);
     /// Overwrites `self` with `from` moved by `step`; both have the same counts.
     fn retract(&mut self, from: &Self, step: &Step<G, C, P>);
     /// What is known of the globals where they are.
-    fn global_beliefs(&self) -> [Belief; G] {
-        [Belief::NONE; G]
+    fn global_priors(&self) -> [GaussianPrior; G] {
+        [GaussianPrior::NONE; G]
     }
     /// Direction in which a homogeneous camera moves without changing any residual; zero where there is none.
     fn camera_gauge(&self, _camera: usize) -> SVector<f64, C> {
@@ -128,7 +128,7 @@ struct Cost {
     sum: f64,
 }
 
-impl<const G: usize, const C: usize, const P: usize> Sink<G, C, P> for Cost {
+impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> for Cost {
     #[inline]
     fn take(&mut self, residual: Vector2<f64>, _jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
         self.sum += self.loss.cost(self.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
@@ -145,8 +145,8 @@ fn cost<const G: usize, const C: usize, const P: usize>(
         total.weight = seen.weight;
         problem.observe(seen, &mut total);
     }
-    let beliefs = problem.global_beliefs();
-    total.sum + beliefs.iter().map(|belief| belief.information * belief.deviation.powi(2)).sum::<f64>()
+    let priors = problem.global_priors();
+    total.sum + priors.iter().map(|belief| belief.information * belief.deviation.powi(2)).sum::<f64>()
 }
 
 /// Minimises the loss over all unknowns, starting from and ending in `problem`.
@@ -160,11 +160,11 @@ pub(super) fn minimise<const G: usize, const C: usize, const P: usize>(
     stop: &StopToken,
 ) -> Report {
     let layout = Layout::new(observations, problem.camera_count(), problem.point_count());
-    if !mirrored::is_worth_it(problem, &layout) {
+    if !camera_elimination::is_worth_it(problem, &layout) {
         return descend(problem, &layout, options, stop);
     }
-    let layout = mirrored::layout(&layout, problem.camera_count());
-    let mut mirrored = Mirrored(problem.clone());
+    let layout = camera_elimination::layout(&layout, problem.camera_count());
+    let mut mirrored = CameraElimination(problem.clone());
     let report = descend(&mut mirrored, &layout, options, stop);
     *problem = mirrored.0;
     report

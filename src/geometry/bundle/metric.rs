@@ -4,7 +4,7 @@
 use nalgebra::{Matrix3, Matrix3x4, Rotation3, SMatrix, Vector2, Vector3};
 
 pub use super::covariance::{Information, Optimum};
-use super::engine::{Belief, Jacobian, Problem, Sink, Step, minimise};
+use super::engine::{GaussianPrior, Jacobian, Problem, ResidualVisitor, Step, minimise};
 use super::intrinsics::ImageGradients;
 pub use super::intrinsics::Intrinsics;
 pub use super::intrinsics_model::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
@@ -228,7 +228,7 @@ impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
     }
 
     #[inline]
-    fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, C, POINT>) {
+    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<G, C, POINT>) {
         let Reconstruction { poses, points, .. } = &self.reconstruction;
         let intrinsics = self.reconstruction.intrinsics_of(observation.view);
         let seen = Projection::new(&intrinsics, &poses[observation.view], &points[observation.point]);
@@ -253,14 +253,14 @@ impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
         }
     }
 
-    fn global_beliefs(&self) -> [Belief; G] {
+    fn global_priors(&self) -> [GaussianPrior; G] {
         self.free.map(|parameter| match parameter {
-            Some(parameter) => Belief {
+            Some(parameter) => GaussianPrior {
                 information: self.prior.information[parameter as usize],
                 deviation: self.prior.deviation(parameter, &self.reconstruction.intrinsics[0]),
             },
             // Known to be where it is.
-            None => Belief { information: 1.0, deviation: 0.0 },
+            None => GaussianPrior { information: 1.0, deviation: 0.0 },
         })
     }
 }

@@ -6,6 +6,7 @@
 //!
 //! Image coordinates are normalised throughout: pixels minus the guessed principal point, over the larger image side.
 
+mod camera_elimination;
 mod cholesky;
 mod covariance;
 pub mod critical;
@@ -13,7 +14,6 @@ mod engine;
 mod intrinsics;
 mod intrinsics_model;
 pub mod metric;
-mod mirrored;
 mod panel;
 pub mod projective;
 mod reduced;

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3x4, SMatrix, SVector, Vector2, Vector3, Vector4};
 
-use super::engine::{Jacobian, Problem, Sink, Step, minimise};
+use super::engine::{Jacobian, Problem, ResidualVisitor, Step, minimise};
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
 
@@ -26,7 +26,7 @@ impl Problem<0, CAMERA, POINT> for Projective {
     }
 
     #[inline]
-    fn observe(&self, observation: &Observation, sink: &mut impl Sink<0, CAMERA, POINT>) {
+    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<0, CAMERA, POINT>) {
         let camera = &self.cameras[observation.view];
         let point = &self.points[observation.point];
         let seen = camera * point;

@@ -8,7 +8,7 @@
 use nalgebra::{Cholesky, Matrix2, SMatrix, SVector, Vector2};
 
 use super::cholesky::CholeskySolver;
-use super::engine::{Belief, Jacobian, Layout, Problem, Sink, Step, usable_squared_norm};
+use super::engine::{GaussianPrior, Jacobian, Layout, Problem, ResidualVisitor, Step, usable_squared_norm};
 use super::panel::Panel;
 use super::{Loss, Observation};
 use crate::simd::vectorised;
@@ -37,7 +37,7 @@ struct Entry<'a, const G: usize, const C: usize, const P: usize> {
     jacobian: &'a mut Jacobian<G, C, P>,
 }
 
-impl<const G: usize, const C: usize, const P: usize> Sink<G, C, P> for Entry<'_, G, C, P> {
+impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> for Entry<'_, G, C, P> {
     #[inline]
     fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
         match usable_squared_norm(&residual) {
@@ -84,7 +84,7 @@ impl<const G: usize, const C: usize, const P: usize> Linearisation<G, C, P> {
 
     /// Linearises at the state of `problem`.
     pub fn fill(&mut self, problem: &impl Problem<G, C, P>, layout: &Layout, loss: Loss) {
-        self.globals_diagonal = SVector::from(problem.global_beliefs().map(|belief| belief.information));
+        self.globals_diagonal = SVector::from(problem.global_priors().map(|belief| belief.information));
         self.camera_diagonals.fill(SVector::zeros());
         self.point_blocks.fill(SMatrix::zeros());
         for (k, seen) in layout.observations.iter().enumerate() {
@@ -155,12 +155,12 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         for (camera, values) in step.cameras.iter_mut().zip(self.vector[G..].chunks_exact(C)) {
             camera.copy_from_slice(values);
         }
-        let lowers = |(belief, by): (Belief, &f64)| {
+        let lowers = |(belief, by): (GaussianPrior, &f64)| {
             belief.information * (belief.deviation.powi(2) - (belief.deviation + by).powi(2))
         };
-        let of_beliefs = problem.global_beliefs().into_iter().zip(step.globals.iter()).map(lowers);
-        let of_beliefs: f64 = of_beliefs.sum();
-        Some(of_beliefs + self.substitute_points(layout, linearisation, step))
+        let of_priors = problem.global_priors().into_iter().zip(step.globals.iter()).map(lowers);
+        let of_priors: f64 = of_priors.sum();
+        Some(of_priors + self.substitute_points(layout, linearisation, step))
     }
 
     /// Eliminates the points; `false` when a point's block cannot be factored.
@@ -187,7 +187,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     ) -> bool {
         self.matrix.fill(0.0);
         self.vector.fill(0.0);
-        for (k, belief) in problem.global_beliefs().iter().enumerate() {
+        for (k, belief) in problem.global_priors().iter().enumerate() {
             self.matrix[k * (self.dimension + 1)] += belief.information;
             self.vector[k] -= belief.information * belief.deviation;
         }

@@ -5,7 +5,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::Observation;
-use super::engine::{Jacobian, Problem, Sink, Step};
+use super::engine::{Jacobian, Problem, ResidualVisitor, Step};
 use super::metric::{Intrinsics, Pose};
 use crate::synthetic::{Scene, SceneOptions};
 
@@ -179,7 +179,7 @@ struct Last<const G: usize, const C: usize, const P: usize> {
     jacobian: Option<Jacobian<G, C, P>>,
 }
 
-impl<const G: usize, const C: usize, const P: usize> Sink<G, C, P> for Last<G, C, P> {
+impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> for Last<G, C, P> {
     fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
         self.residual = residual;
         self.jacobian = Some(jacobian());

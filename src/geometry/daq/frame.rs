@@ -7,7 +7,7 @@ const RANK_TOLERANCE: f64 = 1e-10;
 
 /// A projective reconstruction with `P1 = [I|0]`.
 #[derive(Debug, Clone)]
-pub struct FirstViewFrame {
+pub struct CanonicalFrame {
     /// `P H`; the first exactly `[I|0]`, the others with `|A|^2 = 3` and `det A >= 0` for `P = [A|a]`.
     pub cameras: Vec<Matrix3x4<f64>>,
     /// `H^-1 X`
@@ -23,7 +23,7 @@ pub struct FirstViewFrame {
 /// cameras give the same frame, so a plane at infinity found in it can be used with the cameras of another call.
 ///
 /// Returns `None` without cameras or when the first has no rank 3.
-pub fn to_first_view_frame(cameras: &[Matrix3x4<f64>], points: &[Vector4<f64>]) -> Option<FirstViewFrame> {
+pub fn to_canonical_frame(cameras: &[Matrix3x4<f64>], points: &[Vector4<f64>]) -> Option<CanonicalFrame> {
     let first = cameras.first()?;
     let norm = first.norm();
     // Before the decomposition, which would not end on what is no number.
@@ -52,7 +52,7 @@ pub fn to_first_view_frame(cameras: &[Matrix3x4<f64>], points: &[Vector4<f64>]) 
     let back = homography.try_inverse()?;
     let mut moved: Vec<Matrix3x4<f64>> = cameras.iter().map(|camera| oriented(&(camera * homography))).collect();
     moved[0] = Matrix3x4::identity();
-    Some(FirstViewFrame { cameras: moved, points: points.iter().map(|point| back * point).collect(), homography })
+    Some(CanonicalFrame { cameras: moved, points: points.iter().map(|point| back * point).collect(), homography })
 }
 
 /// The camera centre, by the minors of the camera: exact where a decomposition would round.
@@ -84,7 +84,7 @@ mod tests {
     fn keeps_every_image_point_and_puts_the_first_camera_at_the_origin() {
         let scene = testing::scene(1, 6, 15, 0.0);
         let (cameras, points) = testing::projectively_transformed(&scene, 1);
-        let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
+        let frame = to_canonical_frame(&cameras, &points).expect("rank 3");
         assert_eq!(frame.cameras[0], Matrix3x4::identity());
         for seen in &scene.observations {
             let image = frame.cameras[seen.view] * frame.points[seen.point];
@@ -98,7 +98,7 @@ mod tests {
     fn refuses_a_first_camera_without_rank() {
         let mut flat = Matrix3x4::identity();
         flat.set_row(2, &nalgebra::RowVector4::zeros());
-        assert!(to_first_view_frame(&[flat], &[]).is_none());
-        assert!(to_first_view_frame(&[], &[]).is_none());
+        assert!(to_canonical_frame(&[flat], &[]).is_none());
+        assert!(to_canonical_frame(&[], &[]).is_none());
     }
 }

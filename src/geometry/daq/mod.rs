@@ -1,6 +1,6 @@
 //! The dual absolute quadric (DAQ): its residual over the views, its refinement, and where to start.
 //!
-//! Cameras are in the frame of the first view, `P1 = [I|0]`, see [`to_first_view_frame`]. May depend on `bundle` for
+//! Cameras are in the frame of the first view, `P1 = [I|0]`, see [`to_canonical_frame`]. May depend on `bundle` for
 //! the intrinsics, otherwise on linear algebra alone.
 
 mod frame;
@@ -9,7 +9,7 @@ mod view_focals;
 
 use nalgebra::{Matrix3, Matrix3x4, SMatrix, SVector, Vector3};
 
-pub use self::frame::{FirstViewFrame, to_first_view_frame};
+pub use self::frame::{CanonicalFrame, to_canonical_frame};
 pub use self::starts::{linear, scan};
 pub use self::view_focals::{view_focal, view_focal_starts};
 use super::bundle::metric::Intrinsics;
@@ -183,7 +183,7 @@ impl Problem for Refinement<'_> {
 /// Returns the number of cameras, the worst value there is, when the first camera has no rank 3 or no start stands.
 pub fn hypothesis_residual(cameras: &[Matrix3x4<f64>]) -> f64 {
     let worst = cameras.len() as f64;
-    let Some(frame) = to_first_view_frame(cameras, &[]) else { return worst };
+    let Some(frame) = to_canonical_frame(cameras, &[]) else { return worst };
     let mut starts = scan(&frame.cameras, HYPOTHESIS_FOCALS, HYPOTHESIS_VIEWS);
     starts.truncate(HYPOTHESIS_STARTS);
     starts.extend(linear(&frame.cameras).map(|daq| (daq, residual(&frame.cameras, &daq))));
@@ -204,7 +204,7 @@ mod tests {
     fn framed(seed: u64) -> (Vec<Matrix3x4<f64>>, f64) {
         let scene = testing::scene(seed, 10, 20, 0.0);
         let (cameras, points) = testing::projectively_transformed(&scene, seed);
-        let frame = to_first_view_frame(&cameras, &points).expect("rank 3");
+        let frame = to_canonical_frame(&cameras, &points).expect("rank 3");
         (frame.cameras, scene.intrinsics.focal)
     }
 

@@ -166,7 +166,7 @@ pub fn scan(cameras: &[Matrix3x4<f64>], focals: usize, views: usize) -> Vec<(Daq
 #[cfg(test)]
 mod tests {
     use super::super::super::bundle::testing;
-    use super::super::to_first_view_frame;
+    use super::super::to_canonical_frame;
     use super::*;
 
     #[test]
@@ -175,7 +175,7 @@ mod tests {
         for seed in 0..10 {
             let scene = testing::scene(seed, 10, 20, 0.0);
             let (cameras, _) = testing::projectively_transformed(&scene, seed);
-            let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
+            let frame = to_canonical_frame(&cameras, &[]).expect("rank 3");
             let focal = linear(&frame.cameras).expect("a quadric").intrinsics.focal;
             println!("seed {seed}: {focal:.4} of {:.4}", scene.intrinsics.focal);
             near += usize::from((focal / scene.intrinsics.focal - 1.0).abs() < 0.1);
@@ -187,7 +187,7 @@ mod tests {
     fn the_true_focal_length_gives_the_true_plane_from_every_view() {
         let scene = testing::scene(4, 6, 20, 0.0);
         let (cameras, _) = testing::projectively_transformed(&scene, 4);
-        let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
+        let frame = to_canonical_frame(&cameras, &[]).expect("rank 3");
         for camera in &frame.cameras[1..] {
             let planes = plane_from_second_view(camera, scene.intrinsics.focal).expect("a baseline");
             let costs = planes.map(|plane| residual(&frame.cameras, &Daq::new(scene.intrinsics.focal, plane)));

@@ -51,7 +51,7 @@ pub fn view_focal_starts(cameras: &[Matrix3x4<f64>]) -> Vec<(Daq, f64)> {
 mod tests {
     use super::super::super::bundle::metric::Intrinsics;
     use super::super::super::bundle::testing;
-    use super::super::to_first_view_frame;
+    use super::super::to_canonical_frame;
     use super::*;
 
     #[test]
@@ -62,7 +62,7 @@ mod tests {
             let focals: Vec<f64> = (0..8).map(|view| 1.0 + 0.1 * view as f64).collect();
             let camera = |(view, focal): (usize, &f64)| scene.poses[view].camera(&Intrinsics::from_focal(*focal));
             let cameras: Vec<_> = focals.iter().enumerate().map(camera).collect();
-            let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
+            let frame = to_canonical_frame(&cameras, &[]).expect("rank 3");
             let (best, cost) = view_focal_starts(&frame.cameras)[0];
             let worst = frame.cameras.iter().zip(&focals).map(|(camera, focal)| {
                 view_focal(camera, &best).map_or(f64::INFINITY, |(found, _)| (found / focal).ln().abs())

@@ -4,8 +4,8 @@
 //! Tracks need not be seen by the same views: their `k`-th observations stand side by side, whatever the cameras. What one
 //! comes to does not depend on its neighbours, to the last bit: a track that has arrived stands still while others go on.
 
-pub use super::lane::LANES;
-use super::lane::{DIAGONAL, Lane, Mask, Points, Symmetric, choose, dot, normalised};
+pub use super::f64x8::LANES;
+use super::f64x8::{DIAGONAL, F64x8, Mask, Points, Symmetric, choose, dot, normalised};
 use super::{DAMPING_DOWN, DAMPING_UP, INITIAL_DAMPING, RELATIVE_TOLERANCE};
 use crate::geometry::null_vector::{MOST_ITERATIONS, SHIFT, SQUARINGS, TOLERANCE};
 use crate::geometry::observation::Observation;
@@ -13,7 +13,7 @@ use crate::geometry::{Camera, Point};
 use crate::simd::vectorised;
 
 #[inline(always)]
-fn away_from_zero(depth: Lane) -> Lane {
+fn away_from_zero(depth: F64x8) -> F64x8 {
     depth.map(super::away_from_zero)
 }
 
@@ -21,16 +21,16 @@ fn away_from_zero(depth: Lane) -> Lane {
 #[derive(Clone, Copy)]
 struct Sighted {
     /// The camera's columns, rows within.
-    camera: [[Lane; 3]; 4],
-    xy: [Lane; 2],
+    camera: [[F64x8; 3]; 4],
+    xy: [F64x8; 2],
     /// That of the observation; 0 where the track has none, or does without it.
-    weight: Lane,
+    weight: F64x8,
 }
 
 impl Sighted {
     /// The point's image, homogeneous.
     #[inline(always)]
-    fn image(&self, point: &Points) -> [Lane; 3] {
+    fn image(&self, point: &Points) -> [F64x8; 3] {
         let row = |r: usize| {
             let [a, b, c, d] = &self.camera;
             a[r] * point[0] + b[r] * point[1] + c[r] * point[2] + d[r] * point[3]
@@ -39,7 +39,7 @@ impl Sighted {
     }
 
     #[inline(always)]
-    fn squared_residual(&self, point: &Points) -> Lane {
+    fn squared_residual(&self, point: &Points) -> F64x8 {
         let [x, y, z] = self.image(point);
         let nearness = away_from_zero(z).recip();
         let (x, y) = (x * nearness - self.xy[0], y * nearness - self.xy[1]);
@@ -57,7 +57,7 @@ pub struct Batch {
 #[derive(Debug, Clone, Copy)]
 pub struct Triangulated {
     points: Points,
-    costs: Lane,
+    costs: F64x8,
 }
 
 impl Triangulated {
@@ -82,7 +82,7 @@ impl Batch {
     /// These tracks, [`LANES`] at most; what is beyond is left out.
     pub fn new(cameras: &[Camera], tracks: &[&[Observation]]) -> Self {
         let longest = tracks.iter().map(|track| track.len()).max().unwrap_or(0);
-        let nothing = Sighted { camera: [[Lane::ZERO; 3]; 4], xy: [Lane::ZERO; 2], weight: Lane::ZERO };
+        let nothing = Sighted { camera: [[F64x8::ZERO; 3]; 4], xy: [F64x8::ZERO; 2], weight: F64x8::ZERO };
         let mut sighted = vec![nothing; longest];
         for lane in 0..LANES {
             // A lane without a track repeats the first one, and a place without an observation has the camera of the track's
@@ -146,8 +146,8 @@ impl Batch {
     }
 
     #[inline(always)]
-    fn costs(&self, points: &Points) -> Lane {
-        let mut costs = Lane::ZERO;
+    fn costs(&self, points: &Points) -> F64x8 {
+        let mut costs = F64x8::ZERO;
         for seen in &self.sighted {
             costs += seen.squared_residual(points);
         }
@@ -207,19 +207,19 @@ impl Batch {
             }
         }
         let known = dot(vector, vector).0.map(f64::is_finite);
-        choose(known, vector, [Lane::ZERO, Lane::ZERO, Lane::ZERO, Lane::ONE])
+        choose(known, vector, [F64x8::ZERO, F64x8::ZERO, F64x8::ZERO, F64x8::ONE])
     }
 
     #[inline(always)]
     fn descend(&self, start: Triangulated, mut going: Mask, iterations: usize) -> Triangulated {
         let Triangulated { mut points, mut costs } = start;
-        let mut damping = Lane::ONE * INITIAL_DAMPING;
+        let mut damping = F64x8::ONE * INITIAL_DAMPING;
         for _ in 0..iterations {
             if going == [false; LANES] {
                 break;
             }
             let mut normal = Symmetric::ZERO;
-            let mut gradient = [Lane::ZERO; 4];
+            let mut gradient = [F64x8::ZERO; 4];
             for seen in &self.sighted {
                 let image = seen.image(&points);
                 let nearness = away_from_zero(image[2]).recip();
@@ -245,7 +245,7 @@ impl Batch {
             // The scale of the homogeneous point is free: pin it.
             normal.add_square(normal.trace(), points);
             for diagonal in DIAGONAL {
-                normal.0[diagonal] *= Lane::ONE + damping;
+                normal.0[diagonal] *= F64x8::ONE + damping;
             }
             let step = normal.factor().solve(gradient);
             let candidates =

@@ -1,7 +1,7 @@
 //! Points from cameras and image points: of one track here, of many side by side in [`batch`].
 
 pub mod batch;
-mod lane;
+mod f64x8;
 
 use nalgebra::{Matrix4, Vector2};
 

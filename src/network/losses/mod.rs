@@ -74,7 +74,7 @@ pub fn evaluate(
     debug_assert_eq!(balanced.ncols(), w.len());
     let spectrum = Spectrum::of(balanced, w)?;
     let RankTerms { num, proj, grad_w_num, grad_w_proj } = RankTerms::of(&spectrum, w, settings);
-    let cameras = gauge::CanonicalCameras::of(spectrum.span());
+    let cameras = gauge::CanonicalFrameCameras::of(spectrum.span());
     let daq = daq::residual(&cameras, log_focal, &Vector3::from(n_inf));
     let grad_span = cameras.pull_back(&daq.grad_rotational, &daq.grad_translational);
     let grad_w_daq = spectrum.pull_back_span(&grad_span, w);

@@ -19,12 +19,12 @@ use nalgebra::{Matrix3x4, Vector3, Vector4};
 use crate::domain::{FocalPrior, Grade, StopReason, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
 use crate::geometry::bundle::{Options, projective};
-use crate::geometry::daq::to_first_view_frame;
+use crate::geometry::daq::to_canonical_frame;
 use crate::geometry::metric::plane_at_infinity;
 use crate::geometry::observation::Observation;
 
 use fit::Fit;
-pub use models::knowledge;
+pub use models::default_intrinsics_prior;
 pub use verdict::{CHEIRALITY_LIMIT, grade_of_sigma};
 pub use view_focals::LEAST_DETERMINED;
 
@@ -99,7 +99,7 @@ pub struct Outcome {
     pub warnings: Vec<Warning>,
     /// Which intrinsics the data could carry.
     pub model: IntrinsicsModel,
-    /// `n` of the plane `(n, 1)`, in the frame that [`to_first_view_frame`] gives the problem's cameras.
+    /// `n` of the plane `(n, 1)`, in the frame that [`to_canonical_frame`] gives the problem's cameras.
     pub plane_at_infinity: Option<Vector3<f64>>,
     /// Share of the observations in front of their cameras.
     pub cheirality: f64,
@@ -197,7 +197,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<V
             search::known_focal(&translation, focal.focal_px / scale_px, problem, &priors, stop)
         }
         _ if is_critical => return Ok(refused(warnings)),
-        _ => match to_first_view_frame(&cameras, &points) {
+        _ => match to_canonical_frame(&cameras, &points) {
             Some(frame) => search::minima(&frame, problem, &priors, stop)?,
             None => Vec::new(),
         },

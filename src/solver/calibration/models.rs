@@ -72,7 +72,7 @@ const PROFILE_ITERATIONS: usize = 15;
 const PROFILE_LONGEST: f64 = 0.3;
 
 /// What is known of the intrinsics beforehand, at this noise: what lenses are like, and what the caller says.
-pub fn knowledge(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> IntrinsicsPrior {
+pub fn default_intrinsics_prior(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> IntrinsicsPrior {
     let lenses = IntrinsicsPrior::NONE
         .knowing(Parameter::PrincipalX, 0.0, PRINCIPAL_POINT_SIGMA, noise)
         .knowing(Parameter::PrincipalY, 0.0, PRINCIPAL_POINT_SIGMA, noise)
@@ -151,7 +151,7 @@ pub(super) struct Choice<'a> {
 impl Choice<'_> {
     /// What is known of the intrinsics of each group beforehand, weighed by this noise.
     pub fn priors(&self, noise: f64) -> Vec<IntrinsicsPrior> {
-        let of_group = |focal: &Option<FocalPrior>| knowledge(noise, *focal, self.scale_px);
+        let of_group = |focal: &Option<FocalPrior>| default_intrinsics_prior(noise, *focal, self.scale_px);
         self.problem.focal_priors.iter().map(of_group).collect()
     }
 
@@ -256,7 +256,7 @@ impl Choice<'_> {
     ///
     /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
     /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights
-    /// from Laplace's approximation of each model's evidence under [`knowledge`]. An extension that the data can
+    /// from Laplace's approximation of each model's evidence under [`default_intrinsics_prior`]. An extension that the data can
     /// neither confirm nor refute thus costs what it would move.
     ///
     /// * `inflation`: factor on all of them, for what the calibration does not fit
@@ -391,7 +391,7 @@ mod tests {
             let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
             let cameras = scene.cameras();
             let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
-            let (priors, stop) = (vec![knowledge(NOISE, None, 1000.0)], StopToken::default());
+            let (priors, stop) = (vec![default_intrinsics_prior(NOISE, None, 1000.0)], StopToken::default());
             let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
             let reconstruction = Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone());
             let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 1.0 };

@@ -11,7 +11,7 @@ use crate::geometry::bundle::critical::Translating;
 use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Reconstruction,
 };
-use crate::geometry::daq::{self, Daq, FirstViewFrame, Free};
+use crate::geometry::daq::{self, CanonicalFrame, Daq, Free};
 use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::root_mean_square;
@@ -173,7 +173,7 @@ pub(super) fn minima_near(
 /// Metric reconstructions with the focal length free, or one of each view, that different starts converge to, cheapest
 /// first.
 pub(super) fn minima(
-    frame: &FirstViewFrame,
+    frame: &CanonicalFrame,
     problem: &Problem,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
@@ -187,7 +187,7 @@ pub(super) fn minima(
 
 /// With a focal length a camera group: from what one of each view leads to.
 fn minima_of_groups(
-    frame: &FirstViewFrame,
+    frame: &CanonicalFrame,
     problem: &Problem,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
@@ -203,7 +203,7 @@ fn minima_of_groups(
 }
 
 /// With a focal length a view: from the quadrics that allow for that, and from what one for all leads to.
-fn minima_per_view(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
+fn minima_per_view(frame: &CanonicalFrame, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
     let (model, priors) = (IntrinsicsModel::FOCAL_PER_VIEW, [IntrinsicsPrior::NONE]);
     let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(STARTS);
     let mut starts: Vec<Reconstruction> =
@@ -227,7 +227,7 @@ fn minima_per_view(frame: &FirstViewFrame, problem: &Problem, stop: &StopToken) 
 
 /// With one focal length for all views.
 fn minima_of_one(
-    frame: &FirstViewFrame,
+    frame: &CanonicalFrame,
     problem: &Problem,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
@@ -303,7 +303,7 @@ fn distinct(mut found: Vec<Minimum>, problem: &Problem) -> Vec<Minimum> {
 }
 
 /// Different starts: the linear DAQ and the best of the scan, refined, then the best of each window of the scan.
-fn starts(frame: &FirstViewFrame) -> Vec<Daq> {
+fn starts(frame: &CanonicalFrame) -> Vec<Daq> {
     let cameras = &frame.cameras;
     let scanned = daq::scan(cameras, SCAN_FOCALS, SCAN_VIEWS);
     let best_near = |focal: f64, half_width: f64| {
@@ -342,7 +342,7 @@ fn starts(frame: &FirstViewFrame) -> Vec<Daq> {
 }
 
 /// Every so many-th point, when there are more than the search needs: their observations, and which were chosen.
-fn subsample(frame: &FirstViewFrame, observations: &[Observation]) -> (Option<Vec<Observation>>, Option<Vec<bool>>) {
+fn subsample(frame: &CanonicalFrame, observations: &[Observation]) -> (Option<Vec<Observation>>, Option<Vec<bool>>) {
     let points = frame.points.len();
     if points <= SEARCH_POINTS {
         return (None, None);

@@ -1,7 +1,7 @@
 //! What is told of focal lengths where every view has its own, and whether views have where they were taken to share one.
 
 use super::fit::Fit;
-use super::models::{Candidate, Choice, Sigmas, knowledge};
+use super::models::{Candidate, Choice, Sigmas, default_intrinsics_prior};
 use super::search::converge;
 use super::verdict::{UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO, is_plausible};
 use super::{Problem, ViewFocal};
@@ -83,7 +83,7 @@ pub(super) struct Differing {
 /// * `own`: the fit of `metric`
 pub(super) fn differing(metric: &Reconstruction, own: &Fit, choice: &Choice) -> Option<Differing> {
     let problem: &Problem = choice.problem;
-    let priors = vec![knowledge(own.noise, None, choice.scale_px); problem.groups()];
+    let priors = vec![default_intrinsics_prior(own.noise, None, choice.scale_px); problem.groups()];
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint).with(Extension::RadialK1);
     let mut freed = metric.clone().with_own_focals();
     let report = metric::adjust(&mut freed, problem.observations, model, &priors, &converge(), choice.stop);

@@ -46,7 +46,7 @@ struct Other {
 }
 
 /// What tracks are judged by.
-pub struct Bench<'a> {
+pub struct TrackClassifier<'a> {
     /// Of every view; those of views that are not registered are never asked.
     pub cameras: &'a [Camera],
     pub triangulator: Triangulator<'a>,
@@ -56,7 +56,7 @@ pub struct Bench<'a> {
     pub stop: &'a StopToken,
 }
 
-impl Bench<'_> {
+impl TrackClassifier<'_> {
     /// Judges some tracks, no more than a [`Batch`] takes, and, of those that are linked and right, what they leave;
     /// without those that too few views see.
     pub fn find(&self, input: &Input, ranges: &[usize], tracks: Range<usize>) -> Vec<Finding> {
@@ -261,12 +261,18 @@ mod tests {
         }
     }
 
-    fn bench<'a>(cameras: &'a [Camera], geometry: &'a Geometry) -> Bench<'a> {
+    fn bench<'a>(cameras: &'a [Camera], geometry: &'a Geometry) -> TrackClassifier<'a> {
         let noise = NoiseModel::new(geometry.noise, geometry.outlier_density);
-        Bench { cameras, triangulator: Triangulator::new(cameras), geometry, noise, stop: Box::leak(Box::default()) }
+        TrackClassifier {
+            cameras,
+            triangulator: Triangulator::new(cameras),
+            geometry,
+            noise,
+            stop: Box::leak(Box::default()),
+        }
     }
 
-    fn judged(bench: &Bench, observations: &[Observation]) -> Verdict {
+    fn judged(bench: &TrackClassifier, observations: &[Observation]) -> Verdict {
         bench.judge(&[observations]).pop().expect("a verdict")
     }
 

@@ -19,7 +19,7 @@ use crate::geometry::triangulation::batch::LANES;
 use crate::geometry::{Camera, Point};
 use crate::parallel::Threads;
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
-use bench::Bench;
+use bench::TrackClassifier;
 
 /// The geometry to judge by.
 pub struct Geometry<'a> {
@@ -145,7 +145,7 @@ fn judge_under(
     // Triangulation wants a slice; unregistered views are never sighted.
     let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
     let triangulator = Triangulator::new(&cameras);
-    let bench = Bench { cameras: &cameras, triangulator, geometry, noise, stop };
+    let bench = TrackClassifier { cameras: &cameras, triangulator, geometry, noise, stop };
     let mut judged = Judged::nothing(input, noise);
     let threads = threads.if_worth(input.track_count() >= WORTH_A_THREAD);
     for first in (0..input.track_count()).step_by(BATCH) {

@@ -5,7 +5,7 @@ use crate::domain::Prior;
 use crate::domain::result::PriorTime;
 
 /// One prior's account.
-pub struct Account {
+pub struct ProposalStats {
     pub prior: Prior,
     pub seconds: f64,
     /// Network iterations, or hypotheses.
@@ -26,7 +26,7 @@ struct Record {
 /// Share of the accepted consensus's inliers and certainty that counts as having found it.
 const SUFFICIENT_SHARE: f64 = 0.95;
 
-impl Account {
+impl ProposalStats {
     pub fn new(prior: Prior) -> Self {
         Self { prior, seconds: 0.0, work: 0, records: Vec::new() }
     }

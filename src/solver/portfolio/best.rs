@@ -9,7 +9,7 @@ pub const LN_MARGIN: f64 = 5.0;
 
 /// What a consensus was verified by.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Evidence {
+pub enum VerifiedBy {
     /// Image points alone, under projective cameras.
     ImagePoints,
     /// Image points and depths, under one focal length and rigid motion.
@@ -24,8 +24,8 @@ pub struct Best {
     pub consensus: Consensus,
     pub prior: Prior,
     pub ln_false_alarms: f64,
-    pub evidence: Evidence,
-    /// Inliers that count where few are verified, see [`Opinion::counted`](crate::solver::learned::Opinion::counted).
+    pub verified_by: VerifiedBy,
+    /// Inliers that count where few are verified, see [`TrackScores::counted`](crate::solver::learned::TrackScores::counted).
     pub counted: usize,
 }
 
@@ -47,9 +47,9 @@ impl Best {
 
     /// Whether there are enough inliers for its kind of evidence.
     fn is_verified(&self) -> bool {
-        match self.evidence {
-            Evidence::ImagePoints => self.counted >= LEAST_INLIERS,
-            Evidence::Depths { .. } => true,
+        match self.verified_by {
+            VerifiedBy::ImagePoints => self.counted >= LEAST_INLIERS,
+            VerifiedBy::Depths { .. } => true,
         }
     }
 
@@ -58,9 +58,9 @@ impl Best {
     ///
     /// Costs would not do to compare by: they depend on the noise that each was grown at.
     pub fn displaces(&self, other: &Self) -> bool {
-        match (self.evidence, other.evidence) {
-            (Evidence::ImagePoints, Evidence::Depths { .. }) => self.decides(),
-            (Evidence::Depths { .. }, Evidence::ImagePoints) => self.is_acceptable() && !other.decides(),
+        match (self.verified_by, other.verified_by) {
+            (VerifiedBy::ImagePoints, VerifiedBy::Depths { .. }) => self.decides(),
+            (VerifiedBy::Depths { .. }, VerifiedBy::ImagePoints) => self.is_acceptable() && !other.decides(),
             // What cannot be accepted keeps nothing out that can.
             _ if self.is_verified() != other.is_verified() => self.is_verified(),
             _ if self.is_acceptable() != other.is_acceptable() => self.is_acceptable(),
@@ -86,7 +86,7 @@ mod tests {
             },
             prior: Prior::Uniform,
             ln_false_alarms,
-            evidence: Evidence::ImagePoints,
+            verified_by: VerifiedBy::ImagePoints,
             counted,
         };
         let (doubted, verified) = (best(7, -100.0), best(9, -50.0));

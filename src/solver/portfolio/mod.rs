@@ -1,6 +1,6 @@
 //! The portfolio: priors propose, guided search verifies, the best consensus stands.
 //!
-//! What is cheap goes first: rigid distances where depths are given, the opinion of the network that was trained
+//! What is cheap goes first: rigid distances where depths are given, the track_scores of the network that was trained
 //! beforehand, reweighting, consistency. Where they decide nothing, the paper's network is optimised a few iterations
 //! at a time; between, its ranking is verified by geometry, and so is uniform sampling, which needs no prior to be
 //! right. A decisive consensus ends the search: the paper's network would say nothing after it that anyone waits for,
@@ -17,7 +17,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::grow::{Consensus, LEAST_INLIERS};
-use super::learned::{self, Opinion};
+use super::learned::{self, TrackScores};
 use super::priors;
 use super::recorder::Recorder;
 use super::search::rigid::Rigid;
@@ -26,9 +26,9 @@ use crate::domain::result::PriorTime;
 use crate::domain::{Prior, SolveSettings, StopToken};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::network::{NetworkSettings, PriorNetwork};
-use account::Account;
+use account::ProposalStats;
 use best::Best;
-pub use best::Evidence;
+pub use best::VerifiedBy;
 pub use spread::{MOST_SPREAD, spread};
 
 /// Network iterations between two verifications of its ranking.
@@ -53,7 +53,7 @@ const NOISE_LADDER: [f64; 8] = [1.0, 2.0, 1.0, 4.0, 1.0, 8.0, 1.0, 16.0];
 pub struct Found {
     pub consensus: Option<Consensus>,
     /// What the consensus was verified by.
-    pub evidence: Evidence,
+    pub verified_by: VerifiedBy,
     /// The rigid consensus behind it or beside it, where depths were given and one is not chance.
     pub rigid: Option<Rigid>,
     pub winning_prior: Option<Prior>,
@@ -62,7 +62,7 @@ pub struct Found {
     /// Inliers of the largest consensus that is a crowd, and how many of them count.
     pub crowded: Option<(usize, usize)>,
     /// What the trained network says of the block; `None` where it was not asked.
-    pub opinion: Option<Opinion>,
+    pub track_scores: Option<TrackScores>,
     /// The weights of the network that was trained beforehand, or where it was not asked the last ones of the paper's,
     /// one a track of the block; empty without a network.
     pub network_weights: Vec<f64>,
@@ -86,13 +86,13 @@ pub struct Portfolio<'a> {
     /// Standard deviation of the image points, the yardstick of the false alarms.
     spread: f64,
     rng: ChaCha8Rng,
-    accounts: Vec<Account>,
+    accounts: Vec<ProposalStats>,
     best: Option<Best>,
     crowded: Option<(usize, usize)>,
     /// Consensuses that were crowds.
     crowds: usize,
     rigid: Option<Rigid>,
-    opinion: Option<Opinion>,
+    track_scores: Option<TrackScores>,
     /// The scene's own statistics go first, whatever the trained network says.
     geometry_first: bool,
     /// Only what is cheap is tried.
@@ -116,12 +116,12 @@ impl<'a> Portfolio<'a> {
             noise,
             spread: spread(block),
             rng: ChaCha8Rng::seed_from_u64(settings.seed),
-            accounts: Prior::ALL.into_iter().map(Account::new).collect(),
+            accounts: Prior::ALL.into_iter().map(ProposalStats::new).collect(),
             best: None,
             crowded: None,
             crowds: 0,
             rigid: None,
-            opinion: None,
+            track_scores: None,
             geometry_first: false,
             is_quick: false,
         }
@@ -139,8 +139,8 @@ impl<'a> Portfolio<'a> {
     }
 
     /// What the trained network says of the block, where it was asked already.
-    pub fn with_opinion(self, opinion: Option<Opinion>) -> Self {
-        Self { opinion, ..self }
+    pub fn with_track_scores(self, track_scores: Option<TrackScores>) -> Self {
+        Self { track_scores, ..self }
     }
 
     /// Runs the search; `spread_weights` maps the block's weights to the caller's tracks.
@@ -203,10 +203,10 @@ impl<'a> Portfolio<'a> {
             return;
         }
         let begun = Instant::now();
-        self.opinion = self.opinion.take().or_else(|| Opinion::of(self.block));
+        self.track_scores = self.track_scores.take().or_else(|| TrackScores::of(self.block));
         self.account(Prior::Learned).seconds += begun.elapsed().as_secs_f64();
-        if let Some(opinion) = self.opinion.as_ref().filter(|_| self.settings.weights_every > 0) {
-            recorder.weights(&spread_weights(&opinion.probabilities()));
+        if let Some(track_scores) = self.track_scores.as_ref().filter(|_| self.settings.weights_every > 0) {
+            recorder.weights(&spread_weights(&track_scores.probabilities()));
         }
     }
 
@@ -247,7 +247,7 @@ impl<'a> Portfolio<'a> {
     /// Inliers that count as verified by geometry.
     fn counted(&self, consensus: &Consensus) -> usize {
         let count = consensus.inlier_count();
-        self.opinion.as_ref().map_or(count, |opinion| opinion.counted(&consensus.inliers()))
+        self.track_scores.as_ref().map_or(count, |track_scores| track_scores.counted(&consensus.inliers()))
     }
 
     /// Notes inliers that lie within the noise of each other, where the noise is no more than assumed: more makes any
@@ -287,7 +287,7 @@ impl<'a> Portfolio<'a> {
         }
     }
 
-    fn account(&mut self, prior: Prior) -> &mut Account {
+    fn account(&mut self, prior: Prior) -> &mut ProposalStats {
         let place = Prior::ALL.iter().position(|&other| other == prior).unwrap_or(0);
         &mut self.accounts[place]
     }
@@ -295,7 +295,7 @@ impl<'a> Portfolio<'a> {
     fn finish(self, network: Option<PriorNetwork>) -> Found {
         let with_network = self.settings.method.uses_network();
         let with_depths = self.block.has_depths();
-        let Self { best, crowded, accounts, rigid, opinion, .. } = self;
+        let Self { best, crowded, accounts, rigid, track_scores, .. } = self;
         let doubted = best.as_ref().filter(|best| !best.is_acceptable()).and_then(Best::doubted);
         let accepted = best.filter(Best::is_acceptable);
         let prior_times = accounts
@@ -304,21 +304,21 @@ impl<'a> Portfolio<'a> {
             .filter(|account| with_depths || account.prior != Prior::Rigidity)
             .map(|account| account.time(accepted.as_ref()))
             .collect();
-        let evidence = accepted.as_ref().map_or(Evidence::ImagePoints, |best| best.evidence);
+        let verified_by = accepted.as_ref().map_or(VerifiedBy::ImagePoints, |best| best.verified_by);
         let (consensus, winning_prior) = accepted.map(|best| (best.consensus, best.prior)).unzip();
         Found {
             consensus,
-            evidence,
+            verified_by,
             rigid,
             winning_prior,
             doubted,
             crowded,
-            network_weights: match (&opinion, network) {
-                (Some(opinion), _) => opinion.probabilities(),
+            network_weights: match (&track_scores, network) {
+                (Some(track_scores), _) => track_scores.probabilities(),
                 (None, Some(network)) => network.weights().to_vec(),
                 (None, None) => Vec::new(),
             },
-            opinion,
+            track_scores,
             prior_times,
         }
     }

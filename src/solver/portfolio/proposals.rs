@@ -3,11 +3,11 @@
 use std::time::Instant;
 
 use super::best::Best;
-use super::{AFFINE_SAMPLES, Evidence, NOISE_LADDER, Portfolio, SHORTLIST, SUBSPACE_SAMPLES, Search};
+use super::{AFFINE_SAMPLES, NOISE_LADDER, Portfolio, SHORTLIST, SUBSPACE_SAMPLES, Search, VerifiedBy};
 use crate::domain::Prior;
 use crate::geometry::statistics::median;
 use crate::solver::chance::{self, LN_DECISIVE};
-use crate::solver::learned::Opinion;
+use crate::solver::learned::TrackScores;
 use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid, subspace};
 use crate::solver::{depths, grow, priors};
 
@@ -37,7 +37,7 @@ impl Portfolio<'_> {
         if !self.is_decisive() {
             let found = Best {
                 ln_false_alarms: rigid.ln_false_alarms(search.spread()),
-                evidence: Evidence::Depths { focal: rigid.focal },
+                verified_by: VerifiedBy::Depths { focal: rigid.focal },
                 consensus: depths::consensus(self.block, &rigid, self.noise),
                 counted: rigid.inlier_count(),
                 prior: Prior::Rigidity,
@@ -57,7 +57,7 @@ impl Portfolio<'_> {
     /// Of mostly right tracks the statistics of the scene itself rank better than what was learned from others: on real
     /// photographs they put nearly every right track first. Where few are right they rank worse the fewer there are.
     pub(super) fn propose_at_once(&mut self, round: u32) {
-        let many = self.geometry_first || self.opinion.as_ref().is_none_or(Opinion::expects_many);
+        let many = self.geometry_first || self.track_scores.as_ref().is_none_or(TrackScores::expects_many);
         if many && round == 0 {
             self.propose_geometric();
         }
@@ -67,17 +67,17 @@ impl Portfolio<'_> {
         }
     }
 
-    /// The trained network's opinion: grown as it stands at first, then searched from.
+    /// The trained network's track_scores: grown as it stands at first, then searched from.
     fn propose_learned(&mut self, round: u32) {
         if !self.is_wanted(Prior::Learned) {
             return;
         }
-        let Some(opinion) = self.opinion.clone() else { return };
+        let Some(track_scores) = self.track_scores.clone() else { return };
         // The levels of the noise repeat, and so would what is grown from the same tracks.
         if (round as usize) < NOISE_LADDER.len() && matches!(self.search, Search::Affine(_)) {
-            self.verify(Prior::Learned, affine::seed(self.block, opinion.start()).into_iter().collect());
+            self.verify(Prior::Learned, affine::seed(self.block, track_scores.start()).into_iter().collect());
         }
-        self.propose(Prior::Learned, &opinion.probabilities(), Some(&opinion.truncations()));
+        self.propose(Prior::Learned, &track_scores.probabilities(), Some(&track_scores.truncations()));
     }
 
     /// The priors that need no optimisation, once.
@@ -171,7 +171,7 @@ impl Portfolio<'_> {
             self.account(prior).seconds += begun.elapsed().as_secs_f64();
             let Some(consensus) = grown else { continue };
             self.note_crowd(&consensus);
-            let grown = Best { consensus, prior, ln_false_alarms, evidence: Evidence::ImagePoints, counted };
+            let grown = Best { consensus, prior, ln_false_alarms, verified_by: VerifiedBy::ImagePoints, counted };
             self.account(prior).record(&grown);
             self.offer(grown);
             if self.is_over() || self.stop.is_stopped() {

@@ -114,8 +114,8 @@ impl Extract {
             ..Options::default()
         };
         let priors: Vec<IntrinsicsPrior> =
-            (0..scene.cameras).map(|camera| knowledge(scene, camera, model.noise)).collect();
-        let mut told = || recorder.sign_of_life();
+            (0..scene.cameras).map(|camera| intrinsics_prior(scene, camera, model.noise)).collect();
+        let mut told = || recorder.heartbeat();
         let run = Run { threads: scene.context.threads, stop: scene.stop(), told: &mut told };
         sequence::adjust(&mut self.sequence, &self.observations, free, &priors, &options, run);
     }
@@ -138,8 +138,8 @@ pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> f64 {
 }
 
 /// What is known of the intrinsics of a camera before any observation.
-pub fn knowledge(scene: &Scene, camera: usize, noise: f64) -> IntrinsicsPrior {
-    calibration::knowledge(noise, scene.focal_priors[camera], scene.context.scale_px)
+pub fn intrinsics_prior(scene: &Scene, camera: usize, noise: f64) -> IntrinsicsPrior {
+    calibration::default_intrinsics_prior(noise, scene.focal_priors[camera], scene.context.scale_px)
 }
 
 /// Adjusts the views of a part with the landmarks that hold them best, while more are to come. Lenses that the first

@@ -97,7 +97,7 @@ fn of_cameras(
     recorder: &mut Recorder,
 ) -> Result<Vec<(usize, Outcome)>, Error> {
     let mut extract = core(scene, model, views, of_view(views));
-    let found = of_extract(scene, &extract, model.noise, context, &mut || recorder.sign_of_life())?;
+    let found = of_extract(scene, &extract, model.noise, context, &mut || recorder.heartbeat())?;
     take_over(model, &mut extract, &found);
     Ok(found)
 }

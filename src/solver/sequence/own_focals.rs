@@ -35,7 +35,7 @@ pub fn calibrate(
     };
     let found = if runs.len() == 1 {
         recorder.step(Task::Cameras, 1, 1, 0.0);
-        vec![of_run(0, &mut || recorder.sign_of_life())]
+        vec![of_run(0, &mut || recorder.heartbeat())]
     } else {
         let mut told = |k: usize| recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
         scene.context.threads.map(runs.len(), 1, |k| of_run(k, &mut || {}), &mut told)

@@ -225,7 +225,7 @@ pub fn extend(
         if growing.register(view, &seen, &mut rng) {
             growing.triangulate(Some(view), recorder);
             recorder.registered(growing.views().len());
-            recorder.sign_of_life();
+            recorder.heartbeat();
         } else {
             failed[view] = seen.len();
         }
@@ -286,7 +286,7 @@ impl<'a> Growing<'a> {
         for batch in tracks.chunks(BATCH) {
             let standing = &*self;
             let point = |place: usize| standing.point(&triangulator, gate, batch[place], scene.stop());
-            let found = threads.map(batch.len(), TRACKS_A_RUN, point, &mut |_| recorder.sign_of_life());
+            let found = threads.map(batch.len(), TRACKS_A_RUN, point, &mut |_| recorder.heartbeat());
             if scene.stop().is_stopped() {
                 return;
             }
@@ -404,7 +404,7 @@ impl<'a> Growing<'a> {
         };
         let Projective { cameras, points, observations, .. } = &mut standing;
         bundle::projective::adjust(cameras, points, observations, &options, self.scene.stop());
-        recorder.sign_of_life();
+        recorder.heartbeat();
         if self.scene.stop().is_stopped() {
             return;
         }

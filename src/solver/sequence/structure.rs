@@ -45,7 +45,7 @@ fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize], recorder
         let of_track = |place: usize| {
             (!scene.stop().is_stopped()).then(|| landmark(scene, standing, &triangulator, gate, batch[place])).flatten()
         };
-        let found = threads.map(batch.len(), TRACKS_A_RUN, of_track, &mut |_| recorder.sign_of_life());
+        let found = threads.map(batch.len(), TRACKS_A_RUN, of_track, &mut |_| recorder.heartbeat());
         if scene.stop().is_stopped() {
             return;
         }

@@ -9,7 +9,7 @@ use super::calibrate;
 use super::model::{Model, Scene};
 use crate::domain::{Task, Warning, WarningCode};
 use crate::solver::Error;
-use crate::solver::agreement::Estimate;
+use crate::solver::between_block_variance::Estimate;
 use crate::solver::calibration::{self, Outcome, grade_of_sigma};
 use crate::solver::recorder::Recorder;
 
@@ -117,7 +117,7 @@ fn moved_alone(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> 
         focal_priors: &[None],
         focal_per_view: metric.has_own_focals(),
     };
-    let prior = adjust::knowledge(scene, camera, model.noise);
+    let prior = adjust::intrinsics_prior(scene, camera, model.noise);
     let (log_focal, sigma) = calibration::focal_alone(&problem, &metric, &prior, scene.stop())?;
     Some(Estimate { log_focal: log_focal - metric.log_focal(), sigma })
 }

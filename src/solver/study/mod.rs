@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::chance::{self, LN_DECISIVE};
 use super::grow::{self, Consensus};
-use super::learned::Opinion;
+use super::learned::TrackScores;
 use super::portfolio::spread;
 use super::search::{Sampler, Shortlist, affine};
 use super::{block, priors};
@@ -33,7 +33,7 @@ pub struct Study {
 pub struct Ranking {
     pub weights: Vec<f64>,
     pub seconds: f64,
-    opinion: Option<Opinion>,
+    track_scores: Option<TrackScores>,
 }
 
 /// What a search under a prior found.
@@ -57,26 +57,26 @@ impl Study {
     /// Asks a prior; `None` for one that does not rank image points by themselves.
     pub fn rank(&self, prior: Prior) -> Option<Ranking> {
         let begun = Instant::now();
-        let mut opinion = None;
+        let mut track_scores = None;
         let weights = match prior {
             Prior::Uniform => vec![1.0; self.block.tracks()],
             Prior::Irls => priors::affine_irls(self.search.centred(), &self.stop)?,
             Prior::Consistency => priors::consistency(self.search.centred(), 2),
-            Prior::Learned => opinion.insert(Opinion::of(&self.block)?).probabilities(),
+            Prior::Learned => track_scores.insert(TrackScores::of(&self.block)?).probabilities(),
             Prior::Network | Prior::Rigidity => return None,
         };
-        Some(Ranking { weights, seconds: begun.elapsed().as_secs_f64(), opinion })
+        Some(Ranking { weights, seconds: begun.elapsed().as_secs_f64(), track_scores })
     }
 
     /// What the best hypothesis of so many samples under the trained network says of every track, larger where it is
     /// more likely right, when a nat of the network's odds counts `per_nat` in the score of hypotheses; `None` where
     /// the network has no answer.
     pub fn best_under(&self, per_nat: f64, samples: usize, seed: u64) -> Option<Vec<f64>> {
-        let opinion = Opinion::of(&self.block)?;
-        let truncations = opinion.truncations_at(per_nat);
+        let track_scores = TrackScores::of(&self.block)?;
+        let truncations = track_scores.truncations_at(per_nat);
         let mut shortlist = Shortlist::new(1);
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let sampler = Sampler::new(&opinion.probabilities());
+        let sampler = Sampler::new(&track_scores.probabilities());
         self.search.run(&sampler, &truncations, samples, &mut rng, &mut shortlist, &self.stop);
         let best = shortlist.into_entries().next()?;
         Some(self.search.costs(&best, &truncations).into_iter().map(|cost| -cost).collect())
@@ -86,8 +86,10 @@ impl Study {
     pub fn search(&self, ranking: &Ranking, samples: usize, seed: u64) -> Found {
         let begun = Instant::now();
         let mut best: Option<(f64, Consensus)> = None;
-        let (truncations, mut seeds) = match &ranking.opinion {
-            Some(opinion) => (opinion.truncations(), affine::seed(&self.block, opinion.start()).into_iter().collect()),
+        let (truncations, mut seeds) = match &ranking.track_scores {
+            Some(track_scores) => {
+                (track_scores.truncations(), affine::seed(&self.block, track_scores.start()).into_iter().collect())
+            }
             None => (self.search.even_truncations(), Vec::new()),
         };
         let mut shortlist = Shortlist::new(SHORTLIST);

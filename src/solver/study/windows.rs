@@ -8,7 +8,7 @@ use crate::geometry::epipolar_votes::{Tracks, Votes};
 use crate::geometry::fundamental::MOST_SAMPLES;
 use crate::geometry::observation::Observation;
 use crate::solver::block;
-use crate::solver::learned::Opinion;
+use crate::solver::learned::TrackScores;
 
 /// Views of a window: those of a block that seeds a sequence, for long complete ones hold few tracks.
 pub const WINDOW_VIEWS: usize = 5;
@@ -62,17 +62,17 @@ impl Window {
         let begun = Instant::now();
         let votes = Votes::ask(&self.tracks, NOISE, MOST_SAMPLES, seed, stop);
         let voted = begun.elapsed().as_secs_f64();
-        let opinion = Opinion::of_tracks(&self.tracks);
+        let track_scores = TrackScores::of_tracks(&self.tracks);
         let seconds = [voted, begun.elapsed().as_secs_f64() - voted];
-        let together = match (&votes, &opinion) {
-            (Some(votes), Some(opinion)) => Some(opinion.with_votes(votes)),
-            (Some(votes), None) => Some(Opinion::of_votes(votes)),
-            (None, opinion) => opinion.clone(),
+        let together = match (&votes, &track_scores) {
+            (Some(votes), Some(track_scores)) => Some(track_scores.with_votes(votes)),
+            (Some(votes), None) => Some(TrackScores::of_votes(votes)),
+            (None, track_scores) => track_scores.clone(),
         };
-        let said = |opinion: &Opinion| opinion.observations().to_vec();
+        let said = |track_scores: &TrackScores| track_scores.observations().to_vec();
         WindowRankings {
             epipolar: votes.map(|votes| votes.alone().observations),
-            learned: opinion.as_ref().map(said),
+            learned: track_scores.as_ref().map(said),
             together: together.as_ref().map(said),
             seconds,
         }

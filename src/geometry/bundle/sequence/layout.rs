@@ -6,7 +6,7 @@ use nalgebra::Vector2;
 
 use super::super::intrinsics_model::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
-use super::{Free, Observation, Pace, Reconstruction, holds};
+use super::{CancellationCheck, Free, Observation, Reconstruction, holds};
 
 /// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free intrinsics.
 #[derive(Debug)]
@@ -86,20 +86,20 @@ pub(super) struct Seen {
 
 /// A block of unknowns that a point is coupled with.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Touch {
+pub(super) struct IncidentBlock {
     pub block: u32,
     /// Start of its rows x 3 matrix among the point's couplings, column after column.
     pub coupling: u32,
 }
 
-/// The observations sorted by point, then view, and the blocks each point touches.
+/// The observations sorted by point, then view, and the blocks each point incident_blocks.
 #[derive(Debug)]
 pub(super) struct Layout {
     pub unknowns: Unknowns,
     seen: Vec<Seen>,
     seen_starts: Vec<usize>,
-    touches: Vec<Touch>,
-    touch_starts: Vec<usize>,
+    incident_blocks: Vec<IncidentBlock>,
+    incident_block_starts: Vec<usize>,
     /// Start of a point's couplings.
     coupling_starts: Vec<usize>,
     pub free_points: Vec<bool>,
@@ -110,13 +110,18 @@ impl Layout {
     /// is not positive are left out.
     ///
     /// Returns `None` when it was stopped.
-    pub fn new(sequence: &Reconstruction, observations: &[Observation], free: &Free, pace: &mut Pace) -> Option<Self> {
+    pub fn new(
+        sequence: &Reconstruction,
+        observations: &[Observation],
+        free: &Free,
+        pace: &mut CancellationCheck,
+    ) -> Option<Self> {
         let points = sequence.points.len();
         let usable = || observations.iter().filter(|seen| holds(sequence, seen));
         let mut seen_starts = vec![0; points + 1];
         let mut sees = vec![false; sequence.poses.len()];
         for observation in usable() {
-            if !pace.go_on(1) {
+            if !pace.may_go_on(1) {
                 return None;
             }
             seen_starts[observation.point + 1] += 1;
@@ -127,7 +132,7 @@ impl Layout {
         let mut seen = vec![nothing; seen_starts[points]];
         let mut next = seen_starts.clone();
         for observation in usable() {
-            if !pace.go_on(1) {
+            if !pace.may_go_on(1) {
                 return None;
             }
             let Observation { view, point, xy, weight } = *observation;
@@ -138,28 +143,28 @@ impl Layout {
             unknowns: Unknowns::new(sequence, free, &sees),
             seen,
             seen_starts,
-            touches: Vec::new(),
-            touch_starts: vec![0],
+            incident_blocks: Vec::new(),
+            incident_block_starts: vec![0],
             coupling_starts: vec![0],
             free_points: (0..points).map(|point| is_free(free.points, point)).collect(),
         };
-        layout.couple(sequence, pace).then_some(layout)
+        layout.link_blocks(sequence, pace).then_some(layout)
     }
 
-    /// Finds the blocks that each free point touches and gives them their places among the couplings; `false` when it
+    /// Finds the blocks that each free point incident_blocks and gives them their places among the couplings; `false` when it
     /// was stopped.
-    fn couple(&mut self, sequence: &Reconstruction, pace: &mut Pace) -> bool {
+    fn link_blocks(&mut self, sequence: &Reconstruction, pace: &mut CancellationCheck) -> bool {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
         let mut couplings = 0;
         for point in 0..self.free_points.len() {
             let seen = &mut self.seen[self.seen_starts[point]..self.seen_starts[point + 1]];
-            if !pace.go_on(seen.len()) {
+            if !pace.may_go_on(seen.len()) {
                 return false;
             }
             seen.sort_by_key(|seen| seen.view);
             if self.free_points[point] {
-                let first = self.touches.len();
+                let first = self.incident_blocks.len();
                 let view = |seen: &Seen| unknowns.view_block[seen.view];
                 let group = |seen: &Seen| unknowns.group_block_of_view(sequence, seen.view);
                 blocks.clear();
@@ -169,13 +174,13 @@ impl Layout {
                 blocks.dedup();
                 let mut size = 0;
                 for &block in &blocks {
-                    self.touches.push(Touch { block: block as u32, coupling: size as u32 });
+                    self.incident_blocks.push(IncidentBlock { block: block as u32, coupling: size as u32 });
                     size += POINT * unknowns.range(block).len();
                 }
-                let touches = &self.touches[first..];
+                let incident_blocks = &self.incident_blocks[first..];
                 let place = |block: Option<usize>| {
-                    let at = touches.binary_search_by_key(&(block? as u32), |touch| touch.block).ok()?;
-                    Some(touches[at].coupling)
+                    let at = incident_blocks.binary_search_by_key(&(block? as u32), |touch| touch.block).ok()?;
+                    Some(incident_blocks[at].coupling)
                 };
                 for seen in seen {
                     seen.view_coupling = place(view(seen));
@@ -183,7 +188,7 @@ impl Layout {
                 }
                 couplings += size;
             }
-            self.touch_starts.push(self.touches.len());
+            self.incident_block_starts.push(self.incident_blocks.len());
             self.coupling_starts.push(couplings);
         }
         true
@@ -202,9 +207,9 @@ impl Layout {
         &self.seen[self.seen_starts[point]..self.seen_starts[point + 1]]
     }
 
-    /// Blocks that a point touches, ascending; none for a point that is held.
-    pub fn touches(&self, point: usize) -> &[Touch] {
-        &self.touches[self.touch_starts[point]..self.touch_starts[point + 1]]
+    /// Blocks that a point incident_blocks, ascending; none for a point that is held.
+    pub fn incident_blocks(&self, point: usize) -> &[IncidentBlock] {
+        &self.incident_blocks[self.incident_block_starts[point]..self.incident_block_starts[point + 1]]
     }
 
     /// Where the couplings of a point are.
@@ -250,14 +255,14 @@ impl Layout {
     /// Points that touch each block, ascending: their starts and, one block after the other, the points.
     pub fn points_by_block(&self) -> (Vec<usize>, Vec<u32>) {
         let mut starts = vec![0; self.unknowns.block_count() + 1];
-        for touch in &self.touches {
+        for touch in &self.incident_blocks {
             starts[touch.block as usize + 1] += 1;
         }
         accumulate(&mut starts);
         let mut next = starts.clone();
-        let mut points = vec![0; self.touches.len()];
+        let mut points = vec![0; self.incident_blocks.len()];
         for point in 0..self.point_count() {
-            for touch in self.touches(point) {
+            for touch in self.incident_blocks(point) {
                 let slot = &mut next[touch.block as usize];
                 points[*slot] = point as u32;
                 *slot += 1;

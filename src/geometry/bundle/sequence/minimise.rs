@@ -5,14 +5,14 @@ use nalgebra::Vector3;
 use super::super::engine::{UNDEFINED_SQUARED, usable_squared_norm};
 use super::super::metric::{IntrinsicsPrior, POSE};
 use super::super::{Loss, Options, Report};
-use super::crew::Crew;
+use super::embedded_points::iterate_points;
 use super::layout::{Layout, Seen};
 use super::normal::Normal;
 use super::pattern::Pattern;
 use super::reduced::{Reduced, substitute};
-use super::settle::settle_points;
 use super::solver::Solver;
-use super::{Free, Observation, Pace, Reconstruction, Run};
+use super::worker_pool::WorkerPool;
+use super::{CancellationCheck, Free, Observation, Reconstruction, Run};
 use crate::geometry::levenberg_marquardt::{self, Attempt, Problem};
 
 /// Least damping, as a share of the diagonal. Lower than for a block: the weakest directions of a long chain of views
@@ -47,16 +47,16 @@ pub fn adjust(
     run: Run,
 ) -> Report {
     let Run { threads, stop, told } = run;
-    let mut pace = Pace::new(stop);
+    let mut pace = CancellationCheck::new(stop);
     let unknown = Report { initial_cost: f64::INFINITY, cost: f64::INFINITY, iterations: 0 };
     let Some(layout) = Layout::new(sequence, observations, free, &mut pace) else { return unknown };
-    let crew = Crew::new(&layout, threads, stop);
+    let pool = WorkerPool::new(&layout, threads, stop);
     let descent = match layout.is_empty() {
         true => None,
-        false => Descent::new(sequence, &layout, priors, options, &crew, told, &mut pace),
+        false => Descent::new(sequence, &layout, priors, options, &pool, told, &mut pace),
     };
     let Some(mut descent) = descent else {
-        let cost = cost(sequence, &layout, priors, options.loss, &crew).unwrap_or(f64::INFINITY);
+        let cost = cost(sequence, &layout, priors, options.loss, &pool).unwrap_or(f64::INFINITY);
         return Report { initial_cost: cost, cost, iterations: 0 };
     };
     let report = levenberg_marquardt::minimise(&mut descent, sequence, &options.of_loop(MIN_DAMPING), stop);
@@ -65,7 +65,7 @@ pub fn adjust(
 }
 
 /// Pattern of the reduced system of a layout; `None` when it was stopped.
-pub(super) fn pattern(sequence: &Reconstruction, layout: &Layout, pace: &mut Pace) -> Option<Pattern> {
+pub(super) fn pattern(sequence: &Reconstruction, layout: &Layout, pace: &mut CancellationCheck) -> Option<Pattern> {
     let unknowns = &layout.unknowns;
     let pair = |view: usize| unknowns.view_block[view].zip(unknowns.group_block_of_view(sequence, view));
     Pattern::new(layout, (0..sequence.poses.len()).filter_map(pair), pace)
@@ -77,7 +77,7 @@ fn cost(
     layout: &Layout,
     priors: &[IntrinsicsPrior],
     loss: Loss,
-    crew: &Crew,
+    pool: &WorkerPool,
 ) -> Option<f64> {
     let mut sum = 0.0;
     for (group, (prior, intrinsics)) in priors.iter().zip(&sequence.intrinsics).enumerate() {
@@ -86,7 +86,7 @@ fn cost(
         }
     }
     let of_point = |point: usize| Some(cost_of_point(sequence, layout.seen(point), &sequence.points[point], loss));
-    crew.of_points(layout, of_point)?.into_iter().for_each(|cost| sum += cost);
+    pool.of_points(layout, of_point)?.into_iter().for_each(|cost| sum += cost);
     Some(sum)
 }
 
@@ -109,7 +109,7 @@ struct Descent<'a> {
     normal: Normal,
     reduced: Reduced,
     solver: Solver,
-    crew: &'a Crew<'a>,
+    pool: &'a WorkerPool<'a>,
     told: &'a mut dyn FnMut(),
 }
 
@@ -119,9 +119,9 @@ impl<'a> Descent<'a> {
         layout: &'a Layout,
         priors: &'a [IntrinsicsPrior],
         options: &Options,
-        crew: &'a Crew<'a>,
+        pool: &'a WorkerPool<'a>,
         told: &'a mut dyn FnMut(),
-        pace: &mut Pace,
+        pace: &mut CancellationCheck,
     ) -> Option<Self> {
         let pattern = pattern(sequence, layout, pace)?;
         Some(Self {
@@ -131,7 +131,7 @@ impl<'a> Descent<'a> {
             solver: Solver::new(&pattern)?,
             normal: Normal::new(layout, &pattern, sequence),
             reduced: Reduced::new(layout, pattern),
-            crew,
+            pool,
             told,
         })
     }
@@ -141,17 +141,17 @@ impl Problem for Descent<'_> {
     type State = Reconstruction;
 
     fn cost(&self, sequence: &Reconstruction) -> f64 {
-        cost(sequence, self.layout, self.priors, self.loss, self.crew).unwrap_or(f64::INFINITY)
+        cost(sequence, self.layout, self.priors, self.loss, self.pool).unwrap_or(f64::INFINITY)
     }
 
     /// What is left unfinished when it is stopped is not used: no attempt follows.
     fn linearise(&mut self, sequence: &Reconstruction) {
-        self.normal.fill(sequence, self.layout, self.priors, self.loss, self.crew);
+        self.normal.fill(sequence, self.layout, self.priors, self.loss, self.pool);
     }
 
     fn step(&mut self, from: &Reconstruction, damping: f64, to: &mut Reconstruction) -> Option<f64> {
-        let Self { layout, normal, reduced, crew, .. } = self;
-        if !reduced.build(layout, normal, damping, crew) {
+        let Self { layout, normal, reduced, pool, .. } = self;
+        if !reduced.build(layout, normal, damping, pool) {
             return None;
         }
         reduced.damp(normal, damping);
@@ -159,7 +159,7 @@ impl Problem for Descent<'_> {
             return None;
         }
         let step = &reduced.vector;
-        let possible = retract(to, from, layout, step) && substitute(to, from, layout, normal, damping, step, crew);
+        let possible = retract(to, from, layout, step) && substitute(to, from, layout, normal, damping, step, pool);
         // The rows of the Jacobian are not kept: what they predict is not known.
         possible.then_some(f64::NAN)
     }
@@ -178,7 +178,7 @@ impl Problem for Descent<'_> {
             return Some(Attempt { cost, predicted });
         }
         // Cheaper than another system: most of what a long step spoils is the points' part of its curvature.
-        let settled = settle_points(to, self.layout, self.loss, self.crew)?;
+        let settled = iterate_points(to, self.layout, self.loss, self.pool)?;
         Some(Attempt { cost: cost - settled, predicted })
     }
 }

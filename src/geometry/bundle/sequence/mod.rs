@@ -6,17 +6,17 @@
 //! Shares residuals, loss and damping with the dense adjustment of one block, `bundle::metric`. May depend on nothing
 //! of `geometry` but `bundle` and linear algebra.
 
-mod crew;
+mod embedded_points;
 mod layout;
 mod minimise;
 mod normal;
 mod pattern;
 mod point;
 mod reduced;
-mod settle;
 mod solver;
 #[cfg(test)]
 mod tests;
+mod worker_pool;
 
 pub use self::minimise::adjust;
 use super::Observation;
@@ -62,19 +62,19 @@ pub struct Run<'a> {
 const WORK_BETWEEN_QUESTIONS: usize = 1 << 14;
 
 /// Asks the stop token now and then.
-struct Pace<'a> {
+struct CancellationCheck<'a> {
     stop: &'a StopToken,
     left: usize,
 }
 
-impl<'a> Pace<'a> {
+impl<'a> CancellationCheck<'a> {
     fn new(stop: &'a StopToken) -> Self {
         Self { stop, left: WORK_BETWEEN_QUESTIONS }
     }
 
     /// Whether to go on after so much work.
     #[inline]
-    fn go_on(&mut self, work: usize) -> bool {
+    fn may_go_on(&mut self, work: usize) -> bool {
         match self.left.checked_sub(work) {
             Some(left) => {
                 self.left = left;

@@ -8,11 +8,11 @@ use nalgebra::Vector3;
 use super::super::Loss;
 use super::super::engine::usable_squared_norm;
 use super::super::metric::{IntrinsicsPrior, POSE, Parameter, Projection, ProjectionGradients, VIEW};
-use super::crew::{Crew, split_off};
 use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
 use super::point::PointBlock;
-use super::{Pace, Reconstruction};
+use super::worker_pool::{WorkerPool, split_off};
+use super::{CancellationCheck, Reconstruction};
 use crate::parallel::even_cuts;
 
 /// Where a view's residuals go in the camera part of the normal equations.
@@ -133,15 +133,15 @@ impl Normal {
         layout: &Layout,
         priors: &[IntrinsicsPrior],
         loss: Loss,
-        crew: &Crew,
+        pool: &WorkerPool,
     ) -> bool {
         self.cameras.values.fill(0.0);
         self.cameras.gradient.fill(0.0);
         self.cameras.believe(sequence, layout, priors);
         let mut begun = self.cameras.by_view.0.clone();
-        crew.batches().all(|points| {
-            self.linearise(sequence, layout, loss, crew, points.clone())
-                && self.cameras.add_batch(sequence, layout, crew, points, &self.rows, &mut begun)
+        pool.batches().all(|points| {
+            self.linearise(sequence, layout, loss, pool, points.clone())
+                && self.cameras.add_batch(sequence, layout, pool, points, &self.rows, &mut begun)
         })
     }
 
@@ -150,7 +150,7 @@ impl Normal {
         sequence: &Reconstruction,
         layout: &Layout,
         loss: Loss,
-        crew: &Crew,
+        pool: &WorkerPool,
         points: Range<usize>,
     ) -> bool {
         let seen = layout.seen_range(points.clone()).len();
@@ -168,18 +168,18 @@ impl Normal {
                 range,
             }
         };
-        let pieces = crew.cut(layout, points).windows(2).map(cut).collect();
-        crew.threads.each(pieces, |piece: Points| piece.linearise(sequence, layout, loss, crew.pace()))
+        let pieces = pool.cut(layout, points).windows(2).map(cut).collect();
+        pool.threads.each(pieces, |piece: Points| piece.linearise(sequence, layout, loss, pool.pace()))
     }
 }
 
 impl Points<'_> {
     /// `false` when it was stopped.
-    fn linearise(self, sequence: &Reconstruction, layout: &Layout, loss: Loss, mut pace: Pace) -> bool {
+    fn linearise(self, sequence: &Reconstruction, layout: &Layout, loss: Loss, mut pace: CancellationCheck) -> bool {
         let (mut rows, mut couplings) = (self.rows, self.couplings);
         for (point, slot) in self.range.zip(self.blocks) {
             let seen = layout.seen(point);
-            if !pace.go_on(seen.len()) {
+            if !pace.may_go_on(seen.len()) {
                 return false;
             }
             let mut block = PointBlock::ZERO;
@@ -190,7 +190,7 @@ impl Points<'_> {
                 if let Some(row) = slot {
                     block.add(&row.point, row.residual);
                     let parameters = &layout.unknowns.parameters[sequence.group_of[seen.view]];
-                    row.couple(seen, layout.unknowns.of_view(seen.view), parameters, couplings);
+                    row.link_blocks(seen, layout.unknowns.of_view(seen.view), parameters, couplings);
                 }
             }
             *slot = block;
@@ -250,7 +250,7 @@ impl Cameras {
         &mut self,
         sequence: &Reconstruction,
         layout: &Layout,
-        crew: &Crew,
+        pool: &WorkerPool,
         points: Range<usize>,
         rows: &[Option<Weighted>],
         begun: &mut [usize],
@@ -271,12 +271,12 @@ impl Cameras {
                 gradient: split_off(&mut gradient, last.1 - first.1),
             }
         };
-        let mut pieces: Vec<Sums> = even_cuts(crew.threads.pieces(), weights).windows(2).map(cut).collect();
+        let mut pieces: Vec<Sums> = even_cuts(pool.threads.pieces(), weights).windows(2).map(cut).collect();
         // First, for nobody can share it.
         pieces.insert(0, Sums::Groups { values, gradient });
         let batch = Batch { places, before, parameters: &layout.unknowns.parameters, first: seen.start, rows };
-        let done = crew.threads.each(pieces, |piece: Sums| {
-            let mut pace = crew.pace();
+        let done = pool.threads.each(pieces, |piece: Sums| {
+            let mut pace = pool.pace();
             match piece {
                 Sums::Views { range, values, gradient } => {
                     batch.add_to_views(sequence, range, values, gradient, of_batch, &mut pace)
@@ -304,7 +304,7 @@ impl Batch<'_> {
         values: &mut [f64],
         gradient: &mut [f64],
         seen: impl Fn(usize) -> &'s [u32],
-        pace: &mut Pace,
+        pace: &mut CancellationCheck,
     ) -> bool {
         let (first_value, first_unknown) = self.before[views.start];
         let within = |place: Place| Place { start: place.start - first_value, ..place };
@@ -313,7 +313,7 @@ impl Batch<'_> {
             let gradient = &mut gradient[first - first_unknown..];
             let parameters = &self.parameters[sequence.group_of[view]];
             for &k in seen(view) {
-                if !pace.go_on(1) {
+                if !pace.may_go_on(1) {
                     return false;
                 }
                 let Some(row) = &self.rows[k as usize - self.first] else { continue };
@@ -339,11 +339,11 @@ impl Batch<'_> {
         seen: &[Seen],
         values: &mut [f64],
         gradient: &mut [f64],
-        pace: &mut Pace,
+        pace: &mut CancellationCheck,
     ) -> bool {
         let Some(&(first_value, first_unknown)) = self.before.last() else { return true };
         for (seen, row) in seen.iter().zip(self.rows) {
-            if !pace.go_on(1) {
+            if !pace.may_go_on(1) {
                 return false;
             }
             let (Some((first, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };
@@ -372,7 +372,7 @@ impl Weighted {
     #[inline]
     ///
     /// * `unknowns`: of the view
-    fn couple(&self, seen: &Seen, unknowns: usize, parameters: &[Parameter], couplings: &mut [f64]) {
+    fn link_blocks(&self, seen: &Seen, unknowns: usize, parameters: &[Parameter], couplings: &mut [f64]) {
         let point = [self.point[0].as_slice(), self.point[1].as_slice()];
         if let Some(start) = seen.view_coupling {
             add_to_view(couplings, Place { start: start as usize, stride: unknowns }, unknowns, &self.view, point);

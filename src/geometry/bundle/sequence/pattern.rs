@@ -1,6 +1,6 @@
 //! Where the blocks of the reduced system are that are not zero.
 
-use super::Pace;
+use super::CancellationCheck;
 use super::layout::Layout;
 
 /// The lower triangle of a symmetric matrix of blocks, by block columns.
@@ -29,11 +29,15 @@ pub(super) struct Place {
 }
 
 impl Pattern {
-    /// Blocks that a point touches together, and the pose of every view with the intrinsics of its group. `None` when
+    /// Blocks that a point incident_blocks together, and the pose of every view with the intrinsics of its group. `None` when
     /// it was stopped.
     ///
     /// * `pairs`: pose block and group block of the views where both are free
-    pub fn new(layout: &Layout, pairs: impl Iterator<Item = (usize, usize)>, pace: &mut Pace) -> Option<Self> {
+    pub fn new(
+        layout: &Layout,
+        pairs: impl Iterator<Item = (usize, usize)>,
+        pace: &mut CancellationCheck,
+    ) -> Option<Self> {
         let blocks = layout.unknowns.block_count();
         let mut group_of = vec![None; blocks];
         pairs.for_each(|(pose, group)| group_of[pose] = Some(group));
@@ -52,12 +56,12 @@ impl Pattern {
             list(column);
             group_of[column].into_iter().for_each(&mut list);
             for &point in &points[starts[column]..starts[column + 1]] {
-                let touches = layout.touches(point as usize);
+                let incident_blocks = layout.incident_blocks(point as usize);
                 // A look at a block costs a small part of what an observation's linearisation does.
-                if !pace.go_on(touches.len().div_ceil(8)) {
+                if !pace.may_go_on(incident_blocks.len().div_ceil(8)) {
                     return None;
                 }
-                touches.iter().for_each(|touch| list(touch.block as usize));
+                incident_blocks.iter().for_each(|touch| list(touch.block as usize));
             }
             rows[first..].sort_unstable();
             column_starts.push(rows.len());

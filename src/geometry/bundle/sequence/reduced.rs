@@ -6,12 +6,12 @@ use std::ops::Range;
 use nalgebra::Vector3;
 
 use super::super::metric::{POINT, POSE};
-use super::crew::{Crew, split_off};
 use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::{Column, Pattern};
 use super::solver::Solver;
-use super::{Pace, Reconstruction};
+use super::worker_pool::{WorkerPool, split_off};
+use super::{CancellationCheck, Reconstruction};
 use crate::parallel::even_cuts;
 
 /// Damping beside Marquardt's, as a share of the diagonal: holds the gauge (seven directions for every set of views
@@ -64,19 +64,26 @@ impl Reduced {
     ///
     /// Batch by batch: first the points are whitened, each by itself, then every block column takes from them what they
     /// subtract from it, in their order.
-    pub fn build(&mut self, layout: &Layout, normal: &Normal, damping: f64, crew: &Crew) -> bool {
+    pub fn build(&mut self, layout: &Layout, normal: &Normal, damping: f64, pool: &WorkerPool) -> bool {
         self.values.copy_from_slice(&normal.cameras.values);
         for (slot, gradient) in self.vector.iter_mut().zip(&normal.cameras.gradient) {
             *slot = -gradient;
         }
         let mut begun = self.touching.0.clone();
-        crew.batches().all(|points| {
-            self.whiten(layout, normal, damping, crew, points.clone())
-                && self.subtract(layout, crew, points, &mut begun)
+        pool.batches().all(|points| {
+            self.whiten(layout, normal, damping, pool, points.clone())
+                && self.subtract(layout, pool, points, &mut begun)
         })
     }
 
-    fn whiten(&mut self, layout: &Layout, normal: &Normal, damping: f64, crew: &Crew, points: Range<usize>) -> bool {
+    fn whiten(
+        &mut self,
+        layout: &Layout,
+        normal: &Normal,
+        damping: f64,
+        pool: &WorkerPool,
+        points: Range<usize>,
+    ) -> bool {
         let couplings = layout.couplings_of(points.clone());
         // What is left from another batch is written over before it is read.
         self.whitened.resize(self.whitened.len().max(couplings.len()), 0.0);
@@ -87,12 +94,12 @@ impl Reduced {
             let whitened = split_off(&mut whitened, layout.couplings_of(range.clone()).len());
             Points { pulls: split_off(&mut pulls, range.len()), range, whitened }
         };
-        let pieces = crew.cut(layout, points).windows(2).map(cut).collect();
-        crew.threads.each(pieces, |piece: Points| piece.whiten(layout, normal, damping, &self.pattern, crew.pace()))
+        let pieces = pool.cut(layout, points).windows(2).map(cut).collect();
+        pool.threads.each(pieces, |piece: Points| piece.whiten(layout, normal, damping, &self.pattern, pool.pace()))
     }
 
     /// * `begun`: how far the list of every block's points is worked off
-    fn subtract(&mut self, layout: &Layout, crew: &Crew, points: Range<usize>, begun: &mut [usize]) -> bool {
+    fn subtract(&mut self, layout: &Layout, pool: &WorkerPool, points: Range<usize>, begun: &mut [usize]) -> bool {
         let Self { pattern, values, vector, touching: (starts, touching), whitened, pulls } = self;
         let of_batch = |block: usize| {
             let left = &touching[begun[block]..starts[block + 1]];
@@ -106,11 +113,11 @@ impl Reduced {
             let unknowns = pattern.offsets[range.end] - pattern.offsets[range.start];
             Columns { vector: split_off(&mut vector, unknowns), range, values }
         };
-        let pieces = even_cuts(crew.threads.pieces(), weights).windows(2).map(cut).collect();
+        let pieces = even_cuts(pool.threads.pieces(), weights).windows(2).map(cut).collect();
         let batch =
             Whitened { first: points.start, points: layout.couplings_of(points.clone()).start, whitened, pulls };
-        let done = crew.threads.each(pieces, |piece: Columns| {
-            let mut pace = crew.pace();
+        let done = pool.threads.each(pieces, |piece: Columns| {
+            let mut pace = pool.pace();
             piece.subtract(layout, pattern, &batch, of_batch, &mut pace)
         });
         let ends: Vec<usize> = (0..pattern.block_count()).map(|block| begun[block] + of_batch(block).len()).collect();
@@ -136,14 +143,21 @@ impl Reduced {
 
 impl Points<'_> {
     /// `false` when a block cannot be factored, or it was stopped.
-    fn whiten(self, layout: &Layout, normal: &Normal, damping: f64, pattern: &Pattern, mut pace: Pace) -> bool {
+    fn whiten(
+        self,
+        layout: &Layout,
+        normal: &Normal,
+        damping: f64,
+        pattern: &Pattern,
+        mut pace: CancellationCheck,
+    ) -> bool {
         let base = layout.couplings_of(self.range.clone()).start;
         for (point, pull) in self.range.zip(self.pulls) {
-            let touches = layout.touches(point);
-            if touches.is_empty() {
+            let incident_blocks = layout.incident_blocks(point);
+            if incident_blocks.is_empty() {
                 continue;
             }
-            if !pace.go_on(touches.len()) {
+            if !pace.may_go_on(incident_blocks.len()) {
                 return false;
             }
             let block = &normal.points[point];
@@ -152,7 +166,7 @@ impl Points<'_> {
             let range = layout.couplings(point);
             let couplings = &normal.couplings[range.clone()];
             let whitened = &mut self.whitened[range.start - base..range.end - base];
-            for touch in touches {
+            for touch in incident_blocks {
                 let range =
                     touch.coupling as usize..touch.coupling as usize + POINT * pattern.size(touch.block as usize);
                 factor.whiten_coupling(&couplings[range.clone()], &mut whitened[range]);
@@ -181,7 +195,7 @@ impl Columns<'_> {
         pattern: &Pattern,
         batch: &Whitened,
         touching: impl Fn(usize) -> &'t [u32],
-        pace: &mut Pace,
+        pace: &mut CancellationCheck,
     ) -> bool {
         let (first_value, first_unknown) =
             (pattern.panels(self.range.clone()).start, pattern.offsets[self.range.start]);
@@ -189,21 +203,23 @@ impl Columns<'_> {
             let (size, stride) = (pattern.size(column), pattern.stride(column));
             let vector = &mut self.vector[pattern.offsets[column] - first_unknown..][..size];
             for point in touching(column).iter().map(|&point| point as usize) {
-                let touches = layout.touches(point);
+                let incident_blocks = layout.incident_blocks(point);
                 // Pairs cost what a sixth of an observation's linearisation does.
-                if !pace.go_on(touches.len().div_ceil(6)) {
+                if !pace.may_go_on(incident_blocks.len().div_ceil(6)) {
                     return false;
                 }
-                let Ok(first) = touches.binary_search_by_key(&(column as u32), |touch| touch.block) else { continue };
+                let Ok(first) = incident_blocks.binary_search_by_key(&(column as u32), |touch| touch.block) else {
+                    continue;
+                };
                 let whitened = &batch.whitened[layout.couplings(point).start - batch.points..];
-                let right = &whitened[touches[first].coupling as usize..][..POINT * size];
+                let right = &whitened[incident_blocks[first].coupling as usize..][..POINT * size];
                 let pull = &batch.pulls[point - batch.first];
                 for (k, slot) in vector.iter_mut().enumerate() {
                     *slot += right[k] * pull[0] + right[size + k] * pull[1] + right[2 * size + k] * pull[2];
                 }
                 let mut places: Column = pattern.column(column);
-                for row in &touches[first..] {
-                    // Pattern and touches come from the same layout, so that there is a place.
+                for row in &incident_blocks[first..] {
+                    // Pattern and incident_blocks come from the same layout, so that there is a place.
                     let Some(start) = places.start_of(row.block) else { continue };
                     let height = pattern.size(row.block as usize);
                     let left = &whitened[row.coupling as usize..][..POINT * height];
@@ -228,7 +244,7 @@ pub(super) fn substitute(
     normal: &Normal,
     damping: f64,
     step: &[f64],
-    crew: &Crew,
+    pool: &WorkerPool,
 ) -> bool {
     let place = |point: usize| {
         if layout.seen(point).is_empty() || !layout.free_points[point] {
@@ -238,7 +254,7 @@ pub(super) fn substitute(
         let factor = block.factor(damping)?;
         let mut gradient = block.gradient;
         let couplings = &normal.couplings[layout.couplings(point)];
-        for touch in layout.touches(point) {
+        for touch in layout.incident_blocks(point) {
             let step = &step[layout.unknowns.range(touch.block as usize)];
             let coupling = &couplings[touch.coupling as usize..][..POINT * step.len()];
             for (k, column) in coupling.chunks_exact(step.len()).enumerate() {
@@ -248,7 +264,7 @@ pub(super) fn substitute(
         let shift: Vector3<f64> = factor.unwhiten(&factor.whiten(&gradient));
         shift.iter().all(|value| value.is_finite()).then(|| from.points[point] - shift)
     };
-    match crew.of_points(layout, place) {
+    match pool.of_points(layout, place) {
         Some(points) => {
             moved.points = points;
             true

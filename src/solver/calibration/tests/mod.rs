@@ -162,7 +162,7 @@ fn the_plane_at_infinity_fits_the_callers_frame() {
     let problem = of_one_lens(&cameras, &points, &scene.observations, 1e-5);
     let outcome = only(calibrate(&problem, SIDE_PX, &StopToken::default()));
     let plane = outcome.plane_at_infinity.expect("a plane");
-    let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
+    let frame = to_canonical_frame(&cameras, &[]).expect("rank 3");
     let intrinsics = outcome.intrinsics().expect("a metric reconstruction");
     let residual = daq::residual(&frame.cameras, &Daq { intrinsics, plane_at_infinity: plane });
     assert!(residual < 1e-5, "{residual}");

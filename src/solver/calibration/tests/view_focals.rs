@@ -150,7 +150,7 @@ fn the_plane_at_infinity_goes_with_the_zoom() {
     let outcome = only(calibrate(&problem, SIDE_PX, &StopToken::default()));
     let plane_at_infinity = outcome.plane_at_infinity.expect("a plane");
     let focals = outcome.focals.expect("a focal length a view");
-    let frame = to_first_view_frame(&cameras, &[]).expect("rank 3");
+    let frame = to_canonical_frame(&cameras, &[]).expect("rank 3");
     let daq = Daq::new(focals[0].focal, plane_at_infinity);
     for (camera, focal) in frame.cameras.iter().zip(&focals) {
         let (found, cost) = daq::view_focal(camera, &daq).expect("a focal length");
@@ -207,7 +207,7 @@ fn with_choice<T>(
 ) -> T {
     let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
     let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, NOISE) };
-    let (prior, stop) = (super::super::models::knowledge(NOISE, None, SIDE_PX), StopToken::default());
+    let (prior, stop) = (super::super::models::default_intrinsics_prior(NOISE, None, SIDE_PX), StopToken::default());
     let choice = super::super::models::Choice { problem: &problem, scale_px: SIDE_PX, stop: &stop };
     let start = metric_of(scene, &vec![scene.intrinsics.focal; scene.poses.len()]);
     let start = search::Minimum { reconstruction: start, cost: f64::INFINITY, cheirality: 0.0 };

@@ -1,6 +1,6 @@
 //! Where adjustments end.
 
-use super::super::crew::BATCH;
+use super::super::worker_pool::BATCH;
 use super::*;
 use crate::geometry::bundle::Loss;
 use crate::geometry::bundle::metric::{self, Extension, Parameter};

@@ -2,12 +2,12 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::super::Pace;
-use super::super::crew::BATCH;
-use super::super::crew::Crew;
+use super::super::CancellationCheck;
 use super::super::layout::Layout;
 use super::super::minimise::{pattern, retract};
 use super::super::normal::Normal;
+use super::super::worker_pool::BATCH;
+use super::super::worker_pool::WorkerPool;
 use super::*;
 use crate::domain::StopReason;
 use crate::geometry::bundle::Loss;
@@ -96,14 +96,14 @@ fn compare(
 ) {
     let free = Free { models, views: Some(views), points: Some(points) };
     let going = StopToken::default();
-    let mut pace = Pace::new(&going);
+    let mut pace = CancellationCheck::new(&going);
     let layout = Layout::new(sequence, observations, &free, &mut pace).expect("goes on");
     let pattern = pattern(sequence, &layout, &mut pace).expect("goes on");
     let cameras = pattern.dimension();
     assert_eq!(cameras, unknowns, "{what}");
     let mut normal = Normal::new(&layout, &pattern, sequence);
     let stop = StopToken::default();
-    assert!(normal.fill(sequence, &layout, &[], Loss::Squared, &Crew::new(&layout, Threads::ONE, &stop)));
+    assert!(normal.fill(sequence, &layout, &[], Loss::Squared, &WorkerPool::new(&layout, Threads::ONE, &stop)));
     let (residuals, jacobian) = differentiate(sequence, observations, &layout);
     let information = jacobian.transpose() * &jacobian;
     let gradient = jacobian.transpose() * residuals;
@@ -123,7 +123,7 @@ fn compare(
     for (point, block) in normal.points.iter().enumerate() {
         let first = cameras + 3 * point;
         let mut coupling = DMatrix::zeros(cameras, 3);
-        for touch in layout.touches(point) {
+        for touch in layout.incident_blocks(point) {
             let range = layout.unknowns.range(touch.block as usize);
             let values = &normal.couplings[layout.couplings(point)][touch.coupling as usize..];
             for (k, unknown) in range.clone().enumerate() {
@@ -137,7 +137,7 @@ fn compare(
             }
             compared += 1;
         } else {
-            assert!(layout.touches(point).is_empty());
+            assert!(layout.incident_blocks(point).is_empty());
         }
     }
     assert_eq!(compared, sequence.points.len() - 1);
@@ -148,7 +148,7 @@ fn what_is_known_beforehand_takes_part() {
     let (sequence, observations, models, ..) = mixed();
     let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, 0.2, 0.1, 0.01);
     let going = StopToken::default();
-    let mut pace = Pace::new(&going);
+    let mut pace = CancellationCheck::new(&going);
     let layout = Layout::new(&sequence, &observations, &Free::all(&models), &mut pace).expect("goes on");
     let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let with = |priors: &[IntrinsicsPrior]| {
@@ -158,7 +158,7 @@ fn what_is_known_beforehand_takes_part() {
             &layout,
             priors,
             Loss::Squared,
-            &Crew::new(&layout, Threads::ONE, &StopToken::default())
+            &WorkerPool::new(&layout, Threads::ONE, &StopToken::default())
         ));
         let block = layout.unknowns.group_block[2].expect("free");
         let unknown = layout.unknowns.range(block).start;
@@ -176,7 +176,7 @@ fn a_stop_is_seen_within_one_linearisation() {
     let (sequence, observations) = chain(2, 10, 1 + BATCH / 20, 5, 0.001);
     let free = Free::all(&[IntrinsicsModel::FOCAL]);
     let going = StopToken::default();
-    let mut pace = Pace::new(&going);
+    let mut pace = CancellationCheck::new(&going);
     let layout = Layout::new(&sequence, &observations, &free, &mut pace).expect("goes on");
     let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
     let mut normal = Normal::new(&layout, &pattern, &sequence);
@@ -184,9 +184,9 @@ fn a_stop_is_seen_within_one_linearisation() {
     stop.stop(StopReason::Cancelled);
     assert!(observations.len() > BATCH);
     for threads in [1, 3] {
-        let crew = Crew::new(&layout, Threads::new(threads), &stop);
-        assert!(!normal.fill(&sequence, &layout, &[], Loss::Squared, &crew), "{threads} threads");
-        assert_eq!(crew.of_points(&layout, Some), None, "{threads} threads");
+        let pool = WorkerPool::new(&layout, Threads::new(threads), &stop);
+        assert!(!normal.fill(&sequence, &layout, &[], Loss::Squared, &pool), "{threads} threads");
+        assert_eq!(pool.of_points(&layout, Some), None, "{threads} threads");
     }
     let mut start = sequence.clone();
     let report = adjust(&mut start, &observations, &free, &[], &Options::default(), quiet(&stop, &mut || ()));

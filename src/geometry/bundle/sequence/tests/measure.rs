@@ -3,7 +3,7 @@
 
 use std::time::Instant;
 
-use super::super::Pace;
+use super::super::CancellationCheck;
 use super::super::layout::Layout;
 use super::super::minimise::pattern;
 use super::super::solver::Solver;
@@ -39,7 +39,7 @@ fn time_against_observations() {
             let mut start = perturbed(&truth, 0.002, 1);
             let models = vec![IntrinsicsModel::FOCAL; truth.intrinsics.len()];
             let stop = StopToken::default();
-            let mut pace = Pace::new(&stop);
+            let mut pace = CancellationCheck::new(&stop);
             let (layout_seconds, layout) =
                 timed(|| Layout::new(&truth, &observations, &Free::all(&models), &mut pace).expect("goes on"));
             let (analysis_seconds, _) = timed(|| {

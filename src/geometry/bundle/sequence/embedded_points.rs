@@ -9,11 +9,11 @@ use nalgebra::Vector3;
 
 use super::super::Loss;
 use super::Reconstruction;
-use super::crew::Crew;
 use super::layout::{Layout, Seen};
 use super::minimise::cost_of_point;
 use super::normal::Weighted;
 use super::point::PointBlock;
+use super::worker_pool::WorkerPool;
 
 /// Gauss-Newton steps of a point at most: they converge quadratically from nearby.
 const STEPS: usize = 3;
@@ -22,8 +22,13 @@ const WORTHWHILE: f64 = 1e-2;
 
 /// Moves every free point towards its minimum with the cameras as they are; by how much that lowers the cost. `None`
 /// when it was stopped.
-pub(super) fn settle_points(sequence: &mut Reconstruction, layout: &Layout, loss: Loss, crew: &Crew) -> Option<f64> {
-    let settled = crew.of_points(layout, |point| {
+pub(super) fn iterate_points(
+    sequence: &mut Reconstruction,
+    layout: &Layout,
+    loss: Loss,
+    pool: &WorkerPool,
+) -> Option<f64> {
+    let settled = pool.of_points(layout, |point| {
         let (seen, position) = (layout.seen(point), sequence.points[point]);
         let moves = !seen.is_empty() && layout.free_points[point];
         Some(if moves { settle(sequence, seen, position, loss) } else { (position, 0.0) })

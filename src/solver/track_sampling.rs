@@ -6,7 +6,7 @@
 //! and the search looks at those that it ranks first.
 
 use super::block::Block;
-use super::learned::{self, Opinion, SURELY_ENOUGH};
+use super::learned::{self, SURELY_ENOUGH, TrackScores};
 use super::{Context, Error};
 
 /// Tracks times views that the network is asked about at a time: some 100 MB. Of more, each part is asked for itself.
@@ -16,18 +16,18 @@ const ASKED_OBSERVATIONS: usize = 50_000;
 ///
 /// # Errors
 /// [`Error::Stopped`].
-pub fn sample(block: &Block, most: usize, context: &Context) -> Result<(Block, Option<Opinion>), Error> {
+pub fn sample(block: &Block, most: usize, context: &Context) -> Result<(Block, Option<TrackScores>), Error> {
     let sample = block.clone().sample(most, context.settings.seed);
     // The windows that seed a sequence share their tracks with others, and depths tell right tracks by themselves.
     let is_all = sample.tracks.len() == block.tracks.len();
     if is_all || context.seeding || block.complete.has_depths() || !learned::may_be_asked(context.settings) {
         return Ok((sample, None));
     }
-    let Some(opinion) = Opinion::of(&sample.complete) else { return Ok((sample, None)) };
-    if opinion.likely() >= SURELY_ENOUGH {
-        return Ok((sample, Some(opinion)));
+    let Some(track_scores) = TrackScores::of(&sample.complete) else { return Ok((sample, None)) };
+    if track_scores.likely() >= SURELY_ENOUGH {
+        return Ok((sample, Some(track_scores)));
     }
-    let Some(ln_odds) = of_all(block, context)? else { return Ok((sample, Some(opinion))) };
+    let Some(ln_odds) = of_all(block, context)? else { return Ok((sample, Some(track_scores))) };
     let mut ranked: Vec<usize> = (0..ln_odds.len()).collect();
     ranked.sort_by(|&a, &b| ln_odds[b].total_cmp(&ln_odds[a]).then(a.cmp(&b)));
     ranked.truncate(most);
@@ -44,8 +44,8 @@ fn of_all(block: &Block, context: &Context) -> Result<Option<Vec<f64>>, Error> {
     let mut ln_odds = Vec::with_capacity(tracks.len());
     for part in tracks.chunks(tracks.len().div_ceil(parts)) {
         context.stopped()?;
-        let Some(opinion) = Opinion::of(&block.complete.select(part)) else { return Ok(None) };
-        ln_odds.extend_from_slice(opinion.ln_odds());
+        let Some(track_scores) = TrackScores::of(&block.complete.select(part)) else { return Ok(None) };
+        ln_odds.extend_from_slice(track_scores.ln_odds());
     }
     Ok(Some(ln_odds))
 }

@@ -7,7 +7,7 @@
 use nalgebra::{SVector, Vector2};
 
 use super::Observation;
-use super::engine::{Belief, Jacobian, Layout, Problem, Sink, Step};
+use super::engine::{GaussianPrior, Jacobian, Layout, Problem, ResidualVisitor, Step};
 
 /// Share of the unknowns of the cameras that those of the points may have at most: with as many of either, a camera's
 /// larger blocks cost more to eliminate.
@@ -40,12 +40,14 @@ fn exchanged(seen: &Observation) -> Observation {
 
 /// A problem, mirrored.
 #[derive(Clone)]
-pub(super) struct Mirrored<T>(pub T);
+pub(super) struct CameraElimination<T>(pub T);
 
 /// Hands on what a problem says, mirrored.
 struct Exchanging<'a, S>(&'a mut S);
 
-impl<const G: usize, const C: usize, const P: usize, S: Sink<G, P, C>> Sink<G, C, P> for Exchanging<'_, S> {
+impl<const G: usize, const C: usize, const P: usize, S: ResidualVisitor<G, P, C>> ResidualVisitor<G, C, P>
+    for Exchanging<'_, S>
+{
     #[inline]
     fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
         self.0.take(residual, || {
@@ -55,7 +57,7 @@ impl<const G: usize, const C: usize, const P: usize, S: Sink<G, P, C>> Sink<G, C
     }
 }
 
-impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Problem<G, P, C> for Mirrored<T> {
+impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Problem<G, P, C> for CameraElimination<T> {
     fn camera_count(&self) -> usize {
         self.0.point_count()
     }
@@ -65,7 +67,7 @@ impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Proble
     }
 
     #[inline]
-    fn observe(&self, observation: &Observation, sink: &mut impl Sink<G, P, C>) {
+    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<G, P, C>) {
         self.0.observe(&exchanged(observation), &mut Exchanging(sink));
     }
 
@@ -74,8 +76,8 @@ impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Proble
         self.0.retract(&from.0, &Step { globals: *globals, cameras: points.clone(), points: cameras.clone() });
     }
 
-    fn global_beliefs(&self) -> [Belief; G] {
-        self.0.global_beliefs()
+    fn global_priors(&self) -> [GaussianPrior; G] {
+        self.0.global_priors()
     }
 
     fn camera_gauge(&self, camera: usize) -> SVector<f64, P> {
@@ -109,7 +111,7 @@ mod tests {
         let options = Options::squared(100);
         let expected = descend(&mut problem.clone(), &straight, &options, &StopToken::default());
         let mirrored = layout(&straight, problem.camera_count());
-        let found = descend(&mut Mirrored(problem.clone()), &mirrored, &options, &StopToken::default());
+        let found = descend(&mut CameraElimination(problem.clone()), &mirrored, &options, &StopToken::default());
         let apart = |a: f64, b: f64| (a - b).abs() / b;
         assert!(apart(found.initial_cost, expected.initial_cost) < 1e-12, "{case}");
         assert!(expected.cost < 0.5 * expected.initial_cost, "{case}: {expected:?}");

@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use super::Pace;
+use super::CancellationCheck;
 use super::layout::Layout;
 use crate::domain::StopToken;
 use crate::parallel::{Threads, even_cuts};
@@ -14,14 +14,14 @@ const WORTH_A_THREAD: usize = 4_096;
 pub(super) const BATCH: usize = 16_384;
 
 /// The threads of an adjustment, and the cuts of its points.
-pub(super) struct Crew<'a> {
+pub(super) struct WorkerPool<'a> {
     pub threads: Threads,
     stop: &'a StopToken,
     /// First points of the batches, and the end.
     batches: Vec<usize>,
 }
 
-impl<'a> Crew<'a> {
+impl<'a> WorkerPool<'a> {
     pub fn new(layout: &Layout, threads: Threads, stop: &'a StopToken) -> Self {
         let observations = layout.seen_range(0..layout.point_count()).len();
         let (mut batches, mut sum) = (vec![0], 0);
@@ -37,8 +37,8 @@ impl<'a> Crew<'a> {
     }
 
     /// For one piece of work: asks the stop token at once, and then now and then.
-    pub fn pace(&self) -> Pace<'a> {
-        Pace { stop: self.stop, left: 0 }
+    pub fn pace(&self) -> CancellationCheck<'a> {
+        CancellationCheck { stop: self.stop, left: 0 }
     }
 
     /// The points in runs that are worked on one after the other.
@@ -59,7 +59,7 @@ impl<'a> Crew<'a> {
         let of_piece = |piece: usize| -> Option<Vec<T>> {
             let mut pace = self.pace();
             let points = cuts[piece]..cuts[piece + 1];
-            points.map(|point| work(point).filter(|_| pace.go_on(layout.seen(point).len()))).collect()
+            points.map(|point| work(point).filter(|_| pace.may_go_on(layout.seen(point).len()))).collect()
         };
         let pieces = self.threads.map(cuts.len() - 1, 1, of_piece, &mut |_| ());
         let pieces: Vec<Vec<T>> = pieces.into_iter().collect::<Option<_>>()?;

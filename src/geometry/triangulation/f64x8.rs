@@ -11,12 +11,12 @@ pub const LANES: usize = 8;
 
 /// A number of every track.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Lane(pub [f64; LANES]);
+pub struct F64x8(pub [f64; LANES]);
 
 /// A truth of every track.
 pub type Mask = [bool; LANES];
 
-impl Lane {
+impl F64x8 {
     pub const ZERO: Self = Self([0.0; LANES]);
     pub const ONE: Self = Self([1.0; LANES]);
 
@@ -76,7 +76,7 @@ impl Lane {
     }
 }
 
-impl Add for Lane {
+impl Add for F64x8 {
     type Output = Self;
     #[inline(always)]
     fn add(self, other: Self) -> Self {
@@ -84,7 +84,7 @@ impl Add for Lane {
     }
 }
 
-impl Sub for Lane {
+impl Sub for F64x8 {
     type Output = Self;
     #[inline(always)]
     fn sub(self, other: Self) -> Self {
@@ -92,7 +92,7 @@ impl Sub for Lane {
     }
 }
 
-impl Mul for Lane {
+impl Mul for F64x8 {
     type Output = Self;
     #[inline(always)]
     fn mul(self, other: Self) -> Self {
@@ -100,7 +100,7 @@ impl Mul for Lane {
     }
 }
 
-impl Mul<f64> for Lane {
+impl Mul<f64> for F64x8 {
     type Output = Self;
     #[inline(always)]
     fn mul(self, factor: f64) -> Self {
@@ -108,7 +108,7 @@ impl Mul<f64> for Lane {
     }
 }
 
-impl Div for Lane {
+impl Div for F64x8 {
     type Output = Self;
     #[inline(always)]
     fn div(self, other: Self) -> Self {
@@ -116,14 +116,14 @@ impl Div for Lane {
     }
 }
 
-impl AddAssign for Lane {
+impl AddAssign for F64x8 {
     #[inline(always)]
     fn add_assign(&mut self, other: Self) {
         *self = *self + other;
     }
 }
 
-impl MulAssign for Lane {
+impl MulAssign for F64x8 {
     #[inline(always)]
     fn mul_assign(&mut self, other: Self) {
         *self = *self * other;
@@ -131,21 +131,21 @@ impl MulAssign for Lane {
 }
 
 /// A homogeneous point of every track.
-pub type Points = [Lane; 4];
+pub type Points = [F64x8; 4];
 
 /// Places of the diagonal in a [`Symmetric`] matrix.
 pub const DIAGONAL: [usize; 4] = [0, 2, 5, 9];
 
 /// A symmetric 4x4 matrix of every track: entry (a, b) with b <= a at a (a + 1) / 2 + b.
 #[derive(Clone, Copy)]
-pub struct Symmetric(pub [Lane; 10]);
+pub struct Symmetric(pub [F64x8; 10]);
 
 impl Symmetric {
-    pub const ZERO: Self = Self([Lane::ZERO; 10]);
+    pub const ZERO: Self = Self([F64x8::ZERO; 10]);
 
     /// Adds `weight` times the outer product of a vector with itself.
     #[inline(always)]
-    pub fn add_square(&mut self, weight: Lane, v: Points) {
+    pub fn add_square(&mut self, weight: F64x8, v: Points) {
         let [a, b, c, d] = v;
         let [wa, wb, wc, wd] = [weight * a, weight * b, weight * c, weight * d];
         let m = &mut self.0;
@@ -162,7 +162,7 @@ impl Symmetric {
     }
 
     #[inline(always)]
-    pub fn trace(&self) -> Lane {
+    pub fn trace(&self) -> F64x8 {
         let m = &self.0;
         m[0] + m[2] + m[5] + m[9]
     }
@@ -204,7 +204,7 @@ impl Symmetric {
     }
 
     #[inline(always)]
-    pub fn scaled(&self, factor: Lane) -> Self {
+    pub fn scaled(&self, factor: F64x8) -> Self {
         let mut scaled = *self;
         let mut k = 0;
         while k < 10 {
@@ -233,9 +233,9 @@ impl Symmetric {
 /// A lower triangular factor.
 pub struct Factor {
     /// One over each entry of the diagonal.
-    inverted: [Lane; 4],
+    inverted: [F64x8; 4],
     /// The entries below it, row by row.
-    below: [Lane; 6],
+    below: [F64x8; 6],
 }
 
 impl Factor {
@@ -261,12 +261,12 @@ impl Factor {
         let [d0, d1, d2, d3] = self.inverted;
         let [l10, l20, l21, l30, l31, l32] = self.below;
         // The inverse of the factor, below its diagonal.
-        let i10 = Lane::ZERO - l10 * d0 * d1;
-        let i20 = Lane::ZERO - (l20 * d0 + l21 * i10) * d2;
-        let i21 = Lane::ZERO - l21 * d1 * d2;
-        let i30 = Lane::ZERO - (l30 * d0 + l31 * i10 + l32 * i20) * d3;
-        let i31 = Lane::ZERO - (l31 * d1 + l32 * i21) * d3;
-        let i32 = Lane::ZERO - l32 * d2 * d3;
+        let i10 = F64x8::ZERO - l10 * d0 * d1;
+        let i20 = F64x8::ZERO - (l20 * d0 + l21 * i10) * d2;
+        let i21 = F64x8::ZERO - l21 * d1 * d2;
+        let i30 = F64x8::ZERO - (l30 * d0 + l31 * i10 + l32 * i20) * d3;
+        let i31 = F64x8::ZERO - (l31 * d1 + l32 * i21) * d3;
+        let i32 = F64x8::ZERO - l32 * d2 * d3;
         Symmetric([
             d0 * d0 + i10 * i10 + i20 * i20 + i30 * i30,
             d1 * i10 + i21 * i20 + i31 * i30,
@@ -283,7 +283,7 @@ impl Factor {
 }
 
 #[inline(always)]
-pub fn dot(v: Points, w: Points) -> Lane {
+pub fn dot(v: Points, w: Points) -> F64x8 {
     v[0] * w[0] + v[1] * w[1] + v[2] * w[2] + v[3] * w[3]
 }
 

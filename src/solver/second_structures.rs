@@ -16,7 +16,7 @@ const FAR_GATES: f64 = 16.0;
 const LEAST_SHARE: f64 = 0.1;
 
 /// Searches the tracks that a consensus leaves out for another.
-pub fn structure(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken) -> Option<Warning> {
+pub fn find(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken) -> Option<Warning> {
     let gate = FAR_GATES * chi_square_gate((2 * block.views()) as f64 - 3.0) * consensus.noise * consensus.noise;
     let left: Vec<usize> =
         (0..block.tracks()).filter(|&track| !consensus.inlier[track] && consensus.squared[track] > gate).collect();
