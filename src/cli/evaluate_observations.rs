@@ -13,8 +13,8 @@ use crate::formats::publish::create_directory;
 #[command(next_help_heading = "Observations")]
 pub struct ObservationArgs {
     /// Solve inputs whose right tracks hold wrong observations, complete and with missing ones, instead of the sweeps.
-    /// Writes observations.json, and observations.jsonl, with which it goes on where it was stopped. With --peer another
-    /// program is run on the same files
+    /// Writes observations.json, and observations.jsonl, with which it goes on where it was stopped. With --peer
+    /// another program is run on the same files
     #[arg(long, groups = ["suite", "beside"],
         conflicts_with_all = ["quick", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
     pub observations: bool,

@@ -82,8 +82,8 @@ impl Input {
     /// Sizes that a projective depth may have: its scale is free, and squares of these stay far from overflow.
     pub const DEPTH_RANGE: (f64, f64) = (1e-30, 1e30);
 
-    /// Standard deviations that an observation may have, pixels: their squares weigh observations against each other, and
-    /// a computer tells no more than 1e16 from 1.
+    /// Standard deviations that an observation may have, pixels: their squares weigh observations against each other,
+    /// and a computer tells no more than 1e16 from 1.
     pub const SIGMA_RANGE: (f64, f64) = (1e-4, 1e4);
 
     /// Checks a raw input and sorts its observations.

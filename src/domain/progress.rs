@@ -38,7 +38,7 @@ impl Stage {
     }
 }
 
-/// The three terms of the paper's loss (its eq. 9), unweighted, at the network's latest iteration.
+/// The three terms of the paper's loss (its eq. 11), unweighted, at the network's latest iteration.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Losses {
     /// `exp(t - sum_j s(kappa (w_j - 1/2)))`: too few inliers.

@@ -3,9 +3,9 @@
 //! [`sweeps`] are the scenes, [`plan`] says which contestants solve them, [`runner`] does one of these runs,
 //! [`records`] does many and keeps them (and goes on where it was stopped), [`measures`] scores an answer, [`oracle`]
 //! does what the best could do who knows the truth, and [`summary`] makes numbers of the records, [`figures`] and
-//! [`page`] show them; [`priors`] compares what the search starts from; [`observations`] are inputs that need verdicts on
-//! single observations; [`real`] holds this program beside another one on real sequences. May depend on `solver`, `synthetic`, `geometry`, `formats`, `report` and `domain`; knows nothing
-//! of jobs or transport.
+//! [`page`] show them; [`priors`] compares what the search starts from; [`observations`] are inputs that need verdicts
+//! on single observations; [`real`] holds this program beside another one on real sequences. May depend on `solver`,
+//! `synthetic`, `geometry`, `formats`, `report` and `domain`; knows nothing of jobs or transport.
 
 pub mod figures;
 pub mod measures;

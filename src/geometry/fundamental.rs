@@ -170,7 +170,8 @@ pub fn squared_gate(noise: f64) -> f64 {
 ///
 /// * `noise`: standard deviation of a coordinate, in the units of the matches
 ///
-/// Reliable down to 43 % inliers. Returns `None` for too few matches, no usable noise, or when no sample gives a matrix.
+/// Reliable down to 43 % inliers. Returns `None` for too few matches, no usable noise, or when no sample gives a
+/// matrix.
 pub(crate) fn robust(
     matches: &[Match],
     noise: f64,

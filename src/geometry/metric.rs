@@ -54,8 +54,8 @@ pub fn plane_at_infinity(projective: &[Camera], metric: &[Camera]) -> Option<Vec
 ///
 /// * `own_focals`: whether every view has the focal length that the quadric gives it, or all that of the quadric
 ///
-/// Returns `None` when a pose or the depth is not a number, a camera without rank, a DAQ without meaning; also where the
-/// quadric gives a view no focal length of its own.
+/// Returns `None` when a pose or the depth is not a number, a camera without rank, a DAQ without meaning; also where
+/// the quadric gives a view no focal length of its own.
 pub fn upgrade(
     frame: &CanonicalFrame,
     daq: &Daq,

@@ -4,8 +4,9 @@ use nalgebra::Vector2;
 
 /// An image point of a track in a view, in normalised coordinates.
 ///
-/// Indices are into the slices of views (cameras) and points that it is used with. What is adjusted ignores observations
-/// with an index out of range, a coordinate that is not finite, or a weight that is not finite and positive.
+/// Indices are into the slices of views (cameras) and points that it is used with. What is adjusted ignores
+/// observations with an index out of range, a coordinate that is not finite, or a weight that is not finite and
+/// positive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Observation {
     pub view: usize,

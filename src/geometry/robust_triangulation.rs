@@ -18,8 +18,8 @@ const MOST_HYPOTHESES: usize = 30;
 const POINT_STEPS: usize = 8;
 /// Gates an observation beyond which the point of all observations is not refined: no refinement makes them all agree.
 const HOPELESS_GATES: f64 = 100.0;
-/// Gates within which the squared Sampson distance of two observations must be for both to agree with a point: it is the
-/// least sum of their squared residuals, to first order.
+/// Gates within which the squared Sampson distance of two observations must be for both to agree with a point: it is
+/// the least sum of their squared residuals, to first order.
 const PAIR_GATES: f64 = 2.0;
 
 /// Cameras that tracks are triangulated by, with the epipolar geometry of each with the next, which complete tracks ask

@@ -5,8 +5,9 @@
 //! burn's). Arrays are features x columns, row by row.
 //!
 //! A normalised layer is `Y = max(0, s ⊙ R + b)` with `R = W X`, `s = gain / sqrt(var(R) + ε)`, all rows of X of zero
-//! mean. With `D` the derivative with respect to `s ⊙ R + b` (0 where the maximum is 0) and `p = Σ_j D_j R_j` along rows:
-//! `db = Σ_j D_j`, `dgain = p / sqrt(var + ε)`, `dR = s ⊙ D - s p / (m (var + ε)) ⊙ R`, `dW = dR Xᵀ`, `dX = Wᵀ dR`.
+//! mean. With `D` the derivative with respect to `s ⊙ R + b` (0 where the maximum is 0) and `p = Σ_j D_j R_j` along
+//! rows: `db = Σ_j D_j`, `dgain = p / sqrt(var + ε)`, `dR = s ⊙ D - s p / (m (var + ε)) ⊙ R`, `dW = dR Xᵀ`, `dX = Wᵀ
+//! dR`.
 
 use burn::tensor::{Device, Tensor};
 

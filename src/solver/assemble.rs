@@ -8,7 +8,7 @@ use super::Context;
 use super::attempt::Attempt;
 use super::baselines::Decided;
 use super::calibration::{Outcome, ViewFocal};
-use super::judge::{self, Geometry, Judged, SplitPoint};
+use super::classification::{self, Geometry, Judged, SplitPoint};
 use super::recorder::Recorder;
 use super::sequence::Projective;
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
@@ -122,7 +122,7 @@ pub fn solved(context: &Context, mut attempt: Attempt, mut warnings: Vec<Warning
         iterations,
         seed: context.settings.seed,
         calibrations: usable
-            .map(|metric| pixel_calibrations(&attempt, metric, calibration, context, projective.views[0]))
+            .map(|metric| pixel_calibrations(attempt, metric, calibration, context, projective.views[0]))
             .unwrap_or_default(),
         // Planes transform by the inverse transpose of what moves points: from normalised to pixels that is T1^-T.
         plane_at_infinity: calibration
@@ -171,11 +171,11 @@ pub fn judged(context: &Context, attempt: &Attempt, projective: &Projective, rec
         linked: attempt.judges_observations(),
         least_share: if attempt.judges_observations() { least_share(context) } else { LEAST_RETAINED_SHARE },
         noise: projective.noise,
-        outlier_density: judge::density_of_spread(attempt.spread),
+        outlier_density: classification::density_of_spread(attempt.spread),
         inlier_share: (projective.tracks.len() as f64 + 1.0) / (projective.tried as f64 + 2.0),
     };
     let mut told = |verdicts| recorder.judged(verdicts, context.input.track_count());
-    judge::judge(context.input, context.ranges, &geometry, context.threads, context.stop, &mut told)
+    classification::judge(context.input, context.ranges, &geometry, context.threads, context.stop, &mut told)
 }
 
 /// Tracks of the block by image points and depths together, in place of image points alone.

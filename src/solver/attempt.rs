@@ -1,11 +1,11 @@
 //! One block of views solved from search to calibration.
 
+use super::a_contrario::LN_ACCEPTABLE;
 use super::baselines::{self, Decided};
 use super::block::Block;
 use super::calibration::{self, Outcome};
-use super::chance::LN_ACCEPTABLE;
+use super::classification::Judged;
 use super::grow::{self, Consensus, LEAST_INLIERS};
-use super::judge::Judged;
 use super::learned::TrackScores;
 use super::portfolio::{self, Portfolio, VerifiedBy};
 use super::recorder::Recorder;

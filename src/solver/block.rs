@@ -78,9 +78,9 @@ pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
 /// that is three times too small shows.
 const MEDIAN_WITHIN: f64 = 1.0;
 
-/// Share of the points beyond the right or lower edge of their image, and none beyond the others, from which its size is
-/// doubted: that of a reduced copy leaves half of the points out, exchanged sides a fiftieth and more. Points of scenes
-/// that were made up lie beyond all edges.
+/// Share of the points beyond the right or lower edge of their image, and none beyond the others, from which its size
+/// is doubted: that of a reduced copy leaves half of the points out, exchanged sides a fiftieth and more. Points of
+/// scenes that were made up lie beyond all edges.
 const BEYOND_TWO_EDGES: f64 = 0.01;
 /// How far beyond an edge a point may lie, in pixels: there are conventions that differ by half of one.
 const EDGE_PX: f64 = 1.0;

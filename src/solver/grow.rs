@@ -5,7 +5,7 @@
 //! tracks under the gate stands still. Then a polish: the gate inflated and tightened again, which frees consensuses
 //! that grew into a corner (mean F1 .90 -> 1.00 at 90 % outliers).
 
-use super::chance;
+use super::a_contrario;
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, Loss, projective};
 use crate::geometry::measurement::CompleteBlock;
@@ -352,7 +352,7 @@ pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &
         polish(block, judge(block, consensus.cameras.clone(), noise, stop), stop)
     };
     let with_chance = |settled: Consensus| {
-        let ln_false_alarms = chance::ln_false_alarms(block, &settled, spread, stop);
+        let ln_false_alarms = a_contrario::ln_false_alarms(block, &settled, spread, stop);
         (settled, ln_false_alarms)
     };
     let mut best = with_chance(settle_noise(block, consensus.clone(), stop));

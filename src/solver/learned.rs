@@ -6,8 +6,8 @@
 
 use super::grow::LEAST_INLIERS;
 use crate::domain::{Method, Prior, SolveSettings};
-use crate::geometry::epipolar_votes::{Tracks, Votes};
 use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::pairwise_likelihoods::{Tracks, Votes};
 use crate::network::subspace::{self, Cloud, MOST_VIEWS};
 
 /// Logit that stands for even odds. Training counts the few right tracks of a scene more than the many wrong ones, by
@@ -94,8 +94,8 @@ impl TrackScores {
         Self { ln_odds: said.tracks, observations: said.observations }
     }
 
-    /// This track_scores corrected by what pairs of views say: the odds of the observations enter the votes, and a track is
-    /// right where all its observations are.
+    /// This track_scores corrected by what pairs of views say: the odds of the observations enter the votes, and a
+    /// track is right where all its observations are.
     ///
     /// Nothing weighs the one against the other, both being logarithms of odds; with the network's halved or doubled,
     /// or moved by 1.5 either way, the mean average precision over real windows changes by .002 at most.

@@ -4,24 +4,25 @@
 //!
 //! The way through: [`copies`] keeps one of the tracks that stand in the input several times; [`block`] chooses views
 //! whose tracks are complete: all of them, or a few; [`attempt`] searches such a block, by [`portfolio`] (priors,
-//! [`search`], [`grow`]; [`near_duplicates`] are left aside, the [`track_sampling`] of many tracks searched, [`chance`] verifies;
-//! [`depths`] where those verify what image points cannot; [`extend`] to complete tracks and views that a search leaves
-//! aside) or [`baselines`], and [`calibration`] upgrades it. By image points, [`sequence`] tries blocks in order of cost and
-//! extends what stands to the other views and tracks, projectively or metrically, observation by observation; [`judge`]
-//! has the last word on every track and observation; [`assemble`] writes it down.
+//! [`search`], [`grow`]; [`near_duplicates`] are left aside, the [`track_sampling`] of many tracks searched,
+//! [`a_contrario`] verifies; [`depths`] where those verify what image points cannot; [`extend`] to complete tracks and
+//! views that a search leaves aside) or [`baselines`], and [`calibration`] upgrades it. By image points, [`sequence`]
+//! tries blocks in order of cost and extends what stands to the other views and tracks, projectively or metrically,
+//! observation by observation; [`classification`] has the last word on every track and observation; [`assemble`] writes
+//! it down.
 
+mod a_contrario;
 mod assemble;
 mod attempt;
 mod baselines;
 mod between_block_variance;
 mod block;
 pub(crate) mod calibration;
-mod chance;
+mod classification;
 mod copies;
 mod depths;
 mod extend;
 mod grow;
-mod judge;
 mod learned;
 mod near_duplicates;
 mod per_track;

@@ -1,6 +1,6 @@
 //! Whether the tracks left out agree on a motion of their own.
 
-use super::chance::{self, LN_DECISIVE};
+use super::a_contrario::{self, LN_DECISIVE};
 use super::grow::{self, Consensus};
 use super::portfolio;
 use super::priors;
@@ -64,7 +64,7 @@ fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option
         }
         let found = grow::polish(rest, rough, stop);
         let is_decisive = found.inlier_count() >= grow::LEAST_INLIERS
-            && chance::ln_false_alarms(rest, &found, spread, stop) < LN_DECISIVE;
+            && a_contrario::ln_false_alarms(rest, &found, spread, stop) < LN_DECISIVE;
         is_decisive.then(|| found.inlier_count())
     })
 }

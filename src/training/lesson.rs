@@ -7,7 +7,7 @@ use super::tape::{Batch, constant, numbers};
 use super::{Error, Objective, unlabelled};
 use crate::network::Parameter;
 use crate::network::subspace::{Cloud, SubspaceNet};
-use crate::synthetic::curriculum::Lesson;
+use crate::synthetic::training_scenes::Lesson;
 
 /// The losses of some lessons, each a mean over them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

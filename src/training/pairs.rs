@@ -30,10 +30,10 @@ use crate::network::subspace::pairs::{
     seen_by_both, trace,
 };
 
-/// Least distance of another eigenvalue from the smallest one, as a share of the trace, that a derivative is divided by:
-/// where matches leave a direction nearly free, noise says which way `f` turns. The losses above are .063 and .156 with
-/// a tenth of it, .066 and .164 with ten times as much; with a thousandth single gradients are a hundred times as long
-/// as others.
+/// Least distance of another eigenvalue from the smallest one, as a share of the trace, that a derivative is divided
+/// by: where matches leave a direction nearly free, noise says which way `f` turns. The losses above are .063 and .156
+/// with a tenth of it, .066 and .164 with ten times as much; with a thousandth single gradients are a hundred times as
+/// long as others.
 const LEAST_GAP: f64 = 1e-2;
 /// Rounds of the decomposition after which it is given up, as for what holds no number; it takes some twenty.
 const MOST_ROUNDS: usize = 500;

@@ -6,7 +6,7 @@ use super::tape::constant;
 use super::*;
 use crate::network::Parameter;
 use crate::network::subspace::{Cloud, Shape, SubspaceNet};
-use crate::synthetic::curriculum::{self, Lesson};
+use crate::synthetic::training_scenes::{self, Lesson};
 
 const SMALL: Shape = Shape { state: 6, selections: 3, blocks: 3, encoding: 5, strides: 0 };
 const PAIRED: Shape = Shape { strides: 2, ..SMALL };
@@ -15,7 +15,8 @@ const PAIRED: Shape = Shape { strides: 2, ..SMALL };
 fn lessons(seed: u64) -> Vec<Lesson> {
     let mut numbers = 0..;
     let holed = |lessons: &Vec<Lesson>| lessons.iter().all(|lesson| lesson.visible.iter().any(|seen| !seen));
-    let mut lessons = numbers.find_map(|number| Some(curriculum::batch(seed, number)).filter(holed)).expect("holes");
+    let mut lessons =
+        numbers.find_map(|number| Some(training_scenes::batch(seed, number)).filter(holed)).expect("holes");
     lessons.truncate(2);
     lessons
 }

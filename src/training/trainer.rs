@@ -7,8 +7,8 @@ use super::lesson::{Losses, Slope, differentiate};
 use super::{Error, Objective, adam, initial};
 use crate::network::Parameter;
 use crate::network::subspace::{Cloud, Origin, PriorFile, Shape, SubspaceNet};
-use crate::synthetic::curriculum::{self, Lesson};
 use crate::synthetic::metrics::average_precision;
+use crate::synthetic::training_scenes::{self, Lesson};
 
 /// Batches of lessons in a step, which are differentiated side by side. Part of what a seed means, so not the number of
 /// cores.
@@ -202,7 +202,7 @@ impl Trainer {
         let first = self.step * BATCHES_PER_STEP;
         let network = &self.network;
         let work = |number: u64| {
-            let lessons = curriculum::batch(seed, number);
+            let lessons = training_scenes::batch(seed, number);
             differentiate(network, &lessons, objective).map(|slope| (slope, lessons.len() as u64))
         };
         let threads = std::thread::available_parallelism().map_or(1, |count| count.get() as u64);
@@ -273,7 +273,7 @@ fn validate(network: &SubspaceNet<Vec<f32>>, seed: u64) -> f64 {
         average_precision(&scores, &lesson.inlier)
     };
     let found: Vec<f64> = (0..VALIDATION_BATCHES)
-        .flat_map(|number| curriculum::batch(seed, number))
+        .flat_map(|number| training_scenes::batch(seed, number))
         .filter_map(|lesson| precision(&lesson))
         .collect();
     found.iter().sum::<f64>() / found.len().max(1) as f64

@@ -1,4 +1,4 @@
-//! Learning without labels: the paper's L_num and L_proj (its eq. 9), each scene's own, summed over many scenes.
+//! Learning without labels: the paper's L_num and L_proj (its eq. 11), each scene's own, summed over many scenes.
 //!
 //! The weights of a scene's tracks are the sigmoids of their logits; the matrix is what the network itself made of the
 //! tracks: places in units of their view's spread, times the projective depths of its last block, holes filled.

@@ -16,8 +16,8 @@ pub fn all() -> Vec<Condition> {
     grid().chain(straight()).chain(zooms()).chain(four_cameras()).collect()
 }
 
-/// Right tracks that hold wrong observations: 10 views, 200 tracks, noise of .3 %; complete, and with one observation of
-/// each track deleted.
+/// Right tracks that hold wrong observations: 10 views, 200 tracks, noise of .3 %; complete, and with one observation
+/// of each track deleted.
 fn grid() -> impl Iterator<Item = Condition> {
     let tracks = [0.0, 0.3, 0.5, 0.7].into_iter();
     let counts = tracks.flat_map(|outliers| [1, 2, 3].map(|count| (outliers, count)));
@@ -34,8 +34,8 @@ fn grid() -> impl Iterator<Item = Condition> {
     })
 }
 
-/// Cameras that move and do not turn, so that nothing can be calibrated: at random, on a grid and on a straight walk; each
-/// track is observed by some neighbouring views.
+/// Cameras that move and do not turn, so that nothing can be calibrated: at random, on a grid and on a straight walk;
+/// each track is observed by some neighbouring views.
 fn straight() -> impl Iterator<Item = Condition> {
     let scene = |name: &str, motion: Motion, views: usize| {
         let (tracks, noise, outliers) = (30 * views, 0.0005, 0.3);

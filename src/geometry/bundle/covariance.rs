@@ -248,7 +248,8 @@ impl Information {
     }
 }
 
-/// The reconstruction about its middle, its reduced system and the diagonal of the shared intrinsics were all else known.
+/// The reconstruction about its middle, its reduced system and the diagonal of the shared intrinsics were all else
+/// known.
 type Linearised = (Reconstruction, [Vec<f64>; 2], Vec<f64>);
 
 /// Eliminates the points; `None` without poses.
@@ -278,8 +279,8 @@ fn scale_of(information: f64) -> f64 {
 }
 
 impl WithoutViews {
-    /// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics; its
-    /// lower triangle is given. With it what the views' own focal lengths are, where they have them.
+    /// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics;
+    /// its lower triangle is given. With it what the views' own focal lengths are, where they have them.
     ///
     /// A direction of the views on which rounding hides what the observations say, but which goes along with the
     /// intrinsics, is taken to be as free as it can be: the intrinsics have no information left along with it. Taken as

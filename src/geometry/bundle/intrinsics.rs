@@ -4,8 +4,8 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::intrinsics_model::Parameter;
 
-/// Steps that undo the radial distortion: Newton's method converges quadratically, and where it would leave what encloses
-/// the radius, halving settles 64 bits.
+/// Steps that undo the radial distortion: Newton's method converges quadratically, and where it would leave what
+/// encloses the radius, halving settles 64 bits.
 const UNDISTORT_STEPS: usize = 64;
 /// Relative change of the radius, or of the point, that ends them.
 const UNDISTORT_TOLERANCE: f64 = 4.0 * f64::EPSILON;
@@ -15,10 +15,11 @@ const TANGENTIAL_ROUNDS: usize = 20;
 /// Doublings of the radius after which one that is imaged so far out is not looked for any more.
 const WIDEST_DOUBLINGS: usize = 64;
 
-/// Intrinsics in normalised image units, without skew, behind a lens that distorts radially and tangentially (Brown 1971).
+/// Intrinsics in normalised image units, without skew, behind a lens that distorts radially and tangentially (Brown
+/// 1971).
 ///
-/// A point at `(u, v, 1)` in front of the camera, with `r^2 = u^2 + v^2` and `s = 1 + k1 r^2 + k2 r^4 + k3 r^6`, is imaged
-/// at `x = f (u s + 2 p1 u v + p2 (r^2 + 2 u^2)) + px`, `y = a f (v s + p1 (r^2 + 2 v^2) + 2 p2 u v) + py`.
+/// A point at `(u, v, 1)` in front of the camera, with `r^2 = u^2 + v^2` and `s = 1 + k1 r^2 + k2 r^4 + k3 r^6`, is
+/// imaged at `x = f (u s + 2 p1 u v + p2 (r^2 + 2 u^2)) + px`, `y = a f (v s + p1 (r^2 + 2 v^2) + 2 p2 u v) + py`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
     pub focal: f64,

@@ -34,8 +34,8 @@ impl Pose {
         self.rotation * point + self.translation
     }
 
-    /// Turned about the camera's own centre and moved, `x -> dR x + dt` in camera coordinates, by a rotation vector and a
-    /// translation. About the origin of the world, a camera far from it could turn only against the damping of its
+    /// Turned about the camera's own centre and moved, `x -> dR x + dt` in camera coordinates, by a rotation vector and
+    /// a translation. About the origin of the world, a camera far from it could turn only against the damping of its
     /// lever.
     #[inline]
     pub(crate) fn moved(&self, [a, b, c, x, y, z]: [f64; POSE]) -> Self {
@@ -209,8 +209,8 @@ impl Reconstruction {
     }
 }
 
-/// A reconstruction of one camera group with these `G` shared intrinsics free, in a place without one nothing moves, and `C` unknowns of each
-/// view: [`POSE`], or [`VIEW`] where its own focal length is free.
+/// A reconstruction of one camera group with these `G` shared intrinsics free, in a place without one nothing moves,
+/// and `C` unknowns of each view: [`POSE`], or [`VIEW`] where its own focal length is free.
 #[derive(Clone)]
 pub(super) struct Metric<const G: usize, const C: usize> {
     pub reconstruction: Reconstruction,
@@ -265,8 +265,8 @@ impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
     }
 }
 
-/// Minimises the reprojection error over poses, points and the free intrinsics, the same of every camera group, of which
-/// `priors`, one a group, know something. Focal lengths a view are free only where the reconstruction has them.
+/// Minimises the reprojection error over poses, points and the free intrinsics, the same of every camera group, of
+/// which `priors`, one a group, know something. Focal lengths a view are free only where the reconstruction has them.
 ///
 /// The cost contains what the priors add.
 ///

@@ -1,5 +1,5 @@
-//! Bundle adjustment by Levenberg-Marquardt on the Schur complement of the points, or of the cameras where the points are
-//! few; projective and metric.
+//! Bundle adjustment by Levenberg-Marquardt on the Schur complement of the points, or of the cameras where the points
+//! are few; projective and metric.
 //!
 //! One engine serves both problems; what they share (observations, robust loss, options, report) lives here. May
 //! depend on nothing of `geometry` but `levenberg_marquardt` and `observation`, and on linear algebra.

@@ -15,8 +15,8 @@ const GAUGE: usize = 7;
 /// Eigenvalue, relative to the largest, at which rounding of the normal equations hides what the observations say:
 /// 1e-16 times the square root of the number of terms summed, with a margin.
 const ROUNDING: f64 = 1e-13;
-/// Part of a direction of the similarity that must be left after the others are taken off for it to be another: of views
-/// with one centre, scale is a translation.
+/// Part of a direction of the similarity that must be left after the others are taken off for it to be another: of
+/// views with one centre, scale is a translation.
 const ANOTHER_DIRECTION: f64 = 1e-7;
 
 /// Moves the world's origin into the middle of the cameras: far from it, what tells a turn of a view from a shift of it
@@ -94,7 +94,8 @@ pub(super) struct WhitenedViews<const C: usize> {
 }
 
 impl<const C: usize> WhitenedViews<C> {
-    /// * `matrix`: column-major, its lower triangle given: other unknowns, `first` of them, then `C` a view, whose first
+    /// * `matrix`: column-major, its lower triangle given: other unknowns, `first` of them, then `C` a view, whose
+    ///   first
     ///   are those of its pose
     ///
     /// `None` without views, or where the matrix holds what is no number.

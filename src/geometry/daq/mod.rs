@@ -34,7 +34,7 @@ const HYPOTHESIS_VIEWS: usize = 2;
 const HYPOTHESIS_STARTS: usize = 3;
 const HYPOTHESIS_ITERATIONS: usize = 12;
 
-/// The DAQ of a camera with constant intrinsics, in the frame of the first view (paper, eq. 6).
+/// The DAQ of a camera with constant intrinsics, in the frame of the first view (paper, eq. 5).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Daq {
     pub intrinsics: Intrinsics,
@@ -63,7 +63,7 @@ impl Daq {
 
 /// The DAQ residual `1/2 sum_i |S_i/|S_i| - w/|w||^2` with `S_i = P_i Q P_i'` and `w = K K'`.
 ///
-/// The paper (eq. 8) sums the norms; their squares are smooth at the solution. A view whose projection of the quadric
+/// The paper (eq. 9) sums the norms; their squares are smooth at the solution. A view whose projection of the quadric
 /// vanishes counts 1, as the worst there is. Between 0 and the number of views.
 pub fn residual(cameras: &[Matrix3x4<f64>], daq: &Daq) -> f64 {
     let diac = daq.diac();

@@ -5,8 +5,8 @@ use nalgebra::{Matrix3x4, Vector3};
 use super::starts::{SCAN_RANGE, linear, plane_from_focals, widest_views};
 use super::{Daq, infinite_homography};
 
-/// Focal lengths of the first view that are tried, views that the plane at infinity is taken from, and the ratios of the
-/// focal lengths of the two.
+/// Focal lengths of the first view that are tried, views that the plane at infinity is taken from, and the ratios of
+/// the focal lengths of the two.
 const FOCALS: usize = 20;
 const VIEWS: usize = 4;
 const RATIOS: [f64; 5] = [0.5, 0.71, 1.0, 1.41, 2.0];

@@ -1,8 +1,9 @@
 //! Several tracks triangulated side by side.
 //!
 //! The equations are those of [`linear`](super::linear) and [`refine`](super::refine) for one track (a test compares).
-//! Tracks need not be seen by the same views: their `k`-th observations stand side by side, whatever the cameras. What one
-//! comes to does not depend on its neighbours, to the last bit: a track that has arrived stands still while others go on.
+//! Tracks need not be seen by the same views: their `k`-th observations stand side by side, whatever the cameras. What
+//! one comes to does not depend on its neighbours, to the last bit: a track that has arrived stands still while others
+//! go on.
 
 pub use super::f64x8::LANES;
 use super::f64x8::{DIAGONAL, F64x8, Mask, Points, Symmetric, choose, dot, normalised};
@@ -85,8 +86,8 @@ impl Batch {
         let nothing = Sighted { camera: [[F64x8::ZERO; 3]; 4], xy: [F64x8::ZERO; 2], weight: F64x8::ZERO };
         let mut sighted = vec![nothing; longest];
         for lane in 0..LANES {
-            // A lane without a track repeats the first one, and a place without an observation has the camera of the track's
-            // first: numbers that count nowhere, but are of a usual size.
+            // A lane without a track repeats the first one, and a place without an observation has the camera of the
+            // track's first: numbers that count nowhere, but are of a usual size.
             let Some(track) = tracks.get(lane).or(tracks.first()) else { continue };
             for (k, sighted) in sighted.iter_mut().enumerate() {
                 let Some(seen) = track.get(k).or(track.first()) else { continue };
@@ -137,7 +138,8 @@ impl Batch {
         )
     }
 
-    /// Weighted squared reprojection residuals of the tracks' `k`-th observations, for each `k`; 0 of those that they do without.
+    /// Weighted squared reprojection residuals of the tracks' `k`-th observations, for each `k`; 0 of those that they
+    /// do without.
     pub fn squared_residuals(&self, found: &Triangulated) -> Vec<[f64; LANES]> {
         vectorised(
             #[inline(always)]

@@ -1,5 +1,5 @@
-//! Numbers, vectors and symmetric matrices of several tracks side by side: what is done, is done for all of them at once
-//! in the processor's widest vectors. A track on its own fills a quarter of such a vector at best.
+//! Numbers, vectors and symmetric matrices of several tracks side by side: what is done, is done for all of them at
+//! once in the processor's widest vectors. A track on its own fills a quarter of such a vector at best.
 //!
 //! Everything is inlined into its caller, which [`vectorised`](crate::simd::vectorised) compiles.
 

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::gauge::CanonicalFrameCameras;
+use super::gauge::CanonicalCameras;
 
 /// Under the square root of each view's residual: the first view's is exactly 0, where a norm has no derivative.
 const RESIDUAL_FLOOR: f64 = 1e-10;
@@ -24,7 +24,7 @@ pub struct Residual {
 /// L_DAQ).
 ///
 /// The principal point is the origin and pixels are square: the units of the measurement matrix see to it.
-pub fn residual(cameras: &CanonicalFrameCameras, log_focal: f64, n_inf: &Vector3<f64>) -> Residual {
+pub fn residual(cameras: &CanonicalCameras, log_focal: f64, n_inf: &Vector3<f64>) -> Residual {
     let focal_squared = (2.0 * log_focal).exp();
     let omega = Matrix3::from_diagonal(&Vector3::new(focal_squared, focal_squared, 1.0));
     let omega_norm = omega.norm();

@@ -12,7 +12,7 @@ const NORM_FLOOR: f64 = 1e-20;
 /// `H = [B⁺ | h]` with B the first three rows of Z and h the four-dimensional cross product of its rows; then a is
 /// scaled to the norm of A and its sign fixed. What remains does not depend on the basis of the span, which is what
 /// gives a plane at infinity in these coordinates a meaning from one iteration to the next.
-pub struct CanonicalFrameCameras {
+pub struct CanonicalCameras {
     span: MatrixXx4<f64>,
     first: Matrix3x4<f64>,
     inverse_gram: Matrix3<f64>,
@@ -25,7 +25,7 @@ pub struct CanonicalFrameCameras {
     rotational: Vec<Matrix3<f64>>,
 }
 
-impl CanonicalFrameCameras {
+impl CanonicalCameras {
     /// The cameras of a span with at least two views.
     pub fn of(span: MatrixXx4<f64>) -> Self {
         let views = span.nrows() / 3;

@@ -1,4 +1,4 @@
-//! The three terms of the paper's loss (its eq. 9) with exact gradients, in f64 and outside any autodiff graph.
+//! The three terms of the paper's loss (its eq. 11) with exact gradients, in f64 and outside any autodiff graph.
 //!
 //! Pure functions of the balanced matrix, the weights and the calibration; nothing here knows of the network.
 //!
@@ -74,7 +74,7 @@ pub fn evaluate(
     debug_assert_eq!(balanced.ncols(), w.len());
     let spectrum = Spectrum::of(balanced, w)?;
     let RankTerms { num, proj, grad_w_num, grad_w_proj } = RankTerms::of(&spectrum, w, settings);
-    let cameras = gauge::CanonicalFrameCameras::of(spectrum.span());
+    let cameras = gauge::CanonicalCameras::of(spectrum.span());
     let daq = daq::residual(&cameras, log_focal, &Vector3::from(n_inf));
     let grad_span = cameras.pull_back(&daq.grad_rotational, &daq.grad_translational);
     let grad_w_daq = spectrum.pull_back_span(&grad_span, w);

@@ -2,7 +2,7 @@
 //!
 //! The constants come from an evaluation in numpy that shares nothing with this code but the formulas: singular values
 //! and the span from an SVD of `M diag(w)` itself instead of an eigen-decomposition of its scatter matrix; cameras in
-//! the frame `P₁ = [I|0]` by a pseudo-inverse and a null vector; the DAQ as the 4x4 matrix of the paper's eq. 6 and
+//! the frame `P₁ = [I|0]` by a pseudo-inverse and a null vector; the DAQ as the 4x4 matrix of the paper's eq. 5 and
 //! `S_i = P_i Q P_iᵀ`; every derivative by central differences of sixth order (steps of 4e-4 and 2e-4 agree to 5e-12).
 //! The floors under square roots and the direction that fixes the sign of the fourth columns are the documented ones
 //! of this folder: without them the two could not agree in the last digits.

@@ -107,7 +107,7 @@ fn the_truth_is_a_zero_of_proj_and_daq() {
         let balanced = balanced_matrix(&scene);
         let w = [1.0; 30];
         let log_focal = (scene.truth.focal_px / f64::from(IMAGE_SIDE_PX)).ln();
-        let cameras = gauge::CanonicalFrameCameras::of(Spectrum::of(&balanced, &w).expect("finite").span());
+        let cameras = gauge::CanonicalCameras::of(Spectrum::of(&balanced, &w).expect("finite").span());
         let n_inf = true_plane_at_infinity(&cameras, &scene.truth, log_focal.exp());
         let at = |log_focal: f64| evaluate(&balanced, &w, log_focal, n_inf, &SETTINGS).expect("finite").losses;
         let truth = at(log_focal);
@@ -121,7 +121,7 @@ fn the_truth_is_a_zero_of_proj_and_daq() {
 }
 
 /// The n of `A_i - a_i nᵀ = s_i K R_i K⁻¹` over all views, R_i relative to the first: linear in n and the s_i.
-fn true_plane_at_infinity(cameras: &gauge::CanonicalFrameCameras, truth: &Truth, focal: f64) -> [f64; 3] {
+fn true_plane_at_infinity(cameras: &gauge::CanonicalCameras, truth: &Truth, focal: f64) -> [f64; 3] {
     let views = cameras.rotational().len();
     let rotation = |view: usize| Matrix3::from_fn(|row, column| truth.rotations[view][row][column]);
     let k = Matrix3::from_diagonal(&Vector3::new(focal, focal, 1.0));

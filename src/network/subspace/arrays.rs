@@ -86,7 +86,7 @@ fn is_zero(size: &usize) -> bool {
 }
 
 impl Default for Shape {
-    /// The sizes that the curriculum was found with: 30,205 numbers, about 1 ms for 10 x 200.
+    /// The sizes that the training scenes were chosen with: 30,205 numbers, about 1 ms for 10 x 200.
     fn default() -> Self {
         Self { state: 32, selections: 4, blocks: 6, encoding: 16, strides: 0 }
     }

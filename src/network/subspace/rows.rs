@@ -51,8 +51,8 @@ pub fn accumulate(sums: &mut [f32], values: &[f32]) {
     }
 }
 
-/// Tracks whose sums for four outputs stay in registers side by side: eight registers of eight numbers, which leaves some
-/// for the inputs.
+/// Tracks whose sums for four outputs stay in registers side by side: eight registers of eight numbers, which leaves
+/// some for the inputs.
 const TILE: usize = 16;
 /// The same where fewer are left.
 const HALF_TILE: usize = 8;
@@ -137,8 +137,8 @@ fn add_scaled<const T: usize>(sums: &mut [f32; T], factor: f32, values: &[f32; T
 }
 
 /// Natural logarithm of a positive normal number to 4e-7 of itself: a series in (m - 1) / (m + 1) for the significand m
-/// about 1. It has no branch, so that the logarithms of a row are taken side by side. Infinity stays what it is; what is
-/// not positive has none.
+/// about 1. It has no branch, so that the logarithms of a row are taken side by side. Infinity stays what it is; what
+/// is not positive has none.
 #[inline(always)]
 pub fn logarithm(x: f32) -> f32 {
     const EXPONENT_BIAS: i32 = 127;

@@ -51,8 +51,8 @@ impl Fit {
         (self.statistic(cost, freedom) - 1.0) / (2.0 / added + 2.0 / self.freedom.max(1) as f64).sqrt()
     }
 
-    /// The F statistic of a special case of this model: what each degree of freedom that it has more adds to the cost, over
-    /// what noise would add.
+    /// The F statistic of a special case of this model: what each degree of freedom that it has more adds to the cost,
+    /// over what noise would add.
     pub fn statistic(&self, cost: f64, freedom: usize) -> f64 {
         (cost - self.cost) / self.added(freedom) / (self.noise * self.noise)
     }

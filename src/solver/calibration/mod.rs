@@ -85,10 +85,11 @@ impl ViewFocal {
 pub struct Outcome {
     /// Among those that were calibrated together.
     pub group: usize,
-    /// Of all groups. `None` when no metric reconstruction was found or looked for. With grade PROJECTIVE_ONLY it may stand but is
-    /// not to be used as metric.
+    /// Of all groups. `None` when no metric reconstruction was found or looked for. With grade PROJECTIVE_ONLY it may
+    /// stand but is not to be used as metric.
     pub metric: Option<Reconstruction>,
-    /// With a focal length a view: these; the intrinsics of `metric` have the geometric mean of those that are determined.
+    /// With a focal length a view: these; the intrinsics of `metric` have the geometric mean of those that are
+    /// determined.
     pub focals: Option<Vec<ViewFocal>>,
     /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable.
     pub sigma_log_focal: Option<f64>,

@@ -33,8 +33,8 @@ fn probability(extension: Extension) -> f64 {
     }
 }
 
-/// Gain in chi-square at which an extension of so many groups is taken: the .999 quantile for its degrees of freedom, by
-/// Wilson & Hilferty (1931) where there are many.
+/// Gain in chi-square at which an extension of so many groups is taken: the .999 quantile for its degrees of freedom,
+/// by Wilson & Hilferty (1931) where there are many.
 fn significant_gain(extension: Extension, groups: usize) -> f64 {
     match groups * extension.parameters().len() {
         1 => 10.8,
@@ -51,8 +51,8 @@ pub(super) const CHI_SQUARE_GAIN: f64 = 13.8;
 /// Share of the significant gain that a linearisation must foretell for an adjustment to be tried: it is off where the
 /// richer model is far.
 const WORTH_A_TRIAL: f64 = 0.5;
-/// Share of the noise that a prior was weighed by, below which what is left makes it worth weighing anew. A prior that is
-/// weighed by a misfit's noise is too strong: a third radial term of .4 was held near 0, eleven sigma off.
+/// Share of the noise that a prior was weighed by, below which what is left makes it worth weighing anew. A prior that
+/// is weighed by a misfit's noise is too strong: a third radial term of .4 was held near 0, eleven sigma off.
 const SAME_NOISE: f64 = 0.9;
 /// How often it is: the noise falls by the misfit at once, and by little after.
 const NOISE_ROUNDS: usize = 4;
@@ -134,8 +134,8 @@ impl Candidate {
 
 /// Standard deviations, the doubt about the model included.
 pub(super) struct Sigmas {
-    /// Of each group's intrinsics that the model frees, indexed by [`Parameter`], the log focal length's also where every
-    /// view has its own, then of their mean; `None`: unobservable or not free.
+    /// Of each group's intrinsics that the model frees, indexed by [`Parameter`], the log focal length's also where
+    /// every view has its own, then of their mean; `None`: unobservable or not free.
     pub of_group: Vec<[Option<f64>; Parameter::COUNT]>,
     /// Of the log focal length of each view that has its own; `None`: unobservable.
     pub view_focals: Vec<Option<f64>>,
@@ -255,9 +255,9 @@ impl Choice<'_> {
     /// Standard deviations under the best model and all doubt about it.
     ///
     /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
-    /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights
-    /// from Laplace's approximation of each model's evidence under [`default_intrinsics_prior`]. An extension that the data can
-    /// neither confirm nor refute thus costs what it would move.
+    /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights from
+    /// Laplace's approximation of each model's evidence under [`default_intrinsics_prior`]. An extension that the data
+    /// can neither confirm nor refute thus costs what it would move.
     ///
     /// * `inflation`: factor on all of them, for what the calibration does not fit
     pub fn sigmas(&self, best: &Candidate, inflation: f64) -> Sigmas {

@@ -67,8 +67,8 @@ impl Minimum {
         self.reconstruction.log_focal()
     }
 
-    /// Difference in log focal length, the root mean square over the groups; where views have their own, over those that
-    /// count.
+    /// Difference in log focal length, the root mean square over the groups; where views have their own, over those
+    /// that count.
     pub fn apart(&self, other: &Self, counts: impl Fn(usize) -> bool) -> f64 {
         let (own, others) = (&self.reconstruction, &other.reconstruction);
         let differences: Vec<f64> = if own.focals.is_empty() {

@@ -1,4 +1,5 @@
-//! What is told of focal lengths where every view has its own, and whether views have where they were taken to share one.
+//! What is told of focal lengths where every view has its own, and whether views have where they were taken to share
+//! one.
 
 use super::fit::Fit;
 use super::models::{Candidate, Choice, Sigmas, default_intrinsics_prior};
@@ -9,8 +10,9 @@ use crate::domain::{Grade, WarningCode};
 use crate::geometry::bundle::metric::{self, Extension, IntrinsicsModel, Reconstruction};
 use crate::geometry::statistics::{median, root_mean_square};
 
-/// What a lens may add to log focal lengths of which every view has its own, one standard deviation: few lenses have the
-/// same distortion and centre at every focal length, and one for all is what is estimated. No zoom is METRIC for it.
+/// What a lens may add to log focal lengths of which every view has its own, one standard deviation: few lenses have
+/// the same distortion and centre at every focal length, and one for all is what is estimated. No zoom is METRIC for
+/// it.
 const LENS_SIGMA: f64 = 0.05;
 /// Share of the views whose focal length must be determined: of fewer, what most of the images show says nothing of
 /// the camera.

@@ -1,7 +1,7 @@
 //! The best consensus so far, and when it is good enough.
 
 use crate::domain::Prior;
-use crate::solver::chance::{LN_ACCEPTABLE, LN_DECISIVE};
+use crate::solver::a_contrario::{LN_ACCEPTABLE, LN_DECISIVE};
 use crate::solver::grow::{Consensus, LEAST_INLIERS};
 
 /// Gain in that logarithm below which two consensuses are the same: a single track more changes it by tens.
@@ -25,7 +25,8 @@ pub struct Best {
     pub prior: Prior,
     pub ln_false_alarms: f64,
     pub verified_by: VerifiedBy,
-    /// Inliers that count where few are verified, see [`TrackScores::counted`](crate::solver::learned::TrackScores::counted).
+    /// Inliers that count where few are verified, see
+    /// [`TrackScores::counted`](crate::solver::learned::TrackScores::counted).
     pub counted: usize,
 }
 

@@ -6,7 +6,7 @@ use super::best::Best;
 use super::{AFFINE_SAMPLES, NOISE_LADDER, Portfolio, SHORTLIST, SUBSPACE_SAMPLES, Search, VerifiedBy};
 use crate::domain::Prior;
 use crate::geometry::statistics::median;
-use crate::solver::chance::{self, LN_DECISIVE};
+use crate::solver::a_contrario::{self, LN_DECISIVE};
 use crate::solver::learned::TrackScores;
 use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid, subspace};
 use crate::solver::{depths, grow, priors};
@@ -166,7 +166,7 @@ impl Portfolio<'_> {
             let grown = grow::grow(self.block, seed.cameras, seed.points, seed.support, self.noise, self.stop);
             let counted = grown.as_ref().map_or(0, |consensus| self.counted(consensus));
             let ln_false_alarms = grown.as_ref().map_or(f64::INFINITY, |consensus| {
-                chance::ln_false_alarms(self.block, consensus, self.spread, self.stop)
+                a_contrario::ln_false_alarms(self.block, consensus, self.spread, self.stop)
             });
             self.account(prior).seconds += begun.elapsed().as_secs_f64();
             let Some(consensus) = grown else { continue };

@@ -130,8 +130,8 @@ impl Extract {
     }
 }
 
-/// Core noise, one standard deviation of a coordinate, by the median of these norms of residuals, for what their freedom
-/// leaves of it.
+/// Core noise, one standard deviation of a coordinate, by the median of these norms of residuals, for what their
+/// freedom leaves of it.
 pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> f64 {
     let freedom = 1.0 - unknowns as f64 / (2 * norms.len()).max(1) as f64;
     median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(LEAST_FREEDOM).sqrt()

@@ -15,7 +15,7 @@ use crate::solver::assemble::{
 };
 use crate::solver::block;
 use crate::solver::calibration::Outcome;
-use crate::solver::judge::{self, Geometry, Judged, SplitPoint};
+use crate::solver::classification::{self, Geometry, Judged, SplitPoint};
 use crate::solver::recorder::Recorder;
 
 /// The solution of a sequence.
@@ -91,8 +91,8 @@ fn told(calibrations: &[Outcome], scene: &Scene) -> Vec<Warning> {
 }
 
 /// The calibration of each camera group in pixels, its principal point about the image centre of the group's first
-/// view; where views have their own focal lengths, with the geometric mean of the group's, or of all for one of which none
-/// is determined.
+/// view; where views have their own focal lengths, with the geometric mean of the group's, or of all for one of which
+/// none is determined.
 fn in_pixels(scene: &Scene, model: &Model, calibrations: &[Outcome]) -> Vec<Calibration> {
     let (group_of, groups) = block::camera_groups(scene.context.input);
     let determined = model.determined();
@@ -139,7 +139,7 @@ fn judged(scene: &Scene, model: &Model, recorder: &mut Recorder) -> Judged {
         inlier_share: (verified as f64 + 1.0) / (tried.max(verified) as f64 + 2.0),
     };
     let mut told = |verdicts| recorder.judged(verdicts, scene.tracks());
-    judge::judge(context.input, context.ranges, &geometry, context.threads, context.stop, &mut told)
+    classification::judge(context.input, context.ranges, &geometry, context.threads, context.stop, &mut told)
 }
 
 /// For each part the homography of its first view, see [`first_view_frame`].

@@ -71,7 +71,8 @@ pub fn calibrate(
     Ok(outcomes)
 }
 
-/// Reports the points and the focal length, a mean where views have their own, of the first camera with registered views.
+/// Reports the points and the focal length, a mean where views have their own, of the first camera with registered
+/// views.
 pub fn report_found(scene: &Scene, model: &Model, recorder: &mut Recorder) {
     let mut views = model.registered();
     let first = views.first().map(|&view| scene.camera_of[view]);

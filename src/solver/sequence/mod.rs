@@ -1,12 +1,12 @@
 //! From blocks of complete tracks to a reconstruction of all views.
 //!
-//! Tracks of real sequences live a few views, and a right track may hold wrong observations: no block of complete tracks
-//! holds them all. A block that was searched is the seed. Where it is calibrated, view after view is resected against
-//! the points that stand ([`register`]), its tracks are triangulated ([`structure`]), and bundle adjustment with the
-//! calibration free keeps the whole straight ([`adjust`]); where it is not, the same is done without a calibration
-//! ([`projective`]), and the whole is calibrated then. Views that share no tracks with it become [`parts`] of their own
-//! under the same calibration. What the whole says of the calibration is graded anew ([`calibrate`]) and checked between
-//! its [`windows`], and every track and observation is judged by it ([`assemble`]).
+//! Tracks of real sequences live a few views, and a right track may hold wrong observations: no block of complete
+//! tracks holds them all. A block that was searched is the seed. Where it is calibrated, view after view is resected
+//! against the points that stand ([`register`]), its tracks are triangulated ([`structure`]), and bundle adjustment
+//! with the calibration free keeps the whole straight ([`adjust`]); where it is not, the same is done without a
+//! calibration ([`projective`]), and the whole is calibrated then. Views that share no tracks with it become [`parts`]
+//! of their own under the same calibration. What the whole says of the calibration is graded anew ([`calibrate`]) and
+//! checked between its [`windows`], and every track and observation is judged by it ([`assemble`]).
 
 mod adjust;
 mod assemble;
@@ -247,8 +247,8 @@ fn metric_of<'a>(attempt: Attempt, context: &Context<'a>, recorder: &mut Recorde
     })
 }
 
-/// An attempt on the whole input, extended where it leaves views aside, where several cameras or a lens that distorts take
-/// part, where observations are not equally noisy, and where some are to be gained once each is judged by itself.
+/// An attempt on the whole input, extended where it leaves views aside, where several cameras or a lens that distorts
+/// take part, where observations are not equally noisy, and where some are to be gained once each is judged by itself.
 fn finished<'a>(mut attempt: Attempt, context: &Context<'a>, recorder: &mut Recorder) -> Result<Ended<'a>, Error> {
     let is_whole = attempt.views().len() == block::observed_views(context.input).len();
     let is_one_pinhole = !attempt.has_lens() && context.camera_groups_of(attempt.views()).1 == 1;

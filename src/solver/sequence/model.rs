@@ -7,7 +7,7 @@ use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
 use crate::geometry::observation::Observation;
 use crate::solver::calibration::ViewFocal;
-use crate::solver::{Context, attempt, block, judge};
+use crate::solver::{Context, attempt, block, classification};
 
 /// An input as the extension sees it; observations keep the input's sorted order (track, view).
 pub struct Scene<'a> {
@@ -24,7 +24,7 @@ pub struct Scene<'a> {
     pub cameras: usize,
     /// What is known of the focal length of each camera beforehand; nothing where views have their own.
     pub focal_priors: Vec<Option<FocalPrior>>,
-    /// Density of a wrong coordinate; see [`judge::Geometry::outlier_density`].
+    /// Density of a wrong coordinate; see [`classification::Geometry::outlier_density`].
     pub outlier_density: f64,
 }
 
@@ -38,7 +38,7 @@ impl<'a> Scene<'a> {
             of_view[view].push(k as u32);
             xy.push(context.normalization.normalize(view, input.point_px(k)));
         }
-        let outlier_density = judge::outlier_density(&xy);
+        let outlier_density = classification::outlier_density(&xy);
         let (camera_of, cameras) = match context.merges_cameras {
             true => (vec![0; input.view_count()], 1),
             false => block::camera_groups(input),
@@ -249,8 +249,8 @@ impl Model {
         !self.own_focals.is_empty() || !self.lenses[scene.camera_of[view]].is_known
     }
 
-    /// Takes these intrinsics for a view: its focal length where it has its own, and all for its camera where no view had
-    /// that yet.
+    /// Takes these intrinsics for a view: its focal length where it has its own, and all for its camera where no view
+    /// had that yet.
     pub fn set_intrinsics(&mut self, scene: &Scene, view: usize, intrinsics: Intrinsics) {
         if let Some(own) = self.own_focals.get_mut(view) {
             own.focal = intrinsics.focal;
@@ -285,8 +285,8 @@ impl Model {
         views
     }
 
-    /// Whether the observations determine the focal length of a view: where views have their own, some may have none that
-    /// can be told.
+    /// Whether the observations determine the focal length of a view: where views have their own, some may have none
+    /// that can be told.
     pub fn is_determined(&self, view: usize) -> bool {
         self.own_focals.get(view).is_none_or(|own| own.is_determined)
     }
@@ -331,6 +331,6 @@ impl Model {
 
     /// Squared residual, normalised units, within which an observation agrees with its landmark.
     pub fn gate(&self, scene: &Scene) -> f64 {
-        judge::working_gate(self.noise, scene.outlier_density)
+        classification::working_gate(self.noise, scene.outlier_density)
     }
 }

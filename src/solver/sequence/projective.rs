@@ -18,8 +18,8 @@ use crate::geometry::robust_triangulation::{Robust, Triangulator};
 use crate::geometry::triangulation::weighted_squared;
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::block::Block;
+use crate::solver::classification;
 use crate::solver::grow::Consensus;
-use crate::solver::judge;
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, grow};
@@ -145,7 +145,7 @@ impl Projective {
 /// constraints that the unknowns leave: what one reconstruction of an input is preferred to another by.
 ///
 /// * `noise`: one standard deviation of a coordinate
-/// * `outlier_density`: see [`judge::Geometry::outlier_density`]
+/// * `outlier_density`: see [`classification::Geometry::outlier_density`]
 pub fn evidence(observations: usize, unknowns: usize, noise: f64, outlier_density: f64) -> f64 {
     let constraints = (2 * observations) as f64 - unknowns as f64;
     -constraints * (outlier_density * noise * (std::f64::consts::TAU * std::f64::consts::E).sqrt()).ln()
@@ -281,7 +281,7 @@ impl<'a> Growing<'a> {
         };
         let cameras: Vec<Camera> = self.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
         let triangulator = Triangulator::new(&cameras);
-        let gate = judge::working_gate(self.noise, scene.outlier_density);
+        let gate = classification::working_gate(self.noise, scene.outlier_density);
         let threads = scene.context.threads.if_worth(tracks.len() >= WORTH_A_THREAD);
         for batch in tracks.chunks(BATCH) {
             let standing = &*self;
@@ -345,7 +345,7 @@ impl<'a> Growing<'a> {
         let seen: Vec<usize> = seen.iter().copied().step_by(step).collect();
         let (points, images): (Vec<Point>, Vec<Vector2<f64>>) =
             seen.iter().filter_map(|&k| Some((self.points[scene.track_of(k)]?, scene.xy[k]))).unzip();
-        let gate = judge::working_gate(self.noise, scene.outlier_density);
+        let gate = classification::working_gate(self.noise, scene.outlier_density);
         let least = self.options.least_agreeing.max((self.options.least_share * points.len() as f64).ceil() as usize);
         let Some((camera, agrees)) = resection::robust(&points, &images, gate, least, rng, scene.stop()) else {
             return false;

@@ -26,8 +26,8 @@ const MOST_TRIALS: usize = 4;
 /// Growth of the registered views after which all are adjusted; in between, only what is around each new one. A
 /// geometric growth keeps the cost of all adjustments together at six times that of the last.
 const ADJUST_GROWTH: f64 = 1.2;
-/// Focal lengths that a view of a lens that is not known yet is tried with, as factors on that of another one: a quarter
-/// of an octave apart, from a third to three times.
+/// Focal lengths that a view of a lens that is not known yet is tried with, as factors on that of another one: a
+/// quarter of an octave apart, from a third to three times.
 const OTHER_FOCALS: std::ops::RangeInclusive<i32> = -6..=6;
 const FOCALS_PER_OCTAVE: f64 = 4.0;
 
@@ -171,8 +171,8 @@ fn register(
 }
 
 /// Lenses to try a view with: its camera's own, or, of one that is not known yet, pinholes of what the input says, give
-/// or take its deviation, or of a scan. Where views have focal lengths of their own, the scan is about that of the nearest
-/// view, behind the lens that they share: a zoom takes time.
+/// or take its deviation, or of a scan. Where views have focal lengths of their own, the scan is about that of the
+/// nearest view, behind the lens that they share: a zoom takes time.
 fn guesses(scene: &Scene, model: &Model, view: usize) -> Vec<Intrinsics> {
     let lens = &model.lenses[scene.camera_of[view]];
     if !model.is_focal_unknown(scene, view) {

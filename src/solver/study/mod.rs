@@ -8,7 +8,7 @@ use std::time::Instant;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::{self, LN_DECISIVE};
+use super::a_contrario::{self, LN_DECISIVE};
 use super::grow::{self, Consensus};
 use super::learned::TrackScores;
 use super::portfolio::spread;
@@ -103,7 +103,7 @@ impl Study {
         for seed in seeds {
             let grown = grow::grow(&self.block, seed.cameras, seed.points, seed.support, NOISE, &self.stop);
             let Some(consensus) = grown else { continue };
-            let certainty = chance::ln_false_alarms(&self.block, &consensus, spread, &self.stop);
+            let certainty = a_contrario::ln_false_alarms(&self.block, &consensus, spread, &self.stop);
             if best.as_ref().is_none_or(|(least, _)| certainty < *least) {
                 best = Some((certainty, consensus));
             }

@@ -4,9 +4,9 @@ use std::time::Instant;
 
 use super::NOISE;
 use crate::domain::{Input, StopToken};
-use crate::geometry::epipolar_votes::{Tracks, Votes};
 use crate::geometry::fundamental::MOST_SAMPLES;
 use crate::geometry::observation::Observation;
+use crate::geometry::pairwise_likelihoods::{Tracks, Votes};
 use crate::solver::block;
 use crate::solver::learned::TrackScores;
 

@@ -1,6 +1,6 @@
 //! Whole solves, from an input to a solution.
 
-mod chance;
+mod a_contrario;
 mod copies;
 mod learned;
 mod lenses;
@@ -174,7 +174,7 @@ fn the_projection_frame_and_the_plane_at_infinity_belong_together() {
         })
         .collect();
     assert!((cameras[0] - nalgebra::Matrix3x4::identity()).norm() < 1e-9);
-    // P (x) Q (x) P^T of every view is the same DIAC, that of the true camera: K K^T (paper, eq. 6 and 7).
+    // P (x) Q (x) P^T of every view is the same DIAC, that of the true camera: K K^T (paper, eqs. 5 and 6).
     let [px, py] = scene.truth.principal_point_px;
     let f = scene.truth.focal_px;
     let k = nalgebra::Matrix3::new(f, 0.0, px, 0.0, f, py, 0.0, 0.0, 1.0);

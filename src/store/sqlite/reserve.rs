@@ -17,13 +17,13 @@ use crate::store::Error;
 /// The reserve within the data directory.
 const RESERVE_FILE: &str = "scpsfm.reserve";
 
-/// What is kept, in bytes: the log as long as it may grow before it is written back (1,000 pages, 4 MiB), the
-/// database grown by as much, one [`VACUUM`](super::vacuum::VACUUM) and its pages in the log. The results of the jobs that run
+/// What is kept, in bytes: the log as long as it may grow before it is written back (1,000 pages, 4 MiB), the database
+/// grown by as much, one [`VACUUM`](super::vacuum::VACUUM) and its pages in the log. The results of the jobs that run
 /// seldom have more.
 pub(super) const RESERVE_BYTES: u64 = 16 << 20;
 
-/// What must be free beside it, in bytes, where it is made: as long as the log may grow, so that what is begun again has
-/// room, and it is not given up again at once.
+/// What must be free beside it, in bytes, where it is made: as long as the log may grow, so that what is begun again
+/// has room, and it is not given up again at once.
 const BESIDE_BYTES: u64 = 4 << 20;
 
 /// Between two attempts to have the reserve back: writers wait for each.

@@ -1,4 +1,5 @@
-//! Giving the space of what was removed back to the disk: pages at a time, and only where that gives more than it takes.
+//! Giving the space of what was removed back to the disk: pages at a time, and only where that gives more than it
+//! takes.
 
 use super::connection::WriteConnection;
 use crate::store::Error;
@@ -14,8 +15,8 @@ pub(super) const VACUUM_BYTES: u64 = PAGES * PAGE_BYTES;
 const PAGE_BYTES: u64 = 4_096;
 /// How often, each time that space is to be given back; others may write in between.
 pub(super) const VACUUMS: u32 = 4;
-/// Of so many pages that move one more changes, which tells where they are: 30 were counted beside 1,024, and twice that
-/// is reckoned with.
+/// Of so many pages that move one more changes, which tells where they are: 30 were counted beside 1,024, and twice
+/// that is reckoned with.
 const MOVED_A_POINTER: u64 = 16;
 
 /// The database in pages.
@@ -30,8 +31,8 @@ struct Pages {
 }
 
 impl Pages {
-    /// Whether some of the free ones can be given back so that the log, with what moves for them, fits into the file and
-    /// as many pages more as there is room for.
+    /// Whether some of the free ones can be given back so that the log, with what moves for them, fits into the file
+    /// and as many pages more as there is room for.
     ///
     /// Where it does not, each that moves would take room for nothing, from those who delete: it is they who make it
     /// fit.

@@ -1,6 +1,6 @@
 //! The generator: a random cloud, random cameras, noise, and wrong tracks. One file a subject: where the points lie
-//! (`shape`), how the cameras move (`motion`) and project (`camera`), which views observe a track (`visibility`), what is
-//! wrong with the tracks (`contamination`, `second_body`), the noise.
+//! (`shape`), how the cameras move (`motion`) and project (`camera`), which views observe a track (`visibility`), what
+//! is wrong with the tracks (`contamination`, `second_body`), the noise.
 
 mod camera;
 mod contamination;
@@ -94,8 +94,8 @@ pub struct Scene {
 impl Scene {
     /// Generates the scene of these options; the same options give the same scene.
     ///
-    /// Unless asked for otherwise every track is observed in every view, also where its point falls outside the image, as
-    /// in the paper.
+    /// Unless asked for otherwise every track is observed in every view, also where its point falls outside the image,
+    /// as in the paper.
     ///
     /// # Errors
     /// Options out of range, or under which no camera sees the whole cloud.

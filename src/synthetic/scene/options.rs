@@ -26,8 +26,8 @@ pub struct SceneOptions {
     /// In how many views an outlier track is wrong, random ones for each track; 0: in all that the kind can spoil (half
     /// for [`OutlierKind::Repeated`]).
     pub wrong_views: usize,
-    /// How many views observe a track, those whose cameras are nearest to that of a random view; 0: all. An outlier that
-    /// is wrong in a number of views may be so where it is not observed.
+    /// How many views observe a track, those whose cameras are nearest to that of a random view; 0: all. An outlier
+    /// that is wrong in a number of views may be so where it is not observed.
     pub seen_views: usize,
     /// How many observations of every right track are replaced by uniform points in the image, in random views for each
     /// track, whose depth is that of a random track. The tracks stay right.
@@ -49,9 +49,9 @@ pub struct SceneOptions {
     pub max_roll_rad: f64,
     /// Range of the focal length in pixels.
     pub focal_range_px: (f64, f64),
-    /// Whether every view has a camera of its own, and is a camera group: a focal length in that range, a principal point
-    /// up to .02 of the width off the common one along each axis, and a distortion within 5 % of the common one; a zoom
-    /// does not matter then.
+    /// Whether every view has a camera of its own, and is a camera group: a focal length in that range, a principal
+    /// point up to .02 of the width off the common one along each axis, and a distortion within 5 % of the common one;
+    /// a zoom does not matter then.
     pub own_cameras: bool,
     /// Displacement of the principal point from the image's centre, right and down, as a share of the image width.
     pub principal_point: [f64; 2],

@@ -8,7 +8,8 @@ use super::super::intrinsics_model::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
 use super::{CancellationCheck, Free, Observation, Reconstruction, holds};
 
-/// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free intrinsics.
+/// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free
+/// intrinsics.
 #[derive(Debug)]
 pub(super) struct Unknowns {
     /// Block of a view: its pose, and its own focal length where that is free; `None` where it is held or sees nothing.
@@ -151,8 +152,8 @@ impl Layout {
         layout.link_blocks(sequence, pace).then_some(layout)
     }
 
-    /// Finds the blocks that each free point incident_blocks and gives them their places among the couplings; `false` when it
-    /// was stopped.
+    /// Finds the blocks that each free point incident_blocks and gives them their places among the couplings; `false`
+    /// when it was stopped.
     fn link_blocks(&mut self, sequence: &Reconstruction, pace: &mut CancellationCheck) -> bool {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();

@@ -1,7 +1,6 @@
-//! Metric bundle adjustment of whole sequences, cameras in groups of one calibration, but for focal lengths of their own
-//! where they have these: cost and memory linear in the
-//! observations, by a sparse Cholesky factorisation of the Schur complement of the points (Triggs et al. 2000, "Bundle
-//! adjustment - a modern synthesis", section 6).
+//! Metric bundle adjustment of whole sequences, cameras in groups of one calibration, but for focal lengths of their
+//! own where they have these: cost and memory linear in the observations, by a sparse Cholesky factorisation of the
+//! Schur complement of the points (Triggs et al. 2000, "Bundle adjustment - a modern synthesis", section 6).
 //!
 //! Shares residuals, loss and damping with the dense adjustment of one block, `bundle::metric`. May depend on nothing
 //! of `geometry` but `bundle` and linear algebra.

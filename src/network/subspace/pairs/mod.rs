@@ -25,8 +25,8 @@ use super::arrays::{PAIR_FEATURES, PairLayers};
 use super::cloud::Cloud;
 use super::rows::{accumulate, logarithm, row, row_mut, rows};
 
-/// Added to a squared distance before its logarithm is taken: a thousandth of a view's spread is some tenths of a pixel,
-/// and what lies closer is right wherever it lies.
+/// Added to a squared distance before its logarithm is taken: a thousandth of a view's spread is some tenths of a
+/// pixel, and what lies closer is right wherever it lies.
 pub const DISTANCE_FLOOR: f32 = 1e-6;
 /// Added to the squared gradient that a Sampson distance is divided by: at both epipoles every point lies on its line.
 /// Elsewhere the gradient of a unit vector `f` is some tenths.

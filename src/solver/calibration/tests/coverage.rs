@@ -135,8 +135,8 @@ const ESTIMATED: [Parameter; 6] = [
     Parameter::RadialK2,
 ];
 
-/// A lens of which all of these are to be estimated: each is far enough from where a pinhole has it that chance does not
-/// decide whether it is freed.
+/// A lens of which all of these are to be estimated: each is far enough from where a pinhole has it that chance does
+/// not decide whether it is freed.
 fn strange_lens(seed: u64) -> TestScene {
     let mut scene = testing::scene(seed, 10, 100, 0.0);
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x1e45);

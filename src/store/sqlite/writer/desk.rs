@@ -214,8 +214,8 @@ impl Desk {
         }
     }
 
-    /// Writes a log of so many pages at least back. Where the disk has no room for that, the reserve may have: a log that
-    /// is cut gives more than it takes.
+    /// Writes a log of so many pages at least back. Where the disk has no room for that, the reserve may have: a log
+    /// that is cut gives more than it takes.
     fn write_log_back(&mut self, least_pages: i64) {
         let written = self.connection().and_then(|connection| connection.write_log_back(least_pages));
         let gave_lately = self.gave_for_log.is_some_and(|at| at.elapsed() < RETRY);

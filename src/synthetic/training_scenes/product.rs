@@ -13,7 +13,7 @@ const NOISE: (f64, f64) = (2e-4, 0.03);
 const NOISE_KINDS: [(NoiseKind, f64); 4] =
     [(NoiseKind::Gaussian, 0.55), (NoiseKind::Heavy, 0.2), (NoiseKind::Laplace, 0.15), (NoiseKind::Uniform, 0.1)];
 /// Share of the scenes with a moderate share of outliers, that share, and the share of the others, as in the rest of
-/// the curriculum.
+/// the training scenes.
 const MODERATE: f64 = 0.4;
 const MODERATE_WRONG: (f64, f64) = (0.3, 0.9);
 const HARD_WRONG: (f64, f64) = (0.88, 0.98);

@@ -5,8 +5,8 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
 use super::Frame;
-use crate::synthetic::curriculum::draft::Draft;
-use crate::synthetic::curriculum::draw::{chance, uniform};
+use crate::synthetic::training_scenes::draft::Draft;
+use crate::synthetic::training_scenes::draw::{chance, uniform};
 
 /// Share of the views in which a partly wrong track is wrong, the same for all tracks of a lesson.
 const PARTLY_WRONG: (f64, f64) = (0.2, 1.0);

@@ -4,8 +4,8 @@
 //! in the image. A track is judged by what it retains once observations that are more likely wrong than right are
 //! dropped, at a price for each.
 
-mod bench;
 mod noise;
+mod track_classifier;
 
 pub use noise::{NoiseModel, density_of_spread, outlier_density, working_gate};
 
@@ -19,7 +19,7 @@ use crate::geometry::triangulation::batch::LANES;
 use crate::geometry::{Camera, Point};
 use crate::parallel::Threads;
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
-use bench::TrackClassifier;
+use track_classifier::TrackClassifier;
 
 /// The geometry to judge by.
 pub struct Geometry<'a> {
@@ -34,9 +34,9 @@ pub struct Geometry<'a> {
     /// Weight of each observation; see [`Observation::weight`]. Empty: all have 1.
     pub weights: &'a [f64],
     /// Whether tracks were linked from view to view, so that one wrong link joins two points: the observations that
-    /// agree on one are looked for then, however few they are beside the others. The cameras must be metric, or oriented
-    /// with the plane at infinity off the points. Otherwise the worst observation is dropped as long as it is too far
-    /// from the point of the others.
+    /// agree on one are looked for then, however few they are beside the others. The cameras must be metric, or
+    /// oriented with the plane at infinity off the points. Otherwise the worst observation is dropped as long as it is
+    /// too far from the point of the others.
     pub linked: bool,
     /// Share of its observations in registered views that a right track retains: none where links may be wrong, most of
     /// them where tracks are complete.
@@ -121,8 +121,8 @@ pub fn judge(
     }
 }
 
-/// Weighted squared residuals, in core variances, of the tracks that are right as a whole: a track with a dropped observation
-/// may be wrong in others.
+/// Weighted squared residuals, in core variances, of the tracks that are right as a whole: a track with a dropped
+/// observation may be wrong in others.
 fn whole_tracks(input: &Input, ranges: &[usize], geometry: &Geometry, judged: &Judged) -> Vec<f64> {
     (0..input.track_count())
         .filter(|&track| judged.tracks.inlier[track])

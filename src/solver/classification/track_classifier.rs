@@ -149,8 +149,8 @@ impl TrackClassifier<'_> {
         Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
     }
 
-    /// The observations that a verdict begins with: all, or those that agree where links may be wrong; `None` where none
-    /// do.
+    /// The observations that a verdict begins with: all, or those that agree where links may be wrong; `None` where
+    /// none do.
     fn retained_at_first(&self, observations: &[Observation], gate: f64) -> Option<Vec<usize>> {
         if !self.geometry.linked {
             return Some((0..observations.len()).collect());

@@ -1,4 +1,4 @@
-//! Random draws of the curriculum.
+//! Random draws of the training scenes.
 
 use nalgebra::Vector3;
 use rand::Rng;

@@ -5,9 +5,9 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::{Frame, Kind, image_size};
-use crate::synthetic::curriculum::draft::{Draft, project};
-use crate::synthetic::curriculum::draw::{chance, normal, uniform};
-use crate::synthetic::curriculum::motion::MIN_DEPTH;
+use crate::synthetic::training_scenes::draft::{Draft, project};
+use crate::synthetic::training_scenes::draw::{chance, normal, uniform};
+use crate::synthetic::training_scenes::motion::MIN_DEPTH;
 
 /// Share of the wrong tracks that are in a group; what else is wrong is permuted.
 const IN_GROUP: (f64, f64) = (0.2, 1.0);

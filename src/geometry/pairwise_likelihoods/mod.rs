@@ -16,7 +16,7 @@
 //! What slides along its epipolar lines has the votes of all pairs whose epipolar planes agree: with all centres on one
 //! line pairs cannot tell it.
 
-mod chain;
+mod forward_backward;
 mod residuals;
 #[cfg(test)]
 mod tests;
@@ -126,7 +126,7 @@ impl Votes {
         let mut found = LnOdds { observations: Vec::with_capacity(alone.len()), tracks: Vec::new() };
         for range in self.ranges.windows(2) {
             let range = range[0]..range[1];
-            let posterior = chain::posterior(&alone[range.clone()], &self.ratios[range]);
+            let posterior = forward_backward::posterior(&alone[range.clone()], &self.ratios[range]);
             found.observations.extend(posterior.observations);
             found.tracks.push(posterior.track);
         }
