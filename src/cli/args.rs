@@ -361,7 +361,7 @@ impl From<BackendArg> for Backend {
 /// [`Format`] on the command line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum FormatArg {
-    /// A table `view,track,x,y[,depth]`
+    /// A table `view,track,x,y[,depth][,sigma]`
     Csv,
     /// OpenSfM's tracks.csv, any version
     Opensfm,

@@ -1,4 +1,4 @@
-//! `scpsfm train-prior`: trains the network whose track_scores the search starts from.
+//! `scpsfm train-prior`: trains the network whose scores the search starts from.
 
 use std::fs;
 use std::io::ErrorKind;

@@ -70,7 +70,7 @@ pub struct Input {
     depth: Option<Vec<f64>>,
     /// Position of each observation in the caller's order.
     caller_order: Vec<u32>,
-    /// Last, and absent from inputs that were stored before it was.
+    /// Added later: older stored inputs lack it.
     #[serde(default)]
     sigma: Option<Vec<f64>>,
 }

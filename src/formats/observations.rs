@@ -136,9 +136,9 @@ fn header(text: &str) -> Result<Columns, String> {
         *place = find(wanted)?.ok_or_else(|| {
             let quoted = quote(text);
             if names.iter().all(|name| name.parse::<f64>().is_ok()) {
-                format!("no header; the first line must be `view,track,x,y[,depth]`, not {quoted}")
+                format!("no header; the first line must be `view,track,x,y[,depth][,sigma]`, not {quoted}")
             } else {
-                format!("the header {quoted} has no column `{wanted}`; `view,track,x,y[,depth]` is needed")
+                format!("the header {quoted} has no column `{wanted}`; `view,track,x,y[,depth][,sigma]` is needed")
             }
         })?;
     }

@@ -22,7 +22,7 @@ const OPENSFM_TABS: usize = 7;
 /// A kind of input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// A CSV with a header `view,track,x,y[,depth]`.
+    /// A CSV with a header `view,track,x,y[,depth][,sigma]`.
     Observations,
     /// OpenSfM's tracks.csv.
     OpenSfm,

@@ -38,7 +38,7 @@ pub fn warning(code: WarningCode) -> &'static str {
         }
         WarningCode::CameraGroupsMerged => "Views of different cameras or sizes were treated as one camera.",
         WarningCode::UnverifiedRanking => {
-            "Too few tracks hold together for geometry to verify them; their weights are the trained network's track_scores."
+            "Too few tracks hold together for geometry to verify them; their weights are the trained network's scores."
         }
         WarningCode::DuplicateTracks => {
             "Some tracks stand in the input several times; they count once, and all have the same answer."

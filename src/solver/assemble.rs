@@ -47,7 +47,7 @@ pub fn unsolved(
             let likely = track_scores.likely();
             let detail = format!(
                 "{likely} tracks look right to the trained network and geometry verifies none: `weight` of the \
-                 tracks is its track_scores, nothing has checked it"
+                 tracks is what it gives them, nothing has checked it"
             );
             warnings.push(Warning::new(WarningCode::UnverifiedRanking, detail));
         }
@@ -162,12 +162,16 @@ pub fn judged(context: &Context, attempt: &Attempt, projective: &Projective, rec
     for (&view, camera) in projective.views.iter().zip(&projective.cameras) {
         cameras[view] = Some(*camera);
     }
+    let weights = match attempt.judges_observations() {
+        true => super::block::weights(context.input),
+        false => Vec::new(),
+    };
     let geometry = Geometry {
         cameras: &cameras,
         parts: None,
         normalization: context.normalization,
         lenses: &[],
-        weights: &super::block::weights(context.input),
+        weights: &weights,
         linked: attempt.judges_observations(),
         least_share: if attempt.judges_observations() { least_share(context) } else { LEAST_RETAINED_SHARE },
         noise: projective.noise,
@@ -349,8 +353,8 @@ pub fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
     scaled.iter().all(|entry| entry.is_finite()).then(|| scaled.into())
 }
 
-/// The calibration in pixels: one for all views, or, where the input has several camera groups, one a group in rising
-/// order, their principal points about the image centre of the group's first view.
+/// The calibration in pixels: one for all views, or, where the input has several camera groups, one a group with a view
+/// in rising order, their principal points about the image centre of the group's first view.
 fn pixel_calibrations(
     attempt: &Attempt,
     metric: &Reconstruction,
@@ -358,15 +362,21 @@ fn pixel_calibrations(
     context: &Context,
     first_view: usize,
 ) -> Vec<Calibration> {
-    let about = |view: usize| {
-        let group = attempt.views().binary_search(&view).map_or(0, |place| metric.group_of[place]);
-        pixel_calibration(&metric.intrinsics[group], outcome, context, view)
-    };
+    let about = |view: usize, group: usize| pixel_calibration(&metric.intrinsics[group], outcome, context, view);
     let (group_of, groups) = super::block::camera_groups(context.input);
-    match groups {
-        1 => vec![about(first_view)],
-        _ => (0..groups).filter_map(|group| group_of.iter().position(|of| *of == group)).map(about).collect(),
+    if groups == 1 {
+        return vec![about(first_view, 0)];
     }
+    let of_group = |group: usize| {
+        let first = group_of.iter().position(|of| *of == group)?;
+        // One calibration for all, or that of the views that were solved.
+        let of_metric = match metric.intrinsics.len() {
+            1 => 0,
+            _ => metric.group_of[attempt.views().iter().position(|&view| group_of[view] == group)?],
+        };
+        Some(about(first, of_metric))
+    };
+    (0..groups).filter_map(of_group).collect()
 }
 
 /// One calibration in pixels, its principal point about the image centre of this view.

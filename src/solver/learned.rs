@@ -29,7 +29,7 @@ const MANY: f64 = 1.0 / 3.0;
 /// to three by chance.
 const LEAST_LIKELY: usize = 4;
 
-/// Inliers from which on geometry needs no second track_scores: twice what it needs for any.
+/// Inliers from which on geometry needs no second opinion: twice what it needs for any.
 pub const SURELY_ENOUGH: usize = 2 * LEAST_INLIERS;
 /// Odds against a track, in nats, at which it is held to be wrong: twenty to one.
 const DOUBT_NATS: f64 = 3.0;
@@ -42,7 +42,7 @@ pub fn may_be_asked(settings: &SolveSettings) -> bool {
     settings.method == Method::Auto && !settings.excluded_priors.contains(&Prior::Learned)
 }
 
-/// The network's track_scores of some tracks.
+/// The network's scores of some tracks.
 #[derive(Debug, Clone)]
 pub struct TrackScores {
     /// Natural logarithms of the odds that a track is right.
@@ -94,7 +94,7 @@ impl TrackScores {
         Self { ln_odds: said.tracks, observations: said.observations }
     }
 
-    /// This track_scores corrected by what pairs of views say: the odds of the observations enter the votes, and a
+    /// These scores corrected by what pairs of views say: the odds of the observations enter the votes, and a
     /// track is right where all its observations are.
     ///
     /// Nothing weighs the one against the other, both being logarithms of odds; with the network's halved or doubled,

@@ -119,7 +119,7 @@ fn solve_views(
     observer: &mut dyn Observer,
     stop: &StopToken,
 ) -> Result<Solution, Error> {
-    // A zoom has no constant calibration for the DAQ to ask for.
+    // The DAQ loss assumes constant intrinsics, so it is disabled when the focal length varies.
     let settings = &SolveSettings { use_daq: settings.use_daq && !settings.focal_per_view, ..settings.clone() };
     let mut recorder = Recorder::new(observer, block::observed_views(input).len());
     let ranges = input.track_ranges();
@@ -156,7 +156,7 @@ fn solve_views(
         } else {
             others.push(attempt);
         }
-        // A good block is still asked for a second track_scores.
+        // A good block is still checked against a second one.
         if k > 0 && best.as_ref().is_some_and(Attempt::is_good) {
             break;
         }
@@ -181,7 +181,7 @@ fn solve_by_observation(
     if whole.is_none() && !merges_cameras {
         candidates = block::candidate_views_of_one_camera(context.input, context.ranges, context.stop);
     }
-    // A group an image, say: what no camera alone carries, all together may.
+    // Groups too small to calibrate alone are tried together.
     if whole.is_none() && candidates.is_empty() {
         candidates = block::candidate_views(context.input, context.ranges, context.stop);
     }
@@ -251,7 +251,7 @@ fn of_block(
 struct Context<'a> {
     input: &'a Input,
     settings: &'a SolveSettings,
-    /// Observations of each track; see [`block::track_ranges`].
+    /// Observations of each track; see [`Input::track_ranges`].
     ranges: &'a [usize],
     normalization: &'a Normalization,
     /// Length of a normalised unit in pixels.

@@ -414,7 +414,7 @@ impl Function {
         }
         let is_undetermined = (0..count).any(|view| weight(view) > 0.0 && views.unseen(view, POSE) > TAKES_PART);
         found.variance = found.variance.filter(|variance| !is_undetermined && *variance > 0.0);
-        // That of a focal length that all views of a group share is no coupling with anything else.
+        // The shared log focal length is replaced by the views' own, so its coupling is zeroed.
         found.coupling.iter_mut().step_by(PARAMETERS).for_each(|along| *along = 0.0);
         found
     }
@@ -651,7 +651,7 @@ mod tests {
         }
     }
 
-    /// What several camera groups are told, one is told too; and what is foretold of several, an adjustment finds.
+    /// Groups and a single camera give the same variances; and what is foretold of groups, an adjustment finds.
     #[test]
     fn camera_groups_are_told_as_one_is_and_as_an_adjustment_finds() {
         let model = IntrinsicsModel::FOCAL.with(Extension::RadialK1);

@@ -11,7 +11,7 @@ use proto::create_job_request::Input as Inline;
 /// Name of a track set in violations.
 const TRACK_SET: &str = "track_set";
 
-/// Observations in one chunk that a client sends: at most 2.3 MB, well below any server's message limit.
+/// Observations in one chunk that a client sends: at most 2.8 MB, well below any server's message limit.
 const CHUNK_OBSERVATIONS: usize = 65_536;
 
 /// An input that may not be complete yet. Never holds more than the limits allow and one message on top.

@@ -8,7 +8,7 @@ use super::verdict::{CHEIRALITY_LIMIT, UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO};
 use super::view_focals::{self, Differing};
 use super::{Outcome, Problem, Stopped};
 use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
-use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, Parameter};
+use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 
 /// Difference in log focal from which another minimum is another calibration.
 const OTHER_CALIBRATION: f64 = 0.02;
@@ -37,6 +37,9 @@ pub(super) fn grade(
     let mut focals = view_focals::of(&best, &sigmas);
     let determined: Vec<bool> = focals.iter().map(view_focals::is_determined).collect();
     let rival = rival(&best, &others, |view| determined[view]);
+    let differing = (comparison.is_misfit() && !has_own_focals)
+        .then(|| view_focals::differing(&best.minimum.reconstruction, &best.fit, choice))
+        .flatten();
     let grade_group = |group: usize| -> Outcome {
         let mut verdict = Verdict::new(warnings.clone());
         // What the ratios of the others' deviations are taken of, and the one that is told.
@@ -49,7 +52,8 @@ pub(super) fn grade(
                 let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
                 let mut sigma = of_focal.filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
                 if let Some(focal_prior) = choice.problem.focal_priors[group] {
-                    weigh_prior(&mut verdict, &mut sigma, choice, &best, group, focal_prior);
+                    let of_data = of_data(&best, group, comparison.inflation);
+                    weigh_prior(&mut verdict, &mut sigma, choice, &best, group, of_data, focal_prior);
                 }
                 verdict.judge_sigma(sigma);
                 (of_focal, sigma)
@@ -63,12 +67,10 @@ pub(super) fn grade(
         if verdict.is_misfit && has_own_focals {
             // What a focal length a view behind one lens does not explain, nobody knows the reason of.
             verdict.grade = Grade::ProjectiveOnly;
-        } else if verdict.is_misfit
-            && let Some(differing) = view_focals::differing(&best.minimum.reconstruction, &best.fit, choice)
-        {
+        } else if let Some(differing) = &differing {
             // What the views' own differ from it by, one focal length for all is wrong by.
             sigma = sigma.map(|sigma| sigma.max(differing.shift));
-            verdict.doubt(sigma, differing_words(&differing, choice.scale_px));
+            verdict.doubt(sigma, differing_words(differing, choice.scale_px));
         }
         let focal = best.minimum.reconstruction.intrinsics[group].focal;
         if !has_own_focals {
@@ -77,7 +79,7 @@ pub(super) fn grade(
         }
         verdict.judge_cheirality(best.minimum.cheirality);
         if verdict.grade != Grade::ProjectiveOnly && !has_own_focals {
-            verdict.warnings.extend(principal_point(&best, group, choice.scale_px));
+            verdict.warnings.extend(principal_point(&best, group, comparison.inflation, choice.scale_px));
         }
         let ratio = |sigma: Option<f64>| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite());
         Outcome {
@@ -152,26 +154,41 @@ fn rival<'a>(best: &Candidate, others: &'a [Minimum], counts: impl Fn(usize) -> 
     })
 }
 
+/// The priors without what is known of the focal length of one group.
+fn without_focal(best: &Candidate, group: usize) -> Vec<IntrinsicsPrior> {
+    let mut alone = best.priors.clone();
+    alone[group] = alone[group].forgetting(Parameter::LogFocal);
+    alone
+}
+
+/// Standard deviation of the log focal length of a group by the observations alone; `None`: unobservable.
+fn of_data(best: &Candidate, group: usize, inflation: f64) -> Option<f64> {
+    let sigma = best.sigma(group, Parameter::LogFocal, best.model, &without_focal(best, group))?;
+    Some(sigma * inflation)
+}
+
 /// What a prior on the focal length may not do: contradict the observations unsaid, or make a calibration of nothing.
 ///
 /// Where it contradicts them, sigma grows by as many standard deviations (Birge's ratio of two values): one of the two
 /// is wrong, and which is not known.
+///
+/// * `of_data`: standard deviation by the observations alone
 fn weigh_prior(
     verdict: &mut Verdict,
     sigma: &mut Option<f64>,
     choice: &Choice,
     best: &Candidate,
     group: usize,
+    of_data: Option<f64>,
     focal_prior: FocalPrior,
 ) {
-    let mut alone = best.priors.clone();
-    alone[group] = alone[group].forgetting(Parameter::LogFocal);
-    let of_data = best.sigma(group, Parameter::LogFocal, best.model, &alone);
     // It lifts the grade by one step at most.
     if of_data.is_none_or(|of_data| of_data > WEAK_UP_TO) {
         verdict.grade = verdict.grade.worse(Grade::Weak);
     }
-    let (Some(of_data), Some(optimum)) = (of_data, best.optimum(best.model, &alone)) else { return };
+    let (Some(of_data), Some(optimum)) = (of_data, best.optimum(best.model, &without_focal(best, group))) else {
+        return;
+    };
     let shift = optimum.shift_of(group, Parameter::LogFocal);
     let intrinsics = &best.minimum.reconstruction.intrinsics[group];
     let difference = best.priors[group].deviation(Parameter::LogFocal, intrinsics) + shift;
@@ -189,17 +206,19 @@ fn weigh_prior(
 }
 
 /// Says so where the observations do not determine the principal point.
-fn principal_point(best: &Candidate, group: usize, scale_px: f64) -> Option<Warning> {
+fn principal_point(best: &Candidate, group: usize, inflation: f64, scale_px: f64) -> Option<Warning> {
     let mut alone = best.priors.clone();
     alone[group] = alone[group].forgetting(Parameter::PrincipalX).forgetting(Parameter::PrincipalY);
     let model = best.model.with(Extension::PrincipalPoint);
     let names = [("x", Parameter::PrincipalX), ("y", Parameter::PrincipalY)];
     let unknown: Vec<String> = names
         .into_iter()
-        .filter_map(|(name, parameter)| match best.sigma(group, parameter, model, &alone) {
-            Some(sigma) if sigma <= PRINCIPAL_POINT_UNOBSERVABLE_ABOVE => None,
-            Some(sigma) => Some(format!("{name} only to {:.0} px", sigma * scale_px)),
-            None => Some(format!("{name} not at all")),
+        .filter_map(|(name, parameter)| {
+            match best.sigma(group, parameter, model, &alone).map(|sigma| sigma * inflation) {
+                Some(sigma) if sigma <= PRINCIPAL_POINT_UNOBSERVABLE_ABOVE => None,
+                Some(sigma) => Some(format!("{name} only to {:.0} px", sigma * scale_px)),
+                None => Some(format!("{name} not at all")),
+            }
         })
         .collect();
     let detail = format!("the tracks determine the principal point in {}", unknown.join(" and "));

@@ -4,6 +4,7 @@ use nalgebra::Vector4;
 
 use super::fit::{Fit, MISFIT_DEVIATIONS, posterior_noise};
 use super::models::{Candidate, Choice};
+use super::verdict::RMS_RATIO_LIMIT;
 use super::{Problem, observed_points};
 use crate::geometry::bundle::metric::{self, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::{Options, projective};
@@ -30,6 +31,11 @@ pub(super) struct Comparison {
 }
 
 impl Comparison {
+    /// Whether the metric model is refuted.
+    pub fn is_misfit(&self) -> bool {
+        self.ratio > RMS_RATIO_LIMIT && self.is_significant
+    }
+
     /// * `fit`: of the projective reconstruction
     pub fn new(best: &Candidate, fit: &Fit, choice: &Choice) -> Self {
         let (projective, metric) = undistorted_fits(best, choice).unwrap_or((*fit, best.fit));

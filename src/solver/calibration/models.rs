@@ -127,8 +127,12 @@ impl Candidate {
 
     /// Standard deviation of the log focal length if the model is right, the largest of the groups that have one.
     fn sigma_log_focal(&self) -> Option<f64> {
-        let of_group = |group: usize| self.sigma(group, Parameter::LogFocal, self.model, &self.priors);
-        (0..self.priors.len()).filter_map(of_group).reduce(f64::max)
+        (0..self.priors.len()).filter_map(|group| self.sigma_of_focal(group)).reduce(f64::max)
+    }
+
+    /// The same of one group.
+    fn sigma_of_focal(&self, group: usize) -> Option<f64> {
+        self.sigma(group, Parameter::LogFocal, self.model, &self.priors)
     }
 }
 
@@ -224,17 +228,17 @@ impl Choice<'_> {
         if gain <= significant_gain(extension, self.problem.groups()) {
             return None;
         }
-        let (simple_sigma, rich_sigma) = (best.sigma_log_focal(), richer.sigma_log_focal());
-        let observable = match (simple_sigma, rich_sigma) {
+        let observable = |group: usize| match (best.sigma_of_focal(group), richer.sigma_of_focal(group)) {
             (Some(simple), Some(rich)) => rich <= METRIC_BELOW.max(SIGMA_INFLATION * simple),
-            (None, rich) => rich.is_some(),
             (Some(_), None) => false,
+            // What neither model determines of one group says nothing of the others.
+            (None, rich) => rich.is_some() || self.problem.groups() > 1,
         };
-        if observable {
+        if (0..self.problem.groups()).all(observable) {
             return Some(richer);
         }
         let shift = (richer.minimum.log_focal() - best.minimum.log_focal()).abs();
-        if let Some(sigma) = simple_sigma.filter(|sigma| shift > MODEL_SHIFT * sigma) {
+        if let Some(sigma) = best.sigma_log_focal().filter(|sigma| shift > MODEL_SHIFT * sigma) {
             warnings.push(self.not_taken(best, &richer, extension, shift / sigma));
         }
         None
@@ -329,7 +333,8 @@ impl Choice<'_> {
 
     /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
     ///
-    /// The focal length is held three standard deviations away while everything else adjusts; the chi-square should
+    /// The focal length, of several groups all in their ratios, is held three standard deviations away while everything
+    /// else adjusts; the chi-square should
     /// rise by nine. Near critical motions the linearisation is optimistic: it is taken where the noise has moved the
     /// scene.
     fn profiled(&self, sigma: f64, best: &Candidate) -> f64 {

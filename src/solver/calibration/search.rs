@@ -84,9 +84,12 @@ impl Minimum {
     /// Of which views the observations determine the focal length; all where they do of none.
     fn determined(&self, problem: &Problem) -> Vec<bool> {
         let views = self.reconstruction.focals.len();
+        if views == 0 {
+            return Vec::new();
+        }
         let model = IntrinsicsModel::FOCAL_PER_VIEW;
         let information = Information::new(&self.reconstruction, problem.observations);
-        let Some(information) = information.filter(|_| views > 0) else { return vec![true; views] };
+        let Some(information) = information else { return vec![true; views] };
         let noise = Fit::metric(self.cost, model, problem).noise;
         let sigmas = information
             .own_focals(&information.optimum(model, &vec![IntrinsicsPrior::NONE; problem.groups()]))

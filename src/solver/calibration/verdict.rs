@@ -10,7 +10,7 @@ pub(super) const WEAK_UP_TO: f64 = 0.1;
 pub(super) const UNOBSERVABLE_ABOVE: f64 = 1.0;
 /// Ratio of the metric to the projective posterior noise that speaks of a wrong model; the paper's synthetic scenes
 /// stay within 1.05. With few degrees of freedom it exceeds its limit by chance: the loss of fit must also be more than
-/// [`MISFIT_DEVIATIONS`].
+/// [`MISFIT_DEVIATIONS`](super::fit::MISFIT_DEVIATIONS).
 pub(super) const RMS_RATIO_LIMIT: f64 = 1.15;
 /// The same ratio from which the metric reconstruction is not to be used at all.
 const RMS_RATIO_REFUSAL: f64 = 3.0;
@@ -70,7 +70,7 @@ impl Verdict {
     /// * `free`: what the metric one leaves free, in words
     pub fn judge_fit(&mut self, comparison: &Comparison, free: &str, scale_px: f64) {
         let Comparison { ratio, noise, .. } = *comparison;
-        if ratio > RMS_RATIO_LIMIT && comparison.is_significant {
+        if comparison.is_misfit() {
             let worst = if ratio > RMS_RATIO_REFUSAL { Grade::ProjectiveOnly } else { Grade::Weak };
             let detail = format!(
                 "the metric reconstruction fits {ratio:.2} times worse than the projective one ({:.2} px against \

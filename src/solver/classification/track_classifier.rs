@@ -138,7 +138,9 @@ impl TrackClassifier<'_> {
     fn weigh(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> Verdict {
         let gate = self.noise.gate();
         let dropped = observations.len() - retained.len();
-        let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share);
+        // The density of two coordinates of weight w is w times as high where the residual is 0.
+        let of_weights: f64 = retained.iter().map(|&k| observations[k].weight.ln()).sum();
+        let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share) + of_weights;
         let enough = retained.len() >= self.least_retained(observations);
         let weight = if enough { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
         let mut flags = vec![false; observations.len()];

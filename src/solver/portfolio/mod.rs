@@ -1,6 +1,6 @@
 //! The portfolio: priors propose, guided search verifies, the best consensus stands.
 //!
-//! What is cheap goes first: rigid distances where depths are given, the track_scores of the network that was trained
+//! What is cheap goes first: rigid distances where depths are given, the scores of the network that was trained
 //! beforehand, reweighting, consistency. Where they decide nothing, the paper's network is optimised a few iterations
 //! at a time; between, its ranking is verified by geometry, and so is uniform sampling, which needs no prior to be
 //! right. A decisive consensus ends the search: the paper's network would say nothing after it that anyone waits for,

@@ -67,7 +67,7 @@ impl Portfolio<'_> {
         }
     }
 
-    /// The trained network's track_scores: grown as it stands at first, then searched from.
+    /// The trained network's scores: grown as it stands at first, then searched from.
     fn propose_learned(&mut self, round: u32) {
         if !self.is_wanted(Prior::Learned) {
             return;

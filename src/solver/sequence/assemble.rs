@@ -75,17 +75,21 @@ fn told(calibrations: &[Outcome], scene: &Scene) -> Vec<Warning> {
         let view = scene.camera_of.iter().position(|of| *of == group)?;
         Some(scene.context.input.views()[view].camera_group)
     };
+    let is_common = |warning: &Warning| calibrations.iter().all(|outcome| outcome.warnings.contains(warning));
     let of_group = |(group, outcome): (usize, &Outcome)| -> Vec<Warning> {
         let named = |warning: &Warning| match id_of(group) {
             // One for all groups, or none to tell apart.
             _ if scene.context.merges_cameras => warning.clone(),
+            _ if calibrations.len() > 1 && is_common(warning) => warning.clone(),
             Some(id) if calibrations.len() > 1 => {
                 Warning::new(warning.code, format!("camera group {id}: {}", warning.detail)).of_group(id)
             }
             Some(id) => warning.clone().of_group(id),
             None => warning.clone(),
         };
-        outcome.warnings.iter().map(named).collect()
+        // What is said of all is said once.
+        let is_repeated = |warning: &&Warning| group > 0 && is_common(warning);
+        outcome.warnings.iter().filter(|warning| !is_repeated(warning)).map(named).collect()
     };
     calibrations.iter().enumerate().flat_map(of_group).collect()
 }

@@ -253,16 +253,16 @@ fn finished<'a>(mut attempt: Attempt, context: &Context<'a>, recorder: &mut Reco
     let is_whole = attempt.views().len() == block::observed_views(context.input).len();
     let is_one_pinhole = !attempt.has_lens() && context.camera_groups_of(attempt.views()).1 == 1;
     let is_done = is_whole && is_one_pinhole && !context.input.has_sigmas();
-    let Some(projective) = attempt.projective.as_ref().filter(|_| is_done) else {
-        return metric_of(attempt, context, recorder);
-    };
-    recorder.enter(Stage::Judge);
-    let judged = of_attempt::judged(context, &attempt, projective, recorder);
-    let of_block = |track: &usize| attempt.block.tracks.binary_search(track).is_ok();
-    let retained: usize = (0..judged.retained.len()).filter(of_block).map(|track| judged.retained[track].len()).sum();
-    if retained as f64 <= WORTH_EXTENDING * projective.observations.len() as f64 {
-        attempt.judged = Some(judged);
-        return Ok(Ended::Block(Some(Box::new(attempt))));
+    if let Some(projective) = attempt.projective.as_ref().filter(|_| is_done) {
+        recorder.enter(Stage::Judge);
+        let judged = of_attempt::judged(context, &attempt, projective, recorder);
+        let of_block = |track: &usize| attempt.block.tracks.binary_search(track).is_ok();
+        let retained: usize =
+            (0..judged.retained.len()).filter(of_block).map(|track| judged.retained[track].len()).sum();
+        if retained as f64 <= WORTH_EXTENDING * projective.observations.len() as f64 {
+            attempt.judged = Some(judged);
+            return Ok(Ended::Block(Some(Box::new(attempt))));
+        }
     }
     if !attempt.has_metric()
         && let Some(start) = attempt.projective.take()
