@@ -77,17 +77,7 @@ fn zooms() -> impl Iterator<Item = Condition> {
 
 /// Four views of four cameras under strong lenses, declared as such and as one camera.
 fn four_cameras() -> impl Iterator<Item = Condition> {
-    let options = SceneOptions {
-        views: 4,
-        tracks: 450,
-        noise: 0.0005,
-        outliers: 0.3,
-        own_cameras: true,
-        // 390 to 422 px in images of a width of 640.
-        focal_range_px: (609.0, 659.0),
-        radial_k1: -0.28,
-        ..SceneOptions::default()
-    };
+    let options = SceneOptions::four_cameras();
     [("groups", Declared::Groups), ("one camera", Declared::OneCamera)].into_iter().map(move |(name, declared)| {
         Condition { name: format!("four cameras as {name}"), generator: Generator::Scene(options.clone()), declared }
     })

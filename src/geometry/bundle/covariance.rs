@@ -1,11 +1,12 @@
 //! How well the intrinsics are determined, whatever the gauge.
 
-use nalgebra::{DMatrix, DVector, DVectorView, SVector};
+use nalgebra::{DMatrix, DVector, SVector};
 
 use super::engine::{Layout, Problem};
 use super::intrinsics::Intrinsics;
 use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior, Parameter};
 use super::metric::{Metric, OWN_CAMERA, POINT, POSE, Pose, Reconstruction, VIEW};
+use super::own_focals::{Direction, Function, OwnFocals};
 use super::reduced::{Linearisation, Reduced};
 use super::whitened::{WhitenedViews, centre};
 use super::{Loss, Observation};
@@ -16,12 +17,6 @@ const PARAMETERS: usize = Parameter::COUNT;
 const APART: f64 = 1e-11;
 /// Information on the intrinsics, scaled by what they would have with everything else known, that counts as none.
 const NULL_INTRINSICS: f64 = 1e-10;
-
-/// Share of a view's log focal length in a null direction from which it counts as undetermined.
-const TAKES_PART: f64 = 1e-8;
-/// Variance of a view's log focal length, over the least of any view, up to which it has a say in the mean: one that is
-/// known ten times less well says nothing of it.
-const COUNTS_WITHIN: f64 = 100.0;
 
 /// Place of an intrinsic of a camera group among all.
 fn place(group: usize, parameter: Parameter) -> usize {
@@ -49,25 +44,6 @@ struct WithoutViews {
     /// Half the downward gradient of the cost.
     negative_gradient: DVector<f64>,
     own_focals: Option<OwnFocals>,
-}
-
-/// Log focal lengths of which every view has its own.
-#[derive(Debug, Clone)]
-struct OwnFocals {
-    of_view: Vec<Function>,
-    /// Of each camera group, over the views that are determined about as well as any of it.
-    mean: Vec<Function>,
-}
-
-/// A linear function of the unknowns of the views, with the intrinsics that they share held.
-#[derive(Debug, Clone)]
-struct Function {
-    /// `None`: not determined.
-    variance: Option<f64>,
-    /// By how much it falls where the shared intrinsics rise.
-    coupling: DVector<f64>,
-    /// What it is at the minimum minus what it is here.
-    shift: f64,
 }
 
 /// The minimum of the cost over the intrinsics of one model, to second order.
@@ -346,77 +322,6 @@ impl WithoutViews {
             information.ger(-along.dot(&solved).recip(), &unscaled, &unscaled, 1.0);
         }
         Some(Self { matrix: information, negative_gradient, own_focals })
-    }
-}
-
-/// An eigenvector of the information on the views.
-struct Direction<'a> {
-    /// `None`: rounding hides it.
-    information: Option<f64>,
-    vector: DVectorView<'a, f64>,
-    /// What it has in common with the shared intrinsics, and half the downward gradient along it.
-    coupling: DVector<f64>,
-    gradient: f64,
-}
-
-impl OwnFocals {
-    fn new<const C: usize>(
-        views: &WhitenedViews<C>,
-        directions: &[Direction],
-        group_of: &[usize],
-        groups: usize,
-    ) -> Self {
-        let count = group_of.len();
-        let function = |weight: &dyn Fn(usize) -> f64| Function::new(views, directions, count, weight);
-        let of_view: Vec<Function> =
-            (0..count).map(|view| function(&|other| if other == view { 1.0 } else { 0.0 })).collect();
-        let mean = |group: usize| {
-            let of_group = || (0..count).filter(|view| group_of[*view] == group);
-            let least = of_group().filter_map(|view| of_view[view].variance).fold(f64::INFINITY, f64::min);
-            let counts = |view: usize| {
-                let is_known = |variance: f64| variance <= COUNTS_WITHIN * least;
-                group_of[view] == group && of_view[view].variance.is_some_and(is_known)
-            };
-            let counted = of_group().filter(|view| counts(*view)).count();
-            function(&|view| if counts(view) { (counted as f64).recip() } else { 0.0 })
-        };
-        let mean = (0..groups).map(mean).collect();
-        Self { of_view, mean }
-    }
-}
-
-impl Function {
-    /// A weighted sum of the log focal lengths of so many views.
-    fn new<const C: usize>(
-        views: &WhitenedViews<C>,
-        directions: &[Direction],
-        count: usize,
-        weight: &dyn Fn(usize) -> f64,
-    ) -> Self {
-        let whitened = views.function(|view| {
-            let mut gradient = SVector::zeros();
-            gradient[POSE] = weight(view);
-            gradient
-        });
-        let shared = directions.first().map_or(0, |direction| direction.coupling.len());
-        let mut found = Self { variance: Some(0.0), coupling: DVector::zeros(shared), shift: 0.0 };
-        for direction in directions {
-            let along = whitened.dot(&direction.vector);
-            match direction.information {
-                Some(value) => {
-                    found.variance = found.variance.map(|sum| sum + along * along / value);
-                    found.coupling.axpy(along / value, &direction.coupling, 1.0);
-                    found.shift += direction.gradient * along / value;
-                }
-                None if along * along > TAKES_PART * whitened.norm_squared() => found.variance = None,
-                None => {}
-            }
-        }
-        let is_undetermined = (0..count).any(|view| weight(view) > 0.0 && views.unseen(view, POSE) > TAKES_PART);
-        found.variance = found.variance.filter(|variance| !is_undetermined && *variance > 0.0);
-        // The shared log focal length is replaced by the views' own, so its coupling is zeroed.
-        found.coupling.iter_mut().step_by(PARAMETERS).for_each(|along| *along = 0.0);
-        found
     }
 }
 

@@ -14,6 +14,7 @@ mod engine;
 mod intrinsics;
 mod intrinsics_model;
 pub mod metric;
+mod own_focals;
 mod panel;
 pub mod projective;
 mod reduced;

@@ -25,8 +25,9 @@ pub(super) struct Comparison {
     /// Factor on the standard deviations of the calibration (Birge's ratio), 1 where chance explains the misfit.
     ///
     /// A calibration rests on the few constraints that it puts on a projective reconstruction. Where these are violated
-    /// by more than the noise, whatever the reason, it is as much less certain: four cameras that were taken for one
-    /// were off by 3 to 17 % at a sigma of .5 %, with residuals hardly larger (2 to 20 %) and this ratio at 3 to 10.
+    /// by more than the noise, whatever the reason, it is as much less certain: of four cameras that were taken for one
+    /// (20 scenes), the focal lengths were off by 2.2 % in the median and 17 % at most at a sigma of .45 %, with
+    /// residuals 2 to 25 % larger than projective ones and this ratio between 2.6 and 10.5.
     pub inflation: f64,
 }
 

@@ -61,6 +61,11 @@ impl Problem<'_> {
     pub fn groups(&self) -> usize {
         self.focal_priors.len()
     }
+
+    /// No calibration of any group, for these reasons.
+    fn refused(&self, warnings: &[Warning]) -> Vec<Outcome> {
+        (0..self.groups()).map(|group| Outcome { group, ..Outcome::refused(warnings.to_vec()) }).collect()
+    }
 }
 
 /// The focal length of a view that zooms.
@@ -176,10 +181,6 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<V
     // What is known of one focal length says nothing of a zoom.
     let focal_priors = if problem.focal_per_view { &nothing } else { problem.focal_priors };
     let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_priors, ..*problem };
-    let refused = |warnings: Vec<Warning>| {
-        let outcome = Outcome::refused(warnings);
-        (0..problem.groups()).map(|group| Outcome { group, ..outcome.clone() }).collect()
-    };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < LEAST_INLIERS {
@@ -197,7 +198,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<V
         (Some(translation), [Some(focal)]) => {
             search::known_focal(&translation, focal.focal_px / scale_px, problem, &priors, stop)
         }
-        _ if is_critical => return Ok(refused(warnings)),
+        _ if is_critical => return Ok(problem.refused(&warnings)),
         _ => match to_canonical_frame(&cameras, &points) {
             Some(frame) => search::minima(&frame, problem, &priors, stop)?,
             None => Vec::new(),
@@ -205,7 +206,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<V
     };
     if minima.is_empty() {
         warnings.push(no_start());
-        return Ok(refused(warnings));
+        return Ok(problem.refused(&warnings));
     }
     let mut outcomes = grading::grade(&choice, &fit, minima, warnings)?;
     for outcome in &mut outcomes {
@@ -234,10 +235,6 @@ pub fn from_metric(
     let nothing = vec![None; problem.groups()];
     let focal_priors = if metric.has_own_focals() { &nothing } else { problem.focal_priors };
     let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_priors, ..*problem };
-    let refused = |warnings: Vec<Warning>| {
-        let outcome = Outcome::refused(warnings);
-        (0..problem.groups()).map(|group| Outcome { group, ..outcome.clone() }).collect()
-    };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < LEAST_INLIERS {
@@ -254,13 +251,13 @@ pub fn from_metric(
     let is_critical = critical.warnings.iter().any(|warning| warning.code != WarningCode::PlanarScene);
     warnings.extend(critical.warnings);
     if is_critical {
-        return Ok(refused(warnings));
+        return Ok(problem.refused(&warnings));
     }
     let choice = models::Choice { problem, scale_px, stop };
     let minima = search::minima_near(metric, problem, &choice.priors(fit.noise), stop, told)?;
     if minima.is_empty() {
         warnings.push(no_start());
-        return Ok(refused(warnings));
+        return Ok(problem.refused(&warnings));
     }
     grading::grade(&choice, &fit, minima, warnings)
 }

@@ -100,17 +100,7 @@ fn a_zoom_gets_a_focal_length_a_view() {
 fn cameras_of_one_view_each_are_calibrated_together() {
     let (mut beyond, mut calibrated) = (0, 0);
     for seed in 0..5 {
-        let options = SceneOptions {
-            views: 4,
-            tracks: 450,
-            noise: 0.0005,
-            outliers: 0.3,
-            own_cameras: true,
-            focal_range_px: (609.0, 659.0),
-            radial_k1: -0.28,
-            seed,
-            ..SceneOptions::default()
-        };
+        let options = SceneOptions { seed, ..SceneOptions::four_cameras() };
         let (input, scene) = scene(options);
         let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
         println!("seed {seed}: {:?} {:?}", solution.grade, solution.warnings);
@@ -127,4 +117,18 @@ fn cameras_of_one_view_each_are_calibrated_together() {
     }
     println!("{calibrated} of 5 calibrated, {beyond} of 20 focal lengths beyond 3 sigma");
     assert!(calibrated >= 4 && beyond <= 1, "{calibrated} {beyond}");
+}
+
+/// The same cameras declared as one: what no calibration of one camera fits is not told as certain.
+#[test]
+fn several_cameras_that_are_declared_as_one_are_not_metric_without_a_warning() {
+    for seed in 0..8 {
+        let mut raw = scene(SceneOptions { seed, ..SceneOptions::four_cameras() }).0.to_raw();
+        raw.views.iter_mut().for_each(|view| view.camera_group = 0);
+        let input = Input::new(raw, &Limits::default(), "scene").expect("valid");
+        let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+        let warned = solution.warnings.iter().any(|warning| warning.code == WarningCode::ModelMismatch);
+        println!("seed {seed}: {:?}, {:?}", solution.grade, solution.warnings);
+        assert!(solution.grade != Some(Grade::Metric) || warned, "seed {seed}");
+    }
 }

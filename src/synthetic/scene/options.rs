@@ -66,6 +66,23 @@ pub struct SceneOptions {
     pub seed: u64,
 }
 
+impl SceneOptions {
+    /// Four views of four cameras under strong lenses, as a real set has them: focal lengths of 390 to 422 px in images
+    /// of a width of 640 px, k1 of about -.28, 450 tracks.
+    pub fn four_cameras() -> Self {
+        Self {
+            views: 4,
+            tracks: 450,
+            noise: 0.0005,
+            outliers: 0.3,
+            own_cameras: true,
+            focal_range_px: (609.0, 659.0),
+            radial_k1: -0.28,
+            ..Self::default()
+        }
+    }
+}
+
 impl Default for SceneOptions {
     /// The paper's centre of all sweeps, without depths.
     fn default() -> Self {

@@ -93,7 +93,7 @@ pub(super) struct IncidentBlock {
     pub coupling: u32,
 }
 
-/// The observations sorted by point, then view, and the blocks each point incident_blocks.
+/// The observations sorted by point, then view, and the blocks that each point is linked with.
 #[derive(Debug)]
 pub(super) struct Layout {
     pub unknowns: Unknowns,
@@ -208,7 +208,7 @@ impl Layout {
         &self.seen[self.seen_starts[point]..self.seen_starts[point + 1]]
     }
 
-    /// Blocks that a point incident_blocks, ascending; none for a point that is held.
+    /// Blocks that a point is linked with, ascending; none for a point that is held.
     pub fn incident_blocks(&self, point: usize) -> &[IncidentBlock] {
         &self.incident_blocks[self.incident_block_starts[point]..self.incident_block_starts[point + 1]]
     }

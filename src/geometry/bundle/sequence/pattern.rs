@@ -29,7 +29,7 @@ pub(super) struct Place {
 }
 
 impl Pattern {
-    /// Blocks that a point incident_blocks together, and the pose of every view with the intrinsics of its group.
+    /// Blocks that a point links, and the pose of every view with the intrinsics of its group.
     /// `None` when it was stopped.
     ///
     /// * `pairs`: pose block and group block of the views where both are free

@@ -219,7 +219,7 @@ impl Columns<'_> {
                 }
                 let mut places: Column = pattern.column(column);
                 for row in &incident_blocks[first..] {
-                    // Pattern and incident_blocks come from the same layout, so that there is a place.
+                    // Pattern and incident blocks come from the same layout, so that there is a place.
                     let Some(start) = places.start_of(row.block) else { continue };
                     let height = pattern.size(row.block as usize);
                     let left = &whitened[row.coupling as usize..][..POINT * height];
