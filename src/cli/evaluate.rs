@@ -41,7 +41,6 @@ Examples:
   scpsfm evaluate --ablation --sweeps outliers,orbit --out ablation
   scpsfm evaluate --sweeps outliers --depths given,epipolar --methods paper,psfm --paper-width 1
   scpsfm evaluate --priors --seeds 20 --out priors
-  scpsfm evaluate --priors --real sequences --out windows
   scpsfm evaluate --observations --scenes complete --out observations
   scpsfm evaluate --real sequences --peer 'python peer.py' --out side-by-side
 
@@ -184,10 +183,6 @@ fn is_quick(observations: usize) -> bool {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
-    if args.priors.priors && !args.real.real.is_empty() {
-        args.prior.install()?;
-        return evaluate_priors::run_on_windows(&args.real.real, &args.out, args.json, args.quiet).await;
-    }
     if !args.real.real.is_empty() {
         if args.prior.prior.is_some() {
             return Err(Failure::usage("--prior does not reach the programs that --real starts"));

@@ -1,6 +1,6 @@
 //! `scpsfm evaluate --priors`: what the search starts from, compared.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -11,8 +11,7 @@ use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
 use crate::domain::StopToken;
-use crate::evaluation::priors::{self, Plan, scenes, sweep, table, windows};
-use crate::evaluation::real::{Sequence, folder};
+use crate::evaluation::priors::{self, Plan, scenes, sweep, table};
 use crate::evaluation::records;
 use crate::formats::publish::{create_directory, pretty, write_atomically};
 use crate::network::subspace;
@@ -23,19 +22,18 @@ use crate::network::subspace;
 pub struct PriorArgs {
     /// Compare priors instead: each alone (ranking, searches of 600, 6,000 and 60,000 samples), and AUTO with and
     /// without the trained network; scenes without depths, of training's kinds and of others. Writes priors.json, and
-    /// priors.jsonl, with which it goes on where it was stopped. With --real: how well pairs of views, the trained
-    /// network and both together rank the observations of these sequences, window by window; writes windows.json
+    /// priors.jsonl, with which it goes on where it was stopped
     #[arg(long, group = "suite",
-        conflicts_with_all = ["quick", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
+        conflicts_with_all = ["quick", "real", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
     pub priors: bool,
 
     /// AUTO alone, without the searches of each prior
-    #[arg(long, requires = "priors", conflicts_with = "real")]
+    #[arg(long, requires = "priors")]
     pub auto_only: bool,
 
     /// Only the sweep over what a nat of the trained network's odds counts in the score of hypotheses, on other seeds
     /// than those of every comparison; writes sweep.json, and sweep.jsonl, with which it goes on
-    #[arg(long, requires = "priors", conflicts_with_all = ["auto_only", "real"])]
+    #[arg(long, requires = "priors", conflicts_with = "auto_only")]
     pub sweep: bool,
 
     /// The scenes of this name, or all whose name holds this text [default: all]
@@ -124,28 +122,6 @@ impl Work<'_> {
         }
         Ok(records)
     }
-}
-
-/// Runs the command with `--real`.
-pub async fn run_on_windows(directories: &[PathBuf], out: &Path, json: bool, quiet: bool) -> Result<Exit, Failure> {
-    let folders = folder::find(directories)?;
-    let sequences: Vec<Sequence> = folders.iter().map(|folder| Sequence::read(folder)).collect::<Result<_, _>>()?;
-    create_directory(out)?;
-    let bar = evaluate::progress_bar(quiet, sequences.len(), 0);
-    let stop = StopToken::default();
-    let interrupt = Interrupt::listen()?;
-    let relay = interrupt.stops(&stop);
-    let outcome = tokio::task::block_in_place(|| windows::rows(&sequences, &stop, &mut || bar.inc(1)));
-    relay.abort();
-    bar.finish_and_clear();
-    let rows = outcome.map_err(Failure::bad_input)?;
-    if stop.is_stopped() {
-        print(windows::text(&rows).trim_end())?;
-        return Err(Failure::interrupted_with("interrupted; the rows so far were not written"));
-    }
-    let text = written(out, "windows.json", json!({ "rows": rows }))?;
-    print(if json { text.trim_end().to_owned() } else { windows::text(&rows) }.trim_end())?;
-    Ok(Exit::Done)
 }
 
 /// Writes rows with the version and the network that they are of; returns the JSON.

@@ -25,7 +25,7 @@ K, the known calibration, 3x3 row by row or a list of such, one a view
   labels.csv: view,track,inlier (0 or 1), one line an observation; other columns are ignored
   cameras.json, where known: P, a list of 3x4 matrices, one a view, null where none is known; estimated, true where they \
 were found from these tracks
-Written to --out: real.json, real.csv and real.html; with --priors windows.json.
+Written to --out: real.json, real.csv and real.html.
 
 A peer is called as COMMAND observations.csv WIDTH HEIGHT -o FILE and writes a JSON object: views (how many it \
 registered, in one reconstruction), focal (pixels or null), inlier (0 or 1 for each track id from 0 on) or \

@@ -15,7 +15,7 @@ use crate::domain::StopToken;
 pub const LEAST_MATCHES: usize = 8;
 /// Samples of the robust estimate at most: enough where 43 % of the matches are right. At ninety per cent outliers
 /// 10⁸ would be, which nobody waits for.
-pub const MOST_SAMPLES: usize = 4_000;
+const MOST_SAMPLES: usize = 4_000;
 /// Chi-square quantile of .95 for one degree of freedom, which is what a Sampson distance has.
 const GATE: f64 = 3.841_459;
 /// Refits to the matches within a gate, each of which changes them.
@@ -178,19 +178,7 @@ pub(crate) fn robust(
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<Robust<Fundamental>> {
-    robust_within(matches, noise, MOST_SAMPLES, rng, stop)
-}
-
-/// The same with another bound on the samples: `n` of them are reliable down to a share of inliers of `(4.6 /
-/// n)^(1/8)`.
-pub(crate) fn robust_within(
-    matches: &[Match],
-    noise: f64,
-    most_samples: usize,
-    rng: &mut ChaCha8Rng,
-    stop: &StopToken,
-) -> Option<Robust<Fundamental>> {
-    ransac::estimate(&matches, squared_gate(noise), None, most_samples, rng, stop)
+    ransac::estimate(&matches, squared_gate(noise), None, MOST_SAMPLES, rng, stop)
 }
 
 impl Estimator for &[Match] {

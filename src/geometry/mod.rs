@@ -15,7 +15,6 @@ pub mod measurement;
 pub mod metric;
 mod null_vector;
 pub mod observation;
-pub mod pairwise_likelihoods;
 pub mod pose;
 pub mod procrustes;
 mod ransac;

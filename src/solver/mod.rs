@@ -11,28 +11,27 @@
 //! observation by observation; [`classification`] has the last word on every track and observation; [`assemble`] writes
 //! it down.
 
-mod a_contrario;
+pub(crate) mod a_contrario;
 mod assemble;
 mod attempt;
 mod baselines;
 mod between_block_variance;
-mod block;
+pub(crate) mod block;
 pub(crate) mod calibration;
 mod classification;
 mod copies;
 mod depths;
 mod extend;
-mod grow;
-mod learned;
+pub(crate) mod grow;
+pub(crate) mod learned;
 mod near_duplicates;
 mod per_track;
-mod portfolio;
-mod priors;
+pub(crate) mod portfolio;
+pub(crate) mod priors;
 mod recorder;
-mod search;
+pub(crate) mod search;
 mod second_structures;
 mod sequence;
-pub(crate) mod study;
 #[cfg(test)]
 mod tests;
 mod track_sampling;

@@ -74,15 +74,6 @@ fn both_sides_are_run_measured_and_written() {
     assert_eq!(fs::read_to_string(out.join("real.csv")).expect("written").lines().count(), 3);
     assert!(fs::read_to_string(out.join("real.html")).expect("written").contains("out of luck"));
 
-    // The same sequence, its observations ranked.
-    let ranked = text(&directory.path().join("ranked"));
-    let done = run(["evaluate", "--priors", "--real", &above, "--out", &ranked, "--quiet", "--json"]);
-    assert_eq!(done.code, Some(0), "{done:?}");
-    let said: Value = serde_json::from_str(&done.stdout).expect("JSON");
-    assert!(said["rows"][0]["together"].as_f64() > Some(0.95), "{said}");
-    let file = fs::read_to_string(Path::new(&ranked).join("windows.json")).expect("written");
-    assert_eq!(file.trim(), done.stdout.trim());
-
     // A folder that is wrong ends all of it before anything is solved, and leaves nothing.
     fs::write(folder.join("labels.csv"), "view,track,inlier\n0,0,maybe\n").expect("written");
     let other = text(&directory.path().join("other"));
@@ -93,8 +84,7 @@ fn both_sides_are_run_measured_and_written() {
     for wrong in [
         &["evaluate", "--peer", "true"][..],
         &["evaluate", "--real", &above, "--quick"],
-        &["evaluate", "--real", &above, "--priors", "--peer", "true"],
-        &["evaluate", "--real", &above, "--priors", "--auto-only"],
+        &["evaluate", "--real", &above, "--priors"],
     ] {
         assert_eq!(run(wrong).code, Some(2), "{wrong:?}");
     }

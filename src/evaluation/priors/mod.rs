@@ -1,19 +1,20 @@
 //! What the search starts from, compared: every prior that ranks image points, alone and at several lengths of the
-//! search, and AUTO with and without the network that was trained beforehand. [`scenes`] are the scenes, [`table`]
-//! shows the rows; [`sweep`] is where a constant of the search comes from; [`windows`] ranks the observations of real
-//! sequences.
+//! search ([`alone`]), and AUTO with and without the network that was trained beforehand. [`scenes`] are the scenes,
+//! [`table`] shows the rows; [`sweep`] is where a constant of the search comes from.
 
+mod alone;
 pub mod scenes;
 pub mod sweep;
 pub mod table;
-pub mod windows;
 
 use serde::{Deserialize, Serialize};
+
+use alone::Study;
 
 use crate::domain::{Input, Limits, Prior, Silent, SolveSettings, Status, StopToken};
 use crate::evaluation::records;
 use crate::geometry::statistics::median;
-use crate::solver::{self, study::Study};
+use crate::solver;
 use crate::synthetic::metrics::{agreement, average_precision};
 use crate::synthetic::{Scene, SceneOptions};
 pub use scenes::Condition;

@@ -4,9 +4,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::Condition;
+use super::alone::Study;
 use crate::domain::{Input, Limits, StopToken};
 use crate::evaluation::records;
-use crate::solver::study::Study;
 use crate::synthetic::metrics::average_precision;
 use crate::synthetic::{Scene, SceneOptions};
 

@@ -12,7 +12,6 @@ use serde_json::{Value, json};
 use super::measures::Verdicts;
 use super::{Options, Row, Sequence, Side, folder, ours, page, run, table};
 use crate::domain::{Limits, Method, Silent, SolveSettings, StopToken};
-use crate::evaluation::priors::windows;
 use crate::formats::result_files;
 use crate::synthetic::{self, SequenceOptions};
 
@@ -86,27 +85,6 @@ fn a_solve_is_scored_against_all_that_is_known() {
     let empty = tempfile::tempdir().expect("a directory");
     let reason = ours::answer(&sequence, empty.path(), ExitStatus::default(), "no memory").expect_err("no files");
     assert!(reason.contains("no memory"), "{reason}");
-}
-
-#[test]
-fn the_observations_of_every_window_are_ranked() {
-    let directory = tempfile::tempdir().expect("a directory");
-    let sequence = Sequence::read(&written(directory.path(), "walk", &generated())).expect("a good folder");
-    let mut heard = 0;
-    let rows = windows::rows(&[sequence], &StopToken::default(), &mut || heard += 1).expect("a valid sequence");
-    let [row] = &rows[..] else { panic!("{rows:?}") };
-    assert_eq!((heard, row.sequence.as_str(), row.windows), (1, "walk", 4), "of eight views four windows of five");
-    // Of 250 tracks a fifth is wrong, and a twentieth of the observations of the others.
-    assert!((row.right - 0.76).abs() < 0.06, "{row:?}");
-    assert!(row.epipolar > 0.97 && row.learned > 0.9, "{row:?}");
-    assert!(row.together > row.epipolar.max(row.learned) - 0.002, "{row:?}");
-    let text = windows::text(&rows);
-    assert!(text.lines().nth(1).is_some_and(|line| line.starts_with("walk")), "{text}");
-
-    let stop = StopToken::default();
-    stop.stop(crate::domain::StopReason::Interrupted);
-    let sequence = Sequence::read(&directory.path().join("walk")).expect("a good folder");
-    assert_eq!(windows::rows(&[sequence], &stop, &mut || {}).expect("no error"), Vec::new());
 }
 
 /// The rows of one sequence where this program cannot be started and the peer is this shell script.

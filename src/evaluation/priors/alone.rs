@@ -1,21 +1,18 @@
-//! One prior alone: how well it ranks, and what a search of a given length finds under it; [`windows`] does so for the
-//! observations of real sequences. For `scpsfm evaluate --priors`; a solve does not come through here.
-
-pub mod windows;
+//! One prior alone: how well it ranks, and what a search of a given length finds under it.
 
 use std::time::Instant;
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::a_contrario::{self, LN_DECISIVE};
-use super::grow::{self, Consensus};
-use super::learned::TrackScores;
-use super::portfolio::spread;
-use super::search::{Sampler, Shortlist, affine};
-use super::{block, priors};
 use crate::domain::{Input, Prior, StopToken};
 use crate::geometry::measurement::CompleteBlock;
+use crate::solver::a_contrario::{self, LN_DECISIVE};
+use crate::solver::grow::{self, Consensus};
+use crate::solver::learned::TrackScores;
+use crate::solver::portfolio::spread;
+use crate::solver::search::{Sampler, Shortlist, affine};
+use crate::solver::{block, priors};
 
 /// Hypotheses of a search that are grown: enough that the ranking of hypotheses is not what is measured.
 const SHORTLIST: usize = 6;
