@@ -220,10 +220,10 @@ impl View {
     }
 
     fn milestone(&self, milestone: &Milestone) {
-        let Milestone { step, lessons, loss, parts: [first, second], precision } = milestone;
+        let Milestone { step, scenes, loss, parts: [first, second], precision } = milestone;
         let [first_name, second_name] = self.objective.parts();
         let line = format!(
-            "step {step}, {lessons} scenes: loss {loss:.4} ({first_name} {first:.4}, {second_name} {second:.4}), average \
+            "step {step}, {scenes} scenes: loss {loss:.4} ({first_name} {first:.4}, {second_name} {second:.4}), average \
              precision {precision:.4}"
         );
         self.bar.set_message(format!("AP {precision:.4}"));

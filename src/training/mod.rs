@@ -1,15 +1,15 @@
 //! Training of the [soft-subspace network](crate::network::subspace) on scenes drawn on the fly: what `scpsfm
 //! train-prior` runs. May depend on `network` and `synthetic` only.
 //!
-//! A step draws a few batches of lessons, differentiates each on burn's tape (on a thread of its own where there are
+//! A step draws a few batches of scenes, differentiates each on burn's tape (on a thread of its own where there are
 //! cores), averages the derivatives in a fixed order and takes one step of Adam. Everything is counted in
 //! steps, nothing in seconds: one seed gives one network on one machine, however many cores it has and however often
 //! the training was interrupted.
 
 mod adam;
+mod gradient;
 mod initial;
 mod labelled;
-mod lesson;
 mod objective;
 mod pairs;
 mod tape;

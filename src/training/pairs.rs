@@ -9,14 +9,14 @@
 //! cancels in the distances. Tests compare with finite differences where neither of the following applies.
 //!
 //! # Where it is not the derivative
-//! Reweighting is a recurrence, and its derivative through all blocks explodes: after 1,000 steps the median length of a
-//! gradient was 91, nearly all of it from the first block's pairs, for .7 without pairs, and the loss of the tracks
+//! Reweighting is a recurrence, and its derivative through all blocks explodes: after 1,000 steps the median length of
+//! a gradient was 91, nearly all of it from the first block's pairs, for .7 without pairs, and the loss of the tracks
 //! rose again from step 400 on. Therefore the distances in Cauchy's weights count as given, as they do in reweighted
 //! least squares, and [`LEAST_GAP`] bounds how far `f` turns. With both, lengths are those of a network without pairs.
-//! The last losses of tracks and observations are .058 and .150 with both, .104 and .193 with neither, .080 and .195 without pairs
-//! (`train-prior --seed 0 --steps 2000`, with `--pairs` and without).
+//! The last losses of tracks and observations are .058 and .150 with both, .104 and .193 with neither, .080 and .195
+//! without pairs (`train-prior --seed 0 --steps 2000`, with `--pairs` and without).
 //!
-//! Shapes: `B` lessons, `P` pairs of `n` views, `m` tracks.
+//! Shapes: `B` scenes, `P` pairs of `n` views, `m` tracks.
 
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{DType, Device, Tensor};
@@ -40,7 +40,7 @@ const MOST_ROUNDS: usize = 500;
 /// Stands for the logarithm of a pair that an observation is not in: above that of any distance.
 const ABSENT: f64 = 1e3;
 
-/// The pairs of some lessons on their way through the blocks.
+/// The pairs of some scenes on their way through the blocks.
 pub struct Pairs {
     dtype: DType,
     device: Device,
@@ -74,25 +74,24 @@ impl Pairs {
         layers: &PairLayers<Tensor<2>>,
         dtype: DType,
     ) -> Result<Self, Error> {
-        let [lessons, views, _, tracks] = homogeneous.dims();
+        let [scenes, views, _, tracks] = homogeneous.dims();
         let [strides, _] = layers.log_scale.dims();
         let device = homogeneous.device();
         let pairs: Vec<Pair> = pairs::pairs(views, strides).collect();
         let visible = numbers(batch.visible.clone())?;
-        let of_view = |lesson: usize, view: usize| &visible[(lesson * views + view) * tracks..][..tracks];
-        let of_lesson = |lesson| {
-            pairs.iter().flat_map(move |pair| seen_by_both(of_view(lesson, pair.from), of_view(lesson, pair.to)))
-        };
-        let seen: Vec<f64> = (0..lessons).flat_map(of_lesson).collect();
-        let seen = constant(seen, [lessons, pairs.len(), 1, tracks], dtype, &device);
+        let of_view = |scene: usize, view: usize| &visible[(scene * views + view) * tracks..][..tracks];
+        let of_scene =
+            |scene| pairs.iter().flat_map(move |pair| seen_by_both(of_view(scene, pair.from), of_view(scene, pair.to)));
+        let seen: Vec<f64> = (0..scenes).flat_map(of_scene).collect();
+        let seen = constant(seen, [scenes, pairs.len(), 1, tracks], dtype, &device);
         let chosen = |view: fn(&Pair) -> usize| {
             let views = pairs.iter().map(|pair| homogeneous.clone().narrow(1, view(pair), 1)).collect();
             Tensor::cat(views, 1)
         };
         let (from, to) = (chosen(|pair| pair.from), chosen(|pair| pair.to));
-        let equations = to.clone().reshape([lessons, pairs.len(), 3, 1, tracks])
-            * from.clone().reshape([lessons, pairs.len(), 1, 3, tracks]);
-        let equations = equations.reshape([lessons, pairs.len(), UNKNOWNS, tracks]);
+        let equations = to.clone().reshape([scenes, pairs.len(), 3, 1, tracks])
+            * from.clone().reshape([scenes, pairs.len(), 1, 3, tracks]);
+        let equations = equations.reshape([scenes, pairs.len(), UNKNOWNS, tracks]);
         // At distance 0 Cauchy's weight is 1: the first block has none.
         let squared = Tensor::zeros_like(&seen);
         let places = numbers(batch.places.clone())?;
@@ -120,18 +119,18 @@ impl Pairs {
     /// # Errors
     /// [`Error::Backend`] for a defect of burn.
     pub fn ask(&mut self, layers: &PairLayers<Tensor<2>>, state: &Tensor<3>) -> Result<Tensor<4>, Error> {
-        let [lessons, count, _, tracks] = self.seen.dims();
+        let [scenes, count, _, tracks] = self.seen.dims();
         let trust = sigmoid(affine3(&layers.trust, state.clone()));
         let scale = layers.log_scale.clone().exp();
         let (mut trusts, mut scales) = (Vec::new(), Vec::new());
         for (stride, &pairs) in self.counts.iter().enumerate() {
-            trusts.push(trust.clone().narrow(1, stride, 1).expand([lessons, pairs, tracks]));
+            trusts.push(trust.clone().narrow(1, stride, 1).expand([scenes, pairs, tracks]));
             scales.push(scale.clone().narrow(0, stride, 1).expand([pairs, 1]));
         }
-        let trust = Tensor::cat(trusts, 1).reshape([lessons, count, 1, tracks]);
+        let trust = Tensor::cat(trusts, 1).reshape([scenes, count, 1, tracks]);
         let scale = Tensor::cat(scales, 0).reshape([1, count, 1, 1]);
         let weights = self.seen.clone() * trust * scale.clone() / (self.squared.clone() + scale);
-        let fundamental = self.fundamentals(weights)?.reshape([lessons, count, 3, 3]);
+        let fundamental = self.fundamentals(weights)?.reshape([scenes, count, 3, 3]);
         let squared = self.sampson(fundamental);
         self.squared = squared.clone().detach();
         let logarithms = squared.add_scalar(f64::from(DISTANCE_FLOOR)).log().mul_scalar(0.5);
@@ -140,21 +139,20 @@ impl Pairs {
 
     /// The numbers of every fundamental matrix, B x P x 9 x 1.
     fn fundamentals(&self, weights: Tensor<4>) -> Result<Tensor<4>, Error> {
-        let [lessons, count, _, tracks] = weights.dims();
-        let views = self.places.len() / (2 * lessons * tracks);
+        let [scenes, count, _, tracks] = weights.dims();
+        let views = self.places.len() / (2 * scenes * tracks);
         let values = numbers(weights.clone())?;
         let (mut directions, mut turns) = (Vec::new(), Vec::new());
         for (place, weights) in values.chunks_exact(tracks).enumerate() {
-            let (lesson, Pair { from, to, .. }) = (place / count, self.pairs[place % count]);
-            let row =
-                |view: usize, axis: usize| &self.places[(2 * (lesson * views + view) + axis) * tracks..][..tracks];
+            let (scene, Pair { from, to, .. }) = (place / count, self.pairs[place % count]);
+            let row = |view: usize, axis: usize| &self.places[(2 * (scene * views + view) + axis) * tracks..][..tracks];
             let places = |view: usize| [row(view, 0), row(view, 1)];
             let (direction, turn) = direction(&Matches { from: places(from), to: places(to), weights }.scatter());
             directions.extend(direction);
             turns.extend(turn.as_slice());
         }
-        let directions = constant(directions, [lessons, count, UNKNOWNS, 1], self.dtype, &self.device);
-        let turns = constant(turns, [lessons, count, UNKNOWNS, UNKNOWNS], self.dtype, &self.device);
+        let directions = constant(directions, [scenes, count, UNKNOWNS, 1], self.dtype, &self.device);
+        let turns = constant(turns, [scenes, count, UNKNOWNS, UNKNOWNS], self.dtype, &self.device);
         let errors = directions.clone().transpose().matmul(self.equations.clone());
         let moved = self.equations.clone().matmul((errors * weights).transpose());
         let unmoved = moved.clone().detach();
@@ -188,13 +186,13 @@ impl Pairs {
     /// For each view, the pairs that it may be in as the one view and as the other, zeros where there is none:
     /// B x P x 1 x m to B x n x 2S x m.
     fn by_view(&self, of_pairs: Tensor<4>) -> Tensor<4> {
-        let [lessons, _, _, tracks] = of_pairs.dims();
+        let [scenes, _, _, tracks] = of_pairs.dims();
         let mut first = 0;
         let mut all = Vec::with_capacity(2 * self.counts.len());
         for (stride, &count) in self.counts.iter().enumerate() {
             let apart = stride + 1;
             let none =
-                constant(vec![0.0; lessons * apart * tracks], [lessons, apart, 1, tracks], self.dtype, &self.device);
+                constant(vec![0.0; scenes * apart * tracks], [scenes, apart, 1, tracks], self.dtype, &self.device);
             let of_stride = of_pairs.clone().narrow(1, first, count);
             all.push(Tensor::cat(vec![of_stride.clone(), none.clone()], 1));
             all.push(Tensor::cat(vec![none, of_stride], 1));

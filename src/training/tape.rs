@@ -1,13 +1,13 @@
 //! The soft-subspace network on burn's tape: the same function as its
-//! [`forward`](crate::network::subspace::SubspaceNet::forward) (a test compares), for several lessons of one size at
+//! [`forward`](crate::network::subspace::SubspaceNet::forward) (a test compares), for several scenes of one size at
 //! once, with derivatives.
 //!
 //! # The derivative of the ridge regressions
 //! Nothing differentiates a decomposition. The inverse `X` of `G` is computed off the tape, and one Newton step on the
-//! tape, `X (2 I - G X)`, puts it there: since `X` is the inverse, the step changes no value, and its derivative is that
-//! of the inverse, `-X dG X`. A test compares with finite differences.
+//! tape, `X (2 I - G X)`, puts it there: since `X` is the inverse, the step changes no value, and its derivative is
+//! that of the inverse, `-X dG X`. A test compares with finite differences.
 //!
-//! Shapes: `B` lessons, `n` views, `m` tracks; features come before tracks, so that sums run along memory.
+//! Shapes: `B` scenes, `n` views, `m` tracks; features come before tracks, so that sums run along memory.
 
 use burn::tensor::activation::{relu, sigmoid, softmax};
 use burn::tensor::{DType, Device, Tensor, TensorData};
@@ -20,7 +20,7 @@ use crate::network::subspace::{
     VARIANCE_FLOOR,
 };
 
-/// Lessons as the network sees them.
+/// Training scenes as the network sees them.
 pub struct Batch {
     /// B x n x 2 x m, see [`Cloud`](crate::network::subspace::Cloud).
     pub places: Tensor<4>,
@@ -52,7 +52,7 @@ struct Residuals {
     of_pairs: Option<Tensor<4>>,
 }
 
-/// Lessons on their way through the blocks.
+/// Training scenes on their way through the blocks.
 struct State<'a> {
     batch: &'a Batch,
     /// Homogeneous points, B x n x 3 x m, and their squared lengths, B x n x 1 x m.
@@ -101,14 +101,14 @@ impl SubspaceNet<Tensor<2>> {
 impl<'a> State<'a> {
     fn new(network: &SubspaceNet<Tensor<2>>, batch: &'a Batch, dtype: DType) -> Result<Self, Error> {
         let (places, visible) = (batch.places.clone(), batch.visible.clone());
-        let [lessons, views, _, _] = places.dims();
+        let [scenes, views, _, _] = places.dims();
         let share = visible.clone().sum_dim(1).clamp_min(1.0).recip();
         let hidden = visible.clone().neg().add_scalar(1.0);
         let means = (places.clone() * visible.clone()).sum_dim(1) * share.clone();
         let offsets = (places.clone() - means.clone()) * visible.clone();
         let ones = Tensor::ones_like(&visible);
         let homogeneous = Tensor::cat(vec![places.clone(), ones.clone()], 2);
-        let filling = Tensor::cat(vec![means, ones.clone().slice([0..lessons, 0..1])], 2);
+        let filling = Tensor::cat(vec![means, ones.clone().slice([0..scenes, 0..1])], 2);
         let columns = homogeneous.clone() * visible.clone() + filling * hidden.clone();
         let squared_lengths = homogeneous.clone().square().sum_dim(2);
         let context = Tensor::cat(vec![places.clone().mul_scalar(0.5), visible.clone()], 2);
@@ -137,12 +137,12 @@ impl<'a> State<'a> {
     }
 
     fn residuals(&mut self, block: &Block<Tensor<2>>, dtype: DType) -> Result<Residuals, Error> {
-        let [lessons, views, _, tracks] = self.columns.dims();
+        let [scenes, views, _, tracks] = self.columns.dims();
         let [selections, _] = block.log_ridge.dims();
         let rows = 3 * views;
-        let columns = self.columns.clone().reshape([lessons, 1, rows, tracks]);
+        let columns = self.columns.clone().reshape([scenes, 1, rows, tracks]);
         let shares =
-            softmax(affine3(&block.selection, self.tracks.clone()), 2).reshape([lessons, selections, 1, tracks]);
+            softmax(affine3(&block.selection, self.tracks.clone()), 2).reshape([scenes, selections, 1, tracks]);
         let ridge = block.log_ridge.clone().exp().reshape([1, selections, 1, 1]);
         let scatter = (columns.clone() * shares.clone()).matmul(columns.clone().transpose());
         let scatter = scatter + self.identity.clone() * ridge.clone();
@@ -150,8 +150,8 @@ impl<'a> State<'a> {
         let leverages = (columns * solved.clone()).sum_dim(2);
         let kept = (shares * leverages.clone()).neg().add_scalar(1.0).clamp_min(f64::from(LEAVE_ONE_OUT_FLOOR));
         let left = solved * (ridge.clone() / kept);
-        let squared = left.clone().square().reshape([lessons * selections, views, 3, tracks]).sum_dim(2);
-        let squared = squared.reshape([lessons, selections, views, tracks]).swap_dims(1, 2);
+        let squared = left.clone().square().reshape([scenes * selections, views, 3, tracks]).sum_dim(2);
+        let squared = squared.reshape([scenes, selections, views, tracks]).swap_dims(1, 2);
         let mean = (squared.clone() * self.batch.visible.clone()).sum_dim(1) * self.share.clone();
         let leverages = (leverages * ridge).div_scalar(views as f64).squeeze_dim(2);
         let of_pairs = match (&mut self.pairs, &block.pairs) {
@@ -181,10 +181,10 @@ impl<'a> State<'a> {
     }
 
     fn rescale(&mut self, block: &Block<Tensor<2>>, residuals: &Residuals) {
-        let [lessons, views, _, tracks] = self.columns.dims();
+        let [scenes, views, _, tracks] = self.columns.dims();
         let [selections, _] = block.log_ridge.dims();
-        let mixture = softmax(residuals.of_tracks.clone().neg(), 1).reshape([lessons, selections, 1, tracks]);
-        let mixed = (residuals.left.clone() * mixture).sum_dim(1).reshape([lessons, views, 3, tracks]);
+        let mixture = softmax(residuals.of_tracks.clone().neg(), 1).reshape([scenes, selections, 1, tracks]);
+        let mixed = (residuals.left.clone() * mixture).sum_dim(1).reshape([scenes, views, 3, tracks]);
         let predicted = self.columns.clone() - mixed;
         let factor = (predicted.clone() * self.homogeneous.clone()).sum_dim(2) / self.squared_lengths.clone();
         let factor = factor.clamp(f64::from(DEPTH_RANGE.0), f64::from(DEPTH_RANGE.1));
@@ -198,16 +198,15 @@ impl<'a> State<'a> {
     }
 
     fn observations(self, network: &SubspaceNet<Tensor<2>>, residuals: Residuals) -> Tensor<4> {
-        let [lessons, views, _, tracks] = self.columns.dims();
+        let [scenes, views, _, tracks] = self.columns.dims();
         let [_, selections, _, _] = residuals.left.dims();
-        let by_coordinate = residuals.left.reshape([lessons * selections, views, 3, tracks]);
-        let in_image = by_coordinate.slice([0..lessons * selections, 0..views, 0..2]).square().sum_dim(2);
-        let in_image =
-            logarithm(in_image.reshape([lessons, selections, views, tracks]).swap_dims(1, 2)).mul_scalar(0.5);
+        let by_coordinate = residuals.left.reshape([scenes * selections, views, 3, tracks]);
+        let in_image = by_coordinate.slice([0..scenes * selections, 0..views, 0..2]).square().sum_dim(2);
+        let in_image = logarithm(in_image.reshape([scenes, selections, views, tracks]).swap_dims(1, 2)).mul_scalar(0.5);
         let of_tracks = residuals.of_tracks.mean_dim(1).mul_scalar(0.5);
         let shared = Tensor::cat(vec![of_tracks, self.tracks], 1);
         let [_, features, _] = shared.dims();
-        let shared = shared.reshape([lessons, 1, features, tracks]).expand([lessons, views, features, tracks]);
+        let shared = shared.reshape([scenes, 1, features, tracks]).expand([scenes, views, features, tracks]);
         let mut features = vec![residuals.of_observations, in_image, self.context, shared];
         features.extend(residuals.of_pairs);
         let features = Tensor::cat(features, 2);
@@ -225,12 +224,12 @@ fn pooled(encoded: Tensor<4>, visible: &Tensor<4>, share: &Tensor<4>) -> Tensor<
 /// `X (2 I - G X)` with `X = G⁻¹` as a constant, for every matrix of a batch.
 fn newton_step(scatter: Tensor<4>, dtype: DType) -> Result<Tensor<4>, Error> {
     let device = scatter.device();
-    let [lessons, selections, rows, _] = scatter.dims();
+    let [scenes, selections, rows, _] = scatter.dims();
     let inverses: Vec<f64> = numbers(scatter.clone())?
         .chunks_exact(rows * rows)
         .flat_map(|scatter| inverse(DMatrix::from_row_slice(rows, rows, scatter)).as_slice().to_vec())
         .collect();
-    let inverses = constant(inverses, [lessons, selections, rows, rows], dtype, &device);
+    let inverses = constant(inverses, [scenes, selections, rows, rows], dtype, &device);
     let correction = inverses.clone().matmul(scatter).matmul(inverses.clone());
     Ok(inverses.mul_scalar(2.0) - correction)
 }
@@ -273,8 +272,8 @@ pub fn affine3(layer: &Layer<Tensor<2>>, input: Tensor<3>) -> Tensor<3> {
 
 /// `W X + b`, B x n x F x m.
 fn affine4(layer: &Layer<Tensor<2>>, input: Tensor<4>) -> Tensor<4> {
-    let [lessons, views, inputs, tracks] = input.dims();
-    let output = affine3(layer, input.reshape([lessons * views, inputs, tracks]));
+    let [scenes, views, inputs, tracks] = input.dims();
+    let output = affine3(layer, input.reshape([scenes * views, inputs, tracks]));
     let [_, outputs, _] = output.dims();
-    output.reshape([lessons, views, outputs, tracks])
+    output.reshape([scenes, views, outputs, tracks])
 }

@@ -1,24 +1,24 @@
 use burn::tensor::{DType, Device, Tensor};
 
+use super::gradient::{differentiate, tensors};
 use super::labelled::loss;
-use super::lesson::{differentiate, tensors};
 use super::tape::constant;
 use super::*;
 use crate::network::Parameter;
 use crate::network::subspace::{Cloud, Shape, SubspaceNet};
-use crate::synthetic::training_scenes::{self, Lesson};
+use crate::synthetic::training_scenes::{self, TrainingScene};
 
 const SMALL: Shape = Shape { state: 6, selections: 3, blocks: 3, encoding: 5, strides: 0 };
 const PAIRED: Shape = Shape { strides: 2, ..SMALL };
 
-/// Some lessons with holes.
-fn lessons(seed: u64) -> Vec<Lesson> {
+/// Some scenes with holes.
+fn scenes(seed: u64) -> Vec<TrainingScene> {
     let mut numbers = 0..;
-    let holed = |lessons: &Vec<Lesson>| lessons.iter().all(|lesson| lesson.visible.iter().any(|seen| !seen));
-    let mut lessons =
+    let holed = |scenes: &Vec<TrainingScene>| scenes.iter().all(|scene| scene.visible.iter().any(|seen| !seen));
+    let mut scenes =
         numbers.find_map(|number| Some(training_scenes::batch(seed, number)).filter(holed)).expect("holes");
-    lessons.truncate(2);
-    lessons
+    scenes.truncate(2);
+    scenes
 }
 
 #[test]
@@ -35,10 +35,10 @@ fn assert_same_scores(shape: Shape) {
     let seed = 3;
     let network = initial::initial(shape, seed);
     let device = Device::flex().autodiff();
-    for lesson in lessons(seed) {
-        let (batch, _) = tensors(std::slice::from_ref(&lesson), DType::F32, &device);
+    for scene in scenes(seed) {
+        let (batch, _) = tensors(std::slice::from_ref(&scene), DType::F32, &device);
         let output = network.map(|parameter| parameter.tensor(&device)).on_tape(&batch, DType::F32).expect("a pass");
-        let cloud = Cloud::new(lesson.views, lesson.tracks, &lesson.points, &lesson.visible);
+        let cloud = Cloud::new(scene.views, scene.tracks, &scene.points, &scene.visible);
         let scores = network.map(|parameter| parameter.values().to_vec()).forward(&cloud);
         let last = output.tracks.last().expect("blocks").clone();
         assert_near(&scores.tracks, &values(last.inner()));
@@ -61,7 +61,7 @@ fn loss_at(
     network: &SubspaceNet<Parameter>,
     direction: &SubspaceNet<Vec<f64>>,
     length: f64,
-    lessons: &[Lesson],
+    scenes: &[TrainingScene],
 ) -> f64 {
     let device = Device::flex();
     let mut directions = direction.arrays().into_iter();
@@ -70,7 +70,7 @@ fn loss_at(
         let moved = parameter.values().iter().zip(moves).map(|(value, slope)| f64::from(*value) + length * slope);
         constant::<2>(moved.collect(), parameter.shape(), DType::F64, &device)
     });
-    let (batch, labels) = tensors(lessons, DType::F64, &device);
+    let (batch, labels) = tensors(scenes, DType::F64, &device);
     let total = loss(moved.on_tape(&batch, DType::F64).expect("a pass"), &labels).total;
     total.into_data().try_into_vec::<f64>().expect("f64")[0]
 }
@@ -78,7 +78,7 @@ fn loss_at(
 #[test]
 fn derivatives_agree_with_finite_differences() {
     let seed = 5;
-    assert_differences(&initial::initial(SMALL, seed), &lessons(seed), 0, seed);
+    assert_differences(&initial::initial(SMALL, seed), &scenes(seed), 0, seed);
 }
 
 /// Without reweighting, and with one direction that is freer than all others, derivatives through pairs are exact.
@@ -106,9 +106,9 @@ fn derivatives_of_reweighting_agree_with_finite_differences() {
     assert_differences(&network, &[rectified(seed), rectified(seed + 1)], first + of_blocks, seed);
 }
 
-/// A lesson whose tracks have nearly the same x in every view and any y: the equations `x_to = x_from` of its pairs are
+/// A scene whose tracks have nearly the same x in every view and any y: the equations `x_to = x_from` of its pairs are
 /// met, and no others nearly as well.
-fn rectified(seed: u64) -> Lesson {
+fn rectified(seed: u64) -> TrainingScene {
     use rand::{Rng, SeedableRng};
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
     let (views, tracks) = (4, 60);
@@ -116,16 +116,16 @@ fn rectified(seed: u64) -> Lesson {
     let columns: Vec<f64> = (0..tracks).map(|_| rng.random()).collect();
     let points = (0..all).map(|k| [columns[k % tracks] + 0.02 * rng.random::<f64>(), rng.random()]).collect();
     let [visible, right] = [0.9, 0.5].map(|share| (0..all).map(|_| rng.random_bool(share)).collect::<Vec<bool>>());
-    Lesson { views, tracks, points, inlier: right[..tracks].to_vec(), right, visible }
+    TrainingScene { views, tracks, points, inlier: right[..tracks].to_vec(), right, visible }
 }
 
 /// Central differences of the loss in f64, one direction for every array from the `first` on, against the derivatives
 /// in f32.
-fn assert_differences(network: &SubspaceNet<Parameter>, lessons: &[Lesson], first: usize, seed: u64) {
+fn assert_differences(network: &SubspaceNet<Parameter>, scenes: &[TrainingScene], first: usize, seed: u64) {
     use rand::{Rng, SeedableRng};
     const LENGTH: f64 = 1e-5;
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-    let gradient = differentiate(network, lessons, Objective::Labels).expect("a gradient").gradient;
+    let gradient = differentiate(network, scenes, Objective::Labels).expect("a gradient").gradient;
     let count = network.arrays().len();
     let largest = gradient.arrays().into_iter().flatten().map(|slope| slope.abs()).fold(0.0, f32::max);
     for chosen in first..count {
@@ -135,7 +135,7 @@ fn assert_differences(network: &SubspaceNet<Parameter>, lessons: &[Lesson], firs
             place += 1;
             parameter.values().iter().map(|_| of_chosen * (2.0 * rng.random::<f64>() - 1.0)).collect::<Vec<f64>>()
         });
-        let expected = (loss_at(network, &direction, LENGTH, lessons) - loss_at(network, &direction, -LENGTH, lessons))
+        let expected = (loss_at(network, &direction, LENGTH, scenes) - loss_at(network, &direction, -LENGTH, scenes))
             / (2.0 * LENGTH);
         let (slopes, moves) = (gradient.arrays()[chosen], direction.arrays()[chosen]);
         let found: f64 = slopes.iter().zip(moves).map(|(slope, length)| f64::from(*slope) * length).sum();
@@ -179,24 +179,24 @@ fn without_labels_the_weights_follow_the_papers_losses() {
     use crate::network::NetworkSettings;
     use rand::{Rng, SeedableRng};
     const LENGTH: f64 = 1e-5;
-    let (seed, views, tracks, lessons, blocks) = (7, 4, 30, 2, 2);
+    let (seed, views, tracks, scenes, blocks) = (7, 4, 30, 2, 2);
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
     let mut draw = |count: usize| (0..count).map(|_| 2.0 * rng.random::<f64>() - 1.0).collect::<Vec<f64>>();
-    let columns = draw(lessons * views * 3 * tracks);
+    let columns = draw(scenes * views * 3 * tracks);
     let (logits, directions) =
-        ([draw(lessons * tracks), draw(lessons * tracks)], [(); 2].map(|()| draw(lessons * tracks)));
+        ([draw(scenes * tracks), draw(scenes * tracks)], [(); 2].map(|()| draw(scenes * tracks)));
     let device = Device::flex().autodiff();
     let at = |length: f64| {
         let leaves: Vec<Tensor<3>> = (0..blocks)
             .map(|block| {
                 let moved = logits[block].iter().zip(&directions[block]).map(|(logit, step)| logit + length * step);
-                constant(moved.collect(), [lessons, 1, tracks], DType::F64, &device).require_grad()
+                constant(moved.collect(), [scenes, 1, tracks], DType::F64, &device).require_grad()
             })
             .collect();
         let output = Output {
             tracks: leaves.clone(),
             observations: constant(vec![0.0], [1, 1, 1, 1], DType::F64, &device),
-            columns: constant(columns.clone(), [lessons, views, 3, tracks], DType::F64, &device),
+            columns: constant(columns.clone(), [scenes, views, 3, tracks], DType::F64, &device),
         };
         (unlabelled::loss(output, DType::F64).expect("finite columns"), leaves)
     };

@@ -3,14 +3,14 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::lesson::{Losses, Slope, differentiate};
+use super::gradient::{Losses, Slope, differentiate};
 use super::{Error, Objective, adam, initial};
 use crate::network::Parameter;
 use crate::network::subspace::{Cloud, Origin, PriorFile, Shape, SubspaceNet};
 use crate::synthetic::metrics::average_precision;
-use crate::synthetic::training_scenes::{self, Lesson};
+use crate::synthetic::training_scenes::{self, TrainingScene};
 
-/// Batches of lessons in a step, which are differentiated side by side. Part of what a seed means, so not the number of
+/// Batches of scenes in a step, which are differentiated side by side. Part of what a seed means, so not the number of
 /// cores.
 const BATCHES_PER_STEP: u64 = 2;
 /// Steps between two milestones.
@@ -49,7 +49,7 @@ impl Settings {
         format!("--seed {} --steps {}{objective}{pairs}", self.seed, self.steps)
     }
 
-    /// Seed of the lessons that the training is validated on, which it never sees.
+    /// Seed of the scenes that the training is validated on, which it never sees.
     fn validation_seed(&self) -> u64 {
         !self.seed
     }
@@ -59,13 +59,13 @@ impl Settings {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Milestone {
     pub step: u64,
-    /// Lessons seen.
-    pub lessons: u64,
+    /// Training scenes seen.
+    pub scenes: u64,
     /// Means since the last milestone.
     pub loss: f64,
     /// See [`Objective::parts`].
     pub parts: [f64; 2],
-    /// Mean average precision on lessons that training never sees, of the average of the weights.
+    /// Mean average precision on scenes that training never sees, of the average of the weights.
     pub precision: f64,
 }
 
@@ -73,14 +73,14 @@ pub struct Milestone {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Trainer {
     version: u32,
-    /// Version of the program: another one may draw other lessons.
+    /// Version of the program: another one may draw other scenes.
     program: String,
     settings: Settings,
     network: SubspaceNet<Parameter>,
     /// Average of the weights along the way, heavier on the latest: what is shipped.
     average: SubspaceNet<Vec<f32>>,
     step: u64,
-    lessons: u64,
+    scenes: u64,
     /// Since the last milestone.
     sums: [f64; 3],
     summed: u64,
@@ -98,7 +98,7 @@ impl Trainer {
             average: network.map(|parameter| parameter.values().to_vec()),
             network,
             step: 0,
-            lessons: 0,
+            scenes: 0,
             sums: [0.0; 3],
             summed: 0,
             rejected: 0,
@@ -202,8 +202,8 @@ impl Trainer {
         let first = self.step * BATCHES_PER_STEP;
         let network = &self.network;
         let work = |number: u64| {
-            let lessons = training_scenes::batch(seed, number);
-            differentiate(network, &lessons, objective).map(|slope| (slope, lessons.len() as u64))
+            let scenes = training_scenes::batch(seed, number);
+            differentiate(network, &scenes, objective).map(|slope| (slope, scenes.len() as u64))
         };
         let threads = std::thread::available_parallelism().map_or(1, |count| count.get() as u64);
         let results: Vec<_> = if threads == 1 {
@@ -218,8 +218,8 @@ impl Trainer {
         };
         let mut slopes = Vec::with_capacity(results.len());
         for result in results {
-            let (slope, lessons) = result?;
-            self.lessons += lessons;
+            let (slope, scenes) = result?;
+            self.scenes += scenes;
             slopes.push(slope);
         }
         Ok(slopes)
@@ -239,8 +239,8 @@ impl Trainer {
         let [loss, first, second] = self.sums.map(|sum| sum / self.summed.max(1) as f64);
         (self.sums, self.summed) = ([0.0; 3], 0);
         let precision = validate(&self.average, self.settings.validation_seed());
-        let (step, lessons) = (self.step, self.lessons);
-        let milestone = Milestone { step, lessons, loss, parts: [first, second], precision };
+        let (step, scenes) = (self.step, self.scenes);
+        let milestone = Milestone { step, scenes, loss, parts: [first, second], precision };
         self.milestones.push(milestone);
         milestone
     }
@@ -265,16 +265,16 @@ fn mean(slopes: &[Slope]) -> (Losses, SubspaceNet<Vec<f32>>) {
     (losses, gradient)
 }
 
-/// Mean average precision over the lessons of validation.
+/// Mean average precision over the scenes of validation.
 fn validate(network: &SubspaceNet<Vec<f32>>, seed: u64) -> f64 {
-    let precision = |lesson: &Lesson| {
-        let cloud = Cloud::new(lesson.views, lesson.tracks, &lesson.points, &lesson.visible);
+    let precision = |scene: &TrainingScene| {
+        let cloud = Cloud::new(scene.views, scene.tracks, &scene.points, &scene.visible);
         let scores: Vec<f64> = network.forward(&cloud).tracks.into_iter().map(f64::from).collect();
-        average_precision(&scores, &lesson.inlier)
+        average_precision(&scores, &scene.inlier)
     };
     let found: Vec<f64> = (0..VALIDATION_BATCHES)
         .flat_map(|number| training_scenes::batch(seed, number))
-        .filter_map(|lesson| precision(&lesson))
+        .filter_map(|scene| precision(&scene))
         .collect();
     found.iter().sum::<f64>() / found.len().max(1) as f64
 }

@@ -1,9 +1,9 @@
-//! A lesson in the making: the exact images of a rigid scene, what contamination makes of them, and the labels that
+//! A scene in the making: the exact images of a rigid scene, what contamination makes of them, and the labels that
 //! follow.
 
 use rand_chacha::ChaCha8Rng;
 
-use super::Lesson;
+use super::TrainingScene;
 use super::contamination::{self, Recipe};
 use super::draw::normal;
 use super::motion::Path;
@@ -18,7 +18,7 @@ const MOST_NOISE: f64 = 0.2;
 /// there: 4 % of the right ones are farther off.
 const RIGHT_WITHIN: f64 = 2.5;
 
-/// All of a lesson but its noise and labels. Arrays with one entry an observation are view by view, then track by
+/// All of a scene but its noise and labels. Arrays with one entry an observation are view by view, then track by
 /// track.
 #[derive(Debug, Clone)]
 pub struct Draft {
@@ -58,7 +58,7 @@ impl Draft {
     }
 
     /// Tells right observations from wrong ones by where they are, and adds the noise.
-    pub fn finish(self, rng: &mut ChaCha8Rng) -> Lesson {
+    pub fn finish(self, rng: &mut ChaCha8Rng) -> TrainingScene {
         let within = RIGHT_WITHIN * self.noise;
         let mut right = Vec::with_capacity(self.image.len());
         let mut points = Vec::with_capacity(self.image.len());
@@ -69,7 +69,7 @@ impl Draft {
             points.push([x + self.noise * normal(rng), y + self.noise * normal(rng)]);
             right.push(is_right);
         }
-        Lesson::new(self.views, self.tracks, points, self.visible, right)
+        TrainingScene::new(self.views, self.tracks, points, self.visible, right)
     }
 }
 

@@ -1,4 +1,4 @@
-//! Which observations a lesson lacks.
+//! Which observations a scene lacks.
 
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -40,7 +40,7 @@ impl Holes {
     }
 }
 
-/// Lengths are uniform in half of the lessons; in the others most are about equal, as long as points stay in view.
+/// Lengths are uniform in half of the scenes; in the others most are about equal, as long as points stay in view.
 fn banded(views: usize, tracks: usize, rng: &mut ChaCha8Rng) -> Vec<bool> {
     let shortest = LEAST_RIGHT_IN_TRACK;
     let mean = if chance(0.5, rng) { None } else { Some(uniform((shortest as f64, views as f64), rng)) };

@@ -3,7 +3,7 @@
 //!
 //! One file a subject: what a batch holds (`plan`), where the points lie (`world`), how the cameras move (`motion`),
 //! what is not seen (`holes`), what is wrong (`contamination`), from there to labels (`draft`), and the scenes of
-//! [`Scene::generate`](super::Scene::generate) among them (`product`). Unlike those, a lesson need not be reproducible
+//! [`Scene::generate`](super::Scene::generate) among them (`product`). Unlike those, a scene need not be reproducible
 //! piece by piece: a batch is, by its seed and number.
 //!
 //! # What is labelled
@@ -34,7 +34,7 @@ pub const LEAST_RIGHT_IN_TRACK: usize = 3;
 
 /// One training scene with its labels. Arrays are view by view, then track by track (index = view * tracks + track).
 #[derive(Debug, Clone, PartialEq)]
-pub struct Lesson {
+pub struct TrainingScene {
     pub views: usize,
     pub tracks: usize,
     /// Image points in image widths, with any origin; `[0, 0]` where there is no observation.
@@ -46,7 +46,7 @@ pub struct Lesson {
     pub inlier: Vec<bool>,
 }
 
-impl Lesson {
+impl TrainingScene {
     /// Labels the tracks from their observations; `right` says whether an observation is of its track's own point,
     /// seen or not.
     fn new(views: usize, tracks: usize, mut points: Vec<[f64; 2]>, visible: Vec<bool>, mut right: Vec<bool>) -> Self {
@@ -68,22 +68,22 @@ impl Lesson {
     }
 }
 
-/// Several lessons of one size (views, tracks), so that they can be computed side by side.
+/// Several scenes of one size (views, tracks), so that they can be computed side by side.
 ///
-/// The same seed and batch number give the same lessons, whatever else was drawn. Every lesson has 4 to 20 views, 50 to
+/// The same seed and batch number give the same scenes, whatever else was drawn. Every scene has 4 to 20 views, 50 to
 /// 500 tracks and at least four inlier tracks, every track three observations, and every view eight.
-pub fn batch(seed: u64, number: u64) -> Vec<Lesson> {
+pub fn batch(seed: u64, number: u64) -> Vec<TrainingScene> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(number);
     let plan = Plan::draw(&mut rng);
-    (0..plan.lessons).map(|_| lesson(&plan, &mut rng)).collect()
+    (0..plan.scenes).map(|_| scene(&plan, &mut rng)).collect()
 }
 
-fn lesson(plan: &Plan, rng: &mut ChaCha8Rng) -> Lesson {
+fn scene(plan: &Plan, rng: &mut ChaCha8Rng) -> TrainingScene {
     if plan.draws_product_scene(rng)
-        && let Some(lesson) = product::draw(plan.views, plan.tracks, rng)
+        && let Some(scene) = product::draw(plan.views, plan.tracks, rng)
     {
-        return lesson;
+        return scene;
     }
     Draft::draw(plan, rng).finish(rng)
 }

@@ -1,4 +1,4 @@
-//! How the cameras of a lesson move.
+//! How the cameras of a scene move.
 
 use nalgebra::{Rotation3, Unit, Vector3};
 use rand_chacha::ChaCha8Rng;
@@ -34,7 +34,7 @@ const FORWARD_RANGE: (f64, f64) = (-1.5, 1.0);
 /// Deviations from a smooth path, in radians and in the world's unit.
 const SHAKE: f64 = 0.05;
 
-/// Share of the lessons in which the cameras roll about their axes, and the range of the largest angle.
+/// Share of the scenes in which the cameras roll about their axes, and the range of the largest angle.
 const ROLLS: f64 = 0.25;
 const ROLL_RAD: (f64, f64) = (0.3, std::f64::consts::PI);
 

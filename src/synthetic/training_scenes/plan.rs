@@ -1,4 +1,4 @@
-//! What a batch of lessons holds: one size, one kind of holes, and either lessons of all kinds or lessons that are like
+//! What a batch of scenes holds: one size, one kind of holes, and either scenes of all kinds or scenes that are like
 //! what real image matching gives. Numbers without another reason are those of the prototype, whose network found
 //! inliers at 97 % outliers, on tracks as long as the scene and on banded ones.
 
@@ -15,14 +15,14 @@ const PAPER_SIZE: (usize, usize) = (10, 200);
 const VIEWS: [usize; 12] = [4, 5, 6, 7, 8, 10, 10, 10, 12, 14, 16, 20];
 /// Range of the tracks, uniform in the logarithm.
 const TRACKS: (f64, f64) = (50.0, 500.0);
-/// Observations that the lessons of a batch have in all, or as near as whole lessons get: about what keeps a core's
+/// Observations that the scenes of a batch have in all, or as near as whole scenes get: about what keeps a core's
 /// cache busy, and a gradient of even size.
 const OBSERVATIONS: usize = 16_000;
-/// Lessons of a batch: two at least, or its gradient would be one scene's.
-const LESSONS: (usize, usize) = (2, 24);
+/// Training scenes of a batch: two at least, or its gradient would be one scene's.
+const SCENES: (usize, usize) = (2, 24);
 
-/// Share of the batches that are like real matching. They are larger than the others and have fewer lessons, so that a
-/// quarter of the lessons comes from a third of the batches.
+/// Share of the batches that are like real matching. They are larger than the others and have fewer scenes, so that a
+/// quarter of the scenes comes from a third of the batches.
 const REAL_LIKE: f64 = 0.32;
 /// Views of real-like batches: mostly five, the window that seeds a sequence.
 const REAL_VIEWS: [usize; 8] = [5, 5, 5, 5, 6, 8, 10, 12];
@@ -36,17 +36,17 @@ const REAL_HOLES: [f64; 3] = [0.3, 0.55, 0.15];
 /// Share of the observations that are missing where they are at random.
 const MISSING: (f64, f64) = (0.05, 0.45);
 
-/// Share of the lessons of complete batches that are the product's own scenes, on which it is evaluated.
+/// Share of the scenes of complete batches that are the product's own scenes, on which it is evaluated.
 const PRODUCT_SCENES: f64 = 0.3;
 
-/// What the lessons of one batch have in common.
+/// What the scenes of one batch have in common.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     pub views: usize,
     pub tracks: usize,
-    pub lessons: usize,
+    pub scenes: usize,
     pub holes: Holes,
-    /// Whether the lessons are like what matching of real images gives.
+    /// Whether the scenes are like what matching of real images gives.
     pub real_like: bool,
 }
 
@@ -54,15 +54,15 @@ impl Plan {
     pub fn draw(rng: &mut ChaCha8Rng) -> Self {
         let real_like = chance(REAL_LIKE, rng);
         let (views, tracks) = draw_size(real_like, rng);
-        let most = (OBSERVATIONS / (views * tracks)).clamp(LESSONS.0, LESSONS.1);
+        let most = (OBSERVATIONS / (views * tracks)).clamp(SCENES.0, SCENES.1);
         let shares = if real_like { REAL_HOLES } else { HOLES };
         let missing = uniform(MISSING, rng);
         let [complete, banded, random] = shares;
         let holes = pick(&[(Holes::None, complete), (Holes::Banded, banded), (Holes::Random(missing), random)], rng);
-        Self { views, tracks, lessons: most, holes, real_like }
+        Self { views, tracks, scenes: most, holes, real_like }
     }
 
-    /// Whether the next lesson shall be one of the product's own scenes, which have no holes.
+    /// Whether the next scene shall be one of the product's own scenes, which have no holes.
     pub fn draws_product_scene(&self, rng: &mut ChaCha8Rng) -> bool {
         !self.real_like && self.holes == Holes::None && chance(PRODUCT_SCENES, rng)
     }

@@ -1,10 +1,10 @@
-//! Lessons that are scenes of [`Scene::generate`], on which the product is evaluated: its motions, shapes, noises,
-//! lenses and outliers.
+//! Training scenes that are scenes of [`Scene::generate`], on which the product is evaluated: its motions, shapes,
+//! noises, lenses and outliers.
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::Lesson;
+use super::TrainingScene;
 use super::draw::{chance, log_uniform, pick, uniform};
 use crate::synthetic::scene::{IMAGE_SIDE_PX, Motion, NoiseKind, OutlierKind, Scene, SceneOptions, Shape};
 
@@ -54,16 +54,16 @@ const RADIAL_K1: (f64, f64) = (-0.05, 0.1);
 const DISPLACEMENT: (f64, f64) = (-0.1, 0.1);
 const ZOOM: (f64, f64) = (0.05, 0.3);
 
-/// A scene of this size as a lesson; `None` if no camera of the drawn kind sees the whole scene.
-pub fn draw(views: usize, tracks: usize, rng: &mut ChaCha8Rng) -> Option<Lesson> {
+/// A scene of this size as a training scene; `None` if no camera of the drawn kind sees the whole scene.
+pub fn draw(views: usize, tracks: usize, rng: &mut ChaCha8Rng) -> Option<TrainingScene> {
     let scene = Scene::generate(&options(views, tracks, rng)).ok()?;
     let side_px = f64::from(IMAGE_SIDE_PX);
     let points = scene.input.x.iter().zip(&scene.input.y).map(|(x, y)| [x / side_px, y / side_px]).collect();
-    Some(Lesson::new(views, tracks, points, vec![true; views * tracks], scene.truth.observation_right))
+    Some(TrainingScene::new(views, tracks, points, vec![true; views * tracks], scene.truth.observation_right))
 }
 
 /// Options of a random scene; its seed is drawn from all there are, so that scenes of small seeds, on which results are
-/// reported, are not among the lessons.
+/// reported, are not among the scenes.
 pub fn options(views: usize, tracks: usize, rng: &mut ChaCha8Rng) -> SceneOptions {
     let outlier_kind = pick(&OUTLIER_KINDS, rng);
     let motion = match pick(&MOTIONS, rng) {

@@ -10,7 +10,7 @@ use super::motion::{MIN_DEPTH, Motion};
 use super::*;
 use crate::synthetic::scene::{self, NoiseKind, OutlierKind, Shape};
 
-/// Batches of the tests that look at many: enough for rare things to occur, each of some ten lessons.
+/// Batches of the tests that look at many: enough for rare things to occur, each of some ten scenes.
 const BATCHES: u64 = 200;
 
 /// The generator of a batch, as [`batch`] has it.
@@ -31,33 +31,33 @@ fn drafts(numbers: std::ops::Range<u64>) -> impl Iterator<Item = (u64, Plan, Dra
 
 #[test]
 fn a_seed_and_a_number_give_the_same_lessons_and_others_give_others() {
-    let lessons = batch(5, 3);
+    let scenes = batch(5, 3);
     batch(5, 4);
-    assert_eq!(lessons, batch(5, 3));
-    assert_ne!(lessons, batch(5, 4));
-    assert_ne!(lessons, batch(6, 3));
-    assert!(lessons.windows(2).all(|pair| pair[0] != pair[1]));
+    assert_eq!(scenes, batch(5, 3));
+    assert_ne!(scenes, batch(5, 4));
+    assert_ne!(scenes, batch(6, 3));
+    assert!(scenes.windows(2).all(|pair| pair[0] != pair[1]));
 }
 
 #[test]
 fn every_lesson_has_its_size_its_minimal_counts_and_labels_that_agree() {
     for number in 0..BATCHES {
-        let lessons = batch(1, number);
-        let (views, tracks) = (lessons[0].views, lessons[0].tracks);
+        let scenes = batch(1, number);
+        let (views, tracks) = (scenes[0].views, scenes[0].tracks);
         assert!((4..=20).contains(&views) && (50..=500).contains(&tracks), "batch {number}: {views} x {tracks}");
-        assert!((2..=24).contains(&lessons.len()), "batch {number}: {} lessons", lessons.len());
-        let observations = lessons.len() * views * tracks;
-        assert!(observations <= 16_000 || lessons.len() == 2, "batch {number}: {observations} observations");
-        for lesson in &lessons {
-            assert_eq!((lesson.views, lesson.tracks), (views, tracks), "batch {number}");
-            assert_eq!((lesson.points.len(), lesson.inlier.len()), (views * tracks, tracks));
-            check(lesson, number);
+        assert!((2..=24).contains(&scenes.len()), "batch {number}: {} scenes", scenes.len());
+        let observations = scenes.len() * views * tracks;
+        assert!(observations <= 16_000 || scenes.len() == 2, "batch {number}: {observations} observations");
+        for scene in &scenes {
+            assert_eq!((scene.views, scene.tracks), (views, tracks), "batch {number}");
+            assert_eq!((scene.points.len(), scene.inlier.len()), (views * tracks, tracks));
+            check(scene, number);
         }
     }
 }
 
-fn check(lesson: &Lesson, number: u64) {
-    let Lesson { views, tracks, points, visible, right, inlier } = lesson;
+fn check(scene: &TrainingScene, number: u64) {
+    let TrainingScene { views, tracks, points, visible, right, inlier } = scene;
     assert!(points.iter().flatten().all(|x| x.is_finite()), "batch {number}");
     assert!(points.iter().zip(visible).all(|(point, &seen)| seen || *point == [0.0; 2]), "batch {number}");
     assert!(right.iter().zip(visible).all(|(&right, &seen)| seen || !right), "batch {number}");
@@ -79,16 +79,16 @@ fn check(lesson: &Lesson, number: u64) {
 /// The largest distance between a track's right observations and the images of the world point that fits them best,
 /// and the smallest of its wrong ones, in standard deviations of the noise; images are computed anew from points and
 /// poses, and which point it is, is not asked.
-fn distances(draft: &Draft, lesson: &Lesson, track: usize) -> (f64, f64) {
+fn distances(draft: &Draft, scene: &TrainingScene, track: usize) -> (f64, f64) {
     let mut best = (f64::INFINITY, f64::INFINITY);
     for point in &draft.world.points {
         let (mut right, mut wrong) = (0.0f64, f64::INFINITY);
         for (view, pose) in draft.poses.iter().enumerate() {
-            let k = view * lesson.tracks + track;
+            let k = view * scene.tracks + track;
             let seen = pose.rotation * point + pose.translation;
-            let [x, y] = lesson.points[k];
+            let [x, y] = scene.points[k];
             let off = (draft.world.focal * seen.x / seen.z - x).hypot(draft.world.focal * seen.y / seen.z - y);
-            match (lesson.right[k], lesson.visible[k]) {
+            match (scene.right[k], scene.visible[k]) {
                 (true, _) => right = right.max(off / draft.noise),
                 (false, true) => wrong = wrong.min(off / draft.noise),
                 (false, false) => {}
@@ -108,11 +108,10 @@ fn distances(draft: &Draft, lesson: &Lesson, track: usize) -> (f64, f64) {
 fn right_observations_are_of_one_point_of_the_world_and_wrong_ones_are_not() {
     let (mut right_tracks, mut mixed, mut near) = (0usize, 0usize, 0usize);
     for (number, _, draft) in drafts(0..60) {
-        let lesson = draft.clone().finish(&mut rng(1_000 + number));
-        let shows_its_point =
-            |track: &usize| lesson.right.iter().skip(*track).step_by(lesson.tracks).any(|&right| right);
-        for track in (0..lesson.tracks).filter(shows_its_point) {
-            let (right, wrong) = distances(&draft, &lesson, track);
+        let scene = draft.clone().finish(&mut rng(1_000 + number));
+        let shows_its_point = |track: &usize| scene.right.iter().skip(*track).step_by(scene.tracks).any(|&right| right);
+        for track in (0..scene.tracks).filter(shows_its_point) {
+            let (right, wrong) = distances(&draft, &scene, track);
             // A Rayleigh variable is beyond 6 once in 10^8.
             assert!(right < 6.0, "batch {number}, track {track}: {right} deviations off, {:?}", draft.recipe);
             right_tracks += 1;
@@ -141,12 +140,12 @@ fn cameras_have_the_whole_world_in_front() {
 fn every_kind_of_lesson_occurs_as_often_as_it_shall() {
     let (mut kinds, mut motions, mut dominant) = (HashSet::new(), Vec::new(), 0);
     let (mut wrong, mut noise, mut focal): (Vec<f64>, Vec<f64>, Vec<f64>) = Default::default();
-    let (mut lessons, mut real_like, mut paper_sized, mut chained) = (0, 0, 0, 0);
+    let (mut scenes, mut real_like, mut paper_sized, mut chained) = (0, 0, 0, 0);
     let mut holes = [0; 3];
     for number in 0..BATCHES {
         let plan = Plan::draw(&mut rng(number));
-        lessons += plan.lessons;
-        real_like += if plan.real_like { plan.lessons } else { 0 };
+        scenes += plan.scenes;
+        real_like += if plan.real_like { plan.scenes } else { 0 };
         paper_sized += usize::from((plan.views, plan.tracks) == (10, 200));
         holes[match plan.holes {
             Holes::None => 0,
@@ -164,9 +163,9 @@ fn every_kind_of_lesson_occurs_as_often_as_it_shall() {
             chained += usize::from(draft.recipe.kind == Kind::Chained);
             assert!(draft.noise <= 0.003, "batch {number}");
         } else {
-            let lesson = draft.finish(&mut rng(number));
-            let inliers = lesson.inlier.iter().filter(|&&inlier| inlier).count();
-            wrong.push(1.0 - inliers as f64 / lesson.tracks as f64);
+            let scene = draft.finish(&mut rng(number));
+            let inliers = scene.inlier.iter().filter(|&&inlier| inlier).count();
+            wrong.push(1.0 - inliers as f64 / scene.tracks as f64);
         }
     }
     assert_eq!(kinds.len(), 10, "{kinds:?}");
@@ -179,7 +178,7 @@ fn every_kind_of_lesson_occurs_as_often_as_it_shall() {
     assert!(spans(&noise, 1e-4, 0.025), "{noise:?}");
     assert!(spans(&focal, 0.4, 2.5), "{focal:?}");
     let near = |count: usize, of: usize, share: f64, off: f64| (count as f64 / of as f64 - share).abs() < off;
-    assert!(near(real_like, lessons, 0.25, 0.07), "{real_like} of {lessons} lessons");
+    assert!(near(real_like, scenes, 0.25, 0.07), "{real_like} of {scenes} scenes");
     assert!(near(paper_sized, BATCHES as usize, 0.3, 0.1), "{paper_sized} batches");
     assert!(near(chained, motions.len(), 0.6 * 0.32, 0.06), "{chained} chains of real matching");
     assert!(holes.iter().all(|&count| count > 15) && holes[0] > holes[2], "{holes:?}");
@@ -188,7 +187,7 @@ fn every_kind_of_lesson_occurs_as_often_as_it_shall() {
 #[test]
 fn the_product_s_scenes_are_among_the_lessons_with_all_that_they_can_be() {
     let mut rng = rng(0);
-    let plan = Plan { views: 10, tracks: 50, lessons: 4, holes: Holes::None, real_like: false };
+    let plan = Plan { views: 10, tracks: 50, scenes: 4, holes: Holes::None, real_like: false };
     let count = (0..1_000).filter(|_| plan.draws_product_scene(&mut rng)).count();
     assert!((250..350).contains(&count), "{count}");
     for other in [Plan { holes: Holes::Banded, ..plan.clone() }, Plan { real_like: true, ..plan.clone() }] {
@@ -222,8 +221,8 @@ fn nearly_all_of_the_product_s_options_make_lessons() {
     let mut rng = rng(0);
     let mut made = 0;
     for number in 0..100 {
-        let Some(lesson) = product::draw(10, 60, &mut rng) else { continue };
-        check(&lesson, number);
+        let Some(scene) = product::draw(10, 60, &mut rng) else { continue };
+        check(&scene, number);
         made += 1;
     }
     assert!(made > 90, "{made} of 100");

@@ -1,4 +1,4 @@
-//! Where the points of a lesson lie, and what the camera that sees them is like.
+//! Where the points of a scene lie, and what the camera that sees them is like.
 
 use nalgebra::Vector3;
 use rand::Rng;
@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use super::draw::{chance, in_cube, log_uniform, normals, uniform};
 use crate::synthetic::scene::{FOCAL_RANGE_PX, IMAGE_SIDE_PX};
 
-/// Share of the lessons whose world is the paper's box (its section 5.1). The rest are wider worlds: the network shall
+/// Share of the scenes whose world is the paper's box (its section 5.1). The rest are wider worlds: the network shall
 /// not learn one box by heart.
 const PAPER_BOXES: f64 = 0.5;
 /// The box: sides of 2 about a centre at this distance.

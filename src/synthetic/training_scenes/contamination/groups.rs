@@ -25,7 +25,7 @@ const SLIDE: (f64, f64) = (0.2, 0.6);
 const SLIDE_DRAWS: usize = 8;
 /// Standard deviation of each coordinate of a shift, as a share of the image.
 const SHIFT: (f64, f64) = (0.05, 0.3);
-/// Jitter of what sticks to the sensor, in image widths, in half of the lessons.
+/// Jitter of what sticks to the sensor, in image widths, in half of the scenes.
 const STATIC_JITTER: f64 = 0.01;
 /// Clusters, their standard deviation as a share of the image, and in that of the noise: among tracks that are as
 /// close to one place as the noise allows, right and wrong cannot be told apart.

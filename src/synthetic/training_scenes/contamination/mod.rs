@@ -1,4 +1,4 @@
-//! What is wrong with the tracks of a lesson: kinds that spoil each track by itself (`single`), and kinds in which
+//! What is wrong with the tracks of a scene: kinds that spoil each track by itself (`single`), and kinds in which
 //! wrong tracks agree among themselves (`groups`). All of them put observations elsewhere; the labels follow from where
 //! they end up.
 
@@ -13,7 +13,7 @@ use super::draft::Draft;
 use super::draw::{chance, log_uniform, pick, uniform};
 use super::plan::Plan;
 
-/// What the wrong observations of a lesson are.
+/// What the wrong observations of a scene are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Kind {
     /// Points of other wrong tracks of the same view.
@@ -51,11 +51,11 @@ const KINDS: [(Kind, f64); 10] = [
     (Kind::Static, 0.08),
     (Kind::Clusters, 0.04),
 ];
-/// The same for real-like lessons: matching goes from image to image, so that most wrong tracks are chains.
+/// The same for real-like scenes: matching goes from image to image, so that most wrong tracks are chains.
 const REAL_KINDS: [(Kind, f64); 5] =
     [(Kind::Chained, 0.6), (Kind::Permuted, 0.1), (Kind::Local, 0.1), (Kind::Slid, 0.1), (Kind::Partial, 0.1)];
 
-/// Share of the lessons with a moderate share of outliers, and that share. The others are near the limit of what can be
+/// Share of the scenes with a moderate share of outliers, and that share. The others are near the limit of what can be
 /// found, where a learned prior is worth most.
 const MODERATE: f64 = 0.4;
 const MODERATE_WRONG: (f64, f64) = (0.3, 0.9);
@@ -65,7 +65,7 @@ const HARD_WRONG_OF_MANY: (f64, f64) = (0.88, 0.99);
 const MANY_TRACKS: usize = 300;
 /// Noise in image widths.
 const NOISE: (f64, f64) = (2e-4, 0.04);
-/// Shares of outliers and noise of real-like lessons: detectors are good to a few tenths of a pixel.
+/// Shares of outliers and noise of real-like scenes: detectors are good to a few tenths of a pixel.
 const REAL_WRONG: (f64, f64) = (0.1, 0.85);
 const REAL_NOISE: (f64, f64) = (4e-5, 0.003);
 
@@ -75,13 +75,13 @@ const LEAST_RIGHT: usize = 5;
 const LEAST_RIGHT_EXTREME: usize = 4;
 const EXTREME_WRONG: f64 = 0.979;
 
-/// Share of the lessons of [`Kind::Clusters`] in which every wrong track is in a cluster, with outliers and noise at
+/// Share of the scenes of [`Kind::Clusters`] in which every wrong track is in a cluster, with outliers and noise at
 /// most: no method copes with them yet, and only the right tracks fit as well as the noise allows.
 const CLUSTERS_DOMINATE: f64 = 0.3;
 const DOMINANT_WRONG: f64 = 0.9;
 const DOMINANT_NOISE: f64 = 0.005;
 
-/// Which contamination a lesson has, and how much.
+/// Which contamination a scene has, and how much.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Recipe {
     pub kind: Kind,

@@ -8,7 +8,7 @@ use super::Frame;
 use crate::synthetic::training_scenes::draft::Draft;
 use crate::synthetic::training_scenes::draw::{chance, uniform};
 
-/// Share of the views in which a partly wrong track is wrong, the same for all tracks of a lesson.
+/// Share of the views in which a partly wrong track is wrong, the same for all tracks of a scene.
 const PARTLY_WRONG: (f64, f64) = (0.2, 1.0);
 /// Share of the views in which the observations of partly wrong tracks are permuted; in the others they are anywhere.
 const PARTLY_PERMUTED: f64 = 0.7;

@@ -1,4 +1,4 @@
-//! Lessons as tensors, and the derivatives of their loss.
+//! Training scenes as tensors, and the derivatives of their loss.
 
 use burn::tensor::{DType, Device, Tensor};
 
@@ -7,9 +7,9 @@ use super::tape::{Batch, constant, numbers};
 use super::{Error, Objective, unlabelled};
 use crate::network::Parameter;
 use crate::network::subspace::{Cloud, SubspaceNet};
-use crate::synthetic::training_scenes::Lesson;
+use crate::synthetic::training_scenes::TrainingScene;
 
-/// The losses of some lessons, each a mean over them.
+/// The losses of some scenes, each a mean over them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Losses {
     /// What is minimised.
@@ -24,18 +24,18 @@ pub struct Slope {
     pub gradient: SubspaceNet<Vec<f32>>,
 }
 
-/// Losses and derivatives of a network on lessons of one size.
+/// Losses and derivatives of a network on scenes of one size.
 ///
 /// # Errors
 /// [`Error::Backend`] for a defect of burn; [`Error::NoDecomposition`] without labels, for columns that are not finite.
 pub fn differentiate(
     network: &SubspaceNet<Parameter>,
-    lessons: &[Lesson],
+    scenes: &[TrainingScene],
     objective: Objective,
 ) -> Result<Slope, Error> {
     let device = Device::flex().autodiff();
     let leaves = network.map(|parameter| parameter.tensor(&device).require_grad());
-    let (batch, labels) = tensors(lessons, DType::F32, &device);
+    let (batch, labels) = tensors(scenes, DType::F32, &device);
     let output = leaves.on_tape(&batch, DType::F32)?;
     let loss = match objective {
         Objective::Labels => labelled::loss(output, &labels),
@@ -60,23 +60,23 @@ pub fn differentiate(
     failed.map_or(Ok(Slope { losses, gradient }), Err)
 }
 
-/// What the network sees of lessons of one size, and what it should say.
-pub fn tensors(lessons: &[Lesson], dtype: DType, device: &Device) -> (Batch, Labels) {
-    let (views, tracks) = lessons.first().map_or((0, 0), |lesson| (lesson.views, lesson.tracks));
-    let count = lessons.len();
+/// What the network sees of scenes of one size, and what it should say.
+pub fn tensors(scenes: &[TrainingScene], dtype: DType, device: &Device) -> (Batch, Labels) {
+    let (views, tracks) = scenes.first().map_or((0, 0), |scene| (scene.views, scene.tracks));
+    let count = scenes.len();
     let (mut places, mut visible) = (Vec::new(), Vec::new());
     let (mut inlier, mut of_tracks, mut right, mut of_observations) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let label = |right: &bool| f64::from(u8::from(*right));
-    for lesson in lessons {
-        let cloud = Cloud::new(views, tracks, &lesson.points, &lesson.visible);
+    for scene in scenes {
+        let cloud = Cloud::new(views, tracks, &scene.points, &scene.visible);
         places.extend(cloud.places().iter().map(|&place| f64::from(place)));
         visible.extend(cloud.visible().iter().map(|&seen| f64::from(seen)));
-        inlier.extend(lesson.inlier.iter().map(label));
-        right.extend(lesson.right.iter().map(label));
-        let weights = labelled::weights(&lesson.inlier, &vec![true; tracks]);
+        inlier.extend(scene.inlier.iter().map(label));
+        right.extend(scene.right.iter().map(label));
+        let weights = labelled::weights(&scene.inlier, &vec![true; tracks]);
         let total: f64 = weights.iter().sum();
         of_tracks.extend(weights.into_iter().map(|weight| weight / (total * count as f64)));
-        of_observations.extend(labelled::weights(&lesson.right, &lesson.visible));
+        of_observations.extend(labelled::weights(&scene.right, &scene.visible));
     }
     let total: f64 = of_observations.iter().sum();
     of_observations.iter_mut().for_each(|weight| *weight /= total);
