@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::input_name::InputName;
 use super::progress::Progress;
-use super::result::{Grade, Prior, Status};
+use super::result::{Grade, Proposal, Status};
 use super::settings::SolveSettings;
 use super::warning::Warning;
 
@@ -124,7 +124,7 @@ pub struct Summary {
     pub inlier_tracks: u32,
     pub registered_views: u32,
     pub reprojection_rms_px: Option<f64>,
-    pub winning_prior: Option<Prior>,
+    pub winning_prior: Option<Proposal>,
     pub iterations: u32,
     pub seconds: f64,
     /// Size of the stored result in bytes; `ReadJobResult` streams about as much.

@@ -53,7 +53,7 @@ impl Grade {
 /// What proposed the tracks that the accepted hypothesis was sampled from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
-pub enum Prior {
+pub enum Proposal {
     /// The weights of the network that is optimised on the request.
     Network,
     /// Iteratively reweighted least squares on the subspace.
@@ -68,20 +68,26 @@ pub enum Prior {
     Uniform,
 }
 
-impl Prior {
+impl Proposal {
     /// Every prior.
-    pub const ALL: [Prior; 6] =
-        [Prior::Learned, Prior::Network, Prior::Irls, Prior::Consistency, Prior::Rigidity, Prior::Uniform];
+    pub const ALL: [Proposal; 6] = [
+        Proposal::Learned,
+        Proposal::Network,
+        Proposal::Irls,
+        Proposal::Consistency,
+        Proposal::Rigidity,
+        Proposal::Uniform,
+    ];
 
     /// The prior's name in files, metrics and logs.
     pub fn name(self) -> &'static str {
         match self {
-            Prior::Network => "network",
-            Prior::Irls => "irls",
-            Prior::Consistency => "consistency",
-            Prior::Rigidity => "rigidity",
-            Prior::Learned => "learned",
-            Prior::Uniform => "uniform",
+            Proposal::Network => "network",
+            Proposal::Irls => "irls",
+            Proposal::Consistency => "consistency",
+            Proposal::Rigidity => "rigidity",
+            Proposal::Learned => "learned",
+            Proposal::Uniform => "uniform",
         }
     }
 }
@@ -266,7 +272,7 @@ pub struct StageTime {
 /// When a prior, verified alone, first stood at a consensus as good as the accepted one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PriorTime {
-    pub prior: Prior,
+    pub prior: Proposal,
     /// Seconds of that prior's own work, proposing and verifying; `None`: it never did within the search.
     pub seconds: Option<f64>,
     /// Network iterations (network) or hypotheses (others) it had used by then.
@@ -281,7 +287,7 @@ pub struct Solution {
     pub grade: Option<Grade>,
     pub method: Method,
     /// Prior whose sample led to the accepted consensus; `None` where nothing was accepted or nothing was sampled.
-    pub winning_prior: Option<Prior>,
+    pub winning_prior: Option<Proposal>,
     /// Network iterations spent.
     pub iterations: u32,
     pub seed: u64,

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::error::{InvalidInput, Violation, Violations};
-use super::result::Prior;
+use super::result::Proposal;
 
 /// Which tracks are right is decided by...
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
@@ -89,7 +89,7 @@ pub struct SolveSettings {
     /// Backend of the network; `None` takes the server's.
     pub backend: Option<Backend>,
     /// Priors that AUTO and GEOMETRY leave out: for ablations, not for callers.
-    pub excluded_priors: Vec<Prior>,
+    pub excluded_priors: Vec<Proposal>,
 }
 
 impl SolveSettings {

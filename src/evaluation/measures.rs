@@ -34,7 +34,7 @@ pub struct Measures {
     pub warnings: Vec<WarningCode>,
     pub seconds: f64,
     /// Of AUTO and GEOMETRY: what stood first, by prior.
-    pub winning_prior: Option<crate::domain::Prior>,
+    pub winning_prior: Option<crate::domain::Proposal>,
     /// Network iterations spent.
     pub iterations: u32,
 }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::records;
 use super::sweeps::Sweep;
-use crate::domain::{Method, Prior, SolveSettings};
+use crate::domain::{Method, Proposal, SolveSettings};
 use crate::synthetic::SceneOptions;
 
 /// How projective depths come to the contestants.
@@ -117,15 +117,15 @@ impl Contestant {
     }
 
     /// Priors that this contestant does without.
-    fn excluded_priors(self) -> Vec<Prior> {
+    fn excluded_priors(self) -> Vec<Proposal> {
         match self {
-            Contestant::AutoWithoutIrls => vec![Prior::Irls],
-            Contestant::AutoWithoutConsistency => vec![Prior::Consistency],
-            Contestant::AutoWithoutRigidity => vec![Prior::Rigidity],
-            Contestant::AutoWithoutUniform => vec![Prior::Uniform],
-            Contestant::AutoWithoutLearned => vec![Prior::Learned],
-            Contestant::NetworkAlone => all_but(Prior::Network),
-            Contestant::LearnedAlone => all_but(Prior::Learned),
+            Contestant::AutoWithoutIrls => vec![Proposal::Irls],
+            Contestant::AutoWithoutConsistency => vec![Proposal::Consistency],
+            Contestant::AutoWithoutRigidity => vec![Proposal::Rigidity],
+            Contestant::AutoWithoutUniform => vec![Proposal::Uniform],
+            Contestant::AutoWithoutLearned => vec![Proposal::Learned],
+            Contestant::NetworkAlone => all_but(Proposal::Network),
+            Contestant::LearnedAlone => all_but(Proposal::Learned),
             _ => Vec::new(),
         }
     }
@@ -136,8 +136,8 @@ impl Contestant {
     }
 }
 
-fn all_but(one: Prior) -> Vec<Prior> {
-    Prior::ALL.into_iter().filter(|&prior| prior != one).collect()
+fn all_but(one: Proposal) -> Vec<Proposal> {
+    Proposal::ALL.into_iter().filter(|&prior| prior != one).collect()
 }
 
 /// One scene given to one contestant.

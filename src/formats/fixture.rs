@@ -6,7 +6,8 @@ use std::path::Path;
 use super::{Label, LabelledInput};
 use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{
-    Calibration, Course, Grade, LeftOut, Losses, Method, Prior, Progress, Solution, Stage, Status, Warning, WarningCode,
+    Calibration, Course, Grade, LeftOut, Losses, Method, Progress, Proposal, Solution, Stage, Status, Warning,
+    WarningCode,
 };
 use crate::synthetic::{Scene, SceneOptions, Sequence, SequenceOptions};
 
@@ -177,7 +178,7 @@ fn solution(scene: &Scene) -> Solution {
         status: Status::Solved,
         grade: Some(Grade::Metric),
         method: Method::Auto,
-        winning_prior: Some(Prior::Network),
+        winning_prior: Some(Proposal::Network),
         iterations: 150,
         seed: scene.options.seed,
         calibrations: vec![Calibration {
@@ -223,7 +224,7 @@ fn solution(scene: &Scene) -> Solution {
         warnings: vec![Warning::new(WarningCode::FewInliers, "<b>hostile</b> & \"quoted\" detail")],
         seconds: 1.5,
         stages: Stage::ALL.iter().map(|&stage| StageTime { stage, seconds: 0.3 }).collect(),
-        prior_times: vec![PriorTime { prior: Prior::Uniform, seconds: None, iterations: 600 }],
+        prior_times: vec![PriorTime { prior: Proposal::Uniform, seconds: None, iterations: 600 }],
         history: history(truth.focal_px),
         trained_network: None,
         input_sha256: None,

@@ -85,26 +85,28 @@ fn positive_roots(quartic: &[f64; 5]) -> Vec<f64> {
 /// The pose that most correspondences agree with, refined on those that do; an inlier is in front of the camera.
 ///
 /// * `seen`: images `(u, v)` at unit depth, distortion undone
-/// * `gate`: squared distance, in the same units, within which an image agrees
+/// * `weights`: of the squared distances, see [`Observation::weight`](super::observation::Observation::weight)
+/// * `gate`: squared distance, in the same units, within which an image of weight 1 agrees
 ///
 /// Returns `None` for fewer than three correspondences or when no sample gives a pose.
 pub(crate) fn robust(
     points: &[Vector3<f64>],
     seen: &[Vector2<f64>],
+    weights: &[f64],
     gate: f64,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<Robust<Pose>> {
-    if points.len() != seen.len() {
+    if points.len() != seen.len() || points.len() != weights.len() {
         return None;
     }
-    ransac::estimate(&Correspondences { points, seen }, gate, None, MOST_SAMPLES, rng, stop)
+    ransac::estimate(&Correspondences { points, seen, weights }, gate, None, MOST_SAMPLES, rng, stop)
 }
 
 /// Levenberg-Marquardt on the distances under a Geman-McClure loss of scale `sqrt(gate)`; never worse than the start.
-fn refine(start: Pose, points: &[Vector3<f64>], seen: &[Vector2<f64>], gate: f64) -> Pose {
+fn refine(start: Pose, data: Correspondences, gate: f64) -> Pose {
     let mut pose = start;
-    let mut refinement = Refinement { data: Correspondences { points, seen }, gate, normal: Normal::zeros() };
+    let mut refinement = Refinement { data, gate, normal: Normal::zeros() };
     levenberg_marquardt::minimise(&mut refinement, &mut pose, &REFINEMENT, &StopToken::default());
     pose
 }
@@ -113,6 +115,7 @@ fn refine(start: Pose, points: &[Vector3<f64>], seen: &[Vector2<f64>], gate: f64
 struct Correspondences<'a> {
     points: &'a [Vector3<f64>],
     seen: &'a [Vector2<f64>],
+    weights: &'a [f64],
 }
 
 impl Estimator for Correspondences<'_> {
@@ -132,11 +135,12 @@ impl Estimator for Correspondences<'_> {
     /// Infinite behind the camera.
     fn squared_residual(&self, pose: &Pose, datum: usize) -> f64 {
         let placed = pose.apply(&self.points[datum]);
-        if placed.z > 0.0 { (placed.xy() / placed.z - self.seen[datum]).norm_squared() } else { f64::INFINITY }
+        let squared = (placed.xy() / placed.z - self.seen[datum]).norm_squared();
+        if placed.z > 0.0 { self.weights[datum] * squared } else { f64::INFINITY }
     }
 
     fn refined(&self, pose: &Pose, gate: f64) -> Option<Pose> {
-        Some(refine(*pose, self.points, self.seen, gate))
+        Some(refine(*pose, *self, gate))
     }
 }
 
@@ -158,13 +162,14 @@ impl Problem for Refinement<'_> {
     fn linearise(&mut self, pose: &Pose) {
         self.normal = Normal::zeros();
         let intrinsics = Intrinsics::from_focal(1.0);
-        for (point, seen) in self.data.points.iter().zip(self.data.seen) {
+        let Correspondences { points, seen, weights } = self.data;
+        for ((point, seen), weight) in points.iter().zip(seen).zip(weights) {
             let projection = Projection::new(&intrinsics, pose, point);
             if projection.at.z <= 0.0 {
                 continue;
             }
             let residual = projection.image - seen;
-            let weight = (self.gate / (residual.norm_squared() + self.gate)).powi(2);
+            let weight = weight * (self.gate / (weight * residual.norm_squared() + self.gate)).powi(2);
             for (component, by_pose) in projection.gradients().by_pose.into_iter().enumerate() {
                 self.normal.add(&by_pose.into(), residual[component], weight);
             }
@@ -221,9 +226,9 @@ mod tests {
         assert!(three_points(&[nan, same, same * 2.0], &[Vector2::zeros(); 3]).is_empty());
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let stop = StopToken::default();
-        assert_eq!(robust(&[same; 2], &[Vector2::zeros(); 2], 1e-4, &mut rng, &stop), None);
-        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], 1e-4, &mut rng, &stop), None);
-        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], f64::NAN, &mut rng, &stop), None);
+        assert_eq!(robust(&[same; 2], &[Vector2::zeros(); 2], &[1.0; 2], 1e-4, &mut rng, &stop), None);
+        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9], 1e-4, &mut rng, &stop), None);
+        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9], f64::NAN, &mut rng, &stop), None);
     }
 
     #[test]
@@ -239,12 +244,42 @@ mod tests {
                     *image = Vector2::new(rng.random_range(-0.4..0.4), rng.random_range(-0.4..0.4));
                 }
             }
-            let found = robust(&points, &seen, 13.8 * NOISE * NOISE, &mut rng, &StopToken::default()).expect("a pose");
+            let found =
+                robust(&points, &seen, &vec![1.0; seen.len()], 13.8 * NOISE * NOISE, &mut rng, &StopToken::default())
+                    .expect("a pose");
             let right = found.inlier.iter().enumerate().filter(|(k, inlier)| (k % 3 == 0) == **inlier).count();
             let away = distance(&found.model, &scene.poses[2]);
             println!("seed {seed}: {right} of 90 verdicts right, pose off by {away}");
             assert!(right >= 87 && away < 20.0 * NOISE, "seed {seed}: {right} of 90, off by {away}");
         }
+    }
+
+    /// Half of the images are ten times as noisy as the others: where that is known, the pose is nearer.
+    #[test]
+    fn images_count_by_their_weight() {
+        const NOISE: f64 = 1e-3;
+        let (mut weighted, mut plain) = (0.0, 0.0);
+        for seed in 0..20 {
+            let scene = testing::scene(seed, 4, 60, 0.0);
+            let (points, mut seen) = correspondences(&scene, 2);
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let factor = |k: usize| if k.is_multiple_of(2) { 10.0 } else { 1.0 };
+            for (k, image) in seen.iter_mut().enumerate() {
+                *image += factor(k) * NOISE * Vector2::new(testing::normal(&mut rng), testing::normal(&mut rng));
+            }
+            let weights: Vec<f64> = (0..seen.len()).map(|k| 1.0 / (factor(k) * factor(k))).collect();
+            let mut away = |weights: &[f64]| {
+                let gate = 13.8 * NOISE * NOISE;
+                let found = robust(&points, &seen, weights, gate, &mut rng, &StopToken::default()).expect("a pose");
+                (distance(&found.model, &scene.poses[2]), found.inlier_count())
+            };
+            let (by_weights, by_all) = (away(&weights), away(&vec![1.0; seen.len()]));
+            assert!(by_weights.1 >= 56 && by_all.1 < 45, "seed {seed}: {by_weights:?} {by_all:?}");
+            weighted += by_weights.0;
+            plain += by_all.0;
+        }
+        println!("off by {weighted} with weights, {plain} without");
+        assert!(weighted < 0.9 * plain, "off by {weighted} with weights, {plain} without");
     }
 
     /// A tenth of the images nearly right at the gate of samples does not end the sampling: what counts is the gate.
@@ -269,7 +304,8 @@ mod tests {
                     *image = placed.xy() / placed.z + 3.0 * NOISE * Vector2::new(angle.cos(), angle.sin());
                 }
             }
-            let found = robust(&points, &seen, gate, &mut rng, &StopToken::default()).expect("a pose");
+            let found =
+                robust(&points, &seen, &vec![1.0; seen.len()], gate, &mut rng, &StopToken::default()).expect("a pose");
             let kept = found.inlier[..40].iter().filter(|&&inlier| inlier).count();
             right += usize::from(kept == 40);
         }

@@ -71,22 +71,24 @@ fn six_points(points: &[Point; LEAST_POINTS], images: &[Vector2<f64>; LEAST_POIN
 
 /// The camera that most images agree with, refined on those that do.
 ///
-/// * `gate`: squared residual below which an image agrees, in squared units of the images
+/// * `weights`: of the squared residuals, see [`Observation::weight`](super::observation::Observation::weight)
+/// * `gate`: squared residual below which an image of weight 1 agrees, in squared units of the images
 ///
 /// Reliable down to three right images in ten; once `stop` fires, the best so far. Returns the camera and which images
 /// agree; `None` when fewer than `least` do.
 pub fn robust(
     points: &[Point],
     images: &[Vector2<f64>],
+    weights: &[f64],
     gate: f64,
     least: usize,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<(Camera, Vec<bool>)> {
-    if points.len() != images.len() {
+    if points.len() != images.len() || points.len() != weights.len() {
         return None;
     }
-    let resection = Resection { points: points.iter().map(|point| point.normalize()).collect(), images };
+    let resection = Resection { points: points.iter().map(|point| point.normalize()).collect(), images, weights };
     // Most images are right as a rule: all together first.
     let all = linear(points, images);
     let found = ransac::estimate(&resection, gate, all, MOST_SAMPLES, rng, stop)?;
@@ -97,6 +99,7 @@ struct Resection<'a> {
     /// Unit norm.
     points: Vec<Point>,
     images: &'a [Vector2<f64>],
+    weights: &'a [f64],
 }
 
 impl Estimator for Resection<'_> {
@@ -114,7 +117,7 @@ impl Estimator for Resection<'_> {
     }
 
     fn squared_residual(&self, camera: &Camera, datum: usize) -> f64 {
-        reprojection(camera, &self.points[datum], &self.images[datum]).norm_squared()
+        self.weights[datum] * reprojection(camera, &self.points[datum], &self.images[datum]).norm_squared()
     }
 
     fn refined(&self, camera: &Camera, gate: f64) -> Option<Camera> {
@@ -143,15 +146,16 @@ impl Problem for Refinement<'_> {
 
     fn linearise(&mut self, camera: &Camera) {
         self.normal = Normal::zeros();
-        for (point, image) in self.resection.points.iter().zip(self.resection.images) {
+        let Resection { points, images, weights } = self.resection;
+        for ((point, image), weight) in points.iter().zip(*images).zip(*weights) {
             let residual = reprojection(camera, point, image);
-            let squared = residual.norm_squared();
+            let squared = weight * residual.norm_squared();
             // Written so that NaN is left out.
             let is_near = squared < WEIGHED_GATES * self.gate;
             if !is_near {
                 continue;
             }
-            let weight = (self.gate / (squared + self.gate)).powi(2);
+            let weight = weight * (self.gate / (squared + self.gate)).powi(2);
             let nearer = point / (camera.row(2) * point).x;
             let projected = residual + image;
             for axis in [0, 1] {
@@ -198,8 +202,9 @@ mod tests {
                 let (truth, points, images) = problem(seed, wrong);
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 let gate = 13.8 * 0.001f64.powi(2);
-                let (camera, agreeing) = robust(&points, &images, gate, 10, &mut rng, &StopToken::default())
-                    .unwrap_or_else(|| panic!("seed {seed}, {wrong} wrong"));
+                let (camera, agreeing) =
+                    robust(&points, &images, &vec![1.0; images.len()], gate, 10, &mut rng, &StopToken::default())
+                        .unwrap_or_else(|| panic!("seed {seed}, {wrong} wrong"));
                 assert!(agreeing[..wrong].iter().all(|&agrees| !agrees), "seed {seed}");
                 let right = agreeing[wrong..].iter().filter(|&&agrees| agrees).count();
                 assert!(right + 3 >= 40 - wrong, "seed {seed}: {right} of {}", 40 - wrong);
@@ -233,7 +238,15 @@ mod tests {
                 let (points, images, truth) = contaminated(seed, count);
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 let start = std::time::Instant::now();
-                let robust = robust(&points, &images, 13.8 * 0.001f64.powi(2), 9, &mut rng, &StopToken::default());
+                let robust = robust(
+                    &points,
+                    &images,
+                    &vec![1.0; images.len()],
+                    13.8 * 0.001f64.powi(2),
+                    9,
+                    &mut rng,
+                    &StopToken::default(),
+                );
                 seconds += start.elapsed().as_secs_f64();
                 let Some((camera, agreeing)) = robust else { continue };
                 found += 1;
@@ -255,13 +268,52 @@ mod tests {
         assert!(found >= 59 && right >= 0.99 * f64::from(found), "{found} found, {right}");
     }
 
+    /// Half of the images are ten times as noisy as the others: where that is known, they agree, and the camera is nearer.
+    #[test]
+    fn images_count_by_their_weight() {
+        const NOISE: f64 = 1e-3;
+        let (mut weighted, mut plain) = (0.0, 0.0);
+        for seed in 0..20 {
+            let scene = testing::scene(seed, 3, 60, 0.0);
+            let (cameras, points) = testing::projectively_transformed(&scene, seed);
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let factor = |k: usize| if k.is_multiple_of(2) { 10.0 } else { 1.0 };
+            let of_last = scene.observations.iter().filter(|seen| seen.view == 2);
+            let images: Vec<Vector2<f64>> = of_last
+                .map(|seen| {
+                    let noise = Vector2::new(testing::normal(&mut rng), testing::normal(&mut rng));
+                    seen.xy + factor(seen.point) * NOISE * noise
+                })
+                .collect();
+            let weights: Vec<f64> = (0..images.len()).map(|k| 1.0 / (factor(k) * factor(k))).collect();
+            let mut away = |weights: &[f64]| {
+                let gate = 13.8 * NOISE * NOISE;
+                let found = robust(&points, &images, weights, gate, 10, &mut rng, &StopToken::default());
+                let (camera, agreeing) = found.expect("a camera");
+                let squared = |point: &Point| {
+                    let (seen, expected) = (camera * point, cameras[2] * point);
+                    (seen.xy() / seen.z - expected.xy() / expected.z).norm_squared()
+                };
+                (points.iter().map(squared).sum::<f64>(), agreeing.into_iter().filter(|agrees| *agrees).count())
+            };
+            let (by_weights, by_all) = (away(&weights), away(&vec![1.0; images.len()]));
+            assert!(by_weights.1 >= 54 && by_all.1 < 48, "seed {seed}: {by_weights:?} {by_all:?}");
+            weighted += by_weights.0;
+            plain += by_all.0;
+        }
+        println!("squared error {weighted} with weights, {plain} without");
+        assert!(weighted < plain, "squared error {weighted} with weights, {plain} without");
+    }
+
     /// What the fit to all points cannot do, a sample may.
     #[test]
     fn a_point_without_coordinates_is_an_outlier() {
         let (_, mut points, images) = problem(1, 0);
         points[7] = Point::zeros();
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let (_, agreeing) = robust(&points, &images, 13.8e-6, 10, &mut rng, &StopToken::default()).expect("a camera");
+        let (_, agreeing) =
+            robust(&points, &images, &vec![1.0; images.len()], 13.8e-6, 10, &mut rng, &StopToken::default())
+                .expect("a camera");
         assert!(!agreeing[7] && agreeing.iter().filter(|&&agrees| agrees).count() >= 37);
     }
 
@@ -271,10 +323,13 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let scattered: Vec<Vector2<f64>> =
             (0..40).map(|k| Vector2::new((k as f64 * 1.7).sin(), (k as f64 * 2.9).cos())).collect();
-        assert!(robust(&points, &scattered, 1e-5, 10, &mut rng, &StopToken::default()).is_none());
+        assert!(
+            robust(&points, &scattered, &vec![1.0; scattered.len()], 1e-5, 10, &mut rng, &StopToken::default())
+                .is_none()
+        );
         assert!(linear(&points[..5], &images[..5]).is_none());
         assert!(linear(&[Point::zeros(); 8], &images[..8]).is_none());
         let nan = vec![Point::from_element(f64::NAN); 8];
-        assert!(robust(&nan, &images[..8], 1.0, 6, &mut rng, &StopToken::default()).is_none());
+        assert!(robust(&nan, &images[..8], &[1.0; 8], 1.0, 6, &mut rng, &StopToken::default()).is_none());
     }
 }

@@ -1,69 +1,275 @@
-//! From the geometry of a block to the solution that callers read.
-
-use std::collections::BTreeSet;
+//! From what the stages found to the solution that callers read.
 
 use nalgebra::{Matrix3, Matrix4};
 
-use super::Context;
 use super::attempt::Attempt;
-use super::baselines::Decided;
-use super::calibration::{Outcome, ViewFocal};
-use super::classification::{self, Geometry, Judged, SplitPoint};
+use super::calibration::Outcome;
+use super::classification::{self, Judged};
+use super::grow::{LEAST_INLIERS, LEAST_SUPPORT};
+use super::portfolio::Found;
+use super::problem::{Problem, camera_groups};
+use super::reconstruction::{Reconstruction, own_verdicts};
 use super::recorder::Recorder;
-use super::sequence::Projective;
+use super::sequence::Ended;
+use super::view_selection::{LEAST_TRACKS, LEAST_VIEWS};
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
-use crate::geometry::bundle::metric::{Intrinsics, Parameter, Reconstruction};
-use crate::geometry::daq::to_canonical_frame;
+use crate::geometry::bundle::metric::{Intrinsics, Parameter};
+use crate::geometry::daq::oriented;
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::root_mean_square;
-use crate::geometry::{Camera, Point, triangulation};
+use crate::geometry::{Camera, Point};
 
-/// The solution of a scene in which nothing could be reconstructed; the reason is among `warnings`.
-pub fn unsolved(
-    context: &Context,
-    attempt: Option<&Attempt>,
-    mut warnings: Vec<Warning>,
-    recorder: Recorder,
-) -> Solution {
-    let (input, settings) = (context.input, context.settings);
-    let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
-    let (stages, history) = recorder.finish();
-    let mut tracks = TrackResults {
-        weight: vec![0.0; input.track_count()],
-        inlier: vec![false; input.track_count()],
-        network_weight: Vec::new(),
-        point: vec![None; input.track_count()],
-        part: Vec::new(),
+/// Observations that determine a point.
+const LEAST_OBSERVATIONS: usize = 2;
+
+/// The solution that the best of what was found gives; without any, the reason.
+pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Solution {
+    recorder.enter(Stage::Judge);
+    let mut warnings = problem.warnings.clone();
+    let (reconstruction, mut seed) = match ended {
+        Ended::Extended(extended) => (Some(Reconstruction::of_extended(problem, &extended)), Some(extended.seed)),
+        Ended::Block(Some(attempt)) => (Reconstruction::of_attempt(problem, &attempt), Some(*attempt)),
+        Ended::Block(None) => (None, None),
     };
-    if let Some(attempt) = attempt {
-        tracks.network_weight = network_weights(attempt, context);
-        if let Some(decided) = &attempt.decided {
-            own_verdicts(&attempt.block.tracks, decided, &mut tracks);
+    let (Some(reconstruction), Some(seed)) = (reconstruction, &mut seed) else {
+        warnings.push(why_unsolved(problem, seed.as_ref()));
+        return unsolved(problem, seed.as_ref(), warnings, recorder);
+    };
+    let judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, seed, &mut recorder));
+    reconstruction.solution(problem, seed, judged, warnings, recorder)
+}
+
+impl Reconstruction {
+    fn is_metric(&self) -> bool {
+        self.grade != Grade::ProjectiveOnly
+    }
+
+    /// Judges every track and observation by it and writes down what it says.
+    ///
+    /// With grade PROJECTIVE_ONLY nothing metric is in it, the focal length included: a number that must not be used
+    /// is not given; points are then in the frame of the projective cameras.
+    fn solution(
+        self,
+        problem: &Problem,
+        seed: &Attempt,
+        mut judged: Judged,
+        mut warnings: Vec<Warning>,
+        recorder: Recorder,
+    ) -> Solution {
+        let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
+        // Depths verify fewer, and PAPER and PSFM keep what they keep.
+        if seed.judges_observations() && inliers < LEAST_INLIERS {
+            let detail = format!("{inliers} tracks hold under the final geometry; {LEAST_INLIERS} can be verified");
+            warnings.push(Warning::new(WarningCode::FewInliers, detail));
+            return nothing(problem, Some(seed), warnings, recorder);
         }
-        if let Some(track_scores) = attempt.track_scores.as_ref().filter(|track_scores| track_scores.ranks()) {
-            let probabilities = track_scores.probabilities();
-            tracks.weight = context.scatter(&probabilities, &attempt.block.tracks);
-            let likely = track_scores.likely();
-            let detail = format!(
-                "{likely} tracks look right to the trained network and geometry verifies none: `weight` of the \
-                 tracks is what it gives them, nothing has checked it"
-            );
-            warnings.push(Warning::new(WarningCode::UnverifiedRanking, detail));
+        warnings.extend(self.warnings(problem));
+        warnings.extend(seed.second_structure.clone());
+        let frames = self.frames(problem);
+        let place = |point: &Point, track: usize, retained: &[Observation]| {
+            let back = frames[self.component_of_track[track] as usize].filter(|_| !self.is_metric());
+            let point = match back {
+                Some(frame) => frame.try_inverse()? * point,
+                None => *point,
+            };
+            dehomogenise(&point).filter(|_| self.holds(retained))
+        };
+        let points: Vec<Option<[f64; 3]>> = judged
+            .points
+            .iter()
+            .enumerate()
+            .map(|(track, point)| place(point.as_ref()?, track, &judged.retained[track]))
+            .collect();
+        let split = |split: &classification::SplitPoint| TrackSplit {
+            track: split.track as u32,
+            number: split.number,
+            weight: split.weight as f32,
+            point: place(&split.point, split.track, &split.retained),
+        };
+        let splits = judged.splits.iter().map(split).collect();
+        if self.component_of_view.iter().any(|&part| part > 0) {
+            let part = |(point, part): (&Option<_>, &u32)| point.map_or(0, |_: [f64; 3]| *part);
+            judged.tracks.part = points.iter().zip(&self.component_of_track).map(part).collect();
+        }
+        judged.tracks.point = points;
+        judged.tracks.network_weight = network_weights(problem, seed);
+        let (rms, mean) = reprojection(&judged.observations);
+        Solution {
+            status: Status::Solved,
+            grade: Some(self.grade),
+            winning_prior: seed.found.winning_prior,
+            calibrations: self.calibrations(problem),
+            // The frame is affine to the metric one: its plane at infinity is (0, 0, 0, 1).
+            plane_at_infinity: self.is_metric().then_some([0.0; 3]),
+            views: self.views(problem, &frames),
+            tracks: judged.tracks,
+            observations: judged.observations,
+            splits,
+            noise_px: Some(self.noise * problem.scale_px),
+            reprojection_rms_px: rms,
+            reprojection_mean_px: mean,
+            ..nothing(problem, Some(seed), warnings, recorder)
         }
     }
+
+    /// What is to be said of the calibrations, each group's named where there are several.
+    fn warnings(&self, problem: &Problem) -> Vec<Warning> {
+        let (group_of, groups) = camera_groups(problem.input);
+        let outcomes: Vec<&Outcome> = self.calibrated.iter().map(|(_, outcome)| outcome).collect();
+        let id_of = |group: usize| {
+            let view = group_of.iter().position(|of| *of == group).filter(|_| outcomes.len() == groups)?;
+            Some(problem.input.views()[view].camera_group)
+        };
+        let is_common = |warning: &Warning| outcomes.iter().all(|outcome| outcome.warnings.contains(warning));
+        let of_group = |(group, outcome): (usize, &&Outcome)| -> Vec<Warning> {
+            let named = |warning: &Warning| match id_of(group) {
+                // One for all groups, or none to tell apart.
+                None => warning.clone(),
+                Some(_) if groups > 1 && is_common(warning) => warning.clone(),
+                Some(id) if groups > 1 => {
+                    Warning::new(warning.code, format!("camera group {id}: {}", warning.detail)).of_group(id)
+                }
+                Some(id) => warning.clone().of_group(id),
+            };
+            // What is said of all is said once.
+            let is_repeated = |warning: &&Warning| group > 0 && is_common(warning);
+            outcome.warnings.iter().filter(|warning| !is_repeated(warning)).map(named).collect()
+        };
+        outcomes.iter().enumerate().flat_map(of_group).collect()
+    }
+
+    /// The calibration of each camera group in pixels, its principal point about the image centre of the group's first
+    /// view; where views have their own focal lengths, with the geometric mean of the group's, or of all for one of
+    /// which none is determined.
+    fn calibrations(&self, problem: &Problem) -> Vec<Calibration> {
+        if !self.is_metric() {
+            return Vec::new();
+        }
+        let (group_of, groups) = camera_groups(problem.input);
+        let mean = |views: &[usize]| {
+            let sum: f64 = views.iter().map(|&view| self.lenses[view].focal.ln()).sum();
+            (sum / views.len().max(1) as f64).exp()
+        };
+        let determined: Vec<usize> = (0..self.poses.len()).filter(|&view| self.poses[view].is_some()).collect();
+        let of_group = |group: usize| {
+            let view = group_of.iter().position(|of| *of == group)?;
+            let (intrinsics, outcome) = &self.calibrated[problem.camera_of[view]];
+            let intrinsics = (*intrinsics)?;
+            if !problem.has_own_focals() {
+                return Some(pixel_calibration(&intrinsics, outcome, problem, view));
+            }
+            let own: Vec<usize> = determined.iter().copied().filter(|&view| group_of[view] == group).collect();
+            let focal = mean(if own.is_empty() { &determined } else { &own });
+            let mut calibration = pixel_calibration(&Intrinsics { focal, ..intrinsics }, outcome, problem, view);
+            if own.is_empty() {
+                calibration.grade = Some(Grade::ProjectiveOnly);
+                calibration.sigma_log_focal = None;
+            }
+            Some(calibration)
+        };
+        (0..groups).filter_map(of_group).collect()
+    }
+
+    /// For each component the homography that takes the pixel camera of its first view to `[I|0]`.
+    fn frames(&self, problem: &Problem) -> Vec<Option<Matrix4<f64>>> {
+        let components = self.component_of_view.iter().copied().max().unwrap_or(0);
+        let first = |component: u32| {
+            (0..self.cameras.len()).find_map(|view| {
+                let camera = self.cameras[view].as_ref().filter(|_| self.component_of_view[view] == component)?;
+                let to_pixels = problem.normalization.to_pixels(view);
+                match &self.canonical {
+                    Some(canonical) => Some(canonical.homography * affine_frame(&to_pixels, &canonical.cameras[0])?),
+                    None => affine_frame(&to_pixels, camera),
+                }
+            })
+        };
+        (0..=components).map(first).collect()
+    }
+
+    fn views(&self, problem: &Problem, frames: &[Option<Matrix4<f64>>]) -> Vec<ViewResult> {
+        let result = |view: usize| {
+            let frame = frames[self.component_of_view[view] as usize].as_ref();
+            let (Some(camera), Some(frame)) = (&self.cameras[view], frame) else { return ViewResult::default() };
+            let mut projection = problem.normalization.camera_px(view, camera) * frame;
+            if self.canonical.is_some() {
+                projection = oriented(&projection);
+            }
+            let pose = self.poses[view].as_ref();
+            let has_own_focal = problem.has_own_focals() && pose.is_some();
+            ViewResult {
+                projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| projection[(row, column)]))),
+                rotation: pose
+                    .map(|pose| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
+                translation: pose.map(|pose| pose.translation.into()),
+                focal_px: has_own_focal.then(|| self.lenses[view].focal * problem.scale_px),
+                part: self.component_of_view[view],
+                ..ViewResult::default()
+            }
+        };
+        let mut views: Vec<ViewResult> = (0..self.cameras.len()).map(result).collect();
+        self.left_out.iter().for_each(|(view, reason)| views[*view].left_out = Some(*reason));
+        views
+    }
+
+    /// Whether views with a pose hold the point of these observations: what others alone see is in no metric result.
+    fn holds(&self, retained: &[Observation]) -> bool {
+        let with_pose = retained.iter().filter(|seen| self.poses[seen.view].is_some()).count();
+        !self.is_metric() || with_pose >= LEAST_OBSERVATIONS
+    }
+}
+
+/// The homography that takes the pixel camera of a view to `[I|0]` and leaves the plane at infinity where it is.
+fn affine_frame(to_pixels: &Matrix3<f64>, camera: &Camera) -> Option<Matrix4<f64>> {
+    let camera = to_pixels * camera;
+    let inverse = camera.fixed_columns::<3>(0).try_inverse()?;
+    let mut frame = Matrix4::identity();
+    frame.fixed_view_mut::<3, 3>(0, 0).copy_from(&inverse);
+    frame.fixed_view_mut::<3, 1>(0, 3).copy_from(&-(inverse * camera.column(3)));
+    Some(frame)
+}
+
+/// The solution of a scene in which nothing could be reconstructed; the reason is among `warnings`.
+fn unsolved(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>, recorder: Recorder) -> Solution {
+    let mut solution = nothing(problem, attempt, warnings, recorder);
+    let Some(attempt) = attempt else { return solution };
+    if let Some(decided) = &attempt.decided {
+        own_verdicts(&attempt.block.tracks, decided, &mut solution.tracks);
+    }
+    if let Some(track_scores) = attempt.found.track_scores.as_ref().filter(|track_scores| track_scores.ranks()) {
+        solution.tracks.weight = problem.scatter(&track_scores.probabilities(), &attempt.block.tracks);
+        let detail = format!(
+            "{} tracks look right to the trained network and geometry verifies none: `weight` of the tracks is what it \
+             gives them, nothing has checked it",
+            track_scores.likely()
+        );
+        solution.warnings.push(Warning::new(WarningCode::UnverifiedRanking, detail));
+    }
+    solution
+}
+
+/// A solution that says how the solve went, and nothing else.
+fn nothing(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>, recorder: Recorder) -> Solution {
+    let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
+    let (stages, history) = recorder.finish();
     Solution {
         status: Status::NoReconstruction,
         grade: None,
-        method: settings.method,
+        method: problem.settings.method,
         winning_prior: None,
         iterations,
-        seed: settings.seed,
+        seed: problem.settings.seed,
         calibrations: Vec::new(),
         plane_at_infinity: None,
-        views: vec![ViewResult::default(); input.view_count()],
-        tracks,
-        observations: ObservationResults::unjudged(input.observation_count()),
+        views: vec![ViewResult::default(); problem.views()],
+        tracks: TrackResults {
+            weight: vec![0.0; problem.tracks()],
+            inlier: vec![false; problem.tracks()],
+            network_weight: attempt.map_or_else(Vec::new, |attempt| network_weights(problem, attempt)),
+            point: vec![None; problem.tracks()],
+            part: Vec::new(),
+        },
+        observations: ObservationResults::unjudged(problem.input.observation_count()),
         splits: Vec::new(),
         noise_px: None,
         reprojection_rms_px: None,
@@ -71,323 +277,85 @@ pub fn unsolved(
         warnings,
         seconds,
         stages,
-        prior_times: attempt.map_or_else(Vec::new, |attempt| attempt.prior_times.clone()),
+        prior_times: attempt.map_or_else(Vec::new, |attempt| attempt.found.prior_times.clone()),
         history,
         trained_network: None,
         input_sha256: None,
     }
 }
 
-/// The solution of a block that stands.
-///
-/// With grade PROJECTIVE_ONLY nothing metric is in it, the focal length included: a number that must not be used is
-/// not given.
-pub fn solved(context: &Context, mut attempt: Attempt, mut warnings: Vec<Warning>, mut recorder: Recorder) -> Solution {
-    recorder.enter(Stage::Judge);
-    let already = attempt.judged.take();
-    let attempt = &attempt;
-    let (Some(projective), Some(calibration)) = (&attempt.projective, &attempt.calibration) else {
-        return unsolved(context, Some(attempt), warnings, recorder);
-    };
-    let mut judged = already.unwrap_or_else(|| judged(context, attempt, projective, &mut recorder));
-    if let Some(weights) = &attempt.weights_by_depths {
-        judge_by_depths(attempt, weights, &projective.cameras, context, &mut judged);
-    }
-    if let Some(decided) = &attempt.decided {
-        mask(context, &attempt.block.tracks, decided, &mut judged);
-    }
-    // Where the first camera has no rank 3 the frame stays as it is: there is nothing metric to be consistent with.
-    let frame = to_canonical_frame(&projective.cameras, &[]);
-    let back = frame.as_ref().and_then(|frame| frame.homography.try_inverse()).unwrap_or_else(Matrix4::identity);
-    judged.points.iter_mut().flatten().for_each(|point| *point = back * *point);
-    let first_px = context.normalization.to_pixels(projective.views[0]);
-    let splits = judged.splits.iter().map(|split| split_of(split, &back, &first_px)).collect();
-    let cameras = frame.map_or_else(|| projective.cameras.clone(), |frame| frame.cameras);
-    let usable = calibration.metric.as_ref().filter(|_| calibration.grade != Grade::ProjectiveOnly);
-    let groups: BTreeSet<u32> = context.input.views().iter().map(|view| view.camera_group).collect();
-    let only = groups.first().copied().filter(|_| groups.len() == 1);
-    warnings.extend(calibration.warnings.iter().cloned().map(|warning| Warning { camera_group: only, ..warning }));
-    warnings.extend(attempt.second_structure.clone());
-
-    judged.tracks.point = final_points(context, attempt, usable, &judged, &first_px);
-    judged.tracks.network_weight = network_weights(attempt, context);
-    let (rms, mean) = reprojection(&judged.observations);
-    let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
-    let (stages, history) = recorder.finish();
-    Solution {
-        status: Status::Solved,
-        grade: Some(calibration.grade),
-        method: context.settings.method,
-        winning_prior: attempt.winning_prior,
-        iterations,
-        seed: context.settings.seed,
-        calibrations: usable
-            .map(|metric| pixel_calibrations(attempt, metric, calibration, context, projective.views[0]))
-            .unwrap_or_default(),
-        // Planes transform by the inverse transpose of what moves points: from normalised to pixels that is T1^-T.
-        plane_at_infinity: calibration
-            .plane_at_infinity
-            .filter(|_| usable.is_some())
-            .and_then(|plane| first_px.try_inverse().map(|inverse| (inverse.transpose() * plane).into())),
-        views: views(context, attempt, projective, &cameras, usable),
-        tracks: judged.tracks,
-        observations: judged.observations,
-        splits,
-        noise_px: Some(projective.noise * context.scale_px),
-        reprojection_rms_px: rms,
-        reprojection_mean_px: mean,
-        warnings,
-        seconds,
-        stages,
-        prior_times: attempt.prior_times.clone(),
-        history,
-        trained_network: None,
-        input_sha256: None,
-    }
-}
-
-/// Share of its observations that a complete track must retain: of 100 permuted tracks in ten views about one holds
-/// three observations of one point by chance.
-const LEAST_RETAINED_SHARE: f64 = 0.6;
-
-/// See [`Geometry::least_share`]: tracks of a sequence may be linked wrongly and hold several points.
-pub fn least_share(context: &Context) -> f64 {
-    let is_sequence = super::block::complete_views(context.input, context.ranges).is_none();
-    if is_sequence { 0.0 } else { LEAST_RETAINED_SHARE }
-}
-
-/// Every track and observation judged by the projective cameras.
-pub fn judged(context: &Context, attempt: &Attempt, projective: &Projective, recorder: &mut Recorder) -> Judged {
-    let mut cameras = vec![None; context.input.view_count()];
-    for (&view, camera) in projective.views.iter().zip(&projective.cameras) {
-        cameras[view] = Some(*camera);
-    }
-    let weights = match attempt.judges_observations() {
-        true => super::block::weights(context.input),
-        false => Vec::new(),
-    };
-    let geometry = Geometry {
-        cameras: &cameras,
-        parts: None,
-        normalization: context.normalization,
-        lenses: &[],
-        weights: &weights,
-        linked: attempt.judges_observations(),
-        least_share: if attempt.judges_observations() { least_share(context) } else { LEAST_RETAINED_SHARE },
-        noise: projective.noise,
-        outlier_density: classification::density_of_spread(attempt.spread),
-        inlier_share: (projective.tracks.len() as f64 + 1.0) / (projective.tried as f64 + 2.0),
-    };
-    let mut told = |verdicts| recorder.judged(verdicts, context.input.track_count());
-    classification::judge(context.input, context.ranges, &geometry, context.threads, context.stop, &mut told)
-}
-
-/// Tracks of the block by image points and depths together, in place of image points alone.
-fn judge_by_depths(attempt: &Attempt, weights: &[f64], local: &[Camera], context: &Context, judged: &mut Judged) {
-    let input = context.input;
-    for (j, &track) in attempt.block.tracks.iter().enumerate() {
-        judged.tracks.weight[track] = weights[j] as f32;
-        let inlier = weights[j] > 0.5;
-        if inlier == judged.tracks.inlier[track] {
-            continue;
-        }
-        judged.tracks.inlier[track] = inlier;
-        if context.stop.is_stopped() {
-            return;
-        }
-        let observations = attempt.block.complete.track(j);
-        let start = triangulation::linear(local, observations);
-        let point = triangulation::refine(local, observations, start, POINT_STEPS).0;
-        judged.points[track] = inlier.then_some(point);
-        judged.retained[track] = if inlier {
-            observations
-                .iter()
-                .map(|seen| Observation { view: attempt.block.views[seen.view], point: track, ..*seen })
-                .collect()
-        } else {
-            Vec::new()
-        };
-        for k in context.ranges[track]..context.ranges[track + 1] {
-            let Ok(view) = attempt.block.views.binary_search(&input.view_of(k)) else { continue };
-            let place = input.caller_index(k);
-            let residual = triangulation::reprojection(&local[view], &point, &observations[view].xy).norm();
-            judged.observations.inlier[place] = inlier;
-            judged.observations.weight[place] = judged.noise.weight(residual * residual) as f32;
-            judged.observations.residual_px[place] =
-                Some(residual * context.scale_px).filter(|residual| residual.is_finite());
-        }
+fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
+    match best {
+        None if problem.views() < LEAST_VIEWS => Warning::new(
+            WarningCode::NoConsensus,
+            format!("{} views given; a reconstruction needs at least {}", problem.views(), LEAST_VIEWS),
+        ),
+        None => Warning::new(
+            WarningCode::FewInliers,
+            format!(
+                "no {} views share enough tracks: at least {}, of which none is another's copy, must be seen in all of them",
+                LEAST_VIEWS, LEAST_TRACKS
+            ),
+        ),
+        Some(Attempt { decided: Some(decided), .. }) => Warning::new(
+            WarningCode::FewInliers,
+            format!(
+                "the method kept {} tracks; {} determine the cameras",
+                decided.inlier.iter().filter(|&&inlier| inlier).count(),
+                LEAST_SUPPORT
+            ),
+        ),
+        Some(Attempt { found: Found { rejected_by_network: Some((inliers, counted)), .. }, .. }) => Warning::new(
+            WarningCode::FewInliers,
+            format!(
+                "{inliers} tracks hold under one geometry, but the trained network takes only {counted} of them to be \
+                 right, and so few cameras can adapt to wrong ones; {} are needed. GEOMETRY does not ask the network",
+                LEAST_INLIERS
+            ),
+        ),
+        Some(Attempt { found: Found { near_duplicates: Some((inliers, counted)), .. }, .. }) => Warning::new(
+            WarningCode::FewInliers,
+            format!(
+                "{inliers} tracks hold under one geometry, but lie within the noise of each other in every view: they \
+                 count as {counted}, and {} are needed",
+                LEAST_INLIERS
+            ),
+        ),
+        Some(attempt) => Warning::new(
+            WarningCode::NoConsensus,
+            format!(
+                "among the {} tracks complete over {} views no {} or more agree on one geometry more than by chance",
+                attempt.block.tracks.len(),
+                attempt.block.views.len(),
+                LEAST_INLIERS
+            ),
+        ),
     }
 }
 
 /// The network's own weight of every track; empty where none ran, 0 for tracks it did not see.
-pub fn network_weights(attempt: &Attempt, context: &Context) -> Vec<f32> {
-    if attempt.network_weights.is_empty() {
+fn network_weights(problem: &Problem, attempt: &Attempt) -> Vec<f32> {
+    if attempt.found.network_weights.is_empty() {
         return Vec::new();
     }
-    context.scatter(&attempt.network_weights, &attempt.block.tracks)
-}
-
-/// PAPER and PSFM: the method's own weights and verdicts in place of the geometry's.
-fn own_verdicts(block_tracks: &[usize], decided: &Decided, tracks: &mut TrackResults) {
-    tracks.weight.fill(0.0);
-    tracks.inlier.fill(false);
-    for (j, &track) in block_tracks.iter().enumerate() {
-        tracks.weight[track] = decided.weights[j] as f32;
-        tracks.inlier[track] = decided.inlier[j];
-    }
-}
-
-/// The same, with what follows from it: a track that the method rejects has neither observations nor a point.
-fn mask(context: &Context, block_tracks: &[usize], decided: &Decided, judged: &mut Judged) {
-    own_verdicts(block_tracks, decided, &mut judged.tracks);
-    for track in 0..context.input.track_count() {
-        if !judged.tracks.inlier[track] {
-            judged.retained[track].clear();
-            judged.points[track] = None;
-            for k in context.ranges[track]..context.ranges[track + 1] {
-                judged.observations.inlier[context.input.caller_index(k)] = false;
-            }
-        }
-    }
-}
-
-fn views(
-    context: &Context,
-    attempt: &Attempt,
-    projective: &Projective,
-    local: &[Camera],
-    metric: Option<&Reconstruction>,
-) -> Vec<ViewResult> {
-    let mut views = vec![ViewResult::default(); context.input.view_count()];
-    let first = projective.views[0];
-    // In pixels the frame moves with the first view's pixel transform, so that its camera stays [I|0].
-    let mut frame = Matrix4::identity();
-    if let Some(inverse) = context.normalization.to_pixels(first).try_inverse() {
-        frame.fixed_view_mut::<3, 3>(0, 0).copy_from(&inverse);
-    }
-    for (i, &view) in projective.views.iter().enumerate() {
-        let projection = context.normalization.camera_px(view, &local[i]) * frame;
-        let focal = own_focal(attempt, i);
-        let is_determined = focal.is_none_or(|focal| focal.sigma_log.is_some());
-        let pose = metric.filter(|_| is_determined).map(|metric| &metric.poses[i]);
-        views[view] = ViewResult {
-            projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| projection[(row, column)]))),
-            rotation: pose
-                .map(|pose| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
-            translation: pose.map(|pose| pose.translation.into()),
-            focal_px: pose.and(focal).map(|own| own.focal * context.scale_px),
-            ..ViewResult::default()
-        };
-    }
-    views
-}
-
-/// Focal length of the `i`-th view of the block, where every view has its own.
-fn own_focal(attempt: &Attempt, i: usize) -> Option<ViewFocal> {
-    attempt.calibration.as_ref()?.focals.as_ref()?.get(i).copied()
-}
-
-/// Metric points where the result is metric, projective ones (pixel frame) elsewhere.
-fn final_points(
-    context: &Context,
-    attempt: &Attempt,
-    metric: Option<&Reconstruction>,
-    judged: &Judged,
-    first_px: &Matrix3<f64>,
-) -> Vec<Option<[f64; 3]>> {
-    let Some(metric) = metric else {
-        let moved = |point: &Option<Point>| point.and_then(|point| dehomogenise(&to_pixel_frame(&point, first_px)));
-        return judged.points.iter().map(moved).collect();
-    };
-    let mut cameras = vec![Camera::zeros(); context.input.view_count()];
-    let mut lenses = vec![metric.intrinsics[0]; cameras.len()];
-    let mut has_pose = vec![true; cameras.len()];
-    for (i, &view) in attempt.views().iter().enumerate() {
-        let own = own_focal(attempt, i);
-        let shared = metric.intrinsics[metric.group_of[i]];
-        lenses[view] = Intrinsics { focal: own.map_or(shared.focal, |own| own.focal), ..shared };
-        cameras[view] = metric.poses[i].camera(&lenses[view]);
-        has_pose[view] = own.is_none_or(|own| own.sigma_log.is_some());
-    }
-    let triangulated = |observations: &Vec<Observation>| {
-        if observations.is_empty() || context.stop.is_stopped() {
-            return None;
-        }
-        // These cameras know no distortion.
-        let undone = |seen: &Observation| Some(Observation { xy: lenses[seen.view].undistort(&seen.xy)?, ..*seen });
-        let observations: Vec<Observation> =
-            observations.iter().filter(|seen| has_pose[seen.view]).filter_map(undone).collect();
-        if observations.len() < LEAST_SIGHTINGS {
-            return None;
-        }
-        let start = triangulation::linear(&cameras, &observations);
-        dehomogenise(&triangulation::refine(&cameras, &observations, start, POINT_STEPS).0)
-    };
-    judged.retained.iter().map(triangulated).collect()
-}
-
-/// Observations that determine a point.
-pub const LEAST_SIGHTINGS: usize = 2;
-/// Refinement steps of a final point.
-const POINT_STEPS: usize = 10;
-
-/// A further point of a track, in the frame of the pixel cameras.
-fn split_of(split: &SplitPoint, back: &Matrix4<f64>, first_px: &Matrix3<f64>) -> TrackSplit {
-    TrackSplit {
-        track: split.track as u32,
-        number: split.number,
-        weight: split.weight as f32,
-        point: dehomogenise(&to_pixel_frame(&(back * split.point), first_px)),
-    }
-}
-
-/// The point in the frame of pixel cameras: `P_px = T P H` with `H = diag(T1^-1, 1)`, so points move by `diag(T1, 1)`.
-fn to_pixel_frame(point: &Point, first_px: &Matrix3<f64>) -> Point {
-    let moved = first_px * point.xyz();
-    Point::new(moved.x, moved.y, moved.z, point.w)
+    problem.scatter(&attempt.found.network_weights, &attempt.block.tracks)
 }
 
 /// `None` for points at infinity.
-pub fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
+fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
     let scaled = point.xyz() / point.w;
     scaled.iter().all(|entry| entry.is_finite()).then(|| scaled.into())
-}
-
-/// The calibration in pixels: one for all views, or, where the input has several camera groups, one a group with a view
-/// in rising order, their principal points about the image centre of the group's first view.
-fn pixel_calibrations(
-    attempt: &Attempt,
-    metric: &Reconstruction,
-    outcome: &Outcome,
-    context: &Context,
-    first_view: usize,
-) -> Vec<Calibration> {
-    let about = |view: usize, group: usize| pixel_calibration(&metric.intrinsics[group], outcome, context, view);
-    let (group_of, groups) = super::block::camera_groups(context.input);
-    if groups == 1 {
-        return vec![about(first_view, 0)];
-    }
-    let of_group = |group: usize| {
-        let first = group_of.iter().position(|of| *of == group)?;
-        // One calibration for all, or that of the views that were solved.
-        let of_metric = match metric.intrinsics.len() {
-            1 => 0,
-            _ => metric.group_of[attempt.views().iter().position(|&view| group_of[view] == group)?],
-        };
-        Some(about(first, of_metric))
-    };
-    (0..groups).filter_map(of_group).collect()
 }
 
 /// One calibration in pixels, its principal point about the image centre of this view.
 ///
 /// * `outcome`: says what it is worth
-pub fn pixel_calibration(intrinsics: &Intrinsics, outcome: &Outcome, context: &Context, view: usize) -> Calibration {
-    let offset = intrinsics.principal_point * context.scale_px;
+fn pixel_calibration(intrinsics: &Intrinsics, outcome: &Outcome, problem: &Problem, view: usize) -> Calibration {
+    let offset = intrinsics.principal_point * problem.scale_px;
     Calibration {
-        focal_px: intrinsics.focal * context.scale_px,
+        focal_px: intrinsics.focal * problem.scale_px,
         sigma_log_focal: outcome.sigma_log_focal,
-        principal_point_px: (context.normalization.centres_px[view] + offset).into(),
+        principal_point_px: (problem.normalization.centres_px[view] + offset).into(),
         aspect: intrinsics.aspect,
         radial_k1: intrinsics.radial[0],
         radial_k2: intrinsics.radial[1],
@@ -395,7 +363,7 @@ pub fn pixel_calibration(intrinsics: &Intrinsics, outcome: &Outcome, context: &C
         tangential_p1: intrinsics.tangential[0],
         tangential_p2: intrinsics.tangential[1],
         grade: Some(outcome.grade),
-        sigmas: sigmas(intrinsics, outcome, context.scale_px),
+        sigmas: sigmas(intrinsics, outcome, problem.scale_px),
     }
 }
 
@@ -415,7 +383,7 @@ fn sigmas(intrinsics: &Intrinsics, outcome: &Outcome, scale_px: f64) -> Sigmas {
 }
 
 /// Root mean square and mean of the inlier observations' residuals.
-pub fn reprojection(observations: &ObservationResults) -> (Option<f64>, Option<f64>) {
+fn reprojection(observations: &ObservationResults) -> (Option<f64>, Option<f64>) {
     let residuals: Vec<f64> = observations
         .inlier
         .iter()

@@ -2,9 +2,13 @@
 //!
 //! Where PAPER departs from the paper, and on what evidence, is listed in [`crate::network`].
 
-use super::Context;
+use super::attempt::{self, Attempt, Effort};
 use super::grow::{self, Consensus, LEAST_SUPPORT};
+use super::problem::Problem;
 use super::recorder::Recorder;
+use super::search::subspace;
+use super::sequence::windows::{self, Estimate};
+use super::{Error, view_selection};
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, projective};
 use crate::geometry::epipolar_depths::epipolar_depths;
@@ -12,8 +16,6 @@ use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_res
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::triangulation;
 use crate::network::{NetworkSettings, PriorNetwork};
-
-use super::search::subspace;
 
 /// Weight above which the paper calls a track an inlier.
 const PAPER_THRESHOLD: f64 = 0.5;
@@ -28,7 +30,31 @@ pub struct Decided {
     pub inlier: Vec<bool>,
     /// The method's own weights, one a track of the block.
     pub weights: Vec<f64>,
-    pub network_weights: Vec<f64>,
+}
+
+/// Solves the densest blocks of views, one at least and until one is METRIC; the best of them. Blocks that disagree
+/// raise its uncertainty; other views are left out.
+///
+/// # Errors
+/// [`Error::Stopped`]; [`Error::Internal`] for defects.
+pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Option<Attempt>, Error> {
+    let candidates = view_selection::candidate_views(problem.input, &problem.ranges, problem.stop);
+    let mut attempts: Vec<Attempt> = Vec::new();
+    for (k, views) in candidates.iter().enumerate() {
+        problem.stopped()?;
+        recorder.begin_block(k, candidates.len());
+        attempts.push(attempt::solve_block(problem, problem.block(views), Effort::default(), None, recorder)?);
+        // A good block is still checked against a second one.
+        if k > 0 && attempts.iter().any(Attempt::is_good) {
+            break;
+        }
+    }
+    let estimates: Vec<Estimate> = attempts.iter().filter_map(Attempt::estimate).collect();
+    let mut best = attempts.into_iter().reduce(|best, other| if other.merit() > best.merit() { other } else { best });
+    if let Some(outcome) = best.as_mut().and_then(|best| best.calibration.as_mut()) {
+        windows::admit_misfit(outcome, &estimates);
+    }
+    Ok(best)
 }
 
 /// The block completed with depths from epipolar geometry, where the settings ask for them and the input has none: what
@@ -36,12 +62,12 @@ pub struct Decided {
 ///
 /// Returns `None` where the block stays as it is: not asked for, depths given, or no fundamental matrix to be found, in
 /// which case depths of 1 are what is left.
-pub fn with_epipolar_depths(block: &CompleteBlock, context: &Context, noise: f64) -> Option<CompleteBlock> {
-    let settings = context.settings;
+pub fn with_epipolar_depths(problem: &Problem, block: &CompleteBlock, noise: f64) -> Option<CompleteBlock> {
+    let settings = problem.settings;
     if !settings.epipolar_depths || block.has_depths() {
         return None;
     }
-    epipolar_depths(block, noise, settings.seed, context.stop).map(|depths| block.with_depths(depths))
+    epipolar_depths(block, noise, settings.seed, problem.stop).map(|depths| block.with_depths(depths))
 }
 
 /// PAPER: optimises the network to the end and thresholds its weights.
@@ -51,33 +77,29 @@ pub fn with_epipolar_depths(block: &CompleteBlock, context: &Context, noise: f64
 /// # Errors
 /// The network's own, which are defects: a block has more columns than it asks for.
 pub fn paper(
+    problem: &Problem,
     block: &CompleteBlock,
     tracks: &[usize],
-    context: &Context,
     recorder: &mut Recorder,
 ) -> Result<Decided, crate::network::Error> {
-    let settings = context.settings;
+    let settings = problem.settings;
     let matrix = balance(&block.measurement_matrix());
     let mut network = PriorNetwork::new(&matrix, &NetworkSettings::from(settings))?;
-    while network.iteration() < settings.iterations && !context.stop.is_stopped() {
+    while network.iteration() < settings.iterations && !problem.stop.is_stopped() {
         let step = network.step()?;
         recorder.standing.iteration = step.iteration;
         recorder.standing.losses = Some(step.losses);
         recorder.standing.inliers = network.weights().iter().filter(|&&w| w > PAPER_THRESHOLD).count() as u32;
         if settings.use_daq {
-            recorder.standing.focal_px = Some(network.focal() * context.scale_px);
+            recorder.standing.focal_px = Some(network.focal() * problem.scale_px);
         }
-        recorder.tell(f64::from(step.iteration) / f64::from(settings.iterations));
+        recorder.report(f64::from(step.iteration) / f64::from(settings.iterations));
         if settings.weights_every > 0 && step.iteration.is_multiple_of(settings.weights_every) {
-            recorder.weights(&context.scatter(network.weights(), tracks));
+            recorder.weights(&problem.scatter(network.weights(), tracks));
         }
     }
     let weights = network.weights().to_vec();
-    Ok(Decided {
-        inlier: weights.iter().map(|&weight| weight > PAPER_THRESHOLD).collect(),
-        network_weights: weights.clone(),
-        weights,
-    })
+    Ok(Decided { inlier: weights.iter().map(|&weight| weight > PAPER_THRESHOLD).collect(), weights })
 }
 
 /// PSFM: the dominant subspace of all columns (Sturm & Triggs 1996), and the tracks that lie close to it.
@@ -89,7 +111,6 @@ pub fn psfm(block: &CompleteBlock, noise: f64) -> Decided {
     Decided {
         inlier: residuals.iter().map(|&residual| residual < threshold).collect(),
         weights: residuals.iter().map(|&residual| 1.0 / (1.0 + (residual / threshold).powi(2))).collect(),
-        network_weights: Vec::new(),
     }
 }
 

@@ -3,8 +3,12 @@
 //! Four complete tracks leave ten projective cameras undetermined; with depths and one focal length they leave fifty
 //! constraints over. What stands on fewer tracks than image points can verify is never graded METRIC.
 
+use super::block::Block;
 use super::calibration::{CHEIRALITY_LIMIT, Outcome, few_inliers, grade_of_sigma};
+use super::classification::{Geometry, Judged};
 use super::grow::{Consensus, LEAST_INLIERS, NOISE_BOUNDS};
+use super::portfolio;
+use super::problem::Problem;
 use super::search::Seed;
 use super::search::rigid::{Rigid, Search};
 use crate::domain::{Grade, StopToken, Warning, WarningCode};
@@ -15,7 +19,7 @@ use crate::geometry::bundle::metric::{
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::metric::plane_at_infinity;
 use crate::geometry::observation::Observation;
-use crate::geometry::triangulation;
+use crate::geometry::{Camera, triangulation};
 
 /// Iterations of the metric adjustment, which starts within a few per cent.
 const ADJUSTMENT_ITERATIONS: usize = 60;
@@ -136,21 +140,34 @@ pub const STRONG_NOISE: f64 = 0.015;
 /// next to none are.
 const RIGID_SHARE: f64 = 0.8;
 
-/// Probability of each track of the block to be right by image points and depths together, under the rigid consensus
-/// refitted to the whole block; `None` where that does not hold for the consensus.
+/// Tracks that are weighed at most: a fit of more takes seconds.
+const MOST_WEIGHED: usize = 5_000;
+
+/// Probability of tracks to be right by image points and depths together.
+pub struct TrackWeights {
+    /// Tracks of the input, increasing.
+    tracks: Vec<usize>,
+    /// One a track of these.
+    weights: Vec<f64>,
+}
+
+/// Weighs the complete tracks over the views of a block, under the rigid consensus refitted to all of them; `None`
+/// where that does not hold for the consensus.
 ///
 /// At a noise of a tenth of the image the image points alone lose right tracks; a third coordinate and fewer unknowns
 /// keep them.
 pub fn weights(
-    block: &CompleteBlock,
+    problem: &Problem,
+    searched: &Block,
     consensus: &Consensus,
-    found: &Rigid,
-    spread: f64,
-    stop: &StopToken,
-) -> Option<Vec<f64>> {
-    let search = Search::new(block, spread, stop)?;
-    let inliers = consensus.inliers();
-    let rigid = search.refit(found, &inliers)?;
+    found: &Option<Rigid>,
+) -> Option<TrackWeights> {
+    let all = problem.block(&searched.views).sample_with(MOST_WEIGHED, problem.settings.seed, &searched.tracks);
+    let block = &all.complete;
+    let search = Search::new(block, portfolio::spread(block), problem.stop)?;
+    let place = |track: usize| all.tracks.binary_search(&searched.tracks[track]).ok();
+    let inliers: Vec<usize> = consensus.inliers().into_iter().filter_map(place).collect();
+    let rigid = search.refit(found.as_ref()?, &inliers)?;
     let shared = inliers.iter().filter(|&&track| rigid.inlier[track]).count();
     if (shared as f64) < RIGID_SHARE * inliers.len() as f64 {
         return None;
@@ -166,5 +183,40 @@ pub fn weights(
         let ln_odds = prior + ln_core - 0.5 * squared / (noise * noise) - ln_wrong;
         1.0 / (1.0 + (-ln_odds).exp())
     };
-    Some(rigid.squared.iter().map(weight).collect())
+    let weights = rigid.squared.iter().map(weight).collect();
+    Some(TrackWeights { tracks: all.tracks, weights })
 }
+
+impl TrackWeights {
+    /// Puts these in place of what image points alone say of the tracks.
+    pub fn judge(&self, problem: &Problem, geometry: &Geometry, judged: &mut Judged) {
+        let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+        for (&track, &weight) in self.tracks.iter().zip(&self.weights) {
+            judged.tracks.weight[track] = weight as f32;
+            let inlier = weight > 0.5;
+            if inlier == judged.tracks.inlier[track] || problem.stop.is_stopped() {
+                continue;
+            }
+            judged.tracks.inlier[track] = inlier;
+            let registered = problem.of_track(track).filter(|&k| geometry.cameras[problem.view_of(k)].is_some());
+            let seen: Vec<(usize, Observation)> =
+                registered.map(|k| (k, geometry.observation(problem.input, k))).collect();
+            let observations: Vec<Observation> = seen.iter().map(|(_, observation)| *observation).collect();
+            let start = triangulation::linear(&cameras, &observations);
+            let point = triangulation::refine(&cameras, &observations, start, POINT_STEPS).0;
+            for (k, observation) in seen {
+                let place = problem.input.caller_index(k);
+                let residual = triangulation::reprojection(&cameras[observation.view], &point, &observation.xy).norm();
+                judged.observations.inlier[place] = inlier;
+                judged.observations.weight[place] = judged.noise.weight(residual * residual) as f32;
+                judged.observations.residual_px[place] =
+                    Some(residual * problem.scale_px).filter(|residual| residual.is_finite());
+            }
+            judged.points[track] = inlier.then_some(point);
+            judged.retained[track] = if inlier { observations } else { Vec::new() };
+        }
+    }
+}
+
+/// Refinement steps of a point.
+const POINT_STEPS: usize = 10;

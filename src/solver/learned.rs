@@ -5,7 +5,7 @@
 //! odds are worth in the score of hypotheses comes from `scpsfm evaluate --priors --sweep`.
 
 use super::grow::LEAST_INLIERS;
-use crate::domain::{Method, Prior, SolveSettings};
+use crate::domain::{Method, Proposal, SolveSettings};
 use crate::geometry::measurement::CompleteBlock;
 use crate::network::subspace::{self, Cloud, MOST_VIEWS};
 
@@ -31,14 +31,14 @@ const LEAST_LIKELY: usize = 4;
 /// Inliers from which on geometry needs no second opinion: twice what it needs for any.
 pub const SURELY_ENOUGH: usize = 2 * LEAST_INLIERS;
 /// Odds against a track, in nats, at which it is held to be wrong: twenty to one.
-const DOUBT_NATS: f64 = 3.0;
-/// Tracks below which its doubts do not count: lessons have no fewer, and of ten right tracks alone the network takes
+const REJECTION_NATS: f64 = 3.0;
+/// Tracks below which its doubts do not count: scenes have no fewer, and of ten right tracks alone the network takes
 /// but a few to be right.
 const LEAST_JUDGED: usize = 50;
 
 /// Whether these settings let the search ask the network.
 pub fn may_be_asked(settings: &SolveSettings) -> bool {
-    settings.method == Method::Auto && !settings.excluded_priors.contains(&Prior::Learned)
+    settings.method == Method::Auto && !settings.excluded_priors.contains(&Proposal::Learned)
 }
 
 /// The network's scores of some tracks.
@@ -113,7 +113,7 @@ impl TrackScores {
         if inliers.len() >= SURELY_ENOUGH || self.ln_odds.len() < LEAST_JUDGED {
             return inliers.len();
         }
-        inliers.iter().filter(|&&track| self.ln_odds[track] > -DOUBT_NATS).count()
+        inliers.iter().filter(|&&track| self.ln_odds[track] > -REJECTION_NATS).count()
     }
 
     /// Whether enough tracks are likely right for their ranking to be told where geometry verifies none.

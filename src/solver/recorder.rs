@@ -60,8 +60,8 @@ pub struct Recorder<'a> {
     /// Share of the whole that the blocks have: all, or what an extension leaves them.
     share_of_blocks: f64,
     extending: bool,
-    /// Standing before the block of a further part, while that is solved.
-    before_part: Option<Standing>,
+    /// Standing before the block of a further component, while that is solved.
+    before_component: Option<Standing>,
     /// Network iterations of the blocks before.
     earlier_iterations: u32,
     history: Vec<Progress>,
@@ -70,7 +70,7 @@ pub struct Recorder<'a> {
     records: usize,
     pub standing: Standing,
     course: Course,
-    last_told: Instant,
+    last_report: Instant,
 }
 
 impl<'a> Recorder<'a> {
@@ -89,14 +89,14 @@ impl<'a> Recorder<'a> {
             blocks: 1,
             share_of_blocks: 1.0,
             extending: false,
-            before_part: None,
+            before_component: None,
             earlier_iterations: 0,
             history: Vec::new(),
             stride: 1,
             records: 0,
             standing: Standing::default(),
             course: Course { views: views as u32, ..Course::default() },
-            last_told: now,
+            last_report: now,
         }
     }
 
@@ -126,24 +126,24 @@ impl<'a> Recorder<'a> {
         self.extending = true;
     }
 
-    /// Begins the block of a further part: its course counts as work, and moves the share done no further.
-    pub fn begin_part(&mut self, part: u32) {
-        self.course.part = part;
+    /// Begins the block of a further component: its course counts as work, and moves the share done no further.
+    pub fn begin_component(&mut self, component: u32) {
+        self.course.part = component;
         self.earlier_iterations += self.standing.iteration;
-        self.before_part = Some(std::mem::take(&mut self.standing));
+        self.before_component = Some(std::mem::take(&mut self.standing));
     }
 
     /// Ends it: what stands is again what stood before.
-    pub fn end_part(&mut self) {
+    pub fn end_component(&mut self) {
         self.earlier_iterations += self.standing.iteration;
-        if let Some(before) = self.before_part.take() {
+        if let Some(before) = self.before_component.take() {
             self.standing = Standing { iteration: 0, ..before };
         }
         self.enter(Stage::Extend);
     }
 
-    /// All parts there are to be are built.
-    pub fn end_parts(&mut self) {
+    /// All components there are to be are built.
+    pub fn end_components(&mut self) {
         self.course.part = 0;
     }
 
@@ -157,9 +157,9 @@ impl<'a> Recorder<'a> {
         self.standing.focal_px = focal_px;
     }
 
-    /// So many views have a camera. What a block of a further part has counts once it is among the others.
+    /// So many views have a camera. What a block of a further component has counts once it is among the others.
     pub fn registered(&mut self, views: usize) {
-        if self.before_part.is_none() {
+        if self.before_component.is_none() {
             self.course.registered_views = views as u32;
         }
     }
@@ -170,19 +170,19 @@ impl<'a> Recorder<'a> {
         self.course.step = None;
         self.stage = stage;
         self.observer.stage(stage);
-        self.tell(0.0);
+        self.report(0.0);
     }
 
     /// Tells the observer the current standing; `within` is the share of the stage that is done.
-    pub fn tell(&mut self, within: f64) {
+    pub fn report(&mut self, within: f64) {
         self.advance(within);
         let progress = self.progress();
         self.observer.progress(&progress);
-        self.last_told = Instant::now();
+        self.last_report = Instant::now();
         self.keep(progress);
     }
 
-    /// Begins a step of a task, or tells how many are done; see [`Step`]. `within` as for [`Self::tell`].
+    /// Begins a step of a task, or tells how many are done; see [`Step`]. `within` as for [`Self::report`].
     pub fn step(&mut self, task: Task, step: usize, steps: usize, within: f64) {
         self.course.step = Some(Step { task, step: step as u32, steps: steps as u32 });
         self.advance(within);
@@ -199,10 +199,10 @@ impl<'a> Recorder<'a> {
     ///
     /// When that is depends on the machine, so that none of it goes into the history: one input has one answer.
     pub fn heartbeat(&mut self) {
-        if self.last_told.elapsed() >= SIGN_PERIOD {
+        if self.last_report.elapsed() >= SIGN_PERIOD {
             let progress = self.progress();
             self.observer.progress(&progress);
-            self.last_told = Instant::now();
+            self.last_report = Instant::now();
         }
     }
 
@@ -225,7 +225,7 @@ impl<'a> Recorder<'a> {
     }
 
     fn fraction_done(&self, within: f64) -> f64 {
-        if self.before_part.is_some() {
+        if self.before_component.is_some() {
             return self.fraction;
         }
         let at = if self.extending { fraction_of_extension_at } else { fraction_at };
@@ -258,7 +258,7 @@ impl<'a> Recorder<'a> {
     pub fn finish(mut self) -> (Vec<StageTime>, Vec<Progress>) {
         self.fraction = 1.0;
         self.course.step = None;
-        self.tell(1.0);
+        self.report(1.0);
         self.close_stage();
         (self.stages, self.history)
     }
@@ -322,7 +322,7 @@ mod tests {
             for stage in [Stage::Search, Stage::Refine, Stage::Calibrate] {
                 recorder.enter(stage);
                 for step in 0..1000 {
-                    recorder.tell(f64::from(step) / 1000.0);
+                    recorder.report(f64::from(step) / 1000.0);
                 }
             }
         }

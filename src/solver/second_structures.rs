@@ -81,9 +81,7 @@ mod tests {
     fn left_out(options: &SceneOptions) -> CompleteBlock {
         let scene = Scene::generate(options).expect("valid options");
         let input = Input::new(scene.input, &Limits::default(), "scene").expect("a valid scene");
-        let views: Vec<usize> = (0..input.view_count()).collect();
-        let (normalization, _) = block::normalization(&input);
-        let whole = block::extract(&input, &input.track_ranges(), &normalization, &views);
+        let whole = block::of_all_views(&input);
         let wrong = |place: &usize| !scene.truth.inlier[whole.tracks[*place]];
         whole.complete.select(&(0..whole.tracks.len()).filter(wrong).collect::<Vec<_>>())
     }

@@ -1,6 +1,6 @@
 //! What a solution says of every view beside its camera: the camera group, and why a view is left out.
 
-use super::block;
+use super::problem::observed_views;
 use crate::domain::result::ViewResult;
 use crate::domain::{Input, LeftOut, Solution, Status, left_out};
 
@@ -8,7 +8,7 @@ use crate::domain::{Input, LeftOut, Solution, Status, left_out};
 /// warnings tell the reasons.
 pub fn complete(solution: &mut Solution, input: &Input) {
     let mut observed = vec![false; input.view_count()];
-    block::observed_views(input).into_iter().for_each(|view| observed[view] = true);
+    observed_views(input).into_iter().for_each(|view| observed[view] = true);
     let solved = solution.status == Status::Solved;
     for ((result, view), observed) in solution.views.iter_mut().zip(input.views()).zip(observed) {
         result.camera_group = view.camera_group;

@@ -14,7 +14,7 @@ use metrics::{counter, gauge, histogram};
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle, PrometheusRecorder};
 
 use crate::domain::job::{Job, JobState};
-use crate::domain::{Grade, Prior, Stage};
+use crate::domain::{Grade, Proposal, Stage};
 
 pub use catalogue::*;
 pub use guards::{Held, RpcCall, StoreTimer};
@@ -91,7 +91,7 @@ fn create_known_series() {
     for grade in [None, Some(Grade::Metric), Some(Grade::Weak), Some(Grade::ProjectiveOnly)] {
         counter!(GRADES.name, "grade" => grade_name(grade)).absolute(0);
     }
-    for prior in Prior::ALL {
+    for prior in Proposal::ALL {
         counter!(WINNING_PRIOR.name, "prior" => prior.name()).absolute(0);
     }
     for refusal in Refusal::all() {

@@ -5,7 +5,7 @@ use std::time::Instant;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::domain::{Input, Prior, StopToken};
+use crate::domain::{Input, Proposal, StopToken};
 use crate::geometry::measurement::CompleteBlock;
 use crate::solver::a_contrario::{self, LN_DECISIVE};
 use crate::solver::grow::{self, Consensus};
@@ -44,23 +44,20 @@ pub struct Found {
 impl Study {
     /// The input's tracks that are complete over all its views, their depths left aside.
     pub fn new(input: &Input, stop: &StopToken) -> Self {
-        let ranges = input.track_ranges();
-        let (normalization, _) = block::normalization(input);
-        let views: Vec<usize> = (0..input.view_count()).collect();
-        let block = block::extract(input, &ranges, &normalization, &views).complete;
+        let block = block::of_all_views(input).complete;
         Self { search: affine::Search::new(&block), block, stop: stop.clone() }
     }
 
     /// Asks a prior; `None` for one that does not rank image points by themselves.
-    pub fn rank(&self, prior: Prior) -> Option<Ranking> {
+    pub fn rank(&self, prior: Proposal) -> Option<Ranking> {
         let begun = Instant::now();
         let mut track_scores = None;
         let weights = match prior {
-            Prior::Uniform => vec![1.0; self.block.tracks()],
-            Prior::Irls => priors::affine_irls(self.search.centred(), &self.stop)?,
-            Prior::Consistency => priors::consistency(self.search.centred(), 2),
-            Prior::Learned => track_scores.insert(TrackScores::of(&self.block)?).probabilities(),
-            Prior::Network | Prior::Rigidity => return None,
+            Proposal::Uniform => vec![1.0; self.block.tracks()],
+            Proposal::Irls => priors::affine_irls(self.search.centred(), &self.stop)?,
+            Proposal::Consistency => priors::consistency(self.search.centred(), 2),
+            Proposal::Learned => track_scores.insert(TrackScores::of(&self.block)?).probabilities(),
+            Proposal::Network | Proposal::Rigidity => return None,
         };
         Some(Ranking { weights, seconds: begun.elapsed().as_secs_f64(), track_scores })
     }

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use alone::Study;
 
-use crate::domain::{Input, Limits, Prior, Silent, SolveSettings, Status, StopToken};
+use crate::domain::{Input, Limits, Proposal, Silent, SolveSettings, Status, StopToken};
 use crate::evaluation::records;
 use crate::geometry::statistics::median;
 use crate::solver;
@@ -20,7 +20,7 @@ use crate::synthetic::{Scene, SceneOptions};
 pub use scenes::Condition;
 
 /// Priors that rank image points by themselves.
-pub const PRIORS: [Prior; 4] = [Prior::Uniform, Prior::Consistency, Prior::Irls, Prior::Learned];
+pub const PRIORS: [Proposal; 4] = [Proposal::Uniform, Proposal::Consistency, Proposal::Irls, Proposal::Learned];
 /// Samples of the searches.
 pub const SAMPLES: [usize; 3] = [600, 6_000, 60_000];
 /// First seed: above those of the sweeps, so that nothing was chosen on these scenes.
@@ -30,7 +30,7 @@ const FIRST_SEED: u64 = 500_000;
 #[derive(Debug, Clone, Serialize)]
 pub struct PriorRow {
     pub condition: &'static str,
-    pub prior: Prior,
+    pub prior: Proposal,
     pub seeds: usize,
     /// `None`: no scene has a right track.
     pub average_precision: Option<f64>,
@@ -103,7 +103,7 @@ pub struct Measured {
 /// One prior on one scene.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Alone {
-    prior: Prior,
+    prior: Proposal,
     average_precision: Option<f64>,
     f1_of_ranking: f64,
     ranking_seconds: f64,
@@ -166,7 +166,7 @@ pub fn measure(run: &Run, stop: &StopToken) -> Result<Option<Measured>, String> 
     let scene = Scene::generate(&run.scene).map_err(|error| error.to_string())?;
     let truth = &scene.truth.inlier;
     let input = Input::new(scene.input.clone(), &Limits::default(), "scene").map_err(|error| error.to_string())?;
-    let answer = |excluded_priors: Vec<Prior>| {
+    let answer = |excluded_priors: Vec<Proposal>| {
         let settings = SolveSettings { excluded_priors, ..SolveSettings::default() };
         match solver::solve(&input, &settings, &mut Silent, stop) {
             Ok(solution) => Ok(Some(answer(&solution, truth))),
@@ -179,7 +179,7 @@ pub fn measure(run: &Run, stop: &StopToken) -> Result<Option<Measured>, String> 
         false => Vec::new(),
     };
     let Some(with) = answer(Vec::new())? else { return Ok(None) };
-    let Some(without) = answer(vec![Prior::Learned])? else { return Ok(None) };
+    let Some(without) = answer(vec![Proposal::Learned])? else { return Ok(None) };
     Ok(Some(Measured { priors, auto: [with, without] }))
 }
 
@@ -216,7 +216,7 @@ fn answer(solution: &crate::domain::Solution, truth: &[bool]) -> Answer {
     }
 }
 
-fn prior_row(condition: &'static str, prior: Prior, alone: &[&Alone]) -> PriorRow {
+fn prior_row(condition: &'static str, prior: Proposal, alone: &[&Alone]) -> PriorRow {
     let of_samples = |value: fn(&Alone) -> &Vec<f64>| {
         move |k: usize| -> Vec<f64> { alone.iter().map(|alone| value(alone)[k]).collect() }
     };
@@ -227,7 +227,7 @@ fn prior_row(condition: &'static str, prior: Prior, alone: &[&Alone]) -> PriorRo
         prior,
         seeds: alone.len(),
         average_precision: mean(&alone.iter().filter_map(|alone| alone.average_precision).collect::<Vec<_>>()),
-        f1_of_ranking: (prior == Prior::Learned).then(|| mean(&ranking)).flatten(),
+        f1_of_ranking: (prior == Proposal::Learned).then(|| mean(&ranking)).flatten(),
         ranking_seconds: median(&mut alone.iter().map(|alone| alone.ranking_seconds).collect::<Vec<_>>()),
         f1: (0..SAMPLES.len()).filter_map(|k| mean(&f1(k))).collect(),
         seconds: (0..SAMPLES.len()).map(|k| median(&mut seconds(k))).collect(),

@@ -49,8 +49,8 @@ impl<const G: usize, const C: usize, const P: usize, S: ResidualVisitor<G, P, C>
     for Exchanging<'_, S>
 {
     #[inline]
-    fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
-        self.0.take(residual, || {
+    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+        self.0.visit(residual, || {
             let Jacobian { globals, camera, point } = jacobian();
             Jacobian { globals, camera: point, point: camera }
         });
@@ -67,8 +67,8 @@ impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Proble
     }
 
     #[inline]
-    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<G, P, C>) {
-        self.0.observe(&exchanged(observation), &mut Exchanging(sink));
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<G, P, C>) {
+        self.0.evaluate(&exchanged(observation), &mut Exchanging(visitor));
     }
 
     fn retract(&mut self, from: &Self, step: &Step<G, P, C>) {

@@ -58,11 +58,11 @@ impl Problem<0, 9, 2> for Homographies {
         self.points.len()
     }
 
-    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<0, 9, 2>) {
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<0, 9, 2>) {
         let homography = &self.views[observation.view];
         let point = self.points[observation.point].push(1.0);
         let (image, by_seen) = image(&(homography * point));
-        sink.take(image - observation.xy, || {
+        visitor.visit(image - observation.xy, || {
             let mut jacobian = Jacobian::<0, 9, 2>::zeros();
             for (component, by_seen) in by_seen.iter().enumerate() {
                 let by_entry = SMatrix::<f64, 9, 1>::from_fn(|k, _| by_seen[k / 3] * point[k % 3]);
@@ -98,12 +98,12 @@ impl Problem<3, 3, 2> for Rotating {
         self.points.len()
     }
 
-    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<3, 3, 2>) {
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<3, 3, 2>) {
         let rotation = &self.rotations[observation.view];
         let turned = rotation * self.points[observation.point].push(1.0);
         let (direction, by_turned) = image(&turned);
         let Intrinsics { focal, principal_point, .. } = self.intrinsics;
-        sink.take(direction * focal + principal_point - observation.xy, || {
+        visitor.visit(direction * focal + principal_point - observation.xy, || {
             let mut jacobian = Jacobian::<3, 3, 2>::zeros();
             for (component, by_turned) in by_turned.iter().enumerate() {
                 let by_turned = by_turned * focal;
@@ -138,11 +138,11 @@ impl Problem<0, 3, 3> for Translating {
         self.points.len()
     }
 
-    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<0, 3, 3>) {
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<0, 3, 3>) {
         let translation = &self.translations[observation.view];
         let point = &self.points[observation.point];
         let (image, by_seen) = image(&(point.xy().push(1.0) + translation * point.z));
-        sink.take(image - observation.xy, || {
+        visitor.visit(image - observation.xy, || {
             let mut jacobian = Jacobian::<0, 3, 3>::zeros();
             for (component, by_seen) in by_seen.iter().enumerate() {
                 jacobian.camera.set_column(component, &(by_seen * point.z));

@@ -11,7 +11,7 @@ use crate::domain::StopToken;
 use crate::geometry::levenberg_marquardt::{self, MIN_DAMPING};
 
 /// Squared residual at which an observation counts as undefined (depth zero or nearly so, not a number): a million
-/// image sides. It then costs just this and pulls at nothing, so that costs stay finite and comparable.
+/// image sides. It then costs just this and has no gradient, so that costs stay finite and comparable.
 pub(super) const UNDEFINED_SQUARED: f64 = 1e12;
 
 /// Derivatives of one residual, transposed: column `k` is the gradient of residual component `k`.
@@ -25,9 +25,9 @@ pub(super) struct Jacobian<const G: usize, const C: usize, const P: usize> {
 /// Takes residuals (predicted minus observed) and, if it wants them, their derivatives.
 ///
 /// A problem writes residual and Jacobian once; the cost, the normal equations and the test by finite differences
-/// are sinks of the same code.
+/// are visitors of the same code.
 pub(super) trait ResidualVisitor<const G: usize, const C: usize, const P: usize> {
-    fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>);
+    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>);
 }
 
 /// A change of the unknowns in the tangent space.
@@ -72,8 +72,8 @@ impl GaussianPrior {
 pub(super) trait Problem<const G: usize, const C: usize, const P: usize>: Clone {
     fn camera_count(&self) -> usize;
     fn point_count(&self) -> usize;
-    /// Hands the residual of one observation, and its Jacobian on demand, to `sink`.
-    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<G, C, P>);
+    /// Hands the residual of one observation, and its Jacobian on demand, to `visitor`.
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<G, C, P>);
     /// Overwrites `self` with `from` moved by `step`; both have the same counts.
     fn retract(&mut self, from: &Self, step: &Step<G, C, P>);
     /// What is known of the globals where they are.
@@ -130,7 +130,7 @@ struct Cost {
 
 impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> for Cost {
     #[inline]
-    fn take(&mut self, residual: Vector2<f64>, _jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+    fn visit(&mut self, residual: Vector2<f64>, _jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
         self.sum += self.loss.cost(self.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
     }
 }
@@ -143,10 +143,10 @@ fn cost<const G: usize, const C: usize, const P: usize>(
     let mut total = Cost { loss, weight: 1.0, sum: 0.0 };
     for seen in &layout.observations {
         total.weight = seen.weight;
-        problem.observe(seen, &mut total);
+        problem.evaluate(seen, &mut total);
     }
     let priors = problem.global_priors();
-    total.sum + priors.iter().map(|belief| belief.information * belief.deviation.powi(2)).sum::<f64>()
+    total.sum + priors.iter().map(|prior| prior.information * prior.deviation.powi(2)).sum::<f64>()
 }
 
 /// Minimises the loss over all unknowns, starting from and ending in `problem`.

@@ -228,11 +228,11 @@ impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
     }
 
     #[inline]
-    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<G, C, POINT>) {
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<G, C, POINT>) {
         let Reconstruction { poses, points, .. } = &self.reconstruction;
         let intrinsics = self.reconstruction.intrinsics_of(observation.view);
         let seen = Projection::new(&intrinsics, &poses[observation.view], &points[observation.point]);
-        sink.take(seen.image - observation.xy, || seen.gradients().jacobian(&self.free));
+        visitor.visit(seen.image - observation.xy, || seen.gradients().jacobian(&self.free));
     }
 
     fn retract(&mut self, from: &Self, step: &Step<G, C, POINT>) {
@@ -282,7 +282,7 @@ pub fn adjust(
 ) -> Report {
     let [prior] = priors else {
         let models = vec![model; reconstruction.intrinsics.len()];
-        let run = sequence::Run { threads: Threads::ONE, stop, told: &mut || () };
+        let run = sequence::Run { threads: Threads::ONE, stop, heartbeat: &mut || () };
         return sequence::adjust(reconstruction, observations, &sequence::Free::all(&models), priors, options, run);
     };
     let run = Run { observations, prior, options, stop };
@@ -435,7 +435,8 @@ mod tests {
         let optimum = information.optimum(IntrinsicsModel::FOCAL, &[IntrinsicsPrior::NONE]);
         let variance = optimum.variance_of(0, Parameter::LogFocal).expect("observable");
         let sigma = variance.sqrt() * NOISE;
-        // As well known as the data say, one sigma away: it pulls half the way, and costs half a chi-square.
+        // As well known as the data say, one sigma away: it moves the estimate half the way, and costs half a
+        // chi-square.
         let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, free + sigma, sigma, NOISE);
         let (pulled, dearer) = adjusted(&prior);
         let (way, rise) = ((pulled - free) / sigma, (dearer - cost) / (NOISE * NOISE));

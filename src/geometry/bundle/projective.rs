@@ -26,12 +26,12 @@ impl Problem<0, CAMERA, POINT> for Projective {
     }
 
     #[inline]
-    fn observe(&self, observation: &Observation, sink: &mut impl ResidualVisitor<0, CAMERA, POINT>) {
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<0, CAMERA, POINT>) {
         let camera = &self.cameras[observation.view];
         let point = &self.points[observation.point];
         let seen = camera * point;
         let image = Vector2::new(seen.x / seen.z, seen.y / seen.z);
-        sink.take(image - observation.xy, || {
+        visitor.visit(image - observation.xy, || {
             // Gradients of the two image coordinates with respect to `P X`.
             let scale = seen.z.recip();
             let by_seen = [Vector3::new(scale, 0.0, -image.x * scale), Vector3::new(0.0, scale, -image.y * scale)];

@@ -39,7 +39,7 @@ struct Entry<'a, const G: usize, const C: usize, const P: usize> {
 
 impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> for Entry<'_, G, C, P> {
     #[inline]
-    fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
         match usable_squared_norm(&residual) {
             Some(squared) => {
                 let weight = self.weight.sqrt() * self.loss.root_weight(self.weight * squared);
@@ -84,12 +84,12 @@ impl<const G: usize, const C: usize, const P: usize> Linearisation<G, C, P> {
 
     /// Linearises at the state of `problem`.
     pub fn fill(&mut self, problem: &impl Problem<G, C, P>, layout: &Layout, loss: Loss) {
-        self.globals_diagonal = SVector::from(problem.global_priors().map(|belief| belief.information));
+        self.globals_diagonal = SVector::from(problem.global_priors().map(|prior| prior.information));
         self.camera_diagonals.fill(SVector::zeros());
         self.point_blocks.fill(SMatrix::zeros());
         for (k, seen) in layout.observations.iter().enumerate() {
             let (residual, jacobian) = (&mut self.residuals[k], &mut self.jacobians[k]);
-            problem.observe(seen, &mut Entry { loss, weight: seen.weight, residual, jacobian });
+            problem.evaluate(seen, &mut Entry { loss, weight: seen.weight, residual, jacobian });
             for component in 0..2 {
                 let globals = jacobian.globals.column(component);
                 self.globals_diagonal += globals.component_mul(&globals);
@@ -155,8 +155,8 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         for (camera, values) in step.cameras.iter_mut().zip(self.vector[G..].chunks_exact(C)) {
             camera.copy_from_slice(values);
         }
-        let lowers = |(belief, by): (GaussianPrior, &f64)| {
-            belief.information * (belief.deviation.powi(2) - (belief.deviation + by).powi(2))
+        let lowers = |(prior, by): (GaussianPrior, &f64)| {
+            prior.information * (prior.deviation.powi(2) - (prior.deviation + by).powi(2))
         };
         let of_priors = problem.global_priors().into_iter().zip(step.globals.iter()).map(lowers);
         let of_priors: f64 = of_priors.sum();
@@ -187,9 +187,9 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     ) -> bool {
         self.matrix.fill(0.0);
         self.vector.fill(0.0);
-        for (k, belief) in problem.global_priors().iter().enumerate() {
-            self.matrix[k * (self.dimension + 1)] += belief.information;
-            self.vector[k] -= belief.information * belief.deviation;
+        for (k, prior) in problem.global_priors().iter().enumerate() {
+            self.matrix[k * (self.dimension + 1)] += prior.information;
+            self.vector[k] -= prior.information * prior.deviation;
         }
         for point in 0..self.factors.len() {
             let range = layout.starts[point]..layout.starts[point + 1];
@@ -247,14 +247,14 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         jacobians: &[Jacobian<G, C, P>],
         residuals: &[Vector2<f64>],
     ) {
-        let mut pull = SVector::<f64, P>::zeros();
+        let mut whitened_gradient = SVector::<f64, P>::zeros();
         let mut coupling = SMatrix::<f64, P, G>::zeros();
         for ((whitened, jacobian), residual) in self.whitened.iter().zip(jacobians).zip(residuals) {
-            pull += whitened * residual;
+            whitened_gradient += whitened * residual;
             coupling += whitened * jacobian.globals.transpose();
         }
         for (k, (seen, jacobian)) in observations.iter().zip(jacobians).enumerate() {
-            let left = residuals[k] - self.whitened[k].tr_mul(&pull);
+            let left = residuals[k] - self.whitened[k].tr_mul(&whitened_gradient);
             let first = G + C * seen.view;
             let gradient = jacobian.camera * left;
             for (slot, value) in self.vector[first..first + C].iter_mut().zip(gradient.iter()) {

@@ -180,7 +180,7 @@ struct Last<const G: usize, const C: usize, const P: usize> {
 }
 
 impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> for Last<G, C, P> {
-    fn take(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
         self.residual = residual;
         self.jacobian = Some(jacobian());
     }
@@ -191,7 +191,7 @@ fn at<const G: usize, const C: usize, const P: usize>(
     seen: &Observation,
 ) -> (Vector2<f64>, Jacobian<G, C, P>) {
     let mut last = Last { residual: Vector2::zeros(), jacobian: None };
-    problem.observe(seen, &mut last);
+    problem.evaluate(seen, &mut last);
     (last.residual, last.jacobian.expect("the problem hands over a Jacobian"))
 }
 

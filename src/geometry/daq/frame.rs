@@ -66,7 +66,7 @@ fn centre(camera: &Matrix3x4<f64>) -> Vector4<f64> {
 }
 
 /// The camera with its 3x3 part at norm `sqrt 3` and of determinant at least 0; left alone where it has none.
-fn oriented(camera: &Matrix3x4<f64>) -> Matrix3x4<f64> {
+pub fn oriented(camera: &Matrix3x4<f64>) -> Matrix3x4<f64> {
     let left = camera.fixed_columns::<3>(0).into_owned();
     let scale = 3f64.sqrt() / left.norm();
     if !scale.is_finite() {

@@ -9,7 +9,7 @@ mod view_focals;
 
 use nalgebra::{Matrix3, Matrix3x4, SMatrix, SVector, Vector3};
 
-pub use self::frame::{CanonicalFrame, to_canonical_frame};
+pub use self::frame::{CanonicalFrame, oriented, to_canonical_frame};
 pub use self::starts::{linear, scan};
 pub use self::view_focals::{view_focal, view_focal_starts};
 use super::bundle::metric::Intrinsics;

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::enums::{Twin, optional_to_wire};
 use super::{optional_time, progress, required, result, settings, tellable, time_from_wire};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
-use crate::domain::{Grade, InputName, InvalidInput, Prior, Status, Violation};
+use crate::domain::{Grade, InputName, InvalidInput, Proposal, Status, Violation};
 use crate::rpc::proto;
 use proto::job_event::Body;
 
@@ -180,7 +180,7 @@ fn summary_from_wire(summary: &proto::JobSummary) -> Result<Summary, Violation> 
         inlier_tracks: summary.inlier_tracks,
         registered_views: summary.registered_views,
         reprojection_rms_px: summary.reprojection_rms_px,
-        winning_prior: Prior::from_wire(summary.winning_prior, "summary.winning_prior")?,
+        winning_prior: Proposal::from_wire(summary.winning_prior, "summary.winning_prior")?,
         iterations: summary.iterations,
         seconds: summary.seconds,
         result_bytes: summary.result_bytes,
@@ -212,7 +212,7 @@ mod tests {
             inlier_tracks: 20,
             registered_views: 10,
             reprojection_rms_px: Some(0.4),
-            winning_prior: Some(Prior::Network),
+            winning_prior: Some(Proposal::Network),
             iterations: 60,
             seconds: 1.25,
             result_bytes: 12_345,

@@ -5,7 +5,7 @@ use super::{progress, required};
 use crate::domain::job::JobName;
 use crate::domain::result::{ObservationResults, PriorTime, Sigmas, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{
-    Calibration, Grade, LeftOut, Method, Prior, Solution, Stage, Status, Violation, Warning, WarningCode,
+    Calibration, Grade, LeftOut, Method, Proposal, Solution, Stage, Status, Violation, Warning, WarningCode,
 };
 use crate::rpc::proto;
 
@@ -57,7 +57,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         status: Status::required(result.status, "status")?,
         grade: Grade::from_wire(result.grade, "grade")?,
         method: Method::required(result.method, "method")?,
-        winning_prior: Prior::from_wire(result.winning_prior, "winning_prior")?,
+        winning_prior: Proposal::from_wire(result.winning_prior, "winning_prior")?,
         iterations: result.iterations,
         seed: result.seed,
         calibrations: result.calibrations.iter().map(calibration_from_wire).collect::<Result<_, _>>()?,
@@ -80,7 +80,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
             .prior_times
             .iter()
             .map(|time| {
-                let prior = Prior::required(time.prior, "prior_times.prior")?;
+                let prior = Proposal::required(time.prior, "prior_times.prior")?;
                 Ok(PriorTime { prior, seconds: time.seconds, iterations: time.iterations })
             })
             .collect::<Result<_, Violation>>()?,

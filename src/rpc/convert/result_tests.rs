@@ -28,7 +28,7 @@ pub(super) fn rich() -> Solution {
         status: Status::Solved,
         grade: Some(Grade::Weak),
         method: Method::Auto,
-        winning_prior: Some(Prior::Irls),
+        winning_prior: Some(Proposal::Irls),
         iterations: 150,
         seed: u64::MAX,
         calibrations: vec![
@@ -111,8 +111,8 @@ pub(super) fn rich() -> Solution {
         seconds: 1.5,
         stages: vec![StageTime { stage: Stage::Prepare, seconds: 0.1 }],
         prior_times: vec![
-            PriorTime { prior: Prior::Network, seconds: Some(0.5), iterations: 80 },
-            PriorTime { prior: Prior::Uniform, seconds: None, iterations: 6000 },
+            PriorTime { prior: Proposal::Network, seconds: Some(0.5), iterations: 80 },
+            PriorTime { prior: Proposal::Uniform, seconds: None, iterations: 6000 },
         ],
         history: vec![progress, Progress { losses: None, focal_px: None, best_score: None, ..progress }],
         trained_network: Some("5ea1".into()),

@@ -41,8 +41,8 @@ const LEAST_MEASURED: f64 = 0.01;
 /// Noise levels that a consensus is grown and settled at, each a test of its own: five of the search, three of the
 /// refinement.
 const NOISE_LEVELS: f64 = 8.0;
-/// Neighbours of a point that are no crowd: as many as of points anywhere in the image, and two standard deviations of
-/// their number (Poisson's).
+/// Neighbours of a point that are no near-duplicates: as many as of points anywhere in the image, and two standard
+/// deviations of their number (Poisson's).
 const USUAL_SIGMAS: f64 = 2.0;
 
 /// Natural logarithm of the number of such consensuses to be expected in data without structure: by residuals, and
@@ -196,9 +196,7 @@ mod tests {
                 let options = SceneOptions { views, tracks: 60, outliers, seed, ..SceneOptions::default() };
                 let scene = Scene::generate(&options).expect("valid options");
                 let input = Input::new(scene.input, &Limits::default(), "scene").expect("valid scene");
-                let (normalization, _) = block::normalization(&input);
-                let all: Vec<usize> = (0..views).collect();
-                let complete = block::extract(&input, &input.track_ranges(), &normalization, &all).complete;
+                let complete = block::of_all_views(&input).complete;
                 let spread = portfolio::spread(&complete);
                 let stop = StopToken::default();
                 for noise in [0.003, 0.02, 0.08] {
@@ -254,8 +252,8 @@ mod tests {
         let noise = 1e-3;
         let count = |distance: f64| {
             let apart = (0..10).map(|k| Point::new(0.1 * f64::from(k), 0.0, 0.0, 1.0));
-            let crowd = (0..30).map(|k| Point::new(0.5, 0.5 + distance * f64::from(k), 0.0, 1.0));
-            let consensus = consensus_of(apart.chain(crowd).collect(), noise);
+            let group = (0..30).map(|k| Point::new(0.5, 0.5 + distance * f64::from(k), 0.0, 1.0));
+            let consensus = consensus_of(apart.chain(group).collect(), noise);
             (consensus.distinct_count(0.3), consensus.ln_false_alarms_by_residuals(0.3))
         };
         let (near, apart) = (count(0.1 * noise), count(20.0 * noise));

@@ -3,7 +3,7 @@
 use super::{LEAST_NOISE, Problem};
 use crate::geometry::bundle::metric::IntrinsicsModel;
 
-/// Degrees of freedom from which the posterior noise is believed; it is then known to 13 %.
+/// Degrees of freedom from which the posterior noise is used; it is then known to 13 %.
 const ENOUGH_FREEDOM: usize = 30;
 /// Loss of fit of a model with fewer unknowns, in standard deviations of its F statistic, that chance does not explain.
 pub(super) const MISFIT_DEVIATIONS: f64 = 4.0;

@@ -84,7 +84,7 @@ pub(super) fn grade(
         let ratio = |sigma: Option<f64>| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite());
         Outcome {
             group,
-            sigma_log_focal: verdict.told(sigma),
+            sigma_log_focal: verdict.reported(sigma),
             sigma_ratios: sigmas.of_group[group].map(ratio),
             grade: verdict.grade,
             warnings: verdict.warnings,

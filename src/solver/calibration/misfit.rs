@@ -73,8 +73,8 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
 
     let model = best.model.without_lens();
     let report = metric::adjust(&mut pinhole, &observations, model, &best.priors, &options, choice.stop);
-    let believed = IntrinsicsPrior::cost_of(&best.priors, model, &pinhole.intrinsics);
-    Some((projective, Fit::metric(report.cost - believed, best.model, problem)))
+    let of_priors = IntrinsicsPrior::cost_of(&best.priors, model, &pinhole.intrinsics);
+    Some((projective, Fit::metric(report.cost - of_priors, best.model, problem)))
 }
 
 /// The observations where pinholes would have made them; without those that the lens images nowhere.

@@ -31,7 +31,7 @@ pub use view_focals::LEAST_DETERMINED;
 /// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
 /// caller has adjusted it before.
 const PROJECTIVE_ITERATIONS: usize = 10;
-/// Least noise that is believed, in image sides: a hundredth of a pixel in a 1000-pixel image. Exact input would make
+/// Least noise that is used, in image sides: a hundredth of a pixel in a 1000-pixel image. Exact input would make
 /// every deviation significant and every focal length certain, by its rounding alone.
 const LEAST_NOISE: f64 = 1e-5;
 /// Inlier tracks below which geometry cannot verify a consensus.
@@ -220,7 +220,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<V
 /// length is known to be near a minimum, and others are looked for only where this one is not certain.
 ///
 /// * `problem`: the projective cameras and points of `metric`
-/// * `told`: called after each of its steps, of which a large problem takes some tenths of a second
+/// * `heartbeat`: called after each of its steps, of which a large problem takes some tenths of a second
 ///
 /// # Errors
 /// As [`calibrate`].
@@ -229,7 +229,7 @@ pub fn from_metric(
     metric: &Reconstruction,
     scale_px: f64,
     stop: &StopToken,
-    told: &mut dyn FnMut(),
+    heartbeat: &mut dyn FnMut(),
 ) -> Result<Vec<Outcome>, Stopped> {
     Stopped::check(stop)?;
     let nothing = vec![None; problem.groups()];
@@ -242,10 +242,10 @@ pub fn from_metric(
     }
     let (_, _, fit) = projectively_adjusted(problem, inliers, stop);
     Stopped::check(stop)?;
-    told();
+    heartbeat();
     let critical = critical::find(problem, &fit, scale_px, stop);
     Stopped::check(stop)?;
-    told();
+    heartbeat();
     // A plane under tilted views determines a focal length (Triggs 1998): of a reconstruction that is metric already,
     // sigma says how well, and the warning describes the scene.
     let is_critical = critical.warnings.iter().any(|warning| warning.code != WarningCode::PlanarScene);
@@ -254,7 +254,7 @@ pub fn from_metric(
         return Ok(problem.refused(&warnings));
     }
     let choice = models::Choice { problem, scale_px, stop };
-    let minima = search::minima_near(metric, problem, &choice.priors(fit.noise), stop, told)?;
+    let minima = search::minima_near(metric, problem, &choice.priors(fit.noise), stop, heartbeat)?;
     if minima.is_empty() {
         warnings.push(no_start());
         return Ok(problem.refused(&warnings));

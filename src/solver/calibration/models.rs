@@ -102,8 +102,8 @@ pub(super) struct Candidate {
 impl Candidate {
     /// * `minimum`: of this model with these priors
     pub fn new(minimum: Minimum, model: IntrinsicsModel, priors: Vec<IntrinsicsPrior>, problem: &Problem) -> Self {
-        let believed = IntrinsicsPrior::cost_of(&priors, model, &minimum.reconstruction.intrinsics);
-        let fit = Fit::metric(minimum.cost - believed, model, problem);
+        let of_priors = IntrinsicsPrior::cost_of(&priors, model, &minimum.reconstruction.intrinsics);
+        let fit = Fit::metric(minimum.cost - of_priors, model, problem);
         let information = Information::new(&minimum.reconstruction, problem.observations);
         Self { model, priors, minimum, fit, information }
     }
@@ -353,8 +353,8 @@ impl Choice<'_> {
                 let deviation = prior.deviation(Parameter::LogFocal, intrinsics);
                 prior.information[Parameter::LogFocal as usize] * deviation.powi(2)
             };
-            let believed: f64 = best.priors.iter().zip(&moved.intrinsics).map(of_group).sum();
-            (report.cost + believed - best.minimum.cost).max(0.0) / best.fit.noise.powi(2)
+            let of_priors: f64 = best.priors.iter().zip(&moved.intrinsics).map(of_group).sum();
+            (report.cost + of_priors - best.minimum.cost).max(0.0) / best.fit.noise.powi(2)
         };
         let rise = side(shift).min(side(-shift));
         sigma.max(shift / rise.sqrt().max(f64::MIN_POSITIVE))

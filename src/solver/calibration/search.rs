@@ -143,13 +143,13 @@ const FOLLOWING: usize = 12;
 /// Minima from a reconstruction that is metric already: its own, and those that other focal lengths lead to, which its
 /// poses and points have followed, for freed at once these would only go back to where they were; cheapest first.
 ///
-/// * `told`: called after each
+/// * `heartbeat`: called after each
 pub(super) fn minima_near(
     metric: &Reconstruction,
     problem: &Problem,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
-    told: &mut dyn FnMut(),
+    heartbeat: &mut dyn FnMut(),
 ) -> Result<Vec<Minimum>, Stopped> {
     let model = IntrinsicsModel::focal(metric.has_own_focals());
     let mut found = Vec::new();
@@ -167,7 +167,7 @@ pub(super) fn minima_near(
         }
         let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
         found.push(start.adjusted(problem.observations, model, priors, stop));
-        told();
+        heartbeat();
     }
     Stopped::check(stop)?;
     Ok(distinct(found, problem))

@@ -120,7 +120,7 @@ impl Verdict {
     /// The sigma that is told: not one that the fit contradicts. Whatever lowered the grade is worth at least the
     /// grade's least, and a model that does not fit its most: wrong minima behind a distorting lens were off by 20 to
     /// 30 %.
-    pub fn told(&self, sigma: Option<f64>) -> Option<f64> {
+    pub fn reported(&self, sigma: Option<f64>) -> Option<f64> {
         let least = match (self.grade, self.is_misfit) {
             (Grade::Weak, true) => WEAK_UP_TO,
             (Grade::Weak, false) => METRIC_BELOW,

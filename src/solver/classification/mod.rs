@@ -7,7 +7,7 @@
 mod noise;
 mod track_classifier;
 
-pub use noise::{NoiseModel, density_of_spread, outlier_density, working_gate};
+pub use noise::{NoiseModel, outlier_density, working_gate};
 
 use crate::domain::result::{ObservationResults, TrackResults};
 use crate::domain::{Input, StopToken};
@@ -25,8 +25,8 @@ use track_classifier::TrackClassifier;
 pub struct Geometry<'a> {
     /// Projective camera of every view of the input, normalised; `None`: not registered.
     pub cameras: &'a [Option<Camera>],
-    /// Where views are in several frames: the frame of each view and the one that each track is judged in.
-    pub parts: Option<(&'a [u32], &'a [u32])>,
+    /// The frame of each view, and the one that each track is judged in.
+    pub components: (&'a [u32], &'a [u32]),
     pub normalization: &'a Normalization,
     /// The lens of each view, whose distortion is undone before the cameras, pinholes, are asked; empty: all are
     /// pinholes.
@@ -38,8 +38,8 @@ pub struct Geometry<'a> {
     /// oriented with the plane at infinity off the points. Otherwise the worst observation is dropped as long as it is
     /// too far from the point of the others.
     pub linked: bool,
-    /// Share of its observations in registered views that a right track retains: none where links may be wrong, most of
-    /// them where tracks are complete.
+    /// Share of its observations in registered views that a right track retains, see
+    /// [`least_share`](crate::solver::problem::Problem::least_share).
     pub least_share: f64,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
@@ -52,11 +52,11 @@ pub struct Geometry<'a> {
 impl Geometry<'_> {
     /// Whether a track is judged by what a view saw of it.
     fn judges(&self, track: usize, view: usize) -> bool {
-        self.cameras[view].is_some() && self.parts.is_none_or(|(of_view, of_track)| of_view[view] == of_track[track])
+        self.cameras[view].is_some() && self.components.0[view] == self.components.1[track]
     }
 
     /// Observation `k` where a pinhole would see it; what a lens images nowhere stays where it is, far from any point.
-    fn observation(&self, input: &Input, k: usize) -> Observation {
+    pub fn observation(&self, input: &Input, k: usize) -> Observation {
         let view = input.view_of(k);
         let xy = self.normalization.normalize(view, input.point_px(k));
         let undone = self.lenses.get(view).and_then(|lens| lens.undistort(&xy));
@@ -100,22 +100,22 @@ pub struct SplitPoint {
 /// Where there is none, a wrong observation is told from a right one nearer by: at 8 to 9 core deviations instead of 12
 /// at .3 % noise.
 ///
-/// Once `stop` fires the rest stays unjudged: nobody will look at the result. `told` hears how many verdicts there are,
-/// up to two a track. How many threads there are changes nothing.
+/// Once `stop` fires the rest stays unjudged: nobody will look at the result. `progress` is called with how many verdicts there
+/// are, up to two a track. How many threads there are changes nothing.
 pub fn judge(
     input: &Input,
     ranges: &[usize],
     geometry: &Geometry,
     threads: Threads,
     stop: &StopToken,
-    told: &mut dyn FnMut(usize),
+    progress: &mut dyn FnMut(usize),
 ) -> Judged {
     let noise = NoiseModel::new(geometry.noise, geometry.outlier_density);
-    let judged = judge_under(input, ranges, geometry, noise, threads, stop, told);
+    let judged = judge_under(input, ranges, geometry, noise, threads, stop, progress);
     match noise.with_tail(&whole_tracks(input, ranges, geometry, &judged)) {
         Some(noise) => {
-            let mut told = |tracks| told(input.track_count() + tracks);
-            judge_under(input, ranges, geometry, noise, threads, stop, &mut told)
+            let mut progress = |tracks| progress(input.track_count() + tracks);
+            judge_under(input, ranges, geometry, noise, threads, stop, &mut progress)
         }
         None => judged,
     }
@@ -140,7 +140,7 @@ fn judge_under(
     noise: NoiseModel,
     threads: Threads,
     stop: &StopToken,
-    told: &mut dyn FnMut(usize),
+    progress: &mut dyn FnMut(usize),
 ) -> Judged {
     // Triangulation wants a slice; unregistered views are never sighted.
     let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
@@ -154,8 +154,8 @@ fn judge_under(
             true => Vec::new(),
             false => bench.find(input, ranges, first + k * LANES..last.min(first + (k + 1) * LANES)),
         };
-        let mut told = |batches| told(first + batches * LANES);
-        let found = threads.map((last - first).div_ceil(LANES), TRACKS_A_RUN / LANES, side_by_side, &mut told);
+        let mut progress = |batches| progress(first + batches * LANES);
+        let found = threads.map((last - first).div_ceil(LANES), TRACKS_A_RUN / LANES, side_by_side, &mut progress);
         found.iter().flatten().for_each(|finding| bench.write(&mut judged, finding));
     }
     judged

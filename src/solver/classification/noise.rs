@@ -2,6 +2,9 @@
 
 use nalgebra::Vector2;
 
+use crate::geometry::statistics::median;
+use crate::solver::portfolio::spread_of;
+
 /// Share of right observations in the tail, before it is known, and the tail's width in units of the core. Feature
 /// detectors have a core of .1 to .3 px and tails that a Gaussian of that width would call impossible; together with
 /// the uniform outliers this puts the gate at 12 to 17 core deviations, where real sequences want it (15 to 20).
@@ -17,18 +20,16 @@ const TAIL_ROUNDS: usize = 10;
 /// Prior probability that a single observation of a right track is wrong.
 const WRONG_OBSERVATION: f64 = 0.05;
 
-/// Density of a wrong coordinate among points that are spread like these: one over the width of a uniform distribution
-/// of their standard deviation.
-pub fn outlier_density(points: &[Vector2<f64>]) -> f64 {
-    let count = points.len().max(1) as f64;
-    let mean = points.iter().sum::<Vector2<f64>>() / count;
-    let variance = points.iter().map(|point| (point - mean).norm_squared()).sum::<f64>() / (2.0 * count);
-    density_of_spread(variance.sqrt().clamp(f64::MIN_POSITIVE, crate::solver::portfolio::MOST_SPREAD))
-}
-
-/// The same from the standard deviation of a coordinate: a uniform distribution is `sqrt(12)` times as wide.
-pub fn density_of_spread(spread: f64) -> f64 {
-    1.0 / (12.0f64.sqrt() * spread)
+/// Density of a wrong coordinate in an image: one over the width of a uniform distribution that is spread like the points
+/// of a view, the median over the views.
+///
+/// * `of_view`: places of each view's points among all
+pub fn outlier_density(of_view: &[Vec<u32>], points: &[Vector2<f64>]) -> f64 {
+    let spread =
+        |places: &Vec<u32>| -> f64 { spread_of(&places.iter().map(|&k| points[k as usize]).collect::<Vec<_>>()) };
+    let mut spreads: Vec<f64> = of_view.iter().filter(|places| !places.is_empty()).map(spread).collect();
+    // A uniform distribution is so many standard deviations wide.
+    1.0 / (12.0f64.sqrt() * median(&mut spreads).max(f64::MIN_POSITIVE))
 }
 
 /// Squared residual within which an observation is more likely right than wrong while nothing is known of the noise's

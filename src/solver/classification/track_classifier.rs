@@ -251,7 +251,7 @@ mod tests {
     fn geometry<'a>(normalization: &'a Normalization) -> Geometry<'a> {
         Geometry {
             cameras: &[],
-            parts: None,
+            components: (&[0; 16], &[0; 16]),
             normalization,
             lenses: &[],
             weights: &[],

@@ -1,12 +1,12 @@
 //! What each prior proposed and what that cost, so that a result can say what each alone would have needed.
 
 use super::best::{Best, LN_MARGIN};
-use crate::domain::Prior;
+use crate::domain::Proposal;
 use crate::domain::result::PriorTime;
 
 /// One prior's account.
 pub struct ProposalStats {
-    pub prior: Prior,
+    pub prior: Proposal,
     pub seconds: f64,
     /// Network iterations, or hypotheses.
     pub work: u32,
@@ -27,7 +27,7 @@ struct Record {
 const SUFFICIENT_SHARE: f64 = 0.95;
 
 impl ProposalStats {
-    pub fn new(prior: Prior) -> Self {
+    pub fn new(prior: Proposal) -> Self {
         Self { prior, seconds: 0.0, work: 0, records: Vec::new() }
     }
 

@@ -1,6 +1,6 @@
 //! The best consensus so far, and when it is good enough.
 
-use crate::domain::Prior;
+use crate::domain::Proposal;
 use crate::solver::a_contrario::{LN_ACCEPTABLE, LN_DECISIVE};
 use crate::solver::grow::{Consensus, LEAST_INLIERS};
 
@@ -8,9 +8,10 @@ use crate::solver::grow::{Consensus, LEAST_INLIERS};
 pub const LN_MARGIN: f64 = 5.0;
 
 /// What a consensus was verified by.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub enum VerifiedBy {
     /// Image points alone, under projective cameras.
+    #[default]
     ImagePoints,
     /// Image points and depths, under one focal length and rigid motion.
     Depths {
@@ -22,7 +23,7 @@ pub enum VerifiedBy {
 /// A consensus, where it came from and how likely it is to be chance.
 pub struct Best {
     pub consensus: Consensus,
-    pub prior: Prior,
+    pub prior: Proposal,
     pub ln_false_alarms: f64,
     pub verified_by: VerifiedBy,
     /// Inliers that count where few are verified, see
@@ -40,7 +41,7 @@ impl Best {
     }
 
     /// Its inliers and how many of them count, where that is what keeps it from being accepted.
-    pub fn doubted(&self) -> Option<(usize, usize)> {
+    pub fn rejected_by_network(&self) -> Option<(usize, usize)> {
         let inliers = self.consensus.inlier_count();
         let only_by_count = inliers >= LEAST_INLIERS && !self.is_verified() && self.ln_false_alarms < LN_ACCEPTABLE;
         only_by_count.then_some((inliers, self.counted))
@@ -85,14 +86,14 @@ mod tests {
                 noise: 1e-3,
                 score: 0.5,
             },
-            prior: Prior::Uniform,
+            prior: Proposal::Uniform,
             ln_false_alarms,
             verified_by: VerifiedBy::ImagePoints,
             counted,
         };
-        let (doubted, verified) = (best(7, -100.0), best(9, -50.0));
-        assert!(verified.displaces(&doubted) && !doubted.displaces(&verified));
-        assert!(verified.decides() && !doubted.decides() && !doubted.is_acceptable());
+        let (rejected, verified) = (best(7, -100.0), best(9, -50.0));
+        assert!(verified.displaces(&rejected) && !rejected.displaces(&verified));
+        assert!(verified.decides() && !rejected.decides() && !rejected.is_acceptable());
         // As of cameras that admit any track.
         let (vetoed, barely) = (best(9, -7.0), best(9, -8.0));
         assert!(barely.displaces(&vetoed) && !vetoed.displaces(&barely));

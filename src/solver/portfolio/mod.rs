@@ -23,13 +23,13 @@ use super::recorder::Recorder;
 use super::search::rigid::Rigid;
 use super::search::{affine, subspace};
 use crate::domain::result::PriorTime;
-use crate::domain::{Prior, SolveSettings, StopToken};
+use crate::domain::{Proposal, SolveSettings, StopToken};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::network::{NetworkSettings, PriorNetwork};
 use account::ProposalStats;
 use best::Best;
 pub use best::VerifiedBy;
-pub use spread::{MOST_SPREAD, spread};
+pub use spread::{spread, spread_of};
 
 /// Network iterations between two verifications of its ranking.
 const ITERATIONS_PER_ROUND: u32 = 25;
@@ -42,25 +42,26 @@ const AFFINE_SAMPLES: (usize, usize) = (2_000, 6_000);
 const SUBSPACE_SAMPLES: (usize, usize) = (250, 1_000);
 /// Hypotheses a round and prior that are grown.
 const SHORTLIST: usize = 2;
-/// Consensuses that are crowds after which a search is over: whatever includes one of a crowd that large explains all
+/// Consensuses of near-duplicates after which a search is over: whatever includes one of so many explains all
 /// of it, and outbids what is right.
-const MOST_CROWDS: usize = 4;
+const MOST_NEAR_DUPLICATES: usize = 4;
 /// Every other round grows at more noise than assumed, doubling up to sixteen times: a level that is twice too low
 /// loses the scene, and the caller may have given none.
 const NOISE_LADDER: [f64; 8] = [1.0, 2.0, 1.0, 4.0, 1.0, 8.0, 1.0, 16.0];
 
 /// What the search found.
+#[derive(Default)]
 pub struct Found {
     pub consensus: Option<Consensus>,
     /// What the consensus was verified by.
     pub verified_by: VerifiedBy,
     /// The rigid consensus behind it or beside it, where depths were given and one is not chance.
     pub rigid: Option<Rigid>,
-    pub winning_prior: Option<Prior>,
+    pub winning_prior: Option<Proposal>,
     /// Inliers of a consensus that the trained network keeps from being accepted, and how many of them count.
-    pub doubted: Option<(usize, usize)>,
-    /// Inliers of the largest consensus that is a crowd, and how many of them count.
-    pub crowded: Option<(usize, usize)>,
+    pub rejected_by_network: Option<(usize, usize)>,
+    /// Inliers of the largest consensus of near-duplicates, and how many of them count.
+    pub near_duplicates: Option<(usize, usize)>,
     /// What the trained network says of the block; `None` where it was not asked.
     pub track_scores: Option<TrackScores>,
     /// The weights of the network that was trained beforehand, or where it was not asked the last ones of the paper's,
@@ -88,9 +89,9 @@ pub struct Portfolio<'a> {
     rng: ChaCha8Rng,
     accounts: Vec<ProposalStats>,
     best: Option<Best>,
-    crowded: Option<(usize, usize)>,
-    /// Consensuses that were crowds.
-    crowds: usize,
+    near_duplicates: Option<(usize, usize)>,
+    /// Consensuses of near-duplicates.
+    near_duplicate_count: usize,
     rigid: Option<Rigid>,
     track_scores: Option<TrackScores>,
     /// The scene's own statistics go first, whatever the trained network says.
@@ -116,10 +117,10 @@ impl<'a> Portfolio<'a> {
             noise,
             spread: spread(block),
             rng: ChaCha8Rng::seed_from_u64(settings.seed),
-            accounts: Prior::ALL.into_iter().map(ProposalStats::new).collect(),
+            accounts: Proposal::ALL.into_iter().map(ProposalStats::new).collect(),
             best: None,
-            crowded: None,
-            crowds: 0,
+            near_duplicates: None,
+            near_duplicate_count: 0,
             rigid: None,
             track_scores: None,
             geometry_first: false,
@@ -173,11 +174,11 @@ impl<'a> Portfolio<'a> {
                     none => none.insert(self.paper_network()?),
                 };
                 self.optimise(network, recorder, spread_weights)?;
-                self.propose(Prior::Network, &priors::from_network(network.weights()), None);
+                self.propose(Proposal::Network, &priors::from_network(network.weights()), None);
             }
-            self.propose(Prior::Uniform, &vec![1.0; self.block.tracks()], None);
+            self.propose(Proposal::Uniform, &vec![1.0; self.block.tracks()], None);
             self.stand(recorder);
-            recorder.tell(f64::from(round + 1) / f64::from(rounds));
+            recorder.report(f64::from(round + 1) / f64::from(rounds));
             if self.is_over() || self.stop.is_stopped() {
                 break;
             }
@@ -193,7 +194,7 @@ impl<'a> Portfolio<'a> {
             Search::Affine(_) => balance(&self.block.measurement_matrix()),
         };
         let network = PriorNetwork::new(&matrix, &NetworkSettings::from(self.settings))?;
-        self.account(Prior::Network).seconds += begun.elapsed().as_secs_f64();
+        self.account(Proposal::Network).seconds += begun.elapsed().as_secs_f64();
         Ok(network)
     }
 
@@ -204,7 +205,7 @@ impl<'a> Portfolio<'a> {
         }
         let begun = Instant::now();
         self.track_scores = self.track_scores.take().or_else(|| TrackScores::of(self.block));
-        self.account(Prior::Learned).seconds += begun.elapsed().as_secs_f64();
+        self.account(Proposal::Learned).seconds += begun.elapsed().as_secs_f64();
         if let Some(track_scores) = self.track_scores.as_ref().filter(|_| self.settings.weights_every > 0) {
             recorder.weights(&spread_weights(&track_scores.probabilities()));
         }
@@ -232,13 +233,13 @@ impl<'a> Portfolio<'a> {
             let step = network.step()?;
             recorder.standing.iteration = step.iteration;
             recorder.standing.losses = Some(step.losses);
-            recorder.tell(f64::from(step.iteration) / f64::from(iterations));
+            recorder.report(f64::from(step.iteration) / f64::from(iterations));
             let every = self.settings.weights_every;
             if every > 0 && step.iteration.is_multiple_of(every) {
                 recorder.weights(&spread_weights(network.weights()));
             }
         }
-        let account = self.account(Prior::Network);
+        let account = self.account(Proposal::Network);
         account.seconds += begun.elapsed().as_secs_f64();
         account.work = network.iteration();
         Ok(())
@@ -252,12 +253,13 @@ impl<'a> Portfolio<'a> {
 
     /// Notes inliers that lie within the noise of each other, where the noise is no more than assumed: more makes any
     /// tracks one.
-    fn note_crowd(&mut self, consensus: &Consensus) {
+    fn note_near_duplicates(&mut self, consensus: &Consensus) {
         let (inliers, distinct) = (consensus.inlier_count(), consensus.distinct_count(self.spread));
-        let is_crowd = inliers >= LEAST_INLIERS && distinct < LEAST_INLIERS && self.noise <= self.assumed_noise;
-        self.crowds += usize::from(is_crowd);
-        if is_crowd && self.crowded.is_none_or(|(most, _)| inliers > most) {
-            self.crowded = Some((inliers, distinct));
+        let is_near_duplicate =
+            inliers >= LEAST_INLIERS && distinct < LEAST_INLIERS && self.noise <= self.assumed_noise;
+        self.near_duplicate_count += usize::from(is_near_duplicate);
+        if is_near_duplicate && self.near_duplicates.is_none_or(|(most, _)| inliers > most) {
+            self.near_duplicates = Some((inliers, distinct));
         }
     }
 
@@ -272,11 +274,11 @@ impl<'a> Portfolio<'a> {
         self.best.as_ref().is_some_and(Best::decides)
     }
 
-    /// Whether nothing more is to be expected: something decisive stands, or crowds alone are found by image points and
-    /// there are no depths to go by.
+    /// Whether nothing more is to be expected: something decisive stands, or near-duplicates alone are found by image
+    /// points and there are no depths to go by.
     fn is_over(&self) -> bool {
         let nothing_else = !self.best.as_ref().is_some_and(Best::is_acceptable) && !self.block.has_depths();
-        self.is_decisive() || (nothing_else && self.crowds >= MOST_CROWDS)
+        self.is_decisive() || (nothing_else && self.near_duplicate_count >= MOST_NEAR_DUPLICATES)
     }
 
     /// Writes the best consensus into the progress.
@@ -287,21 +289,22 @@ impl<'a> Portfolio<'a> {
         }
     }
 
-    fn account(&mut self, prior: Prior) -> &mut ProposalStats {
-        let place = Prior::ALL.iter().position(|&other| other == prior).unwrap_or(0);
+    fn account(&mut self, prior: Proposal) -> &mut ProposalStats {
+        let place = Proposal::ALL.iter().position(|&other| other == prior).unwrap_or(0);
         &mut self.accounts[place]
     }
 
     fn finish(self, network: Option<PriorNetwork>) -> Found {
         let with_network = self.settings.method.uses_network();
         let with_depths = self.block.has_depths();
-        let Self { best, crowded, accounts, rigid, track_scores, .. } = self;
-        let doubted = best.as_ref().filter(|best| !best.is_acceptable()).and_then(Best::doubted);
+        let Self { best, near_duplicates, accounts, rigid, track_scores, .. } = self;
+        let rejected_by_network =
+            best.as_ref().filter(|best| !best.is_acceptable()).and_then(Best::rejected_by_network);
         let accepted = best.filter(Best::is_acceptable);
         let prior_times = accounts
             .into_iter()
-            .filter(|account| with_network || !matches!(account.prior, Prior::Network | Prior::Learned))
-            .filter(|account| with_depths || account.prior != Prior::Rigidity)
+            .filter(|account| with_network || !matches!(account.prior, Proposal::Network | Proposal::Learned))
+            .filter(|account| with_depths || account.prior != Proposal::Rigidity)
             .map(|account| account.time(accepted.as_ref()))
             .collect();
         let verified_by = accepted.as_ref().map_or(VerifiedBy::ImagePoints, |best| best.verified_by);
@@ -311,8 +314,8 @@ impl<'a> Portfolio<'a> {
             verified_by,
             rigid,
             winning_prior,
-            doubted,
-            crowded,
+            rejected_by_network,
+            near_duplicates,
             network_weights: match (&track_scores, network) {
                 (Some(track_scores), _) => track_scores.probabilities(),
                 (None, Some(network)) => network.weights().to_vec(),

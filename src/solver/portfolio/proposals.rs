@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use super::best::Best;
 use super::{AFFINE_SAMPLES, NOISE_LADDER, Portfolio, SHORTLIST, SUBSPACE_SAMPLES, Search, VerifiedBy};
-use crate::domain::Prior;
+use crate::domain::Proposal;
 use crate::geometry::statistics::median;
 use crate::solver::a_contrario::{self, LN_DECISIVE};
 use crate::solver::learned::TrackScores;
@@ -13,7 +13,7 @@ use crate::solver::{depths, grow, priors};
 
 impl Portfolio<'_> {
     /// Whether this prior has anything left to say.
-    fn is_wanted(&self, prior: Prior) -> bool {
+    fn is_wanted(&self, prior: Proposal) -> bool {
         !self.is_over() && !self.stop.is_stopped() && !self.settings.excluded_priors.contains(&prior)
     }
 
@@ -22,27 +22,27 @@ impl Portfolio<'_> {
         let is_new = NOISE_LADDER.iter().position(|level| *level == NOISE_LADDER[round as usize % NOISE_LADDER.len()])
             == Some(round as usize);
         // A zoom moves distances with the focal length.
-        if !is_new || self.settings.focal_per_view || !self.is_wanted(Prior::Rigidity) {
+        if !is_new || self.settings.focal_per_view || !self.is_wanted(Proposal::Rigidity) {
             return;
         }
         let Some(search) = rigid::Search::new(self.block, self.spread, self.stop) else { return };
         let begun = Instant::now();
         let found = search.run(self.noise);
         let pairs = self.block.tracks() * (self.block.tracks() - 1) / 2;
-        let account = self.account(Prior::Rigidity);
+        let account = self.account(Proposal::Rigidity);
         account.seconds += begun.elapsed().as_secs_f64();
         account.work += pairs as u32;
         let Some(rigid) = found else { return };
-        self.verify(Prior::Rigidity, vec![depths::seed(&rigid)]);
+        self.verify(Proposal::Rigidity, vec![depths::seed(&rigid)]);
         if !self.is_decisive() {
             let found = Best {
                 ln_false_alarms: rigid.ln_false_alarms(search.spread()),
                 verified_by: VerifiedBy::Depths { focal: rigid.focal },
                 consensus: depths::consensus(self.block, &rigid, self.noise),
                 counted: rigid.inlier_count(),
-                prior: Prior::Rigidity,
+                prior: Proposal::Rigidity,
             };
-            self.account(Prior::Rigidity).record(&found);
+            self.account(Proposal::Rigidity).record(&found);
             self.offer(found);
         }
         let certainty = |rigid: &rigid::Rigid| rigid.ln_false_alarms(search.spread());
@@ -69,23 +69,23 @@ impl Portfolio<'_> {
 
     /// The trained network's scores: grown as it stands at first, then searched from.
     fn propose_learned(&mut self, round: u32) {
-        if !self.is_wanted(Prior::Learned) {
+        if !self.is_wanted(Proposal::Learned) {
             return;
         }
         let Some(track_scores) = self.track_scores.clone() else { return };
         // The levels of the noise repeat, and so would what is grown from the same tracks.
         if (round as usize) < NOISE_LADDER.len() && matches!(self.search, Search::Affine(_)) {
-            self.verify(Prior::Learned, affine::seed(self.block, track_scores.start()).into_iter().collect());
+            self.verify(Proposal::Learned, affine::seed(self.block, track_scores.start()).into_iter().collect());
         }
-        self.propose(Prior::Learned, &track_scores.probabilities(), Some(&track_scores.truncations()));
+        self.propose(Proposal::Learned, &track_scores.probabilities(), Some(&track_scores.truncations()));
     }
 
     /// The priors that need no optimisation, once.
     fn propose_geometric(&mut self) {
-        if self.is_wanted(Prior::Irls) {
+        if self.is_wanted(Proposal::Irls) {
             self.propose_irls();
         }
-        if self.is_wanted(Prior::Consistency) {
+        if self.is_wanted(Proposal::Consistency) {
             self.propose_consistency();
         }
     }
@@ -96,10 +96,10 @@ impl Portfolio<'_> {
             Search::Affine(search) => priors::affine_irls(search.centred(), self.stop),
             Search::Subspace(search) => priors::irls(search.balanced(), subspace::RANK, self.stop),
         };
-        self.account(Prior::Irls).seconds += begun.elapsed().as_secs_f64();
+        self.account(Proposal::Irls).seconds += begun.elapsed().as_secs_f64();
         if let Some(prior) = irls {
-            self.propose_ranking(Prior::Irls, &prior);
-            self.propose(Prior::Irls, &prior, None);
+            self.propose_ranking(Proposal::Irls, &prior);
+            self.propose(Proposal::Irls, &prior, None);
         }
     }
 
@@ -109,20 +109,20 @@ impl Portfolio<'_> {
             Search::Affine(search) => priors::consistency(search.centred(), 2),
             Search::Subspace(search) => priors::consistency(&centred_rows(search.balanced()), 3),
         };
-        self.account(Prior::Consistency).seconds += begun.elapsed().as_secs_f64();
-        self.propose(Prior::Consistency, &consistency, None);
+        self.account(Proposal::Consistency).seconds += begun.elapsed().as_secs_f64();
+        self.propose(Proposal::Consistency, &consistency, None);
     }
 
     /// Searches under a prior and grows what it found.
     ///
     /// * `truncations`: see [`affine::Search::run`]; of a search with depths nothing depends on them
-    pub(super) fn propose(&mut self, prior: Prior, weights: &[f64], truncations: Option<&[f64]>) {
+    pub(super) fn propose(&mut self, prior: Proposal, weights: &[f64], truncations: Option<&[f64]>) {
         if !self.is_wanted(prior) {
             return;
         }
         let begun = Instant::now();
         let sampler = Sampler::new(weights);
-        let uniform = prior == Prior::Uniform;
+        let uniform = prior == Proposal::Uniform;
         let samples = |(guided, free): (usize, usize)| if uniform { free } else { guided };
         let (seeds, drawn) = match &self.search {
             Search::Affine(search) => {
@@ -145,14 +145,14 @@ impl Portfolio<'_> {
         };
         let account = self.account(prior);
         account.seconds += begun.elapsed().as_secs_f64();
-        if prior != Prior::Network {
+        if prior != Proposal::Network {
             account.work += drawn as u32;
         }
         self.verify(prior, seeds);
     }
 
     /// Grows a prior's own best-ranked tracks, without sampling.
-    fn propose_ranking(&mut self, prior: Prior, weights: &[f64]) {
+    fn propose_ranking(&mut self, prior: Proposal, weights: &[f64]) {
         if matches!(self.search, Search::Affine(_)) {
             let costs: Vec<f64> = weights.iter().map(|weight| -weight).collect();
             self.verify(prior, affine::seeds_from_ranking(self.block, &costs));
@@ -160,7 +160,7 @@ impl Portfolio<'_> {
     }
 
     /// Grows seeds until one is decisive, and keeps account.
-    fn verify(&mut self, prior: Prior, seeds: Vec<Seed>) {
+    fn verify(&mut self, prior: Proposal, seeds: Vec<Seed>) {
         for seed in seeds {
             let begun = Instant::now();
             let grown = grow::grow(self.block, seed.cameras, seed.points, seed.support, self.noise, self.stop);
@@ -170,7 +170,7 @@ impl Portfolio<'_> {
             });
             self.account(prior).seconds += begun.elapsed().as_secs_f64();
             let Some(consensus) = grown else { continue };
-            self.note_crowd(&consensus);
+            self.note_near_duplicates(&consensus);
             let grown = Best { consensus, prior, ln_false_alarms, verified_by: VerifiedBy::ImagePoints, counted };
             self.account(prior).record(&grown);
             self.offer(grown);

@@ -3,14 +3,15 @@
 use nalgebra::Vector4;
 
 use super::adjust::{self, Extract};
-use super::model::{Model, Scene};
+use super::model::Model;
 use super::{own_focals, windows};
 use crate::domain::{FocalPrior, Task, Warning, WarningCode};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::solver::calibration::{self, Outcome};
+use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
-use crate::solver::{Context, Error, block};
+use crate::solver::{Error, view_selection};
 
 /// Views that a calibration is made from at most: the projective adjustment that it is compared with is cubic in them.
 /// Of more with one focal length, the stretch with most observations, where the others speak through their windows; a
@@ -31,92 +32,85 @@ const LEAST_KEPT: usize = 3;
 ///
 /// # Errors
 /// [`Error::Stopped`].
-pub fn calibrate(
-    scene: &Scene,
-    model: &mut Model,
-    context: &Context,
-    recorder: &mut Recorder,
-) -> Result<Vec<Outcome>, Error> {
-    if scene.has_own_focals() {
-        return own_focals::calibrate(scene, model, context, recorder).map(|outcome| vec![outcome]);
+pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) -> Result<Vec<Outcome>, Error> {
+    if problem.has_own_focals() {
+        return own_focals::calibrate(problem, model, recorder).map(|outcome| vec![outcome]);
     }
     let registered = model.registered();
     // All cameras together where one calibration takes all views, else each by itself.
     let runs: Vec<Vec<usize>> = match registered.len() <= MOST_VIEWS {
         true => vec![registered],
-        false => (0..scene.cameras)
+        false => (0..problem.cameras)
             .map(|camera| {
                 let own: Vec<usize> =
-                    registered.iter().copied().filter(|&view| scene.camera_of[view] == camera).collect();
-                densest(scene, model, &own)
+                    registered.iter().copied().filter(|&view| problem.camera_of[view] == camera).collect();
+                densest(problem, model, &own)
             })
             .collect(),
     };
-    let mut outcomes: Vec<Outcome> = (0..scene.cameras).map(|_| too_few(0)).collect();
+    let mut outcomes: Vec<Outcome> = (0..problem.cameras).map(|_| too_few(0)).collect();
     for (k, views) in runs.iter().enumerate() {
         recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
-        let found = match views.len() < block::LEAST_VIEWS {
-            true => views.iter().map(|&view| (scene.camera_of[view], too_few(views.len()))).collect(),
-            false => of_cameras(scene, model, views, context, recorder)?,
+        let found = match views.len() < view_selection::LEAST_VIEWS {
+            true => views.iter().map(|&view| (problem.camera_of[view], too_few(views.len()))).collect(),
+            false => of_cameras(problem, model, views, recorder)?,
         };
         found.into_iter().for_each(|(camera, outcome)| outcomes[camera] = outcome);
     }
-    super::structure::triangulate(scene, model, recorder);
-    adjust::all(scene, model, recorder);
-    report_found(scene, model, recorder);
+    super::structure::triangulate(problem, model, recorder);
+    adjust::all(problem, model, recorder);
+    report_found(problem, model, recorder);
     for (camera, outcome) in outcomes.iter_mut().enumerate() {
         admit_difference(model.lenses[camera].intrinsics.focal.ln(), outcome);
-        windows::reconcile(scene, model, camera, outcome, recorder)?;
+        windows::reconcile(problem, model, camera, outcome, recorder)?;
     }
     Ok(outcomes)
 }
 
 /// Reports the points and the focal length, a mean where views have their own, of the first camera with registered
 /// views.
-pub fn report_found(scene: &Scene, model: &Model, recorder: &mut Recorder) {
+pub fn report_found(problem: &Problem, model: &Model, recorder: &mut Recorder) {
     let mut views = model.registered();
-    let first = views.first().map(|&view| scene.camera_of[view]);
+    let first = views.first().map(|&view| problem.camera_of[view]);
     let focal = first.map(|camera| {
-        views.retain(|&view| scene.camera_of[view] == camera);
-        model.log_focal(camera, &views).exp() * scene.context.scale_px
+        views.retain(|&view| problem.camera_of[view] == camera);
+        model.log_focal(camera, &views).exp() * problem.scale_px
     });
     recorder.found(adjust::verified(model).len(), focal.filter(|focal| focal.is_finite()));
 }
 
 /// What is said of a camera of which fewer views are registered than a calibration needs.
 pub fn too_few(views: usize) -> Outcome {
-    let detail = format!("only {views} views are registered; a calibration needs {}", block::LEAST_VIEWS);
+    let detail = format!("only {views} views are registered; a calibration needs {}", view_selection::LEAST_VIEWS);
     Outcome::refused(vec![Warning::new(WarningCode::UnobservableFocal, detail)])
 }
 
 /// The calibrations of the cameras of these views, whose views have one focal length each.
 fn of_cameras(
-    scene: &Scene,
+    problem: &Problem,
     model: &mut Model,
     views: &[usize],
-    context: &Context,
     recorder: &mut Recorder,
 ) -> Result<Vec<(usize, Outcome)>, Error> {
-    let mut extract = core(scene, model, views, of_view(views));
-    let found = of_extract(scene, &extract, model.noise, context, &mut || recorder.heartbeat())?;
+    let mut extract = core(problem, model, views, of_view(views));
+    let found = of_extract(problem, &extract, model.noise, &mut || recorder.heartbeat())?;
     take_over(model, &mut extract, &found);
     Ok(found)
 }
 
 /// The calibrations of the cameras of some views.
 ///
-/// * `told`: called now and then
+/// * `heartbeat`: called now and then
 pub fn of_extract(
-    scene: &Scene,
+    problem: &Problem,
     extract: &Extract,
     noise: f64,
-    context: &Context,
-    told: &mut dyn FnMut(),
+    heartbeat: &mut dyn FnMut(),
 ) -> Result<Vec<(usize, Outcome)>, Error> {
     let (metric, of_group) = extract.block();
     let (cameras, points) = projective(&metric);
-    let focal_priors: Vec<Option<FocalPrior>> = of_group.iter().map(|&camera| scene.focal_priors[camera]).collect();
-    let problem = calibration::Problem {
+    let focal_priors: Vec<Option<FocalPrior>> = of_group.iter().map(|&camera| problem.focal_priors[camera]).collect();
+    let projective = calibration::Problem {
         cameras: &cameras,
         points: &points,
         observations: &extract.observations,
@@ -125,7 +119,7 @@ pub fn of_extract(
         focal_priors: &focal_priors,
         focal_per_view: metric.has_own_focals(),
     };
-    let outcomes = calibration::from_metric(&problem, &metric, context.scale_px, context.stop, told)?;
+    let outcomes = calibration::from_metric(&projective, &metric, problem.scale_px, problem.stop, heartbeat)?;
     Ok(of_group.into_iter().zip(outcomes).collect())
 }
 
@@ -165,8 +159,8 @@ fn admit_difference(log_focal: f64, outcome: &mut Outcome) {
 }
 
 /// The run of at most [`MOST_VIEWS`] of these views that keeps most observations.
-fn densest(scene: &Scene, model: &Model, views: &[usize]) -> Vec<usize> {
-    let kept = |view: &usize| scene.of_view[*view].iter().filter(|&&k| model.kept[k as usize]).count();
+fn densest(problem: &Problem, model: &Model, views: &[usize]) -> Vec<usize> {
+    let kept = |view: &usize| problem.of_view[*view].iter().filter(|&&k| model.kept[k as usize]).count();
     let counts: Vec<usize> = views.iter().map(kept).collect();
     // No views have no runs.
     let length = views.len().clamp(1, MOST_VIEWS);
@@ -183,9 +177,9 @@ pub fn projective(metric: &Reconstruction) -> (Vec<Camera>, Vec<Vector4<f64>>) {
 
 /// Landmarks that give every one of these registered views `of_view` observations, with the observations that the core
 /// of the noise explains.
-pub fn core(scene: &Scene, model: &Model, views: &[usize], of_view: usize) -> Extract {
-    let tracks = adjust::covering(scene, model, views, of_view);
-    let mut extract = Extract::new(scene, model, views, &tracks);
+pub fn core(problem: &Problem, model: &Model, views: &[usize], of_view: usize) -> Extract {
+    let tracks = adjust::covering(problem, model, views, of_view);
+    let mut extract = Extract::new(problem, model, views, &tracks);
     let limit = CORE_SQUARED * model.noise * model.noise;
     let fits: Vec<bool> = extract
         .observations

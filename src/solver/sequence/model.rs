@@ -1,96 +1,14 @@
 //! The state of an extension: what is known of the cameras, the views, the points and the noise.
 
-use nalgebra::{Vector2, Vector3};
+use nalgebra::Vector3;
 
-use crate::domain::{FocalPrior, StopToken};
+use super::options::GrowthOptions;
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
 use crate::geometry::observation::Observation;
 use crate::solver::calibration::ViewFocal;
-use crate::solver::{Context, attempt, block, classification};
-
-/// An input as the extension sees it; observations keep the input's sorted order (track, view).
-pub struct Scene<'a> {
-    pub context: Context<'a>,
-    /// Normalised image points, one an observation.
-    pub xy: Vec<Vector2<f64>>,
-    /// See [`Observation::weight`]; one an observation.
-    pub weights: Vec<f64>,
-    /// Observations of each view.
-    pub of_view: Vec<Vec<u32>>,
-    /// Camera of each view, each of which gets a calibration: the camera groups, counted from 0 in rising order of the
-    /// input's numbers, or one for all where they are merged or views have focal lengths of their own.
-    pub camera_of: Vec<usize>,
-    pub cameras: usize,
-    /// What is known of the focal length of each camera beforehand; nothing where views have their own.
-    pub focal_priors: Vec<Option<FocalPrior>>,
-    /// Density of a wrong coordinate; see [`classification::Geometry::outlier_density`].
-    pub outlier_density: f64,
-}
-
-impl<'a> Scene<'a> {
-    pub fn new(context: &Context<'a>) -> Self {
-        let input = context.input;
-        let mut of_view = vec![Vec::new(); input.view_count()];
-        let mut xy = Vec::with_capacity(input.observation_count());
-        for k in 0..input.observation_count() {
-            let view = input.view_of(k);
-            of_view[view].push(k as u32);
-            xy.push(context.normalization.normalize(view, input.point_px(k)));
-        }
-        let outlier_density = classification::outlier_density(&xy);
-        let (camera_of, cameras) = match context.merges_cameras {
-            true => (vec![0; input.view_count()], 1),
-            false => block::camera_groups(input),
-        };
-        let of_camera = |camera: usize| {
-            let views = input.views().iter().zip(&camera_of).filter(|(_, of)| **of == camera);
-            attempt::focal_prior(views.map(|(view, _)| view))
-        };
-        let is_shared = !context.settings.focal_per_view;
-        let focal_priors = (0..cameras).map(|camera| of_camera(camera).filter(|_| is_shared)).collect();
-        Self {
-            context: *context,
-            xy,
-            weights: block::weights(input),
-            of_view,
-            camera_of,
-            cameras,
-            focal_priors,
-            outlier_density,
-        }
-    }
-
-    /// Whether every view has a focal length of its own.
-    pub fn has_own_focals(&self) -> bool {
-        self.context.settings.focal_per_view
-    }
-
-    pub fn stop(&self) -> &'a StopToken {
-        self.context.stop
-    }
-
-    pub fn tracks(&self) -> usize {
-        self.context.input.track_count()
-    }
-
-    pub fn view_of(&self, k: usize) -> usize {
-        self.context.input.view_of(k)
-    }
-
-    pub fn observation(&self, k: usize) -> Observation {
-        Observation { weight: self.weights[k], ..Observation::new(self.view_of(k), self.track_of(k), self.xy[k]) }
-    }
-
-    pub fn track_of(&self, k: usize) -> usize {
-        self.context.input.track_of(k)
-    }
-
-    /// Observations of a track.
-    pub fn of_track(&self, track: usize) -> std::ops::Range<usize> {
-        self.context.ranges[track]..self.context.ranges[track + 1]
-    }
-}
+use crate::solver::classification;
+use crate::solver::problem::Problem;
 
 /// A point of the reconstruction.
 #[derive(Debug, Clone, Copy)]
@@ -100,8 +18,8 @@ pub struct Landmark {
     pub angle: f64,
     /// Observations that agree with it.
     pub support: usize,
-    /// Part that it was triangulated in.
-    pub part: u32,
+    /// Component that it was triangulated in.
+    pub component: u32,
 }
 
 /// What images the views of a camera.
@@ -132,45 +50,42 @@ pub struct Model {
     pub own_focals: Vec<OwnFocal>,
     /// One a view of the input.
     pub poses: Vec<Option<Pose>>,
-    /// Part of each registered view: views that share no tracks are reconstructions of their own, under one
+    /// Component of each registered view: views that share no tracks are reconstructions of their own, under one
     /// calibration.
-    pub part_of: Vec<u32>,
+    pub component_of: Vec<u32>,
     /// One a track of the input.
     pub landmarks: Vec<Option<Landmark>>,
     /// One an observation: whether it agrees with its landmark.
     pub kept: Vec<bool>,
-    /// The part that grows.
+    /// The component that grows.
     current: u32,
-    /// Landmarks of that part among the tracks of each view that may support a pose.
+    /// Landmarks of that component among the tracks of each view that may support a pose.
     pub supported: Vec<usize>,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
     /// Noise of the seed, whose gates found it.
     seed_noise: f64,
-    /// Whether the residuals would have asked for more noise than [`NOISE_GROWTH`] allows.
+    /// Whether the residuals would have asked for more noise than it may have.
     pub is_strained: bool,
 }
 
-/// Noise that a sequence may have, in that of its seed: the seed's is measured without a calibration, and a metric
-/// reconstruction that fits four times worse is wrong. Without a bound wrong observations widen their own gates.
-const NOISE_GROWTH: f64 = 4.0;
 /// Least noise that is believed, pixels: exact input would close every gate.
 const LEAST_NOISE_PX: f64 = 0.01;
 
 impl Model {
     /// A model of nothing yet, with this noise, all cameras like this one.
-    pub fn new(scene: &Scene, intrinsics: Intrinsics, noise: f64) -> Self {
-        let views = scene.context.input.view_count();
-        let free = IntrinsicsModel::focal(scene.has_own_focals());
+    pub fn new(problem: &Problem, intrinsics: Intrinsics, noise: f64) -> Self {
+        let views = problem.input.view_count();
+        let free = IntrinsicsModel::focal(problem.has_own_focals());
         let lens = Lens { intrinsics, free, is_known: false };
         let own_focal = OwnFocal { focal: intrinsics.focal, is_determined: true };
         Self {
-            lenses: vec![lens; scene.cameras],
-            own_focals: if scene.has_own_focals() { vec![own_focal; views] } else { Vec::new() },
+            lenses: vec![lens; problem.cameras],
+            own_focals: if problem.has_own_focals() { vec![own_focal; views] } else { Vec::new() },
             poses: vec![None; views],
-            part_of: vec![0; views],
-            landmarks: vec![None; scene.tracks()],
-            kept: vec![false; scene.xy.len()],
+            component_of: vec![0; views],
+            landmarks: vec![None; problem.tracks()],
+            kept: vec![false; problem.xy.len()],
             current: 0,
             supported: vec![0; views],
             noise,
@@ -180,96 +95,96 @@ impl Model {
     }
 
     /// Takes the noise that the residuals show, within bounds.
-    pub fn set_noise(&mut self, scene: &Scene, noise: f64) {
-        let least = LEAST_NOISE_PX / scene.context.scale_px;
-        let most = NOISE_GROWTH * self.seed_noise.max(least);
+    pub fn set_noise(&mut self, problem: &Problem, noise: f64) {
+        let least = LEAST_NOISE_PX / problem.scale_px;
+        let most = GrowthOptions::METRIC.noise_growth * self.seed_noise.max(least);
         if noise.is_finite() {
             self.is_strained = noise > most;
             self.noise = noise.clamp(least, most);
         }
     }
 
-    /// Turns to the part that grows next.
-    pub fn turn_to(&mut self, scene: &Scene, part: u32) {
-        self.current = part;
+    /// Turns to the component that grows next.
+    pub fn turn_to(&mut self, problem: &Problem, component: u32) {
+        self.current = component;
         self.supported.fill(0);
         for track in 0..self.landmarks.len() {
-            self.count_support(scene, track, 1);
+            self.count_support(problem, track, 1);
         }
     }
 
     /// Sets the landmark of a track.
-    pub fn set_landmark(&mut self, scene: &Scene, track: usize, landmark: Option<Landmark>) {
-        self.count_support(scene, track, -1);
+    pub fn set_landmark(&mut self, problem: &Problem, track: usize, landmark: Option<Landmark>) {
+        self.count_support(problem, track, -1);
         self.landmarks[track] = landmark;
-        self.count_support(scene, track, 1);
+        self.count_support(problem, track, 1);
     }
 
-    fn count_support(&mut self, scene: &Scene, track: usize, by: isize) {
-        let counts = |landmark: &Landmark| landmark.part == self.current && landmark.supports();
+    fn count_support(&mut self, problem: &Problem, track: usize, by: isize) {
+        let counts = |landmark: &Landmark| landmark.component == self.current && landmark.supports();
         if self.landmarks[track].as_ref().is_some_and(counts) {
-            for k in scene.of_track(track) {
-                let count = &mut self.supported[scene.view_of(k)];
+            for k in problem.of_track(track) {
+                let count = &mut self.supported[problem.view_of(k)];
                 *count = count.saturating_add_signed(by);
             }
         }
     }
 
-    /// Adds the views of a metric block as a part; lenses that are not known yet are the block's.
+    /// Adds the views of a metric block as a component; lenses that are not known yet are the block's.
     ///
     /// * `focals`: the focal length of each of these views, where views have their own
-    pub fn add_part(
+    pub fn add_component(
         &mut self,
-        scene: &Scene,
-        part: u32,
+        problem: &Problem,
+        component: u32,
         views: &[usize],
         metric: &Reconstruction,
         focals: Option<&[ViewFocal]>,
     ) {
         for (i, (&view, pose)) in views.iter().zip(&metric.poses).enumerate() {
-            let lens = &mut self.lenses[scene.camera_of[view]];
+            let lens = &mut self.lenses[problem.camera_of[view]];
             if !lens.is_known {
                 lens.intrinsics = metric.intrinsics[metric.group_of[i]];
             }
             if let (Some(own), Some(found)) = (self.own_focals.get_mut(view), focals.and_then(|focals| focals.get(i))) {
                 *own = OwnFocal { focal: found.focal, is_determined: found.sigma_log.is_some() };
             }
-            self.register(scene, view, part, *pose);
+            self.register(problem, view, component, *pose);
         }
     }
 
-    pub fn register(&mut self, scene: &Scene, view: usize, part: u32, pose: Pose) {
+    pub fn register(&mut self, problem: &Problem, view: usize, component: u32, pose: Pose) {
         self.poses[view] = Some(pose);
-        self.part_of[view] = part;
-        self.lenses[scene.camera_of[view]].is_known = true;
+        self.component_of[view] = component;
+        self.lenses[problem.camera_of[view]].is_known = true;
     }
 
     /// Whether the focal length of a view is not known before it is registered.
-    pub fn is_focal_unknown(&self, scene: &Scene, view: usize) -> bool {
-        !self.own_focals.is_empty() || !self.lenses[scene.camera_of[view]].is_known
+    pub fn is_focal_unknown(&self, problem: &Problem, view: usize) -> bool {
+        !self.own_focals.is_empty() || !self.lenses[problem.camera_of[view]].is_known
     }
 
     /// Takes these intrinsics for a view: its focal length where it has its own, and all for its camera where no view
     /// had that yet.
-    pub fn set_intrinsics(&mut self, scene: &Scene, view: usize, intrinsics: Intrinsics) {
+    pub fn set_intrinsics(&mut self, problem: &Problem, view: usize, intrinsics: Intrinsics) {
         if let Some(own) = self.own_focals.get_mut(view) {
             own.focal = intrinsics.focal;
         }
-        let lens = &mut self.lenses[scene.camera_of[view]];
+        let lens = &mut self.lenses[problem.camera_of[view]];
         if self.own_focals.is_empty() || !lens.is_known {
             lens.intrinsics = intrinsics;
         }
     }
 
     /// Takes views back.
-    pub fn unregister(&mut self, scene: &Scene, views: &[usize]) {
+    pub fn unregister(&mut self, problem: &Problem, views: &[usize]) {
         for &view in views {
             self.poses[view] = None;
-            self.part_of[view] = 0;
+            self.component_of[view] = 0;
         }
         self.lenses.iter_mut().for_each(|lens| lens.is_known = false);
         for view in self.registered() {
-            self.lenses[scene.camera_of[view]].is_known = true;
+            self.lenses[problem.camera_of[view]].is_known = true;
         }
     }
 
@@ -291,13 +206,15 @@ impl Model {
         self.own_focals.get(view).is_none_or(|own| own.is_determined)
     }
 
-    /// Registered views of a part, increasing.
-    pub fn of_part(&self, part: u32) -> Vec<usize> {
-        (0..self.poses.len()).filter(|&view| self.poses[view].is_some() && self.part_of[view] == part).collect()
+    /// Registered views of a component, increasing.
+    pub fn of_component(&self, component: u32) -> Vec<usize> {
+        (0..self.poses.len())
+            .filter(|&view| self.poses[view].is_some() && self.component_of[view] == component)
+            .collect()
     }
 
-    pub fn intrinsics_of(&self, scene: &Scene, view: usize) -> Intrinsics {
-        let shared = self.lenses[scene.camera_of[view]].intrinsics;
+    pub fn intrinsics_of(&self, problem: &Problem, view: usize) -> Intrinsics {
+        let shared = self.lenses[problem.camera_of[view]].intrinsics;
         match self.own_focals.get(view) {
             Some(own) => Intrinsics { focal: own.focal, ..shared },
             None => shared,
@@ -314,23 +231,23 @@ impl Model {
     }
 
     /// Pinhole cameras of all views; `None` for those that are not registered.
-    pub fn cameras(&self, scene: &Scene) -> Vec<Option<Camera>> {
+    pub fn cameras(&self, problem: &Problem) -> Vec<Option<Camera>> {
         let camera =
-            |(view, pose): (usize, &Option<Pose>)| pose.map(|pose| pose.camera(&self.intrinsics_of(scene, view)));
+            |(view, pose): (usize, &Option<Pose>)| pose.map(|pose| pose.camera(&self.intrinsics_of(problem, view)));
         self.poses.iter().enumerate().map(camera).collect()
     }
 
     /// Where the pinhole cameras see an observation; `None` where the view is not registered or the lens images
     /// nothing.
-    pub fn observation(&self, scene: &Scene, k: usize) -> Option<Observation> {
-        let view = scene.view_of(k);
+    pub fn observation(&self, problem: &Problem, k: usize) -> Option<Observation> {
+        let view = problem.view_of(k);
         self.poses[view]?;
-        let seen = scene.observation(k);
-        Some(Observation { xy: self.intrinsics_of(scene, view).undistort(&seen.xy)?, ..seen })
+        let seen = problem.observation(k);
+        Some(Observation { xy: self.intrinsics_of(problem, view).undistort(&seen.xy)?, ..seen })
     }
 
     /// Squared residual, normalised units, within which an observation agrees with its landmark.
-    pub fn gate(&self, scene: &Scene) -> f64 {
-        classification::working_gate(self.noise, scene.outlier_density)
+    pub fn gate(&self, problem: &Problem) -> f64 {
+        classification::working_gate(self.noise, problem.outlier_density)
     }
 }

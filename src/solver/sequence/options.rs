@@ -1,57 +1,76 @@
-//! The thresholds of the projective growth, with their reasons.
+//! The thresholds of growing a reconstruction, with their reasons.
 
-use super::adjust::{CAUCHY_SCALE, TOLERANCE};
-
-/// How a projective reconstruction grows.
+/// How views are added.
 #[derive(Debug, Clone, PartialEq)]
-pub struct ProjectiveOptions {
-    /// Observations that must agree with a point for it to take part: two make it, one verifies it.
-    pub least_support: usize,
-    /// Points that a view must see and that must agree with its camera: six determine it, and each of the others agrees
-    /// with a wrong one by chance in a few cases of a thousand.
+pub struct GrowthOptions {
+    /// Points that a view must see before it is tried, and that must agree with its camera.
     pub least_agreeing: usize,
-    /// Share of the points seen that must agree: more than the three tenths down to which resection is reliable.
+    /// Share of the points seen that must agree.
     pub least_share: f64,
     /// Points of a view beyond which its camera is not made better.
-    pub most_resected: usize,
-    /// Growth of the points that a view sees after which a failed one is tried again.
+    pub most_points: usize,
+    /// Growth of the points that a view sees after which a failed one is tried again: fewer new ones hardly change its
+    /// odds.
     pub retry_growth: f64,
-    /// Growth of the registered views after which all are adjusted.
+    /// Trials of a view.
+    pub most_trials: usize,
+    /// Growth of the registered views after which all are adjusted. A geometric growth keeps the cost of all
+    /// adjustments together at six times that of the last.
     pub adjust_growth: f64,
-    /// Views at most: projective adjustment is cubic in them.
+    /// Views at most.
     pub most_views: usize,
-    /// Observations of a view that an adjustment holds.
+    /// Observations of a view that an adjustment holds while more views are to come.
     pub of_view: usize,
-    /// Iterations of an adjustment while growing, and of each of the last ones.
+    /// Iterations of such an adjustment, and of each of the last ones.
     pub growing_iterations: usize,
     pub final_iterations: usize,
     /// Rounds of adjusting and triangulating that end the growth; the third moves nothing that a gate would see.
     pub final_rounds: usize,
     /// Cost gained by a step, as a share, below which an adjustment that will be repeated ends.
     pub tolerance: f64,
-    /// Scale of the Cauchy loss in units of the noise: as of metric adjustments.
+    /// Scale of the Cauchy loss in units of the core noise: detectors have tails that a wider one would follow.
     pub cauchy_scale: f64,
-    /// Noise that may be found, in that of the start: without a bound wrong observations widen their own gates.
+    /// Noise that may be found, in that of the start: what fits four times worse is wrong, and without a bound wrong
+    /// observations widen their own gates.
     pub noise_growth: f64,
 }
 
-impl Default for ProjectiveOptions {
-    fn default() -> Self {
-        Self {
-            least_support: 3,
-            least_agreeing: 9,
-            least_share: 0.4,
-            most_resected: 500,
-            retry_growth: 1.2,
-            adjust_growth: 1.2,
-            most_views: 100,
-            of_view: 150,
-            growing_iterations: 6,
-            final_iterations: 10,
-            final_rounds: 3,
-            tolerance: TOLERANCE,
-            cauchy_scale: CAUCHY_SCALE,
-            noise_growth: 4.0,
-        }
-    }
+impl GrowthOptions {
+    /// Of metric cameras.
+    pub const METRIC: Self = Self {
+        // Three determine a pose, and each of the other five agrees with a wrong one by chance in one case of a
+        // hundred.
+        least_agreeing: 8,
+        // Below, the samples of the robust pose do not suffice.
+        least_share: 0.1,
+        most_points: 2_000,
+        retry_growth: 1.2,
+        // By the last it sees some 1.7 times the points of the first.
+        most_trials: 4,
+        adjust_growth: 1.2,
+        most_views: usize::MAX,
+        of_view: 100,
+        growing_iterations: 6,
+        final_iterations: 20,
+        final_rounds: 3,
+        tolerance: 1e-4,
+        cauchy_scale: 2.0,
+        noise_growth: 4.0,
+    };
+
+    /// Of projective cameras.
+    pub const PROJECTIVE: Self = Self {
+        // Six determine a camera, and each of the others agrees with a wrong one by chance in a few cases of a
+        // thousand.
+        least_agreeing: 9,
+        // More than the three tenths down to which resection is reliable.
+        least_share: 0.4,
+        most_points: 500,
+        most_trials: usize::MAX,
+        // Projective adjustment is cubic in them.
+        most_views: 100,
+        of_view: 150,
+        final_iterations: 10,
+        ..Self::METRIC
+    };
 }

@@ -5,13 +5,14 @@
 
 use super::adjust::{self, Extract};
 use super::calibrate::{self, too_few};
-use super::model::{Model, Scene};
+use super::model::Model;
 use super::{structure, windows};
 use crate::domain::{Grade, Task, Warning, WarningCode};
 use crate::geometry::statistics::root_mean_square;
 use crate::solver::calibration::{self, LEAST_DETERMINED, Outcome};
+use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
-use crate::solver::{Context, Error, block};
+use crate::solver::{Error, view_selection};
 
 /// The one camera that there is where views have focal lengths of their own.
 const CAMERA: usize = 0;
@@ -20,53 +21,51 @@ const CAMERA: usize = 0;
 ///
 /// # Errors
 /// [`Error::Stopped`].
-pub fn calibrate(
-    scene: &Scene,
-    model: &mut Model,
-    context: &Context,
-    recorder: &mut Recorder,
-) -> Result<Outcome, Error> {
+pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) -> Result<Outcome, Error> {
     let registered = model.registered();
     let runs = runs(model);
-    let of_run = |k: usize, told: &mut dyn FnMut()| {
-        let extract = calibrate::core(scene, model, runs.get(k)?, calibrate::of_view(&runs[k]));
-        let found = calibrate::of_extract(scene, &extract, model.noise, context, told).ok()?;
+    let of_run = |k: usize, heartbeat: &mut dyn FnMut()| {
+        let extract = calibrate::core(problem, model, runs.get(k)?, calibrate::of_view(&runs[k]));
+        let found = calibrate::of_extract(problem, &extract, model.noise, heartbeat).ok()?;
         found.into_iter().next().map(|(_, outcome)| (extract, outcome))
     };
     let found = if runs.len() == 1 {
         recorder.step(Task::Cameras, 1, 1, 0.0);
         vec![of_run(0, &mut || recorder.heartbeat())]
     } else {
-        let mut told = |k: usize| recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
-        scene.context.threads.map(runs.len(), 1, |k| of_run(k, &mut || {}), &mut told)
+        let mut progress = |k: usize| recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
+        problem.threads.map(runs.len(), 1, |k| of_run(k, &mut || {}), &mut progress)
     };
-    scene.context.stopped()?;
+    problem.stopped()?;
     let mut found: Vec<(Extract, Outcome)> = found.into_iter().flatten().collect();
     // The lens that all runs share is that of the one that knows its focal lengths best.
     let sigma = |outcome: &Outcome| outcome.sigma_log_focal.unwrap_or(f64::INFINITY);
     if let Some((extract, outcome)) = found.iter_mut().min_by(|a, b| sigma(&a.1).total_cmp(&sigma(&b.1))) {
         calibrate::take_over(model, extract, &[(CAMERA, outcome.clone())]);
     }
-    structure::triangulate(scene, model, recorder);
-    adjust::all(scene, model, recorder);
-    calibrate::report_found(scene, model, recorder);
+    structure::triangulate(problem, model, recorder);
+    adjust::all(problem, model, recorder);
+    calibrate::report_found(problem, model, recorder);
     let mut outcome = match found.is_empty() {
         true => too_few(registered.len()),
         false => combined(model, found),
     };
-    windows::reconcile(scene, model, CAMERA, &mut outcome, recorder)?;
+    windows::reconcile(problem, model, CAMERA, &mut outcome, recorder)?;
     Ok(outcome)
 }
 
-/// Registered views in runs of one part and about equal length.
+/// Registered views in runs of one component and about equal length.
 fn runs(model: &Model) -> Vec<Vec<usize>> {
-    let parts = model.part_of.iter().copied().max().unwrap_or(0);
-    let of_part = |part: u32| {
-        let views = model.of_part(part);
+    let components = model.component_of.iter().copied().max().unwrap_or(0);
+    let of_component = |component: u32| {
+        let views = model.of_component(component);
         let count = views.len().div_ceil(calibrate::MOST_VIEWS);
         (0..count).map(move |k| views[k * views.len() / count..(k + 1) * views.len() / count].to_vec())
     };
-    (0..=parts).flat_map(of_part).filter(|run: &Vec<usize>| run.len() >= block::LEAST_VIEWS).collect()
+    (0..=components)
+        .flat_map(of_component)
+        .filter(|run: &Vec<usize>| run.len() >= view_selection::LEAST_VIEWS)
+        .collect()
 }
 
 /// One calibration of those of the runs, which are not none: as good as the worst that is not refused, with a sigma

@@ -2,15 +2,14 @@
 
 use nalgebra::Vector3;
 
-use super::model::{Landmark, Model, Scene};
+use super::model::{Landmark, Model};
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::{Camera, Point};
-use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
+use crate::solver::per_track::each_track;
+use crate::solver::problem::{Problem, VERIFIED};
 use crate::solver::recorder::Recorder;
 
-/// Observations that two views and one that verifies them make.
-const VERIFIED: usize = 3;
 /// Angle between the rays from which the depth of a point is known well enough to support a pose, radians: at .3
 /// degrees half a pixel of a thousand in either ray leaves a seventh of the depth open.
 const LEAST_ANGLE: f64 = 0.005;
@@ -18,60 +17,49 @@ const LEAST_ANGLE: f64 = 0.005;
 const LEAST_ANGLE_OF_TWO: f64 = 0.02;
 
 /// Triangulates every track anew.
-pub fn triangulate(scene: &Scene, model: &mut Model, recorder: &mut Recorder) {
-    let tracks: Vec<usize> = (0..scene.tracks()).collect();
-    triangulate_some(scene, model, &tracks, recorder);
+pub fn triangulate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) {
+    let tracks: Vec<usize> = (0..problem.tracks()).collect();
+    triangulate_some(problem, model, &tracks, recorder);
 }
 
 /// Triangulates every track that these views see anew.
-pub fn triangulate_seen(scene: &Scene, model: &mut Model, views: &[usize], recorder: &mut Recorder) {
-    let seen = views.iter().flat_map(|&view| &scene.of_view[view]).map(|&k| scene.track_of(k as usize));
+pub fn triangulate_seen(problem: &Problem, model: &mut Model, views: &[usize], recorder: &mut Recorder) {
+    let seen = views.iter().flat_map(|&view| &problem.of_view[view]).map(|&k| problem.track_of(k as usize));
     let mut tracks: Vec<usize> = seen.collect();
     tracks.sort_unstable();
     tracks.dedup();
-    triangulate_some(scene, model, &tracks, recorder);
+    triangulate_some(problem, model, &tracks, recorder);
 }
 
 /// Triangulates these tracks anew from the registered views.
-fn triangulate_some(scene: &Scene, model: &mut Model, tracks: &[usize], recorder: &mut Recorder) {
+fn triangulate_some(problem: &Problem, model: &mut Model, tracks: &[usize], recorder: &mut Recorder) {
     let cameras: Vec<Camera> =
-        model.cameras(scene).into_iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+        model.cameras(problem).into_iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
     let triangulator = Triangulator::new(&cameras);
-    let gate = model.gate(scene);
-    let threads = scene.context.threads.if_worth(tracks.len() >= WORTH_A_THREAD);
-    for batch in tracks.chunks(BATCH) {
-        // Of one track nothing depends on what becomes of another.
-        let standing = &*model;
-        let of_track = |place: usize| {
-            (!scene.stop().is_stopped()).then(|| landmark(scene, standing, &triangulator, gate, batch[place])).flatten()
-        };
-        let found = threads.map(batch.len(), TRACKS_A_RUN, of_track, &mut |_| recorder.heartbeat());
-        if scene.stop().is_stopped() {
-            return;
+    let gate = model.gate(problem);
+    let find = |model: &Model, track: usize| landmark(problem, model, &triangulator, gate, track);
+    each_track(problem, tracks, model, recorder, find, |model, track, found| {
+        forget(problem, model, track);
+        if let Some((landmark, agreeing)) = found {
+            model.set_landmark(problem, track, Some(landmark));
+            agreeing.into_iter().for_each(|k| model.kept[k] = true);
         }
-        for (&track, found) in batch.iter().zip(found) {
-            forget(scene, model, track);
-            if let Some((landmark, agreeing)) = found {
-                model.set_landmark(scene, track, Some(landmark));
-                agreeing.into_iter().for_each(|k| model.kept[k] = true);
-            }
-        }
-    }
+    });
 }
 
 /// The point of a track, with the observations that agree with it; `None` where there is none.
 fn landmark(
-    scene: &Scene,
+    problem: &Problem,
     model: &Model,
     triangulator: &Triangulator,
     gate: f64,
     track: usize,
 ) -> Option<(Landmark, Vec<usize>)> {
-    let part = part_of_track(scene, model, track)?;
-    let seen: Vec<(usize, Observation)> = scene
+    let component = component_of_track(problem, model, track)?;
+    let seen: Vec<(usize, Observation)> = problem
         .of_track(track)
-        .filter(|&k| model.part_of[scene.view_of(k)] == part)
-        .filter_map(|k| Some((k, model.observation(scene, k)?)))
+        .filter(|&k| model.component_of[problem.view_of(k)] == component)
+        .filter_map(|k| Some((k, model.observation(problem, k)?)))
         .collect();
     if seen.len() < 2 {
         return None;
@@ -86,30 +74,31 @@ fn landmark(
     });
     let angle = widest_angle(&rays.collect::<Vec<_>>());
     let agreeing: Vec<usize> = agreeing().map(|(k, _)| *k).collect();
-    Some((Landmark { position, angle, part, support: agreeing.len() }, agreeing))
+    let is_enough = agreeing.len() as f64 >= problem.least_share * seen.len() as f64;
+    is_enough.then_some((Landmark { position, angle, component, support: agreeing.len() }, agreeing))
 }
 
 /// Takes the point of a track away.
-fn forget(scene: &Scene, model: &mut Model, track: usize) {
-    model.set_landmark(scene, track, None);
-    scene.of_track(track).for_each(|k| model.kept[k] = false);
+fn forget(problem: &Problem, model: &mut Model, track: usize) {
+    model.set_landmark(problem, track, None);
+    problem.of_track(track).for_each(|k| model.kept[k] = false);
 }
 
-/// The part in whose views a track has most observations, the first of equals; `None`: in none.
-fn part_of_track(scene: &Scene, model: &Model, track: usize) -> Option<u32> {
+/// The component in whose views a track has most observations, the first of equals; `None`: in none.
+fn component_of_track(problem: &Problem, model: &Model, track: usize) -> Option<u32> {
     let mut counts: Vec<(u32, usize)> = Vec::new();
-    for k in scene.of_track(track) {
-        let view = scene.view_of(k);
+    for k in problem.of_track(track) {
+        let view = problem.view_of(k);
         if model.poses[view].is_none() {
             continue;
         }
-        let part = model.part_of[view];
-        match counts.iter_mut().find(|(known, _)| *known == part) {
+        let component = model.component_of[view];
+        match counts.iter_mut().find(|(known, _)| *known == component) {
             Some((_, count)) => *count += 1,
-            None => counts.push((part, 1)),
+            None => counts.push((component, 1)),
         }
     }
-    counts.into_iter().max_by(|a, b| a.1.cmp(&b.1).then(b.0.cmp(&a.0))).map(|(part, _)| part)
+    counts.into_iter().max_by(|a, b| a.1.cmp(&b.1).then(b.0.cmp(&a.0))).map(|(component, _)| component)
 }
 
 impl Landmark {

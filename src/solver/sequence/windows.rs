@@ -6,11 +6,11 @@
 
 use super::adjust;
 use super::calibrate;
-use super::model::{Model, Scene};
-use crate::domain::{Task, Warning, WarningCode};
+use super::model::Model;
+use crate::domain::{Grade, Task, Warning, WarningCode};
 use crate::solver::Error;
-use crate::solver::between_block_variance::Estimate;
 use crate::solver::calibration::{self, Outcome, grade_of_sigma};
+use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 
 /// Views of a window where there are many, and of the shortest one: below, a window says little of a focal length.
@@ -23,6 +23,13 @@ pub const OF_VIEW: usize = 150;
 /// Growth of sigma from which a warning says why, and the sigma from which anyone minds: a quarter of a METRIC one.
 const WORTH_A_WARNING: f64 = 3.0;
 const WORTH_MINDING: f64 = 0.005;
+
+/// Log focal length and its standard deviation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    pub log_focal: f64,
+    pub sigma: f64,
+}
 
 /// Several estimates as one.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -37,78 +44,87 @@ pub struct Fused {
 
 /// Raises the sigma of a sequence's calibration to what its windows admit, grades it anew and says so.
 pub fn reconcile(
-    scene: &Scene,
+    problem: &Problem,
     model: &Model,
     camera: usize,
     outcome: &mut Outcome,
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
     let Some(own) = outcome.sigma_log_focal else { return Ok(()) };
-    let (estimates, shared) = estimates(scene, model, camera, recorder)?;
+    let (estimates, shared) = estimates(problem, model, camera, recorder)?;
     let Some(fused) = fuse(&estimates, shared) else { return Ok(()) };
-    let apart = (fused.log_focal - model.log_focal(camera, &of_camera(scene, model, camera))).abs();
-    let sigma = own.max(fused.sigma).max(apart);
-    outcome.sigma_log_focal = Some(sigma);
-    outcome.grade = outcome.grade.worse(grade_of_sigma(Some(sigma)));
-    if sigma > WORTH_A_WARNING * own && sigma > WORTH_MINDING {
-        outcome.warnings.push(Warning::new(
-            WarningCode::ModelMismatch,
-            format!(
-                "{} windows of the sequence differ in focal length by {:.2} % (one standard deviation beside their own), \
-                 chi-square {:.1} a degree of freedom; sigma was raised from {:.3} to {:.3} %",
-                estimates.len(),
-                100.0 * fused.misfit,
-                fused.chi_square,
-                100.0 * own,
-                100.0 * sigma
-            ),
-        ));
-    }
+    let apart = (fused.log_focal - model.log_focal(camera, &of_camera(problem, model, camera))).abs();
+    raise(outcome, own.max(fused.sigma).max(apart), &fused, &format!("{} windows of the sequence", estimates.len()));
     Ok(())
 }
 
+/// Raises the sigma of one block's calibration by what the estimates of all blocks have beside their own.
+pub fn admit_misfit(outcome: &mut Outcome, estimates: &[Estimate]) {
+    let fused = fuse(estimates, 0.0).zip(outcome.sigma_log_focal);
+    if let Some((fused, own)) = fused.filter(|_| outcome.grade != Grade::ProjectiveOnly) {
+        raise(outcome, own.hypot(fused.misfit), &fused, &format!("{} blocks of views", estimates.len()));
+    }
+}
+
+/// Raises the sigma of a calibration, grades it anew and says so.
+fn raise(outcome: &mut Outcome, sigma: f64, fused: &Fused, which: &str) {
+    let Some(own) = outcome.sigma_log_focal.replace(sigma) else { return };
+    outcome.grade = outcome.grade.worse(grade_of_sigma(Some(sigma)));
+    if sigma > WORTH_A_WARNING * own && sigma > WORTH_MINDING {
+        let detail = format!(
+            "{which} differ in focal length by {:.2} % (one standard deviation beside their own), chi-square {:.1} a \
+             degree of freedom; sigma was raised from {:.3} to {:.3} %",
+            100.0 * fused.misfit,
+            fused.chi_square,
+            100.0 * own,
+            100.0 * sigma
+        );
+        outcome.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
+    }
+}
+
 /// Views of a camera that say something of it, increasing.
-fn of_camera(scene: &Scene, model: &Model, camera: usize) -> Vec<usize> {
-    model.determined().into_iter().filter(|&view| scene.camera_of[view] == camera).collect()
+fn of_camera(problem: &Problem, model: &Model, camera: usize) -> Vec<usize> {
+    model.determined().into_iter().filter(|&view| problem.camera_of[view] == camera).collect()
 }
 
 /// What each window says by itself, the rest of the lens as the whole has it; and the share of its views that two of
 /// them have in common.
 fn estimates(
-    scene: &Scene,
+    problem: &Problem,
     model: &Model,
     camera: usize,
     recorder: &mut Recorder,
 ) -> Result<(Vec<Estimate>, f64), Error> {
-    let views = of_camera(scene, model, camera);
+    let views = of_camera(problem, model, camera);
     let whole = model.log_focal(camera, &views);
-    let parts = model.part_of.iter().copied().max().unwrap_or(0);
+    let components = model.component_of.iter().copied().max().unwrap_or(0);
     // Views that say nothing are gaps: what lies on either side may share no track.
-    let of_part = |part: u32| -> Vec<Vec<usize>> {
-        let mut own = model.of_part(part);
-        own.retain(|&view| scene.camera_of[view] == camera);
+    let of_component = |component: u32| -> Vec<Vec<usize>> {
+        let mut own = model.of_component(component);
+        own.retain(|&view| problem.camera_of[view] == camera);
         own.split(|view| views.binary_search(view).is_err()).map(<[usize]>::to_vec).collect()
     };
-    let windows = windows(&(0..=parts).flat_map(of_part).collect::<Vec<_>>());
+    let windows = windows(&(0..=components).flat_map(of_component).collect::<Vec<_>>());
     let of_window = |k: usize| {
-        let views = windows.get(k).filter(|_| !scene.stop().is_stopped())?;
-        let moved = moved_alone(scene, model, camera, views)?;
+        let views = windows.get(k).filter(|_| !problem.stop.is_stopped())?;
+        let moved = moved_alone(problem, model, camera, views)?;
         Some(Estimate { log_focal: whole + moved.log_focal, ..moved })
     };
-    let mut told = |k: usize| {
+    let mut progress = |k: usize| {
         recorder.step(Task::Windows, k + 1, windows.len(), k as f64 / windows.len() as f64);
     };
-    let found = scene.context.threads.map(windows.len(), 1, of_window, &mut told);
-    scene.context.stopped()?;
+    let found = problem.threads.map(windows.len(), 1, of_window, &mut progress);
+    problem.stopped()?;
     Ok((found.into_iter().flatten().collect(), shared(&windows)))
 }
 
 /// By how much the log focal length of these views, their mean where each has its own, moves where they are alone.
-fn moved_alone(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
-    let extract = calibrate::core(scene, model, views, OF_VIEW);
+fn moved_alone(problem: &Problem, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
+    let extract = calibrate::core(problem, model, views, OF_VIEW);
     let (metric, _) = extract.block();
     let (cameras, points) = calibrate::projective(&metric);
-    let problem = calibration::Problem {
+    let projective = calibration::Problem {
         cameras: &cameras,
         points: &points,
         observations: &extract.observations,
@@ -117,8 +133,8 @@ fn moved_alone(scene: &Scene, model: &Model, camera: usize, views: &[usize]) -> 
         focal_priors: &[None],
         focal_per_view: metric.has_own_focals(),
     };
-    let prior = adjust::intrinsics_prior(scene, camera, model.noise);
-    let (log_focal, sigma) = calibration::focal_alone(&problem, &metric, &prior, scene.stop())?;
+    let prior = adjust::intrinsics_prior(problem, camera, model.noise);
+    let (log_focal, sigma) = calibration::focal_alone(&projective, &metric, &prior, problem.stop)?;
     Some(Estimate { log_focal: log_focal - metric.log_focal(), sigma })
 }
 
@@ -131,21 +147,21 @@ fn shared(windows: &[Vec<usize>]) -> f64 {
 
 /// Runs of each of these runs of consecutive views, not overlapping but for the halves of a short one; one or none says
 /// nothing.
-fn windows(parts: &[Vec<usize>]) -> Vec<Vec<usize>> {
-    let long: Vec<&Vec<usize>> = parts.iter().filter(|views| views.len() >= LEAST_VIEWS).collect();
-    // One part is halved, so that there is something to compare; the halves of a short one overlap.
+fn windows(components: &[Vec<usize>]) -> Vec<Vec<usize>> {
+    let long: Vec<&Vec<usize>> = components.iter().filter(|views| views.len() >= LEAST_VIEWS).collect();
+    // One component is halved, so that there is something to compare; the halves of a short one overlap.
     if let [views] = long.as_slice()
         && views.len() < 2 * LEAST_VIEWS
     {
         return [&views[..LEAST_VIEWS], &views[views.len() - LEAST_VIEWS..]].map(<[usize]>::to_vec).to_vec();
     }
     let least = if long.len() == 1 { 2 } else { 1 };
-    let of_part = |views: &Vec<usize>| -> Vec<Vec<usize>> {
+    let of_component = |views: &Vec<usize>| -> Vec<Vec<usize>> {
         let count = (views.len() / VIEWS).max(least);
         let run = |k: usize| views[k * views.len() / count..(k + 1) * views.len() / count].to_vec();
         (0..count).map(run).filter(|run| run.len() >= LEAST_VIEWS).collect()
     };
-    let all: Vec<Vec<usize>> = long.into_iter().flat_map(of_part).collect();
+    let all: Vec<Vec<usize>> = long.into_iter().flat_map(of_component).collect();
     let step = all.len().div_ceil(MOST_WINDOWS).max(1);
     all.into_iter().step_by(step).collect()
 }
@@ -233,10 +249,11 @@ mod tests {
     #[test]
     fn windows_are_runs_of_about_ten() {
         // Parts of these many views, numbered through.
-        let lengths = |parts: &[usize]| -> Vec<usize> {
+        let lengths = |components: &[usize]| -> Vec<usize> {
             let mut views = 0..;
-            let parts: Vec<Vec<usize>> = parts.iter().map(|&count| views.by_ref().take(count).collect()).collect();
-            windows(&parts).iter().map(Vec::len).collect()
+            let components: Vec<Vec<usize>> =
+                components.iter().map(|&count| views.by_ref().take(count).collect()).collect();
+            windows(&components).iter().map(Vec::len).collect()
         };
         assert!(lengths(&[3]).is_empty());
         assert_eq!(lengths(&[6]), [4, 4]);

@@ -8,7 +8,9 @@ mod observations;
 mod sequences;
 
 use super::*;
-use crate::domain::{Backend, Grade, Limits, Method, Prior, Progress, RawInput, Silent, Stage, Status, View};
+use crate::domain::{
+    Backend, FocalPrior, Grade, Limits, Method, Progress, Proposal, RawInput, Silent, Stage, Status, View, WarningCode,
+};
 use crate::synthetic::metrics::agreement;
 use crate::synthetic::{Scene, SceneOptions};
 
@@ -61,7 +63,7 @@ fn an_orbit_where_priors_on_small_motion_fail() {
     let solution = solved(&input, &SolveSettings { method: Method::Geometry, ..SolveSettings::default() });
     let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
     assert!(f1 > 0.99, "F1 {f1}");
-    assert_ne!(solution.winning_prior, Some(Prior::Consistency));
+    assert_ne!(solution.winning_prior, Some(Proposal::Consistency));
     assert!(solution.tracks.network_weight.is_empty(), "GEOMETRY runs no network");
 }
 
@@ -85,7 +87,7 @@ fn four_tracks_with_depths_are_found_and_never_metric() {
         let (input, scene) = scene(SceneOptions { outliers: 0.98, with_depths: true, seed, ..SceneOptions::default() });
         let solution = solved(&input, &SolveSettings { method: Method::Geometry, ..SolveSettings::default() });
         assert_eq!(solution.tracks.inlier, scene.truth.inlier, "seed {seed}");
-        assert_eq!(solution.winning_prior, Some(Prior::Rigidity), "seed {seed}");
+        assert_eq!(solution.winning_prior, Some(Proposal::Rigidity), "seed {seed}");
         assert!(matches!(solution.grade, Some(Grade::Weak | Grade::ProjectiveOnly)), "seed {seed}");
         assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::FewInliers), "seed {seed}");
         assert_eq!(solution.plane_at_infinity.is_some(), solution.is_metric(), "seed {seed}");

@@ -20,6 +20,24 @@ fn right_tracks_that_each_hold_wrong_observations_calibrate() {
     }
 }
 
+/// Depths or none, an input goes one way: where an observation of every track is missing, blocks of complete tracks hold
+/// few of the views, and the others join them; what is wrong within right tracks is told apart.
+#[test]
+fn incomplete_tracks_with_depths_reach_every_view() {
+    for (deleted_observations, wrong_observations) in [(1, 0), (1, 1), (0, 3)] {
+        for seed in 0..2 {
+            let options = SceneOptions { outliers: 0.3, with_depths: true, seed, ..SceneOptions::default() };
+            let (input, scene) = scene(SceneOptions { deleted_observations, wrong_observations, ..options });
+            let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+            let of_observations = agreement(&solution.observations.inlier, &scene.truth.observation_right);
+            println!("{deleted_observations} deleted, {wrong_observations} wrong, seed {seed}: {of_observations:?}");
+            assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}");
+            assert!(solution.views.iter().all(|view| view.projection.is_some()), "seed {seed}: views are left out");
+            assert!(of_observations.precision > 0.99 && of_observations.recall > 0.97, "seed {seed}");
+        }
+    }
+}
+
 /// Tracks that neighbouring views alone see: no block of complete tracks holds all views.
 #[test]
 fn a_translation_with_missing_data_is_one_projective_reconstruction_of_all_views() {

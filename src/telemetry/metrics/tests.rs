@@ -34,7 +34,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
         inlier_tracks: 20,
         registered_views: 10,
         reprojection_rms_px: Some(0.3),
-        winning_prior: grade.map(|_| Prior::Network),
+        winning_prior: grade.map(|_| Proposal::Network),
         iterations: 120,
         seconds: 2.5,
         result_bytes: 1,

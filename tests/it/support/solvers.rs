@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use scpsfm::domain::result::{ObservationResults, TrackResults, ViewResult};
 use scpsfm::domain::{
-    Course, Grade, Input, Method, Observer, Prior, Progress, Solution, SolveSettings, Stage, Status, StopToken,
+    Course, Grade, Input, Method, Observer, Progress, Proposal, Solution, SolveSettings, Stage, Status, StopToken,
 };
 use scpsfm::engine::Solver;
 use scpsfm::solver::Error;
@@ -80,7 +80,7 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         status: Status::Solved,
         grade: Some(Grade::ProjectiveOnly),
         method: Method::Auto,
-        winning_prior: Some(Prior::Uniform),
+        winning_prior: Some(Proposal::Uniform),
         iterations: 10,
         seed: settings.seed,
         calibrations: Vec::new(),

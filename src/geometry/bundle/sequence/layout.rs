@@ -115,14 +115,14 @@ impl Layout {
         sequence: &Reconstruction,
         observations: &[Observation],
         free: &Free,
-        pace: &mut CancellationCheck,
+        cancellation: &mut CancellationCheck,
     ) -> Option<Self> {
         let points = sequence.points.len();
         let usable = || observations.iter().filter(|seen| holds(sequence, seen));
         let mut seen_starts = vec![0; points + 1];
         let mut sees = vec![false; sequence.poses.len()];
         for observation in usable() {
-            if !pace.may_go_on(1) {
+            if !cancellation.may_go_on(1) {
                 return None;
             }
             seen_starts[observation.point + 1] += 1;
@@ -133,7 +133,7 @@ impl Layout {
         let mut seen = vec![nothing; seen_starts[points]];
         let mut next = seen_starts.clone();
         for observation in usable() {
-            if !pace.may_go_on(1) {
+            if !cancellation.may_go_on(1) {
                 return None;
             }
             let Observation { view, point, xy, weight } = *observation;
@@ -149,18 +149,18 @@ impl Layout {
             coupling_starts: vec![0],
             free_points: (0..points).map(|point| is_free(free.points, point)).collect(),
         };
-        layout.link_blocks(sequence, pace).then_some(layout)
+        layout.link_blocks(sequence, cancellation).then_some(layout)
     }
 
     /// Finds the blocks that each free point incident_blocks and gives them their places among the couplings; `false`
     /// when it was stopped.
-    fn link_blocks(&mut self, sequence: &Reconstruction, pace: &mut CancellationCheck) -> bool {
+    fn link_blocks(&mut self, sequence: &Reconstruction, cancellation: &mut CancellationCheck) -> bool {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
         let mut couplings = 0;
         for point in 0..self.free_points.len() {
             let seen = &mut self.seen[self.seen_starts[point]..self.seen_starts[point + 1]];
-            if !pace.may_go_on(seen.len()) {
+            if !cancellation.may_go_on(seen.len()) {
                 return false;
             }
             seen.sort_by_key(|seen| seen.view);
@@ -180,7 +180,7 @@ impl Layout {
                 }
                 let incident_blocks = &self.incident_blocks[first..];
                 let place = |block: Option<usize>| {
-                    let at = incident_blocks.binary_search_by_key(&(block? as u32), |touch| touch.block).ok()?;
+                    let at = incident_blocks.binary_search_by_key(&(block? as u32), |incident| incident.block).ok()?;
                     Some(incident_blocks[at].coupling)
                 };
                 for seen in seen {
@@ -253,18 +253,18 @@ impl Layout {
         &self.seen
     }
 
-    /// Points that touch each block, ascending: their starts and, one block after the other, the points.
+    /// Points that are coupled with each block, ascending: their starts and, one block after the other, the points.
     pub fn points_by_block(&self) -> (Vec<usize>, Vec<u32>) {
         let mut starts = vec![0; self.unknowns.block_count() + 1];
-        for touch in &self.incident_blocks {
-            starts[touch.block as usize + 1] += 1;
+        for incident in &self.incident_blocks {
+            starts[incident.block as usize + 1] += 1;
         }
         accumulate(&mut starts);
         let mut next = starts.clone();
         let mut points = vec![0; self.incident_blocks.len()];
         for point in 0..self.point_count() {
-            for touch in self.incident_blocks(point) {
-                let slot = &mut next[touch.block as usize];
+            for incident in self.incident_blocks(point) {
+                let slot = &mut next[incident.block as usize];
                 points[*slot] = point as u32;
                 *slot += 1;
             }

@@ -46,14 +46,14 @@ pub fn adjust(
     options: &Options,
     run: Run,
 ) -> Report {
-    let Run { threads, stop, told } = run;
-    let mut pace = CancellationCheck::new(stop);
+    let Run { threads, stop, heartbeat } = run;
+    let mut cancellation = CancellationCheck::new(stop);
     let unknown = Report { initial_cost: f64::INFINITY, cost: f64::INFINITY, iterations: 0 };
-    let Some(layout) = Layout::new(sequence, observations, free, &mut pace) else { return unknown };
+    let Some(layout) = Layout::new(sequence, observations, free, &mut cancellation) else { return unknown };
     let pool = WorkerPool::new(&layout, threads, stop);
     let descent = match layout.is_empty() {
         true => None,
-        false => Descent::new(sequence, &layout, priors, options, &pool, told, &mut pace),
+        false => Descent::new(sequence, &layout, priors, options, &pool, heartbeat, &mut cancellation),
     };
     let Some(mut descent) = descent else {
         let cost = cost(sequence, &layout, priors, options.loss, &pool).unwrap_or(f64::INFINITY);
@@ -65,10 +65,14 @@ pub fn adjust(
 }
 
 /// Pattern of the reduced system of a layout; `None` when it was stopped.
-pub(super) fn pattern(sequence: &Reconstruction, layout: &Layout, pace: &mut CancellationCheck) -> Option<Pattern> {
+pub(super) fn pattern(
+    sequence: &Reconstruction,
+    layout: &Layout,
+    cancellation: &mut CancellationCheck,
+) -> Option<Pattern> {
     let unknowns = &layout.unknowns;
     let pair = |view: usize| unknowns.view_block[view].zip(unknowns.group_block_of_view(sequence, view));
-    Pattern::new(layout, (0..sequence.poses.len()).filter_map(pair), pace)
+    Pattern::new(layout, (0..sequence.poses.len()).filter_map(pair), cancellation)
 }
 
 /// Sum of the loss over the observations and of what the priors add; `None` when it was stopped.
@@ -110,7 +114,7 @@ struct Descent<'a> {
     reduced: Reduced,
     solver: Solver,
     pool: &'a WorkerPool<'a>,
-    told: &'a mut dyn FnMut(),
+    heartbeat: &'a mut dyn FnMut(),
 }
 
 impl<'a> Descent<'a> {
@@ -120,10 +124,10 @@ impl<'a> Descent<'a> {
         priors: &'a [IntrinsicsPrior],
         options: &Options,
         pool: &'a WorkerPool<'a>,
-        told: &'a mut dyn FnMut(),
-        pace: &mut CancellationCheck,
+        heartbeat: &'a mut dyn FnMut(),
+        cancellation: &mut CancellationCheck,
     ) -> Option<Self> {
-        let pattern = pattern(sequence, layout, pace)?;
+        let pattern = pattern(sequence, layout, cancellation)?;
         Some(Self {
             layout,
             priors,
@@ -132,7 +136,7 @@ impl<'a> Descent<'a> {
             normal: Normal::new(layout, &pattern, sequence),
             reduced: Reduced::new(layout, pattern),
             pool,
-            told,
+            heartbeat,
         })
     }
 }
@@ -172,7 +176,7 @@ impl Problem for Descent<'_> {
         to: &mut Reconstruction,
     ) -> Option<Attempt> {
         let moved = self.step(from, damping, to).map(|predicted| Attempt { cost: self.cost(to), predicted });
-        (self.told)();
+        (self.heartbeat)();
         let Attempt { cost, predicted } = moved?;
         if cost < present || cost > SETTLE_WITHIN * present {
             return Some(Attempt { cost, predicted });

@@ -54,7 +54,7 @@ pub struct Run<'a> {
     pub threads: Threads,
     pub stop: &'a StopToken,
     /// Called after every attempt at a step.
-    pub told: &'a mut dyn FnMut(),
+    pub heartbeat: &'a mut dyn FnMut(),
 }
 
 /// Observations' worth of work after which the stop token is asked: some milliseconds, 20 in builds for tests.

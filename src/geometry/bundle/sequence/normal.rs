@@ -137,7 +137,7 @@ impl Normal {
     ) -> bool {
         self.cameras.values.fill(0.0);
         self.cameras.gradient.fill(0.0);
-        self.cameras.believe(sequence, layout, priors);
+        self.cameras.add_priors(sequence, layout, priors);
         let mut begun = self.cameras.by_view.0.clone();
         pool.batches().all(|points| {
             self.linearise(sequence, layout, loss, pool, points.clone())
@@ -169,17 +169,23 @@ impl Normal {
             }
         };
         let pieces = pool.cut(layout, points).windows(2).map(cut).collect();
-        pool.threads.each(pieces, |piece: Points| piece.linearise(sequence, layout, loss, pool.pace()))
+        pool.threads.each(pieces, |piece: Points| piece.linearise(sequence, layout, loss, pool.cancellation()))
     }
 }
 
 impl Points<'_> {
     /// `false` when it was stopped.
-    fn linearise(self, sequence: &Reconstruction, layout: &Layout, loss: Loss, mut pace: CancellationCheck) -> bool {
+    fn linearise(
+        self,
+        sequence: &Reconstruction,
+        layout: &Layout,
+        loss: Loss,
+        mut cancellation: CancellationCheck,
+    ) -> bool {
         let (mut rows, mut couplings) = (self.rows, self.couplings);
         for (point, slot) in self.range.zip(self.blocks) {
             let seen = layout.seen(point);
-            if !pace.may_go_on(seen.len()) {
+            if !cancellation.may_go_on(seen.len()) {
                 return false;
             }
             let mut block = PointBlock::ZERO;
@@ -232,7 +238,7 @@ impl Cameras {
     }
 
     /// What is known of the intrinsics beforehand.
-    fn believe(&mut self, sequence: &Reconstruction, layout: &Layout, priors: &[IntrinsicsPrior]) {
+    fn add_priors(&mut self, sequence: &Reconstruction, layout: &Layout, priors: &[IntrinsicsPrior]) {
         for (group, prior) in priors.iter().enumerate().take(sequence.intrinsics.len()) {
             let Some(block) = layout.unknowns.group_block[group] else { continue };
             for (index, parameter) in layout.unknowns.range(block).zip(&layout.unknowns.parameters[group]) {
@@ -276,13 +282,13 @@ impl Cameras {
         pieces.insert(0, Sums::Groups { values, gradient });
         let batch = Batch { places, before, parameters: &layout.unknowns.parameters, first: seen.start, rows };
         let done = pool.threads.each(pieces, |piece: Sums| {
-            let mut pace = pool.pace();
+            let mut cancellation = pool.cancellation();
             match piece {
                 Sums::Views { range, values, gradient } => {
-                    batch.add_to_views(sequence, range, values, gradient, of_batch, &mut pace)
+                    batch.add_to_views(sequence, range, values, gradient, of_batch, &mut cancellation)
                 }
                 Sums::Groups { values, gradient } => {
-                    batch.add_to_groups(sequence, &layout.all_seen()[seen.clone()], values, gradient, &mut pace)
+                    batch.add_to_groups(sequence, &layout.all_seen()[seen.clone()], values, gradient, &mut cancellation)
                 }
             }
         });
@@ -304,7 +310,7 @@ impl Batch<'_> {
         values: &mut [f64],
         gradient: &mut [f64],
         seen: impl Fn(usize) -> &'s [u32],
-        pace: &mut CancellationCheck,
+        cancellation: &mut CancellationCheck,
     ) -> bool {
         let (first_value, first_unknown) = self.before[views.start];
         let within = |place: Place| Place { start: place.start - first_value, ..place };
@@ -313,7 +319,7 @@ impl Batch<'_> {
             let gradient = &mut gradient[first - first_unknown..];
             let parameters = &self.parameters[sequence.group_of[view]];
             for &k in seen(view) {
-                if !pace.may_go_on(1) {
+                if !cancellation.may_go_on(1) {
                     return false;
                 }
                 let Some(row) = &self.rows[k as usize - self.first] else { continue };
@@ -339,11 +345,11 @@ impl Batch<'_> {
         seen: &[Seen],
         values: &mut [f64],
         gradient: &mut [f64],
-        pace: &mut CancellationCheck,
+        cancellation: &mut CancellationCheck,
     ) -> bool {
         let Some(&(first_value, first_unknown)) = self.before.last() else { return true };
         for (seen, row) in seen.iter().zip(self.rows) {
-            if !pace.may_go_on(1) {
+            if !cancellation.may_go_on(1) {
                 return false;
             }
             let (Some((first, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };

@@ -36,7 +36,7 @@ impl Pattern {
     pub fn new(
         layout: &Layout,
         pairs: impl Iterator<Item = (usize, usize)>,
-        pace: &mut CancellationCheck,
+        cancellation: &mut CancellationCheck,
     ) -> Option<Self> {
         let blocks = layout.unknowns.block_count();
         let mut group_of = vec![None; blocks];
@@ -58,10 +58,10 @@ impl Pattern {
             for &point in &points[starts[column]..starts[column + 1]] {
                 let incident_blocks = layout.incident_blocks(point as usize);
                 // A look at a block costs a small part of what an observation's linearisation does.
-                if !pace.may_go_on(incident_blocks.len().div_ceil(8)) {
+                if !cancellation.may_go_on(incident_blocks.len().div_ceil(8)) {
                     return None;
                 }
-                incident_blocks.iter().for_each(|touch| list(touch.block as usize));
+                incident_blocks.iter().for_each(|incident| list(incident.block as usize));
             }
             rows[first..].sort_unstable();
             column_starts.push(rows.len());

@@ -26,19 +26,19 @@ pub(super) struct Reduced {
     pub values: Vec<f64>,
     /// Right-hand side, then solution.
     pub vector: Vec<f64>,
-    /// Points that touch each block, ascending: starts, and one block after the other the points.
-    touching: (Vec<usize>, Vec<u32>),
+    /// Points that are coupled with each block, ascending: starts, and one block after the other the points.
+    incident_points: (Vec<usize>, Vec<u32>),
     /// Couplings of a batch of points, each times the inverse root of its point's block.
     whitened: Vec<f64>,
     /// Gradients of these points, whitened the same way.
-    pulls: Vec<Vector3<f64>>,
+    whitened_gradients: Vec<Vector3<f64>>,
 }
 
 /// Some points of a batch, to be whitened.
 struct Points<'a> {
     range: Range<usize>,
     whitened: &'a mut [f64],
-    pulls: &'a mut [Vector3<f64>],
+    whitened_gradients: &'a mut [Vector3<f64>],
 }
 
 /// Some block columns of the system, for a batch to be subtracted from.
@@ -53,9 +53,9 @@ impl Reduced {
         Self {
             values: vec![0.0; pattern.value_count()],
             vector: vec![0.0; pattern.dimension()],
-            touching: layout.points_by_block(),
+            incident_points: layout.points_by_block(),
             whitened: Vec::new(),
-            pulls: Vec::new(),
+            whitened_gradients: Vec::new(),
             pattern,
         }
     }
@@ -69,7 +69,7 @@ impl Reduced {
         for (slot, gradient) in self.vector.iter_mut().zip(&normal.cameras.gradient) {
             *slot = -gradient;
         }
-        let mut begun = self.touching.0.clone();
+        let mut begun = self.incident_points.0.clone();
         pool.batches().all(|points| {
             self.whiten(layout, normal, damping, pool, points.clone())
                 && self.subtract(layout, pool, points, &mut begun)
@@ -87,22 +87,25 @@ impl Reduced {
         let couplings = layout.couplings_of(points.clone());
         // What is left from another batch is written over before it is read.
         self.whitened.resize(self.whitened.len().max(couplings.len()), 0.0);
-        self.pulls.resize(self.pulls.len().max(points.len()), Vector3::zeros());
-        let (mut whitened, mut pulls) = (self.whitened.as_mut_slice(), self.pulls.as_mut_slice());
+        self.whitened_gradients.resize(self.whitened_gradients.len().max(points.len()), Vector3::zeros());
+        let (mut whitened, mut whitened_gradients) =
+            (self.whitened.as_mut_slice(), self.whitened_gradients.as_mut_slice());
         let cut = |ends: &[usize]| {
             let range = ends[0]..ends[1];
             let whitened = split_off(&mut whitened, layout.couplings_of(range.clone()).len());
-            Points { pulls: split_off(&mut pulls, range.len()), range, whitened }
+            Points { whitened_gradients: split_off(&mut whitened_gradients, range.len()), range, whitened }
         };
         let pieces = pool.cut(layout, points).windows(2).map(cut).collect();
-        pool.threads.each(pieces, |piece: Points| piece.whiten(layout, normal, damping, &self.pattern, pool.pace()))
+        pool.threads
+            .each(pieces, |piece: Points| piece.whiten(layout, normal, damping, &self.pattern, pool.cancellation()))
     }
 
     /// * `begun`: how far the list of every block's points is worked off
     fn subtract(&mut self, layout: &Layout, pool: &WorkerPool, points: Range<usize>, begun: &mut [usize]) -> bool {
-        let Self { pattern, values, vector, touching: (starts, touching), whitened, pulls } = self;
+        let Self { pattern, values, vector, incident_points: (starts, incident_points), whitened, whitened_gradients } =
+            self;
         let of_batch = |block: usize| {
-            let left = &touching[begun[block]..starts[block + 1]];
+            let left = &incident_points[begun[block]..starts[block + 1]];
             &left[..left.partition_point(|&point| (point as usize) < points.end)]
         };
         let weights = (0..pattern.block_count()).map(|block| of_batch(block).len());
@@ -114,11 +117,15 @@ impl Reduced {
             Columns { vector: split_off(&mut vector, unknowns), range, values }
         };
         let pieces = even_cuts(pool.threads.pieces(), weights).windows(2).map(cut).collect();
-        let batch =
-            Whitened { first: points.start, points: layout.couplings_of(points.clone()).start, whitened, pulls };
+        let batch = Whitened {
+            first: points.start,
+            points: layout.couplings_of(points.clone()).start,
+            whitened,
+            whitened_gradients,
+        };
         let done = pool.threads.each(pieces, |piece: Columns| {
-            let mut pace = pool.pace();
-            piece.subtract(layout, pattern, &batch, of_batch, &mut pace)
+            let mut cancellation = pool.cancellation();
+            piece.subtract(layout, pattern, &batch, of_batch, &mut cancellation)
         });
         let ends: Vec<usize> = (0..pattern.block_count()).map(|block| begun[block] + of_batch(block).len()).collect();
         begun[..ends.len()].copy_from_slice(&ends);
@@ -149,26 +156,26 @@ impl Points<'_> {
         normal: &Normal,
         damping: f64,
         pattern: &Pattern,
-        mut pace: CancellationCheck,
+        mut cancellation: CancellationCheck,
     ) -> bool {
         let base = layout.couplings_of(self.range.clone()).start;
-        for (point, pull) in self.range.zip(self.pulls) {
+        for (point, whitened_gradient) in self.range.zip(self.whitened_gradients) {
             let incident_blocks = layout.incident_blocks(point);
             if incident_blocks.is_empty() {
                 continue;
             }
-            if !pace.may_go_on(incident_blocks.len()) {
+            if !cancellation.may_go_on(incident_blocks.len()) {
                 return false;
             }
             let block = &normal.points[point];
             let Some(factor) = block.factor(damping) else { return false };
-            *pull = factor.whiten(&block.gradient);
+            *whitened_gradient = factor.whiten(&block.gradient);
             let range = layout.couplings(point);
             let couplings = &normal.couplings[range.clone()];
             let whitened = &mut self.whitened[range.start - base..range.end - base];
-            for touch in incident_blocks {
-                let range =
-                    touch.coupling as usize..touch.coupling as usize + POINT * pattern.size(touch.block as usize);
+            for incident in incident_blocks {
+                let range = incident.coupling as usize
+                    ..incident.coupling as usize + POINT * pattern.size(incident.block as usize);
                 factor.whiten_coupling(&couplings[range.clone()], &mut whitened[range]);
             }
         }
@@ -182,40 +189,43 @@ struct Whitened<'a> {
     first: usize,
     points: usize,
     whitened: &'a [f64],
-    pulls: &'a [Vector3<f64>],
+    whitened_gradients: &'a [Vector3<f64>],
 }
 
 impl Columns<'_> {
-    /// Takes from these columns what the points that touch them subtract; `false` when it was stopped.
+    /// Takes from these columns what the points that are coupled with them subtract; `false` when it was stopped.
     ///
-    /// * `touching`: points of the batch that touch a block, ascending
+    /// * `incident_points`: points of the batch that are coupled with a block, ascending
     fn subtract<'t>(
         self,
         layout: &Layout,
         pattern: &Pattern,
         batch: &Whitened,
-        touching: impl Fn(usize) -> &'t [u32],
-        pace: &mut CancellationCheck,
+        incident_points: impl Fn(usize) -> &'t [u32],
+        cancellation: &mut CancellationCheck,
     ) -> bool {
         let (first_value, first_unknown) =
             (pattern.panels(self.range.clone()).start, pattern.offsets[self.range.start]);
         for column in self.range {
             let (size, stride) = (pattern.size(column), pattern.stride(column));
             let vector = &mut self.vector[pattern.offsets[column] - first_unknown..][..size];
-            for point in touching(column).iter().map(|&point| point as usize) {
+            for point in incident_points(column).iter().map(|&point| point as usize) {
                 let incident_blocks = layout.incident_blocks(point);
                 // Pairs cost what a sixth of an observation's linearisation does.
-                if !pace.may_go_on(incident_blocks.len().div_ceil(6)) {
+                if !cancellation.may_go_on(incident_blocks.len().div_ceil(6)) {
                     return false;
                 }
-                let Ok(first) = incident_blocks.binary_search_by_key(&(column as u32), |touch| touch.block) else {
+                let Ok(first) = incident_blocks.binary_search_by_key(&(column as u32), |incident| incident.block)
+                else {
                     continue;
                 };
                 let whitened = &batch.whitened[layout.couplings(point).start - batch.points..];
                 let right = &whitened[incident_blocks[first].coupling as usize..][..POINT * size];
-                let pull = &batch.pulls[point - batch.first];
+                let whitened_gradient = &batch.whitened_gradients[point - batch.first];
                 for (k, slot) in vector.iter_mut().enumerate() {
-                    *slot += right[k] * pull[0] + right[size + k] * pull[1] + right[2 * size + k] * pull[2];
+                    *slot += right[k] * whitened_gradient[0]
+                        + right[size + k] * whitened_gradient[1]
+                        + right[2 * size + k] * whitened_gradient[2];
                 }
                 let mut places: Column = pattern.column(column);
                 for row in &incident_blocks[first..] {
@@ -254,9 +264,9 @@ pub(super) fn substitute(
         let factor = block.factor(damping)?;
         let mut gradient = block.gradient;
         let couplings = &normal.couplings[layout.couplings(point)];
-        for touch in layout.incident_blocks(point) {
-            let step = &step[layout.unknowns.range(touch.block as usize)];
-            let coupling = &couplings[touch.coupling as usize..][..POINT * step.len()];
+        for incident in layout.incident_blocks(point) {
+            let step = &step[layout.unknowns.range(incident.block as usize)];
+            let coupling = &couplings[incident.coupling as usize..][..POINT * step.len()];
             for (k, column) in coupling.chunks_exact(step.len()).enumerate() {
                 gradient[k] += dot(column, step);
             }

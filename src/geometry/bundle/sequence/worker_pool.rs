@@ -37,7 +37,7 @@ impl<'a> WorkerPool<'a> {
     }
 
     /// For one piece of work: asks the stop token at once, and then now and then.
-    pub fn pace(&self) -> CancellationCheck<'a> {
+    pub fn cancellation(&self) -> CancellationCheck<'a> {
         CancellationCheck { stop: self.stop, left: 0 }
     }
 
@@ -57,9 +57,9 @@ impl<'a> WorkerPool<'a> {
     pub fn of_points<T: Send>(&self, layout: &Layout, work: impl Fn(usize) -> Option<T> + Sync) -> Option<Vec<T>> {
         let cuts = self.cut(layout, 0..layout.point_count());
         let of_piece = |piece: usize| -> Option<Vec<T>> {
-            let mut pace = self.pace();
+            let mut cancellation = self.cancellation();
             let points = cuts[piece]..cuts[piece + 1];
-            points.map(|point| work(point).filter(|_| pace.may_go_on(layout.seen(point).len()))).collect()
+            points.map(|point| work(point).filter(|_| cancellation.may_go_on(layout.seen(point).len()))).collect()
         };
         let pieces = self.threads.map(cuts.len() - 1, 1, of_piece, &mut |_| ());
         let pieces: Vec<Vec<T>> = pieces.into_iter().collect::<Option<_>>()?;

@@ -332,10 +332,7 @@ mod tests {
     fn found(options: &SceneOptions) -> (Scene, Option<Rigid>, f64) {
         let scene = Scene::generate(options).expect("valid options");
         let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid scene");
-        let (normalization, _) = block::normalization(&input);
-        let ranges = input.track_ranges();
-        let views: Vec<usize> = (0..options.views).collect();
-        let block = block::extract(&input, &ranges, &normalization, &views);
+        let block = block::of_all_views(&input);
         let spread = portfolio::spread(&block.complete);
         let stop = StopToken::default();
         let search = Search::new(&block.complete, spread, &stop).expect("depths");

@@ -221,11 +221,11 @@ fn threads_change_nothing_to_the_last_bit() {
     let free = Free { models: &models, views: Some(&views), points: Some(&points) };
     let options = Options { max_iterations: 4, loss: Loss::Cauchy { scale: 0.004 }, ..Options::default() };
     let on = |threads: usize| {
-        let (mut start, mut told) = (perturbed(&truth, 0.01, 5), 0);
+        let (mut start, mut beats) = (perturbed(&truth, 0.01, 5), 0);
         let stop = StopToken::default();
-        let run = Run { threads: Threads::new(threads), stop: &stop, told: &mut || told += 1 };
+        let run = Run { threads: Threads::new(threads), stop: &stop, heartbeat: &mut || beats += 1 };
         let report = adjust(&mut start, &observations, &free, &[], &options, run);
-        (start, report, told)
+        (start, report, beats)
     };
     let alone = on(1);
     assert!(alone.1.iterations == 4 && alone.2 >= 4 && alone.1.cost < 0.5 * alone.1.initial_cost, "{:?}", alone.1);

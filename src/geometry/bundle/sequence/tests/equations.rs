@@ -96,9 +96,9 @@ fn compare(
 ) {
     let free = Free { models, views: Some(views), points: Some(points) };
     let going = StopToken::default();
-    let mut pace = CancellationCheck::new(&going);
-    let layout = Layout::new(sequence, observations, &free, &mut pace).expect("goes on");
-    let pattern = pattern(sequence, &layout, &mut pace).expect("goes on");
+    let mut cancellation = CancellationCheck::new(&going);
+    let layout = Layout::new(sequence, observations, &free, &mut cancellation).expect("goes on");
+    let pattern = pattern(sequence, &layout, &mut cancellation).expect("goes on");
     let cameras = pattern.dimension();
     assert_eq!(cameras, unknowns, "{what}");
     let mut normal = Normal::new(&layout, &pattern, sequence);
@@ -123,9 +123,9 @@ fn compare(
     for (point, block) in normal.points.iter().enumerate() {
         let first = cameras + 3 * point;
         let mut coupling = DMatrix::zeros(cameras, 3);
-        for touch in layout.incident_blocks(point) {
-            let range = layout.unknowns.range(touch.block as usize);
-            let values = &normal.couplings[layout.couplings(point)][touch.coupling as usize..];
+        for incident in layout.incident_blocks(point) {
+            let range = layout.unknowns.range(incident.block as usize);
+            let values = &normal.couplings[layout.couplings(point)][incident.coupling as usize..];
             for (k, unknown) in range.clone().enumerate() {
                 (0..3).for_each(|column| coupling[(unknown, column)] = values[column * range.len() + k]);
             }
@@ -148,9 +148,9 @@ fn what_is_known_beforehand_takes_part() {
     let (sequence, observations, models, ..) = mixed();
     let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, 0.2, 0.1, 0.01);
     let going = StopToken::default();
-    let mut pace = CancellationCheck::new(&going);
-    let layout = Layout::new(&sequence, &observations, &Free::all(&models), &mut pace).expect("goes on");
-    let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
+    let mut cancellation = CancellationCheck::new(&going);
+    let layout = Layout::new(&sequence, &observations, &Free::all(&models), &mut cancellation).expect("goes on");
+    let pattern = pattern(&sequence, &layout, &mut cancellation).expect("goes on");
     let with = |priors: &[IntrinsicsPrior]| {
         let mut normal = Normal::new(&layout, &pattern, &sequence);
         assert!(normal.fill(
@@ -176,9 +176,9 @@ fn a_stop_is_seen_within_one_linearisation() {
     let (sequence, observations) = chain(2, 10, 1 + BATCH / 20, 5, 0.001);
     let free = Free::all(&[IntrinsicsModel::FOCAL]);
     let going = StopToken::default();
-    let mut pace = CancellationCheck::new(&going);
-    let layout = Layout::new(&sequence, &observations, &free, &mut pace).expect("goes on");
-    let pattern = pattern(&sequence, &layout, &mut pace).expect("goes on");
+    let mut cancellation = CancellationCheck::new(&going);
+    let layout = Layout::new(&sequence, &observations, &free, &mut cancellation).expect("goes on");
+    let pattern = pattern(&sequence, &layout, &mut cancellation).expect("goes on");
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);

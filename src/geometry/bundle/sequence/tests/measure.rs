@@ -39,11 +39,11 @@ fn time_against_observations() {
             let mut start = perturbed(&truth, 0.002, 1);
             let models = vec![IntrinsicsModel::FOCAL; truth.intrinsics.len()];
             let stop = StopToken::default();
-            let mut pace = CancellationCheck::new(&stop);
+            let mut cancellation = CancellationCheck::new(&stop);
             let (layout_seconds, layout) =
-                timed(|| Layout::new(&truth, &observations, &Free::all(&models), &mut pace).expect("goes on"));
+                timed(|| Layout::new(&truth, &observations, &Free::all(&models), &mut cancellation).expect("goes on"));
             let (analysis_seconds, _) = timed(|| {
-                let pattern = pattern(&truth, &layout, &mut pace).expect("goes on");
+                let pattern = pattern(&truth, &layout, &mut cancellation).expect("goes on");
                 Solver::new(&pattern).expect("memory")
             });
             drop(layout);

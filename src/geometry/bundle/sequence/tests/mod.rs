@@ -19,8 +19,8 @@ use crate::parallel::Threads;
 /// Distance between the views of a chain, as a share of the depth of what they see about a tenth.
 const BASELINE: f64 = 0.4;
 
-fn quiet<'a>(stop: &'a StopToken, told: &'a mut dyn FnMut()) -> Run<'a> {
-    Run { threads: Threads::ONE, stop, told }
+fn quiet<'a>(stop: &'a StopToken, heartbeat: &'a mut dyn FnMut()) -> Run<'a> {
+    Run { threads: Threads::ONE, stop, heartbeat }
 }
 
 /// Views on a line that sways and turns, each track seen by `length` neighbours, `tracks_a_view` beginning in each.

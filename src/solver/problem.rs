@@ -1,0 +1,271 @@
+//! An input as every stage sees it: normalised, by view and by track, its views in cameras that have a calibration
+//! each.
+
+use std::collections::BTreeSet;
+
+use nalgebra::Vector2;
+
+use super::block::{self, Block};
+use super::normalization::normalization;
+use super::view_selection::complete_views;
+use super::{Error, classification};
+use crate::domain::{FocalPrior, Input, Method, SolveSettings, StopToken, View, Warning, WarningCode};
+use crate::geometry::measurement::Normalization;
+use crate::geometry::observation::Observation;
+use crate::geometry::statistics::median;
+use crate::parallel::Threads;
+
+/// Share of its observations that a complete track must retain: of 100 permuted tracks in ten views about one holds
+/// three observations of one point by chance, and in fifty views nearly all do.
+pub const LEAST_RETAINED_SHARE: f64 = 0.6;
+
+/// Observations that make a point and verify it: two and one.
+pub const VERIFIED: usize = 3;
+
+/// What every stage of one solve works on; observations keep the input's sorted order (track, view).
+pub struct Problem<'a> {
+    pub input: &'a Input,
+    pub settings: &'a SolveSettings,
+    /// Observations of each track; see [`Input::track_ranges`].
+    pub ranges: Vec<usize>,
+    pub normalization: Normalization,
+    /// Length of a normalised unit in pixels.
+    pub scale_px: f64,
+    /// Normalised image points, one an observation.
+    pub xy: Vec<Vector2<f64>>,
+    /// See [`Observation::weight`]; one an observation.
+    pub weights: Vec<f64>,
+    /// Observations of each view.
+    pub of_view: Vec<Vec<u32>>,
+    /// Camera of each view, each of which gets a calibration: the camera groups, counted from 0 in rising order of the
+    /// input's numbers, or one for all where views have focal lengths of their own or the method knows no groups.
+    pub camera_of: Vec<usize>,
+    pub cameras: usize,
+    /// What is known of the focal length of each camera beforehand; nothing where views have their own.
+    pub focal_priors: Vec<Option<FocalPrior>>,
+    /// Share of its observations in registered views that a right track retains: none where links may be wrong, so that
+    /// a track holds several points, [`LEAST_RETAINED_SHARE`] where tracks are complete.
+    pub least_share: f64,
+    /// Density of a wrong coordinate; see [`classification::Geometry::outlier_density`].
+    pub outlier_density: f64,
+    /// What is to be said of the input.
+    pub warnings: Vec<Warning>,
+    pub threads: Threads,
+    pub stop: &'a StopToken,
+}
+
+impl<'a> Problem<'a> {
+    pub fn new(input: &'a Input, settings: &'a SolveSettings, threads: Threads, stop: &'a StopToken) -> Self {
+        let ranges = input.track_ranges();
+        let (normalization, mut warnings) = normalization(input);
+        let has_groups = is_searched(settings) && !settings.focal_per_view;
+        warnings.extend(merged_cameras(input, has_groups, settings.focal_per_view));
+        let mut of_view = vec![Vec::new(); input.view_count()];
+        let mut xy = Vec::with_capacity(input.observation_count());
+        for k in 0..input.observation_count() {
+            let view = input.view_of(k);
+            of_view[view].push(k as u32);
+            xy.push(normalization.normalize(view, input.point_px(k)));
+        }
+        let (camera_of, cameras) = match has_groups {
+            true => camera_groups(input),
+            false => (vec![0; input.view_count()], 1),
+        };
+        let of_camera = |camera: usize| {
+            let views = input.views().iter().zip(&camera_of).filter(|(_, of)| **of == camera);
+            focal_prior(views.map(|(view, _)| view)).filter(|_| !settings.focal_per_view)
+        };
+        Self {
+            focal_priors: (0..cameras).map(of_camera).collect(),
+            outlier_density: classification::outlier_density(&of_view, &xy),
+            least_share: if complete_views(input, &ranges).is_some() { LEAST_RETAINED_SHARE } else { 0.0 },
+            input,
+            settings,
+            ranges,
+            scale_px: normalization.scale_px,
+            normalization,
+            xy,
+            weights: weights(input),
+            of_view,
+            camera_of,
+            cameras,
+            warnings,
+            threads,
+            stop,
+        }
+    }
+
+    /// `Err` once the token asks for a stop.
+    pub fn stopped(&self) -> Result<(), Error> {
+        self.stop.reason().map_or(Ok(()), |reason| Err(Error::Stopped(reason)))
+    }
+
+    /// Whether the method searches, and judges every observation by itself; PAPER and PSFM decide by themselves.
+    pub fn is_searched(&self) -> bool {
+        is_searched(self.settings)
+    }
+
+    /// Whether every view has a focal length of its own.
+    pub fn has_own_focals(&self) -> bool {
+        self.settings.focal_per_view
+    }
+
+    /// Camera of each of these views, counted among them, and the cameras that these are.
+    pub fn cameras_of(&self, views: &[usize]) -> (Vec<usize>, Vec<usize>) {
+        let mut cameras: Vec<usize> = views.iter().map(|&view| self.camera_of[view]).collect();
+        cameras.sort_unstable();
+        cameras.dedup();
+        let place = |view: &usize| cameras.partition_point(|camera| *camera < self.camera_of[*view]);
+        (views.iter().map(place).collect(), cameras)
+    }
+
+    /// The tracks that are complete over these views.
+    pub fn block(&self, views: &[usize]) -> Block {
+        block::extract(self.input, &self.ranges, &self.normalization, views)
+    }
+
+    /// Weights of some tracks as weights of all, 0 elsewhere.
+    pub fn scatter(&self, weights: &[f64], tracks: &[usize]) -> Vec<f32> {
+        let mut all = vec![0.0; self.tracks()];
+        for (&track, &weight) in tracks.iter().zip(weights) {
+            all[track] = weight as f32;
+        }
+        all
+    }
+
+    pub fn views(&self) -> usize {
+        self.of_view.len()
+    }
+
+    pub fn tracks(&self) -> usize {
+        self.input.track_count()
+    }
+
+    pub fn view_of(&self, k: usize) -> usize {
+        self.input.view_of(k)
+    }
+
+    pub fn track_of(&self, k: usize) -> usize {
+        self.input.track_of(k)
+    }
+
+    pub fn observation(&self, k: usize) -> Observation {
+        Observation { weight: self.weights[k], ..Observation::new(self.view_of(k), self.track_of(k), self.xy[k]) }
+    }
+
+    /// Observations of a track.
+    pub fn of_track(&self, track: usize) -> std::ops::Range<usize> {
+        self.ranges[track]..self.ranges[track + 1]
+    }
+
+    /// How many tracks these views see so often that they may be verified.
+    pub fn verifiable(&self, is_registered: impl Fn(usize) -> bool) -> usize {
+        let seen = |track: usize| self.of_track(track).filter(|&k| is_registered(self.view_of(k))).count();
+        (0..self.tracks()).filter(|&track| seen(track) >= VERIFIED).count()
+    }
+
+    /// The views in which anything is observed, increasing.
+    pub fn observed_views(&self) -> Vec<usize> {
+        observed_views(self.input)
+    }
+}
+
+fn is_searched(settings: &SolveSettings) -> bool {
+    matches!(settings.method, Method::Auto | Method::Geometry)
+}
+
+/// Says so where views of several cameras or sizes are given one focal length.
+///
+/// * `cameras`: each group has a calibration of its own, so that sizes alone matter, within a group
+/// * `zooms`: each view has a focal length of its own, so that nothing is merged
+fn merged_cameras(input: &Input, cameras: bool, zooms: bool) -> Option<Warning> {
+    if zooms {
+        return None;
+    }
+    let (group_of, groups) = camera_groups(input);
+    let size = |view: &View| view.size.map(|size| (size.width_px, size.height_px));
+    let kinds: BTreeSet<_> =
+        input.views().iter().zip(&group_of).map(|(view, group)| (cameras.then_some(*group), size(view))).collect();
+    let distinct = if cameras { groups } else { 1 };
+    if kinds.len() <= distinct && (cameras || groups == 1) {
+        return None;
+    }
+    let detail = if cameras {
+        "views of one camera group have several image sizes; they were solved with one focal length in pixels"
+            .to_owned()
+    } else {
+        format!(
+            "{groups} camera groups and {} image sizes were solved as one camera with one focal length",
+            kinds.len()
+        )
+    };
+    Some(Warning::new(WarningCode::CameraGroupsMerged, detail))
+}
+
+/// Camera group of each view, counted from 0 in rising order of the input's numbers, and how many there are.
+pub fn camera_groups(input: &Input) -> (Vec<usize>, usize) {
+    let numbers: BTreeSet<u32> = input.views().iter().map(|view| view.camera_group).collect();
+    let numbers: Vec<u32> = numbers.into_iter().collect();
+    let of = |view: &View| numbers.partition_point(|number| *number < view.camera_group);
+    (input.views().iter().map(of).collect(), numbers.len())
+}
+
+/// Weight of each observation: the squared ratio of the median standard deviation of all to its own; 1 where none are
+/// given.
+fn weights(input: &Input) -> Vec<f64> {
+    let count = input.observation_count();
+    let mut sigmas: Vec<f64> = (0..count).filter_map(|k| input.sigma_px(k)).collect();
+    let typical = median(&mut sigmas);
+    (0..count).map(|k| input.sigma_px(k).map_or(1.0, |sigma| (typical / sigma).powi(2))).collect()
+}
+
+/// The views in which anything is observed, increasing.
+pub fn observed_views(input: &Input) -> Vec<usize> {
+    let mut seen = vec![false; input.view_count()];
+    (0..input.observation_count()).for_each(|k| seen[input.view_of(k)] = true);
+    (0..seen.len()).filter(|&view| seen[view]).collect()
+}
+
+/// What is known beforehand of the one focal length of these views; `None` where nothing is.
+///
+/// The priors of one camera's views tell one piece of knowledge several times: their mean, weighted by information,
+/// has the standard deviation of one of them, not that of a mean. Where they differ, by so much more.
+fn focal_prior<'a>(views: impl Iterator<Item = &'a View>) -> Option<FocalPrior> {
+    let known: Vec<(f64, f64)> = views
+        .filter_map(|view| view.focal_prior)
+        .map(|prior| (prior.focal_px.ln(), prior.sigma_log.powi(-2)))
+        .collect();
+    let total: f64 = known.iter().map(|(_, information)| information).sum();
+    let mean = known.iter().map(|(log, information)| information * log).sum::<f64>() / total;
+    let spread = known.iter().map(|(log, information)| information * (log - mean).powi(2)).sum::<f64>() / total;
+    let sigma_log = (known.len() as f64 / total + spread).sqrt();
+    let usable = mean.is_finite() && sigma_log.is_finite() && sigma_log > 0.0;
+    usable.then(|| FocalPrior { focal_px: mean.exp(), sigma_log })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn prior(views: &[Option<(f64, f64)>]) -> Option<FocalPrior> {
+        let view = |prior: &Option<(f64, f64)>| View {
+            focal_prior: prior.map(|(focal_px, sigma_log)| FocalPrior { focal_px, sigma_log }),
+            ..View::default()
+        };
+        let views: Vec<View> = views.iter().map(view).collect();
+        focal_prior(views.iter())
+    }
+
+    #[test]
+    fn priors_of_several_views_are_one_piece_of_knowledge() {
+        assert_eq!(prior(&[]), None);
+        assert_eq!(prior(&[None, None]), None);
+        let known = prior(&[Some((800.0, 0.1)), None, Some((800.0, 0.1))]).expect("a prior");
+        assert!((known.focal_px - 800.0).abs() < 1e-9 && (known.sigma_log - 0.1).abs() < 1e-12, "{known:?}");
+        let vague = prior(&[Some((800.0, 0.01)), Some((1600.0, 1.0))]).expect("a prior");
+        assert!((vague.focal_px - 800.0).abs() < 1.0, "the vaguer one hardly counts: {vague:?}");
+        let torn = prior(&[Some((800.0, 0.01)), Some((1600.0, 0.01))]).expect("a prior");
+        assert!((torn.sigma_log - 0.5 * 2f64.ln()).abs() < 1e-3, "{torn:?}");
+        assert_eq!(prior(&[Some((800.0, f64::MAX))]), None, "nothing is known");
+    }
+}

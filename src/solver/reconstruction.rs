@@ -1,0 +1,177 @@
+//! A reconstruction in terms of the input's views and tracks, and what it says of them.
+
+use nalgebra::Matrix4;
+
+use super::attempt::Attempt;
+use super::baselines::Decided;
+use super::calibration::Outcome;
+use super::classification::{self, Geometry, Judged};
+use super::problem::{LEAST_RETAINED_SHARE, Problem};
+use super::recorder::Recorder;
+use super::sequence::{Extended, verified};
+use crate::domain::result::TrackResults;
+use crate::domain::{Grade, LeftOut};
+use crate::geometry::Camera;
+use crate::geometry::bundle::metric::{Intrinsics, Pose, Reconstruction as Metric};
+use crate::geometry::daq::{CanonicalFrame, to_canonical_frame};
+
+/// A reconstruction in terms of the input's views and tracks.
+pub struct Reconstruction {
+    /// Normalised pinholes; `None`: not registered.
+    pub cameras: Vec<Option<Camera>>,
+    /// The lens of each view; empty: all are pinholes.
+    pub lenses: Vec<Intrinsics>,
+    /// The pose of each view that has one to be told.
+    pub poses: Vec<Option<Pose>>,
+    /// The component of each view, and the one that each track is in: components have frames of their own.
+    pub component_of_view: Vec<u32>,
+    pub component_of_track: Vec<u32>,
+    pub left_out: Vec<(usize, LeftOut)>,
+    /// The frame that projective cameras are told in; `None` where they are metric but for the frame, so that the plane
+    /// at infinity is where it should be.
+    pub canonical: Option<CanonicalFrame>,
+    pub grade: Grade,
+    /// What was found of each camera, and what it is worth; intrinsics are left out where no view of it is registered.
+    pub calibrated: Vec<(Option<Intrinsics>, Outcome)>,
+    /// Core noise, one standard deviation of a coordinate, normalised units.
+    pub noise: f64,
+    /// Prior probability that a track is right.
+    pub inlier_share: f64,
+}
+
+impl Reconstruction {
+    /// Of a block, metric where it is calibrated, else projective; `None` where nothing stands.
+    pub fn of_attempt(problem: &Problem, attempt: &Attempt) -> Option<Self> {
+        let (projective, outcome) = (attempt.projective.as_ref()?, attempt.calibration.as_ref()?);
+        let metric = outcome.metric.as_ref().filter(|_| outcome.grade != Grade::ProjectiveOnly);
+        let mut cameras = vec![None; problem.views()];
+        let mut poses = vec![None; problem.views()];
+        let mut lenses = Vec::new();
+        for (i, &view) in projective.views.iter().enumerate() {
+            let camera = |metric: &Metric| metric.poses[i].camera(&metric.intrinsics_of(i));
+            cameras[view] = Some(metric.map_or(projective.cameras[i], camera));
+        }
+        // Where the first camera has no rank 3 the frame stays as it is.
+        let canonical = || {
+            to_canonical_frame(&projective.cameras, &[]).unwrap_or_else(|| CanonicalFrame {
+                cameras: projective.cameras.clone(),
+                points: Vec::new(),
+                homography: Matrix4::identity(),
+            })
+        };
+        let (_, found) = problem.cameras_of(&projective.views);
+        let mut calibrated = vec![(None, Outcome::refused(Vec::new())); problem.cameras];
+        for (group, camera) in found.into_iter().enumerate() {
+            calibrated[camera] = (metric.map(|metric| metric.intrinsics[group]), outcome.clone());
+        }
+        if let Some(metric) = metric {
+            lenses = vec![metric.intrinsics[0]; problem.views()];
+            for (i, &view) in projective.views.iter().enumerate() {
+                lenses[view] = metric.intrinsics_of(i);
+                let own = outcome.focals.as_ref().and_then(|focals| focals.get(i));
+                poses[view] = Some(metric.poses[i]).filter(|_| own.is_none_or(|own| own.sigma_log.is_some()));
+            }
+        }
+        Some(Self {
+            cameras,
+            lenses,
+            poses,
+            component_of_view: vec![0; problem.views()],
+            component_of_track: vec![0; problem.tracks()],
+            left_out: Vec::new(),
+            canonical: metric.is_none().then(canonical),
+            grade: outcome.grade,
+            calibrated,
+            noise: projective.noise,
+            inlier_share: share(projective.tracks.len(), projective.tried),
+        })
+    }
+
+    pub fn of_extended(problem: &Problem, extended: &Extended) -> Self {
+        let Extended { model, calibrations, unregistered, .. } = extended;
+        let grade = extended.grade(problem);
+        let is_told = |view: &usize| grade != Grade::ProjectiveOnly && model.is_determined(*view);
+        let landmark = |track: usize| model.landmarks[track].as_ref();
+        let calibrated = calibrations.iter().enumerate().map(|(camera, outcome)| {
+            let intrinsics = model.lenses[camera].intrinsics;
+            (Some(intrinsics).filter(|_| grade != Grade::ProjectiveOnly), outcome.clone())
+        });
+        Self {
+            cameras: model.cameras(problem),
+            lenses: (0..problem.views()).map(|view| model.intrinsics_of(problem, view)).collect(),
+            poses: (0..problem.views()).map(|view| model.poses[view].filter(|_| is_told(&view))).collect(),
+            component_of_view: model.component_of.clone(),
+            component_of_track: (0..problem.tracks())
+                .map(|track| landmark(track).map_or(0, |point| point.component))
+                .collect(),
+            left_out: unregistered.iter().map(|left| (left.view, left.reason())).collect(),
+            canonical: None,
+            grade,
+            calibrated: calibrated.collect(),
+            noise: model.noise,
+            inlier_share: share(verified(model).len(), problem.verifiable(|view| model.poses[view].is_some())),
+        }
+    }
+
+    /// Every track and observation judged by all registered views, or by what else the method goes by.
+    pub fn judged(&self, problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Judged {
+        let by_points = seed.judges_observations();
+        let geometry = Geometry {
+            cameras: &self.cameras,
+            components: (&self.component_of_view, &self.component_of_track),
+            normalization: &problem.normalization,
+            lenses: &self.lenses,
+            weights: &problem.weights,
+            linked: by_points,
+            least_share: if by_points { problem.least_share } else { LEAST_RETAINED_SHARE },
+            noise: self.noise,
+            outlier_density: problem.outlier_density,
+            inlier_share: self.inlier_share,
+        };
+        let mut progress = |verdicts| recorder.judged(verdicts, problem.tracks());
+        let mut judged = classification::judge(
+            problem.input,
+            &problem.ranges,
+            &geometry,
+            problem.threads,
+            problem.stop,
+            &mut progress,
+        );
+        if let Some(weights) = &seed.weights_by_depths {
+            weights.judge(problem, &geometry, &mut judged);
+        }
+        if let Some(decided) = &seed.decided {
+            mask(problem, &seed.block.tracks, decided, &mut judged);
+        }
+        judged
+    }
+}
+
+/// Prior probability that a track is right, of so many that were found to be.
+fn share(right: usize, tried: usize) -> f64 {
+    (right as f64 + 1.0) / (tried.max(right) as f64 + 2.0)
+}
+
+/// PAPER and PSFM: the method's own weights and verdicts in place of the geometry's.
+pub fn own_verdicts(block_tracks: &[usize], decided: &Decided, tracks: &mut TrackResults) {
+    tracks.weight.fill(0.0);
+    tracks.inlier.fill(false);
+    for (j, &track) in block_tracks.iter().enumerate() {
+        tracks.weight[track] = decided.weights[j] as f32;
+        tracks.inlier[track] = decided.inlier[j];
+    }
+}
+
+/// The same, with what follows from it: a track that the method rejects has neither observations nor a point.
+fn mask(problem: &Problem, block_tracks: &[usize], decided: &Decided, judged: &mut Judged) {
+    own_verdicts(block_tracks, decided, &mut judged.tracks);
+    for track in 0..problem.tracks() {
+        if !judged.tracks.inlier[track] {
+            judged.retained[track].clear();
+            judged.points[track] = None;
+            for k in problem.of_track(track) {
+                judged.observations.inlier[problem.input.caller_index(k)] = false;
+            }
+        }
+    }
+}

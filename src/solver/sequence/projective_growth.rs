@@ -1,0 +1,240 @@
+//! A projective reconstruction grown from a consensus: view after view by resection, every track by robust
+//! triangulation, both kept straight by projective bundle adjustment.
+//!
+//! It needs no calibration, so it reaches the views where none can be given, and it judges by observation, so a track
+//! with some wrong observations takes part by the others.
+
+use nalgebra::Vector2;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::adjust;
+use super::growth::{self, Growth, Trial};
+use super::options::GrowthOptions;
+use super::projective::{CAMERA_UNKNOWNS, Projective};
+use crate::geometry::bundle::{self, Loss};
+use crate::geometry::observation::Observation;
+use crate::geometry::robust_triangulation::{Robust, Triangulator};
+use crate::geometry::triangulation::weighted_squared;
+use crate::geometry::{Camera, Point, resection};
+use crate::solver::per_track::each_track;
+use crate::solver::problem::{Problem, VERIFIED};
+use crate::solver::recorder::Recorder;
+use crate::solver::{Error, classification, grow};
+
+const OPTIONS: GrowthOptions = GrowthOptions::PROJECTIVE;
+
+/// A reconstruction while it grows, indexed as the input is.
+struct Growing<'a> {
+    problem: &'a Problem<'a>,
+    rng: ChaCha8Rng,
+    cameras: Vec<Option<Camera>>,
+    points: Vec<Option<Point>>,
+    /// Observations that agree with the point of each track.
+    support: Vec<usize>,
+    /// One an observation.
+    kept: Vec<bool>,
+    noise: f64,
+    start_noise: f64,
+}
+
+/// Grows a reconstruction to every view that can be registered, and every track that points are found for.
+///
+/// # Errors
+/// [`Error::Stopped`].
+pub fn extend(problem: &Problem, start: Projective, recorder: &mut Recorder) -> Result<Projective, Error> {
+    let mut growing = Growing::new(problem, start.oriented());
+    growing.triangulate(None, recorder);
+    growth::grow(problem, &mut growing, &OPTIONS, &mut vec![Trial::default(); problem.views()], recorder)?;
+    for _ in 0..OPTIONS.final_rounds {
+        problem.stopped()?;
+        growing.adjust(OPTIONS.final_iterations, recorder);
+        growing.triangulate(None, recorder);
+        growing.drop_unsupported();
+    }
+    problem.stopped()?;
+    Ok(growing.finish())
+}
+
+impl<'a> Growing<'a> {
+    fn new(problem: &'a Problem<'a>, start: Projective) -> Self {
+        let mut cameras = vec![None; problem.of_view.len()];
+        start.views.iter().zip(&start.cameras).for_each(|(&view, camera)| cameras[view] = Some(*camera));
+        Self {
+            problem,
+            rng: ChaCha8Rng::seed_from_u64(problem.settings.seed),
+            cameras,
+            points: vec![None; problem.tracks()],
+            support: vec![0; problem.tracks()],
+            kept: vec![false; problem.xy.len()],
+            noise: start.noise,
+            start_noise: start.noise,
+        }
+    }
+
+    fn views(&self) -> Vec<usize> {
+        (0..self.cameras.len()).filter(|&view| self.cameras[view].is_some()).collect()
+    }
+
+    fn is_verified(&self, track: usize) -> bool {
+        self.support[track] >= VERIFIED
+    }
+
+    /// Triangulates every track anew, or those that a view sees.
+    fn triangulate(&mut self, of_view: Option<usize>, recorder: &mut Recorder) {
+        let problem = self.problem;
+        let tracks: Vec<usize> = match of_view {
+            Some(view) => problem.of_view[view].iter().map(|&k| problem.track_of(k as usize)).collect(),
+            None => (0..problem.tracks()).collect(),
+        };
+        let cameras: Vec<Camera> = self.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+        let triangulator = Triangulator::new(&cameras);
+        let gate = classification::working_gate(self.noise, problem.outlier_density);
+        let find = |growing: &Self, track: usize| growing.point(&triangulator, gate, track);
+        each_track(problem, &tracks, self, recorder, find, |growing, track, found| {
+            problem.of_track(track).for_each(|k| growing.kept[k] = false);
+            growing.points[track] = found.as_ref().map(|(found, _)| found.point);
+            let agreeing = found.into_iter().flat_map(|(found, seen)| seen.into_iter().zip(found.agrees));
+            growing.support[track] = 0;
+            for (k, _) in agreeing.filter(|(_, agrees)| *agrees) {
+                growing.kept[k] = true;
+                growing.support[track] += 1;
+            }
+        });
+    }
+
+    /// The point of a track, and the observations that it was looked for among.
+    fn point(&self, triangulator: &Triangulator, gate: f64, track: usize) -> Option<(Robust, Vec<usize>)> {
+        let problem = self.problem;
+        let seen: Vec<usize> =
+            problem.of_track(track).filter(|&k| self.cameras[problem.view_of(k)].is_some()).collect();
+        let observations: Vec<Observation> = seen.iter().map(|&k| problem.observation(k)).collect();
+        let found = triangulator.robust(&observations, gate)?;
+        let agreeing = found.agrees.iter().filter(|&&agrees| agrees).count();
+        (agreeing as f64 >= problem.least_share * seen.len() as f64).then_some((found, seen))
+    }
+
+    /// What is kept: the verified points of the longest tracks until every view has `of_view` observations.
+    fn standing(&self, of_view: usize) -> Projective {
+        let problem = self.problem;
+        let views = self.views();
+        let mut place = vec![usize::MAX; self.cameras.len()];
+        views.iter().enumerate().for_each(|(new, &view)| place[view] = new);
+        let verified = (0..self.points.len()).filter(|&track| self.is_verified(track)).collect();
+        let wanted = vec![of_view; self.cameras.len()];
+        let tracks = growth::covering(problem, verified, |track| self.support[track], &self.kept, &wanted);
+        let observations = tracks.iter().enumerate().flat_map(|(point, &track)| {
+            let kept = problem.of_track(track).filter(|&k| self.kept[k]);
+            kept.map(|k| Observation { view: place[problem.view_of(k)], point, ..problem.observation(k) })
+                .collect::<Vec<_>>()
+        });
+        Projective {
+            cameras: views.iter().filter_map(|&view| self.cameras[view]).collect(),
+            points: tracks.iter().filter_map(|&track| self.points[track]).collect(),
+            observations: observations.collect(),
+            noise: self.noise,
+            tried: problem.verifiable(|view| self.cameras[view].is_some()),
+            views,
+            tracks,
+        }
+    }
+
+    /// Adjusts all registered views with the points that hold them best, and estimates the noise from what remains.
+    fn adjust(&mut self, iterations: usize, recorder: &mut Recorder) {
+        let mut standing = self.standing(OPTIONS.of_view);
+        if standing.observations.is_empty() {
+            return;
+        }
+        let options = bundle::Options {
+            max_iterations: iterations,
+            relative_tolerance: OPTIONS.tolerance,
+            loss: Loss::Cauchy { scale: OPTIONS.cauchy_scale * self.noise },
+            ..Default::default()
+        };
+        let Projective { cameras, points, observations, .. } = &mut standing;
+        bundle::projective::adjust(cameras, points, observations, &options, self.problem.stop);
+        recorder.heartbeat();
+        if self.problem.stop.is_stopped() {
+            return;
+        }
+        self.noise = self.noise_of(&standing);
+        let standing = standing.oriented();
+        standing.views.iter().zip(&standing.cameras).for_each(|(&view, camera)| self.cameras[view] = Some(*camera));
+    }
+
+    /// Core noise of the residuals: their median, for what their freedom leaves of it.
+    fn noise_of(&self, standing: &Projective) -> f64 {
+        let residual = |seen: &Observation| {
+            weighted_squared(&standing.cameras[seen.view], &standing.points[seen.point], seen).sqrt()
+        };
+        let norms: Vec<f64> = standing.observations.iter().map(residual).collect();
+        let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();
+        let noise = adjust::core_noise(norms, unknowns);
+        let (least, most) = grow::NOISE_BOUNDS;
+        noise.clamp(least, (OPTIONS.noise_growth * self.start_noise).min(most))
+    }
+
+    /// Takes back the views that too few points hold.
+    fn drop_unsupported(&mut self) {
+        let problem = self.problem;
+        for view in self.views() {
+            let of_view = problem.of_view[view].iter().map(|&k| k as usize);
+            let held = of_view.filter(|&k| self.kept[k] && self.is_verified(problem.track_of(k))).count();
+            if held < OPTIONS.least_agreeing {
+                self.cameras[view] = None;
+                for &k in &problem.of_view[view] {
+                    let k = k as usize;
+                    if std::mem::take(&mut self.kept[k]) {
+                        self.support[problem.track_of(k)] -= 1;
+                    }
+                }
+            }
+        }
+    }
+
+    fn finish(self) -> Projective {
+        self.standing(usize::MAX)
+    }
+}
+
+impl Growth for Growing<'_> {
+    fn registered(&self) -> usize {
+        self.cameras.iter().flatten().count()
+    }
+
+    fn is_open(&self, view: usize) -> bool {
+        self.cameras[view].is_none()
+    }
+
+    fn support(&self, view: usize) -> usize {
+        self.problem.of_view[view].iter().filter(|&&k| self.is_verified(self.problem.track_of(k as usize))).count()
+    }
+
+    fn supporting(&self, view: usize) -> Vec<usize> {
+        let of_view = self.problem.of_view[view].iter().map(|&k| k as usize);
+        of_view.filter(|&k| self.is_verified(self.problem.track_of(k))).collect()
+    }
+
+    fn register(&mut self, view: usize, seen: &[usize], recorder: &mut Recorder) -> usize {
+        let problem = self.problem;
+        let datum = |&k: &usize| Some((self.points[problem.track_of(k)]?, (problem.xy[k], problem.weights[k])));
+        let (points, seen): (Vec<Point>, Vec<_>) = seen.iter().filter_map(datum).unzip();
+        let (images, weights): (Vec<Vector2<f64>>, Vec<f64>) = seen.into_iter().unzip();
+        let gate = classification::working_gate(self.noise, problem.outlier_density);
+        let least = OPTIONS.least_agreeing.max((OPTIONS.least_share * points.len() as f64).ceil() as usize);
+        let found = resection::robust(&points, &images, &weights, gate, least, &mut self.rng, problem.stop);
+        let Some((camera, agrees)) = found else { return 0 };
+        let depths = points.iter().zip(&agrees).filter(|(_, agrees)| **agrees);
+        let sign: f64 = depths.map(|(point, _)| ((camera.row(2) * point).x * point.w).signum()).sum();
+        self.cameras[view] = Some(if sign < 0.0 { -camera } else { camera });
+        self.triangulate(Some(view), recorder);
+        recorder.registered(self.registered());
+        recorder.heartbeat();
+        agrees.into_iter().filter(|agrees| *agrees).count()
+    }
+
+    fn settle(&mut self, recorder: &mut Recorder) {
+        self.adjust(OPTIONS.growing_iterations, recorder);
+        self.triangulate(None, recorder);
+    }
+}

@@ -1,0 +1,259 @@
+//! Which views are searched together: all of them where their tracks are complete, blocks of views that share many
+//! tracks, and small subsets of either.
+
+use super::problem::{Problem, camera_groups, observed_views};
+use crate::domain::{Input, StopToken};
+
+/// Tracks that a block should have: twice the eight that verification needs, for half of them may be wrong.
+const WANTED_TRACKS: usize = 16;
+/// Tracks below which no block is tried: verification needs eight inliers.
+pub const LEAST_TRACKS: usize = 8;
+/// Views below which a projective reconstruction carries no calibration worth searching for.
+pub const LEAST_VIEWS: usize = 3;
+/// Views that a block grows to. Real tracks are short: longer blocks hold few of them.
+const MOST_VIEWS: usize = 10;
+/// Views that are solved as one block where tracks are complete over all views; of more, these many evenly spread:
+/// bundle adjustment of a block is cubic in its views.
+const MOST_VIEWS_WHOLE: usize = 40;
+/// Tracks beyond which more of them do not make a block better.
+const ENOUGH_TRACKS: usize = 300;
+/// Views that blocks are begun from; of long sequences not every view needs its turn to find a few dense blocks.
+const MOST_FIRST_VIEWS: usize = 64;
+/// Blocks that are tried, best first, before the best result stands.
+const MOST_BLOCKS: usize = 4;
+
+/// Sets of views worth solving, best first; empty when no three views share enough tracks.
+///
+/// Once `stop` fires the answer is whatever was found by then.
+pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec<Vec<usize>> {
+    if let Some(views) = whole(input, ranges) {
+        return vec![views];
+    }
+    candidate_views_among(input, ranges, &vec![true; input.view_count()], stop)
+}
+
+/// Sets of views that a reconstruction may begin with, best first: each of one camera, or, of cameras too small for
+/// that, of several together.
+pub fn blocks(problem: &Problem) -> Vec<Vec<usize>> {
+    let (input, ranges, stop) = (problem.input, &problem.ranges, problem.stop);
+    let of_one = match problem.has_own_focals() {
+        true => Vec::new(),
+        false => candidate_views_of_one_camera(input, ranges, stop),
+    };
+    if of_one.is_empty() { candidate_views(input, ranges, stop) } else { of_one }
+}
+
+/// The views of the one block of an input whose tracks are complete; see [`complete_views`].
+pub fn whole(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
+    complete_views(input, ranges).map(|views| evenly(&views, MOST_VIEWS_WHOLE))
+}
+
+/// The same of incomplete tracks, each set of one camera group: those of the group with most observations first.
+fn candidate_views_of_one_camera(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec<Vec<usize>> {
+    let (group_of, groups) = camera_groups(input);
+    let mut observed = vec![0usize; groups];
+    (0..input.observation_count()).for_each(|k| observed[group_of[input.view_of(k)]] += 1);
+    let mut order: Vec<usize> = (0..groups).collect();
+    order.sort_by_key(|&group| (std::cmp::Reverse(observed[group]), group));
+    let mut found: Vec<Vec<usize>> = Vec::new();
+    for group in order {
+        let open: Vec<bool> = group_of.iter().map(|of| *of == group).collect();
+        let enough = open.iter().filter(|&&open| open).count() >= LEAST_VIEWS;
+        if enough && found.len() < MOST_BLOCKS && !stop.is_stopped() {
+            found.extend(candidate_views_among(input, ranges, &open, stop));
+        }
+    }
+    found.truncate(MOST_BLOCKS);
+    found
+}
+
+/// The same of incomplete tracks, only of views that are `open` (one entry a view).
+pub fn candidate_views_among(input: &Input, ranges: &[usize], open: &[bool], stop: &StopToken) -> Vec<Vec<usize>> {
+    for least in [WANTED_TRACKS, LEAST_TRACKS] {
+        let found = greedy_views(input, ranges, open, least, stop);
+        if !found.is_empty() {
+            return found;
+        }
+    }
+    Vec::new()
+}
+
+/// Views of a subset: of a track with three wrong observations of ten, four views are clean one time in six.
+const SUBSET_VIEWS: usize = 4;
+/// Subsets of one set, and of all sets together.
+const SUBSETS_OF_SET: usize = 6;
+const MOST_SUBSETS: usize = 8;
+
+/// Small subsets of these sets of views: runs and combs in turn, spread over the set; the first of each set first. A
+/// track with some wrong observations is clean in some of them.
+pub fn subsets(sets: &[Vec<usize>]) -> Vec<Vec<usize>> {
+    let subset = |views: &[usize], k: usize| -> Vec<usize> {
+        let longest = (views.len() - 1) / (SUBSET_VIEWS - 1);
+        let step = if k.is_multiple_of(2) { 1 } else { longest };
+        let starts = views.len() - (SUBSET_VIEWS - 1) * step;
+        let first = (k * starts / SUBSETS_OF_SET).min(starts - 1);
+        (0..SUBSET_VIEWS).map(|i| views[first + i * step]).collect()
+    };
+    let mut found: Vec<Vec<usize>> = Vec::new();
+    for k in 0..SUBSETS_OF_SET {
+        for views in sets.iter().filter(|views| views.len() > SUBSET_VIEWS) {
+            let subset = subset(views, k);
+            if !found.contains(&subset) {
+                found.push(subset);
+            }
+        }
+    }
+    found.truncate(MOST_SUBSETS);
+    found
+}
+
+/// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of
+/// them, are seen in all of these. Padding, views and tracks without observations, changes nothing.
+pub fn complete_views(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
+    let views = observed_views(input);
+    let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
+    let complete = ranges.windows(2).filter(|range| range[1] - range[0] == views.len()).count();
+    (views.len() >= LEAST_VIEWS && complete >= LEAST_TRACKS && 2 * complete >= observed).then_some(views)
+}
+
+/// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on
+/// the way, keeps the one with most constraints.
+fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, stop: &StopToken) -> Vec<Vec<usize>> {
+    let mut tracks_of_view: Vec<Vec<usize>> = vec![Vec::new(); input.view_count()];
+    for k in (0..input.observation_count()).filter(|&k| open[input.view_of(k)]) {
+        tracks_of_view[input.view_of(k)].push(input.track_of(k));
+    }
+    let mut found: Vec<(usize, Vec<usize>)> = Vec::new();
+    for first in first_views(&tracks_of_view) {
+        if stop.is_stopped() {
+            break;
+        }
+        let seen = tracks_of_view[first].clone();
+        let mut views = vec![first];
+        let mut tracks = seen;
+        let mut best: Option<(usize, Vec<usize>)> = None;
+        while views.len() < MOST_VIEWS {
+            let mut counts = vec![0usize; input.view_count()];
+            for &track in &tracks {
+                for k in (ranges[track]..ranges[track + 1]).filter(|&k| open[input.view_of(k)]) {
+                    counts[input.view_of(k)] += 1;
+                }
+            }
+            for &view in &views {
+                counts[view] = 0;
+            }
+            // The first of equals, so that one input has one answer.
+            let Some((next, &count)) = counts.iter().enumerate().rev().max_by_key(|&(_, count)| count) else { break };
+            if count < least {
+                break;
+            }
+            views.push(next);
+            tracks.retain(|&track| (ranges[track]..ranges[track + 1]).any(|k| input.view_of(k) == next));
+            if views.len() >= LEAST_VIEWS {
+                let value = count.min(ENOUGH_TRACKS) * (views.len() - 2);
+                if best.as_ref().is_none_or(|(most, _)| value > *most) {
+                    let mut sorted = views.clone();
+                    sorted.sort_unstable();
+                    best = Some((value, sorted));
+                }
+            }
+        }
+        found.extend(best);
+    }
+    found.sort_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
+    found.dedup();
+    diverse(found.into_iter().map(|(_, views)| views).collect())
+}
+
+/// The views that blocks are begun from: all that see something, or as many as are affordable, evenly along the
+/// sequence.
+fn first_views(tracks_of_view: &[Vec<usize>]) -> Vec<usize> {
+    let seeing: Vec<usize> = (0..tracks_of_view.len()).filter(|&view| !tracks_of_view[view].is_empty()).collect();
+    evenly(&seeing, MOST_FIRST_VIEWS)
+}
+
+/// At most `most` of the items, evenly spread.
+pub fn evenly(items: &[usize], most: usize) -> Vec<usize> {
+    let count = items.len().min(most);
+    (0..count).map(|k| items[k * items.len() / count]).collect()
+}
+
+/// At most [`MOST_BLOCKS`] of the ranked sets: those that share at most half of their views with every better one
+/// first, for a block that failed is not saved by changing one view.
+fn diverse(ranked: Vec<Vec<usize>>) -> Vec<Vec<usize>> {
+    let overlaps = |a: &[usize], b: &[usize]| 2 * a.iter().filter(|view| b.contains(view)).count() > a.len();
+    let (mut chosen, mut similar): (Vec<Vec<usize>>, Vec<Vec<usize>>) = (Vec::new(), Vec::new());
+    for views in ranked {
+        let list = if chosen.iter().any(|better| overlaps(&views, better)) { &mut similar } else { &mut chosen };
+        list.push(views);
+    }
+    chosen.append(&mut similar);
+    chosen.truncate(MOST_BLOCKS);
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::{Limits, RawInput, View, WarningCode};
+    use crate::solver::block;
+    use crate::solver::normalization::normalization;
+
+    /// Tracks given as lists of the views that see them.
+    fn input(views: usize, tracks: &[Vec<usize>]) -> Input {
+        let mut raw =
+            RawInput { views: vec![View::default(); views], track_count: tracks.len(), ..RawInput::default() };
+        for (track, seen) in tracks.iter().enumerate() {
+            for &view in seen {
+                raw.view.push(view as u32);
+                raw.track.push(track as u32);
+                raw.x.push((track * 7 % 13) as f64);
+                raw.y.push((track * 5 % 11) as f64);
+            }
+        }
+        Input::new(raw, &Limits::default(), "test").expect("valid")
+    }
+
+    #[test]
+    fn complete_tracks_are_one_block_of_all_views() {
+        let input = input(12, &vec![(0..12).collect(); 20]);
+        let ranges = input.track_ranges();
+        assert_eq!(candidate_views(&input, &ranges, &StopToken::default()), [(0..12).collect::<Vec<_>>()]);
+        let long = self::input(100, &vec![(0..100).collect(); 20]);
+        let views = &candidate_views(&long, &long.track_ranges(), &StopToken::default())[0];
+        assert_eq!((views.len(), views[0], views[39]), (MOST_VIEWS_WHOLE, 0, 97));
+    }
+
+    #[test]
+    fn of_banded_tracks_the_densest_band_comes_first() {
+        let mut tracks = vec![(0..5).collect::<Vec<_>>(); 30];
+        tracks.extend(vec![(3..8).collect::<Vec<_>>(); 60]);
+        let input = input(8, &tracks);
+        let ranges = input.track_ranges();
+        let candidates = candidate_views(&input, &ranges, &StopToken::default());
+        assert_eq!(candidates[0], [3, 4, 5, 6, 7]);
+        let (normalization, warnings) = normalization(&input);
+        let block = block::extract(&input, &ranges, &normalization, &candidates[0]);
+        assert_eq!((block.complete.views(), block.tracks.len()), (5, 60));
+        assert_eq!(warnings[0].code, WarningCode::AssumedImageSize);
+        let sampled = block.clone().sample(7, 1);
+        assert_eq!((sampled.tracks.len(), sampled.complete.tracks()), (7, 7));
+        let place = block.tracks.iter().position(|&track| track == sampled.tracks[3]).expect("a track of the block");
+        assert_eq!(sampled.complete.point(2, 3), block.complete.point(2, place));
+    }
+
+    #[test]
+    fn subsets_are_runs_and_combs_of_each_set_in_turn() {
+        let found = subsets(&[(0..10).collect(), (20..30).collect(), (0..4).collect()]);
+        assert_eq!(found.len(), MOST_SUBSETS);
+        assert_eq!(found[..4], [[0, 1, 2, 3], [20, 21, 22, 23], [0, 3, 6, 9], [20, 23, 26, 29]]);
+        assert!(found.iter().all(|views| views.is_sorted()));
+        assert!(subsets(&[(0..4).collect()]).is_empty());
+    }
+
+    #[test]
+    fn views_that_share_nothing_make_no_block() {
+        let input = input(4, &[vec![0, 1], vec![2, 3], vec![1, 2]]);
+        assert!(candidate_views(&input, &input.track_ranges(), &StopToken::default()).is_empty());
+    }
+}
