@@ -25,7 +25,6 @@ const LEAST_OBSERVATIONS: usize = 2;
 
 /// The solution that the best of what was found gives; without any, the reason.
 pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Solution {
-    recorder.enter(Stage::Judge);
     let mut warnings = problem.warnings.clone();
     let (reconstruction, mut seed) = match ended {
         Ended::Extended(extended) => (Some(Reconstruction::of_extended(problem, &extended)), Some(extended.seed)),
@@ -36,6 +35,7 @@ pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Solu
         warnings.push(why_unsolved(problem, seed.as_ref()));
         return unsolved(problem, seed.as_ref(), warnings, recorder);
     };
+    recorder.enter(Stage::Judge);
     let judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, seed, &mut recorder));
     reconstruction.solution(problem, seed, judged, warnings, recorder)
 }
@@ -45,7 +45,7 @@ impl Reconstruction {
         self.grade != Grade::ProjectiveOnly
     }
 
-    /// Judges every track and observation by it and writes down what it says.
+    /// Writes down what it and the judged tracks say.
     ///
     /// With grade PROJECTIVE_ONLY nothing metric is in it, the focal length included: a number that must not be used
     /// is not given; points are then in the frame of the projective cameras.
@@ -57,6 +57,8 @@ impl Reconstruction {
         mut warnings: Vec<Warning>,
         recorder: Recorder,
     ) -> Solution {
+        warnings.extend(self.warnings.iter().cloned());
+        warnings.extend(seed.second_structure.clone());
         let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
         // Depths verify fewer, and PAPER and PSFM keep what they keep.
         if seed.judges_observations() && inliers < LEAST_INLIERS {
@@ -64,16 +66,12 @@ impl Reconstruction {
             warnings.push(Warning::new(WarningCode::FewInliers, detail));
             return nothing(problem, Some(seed), warnings, recorder);
         }
-        warnings.extend(self.warnings(problem));
-        warnings.extend(seed.second_structure.clone());
         let frames = self.frames(problem);
+        let backs: Vec<Option<Matrix4<f64>>> =
+            frames.iter().map(|frame| frame.filter(|_| !self.is_metric())?.try_inverse()).collect();
         let place = |point: &Point, track: usize, retained: &[Observation]| {
-            let back = frames[self.component_of_track[track] as usize].filter(|_| !self.is_metric());
-            let point = match back {
-                Some(frame) => frame.try_inverse()? * point,
-                None => *point,
-            };
-            dehomogenise(&point).filter(|_| self.holds(retained))
+            let back = backs[self.component_of_track[track] as usize];
+            dehomogenise(&back.map_or(*point, |back| back * point)).filter(|_| self.holds(retained))
         };
         let points: Vec<Option<[f64; 3]>> = judged
             .points
@@ -111,32 +109,6 @@ impl Reconstruction {
             reprojection_mean_px: mean,
             ..nothing(problem, Some(seed), warnings, recorder)
         }
-    }
-
-    /// What is to be said of the calibrations, each group's named where there are several.
-    fn warnings(&self, problem: &Problem) -> Vec<Warning> {
-        let (group_of, groups) = camera_groups(problem.input);
-        let outcomes: Vec<&Outcome> = self.calibrated.iter().map(|(_, outcome)| outcome).collect();
-        let id_of = |group: usize| {
-            let view = group_of.iter().position(|of| *of == group).filter(|_| outcomes.len() == groups)?;
-            Some(problem.input.views()[view].camera_group)
-        };
-        let is_common = |warning: &Warning| outcomes.iter().all(|outcome| outcome.warnings.contains(warning));
-        let of_group = |(group, outcome): (usize, &&Outcome)| -> Vec<Warning> {
-            let named = |warning: &Warning| match id_of(group) {
-                // One for all groups, or none to tell apart.
-                None => warning.clone(),
-                Some(_) if groups > 1 && is_common(warning) => warning.clone(),
-                Some(id) if groups > 1 => {
-                    Warning::new(warning.code, format!("camera group {id}: {}", warning.detail)).of_group(id)
-                }
-                Some(id) => warning.clone().of_group(id),
-            };
-            // What is said of all is said once.
-            let is_repeated = |warning: &&Warning| group > 0 && is_common(warning);
-            outcome.warnings.iter().filter(|warning| !is_repeated(warning)).map(named).collect()
-        };
-        outcomes.iter().enumerate().flat_map(of_group).collect()
     }
 
     /// The calibration of each camera group in pixels, its principal point about the image centre of the group's first
@@ -179,7 +151,7 @@ impl Reconstruction {
                 let camera = self.cameras[view].as_ref().filter(|_| self.component_of_view[view] == component)?;
                 let to_pixels = problem.normalization.to_pixels(view);
                 match &self.canonical {
-                    Some(canonical) => Some(canonical.homography * affine_frame(&to_pixels, &canonical.cameras[0])?),
+                    Some(canonical) => Some(canonical.homography * affine_frame(&to_pixels, &Camera::identity())?),
                     None => affine_frame(&to_pixels, camera),
                 }
             })

@@ -6,13 +6,13 @@ use super::block::Block;
 use super::calibration::{self, Outcome};
 use super::classification::Judged;
 use super::depths::{self, TrackWeights};
+use super::fusion::Estimate;
 use super::grow::{self, LEAST_INLIERS};
 use super::learned::TrackScores;
 use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
 use super::recorder::Recorder;
 use super::sequence::Projective;
-use super::sequence::windows::Estimate;
 use super::{Error, all_tracks, near_duplicates, second_structures, track_sampling};
 use crate::domain::{FocalPrior, Grade, Method, Stage, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
@@ -89,6 +89,20 @@ impl Attempt {
     /// Whether single observations are judged: where image points alone verify and the method decides nothing itself.
     pub fn judges_observations(&self) -> bool {
         matches!(self.found.verified_by, VerifiedBy::ImagePoints) && self.decided.is_none()
+    }
+
+    /// Whether depths verify it, in noise so strong that image points verify nothing beside them.
+    pub fn is_beyond_image_points(&self) -> bool {
+        let noise = self.projective.as_ref().map_or(0.0, |found| found.noise);
+        matches!(self.found.verified_by, VerifiedBy::Depths { .. }) && noise > depths::STRONG_NOISE
+    }
+
+    /// Says that image points verify what it was extended to, whatever verified the seed.
+    pub fn verified_by_image_points(&mut self) {
+        if matches!(self.found.verified_by, VerifiedBy::Depths { .. }) {
+            self.found.verified_by = VerifiedBy::ImagePoints;
+            self.weights_by_depths = None;
+        }
     }
 
     /// Larger is better: solved before unsolved, then by grade, then by the certainty of the focal length.
@@ -290,6 +304,8 @@ fn search(
     if let Some((block, consensus)) = all_tracks::extend(problem, &attempt.block, &refined) {
         attempt.found.network_weights = carry_over(&attempt.found.network_weights, &attempt.block, &block);
         recorder.standing.inliers = consensus.inlier_count() as u32;
+        // What the network says of a sample, it does not say of all.
+        attempt.found.track_scores = None;
         (attempt.block, refined) = (block, consensus);
     }
     problem.stopped()?;
@@ -344,7 +360,7 @@ fn calibrate_projective(
     let prior = prior.filter(|_| cameras.len() == 1);
     let focal_priors: Vec<Option<FocalPrior>> =
         cameras.iter().map(|&camera| prior.or(problem.focal_priors[camera])).collect();
-    let projective = calibration::Problem {
+    let to_calibrate = calibration::Problem {
         cameras: &some.cameras,
         points: &some.points,
         observations: &some.observations,
@@ -353,6 +369,6 @@ fn calibrate_projective(
         group_of: &group_of,
         focal_priors: &focal_priors,
     };
-    let outcomes = calibration::calibrate(&projective, problem.scale_px, problem.stop)?;
+    let outcomes = calibration::calibrate(&to_calibrate, problem.scale_px, problem.stop)?;
     Ok(Outcome::worst(outcomes).unwrap_or_else(|| Outcome::refused(Vec::new())))
 }

@@ -3,11 +3,11 @@
 //! Where PAPER departs from the paper, and on what evidence, is listed in [`crate::network`].
 
 use super::attempt::{self, Attempt, Effort};
+use super::fusion::{self, Estimate};
 use super::grow::{self, Consensus, LEAST_SUPPORT};
 use super::problem::Problem;
 use super::recorder::Recorder;
 use super::search::subspace;
-use super::sequence::windows::{self, Estimate};
 use super::{Error, view_selection};
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, projective};
@@ -52,7 +52,7 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Option<Attemp
     let estimates: Vec<Estimate> = attempts.iter().filter_map(Attempt::estimate).collect();
     let mut best = attempts.into_iter().reduce(|best, other| if other.merit() > best.merit() { other } else { best });
     if let Some(outcome) = best.as_mut().and_then(|best| best.calibration.as_mut()) {
-        windows::admit_misfit(outcome, &estimates);
+        fusion::admit_misfit(outcome, &estimates);
     }
     Ok(best)
 }

@@ -198,7 +198,7 @@ impl TrackWeights {
                 continue;
             }
             judged.tracks.inlier[track] = inlier;
-            let registered = problem.of_track(track).filter(|&k| geometry.cameras[problem.view_of(k)].is_some());
+            let registered = problem.of_track(track).filter(|&k| geometry.judges(track, problem.view_of(k)));
             let seen: Vec<(usize, Observation)> =
                 registered.map(|k| (k, geometry.observation(problem.input, k))).collect();
             let observations: Vec<Observation> = seen.iter().map(|(_, observation)| *observation).collect();

@@ -116,7 +116,7 @@ impl TrackScores {
         inliers.iter().filter(|&&track| self.ln_odds[track] > -REJECTION_NATS).count()
     }
 
-    /// Whether enough tracks are likely right for their ranking to be told where geometry verifies none.
+    /// Whether enough tracks are likely right for their ranking to be reported where geometry verifies none.
     pub fn ranks(&self) -> bool {
         self.likely() >= LEAST_LIKELY
     }

@@ -5,10 +5,10 @@
 //! The way through: [`copies`] keeps one of the tracks that stand in the input several times; [`problem`] is the input
 //! as all stages see it; [`view_selection`] chooses views whose tracks are complete: all of them, or a few; [`attempt`]
 //! searches such a block, by [`portfolio`] (priors, [`search`], [`grow`]; [`near_duplicates`] are left aside, the
-//! [`track_sampling`] of many tracks searched, [`a_contrario`] verifies, [`all_tracks`] join; [`depths`] where those verify what image
-//! points cannot) or [`baselines`], and [`calibration`] upgrades it. [`sequence`] tries blocks in order of cost and
-//! extends what stands to the other views and tracks, projectively or metrically, observation by observation;
-//! [`assemble`] has [`classification`] judge every track and observation, and writes it down.
+//! [`track_sampling`] of many tracks searched, [`a_contrario`] verifies, [`all_tracks`] join; [`depths`] where those
+//! verify what image points cannot) or [`baselines`], and [`calibration`] upgrades it. [`sequence`] tries blocks in
+//! order of cost and extends what stands to the other views and tracks, projectively or metrically, observation by
+//! observation; [`assemble`] has [`classification`] judge every track and observation, and writes it down.
 
 pub(crate) mod a_contrario;
 mod all_tracks;
@@ -20,6 +20,7 @@ pub(crate) mod calibration;
 mod classification;
 mod copies;
 mod depths;
+mod fusion;
 pub(crate) mod grow;
 pub(crate) mod learned;
 mod near_duplicates;
@@ -76,9 +77,10 @@ pub fn solve(
 /// Further ones than the caller's help where a reconstruction is extended and tracks are judged.
 /// `observer` is told of every iteration; `stop` is asked at least every 50 ms or network iteration.
 ///
-/// AUTO and GEOMETRY judge every observation by itself and extend a block to every view that can be registered: all
-/// views at once where their tracks are complete and that decides quickly, else few of them. By PAPER and PSFM the best
-/// block is solved, views outside it are left out with a warning, and blocks that disagree raise its uncertainty.
+/// AUTO and GEOMETRY judge every observation by itself, but where depths alone verify, and extend a block to every view
+/// that can be registered: all views at once where their tracks are complete and that decides quickly, else few of
+/// them. By PAPER and PSFM the best block is solved, views outside it are left out with a warning, and blocks that
+/// disagree raise its uncertainty.
 ///
 /// Tracks that are [copies](Copies) of another count once, whatever the method.
 ///

@@ -6,8 +6,8 @@ use crate::domain::{ImageSize, Input, Warning, WarningCode};
 use crate::geometry::measurement::Normalization;
 use crate::geometry::statistics::median;
 
-/// The transform from pixels of a solve: principal points assumed in the image centres, lengths in
-/// units of the largest image side.
+/// The transform from pixels of a solve: principal points assumed in the image centres, lengths in units of the largest
+/// image side.
 pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
     let mut warnings = Vec::new();
     // One camera took the views of unknown size: one centre, or its principal point would move from view to view.
@@ -45,8 +45,8 @@ pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
 const MEDIAN_WITHIN: f64 = 1.0;
 
 /// Share of the points beyond the right or lower edge of their image, and none beyond the others, from which its size
-/// is suspect: that of a reduced copy leaves half of the points out, exchanged sides a fiftieth and more.
-/// Points of scenes that were made up lie beyond all edges.
+/// is suspect: that of a reduced copy leaves half of the points out, exchanged sides a fiftieth and more. Points of
+/// scenes that were made up lie beyond all edges.
 const BEYOND_TWO_EDGES: f64 = 0.01;
 /// How far beyond an edge a point may lie, in pixels: there are conventions that differ by half of one.
 const EDGE_PX: f64 = 1.0;

@@ -166,7 +166,7 @@ impl<'a> Problem<'a> {
 
     /// The views in which anything is observed, increasing.
     pub fn observed_views(&self) -> Vec<usize> {
-        observed_views(self.input)
+        (0..self.views()).filter(|&view| !self.of_view[view].is_empty()).collect()
     }
 }
 

@@ -1,16 +1,18 @@
 //! A reconstruction in terms of the input's views and tracks, and what it says of them.
 
+use std::collections::BTreeSet;
+
 use nalgebra::Matrix4;
 
 use super::attempt::Attempt;
 use super::baselines::Decided;
 use super::calibration::Outcome;
 use super::classification::{self, Geometry, Judged};
-use super::problem::{LEAST_RETAINED_SHARE, Problem};
+use super::problem::{LEAST_RETAINED_SHARE, Problem, camera_groups};
 use super::recorder::Recorder;
 use super::sequence::{Extended, verified};
 use crate::domain::result::TrackResults;
-use crate::domain::{Grade, LeftOut};
+use crate::domain::{Grade, LeftOut, Warning};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Pose, Reconstruction as Metric};
 use crate::geometry::daq::{CanonicalFrame, to_canonical_frame};
@@ -21,18 +23,20 @@ pub struct Reconstruction {
     pub cameras: Vec<Option<Camera>>,
     /// The lens of each view; empty: all are pinholes.
     pub lenses: Vec<Intrinsics>,
-    /// The pose of each view that has one to be told.
+    /// The pose of each view that has one to be reported.
     pub poses: Vec<Option<Pose>>,
     /// The component of each view, and the one that each track is in: components have frames of their own.
     pub component_of_view: Vec<u32>,
     pub component_of_track: Vec<u32>,
     pub left_out: Vec<(usize, LeftOut)>,
-    /// The frame that projective cameras are told in; `None` where they are metric but for the frame, so that the plane
+    /// The frame that projective cameras are reported in; `None` where they are metric but for the frame, so that the plane
     /// at infinity is where it should be.
     pub canonical: Option<CanonicalFrame>,
     pub grade: Grade,
     /// What was found of each camera, and what it is worth; intrinsics are left out where no view of it is registered.
     pub calibrated: Vec<(Option<Intrinsics>, Outcome)>,
+    /// What is to be said of the calibrations.
+    pub warnings: Vec<Warning>,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
     /// Prior probability that a track is right.
@@ -72,6 +76,8 @@ impl Reconstruction {
                 poses[view] = Some(metric.poses[i]).filter(|_| own.is_none_or(|own| own.sigma_log.is_some()));
             }
         }
+        let groups: BTreeSet<u32> = problem.input.views().iter().map(|view| view.camera_group).collect();
+        let only = groups.first().copied().filter(|_| groups.len() == 1);
         Some(Self {
             cameras,
             lenses,
@@ -82,7 +88,13 @@ impl Reconstruction {
             canonical: metric.is_none().then(canonical),
             grade: outcome.grade,
             calibrated,
-            noise: projective.noise,
+            warnings: outcome
+                .warnings
+                .iter()
+                .map(|warning| Warning { camera_group: only, ..warning.clone() })
+                .collect(),
+            // Estimated under projective cameras: metric ones fit worse by so much.
+            noise: projective.noise * metric.map_or(1.0, |_| outcome.rms_ratio.max(1.0)),
             inlier_share: share(projective.tracks.len(), projective.tried),
         })
     }
@@ -90,7 +102,7 @@ impl Reconstruction {
     pub fn of_extended(problem: &Problem, extended: &Extended) -> Self {
         let Extended { model, calibrations, unregistered, .. } = extended;
         let grade = extended.grade(problem);
-        let is_told = |view: &usize| grade != Grade::ProjectiveOnly && model.is_determined(*view);
+        let is_reported = |view: &usize| grade != Grade::ProjectiveOnly && model.is_determined(*view);
         let landmark = |track: usize| model.landmarks[track].as_ref();
         let calibrated = calibrations.iter().enumerate().map(|(camera, outcome)| {
             let intrinsics = model.lenses[camera].intrinsics;
@@ -99,7 +111,7 @@ impl Reconstruction {
         Self {
             cameras: model.cameras(problem),
             lenses: (0..problem.views()).map(|view| model.intrinsics_of(problem, view)).collect(),
-            poses: (0..problem.views()).map(|view| model.poses[view].filter(|_| is_told(&view))).collect(),
+            poses: (0..problem.views()).map(|view| model.poses[view].filter(|_| is_reported(&view))).collect(),
             component_of_view: model.component_of.clone(),
             component_of_track: (0..problem.tracks())
                 .map(|track| landmark(track).map_or(0, |point| point.component))
@@ -108,6 +120,7 @@ impl Reconstruction {
             canonical: None,
             grade,
             calibrated: calibrated.collect(),
+            warnings: named_warnings(problem, calibrations),
             noise: model.noise,
             inlier_share: share(verified(model).len(), problem.verifiable(|view| model.poses[view].is_some())),
         }
@@ -121,7 +134,7 @@ impl Reconstruction {
             components: (&self.component_of_view, &self.component_of_track),
             normalization: &problem.normalization,
             lenses: &self.lenses,
-            weights: &problem.weights,
+            weights: if by_points { &problem.weights } else { &[] },
             linked: by_points,
             least_share: if by_points { problem.least_share } else { LEAST_RETAINED_SHARE },
             noise: self.noise,
@@ -174,4 +187,29 @@ fn mask(problem: &Problem, block_tracks: &[usize], decided: &Decided, judged: &m
             }
         }
     }
+}
+
+/// What is to be said of the calibrations, each group's named where there are several.
+fn named_warnings(problem: &Problem, outcomes: &[Outcome]) -> Vec<Warning> {
+    let (group_of, groups) = camera_groups(problem.input);
+    let id_of = |group: usize| {
+        let view = group_of.iter().position(|of| *of == group).filter(|_| outcomes.len() == groups)?;
+        Some(problem.input.views()[view].camera_group)
+    };
+    let is_common = |warning: &Warning| outcomes.iter().all(|outcome| outcome.warnings.contains(warning));
+    let of_group = |(group, outcome): (usize, &Outcome)| -> Vec<Warning> {
+        let named = |warning: &Warning| match id_of(group) {
+            // One for all groups, or none to tell apart.
+            None => warning.clone(),
+            Some(_) if groups > 1 && is_common(warning) => warning.clone(),
+            Some(id) if groups > 1 => {
+                Warning::new(warning.code, format!("camera group {id}: {}", warning.detail)).of_group(id)
+            }
+            Some(id) => warning.clone().of_group(id),
+        };
+        // What is said of all is said once.
+        let is_repeated = |warning: &&Warning| group > 0 && is_common(warning);
+        outcome.warnings.iter().filter(|warning| !is_repeated(warning)).map(named).collect()
+    };
+    outcomes.iter().enumerate().flat_map(of_group).collect()
 }

@@ -28,7 +28,7 @@ fn place(group: usize, parameter: Parameter) -> usize {
 ///
 /// For observations with unit variance. From one linearisation it tells of every model at once where its minimum is,
 /// how low, and how well determined: a score test in place of an adjustment a model. Where the reconstruction has focal
-/// lengths a view, these are free in every model, and what it tells of [`Parameter::LogFocal`] is told of their mean.
+/// lengths a view, these are free in every model, and what it says of [`Parameter::LogFocal`] is said of their mean.
 #[derive(Debug, Clone)]
 pub struct Information {
     intrinsics: Vec<Intrinsics>,

@@ -93,7 +93,7 @@ impl Default for Shape {
 }
 
 /// Strides of a network that asks pairs: neighbours have most in common, the next but one closes triangles, so that a
-/// wrong observation disagrees with more than one. On real windows the votes of pairs are no better with 3.
+/// wrong observation disagrees with more than one. On real windows pairs are no better with 3.
 const PAIR_STRIDES: usize = 2;
 
 impl Shape {

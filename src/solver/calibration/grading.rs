@@ -42,7 +42,7 @@ pub(super) fn grade(
         .flatten();
     let grade_group = |group: usize| -> Outcome {
         let mut verdict = Verdict::new(warnings.clone());
-        // What the ratios of the others' deviations are taken of, and the one that is told.
+        // What the ratios of the others' deviations are taken of, and the one that is reported.
         let (of_focal, mut sigma) = match has_own_focals {
             true => {
                 let sigma = view_focals::judge(&mut verdict, &focals);

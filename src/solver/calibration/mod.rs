@@ -74,14 +74,16 @@ pub struct ViewFocal {
     /// Normalised.
     pub focal: f64,
     /// One standard deviation of its natural logarithm, with what an unknown lens adds. `None`: the observations do not
-    /// determine it, and neither it nor the view's pose is to be told.
+    /// determine it, and neither it nor the view's pose is to be reported.
     pub sigma_log: Option<f64>,
 }
 
 impl ViewFocal {
-    /// Whether this focal length, which other observations led to, may be told as that of the view.
-    pub fn stands_as(&self, told: f64) -> bool {
-        self.sigma_log.is_some() && verdict::is_plausible(told) && (told / self.focal).ln().abs() <= verdict::WEAK_UP_TO
+    /// Whether this focal length, which other observations led to, may be reported as that of the view.
+    pub fn stands_as(&self, focal: f64) -> bool {
+        self.sigma_log.is_some()
+            && verdict::is_plausible(focal)
+            && (focal / self.focal).ln().abs() <= verdict::WEAK_UP_TO
     }
 }
 

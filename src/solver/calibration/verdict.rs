@@ -14,7 +14,7 @@ pub(super) const UNOBSERVABLE_ABOVE: f64 = 1.0;
 pub(super) const RMS_RATIO_LIMIT: f64 = 1.15;
 /// The same ratio from which the metric reconstruction is not to be used at all.
 const RMS_RATIO_REFUSAL: f64 = 3.0;
-/// Factor on sigma by a misfit from which it is told: more than half of the sigma comes of it.
+/// Factor on sigma by a misfit from which it is reported: more than half of the sigma comes of it.
 const INFLATION_LIMIT: f64 = 2.0;
 /// Share of the observations that must lie in front of their cameras, or the reconstruction is not to be used: what was
 /// seen was not behind the camera. A forward-moving car gave 2.9 % behind, with a focal length of a quarter of the
@@ -117,7 +117,7 @@ impl Verdict {
         }
     }
 
-    /// The sigma that is told: not one that the fit contradicts. Whatever lowered the grade is worth at least the
+    /// The sigma that is reported: not one that the fit contradicts. Whatever lowered the grade is worth at least the
     /// grade's least, and a model that does not fit its most: wrong minima behind a distorting lens were off by 20 to
     /// 30 %.
     pub fn reported(&self, sigma: Option<f64>) -> Option<f64> {

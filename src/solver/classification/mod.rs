@@ -51,7 +51,7 @@ pub struct Geometry<'a> {
 
 impl Geometry<'_> {
     /// Whether a track is judged by what a view saw of it.
-    fn judges(&self, track: usize, view: usize) -> bool {
+    pub fn judges(&self, track: usize, view: usize) -> bool {
         self.cameras[view].is_some() && self.components.0[view] == self.components.1[track]
     }
 
@@ -100,8 +100,8 @@ pub struct SplitPoint {
 /// Where there is none, a wrong observation is told from a right one nearer by: at 8 to 9 core deviations instead of 12
 /// at .3 % noise.
 ///
-/// Once `stop` fires the rest stays unjudged: nobody will look at the result. `progress` is called with how many verdicts there
-/// are, up to two a track. How many threads there are changes nothing.
+/// Once `stop` fires the rest stays unjudged: nobody will look at the result. `progress` is called with how many
+/// verdicts there are, up to two a track. How many threads there are changes nothing.
 pub fn judge(
     input: &Input,
     ranges: &[usize],
@@ -142,21 +142,21 @@ fn judge_under(
     stop: &StopToken,
     progress: &mut dyn FnMut(usize),
 ) -> Judged {
-    // Triangulation wants a slice; unregistered views are never sighted.
+    // Triangulation wants a slice; nothing is observed in unregistered views.
     let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
     let triangulator = Triangulator::new(&cameras);
-    let bench = TrackClassifier { cameras: &cameras, triangulator, geometry, noise, stop };
+    let classifier = TrackClassifier { cameras: &cameras, triangulator, geometry, noise, stop };
     let mut judged = Judged::nothing(input, noise);
     let threads = threads.if_worth(input.track_count() >= WORTH_A_THREAD);
     for first in (0..input.track_count()).step_by(BATCH) {
         let last = input.track_count().min(first + BATCH);
         let side_by_side = |k: usize| match stop.is_stopped() {
             true => Vec::new(),
-            false => bench.find(input, ranges, first + k * LANES..last.min(first + (k + 1) * LANES)),
+            false => classifier.find(input, ranges, first + k * LANES..last.min(first + (k + 1) * LANES)),
         };
         let mut progress = |batches| progress(first + batches * LANES);
         let found = threads.map((last - first).div_ceil(LANES), TRACKS_A_RUN / LANES, side_by_side, &mut progress);
-        found.iter().flatten().for_each(|finding| bench.write(&mut judged, finding));
+        found.iter().flatten().for_each(|finding| classifier.write(&mut judged, finding));
     }
     judged
 }

@@ -3,7 +3,7 @@
 use nalgebra::Vector2;
 
 use crate::geometry::statistics::median;
-use crate::solver::portfolio::spread_of;
+use crate::solver::portfolio::{MOST_SPREAD, spread_of};
 
 /// Share of right observations in the tail, before it is known, and the tail's width in units of the core. Feature
 /// detectors have a core of .1 to .3 px and tails that a Gaussian of that width would call impossible; together with
@@ -20,16 +20,22 @@ const TAIL_ROUNDS: usize = 10;
 /// Prior probability that a single observation of a right track is wrong.
 const WRONG_OBSERVATION: f64 = 0.05;
 
-/// Density of a wrong coordinate in an image: one over the width of a uniform distribution that is spread like the points
-/// of a view, the median over the views.
+/// Least spread of the points of an image, image sides: half of them within a thousandth are no picture of anything.
+const LEAST_SPREAD: f64 = 1e-3;
+/// Points from which a view has a say in it: the spread of eight is known to a third.
+const LEAST_POINTS: usize = 8;
+
+/// Density of a wrong coordinate in an image: one over the width of a uniform distribution that is spread like the
+/// points of a view, the median over the views with enough of them; without any, like all points.
 ///
 /// * `of_view`: places of each view's points among all
 pub fn outlier_density(of_view: &[Vec<u32>], points: &[Vector2<f64>]) -> f64 {
-    let spread =
-        |places: &Vec<u32>| -> f64 { spread_of(&places.iter().map(|&k| points[k as usize]).collect::<Vec<_>>()) };
-    let mut spreads: Vec<f64> = of_view.iter().filter(|places| !places.is_empty()).map(spread).collect();
+    let views = of_view.iter().filter(|places| places.len() >= LEAST_POINTS);
+    let mut spreads: Vec<f64> =
+        views.map(|places| spread_of(&places.iter().map(|&k| points[k as usize]).collect::<Vec<_>>())).collect();
+    let spread = if spreads.is_empty() { spread_of(points) } else { median(&mut spreads) };
     // A uniform distribution is so many standard deviations wide.
-    1.0 / (12.0f64.sqrt() * median(&mut spreads).max(f64::MIN_POSITIVE))
+    1.0 / (12.0f64.sqrt() * spread.clamp(LEAST_SPREAD, MOST_SPREAD))
 }
 
 /// Squared residual within which an observation is more likely right than wrong while nothing is known of the noise's
@@ -128,6 +134,19 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
+
+    #[test]
+    fn views_of_single_points_do_not_make_every_point_a_wrong_one() {
+        let points: Vec<Vector2<f64>> =
+            (0..220).map(|k| Vector2::new((k % 20) as f64 / 20.0 - 0.5, (k / 20) as f64 / 20.0 - 0.5)).collect();
+        let full: Vec<Vec<u32>> = (0..10).map(|view| (20 * view..20 * view + 20).collect()).collect();
+        let alone = outlier_density(&full, &points[..200]);
+        let stubs = full.iter().cloned().chain((200..220).map(|k| vec![k])).collect::<Vec<_>>();
+        let beside = outlier_density(&stubs, &points);
+        assert!((beside / alone - 1.0).abs() < 1e-12, "{alone} {beside}");
+        let nothing = outlier_density(&[Vec::new(), vec![0]], &points);
+        assert!(nothing.is_finite() && outlier_density(&[], &[]).is_finite(), "{nothing}");
+    }
 
     #[test]
     fn the_tail_is_read_from_the_residuals() {

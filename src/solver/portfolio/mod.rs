@@ -29,7 +29,7 @@ use crate::network::{NetworkSettings, PriorNetwork};
 use account::ProposalStats;
 use best::Best;
 pub use best::VerifiedBy;
-pub use spread::{spread, spread_of};
+pub use spread::{MOST_SPREAD, spread, spread_of};
 
 /// Network iterations between two verifications of its ranking.
 const ITERATIONS_PER_ROUND: u32 = 25;
@@ -146,7 +146,7 @@ impl<'a> Portfolio<'a> {
 
     /// Runs the search; `spread_weights` maps the block's weights to the caller's tracks.
     ///
-    /// The paper's network's own focal length is not told: nothing of a search has verified it.
+    /// The paper's network's own focal length is not reported: nothing of a search has verified it.
     ///
     /// # Errors
     /// The network's own, which are defects: a block has more columns than it asks for.

@@ -6,18 +6,17 @@ use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::statistics::{DEVIATION_PER_MEDIAN, median};
 
 /// Largest spread that points of an image can have: half its side.
-const MOST_SPREAD: f64 = 0.5;
+pub const MOST_SPREAD: f64 = 0.5;
 
 /// Standard deviation of the image points of a block from the middle of their view, one coordinate, normalised units:
 /// the median over the views.
 pub fn spread(block: &CompleteBlock) -> f64 {
-    let of_view = |view: usize| -> f64 {
-        spread_of(&(0..block.tracks()).map(|track| block.point(view, track)).collect::<Vec<_>>())
-    };
-    median(&mut (0..block.views()).map(of_view).collect::<Vec<_>>())
+    let points = |view: usize| (0..block.tracks()).map(|track| block.point(view, track)).collect::<Vec<_>>();
+    let mut spreads: Vec<f64> = (0..block.views()).map(|view| spread_of(&points(view))).collect();
+    median(&mut spreads).clamp(f64::MIN_POSITIVE, MOST_SPREAD)
 }
 
-/// The same of image points: a robust estimate, for a single far point must not make chance look small.
+/// The same of the points of one view: a robust estimate, for a single far point must not make chance look small.
 pub fn spread_of(points: &[Vector2<f64>]) -> f64 {
     let of_axis = |axis: usize| {
         let mut values: Vec<f64> = points.iter().map(|point| point[axis]).collect();
@@ -25,5 +24,5 @@ pub fn spread_of(points: &[Vector2<f64>]) -> f64 {
         values.iter_mut().for_each(|value| *value = (*value - middle).abs());
         median(&mut values)
     };
-    (DEVIATION_PER_MEDIAN * (of_axis(0) + of_axis(1)) / 2.0).clamp(f64::MIN_POSITIVE, MOST_SPREAD)
+    DEVIATION_PER_MEDIAN * (of_axis(0) + of_axis(1)) / 2.0
 }

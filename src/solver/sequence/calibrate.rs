@@ -110,7 +110,7 @@ pub fn of_extract(
     let (metric, of_group) = extract.block();
     let (cameras, points) = projective(&metric);
     let focal_priors: Vec<Option<FocalPrior>> = of_group.iter().map(|&camera| problem.focal_priors[camera]).collect();
-    let projective = calibration::Problem {
+    let to_calibrate = calibration::Problem {
         cameras: &cameras,
         points: &points,
         observations: &extract.observations,
@@ -119,7 +119,7 @@ pub fn of_extract(
         focal_priors: &focal_priors,
         focal_per_view: metric.has_own_focals(),
     };
-    let outcomes = calibration::from_metric(&projective, &metric, problem.scale_px, problem.stop, heartbeat)?;
+    let outcomes = calibration::from_metric(&to_calibrate, &metric, problem.scale_px, problem.stop, heartbeat)?;
     Ok(of_group.into_iter().zip(outcomes).collect())
 }
 

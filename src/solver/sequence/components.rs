@@ -21,7 +21,7 @@ pub const FIRST: u32 = 0;
 /// input without overlap has any number of hopeless ones.
 const MOST_COMPONENTS: u32 = 100;
 const MOST_FAILURES: usize = 3;
-/// Deviation of the log focal length that other components are told of, at least, where the first has one: components
+/// Deviation of the log focal length that other components are given, at least, where the first has one: components
 /// differ by more than each admits. And where the first has none: it only keeps them from running away.
 const PRIOR_SIGMA: f64 = 0.02;
 const VAGUE_SIGMA: f64 = 0.5;
@@ -67,7 +67,7 @@ pub fn others(
         recorder.end_component();
         // Whatever comes of it, a block is tried once.
         views.iter().for_each(|&view| open[view] = false);
-        // Focal lengths of views that their own block does not determine, no other component can tell.
+        // Focal lengths of views that their own block does not determine, no other component can give.
         let usable = |calibration: &&Outcome| !problem.has_own_focals() || calibration.grade != Grade::ProjectiveOnly;
         let Some((calibration, metric)) = attempt
             .calibration

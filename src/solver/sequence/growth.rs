@@ -16,8 +16,10 @@ pub trait Growth {
     /// Whether a view may be added.
     fn is_open(&self, view: usize) -> bool;
 
-    /// Observations of a view whose points may support its registration: how many at most, and which.
+    /// How many observations of a view may support its registration, at most.
     fn support(&self, view: usize) -> usize;
+
+    /// The observations of a view whose points may support its registration.
     fn supporting(&self, view: usize) -> Vec<usize>;
 
     /// Registers a view by some of these if enough of them agree; how many do.
@@ -66,6 +68,7 @@ pub fn grow(
         let step = seen.len().div_ceil(options.most_points).max(1);
         let asked: Vec<usize> = seen.iter().copied().step_by(step).collect();
         let agreeing = growth.register(view, &asked, recorder);
+        recorder.heartbeat();
         trials[view] = Trial { count: trials[view].count + 1, seen: seen.len(), points: asked.len(), agreeing };
     }
 }

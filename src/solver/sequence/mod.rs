@@ -15,12 +15,11 @@ mod growth;
 mod model;
 mod options;
 mod own_focals;
-
 mod projective;
 mod projective_growth;
 mod register;
 mod structure;
-pub mod windows;
+mod windows;
 
 pub use adjust::verified;
 pub use model::Model;
@@ -30,11 +29,11 @@ pub use register::Unregistered;
 use super::attempt::{self, Attempt, Effort};
 use super::calibration::Outcome;
 use super::grow::LEAST_INLIERS;
-use super::portfolio::VerifiedBy;
+use super::learned::SURELY_ENOUGH;
 use super::problem::Problem;
 use super::reconstruction::Reconstruction;
 use super::recorder::Recorder;
-use super::{Error, depths, view_selection};
+use super::{Error, view_selection};
 use crate::domain::{Grade, Stage, Task, Warning, WarningCode};
 use options::GrowthOptions;
 
@@ -93,9 +92,7 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
     let is_quick = !problem.input.has_depths();
     let by_calibration = if let Some(views) = &whole {
         let attempt = of_whole(problem, views, is_quick, recorder)?;
-        // In strong noise image points verify nothing that depths do not.
-        let noise = attempt.projective.as_ref().map_or(0.0, |found| found.noise);
-        if attempt.is_trusted() || (!attempt.judges_observations() && noise > depths::STRONG_NOISE) {
+        if attempt.is_trusted() || attempt.is_beyond_image_points() {
             return finished(problem, attempt, recorder);
         }
         match attempt.is_calibrated() {
@@ -142,12 +139,12 @@ fn stands(attempt: &Option<Attempt>) -> bool {
     attempt.as_ref().is_some_and(|attempt| attempt.projective.is_some())
 }
 
-/// The whole input as one block, with the views that its search left aside.
+/// The whole input as one block, with the views that its search left aside, and the tracks that depths did not verify.
 fn of_whole(problem: &Problem, views: &[usize], is_quick: bool, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let effort = Effort { is_quick, is_seed: false };
     let mut attempt = attempt::search_block(problem, problem.block(views), effort, recorder)?;
-    if views.len() < problem.observed_views().len() && attempt.judges_observations() {
-        extend_projectively(problem, &mut attempt, recorder)?;
+    if views.len() < problem.observed_views().len() || !attempt.judges_observations() {
+        extend_projectively(problem, &mut attempt, true, recorder)?;
     }
     attempt::calibrate(problem, &mut attempt, None, recorder)?;
     Ok(attempt)
@@ -210,7 +207,7 @@ fn by_projective_extension(
                 attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder)?
             }
         };
-        extend_projectively(problem, &mut attempt, recorder)?;
+        extend_projectively(problem, &mut attempt, false, recorder)?;
         if attempt.projective.is_none() {
             unsolved = unsolved.or(Some(attempt));
             continue;
@@ -232,11 +229,12 @@ fn by_projective_extension(
 
 /// Extends an attempt metrically where it has a metric reconstruction and that stands.
 fn metric_of(problem: &Problem, attempt: Attempt, recorder: &mut Recorder) -> Result<Ended, Error> {
-    if !attempt.has_metric() {
+    if !attempt.has_metric() || attempt.is_beyond_image_points() {
         return Ok(Ended::Block(Some(Box::new(attempt))));
     }
-    let extended = extend(problem, attempt, recorder)?;
+    let mut extended = extend(problem, attempt, recorder)?;
     Ok(if extended.stands() {
+        extended.seed.verified_by_image_points();
         Ended::Extended(Box::new(extended))
     } else {
         Ended::Block(Some(Box::new(extended.seed)))
@@ -250,11 +248,7 @@ fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder) ->
     let is_one_pinhole = !attempt.has_lens() && problem.cameras_of(attempt.views()).1.len() == 1;
     let is_done = is_whole && is_one_pinhole && !problem.input.has_sigmas();
     if !attempt.judges_observations() {
-        extend_projectively(problem, &mut attempt, recorder)?;
-        if !attempt.judges_observations() {
-            return Ok(Ended::Block(Some(Box::new(attempt))));
-        }
-        attempt::calibrate(problem, &mut attempt, None, recorder)?;
+        return Ok(Ended::Block(Some(Box::new(attempt))));
     }
     if let Some(found) = Reconstruction::of_attempt(problem, &attempt).filter(|_| is_done) {
         recorder.enter(Stage::Judge);
@@ -267,27 +261,37 @@ fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder) ->
         }
     }
     if !attempt.has_metric() {
-        extend_projectively(problem, &mut attempt, recorder)?;
+        extend_projectively(problem, &mut attempt, true, recorder)?;
         attempt::calibrate(problem, &mut attempt, None, recorder)?;
     }
     metric_of(problem, attempt, recorder)
 }
 
-/// Extends what an attempt has found to all views and tracks; nothing stands where that leaves too few, but what depths
-/// verify by themselves.
-fn extend_projectively(problem: &Problem, attempt: &mut Attempt, recorder: &mut Recorder) -> Result<(), Error> {
-    let by_depths = !attempt.judges_observations();
-    let may_extend = |start: &mut Projective| !by_depths || start.noise <= depths::STRONG_NOISE;
-    let Some(start) = attempt.projective.take_if(may_extend) else { return Ok(()) };
+/// Extends what an attempt has found to all views and tracks, as far as image points verify it by themselves.
+///
+/// * `keeps`: whether what was found stands where that leaves too little, else nothing does; what depths verify stands
+///   in any case
+fn extend_projectively(
+    problem: &Problem,
+    attempt: &mut Attempt,
+    keeps: bool,
+    recorder: &mut Recorder,
+) -> Result<(), Error> {
+    if attempt.is_beyond_image_points() {
+        return Ok(());
+    }
+    let Some(start) = attempt.projective.take() else { return Ok(()) };
     recorder.enter(Stage::Extend);
-    let before = start.clone();
+    let by_depths = !attempt.judges_observations();
+    // Of few tracks that depths have verified one more may agree by chance.
+    let least = if by_depths { SURELY_ENOUGH } else { LEAST_INLIERS };
+    let before = (keeps || by_depths).then(|| start.clone());
     let extended = projective_growth::extend(problem, start, recorder)?;
-    if extended.views.len() >= view_selection::LEAST_VIEWS && extended.tracks.len() >= LEAST_INLIERS {
+    if extended.views.len() >= view_selection::LEAST_VIEWS && extended.tracks.len() >= least {
         attempt.projective = Some(extended);
-        attempt.found.verified_by = VerifiedBy::ImagePoints;
-        attempt.weights_by_depths = attempt.weights_by_depths.take().filter(|_| !by_depths);
-    } else if by_depths {
-        attempt.projective = Some(before);
+        attempt.verified_by_image_points();
+    } else if before.is_some() {
+        attempt.projective = before;
     } else {
         // The reason is that of an attempt without a consensus.
         attempt.found.consensus = None;
@@ -396,7 +400,7 @@ impl Extended {
     /// wrong observations do not.
     fn is_settled(&self, problem: &Problem) -> bool {
         let is_precise = self.model.noise <= attempt::INITIAL_NOISE;
-        // Windows that differ a little are told as a mismatch of a METRIC one too.
+        // Windows that differ a little warn of a mismatch of a METRIC one too.
         is_precise && self.holds_most_views() && (self.fits() || self.grade(problem) == Grade::Metric)
     }
 

@@ -201,7 +201,7 @@ impl Model {
     }
 
     /// Whether the observations determine the focal length of a view: where views have their own, some may have none
-    /// that can be told.
+    /// that can be reported.
     pub fn is_determined(&self, view: usize) -> bool {
         self.own_focals.get(view).is_none_or(|own| own.is_determined)
     }

@@ -12,7 +12,7 @@ pub struct GrowthOptions {
     /// Growth of the points that a view sees after which a failed one is tried again: fewer new ones hardly change its
     /// odds.
     pub retry_growth: f64,
-    /// Trials of a view.
+    /// Trials of a view by a component.
     pub most_trials: usize,
     /// Growth of the registered views after which all are adjusted. A geometric growth keeps the cost of all
     /// adjustments together at six times that of the last.

@@ -229,7 +229,6 @@ impl Growth for Growing<'_> {
         self.cameras[view] = Some(if sign < 0.0 { -camera } else { camera });
         self.triangulate(Some(view), recorder);
         recorder.registered(self.registered());
-        recorder.heartbeat();
         agrees.into_iter().filter(|agrees| *agrees).count()
     }
 

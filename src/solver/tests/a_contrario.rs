@@ -4,7 +4,7 @@ use super::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// A crowd: as many tracks as this that follow a wrong one, each observation moved by so much.
+/// A group: as many tracks as this that follow a wrong one, each observation moved by so much.
 struct Crowd {
     tracks: usize,
     jitter_px: f64,
@@ -18,11 +18,11 @@ fn with_crowds(options: SceneOptions, crowds: &[Crowd]) -> (Input, Vec<bool>) {
     let mut truth = scene.truth.inlier.clone();
     let wrong: Vec<usize> = (0..truth.len()).filter(|&track| !truth[track]).collect();
     let observations = raw.x.len();
-    for (crowd, &followed) in crowds.iter().zip(&wrong) {
+    for (group, &followed) in crowds.iter().zip(&wrong) {
         // The sum of three has a standard deviation of a half.
-        let mut moved = || 2.0 * crowd.jitter_px * (0..3).map(|_| rng.random::<f64>() - 0.5).sum::<f64>();
+        let mut moved = || 2.0 * group.jitter_px * (0..3).map(|_| rng.random::<f64>() - 0.5).sum::<f64>();
         let of_followed: Vec<usize> = (0..observations).filter(|&k| raw.track[k] as usize == followed).collect();
-        for _ in 0..crowd.tracks {
+        for _ in 0..group.tracks {
             for &k in &of_followed {
                 raw.view.push(raw.view[k]);
                 raw.track.push(raw.track_count as u32);

@@ -1,0 +1,118 @@
+//! Several estimates of one focal length as one, and what they say of each other.
+//!
+//! The formal uncertainty of one adjustment knows noise and nothing else; distortion beyond the model, a wrong track or
+//! a motion that hardly turns moves estimates apart by more than they admit. They are fused by information weight, with a
+//! common misfit that makes their chi-square what it should be (DerSimonian & Laird 1986).
+
+use super::calibration::{Outcome, grade_of_sigma};
+use crate::domain::{Grade, Warning, WarningCode};
+
+/// Growth of sigma from which a warning says why, and the sigma from which anyone minds: a quarter of a METRIC one.
+const WORTH_A_WARNING: f64 = 3.0;
+const WORTH_MINDING: f64 = 0.005;
+
+/// Log focal length and its standard deviation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    pub log_focal: f64,
+    pub sigma: f64,
+}
+
+/// Several estimates as one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Fused {
+    pub log_focal: f64,
+    pub sigma: f64,
+    /// Standard deviation of what each has beside its own sigma.
+    pub misfit: f64,
+    /// Chi-square per degree of freedom without it.
+    pub chi_square: f64,
+}
+
+/// Fuses estimates that have this share of their observations in common, and so err alike by as much; `None` for fewer
+/// than two.
+pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
+    if estimates.len() < 2 {
+        return None;
+    }
+    let weights = |misfit: f64| -> Vec<f64> {
+        estimates.iter().map(|estimate| (estimate.sigma.powi(2) + misfit * misfit).recip()).collect()
+    };
+    // Variance of the weighted sum: what two have in common adds up.
+    let variance_of_sum = |weight: &[f64], misfit: f64| -> f64 {
+        let own = |(weight, estimate): (&f64, &Estimate)| {
+            let squared = estimate.sigma.powi(2);
+            weight * weight * (squared * (1.0 - shared) + misfit * misfit)
+        };
+        let in_common: f64 = weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.sigma).sum();
+        weight.iter().zip(estimates).map(own).sum::<f64>() + shared * in_common * in_common
+    };
+    let weight = weights(0.0);
+    let total: f64 = weight.iter().sum();
+    let mean = weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.log_focal).sum::<f64>() / total;
+    let statistic: f64 =
+        weight.iter().zip(estimates).map(|(weight, estimate)| weight * (estimate.log_focal - mean).powi(2)).sum();
+    // What it is expected to be: the number of estimates less one, where they have nothing in common.
+    let expected = (estimates.len() as f64 - variance_of_sum(&weight, 0.0) / total).max(f64::MIN_POSITIVE);
+    let scale = total - weight.iter().map(|weight| weight * weight).sum::<f64>() / total;
+    let misfit = ((statistic - expected).max(0.0) / scale).sqrt();
+    let weight = weights(misfit);
+    let total: f64 = weight.iter().sum();
+    let log_focal =
+        weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.log_focal).sum::<f64>() / total;
+    let sigma = variance_of_sum(&weight, misfit).sqrt() / total;
+    let usable = sigma.is_finite() && misfit.is_finite() && log_focal.is_finite();
+    usable.then_some(Fused { log_focal, sigma, misfit, chi_square: statistic / expected })
+}
+
+/// Raises the sigma of one block's calibration by what the estimates of all blocks have beside their own.
+pub fn admit_misfit(outcome: &mut Outcome, estimates: &[Estimate]) {
+    let fused = fuse(estimates, 0.0).zip(outcome.sigma_log_focal);
+    if let Some((fused, own)) = fused.filter(|_| outcome.grade != Grade::ProjectiveOnly) {
+        raise(outcome, own.hypot(fused.misfit), &fused, &format!("{} blocks of views", estimates.len()));
+    }
+}
+
+/// Raises the sigma of a calibration, grades it anew and says so.
+pub fn raise(outcome: &mut Outcome, sigma: f64, fused: &Fused, which: &str) {
+    let Some(own) = outcome.sigma_log_focal.replace(sigma) else { return };
+    outcome.grade = outcome.grade.worse(grade_of_sigma(Some(sigma)));
+    if sigma > WORTH_A_WARNING * own && sigma > WORTH_MINDING {
+        let detail = format!(
+            "{which} differ in focal length by {:.2} % (one standard deviation beside their own), chi-square {:.1} a \
+             degree of freedom; sigma was raised from {:.3} to {:.3} %",
+            100.0 * fused.misfit,
+            fused.chi_square,
+            100.0 * own,
+            100.0 * sigma
+        );
+        outcome.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn estimates(values: &[(f64, f64)]) -> Vec<Estimate> {
+        values.iter().map(|&(log_focal, sigma)| Estimate { log_focal, sigma }).collect()
+    }
+
+    #[test]
+    fn estimates_that_agree_fuse_by_information() {
+        let fused = fuse(&estimates(&[(0.0, 0.01), (0.005, 0.01), (-0.003, 0.01), (0.002, 0.01)]), 0.0).expect("four");
+        assert_eq!(fused.misfit, 0.0);
+        assert!((fused.sigma - 0.005).abs() < 1e-12, "{fused:?}");
+        assert_eq!(fuse(&estimates(&[(0.0, 0.01)]), 0.0), None);
+    }
+
+    #[test]
+    fn estimates_that_differ_by_more_than_they_admit_raise_sigma() {
+        let fused = fuse(&estimates(&[(0.1, 0.001), (-0.1, 0.001), (0.1, 0.001), (-0.1, 0.001)]), 0.0).expect("four");
+        // Four values of standard deviation .115: their mean is known to half of that.
+        assert!((fused.misfit - 0.1155).abs() < 1e-3 && (fused.sigma - 0.0577).abs() < 1e-3, "{fused:?}");
+        // One that knows nothing refutes nothing.
+        let fused = fuse(&estimates(&[(0.0, 0.001), (0.5, 0.6)]), 0.0).expect("two");
+        assert_eq!(fused.misfit, 0.0);
+    }
+}
