@@ -286,7 +286,12 @@ fn extend_projectively(
     // Of few tracks that depths have verified one more may agree by chance.
     let least = if by_depths { SURELY_ENOUGH } else { LEAST_INLIERS };
     let before = (keeps || by_depths).then(|| start.clone());
-    let extended = projective_growth::extend(problem, start, recorder)?;
+    let mut options = GrowthOptions::PROJECTIVE;
+    if keeps && start.views.len() < problem.observed_views().len() {
+        // The complete tracks of a whole input have their points: views that join give none and move none.
+        options = GrowthOptions { gives_points: false, adjust_growth: f64::INFINITY, final_rounds: 1, ..options };
+    }
+    let extended = projective_growth::extend(problem, start, &options, recorder)?;
     if extended.views.len() >= view_selection::LEAST_VIEWS && extended.tracks.len() >= least {
         attempt.projective = Some(extended);
         attempt.verified_by_image_points();

@@ -14,6 +14,8 @@ pub struct GrowthOptions {
     pub retry_growth: f64,
     /// Trials of a view by a component.
     pub most_trials: usize,
+    /// Whether a view that joins may give tracks their points, so that its tracks are triangulated at once.
+    pub gives_points: bool,
     /// Growth of the registered views after which all are adjusted. A geometric growth keeps the cost of all
     /// adjustments together at six times that of the last.
     pub adjust_growth: f64,
@@ -47,6 +49,7 @@ impl GrowthOptions {
         retry_growth: 1.2,
         // By the last it sees some 1.7 times the points of the first.
         most_trials: 4,
+        gives_points: true,
         adjust_growth: 1.2,
         most_views: usize::MAX,
         of_view: 100,

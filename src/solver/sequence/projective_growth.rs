@@ -28,6 +28,8 @@ const OPTIONS: GrowthOptions = GrowthOptions::PROJECTIVE;
 struct Growing<'a> {
     problem: &'a Problem<'a>,
     rng: ChaCha8Rng,
+    /// See [`GrowthOptions::gives_points`].
+    gives_points: bool,
     cameras: Vec<Option<Camera>>,
     points: Vec<Option<Point>>,
     /// Observations that agree with the point of each track.
@@ -42,13 +44,18 @@ struct Growing<'a> {
 ///
 /// # Errors
 /// [`Error::Stopped`].
-pub fn extend(problem: &Problem, start: Projective, recorder: &mut Recorder) -> Result<Projective, Error> {
-    let mut growing = Growing::new(problem, start.oriented());
+pub fn extend(
+    problem: &Problem,
+    start: Projective,
+    options: &GrowthOptions,
+    recorder: &mut Recorder,
+) -> Result<Projective, Error> {
+    let mut growing = Growing::new(problem, start.oriented(), options);
     growing.triangulate(None, recorder);
-    growth::grow(problem, &mut growing, &OPTIONS, &mut vec![Trial::default(); problem.views()], recorder)?;
-    for _ in 0..OPTIONS.final_rounds {
+    growth::grow(problem, &mut growing, options, &mut vec![Trial::default(); problem.views()], recorder)?;
+    for _ in 0..options.final_rounds {
         problem.stopped()?;
-        growing.adjust(OPTIONS.final_iterations, recorder);
+        growing.adjust(options.final_iterations, recorder);
         growing.triangulate(None, recorder);
         growing.drop_unsupported();
     }
@@ -57,12 +64,13 @@ pub fn extend(problem: &Problem, start: Projective, recorder: &mut Recorder) -> 
 }
 
 impl<'a> Growing<'a> {
-    fn new(problem: &'a Problem<'a>, start: Projective) -> Self {
+    fn new(problem: &'a Problem<'a>, start: Projective, options: &GrowthOptions) -> Self {
         let mut cameras = vec![None; problem.of_view.len()];
         start.views.iter().zip(&start.cameras).for_each(|(&view, camera)| cameras[view] = Some(*camera));
         Self {
             problem,
             rng: ChaCha8Rng::seed_from_u64(problem.settings.seed),
+            gives_points: options.gives_points,
             cameras,
             points: vec![None; problem.tracks()],
             support: vec![0; problem.tracks()],
@@ -227,7 +235,9 @@ impl Growth for Growing<'_> {
         let depths = points.iter().zip(&agrees).filter(|(_, agrees)| **agrees);
         let sign: f64 = depths.map(|(point, _)| ((camera.row(2) * point).x * point.w).signum()).sum();
         self.cameras[view] = Some(if sign < 0.0 { -camera } else { camera });
-        self.triangulate(Some(view), recorder);
+        if self.gives_points {
+            self.triangulate(Some(view), recorder);
+        }
         recorder.registered(self.registered());
         agrees.into_iter().filter(|agrees| *agrees).count()
     }
