@@ -86,9 +86,9 @@ impl Reconstruction {
             point: place(&split.point, split.track, &split.retained),
         };
         let splits = judged.splits.iter().map(split).collect();
-        if self.component_of_view.iter().any(|&part| part > 0) {
-            let part = |(point, part): (&Option<_>, &u32)| point.map_or(0, |_: [f64; 3]| *part);
-            judged.tracks.part = points.iter().zip(&self.component_of_track).map(part).collect();
+        if self.component_of_view.iter().any(|&component| component > 0) {
+            let of_point = |(point, component): (&Option<_>, &u32)| point.map_or(0, |_: [f64; 3]| *component);
+            judged.tracks.part = points.iter().zip(&self.component_of_track).map(of_point).collect();
         }
         judged.tracks.point = points;
         judged.tracks.network_weight = network_weights(problem, seed);

@@ -271,13 +271,12 @@ fn search(
     problem.stopped()?;
     let Some(consensus) = attempt.found.consensus.take() else { return Ok(attempt) };
     recorder.enter(Stage::Refine);
-    let spread = portfolio::spread(complete);
     if matches!(attempt.found.verified_by, VerifiedBy::Depths { .. }) {
         attempt.weights_by_depths = depths::weights(problem, &attempt.block, &consensus, &attempt.found.rigid);
         attempt.found.consensus = Some(consensus);
         return Ok(attempt);
     }
-    let (refined, ln_false_alarms) = grow::refine(complete, &consensus, spread, problem.stop);
+    let (mut refined, ln_false_alarms) = grow::refine(complete, &consensus, portfolio::spread(complete), problem.stop);
     recorder.standing.inliers = refined.inlier_count() as u32;
     recorder.standing.best_score = Some(refined.score);
     recorder.report(1.0);
@@ -300,7 +299,6 @@ fn search(
         attempt.found.consensus = Some(refined);
         return Ok(attempt);
     }
-    let mut refined = refined;
     if let Some((block, consensus)) = all_tracks::extend(problem, &attempt.block, &refined) {
         attempt.found.network_weights = carry_over(&attempt.found.network_weights, &attempt.block, &block);
         recorder.standing.inliers = consensus.inlier_count() as u32;

@@ -56,15 +56,17 @@ pub fn grow(
     loop {
         problem.stopped()?;
         let registered = growth.registered();
-        let next = next(growth, options, trials).filter(|_| registered < options.most_views);
-        // What a last adjustment moves may let a view fit that did not.
-        let is_due = registered as f64 >= options.adjust_growth * settled_at as f64;
-        if registered > settled_at && (is_due || next.is_none()) {
+        let is_due = registered > settled_at && registered as f64 >= options.adjust_growth * settled_at as f64;
+        let is_paused = is_due || registered >= options.most_views;
+        let Some((view, seen)) = (!is_paused).then(|| next(growth, options, trials)).flatten() else {
+            if registered == settled_at {
+                return Ok(());
+            }
+            // What a last adjustment moves may let a view fit that did not.
             growth.settle(recorder);
             settled_at = registered;
             continue;
-        }
-        let Some((view, seen)) = next else { return Ok(()) };
+        };
         let step = seen.len().div_ceil(options.most_points).max(1);
         let asked: Vec<usize> = seen.iter().copied().step_by(step).collect();
         let agreeing = growth.register(view, &asked, recorder);

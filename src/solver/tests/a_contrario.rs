@@ -10,15 +10,15 @@ struct Crowd {
     jitter_px: f64,
 }
 
-/// A scene with crowds about its first wrong tracks; and the truth of every track, those of the crowds last.
-fn with_crowds(options: SceneOptions, crowds: &[Crowd]) -> (Input, Vec<bool>) {
+/// A scene with groups about its first wrong tracks; and the truth of every track, those of the groups last.
+fn with_groups(options: SceneOptions, groups: &[Crowd]) -> (Input, Vec<bool>) {
     let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
     let (input, scene) = scene(options);
     let mut raw = input.to_raw();
     let mut truth = scene.truth.inlier.clone();
     let wrong: Vec<usize> = (0..truth.len()).filter(|&track| !truth[track]).collect();
     let observations = raw.x.len();
-    for (group, &followed) in crowds.iter().zip(&wrong) {
+    for (group, &followed) in groups.iter().zip(&wrong) {
         // The sum of three has a standard deviation of a half.
         let mut moved = || 2.0 * group.jitter_px * (0..3).map(|_| rng.random::<f64>() - 0.5).sum::<f64>();
         let of_followed: Vec<usize> = (0..observations).filter(|&k| raw.track[k] as usize == followed).collect();
@@ -44,7 +44,7 @@ fn by_geometry(input: &Input) -> Solution {
 fn a_crowd_about_a_wrong_track_outvotes_no_right_ones() {
     for (seed, jitter_px) in [(0, 0.1), (1, 0.3), (2, 1.0), (3, 3.0)] {
         let options = SceneOptions { tracks: 105, outliers: 30.0 / 105.0, seed, ..SceneOptions::default() };
-        let (input, truth) = with_crowds(options, &[Crowd { tracks: 100, jitter_px }]);
+        let (input, truth) = with_groups(options, &[Crowd { tracks: 100, jitter_px }]);
         let solution = by_geometry(&input);
         let f1 = agreement(&solution.tracks.inlier, &truth).f1;
         assert!(f1 > 0.97, "seed {seed}, jitter {jitter_px} px: F1 {f1}");
@@ -52,11 +52,11 @@ fn a_crowd_about_a_wrong_track_outvotes_no_right_ones() {
 }
 
 #[test]
-fn crowds_verify_no_more_than_a_track_each() {
+fn groups_verify_no_more_than_a_track_each() {
     for seed in 0..3 {
         let options = SceneOptions { tracks: 40, outliers: 1.0, seed, ..SceneOptions::default() };
-        let crowds = [Crowd { tracks: 60, jitter_px: 0.3 }, Crowd { tracks: 40, jitter_px: 1.0 }];
-        let (input, _) = with_crowds(options, &crowds);
+        let groups = [Crowd { tracks: 60, jitter_px: 0.3 }, Crowd { tracks: 40, jitter_px: 1.0 }];
+        let (input, _) = with_groups(options, &groups);
         let solution = by_geometry(&input);
         assert_eq!(solution.status, Status::NoReconstruction, "seed {seed}: {} inliers", solution.inlier_track_count());
         let reason = solution.warnings.iter().find(|warning| warning.code == WarningCode::FewInliers);
