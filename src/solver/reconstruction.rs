@@ -8,6 +8,7 @@ use super::attempt::Attempt;
 use super::baselines::Decided;
 use super::calibration::Outcome;
 use super::classification::{self, Geometry, Judged};
+use super::depths::STRONG_NOISE;
 use super::problem::{LEAST_RETAINED_SHARE, Problem, camera_groups};
 use super::recorder::Recorder;
 use super::sequence::{Extended, verified};
@@ -150,7 +151,9 @@ impl Reconstruction {
             problem.stop,
             &mut progress,
         );
-        if let Some(weights) = &seed.weights_by_depths {
+        // In what it was extended to, the noise may be no longer so strong that depths say more.
+        let depths_say_more = !by_points || self.noise > STRONG_NOISE;
+        if let Some(weights) = seed.weights_by_depths.as_ref().filter(|_| depths_say_more) {
             weights.judge(problem, &geometry, &mut judged);
         }
         if let Some(decided) = &seed.decided {

@@ -17,14 +17,20 @@ pub fn all() -> Vec<Condition> {
 }
 
 /// Right tracks that hold wrong observations: 10 views, 200 tracks, noise of .3 %; complete, and with one observation
-/// of each track deleted.
+/// of each track deleted; without depths and with them.
 fn grid() -> impl Iterator<Item = Condition> {
     let tracks = [0.0, 0.3, 0.5, 0.7].into_iter();
     let counts = tracks.flat_map(|outliers| [1, 2, 3].map(|count| (outliers, count)));
     counts.flat_map(|(outliers, wrong_observations)| {
-        [("complete", 0), ("deleted", 1)].map(|(name, deleted_observations)| {
-            let options =
-                SceneOptions { outliers, wrong_observations, deleted_observations, ..SceneOptions::default() };
+        let kinds = [("complete", 0, false), ("deleted", 1, false), ("depths", 0, true), ("depths, deleted", 1, true)];
+        kinds.map(|(name, deleted_observations, with_depths)| {
+            let options = SceneOptions {
+                outliers,
+                wrong_observations,
+                deleted_observations,
+                with_depths,
+                ..SceneOptions::default()
+            };
             Condition {
                 name: format!("{name} {outliers}, K {wrong_observations}"),
                 generator: Generator::Scene(options),

@@ -3,6 +3,7 @@
 use nalgebra::{Matrix4, Vector4};
 
 use crate::geometry::observation::Observation;
+use crate::geometry::triangulation::weighted_squared;
 use crate::geometry::{Camera, Point};
 use crate::solver::block::Block;
 use crate::solver::grow::{self, Consensus};
@@ -83,6 +84,12 @@ impl Projective {
     pub fn evidence(&self, outlier_density: f64) -> f64 {
         let unknowns = CAMERA_UNKNOWNS * self.views.len() + 3 * self.tracks.len() - GAUGE_UNKNOWNS;
         evidence(self.observations.len(), unknowns, self.noise, outlier_density)
+    }
+
+    /// Squared reprojection residual of each observation, weighted.
+    pub fn squared_residuals(&self) -> Vec<f64> {
+        let squared = |seen: &Observation| weighted_squared(&self.cameras[seen.view], &self.points[seen.point], seen);
+        self.observations.iter().map(squared).collect()
     }
 
     /// The same reconstruction in a frame in which "in front of the camera" means what it says: every camera and point

@@ -24,14 +24,17 @@ fn right_tracks_that_each_hold_wrong_observations_calibrate() {
 /// few of the views, and the others join them; what is wrong within right tracks is told apart.
 #[test]
 fn incomplete_tracks_with_depths_reach_every_view() {
-    for (deleted_observations, wrong_observations) in [(1, 0), (1, 1), (0, 3)] {
+    for (deleted_observations, wrong_observations) in [(1, 0), (1, 1), (0, 1), (0, 2), (0, 3)] {
         for seed in 0..2 {
             let options = SceneOptions { outliers: 0.3, with_depths: true, seed, ..SceneOptions::default() };
             let (input, scene) = scene(SceneOptions { deleted_observations, wrong_observations, ..options });
             let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+            let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
             let of_observations = agreement(&solution.observations.inlier, &scene.truth.observation_right);
-            println!("{deleted_observations} deleted, {wrong_observations} wrong, seed {seed}: {of_observations:?}");
-            assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}");
+            let case = format!("{deleted_observations} deleted, {wrong_observations} wrong, seed {seed}");
+            println!("{case}: F1 {f1}, {of_observations:?}");
+            assert_eq!(solution.grade, Some(Grade::Metric), "{case}");
+            assert!(f1 > 0.98, "{case}: F1 {f1}");
             assert!(solution.views.iter().all(|view| view.projection.is_some()), "seed {seed}: views are left out");
             assert!(of_observations.precision > 0.99 && of_observations.recall > 0.97, "seed {seed}");
         }
