@@ -112,8 +112,8 @@ fn prior_of(problem: &Problem, seed: &Attempt, model: &Model, camera: usize) -> 
 }
 
 /// Takes back the views of a component that see too few of its points to be held by them, and the whole component if
-/// too few are left.
-pub fn drop_unsupported(problem: &Problem, model: &mut Model, component: u32, recorder: &mut Recorder) {
+/// too few are left; these views.
+pub fn drop_unsupported(problem: &Problem, model: &mut Model, component: u32, recorder: &mut Recorder) -> Vec<usize> {
     let unsupported = |&view: &usize| {
         let kept = problem.of_view[view].iter().filter(|&&k| {
             let k = k as usize;
@@ -129,6 +129,7 @@ pub fn drop_unsupported(problem: &Problem, model: &mut Model, component: u32, re
     model.unregister(problem, &dropped);
     structure::triangulate_seen(problem, model, &dropped, recorder);
     recorder.registered(model.registered().len());
+    dropped
 }
 
 /// Numbers the components anew, the one with most views first; of equals the one found first.

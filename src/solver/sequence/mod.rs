@@ -329,7 +329,11 @@ fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Result<E
         adjust::all(problem, &mut model, recorder);
         structure::triangulate(problem, &mut model, recorder);
         for component in 0..=model.component_of.iter().copied().max().unwrap_or(components::FIRST) {
-            components::drop_unsupported(problem, &mut model, component, recorder);
+            let dropped = components::drop_unsupported(problem, &mut model, component, recorder);
+            // What joins in the last round would not be adjusted with the rest.
+            if !dropped.is_empty() && round + 1 < rounds {
+                register::join_again(problem, &mut model, component, &dropped, &mut trials, recorder)?;
+            }
         }
         recorder.report(within);
     }

@@ -15,7 +15,6 @@ use super::projective::{CAMERA_UNKNOWNS, Projective};
 use crate::geometry::bundle::{self, Loss};
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{Robust, Triangulator};
-use crate::geometry::triangulation::weighted_squared;
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::per_track::each_track;
 use crate::solver::problem::{Problem, VERIFIED};
@@ -52,12 +51,18 @@ pub fn extend(
 ) -> Result<Projective, Error> {
     let mut growing = Growing::new(problem, start.oriented(), options);
     growing.triangulate(None, recorder);
-    growth::grow(problem, &mut growing, options, &mut vec![Trial::default(); problem.views()], recorder)?;
-    for _ in 0..options.final_rounds {
+    let mut trials = vec![Trial::default(); problem.views()];
+    growth::grow(problem, &mut growing, options, &mut trials, recorder)?;
+    for round in 1..=options.final_rounds {
         problem.stopped()?;
         growing.adjust(options.final_iterations, recorder);
         growing.triangulate(None, recorder);
-        growing.drop_unsupported();
+        let dropped = growing.drop_unsupported();
+        // What stands without them may place them better; in the last round nothing would adjust them.
+        if !dropped.is_empty() && round < options.final_rounds {
+            dropped.iter().for_each(|&view| trials[view] = Trial::default());
+            growth::grow(problem, &mut growing, options, &mut trials, recorder)?;
+        }
     }
     problem.stopped()?;
     Ok(growing.finish())
@@ -172,23 +177,22 @@ impl<'a> Growing<'a> {
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise_of(&self, standing: &Projective) -> f64 {
-        let residual = |seen: &Observation| {
-            weighted_squared(&standing.cameras[seen.view], &standing.points[seen.point], seen).sqrt()
-        };
-        let norms: Vec<f64> = standing.observations.iter().map(residual).collect();
+        let norms: Vec<f64> = standing.squared_residuals().into_iter().map(f64::sqrt).collect();
         let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();
         let noise = adjust::core_noise(norms, unknowns);
         let (least, most) = grow::NOISE_BOUNDS;
         noise.clamp(least, (OPTIONS.noise_growth * self.start_noise).min(most))
     }
 
-    /// Takes back the views that too few points hold.
-    fn drop_unsupported(&mut self) {
+    /// Takes back the views that too few points hold; these views.
+    fn drop_unsupported(&mut self) -> Vec<usize> {
         let problem = self.problem;
+        let mut dropped = Vec::new();
         for view in self.views() {
             let of_view = problem.of_view[view].iter().map(|&k| k as usize);
             let held = of_view.filter(|&k| self.kept[k] && self.is_verified(problem.track_of(k))).count();
             if held < OPTIONS.least_agreeing {
+                dropped.push(view);
                 self.cameras[view] = None;
                 for &k in &problem.of_view[view] {
                     let k = k as usize;
@@ -198,6 +202,7 @@ impl<'a> Growing<'a> {
                 }
             }
         }
+        dropped
     }
 
     fn finish(self) -> Projective {

@@ -58,11 +58,32 @@ pub fn join(
 ) -> Result<(), Error> {
     // Views that another component could not take may fit this one.
     trials.iter_mut().for_each(|trial| trial.count = 0);
-    model.turn_to(problem, component);
-    let rng = ChaCha8Rng::seed_from_u64(problem.settings.seed);
-    let mut growth = Component { problem, model, component, rng };
+    let mut growth = Component::new(problem, model, component);
     growth.settle(recorder);
     growth::grow(problem, &mut growth, &OPTIONS, trials, recorder)
+}
+
+/// Joins views to a component again from which they were taken back: what stands without them may place them better.
+///
+/// # Errors
+/// [`Error::Stopped`].
+pub fn join_again(
+    problem: &Problem,
+    model: &mut Model,
+    component: u32,
+    dropped: &[usize],
+    trials: &mut [Trial],
+    recorder: &mut Recorder,
+) -> Result<(), Error> {
+    dropped.iter().for_each(|&view| trials[view] = Trial::default());
+    growth::grow(problem, &mut Component::new(problem, model, component), &OPTIONS, trials, recorder)
+}
+
+impl<'a> Component<'a> {
+    fn new(problem: &'a Problem<'a>, model: &'a mut Model, component: u32) -> Self {
+        model.turn_to(problem, component);
+        Self { problem, model, component, rng: ChaCha8Rng::seed_from_u64(problem.settings.seed) }
+    }
 }
 
 /// The views that were not registered, with what came of the last trial of each.
