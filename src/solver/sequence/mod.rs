@@ -48,7 +48,7 @@ const ENOUGH_REGISTERED: f64 = 0.5;
 /// tenth more of them sigma falls by a twentieth.
 const WORTH_EXTENDING: f64 = 1.1;
 
-/// Subsets that are tried before the whole is searched at length.
+/// Subsets that are tried before blocks are searched at length.
 const FIRST_SUBSETS: usize = 3;
 
 /// How a block is searched that is to be extended, and how where many are tried.
@@ -74,54 +74,37 @@ pub enum Ended {
 
 /// Solves and extends block after block until one carries a reconstruction of most of the views.
 ///
-/// In order of cost: the whole input as one block, where its tracks are complete; blocks that are calibrated and
-/// extended metrically; blocks and small subsets of them that are extended projectively and calibrated then; at last
-/// the whole again, with everything that a search can try.
+/// In order of cost, where the blocks are the whole input if its tracks are complete: blocks that are searched quickly,
+/// calibrated and extended metrically; what they found and some small subsets of them, extended projectively and
+/// calibrated then; the blocks again, with everything that a search can try; at last the other subsets.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
-    let whole = view_selection::whole(problem.input, &problem.ranges);
-    let sets = match &whole {
-        Some(views) => vec![views.clone()],
-        None => view_selection::blocks(problem),
-    };
+    let blocks = Blocks::of(problem);
+    // Depths decide in the first round or take all of them.
+    let is_quick = !(blocks.is_whole && problem.input.has_depths());
     // A calibrated reconstruction that another might be better than.
     let mut metric: Option<Box<Extended>> = None;
-    // Depths decide in the first round or take all of them.
-    let is_quick = !problem.input.has_depths();
-    let by_calibration = if let Some(views) = &whole {
-        let attempt = of_whole(problem, views, is_quick, recorder)?;
-        if attempt.is_trusted() || attempt.is_beyond_image_points() {
-            return finished(problem, attempt, recorder);
-        }
-        match attempt.is_calibrated() {
-            true => metric_of(problem, attempt, recorder)?,
-            false => Ended::Block(Some(Box::new(attempt))),
-        }
-    } else {
-        by_calibrated_blocks(problem, &sets, recorder)?
-    };
-    let first = match by_calibration {
-        Ended::Extended(extended) if extended.is_settled(problem) => return Ok(Ended::Extended(extended)),
-        Ended::Extended(extended) if extended.is_calibrated(problem) => {
+    let first = match blocks.by_calibration(problem, is_quick, recorder)? {
+        Searched::Done(ended) => return Ok(ended),
+        Searched::Open(Ended::Extended(extended)) if extended.is_calibrated(problem) => {
             metric = Some(extended);
             None
         }
-        Ended::Extended(extended) => Some(extended.seed),
-        Ended::Block(attempt) => attempt.map(|attempt| *attempt),
+        Searched::Open(Ended::Extended(extended)) => Some(extended.seed),
+        Searched::Open(Ended::Block(attempt)) => attempt.map(|attempt| *attempt),
     };
-    let subsets = view_selection::subsets(&sets);
-    // Where the whole can still be searched at length, that comes before the rest of its subsets.
-    let (cheap, rest) = subsets.split_at(subsets.len().min(if whole.is_some() { FIRST_SUBSETS } else { usize::MAX }));
+    let subsets = view_selection::subsets(&blocks.views);
+    let (cheap, rest) = subsets.split_at(subsets.len().min(FIRST_SUBSETS));
     let mut best = by_projective_extension(problem, first, cheap, recorder)?;
-    if let Some(views) = whole.filter(|_| is_quick && !stands(&best)) {
-        let attempt = of_whole(problem, &views, false, recorder)?;
-        if attempt.projective.is_some() {
-            return finished(problem, attempt, recorder);
-        }
-        let others = by_projective_extension(problem, None, rest, recorder)?;
-        best = if stands(&others) { others } else { Some(attempt) };
+    if is_quick && metric.is_none() && !stands(&best) {
+        let first = match blocks.by_calibration(problem, false, recorder)? {
+            Searched::Done(ended) => return Ok(ended),
+            Searched::Open(Ended::Extended(extended)) => return Ok(Ended::Extended(extended)),
+            Searched::Open(Ended::Block(attempt)) => attempt.map(|attempt| *attempt),
+        };
+        best = by_projective_extension(problem, first, rest, recorder)?;
     }
     let Some(best) = best else { return Ok(metric.map_or(Ended::Block(None), Ended::Extended)) };
     if metric.is_some() && !best.is_trusted() {
@@ -132,6 +115,49 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
         (_, Some(metric)) => Ended::Extended(metric),
         (found, None) => found,
     })
+}
+
+/// Sets of views that a reconstruction may begin with, best first.
+struct Blocks {
+    views: Vec<Vec<usize>>,
+    /// Whether there is one, which is the whole input, for its tracks are complete.
+    is_whole: bool,
+}
+
+/// What came of a search of the blocks.
+enum Searched {
+    /// Nothing else needs to be tried.
+    Done(Ended),
+    Open(Ended),
+}
+
+impl Blocks {
+    fn of(problem: &Problem) -> Self {
+        match view_selection::whole(problem.input, &problem.ranges) {
+            Some(whole) => Self { views: vec![whole], is_whole: true },
+            None => Self { views: view_selection::blocks(problem), is_whole: false },
+        }
+    }
+
+    /// Calibrates the blocks and extends them from there.
+    fn by_calibration(&self, problem: &Problem, is_quick: bool, recorder: &mut Recorder) -> Result<Searched, Error> {
+        let ended = if self.is_whole {
+            let attempt = of_whole(problem, &self.views[0], is_quick, recorder)?;
+            // What a search has found that tries everything is the last word.
+            let is_last = !is_quick && !problem.input.has_depths() && attempt.projective.is_some();
+            if is_last || attempt.is_trusted() || attempt.is_beyond_image_points() {
+                return Ok(Searched::Done(finished(problem, attempt, recorder)?));
+            }
+            match attempt.is_calibrated() {
+                true => metric_of(problem, attempt, recorder)?,
+                false => Ended::Block(Some(Box::new(attempt))),
+            }
+        } else {
+            by_calibrated_blocks(problem, &self.views, Effort { is_seed: true, is_quick }, recorder)?
+        };
+        let is_settled = matches!(&ended, Ended::Extended(extended) if extended.is_settled(problem));
+        Ok(if is_settled { Searched::Done(ended) } else { Searched::Open(ended) })
+    }
 }
 
 /// Whether there is a reconstruction.
@@ -151,14 +177,19 @@ fn of_whole(problem: &Problem, views: &[usize], is_quick: bool, recorder: &mut R
 }
 
 /// Blocks that are calibrated and extended from there.
-fn by_calibrated_blocks(problem: &Problem, candidates: &[Vec<usize>], recorder: &mut Recorder) -> Result<Ended, Error> {
+fn by_calibrated_blocks(
+    problem: &Problem,
+    candidates: &[Vec<usize>],
+    effort: Effort,
+    recorder: &mut Recorder,
+) -> Result<Ended, Error> {
     let mut best: Option<Extended> = None;
     let mut unextended: Option<Attempt> = None;
     recorder.expect_extension();
     for (k, views) in candidates.iter().enumerate() {
         problem.stopped()?;
         recorder.begin_block(k, candidates.len());
-        let attempt = attempt::solve_block(problem, problem.block(views), SEED, None, recorder)?;
+        let attempt = attempt::solve_block(problem, problem.block(views), effort, None, recorder)?;
         if attempt.is_good() {
             let extended = extend(problem, attempt, recorder)?;
             if !extended.stands() {
