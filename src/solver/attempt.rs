@@ -235,7 +235,7 @@ pub fn calibrate(
     recorder.enter(Stage::Calibrate);
     attempt.calibration = Some(match attempt.found.verified_by {
         VerifiedBy::ImagePoints => calibrate_projective(problem, projective, prior)?,
-        VerifiedBy::Depths { focal } => depths::calibrate(&attempt.block.complete, consensus, focal, problem.stop),
+        VerifiedBy::Depths { focal } => depths::calibrate(problem, &attempt.block.complete, consensus, focal),
     });
     if let Some(intrinsics) = attempt.calibration.as_ref().and_then(Outcome::intrinsics) {
         recorder.standing.focal_px = Some(intrinsics.focal * problem.scale_px);
@@ -383,6 +383,7 @@ fn calibrate_projective(
         focal_per_view: problem.has_own_focals(),
         group_of: &group_of,
         focal_priors: &focal_priors,
+        options: &problem.calibration,
     };
     let outcomes = calibration::calibrate(&to_calibrate, problem.scale_px, problem.stop)?;
     Ok(Outcome::worst(outcomes).unwrap_or_else(|| Outcome::refused(Vec::new())))

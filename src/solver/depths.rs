@@ -4,14 +4,14 @@
 //! constraints over. What stands on fewer tracks than image points can verify is never graded METRIC.
 
 use super::block::Block;
-use super::calibration::{CHEIRALITY_LIMIT, Outcome, few_inliers, grade_of_sigma};
+use super::calibration::{Outcome, few_inliers};
 use super::classification::{Geometry, Judged};
 use super::grow::{Consensus, LEAST_INLIERS, NOISE_BOUNDS};
 use super::portfolio;
 use super::problem::Problem;
 use super::search::Seed;
 use super::search::rigid::{Rigid, Search};
-use crate::domain::{Grade, StopToken, Warning, WarningCode};
+use crate::domain::{Grade, Warning, WarningCode};
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
@@ -65,11 +65,11 @@ pub fn consensus(block: &CompleteBlock, rigid: &Rigid, noise: f64) -> Consensus 
 /// projective reconstructions has nothing to start from.
 ///
 /// * `focal`: that of the consensus's cameras, `K [R|t]`
-pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop: &StopToken) -> Outcome {
+pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus, focal: f64) -> Outcome {
     let inliers = consensus.inliers();
     let mut outcome = Outcome::refused(Vec::new());
     if inliers.len() < LEAST_INLIERS {
-        outcome.warnings.push(few_inliers(inliers.len()));
+        outcome.warnings.push(few_inliers(inliers.len(), &problem.calibration));
     }
     let refused = |mut outcome: Outcome, code: WarningCode, detail: String| {
         outcome.warnings.push(Warning::new(code, detail));
@@ -89,7 +89,7 @@ pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop:
         relative_tolerance: ADJUSTMENT_TOLERANCE,
         ..Options::default()
     };
-    let report = metric::adjust(&mut found, &observations, model, &[IntrinsicsPrior::NONE], &options, stop);
+    let report = metric::adjust(&mut found, &observations, model, &[IntrinsicsPrior::NONE], &options, problem.stop);
     let noise = consensus.noise.max((report.cost / freedom as f64).sqrt());
     let sigma = Information::new(&found, &observations)
         .and_then(|information| {
@@ -104,12 +104,12 @@ pub fn calibrate(block: &CompleteBlock, consensus: &Consensus, focal: f64, stop:
         let detail = format!("image points alone give a focal length that differs by a factor of {:.2}", strayed.exp());
         return refused(outcome, WarningCode::ModelMismatch, detail);
     }
-    if cheirality < CHEIRALITY_LIMIT {
+    if cheirality < problem.calibration.grades.least_in_front {
         let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - cheirality));
         return refused(outcome, WarningCode::Cheirality, detail);
     }
     outcome.plane_at_infinity = plane_at_infinity(&consensus.cameras, &found.cameras());
-    outcome.grade = grade_of_sigma(sigma).worse(Grade::Weak);
+    outcome.grade = problem.calibration.grades.grade(sigma).worse(Grade::Weak);
     outcome.sigma_log_focal = sigma;
     outcome.cheirality = cheirality;
     outcome.metric = Some(found);

@@ -4,7 +4,7 @@
 //! a motion that hardly turns moves estimates apart by more than they admit. They are fused by information weight, with a
 //! common misfit that makes their chi-square what it should be (DerSimonian & Laird 1986).
 
-use super::calibration::{Outcome, grade_of_sigma};
+use super::calibration::{GradeOptions, Outcome};
 use crate::domain::{Grade, Warning, WarningCode};
 
 /// Growth of sigma from which a warning says why, and the sigma from which anyone minds: a quarter of a METRIC one.
@@ -66,17 +66,17 @@ pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
 }
 
 /// Raises the sigma of one block's calibration by what the estimates of all blocks have beside their own.
-pub fn admit_misfit(outcome: &mut Outcome, estimates: &[Estimate]) {
+pub fn admit_misfit(outcome: &mut Outcome, estimates: &[Estimate], grades: &GradeOptions) {
     let fused = fuse(estimates, 0.0).zip(outcome.sigma_log_focal);
     if let Some((fused, own)) = fused.filter(|_| outcome.grade != Grade::ProjectiveOnly) {
-        raise(outcome, own.hypot(fused.misfit), &fused, &format!("{} blocks of views", estimates.len()));
+        raise(outcome, own.hypot(fused.misfit), &fused, &format!("{} blocks of views", estimates.len()), grades);
     }
 }
 
 /// Raises the sigma of a calibration, grades it anew and says so.
-pub fn raise(outcome: &mut Outcome, sigma: f64, fused: &Fused, which: &str) {
+pub fn raise(outcome: &mut Outcome, sigma: f64, fused: &Fused, which: &str, grades: &GradeOptions) {
     let Some(own) = outcome.sigma_log_focal.replace(sigma) else { return };
-    outcome.grade = outcome.grade.worse(grade_of_sigma(Some(sigma)));
+    outcome.grade = outcome.grade.worse(grades.grade(Some(sigma)));
     if sigma > WORTH_A_WARNING * own && sigma > WORTH_MINDING {
         let detail = format!(
             "{which} differ in focal length by {:.2} % (one standard deviation beside their own), chi-square {:.1} a \

@@ -6,6 +6,7 @@ use std::collections::BTreeSet;
 use nalgebra::Vector2;
 
 use super::block::{self, Block};
+use super::calibration::CalibrationOptions;
 use super::normalization::normalization;
 use super::view_selection::complete_views;
 use super::{Error, classification};
@@ -48,6 +49,7 @@ pub struct Problem<'a> {
     pub least_share: f64,
     /// Density of a wrong coordinate; see [`classification::Geometry::outlier_density`].
     pub outlier_density: f64,
+    pub calibration: CalibrationOptions,
     /// What is to be said of the input.
     pub warnings: Vec<Warning>,
     pub threads: Threads,
@@ -89,6 +91,7 @@ impl<'a> Problem<'a> {
             of_view,
             camera_of,
             cameras,
+            calibration: CalibrationOptions::DEFAULT,
             warnings,
             threads,
             stop,

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
 use crate::geometry::bundle::metric::Parameter;
-use crate::solver::calibration::default_intrinsics_prior;
+use crate::solver::calibration::CalibrationOptions;
 use crate::synthetic::Scene;
 use crate::synthetic::scene::IMAGE_SIDE_PX;
 
@@ -36,7 +36,7 @@ pub fn sigmas(scene: &Scene) -> Option<Vec<f64>> {
         reduced -= &coupling * of_point.try_inverse()? * coupling.transpose();
     }
     reduced /= noise * noise;
-    let prior = default_intrinsics_prior(1.0, None, f64::from(IMAGE_SIDE_PX));
+    let prior = CalibrationOptions::DEFAULT.lenses.prior(1.0, None, f64::from(IMAGE_SIDE_PX));
     for view in 0..views {
         for (k, parameter) in INTRINSICS.into_iter().enumerate() {
             reduced[(VIEW * view + k, VIEW * view + k)] += prior.information[parameter as usize];

@@ -3,29 +3,12 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::Problem;
-use super::fit::{Fit, MISFIT_DEVIATIONS};
+use super::fit::Fit;
+use super::options::{CalibrationOptions, CriticalOptions};
 use crate::domain::{StopToken, Warning, WarningCode};
 use crate::geometry::bundle::critical::{Rotating, Translating};
 use crate::geometry::critical;
 use crate::geometry::homography;
-
-/// Median homography residual, in units of the noise, below which the scene counts as planar or the camera as only
-/// rotating. Measured: 1.1 to 1.8 for those, above 11 for general motion.
-const HOMOGRAPHY_LIMIT: f64 = 3.0;
-/// Median distance from the epipolar lines of a translation, in units of the noise, above which the motion is none and
-/// nothing is adjusted. A translation has about .7; the epipoles are only a start.
-const EPIPOLAR_LIMIT: f64 = 3.0;
-/// Loss of fit, in standard deviations of its statistic, from which a rotation is refuted in favour of a plane, and a
-/// plane in favour of depth. Up to [`MISFIT_DEVIATIONS`] a rotation stands, and between the two the data do not decide.
-/// Before a plane the projective model is singular and fits 3 to 5 deviations better than it should; depth, even with
-/// the short baselines of forward motion, has 50 and more.
-const PLANE_DEVIATIONS: f64 = 8.0;
-/// Spread of the camera's positions off the line that fits them best, relative to that along it, up to which the
-/// motion is along one line; noise leaves a few hundredths.
-const STRAIGHT: f64 = 0.2;
-/// Distance of the point that a straight motion heads for from the image centre, in image sides, up to which it is
-/// along the optical axis.
-const NEAR_AXIS: f64 = 0.1;
 
 /// What carries no calibration, as far as the views show.
 pub(super) struct Critical {
@@ -42,16 +25,18 @@ pub(super) struct Critical {
 pub(super) fn find(problem: &Problem, fit: &Fit, scale_px: f64, stop: &StopToken) -> Critical {
     let (observations, views) = (problem.observations, problem.cameras.len());
     let points = problem.points.len();
-    let translation = critical::fit_translation(observations, views, points, fit.noise, EPIPOLAR_LIMIT, stop)
-        .filter(|found| !fit.refutes(&Fit::new(found.cost, found.unknowns, problem)));
-    let flat = homography::median_residual(observations, views, fit.noise, HOMOGRAPHY_LIMIT)
+    let CalibrationOptions { critical: options, fit: fits, .. } = problem.options;
+    let translation = critical::fit_translation(observations, views, points, fit.noise, options.epipolar_limit, stop)
+        .filter(|found| !fit.refutes(&Fit::new(found.cost, found.unknowns, problem), fits));
+    let flat = homography::median_residual(observations, views, fit.noise, options.homography_limit)
         .and_then(|residual| without_parallax(problem, fit, residual, translation.is_some(), scale_px, stop));
     if let Some(flat) = flat {
         return Critical { warnings: vec![flat], translation: None };
     }
     let Some(translation) = translation else { return Critical { warnings: Vec::new(), translation: None } };
     let detail = "a camera that does not turn leaves the focal length free";
-    let warnings = vec![pure_translation(&translation.model), Warning::new(WarningCode::UnobservableFocal, detail)];
+    let warnings =
+        vec![pure_translation(&translation.model, options), Warning::new(WarningCode::UnobservableFocal, detail)];
     Critical { warnings, translation: Some(translation.model) }
 }
 
@@ -80,8 +65,9 @@ fn without_parallax(
     let by_plane = Fit::new(plane.cost, plane.unknowns, problem);
     let by_turning = Fit::new(turning.cost, turning.unknowns, problem);
     let deviations = by_plane.loss_deviations(by_turning.cost, by_turning.freedom);
-    let turns = deviations < MISFIT_DEVIATIONS;
-    if translates && !turns && fit.loss_deviations(by_plane.cost, by_plane.freedom) > PLANE_DEVIATIONS {
+    let turns = deviations < problem.options.fit.misfit_deviations;
+    let plane_deviations = problem.options.critical.plane_deviations;
+    if translates && !turns && fit.loss_deviations(by_plane.cost, by_plane.freedom) > plane_deviations {
         return None;
     }
     let worse = format!("a camera that only turns fits worse than homographies by {deviations:.1} standard deviations");
@@ -95,7 +81,7 @@ fn without_parallax(
             WarningCode::PlanarOrRotation,
             "with a focal length a view, a planar scene and a camera that only turns are not told apart".to_owned(),
         ),
-        (false, _) if deviations < PLANE_DEVIATIONS => (
+        (false, _) if deviations < plane_deviations => (
             WarningCode::PlanarOrRotation,
             format!("a planar scene is more likely than a camera that only turns; {worse}"),
         ),
@@ -111,9 +97,9 @@ fn rotation_in_words(turning: &Rotating, scale_px: f64) -> String {
     )
 }
 
-fn pure_translation(translation: &Translating) -> Warning {
-    let direction = match direction(translation) {
-        Some(heading) if heading.z != 0.0 && heading.xy().norm() <= NEAR_AXIS * heading.z.abs() => {
+fn pure_translation(translation: &Translating, options: &CriticalOptions) -> Warning {
+    let direction = match direction(translation, options.straight) {
+        Some(heading) if heading.z != 0.0 && heading.xy().norm() <= options.near_axis * heading.z.abs() => {
             ", along the optical axis"
         }
         Some(_) => ", along a line",
@@ -127,7 +113,9 @@ fn pure_translation(translation: &Translating) -> Warning {
 }
 
 /// Direction of the line along which the camera moved, times `K`; `None` where it left the line.
-fn direction(translation: &Translating) -> Option<Vector3<f64>> {
+///
+/// * `straight`: see [`CriticalOptions`]
+fn direction(translation: &Translating, straight: f64) -> Option<Vector3<f64>> {
     let positions = &translation.translations;
     let mean = positions.iter().sum::<Vector3<f64>>() / positions.len().max(1) as f64;
     let mut spread = Matrix3::zeros();
@@ -140,6 +128,6 @@ fn direction(translation: &Translating) -> Option<Vector3<f64>> {
     let eigen = spread.symmetric_eigen();
     let along = eigen.eigenvalues.imax();
     let off: f64 = (0..3).filter(|&k| k != along).map(|k| eigen.eigenvalues[k].max(0.0)).sum();
-    let straight = off <= STRAIGHT * STRAIGHT * eigen.eigenvalues[along];
-    straight.then(|| eigen.eigenvectors.column(along).into_owned())
+    let is_straight = off <= straight * straight * eigen.eigenvalues[along];
+    is_straight.then(|| eigen.eigenvectors.column(along).into_owned())
 }

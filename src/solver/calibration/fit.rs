@@ -1,12 +1,8 @@
 //! How well a model fits, and whether one that fits worse is refuted.
 
-use super::{LEAST_NOISE, Problem};
+use super::Problem;
+use super::options::FitOptions;
 use crate::geometry::bundle::metric::IntrinsicsModel;
-
-/// Degrees of freedom from which the posterior noise is used; it is then known to 13 %.
-const ENOUGH_FREEDOM: usize = 30;
-/// Loss of fit of a model with fewer unknowns, in standard deviations of its F statistic, that chance does not explain.
-pub(super) const MISFIT_DEVIATIONS: f64 = 4.0;
 
 /// The fit of a model that others are compared with.
 #[derive(Debug, Clone, Copy)]
@@ -22,8 +18,9 @@ impl Fit {
     /// * `unknowns`: those that the observations could determine, the gauge taken off
     pub fn new(cost: f64, unknowns: usize, problem: &Problem) -> Self {
         let freedom = (2 * problem.observations.len()).saturating_sub(unknowns);
-        let posterior = posterior_noise(cost, freedom);
-        let noise = if freedom < ENOUGH_FREEDOM { posterior.max(problem.noise) } else { posterior };
+        let options = &problem.options.fit;
+        let posterior = options.posterior_noise(cost, freedom);
+        let noise = if freedom < options.enough_freedom { posterior.max(problem.noise) } else { posterior };
         Self { cost, freedom, noise }
     }
 
@@ -62,13 +59,8 @@ impl Fit {
     }
 
     /// Whether a special case of this model fits worse than chance explains.
-    pub fn refutes(&self, other: &Fit) -> bool {
+    pub fn refutes(&self, other: &Fit, options: &FitOptions) -> bool {
         let loss = self.loss_deviations(other.cost, other.freedom);
-        loss > MISFIT_DEVIATIONS || loss.is_nan()
+        loss > options.misfit_deviations || loss.is_nan()
     }
-}
-
-/// Standard deviation of a coordinate that goes with a sum of squares over so many degrees of freedom.
-pub(super) fn posterior_noise(cost: f64, freedom: usize) -> f64 {
-    (cost / freedom.max(1) as f64).sqrt().max(LEAST_NOISE)
 }

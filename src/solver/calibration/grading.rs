@@ -2,22 +2,14 @@
 
 use super::fit::Fit;
 use super::misfit::Comparison;
-use super::models::{CHI_SQUARE_GAIN, Candidate, Choice};
+use super::models::{Candidate, Choice};
+use super::options::{CalibrationOptions, GradeOptions};
 use super::search::Minimum;
-use super::verdict::{CHEIRALITY_LIMIT, UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO};
+use super::verdict::Verdict;
 use super::view_focals::{self, Differing};
 use super::{Outcome, Problem, Stopped};
 use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
-
-/// Difference in log focal from which another minimum is another calibration.
-const OTHER_CALIBRATION: f64 = 0.02;
-/// Standard deviation of a coordinate of the principal point, in image sides and from the observations alone, above
-/// which they do not determine it: no lens is worse centred than that.
-const PRINCIPAL_POINT_UNOBSERVABLE_ABOVE: f64 = 0.05;
-/// Difference between a prior and what the observations say, in standard deviations of the difference, that one of the
-/// two does not survive.
-const PRIOR_CONTRADICTED: f64 = 3.0;
 
 /// Chooses among the minima and models, and says what the choice is worth for each camera group.
 ///
@@ -29,19 +21,20 @@ pub(super) fn grade(
     minima: Vec<Minimum>,
     mut warnings: Vec<Warning>,
 ) -> Result<Vec<Outcome>, Stopped> {
+    let CalibrationOptions { fit: fits, lenses, grades, .. } = choice.problem.options;
     let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
     Stopped::check(choice.stop)?;
     let comparison = Comparison::new(&best, fit, choice);
     let sigmas = choice.sigmas(&best, comparison.inflation);
     let has_own_focals = best.minimum.reconstruction.has_own_focals();
-    let mut focals = view_focals::of(&best, &sigmas);
-    let determined: Vec<bool> = focals.iter().map(view_focals::is_determined).collect();
-    let rival = rival(&best, &others, |view| determined[view]);
-    let differing = (comparison.is_misfit() && !has_own_focals)
+    let mut focals = view_focals::of(&best, &sigmas, lenses);
+    let determined: Vec<bool> = focals.iter().map(|view| view_focals::is_determined(view, grades)).collect();
+    let rival = rival(choice.problem, &best, &others, |view| determined[view]);
+    let differing = (comparison.is_misfit(fits) && !has_own_focals)
         .then(|| view_focals::differing(&best.minimum.reconstruction, &best.fit, choice))
         .flatten();
     let grade_group = |group: usize| -> Outcome {
-        let mut verdict = Verdict::new(warnings.clone());
+        let mut verdict = Verdict::new(choice.problem.options, warnings.clone());
         // What the ratios of the others' deviations are taken of, and the one that is reported.
         let (of_focal, mut sigma) = match has_own_focals {
             true => {
@@ -50,7 +43,7 @@ pub(super) fn grade(
             }
             false => {
                 let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
-                let mut sigma = of_focal.filter(|sigma| *sigma < UNOBSERVABLE_ABOVE);
+                let mut sigma = of_focal.filter(|sigma| *sigma < grades.unobservable_above);
                 if let Some(focal_prior) = choice.problem.focal_priors[group] {
                     let of_data = of_data(&best, group, comparison.inflation);
                     weigh_prior(&mut verdict, &mut sigma, choice, &best, group, of_data, focal_prior);
@@ -60,7 +53,7 @@ pub(super) fn grade(
             }
         };
         if let Some((rival, shift)) = rival {
-            let worst = if shift > WEAK_UP_TO { Grade::ProjectiveOnly } else { Grade::Weak };
+            let worst = if shift > grades.weak_up_to { Grade::ProjectiveOnly } else { Grade::Weak };
             verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, choice.scale_px));
         }
         verdict.judge_fit(&comparison, &best.model.name(), choice.scale_px);
@@ -79,7 +72,7 @@ pub(super) fn grade(
         }
         verdict.judge_cheirality(best.minimum.cheirality);
         if verdict.grade != Grade::ProjectiveOnly && !has_own_focals {
-            verdict.warnings.extend(principal_point(&best, group, comparison.inflation, choice.scale_px));
+            verdict.warnings.extend(principal_point(&best, group, comparison.inflation, choice));
         }
         let ratio = |sigma: Option<f64>| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite());
         Outcome {
@@ -97,7 +90,7 @@ pub(super) fn grade(
         }
     };
     let mut outcomes: Vec<Outcome> = (0..choice.problem.groups()).map(grade_group).collect();
-    focals.iter_mut().for_each(view_focals::forget_undetermined);
+    focals.iter_mut().for_each(|view| view_focals::forget_undetermined(view, grades));
     let mut metric = best.minimum.reconstruction;
     if let ([lens], Some(mean)) = (metric.intrinsics.as_mut_slice(), view_focals::mean(&focals)) {
         lens.focal = mean;
@@ -123,11 +116,12 @@ fn chosen(
     if best.model == simplest {
         return Ok((best, minima));
     }
+    let least_in_front = problem.options.grades.least_in_front;
     for minimum in &mut minima {
         Stopped::check(choice.stop)?;
-        *minimum = minimum.adjusted(problem.observations, best.model, &best.priors, choice.stop);
+        *minimum = minimum.adjusted(problem, best.model, &best.priors, choice.stop);
         // A model that is wrong may rank the minima wrongly.
-        if minimum.cost < best.minimum.cost && minimum.cheirality >= CHEIRALITY_LIMIT.min(best.minimum.cheirality) {
+        if minimum.cost < best.minimum.cost && minimum.cheirality >= least_in_front.min(best.minimum.cheirality) {
             let better = Candidate::new(minimum.clone(), best.model, best.priors.clone(), problem);
             *minimum = std::mem::replace(&mut best, better).minimum;
         }
@@ -138,19 +132,26 @@ fn chosen(
 /// The cheapest minimum whose points are in front of the cameras, if the data do not tell it from the cheapest.
 fn best_in_front(minima: &[Minimum], problem: &Problem, fit: &Fit) -> usize {
     let unit = fit.noise.max(problem.noise).powi(2);
-    let near = |minimum: &Minimum| minimum.cost - minima[0].cost < CHI_SQUARE_GAIN * unit;
-    minima.iter().position(|minimum| minimum.cheirality >= CHEIRALITY_LIMIT && near(minimum)).unwrap_or(0)
+    let CalibrationOptions { models, grades: GradeOptions { least_in_front, .. }, .. } = problem.options;
+    let near = |minimum: &Minimum| minimum.cost - minima[0].cost < models.significant_gain_of_two * unit;
+    minima.iter().position(|minimum| minimum.cheirality >= *least_in_front && near(minimum)).unwrap_or(0)
 }
 
 /// Another calibration that explains the data about as well, and how far its log focal length is from the best one's.
 ///
 /// * `counts`: which views do where they have focal lengths of their own
-fn rival<'a>(best: &Candidate, others: &'a [Minimum], counts: impl Fn(usize) -> bool) -> Option<(&'a Minimum, f64)> {
+fn rival<'a>(
+    problem: &Problem,
+    best: &Candidate,
+    others: &'a [Minimum],
+    counts: impl Fn(usize) -> bool,
+) -> Option<(&'a Minimum, f64)> {
+    let CalibrationOptions { models, grades, .. } = problem.options;
     let mut apart = others.iter().map(|other| (other, other.apart(&best.minimum, &counts)));
     apart.find(|(other, apart)| {
-        *apart > OTHER_CALIBRATION
-            && other.cheirality >= CHEIRALITY_LIMIT.min(best.minimum.cheirality)
-            && other.cost - best.minimum.cost < CHI_SQUARE_GAIN * best.fit.noise.powi(2)
+        *apart > grades.other_calibration
+            && other.cheirality >= grades.least_in_front.min(best.minimum.cheirality)
+            && other.cost - best.minimum.cost < models.significant_gain_of_two * best.fit.noise.powi(2)
     })
 }
 
@@ -183,7 +184,7 @@ fn weigh_prior(
     focal_prior: FocalPrior,
 ) {
     // It lifts the grade by one step at most.
-    if of_data.is_none_or(|of_data| of_data > WEAK_UP_TO) {
+    if of_data.is_none_or(|of_data| of_data > choice.problem.options.grades.weak_up_to) {
         verdict.grade = verdict.grade.worse(Grade::Weak);
     }
     let (Some(of_data), Some(optimum)) = (of_data, best.optimum(best.model, &without_focal(best, group))) else {
@@ -193,7 +194,7 @@ fn weigh_prior(
     let intrinsics = &best.minimum.reconstruction.intrinsics[group];
     let difference = best.priors[group].deviation(Parameter::LogFocal, intrinsics) + shift;
     let deviations = difference.abs() / of_data.hypot(focal_prior.sigma_log);
-    if deviations > PRIOR_CONTRADICTED {
+    if deviations > choice.problem.options.grades.prior_contradicted {
         let detail = format!(
             "the tracks alone give a focal length of {:.1} px, {deviations:.1} standard deviations from the {:.1} px \
              known beforehand",
@@ -206,7 +207,7 @@ fn weigh_prior(
 }
 
 /// Says so where the observations do not determine the principal point.
-fn principal_point(best: &Candidate, group: usize, inflation: f64, scale_px: f64) -> Option<Warning> {
+fn principal_point(best: &Candidate, group: usize, inflation: f64, choice: &Choice) -> Option<Warning> {
     let mut alone = best.priors.clone();
     alone[group] = alone[group].forgetting(Parameter::PrincipalX).forgetting(Parameter::PrincipalY);
     let model = best.model.with(Extension::PrincipalPoint);
@@ -215,8 +216,8 @@ fn principal_point(best: &Candidate, group: usize, inflation: f64, scale_px: f64
         .into_iter()
         .filter_map(|(name, parameter)| {
             match best.sigma(group, parameter, model, &alone).map(|sigma| sigma * inflation) {
-                Some(sigma) if sigma <= PRINCIPAL_POINT_UNOBSERVABLE_ABOVE => None,
-                Some(sigma) => Some(format!("{name} only to {:.0} px", sigma * scale_px)),
+                Some(sigma) if sigma <= choice.problem.options.grades.principal_point_unobservable_above => None,
+                Some(sigma) => Some(format!("{name} only to {:.0} px", sigma * choice.scale_px)),
                 None => Some(format!("{name} not at all")),
             }
         })

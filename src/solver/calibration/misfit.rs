@@ -2,16 +2,13 @@
 
 use nalgebra::Vector4;
 
-use super::fit::{Fit, MISFIT_DEVIATIONS, posterior_noise};
+use super::fit::Fit;
 use super::models::{Candidate, Choice};
-use super::verdict::RMS_RATIO_LIMIT;
+use super::options::FitOptions;
 use super::{Problem, observed_points};
 use crate::geometry::bundle::metric::{self, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::observation::Observation;
-
-/// Iterations from the metric reconstruction to the minima that are compared; both are near.
-const ITERATIONS: usize = 10;
 
 /// A metric reconstruction, compared with the projective one.
 #[derive(Debug, Clone, Copy)]
@@ -33,19 +30,20 @@ pub(super) struct Comparison {
 
 impl Comparison {
     /// Whether the metric model is refuted.
-    pub fn is_misfit(&self) -> bool {
-        self.ratio > RMS_RATIO_LIMIT && self.is_significant
+    pub fn is_misfit(&self, options: &FitOptions) -> bool {
+        self.ratio > options.rms_ratio_limit && self.is_significant
     }
 
     /// * `fit`: of the projective reconstruction
     pub fn new(best: &Candidate, fit: &Fit, choice: &Choice) -> Self {
         let (projective, metric) = undistorted_fits(best, choice).unwrap_or((*fit, best.fit));
+        let options = &choice.problem.options.fit;
         let root = projective.statistic(metric.cost, metric.freedom).max(1.0).sqrt();
         Self {
-            ratio: posterior_noise(best.fit.cost, best.fit.freedom) / fit.noise,
+            ratio: options.posterior_noise(best.fit.cost, best.fit.freedom) / fit.noise,
             noise: fit.noise,
-            is_significant: fit.loss_deviations(best.fit.cost, best.fit.freedom) > MISFIT_DEVIATIONS,
-            inflation: if projective.refutes(&metric) { root } else { 1.0 },
+            is_significant: fit.loss_deviations(best.fit.cost, best.fit.freedom) > options.misfit_deviations,
+            inflation: if projective.refutes(&metric, options) { root } else { 1.0 },
         }
     }
 }
@@ -60,7 +58,7 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
     }
     let observations = undistorted(&best.minimum.reconstruction, choice.problem.observations);
     let problem = &Problem { observations: &observations, ..*choice.problem };
-    let options = Options::squared(ITERATIONS);
+    let options = Options::squared(problem.options.fit.undistorted_iterations);
 
     let mut pinhole = best.minimum.reconstruction.clone();
     for lens in &mut pinhole.intrinsics {

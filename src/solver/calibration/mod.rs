@@ -8,6 +8,7 @@ mod fit;
 mod grading;
 mod misfit;
 mod models;
+mod options;
 mod search;
 #[cfg(test)]
 mod tests;
@@ -24,18 +25,7 @@ use crate::geometry::metric::plane_at_infinity;
 use crate::geometry::observation::Observation;
 
 use fit::Fit;
-pub use models::default_intrinsics_prior;
-pub use verdict::{CHEIRALITY_LIMIT, grade_of_sigma};
-pub use view_focals::LEAST_DETERMINED;
-
-/// Iterations that bring the projective reconstruction to its minimum, to which the metric one is compared; the
-/// caller has adjusted it before.
-const PROJECTIVE_ITERATIONS: usize = 10;
-/// Least noise that is used, in image sides: a hundredth of a pixel in a 1000-pixel image. Exact input would make
-/// every deviation significant and every focal length certain, by its rounding alone.
-const LEAST_NOISE: f64 = 1e-5;
-/// Inlier tracks below which geometry cannot verify a consensus.
-const LEAST_INLIERS: usize = 8;
+pub use options::{CalibrationOptions, GradeOptions};
 
 /// A projective reconstruction to calibrate; inliers only.
 #[derive(Debug, Clone, Copy)]
@@ -54,6 +44,7 @@ pub struct Problem<'a> {
     pub focal_priors: &'a [Option<FocalPrior>],
     /// Whether every view has a focal length of its own.
     pub focal_per_view: bool,
+    pub options: &'a CalibrationOptions,
 }
 
 impl Problem<'_> {
@@ -80,10 +71,10 @@ pub struct ViewFocal {
 
 impl ViewFocal {
     /// Whether this focal length, which other observations led to, may be reported as that of the view.
-    pub fn stands_as(&self, focal: f64) -> bool {
+    pub fn stands_as(&self, focal: f64, options: &CalibrationOptions) -> bool {
         self.sigma_log.is_some()
-            && verdict::is_plausible(focal)
-            && (focal / self.focal).ln().abs() <= verdict::WEAK_UP_TO
+            && options.lenses.is_plausible(focal)
+            && (focal / self.focal).ln().abs() <= options.grades.weak_up_to
     }
 }
 
@@ -182,11 +173,11 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<V
     let nothing = vec![None; problem.groups()];
     // What is known of one focal length says nothing of a zoom.
     let focal_priors = if problem.focal_per_view { &nothing } else { problem.focal_priors };
-    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_priors, ..*problem };
+    let problem = &Problem { noise: problem.noise.max(problem.options.fit.least_noise), focal_priors, ..*problem };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
-    if inliers < LEAST_INLIERS {
-        warnings.push(few_inliers(inliers));
+    if inliers < problem.options.fit.least_inliers {
+        warnings.push(few_inliers(inliers, problem.options));
     }
     let (cameras, points, fit) = projectively_adjusted(problem, inliers, stop);
     Stopped::check(stop)?;
@@ -236,11 +227,11 @@ pub fn from_metric(
     Stopped::check(stop)?;
     let nothing = vec![None; problem.groups()];
     let focal_priors = if metric.has_own_focals() { &nothing } else { problem.focal_priors };
-    let problem = &Problem { noise: problem.noise.max(LEAST_NOISE), focal_priors, ..*problem };
+    let problem = &Problem { noise: problem.noise.max(problem.options.fit.least_noise), focal_priors, ..*problem };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
-    if inliers < LEAST_INLIERS {
-        warnings.push(few_inliers(inliers));
+    if inliers < problem.options.fit.least_inliers {
+        warnings.push(few_inliers(inliers, problem.options));
     }
     let (_, _, fit) = projectively_adjusted(problem, inliers, stop);
     Stopped::check(stop)?;
@@ -275,7 +266,7 @@ pub fn focal_alone(
     let start = search::Minimum { reconstruction: metric.clone(), cost: f64::INFINITY, cheirality: 0.0 };
     let priors = vec![prior.forgetting(Parameter::LogFocal)];
     let model = IntrinsicsModel::focal(metric.has_own_focals());
-    let minimum = start.adjusted(problem.observations, model, &priors, stop);
+    let minimum = start.adjusted(problem, model, &priors, stop);
     let candidate = models::Candidate::new(minimum, model, priors, problem);
     let sigma = candidate.sigma(0, Parameter::LogFocal, model, &candidate.priors)?;
     let log_focal = candidate.minimum.log_focal();
@@ -283,9 +274,9 @@ pub fn focal_alone(
 }
 
 /// What is said of fewer inliers than image points alone can verify.
-pub fn few_inliers(inliers: usize) -> Warning {
-    let detail =
-        format!("{inliers} inlier tracks cannot be verified by image points alone, which takes {LEAST_INLIERS}");
+pub fn few_inliers(inliers: usize, options: &CalibrationOptions) -> Warning {
+    let least = options.fit.least_inliers;
+    let detail = format!("{inliers} inlier tracks cannot be verified by image points alone, which takes {least}");
     Warning::new(WarningCode::FewInliers, detail)
 }
 
@@ -301,7 +292,7 @@ fn projectively_adjusted(
     stop: &StopToken,
 ) -> (Vec<Matrix3x4<f64>>, Vec<Vector4<f64>>, Fit) {
     let (mut cameras, mut points) = (problem.cameras.to_vec(), problem.points.to_vec());
-    let options = Options::squared(PROJECTIVE_ITERATIONS);
+    let options = Options::squared(problem.options.fit.projective_iterations);
     let report = projective::adjust(&mut cameras, &mut points, problem.observations, &options, stop);
     (cameras, points, Fit::projective(report.cost, problem, inliers, 0))
 }

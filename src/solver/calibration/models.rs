@@ -1,92 +1,14 @@
 //! Which intrinsics the data carry, and what not knowing that costs the focal length.
 
 use super::fit::Fit;
+use super::options::{CalibrationOptions, GradeOptions};
 use super::search::Minimum;
-use super::verdict::METRIC_BELOW;
 use super::{Problem, Stopped};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
     self, Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter,
 };
-
-/// How far the principal point of a lens may be expected from the image centre, one standard deviation of each
-/// coordinate in image sides: lenses are centred to a few hundredths, and only cropping takes it farther.
-const PRINCIPAL_POINT_SIGMA: f64 = 0.05;
-/// The same of the log aspect: digitised video has pixels up to a tenth off square.
-const LOG_ASPECT_SIGMA: f64 = 0.1;
-/// The same of `k1`: phones and cameras have a few hundredths, wide lenses -.3.
-const RADIAL_SIGMA: f64 = 0.2;
-/// The same of `k2` and `k3`: calibrations on boards give them the size of `k1`, with either sign.
-const LATER_RADIAL_SIGMA: f64 = 0.2;
-/// The same of `p1` and `p2`: calibrations on boards give some thousandths, and what a decentred lens mostly does is
-/// displace the principal point.
-const TANGENTIAL_SIGMA: f64 = 0.005;
-/// Probability, before any observation, that a camera needs the extension. Principal points and distortion are as often
-/// in order (rectified, rendered) as not; pixels are square in all but old video. That of a second radial term is where
-/// there is a first; few lenses need a third, or are so far off centre that it shows.
-fn probability(extension: Extension) -> f64 {
-    match extension {
-        Extension::PrincipalPoint | Extension::RadialK1 | Extension::RadialK2 => 0.5,
-        Extension::RadialK3 | Extension::Tangential => 0.2,
-        Extension::Aspect => 0.05,
-    }
-}
-
-/// Gain in chi-square at which an extension of so many groups is taken: the .999 quantile for its degrees of freedom,
-/// by Wilson & Hilferty (1931) where there are many.
-fn significant_gain(extension: Extension, groups: usize) -> f64 {
-    match groups * extension.parameters().len() {
-        1 => 10.8,
-        2 => CHI_SQUARE_GAIN,
-        many => {
-            let variance = 2.0 / (9.0 * many as f64);
-            many as f64 * (1.0 - variance + 3.09 * variance.sqrt()).powi(3)
-        }
-    }
-}
-
-/// The .999 quantile of chi-square for two degrees of freedom.
-pub(super) const CHI_SQUARE_GAIN: f64 = 13.8;
-/// Share of the significant gain that a linearisation must foretell for an adjustment to be tried: it is off where the
-/// richer model is far.
-const WORTH_A_TRIAL: f64 = 0.5;
-/// Share of the noise that a prior was weighed by, below which what is left makes it worth weighing anew. A prior that
-/// is weighed by a misfit's noise is too strong: with a third radial term of .4, k1 to k3 were up to 7.4 sigma off.
-const SAME_NOISE: f64 = 0.9;
-/// How often it is: the noise falls by the misfit at once, and by little after.
-const NOISE_ROUNDS: usize = 4;
-/// How much a richer model may raise the standard deviation of the log focal length and still be taken: beyond, it
-/// fits by giving up what was to be found.
-const SIGMA_INFLATION: f64 = 3.0;
-/// Shift of the log focal length between models, in standard deviations, that speaks of a wrong model.
-const MODEL_SHIFT: f64 = 3.0;
-/// Weight of a model below which it has no say in whether the focal length is observable.
-const NEGLIGIBLE: f64 = 1e-3;
-/// Where the profile of the cost is sampled, in standard deviations to either side.
-const PROFILE_DEVIATIONS: f64 = 3.0;
-/// Iterations there. Few-view scenes with hardly any turning and chains of 40 views converge within nine, to 1e-13 of
-/// the cost (a test).
-const PROFILE_ITERATIONS: usize = 15;
-/// Largest step of the profile in log focal: a factor of 1.35.
-const PROFILE_LONGEST: f64 = 0.3;
-
-/// What is known of the intrinsics beforehand, at this noise: what lenses are like, and what the caller says.
-pub fn default_intrinsics_prior(noise: f64, focal: Option<FocalPrior>, scale_px: f64) -> IntrinsicsPrior {
-    let lenses = IntrinsicsPrior::NONE
-        .knowing(Parameter::PrincipalX, 0.0, PRINCIPAL_POINT_SIGMA, noise)
-        .knowing(Parameter::PrincipalY, 0.0, PRINCIPAL_POINT_SIGMA, noise)
-        .knowing(Parameter::LogAspect, 0.0, LOG_ASPECT_SIGMA, noise)
-        .knowing(Parameter::RadialK1, 0.0, RADIAL_SIGMA, noise)
-        .knowing(Parameter::RadialK2, 0.0, LATER_RADIAL_SIGMA, noise)
-        .knowing(Parameter::RadialK3, 0.0, LATER_RADIAL_SIGMA, noise)
-        .knowing(Parameter::TangentialP1, 0.0, TANGENTIAL_SIGMA, noise)
-        .knowing(Parameter::TangentialP2, 0.0, TANGENTIAL_SIGMA, noise);
-    match focal {
-        Some(prior) => lenses.knowing(Parameter::LogFocal, (prior.focal_px / scale_px).ln(), prior.sigma_log, noise),
-        None => lenses,
-    }
-}
 
 /// A metric reconstruction under one model, with what the observations say of the intrinsics there.
 pub(super) struct Candidate {
@@ -155,8 +77,13 @@ pub(super) struct Choice<'a> {
 impl Choice<'_> {
     /// What is known of the intrinsics of each group beforehand, weighed by this noise.
     pub fn priors(&self, noise: f64) -> Vec<IntrinsicsPrior> {
-        let of_group = |focal: &Option<FocalPrior>| default_intrinsics_prior(noise, *focal, self.scale_px);
+        let of_group = |focal: &Option<FocalPrior>| self.problem.options.lenses.prior(noise, *focal, self.scale_px);
         self.problem.focal_priors.iter().map(of_group).collect()
+    }
+
+    fn significant_gain(&self, extension: Extension) -> f64 {
+        let freedom = self.problem.groups() * extension.parameters().len();
+        self.problem.options.models.significant_gain(freedom)
     }
 
     /// The minimum of a model from here, with the prior weighed by the noise that this leaves.
@@ -165,12 +92,13 @@ impl Choice<'_> {
     fn adjusted(&self, from: &Minimum, model: IntrinsicsModel, mut noise: f64) -> Candidate {
         let adjusted = |from: &Minimum, noise: f64| {
             let priors = self.priors(noise);
-            let minimum = from.adjusted(self.problem.observations, model, &priors, self.stop);
+            let minimum = from.adjusted(self.problem, model, &priors, self.stop);
             Candidate::new(minimum, model, priors, self.problem)
         };
         let mut found = adjusted(from, noise);
-        for _ in 1..NOISE_ROUNDS {
-            if found.fit.noise >= SAME_NOISE * noise {
+        let options = &self.problem.options.models;
+        for _ in 1..options.noise_rounds {
+            if found.fit.noise >= options.same_noise * noise {
                 break;
             }
             noise = found.fit.noise;
@@ -206,8 +134,8 @@ impl Choice<'_> {
             let there = best.optimum(best.model.with(extension), &best.priors)?;
             let left = (best.fit.cost + there.delta_cost).max(0.0) / best.fit.cost.max(f64::MIN_POSITIVE);
             let gain = (here.delta_cost - there.delta_cost) / (best.fit.noise.powi(2) * left.max(f64::EPSILON));
-            let needed = significant_gain(extension, self.problem.groups());
-            (gain > WORTH_A_TRIAL * needed).then_some((extension, gain - needed))
+            let needed = self.significant_gain(extension);
+            (gain > self.problem.options.models.worth_a_trial * needed).then_some((extension, gain - needed))
         };
         let mut found: Vec<(Extension, f64)> = Extension::ALL
             .into_iter()
@@ -225,11 +153,12 @@ impl Choice<'_> {
         // What the simpler model costs with the same prior.
         let simple = best.fit.cost + best.optimum(best.model, &richer.priors)?.delta_cost;
         let gain = (simple - richer.minimum.cost) / richer.fit.noise.powi(2);
-        if gain <= significant_gain(extension, self.problem.groups()) {
+        if gain <= self.significant_gain(extension) {
             return None;
         }
+        let CalibrationOptions { models, grades: GradeOptions { metric_below, .. }, .. } = self.problem.options;
         let observable = |group: usize| match (best.sigma_of_focal(group), richer.sigma_of_focal(group)) {
-            (Some(simple), Some(rich)) => rich <= METRIC_BELOW.max(SIGMA_INFLATION * simple),
+            (Some(simple), Some(rich)) => rich <= metric_below.max(models.sigma_inflation * simple),
             (Some(_), None) => false,
             // What neither model determines of one group says nothing of the others.
             (None, rich) => rich.is_some() || self.problem.groups() > 1,
@@ -238,7 +167,7 @@ impl Choice<'_> {
             return Some(richer);
         }
         let shift = (richer.minimum.log_focal() - best.minimum.log_focal()).abs();
-        if let Some(sigma) = best.sigma_log_focal().filter(|sigma| shift > MODEL_SHIFT * sigma) {
+        if let Some(sigma) = best.sigma_log_focal().filter(|sigma| shift > models.model_shift * sigma) {
             warnings.push(self.not_taken(best, &richer, extension, shift / sigma));
         }
         None
@@ -260,7 +189,7 @@ impl Choice<'_> {
     ///
     /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
     /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights from
-    /// Laplace's approximation of each model's evidence under [`default_intrinsics_prior`]. An extension that the data
+    /// Laplace's approximation of each model's evidence under [`LensOptions`]. An extension that the data
     /// can neither confirm nor refute thus costs what it would move.
     ///
     /// * `inflation`: factor on all of them, for what the calibration does not fit
@@ -293,7 +222,7 @@ impl Choice<'_> {
                 let (variance, shift) = of_models(k);
                 match variance {
                     Some(variance) => squared += weight * (variance * unit + (shift - here).powi(2)),
-                    None if weight > NEGLIGIBLE => return None,
+                    None if weight > self.problem.options.models.negligible => return None,
                     None => {}
                 }
             }
@@ -317,14 +246,15 @@ impl Choice<'_> {
 
     /// Logarithm of prior probability times evidence, up to what all models share.
     fn log_weight(&self, best: &Candidate, model: IntrinsicsModel, here: &Optimum, there: &Optimum) -> f64 {
+        let lenses = &self.problem.options.lenses;
         let of = |extension: Extension| match model.contains(extension) {
             true => {
                 let of_group = |prior: &IntrinsicsPrior| -> f64 {
                     extension.parameters().iter().map(|parameter| prior.information[*parameter as usize].ln()).sum()
                 };
-                probability(extension).ln() + 0.5 * best.priors.iter().map(of_group).sum::<f64>()
+                lenses.probability(extension).ln() + 0.5 * best.priors.iter().map(of_group).sum::<f64>()
             }
-            false if model.admits(extension) => (1.0 - probability(extension)).ln(),
+            false if model.admits(extension) => (1.0 - lenses.probability(extension)).ln(),
             false => 0.0,
         };
         let prior: f64 = Extension::ALL.into_iter().map(of).sum();
@@ -334,11 +264,11 @@ impl Choice<'_> {
     /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
     ///
     /// The focal length, of several groups all in their ratios, is held three standard deviations away while everything
-    /// else adjusts; the chi-square should
-    /// rise by nine. Near critical motions the linearisation is optimistic: it is taken where the noise has moved the
-    /// scene.
+    /// else adjusts; the chi-square should rise by nine. Near critical motions the linearisation is optimistic: it is taken
+    /// where the noise has moved the scene.
     fn profiled(&self, sigma: f64, best: &Candidate) -> f64 {
-        let shift = (PROFILE_DEVIATIONS * sigma).min(PROFILE_LONGEST);
+        let options = &self.problem.options.models;
+        let shift = (options.profile_deviations * sigma).min(options.profile_longest);
         if shift <= 0.0 {
             return sigma;
         }
@@ -346,7 +276,7 @@ impl Choice<'_> {
         let side = |shift: f64| {
             let mut moved = best.minimum.reconstruction.clone();
             moved.scale_focals(shift.exp());
-            let options = Options::squared(PROFILE_ITERATIONS);
+            let options = Options::squared(options.profile_iterations);
             let report =
                 metric::adjust(&mut moved, self.problem.observations, model, &best.priors, &options, self.stop);
             let of_group = |(prior, intrinsics): (&IntrinsicsPrior, &Intrinsics)| {
@@ -391,21 +321,22 @@ mod tests {
         let banded = [10, 20, 40]
             .into_iter()
             .flat_map(|views| (0..3).map(move |seed| (format!("{views} views, seed {seed}"), banded(seed, views))));
+        let options = CalibrationOptions::DEFAULT.models;
         let mut longest = 0;
         for (case, scene) in turning.chain(banded) {
             let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
             let cameras = scene.cameras();
             let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
-            let (priors, stop) = (vec![default_intrinsics_prior(NOISE, None, 1000.0)], StopToken::default());
+            let (priors, stop) = (vec![problem.options.lenses.prior(NOISE, None, 1000.0)], StopToken::default());
             let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
             let reconstruction = Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone());
             let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 1.0 };
             for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
-                let minimum = start.adjusted(&scene.observations, model, &priors, &stop);
+                let minimum = start.adjusted(&problem, model, &priors, &stop);
                 let best = Candidate::new(minimum, model, priors.clone(), &problem);
                 let sigma = best.sigma_log_focal().expect("observable");
                 let profiled = choice.profiled(sigma, &best);
-                let shift = (PROFILE_DEVIATIONS * sigma).min(PROFILE_LONGEST);
+                let shift = (options.profile_deviations * sigma).min(options.profile_longest);
                 let mut rise = |shift: f64| {
                     let mut moved = best.minimum.reconstruction.clone();
                     moved.scale_focals(shift.exp());
@@ -421,6 +352,6 @@ mod tests {
             }
         }
         println!("{longest} iterations at most");
-        assert!(longest < PROFILE_ITERATIONS, "{longest} iterations");
+        assert!(longest < options.profile_iterations, "{longest} iterations");
     }
 }

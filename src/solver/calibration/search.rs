@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::fit::Fit;
-use super::verdict::WEAK_UP_TO;
+use super::options::SearchOptions;
 use super::{Problem, Stopped};
 use crate::domain::StopToken;
 use crate::geometry::bundle::Options;
@@ -16,42 +16,6 @@ use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::root_mean_square;
 use crate::geometry::triangulation;
-
-/// The scan of focal lengths: 40 in the range, from the 4 widest views.
-const SCAN_FOCALS: usize = 40;
-const SCAN_VIEWS: usize = 4;
-/// Refined starts kept, and the iterations of their refinement; it converges in 10 to 20.
-const REFINED_STARTS: usize = 4;
-const REFINE_ITERATIONS: usize = 40;
-/// Best entries of the scan that are refined.
-const REFINED_FROM_SCAN: usize = 3;
-/// Starts that are adjusted. With the refined ones alone a third of the scenes at .3 % noise was within 1 % of the
-/// focal length, with these .92.
-const STARTS: usize = 8;
-/// Windows of the scan, in image sides, whose best entry is a start as it stands: they keep starts apart that the
-/// refinement would draw into one minimum.
-const WINDOW_RANGE: (f64, f64) = (0.45, 3.2);
-/// Half width of a window in log focal; neighbours touch.
-const WINDOW_HALF_WIDTH: f64 = 0.15;
-/// Difference in log focal below which refined starts are the same.
-const SAME_START: f64 = 0.02;
-/// Iterations and tolerance of the first adjustment, which only has to rank the starts.
-const FIRST_ITERATIONS: usize = 12;
-const FIRST_TOLERANCE: f64 = 1e-4;
-/// Starts that are adjusted to convergence, and the iterations allowed.
-const CONVERGED: usize = 3;
-const FINAL_ITERATIONS: usize = 60;
-const FINAL_TOLERANCE: f64 = 1e-9;
-/// Share of the cheapest minimum's cost that a start must get down to at its pace to be adjusted to convergence: a
-/// rival is within a few per cent, and one stuck at thirty times the cost took half the time of a calibration.
-const HOPELESS: f64 = 4.0;
-/// Adjusted starts this near in log focal, and within this share in cost, are the same minimum.
-const SAME_MINIMUM: f64 = 0.01;
-const SAME_COST: f64 = 0.1;
-/// Focal lengths that the refinement may end at, in image sides; beyond, it ran away along a null direction.
-const PLAUSIBLE_FOCAL: std::ops::Range<f64> = 0.05..50.0;
-/// Points that take part in the search; more tell no minimum from another that these do not.
-const SEARCH_POINTS: usize = 150;
 
 /// A converged metric reconstruction.
 #[derive(Debug, Clone)]
@@ -95,7 +59,9 @@ impl Minimum {
             .own_focals(&information.optimum(model, &vec![IntrinsicsPrior::NONE; problem.groups()]))
             .into_iter();
         let determined: Vec<bool> = sigmas
-            .map(|(variance, _)| variance.is_some_and(|variance| variance.sqrt() * noise <= WEAK_UP_TO))
+            .map(|(variance, _)| {
+                variance.is_some_and(|variance| variance.sqrt() * noise <= problem.options.grades.weak_up_to)
+            })
             .collect();
         if determined.contains(&true) { determined } else { vec![true; views] }
     }
@@ -103,42 +69,28 @@ impl Minimum {
     /// Adjusts to convergence from here with this model.
     pub fn adjusted(
         &self,
-        observations: &[Observation],
+        problem: &Problem,
         model: IntrinsicsModel,
         priors: &[IntrinsicsPrior],
         stop: &StopToken,
     ) -> Self {
-        self.adjusted_by(&converge(), observations, model, priors, stop)
+        self.adjusted_by(&problem.options.search.last(), problem, model, priors, stop)
     }
 
     fn adjusted_by(
         &self,
         options: &Options,
-        observations: &[Observation],
+        problem: &Problem,
         model: IntrinsicsModel,
         priors: &[IntrinsicsPrior],
         stop: &StopToken,
     ) -> Self {
         let mut reconstruction = self.reconstruction.clone();
-        let report = metric::adjust(&mut reconstruction, observations, model, priors, options, stop);
-        let cheirality = cheirality(&reconstruction, observations);
+        let report = metric::adjust(&mut reconstruction, problem.observations, model, priors, options, stop);
+        let cheirality = cheirality(&reconstruction, problem.observations);
         Self { reconstruction, cost: report.cost, cheirality }
     }
 }
-
-fn first() -> Options {
-    Options { max_iterations: FIRST_ITERATIONS, relative_tolerance: FIRST_TOLERANCE, ..Options::default() }
-}
-
-pub(super) fn converge() -> Options {
-    Options { max_iterations: FINAL_ITERATIONS, relative_tolerance: FINAL_TOLERANCE, ..Options::default() }
-}
-
-/// Factors on the focal length of a reconstruction from which other minima are looked for: a forward motion has them
-/// half or twice as far.
-pub(super) const OTHER_FOCALS: [f64; 4] = [0.5, 0.75, 1.33, 2.0];
-/// Iterations in which poses and points follow a focal length that is held.
-const FOLLOWING: usize = 12;
 
 /// Minima from a reconstruction that is metric already: its own, and those that other focal lengths lead to, which its
 /// poses and points have followed, for freed at once these would only go back to where they were; cheapest first.
@@ -153,7 +105,8 @@ pub(super) fn minima_near(
 ) -> Result<Vec<Minimum>, Stopped> {
     let model = IntrinsicsModel::focal(metric.has_own_focals());
     let mut found = Vec::new();
-    for factor in std::iter::once(1.0).chain(OTHER_FOCALS) {
+    let options = &problem.options.search;
+    for factor in std::iter::once(1.0).chain(options.other_focals) {
         Stopped::check(stop)?;
         let mut reconstruction = metric.clone();
         reconstruction
@@ -162,11 +115,11 @@ pub(super) fn minima_near(
             .for_each(|intrinsics| *intrinsics = Intrinsics::from_focal(intrinsics.focal));
         reconstruction.scale_focals(factor);
         if factor != 1.0 {
-            let options = Options { max_iterations: FOLLOWING, ..Options::default() };
-            metric::adjust(&mut reconstruction, problem.observations, IntrinsicsModel::FIXED, priors, &options, stop);
+            let following = Options { max_iterations: options.following_iterations, ..Options::default() };
+            metric::adjust(&mut reconstruction, problem.observations, IntrinsicsModel::FIXED, priors, &following, stop);
         }
         let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
-        found.push(start.adjusted(problem.observations, model, priors, stop));
+        found.push(start.adjusted(problem, model, priors, stop));
         heartbeat();
     }
     Stopped::check(stop)?;
@@ -200,7 +153,7 @@ fn minima_of_groups(
     for minimum in &mut found {
         Stopped::check(stop)?;
         minimum.reconstruction = minimum.reconstruction.clone().in_groups(problem.group_of, problem.groups());
-        *minimum = minimum.adjusted(problem.observations, IntrinsicsModel::FOCAL, priors, stop);
+        *minimum = minimum.adjusted(problem, IntrinsicsModel::FOCAL, priors, stop);
     }
     Ok(distinct(found, problem))
 }
@@ -208,7 +161,8 @@ fn minima_of_groups(
 /// With a focal length a view: from the quadrics that allow for that, and from what one for all leads to.
 fn minima_per_view(frame: &CanonicalFrame, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
     let (model, priors) = (IntrinsicsModel::FOCAL_PER_VIEW, [IntrinsicsPrior::NONE]);
-    let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(STARTS);
+    let options = &problem.options.search;
+    let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(options.starts);
     let mut starts: Vec<Reconstruction> =
         quadrics.filter_map(|(daq, _)| upgrade(frame, &daq, true, problem.observations)).collect();
     let of_one = minima_of_one(frame, problem, &priors, stop)?;
@@ -217,13 +171,13 @@ fn minima_per_view(frame: &CanonicalFrame, problem: &Problem, stop: &StopToken) 
     for reconstruction in starts {
         Stopped::check(stop)?;
         let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
-        found.push(start.adjusted_by(&first(), problem.observations, model, &priors, stop));
+        found.push(start.adjusted_by(&options.first(), problem, model, &priors, stop));
     }
     let mut found = distinct(found, problem);
-    found.truncate(CONVERGED);
+    found.truncate(options.converged);
     for minimum in &mut found {
         Stopped::check(stop)?;
-        *minimum = minimum.adjusted(problem.observations, model, &priors, stop);
+        *minimum = minimum.adjusted(problem, model, &priors, stop);
     }
     Ok(distinct(found, problem))
 }
@@ -236,34 +190,36 @@ fn minima_of_one(
     stop: &StopToken,
 ) -> Result<Vec<Minimum>, Stopped> {
     let model = IntrinsicsModel::FOCAL;
-    let (subset, chosen) = subsample(frame, problem.observations);
-    let observations = subset.as_deref().unwrap_or(problem.observations);
+    let options = &problem.options.search;
+    let (subset, chosen) = subsample(frame, problem.observations, options);
+    let searched = &Problem { observations: subset.as_deref().unwrap_or(problem.observations), ..*problem };
     let mut found: Vec<Minimum> = Vec::new();
-    for start in starts(frame) {
+    for start in starts(frame, options) {
         Stopped::check(stop)?;
-        let Some(mut reconstruction) = upgrade(frame, &start, false, observations) else { continue };
-        let report = metric::adjust(&mut reconstruction, observations, model, priors, &first(), stop);
+        let Some(mut reconstruction) = upgrade(frame, &start, false, searched.observations) else { continue };
+        let report = metric::adjust(&mut reconstruction, searched.observations, model, priors, &options.first(), stop);
         found.push(Minimum { cheirality: 0.0, cost: report.cost, reconstruction });
     }
     let mut found = distinct(found, problem);
-    found.truncate(CONVERGED);
+    found.truncate(options.converged);
     let mut converged: Vec<Minimum> = Vec::with_capacity(found.len());
     let mut cheapest = f64::INFINITY;
     for mut start in found {
         Stopped::check(stop)?;
-        if start.cost > HOPELESS * cheapest {
-            let tried = start.adjusted_by(&first(), observations, model, priors, stop);
-            let pace = (tried.cost / start.cost).powf(FINAL_ITERATIONS as f64 / FIRST_ITERATIONS as f64);
-            if pace * tried.cost > HOPELESS * cheapest {
+        if start.cost > options.hopeless * cheapest {
+            let tried = start.adjusted_by(&options.first(), searched, model, priors, stop);
+            let pace =
+                (tried.cost / start.cost).powf(options.final_iterations as f64 / options.first_iterations as f64);
+            if pace * tried.cost > options.hopeless * cheapest {
                 continue;
             }
             start = tried;
         }
-        let mut minimum = start.adjusted(observations, model, priors, stop);
+        let mut minimum = start.adjusted(searched, model, priors, stop);
         cheapest = cheapest.min(minimum.cost);
         if let Some(chosen) = &chosen {
             fill_points(&mut minimum, chosen, problem.observations);
-            minimum = minimum.adjusted(problem.observations, model, priors, stop);
+            minimum = minimum.adjusted(problem, model, priors, stop);
         }
         converged.push(minimum);
     }
@@ -280,23 +236,23 @@ pub(super) fn known_focal(
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
 ) -> Vec<Minimum> {
-    let observations = problem.observations;
-    let start = upgrade_translation(translation, focal, observations);
+    let start = upgrade_translation(translation, focal, problem.observations);
     let minimum = start.map(|reconstruction| Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 });
-    let adjusted = minimum.map(|start| start.adjusted(observations, IntrinsicsModel::FOCAL, priors, stop));
+    let adjusted = minimum.map(|start| start.adjusted(problem, IntrinsicsModel::FOCAL, priors, stop));
     distinct(adjusted.into_iter().collect(), problem)
 }
 
 /// Cheapest first, without those that repeat a cheaper one.
 fn distinct(mut found: Vec<Minimum>, problem: &Problem) -> Vec<Minimum> {
+    let options = &problem.options.search;
     found.retain(|minimum| minimum.cost.is_finite() && minimum.log_focal().is_finite());
     found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
     let counts = found.first().map(|cheapest| cheapest.determined(problem)).unwrap_or_default();
     let mut kept: Vec<Minimum> = Vec::with_capacity(found.len());
     for candidate in found {
         let repeats = kept.iter().any(|minimum| {
-            candidate.apart(minimum, |view| counts[view]) < SAME_MINIMUM
-                && candidate.cost < (1.0 + SAME_COST) * minimum.cost
+            candidate.apart(minimum, |view| counts[view]) < options.same_minimum
+                && candidate.cost < (1.0 + options.same_cost) * minimum.cost
         });
         if !repeats {
             kept.push(candidate);
@@ -306,52 +262,56 @@ fn distinct(mut found: Vec<Minimum>, problem: &Problem) -> Vec<Minimum> {
 }
 
 /// Different starts: the linear DAQ and the best of the scan, refined, then the best of each window of the scan.
-fn starts(frame: &CanonicalFrame) -> Vec<Daq> {
+fn starts(frame: &CanonicalFrame, options: &SearchOptions) -> Vec<Daq> {
     let cameras = &frame.cameras;
-    let scanned = daq::scan(cameras, SCAN_FOCALS, SCAN_VIEWS);
+    let scanned = daq::scan(cameras, options.scan_focals, options.scan_views);
     let best_near = |focal: f64, half_width: f64| {
         scanned.iter().find(|(daq, _)| (daq.intrinsics.focal / focal).ln().abs() < half_width).map(|(daq, _)| *daq)
     };
     let mut to_refine: Vec<Daq> = daq::linear(cameras).into_iter().collect();
-    to_refine.extend(scanned.iter().take(REFINED_FROM_SCAN).map(|(daq, _)| *daq));
-    to_refine.extend([0.5, 1.0, 2.0, 4.0].into_iter().filter_map(|focal| best_near(focal, 0.5 * 2f64.ln())));
+    to_refine.extend(scanned.iter().take(options.refined_from_scan).map(|(daq, _)| *daq));
+    to_refine.extend(options.scan_octaves.into_iter().filter_map(|focal| best_near(focal, 0.5 * 2f64.ln())));
     let mut refined: Vec<(Daq, f64)> = to_refine
         .into_iter()
-        .map(|start| daq::refine(cameras, start, Free::FocalAndPlane, REFINE_ITERATIONS))
-        .filter(|(daq, cost)| cost.is_finite() && PLAUSIBLE_FOCAL.contains(&daq.intrinsics.focal))
+        .map(|start| daq::refine(cameras, start, Free::FocalAndPlane, options.refine_iterations))
+        .filter(|(daq, cost)| cost.is_finite() && options.plausible_focal.contains(&daq.intrinsics.focal))
         .collect();
     refined.sort_by(|a, b| a.1.total_cmp(&b.1));
 
-    let mut kept: Vec<Daq> = Vec::with_capacity(STARTS);
+    let mut kept: Vec<Daq> = Vec::with_capacity(options.starts);
     for (daq, _) in refined {
         let repeats = kept.iter().any(|other| {
-            (daq.intrinsics.focal / other.intrinsics.focal).ln().abs() < SAME_START
+            (daq.intrinsics.focal / other.intrinsics.focal).ln().abs() < options.same_start
                 && (daq.plane_at_infinity - other.plane_at_infinity).norm()
-                    < 0.05 * (1.0 + daq.plane_at_infinity.norm())
+                    < options.same_plane * (1.0 + daq.plane_at_infinity.norm())
         });
-        if !repeats && kept.len() < REFINED_STARTS {
+        if !repeats && kept.len() < options.refined_starts {
             kept.push(daq);
         }
     }
-    let windows = STARTS - 1;
-    let ratio = (WINDOW_RANGE.1 / WINDOW_RANGE.0).ln() / windows as f64;
+    let windows = options.starts - 1;
+    let ratio = (options.window_range.1 / options.window_range.0).ln() / windows as f64;
     let mut windowed: Vec<(Daq, f64)> = (0..=windows)
-        .filter_map(|k| best_near(WINDOW_RANGE.0 * (ratio * k as f64).exp(), WINDOW_HALF_WIDTH))
+        .filter_map(|k| best_near(options.window_range.0 * (ratio * k as f64).exp(), options.window_half_width))
         .map(|daq| (daq, daq::residual(cameras, &daq)))
         .collect();
     windowed.sort_by(|a, b| a.1.total_cmp(&b.1));
-    kept.extend(windowed.into_iter().map(|(daq, _)| daq).take(STARTS - kept.len()));
+    kept.extend(windowed.into_iter().map(|(daq, _)| daq).take(options.starts - kept.len()));
     kept
 }
 
 /// Every so many-th point, when there are more than the search needs: their observations, and which were chosen.
-fn subsample(frame: &CanonicalFrame, observations: &[Observation]) -> (Option<Vec<Observation>>, Option<Vec<bool>>) {
+fn subsample(
+    frame: &CanonicalFrame,
+    observations: &[Observation],
+    options: &SearchOptions,
+) -> (Option<Vec<Observation>>, Option<Vec<bool>>) {
     let points = frame.points.len();
-    if points <= SEARCH_POINTS {
+    if points <= options.points {
         return (None, None);
     }
     let mut chosen = vec![false; points];
-    (0..SEARCH_POINTS).for_each(|k| chosen[k * points / SEARCH_POINTS] = true);
+    (0..options.points).for_each(|k| chosen[k * points / options.points] = true);
     // A view that would be left with too few points keeps all of its own.
     let mut left = vec![0usize; frame.cameras.len()];
     let in_range = |seen: &&Observation| seen.view < frame.cameras.len() && seen.point < points;
@@ -359,16 +319,13 @@ fn subsample(frame: &CanonicalFrame, observations: &[Observation]) -> (Option<Ve
         left[seen.view] += usize::from(chosen[seen.point]);
     }
     for seen in observations.iter().filter(in_range) {
-        if left[seen.view] < LEAST_POINTS_OF_A_VIEW {
+        if left[seen.view] < options.least_points_of_view {
             chosen[seen.point] = true;
         }
     }
     let subset = observations.iter().filter(in_range).filter(|seen| chosen[seen.point]).copied().collect();
     (Some(subset), Some(chosen))
 }
-
-/// Points below which the search does not thin out a view.
-const LEAST_POINTS_OF_A_VIEW: usize = 20;
 
 /// Triangulates the points that took no part in the search with the cameras it found.
 fn fill_points(minimum: &mut Minimum, chosen: &[bool], observations: &[Observation]) {

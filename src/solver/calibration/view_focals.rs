@@ -2,51 +2,45 @@
 //! one.
 
 use super::fit::Fit;
-use super::models::{Candidate, Choice, Sigmas, default_intrinsics_prior};
-use super::search::converge;
-use super::verdict::{UNOBSERVABLE_ABOVE, Verdict, WEAK_UP_TO, is_plausible};
+use super::models::{Candidate, Choice, Sigmas};
+use super::options::{GradeOptions, LensOptions};
+use super::verdict::Verdict;
 use super::{Problem, ViewFocal};
 use crate::domain::{Grade, WarningCode};
 use crate::geometry::bundle::metric::{self, Extension, IntrinsicsModel, Reconstruction};
 use crate::geometry::statistics::{median, root_mean_square};
 
-/// What a lens may add to log focal lengths of which every view has its own, one standard deviation: few lenses have
-/// the same distortion and centre at every focal length, and one for all is what is estimated. No zoom is METRIC for
-/// it.
-const LENS_SIGMA: f64 = 0.05;
-/// Share of the views whose focal length must be determined: of fewer, what most of the images show says nothing of
-/// the camera.
-pub const LEAST_DETERMINED: f64 = 0.5;
-
 /// The focal length of each view, undetermined where it is.
-pub(super) fn of(best: &Candidate, sigmas: &Sigmas) -> Vec<ViewFocal> {
+pub(super) fn of(best: &Candidate, sigmas: &Sigmas, options: &LensOptions) -> Vec<ViewFocal> {
     let focals = best.minimum.reconstruction.focals.iter().zip(&sigmas.view_focals);
     let of_view = |(&focal, sigma): (&f64, &Option<f64>)| {
-        let sigma_log = sigma.map(|sigma| sigma.hypot(LENS_SIGMA)).filter(|_| is_plausible(focal));
+        let sigma_log = sigma.map(|sigma| sigma.hypot(options.zoom_sigma)).filter(|_| options.is_plausible(focal));
         ViewFocal { focal, sigma_log }
     };
     focals.map(of_view).collect()
 }
 
 /// Whether the observations determine the focal length of a view.
-pub(super) fn is_determined(view: &ViewFocal) -> bool {
-    view.sigma_log.is_some_and(|sigma| sigma <= WEAK_UP_TO)
+pub(super) fn is_determined(view: &ViewFocal, options: &GradeOptions) -> bool {
+    view.sigma_log.is_some_and(|sigma| sigma <= options.weak_up_to)
 }
 
 /// Leaves what is not determined without a sigma.
-pub(super) fn forget_undetermined(view: &mut ViewFocal) {
-    view.sigma_log = view.sigma_log.filter(|sigma| *sigma <= WEAK_UP_TO);
+pub(super) fn forget_undetermined(view: &mut ViewFocal, options: &GradeOptions) {
+    view.sigma_log = view.sigma_log.filter(|sigma| *sigma <= options.weak_up_to);
 }
 
 /// Says which of the views are undetermined; returns sigma, the root mean square of that of the others. Where most are,
 /// that is the median of all, `None` if it is beyond all bounds.
 pub(super) fn judge(verdict: &mut Verdict, focals: &[ViewFocal]) -> Option<f64> {
+    let options = &verdict.options.grades;
     let mut all: Vec<f64> = focals.iter().map(|view| view.sigma_log.unwrap_or(f64::INFINITY)).collect();
     let determined: Vec<f64> =
-        focals.iter().filter(|view| is_determined(view)).filter_map(|view| view.sigma_log).collect();
+        focals.iter().filter(|view| is_determined(view, options)).filter_map(|view| view.sigma_log).collect();
     let sigma = root_mean_square(&determined);
-    if (determined.len() as f64) < LEAST_DETERMINED * focals.len() as f64 || sigma.is_none() {
-        let typical = Some(median(&mut all)).filter(|sigma| *sigma > WEAK_UP_TO && *sigma < UNOBSERVABLE_ABOVE);
+    if (determined.len() as f64) < options.least_determined * focals.len() as f64 || sigma.is_none() {
+        let is_known = |sigma: &f64| *sigma > options.weak_up_to && *sigma < options.unobservable_above;
+        let typical = Some(median(&mut all)).filter(is_known);
         verdict.judge_sigma(typical);
         return typical;
     }
@@ -85,11 +79,12 @@ pub(super) struct Differing {
 /// * `own`: the fit of `metric`
 pub(super) fn differing(metric: &Reconstruction, own: &Fit, choice: &Choice) -> Option<Differing> {
     let problem: &Problem = choice.problem;
-    let priors = vec![default_intrinsics_prior(own.noise, None, choice.scale_px); problem.groups()];
+    let options = problem.options;
+    let priors = vec![options.lenses.prior(own.noise, None, choice.scale_px); problem.groups()];
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint).with(Extension::RadialK1);
     let mut freed = metric.clone().with_own_focals();
-    let report = metric::adjust(&mut freed, problem.observations, model, &priors, &converge(), choice.stop);
-    if !Fit::metric(report.cost, model, problem).refutes(own) {
+    let report = metric::adjust(&mut freed, problem.observations, model, &priors, &options.search.last(), choice.stop);
+    if !Fit::metric(report.cost, model, problem).refutes(own, &options.fit) {
         return None;
     }
     let shift = |(view, focal): (usize, &f64)| (focal / metric.intrinsics_of(view).focal).ln();

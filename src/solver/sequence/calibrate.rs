@@ -8,7 +8,7 @@ use super::{own_focals, windows};
 use crate::domain::{FocalPrior, Task, Warning, WarningCode};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
-use crate::solver::calibration::{self, Outcome};
+use crate::solver::calibration::{self, GradeOptions, Outcome};
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, view_selection};
@@ -61,7 +61,7 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     adjust::all(problem, model, recorder);
     report_found(problem, model, recorder);
     for (camera, outcome) in outcomes.iter_mut().enumerate() {
-        admit_difference(model.lenses[camera].intrinsics.focal.ln(), outcome);
+        admit_difference(model.lenses[camera].intrinsics.focal.ln(), outcome, &problem.calibration.grades);
         windows::reconcile(problem, model, camera, outcome, recorder)?;
     }
     Ok(outcomes)
@@ -118,6 +118,7 @@ pub fn of_extract(
         group_of: &metric.group_of,
         focal_priors: &focal_priors,
         focal_per_view: metric.has_own_focals(),
+        options: &problem.calibration,
     };
     let outcomes = calibration::from_metric(&to_calibrate, &metric, problem.scale_px, problem.stop, heartbeat)?;
     Ok(of_group.into_iter().zip(outcomes).collect())
@@ -149,12 +150,12 @@ pub fn of_view(views: &[usize]) -> usize {
 }
 
 /// Raises sigma to what lies between the focal length that was graded and the one that all observations led to.
-fn admit_difference(log_focal: f64, outcome: &mut Outcome) {
+fn admit_difference(log_focal: f64, outcome: &mut Outcome, grades: &GradeOptions) {
     let (Some(intrinsics), Some(sigma)) = (outcome.intrinsics(), outcome.sigma_log_focal) else { return };
     let difference = (log_focal - intrinsics.focal.ln()).abs();
     if difference > sigma {
         outcome.sigma_log_focal = Some(difference);
-        outcome.grade = outcome.grade.worse(calibration::grade_of_sigma(Some(difference)));
+        outcome.grade = outcome.grade.worse(grades.grade(Some(difference)));
     }
 }
 

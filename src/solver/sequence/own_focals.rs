@@ -9,7 +9,7 @@ use super::model::Model;
 use super::{structure, windows};
 use crate::domain::{Grade, Task, Warning, WarningCode};
 use crate::geometry::statistics::root_mean_square;
-use crate::solver::calibration::{self, LEAST_DETERMINED, Outcome};
+use crate::solver::calibration::Outcome;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, view_selection};
@@ -48,7 +48,7 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     calibrate::report_found(problem, model, recorder);
     let mut outcome = match found.is_empty() {
         true => too_few(registered.len()),
-        false => combined(model, found),
+        false => combined(problem, model, found),
     };
     windows::reconcile(problem, model, CAMERA, &mut outcome, recorder)?;
     Ok(outcome)
@@ -71,7 +71,7 @@ fn runs(model: &Model) -> Vec<Vec<usize>> {
 /// One calibration of those of the runs, which are not none: as good as the worst that is not refused, with a sigma
 /// that admits what lies between a run's focal lengths and those that all observations led to. Says in the model which
 /// views have one.
-fn combined(model: &mut Model, runs: Vec<(Extract, Outcome)>) -> Outcome {
+fn combined(problem: &Problem, model: &mut Model, runs: Vec<(Extract, Outcome)>) -> Outcome {
     let registered = model.registered();
     let is_whole = matches!(runs.as_slice(), [(extract, _)] if extract.views == registered);
     model.own_focals.iter_mut().for_each(|own| own.is_determined = false);
@@ -82,7 +82,7 @@ fn combined(model: &mut Model, runs: Vec<(Extract, Outcome)>) -> Outcome {
         let mut differences = Vec::new();
         for (&view, own) in extract.views.iter().zip(focals.iter().flatten()) {
             let whole = &mut model.own_focals[view];
-            whole.is_determined = own.stands_as(whole.focal);
+            whole.is_determined = own.stands_as(whole.focal, &problem.calibration);
             if whole.is_determined {
                 differences.push((whole.focal / own.focal).ln());
             }
@@ -105,11 +105,12 @@ fn combined(model: &mut Model, runs: Vec<(Extract, Outcome)>) -> Outcome {
         };
         whole.warnings.extend(outcome.warnings.into_iter().map(named));
     }
+    let grades = &problem.calibration.grades;
     // No rounding makes the whole worse than its worst run.
     let largest = deviations.iter().fold(0.0f64, |largest, sigma| largest.max(*sigma));
     whole.sigma_log_focal = root_mean_square(&deviations).map(|sigma| sigma.min(largest));
-    whole.grade = whole.grade.worse(calibration::grade_of_sigma(whole.sigma_log_focal));
-    if (deviations.len() as f64) < LEAST_DETERMINED * registered.len() as f64 {
+    whole.grade = whole.grade.worse(grades.grade(whole.sigma_log_focal));
+    if (deviations.len() as f64) < grades.least_determined * registered.len() as f64 {
         whole.grade = Grade::ProjectiveOnly;
     }
     if !is_whole && deviations.len() < registered.len() {

@@ -27,7 +27,24 @@ pub fn of_one_lens<'a>(
     noise: f64,
 ) -> Problem<'a> {
     let group_of = &[0; 64][..cameras.len()];
-    Problem { cameras, points, observations, noise, group_of, focal_priors: &[None], focal_per_view: false }
+    let options = &CalibrationOptions::DEFAULT;
+    Problem { cameras, points, observations, noise, group_of, focal_priors: &[None], focal_per_view: false, options }
+}
+
+/// The thresholds are those of the problem's options.
+#[test]
+fn the_options_bound_the_grades() {
+    let scene = testing::scene(1, 10, 60, 1e-3);
+    let (cameras, points) = projective_problem(&scene, 1);
+    let grade = |metric_below: f64, weak_up_to: f64| {
+        let mut options = CalibrationOptions::DEFAULT;
+        (options.grades.metric_below, options.grades.weak_up_to) = (metric_below, weak_up_to);
+        let problem = Problem { options: &options, ..of_one_lens(&cameras, &points, &scene.observations, 1e-3) };
+        only(calibrate(&problem, SIDE_PX, &StopToken::default())).grade
+    };
+    assert_eq!(grade(0.02, 0.1), Grade::Metric);
+    assert_eq!(grade(1e-9, 0.1), Grade::Weak);
+    assert_eq!(grade(1e-9, 1e-9), Grade::ProjectiveOnly);
 }
 
 fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {

@@ -207,11 +207,11 @@ fn with_choice<T>(
 ) -> T {
     let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
     let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, NOISE) };
-    let (prior, stop) = (super::super::models::default_intrinsics_prior(NOISE, None, SIDE_PX), StopToken::default());
+    let (prior, stop) = (problem.options.lenses.prior(NOISE, None, SIDE_PX), StopToken::default());
     let choice = super::super::models::Choice { problem: &problem, scale_px: SIDE_PX, stop: &stop };
     let start = metric_of(scene, &vec![scene.intrinsics.focal; scene.poses.len()]);
     let start = search::Minimum { reconstruction: start, cost: f64::INFINITY, cheirality: 0.0 };
-    let best = start.adjusted(&scene.observations, IntrinsicsModel::FOCAL_PER_VIEW, &[prior], &stop);
+    let best = start.adjusted(&problem, IntrinsicsModel::FOCAL_PER_VIEW, &[prior], &stop);
     let fit = Fit::metric(best.cost, IntrinsicsModel::FOCAL_PER_VIEW, &problem);
     ask(&choice, &fit, &best)
 }
