@@ -12,9 +12,9 @@ use crate::formats::publish::create_directory;
 #[derive(Debug, Clone, clap::Args)]
 #[command(next_help_heading = "Observations")]
 pub struct ObservationArgs {
-    /// Solve inputs whose right tracks hold wrong observations, complete and with missing ones, instead of the sweeps.
-    /// Writes observations.json, and observations.jsonl, with which it goes on where it was stopped. With --peer
-    /// another program is run on the same files
+    /// Solve inputs whose right tracks hold wrong observations, complete and with missing ones, without depths and
+    /// with them, instead of the sweeps. Writes observations.json, and observations.jsonl, with which it goes on where
+    /// it was stopped. With --peer another program is run on the same files
     #[arg(long, groups = ["suite", "beside"],
         conflicts_with_all = ["quick", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
     pub observations: bool,

@@ -52,7 +52,7 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Option<Attemp
     let estimates: Vec<Estimate> = attempts.iter().filter_map(Attempt::estimate).collect();
     let mut best = attempts.into_iter().reduce(|best, other| if other.merit() > best.merit() { other } else { best });
     if let Some(outcome) = best.as_mut().and_then(|best| best.calibration.as_mut()) {
-        fusion::admit_misfit(outcome, &estimates, &problem.calibration.grades);
+        fusion::admit_misfit(outcome, &estimates, &problem.calibration_options.grades);
     }
     Ok(best)
 }

@@ -6,13 +6,12 @@
 use super::block::Block;
 use super::calibration::{Outcome, few_inliers};
 use super::classification::{Geometry, Judged};
-use super::grow::{Consensus, LEAST_INLIERS, NOISE_BOUNDS};
+use super::grow::{Consensus, NOISE_BOUNDS};
 use super::portfolio;
 use super::problem::Problem;
 use super::search::Seed;
 use super::search::rigid::{Rigid, Search};
 use crate::domain::{Grade, Warning, WarningCode};
-use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
 };
@@ -21,9 +20,6 @@ use crate::geometry::metric::plane_at_infinity;
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, triangulation};
 
-/// Iterations of the metric adjustment, which starts within a few per cent.
-const ADJUSTMENT_ITERATIONS: usize = 60;
-const ADJUSTMENT_TOLERANCE: f64 = 1e-9;
 /// Directions that no observation sees: a similarity's.
 const SIMILARITY: usize = 7;
 /// Constraints beyond the unknowns from which a focal length is looked for: its variance is then known to 45 %.
@@ -68,8 +64,9 @@ pub fn consensus(block: &CompleteBlock, rigid: &Rigid, noise: f64) -> Consensus 
 pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus, focal: f64) -> Outcome {
     let inliers = consensus.inliers();
     let mut outcome = Outcome::refused(Vec::new());
-    if inliers.len() < LEAST_INLIERS {
-        outcome.warnings.push(few_inliers(inliers.len(), &problem.calibration));
+    let fit = &problem.calibration_options.fit;
+    if inliers.len() < fit.least_inliers {
+        outcome.warnings.push(few_inliers(inliers.len(), fit));
     }
     let refused = |mut outcome: Outcome, code: WarningCode, detail: String| {
         outcome.warnings.push(Warning::new(code, detail));
@@ -84,11 +81,7 @@ pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus
         return refused(outcome, WarningCode::UnobservableFocal, detail);
     }
     let Some(mut found) = start(consensus, &inliers, focal) else { return outcome };
-    let options = Options {
-        max_iterations: ADJUSTMENT_ITERATIONS,
-        relative_tolerance: ADJUSTMENT_TOLERANCE,
-        ..Options::default()
-    };
+    let options = problem.calibration_options.search.to_convergence();
     let report = metric::adjust(&mut found, &observations, model, &[IntrinsicsPrior::NONE], &options, problem.stop);
     let noise = consensus.noise.max((report.cost / freedom as f64).sqrt());
     let sigma = Information::new(&found, &observations)
@@ -104,12 +97,12 @@ pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus
         let detail = format!("image points alone give a focal length that differs by a factor of {:.2}", strayed.exp());
         return refused(outcome, WarningCode::ModelMismatch, detail);
     }
-    if cheirality < problem.calibration.grades.least_in_front {
+    if cheirality < problem.calibration_options.grades.least_in_front {
         let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - cheirality));
         return refused(outcome, WarningCode::Cheirality, detail);
     }
     outcome.plane_at_infinity = plane_at_infinity(&consensus.cameras, &found.cameras());
-    outcome.grade = problem.calibration.grades.grade(sigma).worse(Grade::Weak);
+    outcome.grade = problem.calibration_options.grades.grade(sigma).worse(Grade::Weak);
     outcome.sigma_log_focal = sigma;
     outcome.cheirality = cheirality;
     outcome.metric = Some(found);

@@ -49,7 +49,8 @@ pub struct Problem<'a> {
     pub least_share: f64,
     /// Density of a wrong coordinate; see [`classification::Geometry::outlier_density`].
     pub outlier_density: f64,
-    pub calibration: CalibrationOptions,
+    /// Thresholds of the calibration.
+    pub calibration_options: CalibrationOptions,
     /// What is to be said of the input.
     pub warnings: Vec<Warning>,
     pub threads: Threads,
@@ -91,7 +92,7 @@ impl<'a> Problem<'a> {
             of_view,
             camera_of,
             cameras,
-            calibration: CalibrationOptions::DEFAULT,
+            calibration_options: CalibrationOptions::DEFAULT,
             warnings,
             threads,
             stop,

@@ -151,7 +151,7 @@ impl Reconstruction {
             problem.stop,
             &mut progress,
         );
-        // In what it was extended to, the noise may be no longer so strong that depths say more.
+        // Once wrong observations are left out, the noise may be too low for depths to add anything.
         let depths_say_more = !by_points || self.noise > STRONG_NOISE;
         if let Some(weights) = seed.weights_by_depths.as_ref().filter(|_| depths_say_more) {
             weights.judge(problem, &geometry, &mut judged);

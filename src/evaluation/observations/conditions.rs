@@ -22,7 +22,12 @@ fn grid() -> impl Iterator<Item = Condition> {
     let tracks = [0.0, 0.3, 0.5, 0.7].into_iter();
     let counts = tracks.flat_map(|outliers| [1, 2, 3].map(|count| (outliers, count)));
     counts.flat_map(|(outliers, wrong_observations)| {
-        let kinds = [("complete", 0, false), ("deleted", 1, false), ("depths", 0, true), ("depths, deleted", 1, true)];
+        let kinds = [
+            ("complete", 0, false),
+            ("deleted", 1, false),
+            ("complete with depths", 0, true),
+            ("deleted with depths", 1, true),
+        ];
         kinds.map(|(name, deleted_observations, with_depths)| {
             let options = SceneOptions {
                 outliers,

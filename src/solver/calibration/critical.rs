@@ -25,9 +25,9 @@ pub(super) struct Critical {
 pub(super) fn find(problem: &Problem, fit: &Fit, scale_px: f64, stop: &StopToken) -> Critical {
     let (observations, views) = (problem.observations, problem.cameras.len());
     let points = problem.points.len();
-    let CalibrationOptions { critical: options, fit: fits, .. } = problem.options;
+    let CalibrationOptions { critical: options, fit: fit_options, .. } = problem.options;
     let translation = critical::fit_translation(observations, views, points, fit.noise, options.epipolar_limit, stop)
-        .filter(|found| !fit.refutes(&Fit::new(found.cost, found.unknowns, problem), fits));
+        .filter(|found| !fit.refutes(&Fit::new(found.cost, found.unknowns, problem), fit_options));
     let flat = homography::median_residual(observations, views, fit.noise, options.homography_limit)
         .and_then(|residual| without_parallax(problem, fit, residual, translation.is_some(), scale_px, stop));
     if let Some(flat) = flat {
@@ -98,7 +98,7 @@ fn rotation_in_words(turning: &Rotating, scale_px: f64) -> String {
 }
 
 fn pure_translation(translation: &Translating, options: &CriticalOptions) -> Warning {
-    let direction = match direction(translation, options.straight) {
+    let direction = match direction(translation, options.most_off_line) {
         Some(heading) if heading.z != 0.0 && heading.xy().norm() <= options.near_axis * heading.z.abs() => {
             ", along the optical axis"
         }
@@ -114,8 +114,8 @@ fn pure_translation(translation: &Translating, options: &CriticalOptions) -> War
 
 /// Direction of the line along which the camera moved, times `K`; `None` where it left the line.
 ///
-/// * `straight`: see [`CriticalOptions`]
-fn direction(translation: &Translating, straight: f64) -> Option<Vector3<f64>> {
+/// * `most_off_line`: see [`CriticalOptions`]
+fn direction(translation: &Translating, most_off_line: f64) -> Option<Vector3<f64>> {
     let positions = &translation.translations;
     let mean = positions.iter().sum::<Vector3<f64>>() / positions.len().max(1) as f64;
     let mut spread = Matrix3::zeros();
@@ -128,6 +128,6 @@ fn direction(translation: &Translating, straight: f64) -> Option<Vector3<f64>> {
     let eigen = spread.symmetric_eigen();
     let along = eigen.eigenvalues.imax();
     let off: f64 = (0..3).filter(|&k| k != along).map(|k| eigen.eigenvalues[k].max(0.0)).sum();
-    let is_straight = off <= straight * straight * eigen.eigenvalues[along];
+    let is_straight = off <= most_off_line * most_off_line * eigen.eigenvalues[along];
     is_straight.then(|| eigen.eigenvectors.column(along).into_owned())
 }

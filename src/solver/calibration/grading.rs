@@ -3,7 +3,7 @@
 use super::fit::Fit;
 use super::misfit::Comparison;
 use super::models::{Candidate, Choice};
-use super::options::{CalibrationOptions, GradeOptions};
+use super::options::CalibrationOptions;
 use super::search::Minimum;
 use super::verdict::Verdict;
 use super::view_focals::{self, Differing};
@@ -21,7 +21,7 @@ pub(super) fn grade(
     minima: Vec<Minimum>,
     mut warnings: Vec<Warning>,
 ) -> Result<Vec<Outcome>, Stopped> {
-    let CalibrationOptions { fit: fits, lenses, grades, .. } = choice.problem.options;
+    let CalibrationOptions { fit: fit_options, lenses, grades, .. } = choice.problem.options;
     let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
     Stopped::check(choice.stop)?;
     let comparison = Comparison::new(&best, fit, choice);
@@ -30,7 +30,7 @@ pub(super) fn grade(
     let mut focals = view_focals::of(&best, &sigmas, lenses);
     let determined: Vec<bool> = focals.iter().map(|view| view_focals::is_determined(view, grades)).collect();
     let rival = rival(choice.problem, &best, &others, |view| determined[view]);
-    let differing = (comparison.is_misfit(fits) && !has_own_focals)
+    let differing = (comparison.is_misfit(fit_options) && !has_own_focals)
         .then(|| view_focals::differing(&best.minimum.reconstruction, &best.fit, choice))
         .flatten();
     let grade_group = |group: usize| -> Outcome {
@@ -132,9 +132,9 @@ fn chosen(
 /// The cheapest minimum whose points are in front of the cameras, if the data do not tell it from the cheapest.
 fn best_in_front(minima: &[Minimum], problem: &Problem, fit: &Fit) -> usize {
     let unit = fit.noise.max(problem.noise).powi(2);
-    let CalibrationOptions { models, grades: GradeOptions { least_in_front, .. }, .. } = problem.options;
-    let near = |minimum: &Minimum| minimum.cost - minima[0].cost < models.significant_gain_of_two * unit;
-    minima.iter().position(|minimum| minimum.cheirality >= *least_in_front && near(minimum)).unwrap_or(0)
+    let options = &problem.options.grades;
+    let near = |minimum: &Minimum| minimum.cost - minima[0].cost < options.indistinguishable * unit;
+    minima.iter().position(|minimum| minimum.cheirality >= options.least_in_front && near(minimum)).unwrap_or(0)
 }
 
 /// Another calibration that explains the data about as well, and how far its log focal length is from the best one's.
@@ -146,12 +146,12 @@ fn rival<'a>(
     others: &'a [Minimum],
     counts: impl Fn(usize) -> bool,
 ) -> Option<(&'a Minimum, f64)> {
-    let CalibrationOptions { models, grades, .. } = problem.options;
+    let grades = &problem.options.grades;
     let mut apart = others.iter().map(|other| (other, other.apart(&best.minimum, &counts)));
     apart.find(|(other, apart)| {
         *apart > grades.other_calibration
             && other.cheirality >= grades.least_in_front.min(best.minimum.cheirality)
-            && other.cost - best.minimum.cost < models.significant_gain_of_two * best.fit.noise.powi(2)
+            && other.cost - best.minimum.cost < grades.indistinguishable * best.fit.noise.powi(2)
     })
 }
 

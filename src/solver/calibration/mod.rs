@@ -25,6 +25,7 @@ use crate::geometry::metric::plane_at_infinity;
 use crate::geometry::observation::Observation;
 
 use fit::Fit;
+use options::FitOptions;
 pub use options::{CalibrationOptions, GradeOptions};
 
 /// A projective reconstruction to calibrate; inliers only.
@@ -177,7 +178,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<V
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < problem.options.fit.least_inliers {
-        warnings.push(few_inliers(inliers, problem.options));
+        warnings.push(few_inliers(inliers, &problem.options.fit));
     }
     let (cameras, points, fit) = projectively_adjusted(problem, inliers, stop);
     Stopped::check(stop)?;
@@ -231,7 +232,7 @@ pub fn from_metric(
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < problem.options.fit.least_inliers {
-        warnings.push(few_inliers(inliers, problem.options));
+        warnings.push(few_inliers(inliers, &problem.options.fit));
     }
     let (_, _, fit) = projectively_adjusted(problem, inliers, stop);
     Stopped::check(stop)?;
@@ -274,8 +275,8 @@ pub fn focal_alone(
 }
 
 /// What is said of fewer inliers than image points alone can verify.
-pub fn few_inliers(inliers: usize, options: &CalibrationOptions) -> Warning {
-    let least = options.fit.least_inliers;
+pub fn few_inliers(inliers: usize, options: &FitOptions) -> Warning {
+    let least = options.least_inliers;
     let detail = format!("{inliers} inlier tracks cannot be verified by image points alone, which takes {least}");
     Warning::new(WarningCode::FewInliers, detail)
 }

@@ -189,8 +189,8 @@ impl Choice<'_> {
     ///
     /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
     /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights from
-    /// Laplace's approximation of each model's evidence under [`LensOptions`]. An extension that the data
-    /// can neither confirm nor refute thus costs what it would move.
+    /// Laplace's approximation of each model's evidence under [`LensOptions`](super::options::LensOptions). An
+    /// extension that the data can neither confirm nor refute thus costs what it would move.
     ///
     /// * `inflation`: factor on all of them, for what the calibration does not fit
     pub fn sigmas(&self, best: &Candidate, inflation: f64) -> Sigmas {
@@ -264,8 +264,8 @@ impl Choice<'_> {
     /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
     ///
     /// The focal length, of several groups all in their ratios, is held three standard deviations away while everything
-    /// else adjusts; the chi-square should rise by nine. Near critical motions the linearisation is optimistic: it is taken
-    /// where the noise has moved the scene.
+    /// else adjusts; the chi-square should rise by nine. Near critical motions the linearisation is optimistic: it is
+    /// taken where the noise has moved the scene.
     fn profiled(&self, sigma: f64, best: &Candidate) -> f64 {
         let options = &self.problem.options.models;
         let shift = (options.profile_deviations * sigma).min(options.profile_longest);

@@ -1,14 +1,15 @@
 //! The thresholds of the calibration, with their reasons.
 //!
-//! Lengths are in image sides, focal lengths in these or as natural logarithms, standard deviations of the latter.
+//! Lengths and focal lengths are in units of the longer image side; `log` is the natural logarithm. A field that counts
+//! standard deviations, or is in units of the noise, says so.
 
 use crate::domain::{FocalPrior, Grade};
 use crate::geometry::bundle;
 use crate::geometry::bundle::metric::{Extension, IntrinsicsPrior, Parameter};
-use crate::geometry::statistics::chi_square_gate;
+use crate::geometry::statistics::chi_square_quantile;
 use crate::solver::grow::LEAST_INLIERS;
 
-/// What a calibration goes by.
+/// Thresholds of a calibration, by stage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CalibrationOptions {
     pub fit: FitOptions,
@@ -96,7 +97,7 @@ pub struct CriticalOptions {
     pub plane_deviations: f64,
     /// Spread of the camera's positions off the line that fits them best, relative to that along it, up to which the
     /// motion is along one line.
-    pub straight: f64,
+    pub most_off_line: f64,
     /// Distance of the point that a straight motion heads for from the image centre up to which it is along the optical
     /// axis.
     pub near_axis: f64,
@@ -112,7 +113,7 @@ impl CriticalOptions {
         // with the short baselines of forward motion, has 50 and more.
         plane_deviations: 8.0,
         // Noise leaves a few hundredths.
-        straight: 0.2,
+        most_off_line: 0.2,
         near_axis: 0.1,
     };
 }
@@ -120,27 +121,30 @@ impl CriticalOptions {
 /// How minima are searched for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SearchOptions {
-    /// Focal lengths of the scan, and the views that it looks at, those with the widest baselines.
+    /// Focal lengths of the scan.
     pub scan_focals: usize,
+    /// Views that it looks at: those with the widest baselines to the first.
     pub scan_views: usize,
-    /// Focal lengths about each of which the best entry of the scan is refined, within half an octave.
-    pub scan_octaves: [f64; 4],
+    /// Focal lengths about each of which the best entry of the scan is refined, within this difference in log focal.
+    pub scan_centres: [f64; 4],
+    pub scan_half_width: f64,
     /// Best entries of the scan that are refined.
     pub refined_from_scan: usize,
     /// Refined starts kept, and the iterations of their refinement.
     pub refined_starts: usize,
     pub refine_iterations: usize,
-    /// Starts that are adjusted.
+    /// Starts that are adjusted: at least two, and no fewer than `refined_starts`.
     pub starts: usize,
     /// Windows of the scan whose best entry is a start as it stands: they keep starts apart that the refinement would
     /// draw into one minimum. Their range, and the half width of each in log focal.
     pub window_range: (f64, f64),
     pub window_half_width: f64,
-    /// Difference in log focal, and in the plane at infinity relative to it, below which refined starts are the same.
+    /// Difference in log focal below which refined starts are the same.
     pub same_start: f64,
+    /// And in the plane at infinity, in units of one plus its norm.
     pub same_plane: f64,
     /// Focal lengths that the refinement may end at; beyond, it ran away along a null direction.
-    pub plausible_focal: std::ops::Range<f64>,
+    pub refined_focals: std::ops::RangeInclusive<f64>,
     /// Iterations and tolerance of the first adjustment, which only has to rank the starts.
     pub first_iterations: usize,
     pub first_tolerance: f64,
@@ -148,14 +152,15 @@ pub struct SearchOptions {
     pub converged: usize,
     pub final_iterations: usize,
     pub final_tolerance: f64,
-    /// Share of the cheapest minimum's cost that a start must get down to at its pace to be adjusted to convergence.
-    pub hopeless: f64,
+    /// Multiple of the cheapest minimum's cost: a start that at its pace does not get below is not adjusted to
+    /// convergence.
+    pub hopeless_cost: f64,
     /// Adjusted starts this near in log focal, and within this share in cost, are the same minimum.
     pub same_minimum: f64,
     pub same_cost: f64,
-    /// Points that take part in the search, and the least of a view in it; more tell no minimum from another that these
-    /// do not.
+    /// Points that take part in the search: more tell no minimum from another that these do not.
     pub points: usize,
+    /// Points below which the search does not thin out a view.
     pub least_points_of_view: usize,
     /// Factors on the focal length of a reconstruction from which other minima are looked for.
     pub other_focals: [f64; 4],
@@ -167,27 +172,29 @@ impl SearchOptions {
     pub const DEFAULT: Self = Self {
         scan_focals: 40,
         scan_views: 4,
-        scan_octaves: [0.5, 1.0, 2.0, 4.0],
+        scan_centres: [0.5, 1.0, 2.0, 4.0],
+        // Half an octave: neighbours touch.
+        scan_half_width: 0.5 * std::f64::consts::LN_2,
         refined_from_scan: 3,
         refined_starts: 4,
         // It converges in 10 to 20.
         refine_iterations: 40,
-        // With the refined ones alone a third of the scenes at .3 % noise was within 1 % of the focal length, with these
-        // .92.
+        // With the refined ones alone a third of the scenes at .3 % noise was within 1 % of the focal length, with
+        // these .92.
         starts: 8,
         window_range: (0.45, 3.2),
-        // Neighbours touch.
+        // Neighbours overlap a little.
         window_half_width: 0.15,
         same_start: 0.02,
         same_plane: 0.05,
-        plausible_focal: 0.05..50.0,
+        refined_focals: 0.05..=50.0,
         first_iterations: 12,
         first_tolerance: 1e-4,
         converged: 3,
         final_iterations: 60,
         final_tolerance: 1e-9,
         // A rival is within a few per cent, and one stuck at thirty times the cost took half the time of a calibration.
-        hopeless: 4.0,
+        hopeless_cost: 4.0,
         same_minimum: 0.01,
         same_cost: 0.1,
         points: 150,
@@ -207,7 +214,7 @@ impl SearchOptions {
     }
 
     /// An adjustment to convergence.
-    pub fn last(&self) -> bundle::Options {
+    pub fn to_convergence(&self) -> bundle::Options {
         bundle::Options {
             max_iterations: self.final_iterations,
             relative_tolerance: self.final_tolerance,
@@ -221,21 +228,30 @@ impl SearchOptions {
 pub struct LensOptions {
     /// Standard deviation of each coordinate of the principal point from the image centre.
     pub principal_point_sigma: f64,
+    /// The same of the log aspect.
     pub log_aspect_sigma: f64,
+    /// Of `k1`.
     pub radial_k1_sigma: f64,
+    /// Of `k2` and `k3`.
     pub later_radial_sigma: f64,
+    /// Of `p1` and `p2`.
     pub tangential_sigma: f64,
-    /// Probabilities that a camera needs an extension of the model, in the order of [`Extension::ALL`].
-    pub probabilities: [f64; Extension::ALL.len()],
+    /// Probability, before any observation, that a camera needs its principal point or radial distortion freed, that of
+    /// the second radial term where it has a first.
+    pub likely: f64,
+    /// The same of a third radial term and of tangential distortion.
+    pub unlikely: f64,
+    /// The same of the aspect.
+    pub rare: f64,
     /// What a lens may add to log focal lengths of which every view has its own, one standard deviation.
     pub zoom_sigma: f64,
     /// Focal lengths that lenses have.
-    pub focal_range: (f64, f64),
+    pub focals: std::ops::RangeInclusive<f64>,
 }
 
 impl LensOptions {
     pub const DEFAULT: Self = Self {
-        // Lenses are centred to a few hundredths, and only cropping takes it farther.
+        // Lenses are centred to a few hundredths, and only cropping takes the principal point farther.
         principal_point_sigma: 0.05,
         // Digitised video has pixels up to a tenth off square.
         log_aspect_sigma: 0.1,
@@ -246,16 +262,18 @@ impl LensOptions {
         // Calibrations on boards give some thousandths, and what a decentred lens mostly does is displace the principal
         // point.
         tangential_sigma: 0.005,
-        // Principal points and distortion are as often in order (rectified, rendered) as not; pixels are square in all
-        // but old video. That of a second radial term is where there is a first; few lenses need a third, or are so far
-        // off centre that it shows.
-        probabilities: [0.5, 0.05, 0.5, 0.5, 0.2, 0.2],
-        // Few lenses have the same distortion and centre at every focal length, and one for all is what is estimated. No
-        // zoom is METRIC for it.
+        // Principal points and distortion are as often in order (rectified, rendered) as not.
+        likely: 0.5,
+        // Few lenses need a third term, or are so far off centre that it shows.
+        unlikely: 0.2,
+        // Pixels are square in all but old video.
+        rare: 0.05,
+        // Few lenses have the same distortion and centre at every focal length, and one for all is what is estimated.
+        // It exceeds what METRIC allows: no zoom is METRIC.
         zoom_sigma: 0.05,
-        // Rectilinear ones end at a field of view of 135 degrees (.2), telescopes at half a degree. Beyond, a minimum is
-        // no camera: of windows of a forward-moving car one was taken for a lens of 170 degrees, at a sigma of 10 %.
-        focal_range: (0.15, 120.0),
+        // Rectilinear ones end at a field of view of 135 degrees (.2), telescopes at half a degree. Beyond, a minimum
+        // is no camera: of windows of a forward-moving car one was taken for a lens of 170 degrees, at a sigma of 10 %.
+        focals: 0.15..=120.0,
     };
 
     /// What is known of the intrinsics beforehand, at this noise: what lenses are like, and what the caller says.
@@ -279,27 +297,33 @@ impl LensOptions {
 
     /// Probability, before any observation, that a camera needs the extension.
     pub fn probability(&self, extension: Extension) -> f64 {
-        self.probabilities[extension as usize]
+        match extension {
+            Extension::PrincipalPoint | Extension::RadialK1 | Extension::RadialK2 => self.likely,
+            Extension::RadialK3 | Extension::Tangential => self.unlikely,
+            Extension::Aspect => self.rare,
+        }
     }
 
     /// Whether there is a lens of this focal length.
     pub fn is_plausible(&self, focal: f64) -> bool {
-        (self.focal_range.0..=self.focal_range.1).contains(&focal)
+        self.focals.contains(&focal)
     }
 }
 
 /// How a model is chosen, and what not knowing which is right costs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelOptions {
-    /// Gain in chi-square at which an extension of one degree of freedom is taken, and one of two.
+    /// Gain in chi-square at which an extension of one degree of freedom is taken, one of two, and the normal quantile
+    /// of the level for more.
     pub significant_gain_of_one: f64,
     pub significant_gain_of_two: f64,
+    pub significance: f64,
     /// Share of the significant gain that a linearisation must foretell for an adjustment to be tried: it is off where
     /// the richer model is far.
     pub worth_a_trial: f64,
-    /// Share of the noise that a prior was weighed by, below which what is left makes it worth weighing anew, and how
-    /// often it is.
+    /// Share of the noise that a prior was weighed by, below which what is left makes it worth weighing anew.
     pub same_noise: f64,
+    /// Times that it is weighed at most, the first included.
     pub noise_rounds: usize,
     /// How much a richer model may raise the standard deviation of the log focal length and still be taken: beyond, it
     /// fits by giving up what was to be found.
@@ -317,12 +341,13 @@ pub struct ModelOptions {
 
 impl ModelOptions {
     pub const DEFAULT: Self = Self {
-        // The .999 quantiles of chi-square; see [`chi_square_gate`] for more.
+        // The .999 quantiles of chi-square and of the normal distribution.
         significant_gain_of_one: 10.8,
         significant_gain_of_two: 13.8,
+        significance: 3.09,
         worth_a_trial: 0.5,
-        // A prior that is weighed by a misfit's noise is too strong: with a third radial term of .4, k1 to k3 were up to
-        // 7.4 sigma off.
+        // A prior that is weighed by a misfit's noise is too strong: with a third radial term of .4, k1 to k3 were up
+        // to 7.4 sigma off.
         same_noise: 0.9,
         // The noise falls by the misfit at once, and by little after.
         noise_rounds: 4,
@@ -342,7 +367,7 @@ impl ModelOptions {
         match freedom {
             1 => self.significant_gain_of_one,
             2 => self.significant_gain_of_two,
-            many => chi_square_gate(many as f64),
+            many => chi_square_quantile(many as f64, self.significance),
         }
     }
 }
@@ -360,6 +385,8 @@ pub struct GradeOptions {
     pub least_in_front: f64,
     /// Difference in log focal from which another minimum is another calibration.
     pub other_calibration: f64,
+    /// Difference in chi-square up to which the data do not tell two minima apart.
+    pub indistinguishable: f64,
     /// Standard deviation of a coordinate of the principal point, from the observations alone, above which they do not
     /// determine it.
     pub principal_point_unobservable_above: f64,
@@ -380,6 +407,8 @@ impl GradeOptions {
         // A forward-moving car gave 2.9 % behind, with a focal length of a quarter of the true.
         least_in_front: 0.99,
         other_calibration: 0.02,
+        // The .999 quantile for two degrees of freedom.
+        indistinguishable: 13.8,
         // No lens is worse centred than that.
         principal_point_unobservable_above: 0.05,
         prior_contradicted: 3.0,

@@ -74,7 +74,7 @@ impl Minimum {
         priors: &[IntrinsicsPrior],
         stop: &StopToken,
     ) -> Self {
-        self.adjusted_by(&problem.options.search.last(), problem, model, priors, stop)
+        self.adjusted_by(&problem.options.search.to_convergence(), problem, model, priors, stop)
     }
 
     fn adjusted_by(
@@ -206,11 +206,11 @@ fn minima_of_one(
     let mut cheapest = f64::INFINITY;
     for mut start in found {
         Stopped::check(stop)?;
-        if start.cost > options.hopeless * cheapest {
+        if start.cost > options.hopeless_cost * cheapest {
             let tried = start.adjusted_by(&options.first(), searched, model, priors, stop);
             let pace =
                 (tried.cost / start.cost).powf(options.final_iterations as f64 / options.first_iterations as f64);
-            if pace * tried.cost > options.hopeless * cheapest {
+            if pace * tried.cost > options.hopeless_cost * cheapest {
                 continue;
             }
             start = tried;
@@ -270,11 +270,11 @@ fn starts(frame: &CanonicalFrame, options: &SearchOptions) -> Vec<Daq> {
     };
     let mut to_refine: Vec<Daq> = daq::linear(cameras).into_iter().collect();
     to_refine.extend(scanned.iter().take(options.refined_from_scan).map(|(daq, _)| *daq));
-    to_refine.extend(options.scan_octaves.into_iter().filter_map(|focal| best_near(focal, 0.5 * 2f64.ln())));
+    to_refine.extend(options.scan_centres.into_iter().filter_map(|focal| best_near(focal, options.scan_half_width)));
     let mut refined: Vec<(Daq, f64)> = to_refine
         .into_iter()
         .map(|start| daq::refine(cameras, start, Free::FocalAndPlane, options.refine_iterations))
-        .filter(|(daq, cost)| cost.is_finite() && options.plausible_focal.contains(&daq.intrinsics.focal))
+        .filter(|(daq, cost)| cost.is_finite() && options.refined_focals.contains(&daq.intrinsics.focal))
         .collect();
     refined.sort_by(|a, b| a.1.total_cmp(&b.1));
 
@@ -289,14 +289,14 @@ fn starts(frame: &CanonicalFrame, options: &SearchOptions) -> Vec<Daq> {
             kept.push(daq);
         }
     }
-    let windows = options.starts - 1;
+    let windows = options.starts.saturating_sub(1).max(1);
     let ratio = (options.window_range.1 / options.window_range.0).ln() / windows as f64;
     let mut windowed: Vec<(Daq, f64)> = (0..=windows)
         .filter_map(|k| best_near(options.window_range.0 * (ratio * k as f64).exp(), options.window_half_width))
         .map(|daq| (daq, daq::residual(cameras, &daq)))
         .collect();
     windowed.sort_by(|a, b| a.1.total_cmp(&b.1));
-    kept.extend(windowed.into_iter().map(|(daq, _)| daq).take(options.starts - kept.len()));
+    kept.extend(windowed.into_iter().map(|(daq, _)| daq).take(options.starts.saturating_sub(kept.len())));
     kept
 }
 

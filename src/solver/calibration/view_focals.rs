@@ -39,8 +39,8 @@ pub(super) fn judge(verdict: &mut Verdict, focals: &[ViewFocal]) -> Option<f64> 
         focals.iter().filter(|view| is_determined(view, options)).filter_map(|view| view.sigma_log).collect();
     let sigma = root_mean_square(&determined);
     if (determined.len() as f64) < options.least_determined * focals.len() as f64 || sigma.is_none() {
-        let is_known = |sigma: &f64| *sigma > options.weak_up_to && *sigma < options.unobservable_above;
-        let typical = Some(median(&mut all)).filter(is_known);
+        let is_bounded = |sigma: &f64| *sigma > options.weak_up_to && *sigma < options.unobservable_above;
+        let typical = Some(median(&mut all)).filter(is_bounded);
         verdict.judge_sigma(typical);
         return typical;
     }
@@ -83,7 +83,8 @@ pub(super) fn differing(metric: &Reconstruction, own: &Fit, choice: &Choice) -> 
     let priors = vec![options.lenses.prior(own.noise, None, choice.scale_px); problem.groups()];
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint).with(Extension::RadialK1);
     let mut freed = metric.clone().with_own_focals();
-    let report = metric::adjust(&mut freed, problem.observations, model, &priors, &options.search.last(), choice.stop);
+    let report =
+        metric::adjust(&mut freed, problem.observations, model, &priors, &options.search.to_convergence(), choice.stop);
     if !Fit::metric(report.cost, model, problem).refutes(own, &options.fit) {
         return None;
     }

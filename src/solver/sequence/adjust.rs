@@ -134,7 +134,7 @@ pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> f64 {
 
 /// What is known of the intrinsics of a camera before any observation.
 pub fn intrinsics_prior(problem: &Problem, camera: usize, noise: f64) -> IntrinsicsPrior {
-    problem.calibration.lenses.prior(noise, problem.focal_priors[camera], problem.scale_px)
+    problem.calibration_options.lenses.prior(noise, problem.focal_priors[camera], problem.scale_px)
 }
 
 /// Adjusts the views of a component with the landmarks that hold them best, while more are to come. Lenses that the

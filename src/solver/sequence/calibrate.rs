@@ -61,7 +61,7 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     adjust::all(problem, model, recorder);
     report_found(problem, model, recorder);
     for (camera, outcome) in outcomes.iter_mut().enumerate() {
-        admit_difference(model.lenses[camera].intrinsics.focal.ln(), outcome, &problem.calibration.grades);
+        admit_difference(model.lenses[camera].intrinsics.focal.ln(), outcome, &problem.calibration_options.grades);
         windows::reconcile(problem, model, camera, outcome, recorder)?;
     }
     Ok(outcomes)
@@ -118,7 +118,7 @@ pub fn of_extract(
         group_of: &metric.group_of,
         focal_priors: &focal_priors,
         focal_per_view: metric.has_own_focals(),
-        options: &problem.calibration,
+        options: &problem.calibration_options,
     };
     let outcomes = calibration::from_metric(&to_calibrate, &metric, problem.scale_px, problem.stop, heartbeat)?;
     Ok(of_group.into_iter().zip(outcomes).collect())

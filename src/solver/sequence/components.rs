@@ -1,7 +1,6 @@
 //! Reconstructions of an input that share no tracks, or too few: each with a frame and a scale of its own, all with one
 //! calibration.
 
-use super::SEED;
 use super::growth::Trial;
 use super::model::Model;
 use super::options::GrowthOptions;
@@ -9,12 +8,14 @@ use super::register;
 use super::structure;
 use crate::domain::{FocalPrior, Grade};
 use crate::geometry::bundle::metric::Intrinsics;
-use crate::solver::attempt::{self, Attempt};
+use crate::solver::attempt::{self, Attempt, Effort};
 use crate::solver::calibration::Outcome;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, view_selection};
 
+/// How the block of a further component is searched.
+const SEED: Effort = Effort { is_seed: true, is_quick: false };
 /// The component that the calibration comes from.
 pub const FIRST: u32 = 0;
 /// Blocks that are tried for components at most, and how many may fail one after the other: the best come first, and an
@@ -112,7 +113,7 @@ fn prior_of(problem: &Problem, seed: &Attempt, model: &Model, camera: usize) -> 
 }
 
 /// Takes back the views of a component that see too few of its points to be held by them, and the whole component if
-/// too few are left; these views.
+/// too few are left. Returns the views taken back.
 pub fn drop_unsupported(problem: &Problem, model: &mut Model, component: u32, recorder: &mut Recorder) -> Vec<usize> {
     let unsupported = |&view: &usize| {
         let kept = problem.of_view[view].iter().filter(|&&k| {

@@ -21,6 +21,8 @@ mod register;
 mod structure;
 mod windows;
 
+use std::ops::ControlFlow;
+
 pub use adjust::verified;
 pub use model::Model;
 pub use projective::Projective;
@@ -48,11 +50,10 @@ const ENOUGH_REGISTERED: f64 = 0.5;
 /// tenth more of them sigma falls by a twentieth.
 const WORTH_EXTENDING: f64 = 1.1;
 
-/// Subsets that are tried before blocks are searched at length.
+/// Subsets of a whole input that are tried before it is searched at length.
 const FIRST_SUBSETS: usize = 3;
 
-/// How a block is searched that is to be extended, and how where many are tried.
-const SEED: Effort = Effort { is_seed: true, is_quick: false };
+/// How subsets are searched, of which many are tried.
 const QUICK_SEED: Effort = Effort { is_seed: true, is_quick: true };
 
 /// A metric reconstruction that stands, with the block that it grew from.
@@ -74,37 +75,42 @@ pub enum Ended {
 
 /// Solves and extends block after block until one carries a reconstruction of most of the views.
 ///
-/// In order of cost, where the blocks are the whole input if its tracks are complete: blocks that are searched quickly,
-/// calibrated and extended metrically; what they found and some small subsets of them, extended projectively and
-/// calibrated then; the blocks again, with everything that a search can try; at last the other subsets.
+/// In order of cost: the blocks, searched quickly, calibrated and extended metrically; what they found and small
+/// subsets of them, extended projectively and calibrated then. Only where none of these stands: the blocks again, with
+/// everything that a search can try, and the subsets that are left. An input whose tracks are mostly complete is its
+/// only block; with depths it is searched at length at once.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
     let blocks = Blocks::of(problem);
-    // Depths decide in the first round or take all of them.
+    // In the one block of a whole input depths decide in the first round or take all of them. Other blocks are several,
+    // of which another may do.
     let is_quick = !(blocks.is_whole && problem.input.has_depths());
     // A calibrated reconstruction that another might be better than.
     let mut metric: Option<Box<Extended>> = None;
     let first = match blocks.by_calibration(problem, is_quick, recorder)? {
-        Searched::Done(ended) => return Ok(ended),
-        Searched::Open(Ended::Extended(extended)) if extended.is_calibrated(problem) => {
+        ControlFlow::Break(ended) => return Ok(ended),
+        ControlFlow::Continue(Ended::Extended(extended)) if extended.is_calibrated(problem) => {
             metric = Some(extended);
             None
         }
-        Searched::Open(Ended::Extended(extended)) => Some(extended.seed),
-        Searched::Open(Ended::Block(attempt)) => attempt.map(|attempt| *attempt),
+        ControlFlow::Continue(ended) => ended.seed(),
     };
-    let subsets = view_selection::subsets(&blocks.views);
-    let (cheap, rest) = subsets.split_at(subsets.len().min(FIRST_SUBSETS));
-    let mut best = by_projective_extension(problem, first, cheap, recorder)?;
+    let subsets = view_selection::subsets(&blocks.sets);
+    let cheap = if blocks.is_whole { FIRST_SUBSETS.min(subsets.len()) } else { subsets.len() };
+    let (cheap, rest) = subsets.split_at(cheap);
+    // Nothing else is searched of a whole input with depths: what it has found stands.
+    let mut best = by_projective_extension(problem, first, !is_quick, cheap, recorder)?;
     if is_quick && metric.is_none() && !stands(&best) {
         let first = match blocks.by_calibration(problem, false, recorder)? {
-            Searched::Done(ended) => return Ok(ended),
-            Searched::Open(Ended::Extended(extended)) => return Ok(Ended::Extended(extended)),
-            Searched::Open(Ended::Block(attempt)) => attempt.map(|attempt| *attempt),
+            ControlFlow::Break(ended) => return Ok(ended),
+            ControlFlow::Continue(Ended::Extended(extended)) if extended.is_calibrated(problem) => {
+                return Ok(Ended::Extended(extended));
+            }
+            ControlFlow::Continue(ended) => ended.seed(),
         };
-        best = by_projective_extension(problem, first, rest, recorder)?;
+        best = by_projective_extension(problem, first, false, rest, recorder)?;
     }
     let Some(best) = best else { return Ok(metric.map_or(Ended::Block(None), Ended::Extended)) };
     if metric.is_some() && !best.is_trusted() {
@@ -117,46 +123,55 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
     })
 }
 
-/// Sets of views that a reconstruction may begin with, best first.
-struct Blocks {
-    views: Vec<Vec<usize>>,
-    /// Whether there is one, which is the whole input, for its tracks are complete.
-    is_whole: bool,
+impl Ended {
+    /// What it began from.
+    fn seed(self) -> Option<Attempt> {
+        match self {
+            Ended::Extended(extended) => Some(extended.seed),
+            Ended::Block(attempt) => attempt.map(|attempt| *attempt),
+        }
+    }
 }
 
-/// What came of a search of the blocks.
-enum Searched {
-    /// Nothing else needs to be tried.
-    Done(Ended),
-    Open(Ended),
+/// Sets of views that a reconstruction may begin with, best first.
+struct Blocks {
+    sets: Vec<Vec<usize>>,
+    /// Whether it is the one of [`view_selection::whole`].
+    is_whole: bool,
 }
 
 impl Blocks {
     fn of(problem: &Problem) -> Self {
         match view_selection::whole(problem.input, &problem.ranges) {
-            Some(whole) => Self { views: vec![whole], is_whole: true },
-            None => Self { views: view_selection::blocks(problem), is_whole: false },
+            Some(whole) => Self { sets: vec![whole], is_whole: true },
+            None => Self { sets: view_selection::blocks(problem), is_whole: false },
         }
     }
 
-    /// Calibrates the blocks and extends them from there.
-    fn by_calibration(&self, problem: &Problem, is_quick: bool, recorder: &mut Recorder) -> Result<Searched, Error> {
+    /// Calibrates the blocks and extends them from there; breaks where nothing else needs to be tried.
+    fn by_calibration(
+        &self,
+        problem: &Problem,
+        is_quick: bool,
+        recorder: &mut Recorder,
+    ) -> Result<ControlFlow<Ended, Ended>, Error> {
         let ended = if self.is_whole {
-            let attempt = of_whole(problem, &self.views[0], is_quick, recorder)?;
-            // What a search has found that tries everything is the last word.
+            let attempt = of_whole(problem, &self.sets[0], is_quick, recorder)?;
+            // A second search, which tries everything, has the last word. With depths there is one only, and subsets
+            // follow.
             let is_last = !is_quick && !problem.input.has_depths() && attempt.projective.is_some();
             if is_last || attempt.is_trusted() || attempt.is_beyond_image_points() {
-                return Ok(Searched::Done(finished(problem, attempt, recorder)?));
+                return Ok(ControlFlow::Break(finished(problem, attempt, recorder)?));
             }
             match attempt.is_calibrated() {
                 true => metric_of(problem, attempt, recorder)?,
                 false => Ended::Block(Some(Box::new(attempt))),
             }
         } else {
-            by_calibrated_blocks(problem, &self.views, Effort { is_seed: true, is_quick }, recorder)?
+            by_calibrated_blocks(problem, &self.sets, Effort { is_seed: true, is_quick }, recorder)?
         };
         let is_settled = matches!(&ended, Ended::Extended(extended) if extended.is_settled(problem));
-        Ok(if is_settled { Searched::Done(ended) } else { Searched::Open(ended) })
+        Ok(if is_settled { ControlFlow::Break(ended) } else { ControlFlow::Continue(ended) })
     }
 }
 
@@ -218,9 +233,12 @@ fn by_calibrated_blocks(
 
 /// The best of an attempt and of those on these sets of views, each extended to all views without a calibration and
 /// calibrated then; the first that is METRIC.
+///
+/// * `keeps_first`: whether the first stands as it is where its extension leaves too little
 fn by_projective_extension(
     problem: &Problem,
     first: Option<Attempt>,
+    keeps_first: bool,
     sets: &[Vec<usize>],
     recorder: &mut Recorder,
 ) -> Result<Option<Attempt>, Error> {
@@ -230,15 +248,15 @@ fn by_projective_extension(
     let starts = usize::from(first.is_some()) + sets.len();
     for k in 0..starts {
         problem.stopped()?;
-        let mut attempt = match first.take() {
-            Some(attempt) => attempt,
+        let (mut attempt, keeps) = match first.take() {
+            Some(attempt) => (attempt, keeps_first),
             None => {
                 recorder.begin_block(k, starts);
                 let views = &sets[k - (starts - sets.len())];
-                attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder)?
+                (attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder)?, false)
             }
         };
-        extend_projectively(problem, &mut attempt, false, recorder)?;
+        extend_projectively(problem, &mut attempt, keeps, recorder)?;
         if attempt.projective.is_none() {
             unsolved = unsolved.or(Some(attempt));
             continue;
@@ -361,7 +379,7 @@ fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Result<E
         structure::triangulate(problem, &mut model, recorder);
         for component in 0..=model.component_of.iter().copied().max().unwrap_or(components::FIRST) {
             let dropped = components::drop_unsupported(problem, &mut model, component, recorder);
-            // What joins in the last round would not be adjusted with the rest.
+            // After the last round nothing would check the views that join.
             if !dropped.is_empty() && round + 1 < rounds {
                 register::join_again(problem, &mut model, component, &dropped, &mut trials, recorder)?;
             }

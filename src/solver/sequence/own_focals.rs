@@ -82,7 +82,7 @@ fn combined(problem: &Problem, model: &mut Model, runs: Vec<(Extract, Outcome)>)
         let mut differences = Vec::new();
         for (&view, own) in extract.views.iter().zip(focals.iter().flatten()) {
             let whole = &mut model.own_focals[view];
-            whole.is_determined = own.stands_as(whole.focal, &problem.calibration);
+            whole.is_determined = own.stands_as(whole.focal, &problem.calibration_options);
             if whole.is_determined {
                 differences.push((whole.focal / own.focal).ln());
             }
@@ -105,7 +105,7 @@ fn combined(problem: &Problem, model: &mut Model, runs: Vec<(Extract, Outcome)>)
         };
         whole.warnings.extend(outcome.warnings.into_iter().map(named));
     }
-    let grades = &problem.calibration.grades;
+    let grades = &problem.calibration_options.grades;
     // No rounding makes the whole worse than its worst run.
     let largest = deviations.iter().fold(0.0f64, |largest, sigma| largest.max(*sigma));
     whole.sigma_log_focal = root_mean_square(&deviations).map(|sigma| sigma.min(largest));

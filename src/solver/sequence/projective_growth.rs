@@ -58,9 +58,9 @@ pub fn extend(
         growing.adjust(options.final_iterations, recorder);
         growing.triangulate(None, recorder);
         let dropped = growing.drop_unsupported();
-        // What stands without them may place them better; in the last round nothing would adjust them.
+        // What stands without them may place them better; after the last round nothing would check them.
         if !dropped.is_empty() && round < options.final_rounds {
-            dropped.iter().for_each(|&view| trials[view] = Trial::default());
+            dropped.iter().for_each(|&view| trials[view].count = 0);
             growth::grow(problem, &mut growing, options, &mut trials, recorder)?;
         }
     }
@@ -184,7 +184,7 @@ impl<'a> Growing<'a> {
         noise.clamp(least, (OPTIONS.noise_growth * self.start_noise).min(most))
     }
 
-    /// Takes back the views that too few points hold; these views.
+    /// Takes back the views that too few points hold, and returns them.
     fn drop_unsupported(&mut self) -> Vec<usize> {
         let problem = self.problem;
         let mut dropped = Vec::new();

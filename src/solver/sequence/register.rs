@@ -63,7 +63,9 @@ pub fn join(
     growth::grow(problem, &mut growth, &OPTIONS, trials, recorder)
 }
 
-/// Joins views to a component again from which they were taken back: what stands without them may place them better.
+/// Tries the views again that a component has lost, as [`join`] does: what stands without them may place them better.
+///
+/// * `dropped`: their trials count anew
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -75,7 +77,7 @@ pub fn join_again(
     trials: &mut [Trial],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
-    dropped.iter().for_each(|&view| trials[view] = Trial::default());
+    dropped.iter().for_each(|&view| trials[view].count = 0);
     growth::grow(problem, &mut Component::new(problem, model, component), &OPTIONS, trials, recorder)
 }
 

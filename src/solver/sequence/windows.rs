@@ -30,7 +30,7 @@ pub fn reconcile(
     let Some(fused) = fuse(&estimates, shared) else { return Ok(()) };
     let apart = (fused.log_focal - model.log_focal(camera, &of_camera(problem, model, camera))).abs();
     let which = format!("{} windows of the sequence", estimates.len());
-    raise(outcome, own.max(fused.sigma).max(apart), &fused, &which, &problem.calibration.grades);
+    raise(outcome, own.max(fused.sigma).max(apart), &fused, &which, &problem.calibration_options.grades);
     Ok(())
 }
 
@@ -83,7 +83,7 @@ fn moved_alone(problem: &Problem, model: &Model, camera: usize, views: &[usize])
         group_of: &metric.group_of,
         focal_priors: &[None],
         focal_per_view: metric.has_own_focals(),
-        options: &problem.calibration,
+        options: &problem.calibration_options,
     };
     let prior = adjust::intrinsics_prior(problem, camera, model.noise);
     let (log_focal, sigma) = calibration::focal_alone(&to_calibrate, &metric, &prior, problem.stop)?;
