@@ -376,7 +376,7 @@ fn calibrate_projective(
     let prior = prior.filter(|_| cameras.len() == 1);
     let focal_priors: Vec<Option<FocalPrior>> =
         cameras.iter().map(|&camera| prior.or(problem.focal_priors[camera])).collect();
-    let to_calibrate = calibration::Problem {
+    let to_calibrate = calibration::Uncalibrated {
         cameras: &some.cameras,
         points: &some.points,
         observations: &some.observations,

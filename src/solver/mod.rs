@@ -4,7 +4,7 @@
 //!
 //! The way through: [`copies`] keeps one of the tracks that stand in the input several times; [`problem`] is the input
 //! as all stages see it; [`view_selection`] chooses views whose tracks are complete: all of them, or a few; [`attempt`]
-//! searches such a block, by [`portfolio`] (priors, [`search`], [`grow`]; [`near_duplicates`] are left aside, the
+//! searches such a block, by [`portfolio`] (proposals, [`search`], [`grow`]; [`near_duplicates`] are left aside, the
 //! [`track_sampling`] of many tracks searched, [`a_contrario`] verifies, [`all_tracks`] join; [`depths`] where those
 //! verify what image points cannot) or [`baselines`], and [`calibration`] upgrades it. [`sequence`] tries blocks in
 //! order of cost and extends what stands to the other views and tracks, projectively or metrically, observation by

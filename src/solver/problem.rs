@@ -180,21 +180,21 @@ fn is_searched(settings: &SolveSettings) -> bool {
 
 /// Says so where views of several cameras or sizes are given one focal length.
 ///
-/// * `cameras`: each group has a calibration of its own, so that sizes alone matter, within a group
-/// * `zooms`: each view has a focal length of its own, so that nothing is merged
-fn merged_cameras(input: &Input, cameras: bool, zooms: bool) -> Option<Warning> {
-    if zooms {
+/// * `has_groups`: each group has a calibration of its own, so that sizes alone matter, within a group
+/// * `has_own_focals`: each view has a focal length of its own, so that nothing is merged
+fn merged_cameras(input: &Input, has_groups: bool, has_own_focals: bool) -> Option<Warning> {
+    if has_own_focals {
         return None;
     }
     let (group_of, groups) = camera_groups(input);
     let size = |view: &View| view.size.map(|size| (size.width_px, size.height_px));
     let kinds: BTreeSet<_> =
-        input.views().iter().zip(&group_of).map(|(view, group)| (cameras.then_some(*group), size(view))).collect();
-    let distinct = if cameras { groups } else { 1 };
-    if kinds.len() <= distinct && (cameras || groups == 1) {
+        input.views().iter().zip(&group_of).map(|(view, group)| (has_groups.then_some(*group), size(view))).collect();
+    let distinct = if has_groups { groups } else { 1 };
+    if kinds.len() <= distinct && (has_groups || groups == 1) {
         return None;
     }
-    let detail = if cameras {
+    let detail = if has_groups {
         "views of one camera group have several image sizes; they were solved with one focal length in pixels"
             .to_owned()
     } else {

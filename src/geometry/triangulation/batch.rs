@@ -20,7 +20,7 @@ fn away_from_zero(depth: F64x8) -> F64x8 {
 
 /// The `k`-th observation of every track.
 #[derive(Clone, Copy)]
-struct Sighted {
+struct BatchedObservation {
     /// The camera's columns, rows within.
     camera: [[F64x8; 3]; 4],
     xy: [F64x8; 2],
@@ -28,7 +28,7 @@ struct Sighted {
     weight: F64x8,
 }
 
-impl Sighted {
+impl BatchedObservation {
     /// The point's image, homogeneous.
     #[inline(always)]
     fn image(&self, point: &Points) -> [F64x8; 3] {
@@ -50,7 +50,7 @@ impl Sighted {
 
 /// Up to [`LANES`] tracks.
 pub struct Batch {
-    sighted: Vec<Sighted>,
+    batched: Vec<BatchedObservation>,
     tracks: usize,
 }
 
@@ -83,28 +83,28 @@ impl Batch {
     /// These tracks, [`LANES`] at most; what is beyond is left out.
     pub fn new(cameras: &[Camera], tracks: &[&[Observation]]) -> Self {
         let longest = tracks.iter().map(|track| track.len()).max().unwrap_or(0);
-        let nothing = Sighted { camera: [[F64x8::ZERO; 3]; 4], xy: [F64x8::ZERO; 2], weight: F64x8::ZERO };
-        let mut sighted = vec![nothing; longest];
+        let nothing = BatchedObservation { camera: [[F64x8::ZERO; 3]; 4], xy: [F64x8::ZERO; 2], weight: F64x8::ZERO };
+        let mut batched = vec![nothing; longest];
         for lane in 0..LANES {
             // A lane without a track repeats the first one, and a place without an observation has the camera of the
             // track's first: numbers that count nowhere, but are of a usual size.
             let Some(track) = tracks.get(lane).or(tracks.first()) else { continue };
-            for (k, sighted) in sighted.iter_mut().enumerate() {
+            for (k, batched) in batched.iter_mut().enumerate() {
                 let Some(seen) = track.get(k).or(track.first()) else { continue };
                 let camera: &[[f64; 3]; 4] = cameras[seen.view].as_ref();
-                for (lanes, entries) in sighted.camera.iter_mut().zip(camera) {
+                for (lanes, entries) in batched.camera.iter_mut().zip(camera) {
                     for (lanes, entry) in lanes.iter_mut().zip(entries) {
                         lanes.0[lane] = *entry;
                     }
                 }
                 if k < track.len() {
-                    sighted.xy[0].0[lane] = seen.xy.x;
-                    sighted.xy[1].0[lane] = seen.xy.y;
-                    sighted.weight.0[lane] = seen.weight;
+                    batched.xy[0].0[lane] = seen.xy.x;
+                    batched.xy[1].0[lane] = seen.xy.y;
+                    batched.weight.0[lane] = seen.weight;
                 }
             }
         }
-        Self { sighted, tracks: tracks.len().min(LANES) }
+        Self { batched, tracks: tracks.len().min(LANES) }
     }
 
     pub fn tracks(&self) -> usize {
@@ -113,7 +113,7 @@ impl Batch {
 
     /// Does without the `k`-th observation of a track from now on.
     pub fn drop_observation(&mut self, track: usize, k: usize) {
-        let Sighted { weight, xy, .. } = &mut self.sighted[k];
+        let BatchedObservation { weight, xy, .. } = &mut self.batched[k];
         // However far out it was: nothing times what has no end would be no number.
         (weight.0[track], xy[0].0[track], xy[1].0[track]) = (0.0, 0.0, 0.0);
     }
@@ -143,14 +143,14 @@ impl Batch {
     pub fn squared_residuals(&self, found: &Triangulated) -> Vec<[f64; LANES]> {
         vectorised(
             #[inline(always)]
-            || self.sighted.iter().map(|seen| seen.squared_residual(&found.points).0).collect(),
+            || self.batched.iter().map(|seen| seen.squared_residual(&found.points).0).collect(),
         )
     }
 
     #[inline(always)]
     fn costs(&self, points: &Points) -> F64x8 {
         let mut costs = F64x8::ZERO;
-        for seen in &self.sighted {
+        for seen in &self.batched {
             costs += seen.squared_residual(points);
         }
         costs
@@ -159,7 +159,7 @@ impl Batch {
     #[inline(always)]
     fn null_vectors(&self) -> Points {
         let mut normal = Symmetric::ZERO;
-        for seen in &self.sighted {
+        for seen in &self.batched {
             let [a, b, c, d] = seen.camera;
             let of_direction = a[2] * a[2] + b[2] * b[2] + c[2] * c[2];
             let of_all = of_direction + d[2] * d[2];
@@ -222,7 +222,7 @@ impl Batch {
             }
             let mut normal = Symmetric::ZERO;
             let mut gradient = [F64x8::ZERO; 4];
-            for seen in &self.sighted {
+            for seen in &self.batched {
                 let image = seen.image(&points);
                 let nearness = away_from_zero(image[2]).recip();
                 let [a, b, c, d] = &seen.camera;

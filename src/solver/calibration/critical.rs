@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::Problem;
+use super::Uncalibrated;
 use super::fit::Fit;
 use super::options::{CalibrationOptions, CriticalOptions};
 use crate::domain::{StopToken, Warning, WarningCode};
@@ -22,7 +22,7 @@ pub(super) struct Critical {
 /// Whether the views of this consensus carry no calibration, and why.
 ///
 /// * `fit`: the projective cameras that every model is tested against
-pub(super) fn find(problem: &Problem, fit: &Fit, scale_px: f64, stop: &StopToken) -> Critical {
+pub(super) fn find(problem: &Uncalibrated, fit: &Fit, scale_px: f64, stop: &StopToken) -> Critical {
     let (observations, views) = (problem.observations, problem.cameras.len());
     let points = problem.points.len();
     let CalibrationOptions { critical: options, fit: fit_options, .. } = problem.options;
@@ -44,7 +44,7 @@ pub(super) fn find(problem: &Problem, fit: &Fit, scale_px: f64, stop: &StopToken
 ///
 /// * `translates`: whether a camera that does not turn explains the views
 fn without_parallax(
-    problem: &Problem,
+    problem: &Uncalibrated,
     fit: &Fit,
     residual: f64,
     translates: bool,

@@ -1,6 +1,6 @@
 //! How well a model fits, and whether one that fits worse is refuted.
 
-use super::Problem;
+use super::Uncalibrated;
 use super::options::FitOptions;
 use crate::geometry::bundle::metric::IntrinsicsModel;
 
@@ -16,7 +16,7 @@ pub(super) struct Fit {
 
 impl Fit {
     /// * `unknowns`: those that the observations could determine, the gauge taken off
-    pub fn new(cost: f64, unknowns: usize, problem: &Problem) -> Self {
+    pub fn new(cost: f64, unknowns: usize, problem: &Uncalibrated) -> Self {
         let freedom = (2 * problem.observations.len()).saturating_sub(unknowns);
         let options = &problem.options.fit;
         let posterior = options.posterior_noise(cost, freedom);
@@ -27,12 +27,12 @@ impl Fit {
     /// The fit of free projective cameras and points.
     ///
     /// * `others`: parameters that the points were made with
-    pub fn projective(cost: f64, problem: &Problem, inliers: usize, others: usize) -> Self {
+    pub fn projective(cost: f64, problem: &Uncalibrated, inliers: usize, others: usize) -> Self {
         Self::new(cost, (11 * problem.cameras.len() + 3 * inliers + others).saturating_sub(15), problem)
     }
 
     /// The fit of metric cameras with these intrinsics of each group free, and points.
-    pub fn metric(cost: f64, model: IntrinsicsModel, problem: &Problem) -> Self {
+    pub fn metric(cost: f64, model: IntrinsicsModel, problem: &Uncalibrated) -> Self {
         let of_view = if model.is_per_view() { 7 } else { 6 };
         let inliers = super::observed_points(problem);
         let unknowns = of_view * problem.cameras.len() + 3 * inliers + model.parameters().len() * problem.groups();

@@ -7,7 +7,7 @@ use super::options::CalibrationOptions;
 use super::search::Minimum;
 use super::verdict::Verdict;
 use super::view_focals::{self, Differing};
-use super::{Outcome, Problem, Stopped};
+use super::{Outcome, Stopped, Uncalibrated};
 use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 
@@ -130,7 +130,7 @@ fn chosen(
 }
 
 /// The cheapest minimum whose points are in front of the cameras, if the data do not tell it from the cheapest.
-fn best_in_front(minima: &[Minimum], problem: &Problem, fit: &Fit) -> usize {
+fn best_in_front(minima: &[Minimum], problem: &Uncalibrated, fit: &Fit) -> usize {
     let unit = fit.noise.max(problem.noise).powi(2);
     let options = &problem.options.grades;
     let near = |minimum: &Minimum| minimum.cost - minima[0].cost < options.indistinguishable * unit;
@@ -141,7 +141,7 @@ fn best_in_front(minima: &[Minimum], problem: &Problem, fit: &Fit) -> usize {
 ///
 /// * `counts`: which views do where they have focal lengths of their own
 fn rival<'a>(
-    problem: &Problem,
+    problem: &Uncalibrated,
     best: &Candidate,
     others: &'a [Minimum],
     counts: impl Fn(usize) -> bool,

@@ -5,7 +5,7 @@ use nalgebra::Vector4;
 use super::fit::Fit;
 use super::models::{Candidate, Choice};
 use super::options::FitOptions;
-use super::{Problem, observed_points};
+use super::{Uncalibrated, observed_points};
 use crate::geometry::bundle::metric::{self, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::observation::Observation;
@@ -57,7 +57,7 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
         return None;
     }
     let observations = undistorted(&best.minimum.reconstruction, choice.problem.observations);
-    let problem = &Problem { observations: &observations, ..*choice.problem };
+    let problem = &Uncalibrated { observations: &observations, ..*choice.problem };
     let options = Options::squared(problem.options.fit.undistorted_iterations);
 
     let mut pinhole = best.minimum.reconstruction.clone();

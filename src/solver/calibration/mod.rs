@@ -30,7 +30,7 @@ pub use options::{CalibrationOptions, GradeOptions};
 
 /// A projective reconstruction to calibrate; inliers only.
 #[derive(Debug, Clone, Copy)]
-pub struct Problem<'a> {
+pub struct Uncalibrated<'a> {
     /// 3x4, any projective frame and scale.
     pub cameras: &'a [Matrix3x4<f64>],
     /// Homogeneous.
@@ -48,7 +48,7 @@ pub struct Problem<'a> {
     pub options: &'a CalibrationOptions,
 }
 
-impl Problem<'_> {
+impl Uncalibrated<'_> {
     /// Camera groups.
     pub fn groups(&self) -> usize {
         self.focal_priors.len()
@@ -60,7 +60,7 @@ impl Problem<'_> {
     }
 }
 
-/// The focal length of a view that zooms.
+/// The focal length of a view that has its own.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ViewFocal {
     /// Normalised.
@@ -169,12 +169,12 @@ impl From<Stopped> for super::Error {
 ///
 /// # Errors
 /// [`Stopped`] when `stop` fired; what stands by then is not worth returning.
-pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Stopped> {
+pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Stopped> {
     Stopped::check(stop)?;
     let nothing = vec![None; problem.groups()];
     // What is known of one focal length says nothing of a zoom.
     let focal_priors = if problem.focal_per_view { &nothing } else { problem.focal_priors };
-    let problem = &Problem { noise: problem.noise.max(problem.options.fit.least_noise), focal_priors, ..*problem };
+    let problem = &Uncalibrated { noise: problem.noise.max(problem.options.fit.least_noise), focal_priors, ..*problem };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < problem.options.fit.least_inliers {
@@ -219,7 +219,7 @@ pub fn calibrate(problem: &Problem, scale_px: f64, stop: &StopToken) -> Result<V
 /// # Errors
 /// As [`calibrate`].
 pub fn from_metric(
-    problem: &Problem,
+    problem: &Uncalibrated,
     metric: &Reconstruction,
     scale_px: f64,
     stop: &StopToken,
@@ -228,7 +228,7 @@ pub fn from_metric(
     Stopped::check(stop)?;
     let nothing = vec![None; problem.groups()];
     let focal_priors = if metric.has_own_focals() { &nothing } else { problem.focal_priors };
-    let problem = &Problem { noise: problem.noise.max(problem.options.fit.least_noise), focal_priors, ..*problem };
+    let problem = &Uncalibrated { noise: problem.noise.max(problem.options.fit.least_noise), focal_priors, ..*problem };
     let mut warnings = Vec::new();
     let inliers = observed_points(problem);
     if inliers < problem.options.fit.least_inliers {
@@ -259,7 +259,7 @@ pub fn from_metric(
 /// The log focal length that a metric reconstruction has by these observations alone, the mean of those of its views
 /// where each has its own, the rest of the lens held, and its standard deviation; `None` where that is not finite.
 pub fn focal_alone(
-    problem: &Problem,
+    problem: &Uncalibrated,
     metric: &Reconstruction,
     prior: &IntrinsicsPrior,
     stop: &StopToken,
@@ -288,7 +288,7 @@ fn no_start() -> Warning {
 
 /// The projective reconstruction at its minimum, and how well it fits.
 fn projectively_adjusted(
-    problem: &Problem,
+    problem: &Uncalibrated,
     inliers: usize,
     stop: &StopToken,
 ) -> (Vec<Matrix3x4<f64>>, Vec<Vector4<f64>>, Fit) {
@@ -299,7 +299,7 @@ fn projectively_adjusted(
 }
 
 /// Points with an observation.
-fn observed_points(problem: &Problem) -> usize {
+fn observed_points(problem: &Uncalibrated) -> usize {
     let mut seen = vec![false; problem.points.len()];
     for observation in problem.observations {
         if let Some(seen) = seen.get_mut(observation.point) {

@@ -3,7 +3,7 @@
 use super::fit::Fit;
 use super::options::{CalibrationOptions, GradeOptions};
 use super::search::Minimum;
-use super::{Problem, Stopped};
+use super::{Stopped, Uncalibrated};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
@@ -23,7 +23,7 @@ pub(super) struct Candidate {
 
 impl Candidate {
     /// * `minimum`: of this model with these priors
-    pub fn new(minimum: Minimum, model: IntrinsicsModel, priors: Vec<IntrinsicsPrior>, problem: &Problem) -> Self {
+    pub fn new(minimum: Minimum, model: IntrinsicsModel, priors: Vec<IntrinsicsPrior>, problem: &Uncalibrated) -> Self {
         let of_priors = IntrinsicsPrior::cost_of(&priors, model, &minimum.reconstruction.intrinsics);
         let fit = Fit::metric(minimum.cost - of_priors, model, problem);
         let information = Information::new(&minimum.reconstruction, problem.observations);
@@ -69,7 +69,7 @@ pub(super) struct Sigmas {
 
 /// What the choice of a model works with.
 pub(super) struct Choice<'a> {
-    pub problem: &'a Problem<'a>,
+    pub problem: &'a Uncalibrated<'a>,
     pub scale_px: f64,
     pub stop: &'a StopToken,
 }

@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::fit::Fit;
 use super::options::SearchOptions;
-use super::{Problem, Stopped};
+use super::{Stopped, Uncalibrated};
 use crate::domain::StopToken;
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::critical::Translating;
@@ -46,7 +46,7 @@ impl Minimum {
     }
 
     /// Of which views the observations determine the focal length; all where they do of none.
-    fn determined(&self, problem: &Problem) -> Vec<bool> {
+    fn determined(&self, problem: &Uncalibrated) -> Vec<bool> {
         let views = self.reconstruction.focals.len();
         if views == 0 {
             return Vec::new();
@@ -69,7 +69,7 @@ impl Minimum {
     /// Adjusts to convergence from here with this model.
     pub fn adjusted(
         &self,
-        problem: &Problem,
+        problem: &Uncalibrated,
         model: IntrinsicsModel,
         priors: &[IntrinsicsPrior],
         stop: &StopToken,
@@ -80,7 +80,7 @@ impl Minimum {
     fn adjusted_by(
         &self,
         options: &Options,
-        problem: &Problem,
+        problem: &Uncalibrated,
         model: IntrinsicsModel,
         priors: &[IntrinsicsPrior],
         stop: &StopToken,
@@ -98,7 +98,7 @@ impl Minimum {
 /// * `heartbeat`: called after each
 pub(super) fn minima_near(
     metric: &Reconstruction,
-    problem: &Problem,
+    problem: &Uncalibrated,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
     heartbeat: &mut dyn FnMut(),
@@ -130,7 +130,7 @@ pub(super) fn minima_near(
 /// first.
 pub(super) fn minima(
     frame: &CanonicalFrame,
-    problem: &Problem,
+    problem: &Uncalibrated,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
 ) -> Result<Vec<Minimum>, Stopped> {
@@ -144,11 +144,11 @@ pub(super) fn minima(
 /// With a focal length a camera group: from what one of each view leads to.
 fn minima_of_groups(
     frame: &CanonicalFrame,
-    problem: &Problem,
+    problem: &Uncalibrated,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
 ) -> Result<Vec<Minimum>, Stopped> {
-    let alone = Problem { group_of: &vec![0; frame.cameras.len()], focal_priors: &[None], ..*problem };
+    let alone = Uncalibrated { group_of: &vec![0; frame.cameras.len()], focal_priors: &[None], ..*problem };
     let mut found = minima_per_view(frame, &alone, stop)?;
     for minimum in &mut found {
         Stopped::check(stop)?;
@@ -159,7 +159,7 @@ fn minima_of_groups(
 }
 
 /// With a focal length a view: from the quadrics that allow for that, and from what one for all leads to.
-fn minima_per_view(frame: &CanonicalFrame, problem: &Problem, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
+fn minima_per_view(frame: &CanonicalFrame, problem: &Uncalibrated, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
     let (model, priors) = (IntrinsicsModel::FOCAL_PER_VIEW, [IntrinsicsPrior::NONE]);
     let options = &problem.options.search;
     let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(options.starts);
@@ -185,14 +185,14 @@ fn minima_per_view(frame: &CanonicalFrame, problem: &Problem, stop: &StopToken) 
 /// With one focal length for all views.
 fn minima_of_one(
     frame: &CanonicalFrame,
-    problem: &Problem,
+    problem: &Uncalibrated,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
 ) -> Result<Vec<Minimum>, Stopped> {
     let model = IntrinsicsModel::FOCAL;
     let options = &problem.options.search;
     let (subset, chosen) = subsample(frame, problem.observations, options);
-    let searched = &Problem { observations: subset.as_deref().unwrap_or(problem.observations), ..*problem };
+    let searched = &Uncalibrated { observations: subset.as_deref().unwrap_or(problem.observations), ..*problem };
     let mut found: Vec<Minimum> = Vec::new();
     for start in starts(frame, options) {
         Stopped::check(stop)?;
@@ -232,7 +232,7 @@ fn minima_of_one(
 pub(super) fn known_focal(
     translation: &Translating,
     focal: f64,
-    problem: &Problem,
+    problem: &Uncalibrated,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
 ) -> Vec<Minimum> {
@@ -243,7 +243,7 @@ pub(super) fn known_focal(
 }
 
 /// Cheapest first, without those that repeat a cheaper one.
-fn distinct(mut found: Vec<Minimum>, problem: &Problem) -> Vec<Minimum> {
+fn distinct(mut found: Vec<Minimum>, problem: &Uncalibrated) -> Vec<Minimum> {
     let options = &problem.options.search;
     found.retain(|minimum| minimum.cost.is_finite() && minimum.log_focal().is_finite());
     found.sort_by(|a, b| a.cost.total_cmp(&b.cost));

@@ -5,7 +5,7 @@ use super::fit::Fit;
 use super::models::{Candidate, Choice, Sigmas};
 use super::options::{GradeOptions, LensOptions};
 use super::verdict::Verdict;
-use super::{Problem, ViewFocal};
+use super::{Uncalibrated, ViewFocal};
 use crate::domain::{Grade, WarningCode};
 use crate::geometry::bundle::metric::{self, Extension, IntrinsicsModel, Reconstruction};
 use crate::geometry::statistics::{median, root_mean_square};
@@ -78,7 +78,7 @@ pub(super) struct Differing {
 ///
 /// * `own`: the fit of `metric`
 pub(super) fn differing(metric: &Reconstruction, own: &Fit, choice: &Choice) -> Option<Differing> {
-    let problem: &Problem = choice.problem;
+    let problem: &Uncalibrated = choice.problem;
     let options = problem.options;
     let priors = vec![options.lenses.prior(own.noise, None, choice.scale_px); problem.groups()];
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint).with(Extension::RadialK1);

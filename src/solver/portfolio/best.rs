@@ -23,7 +23,7 @@ pub enum VerifiedBy {
 /// A consensus, where it came from and how likely it is to be chance.
 pub struct Best {
     pub consensus: Consensus,
-    pub prior: Proposal,
+    pub proposal: Proposal,
     pub ln_false_alarms: f64,
     pub verified_by: VerifiedBy,
     /// Inliers that count where few are verified, see
@@ -55,7 +55,7 @@ impl Best {
         }
     }
 
-    /// Whether it displaces another: clearly less likely to be chance, the prior that came first wins. Of different
+    /// Whether it displaces another: clearly less likely to be chance, the proposal that came first wins. Of different
     /// evidence, what image points alone verify is better: it holds whatever the depths are worth.
     ///
     /// Costs would not do to compare by: they depend on the noise that each was grown at.
@@ -86,7 +86,7 @@ mod tests {
                 noise: 1e-3,
                 score: 0.5,
             },
-            prior: Proposal::Uniform,
+            proposal: Proposal::Uniform,
             ln_false_alarms,
             verified_by: VerifiedBy::ImagePoints,
             counted,

@@ -1,15 +1,15 @@
-//! The portfolio: priors propose, guided search verifies, the best consensus stands.
+//! The portfolio: proposals rank tracks, guided search verifies, the best consensus stands.
 //!
 //! What is cheap goes first: rigid distances where depths are given, the scores of the network that was trained
 //! beforehand, reweighting, consistency. Where they decide nothing, the paper's network is optimised a few iterations
-//! at a time; between, its ranking is verified by geometry, and so is uniform sampling, which needs no prior to be
+//! at a time; between, its ranking is verified by geometry, and so is uniform sampling, which needs no ranking to be
 //! right. A decisive consensus ends the search: the paper's network would say nothing after it that anyone waits for,
-//! and its first iterations took as long as everything else. Each prior's own time is kept.
+//! and its first iterations took as long as everything else. Each proposal's own time is kept.
 
-mod account;
 mod best;
 mod proposals;
 mod spread;
+mod stats;
 
 use std::time::Instant;
 
@@ -26,10 +26,10 @@ use crate::domain::result::PriorTime;
 use crate::domain::{Proposal, SolveSettings, StopToken};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::network::{NetworkSettings, PriorNetwork};
-use account::ProposalStats;
 use best::Best;
 pub use best::VerifiedBy;
 pub use spread::{MOST_SPREAD, spread, spread_of};
+use stats::ProposalStats;
 
 /// Network iterations between two verifications of its ranking.
 const ITERATIONS_PER_ROUND: u32 = 25;
@@ -37,10 +37,10 @@ const ITERATIONS_PER_ROUND: u32 = 25;
 const ROUNDS_WITHOUT_NETWORK: u32 = 16;
 /// Rounds of a quick search: the noise as assumed, which is rather too high.
 const QUICK_ROUNDS: u32 = 1;
-/// Samples a round and prior, without depths (a sample costs microseconds) and with.
+/// Samples a round and proposal, without depths (a sample costs microseconds) and with.
 const AFFINE_SAMPLES: (usize, usize) = (2_000, 6_000);
 const SUBSPACE_SAMPLES: (usize, usize) = (250, 1_000);
-/// Hypotheses a round and prior that are grown.
+/// Hypotheses a round and proposal that are grown.
 const SHORTLIST: usize = 2;
 /// Consensuses of near-duplicates after which a search is over: whatever includes one of so many explains all
 /// of it, and outbids what is right.
@@ -87,7 +87,7 @@ pub struct Portfolio<'a> {
     /// Standard deviation of the image points, the yardstick of the false alarms.
     spread: f64,
     rng: ChaCha8Rng,
-    accounts: Vec<ProposalStats>,
+    stats: Vec<ProposalStats>,
     best: Option<Best>,
     near_duplicates: Option<(usize, usize)>,
     /// Consensuses of near-duplicates.
@@ -117,7 +117,7 @@ impl<'a> Portfolio<'a> {
             noise,
             spread: spread(block),
             rng: ChaCha8Rng::seed_from_u64(settings.seed),
-            accounts: Proposal::ALL.into_iter().map(ProposalStats::new).collect(),
+            stats: Proposal::ALL.into_iter().map(ProposalStats::new).collect(),
             best: None,
             near_duplicates: None,
             near_duplicate_count: 0,
@@ -194,7 +194,7 @@ impl<'a> Portfolio<'a> {
             Search::Affine(_) => balance(&self.block.measurement_matrix()),
         };
         let network = PriorNetwork::new(&matrix, &NetworkSettings::from(self.settings))?;
-        self.account(Proposal::Network).seconds += begun.elapsed().as_secs_f64();
+        self.stats(Proposal::Network).seconds += begun.elapsed().as_secs_f64();
         Ok(network)
     }
 
@@ -205,7 +205,7 @@ impl<'a> Portfolio<'a> {
         }
         let begun = Instant::now();
         self.track_scores = self.track_scores.take().or_else(|| TrackScores::of(self.block));
-        self.account(Proposal::Learned).seconds += begun.elapsed().as_secs_f64();
+        self.stats(Proposal::Learned).seconds += begun.elapsed().as_secs_f64();
         if let Some(track_scores) = self.track_scores.as_ref().filter(|_| self.settings.weights_every > 0) {
             recorder.weights(&spread_weights(&track_scores.probabilities()));
         }
@@ -239,9 +239,9 @@ impl<'a> Portfolio<'a> {
                 recorder.weights(&spread_weights(network.weights()));
             }
         }
-        let account = self.account(Proposal::Network);
-        account.seconds += begun.elapsed().as_secs_f64();
-        account.work = network.iteration();
+        let stats = self.stats(Proposal::Network);
+        stats.seconds += begun.elapsed().as_secs_f64();
+        stats.work = network.iteration();
         Ok(())
     }
 
@@ -289,26 +289,26 @@ impl<'a> Portfolio<'a> {
         }
     }
 
-    fn account(&mut self, prior: Proposal) -> &mut ProposalStats {
-        let place = Proposal::ALL.iter().position(|&other| other == prior).unwrap_or(0);
-        &mut self.accounts[place]
+    fn stats(&mut self, proposal: Proposal) -> &mut ProposalStats {
+        let place = Proposal::ALL.iter().position(|&other| other == proposal).unwrap_or(0);
+        &mut self.stats[place]
     }
 
     fn finish(self, network: Option<PriorNetwork>) -> Found {
         let with_network = self.settings.method.uses_network();
         let with_depths = self.block.has_depths();
-        let Self { best, near_duplicates, accounts, rigid, track_scores, .. } = self;
+        let Self { best, near_duplicates, stats, rigid, track_scores, .. } = self;
         let rejected_by_network =
             best.as_ref().filter(|best| !best.is_acceptable()).and_then(Best::rejected_by_network);
         let accepted = best.filter(Best::is_acceptable);
-        let prior_times = accounts
+        let prior_times = stats
             .into_iter()
-            .filter(|account| with_network || !matches!(account.prior, Proposal::Network | Proposal::Learned))
-            .filter(|account| with_depths || account.prior != Proposal::Rigidity)
-            .map(|account| account.time(accepted.as_ref()))
+            .filter(|stats| with_network || !matches!(stats.proposal, Proposal::Network | Proposal::Learned))
+            .filter(|stats| with_depths || stats.proposal != Proposal::Rigidity)
+            .map(|stats| stats.time(accepted.as_ref()))
             .collect();
         let verified_by = accepted.as_ref().map_or(VerifiedBy::ImagePoints, |best| best.verified_by);
-        let (consensus, winning_prior) = accepted.map(|best| (best.consensus, best.prior)).unzip();
+        let (consensus, winning_prior) = accepted.map(|best| (best.consensus, best.proposal)).unzip();
         Found {
             consensus,
             verified_by,

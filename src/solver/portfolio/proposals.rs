@@ -1,4 +1,4 @@
-//! What each prior proposes, and how a proposal becomes a consensus.
+//! What is proposed, and how a proposal becomes a consensus.
 
 use std::time::Instant;
 
@@ -12,9 +12,9 @@ use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid, subspace};
 use crate::solver::{depths, grow, priors};
 
 impl Portfolio<'_> {
-    /// Whether this prior has anything left to say.
-    fn is_wanted(&self, prior: Proposal) -> bool {
-        !self.is_over() && !self.stop.is_stopped() && !self.settings.excluded_priors.contains(&prior)
+    /// Whether this proposal may find anything yet.
+    fn is_wanted(&self, proposal: Proposal) -> bool {
+        !self.is_over() && !self.stop.is_stopped() && !self.settings.excluded_priors.contains(&proposal)
     }
 
     /// Tracks whose distances stay the same, once a noise level: where depths are given and true up to one scale.
@@ -29,9 +29,9 @@ impl Portfolio<'_> {
         let begun = Instant::now();
         let found = search.run(self.noise);
         let pairs = self.block.tracks() * (self.block.tracks() - 1) / 2;
-        let account = self.account(Proposal::Rigidity);
-        account.seconds += begun.elapsed().as_secs_f64();
-        account.work += pairs as u32;
+        let stats = self.stats(Proposal::Rigidity);
+        stats.seconds += begun.elapsed().as_secs_f64();
+        stats.work += pairs as u32;
         let Some(rigid) = found else { return };
         self.verify(Proposal::Rigidity, vec![depths::seed(&rigid)]);
         if !self.is_decisive() {
@@ -40,9 +40,9 @@ impl Portfolio<'_> {
                 verified_by: VerifiedBy::Depths { focal: rigid.focal },
                 consensus: depths::consensus(self.block, &rigid, self.noise),
                 counted: rigid.inlier_count(),
-                prior: Proposal::Rigidity,
+                proposal: Proposal::Rigidity,
             };
-            self.account(Proposal::Rigidity).record(&found);
+            self.stats(Proposal::Rigidity).record(&found);
             self.offer(found);
         }
         let certainty = |rigid: &rigid::Rigid| rigid.ln_false_alarms(search.spread());
@@ -80,7 +80,7 @@ impl Portfolio<'_> {
         self.propose(Proposal::Learned, &track_scores.probabilities(), Some(&track_scores.truncations()));
     }
 
-    /// The priors that need no optimisation, once.
+    /// The proposals that need no optimisation, once.
     fn propose_geometric(&mut self) {
         if self.is_wanted(Proposal::Irls) {
             self.propose_irls();
@@ -96,10 +96,10 @@ impl Portfolio<'_> {
             Search::Affine(search) => priors::affine_irls(search.centred(), self.stop),
             Search::Subspace(search) => priors::irls(search.balanced(), subspace::RANK, self.stop),
         };
-        self.account(Proposal::Irls).seconds += begun.elapsed().as_secs_f64();
-        if let Some(prior) = irls {
-            self.propose_ranking(Proposal::Irls, &prior);
-            self.propose(Proposal::Irls, &prior, None);
+        self.stats(Proposal::Irls).seconds += begun.elapsed().as_secs_f64();
+        if let Some(weights) = irls {
+            self.propose_ranking(Proposal::Irls, &weights);
+            self.propose(Proposal::Irls, &weights, None);
         }
     }
 
@@ -109,20 +109,20 @@ impl Portfolio<'_> {
             Search::Affine(search) => priors::consistency(search.centred(), 2),
             Search::Subspace(search) => priors::consistency(&centred_rows(search.balanced()), 3),
         };
-        self.account(Proposal::Consistency).seconds += begun.elapsed().as_secs_f64();
+        self.stats(Proposal::Consistency).seconds += begun.elapsed().as_secs_f64();
         self.propose(Proposal::Consistency, &consistency, None);
     }
 
-    /// Searches under a prior and grows what it found.
+    /// Samples tracks by their weights and grows what that finds.
     ///
     /// * `truncations`: see [`affine::Search::run`]; of a search with depths nothing depends on them
-    pub(super) fn propose(&mut self, prior: Proposal, weights: &[f64], truncations: Option<&[f64]>) {
-        if !self.is_wanted(prior) {
+    pub(super) fn propose(&mut self, proposal: Proposal, weights: &[f64], truncations: Option<&[f64]>) {
+        if !self.is_wanted(proposal) {
             return;
         }
         let begun = Instant::now();
         let sampler = Sampler::new(weights);
-        let uniform = prior == Proposal::Uniform;
+        let uniform = proposal == Proposal::Uniform;
         let samples = |(guided, free): (usize, usize)| if uniform { free } else { guided };
         let (seeds, drawn) = match &self.search {
             Search::Affine(search) => {
@@ -143,24 +143,24 @@ impl Portfolio<'_> {
                 (shortlist.into_entries().map(|hypothesis| search.seed(self.block, &hypothesis)).collect(), drawn)
             }
         };
-        let account = self.account(prior);
-        account.seconds += begun.elapsed().as_secs_f64();
-        if prior != Proposal::Network {
-            account.work += drawn as u32;
+        let stats = self.stats(proposal);
+        stats.seconds += begun.elapsed().as_secs_f64();
+        if proposal != Proposal::Network {
+            stats.work += drawn as u32;
         }
-        self.verify(prior, seeds);
+        self.verify(proposal, seeds);
     }
 
-    /// Grows a prior's own best-ranked tracks, without sampling.
-    fn propose_ranking(&mut self, prior: Proposal, weights: &[f64]) {
+    /// Grows the tracks of most weight, without sampling.
+    fn propose_ranking(&mut self, proposal: Proposal, weights: &[f64]) {
         if matches!(self.search, Search::Affine(_)) {
             let costs: Vec<f64> = weights.iter().map(|weight| -weight).collect();
-            self.verify(prior, affine::seeds_from_ranking(self.block, &costs));
+            self.verify(proposal, affine::seeds_from_ranking(self.block, &costs));
         }
     }
 
-    /// Grows seeds until one is decisive, and keeps account.
-    fn verify(&mut self, prior: Proposal, seeds: Vec<Seed>) {
+    /// Grows seeds until one is decisive, and keeps the statistics.
+    fn verify(&mut self, proposal: Proposal, seeds: Vec<Seed>) {
         for seed in seeds {
             let begun = Instant::now();
             let grown = grow::grow(self.block, seed.cameras, seed.points, seed.support, self.noise, self.stop);
@@ -168,11 +168,11 @@ impl Portfolio<'_> {
             let ln_false_alarms = grown.as_ref().map_or(f64::INFINITY, |consensus| {
                 a_contrario::ln_false_alarms(self.block, consensus, self.spread, self.stop)
             });
-            self.account(prior).seconds += begun.elapsed().as_secs_f64();
+            self.stats(proposal).seconds += begun.elapsed().as_secs_f64();
             let Some(consensus) = grown else { continue };
             self.note_near_duplicates(&consensus);
-            let grown = Best { consensus, prior, ln_false_alarms, verified_by: VerifiedBy::ImagePoints, counted };
-            self.account(prior).record(&grown);
+            let grown = Best { consensus, proposal, ln_false_alarms, verified_by: VerifiedBy::ImagePoints, counted };
+            self.stats(proposal).record(&grown);
             self.offer(grown);
             if self.is_over() || self.stop.is_stopped() {
                 break;

@@ -110,7 +110,7 @@ pub fn of_extract(
     let (metric, of_group) = extract.block();
     let (cameras, points) = projective(&metric);
     let focal_priors: Vec<Option<FocalPrior>> = of_group.iter().map(|&camera| problem.focal_priors[camera]).collect();
-    let to_calibrate = calibration::Problem {
+    let to_calibrate = calibration::Uncalibrated {
         cameras: &cameras,
         points: &points,
         observations: &extract.observations,

@@ -75,7 +75,7 @@ fn moved_alone(problem: &Problem, model: &Model, camera: usize, views: &[usize])
     let extract = calibrate::core(problem, model, views, OF_VIEW);
     let (metric, _) = extract.block();
     let (cameras, points) = calibrate::projective(&metric);
-    let to_calibrate = calibration::Problem {
+    let to_calibrate = calibration::Uncalibrated {
         cameras: &cameras,
         points: &points,
         observations: &extract.observations,

@@ -25,10 +25,19 @@ pub fn of_one_lens<'a>(
     points: &'a [Vector4<f64>],
     observations: &'a [Observation],
     noise: f64,
-) -> Problem<'a> {
+) -> Uncalibrated<'a> {
     let group_of = &[0; 64][..cameras.len()];
     let options = &CalibrationOptions::DEFAULT;
-    Problem { cameras, points, observations, noise, group_of, focal_priors: &[None], focal_per_view: false, options }
+    Uncalibrated {
+        cameras,
+        points,
+        observations,
+        noise,
+        group_of,
+        focal_priors: &[None],
+        focal_per_view: false,
+        options,
+    }
 }
 
 /// The thresholds are those of the problem's options.
@@ -39,7 +48,7 @@ fn the_options_bound_the_grades() {
     let grade = |metric_below: f64, weak_up_to: f64| {
         let mut options = CalibrationOptions::DEFAULT;
         (options.grades.metric_below, options.grades.weak_up_to) = (metric_below, weak_up_to);
-        let problem = Problem { options: &options, ..of_one_lens(&cameras, &points, &scene.observations, 1e-3) };
+        let problem = Uncalibrated { options: &options, ..of_one_lens(&cameras, &points, &scene.observations, 1e-3) };
         only(calibrate(&problem, SIDE_PX, &StopToken::default())).grade
     };
     assert_eq!(grade(0.02, 0.1), Grade::Metric);
@@ -54,7 +63,7 @@ fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
 fn calibrated_knowing(scene: &TestScene, seed: u64, noise: f64, focal_prior: Option<FocalPrior>) -> Outcome {
     let (cameras, points) = projective_problem(scene, seed);
     let focal_priors = &[focal_prior];
-    let problem = Problem { focal_priors, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
+    let problem = Uncalibrated { focal_priors, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
     only(calibrate(&problem, SIDE_PX, &StopToken::default()))
 }
 

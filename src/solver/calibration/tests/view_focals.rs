@@ -43,7 +43,7 @@ fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
 fn calibrated_as(focal_per_view: bool, scene: &TestScene, seed: u64, noise: f64) -> Outcome {
     // Any projective frame of any cameras near the truth is adjusted to the observations.
     let (cameras, points) = projective_problem(scene, seed);
-    let problem = Problem { focal_per_view, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
+    let problem = Uncalibrated { focal_per_view, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
     only(calibrate(&problem, SIDE_PX, &StopToken::default()))
 }
 
@@ -146,7 +146,7 @@ fn critical_motions_are_refused_with_a_focal_length_a_view_too() {
 fn the_plane_at_infinity_goes_with_the_zoom() {
     let (scene, _) = zooming(3, 60, 1e-5, 0.3);
     let (cameras, points) = projective_problem(&scene, 3);
-    let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, 1e-5) };
+    let problem = Uncalibrated { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, 1e-5) };
     let outcome = only(calibrate(&problem, SIDE_PX, &StopToken::default()));
     let plane_at_infinity = outcome.plane_at_infinity.expect("a plane");
     let focals = outcome.focals.expect("a focal length a view");
@@ -187,7 +187,7 @@ fn near_truth(scene: &TestScene, focals: &[f64], noise: f64) -> Outcome {
     let metric = metric_of(scene, focals);
     let points: Vec<Vector4<f64>> = metric.points.iter().map(|point| point.push(1.0)).collect();
     let cameras = metric.cameras();
-    let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
+    let problem = Uncalibrated { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
     only(from_metric(&problem, &metric, SIDE_PX, &StopToken::default(), &mut || {}))
 }
 
@@ -206,7 +206,7 @@ fn with_choice<T>(
     ask: impl FnOnce(&super::super::models::Choice, &Fit, &search::Minimum) -> T,
 ) -> T {
     let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
-    let problem = Problem { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, NOISE) };
+    let problem = Uncalibrated { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, NOISE) };
     let (prior, stop) = (problem.options.lenses.prior(NOISE, None, SIDE_PX), StopToken::default());
     let choice = super::super::models::Choice { problem: &problem, scale_px: SIDE_PX, stop: &stop };
     let start = metric_of(scene, &vec![scene.intrinsics.focal; scene.poses.len()]);

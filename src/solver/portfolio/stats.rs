@@ -1,20 +1,20 @@
-//! What each prior proposed and what that cost, so that a result can say what each alone would have needed.
+//! What each proposal found and what that cost, so that a result can say what each alone would have needed.
 
 use super::best::{Best, LN_MARGIN};
 use crate::domain::Proposal;
 use crate::domain::result::PriorTime;
 
-/// One prior's account.
+/// What one proposal found, and its cost.
 pub struct ProposalStats {
-    pub prior: Proposal,
+    pub proposal: Proposal,
     pub seconds: f64,
     /// Network iterations, or hypotheses.
     pub work: u32,
-    /// Every consensus better than the prior's last.
+    /// Every consensus better than its last.
     records: Vec<Record>,
 }
 
-/// A consensus in a prior's account.
+/// A consensus of a proposal.
 struct Record {
     /// Spent by then.
     seconds: f64,
@@ -27,8 +27,8 @@ struct Record {
 const SUFFICIENT_SHARE: f64 = 0.95;
 
 impl ProposalStats {
-    pub fn new(prior: Proposal) -> Self {
-        Self { prior, seconds: 0.0, work: 0, records: Vec::new() }
+    pub fn new(proposal: Proposal) -> Self {
+        Self { proposal, seconds: 0.0, work: 0, records: Vec::new() }
     }
 
     /// Enters a consensus, if it is better than the last.
@@ -43,7 +43,7 @@ impl ProposalStats {
         }
     }
 
-    /// When this prior first stood at a consensus as good as the accepted one.
+    /// When this proposal first stood at a consensus as good as the accepted one.
     pub fn time(&self, accepted: Option<&Best>) -> PriorTime {
         let sufficient = accepted.and_then(|accepted| {
             let inliers = SUFFICIENT_SHARE * accepted.consensus.inlier_count() as f64;
@@ -52,7 +52,7 @@ impl ProposalStats {
             self.records.iter().find(is_enough)
         });
         PriorTime {
-            prior: self.prior,
+            prior: self.proposal,
             seconds: sufficient.map(|record| record.seconds),
             iterations: sufficient.map_or(self.work, |record| record.work),
         }
