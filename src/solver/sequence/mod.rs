@@ -6,11 +6,13 @@
 //! adjustment with the calibration free keeps the whole straight ([`adjust`]); where it is not, the same is done
 //! without a calibration ([`projective_growth`]), and the whole is calibrated then. Views that share no tracks with it
 //! become [`components`] of their own under the same calibration. What the whole says of the calibration is graded anew
-//! ([`calibrate`]) and checked between its [`windows`].
+//! ([`calibrate`]) and checked between its [`windows`]. This file decides which blocks are tried and what is made of
+//! them; [`extended`] is the metric extension of one.
 
 mod adjust;
 mod calibrate;
 mod components;
+mod extended;
 mod growth;
 mod model;
 mod options;
@@ -24,27 +26,19 @@ mod windows;
 use std::ops::ControlFlow;
 
 pub use adjust::verified;
-pub use model::Model;
+pub use extended::Extended;
 pub use projective::Projective;
-pub use register::Unregistered;
 
 use super::attempt::{self, Attempt, Effort};
-use super::calibration::Outcome;
 use super::grow::LEAST_INLIERS;
 use super::learned::SURELY_ENOUGH;
 use super::problem::Problem;
 use super::reconstruction::Reconstruction;
 use super::recorder::Recorder;
 use super::{Error, view_selection};
-use crate::domain::{Grade, Stage, Task, Warning, WarningCode};
+use crate::domain::Stage;
+use extended::extend;
 use options::GrowthOptions;
-
-/// Share of an extension's time before its calibration that registering takes, the rounds the rest: .71 and .67 as
-/// measured on 1,000 views with 350 and 87 observations a view.
-pub const SHARE_OF_REGISTERING: f64 = 0.7;
-/// Share of the views that an extension must register for no other seed to be tried: one that carries most of them is a
-/// component of whatever another would lead to.
-const ENOUGH_REGISTERED: f64 = 0.5;
 
 /// Growth of the retained observations, once each is judged by itself, from which a whole input is extended: with a
 /// tenth more of them sigma falls by a twentieth.
@@ -55,16 +49,6 @@ const FIRST_SUBSETS: usize = 3;
 
 /// How subsets are searched, of which many are tried.
 const QUICK_SEED: Effort = Effort { is_seed: true, is_quick: true };
-
-/// A metric reconstruction that stands, with the block that it grew from.
-pub struct Extended {
-    pub seed: Attempt,
-    pub model: Model,
-    /// One a camera of the problem.
-    pub calibrations: Vec<Outcome>,
-    /// Views that could not be registered, with the reason.
-    pub unregistered: Vec<Unregistered>,
-}
 
 /// What came of an input.
 pub enum Ended {
@@ -358,112 +342,5 @@ fn better(best: Option<Attempt>, attempt: Attempt) -> Option<Attempt> {
     match best {
         Some(best) if best.merit() >= attempt.merit() => Some(best),
         _ => Some(attempt),
-    }
-}
-
-/// Extends a block, which must be metric, to every view that can be registered.
-fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Result<Extended, Error> {
-    recorder.begin_extension();
-    recorder.enter(Stage::Extend);
-    let mut model = components::first(problem, &seed, recorder);
-    let mut trials = vec![growth::Trial::default(); problem.views()];
-    register::join(problem, &mut model, components::FIRST, &mut trials, recorder)?;
-    components::others(problem, &mut model, &seed, &mut trials, recorder)?;
-    recorder.end_components();
-    let rounds = GrowthOptions::METRIC.final_rounds;
-    for round in 0..rounds {
-        problem.stopped()?;
-        let within = SHARE_OF_REGISTERING + (1.0 - SHARE_OF_REGISTERING) * round as f64 / rounds as f64;
-        recorder.step(Task::Adjust, round + 1, rounds, within);
-        adjust::all(problem, &mut model, recorder);
-        structure::triangulate(problem, &mut model, recorder);
-        for component in 0..=model.component_of.iter().copied().max().unwrap_or(components::FIRST) {
-            let dropped = components::drop_unsupported(problem, &mut model, component, recorder);
-            // After the last round nothing would check the views that join.
-            if !dropped.is_empty() && round + 1 < rounds {
-                register::join_again(problem, &mut model, component, &dropped, &mut trials, recorder)?;
-            }
-        }
-        recorder.report(within);
-    }
-    problem.stopped()?;
-    recorder.enter(Stage::Calibrate);
-    let mut calibrations = calibrate::calibrate(problem, &mut model, recorder)?;
-    if model.is_strained {
-        calibrations.iter_mut().for_each(|outcome| refuse(problem, &model, outcome));
-    }
-    problem.stopped()?;
-    components::largest_first(&mut model);
-    let unregistered = register::left(problem, &model, &trials);
-    Ok(Extended { seed, model, calibrations, unregistered })
-}
-
-/// Takes back a calibration under which the sequence does not hold together.
-fn refuse(problem: &Problem, model: &Model, outcome: &mut Outcome) {
-    let detail = format!(
-        "the views together fit much worse than the block that they were registered against: more than {:.2} px",
-        model.noise * problem.scale_px
-    );
-    outcome.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
-    outcome.grade = Grade::ProjectiveOnly;
-}
-
-impl Extended {
-    /// The worst of the cameras that have enough registered views to be calibrated by themselves: a few photographs of
-    /// another camera take nothing from the rest. Of all cameras where none has.
-    pub fn grade(&self, problem: &Problem) -> Grade {
-        let mut views = vec![0; problem.cameras];
-        self.model.registered().into_iter().for_each(|view| views[problem.camera_of[view]] += 1);
-        let worst = |least: usize| {
-            let grades = self.calibrations.iter().zip(&views).filter(|(_, views)| **views >= least);
-            grades.map(|(outcome, _)| outcome.grade).reduce(Grade::worse)
-        };
-        worst(view_selection::LEAST_VIEWS).or_else(|| worst(1)).unwrap_or(Grade::ProjectiveOnly)
-    }
-
-    fn is_calibrated(&self, problem: &Problem) -> bool {
-        self.grade(problem) != Grade::ProjectiveOnly
-    }
-
-    /// Larger is better: a calibration before none, then the number of views.
-    fn merit(&self, problem: &Problem) -> (bool, usize) {
-        (self.is_calibrated(problem), self.model.registered().len())
-    }
-
-    /// What decides between reconstructions that were found in different ways: a calibration that fits as well as
-    /// projective cameras before others, then how well the observations fit.
-    fn rank(&self, problem: &Problem) -> (bool, f64) {
-        let model = &self.model;
-        let verified = adjust::verified(model);
-        let observations = verified.iter().filter_map(|&track| model.landmarks[track]).map(|point| point.support).sum();
-        let unknowns = 6 * model.registered().len() + 3 * verified.len();
-        let evidence = projective::evidence(observations, unknowns, model.noise, problem.outlier_density);
-        (self.is_calibrated(problem) && self.fits(), evidence)
-    }
-
-    /// Whether nothing says that projective cameras would fit better.
-    fn fits(&self) -> bool {
-        let mut warnings = self.calibrations.iter().flat_map(|outcome| &outcome.warnings);
-        warnings.all(|warning| warning.code != WarningCode::ModelMismatch)
-    }
-
-    /// Whether there is anything that geometry verifies: views that points hold, and enough points.
-    fn stands(&self) -> bool {
-        self.model.registered().len() >= view_selection::LEAST_VIEWS
-            && adjust::verified(&self.model).len() >= LEAST_INLIERS
-            && self.calibrations.iter().any(|outcome| outcome.metric.is_some())
-    }
-
-    /// Whether nothing is to be gained by extending without a calibration: most views hold together so precisely that
-    /// wrong observations do not.
-    fn is_settled(&self, problem: &Problem) -> bool {
-        let is_precise = self.model.noise <= attempt::INITIAL_NOISE;
-        // Windows that differ a little warn of a mismatch of a METRIC one too.
-        is_precise && self.holds_most_views() && (self.fits() || self.grade(problem) == Grade::Metric)
-    }
-
-    fn holds_most_views(&self) -> bool {
-        let registered = self.model.registered().len();
-        registered as f64 >= ENOUGH_REGISTERED * (registered + self.unregistered.len()) as f64
     }
 }

@@ -141,7 +141,7 @@ impl Growth for Component<'_> {
         recorder.standing.focal_px = Some(focal * problem.scale_px);
         recorder.registered(registered.len());
         let share = registered.len() as f64 / problem.observed_views().len() as f64;
-        recorder.report(super::SHARE_OF_REGISTERING * share);
+        recorder.report(super::extended::SHARE_OF_REGISTERING * share);
         agreeing
     }
 
