@@ -38,8 +38,8 @@ const CRITICAL: [WarningCode; 4] =
     [WarningCode::PureTranslation, WarningCode::PureRotation, WarningCode::PlanarScene, WarningCode::PlanarOrRotation];
 
 /// Median of the squared residuals over their mean, below which they are of several kinds; one normal noise gives .69.
-/// Measured on scenes of ten views and 200 tracks with depths: .60 to .80 in 150 of noise of 3 to 11 %, .14 to .49 in
-/// 120 with one to three wrong observations in every right track where these were first fitted at too high a noise.
+/// Measured on scenes of ten views and 200 tracks with depths: .60 to .80 in 150 of noise 3 to 11 %; .15 to .49 in the
+/// 46 that were first fitted at too high a noise of 120 with one to three wrong observations in every right track.
 const LEAST_MEDIAN_SHARE: f64 = 0.5;
 
 /// Merit of a WEAK attempt, see [`Attempt::merit`].
