@@ -92,11 +92,10 @@ impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Proble
 #[cfg(test)]
 mod tests {
     use super::super::Options;
+    use super::super::critical::Rotating;
     use super::super::engine::{descend, minimise};
-    use super::super::metric::{IntrinsicsPrior, Parameter, Reconstruction};
-    use super::super::metric::{Metric, POINT, POSE};
     use super::super::projective::Projective;
-    use super::super::testing::{self, NOISE};
+    use super::super::testing::{self, Motion, NOISE};
     use super::*;
     use crate::domain::StopToken;
 
@@ -135,14 +134,22 @@ mod tests {
                 testing::perturb(problem.points.iter_mut().flat_map(|point| point.iter_mut()), 0.003, seed + 1);
                 both_end_at_the_same_cost::<0, 12, 4>(&problem, &scene.observations, &case);
 
-                let mut reconstruction =
-                    Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone());
-                testing::perturb(reconstruction.points.iter_mut().flat_map(|point| point.iter_mut()), 0.1, seed);
-                let few: Vec<Observation> = scene.observations.iter().filter(|seen| seen.point < 8).copied().collect();
-                reconstruction.points.truncate(8);
-                let free = [Some(Parameter::LogFocal)];
-                let problem = Metric::<1, POSE> { reconstruction, free, prior: IntrinsicsPrior::NONE };
-                both_end_at_the_same_cost::<1, POSE, POINT>(&problem, &few, &case);
+                let turning = testing::scene_of(seed, 10, 7, NOISE, Motion::Rotation, false);
+                let start = &turning.poses[0].rotation;
+                let mut problem = Rotating {
+                    intrinsics: turning.intrinsics,
+                    rotations: turning.poses.iter().map(|pose| pose.rotation * start.transpose()).collect(),
+                    points: turning
+                        .points
+                        .iter()
+                        .map(|point| {
+                            let seen = start * point;
+                            seen.xy() / seen.z
+                        })
+                        .collect(),
+                };
+                testing::perturb(problem.points.iter_mut().flat_map(|point| point.iter_mut()), 0.01, seed);
+                both_end_at_the_same_cost::<3, 3, 2>(&problem, &turning.observations, &case);
             }
         }
     }

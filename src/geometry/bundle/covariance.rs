@@ -1,27 +1,18 @@
 //! How well the intrinsics are determined, whatever the gauge.
 
-use nalgebra::{DMatrix, DVector, SVector};
+use nalgebra::{DMatrix, DVector};
 
-use super::engine::{Layout, Problem};
+use super::Observation;
 use super::intrinsics::Intrinsics;
 use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior, Parameter};
-use super::metric::{Metric, OWN_CAMERA, POINT, POSE, Pose, Reconstruction, VIEW};
-use super::own_focals::{Direction, Function, OwnFocals};
-use super::reduced::{Linearisation, Reduced};
-use super::whitened::{WhitenedViews, centre};
-use super::{Loss, Observation};
+use super::metric::Reconstruction;
+use super::own_focals::Function;
+use super::sequence::System;
+use super::whitened::centre;
+use super::without_views::{PARAMETERS, WithoutViews, place, scale_of};
 
-const PARAMETERS: usize = Parameter::COUNT;
-/// Part of a parameter's information, as the root of a share, that a direction of the poses may take and still count as
-/// apart from the intrinsics: what rounding leaves where the two have nothing to do with each other.
-const APART: f64 = 1e-11;
 /// Information on the intrinsics, scaled by what they would have with everything else known, that counts as none.
 const NULL_INTRINSICS: f64 = 1e-10;
-
-/// Place of an intrinsic of a camera group among all.
-fn place(group: usize, parameter: Parameter) -> usize {
-    PARAMETERS * group + parameter as usize
-}
 
 /// What the observations say of the intrinsics of all camera groups together, poses and points marginalised, at one
 /// reconstruction.
@@ -33,17 +24,6 @@ fn place(group: usize, parameter: Parameter) -> usize {
 pub struct Information {
     intrinsics: Vec<Intrinsics>,
     reduced: WithoutViews,
-    /// The matrix' diagonal were poses and points known.
-    known: Vec<f64>,
-}
-
-/// Normal equations of the intrinsics with the views eliminated; each group's in the order of [`Parameter`].
-#[derive(Debug, Clone)]
-struct WithoutViews {
-    matrix: DMatrix<f64>,
-    /// Half the downward gradient of the cost.
-    negative_gradient: DVector<f64>,
-    own_focals: Option<OwnFocals>,
 }
 
 /// The minimum of the cost over the intrinsics of one model, to second order.
@@ -89,62 +69,14 @@ impl Information {
     /// The seven directions of a similarity are projected out. Returns `None` without poses, or where the system
     /// holds what is no number.
     pub fn new(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
-        match (reconstruction.intrinsics.len(), reconstruction.has_own_focals()) {
-            (1, true) => Self::of_one_group::<VIEW>(reconstruction, observations),
-            (1, false) => Self::of_one_group::<POSE>(reconstruction, observations),
-            (_, true) => Self::of_groups::<VIEW>(reconstruction, observations),
-            (_, false) => Self::of_groups::<POSE>(reconstruction, observations),
+        let mut metric = reconstruction.clone();
+        if metric.poses.is_empty() {
+            return None;
         }
-    }
-
-    /// * `C`: unknowns of a view
-    fn of_one_group<const C: usize>(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
-        let (metric, [matrix, vector], known) =
-            linearised::<PARAMETERS, C>(reconstruction, Parameter::ALL.map(Some), observations)?;
-        Self::without_views::<C>(metric, &matrix, &vector, known)
-    }
-
-    /// The same of several camera groups: of views with intrinsics of their own, which those of each group share.
-    fn of_groups<const C: usize>(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
-        let (metric, [own, own_vector], _) = linearised::<0, OWN_CAMERA>(reconstruction, [], observations)?;
-        let views = metric.poses.len();
-        let first = PARAMETERS * metric.intrinsics.len();
-        let (from, to) = (OWN_CAMERA * views, first + C * views);
-        // Where an unknown of a view with its own intrinsics goes: its pose, and its own focal length, stay its own.
-        let places = |k: usize| {
-            let (view, unknown) = (k / OWN_CAMERA, k % OWN_CAMERA);
-            let of_view = (unknown < C).then_some(first + C * view + unknown);
-            let parameter = unknown.checked_sub(POSE);
-            [of_view, parameter.map(|parameter| PARAMETERS * metric.group_of[view] + parameter)]
-        };
-        let (mut matrix, mut vector, mut known) = (vec![0.0; to * to], vec![0.0; to], vec![0.0; first]);
-        for column in 0..from {
-            places(column).into_iter().flatten().for_each(|to| vector[to] += own_vector[column]);
-            for row in 0..from {
-                let value = own[row.min(column) * from + row.max(column)];
-                for to_column in places(column).into_iter().flatten() {
-                    for to_row in places(row).into_iter().flatten().filter(|to_row| *to_row >= to_column) {
-                        matrix[to_column * to + to_row] += value;
-                    }
-                }
-            }
-        }
-        for (k, known) in known.iter_mut().enumerate() {
-            *known = matrix[k * to + k];
-        }
-        Self::without_views::<C>(metric, &matrix, &vector, known)
-    }
-
-    /// * `metric`: about its middle
-    fn without_views<const C: usize>(
-        metric: Reconstruction,
-        matrix: &[f64],
-        vector: &[f64],
-        known: Vec<f64>,
-    ) -> Option<Self> {
-        let reduced = WithoutViews::new::<C>(matrix, vector, &known, &metric.group_of, &metric.poses)?;
+        centre(&mut metric.poses, &mut metric.points);
+        let reduced = WithoutViews::new(&System::new(&metric, observations)?, &metric)?;
         let finite = reduced.matrix.iter().chain(reduced.negative_gradient.iter()).all(|value| value.is_finite());
-        finite.then_some(Self { intrinsics: metric.intrinsics, reduced, known })
+        finite.then_some(Self { intrinsics: metric.intrinsics, reduced })
     }
 
     /// Variance of the log focal length of each view that has its own under a model, and its value at the minimum of
@@ -162,7 +94,7 @@ impl Information {
     ///
     /// * `priors`: one a camera group
     pub fn optimum(&self, model: IntrinsicsModel, priors: &[IntrinsicsPrior]) -> Optimum {
-        let WithoutViews { matrix, negative_gradient, own_focals } = &self.reduced;
+        let WithoutViews { matrix, negative_gradient, own_focals, known } = &self.reduced;
         let parameters = model.parameters();
         let groups = self.intrinsics.len();
         let free: Vec<usize> =
@@ -180,7 +112,7 @@ impl Information {
             }
         }
         let gradient = negative_gradient - matrix * &shift;
-        let scale: Vec<f64> = free.iter().map(|&k| scale_of(self.known[k] + information[k])).collect();
+        let scale: Vec<f64> = free.iter().map(|&k| scale_of(known[k] + information[k])).collect();
         let scaled = DMatrix::from_fn(free.len(), free.len(), |row, column| {
             let (k, l) = (free[row], free[column]);
             let believed = if k == l { information[k] } else { 0.0 };
@@ -224,110 +156,9 @@ impl Information {
     }
 }
 
-/// The reconstruction about its middle, its reduced system and the diagonal of the shared intrinsics were all else
-/// known.
-type Linearised = (Reconstruction, [Vec<f64>; 2], Vec<f64>);
-
-/// Eliminates the points; `None` without poses.
-fn linearised<const G: usize, const C: usize>(
-    reconstruction: &Reconstruction,
-    free: [Option<Parameter>; G],
-    observations: &[Observation],
-) -> Option<Linearised> {
-    let mut reconstruction = reconstruction.clone();
-    if reconstruction.poses.is_empty() {
-        return None;
-    }
-    centre(&mut reconstruction.poses, &mut reconstruction.points);
-    let problem = Metric::<G, C> { reconstruction, free, prior: IntrinsicsPrior::NONE };
-    let layout = Layout::new(observations, problem.camera_count(), problem.point_count());
-    let mut linearisation = Linearisation::<G, C, POINT>::new(&layout, problem.camera_count());
-    linearisation.fill(&problem, &layout, Loss::Squared);
-    let known = linearisation.globals_diagonal().iter().copied().collect();
-    let mut reduced = Reduced::new(&layout, problem.camera_count());
-    let possible = reduced.build(&problem, &layout, &linearisation, 0.0);
-    possible.then_some((problem.reconstruction, [reduced.matrix, reduced.vector], known))
-}
-
-/// Unit information for a parameter of which something is known.
-fn scale_of(information: f64) -> f64 {
-    if information > 0.0 { information.sqrt().recip() } else { 1.0 }
-}
-
-impl WithoutViews {
-    /// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics;
-    /// its lower triangle is given. With it what the views' own focal lengths are, where they have them.
-    ///
-    /// A direction of the views on which rounding hides what the observations say, but which goes along with the
-    /// intrinsics, is taken to be as free as it can be: the intrinsics have no information left along with it. Taken as
-    /// known, it would make them certain.
-    fn new<const C: usize>(
-        matrix: &[f64],
-        vector: &[f64],
-        known: &[f64],
-        group_of: &[usize],
-        poses: &[Pose],
-    ) -> Option<Self> {
-        let first = known.len();
-        let dimension = first + C * poses.len();
-        let at = |row: usize, column: usize| matrix[column * dimension + row];
-        let mut information = DMatrix::from_fn(first, first, |row, column| at(row.max(column), row.min(column)));
-        let mut negative_gradient = DVector::from_column_slice(&vector[..first]);
-        let views = WhitenedViews::<C>::new(matrix, first, poses)?;
-        let of_view =
-            |view: usize, column: usize| SVector::<f64, C>::from_fn(|row, _| at(first + C * view + row, column));
-        let coupling: Vec<DVector<f64>> =
-            (0..first).map(|column| views.function(|view| of_view(view, column))).collect();
-        let gradient = views.function(|view| SVector::<f64, C>::from_fn(|row, _| vector[first + C * view + row]));
-        let directions: Vec<Direction> = views
-            .directions()
-            .map(|(information, vector)| Direction {
-                information,
-                vector,
-                coupling: DVector::from_fn(first, |row, _| coupling[row].dot(&vector)),
-                gradient: gradient.dot(&vector),
-            })
-            .collect();
-        let mut free = Vec::new();
-        for direction in &directions {
-            let along = &direction.coupling;
-            match direction.information {
-                Some(value) => {
-                    information.ger(-value.recip(), along, along, 1.0);
-                    negative_gradient.axpy(-direction.gradient / value, along, 1.0);
-                }
-                None => free.push(along.clone()),
-            }
-        }
-        let groups = first / PARAMETERS;
-        let own_focals = (C > POSE).then(|| OwnFocals::new(&views, &directions, group_of, groups));
-        for shared in (0..groups).filter(|_| own_focals.is_some()).map(|group| place(group, Parameter::LogFocal)) {
-            // A focal length for all is a direction of the views' own; with it the system would have none of its rank.
-            information.row_mut(shared).fill(0.0);
-            information.column_mut(shared).fill(0.0);
-            information[(shared, shared)] = known[shared];
-            negative_gradient[shared] = 0.0;
-        }
-        let scale = DVector::from_fn(first, |row, _| scale_of(known[row]));
-        for along in free {
-            let along = along.component_mul(&scale);
-            if along.amax() <= APART {
-                continue;
-            }
-            // The most that leaves the information positive.
-            let scaled =
-                DMatrix::from_fn(first, first, |row, column| information[(row, column)] * scale[row] * scale[column]);
-            let Some(solved) = scaled.cholesky().map(|factor| factor.solve(&along)) else { continue };
-            let unscaled = along.component_div(&scale);
-            information.ger(-along.dot(&solved).recip(), &unscaled, &unscaled, 1.0);
-        }
-        Some(Self { matrix: information, negative_gradient, own_focals })
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Matrix3, Vector2, Vector3};
+    use nalgebra::{Vector2, Vector3};
 
     use super::super::Options;
     use super::super::metric::{Extension, adjust};
@@ -387,31 +218,6 @@ mod tests {
                 }
             }
         }
-    }
-
-    /// One pose of which the observations say next to nothing but together with the focal length.
-    #[test]
-    fn a_pose_that_is_hidden_by_rounding_leaves_the_focal_length_free() {
-        // A turn of one view against the other is no similarity.
-        let pose = |x: f64| Pose { rotation: Matrix3::identity(), translation: Vector3::new(x, 0.0, 0.0) };
-        let dimension = PARAMETERS + 2 * POSE;
-        let system = |weak: f64, coupled: f64| {
-            let mut matrix = DMatrix::<f64>::identity(dimension, dimension);
-            let (first, second) = (PARAMETERS, PARAMETERS + POSE);
-            matrix[(second, first)] = 1.0 - weak;
-            matrix[(first, 0)] = coupled * (weak / 2.0).sqrt();
-            matrix[(second, 0)] = -matrix[(first, 0)];
-            let poses = [pose(0.0), pose(1.0)];
-            WithoutViews::new::<POSE>(matrix.as_slice(), &vec![0.0; dimension], &[1.0; PARAMETERS], &[0; 2], &poses)
-                .expect("finite")
-                .matrix
-        };
-        for weak in [1e-4, 1e-9, 1e-15] {
-            let left = system(weak, 0.999)[(0, 0)];
-            println!("{weak:e}: {left}");
-            assert!(left < 0.01, "{weak:e}: {left}");
-        }
-        assert_eq!(system(1e-15, 0.0)[(0, 0)], 1.0, "what is apart from the poses is left alone");
     }
 
     #[test]
@@ -556,32 +362,12 @@ mod tests {
         }
     }
 
-    /// Groups and a single camera give the same variances; and what is foretold of groups, an adjustment finds.
     #[test]
-    fn camera_groups_are_told_as_one_is_and_as_an_adjustment_finds() {
+    fn what_is_foretold_of_camera_groups_an_adjustment_finds() {
         let model = IntrinsicsModel::FOCAL.with(Extension::RadialK1);
         for seed in 0..3 {
             println!("seed {seed}");
             let scene = testing::scene(seed, 8, 40, NOISE);
-            for start in [truth(&scene), truth(&scene).with_own_focals()] {
-                let [one, several] = match start.has_own_focals() {
-                    true => [Information::of_one_group::<VIEW>, Information::of_groups::<VIEW>],
-                    false => [Information::of_one_group::<POSE>, Information::of_groups::<POSE>],
-                }
-                .map(|linearised| linearised(&start, &scene.observations).expect("poses"));
-                let prior = [IntrinsicsPrior::NONE];
-                let (expected, found) = (one.optimum(model, &prior), several.optimum(model, &prior));
-                for parameter in model.parameters() {
-                    let variances = [&expected, &found].map(|optimum| optimum.variance_of(0, parameter));
-                    let [expected, found] = variances.map(|variance| variance.expect("observable"));
-                    assert!((found / expected - 1.0).abs() < 1e-6, "{parameter:?}: {found} for {expected}");
-                }
-                let owns = [one.own_focals(&expected), several.own_focals(&found)];
-                for ((expected, _), (found, _)) in owns[0].iter().zip(&owns[1]) {
-                    let [expected, found] = [expected, found].map(|variance| variance.expect("observable"));
-                    assert!((found / expected - 1.0).abs() < 1e-6, "{found} for {expected}");
-                }
-            }
             let adjusted = |mut start: Reconstruction, model: IntrinsicsModel| {
                 let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
                 let priors = [IntrinsicsPrior::NONE; 2];

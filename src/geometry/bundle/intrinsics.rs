@@ -52,27 +52,27 @@ impl Intrinsics {
     }
 
     /// The radial scale `s` at a squared radius.
-    #[inline]
+    #[inline(always)]
     fn scale(&self, squared: f64) -> f64 {
         let [k1, k2, k3] = self.radial;
         1.0 + squared * (k1 + squared * (k2 + squared * k3))
     }
 
     /// Derivative of the scale by the squared radius.
-    #[inline]
+    #[inline(always)]
     fn scale_slope(&self, squared: f64) -> f64 {
         let [k1, k2, k3] = self.radial;
         k1 + squared * (2.0 * k2 + squared * 3.0 * k3)
     }
 
     /// Derivative of the imaged radius `r s` by the radius: positive before the fold.
-    #[inline]
+    #[inline(always)]
     pub(super) fn radius_slope(&self, squared: f64) -> f64 {
         self.scale(squared) + 2.0 * squared * self.scale_slope(squared)
     }
 
     /// What tangential distortion adds to a point at unit depth.
-    #[inline]
+    #[inline(always)]
     fn tangential_shift(&self, u: f64, v: f64) -> Vector2<f64> {
         let [p1, p2] = self.tangential;
         let squared = u * u + v * v;
@@ -80,7 +80,7 @@ impl Intrinsics {
     }
 
     /// Image of a point in camera coordinates; infinite or not a number at depth zero.
-    #[inline]
+    #[inline(always)]
     pub fn project(&self, seen: &Vector3<f64>) -> Vector2<f64> {
         let (u, v) = (seen.x / seen.z, seen.y / seen.z);
         let distorted = Vector2::new(u, v) * self.scale(u * u + v * v) + self.tangential_shift(u, v);
@@ -88,7 +88,7 @@ impl Intrinsics {
     }
 
     /// Derivatives of [`Self::project`]; infinite or not a number at depth zero.
-    #[inline]
+    #[inline(always)]
     pub(super) fn gradients(&self, seen: &Vector3<f64>) -> ImageGradients {
         let scale = seen.z.recip();
         let (u, v) = (seen.x * scale, seen.y * scale);

@@ -109,7 +109,7 @@ impl IntrinsicsModel {
     pub const FOCAL: Self = Self { focal: FocalLength::Shared, ..Self::FIXED };
     pub const FOCAL_PER_VIEW: Self = Self { focal: FocalLength::PerView, ..Self::FIXED };
     #[cfg(test)]
-    pub const FULL: Self = Self { extensions: [true; Extension::ALL.len()], ..Self::FOCAL };
+    pub const FULL: Self = Self::FOCAL.with_all_extensions();
 
     /// The simplest model: a focal length for all views, or one of each view.
     pub fn focal(per_view: bool) -> Self {
@@ -141,6 +141,11 @@ impl IntrinsicsModel {
     pub fn with(mut self, extension: Extension) -> Self {
         self.extensions[extension as usize] = true;
         self
+    }
+
+    /// This model with everything freed beside the focal length.
+    pub const fn with_all_extensions(self) -> Self {
+        Self { extensions: [true; Extension::ALL.len()], ..self }
     }
 
     /// This model with the focal length held.

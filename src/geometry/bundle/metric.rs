@@ -1,10 +1,9 @@
 //! Metric bundle adjustment: intrinsics that the views share, but for focal lengths of their own where they have these,
 //! rotations, translations and Euclidean points.
 
-use nalgebra::{Matrix3, Matrix3x4, Rotation3, SMatrix, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix3x4, Rotation3, Vector2, Vector3};
 
 pub use super::covariance::{Information, Optimum};
-use super::engine::{GaussianPrior, Jacobian, Problem, ResidualVisitor, Step, minimise};
 use super::intrinsics::ImageGradients;
 pub use super::intrinsics::Intrinsics;
 pub use super::intrinsics_model::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
@@ -16,8 +15,6 @@ use crate::parallel::Threads;
 /// comes after its pose, and of a point.
 pub(super) const POSE: usize = 6;
 pub(super) const VIEW: usize = POSE + 1;
-/// The same of a view with intrinsics of its own, which come after its pose.
-pub(super) const OWN_CAMERA: usize = POSE + Parameter::COUNT;
 pub(super) const POINT: usize = 3;
 
 /// World to camera: `x = R X + t`.
@@ -29,7 +26,7 @@ pub struct Pose {
 
 impl Pose {
     /// A world point in camera coordinates.
-    #[inline]
+    #[inline(always)]
     pub fn apply(&self, point: &Vector3<f64>) -> Vector3<f64> {
         self.rotation * point + self.translation
     }
@@ -72,13 +69,13 @@ pub(crate) struct ProjectionGradients {
 }
 
 impl<'a> Projection<'a> {
-    #[inline]
+    #[inline(always)]
     pub fn new(intrinsics: &'a Intrinsics, pose: &'a Pose, point: &Vector3<f64>) -> Self {
         let at = pose.apply(point);
         Self { intrinsics, pose, at, image: intrinsics.project(&at) }
     }
 
-    #[inline]
+    #[inline(always)]
     pub fn gradients(&self) -> ProjectionGradients {
         let ImageGradients { by_parameter, by_seen } = self.intrinsics.gradients(&self.at);
         let by_pose = by_seen.map(|by_seen| {
@@ -89,27 +86,6 @@ impl<'a> Projection<'a> {
             by_parameter,
             by_pose,
             by_point: by_seen.map(|by_seen| self.pose.rotation.tr_mul(&by_seen)),
-        }
-    }
-}
-
-impl ProjectionGradients {
-    /// By these intrinsics, pose and point; of a view with more unknowns, which come after the pose, by its own
-    /// intrinsics in the order of [`Parameter`], of which the log focal length is the first.
-    #[inline]
-    pub(super) fn jacobian<const G: usize, const C: usize>(
-        &self,
-        globals: &[Option<Parameter>; G],
-    ) -> Jacobian<G, C, POINT> {
-        Jacobian {
-            globals: SMatrix::from_fn(|k, component| {
-                globals[k].map_or(0.0, |parameter| self.by_parameter[component][parameter as usize])
-            }),
-            camera: SMatrix::from_fn(|k, component| match self.by_pose[component].get(k) {
-                Some(by_pose) => *by_pose,
-                None => self.by_parameter[component][k - POSE],
-            }),
-            point: SMatrix::from_columns(&self.by_point),
         }
     }
 }
@@ -163,7 +139,7 @@ impl Reconstruction {
     ///
     /// # Panics
     /// When the view or its group is out of range.
-    #[inline]
+    #[inline(always)]
     pub fn intrinsics_of(&self, view: usize) -> Intrinsics {
         let shared = self.intrinsics[self.group_of[view]];
         match self.focals.get(view) {
@@ -209,62 +185,6 @@ impl Reconstruction {
     }
 }
 
-/// A reconstruction of one camera group with these `G` shared intrinsics free, in a place without one nothing moves,
-/// and `C` unknowns of each view: [`POSE`], or [`VIEW`] where its own focal length is free.
-#[derive(Clone)]
-pub(super) struct Metric<const G: usize, const C: usize> {
-    pub reconstruction: Reconstruction,
-    pub free: [Option<Parameter>; G],
-    pub prior: IntrinsicsPrior,
-}
-
-impl<const G: usize, const C: usize> Problem<G, C, POINT> for Metric<G, C> {
-    fn camera_count(&self) -> usize {
-        self.reconstruction.poses.len()
-    }
-
-    fn point_count(&self) -> usize {
-        self.reconstruction.points.len()
-    }
-
-    #[inline]
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<G, C, POINT>) {
-        let Reconstruction { poses, points, .. } = &self.reconstruction;
-        let intrinsics = self.reconstruction.intrinsics_of(observation.view);
-        let seen = Projection::new(&intrinsics, &poses[observation.view], &points[observation.point]);
-        visitor.visit(seen.image - observation.xy, || seen.gradients().jacobian(&self.free));
-    }
-
-    fn retract(&mut self, from: &Self, step: &Step<G, C, POINT>) {
-        let (moved, from) = (&mut self.reconstruction, &from.reconstruction);
-        moved.intrinsics.copy_from_slice(&from.intrinsics);
-        for (parameter, by) in self.free.iter().zip(step.globals.iter()) {
-            parameter.iter().for_each(|parameter| moved.intrinsics[0].shift(*parameter, *by));
-        }
-        for ((pose, from), step) in moved.poses.iter_mut().zip(&from.poses).zip(&step.cameras) {
-            *pose = from.moved(std::array::from_fn(|k| step[k]));
-        }
-        let shared = moved.intrinsics[0].focal / from.intrinsics[0].focal;
-        for ((focal, from), step) in moved.focals.iter_mut().zip(&from.focals).zip(&step.cameras) {
-            *focal = from * shared * step.get(POSE).map_or(1.0, |by| by.exp());
-        }
-        for ((point, from), step) in moved.points.iter_mut().zip(&from.points).zip(&step.points) {
-            *point = from + step;
-        }
-    }
-
-    fn global_priors(&self) -> [GaussianPrior; G] {
-        self.free.map(|parameter| match parameter {
-            Some(parameter) => GaussianPrior {
-                information: self.prior.information[parameter as usize],
-                deviation: self.prior.deviation(parameter, &self.reconstruction.intrinsics[0]),
-            },
-            // Known to be where it is.
-            None => GaussianPrior { information: 1.0, deviation: 0.0 },
-        })
-    }
-}
-
 /// Minimises the reprojection error over poses, points and the free intrinsics, the same of every camera group, of
 /// which `priors`, one a group, know something. Focal lengths a view are free only where the reconstruction has them.
 ///
@@ -280,51 +200,9 @@ pub fn adjust(
     options: &Options,
     stop: &StopToken,
 ) -> Report {
-    let [prior] = priors else {
-        let models = vec![model; reconstruction.intrinsics.len()];
-        let run = sequence::Run { threads: Threads::ONE, stop, heartbeat: &mut || () };
-        return sequence::adjust(reconstruction, observations, &sequence::Free::all(&models), priors, options, run);
-    };
-    let run = Run { observations, prior, options, stop };
-    let report = match model.is_per_view() && reconstruction.has_own_focals() {
-        true => run.with::<VIEW>(model, reconstruction),
-        false => run.with::<POSE>(model, reconstruction),
-    };
-    reconstruction.average_focals();
-    report
-}
-
-/// What an adjustment of one camera group works with, whatever is free.
-struct Run<'a> {
-    observations: &'a [Observation],
-    prior: &'a IntrinsicsPrior,
-    options: &'a Options,
-    stop: &'a StopToken,
-}
-
-impl Run<'_> {
-    /// Few sizes, for each is compiled by itself: what a size is too large for has nothing in its last places.
-    fn with<const C: usize>(&self, model: IntrinsicsModel, reconstruction: &mut Reconstruction) -> Report {
-        let free = model.parameters();
-        match free.len() {
-            0 => self.sized::<0, C>(&free, reconstruction),
-            1 => self.sized::<1, C>(&free, reconstruction),
-            2 | 3 => self.sized::<3, C>(&free, reconstruction),
-            4 | 5 => self.sized::<5, C>(&free, reconstruction),
-            _ => self.sized::<{ Parameter::COUNT }, C>(&free, reconstruction),
-        }
-    }
-
-    fn sized<const G: usize, const C: usize>(&self, free: &[Parameter], reconstruction: &mut Reconstruction) -> Report {
-        let mut problem = Metric::<G, C> {
-            reconstruction: reconstruction.clone(),
-            free: std::array::from_fn(|k| free.get(k).copied()),
-            prior: *self.prior,
-        };
-        let report = minimise(&mut problem, self.observations, self.options, self.stop);
-        *reconstruction = problem.reconstruction;
-        report
-    }
+    let models = vec![model; reconstruction.intrinsics.len()];
+    let run = sequence::Run { threads: Threads::ONE, stop, heartbeat: &mut || () };
+    sequence::adjust(reconstruction, observations, &sequence::Free::all(&models), priors, options, run)
 }
 
 #[cfg(test)]
@@ -346,43 +224,6 @@ mod tests {
             pose.rotation = Rotation3::from_scaled_axis(turn) * pose.rotation;
         }
         start
-    }
-
-    #[test]
-    fn jacobians_of_all_models_agree_with_finite_differences() {
-        let scene = testing::scene(1, 4, 8, NOISE);
-        let mut start = perturbed(&scene, 0.01, 1);
-        start.intrinsics[0].principal_point = Vector2::new(0.03, -0.02);
-        start.intrinsics[0].aspect = 1.1;
-        for (radial, tangential) in
-            [([0.0; 3], [0.0; 2]), ([-0.1, 0.0, 0.0], [0.01, 0.0]), ([-0.1, 0.07, -0.03], [0.01, -0.02])]
-        {
-            (start.intrinsics[0].radial, start.intrinsics[0].tangential) = (radial, tangential);
-            let mut own = start.clone();
-            own.focals = vec![0.9, 1.0, 1.2, 1.5];
-            for reconstruction in [start.clone(), own] {
-                check::<0, POSE>(&reconstruction, [], &scene);
-                check::<1, VIEW>(&reconstruction, [Some(Parameter::RadialK1)], &scene);
-                check::<3, POSE>(
-                    &reconstruction,
-                    [Some(Parameter::LogFocal), Some(Parameter::TangentialP1), None],
-                    &scene,
-                );
-                check::<{ Parameter::COUNT }, POSE>(&reconstruction, Parameter::ALL.map(Some), &scene);
-            }
-        }
-    }
-
-    /// Of a view's own focal length, which is there only where the reconstruction has it, with the shared one held.
-    fn check<const G: usize, const C: usize>(
-        reconstruction: &Reconstruction,
-        free: [Option<Parameter>; G],
-        scene: &TestScene,
-    ) {
-        if C == POSE || reconstruction.has_own_focals() {
-            let (reconstruction, prior) = (reconstruction.clone(), IntrinsicsPrior::NONE);
-            testing::check_jacobian(&Metric::<G, C> { reconstruction, free, prior }, &scene.observations);
-        }
     }
 
     #[test]

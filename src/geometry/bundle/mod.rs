@@ -22,6 +22,7 @@ pub mod sequence;
 #[cfg(test)]
 pub(crate) mod testing;
 mod whitened;
+mod without_views;
 
 use super::levenberg_marquardt;
 pub use super::levenberg_marquardt::Report;

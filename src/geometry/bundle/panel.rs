@@ -1,6 +1,7 @@
 //! Points eliminated many at a time, where most cameras see them.
 
 use faer::linalg::matmul::triangular::{self, BlockStructure};
+use faer::prelude::ReborrowMut;
 use faer::{Accum, MatMut, MatRef, Par};
 use nalgebra::SMatrix;
 
@@ -10,9 +11,9 @@ use super::engine::{Jacobian, Layout};
 /// Share of all pairs of point and camera that must be observed for the points to be eliminated by panels, which
 /// calculate with zeros for the others: a product of panels takes about a third of the time of its pairs, whose number
 /// falls with the square of the share.
-const PANEL_SHARE: f64 = 0.6;
-/// Points of a panel: enough for the product to run at full speed, few enough for a second-level cache.
-const PANEL_POINTS: usize = 64;
+pub(super) const PANEL_SHARE: f64 = 0.6;
+/// Columns of a panel: enough for the product to run at full speed, few enough for a second-level cache.
+const PANEL_COLUMNS: usize = 256;
 
 /// `Jc' Q'` of some points side by side, `C` rows a camera and `P` columns a point: times its own transpose it is what
 /// eliminating the points takes off the camera blocks, by one product that runs at the processor's full speed.
@@ -32,11 +33,11 @@ impl<const C: usize, const P: usize> Panel<C, P> {
 
     pub fn new(cameras: usize) -> Self {
         let rows = C * cameras;
-        Self { rows, values: Vec::with_capacity(rows * P * PANEL_POINTS) }
+        Self { rows, values: Vec::with_capacity(rows * (PANEL_COLUMNS + P)) }
     }
 
     pub fn is_full(&self) -> bool {
-        self.values.len() >= self.rows * P * PANEL_POINTS
+        self.values.len() >= self.rows * PANEL_COLUMNS
     }
 
     /// Appends a point's columns.
@@ -70,21 +71,32 @@ impl<const C: usize, const P: usize> Panel<C, P> {
     /// Subtracts the product with its transpose from the lower triangle of `matrix` below and right of `offset`, and
     /// empties the panel.
     pub fn subtract(&mut self, matrix: &mut [f64], offset: usize) {
-        let dimension = offset + self.rows;
-        let panel = MatRef::from_column_major_slice(&self.values, self.rows, self.values.len() / self.rows.max(1));
-        let cameras = MatMut::from_column_major_slice_mut(matrix, dimension, dimension)
-            .submatrix_mut(offset, offset, self.rows, self.rows);
+        subtract(&self.values, self.rows, matrix, offset + self.rows);
+        self.values.clear();
+    }
+}
+
+/// Subtracts the product of a panel with its transpose from the lower triangle of the last `rows` rows and columns of a
+/// square matrix.
+///
+/// * `panel`: column-major, of so many rows
+/// * `matrix`: column-major, `dimension x dimension`
+pub(super) fn subtract(panel: &[f64], rows: usize, matrix: &mut [f64], dimension: usize) {
+    let offset = dimension - rows;
+    let mut block =
+        MatMut::from_column_major_slice_mut(matrix, dimension, dimension).submatrix_mut(offset, offset, rows, rows);
+    for columns in panel.chunks(PANEL_COLUMNS * rows.max(1)) {
+        let columns = MatRef::from_column_major_slice(columns, rows, columns.len() / rows.max(1));
         triangular::matmul(
-            cameras,
+            block.rb_mut(),
             BlockStructure::TriangularLower,
             Accum::Add,
-            panel,
+            columns,
             BlockStructure::Rectangular,
-            panel.transpose(),
+            columns.transpose(),
             BlockStructure::Rectangular,
             -1.0,
             Par::Seq,
         );
-        self.values.clear();
     }
 }

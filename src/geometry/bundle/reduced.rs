@@ -77,11 +77,6 @@ impl<const G: usize, const C: usize, const P: usize> Linearisation<G, C, P> {
         }
     }
 
-    /// Diagonal of the information on the globals with everything else known.
-    pub fn globals_diagonal(&self) -> &SVector<f64, G> {
-        &self.globals_diagonal
-    }
-
     /// Linearises at the state of `problem`.
     pub fn fill(&mut self, problem: &impl Problem<G, C, P>, layout: &Layout, loss: Loss) {
         self.globals_diagonal = SVector::from(problem.global_priors().map(|prior| prior.information));

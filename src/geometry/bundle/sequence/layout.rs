@@ -63,6 +63,11 @@ impl Unknowns {
         self.offsets.len() - 1
     }
 
+    /// Unknowns of all blocks.
+    pub fn count(&self) -> usize {
+        self.offsets[self.block_count()]
+    }
+
     /// The unknowns of a block.
     pub fn range(&self, block: usize) -> Range<usize> {
         self.offsets[block]..self.offsets[block + 1]
@@ -226,6 +231,12 @@ impl Layout {
     /// Values of all couplings.
     pub fn coupling_count(&self) -> usize {
         self.coupling_starts[self.point_count()]
+    }
+
+    /// Share of all pairs of an unknown and a point with any that are coupled; not a number where there are none.
+    pub fn coupled_share(&self) -> f64 {
+        let points = (0..self.point_count()).filter(|point| !self.couplings(*point).is_empty()).count();
+        self.coupling_count() as f64 / (POINT * self.unknowns.count() * points) as f64
     }
 
     /// Where the observations of a run of points are among all.

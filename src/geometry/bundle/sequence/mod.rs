@@ -13,11 +13,13 @@ mod pattern;
 mod point;
 mod reduced;
 mod solver;
+mod system;
 #[cfg(test)]
 mod tests;
 mod worker_pool;
 
 pub use self::minimise::adjust;
+pub use self::system::System;
 use super::Observation;
 use super::metric::{IntrinsicsModel, Reconstruction};
 use crate::domain::StopToken;

@@ -14,6 +14,7 @@ use super::point::PointBlock;
 use super::worker_pool::{WorkerPool, split_off};
 use super::{CancellationCheck, Reconstruction};
 use crate::parallel::even_cuts;
+use crate::simd::vectorised;
 
 /// Where a view's residuals go in the camera part of the normal equations.
 #[derive(Debug, Clone, Copy)]
@@ -38,7 +39,7 @@ pub(super) struct Weighted {
 
 impl Weighted {
     /// `None` where the observation is undefined.
-    #[inline]
+    #[inline(always)]
     pub fn new(sequence: &Reconstruction, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
         let intrinsics = sequence.intrinsics_of(seen.view);
         let projection = Projection::new(&intrinsics, &sequence.poses[seen.view], point);
@@ -169,12 +170,18 @@ impl Normal {
             }
         };
         let pieces = pool.cut(layout, points).windows(2).map(cut).collect();
-        pool.threads.each(pieces, |piece: Points| piece.linearise(sequence, layout, loss, pool.cancellation()))
+        pool.threads.each(pieces, |piece: Points| {
+            vectorised(
+                #[inline(always)]
+                || piece.linearise(sequence, layout, loss, pool.cancellation()),
+            )
+        })
     }
 }
 
 impl Points<'_> {
     /// `false` when it was stopped.
+    #[inline(always)]
     fn linearise(
         self,
         sequence: &Reconstruction,
@@ -282,15 +289,10 @@ impl Cameras {
         pieces.insert(0, Sums::Groups { values, gradient });
         let batch = Batch { places, before, parameters: &layout.unknowns.parameters, first: seen.start, rows };
         let done = pool.threads.each(pieces, |piece: Sums| {
-            let mut cancellation = pool.cancellation();
-            match piece {
-                Sums::Views { range, values, gradient } => {
-                    batch.add_to_views(sequence, range, values, gradient, of_batch, &mut cancellation)
-                }
-                Sums::Groups { values, gradient } => {
-                    batch.add_to_groups(sequence, &layout.all_seen()[seen.clone()], values, gradient, &mut cancellation)
-                }
-            }
+            vectorised(
+                #[inline(always)]
+                || batch.add(sequence, piece, &layout.all_seen()[seen.clone()], of_batch, pool.cancellation()),
+            )
         });
         let ends: Vec<usize> = (0..places.len()).map(|view| begun[view] + of_batch(view).len()).collect();
         begun[..ends.len()].copy_from_slice(&ends);
@@ -299,10 +301,34 @@ impl Cameras {
 }
 
 impl Batch<'_> {
+    /// Adds to a piece; `false` when it was stopped.
+    ///
+    /// * `seen`: the observations of the batch
+    /// * `of_view`: those of a view, ascending
+    #[inline(always)]
+    fn add<'s>(
+        &self,
+        sequence: &Reconstruction,
+        piece: Sums,
+        seen: &[Seen],
+        of_view: impl Fn(usize) -> &'s [u32],
+        mut cancellation: CancellationCheck,
+    ) -> bool {
+        match piece {
+            Sums::Views { range, values, gradient } => {
+                self.add_to_views(sequence, range, values, gradient, of_view, &mut cancellation)
+            }
+            Sums::Groups { values, gradient } => {
+                self.add_to_groups(sequence, seen, values, gradient, &mut cancellation)
+            }
+        }
+    }
+
     /// Adds to the blocks of a run of views; `false` when it was stopped.
     ///
     /// * `values`, `gradient`: those of these views
     /// * `seen`: observations of a view in this batch, ascending
+    #[inline(always)]
     fn add_to_views<'s>(
         &self,
         sequence: &Reconstruction,
@@ -339,6 +365,7 @@ impl Batch<'_> {
     ///
     /// * `values`, `gradient`: those of the groups
     /// * `seen`: the observations of the batch
+    #[inline(always)]
     fn add_to_groups(
         &self,
         sequence: &Reconstruction,
@@ -365,7 +392,7 @@ impl Batch<'_> {
 
 impl Weighted {
     /// Derivatives by the free intrinsics, in their order, and zeros behind them.
-    #[inline]
+    #[inline(always)]
     fn free(&self, parameters: &[Parameter]) -> [[f64; Parameter::COUNT]; 2] {
         self.by_parameter.map(|by_parameter| {
             let mut free = [0.0; Parameter::COUNT];
@@ -375,9 +402,9 @@ impl Weighted {
     }
 
     /// Adds this observation to the couplings of its point.
-    #[inline]
     ///
     /// * `unknowns`: of the view
+    #[inline(always)]
     fn link_blocks(&self, seen: &Seen, unknowns: usize, parameters: &[Parameter], couplings: &mut [f64]) {
         let point = [self.point[0].as_slice(), self.point[1].as_slice()];
         if let Some(start) = seen.view_coupling {
@@ -392,13 +419,13 @@ impl Weighted {
 }
 
 /// What there is of the derivatives by the free intrinsics.
-#[inline]
+#[inline(always)]
 fn chosen<'f>(free: &'f [[f64; Parameter::COUNT]; 2], parameters: &[Parameter]) -> [&'f [f64]; 2] {
     [&free[0][..parameters.len()], &free[1][..parameters.len()]]
 }
 
 /// Adds `rows' columns` to a block of as many rows as a view has unknowns.
-#[inline]
+#[inline(always)]
 fn add_to_view(values: &mut [f64], place: Place, unknowns: usize, rows: &[[f64; VIEW]; 2], columns: [&[f64]; 2]) {
     match unknowns {
         POSE => add_rows::<POSE>(values, place, rows, columns),
@@ -408,7 +435,7 @@ fn add_to_view(values: &mut [f64], place: Place, unknowns: usize, rows: &[[f64; 
 
 /// Loops by hand over arrays, here and below: iterators cost several times as much in builds for tests, which barely
 /// optimise.
-#[inline]
+#[inline(always)]
 fn add_rows<const R: usize>(values: &mut [f64], place: Place, rows: &[[f64; VIEW]; 2], [a, b]: [&[f64]; 2]) {
     let [first, second] = rows;
     let b = &b[..a.len()];
@@ -426,7 +453,7 @@ fn add_rows<const R: usize>(values: &mut [f64], place: Place, rows: &[[f64; VIEW
 }
 
 /// Adds `rows' columns` to a block.
-#[inline]
+#[inline(always)]
 fn add_product(values: &mut [f64], place: Place, rows: [&[f64]; 2], columns: [&[f64]; 2]) {
     let [first, second] = rows;
     for (k, (a, b)) in columns[0].iter().zip(columns[1]).enumerate() {
@@ -438,7 +465,7 @@ fn add_product(values: &mut [f64], place: Place, rows: [&[f64]; 2], columns: [&[
 }
 
 /// Adds `rows' residual`.
-#[inline]
+#[inline(always)]
 fn add_gradient(gradient: &mut [f64], rows: [&[f64]; 2], residual: [f64; 2]) {
     for ((slot, a), b) in gradient.iter_mut().zip(rows[0]).zip(rows[1]) {
         *slot += a * residual[0] + b * residual[1];

@@ -1,14 +1,23 @@
 //! Where the blocks of the reduced system are that are not zero.
 
+use super::super::panel::PANEL_SHARE;
 use super::CancellationCheck;
-use super::layout::Layout;
+use super::layout::{Layout, Unknowns};
+
+/// Unknowns up to which no block counts as zero, about forty views: a dense factorisation of these needs no analysis.
+const DENSE_LIMIT: usize = 256;
+/// The same where most blocks are not zero: 72 MB.
+const FULL_LIMIT: usize = 3_000;
 
 /// The lower triangle of a symmetric matrix of blocks, by block columns.
 ///
 /// The blocks of one column are a dense panel, column-major, the diagonal block (held in full) on top: the values are
-/// those of a compressed sparse column matrix whose row indices are the same all over a panel.
+/// those of a compressed sparse column matrix whose row indices are the same all over a panel. Of a small system they
+/// are those of a square matrix.
 #[derive(Debug)]
 pub(super) struct Pattern {
+    /// Whether the values are those of a square matrix, column-major, of which only the lower triangle counts.
+    pub is_square: bool,
     /// First unknown of a block, and at the end their number.
     pub offsets: Vec<usize>,
     /// Where a block column starts in `rows`.
@@ -19,6 +28,8 @@ pub(super) struct Pattern {
     heights: Vec<u32>,
     /// Where the panel of a block column starts among the values.
     panel_starts: Vec<usize>,
+    /// Distance between the columns of the panel of a block column.
+    strides: Vec<usize>,
 }
 
 /// A block among the values: its first, and the distance between its columns.
@@ -29,7 +40,7 @@ pub(super) struct Place {
 }
 
 impl Pattern {
-    /// Blocks that a point links, and the pose of every view with the intrinsics of its group.
+    /// Blocks that a point links, and the pose of every view with the intrinsics of its group; all where they are few.
     /// `None` when it was stopped.
     ///
     /// * `pairs`: pose block and group block of the views where both are free
@@ -39,6 +50,10 @@ impl Pattern {
         cancellation: &mut CancellationCheck,
     ) -> Option<Self> {
         let blocks = layout.unknowns.block_count();
+        let limit = if layout.coupled_share() >= PANEL_SHARE { FULL_LIMIT } else { DENSE_LIMIT };
+        if layout.unknowns.count() <= limit {
+            return Some(Self::square(&layout.unknowns));
+        }
         let mut group_of = vec![None; blocks];
         pairs.for_each(|(pose, group)| group_of[pose] = Some(group));
         let (starts, points) = layout.points_by_block();
@@ -69,9 +84,24 @@ impl Pattern {
         Some(Self::from_rows(layout.unknowns.offsets.clone(), column_starts, rows))
     }
 
+    /// A square matrix.
+    fn square(unknowns: &Unknowns) -> Self {
+        let (offsets, blocks, n) = (unknowns.offsets.clone(), unknowns.block_count(), unknowns.count());
+        let mut column_starts = vec![0];
+        let (mut rows, mut heights) = (Vec::new(), Vec::new());
+        for column in 0..blocks {
+            rows.extend(column as u32..blocks as u32);
+            heights.extend((column..blocks).map(|row| (offsets[row] - offsets[column]) as u32));
+            column_starts.push(rows.len());
+        }
+        let mut panel_starts: Vec<usize> = offsets.iter().map(|offset| offset * (n + 1)).collect();
+        panel_starts[blocks] = n * n;
+        Self { is_square: true, offsets, column_starts, rows, heights, panel_starts, strides: vec![n; blocks] }
+    }
+
     fn from_rows(offsets: Vec<usize>, column_starts: Vec<usize>, rows: Vec<u32>) -> Self {
         let mut heights = Vec::with_capacity(rows.len());
-        let mut panel_starts = vec![0];
+        let (mut panel_starts, mut strides) = (vec![0], Vec::new());
         let mut values = 0;
         for column in 0..column_starts.len() - 1 {
             let mut height = 0;
@@ -81,8 +111,9 @@ impl Pattern {
             }
             values += height * (offsets[column + 1] - offsets[column]);
             panel_starts.push(values);
+            strides.push(height);
         }
-        Self { offsets, column_starts, rows, heights, panel_starts }
+        Self { is_square: false, offsets, column_starts, rows, heights, panel_starts, strides }
     }
 
     pub fn block_count(&self) -> usize {
@@ -107,10 +138,9 @@ impl Pattern {
         self.panel_starts[columns.start]..self.panel_starts[columns.end]
     }
 
-    /// Rows of the panel of a block column.
+    /// Distance between the columns of the panel of a block column.
     pub fn stride(&self, column: usize) -> usize {
-        let last = self.column_starts[column + 1] - 1;
-        self.heights[last] as usize + self.size(self.rows[last] as usize)
+        self.strides[column]
     }
 
     /// Where panel and list of rows of a block column start.
@@ -133,8 +163,8 @@ impl Pattern {
     /// Calls `take` with row, column and index of every value, those of the diagonal blocks' upper triangles too.
     pub fn for_each(&self, mut take: impl FnMut(usize, usize, usize)) {
         for block in 0..self.block_count() {
-            let mut index = self.panel_starts[block];
-            for column in self.offsets[block]..self.offsets[block + 1] {
+            for (k, column) in (self.offsets[block]..self.offsets[block + 1]).enumerate() {
+                let mut index = self.panel_starts[block] + k * self.strides[block];
                 for &row in &self.rows[self.column_starts[block]..self.column_starts[block + 1]] {
                     for row in self.offsets[row as usize]..self.offsets[row as usize + 1] {
                         take(row, column, index);

@@ -20,7 +20,7 @@ pub(super) struct PointFactor([f64; 6]);
 impl PointBlock {
     pub const ZERO: Self = Self { matrix: [0.0; 6], gradient: Vector3::new(0.0, 0.0, 0.0) };
 
-    #[inline]
+    #[inline(always)]
     pub fn add(&mut self, rows: &[Vector3<f64>; 2], residual: [f64; 2]) {
         let [a, b] = rows;
         let entry = |i: usize, j: usize| a[i] * a[j] + b[i] * b[j];
@@ -30,7 +30,7 @@ impl PointBlock {
     }
 
     /// Factors the block with Marquardt's damping; `None` when it is not positive definite.
-    #[inline]
+    #[inline(always)]
     pub fn factor(&self, damping: f64) -> Option<PointFactor> {
         let [m00, m10, m20, m11, m21, m22] = self.matrix;
         let least = POINT_DAMPING * (m00 + m11 + m22) + f64::MIN_POSITIVE;
@@ -46,7 +46,7 @@ impl PointBlock {
 
 impl PointFactor {
     /// `L^-1 x`
-    #[inline]
+    #[inline(always)]
     pub fn whiten(&self, x: &Vector3<f64>) -> Vector3<f64> {
         let [l00, l10, l20, l11, l21, l22] = self.0;
         let first = x[0] * l00;
@@ -55,7 +55,7 @@ impl PointFactor {
     }
 
     /// `L'^-1 x`
-    #[inline]
+    #[inline(always)]
     pub fn unwhiten(&self, x: &Vector3<f64>) -> Vector3<f64> {
         let [l00, l10, l20, l11, l21, l22] = self.0;
         let third = x[2] * l22;
@@ -64,18 +64,21 @@ impl PointFactor {
     }
 
     /// `W L'^-1` for a coupling `W`, `rows x 3`, column-major.
-    #[inline]
-    pub fn whiten_coupling(&self, coupling: &[f64], whitened: &mut [f64]) {
+    ///
+    /// * `stride`: distance between the columns of `whitened`
+    #[inline(always)]
+    pub fn whiten_coupling(&self, coupling: &[f64], whitened: &mut [f64], stride: usize) {
         let [l00, l10, l20, l11, l21, l22] = self.0;
         let rows = coupling.len() / POINT;
-        let (coupling, whitened) = (&coupling[..POINT * rows], &mut whitened[..POINT * rows]);
+        let coupling = &coupling[..POINT * rows];
+        let (a, rest) = whitened.split_at_mut(stride);
+        let (b, c) = rest.split_at_mut(stride);
+        let (a, b, c) = (&mut a[..rows], &mut b[..rows], &mut c[..rows]);
         let mut k = 0;
         while k < rows {
-            let first = coupling[k] * l00;
-            let second = (coupling[rows + k] - l10 * first) * l11;
-            whitened[k] = first;
-            whitened[rows + k] = second;
-            whitened[2 * rows + k] = (coupling[2 * rows + k] - l20 * first - l21 * second) * l22;
+            a[k] = coupling[k] * l00;
+            b[k] = (coupling[rows + k] - l10 * a[k]) * l11;
+            c[k] = (coupling[2 * rows + k] - l20 * a[k] - l21 * b[k]) * l22;
             k += 1;
         }
     }

@@ -1,11 +1,12 @@
-//! The system of poses and intrinsics that is left when the points are eliminated: built point by point, damped, and
-//! solved.
+//! The system of poses and intrinsics that is left when the points are eliminated: built point by point, or of many
+//! points at a time where most views see most of them, damped, and solved.
 
 use std::ops::Range;
 
 use nalgebra::Vector3;
 
 use super::super::metric::{POINT, POSE};
+use super::super::panel::{self, PANEL_SHARE};
 use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::{Column, Pattern};
@@ -13,6 +14,7 @@ use super::solver::Solver;
 use super::worker_pool::{WorkerPool, split_off};
 use super::{CancellationCheck, Reconstruction};
 use crate::parallel::even_cuts;
+use crate::simd::vectorised;
 
 /// Damping beside Marquardt's, as a share of the diagonal: holds the gauge (seven directions for every set of views
 /// that no point connects with another). Rounding leaves some 1e-15 of the diagonal in these directions; the weakest
@@ -28,8 +30,11 @@ pub(super) struct Reduced {
     pub vector: Vec<f64>,
     /// Points that are coupled with each block, ascending: starts, and one block after the other the points.
     incident_points: (Vec<usize>, Vec<u32>),
-    /// Couplings of a batch of points, each times the inverse root of its point's block.
+    /// Couplings of a batch of points, each times the inverse root of its point's block: one point's after the other,
+    /// or the columns of a panel.
     whitened: Vec<f64>,
+    /// Whether points are eliminated by panels, as columns over all unknowns.
+    by_panels: bool,
     /// Gradients of these points, whitened the same way.
     whitened_gradients: Vec<Vector3<f64>>,
 }
@@ -51,6 +56,7 @@ struct Columns<'a> {
 impl Reduced {
     pub fn new(layout: &Layout, pattern: Pattern) -> Self {
         Self {
+            by_panels: pattern.is_square && layout.coupled_share() >= PANEL_SHARE,
             values: vec![0.0; pattern.value_count()],
             vector: vec![0.0; pattern.dimension()],
             incident_points: layout.points_by_block(),
@@ -72,7 +78,13 @@ impl Reduced {
         let mut begun = self.incident_points.0.clone();
         pool.batches().all(|points| {
             self.whiten(layout, normal, damping, pool, points.clone())
-                && self.subtract(layout, pool, points, &mut begun)
+                && match self.by_panels {
+                    true => {
+                        self.subtract_panel(points);
+                        true
+                    }
+                    false => self.subtract(layout, pool, points, &mut begun),
+                }
         })
     }
 
@@ -84,26 +96,46 @@ impl Reduced {
         pool: &WorkerPool,
         points: Range<usize>,
     ) -> bool {
-        let couplings = layout.couplings_of(points.clone());
+        let (by_panels, column) = (self.by_panels, self.pattern.dimension());
+        let length = |points: Range<usize>| match by_panels {
+            true => POINT * column * points.len(),
+            false => layout.couplings_of(points).len(),
+        };
         // What is left from another batch is written over before it is read.
-        self.whitened.resize(self.whitened.len().max(couplings.len()), 0.0);
+        self.whitened.resize(self.whitened.len().max(length(points.clone())), 0.0);
         self.whitened_gradients.resize(self.whitened_gradients.len().max(points.len()), Vector3::zeros());
         let (mut whitened, mut whitened_gradients) =
             (self.whitened.as_mut_slice(), self.whitened_gradients.as_mut_slice());
         let cut = |ends: &[usize]| {
             let range = ends[0]..ends[1];
-            let whitened = split_off(&mut whitened, layout.couplings_of(range.clone()).len());
+            let whitened = split_off(&mut whitened, length(range.clone()));
             Points { whitened_gradients: split_off(&mut whitened_gradients, range.len()), range, whitened }
         };
         let pieces = pool.cut(layout, points).windows(2).map(cut).collect();
-        pool.threads
-            .each(pieces, |piece: Points| piece.whiten(layout, normal, damping, &self.pattern, pool.cancellation()))
+        let pattern = &self.pattern;
+        pool.threads.each(pieces, |piece: Points| {
+            vectorised(
+                #[inline(always)]
+                || piece.whiten(layout, normal, damping, pattern, by_panels, pool.cancellation()),
+            )
+        })
+    }
+
+    /// Takes from the system what the points of a batch subtract, as columns of a panel.
+    fn subtract_panel(&mut self, points: Range<usize>) {
+        let rows = self.pattern.dimension();
+        let whitened = &self.whitened[..POINT * rows * points.len()];
+        panel::subtract(whitened, rows, &mut self.values, rows);
+        let gradients = self.whitened_gradients[..points.len()].iter().flat_map(|gradient| gradient.iter());
+        for (column, gradient) in whitened.chunks_exact(rows.max(1)).zip(gradients) {
+            self.vector.iter_mut().zip(column).for_each(|(slot, value)| *slot += value * gradient);
+        }
     }
 
     /// * `begun`: how far the list of every block's points is worked off
     fn subtract(&mut self, layout: &Layout, pool: &WorkerPool, points: Range<usize>, begun: &mut [usize]) -> bool {
-        let Self { pattern, values, vector, incident_points: (starts, incident_points), whitened, whitened_gradients } =
-            self;
+        let Self { pattern, values, vector, incident_points, whitened, whitened_gradients, .. } = self;
+        let (starts, incident_points) = incident_points;
         let of_batch = |block: usize| {
             let left = &incident_points[begun[block]..starts[block + 1]];
             &left[..left.partition_point(|&point| (point as usize) < points.end)]
@@ -125,7 +157,10 @@ impl Reduced {
         };
         let done = pool.threads.each(pieces, |piece: Columns| {
             let mut cancellation = pool.cancellation();
-            piece.subtract(layout, pattern, &batch, of_batch, &mut cancellation)
+            vectorised(
+                #[inline(always)]
+                || piece.subtract(layout, pattern, &batch, of_batch, &mut cancellation),
+            )
         });
         let ends: Vec<usize> = (0..pattern.block_count()).map(|block| begun[block] + of_batch(block).len()).collect();
         begun[..ends.len()].copy_from_slice(&ends);
@@ -144,23 +179,34 @@ impl Reduced {
 
     /// Solves for the step in place of the right-hand side; `false` when the system is not positive definite.
     pub fn solve(&mut self, solver: &mut Solver) -> bool {
-        solver.solve(&self.pattern, &self.values, &mut self.vector) && self.vector.iter().all(|value| value.is_finite())
+        solver.solve(&mut self.values, &mut self.vector) && self.vector.iter().all(|value| value.is_finite())
     }
 }
 
 impl Points<'_> {
     /// `false` when a block cannot be factored, or it was stopped.
+    #[inline(always)]
     fn whiten(
         self,
         layout: &Layout,
         normal: &Normal,
         damping: f64,
         pattern: &Pattern,
+        by_panels: bool,
         mut cancellation: CancellationCheck,
     ) -> bool {
-        let base = layout.couplings_of(self.range.clone()).start;
+        let mut whitened = self.whitened;
         for (point, whitened_gradient) in self.range.zip(self.whitened_gradients) {
             let incident_blocks = layout.incident_blocks(point);
+            let couplings = &normal.couplings[layout.couplings(point)];
+            let whitened = match by_panels {
+                true => split_off(&mut whitened, POINT * pattern.dimension()),
+                false => split_off(&mut whitened, couplings.len()),
+            };
+            if by_panels {
+                whitened.fill(0.0);
+                *whitened_gradient = Vector3::zeros();
+            }
             if incident_blocks.is_empty() {
                 continue;
             }
@@ -170,13 +216,12 @@ impl Points<'_> {
             let block = &normal.points[point];
             let Some(factor) = block.factor(damping) else { return false };
             *whitened_gradient = factor.whiten(&block.gradient);
-            let range = layout.couplings(point);
-            let couplings = &normal.couplings[range.clone()];
-            let whitened = &mut self.whitened[range.start - base..range.end - base];
             for incident in incident_blocks {
-                let range = incident.coupling as usize
-                    ..incident.coupling as usize + POINT * pattern.size(incident.block as usize);
-                factor.whiten_coupling(&couplings[range.clone()], &mut whitened[range]);
+                let (block, start) = (incident.block as usize, incident.coupling as usize);
+                let size = pattern.size(block);
+                let (place, stride) =
+                    if by_panels { (pattern.offsets[block], pattern.dimension()) } else { (start, size) };
+                factor.whiten_coupling(&couplings[start..start + POINT * size], &mut whitened[place..], stride);
             }
         }
         true
@@ -196,6 +241,7 @@ impl Columns<'_> {
     /// Takes from these columns what the points that are coupled with them subtract; `false` when it was stopped.
     ///
     /// * `incident_points`: points of the batch that are coupled with a block, ascending
+    #[inline(always)]
     fn subtract<'t>(
         self,
         layout: &Layout,
@@ -283,7 +329,7 @@ pub(super) fn substitute(
     }
 }
 
-#[inline]
+#[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let b = &b[..a.len()];
     let (mut sum, mut k) = (0.0, 0);
@@ -298,7 +344,7 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 ///
 /// Loops by hand over arrays, here and below: this is the innermost loop, and iterators cost several times as much in
 /// builds for tests, which barely optimise.
-#[inline]
+#[inline(always)]
 fn subtract_from_pose(values: &mut [f64], stride: usize, left: &[f64; POINT * POSE], right: &[f64]) {
     let columns = right.len() / POINT;
     let mut k = 0;
@@ -316,7 +362,7 @@ fn subtract_from_pose(values: &mut [f64], stride: usize, left: &[f64; POINT * PO
 }
 
 /// Subtracts `left right'` from a block.
-#[inline]
+#[inline(always)]
 fn subtract_product(values: &mut [f64], stride: usize, left: &[f64], right: &[f64]) {
     let (rows, columns) = (left.len() / POINT, right.len() / POINT);
     let mut k = 0;

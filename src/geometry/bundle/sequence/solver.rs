@@ -10,35 +10,27 @@ use faer::{Conj, MatMut, Par, Side};
 use super::super::cholesky::CholeskySolver;
 use super::pattern::Pattern;
 
-/// Unknowns up to which the dense factorisation is used, about forty views: its plain loop needs no analysis.
-const DENSE_LIMIT: usize = 256;
-
 /// Solves systems of one pattern.
 pub(super) enum Solver {
-    Dense { solver: CholeskySolver, matrix: Vec<f64> },
+    Dense { solver: CholeskySolver },
     Sparse(Box<SparseCholesky>),
 }
 
 impl Solver {
     /// `None` when the analysis runs out of memory.
     pub fn new(pattern: &Pattern) -> Option<Self> {
-        let n = pattern.dimension();
-        if n <= DENSE_LIMIT {
-            return Some(Self::Dense { solver: CholeskySolver::new(n), matrix: vec![0.0; n * n] });
+        if pattern.is_square {
+            return Some(Self::Dense { solver: CholeskySolver::new(pattern.dimension()) });
         }
         SparseCholesky::new(pattern).map(|cholesky| Self::Sparse(Box::new(cholesky)))
     }
 
     /// Solves in place of `vector`; `false` when the matrix is not positive definite.
-    pub fn solve(&mut self, pattern: &Pattern, values: &[f64], vector: &mut [f64]) -> bool {
+    ///
+    /// * `values`: in the order of the pattern; overwritten where that is square
+    pub fn solve(&mut self, values: &mut [f64], vector: &mut [f64]) -> bool {
         match self {
-            Self::Dense { solver, matrix } => {
-                let n = vector.len();
-                matrix.fill(0.0);
-                // The blocks' upper triangles land above the diagonal, where nothing looks.
-                pattern.for_each(|row, column, index| matrix[column * n + row] = values[index]);
-                solver.solve(matrix, vector)
-            }
+            Self::Dense { solver } => solver.solve(values, vector),
             Self::Sparse(cholesky) => {
                 cholesky.factor(values) && {
                     cholesky.solve(vector);

@@ -1,4 +1,4 @@
-//! Time of an iteration, against the number of observations and against a block's adjustment; run by hand:
+//! Time of an iteration against the number of observations; run by hand:
 //! `cargo test --lib sequence::tests::measure -- --ignored --nocapture --test-threads 1`.
 
 use std::time::Instant;
@@ -8,8 +8,6 @@ use super::super::layout::Layout;
 use super::super::minimise::pattern;
 use super::super::solver::Solver;
 use super::*;
-use crate::geometry::bundle::metric;
-use crate::geometry::bundle::testing::{self, NOISE};
 
 /// Steps of a measurement, after which its time is divided.
 const STEPS: usize = 5;
@@ -58,25 +56,4 @@ fn time_against_observations() {
         }
     }
     println!("log-log slope {:.3}", (logs[2].1 - logs[0].1) / (logs[2].0 - logs[0].0));
-}
-
-#[test]
-#[ignore = "prints a measurement"]
-fn time_against_a_block() {
-    const REPEATS: u64 = 20;
-    let (mut block_seconds, mut sequence_seconds) = (0.0, 0.0);
-    for seed in 0..REPEATS {
-        let scene = testing::scene(seed, 10, 200, NOISE);
-        let (truth, observations) = sequence_of(&scene);
-        let mut start = perturbed(&truth, 0.01, seed);
-        let mut block = Reconstruction::new(start.intrinsics[0], start.poses.clone(), start.points.clone());
-        let (model, prior, stop) = (IntrinsicsModel::FOCAL, IntrinsicsPrior::NONE, StopToken::default());
-        let (seconds, dense) =
-            timed(|| metric::adjust(&mut block, &scene.observations, model, &[prior], &options(), &stop));
-        block_seconds += seconds / dense.iterations as f64;
-        let (seconds, sparse) = timed(|| adjusted(&mut start, &observations, &[model], &options()));
-        sequence_seconds += seconds / sparse.iterations as f64;
-    }
-    let [block, sequence] = [block_seconds, sequence_seconds].map(|seconds| 1e3 * seconds / REPEATS as f64);
-    println!("10 views, 200 tracks: block {block:.2} ms, sequence {sequence:.2} ms an iteration");
 }

@@ -1,0 +1,76 @@
+//! The normal equations of views and intrinsics at one reconstruction, the points eliminated.
+
+use std::ops::Range;
+
+use super::layout::{Layout, Unknowns};
+use super::minimise::pattern;
+use super::normal::Normal;
+use super::reduced::Reduced;
+use super::worker_pool::WorkerPool;
+use super::{CancellationCheck, Free, Observation, Reconstruction};
+use crate::domain::StopToken;
+use crate::geometry::bundle::Loss;
+use crate::geometry::bundle::metric::{IntrinsicsModel, Parameter};
+use crate::parallel::Threads;
+
+/// What the observations say of the poses and of all intrinsics, those that views have of their own and those that they
+/// share, nothing damped.
+pub struct System {
+    unknowns: Unknowns,
+    reduced: Reduced,
+    /// The diagonal were the points and everything else known.
+    pub known: Vec<f64>,
+}
+
+impl System {
+    /// Linearises; `None` where a point's block is no number.
+    pub fn new(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
+        let model = IntrinsicsModel::focal(reconstruction.has_own_focals()).with_all_extensions();
+        let models = vec![model; reconstruction.intrinsics.len()];
+        let stop = StopToken::default();
+        let mut cancellation = CancellationCheck::new(&stop);
+        let layout = Layout::new(reconstruction, observations, &Free::all(&models), &mut cancellation)?;
+        let pattern = pattern(reconstruction, &layout, &mut cancellation)?;
+        let pool = WorkerPool::new(&layout, Threads::ONE, &stop);
+        let mut normal = Normal::new(&layout, &pattern, reconstruction);
+        normal.fill(reconstruction, &layout, &[], Loss::Squared, &pool);
+        let mut reduced = Reduced::new(&layout, pattern);
+        let possible = reduced.build(&layout, &normal, 0.0, &pool);
+        let known = normal.cameras.diagonal.iter().map(|&index| normal.cameras.values[index]).collect();
+        possible.then_some(Self { unknowns: layout.unknowns, reduced, known })
+    }
+
+    pub fn dimension(&self) -> usize {
+        self.unknowns.count()
+    }
+
+    /// Views that see something, and their unknowns: the pose, and the focal length where it is the view's own.
+    pub fn of_views(&self) -> impl Iterator<Item = (usize, Range<usize>)> {
+        let views = self.unknowns.view_block.iter().enumerate();
+        views.filter_map(|(view, block)| Some((view, self.unknowns.range((*block)?))))
+    }
+
+    /// Camera group, intrinsic and unknown of all that views share.
+    pub fn of_groups(&self) -> impl Iterator<Item = (usize, Parameter, usize)> {
+        let Unknowns { group_block, parameters, .. } = &self.unknowns;
+        let blocks = group_block.iter().zip(parameters).enumerate();
+        blocks.flat_map(|(group, (block, parameters))| {
+            let unknowns = block.map_or(0..0, |block| self.unknowns.range(block));
+            parameters.iter().zip(unknowns).map(move |(parameter, unknown)| (group, *parameter, unknown))
+        })
+    }
+
+    /// Calls `take` with row, column and value of the lower triangle.
+    pub fn for_each(&self, mut take: impl FnMut(usize, usize, f64)) {
+        self.reduced.pattern.for_each(|row, column, index| {
+            if row >= column {
+                take(row, column, self.reduced.values[index]);
+            }
+        });
+    }
+
+    /// Half the downward gradient of the cost.
+    pub fn negative_gradient(&self) -> &[f64] {
+        &self.reduced.vector
+    }
+}
