@@ -10,6 +10,7 @@ use super::portfolio::Found;
 use super::problem::{Problem, camera_groups};
 use super::reconstruction::{Reconstruction, own_verdicts};
 use super::recorder::Recorder;
+use super::second_structures;
 use super::sequence::Ended;
 use super::view_selection::{LEAST_TRACKS, LEAST_VIEWS};
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
@@ -58,7 +59,7 @@ impl Reconstruction {
         recorder: Recorder,
     ) -> Solution {
         warnings.extend(self.warnings.iter().cloned());
-        warnings.extend(seed.second_structure.clone());
+        warnings.extend(second_structures::warning(&seed.second_structure, &judged.tracks.inlier));
         let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
         // Depths verify fewer, and PAPER and PSFM keep what they keep.
         if seed.judges_observations() && inliers < LEAST_INLIERS {

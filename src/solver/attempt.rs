@@ -14,7 +14,7 @@ use super::problem::Problem;
 use super::recorder::Recorder;
 use super::sequence::Projective;
 use super::{Error, all_tracks, near_duplicates, second_structures, track_sampling};
-use crate::domain::{FocalPrior, Grade, Method, Stage, Warning, WarningCode};
+use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::geometry::statistics::median;
 
@@ -64,8 +64,8 @@ pub struct Attempt {
     /// Every track and observation judged by it, where that was done already.
     pub judged: Option<Judged>,
     pub calibration: Option<Outcome>,
-    /// That the tracks left out agree on a motion of their own.
-    pub second_structure: Option<Warning>,
+    /// Tracks of the input that the search left out and that agree on a motion of their own.
+    pub second_structure: Vec<usize>,
     /// Probability of tracks to be right by image points and depths together; `None` where depths say nothing more.
     pub weights_by_depths: Option<TrackWeights>,
     /// The method's own verdicts where it searches nothing (PAPER, PSFM).
@@ -81,7 +81,7 @@ impl Attempt {
             projective: None,
             judged: None,
             calibration: None,
-            second_structure: None,
+            second_structure: Vec::new(),
             weights_by_depths: None,
             decided: None,
         }
@@ -311,7 +311,8 @@ fn search(
     if ln_false_alarms >= LN_ACCEPTABLE {
         return Ok(attempt);
     }
-    attempt.second_structure = second_structures::find(complete, &refined, problem.stop);
+    let second = second_structures::find(complete, &refined, problem.stop).unwrap_or_default();
+    attempt.second_structure = second.into_iter().map(|track| tracks[track]).collect();
     problem.stopped()?;
     if effort.is_seed {
         attempt.found.consensus = Some(refined);

@@ -15,8 +15,9 @@ const FAR_GATES: f64 = 16.0;
 /// Tracks of a second structure, at least, as a share of the first: a handful that moves together is no second body.
 const LEAST_SHARE: f64 = 0.1;
 
-/// Searches the tracks that a consensus leaves out for another.
-pub fn find(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken) -> Option<Warning> {
+/// Searches the tracks that a consensus leaves out for another; the tracks of the block that agree, where they are
+/// enough.
+pub fn find(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken) -> Option<Vec<usize>> {
     let gate = FAR_GATES * chi_square_gate((2 * block.views()) as f64 - 3.0) * consensus.noise * consensus.noise;
     let left: Vec<usize> =
         (0..block.tracks()).filter(|&track| !consensus.inlier[track] && consensus.squared[track] > gate).collect();
@@ -28,23 +29,37 @@ pub fn find(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken) -> O
         true => by_depths(&rest, consensus.noise, stop),
         false => by_image_points(&rest, consensus.noise, stop),
     };
-    let least = LEAST_SHARE * consensus.inlier_count() as f64;
-    let count = second.filter(|&count| count >= grow::LEAST_INLIERS && count as f64 >= least)?;
-    Some(Warning::new(
-        WarningCode::SecondStructure,
-        format!(
-            "about {count} tracks that the search left out agree on another rigid motion: a second moving body, or a \
-             repeated structure; the result is that of the set that was found first, {} tracks, not of both",
-            consensus.inlier_count()
-        ),
-    ))
+    let second: Vec<usize> = second?.into_iter().map(|track| left[track]).collect();
+    is_enough(second.len(), consensus.inlier_count()).then_some(second)
+}
+
+/// Whether so many tracks are a second structure beside a first one of so many.
+fn is_enough(second: usize, first: usize) -> bool {
+    second >= grow::LEAST_INLIERS && second as f64 >= LEAST_SHARE * first as f64
+}
+
+/// What is said of tracks that agree on a motion of their own, where the result still leaves out enough of them: a lens
+/// that the search did not know may have brought them in.
+///
+/// * `inlier`: the verdict on every track of the input
+pub fn warning(second: &[usize], inlier: &[bool]) -> Option<Warning> {
+    let left = second.iter().filter(|track| !inlier[**track]).count();
+    let first = inlier.iter().filter(|inlier| **inlier).count();
+    is_enough(left, first).then(|| {
+        let detail = format!(
+            "about {left} tracks that are left out agree on another rigid motion: a second moving body, or a repeated \
+             structure; the result is that of the set that was found first, {first} tracks, not of both"
+        );
+        Warning::new(WarningCode::SecondStructure, detail)
+    })
 }
 
 /// Tracks of another rigid shape, where depths are given.
-fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize> {
+fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<Vec<usize>> {
     let search = rigid::Search::new(rest, portfolio::spread(rest), stop)?;
     let found = search.run(noise)?;
-    (found.ln_false_alarms(search.spread()) < LN_DECISIVE).then(|| found.inlier_count())
+    let is_decisive = found.ln_false_alarms(search.spread()) < LN_DECISIVE;
+    is_decisive.then(|| (0..found.inlier.len()).filter(|&track| found.inlier[track]).collect())
 }
 
 /// Tracks of another projective reconstruction: one ranking, grown; a structure that takes more to be found is not
@@ -53,7 +68,7 @@ fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize
 /// Nothing is grown where the ranking holds fewer tracks than determine cameras. Any four tracks agree on affine
 /// cameras, and of wrong ones no fifth does (a test counts them); growing from those by chance took nearly as long as
 /// the rest of a solve.
-fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<usize> {
+fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<Vec<usize>> {
     let ranking = priors::affine_irls_of(grow::LEAST_SUPPORT, affine::Search::new(rest).centred(), stop)?;
     let costs: Vec<f64> = ranking.iter().map(|weight| -weight).collect();
     let spread = portfolio::spread(rest);
@@ -65,7 +80,7 @@ fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option
         let found = grow::polish(rest, rough, stop);
         let is_decisive = found.inlier_count() >= grow::LEAST_INLIERS
             && a_contrario::ln_false_alarms(rest, &found, spread, stop) < LN_DECISIVE;
-        is_decisive.then(|| found.inlier_count())
+        is_decisive.then(|| found.inliers())
     })
 }
 
