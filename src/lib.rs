@@ -1,5 +1,8 @@
 //! Self-calibrating projective structure from motion, as a library and as a long-running gRPC service.
 //!
+//! After R. Gong, D. P. Paudel, A. Chhatkuli, L. Van Gool: Self-Calibration Supported Robust Projective
+//! Structure-from-Motion, 2020; called "the paper" from here on, its equations by its own numbers.
+//!
 //! Tracks of uncalibrated images go in, most of them possibly wrong; which tracks are right, the intrinsics with
 //! their uncertainty, the plane at infinity and the projective and metric reconstruction come out, or the honest
 //! statement that the motion carries no calibration.

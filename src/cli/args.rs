@@ -94,7 +94,7 @@ pub struct InputArgs {
     /// The kind is told from the name and the first bytes; --format overrides.
     ///
     /// In the CSV, a line is an observation, in pixels; the centre of the top-left pixel is (0, 0); sigma is one
-    /// standard deviation of a coordinate. Ids are any whole numbers, other columns are ignored. OpenSfM's coordinates
+    /// standard deviation of a coordinate. Ids are whole numbers from 0, other columns are ignored. OpenSfM's coordinates
     /// are relative to the image size, which is read from exif/IMAGE.exif beside the file; --width and --height give
     /// that of images without one. Of a database, matches are joined into tracks; a match that would put two keypoints
     /// of one image into one track is cut. A model gives its tracks; its poses, points and calibration are not used.

@@ -16,7 +16,8 @@ use crate::telemetry;
 
 const HELP: &str = "\
 Configuration: defaults, then the file, then the environment, then flags; later ones win. Every key of the file \
-may stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__WORKERS=4. --print-config shows all keys.
+may stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__WORKERS=4. --print-config shows all \
+keys that have a value.
 
 When it serves, two lines on stdout say where: `grpc http://...` (or https) and `metrics http://...`. SIGTERM or Ctrl-C drains: \
 new jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start; \

@@ -218,7 +218,7 @@ impl Input {
 fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String, found: &mut Violations) {
     let mut bound = |name: &str, count: usize, max: usize, what: &str| {
         if count > max {
-            found.push(Violation::of(field(name), format!("{count} {what} are above this server's limit of {max}")));
+            found.push(Violation::of(field(name), format!("{count} {what} are above the limit of {max}")));
         }
     };
     bound("views", raw.views.len(), limits.max_views, "views");

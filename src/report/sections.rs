@@ -159,7 +159,11 @@ pub fn convergence(solution: &Solution) -> String {
         losses,
         single("Inliers of the best hypothesis", over_steps(|record| Some(f64::from(record.inliers))), None),
         single("Focal length of the best hypothesis (px)", over_steps(|record| record.focal_px), clip),
-        single("Score of the best hypothesis (0 best, 1 none)", over_steps(|record| record.best_score), None),
+        single(
+            "Cost of the best hypothesis (share of that without inliers)",
+            over_steps(|record| record.best_score),
+            None,
+        ),
     ];
     let svgs: Vec<String> = charts.iter().map(|chart| format!("<figure>{}</figure>\n", chart.svg())).collect();
     format!(
@@ -194,8 +198,12 @@ fn prior_times(solution: &Solution) -> String {
         return String::new();
     }
     let sentence = |time: &PriorTime| {
-        let seconds = time.seconds.map_or_else(|| "never".into(), |seconds| format!("{seconds:.2} s"));
-        format!("{} {seconds} ({} steps)", time.prior.name(), time.iterations)
+        let when = match time.seconds {
+            Some(seconds) => format!("{seconds:.2} s ({} steps)", time.iterations),
+            None if time.iterations == 0 => "not asked".to_owned(),
+            None => format!("never ({} steps)", time.iterations),
+        };
+        format!("{} {when}", time.prior.name())
     };
     let times: Vec<String> = solution.prior_times.iter().map(sentence).collect();
     format!(
@@ -279,6 +287,8 @@ mod tests {
     fn priors_that_never_sufficed_say_so() {
         let (_, mut solution) = fixture::solved();
         assert!(prior_times(&solution).contains("uniform never (600 steps)"));
+        solution.prior_times.iter_mut().for_each(|time| (time.seconds, time.iterations) = (None, 0));
+        assert!(prior_times(&solution).contains("uniform not asked"));
         solution.prior_times.clear();
         assert!(prior_times(&solution).is_empty());
     }
