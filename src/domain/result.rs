@@ -213,6 +213,11 @@ pub struct TrackResults {
 }
 
 impl TrackResults {
+    /// Nothing judged of this many tracks.
+    pub fn unjudged(count: usize) -> Self {
+        Self { weight: vec![0.0; count], inlier: vec![false; count], point: vec![None; count], ..Self::default() }
+    }
+
     /// The reconstruction that a track has a point in; `None` where it has none.
     pub fn part_of(&self, track: usize) -> Option<u32> {
         self.point.get(track)?.as_ref()?;

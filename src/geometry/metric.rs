@@ -1,11 +1,10 @@
 //! From a projective to a metric reconstruction, given the DAQ.
 
-use nalgebra::{Matrix3, Matrix4, SMatrix, SVector, Vector3, Vector4};
+use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
-use super::Camera;
 use super::bundle::critical::Translating;
 use super::bundle::metric::{Intrinsics, Pose, Reconstruction};
-use super::daq::{self, CanonicalFrame, Daq, to_canonical_frame};
+use super::daq::{self, CanonicalFrame, Daq};
 use super::observation::Observation;
 use super::statistics::median;
 
@@ -20,33 +19,6 @@ pub fn upgrading_homography(daq: &Daq) -> Matrix4<f64> {
     homography.fixed_view_mut::<3, 3>(0, 0).copy_from(&calibration);
     homography.fixed_view_mut::<1, 3>(3, 0).copy_from(&-(daq.plane_at_infinity.transpose() * calibration));
     homography
-}
-
-/// The plane at infinity of projective cameras that goes best with what they are as metric ones, `n` of `(n, 1)` in the
-/// frame that [`to_canonical_frame`] gives them.
-///
-/// For every projective `P = [A|a]` there and metric `K [R|t]`, `A - a n' ~ K R (K1 R1)^-1` is the homography of the
-/// plane at infinity between the first view and this one (Hartley & Zisserman 2004, chapter 19): linear in `n` and the
-/// scales.
-///
-/// Returns `None` where the first camera has no rank 3, or the cameras have one centre.
-pub fn plane_at_infinity(projective: &[Camera], metric: &[Camera]) -> Option<Vector3<f64>> {
-    let frame = to_canonical_frame(projective, &[])?;
-    let back = metric.first()?.fixed_columns::<3>(0).into_owned().try_inverse()?;
-    let (mut normal, mut target) = (Matrix3::zeros(), Vector3::zeros());
-    for (projective, metric) in frame.cameras.iter().zip(metric) {
-        let infinite = metric.fixed_columns::<3>(0) * back;
-        let infinite = SVector::<f64, 9>::from_column_slice((infinite / infinite.norm()).as_slice());
-        // Entry (row, column) of `A` is at 3 column + row, and `a_row n_column` beside it.
-        let by_plane =
-            SMatrix::<f64, 9, 3>::from_fn(|k, column| if k / 3 == column { projective[(k % 3, 3)] } else { 0.0 });
-        let without_scale = by_plane - infinite * (infinite.transpose() * by_plane);
-        let left = SVector::<f64, 9>::from_column_slice(projective.fixed_columns::<3>(0).into_owned().as_slice());
-        normal += without_scale.transpose() * by_plane;
-        target += without_scale.transpose() * left;
-    }
-    let plane = normal.try_inverse()? * target;
-    plane.iter().all(|value| value.is_finite()).then_some(plane)
 }
 
 /// Upgrades a projective reconstruction: the nearest rotations, and of the two mirror images the one with more
@@ -170,6 +142,7 @@ pub fn cheirality(reconstruction: &Reconstruction, observations: &[Observation])
 #[cfg(test)]
 mod tests {
     use super::super::bundle::testing;
+    use super::super::daq::to_canonical_frame;
     use super::super::daq::{Free, refine, scan};
     use super::*;
 
@@ -190,21 +163,6 @@ mod tests {
                 let error = upgraded.residual(seen).norm();
                 assert!(error < 1e-5, "seed {seed}: {error}");
             }
-        }
-    }
-
-    #[test]
-    fn the_plane_at_infinity_of_metric_cameras_upgrades_projective_ones() {
-        for seed in 0..5 {
-            let scene = testing::scene(seed, 8, 20, 0.0);
-            let (cameras, points) = testing::projectively_transformed(&scene, seed);
-            let plane_at_infinity = plane_at_infinity(&cameras, &scene.cameras()).expect("views apart");
-            let frame = to_canonical_frame(&cameras, &points).expect("rank 3");
-            let daq = Daq { intrinsics: scene.intrinsics, plane_at_infinity };
-            let upgraded = upgrade(&frame, &daq, false, &scene.observations).expect("metric");
-            let errors = scene.observations.iter().map(|seen| upgraded.residual(seen).norm());
-            let worst = errors.fold(0.0, f64::max);
-            assert!(worst < 1e-7, "seed {seed}: {worst:e}");
         }
     }
 

@@ -1,25 +1,17 @@
 //! The pose of a calibrated camera from known points and their images.
 
-use nalgebra::{Matrix4, RowVector4, Schur, Vector2, Vector3};
+use nalgebra::{Matrix4, RowVector4, SVector, Schur, Vector2, Vector3};
 use rand_chacha::ChaCha8Rng;
 
 use super::bundle::metric::{Intrinsics, Pose, Projection};
-use super::levenberg_marquardt::{self, Normal, Problem};
 use super::procrustes;
-use super::ransac::{self, Estimator, Robust};
+use super::ransac::{self, Estimator, Refinable, Robust};
 use crate::domain::StopToken;
 
 /// Correspondences that determine a pose up to four solutions.
 const SAMPLE: usize = 3;
 /// Samples of the robust pose at most: enough where one correspondence in ten is right.
 const MOST_SAMPLES: usize = 5_000;
-/// The refinement of a pose that is nearly right.
-const REFINEMENT: levenberg_marquardt::Options = levenberg_marquardt::Options {
-    max_iterations: 10,
-    relative_tolerance: 1e-6,
-    initial_damping: 1e-4,
-    min_damping: levenberg_marquardt::MIN_DAMPING,
-};
 /// Imaginary part of a root, relative to the root, that rounding explains.
 const REAL: f64 = 1e-4;
 /// Iterations of the eigenvalue solver; four eigenvalues take a dozen.
@@ -103,14 +95,6 @@ pub(crate) fn robust(
     ransac::estimate(&Correspondences { points, seen, weights }, gate, None, MOST_SAMPLES, rng, stop)
 }
 
-/// Levenberg-Marquardt on the distances under a Geman-McClure loss of scale `sqrt(gate)`; never worse than the start.
-fn refine(start: Pose, data: Correspondences, gate: f64) -> Pose {
-    let mut pose = start;
-    let mut refinement = Refinement { data, gate, normal: Normal::zeros() };
-    levenberg_marquardt::minimise(&mut refinement, &mut pose, &REFINEMENT, &StopToken::default());
-    pose
-}
-
 #[derive(Clone, Copy)]
 struct Correspondences<'a> {
     points: &'a [Vector3<f64>],
@@ -140,46 +124,24 @@ impl Estimator for Correspondences<'_> {
     }
 
     fn refined(&self, pose: &Pose, gate: f64) -> Option<Pose> {
-        Some(refine(*pose, *self, gate))
+        Some(ransac::refined(self, pose, gate))
     }
 }
 
-struct Refinement<'a> {
-    data: Correspondences<'a>,
-    gate: f64,
-    normal: Normal<6>,
-}
-
-impl Problem for Refinement<'_> {
-    type State = Pose;
-
-    fn cost(&self, pose: &Pose) -> f64 {
-        let gate = self.gate;
-        let one = |squared: f64| if squared.is_finite() { gate * squared / (squared + gate) } else { gate };
-        (0..self.data.len()).map(|datum| one(self.data.squared_residual(pose, datum))).sum()
-    }
-
-    fn linearise(&mut self, pose: &Pose) {
-        self.normal = Normal::zeros();
+impl Refinable<6> for Correspondences<'_> {
+    fn residual(&self, pose: &Pose, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 6>; 2])> {
         let intrinsics = Intrinsics::from_focal(1.0);
-        let Correspondences { points, seen, weights } = self.data;
-        for ((point, seen), weight) in points.iter().zip(seen).zip(weights) {
-            let projection = Projection::new(&intrinsics, pose, point);
-            if projection.at.z <= 0.0 {
-                continue;
-            }
-            let residual = projection.image - seen;
-            let weight = weight * (self.gate / (weight * residual.norm_squared() + self.gate)).powi(2);
-            for (component, by_pose) in projection.gradients().by_pose.into_iter().enumerate() {
-                self.normal.add(&by_pose.into(), residual[component], weight);
-            }
-        }
+        let projection = Projection::new(&intrinsics, pose, &self.points[datum]);
+        let gradients = projection.gradients().by_pose.map(SVector::from);
+        (projection.at.z > 0.0).then(|| (projection.image - self.seen[datum], gradients))
     }
 
-    fn step(&mut self, from: &Pose, damping: f64, to: &mut Pose) -> Option<f64> {
-        let (step, predicted) = self.normal.solve(damping)?;
-        *to = from.moved(step.into());
-        Some(predicted)
+    fn weight(&self, datum: usize) -> f64 {
+        self.weights[datum]
+    }
+
+    fn moved(&self, pose: &Pose, step: &SVector<f64, 6>) -> Option<Pose> {
+        Some(pose.moved((*step).into()))
     }
 }
 

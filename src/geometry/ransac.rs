@@ -1,9 +1,11 @@
 //! Robust estimation from contaminated data: one LO-MSAC loop (Torr & Zisserman 2000; Chum, Matas & Kittler 2003), with
 //! the minimal solvers as plug-ins.
 
+use nalgebra::{SVector, Vector2};
 use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 
+use super::levenberg_marquardt::{self, Normal};
 use crate::domain::StopToken;
 
 /// Probability with which one sample without outliers is to be among those drawn.
@@ -32,6 +34,84 @@ pub(crate) trait Estimator {
 
     /// The model fitted to the data that are within about this squared residual of it; `None` where there are too few.
     fn refined(&self, model: &Self::Model, gate: f64) -> Option<Self::Model>;
+}
+
+/// An estimator whose models are refined by the gradients of its residuals of two coordinates, by `N` unknowns.
+pub(crate) trait Refinable<const N: usize>: Estimator {
+    /// Residual, in the units of a datum of weight 1, and its gradients; `None` where a datum has none.
+    fn residual(&self, model: &Self::Model, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, N>; 2])>;
+
+    /// Weight of the squared residual of a datum.
+    fn weight(&self, datum: usize) -> f64;
+
+    /// The model moved by a step; `None` where that is none.
+    fn moved(&self, model: &Self::Model, step: &SVector<f64, N>) -> Option<Self::Model>;
+
+    /// Direction in which a model moves without changing any residual, which a refinement pins; zero where there is none.
+    fn gauge(&self, _model: &Self::Model) -> SVector<f64, N> {
+        SVector::zeros()
+    }
+}
+
+/// The refinement of a model that is nearly right.
+const REFINEMENT: levenberg_marquardt::Options = levenberg_marquardt::Options {
+    max_iterations: 10,
+    relative_tolerance: 1e-6,
+    initial_damping: 1e-4,
+    min_damping: levenberg_marquardt::MIN_DAMPING,
+};
+/// Gates beyond which a datum weighs nothing in a refinement: a hundredth of its weight is left there.
+const WEIGHED_GATES: f64 = 9.0;
+
+/// Levenberg-Marquardt on the residuals under a Geman-McClure loss of scale `sqrt(gate)`; never worse than the start.
+pub(crate) fn refined<const N: usize, E: Refinable<N>>(estimator: &E, start: &E::Model, gate: f64) -> E::Model {
+    let mut model = start.clone();
+    let mut refinement = Refinement { estimator, gate, normal: Normal::<N>::zeros() };
+    levenberg_marquardt::minimise(&mut refinement, &mut model, &REFINEMENT, &StopToken::default());
+    model
+}
+
+struct Refinement<'a, const N: usize, E> {
+    estimator: &'a E,
+    gate: f64,
+    normal: Normal<N>,
+}
+
+impl<const N: usize, E: Refinable<N>> levenberg_marquardt::Problem for Refinement<'_, N, E> {
+    type State = E::Model;
+
+    fn cost(&self, model: &E::Model) -> f64 {
+        let squared = (0..self.estimator.len()).map(|datum| self.estimator.squared_residual(model, datum));
+        // What is not a number costs as much as an outlier may.
+        squared.map(|squared| (self.gate * squared / (squared + self.gate)).min(self.gate)).sum()
+    }
+
+    fn linearise(&mut self, model: &E::Model) {
+        self.normal = Normal::zeros();
+        for datum in 0..self.estimator.len() {
+            let Some((residual, gradients)) = self.estimator.residual(model, datum) else { continue };
+            let weight = self.estimator.weight(datum);
+            let squared = weight * residual.norm_squared();
+            // Written so that NaN is left out.
+            let is_near = squared < WEIGHED_GATES * self.gate;
+            if !is_near {
+                continue;
+            }
+            let weight = weight * (self.gate / (squared + self.gate)).powi(2);
+            for (gradient, residual) in gradients.iter().zip(residual.iter()) {
+                self.normal.add(gradient, *residual, weight);
+            }
+        }
+        // As much information along it as along all others together.
+        let gauge = self.estimator.gauge(model);
+        self.normal.matrix += gauge * gauge.transpose() * self.normal.matrix.trace();
+    }
+
+    fn step(&mut self, from: &E::Model, damping: f64, to: &mut E::Model) -> Option<f64> {
+        let (step, predicted) = self.normal.solve(damping)?;
+        *to = self.estimator.moved(from, &step)?;
+        Some(predicted)
+    }
 }
 
 /// What most data agree on.

@@ -3,33 +3,23 @@
 use nalgebra::{Matrix4, SMatrix, SVector, Vector2};
 use rand_chacha::ChaCha8Rng;
 
-use super::levenberg_marquardt::{self, Normal, Problem};
 use super::null_vector::{null_vector, smallest_eigenvector};
-use super::ransac::{self, Estimator};
+use super::ransac::{self, Estimator, Refinable};
 use super::triangulation::reprojection;
 use super::{Camera, Point};
 use crate::domain::StopToken;
 
 /// Correspondences that determine a projective camera: eleven unknowns, two equations each.
-pub const LEAST_POINTS: usize = 6;
+const LEAST_POINTS: usize = 6;
 /// Samples of the robust resection at most: enough where three images in ten are right, twelve of forty even.
 const MOST_SAMPLES: usize = 20_000;
-/// The refinement, from a camera that is nearly right.
-const REFINEMENT: levenberg_marquardt::Options = levenberg_marquardt::Options {
-    max_iterations: 10,
-    relative_tolerance: 1e-6,
-    initial_damping: 1e-4,
-    min_damping: levenberg_marquardt::MIN_DAMPING,
-};
-/// Gates beyond which an image weighs nothing in a refinement: a hundredth of its weight is left there.
-const WEIGHED_GATES: f64 = 9.0;
 
 /// The camera of least algebraic error (Hartley & Zisserman, section 7.1), unit Frobenius norm.
 ///
 /// * `points`: homogeneous, at least [`LEAST_POINTS`], not all on a plane or a twisted cubic with the camera
 ///
 /// Returns `None` for too few points or when nothing finite comes of them.
-pub fn linear(points: &[Point], images: &[Vector2<f64>]) -> Option<Camera> {
+fn linear(points: &[Point], images: &[Vector2<f64>]) -> Option<Camera> {
     if points.len() < LEAST_POINTS || points.len() != images.len() {
         return None;
     }
@@ -121,59 +111,36 @@ impl Estimator for Resection<'_> {
     }
 
     fn refined(&self, camera: &Camera, gate: f64) -> Option<Camera> {
-        let mut refined = *camera;
-        let mut refinement = Refinement { resection: self, gate, normal: Normal::zeros() };
-        levenberg_marquardt::minimise(&mut refinement, &mut refined, &REFINEMENT, &StopToken::default());
-        Some(refined)
+        Some(ransac::refined(self, camera, gate))
     }
 }
 
-/// The reprojection errors under a Geman-McClure loss of scale `sqrt(gate)`.
-struct Refinement<'a> {
-    resection: &'a Resection<'a>,
-    gate: f64,
-    normal: Normal<12>,
-}
-
-impl Problem for Refinement<'_> {
-    type State = Camera;
-
-    fn cost(&self, camera: &Camera) -> f64 {
-        let squared = (0..self.resection.len()).map(|datum| self.resection.squared_residual(camera, datum));
-        // What is not a number costs as much as an outlier may.
-        squared.map(|squared| (self.gate * squared / (squared + self.gate)).min(self.gate)).sum()
+impl Refinable<12> for Resection<'_> {
+    fn residual(&self, camera: &Camera, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 12>; 2])> {
+        let (point, image) = (&self.points[datum], &self.images[datum]);
+        let residual = reprojection(camera, point, image);
+        let nearer = point / (camera.row(2) * point).x;
+        let projected = residual + image;
+        let gradient = |axis: usize| {
+            let mut gradient = SVector::<f64, 12>::zeros();
+            gradient.fixed_rows_mut::<4>(4 * axis).copy_from(&nearer);
+            gradient.fixed_rows_mut::<4>(8).copy_from(&(-projected[axis] * nearer));
+            gradient
+        };
+        Some((residual, [gradient(0), gradient(1)]))
     }
 
-    fn linearise(&mut self, camera: &Camera) {
-        self.normal = Normal::zeros();
-        let Resection { points, images, weights } = self.resection;
-        for ((point, image), weight) in points.iter().zip(*images).zip(*weights) {
-            let residual = reprojection(camera, point, image);
-            let squared = weight * residual.norm_squared();
-            // Written so that NaN is left out.
-            let is_near = squared < WEIGHED_GATES * self.gate;
-            if !is_near {
-                continue;
-            }
-            let weight = weight * (self.gate / (squared + self.gate)).powi(2);
-            let nearer = point / (camera.row(2) * point).x;
-            let projected = residual + image;
-            for axis in [0, 1] {
-                let mut derivative = SVector::<f64, 12>::zeros();
-                derivative.fixed_rows_mut::<4>(4 * axis).copy_from(&nearer);
-                derivative.fixed_rows_mut::<4>(8).copy_from(&(-projected[axis] * nearer));
-                self.normal.add(&derivative, residual[axis], weight);
-            }
-        }
-        // The scale of the homogeneous camera is free: pin it.
-        let gauge = SVector::<f64, 12>::from_fn(|k, _| camera[(k / 4, k % 4)]);
-        self.normal.matrix += gauge * gauge.transpose() * self.normal.matrix.trace();
+    fn weight(&self, datum: usize) -> f64 {
+        self.weights[datum]
     }
 
-    fn step(&mut self, from: &Camera, damping: f64, to: &mut Camera) -> Option<f64> {
-        let (step, predicted) = self.normal.solve(damping)?;
-        *to = (from + Camera::from_fn(|row, column| step[4 * row + column])).try_normalize(f64::MIN_POSITIVE)?;
-        Some(predicted)
+    fn moved(&self, camera: &Camera, step: &SVector<f64, 12>) -> Option<Camera> {
+        (camera + Camera::from_fn(|row, column| step[4 * row + column])).try_normalize(f64::MIN_POSITIVE)
+    }
+
+    /// The scale of the homogeneous camera is free.
+    fn gauge(&self, camera: &Camera) -> SVector<f64, 12> {
+        SVector::from_fn(|k, _| camera[(k / 4, k % 4)])
     }
 }
 

@@ -152,7 +152,7 @@ impl Reconstruction {
                 let camera = self.cameras[view].as_ref().filter(|_| self.component_of_view[view] == component)?;
                 let to_pixels = problem.normalization.to_pixels(view);
                 match &self.canonical {
-                    Some(canonical) => Some(canonical.homography * affine_frame(&to_pixels, &Camera::identity())?),
+                    Some(canonical) => Some(canonical * affine_frame(&to_pixels, &Camera::identity())?),
                     None => affine_frame(&to_pixels, camera),
                 }
             })
@@ -236,11 +236,8 @@ fn nothing(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>,
         plane_at_infinity: None,
         views: vec![ViewResult::default(); problem.views()],
         tracks: TrackResults {
-            weight: vec![0.0; problem.tracks()],
-            inlier: vec![false; problem.tracks()],
             network_weight: attempt.map_or_else(Vec::new, |attempt| network_weights(problem, attempt)),
-            point: vec![None; problem.tracks()],
-            part: Vec::new(),
+            ..TrackResults::unjudged(problem.tracks())
         },
         observations: ObservationResults::unjudged(problem.input.observation_count()),
         splits: Vec::new(),

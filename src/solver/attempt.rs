@@ -108,10 +108,8 @@ impl Attempt {
     /// Whether the residuals are of several kinds, most small and some large: tracks that hold wrong observations were
     /// fitted at too high a noise. Never up to [`INITIAL_NOISE`], where the gates keep wrong observations out.
     pub fn has_mixed_residuals(&self) -> bool {
-        let Some(found) = self.projective.as_ref().filter(|found| found.noise > INITIAL_NOISE) else { return false };
-        let mut squared = found.squared_residuals();
-        let mean = squared.iter().sum::<f64>() / squared.len().max(1) as f64;
-        median(&mut squared) < LEAST_MEDIAN_SHARE * mean
+        let noisy = self.projective.as_ref().filter(|found| found.noise > INITIAL_NOISE);
+        noisy.is_some_and(|found| are_mixed(found.squared_residuals()))
     }
 
     /// Says that image points verify what it was extended to, whatever verified the seed.
@@ -177,6 +175,12 @@ impl Attempt {
         };
         self.calibration.as_ref().is_some_and(is_good)
     }
+}
+
+/// Whether squared residuals are of several kinds, most small and some large.
+pub fn are_mixed(mut squared: Vec<f64>) -> bool {
+    let mean = squared.iter().sum::<f64>() / squared.len().max(1) as f64;
+    median(&mut squared) < LEAST_MEDIAN_SHARE * mean
 }
 
 /// Solves a block, or as many of its tracks as its method can afford.

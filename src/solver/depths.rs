@@ -16,7 +16,6 @@ use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
 };
 use crate::geometry::measurement::CompleteBlock;
-use crate::geometry::metric::plane_at_infinity;
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, triangulation};
 
@@ -101,10 +100,8 @@ pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus
         let detail = format!("{:.1} % of the observations lie behind their cameras", 100.0 * (1.0 - cheirality));
         return refused(outcome, WarningCode::Cheirality, detail);
     }
-    outcome.plane_at_infinity = plane_at_infinity(&consensus.cameras, &found.cameras());
     outcome.grade = problem.calibration_options.grades.grade(sigma).worse(Grade::Weak);
     outcome.sigma_log_focal = sigma;
-    outcome.cheirality = cheirality;
     outcome.metric = Some(found);
     outcome
 }

@@ -23,6 +23,8 @@ pub struct Estimate {
 pub struct Fused {
     pub log_focal: f64,
     pub sigma: f64,
+    /// What that would be without misfit.
+    pub formal: f64,
     /// Standard deviation of what each has beside its own sigma.
     pub misfit: f64,
     /// Chi-square per degree of freedom without it.
@@ -54,6 +56,7 @@ pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
         weight.iter().zip(estimates).map(|(weight, estimate)| weight * (estimate.log_focal - mean).powi(2)).sum();
     // What it is expected to be: the number of estimates less one, where they have nothing in common.
     let expected = (estimates.len() as f64 - variance_of_sum(&weight, 0.0) / total).max(f64::MIN_POSITIVE);
+    let formal = variance_of_sum(&weight, 0.0).sqrt() / total;
     let scale = total - weight.iter().map(|weight| weight * weight).sum::<f64>() / total;
     let misfit = ((statistic - expected).max(0.0) / scale).sqrt();
     let weight = weights(misfit);
@@ -62,7 +65,7 @@ pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
         weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.log_focal).sum::<f64>() / total;
     let sigma = variance_of_sum(&weight, misfit).sqrt() / total;
     let usable = sigma.is_finite() && misfit.is_finite() && log_focal.is_finite();
-    usable.then_some(Fused { log_focal, sigma, misfit, chi_square: statistic / expected })
+    usable.then_some(Fused { log_focal, sigma, formal, misfit, chi_square: statistic / expected })
 }
 
 /// Raises the sigma of one block's calibration by what the estimates of all blocks have beside their own.
@@ -75,8 +78,8 @@ pub fn admit_misfit(outcome: &mut Outcome, estimates: &[Estimate], grades: &Grad
 
 /// Raises the sigma of a calibration, grades it anew and says so.
 pub fn raise(outcome: &mut Outcome, sigma: f64, fused: &Fused, which: &str, grades: &GradeOptions) {
-    let Some(own) = outcome.sigma_log_focal.replace(sigma) else { return };
-    outcome.grade = outcome.grade.worse(grades.grade(Some(sigma)));
+    let Some(own) = outcome.sigma_log_focal else { return };
+    outcome.raise_sigma(sigma, grades);
     if sigma > WORTH_A_WARNING * own && sigma > WORTH_MINDING {
         let detail = format!(
             "{which} differ in focal length by {:.2} % (one standard deviation beside their own), chi-square {:.1} a \

@@ -6,6 +6,7 @@
 //! that grew into a corner (mean F1 .90 -> 1.00 at 90 % outliers).
 
 use super::a_contrario;
+use super::search::Seed;
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, Loss, projective};
 use crate::geometry::measurement::CompleteBlock;
@@ -104,7 +105,7 @@ pub fn judge(block: &CompleteBlock, cameras: Vec<Camera>, noise: f64, stop: &Sto
 ///
 /// Growing and polishing come back to a support that stands still several times each: with 100 right tracks in 11
 /// views, 37 adjustments become 11.
-struct Fits<'a> {
+pub struct Fits<'a> {
     block: &'a CompleteBlock,
     noise: f64,
     stop: &'a StopToken,
@@ -119,7 +120,7 @@ struct Converged {
 }
 
 impl<'a> Fits<'a> {
-    fn new(block: &'a CompleteBlock, noise: f64, stop: &'a StopToken) -> Self {
+    pub fn new(block: &'a CompleteBlock, noise: f64, stop: &'a StopToken) -> Self {
         Self { block, noise, stop, converged: Vec::new() }
     }
 
@@ -155,6 +156,70 @@ impl<'a> Fits<'a> {
         let points = support.iter().map(|&track| from.points[track]).collect();
         self.fit(&from.cameras, points, support, loss, iterations).0
     }
+
+    /// Grows a seed; the best consensus met.
+    pub fn grow(&mut self, seed: Seed) -> Option<Consensus> {
+        if seed.support.len() < LEAST_SUPPORT || self.block.views() < 2 {
+            return None;
+        }
+        let Seed { mut cameras, mut points, mut support } = seed;
+        let mut best: Option<Consensus> = None;
+        let mut idle = 0;
+        for round in 0..GROWING_ROUNDS {
+            let loss = if support.len() > PLAIN_SUPPORT { robust(self.noise) } else { Loss::Squared };
+            let iterations = if round < 3 { ADJUSTMENTS.0 } else { ADJUSTMENTS.1 };
+            let (judged, converged) = self.fit(&cameras, points, &support, loss, iterations);
+            cameras = judged.cameras.clone();
+            let next = next_support(&judged, support.len(), self.block.views());
+            points = next.iter().map(|&track| judged.points[track]).collect();
+            if best.as_ref().is_none_or(|best| judged.score < best.score - 1e-12) {
+                best = Some(judged);
+                idle = 0;
+            } else {
+                idle += 1;
+            }
+            let stands_still = next == support && (converged || round > 1);
+            if idle >= PATIENCE || stands_still || self.stop.is_stopped() {
+                break;
+            }
+            support = next;
+        }
+        best
+    }
+
+    /// Inflates the gate and tightens it again, keeping what gets better.
+    pub fn polish(&mut self, consensus: Consensus) -> Consensus {
+        let (block, noise) = (self.block, self.noise);
+        let gate = gate(block.views()) * noise * noise;
+        let mut best = consensus;
+        for _ in 0..POLISH_ROUNDS {
+            let before = best.score;
+            let mut current = best.clone();
+            let mut fitted = current.inliers();
+            for inflation in POLISH_INFLATIONS {
+                let support: Vec<usize> =
+                    (0..block.tracks()).filter(|&track| current.squared[track] < inflation * gate).collect();
+                let too_many = inflation > 1.0 && support.len() > 3 * best.inlier_count().max(LEAST_SUPPORT);
+                if support.len() < LEAST_SUPPORT || too_many || self.stop.is_stopped() {
+                    continue;
+                }
+                let loss = if inflation > 1.0 { robust(noise) } else { Loss::Squared };
+                current = self.refit(&current, &support, loss, ADJUSTMENTS.1);
+                if current.score < best.score {
+                    best = current.clone();
+                }
+                // Fitted to what the gate admits, and the same again: the remaining steps would repeat it.
+                if inflation <= 1.0 && support == fitted {
+                    break;
+                }
+                fitted = support;
+            }
+            if best.score > before - 1e-6 {
+                break;
+            }
+        }
+        best
+    }
 }
 
 /// The observations of some tracks; point `k` is `support[k]`.
@@ -166,61 +231,12 @@ pub fn observations_of(block: &CompleteBlock, support: &[usize]) -> Vec<Observat
         .collect()
 }
 
-/// Grows a seed to a consensus and polishes it. `points` are those of `support`, in its order.
+/// Grows a seed to a consensus and polishes it.
 ///
 /// Returns the best consensus met; `None` when the seed is too small or nothing finite came of it.
-pub fn grow(
-    block: &CompleteBlock,
-    cameras: Vec<Camera>,
-    points: Vec<Point>,
-    support: Vec<usize>,
-    noise: f64,
-    stop: &StopToken,
-) -> Option<Consensus> {
+pub fn grow(block: &CompleteBlock, seed: Seed, noise: f64, stop: &StopToken) -> Option<Consensus> {
     let mut fits = Fits::new(block, noise, stop);
-    grow_with(&mut fits, cameras, points, support).map(|consensus| polish_with(&mut fits, consensus))
-}
-
-/// The same without the polish.
-pub fn grow_roughly(
-    block: &CompleteBlock,
-    cameras: Vec<Camera>,
-    points: Vec<Point>,
-    support: Vec<usize>,
-    noise: f64,
-    stop: &StopToken,
-) -> Option<Consensus> {
-    grow_with(&mut Fits::new(block, noise, stop), cameras, points, support)
-}
-
-fn grow_with(fits: &mut Fits, cameras: Vec<Camera>, points: Vec<Point>, support: Vec<usize>) -> Option<Consensus> {
-    let (block, noise) = (fits.block, fits.noise);
-    if support.len() < LEAST_SUPPORT || block.views() < 2 {
-        return None;
-    }
-    let (mut cameras, mut points, mut support) = (cameras, points, support);
-    let mut best: Option<Consensus> = None;
-    let mut idle = 0;
-    for round in 0..GROWING_ROUNDS {
-        let loss = if support.len() > PLAIN_SUPPORT { robust(noise) } else { Loss::Squared };
-        let iterations = if round < 3 { ADJUSTMENTS.0 } else { ADJUSTMENTS.1 };
-        let (judged, converged) = fits.fit(&cameras, points, &support, loss, iterations);
-        cameras = judged.cameras.clone();
-        let next = next_support(&judged, support.len(), block.views());
-        points = next.iter().map(|&track| judged.points[track]).collect();
-        if best.as_ref().is_none_or(|best| judged.score < best.score - 1e-12) {
-            best = Some(judged);
-            idle = 0;
-        } else {
-            idle += 1;
-        }
-        let stands_still = next == support && (converged || round > 1);
-        if idle >= PATIENCE || stands_still || fits.stop.is_stopped() {
-            break;
-        }
-        support = next;
-    }
-    best
+    fits.grow(seed).map(|consensus| fits.polish(consensus))
 }
 
 /// Robust loss at a noise level.
@@ -258,44 +274,6 @@ fn next_support(judged: &Consensus, size: usize, views: usize) -> Vec<usize> {
     ranked
 }
 
-/// Inflates the gate and tightens it again, keeping what gets better.
-pub fn polish(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> Consensus {
-    polish_with(&mut Fits::new(block, consensus.noise, stop), consensus)
-}
-
-fn polish_with(fits: &mut Fits, consensus: Consensus) -> Consensus {
-    let (block, noise) = (fits.block, fits.noise);
-    let gate = gate(block.views()) * noise * noise;
-    let mut best = consensus;
-    for _ in 0..POLISH_ROUNDS {
-        let before = best.score;
-        let mut current = best.clone();
-        let mut fitted = current.inliers();
-        for inflation in POLISH_INFLATIONS {
-            let support: Vec<usize> =
-                (0..block.tracks()).filter(|&track| current.squared[track] < inflation * gate).collect();
-            let too_many = inflation > 1.0 && support.len() > 3 * best.inlier_count().max(LEAST_SUPPORT);
-            if support.len() < LEAST_SUPPORT || too_many || fits.stop.is_stopped() {
-                continue;
-            }
-            let loss = if inflation > 1.0 { robust(noise) } else { Loss::Squared };
-            current = fits.refit(&current, &support, loss, ADJUSTMENTS.1);
-            if current.score < best.score {
-                best = current.clone();
-            }
-            // Fitted to what the gate admits, and the same again: the remaining steps would repeat it.
-            if inflation <= 1.0 && support == fitted {
-                break;
-            }
-            fitted = support;
-        }
-        if best.score > before - 1e-6 {
-            break;
-        }
-    }
-    best
-}
-
 /// Rounds of re-estimating the noise; from ten times too high two or three suffice.
 const NOISE_ROUNDS: usize = 6;
 /// Relative change of the noise below which it has settled.
@@ -320,7 +298,7 @@ fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -
         let settled = (noise / current.noise - 1.0).abs() < NOISE_SETTLED;
         let mut fits = Fits::new(block, noise, stop);
         let fitted = fits.refit(&current, &inliers, robust(noise), ADJUSTMENTS.0);
-        let refitted = polish_with(&mut fits, fitted);
+        let refitted = fits.polish(fitted);
         // A noise level at which the consensus falls apart was estimated from a fit too flexible to trust.
         if refitted.inlier_count() < LEAST_INLIERS {
             break;
@@ -349,7 +327,7 @@ const SURELY_HIGH: f64 = 0.75;
 pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> (Consensus, f64) {
     let higher = |factor: f64| {
         let noise = (factor * consensus.noise).min(NOISE_BOUNDS.1);
-        polish(block, judge(block, consensus.cameras.clone(), noise, stop), stop)
+        Fits::new(block, noise, stop).polish(judge(block, consensus.cameras.clone(), noise, stop))
     };
     let with_chance = |settled: Consensus| {
         let ln_false_alarms = a_contrario::ln_false_alarms(block, &settled, spread, stop);

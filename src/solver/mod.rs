@@ -58,6 +58,13 @@ pub enum Error {
     Internal(String),
 }
 
+impl Error {
+    /// `Err` once the token asks for a stop.
+    fn check(stop: &StopToken) -> Result<(), Self> {
+        stop.reason().map_or(Ok(()), |reason| Err(Self::Stopped(reason)))
+    }
+}
+
 /// Solves one input on the caller's thread; see [`solve_on`].
 ///
 /// # Errors

@@ -93,17 +93,14 @@ const AFFINE_RANK: usize = 3;
 /// The same idea for image points without depths: a rank-3 affine subspace of the centred coordinates (2n x m) under
 /// graduated Geman-McClure weights. The floor is wide: perspective makes right tracks deviate from affine.
 ///
-/// Returns the weights of the last round; `None` when a decomposition fails or `stop` fires.
-pub fn affine_irls(centred: &DMatrix<f64>, stop: &StopToken) -> Option<Vec<f64>> {
-    affine_reweighted(AFFINE_SHRINK, 0, centred, stop)
-}
-
-/// The same at a faster pace, where at least so many tracks agree; `None` as soon as it is clear that fewer will.
-pub fn affine_irls_of(least: usize, centred: &DMatrix<f64>, stop: &StopToken) -> Option<Vec<f64>> {
-    affine_reweighted(AFFINE_SHRINK_OF_MANY, least, centred, stop)
-}
-
-fn affine_reweighted(shrink: f64, least: usize, centred: &DMatrix<f64>, stop: &StopToken) -> Option<Vec<f64>> {
+/// * `centred`: 2n x m
+/// * `least`: tracks that must agree: the scale shrinks faster ([`AFFINE_SHRINK_OF_MANY`]) and the search ends early; 0:
+///   no such condition
+///
+/// Returns the weights of the last round; `None` when a decomposition fails or `stop` fires, or as soon as it is clear
+/// that fewer tracks will agree.
+pub fn affine_irls(centred: &DMatrix<f64>, least: usize, stop: &StopToken) -> Option<Vec<f64>> {
+    let shrink = if least > 0 { AFFINE_SHRINK_OF_MANY } else { AFFINE_SHRINK };
     let rows = centred.nrows() as f64;
     let energy: Vec<f64> = centred.column_iter().map(|column| column.norm_squared()).collect();
     let mut weights = DVector::from_element(centred.ncols(), 1.0f64);
@@ -195,7 +192,7 @@ mod tests {
     #[test]
     fn reweighting_separates_a_subspace_from_clutter() {
         separates(&irls(&half_and_half(), 3, &StopToken::default()).expect("finite"));
-        separates(&affine_irls(&half_and_half(), &StopToken::default()).expect("finite"));
+        separates(&affine_irls(&half_and_half(), 0, &StopToken::default()).expect("finite"));
     }
 
     #[test]

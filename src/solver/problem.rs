@@ -101,7 +101,7 @@ impl<'a> Problem<'a> {
 
     /// `Err` once the token asks for a stop.
     pub fn stopped(&self) -> Result<(), Error> {
-        self.stop.reason().map_or(Ok(()), |reason| Err(Error::Stopped(reason)))
+        Error::check(self.stop)
     }
 
     /// Whether the method searches, and judges every observation by itself; PAPER and PSFM decide by themselves.
@@ -121,6 +121,11 @@ impl<'a> Problem<'a> {
         cameras.dedup();
         let place = |view: &usize| cameras.partition_point(|camera| *camera < self.camera_of[*view]);
         (views.iter().map(place).collect(), cameras)
+    }
+
+    /// Squared residual, normalised units, within which an observation agrees with its point at this noise.
+    pub fn gate(&self, noise: f64) -> f64 {
+        classification::working_gate(noise, self.outlier_density)
     }
 
     /// The tracks that are complete over these views.

@@ -1,7 +1,5 @@
 //! A reconstruction in terms of the input's views and tracks, and what it says of them.
 
-use std::collections::BTreeSet;
-
 use nalgebra::Matrix4;
 
 use super::attempt::Attempt;
@@ -16,7 +14,7 @@ use crate::domain::result::TrackResults;
 use crate::domain::{Grade, LeftOut, Warning};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Pose, Reconstruction as Metric};
-use crate::geometry::daq::{CanonicalFrame, to_canonical_frame};
+use crate::geometry::daq::to_canonical_frame;
 
 /// A reconstruction in terms of the input's views and tracks.
 pub struct Reconstruction {
@@ -30,9 +28,9 @@ pub struct Reconstruction {
     pub component_of_view: Vec<u32>,
     pub component_of_track: Vec<u32>,
     pub left_out: Vec<(usize, LeftOut)>,
-    /// The frame that projective cameras are reported in; `None` where they are metric but for the frame, so that the plane
-    /// at infinity is where it should be.
-    pub canonical: Option<CanonicalFrame>,
+    /// Homography into the canonical frame that projective cameras are reported in. `None` for metric cameras, whose
+    /// plane at infinity is (0, 0, 0, 1) already.
+    pub canonical: Option<Matrix4<f64>>,
     pub grade: Grade,
     /// What was found of each camera, and what it is worth; intrinsics are left out where no view of it is registered.
     pub calibrated: Vec<(Option<Intrinsics>, Outcome)>,
@@ -58,11 +56,8 @@ impl Reconstruction {
         }
         // Where the first camera has no rank 3 the frame stays as it is.
         let canonical = || {
-            to_canonical_frame(&projective.cameras, &[]).unwrap_or_else(|| CanonicalFrame {
-                cameras: projective.cameras.clone(),
-                points: Vec::new(),
-                homography: Matrix4::identity(),
-            })
+            let frame = to_canonical_frame(&projective.cameras, &[]);
+            frame.map_or_else(Matrix4::identity, |frame| frame.homography)
         };
         let (_, found) = problem.cameras_of(&projective.views);
         let mut calibrated = vec![(None, Outcome::refused(Vec::new())); problem.cameras];
@@ -77,8 +72,6 @@ impl Reconstruction {
                 poses[view] = Some(metric.poses[i]).filter(|_| own.is_none_or(|own| own.sigma_log.is_some()));
             }
         }
-        let groups: BTreeSet<u32> = problem.input.views().iter().map(|view| view.camera_group).collect();
-        let only = groups.first().copied().filter(|_| groups.len() == 1);
         Some(Self {
             cameras,
             lenses,
@@ -89,11 +82,7 @@ impl Reconstruction {
             canonical: metric.is_none().then(canonical),
             grade: outcome.grade,
             calibrated,
-            warnings: outcome
-                .warnings
-                .iter()
-                .map(|warning| Warning { camera_group: only, ..warning.clone() })
-                .collect(),
+            warnings: named_warnings(problem, std::slice::from_ref(outcome)),
             // Estimated under projective cameras: metric ones fit worse by so much.
             noise: projective.noise * metric.map_or(1.0, |_| outcome.rms_ratio.max(1.0)),
             inlier_share: share(projective.tracks.len(), projective.tried),
@@ -101,7 +90,7 @@ impl Reconstruction {
     }
 
     pub fn of_extended(problem: &Problem, extended: &Extended) -> Self {
-        let Extended { model, calibrations, unregistered, .. } = extended;
+        let Extended { model, calibrations, left_out, .. } = extended;
         let grade = extended.grade(problem);
         let is_reported = |view: &usize| grade != Grade::ProjectiveOnly && model.is_determined(*view);
         let landmark = |track: usize| model.landmarks[track].as_ref();
@@ -117,7 +106,7 @@ impl Reconstruction {
             component_of_track: (0..problem.tracks())
                 .map(|track| landmark(track).map_or(0, |point| point.component))
                 .collect(),
-            left_out: unregistered.iter().map(|left| (left.view, left.reason())).collect(),
+            left_out: left_out.clone(),
             canonical: None,
             grade,
             calibrated: calibrated.collect(),

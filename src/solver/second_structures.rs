@@ -1,7 +1,7 @@
 //! Whether the tracks left out agree on a motion of their own.
 
 use super::a_contrario::{self, LN_DECISIVE};
-use super::grow::{self, Consensus};
+use super::grow::{self, Consensus, Fits};
 use super::portfolio;
 use super::priors;
 use super::search::{affine, rigid};
@@ -30,22 +30,19 @@ pub fn find(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken) -> O
         false => by_image_points(&rest, consensus.noise, stop),
     };
     let second: Vec<usize> = second?.into_iter().map(|track| left[track]).collect();
-    is_enough(second.len(), consensus.inlier_count()).then_some(second)
+    let least = LEAST_SHARE * consensus.inlier_count() as f64;
+    (second.len() >= grow::LEAST_INLIERS && second.len() as f64 >= least).then_some(second)
 }
 
-/// Whether so many tracks are a second structure beside a first one of so many.
-fn is_enough(second: usize, first: usize) -> bool {
-    second >= grow::LEAST_INLIERS && second as f64 >= LEAST_SHARE * first as f64
-}
-
-/// What is said of tracks that agree on a motion of their own, where the result still leaves out enough of them: a lens
-/// that the search did not know may have brought them in.
+/// What is said of tracks that agree on a motion of their own, unless the result holds most of them: a lens that the
+/// search did not know may have brought them in.
 ///
+/// * `second`: of the input, as [`find`] has found them
 /// * `inlier`: the verdict on every track of the input
 pub fn warning(second: &[usize], inlier: &[bool]) -> Option<Warning> {
     let left = second.iter().filter(|track| !inlier[**track]).count();
     let first = inlier.iter().filter(|inlier| **inlier).count();
-    is_enough(left, first).then(|| {
+    (left >= grow::LEAST_INLIERS && 2 * left >= second.len()).then(|| {
         let detail = format!(
             "about {left} tracks that are left out agree on another rigid motion: a second moving body, or a repeated \
              structure; the result is that of the set that was found first, {first} tracks, not of both"
@@ -69,15 +66,16 @@ fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<Vec<u
 /// cameras, and of wrong ones no fifth does (a test counts them); growing from those by chance took nearly as long as
 /// the rest of a solve.
 fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<Vec<usize>> {
-    let ranking = priors::affine_irls_of(grow::LEAST_SUPPORT, affine::Search::new(rest).centred(), stop)?;
+    let ranking = priors::affine_irls(affine::Search::new(rest).centred(), grow::LEAST_SUPPORT, stop)?;
     let costs: Vec<f64> = ranking.iter().map(|weight| -weight).collect();
     let spread = portfolio::spread(rest);
     affine::seeds_from_ranking(rest, &costs).into_iter().find_map(|seed| {
-        let rough = grow::grow_roughly(rest, seed.cameras, seed.points, seed.support, noise, stop)?;
+        let mut fits = Fits::new(rest, noise, stop);
+        let rough = fits.grow(seed)?;
         if rough.inlier_count() < grow::LEAST_SUPPORT {
             return None;
         }
-        let found = grow::polish(rest, rough, stop);
+        let found = fits.polish(rough);
         let is_decisive = found.inlier_count() >= grow::LEAST_INLIERS
             && a_contrario::ln_false_alarms(rest, &found, spread, stop) < LN_DECISIVE;
         is_decisive.then(|| found.inliers())
@@ -116,11 +114,11 @@ mod tests {
             for seed in 30_000..30_008 {
                 let count = |second_motion: f64| {
                     let rest = left_out(&SceneOptions { second_motion, seed, ..options.clone() });
-                    let ranking = priors::affine_irls(affine::Search::new(&rest).centred(), &StopToken::default());
+                    let ranking = priors::affine_irls(affine::Search::new(&rest).centred(), 0, &StopToken::default());
                     let count = priors::agreeing(&ranking.expect("finite points"));
-                    let held = priors::affine_irls_of(
-                        grow::LEAST_SUPPORT,
+                    let held = priors::affine_irls(
                         affine::Search::new(&rest).centred(),
+                        grow::LEAST_SUPPORT,
                         &StopToken::default(),
                     );
                     assert_eq!(held.is_some(), count >= grow::LEAST_SUPPORT, "{kind}, seed {seed}: {count}");

@@ -54,7 +54,7 @@ impl Study {
         let mut track_scores = None;
         let weights = match prior {
             Proposal::Uniform => vec![1.0; self.block.tracks()],
-            Proposal::Irls => priors::affine_irls(self.search.centred(), &self.stop)?,
+            Proposal::Irls => priors::affine_irls(self.search.centred(), 0, &self.stop)?,
             Proposal::Consistency => priors::consistency(self.search.centred(), 2),
             Proposal::Learned => track_scores.insert(TrackScores::of(&self.block)?).probabilities(),
             Proposal::Network | Proposal::Rigidity => return None,
@@ -95,7 +95,7 @@ impl Study {
             seeds.extend(self.search.seeds(&self.block, &hypothesis, &truncations));
         }
         for seed in seeds {
-            let grown = grow::grow(&self.block, seed.cameras, seed.points, seed.support, NOISE, &self.stop);
+            let grown = grow::grow(&self.block, seed, NOISE, &self.stop);
             let Some(consensus) = grown else { continue };
             let certainty = a_contrario::ln_false_alarms(&self.block, &consensus, spread, &self.stop);
             if best.as_ref().is_none_or(|(least, _)| certainty < *least) {

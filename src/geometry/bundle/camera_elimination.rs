@@ -7,7 +7,7 @@
 use nalgebra::{SVector, Vector2};
 
 use super::Observation;
-use super::engine::{GaussianPrior, Jacobian, Layout, Problem, ResidualVisitor, Step};
+use super::engine::{Jacobian, Layout, Problem, ResidualVisitor, Step};
 
 /// Share of the unknowns of the cameras that those of the points may have at most: with as many of either, a camera's
 /// larger blocks cost more to eliminate.
@@ -28,7 +28,7 @@ pub(super) fn is_worth_it<const G: usize, const C: usize, const P: usize>(
     residuals.iter().all(|&count| count >= C)
 }
 
-/// The layout of the mirrored problem.
+/// The layout of the problem with cameras and points exchanged.
 pub(super) fn layout(layout: &Layout, cameras: usize) -> Layout {
     let observations: Vec<Observation> = layout.observations.iter().map(exchanged).collect();
     Layout::new(&observations, layout.starts.len() - 1, cameras)
@@ -38,11 +38,11 @@ fn exchanged(seen: &Observation) -> Observation {
     Observation { view: seen.point, point: seen.view, ..*seen }
 }
 
-/// A problem, mirrored.
+/// A problem with cameras and points exchanged.
 #[derive(Clone)]
 pub(super) struct CameraElimination<T>(pub T);
 
-/// Hands on what a problem says, mirrored.
+/// Hands on what a problem says, cameras and points exchanged.
 struct Exchanging<'a, S>(&'a mut S);
 
 impl<const G: usize, const C: usize, const P: usize, S: ResidualVisitor<G, P, C>> ResidualVisitor<G, C, P>
@@ -76,10 +76,6 @@ impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Proble
         self.0.retract(&from.0, &Step { globals: *globals, cameras: points.clone(), points: cameras.clone() });
     }
 
-    fn global_priors(&self) -> [GaussianPrior; G] {
-        self.0.global_priors()
-    }
-
     fn camera_gauge(&self, camera: usize) -> SVector<f64, P> {
         self.0.point_gauge(camera)
     }
@@ -99,7 +95,7 @@ mod tests {
     use super::*;
     use crate::domain::StopToken;
 
-    /// Adjusts a problem as it is and mirrored, from the same start.
+    /// Adjusts a problem as it is and with cameras and points exchanged, from the same start.
     fn both_end_at_the_same_cost<const G: usize, const C: usize, const P: usize>(
         problem: &impl Problem<G, C, P>,
         observations: &[Observation],
@@ -109,8 +105,8 @@ mod tests {
         assert!(is_worth_it(problem, &straight), "{case}");
         let options = Options::squared(100);
         let expected = descend(&mut problem.clone(), &straight, &options, &StopToken::default());
-        let mirrored = layout(&straight, problem.camera_count());
-        let found = descend(&mut CameraElimination(problem.clone()), &mirrored, &options, &StopToken::default());
+        let exchanged = layout(&straight, problem.camera_count());
+        let found = descend(&mut CameraElimination(problem.clone()), &exchanged, &options, &StopToken::default());
         let apart = |a: f64, b: f64| (a - b).abs() / b;
         assert!(apart(found.initial_cost, expected.initial_cost) < 1e-12, "{case}");
         assert!(expected.cost < 0.5 * expected.initial_cost, "{case}: {expected:?}");
@@ -123,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn mirrored_problems_end_where_problems_do() {
+    fn exchanged_problems_end_where_problems_do() {
         for seed in 0..10 {
             for tracks in [8, 12] {
                 let case = format!("seed {seed}, {tracks} tracks");
@@ -159,13 +155,13 @@ mod tests {
         let scene = testing::scene(1, 10, 30, NOISE);
         let (cameras, points) = testing::projectively_transformed(&scene, 1);
         let problem = |count: usize| Projective { cameras: cameras.clone(), points: points[..count].to_vec() };
-        let is_mirrored = |problem: &Projective, observations: &[Observation]| {
+        let is_exchanged = |problem: &Projective, observations: &[Observation]| {
             is_worth_it(problem, &Layout::new(observations, problem.camera_count(), problem.point_count()))
         };
-        assert!(is_mirrored(&problem(15), &scene.observations));
-        assert!(!is_mirrored(&problem(16), &scene.observations));
+        assert!(is_exchanged(&problem(15), &scene.observations));
+        assert!(!is_exchanged(&problem(16), &scene.observations));
         let blind = |seen: &&Observation| seen.view != 3 || seen.point < 5;
         let few: Vec<Observation> = scene.observations.iter().filter(blind).copied().collect();
-        assert!(!is_mirrored(&problem(15), &few));
+        assert!(!is_exchanged(&problem(15), &few));
     }
 }

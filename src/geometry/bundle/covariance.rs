@@ -115,8 +115,8 @@ impl Information {
         let scale: Vec<f64> = free.iter().map(|&k| scale_of(known[k] + information[k])).collect();
         let scaled = DMatrix::from_fn(free.len(), free.len(), |row, column| {
             let (k, l) = (free[row], free[column]);
-            let believed = if k == l { information[k] } else { 0.0 };
-            (matrix[(k, l)] + believed) * scale[row] * scale[column]
+            let of_prior = if k == l { information[k] } else { 0.0 };
+            (matrix[(k, l)] + of_prior) * scale[row] * scale[column]
         });
         let target = DVector::from_fn(free.len(), |row, _| {
             let k = free[row];
@@ -145,8 +145,8 @@ impl Information {
                 }
             }
         }
-        let believed: f64 = free.iter().map(|&k| information[k] * (deviation[k] + shift[k]).powi(2)).sum();
-        let delta_cost = shift.dot(&(matrix * &shift)) - 2.0 * negative_gradient.dot(&shift) + believed;
+        let of_priors: f64 = free.iter().map(|&k| information[k] * (deviation[k] + shift[k]).powi(2)).sum();
+        let delta_cost = shift.dot(&(matrix * &shift)) - 2.0 * negative_gradient.dot(&shift) + of_priors;
         let mut optimum = Optimum { shift, variance, delta_cost, log_determinant, covariance };
         for (group, mean) in own_focals.iter().flat_map(|own| &own.mean).enumerate() {
             let k = place(group, Parameter::LogFocal);
@@ -299,9 +299,9 @@ mod tests {
         assert!(free(optimum.variance_of(0, Parameter::LogFocal).map(|variance| variance.sqrt() * NOISE)));
     }
 
-    /// What one linearisation foretells of a richer model, an adjustment of that model finds.
+    /// What one linearisation predicts of a richer model, an adjustment of that model finds.
     #[test]
-    fn the_optimum_of_a_richer_model_is_foretold() {
+    fn the_optimum_of_a_richer_model_is_predicted() {
         for seed in 0..5 {
             let mut scene = testing::scene(seed, 8, 40, 0.0);
             scene.intrinsics.principal_point = Vector2::new(0.002, -0.001);
@@ -322,16 +322,16 @@ mod tests {
             let constant = simple.clone();
             let information = Information::new(&simple, &scene.observations).expect("poses");
             for model in IntrinsicsModel::FOCAL.with_any_extensions() {
-                let foretold = information.optimum(model, &[prior]);
+                let predicted = information.optimum(model, &[prior]);
                 let (found, found_cost) = adjusted(&simple, model, &prior);
                 let rise = found_cost - cost;
                 for parameter in Parameter::ALL {
                     let shift = found.intrinsics[0].value(parameter) - simple.intrinsics[0].value(parameter);
-                    let sigma = foretold.variance_of(0, parameter).expect("observable").sqrt() * 0.0005;
-                    let error = (foretold.shift_of(0, parameter) - shift).abs();
+                    let sigma = predicted.variance_of(0, parameter).expect("observable").sqrt() * 0.0005;
+                    let error = (predicted.shift_of(0, parameter) - shift).abs();
                     assert!(error <= 0.1 * sigma + 1e-9, "seed {seed}, {}: {parameter:?} off by {error}", model.name());
                 }
-                let error = (foretold.delta_cost - rise).abs() / (0.0005 * 0.0005);
+                let error = (predicted.delta_cost - rise).abs() / (0.0005 * 0.0005);
                 println!("seed {seed}, {}: chi-square off by {error:.3}", model.name());
                 assert!(error < 0.2, "seed {seed}, {}: {error}", model.name());
             }
@@ -339,10 +339,10 @@ mod tests {
             let (simple, _) = adjusted(&simple.with_own_focals(), IntrinsicsModel::FOCAL_PER_VIEW, &prior);
             let information = Information::new(&simple, &scene.observations).expect("poses");
             for model in IntrinsicsModel::FOCAL_PER_VIEW.with_any_extensions() {
-                let foretold = information.own_focals(&information.optimum(model, &[prior]));
+                let predicted = information.own_focals(&information.optimum(model, &[prior]));
                 let (found, _) = adjusted(&simple, model, &prior);
-                assert_eq!(foretold.len(), 8);
-                for (view, (variance, shift)) in foretold.into_iter().enumerate() {
+                assert_eq!(predicted.len(), 8);
+                for (view, (variance, shift)) in predicted.into_iter().enumerate() {
                     let error = (shift - (found.focals[view] / simple.focals[view]).ln()).abs();
                     let sigma = variance.expect("observable").sqrt() * 0.0005;
                     assert!(error <= 0.1 * sigma + 1e-9, "seed {seed}, {}: view {view} off by {error}", model.name());
@@ -356,14 +356,14 @@ mod tests {
             let (rich, rich_cost) = adjusted(&constant, model, &prior);
             let information = Information::new(&rich, &scene.observations).expect("poses");
             let back = information.optimum(IntrinsicsModel::FOCAL, &[prior]);
-            let believed = prior.cost(model, &rich.intrinsics[0]);
-            let error = (back.delta_cost - (cost - rich_cost + believed)).abs() / (0.0005 * 0.0005);
+            let of_prior = prior.cost(model, &rich.intrinsics[0]);
+            let error = (back.delta_cost - (cost - rich_cost + of_prior)).abs() / (0.0005 * 0.0005);
             assert!(error < 0.02 * (cost - rich_cost) / (0.0005 * 0.0005) + 0.2, "seed {seed}: {error}");
         }
     }
 
     #[test]
-    fn what_is_foretold_of_camera_groups_an_adjustment_finds() {
+    fn an_adjustment_of_camera_groups_ends_at_the_predicted_optimum() {
         let model = IntrinsicsModel::FOCAL.with(Extension::RadialK1);
         for seed in 0..3 {
             println!("seed {seed}");
@@ -377,13 +377,13 @@ mod tests {
             let simple = adjusted(truth(&scene).in_groups(&[0, 0, 0, 0, 1, 1, 1, 1], 2), IntrinsicsModel::FOCAL);
             let rich = adjusted(simple.clone(), model);
             let information = Information::new(&simple, &scene.observations).expect("poses");
-            let foretold = information.optimum(model, &[IntrinsicsPrior::NONE; 2]);
+            let predicted = information.optimum(model, &[IntrinsicsPrior::NONE; 2]);
             for (group, parameter) in
                 [0, 1].into_iter().flat_map(|group| model.parameters().into_iter().map(move |p| (group, p)))
             {
                 let [from, to] = [&simple, &rich].map(|found| found.intrinsics[group].value(parameter));
-                let sigma = foretold.variance_of(group, parameter).expect("observable").sqrt() * NOISE;
-                let error = (to - from - foretold.shift_of(group, parameter)).abs() / sigma;
+                let sigma = predicted.variance_of(group, parameter).expect("observable").sqrt() * NOISE;
+                let error = (to - from - predicted.shift_of(group, parameter)).abs() / sigma;
                 assert!(error < 0.2, "group {group}, {parameter:?}: off by {error} sigma");
             }
         }

@@ -55,19 +55,6 @@ impl<const G: usize, const C: usize, const P: usize> Step<G, C, P> {
     }
 }
 
-/// What is known of a global unknown beforehand.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct GaussianPrior {
-    /// What a squared deviation costs.
-    pub information: f64,
-    /// Present minus expected value.
-    pub deviation: f64,
-}
-
-impl GaussianPrior {
-    pub const NONE: Self = Self { information: 0.0, deviation: 0.0 };
-}
-
 /// A bundle adjustment: `G` unknowns shared by all views, `C` a camera, `P` a point.
 pub(super) trait Problem<const G: usize, const C: usize, const P: usize>: Clone {
     fn camera_count(&self) -> usize;
@@ -76,10 +63,6 @@ pub(super) trait Problem<const G: usize, const C: usize, const P: usize>: Clone 
     fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<G, C, P>);
     /// Overwrites `self` with `from` moved by `step`; both have the same counts.
     fn retract(&mut self, from: &Self, step: &Step<G, C, P>);
-    /// What is known of the globals where they are.
-    fn global_priors(&self) -> [GaussianPrior; G] {
-        [GaussianPrior::NONE; G]
-    }
     /// Direction in which a homogeneous camera moves without changing any residual; zero where there is none.
     fn camera_gauge(&self, _camera: usize) -> SVector<f64, C> {
         SVector::zeros()
@@ -145,8 +128,7 @@ fn cost<const G: usize, const C: usize, const P: usize>(
         total.weight = seen.weight;
         problem.evaluate(seen, &mut total);
     }
-    let priors = problem.global_priors();
-    total.sum + priors.iter().map(|prior| prior.information * prior.deviation.powi(2)).sum::<f64>()
+    total.sum
 }
 
 /// Minimises the loss over all unknowns, starting from and ending in `problem`.
@@ -164,9 +146,9 @@ pub(super) fn minimise<const G: usize, const C: usize, const P: usize>(
         return descend(problem, &layout, options, stop);
     }
     let layout = camera_elimination::layout(&layout, problem.camera_count());
-    let mut mirrored = CameraElimination(problem.clone());
-    let report = descend(&mut mirrored, &layout, options, stop);
-    *problem = mirrored.0;
+    let mut exchanged = CameraElimination(problem.clone());
+    let report = descend(&mut exchanged, &layout, options, stop);
+    *problem = exchanged.0;
     report
 }
 

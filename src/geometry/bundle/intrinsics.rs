@@ -12,6 +12,9 @@ const UNDISTORT_TOLERANCE: f64 = 4.0 * f64::EPSILON;
 /// Rounds in which tangential terms are taken away where the last round put the point: each leaves a share of some
 /// `p r` of the error, and a lens with more than a tenth of that is none.
 const TANGENTIAL_ROUNDS: usize = 20;
+/// Inverse of the squared radius of a fold below which there is none: a thousand focal lengths from the axis. Rounding
+/// leaves about 1e-8 of a root at zero.
+const LEAST_INVERSE_FOLD: f64 = 1e-6;
 /// Doublings of the radius after which one that is imaged so far out is not looked for any more.
 const WIDEST_DOUBLINGS: usize = 64;
 
@@ -124,44 +127,23 @@ impl Intrinsics {
 
     /// Squared radius at which the image folds back: the least at which the derivative of `r s`, the cubic `1 + 3 k1 t
     /// + 5 k2 t^2 + 7 k3 t^3` of it, vanishes. Tangential terms, which are small before the radial ones, are left out.
+    ///
+    /// It is the inverse of the largest root of `s^3 + 3 k1 s^2 + 5 k2 s + 7 k3`, which has a closed form (Cardano's,
+    /// and Viete's where there are three).
     fn fold(&self) -> Option<f64> {
         let [k1, k2, k3] = self.radial;
-        if k3 == 0.0 {
-            let (half_b, a) = (1.5 * k1, 5.0 * k2);
-            let discriminant = half_b * half_b - a;
-            if discriminant < 0.0 {
-                return None;
-            }
-            // Of the two roots 1 / (-b/2 +- sqrt(..)) the smaller that is positive, in the form that knows a = 0 too.
-            let inverse = discriminant.sqrt() - half_b;
-            return (inverse > 0.0).then(|| inverse.recip());
-        }
-        // Between its extremes, the roots of 3 k1 + 10 k2 t + 21 k3 t^2, the cubic is monotonic; it is 1 at 0.
-        let discriminant = 25.0 * k2 * k2 - 63.0 * k1 * k3;
-        let extremes = (discriminant >= 0.0).then(|| {
-            let root = discriminant.sqrt();
-            let mut extremes = [(-5.0 * k2 - root) / (21.0 * k3), (-5.0 * k2 + root) / (21.0 * k3)];
-            extremes.sort_by(f64::total_cmp);
-            extremes
-        });
-        let mut low = 0.0;
-        for extreme in extremes.into_iter().flatten().filter(|extreme| *extreme > 0.0) {
-            if self.radius_slope(extreme) <= 0.0 {
-                return Some(bisected(low, extreme, |squared| self.radius_slope(squared) > 0.0));
-            }
-            low = extreme;
-        }
-        if k3 > 0.0 {
-            return None;
-        }
-        let mut high = low.max(1.0);
-        for _ in 0..WIDEST_DOUBLINGS {
-            if self.radius_slope(high) <= 0.0 {
-                return Some(bisected(low, high, |squared| self.radius_slope(squared) > 0.0));
-            }
-            high *= 2.0;
-        }
-        None
+        // Depressed: y^3 + 3 third_p y + 2 half_q with y = s + k1.
+        let (third_p, half_q) = ((5.0 * k2 - 3.0 * k1 * k1) / 3.0, k1.powi(3) - 2.5 * k1 * k2 + 3.5 * k3);
+        let discriminant = half_q * half_q + third_p.powi(3);
+        let root = if discriminant > 0.0 {
+            let cube_root = (-half_q - discriminant.sqrt().copysign(half_q)).cbrt();
+            cube_root - third_p / cube_root
+        } else {
+            let radius = (-third_p).max(0.0).sqrt();
+            let cosine = if radius > 0.0 { (-half_q / radius.powi(3)).clamp(-1.0, 1.0) } else { 0.0 };
+            2.0 * radius * (cosine.acos() / 3.0).cos()
+        };
+        Some(root - k1).filter(|inverse| *inverse > LEAST_INVERSE_FOLD).map(f64::recip)
     }
 
     /// Where a pinhole with this `K` would see what the lens images at `xy`.
@@ -272,15 +254,6 @@ impl Intrinsics {
             Parameter::TangentialP2 => self.tangential[1] += by,
         }
     }
-}
-
-/// Where, within these, a condition that holds below ends.
-fn bisected(mut low: f64, mut high: f64, holds: impl Fn(f64) -> bool) -> f64 {
-    for _ in 0..UNDISTORT_STEPS {
-        let middle = 0.5 * (low + high);
-        if holds(middle) { low = middle } else { high = middle }
-    }
-    low
 }
 
 /// Gradients of the two coordinates of an image point.

@@ -1,8 +1,9 @@
 //! Bundle adjustment by Levenberg-Marquardt on the Schur complement of the points, or of the cameras where the points
 //! are few; projective and metric.
 //!
-//! One engine serves both problems; what they share (observations, robust loss, options, report) lives here. May
-//! depend on nothing of `geometry` but `levenberg_marquardt` and `observation`, and on linear algebra.
+//! Metric reconstructions are adjusted by `sequence`; projective ones and the models of `critical` by `engine`, whose
+//! unknowns have sizes that are known when it is compiled. What both share (robust loss, options, report) lives here.
+//! May depend on nothing of `geometry` but `levenberg_marquardt` and `observation`, and on linear algebra.
 //!
 //! Image coordinates are normalised throughout: pixels minus the guessed principal point, over the larger image side.
 

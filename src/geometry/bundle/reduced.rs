@@ -8,7 +8,7 @@
 use nalgebra::{Cholesky, Matrix2, SMatrix, SVector, Vector2};
 
 use super::cholesky::CholeskySolver;
-use super::engine::{GaussianPrior, Jacobian, Layout, Problem, ResidualVisitor, Step, usable_squared_norm};
+use super::engine::{Jacobian, Layout, Problem, ResidualVisitor, Step, usable_squared_norm};
 use super::panel::Panel;
 use super::{Loss, Observation};
 use crate::simd::vectorised;
@@ -79,7 +79,7 @@ impl<const G: usize, const C: usize, const P: usize> Linearisation<G, C, P> {
 
     /// Linearises at the state of `problem`.
     pub fn fill(&mut self, problem: &impl Problem<G, C, P>, layout: &Layout, loss: Loss) {
-        self.globals_diagonal = SVector::from(problem.global_priors().map(|prior| prior.information));
+        self.globals_diagonal = SVector::zeros();
         self.camera_diagonals.fill(SVector::zeros());
         self.point_blocks.fill(SMatrix::zeros());
         for (k, seen) in layout.observations.iter().enumerate() {
@@ -150,12 +150,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         for (camera, values) in step.cameras.iter_mut().zip(self.vector[G..].chunks_exact(C)) {
             camera.copy_from_slice(values);
         }
-        let lowers = |(prior, by): (GaussianPrior, &f64)| {
-            prior.information * (prior.deviation.powi(2) - (prior.deviation + by).powi(2))
-        };
-        let of_priors = problem.global_priors().into_iter().zip(step.globals.iter()).map(lowers);
-        let of_priors: f64 = of_priors.sum();
-        Some(of_priors + self.substitute_points(layout, linearisation, step))
+        Some(self.substitute_points(layout, linearisation, step))
     }
 
     /// Eliminates the points; `false` when a point's block cannot be factored.
@@ -182,10 +177,6 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     ) -> bool {
         self.matrix.fill(0.0);
         self.vector.fill(0.0);
-        for (k, prior) in problem.global_priors().iter().enumerate() {
-            self.matrix[k * (self.dimension + 1)] += prior.information;
-            self.vector[k] -= prior.information * prior.deviation;
-        }
         for point in 0..self.factors.len() {
             let range = layout.starts[point]..layout.starts[point + 1];
             let mut block = linearisation.point_blocks[point];
@@ -288,7 +279,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
                 }
                 let (row, column) = (observations[a].view, observations[b].view);
                 self.add_block(row, column, &jacobians[a].camera, &through, &jacobians[b].camera);
-                // Two observations of one point in one view: the mirrored pair falls into the same block.
+                // Two observations of one point in one view: the exchanged pair falls into the same block.
                 if a != b && row == column {
                     self.add_block(row, column, &jacobians[b].camera, &through.transpose(), &jacobians[a].camera);
                 }

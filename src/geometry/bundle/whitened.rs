@@ -94,9 +94,8 @@ pub(super) struct WhitenedViews<const C: usize> {
 }
 
 impl<const C: usize> WhitenedViews<C> {
-    /// * `matrix`: column-major, its lower triangle given: other unknowns, `first` of them, then `C` a view, whose
-    ///   first
-    ///   are those of its pose
+    /// * `matrix`: column-major, its lower triangle given: other unknowns, `first` of them, then `C` a view, of which
+    ///   those of its pose come first
     ///
     /// `None` without views, or where the matrix holds what is no number.
     pub fn new(matrix: &[f64], first: usize, poses: &[Pose]) -> Option<Self> {

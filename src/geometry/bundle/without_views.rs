@@ -8,15 +8,13 @@ use nalgebra::{DMatrix, DVector, SVector};
 use super::intrinsics_model::Parameter;
 use super::metric::{POSE, Pose, Reconstruction, VIEW};
 use super::own_focals::{Direction, OwnFocals};
-use super::sequence::System;
+use super::sequence::{GAUGE_DAMPING, System};
 use super::whitened::WhitenedViews;
 
 pub(super) const PARAMETERS: usize = Parameter::COUNT;
 /// Views up to which they are eliminated by eigenvectors, which tell what the observations do not say of them, in time
 /// cubic in the views: some 10 ms.
 const BY_EIGENVECTORS: usize = 40;
-/// Damping of a factorisation as a share of the diagonal: holds the seven directions of a similarity.
-const GAUGE_DAMPING: f64 = 1e-13;
 /// Part of a parameter's information, as the root of a share, that a direction of the poses may take and still count as
 /// apart from the intrinsics: what rounding leaves where the two have nothing to do with each other.
 const APART: f64 = 1e-11;
@@ -85,9 +83,9 @@ impl WithoutViews {
         Self::by_eigenvectors::<C>(&matrix, &vector, known, &metric.group_of, &metric.poses)
     }
 
-    /// By a sparse factorisation of the poses, in time linear in views of which each is connected with a bounded number
-    /// of others. Directions of the poses on which rounding hides what the observations say count as known; `None`
-    /// where the poses' equations are not positive definite.
+    /// By a sparse factorisation of the poses, in time linear in the views where each shares points with a bounded
+    /// number of others. Directions of the poses on which rounding hides what the observations say count as known;
+    /// `None` without intrinsics, or where the poses' equations are not positive definite.
     fn by_factorisation(system: &System, metric: &Reconstruction) -> Option<Self> {
         let known = known(system, metric);
         let places: Vec<(usize, usize)> =
@@ -99,7 +97,12 @@ impl WithoutViews {
         let mut coupling = Mat::<f64>::zeros(poses, known.len());
         let mut among_poses = Vec::new();
         system.for_each(|row, column, value| match (row < poses, column < poses) {
-            (true, _) if row == column => among_poses.push(Triplet::new(row, column, value * (1.0 + GAUGE_DAMPING))),
+            (true, _) if row == column => {
+                // Nothing is known of this unknown: it stays where it is.
+                let held = if system.known[row] > 0.0 { GAUGE_DAMPING * system.known[row] } else { 1.0 };
+                among_poses.push(Triplet::new(row, column, value + held));
+            }
+            (true, _) if value == 0.0 => (),
             (true, _) => among_poses.push(Triplet::new(row, column, value)),
             (false, true) => coupling[(column, shared(row))] = value,
             (false, false) => {

@@ -18,7 +18,7 @@ use crate::domain::StopToken;
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::statistics::{chi_square_gate, ln_choose};
 use crate::geometry::triangulation;
-use random::{FIFTIETH, RandomTracks, SIXTEENTH, Share, Tail, constraints_of_track, gate};
+use random::{RandomTracks, Tail, constraints_of_track, gate};
 
 /// Logarithm of the expected number of false alarms at which a consensus is decisive (e^-40: never by chance), and at
 /// which it may be accepted once the search has ended.
@@ -31,9 +31,6 @@ const LN_BY_CAMERAS: f64 = -10.0;
 /// Random tracks that cameras are tried on: some milliseconds at 10 views, for the few consensuses that may be
 /// accepted.
 const RANDOM_TRACKS: usize = 500;
-/// So many tell enough of most cameras: the smallest residual of these is above that of this share of all one time in
-/// fifty (.9375^60, .98^200), and the probability that follows from it is too large rather than too small.
-const FIRST_TRACKS: [(usize, Share); 2] = [(60, SIXTEENTH), (200, FIFTIETH)];
 /// What those residuals are at least, a constraint, as a share of the variance of the image points: cameras that do not
 /// bend the images of a set of tracks leave a fiftieth of random tracks .06 (three views) to .4 (ten) of it, and what
 /// bends them is allowed to take most of that. Cameras that verify by that much need not be tried.
@@ -80,27 +77,28 @@ fn by_cameras(block: &CompleteBlock, consensus: &Consensus, inliers: usize, spre
     let constraints = constraints_of_track(block);
     let variance = spread * spread;
     let measured = LEAST_MEASURED * constraints * variance;
-    let least = Tail { constraints, variance, share: FIFTIETH, measured };
+    let least = Tail { constraints, variance, measured };
     let at_most = at(least.ln_below(gate(block, consensus)));
     if at_most < LN_BY_CAMERAS {
         return at_most;
     }
     let mut random = RandomTracks::new(block, consensus, spread);
     // To stop is to accept nothing.
-    for (first, share) in FIRST_TRACKS {
-        if !random.try_until(first, stop) {
-            return f64::INFINITY;
-        }
-        if let Some(by_first) = random.ln_admitted_by_first(share).map(at)
-            && by_first < LN_BY_CAMERAS
-        {
-            return by_first;
-        }
-    }
     if !random.try_until(RANDOM_TRACKS, stop) {
         return f64::INFINITY;
     }
     at(random.ln_as_good())
+}
+
+/// Natural logarithm of the number of false alarms by residuals, `m C(m, k) p`: the sizes and sets of inliers, times the
+/// probability that unstructured coordinates leave residuals this small.
+///
+/// * `tracks`, `inliers`: m and k
+/// * `constraints`: that the inliers leave over
+/// * `rms`: of the residuals, one coordinate; `spread`: standard deviation of unstructured coordinates, in the same unit
+pub fn ln_false_alarms_of(tracks: usize, inliers: usize, constraints: f64, rms: f64, spread: f64) -> f64 {
+    let ln_probability = 0.5 * constraints * (1.0 + 2.0 * (rms.max(f64::MIN_POSITIVE) / spread).ln()).min(0.0);
+    ln_choose(tracks, inliers) + (tracks as f64).ln() + ln_probability
 }
 
 impl Consensus {
@@ -119,8 +117,7 @@ impl Consensus {
         if constraints <= 0.0 {
             return f64::INFINITY;
         }
-        let ln_probability = 0.5 * constraints * (1.0 + 2.0 * (rms.max(f64::MIN_POSITIVE) / spread).ln()).min(0.0);
-        ln_choose(tracks, inliers) + (tracks as f64).ln() + ln_probability
+        ln_false_alarms_of(tracks, inliers, constraints, rms, spread)
     }
 
     /// Root mean square residual of the inliers, one coordinate; `None` where they leave no constraints.
@@ -190,7 +187,6 @@ mod tests {
     #[test]
     fn cameras_that_need_not_be_tried_would_admit_no_more() {
         let (mut tried, mut least) = (0, f64::INFINITY);
-        let mut counts = [(0, 0); FIRST_TRACKS.len()];
         for (views, seed) in [3, 4, 5, 7, 10].into_iter().flat_map(|views| (0..4).map(move |seed| (views, seed))) {
             for outliers in [0.3, 1.0] {
                 let options = SceneOptions { views, tracks: 60, outliers, seed, ..SceneOptions::default() };
@@ -201,18 +197,10 @@ mod tests {
                 let stop = StopToken::default();
                 for noise in [0.003, 0.02, 0.08] {
                     let Some(start) = affine::seed(&complete, (0..12).collect()) else { continue };
-                    let grown = grow::grow(&complete, start.cameras, start.points, start.support, noise, &stop);
+                    let grown = grow::grow(&complete, start, noise, &stop);
                     let Some(consensus) = grown else { continue };
                     let mut random = RandomTracks::new(&complete, &consensus, spread);
-                    let by_first = FIRST_TRACKS.map(|(first, share)| {
-                        assert!(random.try_until(first, &stop));
-                        random.ln_admitted_by_first(share)
-                    });
                     assert!(random.try_until(RANDOM_TRACKS, &stop));
-                    for ((decided, too_low), by_first) in counts.iter_mut().zip(by_first) {
-                        *decided += usize::from(by_first.is_some());
-                        *too_low += usize::from(by_first.is_some_and(|first| first < random.ln_as_good()));
-                    }
                     let share = random.measured() / (constraints_of_track(&complete) * spread * spread);
                     assert!(share > LEAST_MEASURED, "{views} views, seed {seed}, outliers {outliers}: {share}");
                     (tried, least) = (tried + 1, share.min(least));
@@ -220,11 +208,7 @@ mod tests {
             }
         }
         assert!(tried > 60, "{tried}");
-        println!("{tried} consensuses, least share {least}; decided by the first, and too low: {counts:?}");
-        // The first are to tell too little rather than too much: one time in fifty they may not.
-        for (decided, too_low) in counts {
-            assert!(decided > tried / 3 && too_low <= decided / 25, "{too_low} of {decided} of {tried}");
-        }
+        println!("{tried} consensuses, least share {least}");
     }
 
     /// Five cameras on a line before these points, all of them inliers; the noise of their residuals, normalised units.

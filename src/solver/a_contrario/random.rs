@@ -10,18 +10,11 @@ use crate::geometry::statistics::chi_square_quantile;
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::solver::grow::{self, Consensus};
 
-/// A share of random tracks whose residual is measured; smaller ones are extrapolated from there.
-#[derive(Debug, Clone, Copy)]
-pub struct Share {
-    of_all: f64,
-    /// The standard normal quantile of that share.
-    quantile: f64,
-}
-
-/// What most are measured by: of 500, a fiftieth is known to a third.
-pub const FIFTIETH: Share = Share { of_all: 0.02, quantile: -2.053_749 };
-/// What few are measured by.
-pub const SIXTEENTH: Share = Share { of_all: 0.062_5, quantile: -1.534_121 };
+/// Share of random tracks whose residual is measured, of 500 known to a third; smaller ones are extrapolated from
+/// there.
+const MEASURED_SHARE: f64 = 0.02;
+/// Standard normal quantile of that share.
+const MEASURED_QUANTILE: f64 = -2.053_749;
 /// Where the random numbers begin: one consensus, one answer.
 const SEED: u64 = 0;
 /// Residuals that stand for those of the smallest share, and the least of them as a share of what the inliers leave:
@@ -49,8 +42,7 @@ pub struct Tail {
     pub constraints: f64,
     /// Variance of the coordinates, that of the image points at most: cameras that bend leave less.
     pub variance: f64,
-    pub share: Share,
-    /// The residual that this share of them have at most.
+    /// The residual that [`MEASURED_SHARE`] of them have at most.
     pub measured: f64,
 }
 
@@ -62,13 +54,13 @@ impl Tail {
     /// as many residuals below what was measured: too large a one would make small residuals too improbable.
     pub fn ln_below(&self, x: f64) -> f64 {
         // In units of the variance; beyond the mean of all it would be no tail.
-        let least = chi_square_quantile(self.constraints, self.share.quantile).min(self.constraints);
+        let least = chi_square_quantile(self.constraints, MEASURED_QUANTILE).min(self.constraints);
         let measured = (self.measured / self.variance).clamp(least, self.constraints);
         let ratio = x / self.measured;
         if ratio > 1.0 {
             return 0.0;
         }
-        self.share.of_all.ln() + 0.5 * self.constraints * ratio.ln() + 0.5 * measured * (1.0 - ratio)
+        MEASURED_SHARE.ln() + 0.5 * self.constraints * ratio.ln() + 0.5 * measured * (1.0 - ratio)
     }
 }
 
@@ -110,28 +102,16 @@ impl<'a> RandomTracks<'a> {
         true
     }
 
-    /// The residual that a [fiftieth](FIFTIETH) of those that were tried have at most.
+    /// The residual that [`MEASURED_SHARE`] of those that were tried have at most.
     pub fn measured(&self) -> f64 {
-        self.squared[(FIFTIETH.of_all * self.squared.len() as f64) as usize]
-    }
-
-    fn tail(&self, share: Share, measured: f64) -> Tail {
-        Tail { constraints: constraints_of_track(self.block), variance: self.variance, share, measured }
-    }
-
-    /// No less than what [`ln_as_good`](Self::ln_as_good) is likely to say of more of them; `None` where some are
-    /// admitted.
-    ///
-    /// * `share`: of all, whose residual the smallest of those that were tried is likely to be above
-    pub fn ln_admitted_by_first(&self, share: Share) -> Option<f64> {
-        let (gate, smallest) = (gate(self.block, self.consensus), self.squared[0]);
-        (smallest > gate).then(|| self.tail(share, smallest).ln_below(gate))
+        self.squared[(MEASURED_SHARE * self.squared.len() as f64) as usize]
     }
 
     /// Natural logarithm of the probability `a` of which `a^n` bounds that `n` of them are all admitted and leave no
     /// more on average than the inliers of the consensus do: see [`ln_as_small`].
     pub fn ln_as_good(&self) -> f64 {
-        let tail = self.tail(FIFTIETH, self.measured());
+        let constraints = constraints_of_track(self.block);
+        let tail = Tail { constraints, variance: self.variance, measured: self.measured() };
         // By the constraints of all inliers together: what they leave once the cameras are not fitted to them.
         let mean = self.consensus.rms().map_or(f64::INFINITY, |rms| rms * rms * tail.constraints);
         ln_as_small(&self.squared, &tail, gate(self.block, self.consensus), mean)
@@ -169,7 +149,7 @@ fn ln_as_small(squared: &[f64], tail: &Tail, gate: f64, mean: f64) -> f64 {
         false => (0.0, below(place)),
     };
     let counted = &squared[squared.partition_point(|&x| x <= tail.measured)..];
-    let share = (1.0 - tail.share.of_all) / counted.len() as f64;
+    let share = (1.0 - MEASURED_SHARE) / counted.len() as f64;
     let tried = counted.iter().take_while(|&&x| x <= gate).map(|&x| (x, share));
     let residuals: Vec<(f64, f64)> = (0..=EXTRAPOLATED).map(at).chain(tried).collect();
     // Of the tilted distribution the probability, and whether its mean is below that of the inliers.
@@ -203,8 +183,8 @@ mod tests {
     fn distribution(constraints: usize, rng: &mut ChaCha8Rng) -> (Vec<f64>, Tail) {
         let mut squared = chi_square(constraints, 20_000, rng);
         squared.sort_by(f64::total_cmp);
-        let measured = squared[(FIFTIETH.of_all * squared.len() as f64) as usize];
-        (squared, Tail { constraints: constraints as f64, variance: 1.0, share: FIFTIETH, measured })
+        let measured = squared[(MEASURED_SHARE * squared.len() as f64) as usize];
+        (squared, Tail { constraints: constraints as f64, variance: 1.0, measured })
     }
 
     #[test]
@@ -238,9 +218,9 @@ mod tests {
 
     #[test]
     fn beyond_what_was_measured_a_tail_is_no_bound_but_one() {
-        let tail = Tail { constraints: 3.0, variance: 1.0, share: FIFTIETH, measured: 0.03 };
-        assert_eq!(tail.ln_below(0.03), FIFTIETH.of_all.ln());
-        assert!(tail.ln_below(0.02) < FIFTIETH.of_all.ln() && tail.ln_below(0.04) == 0.0);
+        let tail = Tail { constraints: 3.0, variance: 1.0, measured: 0.03 };
+        assert_eq!(tail.ln_below(0.03), MEASURED_SHARE.ln());
+        assert!(tail.ln_below(0.02) < MEASURED_SHARE.ln() && tail.ln_below(0.04) == 0.0);
     }
 
     /// Four that are all admitted and leave so little on average: as often as said at most, and not much more seldom.

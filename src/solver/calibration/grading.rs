@@ -7,24 +7,32 @@ use super::options::CalibrationOptions;
 use super::search::Minimum;
 use super::verdict::Verdict;
 use super::view_focals::{self, Differing};
-use super::{Outcome, Stopped, Uncalibrated};
+use super::{Error, Outcome, Stretch, Uncalibrated};
 use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 
 /// Chooses among the minima and models, and says what the choice is worth for each camera group.
 ///
-/// * `fit`: of the projective cameras
+/// * `fit`: of the projective cameras, to the views of `stretch`
+/// * `stretch`: the views on which both are compared; `None`: all
 /// * `minima`: not empty, cheapest first, with the focal length free, or that of each view
 pub(super) fn grade(
     choice: &Choice,
     fit: &Fit,
+    stretch: Option<Stretch>,
     minima: Vec<Minimum>,
     mut warnings: Vec<Warning>,
-) -> Result<Vec<Outcome>, Stopped> {
+) -> Result<Vec<Outcome>, Error> {
     let CalibrationOptions { fit: fit_options, lenses, grades, .. } = choice.problem.options;
     let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
-    Stopped::check(choice.stop)?;
-    let comparison = Comparison::new(&best, fit, choice);
+    Error::check(choice.stop)?;
+    let comparison = match &stretch {
+        None => Comparison::new(&best, fit, choice),
+        Some(stretch) => {
+            let choice = Choice { problem: &stretch.problem, ..*choice };
+            Comparison::new(&choice.on_stretch(&best, stretch.metric), fit, &choice).beside(&best.fit)
+        }
+    };
     let sigmas = choice.sigmas(&best, comparison.inflation);
     let has_own_focals = best.minimum.reconstruction.has_own_focals();
     let mut focals = view_focals::of(&best, &sigmas, lenses);
@@ -82,8 +90,6 @@ pub(super) fn grade(
             grade: verdict.grade,
             warnings: verdict.warnings,
             model: best.model,
-            plane_at_infinity: None,
-            cheirality: best.minimum.cheirality,
             rms_ratio: comparison.ratio,
             metric: None,
             focals: None,
@@ -108,7 +114,7 @@ fn chosen(
     fit: &Fit,
     mut minima: Vec<Minimum>,
     warnings: &mut Vec<Warning>,
-) -> Result<(Candidate, Vec<Minimum>), Stopped> {
+) -> Result<(Candidate, Vec<Minimum>), Error> {
     let problem = choice.problem;
     let first = minima.remove(best_in_front(&minima, problem, fit));
     let simplest = IntrinsicsModel::focal(first.reconstruction.has_own_focals());
@@ -118,7 +124,7 @@ fn chosen(
     }
     let least_in_front = problem.options.grades.least_in_front;
     for minimum in &mut minima {
-        Stopped::check(choice.stop)?;
+        Error::check(choice.stop)?;
         *minimum = minimum.adjusted(problem, best.model, &best.priors, choice.stop);
         // A model that is wrong may rank the minima wrongly.
         if minimum.cost < best.minimum.cost && minimum.cheirality >= least_in_front.min(best.minimum.cheirality) {

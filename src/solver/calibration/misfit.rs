@@ -13,7 +13,8 @@ use crate::geometry::observation::Observation;
 /// A metric reconstruction, compared with the projective one.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Comparison {
-    /// Posterior noise of the metric over that of the projective one, of the points as they are.
+    /// Posterior noise of the metric over that of the projective one, of the points as they are; where that is larger,
+    /// noise of all views over that of a stretch.
     pub ratio: f64,
     /// Of the projective one, normalised units.
     pub noise: f64,
@@ -32,6 +33,19 @@ impl Comparison {
     /// Whether the metric model is refuted.
     pub fn is_misfit(&self, options: &FitOptions) -> bool {
         self.ratio > options.rms_ratio_limit && self.is_significant
+    }
+
+    /// The same where all views fit worse than a stretch of them: their noise is taken to be that of the stretch.
+    ///
+    /// * `all`: the fit of the metric reconstruction to all views, of so many observations that chance explains nothing
+    pub fn beside(self, all: &Fit) -> Self {
+        let ratio = all.noise / self.noise;
+        Self {
+            ratio: self.ratio.max(ratio),
+            is_significant: self.is_significant || ratio > self.ratio,
+            inflation: self.inflation.max(ratio),
+            ..self
+        }
     }
 
     /// * `fit`: of the projective reconstruction

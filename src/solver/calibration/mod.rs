@@ -15,15 +15,15 @@ mod tests;
 mod verdict;
 mod view_focals;
 
-use nalgebra::{Matrix3x4, Vector3, Vector4};
+use nalgebra::{Matrix3x4, Vector4};
 
-use crate::domain::{FocalPrior, Grade, StopReason, StopToken, Warning, WarningCode};
+use crate::domain::{FocalPrior, Grade, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::daq::to_canonical_frame;
-use crate::geometry::metric::plane_at_infinity;
 use crate::geometry::observation::Observation;
 
+use super::Error;
 use fit::Fit;
 use options::FitOptions;
 pub use options::{CalibrationOptions, GradeOptions};
@@ -52,6 +52,11 @@ impl Uncalibrated<'_> {
     /// Camera groups.
     pub fn groups(&self) -> usize {
         self.focal_priors.len()
+    }
+
+    /// The same with a noise that has a meaning.
+    fn with_least_noise(&self) -> Self {
+        Self { noise: self.noise.max(self.options.fit.least_noise), ..*self }
     }
 
     /// No calibration of any group, for these reasons.
@@ -99,10 +104,6 @@ pub struct Outcome {
     pub warnings: Vec<Warning>,
     /// Which intrinsics the data could carry.
     pub model: IntrinsicsModel,
-    /// `n` of the plane `(n, 1)`, in the frame that [`to_canonical_frame`] gives the problem's cameras.
-    pub plane_at_infinity: Option<Vector3<f64>>,
-    /// Share of the observations in front of their cameras.
-    pub cheirality: f64,
     /// Posterior noise of the metric over that of the projective reconstruction; 1 when the calibration is right.
     pub rms_ratio: f64,
 }
@@ -128,6 +129,18 @@ impl Outcome {
         Some(self.sigma_ratios[parameter as usize]? * self.sigma_log_focal?)
     }
 
+    /// Raises the standard deviation of the log focal length, and lowers the grade to what that is worth; says so where
+    /// that is no calibration.
+    pub fn raise_sigma(&mut self, sigma: f64, grades: &GradeOptions) {
+        let sigma = self.sigma_log_focal.map_or(sigma, |own| own.max(sigma));
+        self.sigma_log_focal = Some(sigma);
+        let worth = grades.grade(Some(sigma));
+        if worth == Grade::ProjectiveOnly && self.grade != worth {
+            self.warnings.push(grades.unobservable(Some(sigma)));
+        }
+        self.grade = self.grade.worse(worth);
+    }
+
     /// An outcome without a calibration, for these reasons.
     pub fn refused(warnings: Vec<Warning>) -> Self {
         Self {
@@ -139,27 +152,8 @@ impl Outcome {
             grade: Grade::ProjectiveOnly,
             warnings,
             model: IntrinsicsModel::FOCAL,
-            plane_at_infinity: None,
-            cheirality: 0.0,
             rms_ratio: 1.0,
         }
-    }
-}
-
-/// The stop token ended the calibration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("stopped while calibrating: {0:?}")]
-pub struct Stopped(pub StopReason);
-
-impl Stopped {
-    fn check(stop: &StopToken) -> Result<(), Self> {
-        stop.reason().map_or(Ok(()), |reason| Err(Self(reason)))
-    }
-}
-
-impl From<Stopped> for super::Error {
-    fn from(Stopped(reason): Stopped) -> Self {
-        Self::Stopped(reason)
     }
 }
 
@@ -168,22 +162,11 @@ impl From<Stopped> for super::Error {
 /// `scale_px` is the length of a normalised unit in pixels, for the words of the warnings.
 ///
 /// # Errors
-/// [`Stopped`] when `stop` fired; what stands by then is not worth returning.
-pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Stopped> {
-    Stopped::check(stop)?;
-    let nothing = vec![None; problem.groups()];
-    // What is known of one focal length says nothing of a zoom.
-    let focal_priors = if problem.focal_per_view { &nothing } else { problem.focal_priors };
-    let problem = &Uncalibrated { noise: problem.noise.max(problem.options.fit.least_noise), focal_priors, ..*problem };
-    let mut warnings = Vec::new();
-    let inliers = observed_points(problem);
-    if inliers < problem.options.fit.least_inliers {
-        warnings.push(few_inliers(inliers, &problem.options.fit));
-    }
-    let (cameras, points, fit) = projectively_adjusted(problem, inliers, stop);
-    Stopped::check(stop)?;
-    let critical = critical::find(problem, &fit, scale_px, stop);
-    Stopped::check(stop)?;
+/// [`Error::Stopped`] when `stop` fired; what stands by then is not worth returning.
+pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Error> {
+    let problem = &problem.with_least_noise();
+    let Compared { cameras, points, fit, critical, mut warnings } =
+        Compared::new(problem, problem, scale_px, stop, &mut || ())?;
     let is_critical = !critical.warnings.is_empty();
     warnings.extend(critical.warnings);
     let choice = models::Choice { problem, scale_px, stop };
@@ -202,18 +185,21 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
         warnings.push(no_start());
         return Ok(problem.refused(&warnings));
     }
-    let mut outcomes = grading::grade(&choice, &fit, minima, warnings)?;
-    for outcome in &mut outcomes {
-        outcome.plane_at_infinity =
-            outcome.metric.as_ref().and_then(|metric| plane_at_infinity(problem.cameras, &metric.cameras()));
-    }
-    Ok(outcomes)
+    grading::grade(&choice, &fit, None, minima, warnings)
+}
+
+/// Some of the views of a reconstruction, which projective cameras are fitted to where they are too many for that.
+#[derive(Clone, Copy)]
+pub struct Stretch<'a> {
+    pub problem: Uncalibrated<'a>,
+    pub metric: &'a Reconstruction,
 }
 
 /// Calibrates a reconstruction that is metric already, as a sequence is that grew from a calibrated block: its focal
-/// length is known to be near a minimum, and others are looked for only where this one is not certain.
+/// length is known to be near a minimum, and others are looked for near it.
 ///
 /// * `problem`: the projective cameras and points of `metric`
+/// * `stretch`: the views on which it is compared with projective cameras, of the same camera groups; `None`: all
 /// * `heartbeat`: called after each of its steps, of which a large problem takes some tenths of a second
 ///
 /// # Errors
@@ -221,25 +207,15 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
 pub fn from_metric(
     problem: &Uncalibrated,
     metric: &Reconstruction,
+    stretch: Option<Stretch>,
     scale_px: f64,
     stop: &StopToken,
     heartbeat: &mut dyn FnMut(),
-) -> Result<Vec<Outcome>, Stopped> {
-    Stopped::check(stop)?;
-    let nothing = vec![None; problem.groups()];
-    let focal_priors = if metric.has_own_focals() { &nothing } else { problem.focal_priors };
-    let problem = &Uncalibrated { noise: problem.noise.max(problem.options.fit.least_noise), focal_priors, ..*problem };
-    let mut warnings = Vec::new();
-    let inliers = observed_points(problem);
-    if inliers < problem.options.fit.least_inliers {
-        warnings.push(few_inliers(inliers, &problem.options.fit));
-    }
-    let (_, _, fit) = projectively_adjusted(problem, inliers, stop);
-    Stopped::check(stop)?;
-    heartbeat();
-    let critical = critical::find(problem, &fit, scale_px, stop);
-    Stopped::check(stop)?;
-    heartbeat();
+) -> Result<Vec<Outcome>, Error> {
+    let problem = &problem.with_least_noise();
+    let stretch = stretch.map(|stretch| Stretch { problem: stretch.problem.with_least_noise(), ..stretch });
+    let on = stretch.as_ref().map_or(problem, |stretch| &stretch.problem);
+    let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on, scale_px, stop, heartbeat)?;
     // A plane under tilted views determines a focal length (Triggs 1998): of a reconstruction that is metric already,
     // sigma says how well, and the warning describes the scene.
     let is_critical = critical.warnings.iter().any(|warning| warning.code != WarningCode::PlanarScene);
@@ -248,12 +224,19 @@ pub fn from_metric(
         return Ok(problem.refused(&warnings));
     }
     let choice = models::Choice { problem, scale_px, stop };
-    let minima = search::minima_near(metric, problem, &choice.priors(fit.noise), stop, heartbeat)?;
+    let priors = choice.priors(fit.noise);
+    let mut factors: Vec<f64> = std::iter::once(1.0).chain(problem.options.search.other_focals).collect();
+    if let Some(Stretch { problem, metric }) = &stretch {
+        // Many views are adjusted from where few of them end, instead of from everywhere.
+        let found = search::minima_near(metric, problem, &factors, &priors, stop, heartbeat)?;
+        factors = found.iter().map(|minimum| (minimum.log_focal() - metric.log_focal()).exp()).collect();
+    }
+    let minima = search::minima_near(metric, problem, &factors, &priors, stop, heartbeat)?;
     if minima.is_empty() {
         warnings.push(no_start());
         return Ok(problem.refused(&warnings));
     }
-    grading::grade(&choice, &fit, minima, warnings)
+    grading::grade(&choice, &fit, stretch, minima, warnings)
 }
 
 /// The log focal length that a metric reconstruction has by these observations alone, the mean of those of its views
@@ -264,10 +247,9 @@ pub fn focal_alone(
     prior: &IntrinsicsPrior,
     stop: &StopToken,
 ) -> Option<(f64, f64)> {
-    let start = search::Minimum { reconstruction: metric.clone(), cost: f64::INFINITY, cheirality: 0.0 };
     let priors = vec![prior.forgetting(Parameter::LogFocal)];
     let model = IntrinsicsModel::focal(metric.has_own_focals());
-    let minimum = start.adjusted(problem, model, &priors, stop);
+    let minimum = search::Minimum::near(metric.clone(), problem, model, &priors, stop);
     let candidate = models::Candidate::new(minimum, model, priors, problem);
     let sigma = candidate.sigma(0, Parameter::LogFocal, model, &candidate.priors)?;
     let log_focal = candidate.minimum.log_focal();
@@ -286,16 +268,41 @@ fn no_start() -> Warning {
     Warning::new(WarningCode::UnobservableFocal, detail)
 }
 
-/// The projective reconstruction at its minimum, and how well it fits.
-fn projectively_adjusted(
-    problem: &Uncalibrated,
-    inliers: usize,
-    stop: &StopToken,
-) -> (Vec<Matrix3x4<f64>>, Vec<Vector4<f64>>, Fit) {
-    let (mut cameras, mut points) = (problem.cameras.to_vec(), problem.points.to_vec());
-    let options = Options::squared(problem.options.fit.projective_iterations);
-    let report = projective::adjust(&mut cameras, &mut points, problem.observations, &options, stop);
-    (cameras, points, Fit::projective(report.cost, problem, inliers, 0))
+/// What a calibration is compared with.
+struct Compared {
+    /// The projective reconstruction at its minimum.
+    cameras: Vec<Matrix3x4<f64>>,
+    points: Vec<Vector4<f64>>,
+    /// How well it fits.
+    fit: Fit,
+    critical: critical::Critical,
+    warnings: Vec<Warning>,
+}
+
+impl Compared {
+    /// * `on`: the problem, or a stretch of it whose projective cameras are fitted
+    fn new(
+        problem: &Uncalibrated,
+        on: &Uncalibrated,
+        scale_px: f64,
+        stop: &StopToken,
+        heartbeat: &mut dyn FnMut(),
+    ) -> Result<Self, Error> {
+        Error::check(stop)?;
+        let options = &problem.options.fit;
+        let inliers = observed_points(problem);
+        let warnings = if inliers < options.least_inliers { vec![few_inliers(inliers, options)] } else { Vec::new() };
+        let (mut cameras, mut points) = (on.cameras.to_vec(), on.points.to_vec());
+        let adjustment = Options::squared(options.projective_iterations);
+        let report = projective::adjust(&mut cameras, &mut points, on.observations, &adjustment, stop);
+        let fit = Fit::projective(report.cost, on, observed_points(on), 0);
+        Error::check(stop)?;
+        heartbeat();
+        let critical = critical::find(on, &fit, scale_px, stop);
+        Error::check(stop)?;
+        heartbeat();
+        Ok(Self { cameras, points, fit, critical, warnings })
+    }
 }
 
 /// Points with an observation.

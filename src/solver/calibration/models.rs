@@ -3,11 +3,11 @@
 use super::fit::Fit;
 use super::options::{CalibrationOptions, GradeOptions};
 use super::search::Minimum;
-use super::{Stopped, Uncalibrated};
+use super::{Error, Uncalibrated};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
-    self, Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter,
+    self, Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter, Reconstruction,
 };
 
 /// A metric reconstruction under one model, with what the observations say of the intrinsics there.
@@ -68,6 +68,7 @@ pub(super) struct Sigmas {
 }
 
 /// What the choice of a model works with.
+#[derive(Clone, Copy)]
 pub(super) struct Choice<'a> {
     pub problem: &'a Uncalibrated<'a>,
     pub scale_px: f64,
@@ -107,14 +108,24 @@ impl Choice<'_> {
         found
     }
 
+    /// What a model that was chosen by more views makes of these alone.
+    ///
+    /// * `metric`: near its minimum
+    pub fn on_stretch(&self, chosen: &Candidate, metric: &Reconstruction) -> Candidate {
+        let intrinsics = chosen.minimum.reconstruction.intrinsics.clone();
+        let reconstruction = Reconstruction { intrinsics, ..metric.clone() };
+        let minimum = Minimum::near(reconstruction, self.problem, chosen.model, &chosen.priors, self.stop);
+        Candidate::new(minimum, chosen.model, chosen.priors.clone(), self.problem)
+    }
+
     /// Frees extension after extension, the most significant first, as long as the data ask for one and still determine
     /// the focal length.
-    pub fn richest(&self, simple: Candidate, warnings: &mut Vec<Warning>) -> Result<Candidate, Stopped> {
+    pub fn richest(&self, simple: Candidate, warnings: &mut Vec<Warning>) -> Result<Candidate, Error> {
         let mut best = simple;
         loop {
             let mut taken = None;
             for (extension, _) in self.promising(&best) {
-                Stopped::check(self.stop)?;
+                Error::check(self.stop)?;
                 taken = self.extended(&best, extension, warnings);
                 if taken.is_some() {
                     break;
@@ -296,7 +307,6 @@ mod tests {
     use nalgebra::Vector4;
 
     use super::*;
-    use crate::geometry::bundle::metric::Reconstruction;
     use crate::geometry::bundle::testing::{self, TestScene};
     use crate::solver::calibration::tests::of_one_lens;
 

@@ -3,7 +3,7 @@
 //! Lengths and focal lengths are in units of the longer image side; `log` is the natural logarithm. A field that counts
 //! standard deviations, or is in units of the noise, says so.
 
-use crate::domain::{FocalPrior, Grade};
+use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle;
 use crate::geometry::bundle::metric::{Extension, IntrinsicsPrior, Parameter};
 use crate::geometry::statistics::chi_square_quantile;
@@ -422,5 +422,18 @@ impl GradeOptions {
             Some(sigma) if sigma <= self.weak_up_to => Grade::Weak,
             _ => Grade::ProjectiveOnly,
         }
+    }
+
+    /// Why a standard deviation, `None` where there is none, gives no calibration.
+    pub fn unobservable(&self, sigma: Option<f64>) -> Warning {
+        let detail = match sigma {
+            Some(sigma) => format!(
+                "the motion determines the logarithm of the focal length only to {sigma:.2} (one standard deviation), \
+                 more than {}",
+                self.weak_up_to
+            ),
+            None => "the motion does not determine the focal length".to_owned(),
+        };
+        Warning::new(WarningCode::UnobservableFocal, detail)
     }
 }

@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::fit::Fit;
 use super::options::SearchOptions;
-use super::{Stopped, Uncalibrated};
+use super::{Error, Uncalibrated};
 use crate::domain::StopToken;
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::critical::Translating;
@@ -74,18 +74,29 @@ impl Minimum {
         priors: &[IntrinsicsPrior],
         stop: &StopToken,
     ) -> Self {
-        self.adjusted_by(&problem.options.search.to_convergence(), problem, model, priors, stop)
+        Self::near(self.reconstruction.clone(), problem, model, priors, stop)
     }
 
-    fn adjusted_by(
-        &self,
-        options: &Options,
+    /// Adjusts a reconstruction to convergence.
+    pub fn near(
+        start: Reconstruction,
         problem: &Uncalibrated,
         model: IntrinsicsModel,
         priors: &[IntrinsicsPrior],
         stop: &StopToken,
     ) -> Self {
-        let mut reconstruction = self.reconstruction.clone();
+        Self::by(&problem.options.search.to_convergence(), start, problem, model, priors, stop)
+    }
+
+    fn by(
+        options: &Options,
+        start: Reconstruction,
+        problem: &Uncalibrated,
+        model: IntrinsicsModel,
+        priors: &[IntrinsicsPrior],
+        stop: &StopToken,
+    ) -> Self {
+        let mut reconstruction = start;
         let report = metric::adjust(&mut reconstruction, problem.observations, model, priors, options, stop);
         let cheirality = cheirality(&reconstruction, problem.observations);
         Self { reconstruction, cost: report.cost, cheirality }
@@ -95,19 +106,21 @@ impl Minimum {
 /// Minima from a reconstruction that is metric already: its own, and those that other focal lengths lead to, which its
 /// poses and points have followed, for freed at once these would only go back to where they were; cheapest first.
 ///
+/// * `factors`: on the focal length, to begin from
 /// * `heartbeat`: called after each
 pub(super) fn minima_near(
     metric: &Reconstruction,
     problem: &Uncalibrated,
+    factors: &[f64],
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
     heartbeat: &mut dyn FnMut(),
-) -> Result<Vec<Minimum>, Stopped> {
+) -> Result<Vec<Minimum>, Error> {
     let model = IntrinsicsModel::focal(metric.has_own_focals());
     let mut found = Vec::new();
     let options = &problem.options.search;
-    for factor in std::iter::once(1.0).chain(options.other_focals) {
-        Stopped::check(stop)?;
+    for &factor in factors {
+        Error::check(stop)?;
         let mut reconstruction = metric.clone();
         reconstruction
             .intrinsics
@@ -118,11 +131,10 @@ pub(super) fn minima_near(
             let following = Options { max_iterations: options.following_iterations, ..Options::default() };
             metric::adjust(&mut reconstruction, problem.observations, IntrinsicsModel::FIXED, priors, &following, stop);
         }
-        let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
-        found.push(start.adjusted(problem, model, priors, stop));
+        found.push(Minimum::near(reconstruction, problem, model, priors, stop));
         heartbeat();
     }
-    Stopped::check(stop)?;
+    Error::check(stop)?;
     Ok(distinct(found, problem))
 }
 
@@ -133,7 +145,7 @@ pub(super) fn minima(
     problem: &Uncalibrated,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
-) -> Result<Vec<Minimum>, Stopped> {
+) -> Result<Vec<Minimum>, Error> {
     match problem.focal_per_view {
         true => minima_per_view(frame, problem, stop),
         false if problem.groups() > 1 => minima_of_groups(frame, problem, priors, stop),
@@ -147,11 +159,11 @@ fn minima_of_groups(
     problem: &Uncalibrated,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
-) -> Result<Vec<Minimum>, Stopped> {
+) -> Result<Vec<Minimum>, Error> {
     let alone = Uncalibrated { group_of: &vec![0; frame.cameras.len()], focal_priors: &[None], ..*problem };
     let mut found = minima_per_view(frame, &alone, stop)?;
     for minimum in &mut found {
-        Stopped::check(stop)?;
+        Error::check(stop)?;
         minimum.reconstruction = minimum.reconstruction.clone().in_groups(problem.group_of, problem.groups());
         *minimum = minimum.adjusted(problem, IntrinsicsModel::FOCAL, priors, stop);
     }
@@ -159,7 +171,7 @@ fn minima_of_groups(
 }
 
 /// With a focal length a view: from the quadrics that allow for that, and from what one for all leads to.
-fn minima_per_view(frame: &CanonicalFrame, problem: &Uncalibrated, stop: &StopToken) -> Result<Vec<Minimum>, Stopped> {
+fn minima_per_view(frame: &CanonicalFrame, problem: &Uncalibrated, stop: &StopToken) -> Result<Vec<Minimum>, Error> {
     let (model, priors) = (IntrinsicsModel::FOCAL_PER_VIEW, [IntrinsicsPrior::NONE]);
     let options = &problem.options.search;
     let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(options.starts);
@@ -169,14 +181,13 @@ fn minima_per_view(frame: &CanonicalFrame, problem: &Uncalibrated, stop: &StopTo
     starts.extend(of_one.into_iter().map(|minimum| minimum.reconstruction.with_own_focals()));
     let mut found = Vec::with_capacity(starts.len());
     for reconstruction in starts {
-        Stopped::check(stop)?;
-        let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 };
-        found.push(start.adjusted_by(&options.first(), problem, model, &priors, stop));
+        Error::check(stop)?;
+        found.push(Minimum::by(&options.first(), reconstruction, problem, model, &priors, stop));
     }
     let mut found = distinct(found, problem);
     found.truncate(options.converged);
     for minimum in &mut found {
-        Stopped::check(stop)?;
+        Error::check(stop)?;
         *minimum = minimum.adjusted(problem, model, &priors, stop);
     }
     Ok(distinct(found, problem))
@@ -188,14 +199,14 @@ fn minima_of_one(
     problem: &Uncalibrated,
     priors: &[IntrinsicsPrior],
     stop: &StopToken,
-) -> Result<Vec<Minimum>, Stopped> {
+) -> Result<Vec<Minimum>, Error> {
     let model = IntrinsicsModel::FOCAL;
     let options = &problem.options.search;
     let (subset, chosen) = subsample(frame, problem.observations, options);
     let searched = &Uncalibrated { observations: subset.as_deref().unwrap_or(problem.observations), ..*problem };
     let mut found: Vec<Minimum> = Vec::new();
     for start in starts(frame, options) {
-        Stopped::check(stop)?;
+        Error::check(stop)?;
         let Some(mut reconstruction) = upgrade(frame, &start, false, searched.observations) else { continue };
         let report = metric::adjust(&mut reconstruction, searched.observations, model, priors, &options.first(), stop);
         found.push(Minimum { cheirality: 0.0, cost: report.cost, reconstruction });
@@ -205,9 +216,9 @@ fn minima_of_one(
     let mut converged: Vec<Minimum> = Vec::with_capacity(found.len());
     let mut cheapest = f64::INFINITY;
     for mut start in found {
-        Stopped::check(stop)?;
+        Error::check(stop)?;
         if start.cost > options.hopeless_cost * cheapest {
-            let tried = start.adjusted_by(&options.first(), searched, model, priors, stop);
+            let tried = Minimum::by(&options.first(), start.reconstruction, searched, model, priors, stop);
             let pace =
                 (tried.cost / start.cost).powf(options.final_iterations as f64 / options.first_iterations as f64);
             if pace * tried.cost > options.hopeless_cost * cheapest {
@@ -223,7 +234,7 @@ fn minima_of_one(
         }
         converged.push(minimum);
     }
-    Stopped::check(stop)?;
+    Error::check(stop)?;
     Ok(distinct(converged, problem))
 }
 
@@ -237,9 +248,8 @@ pub(super) fn known_focal(
     stop: &StopToken,
 ) -> Vec<Minimum> {
     let start = upgrade_translation(translation, focal, problem.observations);
-    let minimum = start.map(|reconstruction| Minimum { reconstruction, cost: f64::INFINITY, cheirality: 0.0 });
-    let adjusted = minimum.map(|start| start.adjusted(problem, IntrinsicsModel::FOCAL, priors, stop));
-    distinct(adjusted.into_iter().collect(), problem)
+    let minimum = start.map(|start| Minimum::near(start, problem, IntrinsicsModel::FOCAL, priors, stop));
+    distinct(minimum.into_iter().collect(), problem)
 }
 
 /// Cheapest first, without those that repeat a cheaper one.

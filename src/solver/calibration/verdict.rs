@@ -36,15 +36,7 @@ impl<'a> Verdict<'a> {
         if grade != Grade::ProjectiveOnly || self.has(WarningCode::UnobservableFocal) {
             return;
         }
-        let detail = match sigma {
-            Some(sigma) => format!(
-                "the motion determines the logarithm of the focal length only to {sigma:.2} (one standard deviation), \
-                 more than {}",
-                self.options.grades.weak_up_to
-            ),
-            None => "the motion does not determine the focal length".to_owned(),
-        };
-        self.warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
+        self.warnings.push(self.options.grades.unobservable(sigma));
     }
 
     /// Asks whether the metric reconstruction fits as well as the projective one.

@@ -166,13 +166,7 @@ impl Judged {
     fn nothing(input: &Input, noise: NoiseModel) -> Self {
         let count = input.track_count();
         Self {
-            tracks: TrackResults {
-                weight: vec![0.0; count],
-                inlier: vec![false; count],
-                network_weight: Vec::new(),
-                point: vec![None; count],
-                part: Vec::new(),
-            },
+            tracks: TrackResults::unjudged(count),
             observations: ObservationResults::unjudged(input.observation_count()),
             retained: vec![Vec::new(); count],
             points: vec![None; count],

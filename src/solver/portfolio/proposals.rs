@@ -93,7 +93,7 @@ impl Portfolio<'_> {
     fn propose_irls(&mut self) {
         let begun = Instant::now();
         let irls = match &self.search {
-            Search::Affine(search) => priors::affine_irls(search.centred(), self.stop),
+            Search::Affine(search) => priors::affine_irls(search.centred(), 0, self.stop),
             Search::Subspace(search) => priors::irls(search.balanced(), subspace::RANK, self.stop),
         };
         self.stats(Proposal::Irls).seconds += begun.elapsed().as_secs_f64();
@@ -140,7 +140,7 @@ impl Portfolio<'_> {
                 let mut shortlist = Shortlist::new(SHORTLIST);
                 let drawn = samples(SUBSPACE_SAMPLES);
                 search.run(&sampler, drawn, &mut self.rng, &mut shortlist, self.stop);
-                (shortlist.into_entries().map(|hypothesis| search.seed(self.block, &hypothesis)).collect(), drawn)
+                (shortlist.into_entries().map(|basis| search.seed(self.block, &basis)).collect(), drawn)
             }
         };
         let stats = self.stats(proposal);
@@ -163,7 +163,7 @@ impl Portfolio<'_> {
     fn verify(&mut self, proposal: Proposal, seeds: Vec<Seed>) {
         for seed in seeds {
             let begun = Instant::now();
-            let grown = grow::grow(self.block, seed.cameras, seed.points, seed.support, self.noise, self.stop);
+            let grown = grow::grow(self.block, seed, self.noise, self.stop);
             let counted = grown.as_ref().map_or(0, |consensus| self.counted(consensus));
             let ln_false_alarms = grown.as_ref().map_or(f64::INFINITY, |consensus| {
                 a_contrario::ln_false_alarms(self.block, consensus, self.spread, self.stop)

@@ -28,12 +28,6 @@ const DAQ_WEIGHT: f64 = 20.0;
 /// Samples between two looks at the stop token.
 const SAMPLES_PER_LOOK: usize = 8;
 
-/// A column space with its cost.
-#[derive(Debug, Clone)]
-pub struct Hypothesis {
-    basis: DMatrix<f64>,
-}
-
 /// The balanced measurement matrix of a block with depths, ready to be searched.
 #[derive(Debug, Clone)]
 pub struct Search {
@@ -66,7 +60,7 @@ impl Search {
         sampler: &Sampler,
         samples: usize,
         rng: &mut ChaCha8Rng,
-        shortlist: &mut Shortlist<Hypothesis>,
+        shortlist: &mut Shortlist<DMatrix<f64>>,
         stop: &StopToken,
     ) {
         let mut best = f64::INFINITY;
@@ -84,8 +78,8 @@ impl Search {
             // Only a sample that beats the best one so far is worth a local optimisation.
             if cost < best {
                 best = cost;
-                let hypothesis = Hypothesis { basis: self.optimise_locally(basis) };
-                shortlist.offer(self.cost(&hypothesis), hypothesis);
+                let basis = self.optimise_locally(basis);
+                shortlist.offer(self.cost(&basis), basis);
             }
         }
     }
@@ -99,10 +93,9 @@ impl Search {
     }
 
     /// Truncated cost plus the weighted DAQ residual of the cameras in the subspace.
-    fn cost(&self, hypothesis: &Hypothesis) -> f64 {
-        let penalty =
-            if self.use_daq { DAQ_WEIGHT * daq::hypothesis_residual(&cameras_of(&hypothesis.basis)) } else { 0.0 };
-        self.truncated_cost(&hypothesis.basis) + penalty
+    fn cost(&self, basis: &DMatrix<f64>) -> f64 {
+        let penalty = if self.use_daq { DAQ_WEIGHT * daq::hypothesis_residual(&cameras_of(basis)) } else { 0.0 };
+        self.truncated_cost(basis) + penalty
     }
 
     /// Refits the subspace to the columns within a shrinking tolerance.
@@ -128,13 +121,9 @@ impl Search {
         best
     }
 
-    /// The seed of a hypothesis: the cameras in its basis, the columns within the tolerance.
-    pub fn seed(&self, block: &CompleteBlock, hypothesis: &Hypothesis) -> Seed {
-        self.seed_from_basis(block, &hypothesis.basis)
-    }
-
-    /// The seed of a column space given by an orthonormal basis (3n x 4).
-    pub fn seed_from_basis(&self, block: &CompleteBlock, basis: &DMatrix<f64>) -> Seed {
+    /// The seed of a column space given by an orthonormal basis (3n x 4): its cameras, and the columns within the
+    /// tolerance.
+    pub fn seed(&self, block: &CompleteBlock, basis: &DMatrix<f64>) -> Seed {
         let support = nearest(&subspace_residuals(&self.balanced, basis), self.tolerance);
         let cameras = cameras_of(basis);
         let points = support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();

@@ -6,7 +6,6 @@ use super::model::{Lens, Model};
 use super::options::GrowthOptions;
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::sequence::{self, Free, Run};
-use crate::geometry::bundle::{Loss, Options};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::median;
 use crate::solver::problem::Problem;
@@ -102,12 +101,7 @@ impl Extract {
     }
 
     fn adjust(&mut self, problem: &Problem, model: &Model, free: &Free, iterations: usize, recorder: &mut Recorder) {
-        let options = Options {
-            max_iterations: iterations,
-            relative_tolerance: OPTIONS.tolerance,
-            loss: Loss::Cauchy { scale: OPTIONS.cauchy_scale * model.noise },
-            ..Options::default()
-        };
+        let options = OPTIONS.adjustment(iterations, model.noise);
         let priors: Vec<IntrinsicsPrior> =
             (0..problem.cameras).map(|camera| intrinsics_prior(problem, camera, model.noise)).collect();
         let mut heartbeat = || recorder.heartbeat();
@@ -115,10 +109,15 @@ impl Extract {
         sequence::adjust(&mut self.sequence, &self.observations, free, &priors, &options, run);
     }
 
+    /// Squared residuals, times the weights of the observations.
+    pub fn squared_residuals(&self) -> Vec<f64> {
+        let squared = |seen: &Observation| seen.weight * self.sequence.residual(seen).norm_squared();
+        self.observations.iter().map(squared).collect()
+    }
+
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
     fn noise(&self, problem: &Problem) -> f64 {
-        let norms: Vec<f64> =
-            self.observations.iter().map(|seen| seen.weight.sqrt() * self.sequence.residual(seen).norm()).collect();
+        let norms = self.squared_residuals().into_iter().map(f64::sqrt).collect();
         let of_view = if problem.has_own_focals() { 7 } else { 6 };
         let unknowns = of_view * self.views.len() + 3 * self.tracks.len();
         core_noise(norms, unknowns)

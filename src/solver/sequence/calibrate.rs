@@ -1,21 +1,19 @@
 //! What the whole sequence says of the calibration of each camera.
 
-use nalgebra::Vector4;
-
 use super::adjust::{self, Extract};
 use super::model::Model;
 use super::{own_focals, windows};
 use crate::domain::{FocalPrior, Task, Warning, WarningCode};
-use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
-use crate::solver::calibration::{self, GradeOptions, Outcome};
+use crate::geometry::observation::Observation;
+use crate::geometry::{Camera, Point};
+use crate::solver::calibration::{self, GradeOptions, Outcome, Uncalibrated};
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, view_selection};
 
-/// Views that a calibration is made from at most: the projective adjustment that it is compared with is cubic in them.
-/// Of more with one focal length, the stretch with most observations, where the others speak through their windows; a
-/// zoom is asked stretch after stretch.
+/// Views that a calibration is compared with projective cameras on at most, whose adjustment is cubic in them: of more,
+/// the stretch with most observations. A zoom is asked stretch after stretch.
 pub const MOST_VIEWS: usize = 40;
 /// Observations that a calibration is made from, and of one view at least and at most: other errors than noise bound
 /// what more of them would give.
@@ -37,15 +35,11 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
         return own_focals::calibrate(problem, model, recorder).map(|outcome| vec![outcome]);
     }
     let registered = model.registered();
-    // All cameras together where one calibration takes all views, else each by itself.
+    // All cameras together where they have few views, else each by itself.
     let runs: Vec<Vec<usize>> = match registered.len() <= MOST_VIEWS {
         true => vec![registered],
         false => (0..problem.cameras)
-            .map(|camera| {
-                let own: Vec<usize> =
-                    registered.iter().copied().filter(|&view| problem.camera_of[view] == camera).collect();
-                densest(problem, model, &own)
-            })
+            .map(|camera| registered.iter().copied().filter(|&view| problem.camera_of[view] == camera).collect())
             .collect(),
     };
     let mut outcomes: Vec<Outcome> = (0..problem.cameras).map(|_| too_few(0)).collect();
@@ -93,34 +87,40 @@ fn of_cameras(
     recorder: &mut Recorder,
 ) -> Result<Vec<(usize, Outcome)>, Error> {
     let mut extract = core(problem, model, views, of_view(views));
-    let found = of_extract(problem, &extract, model.noise, &mut || recorder.heartbeat())?;
+    let stretch = (views.len() > MOST_VIEWS).then(|| {
+        let stretch = densest(problem, model, views);
+        core(problem, model, &stretch, of_view(&stretch))
+    });
+    let found = of_extract(problem, &extract, stretch.as_ref(), model.noise, &mut || recorder.heartbeat())?;
     take_over(model, &mut extract, &found);
     Ok(found)
 }
 
 /// The calibrations of the cameras of some views.
 ///
+/// * `stretch`: some of them, of the same cameras, where they are many
 /// * `heartbeat`: called now and then
 pub fn of_extract(
     problem: &Problem,
     extract: &Extract,
+    stretch: Option<&Extract>,
     noise: f64,
     heartbeat: &mut dyn FnMut(),
 ) -> Result<Vec<(usize, Outcome)>, Error> {
     let (metric, of_group) = extract.block();
-    let (cameras, points) = projective(&metric);
     let focal_priors: Vec<Option<FocalPrior>> = of_group.iter().map(|&camera| problem.focal_priors[camera]).collect();
-    let to_calibrate = calibration::Uncalibrated {
-        cameras: &cameras,
-        points: &points,
-        observations: &extract.observations,
-        noise,
-        group_of: &metric.group_of,
-        focal_priors: &focal_priors,
-        focal_per_view: metric.has_own_focals(),
-        options: &problem.calibration_options,
-    };
-    let outcomes = calibration::from_metric(&to_calibrate, &metric, problem.scale_px, problem.stop, heartbeat)?;
+    let all = Projective::of(&metric);
+    let stretch = stretch.map(|extract| {
+        let (metric, _) = extract.block();
+        (Projective::of(&metric), metric, &extract.observations)
+    });
+    let stretch = stretch.as_ref().map(|(projective, metric, observations)| calibration::Stretch {
+        problem: projective.uncalibrated(problem, metric, observations, &focal_priors, noise),
+        metric,
+    });
+    let to_calibrate = all.uncalibrated(problem, &metric, &extract.observations, &focal_priors, noise);
+    let outcomes =
+        calibration::from_metric(&to_calibrate, &metric, stretch, problem.scale_px, problem.stop, heartbeat)?;
     Ok(of_group.into_iter().zip(outcomes).collect())
 }
 
@@ -154,8 +154,7 @@ fn admit_difference(log_focal: f64, outcome: &mut Outcome, grades: &GradeOptions
     let (Some(intrinsics), Some(sigma)) = (outcome.intrinsics(), outcome.sigma_log_focal) else { return };
     let difference = (log_focal - intrinsics.focal.ln()).abs();
     if difference > sigma {
-        outcome.sigma_log_focal = Some(difference);
-        outcome.grade = outcome.grade.worse(grades.grade(Some(difference)));
+        outcome.raise_sigma(difference, grades);
     }
 }
 
@@ -172,8 +171,39 @@ fn densest(problem: &Problem, model: &Model, views: &[usize]) -> Vec<usize> {
 }
 
 /// The cameras and points of a metric reconstruction without what makes it metric.
-pub fn projective(metric: &Reconstruction) -> (Vec<Camera>, Vec<Vector4<f64>>) {
-    (metric.cameras(), metric.points.iter().map(|point| point.push(1.0)).collect())
+pub struct Projective {
+    cameras: Vec<Camera>,
+    points: Vec<Point>,
+}
+
+impl Projective {
+    pub fn of(metric: &Reconstruction) -> Self {
+        Self { cameras: metric.cameras(), points: metric.points.iter().map(|point| point.push(1.0)).collect() }
+    }
+
+    /// What there is to calibrate.
+    ///
+    /// * `metric`: what these are the cameras and points of
+    /// * `focal_priors`: one a camera group of it
+    pub fn uncalibrated<'a>(
+        &'a self,
+        problem: &'a Problem,
+        metric: &'a Reconstruction,
+        observations: &'a [Observation],
+        focal_priors: &'a [Option<FocalPrior>],
+        noise: f64,
+    ) -> Uncalibrated<'a> {
+        Uncalibrated {
+            cameras: &self.cameras,
+            points: &self.points,
+            observations,
+            noise,
+            group_of: &metric.group_of,
+            focal_priors,
+            focal_per_view: metric.has_own_focals(),
+            options: &problem.calibration_options,
+        }
+    }
 }
 
 /// Landmarks that give every one of these registered views `of_view` observations, with the observations that the core

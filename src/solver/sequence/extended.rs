@@ -2,9 +2,9 @@
 
 use super::model::Model;
 use super::options::GrowthOptions;
-use super::register::{self, Unregistered};
+use super::register;
 use super::{adjust, calibrate, components, growth, projective, structure};
-use crate::domain::{Grade, Stage, Task, Warning, WarningCode};
+use crate::domain::{Grade, LeftOut, Stage, Task, Warning, WarningCode};
 use crate::solver::attempt::{self, Attempt};
 use crate::solver::calibration::Outcome;
 use crate::solver::grow::LEAST_INLIERS;
@@ -26,7 +26,7 @@ pub struct Extended {
     /// One a camera of the problem.
     pub calibrations: Vec<Outcome>,
     /// Views that could not be registered, with the reason.
-    pub unregistered: Vec<Unregistered>,
+    pub left_out: Vec<(usize, LeftOut)>,
 }
 
 /// Extends a block, which must be metric, to every view that can be registered.
@@ -62,8 +62,8 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
     }
     problem.stopped()?;
     components::largest_first(&mut model);
-    let unregistered = register::left(problem, &model, &trials);
-    Ok(Extended { seed, model, calibrations, unregistered })
+    let left_out = register::left_out(problem, &model, &trials);
+    Ok(Extended { seed, model, calibrations, left_out })
 }
 
 /// Takes back a calibration under which the sequence does not hold together.
@@ -123,15 +123,25 @@ impl Extended {
     }
 
     /// Whether nothing is to be gained by extending without a calibration: most views hold together so precisely that
-    /// wrong observations do not.
+    /// wrong observations do not. Of more views than projective cameras are fitted to, the residuals must be of one
+    /// kind, too: those of a street of 60 or 120 views that was bent to a wrong focal length were not.
     pub fn is_settled(&self, problem: &Problem) -> bool {
         let is_precise = self.model.noise <= attempt::INITIAL_NOISE;
         // Windows that differ a little warn of a mismatch of a METRIC one too.
-        is_precise && self.holds_most_views() && (self.fits() || self.grade(problem) == Grade::Metric)
+        is_precise
+            && self.holds_most_views()
+            && !self.is_bent(problem)
+            && (self.fits() || self.grade(problem) == Grade::Metric)
+    }
+
+    fn is_bent(&self, problem: &Problem) -> bool {
+        let (views, tracks) = (self.model.registered(), adjust::verified(&self.model));
+        views.len() > calibrate::MOST_VIEWS
+            && attempt::are_mixed(adjust::Extract::new(problem, &self.model, &views, &tracks).squared_residuals())
     }
 
     pub fn holds_most_views(&self) -> bool {
         let registered = self.model.registered().len();
-        registered as f64 >= ENOUGH_REGISTERED * (registered + self.unregistered.len()) as f64
+        registered as f64 >= ENOUGH_REGISTERED * (registered + self.left_out.len()) as f64
     }
 }

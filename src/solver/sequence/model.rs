@@ -7,7 +7,6 @@ use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
 use crate::geometry::observation::Observation;
 use crate::solver::calibration::ViewFocal;
-use crate::solver::classification;
 use crate::solver::problem::Problem;
 
 /// A point of the reconstruction.
@@ -244,10 +243,5 @@ impl Model {
         self.poses[view]?;
         let seen = problem.observation(k);
         Some(Observation { xy: self.intrinsics_of(problem, view).undistort(&seen.xy)?, ..seen })
-    }
-
-    /// Squared residual, normalised units, within which an observation agrees with its landmark.
-    pub fn gate(&self, problem: &Problem) -> f64 {
-        classification::working_gate(self.noise, problem.outlier_density)
     }
 }

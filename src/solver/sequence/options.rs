@@ -1,5 +1,7 @@
 //! The thresholds of growing a reconstruction, with their reasons.
 
+use crate::geometry::bundle::{Loss, Options};
+
 /// How views are added.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GrowthOptions {
@@ -76,4 +78,10 @@ impl GrowthOptions {
         final_iterations: 10,
         ..Self::METRIC
     };
+
+    /// How to adjust at this core noise.
+    pub fn adjustment(&self, max_iterations: usize, noise: f64) -> Options {
+        let loss = Loss::Cauchy { scale: self.cauchy_scale * noise };
+        Options { max_iterations, relative_tolerance: self.tolerance, loss, ..Options::default() }
+    }
 }

@@ -26,7 +26,7 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     let runs = runs(model);
     let of_run = |k: usize, heartbeat: &mut dyn FnMut()| {
         let extract = calibrate::core(problem, model, runs.get(k)?, calibrate::of_view(&runs[k]));
-        let found = calibrate::of_extract(problem, &extract, model.noise, heartbeat).ok()?;
+        let found = calibrate::of_extract(problem, &extract, None, model.noise, heartbeat).ok()?;
         found.into_iter().next().map(|(_, outcome)| (extract, outcome))
     };
     let found = if runs.len() == 1 {
@@ -75,7 +75,7 @@ fn combined(problem: &Problem, model: &mut Model, runs: Vec<(Extract, Outcome)>)
     let registered = model.registered();
     let is_whole = matches!(runs.as_slice(), [(extract, _)] if extract.views == registered);
     model.own_focals.iter_mut().for_each(|own| own.is_determined = false);
-    let mut whole = Outcome { grade: Grade::Metric, cheirality: 1.0, ..Outcome::refused(Vec::new()) };
+    let mut whole = Outcome { grade: Grade::Metric, ..Outcome::refused(Vec::new()) };
     let mut deviations = Vec::with_capacity(registered.len());
     for (extract, outcome) in runs {
         let focals = outcome.focals.filter(|_| outcome.grade != Grade::ProjectiveOnly);
@@ -91,7 +91,6 @@ fn combined(problem: &Problem, model: &mut Model, runs: Vec<(Extract, Outcome)>)
             let sigma = own.max(difference);
             deviations.extend(differences.iter().map(|_| sigma));
             whole.grade = whole.grade.worse(outcome.grade);
-            whole.cheirality = whole.cheirality.min(outcome.cheirality);
             whole.rms_ratio = whole.rms_ratio.max(outcome.rms_ratio);
             whole.sigma_ratios = outcome.sigma_ratios;
         }

@@ -12,14 +12,14 @@ use super::adjust;
 use super::growth::{self, Growth, Trial};
 use super::options::GrowthOptions;
 use super::projective::{CAMERA_UNKNOWNS, Projective};
-use crate::geometry::bundle::{self, Loss};
+use crate::geometry::bundle;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{Robust, Triangulator};
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::per_track::each_track;
 use crate::solver::problem::{Problem, VERIFIED};
 use crate::solver::recorder::Recorder;
-use crate::solver::{Error, classification, grow};
+use crate::solver::{Error, grow};
 
 const OPTIONS: GrowthOptions = GrowthOptions::PROJECTIVE;
 
@@ -102,7 +102,7 @@ impl<'a> Growing<'a> {
         };
         let cameras: Vec<Camera> = self.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
         let triangulator = Triangulator::new(&cameras);
-        let gate = classification::working_gate(self.noise, problem.outlier_density);
+        let gate = problem.gate(self.noise);
         let find = |growing: &Self, track: usize| growing.point(&triangulator, gate, track);
         each_track(problem, &tracks, self, recorder, find, |growing, track, found| {
             problem.of_track(track).for_each(|k| growing.kept[k] = false);
@@ -158,12 +158,7 @@ impl<'a> Growing<'a> {
         if standing.observations.is_empty() {
             return;
         }
-        let options = bundle::Options {
-            max_iterations: iterations,
-            relative_tolerance: OPTIONS.tolerance,
-            loss: Loss::Cauchy { scale: OPTIONS.cauchy_scale * self.noise },
-            ..Default::default()
-        };
+        let options = OPTIONS.adjustment(iterations, self.noise);
         let Projective { cameras, points, observations, .. } = &mut standing;
         bundle::projective::adjust(cameras, points, observations, &options, self.problem.stop);
         recorder.heartbeat();
@@ -233,7 +228,7 @@ impl Growth for Growing<'_> {
         let datum = |&k: &usize| Some((self.points[problem.track_of(k)]?, (problem.xy[k], problem.weights[k])));
         let (points, seen): (Vec<Point>, Vec<_>) = seen.iter().filter_map(datum).unzip();
         let (images, weights): (Vec<Vector2<f64>>, Vec<f64>) = seen.into_iter().unzip();
-        let gate = classification::working_gate(self.noise, problem.outlier_density);
+        let gate = problem.gate(self.noise);
         let least = OPTIONS.least_agreeing.max((OPTIONS.least_share * points.len() as f64).ceil() as usize);
         let found = resection::robust(&points, &images, &weights, gate, least, &mut self.rng, problem.stop);
         let Some((camera, agrees)) = found else { return 0 };

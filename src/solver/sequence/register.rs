@@ -21,22 +21,6 @@ const OPTIONS: GrowthOptions = GrowthOptions::METRIC;
 const OTHER_FOCALS: std::ops::RangeInclusive<i32> = -6..=6;
 const FOCALS_PER_OCTAVE: f64 = 4.0;
 
-/// A view left out, and why.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Unregistered {
-    pub view: usize,
-    /// Points of the reconstruction that it sees.
-    pub points: usize,
-    /// How many of these agreed with a pose.
-    pub agreeing: usize,
-}
-
-impl Unregistered {
-    pub fn reason(&self) -> LeftOut {
-        LeftOut::NotRegistered { points: self.points as u32, agreeing: self.agreeing as u32 }
-    }
-}
-
 /// A component of a model that grows.
 struct Component<'a> {
     problem: &'a Problem<'a>,
@@ -89,12 +73,13 @@ impl<'a> Component<'a> {
 }
 
 /// The views that were not registered, with what came of the last trial of each.
-pub fn left(problem: &Problem, model: &Model, trials: &[Trial]) -> Vec<Unregistered> {
+pub fn left_out(problem: &Problem, model: &Model, trials: &[Trial]) -> Vec<(usize, LeftOut)> {
+    let reason = |view: usize| LeftOut::NotRegistered {
+        points: trials[view].points as u32,
+        agreeing: trials[view].agreeing as u32,
+    };
     let views = problem.observed_views().into_iter();
-    views
-        .filter(|&view| model.poses[view].is_none())
-        .map(|view| Unregistered { view, points: trials[view].points, agreeing: trials[view].agreeing })
-        .collect()
+    views.filter(|&view| model.poses[view].is_none()).map(|view| (view, reason(view))).collect()
 }
 
 impl Growth for Component<'_> {
@@ -193,7 +178,7 @@ fn robust_pose(
     };
     let (points, seen): (Vec<_>, Vec<_>) = seen.iter().filter_map(datum).unzip();
     let (rays, weights): (Vec<_>, Vec<_>) = seen.into_iter().unzip();
-    let gate = model.gate(problem) / intrinsics.focal.powi(2);
+    let gate = problem.gate(model.noise) / intrinsics.focal.powi(2);
     let found = pose::robust(&points, &rays, &weights, gate, rng, problem.stop)?;
     Some((found.model, found.inlier_count()))
 }

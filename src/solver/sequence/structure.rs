@@ -36,7 +36,7 @@ fn triangulate_some(problem: &Problem, model: &mut Model, tracks: &[usize], reco
     let cameras: Vec<Camera> =
         model.cameras(problem).into_iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
     let triangulator = Triangulator::new(&cameras);
-    let gate = model.gate(problem);
+    let gate = problem.gate(model.noise);
     let find = |model: &Model, track: usize| landmark(problem, model, &triangulator, gate, track);
     each_track(problem, tracks, model, recorder, find, |model, track, found| {
         forget(problem, model, track);

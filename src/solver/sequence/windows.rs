@@ -1,7 +1,7 @@
 //! What windows of a sequence say of each other's focal length.
 
 use super::adjust;
-use super::calibrate;
+use super::calibrate::{self, Projective};
 use super::model::Model;
 use crate::domain::Task;
 use crate::solver::Error;
@@ -17,6 +17,7 @@ const LEAST_VIEWS: usize = 4;
 const MOST_WINDOWS: usize = 50;
 /// Observations of a view that a window holds.
 pub const OF_VIEW: usize = 150;
+
 /// Raises the sigma of a sequence's calibration to what its windows admit, grades it anew and says so.
 pub fn reconcile(
     problem: &Problem,
@@ -28,9 +29,12 @@ pub fn reconcile(
     let Some(own) = outcome.sigma_log_focal else { return Ok(()) };
     let (estimates, shared) = estimates(problem, model, camera, recorder)?;
     let Some(fused) = fuse(&estimates, shared) else { return Ok(()) };
-    let apart = (fused.log_focal - model.log_focal(camera, &of_camera(problem, model, camera))).abs();
+    let apart = fused.log_focal - model.log_focal(camera, &of_camera(problem, model, camera));
+    // The windows' own formal variance is taken off: only what lies beyond it raises the sigma of the whole.
+    let beyond = |value: f64| (value.powi(2) - fused.formal.powi(2)).max(0.0).sqrt();
+    let sigma = own.hypot(beyond(fused.sigma)).max(beyond(apart));
     let which = format!("{} windows of the sequence", estimates.len());
-    raise(outcome, own.max(fused.sigma).max(apart), &fused, &which, &problem.calibration_options.grades);
+    raise(outcome, sigma, &fused, &which, &problem.calibration_options.grades);
     Ok(())
 }
 
@@ -74,17 +78,8 @@ fn estimates(
 fn moved_alone(problem: &Problem, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
     let extract = calibrate::core(problem, model, views, OF_VIEW);
     let (metric, _) = extract.block();
-    let (cameras, points) = calibrate::projective(&metric);
-    let to_calibrate = calibration::Uncalibrated {
-        cameras: &cameras,
-        points: &points,
-        observations: &extract.observations,
-        noise: model.noise,
-        group_of: &metric.group_of,
-        focal_priors: &[None],
-        focal_per_view: metric.has_own_focals(),
-        options: &problem.calibration_options,
-    };
+    let projective = Projective::of(&metric);
+    let to_calibrate = projective.uncalibrated(problem, &metric, &extract.observations, &[None], model.noise);
     let prior = adjust::intrinsics_prior(problem, camera, model.noise);
     let (log_focal, sigma) = calibration::focal_alone(&to_calibrate, &metric, &prior, problem.stop)?;
     Some(Estimate { log_focal: log_focal - metric.log_focal(), sigma })

@@ -77,8 +77,7 @@ fn a_distorting_lens_is_estimated_and_everything_reprojects_through_it() {
 #[test]
 fn tracks_that_a_lens_brings_in_are_no_second_structure() {
     for seed in [11, 13] {
-        let options =
-            SceneOptions { noise: 0.0005, outliers: 0.0, radial_k1: -0.3, seed, ..SceneOptions::default() };
+        let options = SceneOptions { noise: 0.0005, outliers: 0.0, radial_k1: -0.3, seed, ..SceneOptions::default() };
         let solution = solved(&scene(options).0, &SolveSettings::default());
         println!("seed {seed}: {} inliers, {:?}", solution.inlier_track_count(), solution.warnings);
         assert_eq!(solution.inlier_track_count(), 200, "seed {seed}");

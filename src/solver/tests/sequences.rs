@@ -49,6 +49,27 @@ fn every_view_is_registered_and_every_observation_judged() {
     }
 }
 
+/// What all views say of one focal length counts, not what a stretch of them says.
+#[test]
+fn the_focal_length_of_a_longer_sequence_is_known_better() {
+    let [mut short, mut long] = [0.0, 0.0];
+    for seed in 0..2 {
+        for (views, sum) in [(40, &mut short), (120, &mut long)] {
+            let options =
+                SequenceOptions { views, tracks: 20 * views, lifetime: (3, 10), seed, ..SequenceOptions::default() };
+            let sequence = Sequence::generate(&options).expect("valid");
+            let solution = solved(&input_of(&sequence), &SolveSettings { seed, ..SolveSettings::default() });
+            let sigma = solution.calibrations[0].sigma_log_focal.expect("observable");
+            let error = (solution.calibrations[0].focal_px / sequence.truth.focal_px).ln().abs();
+            println!("seed {seed}, {views} views: off by {error:.5} at {sigma:.5}, {:?}", solution.warnings);
+            assert!(error < 3.5 * sigma, "seed {seed}, {views} views");
+            *sum += sigma;
+        }
+    }
+    // Three times the views: the square root of a third, were they as good.
+    assert!(long < 0.8 * short, "{long} for {short}");
+}
+
 /// Progress follows the calibration and what it verifies, not the block that the sequence grew from.
 #[test]
 fn the_last_progress_has_the_focal_length_of_the_solution() {

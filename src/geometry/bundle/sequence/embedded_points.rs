@@ -28,13 +28,13 @@ pub(super) fn iterate_points(
     loss: Loss,
     pool: &WorkerPool,
 ) -> Option<f64> {
-    let settled = pool.of_points(layout, |point| {
+    let iterated = pool.of_points(layout, |point| {
         let (seen, position) = (layout.seen(point), sequence.points[point]);
         let moves = !seen.is_empty() && layout.free_points[point];
-        Some(if moves { settle(sequence, seen, position, loss) } else { (position, 0.0) })
+        Some(if moves { iterate(sequence, seen, position, loss) } else { (position, 0.0) })
     })?;
     let mut lowered = 0.0;
-    for (slot, (position, by)) in sequence.points.iter_mut().zip(settled) {
+    for (slot, (position, by)) in sequence.points.iter_mut().zip(iterated) {
         *slot = position;
         lowered += by;
     }
@@ -42,7 +42,7 @@ pub(super) fn iterate_points(
 }
 
 /// A point nearer its minimum, and by how much it costs less there.
-fn settle(sequence: &Reconstruction, seen: &[Seen], mut position: Vector3<f64>, loss: Loss) -> (Vector3<f64>, f64) {
+fn iterate(sequence: &Reconstruction, seen: &[Seen], mut position: Vector3<f64>, loss: Loss) -> (Vector3<f64>, f64) {
     let initial_cost = cost_of_point(sequence, seen, &position, loss);
     let mut cost = initial_cost;
     for _ in 0..STEPS {

@@ -157,8 +157,8 @@ impl Layout {
         layout.link_blocks(sequence, cancellation).then_some(layout)
     }
 
-    /// Finds the blocks that each free point incident_blocks and gives them their places among the couplings; `false`
-    /// when it was stopped.
+    /// Finds the blocks that each free point is linked with and gives them their places among the couplings; `false` when
+    /// it was stopped.
     fn link_blocks(&mut self, sequence: &Reconstruction, cancellation: &mut CancellationCheck) -> bool {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
@@ -218,6 +218,11 @@ impl Layout {
         &self.incident_blocks[self.incident_block_starts[point]..self.incident_block_starts[point + 1]]
     }
 
+    /// Whether a point is linked with any block.
+    pub fn is_coupled(&self, point: usize) -> bool {
+        !self.incident_blocks(point).is_empty()
+    }
+
     /// Where the couplings of a point are.
     pub fn couplings(&self, point: usize) -> Range<usize> {
         self.coupling_starts[point]..self.coupling_starts[point + 1]
@@ -235,7 +240,7 @@ impl Layout {
 
     /// Share of all pairs of an unknown and a point with any that are coupled; not a number where there are none.
     pub fn coupled_share(&self) -> f64 {
-        let points = (0..self.point_count()).filter(|point| !self.couplings(*point).is_empty()).count();
+        let points = (0..self.point_count()).filter(|point| self.is_coupled(*point)).count();
         self.coupling_count() as f64 / (POINT * self.unknowns.count() * points) as f64
     }
 

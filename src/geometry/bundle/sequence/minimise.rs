@@ -20,10 +20,10 @@ use crate::geometry::levenberg_marquardt::{self, Attempt, Problem};
 /// with more.
 const MIN_DAMPING: f64 = 1e-14;
 
-/// Factor by which a step may raise the cost for its points to be settled. A chain of 100 views bent by half a radian
-/// takes 14 steps with 2, 9 with 10; but from a start with cameras a quarter of the depth away, points settle into
+/// Factor by which a step may raise the cost for its points to be iterated. A chain of 100 views bent by half a radian
+/// takes 14 steps with 2, 9 with 10; but from a start with cameras a quarter of the depth away, points end in
 /// false places with 10 and do not with 2.
-const SETTLE_WITHIN: f64 = 2.0;
+const ITERATE_WITHIN: f64 = 2.0;
 
 /// Minimises the reprojection error over what is free.
 ///
@@ -178,12 +178,12 @@ impl Problem for Descent<'_> {
         let moved = self.step(from, damping, to).map(|predicted| Attempt { cost: self.cost(to), predicted });
         (self.heartbeat)();
         let Attempt { cost, predicted } = moved?;
-        if cost < present || cost > SETTLE_WITHIN * present {
+        if cost < present || cost > ITERATE_WITHIN * present {
             return Some(Attempt { cost, predicted });
         }
         // Cheaper than another system: most of what a long step spoils is the points' part of its curvature.
-        let settled = iterate_points(to, self.layout, self.loss, self.pool)?;
-        Some(Attempt { cost: cost - settled, predicted })
+        let lowered = iterate_points(to, self.layout, self.loss, self.pool)?;
+        Some(Attempt { cost: cost - lowered, predicted })
     }
 }
 

@@ -2,8 +2,9 @@
 //! own where they have these: cost and memory linear in the observations, by a sparse Cholesky factorisation of the
 //! Schur complement of the points (Triggs et al. 2000, "Bundle adjustment - a modern synthesis", section 6).
 //!
-//! Shares residuals, loss and damping with the dense adjustment of one block, `bundle::metric`. May depend on nothing
-//! of `geometry` but `bundle` and linear algebra.
+//! Serves every metric reconstruction: a small system, and one that most views share, is a square matrix whose points
+//! are eliminated many at a time. May depend on nothing of `geometry` but `bundle` and `levenberg_marquardt`, and on
+//! linear algebra.
 
 mod embedded_points;
 mod layout;
@@ -19,6 +20,7 @@ mod tests;
 mod worker_pool;
 
 pub use self::minimise::adjust;
+pub(super) use self::reduced::GAUGE_DAMPING;
 pub use self::system::System;
 use super::Observation;
 use super::metric::{IntrinsicsModel, Reconstruction};

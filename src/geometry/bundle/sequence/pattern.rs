@@ -4,16 +4,16 @@ use super::super::panel::PANEL_SHARE;
 use super::CancellationCheck;
 use super::layout::{Layout, Unknowns};
 
-/// Unknowns up to which no block counts as zero, about forty views: a dense factorisation of these needs no analysis.
-const DENSE_LIMIT: usize = 256;
-/// The same where most blocks are not zero: 72 MB.
-const FULL_LIMIT: usize = 3_000;
+/// Unknowns up to which a system is a square matrix, about forty views: its dense factorisation needs no analysis.
+const SQUARE_LIMIT: usize = 256;
+/// The same of a system of which [`PANEL_SHARE`] is coupled: 72 MB each for the values and for those that are left.
+const SQUARE_LIMIT_OF_COUPLED: usize = 3_000;
 
 /// The lower triangle of a symmetric matrix of blocks, by block columns.
 ///
 /// The blocks of one column are a dense panel, column-major, the diagonal block (held in full) on top: the values are
-/// those of a compressed sparse column matrix whose row indices are the same all over a panel. Of a small system they
-/// are those of a square matrix.
+/// those of a compressed sparse column matrix whose row indices are the same all over a panel. Of a system that is
+/// small, or coupled as a whole, they are those of a square matrix.
 #[derive(Debug)]
 pub(super) struct Pattern {
     /// Whether the values are those of a square matrix, column-major, of which only the lower triangle counts.
@@ -40,8 +40,8 @@ pub(super) struct Place {
 }
 
 impl Pattern {
-    /// Blocks that a point links, and the pose of every view with the intrinsics of its group; all where they are few.
-    /// `None` when it was stopped.
+    /// Blocks that a point links, and the pose of every view with the intrinsics of its group; all, in a square matrix,
+    /// where they are few or most are linked. `None` when it was stopped.
     ///
     /// * `pairs`: pose block and group block of the views where both are free
     pub fn new(
@@ -49,11 +49,20 @@ impl Pattern {
         pairs: impl Iterator<Item = (usize, usize)>,
         cancellation: &mut CancellationCheck,
     ) -> Option<Self> {
-        let blocks = layout.unknowns.block_count();
-        let limit = if layout.coupled_share() >= PANEL_SHARE { FULL_LIMIT } else { DENSE_LIMIT };
+        let limit = if layout.coupled_share() >= PANEL_SHARE { SQUARE_LIMIT_OF_COUPLED } else { SQUARE_LIMIT };
         if layout.unknowns.count() <= limit {
             return Some(Self::square(&layout.unknowns));
         }
+        Self::sparse(layout, pairs, cancellation)
+    }
+
+    /// Without the blocks that are zero; `None` when it was stopped.
+    pub fn sparse(
+        layout: &Layout,
+        pairs: impl Iterator<Item = (usize, usize)>,
+        cancellation: &mut CancellationCheck,
+    ) -> Option<Self> {
+        let blocks = layout.unknowns.block_count();
         let mut group_of = vec![None; blocks];
         pairs.for_each(|(pose, group)| group_of[pose] = Some(group));
         let (starts, points) = layout.points_by_block();
@@ -143,7 +152,7 @@ impl Pattern {
         self.strides[column]
     }
 
-    /// Where panel and list of rows of a block column start.
+    /// A block column, whose rows can be looked up.
     pub fn column(&self, column: usize) -> Column<'_> {
         let range = self.column_starts[column]..self.column_starts[column + 1];
         Column {

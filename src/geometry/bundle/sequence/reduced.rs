@@ -19,7 +19,7 @@ use crate::simd::vectorised;
 /// Damping beside Marquardt's, as a share of the diagonal: holds the gauge (seven directions for every set of views
 /// that no point connects with another). Rounding leaves some 1e-15 of the diagonal in these directions; the weakest
 /// real ones, the bending of long chains of views, have about the inverse fourth power of their number.
-const GAUGE_DAMPING: f64 = 1e-13;
+pub(in super::super) const GAUGE_DAMPING: f64 = 1e-13;
 
 /// The reduced system and the scratch to build and solve it, reused from step to step.
 pub(super) struct Reduced {
@@ -33,10 +33,10 @@ pub(super) struct Reduced {
     /// Couplings of a batch of points, each times the inverse root of its point's block: one point's after the other,
     /// or the columns of a panel.
     whitened: Vec<f64>,
-    /// Whether points are eliminated by panels, as columns over all unknowns.
-    by_panels: bool,
     /// Gradients of these points, whitened the same way.
     whitened_gradients: Vec<Vector3<f64>>,
+    /// Whether points are eliminated by panels, as columns over all unknowns.
+    pub by_panels: bool,
 }
 
 /// Some points of a batch, to be whitened.
@@ -69,7 +69,7 @@ impl Reduced {
     /// Eliminates the points; `false` when a point's block cannot be factored, or it was stopped.
     ///
     /// Batch by batch: first the points are whitened, each by itself, then every block column takes from them what they
-    /// subtract from it, in their order.
+    /// subtract from it, in their order; by panels, one product does.
     pub fn build(&mut self, layout: &Layout, normal: &Normal, damping: f64, pool: &WorkerPool) -> bool {
         self.values.copy_from_slice(&normal.cameras.values);
         for (slot, gradient) in self.vector.iter_mut().zip(&normal.cameras.gradient) {
@@ -79,10 +79,7 @@ impl Reduced {
         pool.batches().all(|points| {
             self.whiten(layout, normal, damping, pool, points.clone())
                 && match self.by_panels {
-                    true => {
-                        self.subtract_panel(points);
-                        true
-                    }
+                    true => self.subtract_panel(layout, points, pool.cancellation()),
                     false => self.subtract(layout, pool, points, &mut begun),
                 }
         })
@@ -96,9 +93,9 @@ impl Reduced {
         pool: &WorkerPool,
         points: Range<usize>,
     ) -> bool {
-        let (by_panels, column) = (self.by_panels, self.pattern.dimension());
+        let (by_panels, rows) = (self.by_panels, self.pattern.dimension());
         let length = |points: Range<usize>| match by_panels {
-            true => POINT * column * points.len(),
+            true => POINT * rows * points.filter(|point| layout.is_coupled(*point)).count(),
             false => layout.couplings_of(points).len(),
         };
         // What is left from another batch is written over before it is read.
@@ -121,15 +118,21 @@ impl Reduced {
         })
     }
 
-    /// Takes from the system what the points of a batch subtract, as columns of a panel.
-    fn subtract_panel(&mut self, points: Range<usize>) {
+    /// Takes from the system what the points of a batch subtract, as columns of a panel; `false` when it was stopped.
+    fn subtract_panel(&mut self, layout: &Layout, points: Range<usize>, mut cancellation: CancellationCheck) -> bool {
         let rows = self.pattern.dimension();
-        let whitened = &self.whitened[..POINT * rows * points.len()];
+        let first = points.start;
+        let coupled: Vec<usize> = points.filter(|point| layout.is_coupled(*point)).map(|point| point - first).collect();
+        if !cancellation.may_go_on(1) {
+            return false;
+        }
+        let whitened = &self.whitened[..POINT * rows * coupled.len()];
         panel::subtract(whitened, rows, &mut self.values, rows);
-        let gradients = self.whitened_gradients[..points.len()].iter().flat_map(|gradient| gradient.iter());
+        let gradients = coupled.iter().flat_map(|point| self.whitened_gradients[*point].iter());
         for (column, gradient) in whitened.chunks_exact(rows.max(1)).zip(gradients) {
             self.vector.iter_mut().zip(column).for_each(|(slot, value)| *slot += value * gradient);
         }
+        true
     }
 
     /// * `begun`: how far the list of every block's points is worked off
@@ -198,6 +201,9 @@ impl Points<'_> {
         let mut whitened = self.whitened;
         for (point, whitened_gradient) in self.range.zip(self.whitened_gradients) {
             let incident_blocks = layout.incident_blocks(point);
+            if incident_blocks.is_empty() {
+                continue;
+            }
             let couplings = &normal.couplings[layout.couplings(point)];
             let whitened = match by_panels {
                 true => split_off(&mut whitened, POINT * pattern.dimension()),
@@ -205,10 +211,6 @@ impl Points<'_> {
             };
             if by_panels {
                 whitened.fill(0.0);
-                *whitened_gradient = Vector3::zeros();
-            }
-            if incident_blocks.is_empty() {
-                continue;
             }
             if !cancellation.may_go_on(incident_blocks.len()) {
                 return false;

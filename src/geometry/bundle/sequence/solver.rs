@@ -1,9 +1,9 @@
-//! Cholesky factorisation of a system with a block pattern: dense where it is small, else sparse.
+//! Cholesky factorisation of a system with a block pattern: dense where that is a square matrix, else sparse.
 
 use faer::dyn_stack::{MemBuffer, MemStack, StackReq};
 use faer::perm::Perm;
 use faer::sparse::linalg::amd;
-use faer::sparse::linalg::cholesky::{LltRef, SymbolicCholesky, SymmetricOrdering, factorize_symbolic_cholesky};
+use faer::sparse::linalg::cholesky::{SymbolicCholesky, SymmetricOrdering, factorize_symbolic_cholesky};
 use faer::sparse::{SparseColMatRef, SymbolicSparseColMat, SymbolicSparseColMatRef};
 use faer::{Conj, MatMut, Par, Side};
 
@@ -12,7 +12,7 @@ use super::pattern::Pattern;
 
 /// Solves systems of one pattern.
 pub(super) enum Solver {
-    Dense { solver: CholeskySolver },
+    Dense(CholeskySolver),
     Sparse(Box<SparseCholesky>),
 }
 
@@ -20,7 +20,7 @@ impl Solver {
     /// `None` when the analysis runs out of memory.
     pub fn new(pattern: &Pattern) -> Option<Self> {
         if pattern.is_square {
-            return Some(Self::Dense { solver: CholeskySolver::new(pattern.dimension()) });
+            return Some(Self::Dense(CholeskySolver::new(pattern.dimension())));
         }
         SparseCholesky::new(pattern).map(|cholesky| Self::Sparse(Box::new(cholesky)))
     }
@@ -30,13 +30,8 @@ impl Solver {
     /// * `values`: in the order of the pattern; overwritten where that is square
     pub fn solve(&mut self, values: &mut [f64], vector: &mut [f64]) -> bool {
         match self {
-            Self::Dense { solver } => solver.solve(values, vector),
-            Self::Sparse(cholesky) => {
-                cholesky.factor(values) && {
-                    cholesky.solve(vector);
-                    true
-                }
-            }
+            Self::Dense(solver) => solver.solve(values, vector),
+            Self::Sparse(cholesky) => cholesky.solve(values, vector),
         }
     }
 }
@@ -70,20 +65,18 @@ impl SparseCholesky {
         Some(Self { factor: vec![0.0; symbolic.len_val()], structure, symbolic, memory })
     }
 
-    /// Factors the matrix with these values; `false` when it is not positive definite.
-    pub fn factor(&mut self, values: &[f64]) -> bool {
+    /// Factors the matrix with these values and solves in place of `vector`; `false` when it is not positive definite.
+    pub fn solve(&mut self, values: &[f64], vector: &mut [f64]) -> bool {
         let stack = MemStack::new(&mut self.memory);
         let matrix = SparseColMatRef::new(self.structure.as_ref(), values);
-        let factor = &mut self.factor;
         let (par, regularisation, parameters) = (Par::Seq, Default::default(), Default::default());
-        self.symbolic.factorize_numeric_llt(factor, matrix, Side::Lower, regularisation, par, stack, parameters).is_ok()
-    }
-
-    /// Solves in place with the latest factor.
-    pub fn solve(&mut self, vector: &mut [f64]) {
-        let factor = LltRef::new(&self.symbolic, &self.factor);
+        let factor = &mut self.factor;
+        let factored =
+            self.symbolic.factorize_numeric_llt(factor, matrix, Side::Lower, regularisation, par, stack, parameters);
+        let Ok(factor) = factored else { return false };
         let vector = MatMut::from_column_major_slice_mut(vector, self.structure.nrows(), 1);
-        factor.solve_in_place_with_conj(Conj::No, vector, Par::Seq, MemStack::new(&mut self.memory));
+        factor.solve_in_place_with_conj(Conj::No, vector, par, MemStack::new(&mut self.memory));
+        true
     }
 }
 

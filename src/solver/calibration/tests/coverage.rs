@@ -159,7 +159,7 @@ fn calibrated_from_truth(scene: &TestScene) -> Outcome {
     let cameras = scene.cameras();
     let problem = of_one_lens(&cameras, &points_in_space, &scene.observations, STRANGE_NOISE);
     let metric = Reconstruction::new(intrinsics, poses, points);
-    only(from_metric(&problem, &metric, SIDE_PX, &StopToken::default(), &mut || ()))
+    only(from_metric(&problem, &metric, None, SIDE_PX, &StopToken::default(), &mut || ()))
 }
 
 /// The sigmas of the other intrinsics against their errors, over 100 scenes.

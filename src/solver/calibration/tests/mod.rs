@@ -6,8 +6,8 @@ mod models;
 mod view_focals;
 
 use super::*;
+use crate::domain::StopReason;
 use crate::geometry::bundle::testing::{self, Motion, NOISE, TestScene};
-use crate::geometry::daq::{self, Daq};
 use crate::geometry::observation::Observation;
 
 const SIDE_PX: f64 = 1000.0;
@@ -68,7 +68,7 @@ fn calibrated_knowing(scene: &TestScene, seed: u64, noise: f64, focal_prior: Opt
 }
 
 /// The outcome of the only camera group.
-fn only(outcomes: Result<Vec<Outcome>, Stopped>) -> Outcome {
+fn only(outcomes: Result<Vec<Outcome>, Error>) -> Outcome {
     let mut outcomes = outcomes.expect("nothing stops it");
     assert_eq!(outcomes.len(), 1);
     outcomes.remove(0)
@@ -101,7 +101,6 @@ fn general_motion_is_calibrated() {
             begun.elapsed()
         );
         assert_ne!(outcome.grade, Grade::ProjectiveOnly, "seed {seed}");
-        assert_eq!(outcome.cheirality, 1.0, "seed {seed}");
         assert!(error < 5.0 * outcome.sigma_log_focal.expect("observable"), "seed {seed}");
         errors.push(error);
     }
@@ -182,19 +181,6 @@ fn three_views_are_graded_honestly() {
 }
 
 #[test]
-fn the_plane_at_infinity_fits_the_callers_frame() {
-    let scene = testing::scene(3, 10, 30, 1e-5);
-    let (cameras, points) = projective_problem(&scene, 3);
-    let problem = of_one_lens(&cameras, &points, &scene.observations, 1e-5);
-    let outcome = only(calibrate(&problem, SIDE_PX, &StopToken::default()));
-    let plane = outcome.plane_at_infinity.expect("a plane");
-    let frame = to_canonical_frame(&cameras, &[]).expect("rank 3");
-    let intrinsics = outcome.intrinsics().expect("a metric reconstruction");
-    let residual = daq::residual(&frame.cameras, &Daq { intrinsics, plane_at_infinity: plane });
-    assert!(residual < 1e-5, "{residual}");
-}
-
-#[test]
 fn many_points_are_all_adjusted() {
     let scene = testing::scene(2, 8, 400, NOISE);
     let outcome = calibrated(&scene, 2, NOISE);
@@ -235,5 +221,5 @@ fn a_stopped_token_ends_it() {
     let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);
-    assert_eq!(calibrate(&problem, SIDE_PX, &stop).map(|_| ()), Err(Stopped(StopReason::Cancelled)));
+    assert_eq!(calibrate(&problem, SIDE_PX, &stop).map(|_| ()), Err(Error::Stopped(StopReason::Cancelled)));
 }

@@ -19,8 +19,9 @@ use crate::domain::StopToken;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::procrustes::{generalised, mean_position};
-use crate::geometry::statistics::{DEVIATION_PER_MEDIAN, chi_square_gate, ln_choose, median};
+use crate::geometry::statistics::{DEVIATION_PER_MEDIAN, chi_square_gate, median};
 use crate::geometry::{Camera, Point};
+use crate::solver::a_contrario::ln_false_alarms_of;
 
 /// Standard deviation of a distance over the views, in units of the noise times the depth, below which a pair is
 /// rigid: a distance has the noise of two points in up to three coordinates, and the grid adds to it.
@@ -106,10 +107,7 @@ impl Rigid {
     pub fn ln_false_alarms(&self, spread: f64) -> f64 {
         let (tracks, inliers, constraints) = (self.inlier.len(), self.inlier_count(), self.constraints());
         let Some(rms) = self.noise() else { return f64::INFINITY };
-        let rms = rms.max(f64::MIN_POSITIVE);
-        ln_choose(tracks, inliers)
-            + (tracks as f64).ln()
-            + 0.5 * constraints * (1.0 + 2.0 * (rms / spread).ln()).min(0.0)
+        ln_false_alarms_of(tracks, inliers, constraints, rms, spread)
     }
 }
 

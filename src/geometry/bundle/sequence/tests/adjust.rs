@@ -3,41 +3,8 @@
 use super::super::worker_pool::BATCH;
 use super::*;
 use crate::geometry::bundle::Loss;
-use crate::geometry::bundle::metric::{self, Extension, Parameter};
+use crate::geometry::bundle::metric::{Extension, Parameter};
 use crate::geometry::bundle::testing::{self, NOISE};
-
-/// Small systems go dense, large ones sparse: both end where the adjustment of one block does.
-#[test]
-fn one_group_ends_where_a_block_does() {
-    for (seed, views, tracks) in [(1, 8, 40), (2, 10, 60), (3, 48, 30)] {
-        let scene = testing::scene(seed, views, tracks, NOISE);
-        let (truth, observations) = sequence_of(&scene);
-        let start = perturbed(&truth, 0.01, seed);
-        let model = IntrinsicsModel::FOCAL.with(Extension::RadialK1);
-        let prior = IntrinsicsPrior::NONE.knowing(Parameter::RadialK1, 0.0, 0.05, NOISE);
-        for options in [thorough(), Options { loss: Loss::Cauchy { scale: NOISE }, ..thorough() }] {
-            let mut block = Reconstruction::new(start.intrinsics[0], start.poses.clone(), start.points.clone());
-            let stop = StopToken::default();
-            let dense = metric::adjust(&mut block, &scene.observations, model, &[prior], &options, &stop);
-            let mut sequence = start.clone();
-            let sparse = adjust(
-                &mut sequence,
-                &observations,
-                &Free::all(&[model]),
-                &[prior],
-                &options,
-                quiet(&stop, &mut || ()),
-            );
-            println!("seed {seed}, {views} views: {dense:?}, {sparse:?}");
-            assert!((sparse.initial_cost / dense.initial_cost - 1.0).abs() < 1e-12, "seed {seed}");
-            assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
-            for parameter in [Parameter::LogFocal, Parameter::RadialK1] {
-                let error = sequence.intrinsics[0].value(parameter) - block.intrinsics[0].value(parameter);
-                assert!(error.abs() < 1e-5, "seed {seed}: {parameter:?} off by {error}");
-            }
-        }
-    }
-}
 
 #[test]
 fn two_groups_are_recovered() {
@@ -57,28 +24,6 @@ fn two_groups_are_recovered() {
                 let error = found.value(parameter) - expected.value(parameter);
                 assert!(error.abs() < 1e-6, "seed {seed}: {parameter:?} off by {error}");
             }
-        }
-    }
-}
-
-#[test]
-fn focal_lengths_a_view_behind_one_lens_end_where_those_of_a_block_do() {
-    for seed in 0..3 {
-        let scene = testing::scene(seed, 12, 40, NOISE);
-        for model in [IntrinsicsModel::FOCAL_PER_VIEW, IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1)] {
-            let mut block = reconstruction_of(&scene).with_own_focals();
-            let mut start = block.clone();
-            let (_, observations) = sequence_of(&scene);
-            let (prior, stop) = (IntrinsicsPrior::NONE, StopToken::default());
-            let dense = metric::adjust(&mut block, &scene.observations, model, &[prior], &thorough(), &stop);
-            let sparse = adjusted(&mut start, &observations, &[model], &thorough());
-            println!("seed {seed}, {}: {dense:?} {sparse:?}", model.name());
-            assert!((sparse.cost / dense.cost - 1.0).abs() < 1e-8, "seed {seed}: {sparse:?} {dense:?}");
-            for (found, expected) in start.focals.iter().zip(&block.focals) {
-                assert!((found / expected - 1.0).abs() < 1e-5, "seed {seed}: {found} {expected}");
-            }
-            assert!((start.intrinsics[0].focal / block.intrinsics[0].focal - 1.0).abs() < 1e-5, "seed {seed}");
-            assert!((start.intrinsics[0].radial[0] - block.intrinsics[0].radial[0]).abs() < 1e-5, "seed {seed}");
         }
     }
 }
@@ -231,5 +176,21 @@ fn threads_change_nothing_to_the_last_bit() {
     assert!(alone.1.iterations == 4 && alone.2 >= 4 && alone.1.cost < 0.5 * alone.1.initial_cost, "{:?}", alone.1);
     for threads in [2, 3, 7] {
         assert!(on(threads) == alone, "{threads} threads");
+    }
+}
+
+/// Of a system that is sparse, and of one that is eliminated by panels.
+#[test]
+fn threads_change_nothing_to_other_systems_either() {
+    for (truth, observations) in [chain(6, 60, 60, 5, 0.002), sequence_of(&testing::scene(5, 10, 1_000, NOISE))] {
+        assert!(observations.len() > BATCH / 2, "{} are too few for a second thread", observations.len());
+        let on = |threads: usize| {
+            let (mut start, stop) = (perturbed(&truth, 0.003, 5), StopToken::default());
+            let run = Run { threads: Threads::new(threads), stop: &stop, heartbeat: &mut || () };
+            let options = Options { max_iterations: 3, ..Options::default() };
+            let report = adjust(&mut start, &observations, &Free::all(&[IntrinsicsModel::FOCAL]), &[], &options, run);
+            (start, report)
+        };
+        assert!(on(3) == on(1));
     }
 }

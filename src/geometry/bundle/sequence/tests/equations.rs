@@ -6,6 +6,8 @@ use super::super::CancellationCheck;
 use super::super::layout::Layout;
 use super::super::minimise::{pattern, retract};
 use super::super::normal::Normal;
+use super::super::pattern::Pattern;
+use super::super::reduced::Reduced;
 use super::super::worker_pool::BATCH;
 use super::super::worker_pool::WorkerPool;
 use super::*;
@@ -83,6 +85,48 @@ fn normal_equations_agree_with_finite_differences() {
     models[2] = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1);
     observe(&sequence, &mut observations, 0.003, 1);
     compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 2 + 9 + 1, "two more unknowns of views");
+    models[2] = IntrinsicsModel::FOCAL_PER_VIEW.with_all_extensions();
+    compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 2 + 9 + 8, "all that a lens has");
+}
+
+/// Sparse, square and pair by pair, and by panels.
+#[test]
+fn every_layout_of_the_system_is_the_same_system() {
+    let scene = crate::geometry::bundle::testing::scene(1, 6, 200, 0.003);
+    let (sequence, mut observations) = sequence_of(&scene);
+    observations.retain(|seen| (seen.point + seen.view) % 7 != 0 && seen.point != 5);
+    observations.push(observations[0]);
+    let stop = StopToken::default();
+    let mut cancellation = CancellationCheck::new(&stop);
+    let models = [IntrinsicsModel::FOCAL];
+    let layout = Layout::new(&sequence, &observations, &Free::all(&models), &mut cancellation).expect("goes on");
+    let pool = WorkerPool::new(&layout, Threads::ONE, &stop);
+    let pairs = || (0..6).map(|view| (view, 6));
+    let mut built = Vec::new();
+    for by_panels in [None, Some(false), Some(true)] {
+        let pattern = match by_panels {
+            None => Pattern::sparse(&layout, pairs(), &mut cancellation),
+            Some(_) => Pattern::new(&layout, pairs(), &mut cancellation),
+        };
+        let pattern = pattern.expect("goes on");
+        assert_eq!(pattern.is_square, by_panels.is_some());
+        let mut normal = Normal::new(&layout, &pattern, &sequence);
+        assert!(normal.fill(&sequence, &layout, &[], Loss::Squared, &pool));
+        let mut reduced = Reduced::new(&layout, pattern);
+        reduced.by_panels = by_panels == Some(true);
+        assert!(reduced.build(&layout, &normal, 1e-3, &pool));
+        let mut matrix = DMatrix::zeros(37, 37);
+        reduced.pattern.for_each(|row, column, index| {
+            if row >= column {
+                matrix[(row, column)] = reduced.values[index];
+            }
+        });
+        built.push((matrix, DVector::from_column_slice(&reduced.vector)));
+    }
+    for (matrix, vector) in &built[1..] {
+        assert!((matrix - &built[0].0).amax() < 1e-11 * built[0].0.amax());
+        assert!((vector - &built[0].1).amax() < 1e-11 * built[0].1.amax());
+    }
 }
 
 fn compare(
