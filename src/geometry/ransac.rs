@@ -47,7 +47,8 @@ pub(crate) trait Refinable<const N: usize>: Estimator {
     /// The model moved by a step; `None` where that is none.
     fn moved(&self, model: &Self::Model, step: &SVector<f64, N>) -> Option<Self::Model>;
 
-    /// Direction in which a model moves without changing any residual, which a refinement pins; zero where there is none.
+    /// Direction in which a model moves without changing any residual, which a refinement pins; zero where there is
+    /// none.
     fn gauge(&self, _model: &Self::Model) -> SVector<f64, N> {
         SVector::zeros()
     }

@@ -123,14 +123,15 @@ impl Extended {
     }
 
     /// Whether nothing is to be gained by extending without a calibration: most views hold together so precisely that
-    /// wrong observations do not. Of more views than projective cameras are fitted to, the residuals must be of one
-    /// kind, too: those of a street of 60 or 120 views that was bent to a wrong focal length were not.
+    /// wrong observations do not. Of more views than projective cameras are fitted to, the residuals under a
+    /// calibration must be of one kind, too: those of a street of 60 or 120 views that was bent to a wrong focal length
+    /// were not.
     pub fn is_settled(&self, problem: &Problem) -> bool {
         let is_precise = self.model.noise <= attempt::INITIAL_NOISE;
         // Windows that differ a little warn of a mismatch of a METRIC one too.
         is_precise
             && self.holds_most_views()
-            && !self.is_bent(problem)
+            && !(self.is_calibrated(problem) && self.is_bent(problem))
             && (self.fits() || self.grade(problem) == Grade::Metric)
     }
 

@@ -157,8 +157,8 @@ impl Layout {
         layout.link_blocks(sequence, cancellation).then_some(layout)
     }
 
-    /// Finds the blocks that each free point is linked with and gives them their places among the couplings; `false` when
-    /// it was stopped.
+    /// Finds the blocks that each free point is linked with and gives them their places among the couplings; `false`
+    /// when it was stopped.
     fn link_blocks(&mut self, sequence: &Reconstruction, cancellation: &mut CancellationCheck) -> bool {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
