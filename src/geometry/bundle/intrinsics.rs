@@ -12,8 +12,8 @@ const UNDISTORT_TOLERANCE: f64 = 4.0 * f64::EPSILON;
 /// Rounds in which tangential terms are taken away where the last round put the point: each leaves a share of some
 /// `p r` of the error, and a lens with more than a tenth of that is none.
 const TANGENTIAL_ROUNDS: usize = 20;
-/// Inverse of the squared radius of a fold below which there is none: a thousand focal lengths from the axis. Rounding
-/// leaves about 1e-8 of a root at zero.
+/// Inverse of the squared radius of a fold below which there is none: a thousand focal lengths from the axis, and above
+/// what rounding leaves of a root at zero.
 const LEAST_INVERSE_FOLD: f64 = 1e-6;
 /// Doublings of the radius after which one that is imaged so far out is not looked for any more.
 const WIDEST_DOUBLINGS: usize = 64;

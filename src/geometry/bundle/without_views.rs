@@ -13,7 +13,7 @@ use super::whitened::WhitenedViews;
 
 pub(super) const PARAMETERS: usize = Parameter::COUNT;
 /// Views up to which they are eliminated by eigenvectors, which tell what the observations do not say of them, in time
-/// cubic in the views: some 10 ms.
+/// cubic in the views: as many as projective cameras are fitted to.
 const BY_EIGENVECTORS: usize = 40;
 /// Part of a parameter's information, as the root of a share, that a direction of the poses may take and still count as
 /// apart from the intrinsics: what rounding leaves where the two have nothing to do with each other.

@@ -103,10 +103,10 @@ impl Minimum {
     }
 }
 
-/// Minima from a reconstruction that is metric already: its own, and those that other focal lengths lead to, which its
-/// poses and points have followed, for freed at once these would only go back to where they were; cheapest first.
+/// Minima from a reconstruction that is metric already, cheapest first: those that other focal lengths lead to, once its
+/// poses and points have followed, for freed at once these would only go back to where they were.
 ///
-/// * `factors`: on the focal length, to begin from
+/// * `factors`: on its focal length, to begin from; 1 for its own
 /// * `heartbeat`: called after each
 pub(super) fn minima_near(
     metric: &Reconstruction,

@@ -122,13 +122,13 @@ impl Reduced {
     fn subtract_panel(&mut self, layout: &Layout, points: Range<usize>, mut cancellation: CancellationCheck) -> bool {
         let rows = self.pattern.dimension();
         let first = points.start;
-        let coupled: Vec<usize> = points.filter(|point| layout.is_coupled(*point)).map(|point| point - first).collect();
+        let coupled = points.filter(|point| layout.is_coupled(*point)).map(|point| point - first);
         if !cancellation.may_go_on(1) {
             return false;
         }
-        let whitened = &self.whitened[..POINT * rows * coupled.len()];
+        let whitened = &self.whitened[..POINT * rows * coupled.clone().count()];
         panel::subtract(whitened, rows, &mut self.values, rows);
-        let gradients = coupled.iter().flat_map(|point| self.whitened_gradients[*point].iter());
+        let gradients = coupled.flat_map(|point| self.whitened_gradients[point].iter());
         for (column, gradient) in whitened.chunks_exact(rows.max(1)).zip(gradients) {
             self.vector.iter_mut().zip(column).for_each(|(slot, value)| *slot += value * gradient);
         }
