@@ -71,7 +71,7 @@ impl Reconstruction {
         let backs: Vec<Option<Matrix4<f64>>> =
             frames.iter().map(|frame| frame.filter(|_| !self.is_metric())?.try_inverse()).collect();
         let place = |point: &Point, track: usize, retained: &[Observation]| {
-            let back = backs[self.component_of_track[track] as usize];
+            let back = backs[self.geometry.component_of_track[track] as usize];
             dehomogenise(&back.map_or(*point, |back| back * point)).filter(|_| self.holds(retained))
         };
         let points: Vec<Option<[f64; 3]>> = judged
@@ -87,9 +87,9 @@ impl Reconstruction {
             point: place(&split.point, split.track, &split.retained),
         };
         let splits = judged.splits.iter().map(split).collect();
-        if self.component_of_view.iter().any(|&component| component > 0) {
+        if self.geometry.component_of_view.iter().any(|&component| component > 0) {
             let of_point = |(point, component): (&Option<_>, &u32)| point.map_or(0, |_: [f64; 3]| *component);
-            judged.tracks.part = points.iter().zip(&self.component_of_track).map(of_point).collect();
+            judged.tracks.part = points.iter().zip(&self.geometry.component_of_track).map(of_point).collect();
         }
         judged.tracks.point = points;
         judged.tracks.network_weight = network_weights(problem, seed);
@@ -105,7 +105,7 @@ impl Reconstruction {
             tracks: judged.tracks,
             observations: judged.observations,
             splits,
-            noise_px: Some(self.noise * problem.scale_px),
+            noise_px: Some(self.geometry.noise * problem.scale_px),
             reprojection_rms_px: rms,
             reprojection_mean_px: mean,
             ..nothing(problem, Some(seed), warnings, recorder)
@@ -121,7 +121,7 @@ impl Reconstruction {
         }
         let (group_of, groups) = camera_groups(problem.input);
         let mean = |views: &[usize]| {
-            let sum: f64 = views.iter().map(|&view| self.lenses[view].focal.ln()).sum();
+            let sum: f64 = views.iter().map(|&view| self.geometry.lenses[view].focal.ln()).sum();
             (sum / views.len().max(1) as f64).exp()
         };
         let determined: Vec<usize> = (0..self.poses.len()).filter(|&view| self.poses[view].is_some()).collect();
@@ -146,10 +146,12 @@ impl Reconstruction {
 
     /// For each component the homography that takes the pixel camera of its first view to `[I|0]`.
     fn frames(&self, problem: &Problem) -> Vec<Option<Matrix4<f64>>> {
-        let components = self.component_of_view.iter().copied().max().unwrap_or(0);
+        let components = self.geometry.component_of_view.iter().copied().max().unwrap_or(0);
         let first = |component: u32| {
-            (0..self.cameras.len()).find_map(|view| {
-                let camera = self.cameras[view].as_ref().filter(|_| self.component_of_view[view] == component)?;
+            (0..self.geometry.cameras.len()).find_map(|view| {
+                let camera = self.geometry.cameras[view]
+                    .as_ref()
+                    .filter(|_| self.geometry.component_of_view[view] == component)?;
                 let to_pixels = problem.normalization.to_pixels(view);
                 match &self.canonical {
                     Some(canonical) => Some(canonical * affine_frame(&to_pixels, &Camera::identity())?),
@@ -162,8 +164,10 @@ impl Reconstruction {
 
     fn views(&self, problem: &Problem, frames: &[Option<Matrix4<f64>>]) -> Vec<ViewResult> {
         let result = |view: usize| {
-            let frame = frames[self.component_of_view[view] as usize].as_ref();
-            let (Some(camera), Some(frame)) = (&self.cameras[view], frame) else { return ViewResult::default() };
+            let frame = frames[self.geometry.component_of_view[view] as usize].as_ref();
+            let (Some(camera), Some(frame)) = (&self.geometry.cameras[view], frame) else {
+                return ViewResult::default();
+            };
             let mut projection = problem.normalization.camera_px(view, camera) * frame;
             if self.canonical.is_some() {
                 projection = oriented(&projection);
@@ -175,12 +179,12 @@ impl Reconstruction {
                 rotation: pose
                     .map(|pose| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
                 translation: pose.map(|pose| pose.translation.into()),
-                focal_px: has_own_focal.then(|| self.lenses[view].focal * problem.scale_px),
-                part: self.component_of_view[view],
+                focal_px: has_own_focal.then(|| self.geometry.lenses[view].focal * problem.scale_px),
+                part: self.geometry.component_of_view[view],
                 ..ViewResult::default()
             }
         };
-        let mut views: Vec<ViewResult> = (0..self.cameras.len()).map(result).collect();
+        let mut views: Vec<ViewResult> = (0..self.geometry.cameras.len()).map(result).collect();
         self.left_out.iter().for_each(|(view, reason)| views[*view].left_out = Some(*reason));
         views
     }

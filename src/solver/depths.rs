@@ -17,7 +17,7 @@ use crate::geometry::bundle::metric::{
 };
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::observation::Observation;
-use crate::geometry::{Camera, triangulation};
+use crate::geometry::triangulation;
 
 /// Directions that no observation sees: a similarity's.
 const SIMILARITY: usize = 7;
@@ -180,7 +180,7 @@ pub fn weights(
 impl TrackWeights {
     /// Puts these in place of what image points alone say of the tracks.
     pub fn judge(&self, problem: &Problem, geometry: &Geometry, judged: &mut Judged) {
-        let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+        let cameras = geometry.all_cameras();
         for (&track, &weight) in self.tracks.iter().zip(&self.weights) {
             judged.tracks.weight[track] = weight as f32;
             let inlier = weight > 0.5;
@@ -188,9 +188,8 @@ impl TrackWeights {
                 continue;
             }
             judged.tracks.inlier[track] = inlier;
-            let registered = problem.of_track(track).filter(|&k| geometry.judges(track, problem.view_of(k)));
-            let seen: Vec<(usize, Observation)> =
-                registered.map(|k| (k, geometry.observation(problem.input, k))).collect();
+            let registered = geometry.of_track(problem, track).into_iter();
+            let seen: Vec<(usize, Observation)> = registered.map(|k| (k, geometry.observation(problem, k))).collect();
             let observations: Vec<Observation> = seen.iter().map(|(_, observation)| *observation).collect();
             let start = triangulation::linear(&cameras, &observations);
             let point = triangulation::refine(&cameras, &observations, start, POINT_STEPS).0;

@@ -47,7 +47,7 @@ pub struct Problem<'a> {
     /// Share of its observations in registered views that a right track retains: none where links may be wrong, so that
     /// a track holds several points, [`LEAST_RETAINED_SHARE`] where tracks are complete.
     pub least_share: f64,
-    /// Density of a wrong coordinate; see [`classification::Geometry::outlier_density`].
+    /// Density of a wrong coordinate: one over the width of the points' distribution, normalised units.
     pub outlier_density: f64,
     /// Thresholds of the calibration.
     pub calibration_options: CalibrationOptions,

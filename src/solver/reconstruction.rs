@@ -7,26 +7,19 @@ use super::baselines::Decided;
 use super::calibration::Outcome;
 use super::classification::{self, Geometry, Judged};
 use super::depths::STRONG_NOISE;
-use super::problem::{LEAST_RETAINED_SHARE, Problem, camera_groups};
+use super::problem::{Problem, camera_groups};
 use super::recorder::Recorder;
 use super::sequence::{Extended, verified};
 use crate::domain::result::TrackResults;
 use crate::domain::{Grade, LeftOut, Warning};
-use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, Pose, Reconstruction as Metric};
 use crate::geometry::daq::to_canonical_frame;
 
 /// A reconstruction in terms of the input's views and tracks.
 pub struct Reconstruction {
-    /// Normalised pinholes; `None`: not registered.
-    pub cameras: Vec<Option<Camera>>,
-    /// The lens of each view; empty: all are pinholes.
-    pub lenses: Vec<Intrinsics>,
+    pub geometry: Geometry,
     /// The pose of each view that has one to be reported.
     pub poses: Vec<Option<Pose>>,
-    /// The component of each view, and the one that each track is in: components have frames of their own.
-    pub component_of_view: Vec<u32>,
-    pub component_of_track: Vec<u32>,
     pub left_out: Vec<(usize, LeftOut)>,
     /// Homography into the canonical frame that projective cameras are reported in. `None` for metric cameras, whose
     /// plane at infinity is (0, 0, 0, 1) already.
@@ -36,10 +29,6 @@ pub struct Reconstruction {
     pub calibrated: Vec<(Option<Intrinsics>, Outcome)>,
     /// What is to be said of the calibrations.
     pub warnings: Vec<Warning>,
-    /// Core noise, one standard deviation of a coordinate, normalised units.
-    pub noise: f64,
-    /// Prior probability that a track is right.
-    pub inlier_share: f64,
 }
 
 impl Reconstruction {
@@ -72,78 +61,64 @@ impl Reconstruction {
                 poses[view] = Some(metric.poses[i]).filter(|_| own.is_none_or(|own| own.sigma_log.is_some()));
             }
         }
-        Some(Self {
+        let geometry = Geometry {
             cameras,
             lenses,
-            poses,
             component_of_view: vec![0; problem.views()],
             component_of_track: vec![0; problem.tracks()],
+            by_observation: attempt.judges_observations(),
+            // Estimated under projective cameras: metric ones fit worse by so much.
+            noise: projective.noise * metric.map_or(1.0, |_| outcome.rms_ratio.max(1.0)),
+            inlier_share: share(projective.tracks.len(), projective.tried),
+        };
+        Some(Self {
+            geometry,
+            poses,
             left_out: Vec::new(),
             canonical: metric.is_none().then(canonical),
             grade: outcome.grade,
             calibrated,
             warnings: named_warnings(problem, std::slice::from_ref(outcome)),
-            // Estimated under projective cameras: metric ones fit worse by so much.
-            noise: projective.noise * metric.map_or(1.0, |_| outcome.rms_ratio.max(1.0)),
-            inlier_share: share(projective.tracks.len(), projective.tried),
         })
     }
 
     pub fn of_extended(problem: &Problem, extended: &Extended) -> Self {
-        let Extended { model, calibrations, left_out, .. } = extended;
+        let Extended { seed, model, calibrations, left_out } = extended;
         let grade = extended.grade(problem);
         let is_reported = |view: &usize| grade != Grade::ProjectiveOnly && model.is_determined(*view);
-        let landmark = |track: usize| model.landmarks[track].as_ref();
+        let component = |track: usize| model.landmarks[track].as_ref().map_or(0, |point| point.component);
         let calibrated = calibrations.iter().enumerate().map(|(camera, outcome)| {
             let intrinsics = model.lenses[camera].intrinsics;
             (Some(intrinsics).filter(|_| grade != Grade::ProjectiveOnly), outcome.clone())
         });
-        Self {
+        let geometry = Geometry {
             cameras: model.cameras(problem),
             lenses: (0..problem.views()).map(|view| model.intrinsics_of(problem, view)).collect(),
-            poses: (0..problem.views()).map(|view| model.poses[view].filter(|_| is_reported(&view))).collect(),
             component_of_view: model.component_of.clone(),
-            component_of_track: (0..problem.tracks())
-                .map(|track| landmark(track).map_or(0, |point| point.component))
-                .collect(),
+            component_of_track: (0..problem.tracks()).map(component).collect(),
+            by_observation: seed.judges_observations(),
+            noise: model.noise,
+            inlier_share: share(verified(model).len(), problem.verifiable(|view| model.poses[view].is_some())),
+        };
+        Self {
+            geometry,
+            poses: (0..problem.views()).map(|view| model.poses[view].filter(|_| is_reported(&view))).collect(),
             left_out: left_out.clone(),
             canonical: None,
             grade,
             calibrated: calibrated.collect(),
             warnings: named_warnings(problem, calibrations),
-            noise: model.noise,
-            inlier_share: share(verified(model).len(), problem.verifiable(|view| model.poses[view].is_some())),
         }
     }
 
     /// Every track and observation judged by all registered views, or by what else the method goes by.
     pub fn judged(&self, problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Judged {
-        let by_points = seed.judges_observations();
-        let geometry = Geometry {
-            cameras: &self.cameras,
-            components: (&self.component_of_view, &self.component_of_track),
-            normalization: &problem.normalization,
-            lenses: &self.lenses,
-            weights: if by_points { &problem.weights } else { &[] },
-            linked: by_points,
-            least_share: if by_points { problem.least_share } else { LEAST_RETAINED_SHARE },
-            noise: self.noise,
-            outlier_density: problem.outlier_density,
-            inlier_share: self.inlier_share,
-        };
         let mut progress = |verdicts| recorder.judged(verdicts, problem.tracks());
-        let mut judged = classification::judge(
-            problem.input,
-            &problem.ranges,
-            &geometry,
-            problem.threads,
-            problem.stop,
-            &mut progress,
-        );
+        let mut judged = classification::judge(problem, &self.geometry, &mut progress);
         // Once wrong observations are left out, the noise may be too low for depths to add anything.
-        let depths_say_more = !by_points || self.noise > STRONG_NOISE;
+        let depths_say_more = !self.geometry.by_observation || self.geometry.noise > STRONG_NOISE;
         if let Some(weights) = seed.weights_by_depths.as_ref().filter(|_| depths_say_more) {
-            weights.judge(problem, &geometry, &mut judged);
+            weights.judge(problem, &self.geometry, &mut judged);
         }
         if let Some(decided) = &seed.decided {
             mask(problem, &seed.block.tracks, decided, &mut judged);

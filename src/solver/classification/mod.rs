@@ -9,63 +9,62 @@ mod track_classifier;
 
 pub use noise::{NoiseModel, outlier_density, working_gate};
 
+use crate::domain::Input;
 use crate::domain::result::{ObservationResults, TrackResults};
-use crate::domain::{Input, StopToken};
 use crate::geometry::bundle::metric::Intrinsics;
-use crate::geometry::measurement::Normalization;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::triangulation::batch::LANES;
 use crate::geometry::{Camera, Point};
-use crate::parallel::Threads;
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
+use crate::solver::problem::{LEAST_RETAINED_SHARE, Problem};
 use track_classifier::TrackClassifier;
 
-/// The geometry to judge by.
-pub struct Geometry<'a> {
-    /// Projective camera of every view of the input, normalised; `None`: not registered.
-    pub cameras: &'a [Option<Camera>],
-    /// The frame of each view, and the one that each track is judged in.
-    pub components: (&'a [u32], &'a [u32]),
-    pub normalization: &'a Normalization,
-    /// The lens of each view, whose distortion is undone before the cameras, pinholes, are asked; empty: all are
-    /// pinholes.
-    pub lenses: &'a [Intrinsics],
-    /// Weight of each observation; see [`Observation::weight`]. Empty: all have 1.
-    pub weights: &'a [f64],
-    /// Whether tracks were linked from view to view, so that one wrong link joins two points: the observations that
-    /// agree on one are looked for then, however few they are beside the others. The cameras must be metric, or
-    /// oriented with the plane at infinity off the points. Otherwise the worst observation is dropped as long as it is
-    /// too far from the point of the others.
-    pub linked: bool,
-    /// Share of its observations in registered views that a right track retains, see
-    /// [`least_share`](crate::solver::problem::Problem::least_share).
-    pub least_share: f64,
+/// The geometry to judge by, indexed by the input's views and tracks.
+pub struct Geometry {
+    /// Normalised pinhole of every view; `None`: not registered.
+    pub cameras: Vec<Option<Camera>>,
+    /// The lens of each view, whose distortion is undone before the cameras are asked; empty: all are pinholes.
+    pub lenses: Vec<Intrinsics>,
+    /// The component of each view, and the one that each track is in: components have frames of their own.
+    pub component_of_view: Vec<u32>,
+    pub component_of_track: Vec<u32>,
+    /// Whether single observations may be wrong, be it that one wrong link joins two points: those that agree on one
+    /// are looked for then, however few they are beside the others, and weigh by their sigmas. The cameras must be
+    /// metric, or oriented with the plane at infinity off the points. Otherwise the worst observation is dropped as long
+    /// as it is too far from the point of the others.
+    pub by_observation: bool,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
-    /// Density of a wrong coordinate: one over the width of the points' distribution, normalised units.
-    pub outlier_density: f64,
     /// Prior probability that a track is right.
     pub inlier_share: f64,
 }
 
-impl Geometry<'_> {
-    /// Whether a track is judged by what a view saw of it.
-    pub fn judges(&self, track: usize, view: usize) -> bool {
-        self.cameras[view].is_some() && self.components.0[view] == self.components.1[track]
+impl Geometry {
+    /// Of every view, for what wants a slice: nothing is observed in unregistered views.
+    pub fn all_cameras(&self) -> Vec<Camera> {
+        self.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect()
+    }
+
+    /// The observations of a track in the registered views of its component.
+    pub fn of_track(&self, problem: &Problem, track: usize) -> Vec<usize> {
+        let is_seen = |view: usize| {
+            self.cameras[view].is_some() && self.component_of_view[view] == self.component_of_track[track]
+        };
+        problem.of_track(track).filter(|&k| is_seen(problem.view_of(k))).collect()
     }
 
     /// Observation `k` where a pinhole would see it; what a lens images nowhere stays where it is, far from any point.
-    pub fn observation(&self, input: &Input, k: usize) -> Observation {
-        let view = input.view_of(k);
-        let xy = self.normalization.normalize(view, input.point_px(k));
-        let undone = self.lenses.get(view).and_then(|lens| lens.undistort(&xy));
-        let seen = Observation::new(view, input.track_of(k), undone.unwrap_or(xy));
-        Observation { weight: self.weight(k), ..seen }
+    pub fn observation(&self, problem: &Problem, k: usize) -> Observation {
+        let seen = problem.observation(k);
+        let undone = self.lenses.get(seen.view).and_then(|lens| lens.undistort(&seen.xy));
+        let weight = if self.by_observation { seen.weight } else { 1.0 };
+        Observation { xy: undone.unwrap_or(seen.xy), weight, ..seen }
     }
 
-    fn weight(&self, k: usize) -> f64 {
-        self.weights.get(k).copied().unwrap_or(1.0)
+    /// Share of its observations in registered views that a right track retains.
+    fn least_share(&self, problem: &Problem) -> f64 {
+        if self.by_observation { problem.least_share } else { LEAST_RETAINED_SHARE }
     }
 }
 
@@ -102,57 +101,40 @@ pub struct SplitPoint {
 ///
 /// Once `stop` fires the rest stays unjudged: nobody will look at the result. `progress` is called with how many
 /// verdicts there are, up to two a track. How many threads there are changes nothing.
-pub fn judge(
-    input: &Input,
-    ranges: &[usize],
-    geometry: &Geometry,
-    threads: Threads,
-    stop: &StopToken,
-    progress: &mut dyn FnMut(usize),
-) -> Judged {
-    let noise = NoiseModel::new(geometry.noise, geometry.outlier_density);
-    let judged = judge_under(input, ranges, geometry, noise, threads, stop, progress);
-    match noise.with_tail(&whole_tracks(input, ranges, geometry, &judged)) {
-        Some(noise) => {
-            let mut progress = |tracks| progress(input.track_count() + tracks);
-            judge_under(input, ranges, geometry, noise, threads, stop, &mut progress)
-        }
+pub fn judge(problem: &Problem, geometry: &Geometry, progress: &mut dyn FnMut(usize)) -> Judged {
+    let noise = NoiseModel::new(geometry.noise, problem.outlier_density);
+    let judged = judge_under(problem, geometry, noise, progress);
+    match noise.with_tail(&whole_tracks(problem, geometry, &judged)) {
+        Some(noise) => judge_under(problem, geometry, noise, &mut |tracks| progress(problem.tracks() + tracks)),
         None => judged,
     }
 }
 
 /// Weighted squared residuals, in core variances, of the tracks that are right as a whole: a track with a dropped
 /// observation may be wrong in others.
-fn whole_tracks(input: &Input, ranges: &[usize], geometry: &Geometry, judged: &Judged) -> Vec<f64> {
-    (0..input.track_count())
+fn whole_tracks(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Vec<f64> {
+    let weight = |k: usize| if geometry.by_observation { problem.weights[k] } else { 1.0 };
+    (0..problem.tracks())
         .filter(|&track| judged.tracks.inlier[track])
-        .filter(|&track| judged.retained[track].len() == ranges[track + 1] - ranges[track])
-        .flat_map(|track| ranges[track]..ranges[track + 1])
-        .filter_map(|k| Some((geometry.weight(k), judged.observations.residual_px[input.caller_index(k)]?)))
-        .map(|(weight, residual)| weight * (residual / geometry.normalization.scale_px / geometry.noise).powi(2))
+        .filter(|&track| judged.retained[track].len() == problem.of_track(track).len())
+        .flat_map(|track| problem.of_track(track))
+        .filter_map(|k| Some((weight(k), judged.observations.residual_px[problem.input.caller_index(k)]?)))
+        .map(|(weight, residual)| weight * (residual / problem.scale_px / geometry.noise).powi(2))
         .collect()
 }
 
-fn judge_under(
-    input: &Input,
-    ranges: &[usize],
-    geometry: &Geometry,
-    noise: NoiseModel,
-    threads: Threads,
-    stop: &StopToken,
-    progress: &mut dyn FnMut(usize),
-) -> Judged {
-    // Triangulation wants a slice; nothing is observed in unregistered views.
-    let cameras: Vec<Camera> = geometry.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+fn judge_under(problem: &Problem, geometry: &Geometry, noise: NoiseModel, progress: &mut dyn FnMut(usize)) -> Judged {
+    let cameras = geometry.all_cameras();
     let triangulator = Triangulator::new(&cameras);
-    let classifier = TrackClassifier { cameras: &cameras, triangulator, geometry, noise, stop };
-    let mut judged = Judged::nothing(input, noise);
-    let threads = threads.if_worth(input.track_count() >= WORTH_A_THREAD);
-    for first in (0..input.track_count()).step_by(BATCH) {
-        let last = input.track_count().min(first + BATCH);
-        let side_by_side = |k: usize| match stop.is_stopped() {
+    let least_share = geometry.least_share(problem);
+    let classifier = TrackClassifier { problem, cameras: &cameras, triangulator, geometry, least_share, noise };
+    let mut judged = Judged::nothing(problem.input, noise);
+    let threads = problem.threads.if_worth(problem.tracks() >= WORTH_A_THREAD);
+    for first in (0..problem.tracks()).step_by(BATCH) {
+        let last = problem.tracks().min(first + BATCH);
+        let side_by_side = |k: usize| match problem.stop.is_stopped() {
             true => Vec::new(),
-            false => classifier.find(input, ranges, first + k * LANES..last.min(first + (k + 1) * LANES)),
+            false => classifier.find(first + k * LANES..last.min(first + (k + 1) * LANES)),
         };
         let mut progress = |batches| progress(first + batches * LANES);
         let found = threads.map((last - first).div_ceil(LANES), TRACKS_A_RUN / LANES, side_by_side, &mut progress);

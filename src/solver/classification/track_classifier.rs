@@ -3,11 +3,11 @@
 use std::ops::Range;
 
 use super::{Geometry, Judged, NoiseModel, SplitPoint};
-use crate::domain::{Input, StopToken};
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::geometry::{Camera, Point, triangulation};
+use crate::solver::problem::Problem;
 
 /// Observations that a track must retain.
 const LEAST_RETAINED: usize = 3;
@@ -47,35 +47,37 @@ struct Other {
 
 /// What tracks are judged by.
 pub struct TrackClassifier<'a> {
+    pub problem: &'a Problem<'a>,
     /// Of every view; those of views that are not registered are never asked.
     pub cameras: &'a [Camera],
     pub triangulator: Triangulator<'a>,
-    pub geometry: &'a Geometry<'a>,
+    pub geometry: &'a Geometry,
+    /// Share of its observations that a right track retains.
+    pub least_share: f64,
     pub noise: NoiseModel,
-    /// Once it fires, verdicts mean nothing.
-    pub stop: &'a StopToken,
 }
 
 impl TrackClassifier<'_> {
-    /// Judges some tracks, no more than a [`Batch`] takes, and, of those that are linked and right, what they leave;
-    /// without those that too few views see.
-    pub fn find(&self, input: &Input, ranges: &[usize], tracks: Range<usize>) -> Vec<Finding> {
-        let geometry = self.geometry;
-        let seen = |track: usize| -> Vec<usize> {
-            (ranges[track]..ranges[track + 1]).filter(|&k| geometry.judges(track, input.view_of(k))).collect()
-        };
-        let observation = |&k: &usize| geometry.observation(input, k);
-        let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) =
-            tracks.map(|track| (track, seen(track))).filter(|(_, seen)| seen.len() >= LEAST_RETAINED).unzip();
+    /// Judges some tracks, no more than a [`Batch`] takes, and, of those that are right and may hold wrong
+    /// observations, what they leave; without those that too few views see.
+    pub fn find(&self, tracks: Range<usize>) -> Vec<Finding> {
+        let Self { problem, geometry, .. } = self;
+        let observation = |&k: &usize| geometry.observation(problem, k);
+        let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) = tracks
+            .map(|track| (track, geometry.of_track(problem, track)))
+            .filter(|(_, seen)| seen.len() >= LEAST_RETAINED)
+            .unzip();
         let observations: Vec<Vec<Observation>> =
             seen.iter().map(|seen| seen.iter().map(observation).collect()).collect();
         let verdicts = self.judge(&observations.iter().map(Vec::as_slice).collect::<Vec<_>>());
         let found = tracks.into_iter().zip(seen).zip(observations).zip(verdicts);
         found
             .map(|(((track, seen), observations), verdict)| {
-                let places = seen.into_iter().map(|k| input.caller_index(k)).collect();
-                let others =
-                    if geometry.linked && verdict.inlier { self.others(&observations, &verdict) } else { Vec::new() };
+                let places = seen.into_iter().map(|k| problem.input.caller_index(k)).collect();
+                let others = match geometry.by_observation && verdict.inlier {
+                    true => self.others(&observations, &verdict),
+                    false => Vec::new(),
+                };
                 Finding { track, observations, places, verdict, others }
             })
             .collect()
@@ -94,7 +96,7 @@ impl TrackClassifier<'_> {
             (0..observations.len()).filter(is_left).for_each(|k| batch.drop_observation(lane, k));
         }
         let mut found = batch.refine(batch.linear(), |_| true, DROPPING_STEPS);
-        while !self.stop.is_stopped() {
+        while !self.problem.stop.is_stopped() {
             let worst = |squared: &[[f64; LANES]], lane: usize| {
                 let retained = retained.get(lane).and_then(Option::as_ref)?;
                 worst_beyond(retained, self.least_retained(tracks[lane]), gate, |k| squared[k][lane])
@@ -131,7 +133,7 @@ impl TrackClassifier<'_> {
 
     /// Observations that a track must retain.
     fn least_retained(&self, observations: &[Observation]) -> usize {
-        LEAST_RETAINED.max((self.geometry.least_share * observations.len() as f64).ceil() as usize)
+        LEAST_RETAINED.max((self.least_share * observations.len() as f64).ceil() as usize)
     }
 
     /// The verdict on a track by the observations that it retains.
@@ -154,7 +156,7 @@ impl TrackClassifier<'_> {
     /// The observations that a verdict begins with: all, or those that agree where links may be wrong; `None` where
     /// none do.
     fn retained_at_first(&self, observations: &[Observation], gate: f64) -> Option<Vec<usize>> {
-        if !self.geometry.linked {
+        if !self.geometry.by_observation {
             return Some((0..observations.len()).collect());
         }
         let found = self.triangulator.robust(observations, gate)?;
@@ -175,7 +177,7 @@ impl TrackClassifier<'_> {
         for ((&place, observation), &retained) in places.iter().zip(observations).zip(&verdict.retained) {
             let squared = self.squared(&verdict.point, observation);
             judged.observations.residual_px[place] =
-                Some((squared / observation.weight).sqrt() * self.geometry.normalization.scale_px)
+                Some((squared / observation.weight).sqrt() * self.problem.scale_px)
                     .filter(|residual| residual.is_finite());
             judged.observations.weight[place] = self.noise.weight(squared) as f32;
             judged.observations.inlier[place] = verdict.inlier && retained;
@@ -197,7 +199,7 @@ impl TrackClassifier<'_> {
     fn others(&self, observations: &[Observation], verdict: &Verdict) -> Vec<Other> {
         let mut left: Vec<usize> = (0..observations.len()).filter(|&k| !verdict.retained[k]).collect();
         let mut others = Vec::new();
-        while left.len() >= LEAST_RETAINED && !self.stop.is_stopped() {
+        while left.len() >= LEAST_RETAINED && !self.problem.stop.is_stopped() {
             let these = chosen(observations, &left);
             let Some(verdict) = self.judge(&[&these]).pop().filter(|verdict| verdict.inlier) else { break };
             let (of_other, rest): (Vec<_>, Vec<_>) = left.iter().zip(&verdict.retained).partition(|(_, kept)| **kept);
@@ -236,8 +238,8 @@ mod tests {
     use super::*;
     use nalgebra::Vector2;
 
-    use crate::domain::{Limits, RawInput, View};
-    use crate::geometry::measurement::Normalization;
+    use crate::domain::{Input, Limits, RawInput, View};
+    use crate::parallel::Threads;
 
     fn cameras(views: usize) -> Vec<Camera> {
         (0..views)
@@ -248,30 +250,27 @@ mod tests {
             .collect()
     }
 
-    fn geometry<'a>(normalization: &'a Normalization) -> Geometry<'a> {
+    fn geometry(by_observation: bool) -> Geometry {
         Geometry {
-            cameras: &[],
-            components: (&[0; 16], &[0; 16]),
-            normalization,
-            lenses: &[],
-            weights: &[],
-            linked: false,
-            least_share: 0.6,
+            cameras: Vec::new(),
+            lenses: Vec::new(),
+            component_of_view: Vec::new(),
+            component_of_track: Vec::new(),
+            by_observation,
             noise: 0.001,
-            outlier_density: 2.0,
             inlier_share: 0.3,
         }
     }
 
-    fn bench<'a>(cameras: &'a [Camera], geometry: &'a Geometry) -> TrackClassifier<'a> {
-        let noise = NoiseModel::new(geometry.noise, geometry.outlier_density);
-        TrackClassifier {
-            cameras,
-            triangulator: Triangulator::new(cameras),
-            geometry,
-            noise,
-            stop: Box::leak(Box::default()),
-        }
+    /// A classifier of tracks that are seen by cameras in a row, under an input of one track in so many views.
+    fn bench(cameras: &[Camera], by_observation: bool) -> TrackClassifier<'static> {
+        let (input, settings) = (Box::leak(Box::new(input(cameras.len()))), Box::leak(Box::default()));
+        let problem = Box::leak(Box::new(Problem::new(input, settings, Threads::ONE, Box::leak(Box::default()))));
+        let cameras: &[Camera] = Box::leak(cameras.to_vec().into_boxed_slice());
+        let geometry = Box::leak(Box::new(geometry(by_observation)));
+        let noise = NoiseModel::new(geometry.noise, 2.0);
+        let least_share = if by_observation { 0.0 } else { 0.6 };
+        TrackClassifier { problem, cameras, triangulator: Triangulator::new(cameras), geometry, least_share, noise }
     }
 
     fn judged(bench: &TrackClassifier, observations: &[Observation]) -> Verdict {
@@ -293,10 +292,8 @@ mod tests {
 
     #[test]
     fn a_right_track_a_track_with_one_wrong_observation_and_a_wrong_track() {
-        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
-        let geometry = geometry(&normalization);
         let cameras = cameras(6);
-        let bench = bench(&cameras, &geometry);
+        let bench = bench(&cameras, false);
         let verdict = |shifts: [f64; 6]| judged(&bench, &observations(&cameras, &shifts));
         let right = verdict([0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001]);
         assert!(right.inlier && right.weight > 0.999 && right.retained.iter().all(|&kept| kept));
@@ -310,12 +307,9 @@ mod tests {
     /// To the last bit: of all kinds, of different lengths, with none and several observations to drop.
     #[test]
     fn tracks_side_by_side_get_the_verdicts_that_each_gets_alone() {
-        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
         let cameras = cameras(10);
-        for linked in [false, true] {
-            let least_share = if linked { 0.0 } else { 0.6 };
-            let geometry = Geometry { linked, least_share, ..geometry(&normalization) };
-            let bench = bench(&cameras, &geometry);
+        for by_observation in [false, true] {
+            let bench = bench(&cameras, by_observation);
             let shifts: [&[f64]; LANES] = [
                 &[0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001],
                 &[0.0, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, -0.1, 0.0],
@@ -332,23 +326,21 @@ mod tests {
             let mut right = 0;
             for (track, together) in tracks.iter().zip(&together) {
                 let alone = judged(&bench, track);
-                assert_eq!((together.weight, together.point), (alone.weight, alone.point), "linked: {linked}");
-                assert_eq!((together.inlier, &together.retained), (alone.inlier, &alone.retained), "linked: {linked}");
+                assert_eq!((together.weight, together.point), (alone.weight, alone.point), "{by_observation}");
+                assert_eq!((together.inlier, &together.retained), (alone.inlier, &alone.retained), "{by_observation}");
                 right += usize::from(alone.inlier);
             }
-            assert!((3..LANES).contains(&right), "linked: {linked}, {right} are right");
+            assert!((3..LANES).contains(&right), "{by_observation}, {right} are right");
         }
     }
 
     /// A track that goes over to another point, and one wrong observation between the two.
     #[test]
     fn a_track_that_joins_two_points_is_split_and_one_that_strays_is_not() {
-        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
-        let geometry = Geometry { linked: true, least_share: 0.0, ..geometry(&normalization) };
         let cameras = cameras(8);
-        let bench = bench(&cameras, &geometry);
+        let bench = bench(&cameras, true);
         let split = |observations: &[Observation]| {
-            let mut all = Judged::nothing(&testing_input(), bench.noise);
+            let mut all = Judged::nothing(bench.problem.input, bench.noise);
             let verdict = judged(&bench, observations);
             assert!(verdict.inlier);
             let others = bench.others(observations, &verdict);
@@ -367,15 +359,14 @@ mod tests {
         assert_eq!(split(&astray), (vec![0; 8], 0));
     }
 
-    /// One track in eight views.
-    fn testing_input() -> Input {
+    fn input(views: usize) -> Input {
         let raw = RawInput {
-            views: vec![View::default(); 8],
+            views: vec![View::default(); views],
             track_count: 1,
-            view: (0..8).collect(),
-            track: vec![0; 8],
-            x: (0..8).map(f64::from).collect(),
-            y: vec![0.0; 8],
+            view: (0..views as u32).collect(),
+            track: vec![0; views],
+            x: (0..views).map(|view| view as f64).collect(),
+            y: vec![0.0; views],
             ..RawInput::default()
         };
         Input::new(raw, &Limits::default(), "track").expect("valid")
@@ -383,15 +374,13 @@ mod tests {
 
     #[test]
     fn of_a_linked_track_the_right_run_is_kept_and_nothing_behind_the_cameras() {
-        let normalization = Normalization { centres_px: Vec::new(), scale_px: 1.0 };
-        let geometry = Geometry { linked: true, least_share: 0.0, ..geometry(&normalization) };
         let cameras = cameras(6);
         let joined = observations(&cameras, &[0.0, 0.0005, -0.0005, 0.2, -0.15, 0.31]);
-        let verdict = judged(&bench(&cameras, &geometry), &joined);
+        let verdict = judged(&bench(&cameras, true), &joined);
         assert!(verdict.inlier, "{}", verdict.weight);
         assert_eq!(verdict.retained, [true, true, true, false, false, false]);
         let behind: Vec<Camera> = cameras.iter().map(|camera| -camera).collect();
-        let verdict = judged(&bench(&behind, &geometry), &observations(&cameras, &[0.0; 6]));
+        let verdict = judged(&bench(&behind, true), &observations(&cameras, &[0.0; 6]));
         assert!(!verdict.inlier && verdict.weight == 0.0, "{}", verdict.weight);
     }
 }

@@ -101,12 +101,16 @@ impl Extended {
     /// What decides between reconstructions that were found in different ways: a calibration that fits as well as
     /// projective cameras before others, then how well the observations fit.
     pub fn rank(&self, problem: &Problem) -> (bool, f64) {
+        (self.is_calibrated(problem) && self.fits(), self.evidence(problem))
+    }
+
+    /// As [`projective::evidence`].
+    pub fn evidence(&self, problem: &Problem) -> f64 {
         let model = &self.model;
         let verified = adjust::verified(model);
         let observations = verified.iter().filter_map(|&track| model.landmarks[track]).map(|point| point.support).sum();
         let unknowns = 6 * model.registered().len() + 3 * verified.len();
-        let evidence = projective::evidence(observations, unknowns, model.noise, problem.outlier_density);
-        (self.is_calibrated(problem) && self.fits(), evidence)
+        projective::evidence(observations, unknowns, model.noise, problem.outlier_density)
     }
 
     /// Whether nothing says that projective cameras would fit better.

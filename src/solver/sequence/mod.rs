@@ -261,17 +261,21 @@ fn by_projective_extension(
 }
 
 /// Extends an attempt metrically where it has a metric reconstruction and that stands.
+///
+/// An attempt without a calibration has the focal length that happens to fit best, which other views may refute: its
+/// extension stands only where it explains more than the projective reconstruction that it began from.
 fn metric_of(problem: &Problem, attempt: Attempt, recorder: &mut Recorder) -> Result<Ended, Error> {
     if !attempt.has_metric() || attempt.is_beyond_image_points() {
         return Ok(Ended::Block(Some(Box::new(attempt))));
     }
     let mut extended = extend(problem, attempt, recorder)?;
-    Ok(if extended.stands() {
+    let known = extended.seed.projective.as_ref().map_or(0.0, |found| found.evidence(problem.outlier_density));
+    if extended.stands() && (extended.is_calibrated(problem) || extended.evidence(problem) > known) {
         extended.seed.verified_by_image_points();
-        Ended::Extended(Box::new(extended))
+        Ok(Ended::Extended(Box::new(extended)))
     } else {
-        Ended::Block(Some(Box::new(extended.seed)))
-    })
+        Ok(Ended::Block(Some(Box::new(extended.seed))))
+    }
 }
 
 /// An attempt on the whole input, extended where it leaves views aside, where several cameras or a lens that distorts

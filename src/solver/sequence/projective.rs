@@ -136,7 +136,7 @@ impl Projective {
 /// constraints that the unknowns leave: what one reconstruction of an input is preferred to another by.
 ///
 /// * `noise`: one standard deviation of a coordinate
-/// * `outlier_density`: see [`crate::solver::classification::Geometry::outlier_density`]
+/// * `outlier_density`: see [`crate::solver::problem::Problem::outlier_density`]
 pub fn evidence(observations: usize, unknowns: usize, noise: f64, outlier_density: f64) -> f64 {
     let constraints = (2 * observations) as f64 - unknowns as f64;
     -constraints * (outlier_density * noise * (std::f64::consts::TAU * std::f64::consts::E).sqrt()).ln()

@@ -41,27 +41,28 @@ fn tracks_with_depths_reach_every_view() {
     }
 }
 
-/// Tracks that neighbouring views alone see: no block of complete tracks holds all views.
+/// Tracks that neighbouring views alone see: no block of complete tracks holds all views. In the scene of 40 views the
+/// focal length that fits best is many times too long, and under it a metric extension breaks into parts.
 #[test]
 fn a_translation_with_missing_data_is_one_projective_reconstruction_of_all_views() {
-    for seed in 0..2 {
+    for (views, seed) in [(16, 0), (16, 1), (40, 700_000)] {
         let (input, scene) = scene(SceneOptions {
-            views: 16,
-            tracks: 400,
+            views,
+            tracks: 30 * views,
             noise: 5e-4,
-            outliers: 0.2,
+            outliers: 0.3,
             motion: Motion::PureTranslation,
             seen_views: 5,
             seed,
             ..SceneOptions::default()
         });
         let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
-        assert_eq!(solution.grade, Some(Grade::ProjectiveOnly), "seed {seed}");
-        let registered = solution.views.iter().filter(|view| view.projection.is_some()).count();
+        assert_eq!(solution.grade, Some(Grade::ProjectiveOnly), "{views} views, seed {seed}");
+        let in_first = solution.views.iter().filter(|view| view.projection.is_some() && view.part == 0).count();
         let of_observations = agreement(&solution.observations.inlier, &scene.truth.observation_right);
-        println!("seed {seed}: {registered} views, {of_observations:?}");
-        assert!(registered >= 15, "seed {seed}: {registered} of 16 views");
-        assert!(of_observations.f1 > 0.95, "seed {seed}: {of_observations:?}");
+        println!("{views} views, seed {seed}: {in_first} views, {of_observations:?}");
+        assert!(in_first + 1 >= views, "seed {seed}: {in_first} of {views} views");
+        assert!(of_observations.f1 > 0.95, "{views} views, seed {seed}: {of_observations:?}");
     }
 }
 
