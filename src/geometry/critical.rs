@@ -7,7 +7,7 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::bundle::Options;
 use super::bundle::critical::{
-    Adjust, HOMOGRAPHIES_GAUGE, Homographies, ROTATING_GAUGE, Rotating, TRANSLATING_GAUGE, Translating,
+    HOMOGRAPHIES_GAUGE, Homographies, Problem, ROTATING_GAUGE, Rotating, TRANSLATING_GAUGE, Translating, minimise,
 };
 use super::bundle::metric::Intrinsics;
 use super::fundamental::{Fundamental, Match};
@@ -76,14 +76,14 @@ pub fn fit_without_parallax(
     ))
 }
 
-fn adjusted<M: Adjust>(
+fn adjusted<const G: usize, const C: usize, const P: usize, M: Problem<G, C, P>>(
     mut model: M,
     unknowns: usize,
     gauge: usize,
     observations: &[Observation],
     stop: &StopToken,
 ) -> Fit<M> {
-    let report = model.adjust(observations, &Options::squared(ITERATIONS), stop);
+    let report = minimise(&mut model, observations, &Options::squared(ITERATIONS), stop);
     Fit { model, cost: report.cost, unknowns: unknowns.saturating_sub(gauge) }
 }
 

@@ -19,7 +19,7 @@ pub(super) fn is_worth_it<const G: usize, const C: usize, const P: usize>(
     problem: &impl Problem<G, C, P>,
     layout: &Layout,
 ) -> bool {
-    let (cameras, points) = (problem.camera_count(), problem.point_count());
+    let (cameras, points) = problem.counts();
     if (P * points) as f64 > MOST_SHARE * (C * cameras) as f64 {
         return false;
     }
@@ -58,12 +58,9 @@ impl<const G: usize, const C: usize, const P: usize, S: ResidualVisitor<G, P, C>
 }
 
 impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Problem<G, P, C> for CameraElimination<T> {
-    fn camera_count(&self) -> usize {
-        self.0.point_count()
-    }
-
-    fn point_count(&self) -> usize {
-        self.0.camera_count()
+    fn counts(&self) -> (usize, usize) {
+        let (cameras, points) = self.0.counts();
+        (points, cameras)
     }
 
     #[inline]
@@ -101,11 +98,12 @@ mod tests {
         observations: &[Observation],
         case: &str,
     ) {
-        let straight = Layout::new(observations, problem.camera_count(), problem.point_count());
+        let (cameras, points) = problem.counts();
+        let straight = Layout::new(observations, cameras, points);
         assert!(is_worth_it(problem, &straight), "{case}");
         let options = Options::squared(100);
         let expected = descend(&mut problem.clone(), &straight, &options, &StopToken::default());
-        let exchanged = layout(&straight, problem.camera_count());
+        let exchanged = layout(&straight, cameras);
         let found = descend(&mut CameraElimination(problem.clone()), &exchanged, &options, &StopToken::default());
         let apart = |a: f64, b: f64| (a - b).abs() / b;
         assert!(apart(found.initial_cost, expected.initial_cost) < 1e-12, "{case}");
@@ -156,7 +154,7 @@ mod tests {
         let (cameras, points) = testing::projectively_transformed(&scene, 1);
         let problem = |count: usize| Projective { cameras: cameras.clone(), points: points[..count].to_vec() };
         let is_exchanged = |problem: &Projective, observations: &[Observation]| {
-            is_worth_it(problem, &Layout::new(observations, problem.camera_count(), problem.point_count()))
+            is_worth_it(problem, &Layout::new(observations, problem.cameras.len(), problem.points.len()))
         };
         assert!(is_exchanged(&problem(15), &scene.observations));
         assert!(!is_exchanged(&problem(16), &scene.observations));

@@ -6,10 +6,10 @@
 
 use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
-use super::engine::{Jacobian, Problem, ResidualVisitor, Step, minimise};
+use super::Observation;
+use super::engine::{Jacobian, ResidualVisitor, Step, image, move_each, unit_norm};
+pub(crate) use super::engine::{Problem, minimise};
 use super::metric::Intrinsics;
-use super::{Observation, Options, Report};
-use crate::domain::StopToken;
 
 /// Views of a plane, or of anything from one centre: `x ~ H (x, y, 1)`.
 #[derive(Debug, Clone)]
@@ -42,20 +42,9 @@ pub const HOMOGRAPHIES_GAUGE: usize = 8;
 pub const ROTATING_GAUGE: usize = 3;
 pub const TRANSLATING_GAUGE: usize = 4;
 
-/// Image `seen.xy / seen.z`, and the gradients of its two coordinates with respect to `seen`.
-fn image(seen: &Vector3<f64>) -> (Vector2<f64>, [Vector3<f64>; 2]) {
-    let scale = seen.z.recip();
-    let image = Vector2::new(seen.x * scale, seen.y * scale);
-    (image, [Vector3::new(scale, 0.0, -image.x * scale), Vector3::new(0.0, scale, -image.y * scale)])
-}
-
 impl Problem<0, 9, 2> for Homographies {
-    fn camera_count(&self) -> usize {
-        self.views.len()
-    }
-
-    fn point_count(&self) -> usize {
-        self.points.len()
+    fn counts(&self) -> (usize, usize) {
+        (self.views.len(), self.points.len())
     }
 
     fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<0, 9, 2>) {
@@ -74,14 +63,10 @@ impl Problem<0, 9, 2> for Homographies {
     }
 
     fn retract(&mut self, from: &Self, step: &Step<0, 9, 2>) {
-        for ((view, from), step) in self.views.iter_mut().zip(&from.views).zip(&step.cameras) {
-            let moved = from + Matrix3::from_row_slice(step.as_slice());
-            let norm = moved.norm();
-            *view = if norm > 0.0 && norm.is_finite() { moved / norm } else { moved };
-        }
-        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
-            *point = from + step;
-        }
+        move_each(&mut self.views, &from.views, &step.cameras, |view, step| {
+            unit_norm(&(view + Matrix3::from_row_slice(step.as_slice())))
+        });
+        move_each(&mut self.points, &from.points, &step.points, |point, step| point + step);
     }
 
     fn camera_gauge(&self, camera: usize) -> SVector<f64, 9> {
@@ -90,12 +75,8 @@ impl Problem<0, 9, 2> for Homographies {
 }
 
 impl Problem<3, 3, 2> for Rotating {
-    fn camera_count(&self) -> usize {
-        self.rotations.len()
-    }
-
-    fn point_count(&self) -> usize {
-        self.points.len()
+    fn counts(&self) -> (usize, usize) {
+        (self.rotations.len(), self.points.len())
     }
 
     fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<3, 3, 2>) {
@@ -120,22 +101,16 @@ impl Problem<3, 3, 2> for Rotating {
         self.intrinsics.focal = from.intrinsics.focal * step.globals[0].exp();
         self.intrinsics.principal_point =
             from.intrinsics.principal_point + Vector2::new(step.globals[1], step.globals[2]);
-        for ((rotation, from), step) in self.rotations.iter_mut().zip(&from.rotations).zip(&step.cameras) {
-            *rotation = Rotation3::from_scaled_axis(*step) * from;
-        }
-        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
-            *point = from + step;
-        }
+        move_each(&mut self.rotations, &from.rotations, &step.cameras, |rotation, step| {
+            Rotation3::from_scaled_axis(*step) * rotation
+        });
+        move_each(&mut self.points, &from.points, &step.points, |point, step| point + step);
     }
 }
 
 impl Problem<0, 3, 3> for Translating {
-    fn camera_count(&self) -> usize {
-        self.translations.len()
-    }
-
-    fn point_count(&self) -> usize {
-        self.points.len()
+    fn counts(&self) -> (usize, usize) {
+        (self.translations.len(), self.points.len())
     }
 
     fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<0, 3, 3>) {
@@ -153,31 +128,10 @@ impl Problem<0, 3, 3> for Translating {
     }
 
     fn retract(&mut self, from: &Self, step: &Step<0, 3, 3>) {
-        for ((translation, from), step) in self.translations.iter_mut().zip(&from.translations).zip(&step.cameras) {
-            *translation = from + step;
-        }
-        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
-            *point = from + step;
-        }
+        move_each(&mut self.translations, &from.translations, &step.cameras, |translation, step| translation + step);
+        move_each(&mut self.points, &from.points, &step.points, |point, step| point + step);
     }
 }
-
-/// Minimises the reprojection error over all unknowns of one of these models.
-pub trait Adjust {
-    fn adjust(&mut self, observations: &[Observation], options: &Options, stop: &StopToken) -> Report;
-}
-
-macro_rules! adjust {
-    ($($model:ty),+) => {$(
-        impl Adjust for $model {
-            fn adjust(&mut self, observations: &[Observation], options: &Options, stop: &StopToken) -> Report {
-                minimise(self, observations, options, stop)
-            }
-        }
-    )+};
-}
-
-adjust!(Homographies, Rotating, Translating);
 
 #[cfg(test)]
 mod tests {

@@ -2,7 +2,7 @@
 
 use std::marker::PhantomData;
 
-use nalgebra::{SMatrix, SVector, Vector2};
+use nalgebra::{SMatrix, SVector, Vector2, Vector3};
 
 use super::camera_elimination::{self, CameraElimination};
 use super::reduced::{Linearisation, Reduced};
@@ -16,7 +16,7 @@ pub(super) const UNDEFINED_SQUARED: f64 = 1e12;
 
 /// Derivatives of one residual, transposed: column `k` is the gradient of residual component `k`.
 #[derive(Debug, Clone)]
-pub(super) struct Jacobian<const G: usize, const C: usize, const P: usize> {
+pub(crate) struct Jacobian<const G: usize, const C: usize, const P: usize> {
     pub globals: SMatrix<f64, G, 2>,
     pub camera: SMatrix<f64, C, 2>,
     pub point: SMatrix<f64, P, 2>,
@@ -26,13 +26,13 @@ pub(super) struct Jacobian<const G: usize, const C: usize, const P: usize> {
 ///
 /// A problem writes residual and Jacobian once; the cost, the normal equations and the test by finite differences
 /// are visitors of the same code.
-pub(super) trait ResidualVisitor<const G: usize, const C: usize, const P: usize> {
+pub(crate) trait ResidualVisitor<const G: usize, const C: usize, const P: usize> {
     fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>);
 }
 
 /// A change of the unknowns in the tangent space.
 #[derive(Debug, Clone)]
-pub(super) struct Step<const G: usize, const C: usize, const P: usize> {
+pub(crate) struct Step<const G: usize, const C: usize, const P: usize> {
     pub globals: SVector<f64, G>,
     pub cameras: Vec<SVector<f64, C>>,
     pub points: Vec<SVector<f64, P>>,
@@ -48,17 +48,15 @@ impl<const G: usize, const C: usize, const P: usize> Step<G, C, P> {
     }
 
     fn is_finite(&self) -> bool {
-        let finite = |values: &[f64]| values.iter().all(|value| value.is_finite());
-        finite(self.globals.as_slice())
-            && self.cameras.iter().all(|camera| finite(camera.as_slice()))
-            && self.points.iter().all(|point| finite(point.as_slice()))
+        let Self { globals, cameras, points } = self;
+        globals.iter().chain(cameras.iter().flatten()).chain(points.iter().flatten()).all(|value| value.is_finite())
     }
 }
 
 /// A bundle adjustment: `G` unknowns shared by all views, `C` a camera, `P` a point.
-pub(super) trait Problem<const G: usize, const C: usize, const P: usize>: Clone {
-    fn camera_count(&self) -> usize;
-    fn point_count(&self) -> usize;
+pub(crate) trait Problem<const G: usize, const C: usize, const P: usize>: Clone {
+    /// How many cameras and points there are.
+    fn counts(&self) -> (usize, usize);
     /// Hands the residual of one observation, and its Jacobian on demand, to `visitor`.
     fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<G, C, P>);
     /// Overwrites `self` with `from` moved by `step`; both have the same counts.
@@ -73,6 +71,27 @@ pub(super) trait Problem<const G: usize, const C: usize, const P: usize>: Clone 
     }
 }
 
+/// Overwrites each of some unknowns by what it was, moved by its part of a step.
+pub(super) fn move_each<T, S>(moved: &mut [T], from: &[T], steps: &[S], by: impl Fn(&T, &S) -> T) {
+    for ((moved, from), step) in moved.iter_mut().zip(from).zip(steps) {
+        *moved = by(from, step);
+    }
+}
+
+/// The homogeneous quantity at unit norm; left alone where it has none.
+pub(super) fn unit_norm<const R: usize, const C: usize>(homogeneous: &SMatrix<f64, R, C>) -> SMatrix<f64, R, C> {
+    let norm = homogeneous.norm();
+    if norm > 0.0 && norm.is_finite() { homogeneous / norm } else { *homogeneous }
+}
+
+/// Image `seen.xy / seen.z`, and the gradients of its two coordinates with respect to `seen`.
+#[inline(always)]
+pub(super) fn image(seen: &Vector3<f64>) -> (Vector2<f64>, [Vector3<f64>; 2]) {
+    let image = Vector2::new(seen.x / seen.z, seen.y / seen.z);
+    let scale = seen.z.recip();
+    (image, [Vector3::new(scale, 0.0, -image.x * scale), Vector3::new(0.0, scale, -image.y * scale)])
+}
+
 /// Observations sorted by point, then camera; observations of point `j` are `starts[j]..starts[j + 1]`.
 #[derive(Debug, Clone)]
 pub(super) struct Layout {
@@ -85,13 +104,7 @@ impl Layout {
         let mut kept: Vec<Observation> =
             observations.iter().filter(|seen| seen.is_usable(cameras, points)).copied().collect();
         kept.sort_by_key(|seen| (seen.point, seen.view));
-        let mut starts = vec![0; points + 1];
-        for seen in &kept {
-            starts[seen.point + 1] += 1;
-        }
-        for point in 0..points {
-            starts[point + 1] += starts[point];
-        }
+        let starts = (0..=points).map(|point| kept.partition_point(|seen| seen.point < point)).collect();
         Self { observations: kept, starts }
     }
 }
@@ -135,17 +148,18 @@ fn cost<const G: usize, const C: usize, const P: usize>(
 ///
 /// The cost never rises. `stop` is asked before every damped solve; a stopped, stuck or degenerate problem keeps its
 /// last good state.
-pub(super) fn minimise<const G: usize, const C: usize, const P: usize>(
+pub(crate) fn minimise<const G: usize, const C: usize, const P: usize>(
     problem: &mut impl Problem<G, C, P>,
     observations: &[Observation],
     options: &Options,
     stop: &StopToken,
 ) -> Report {
-    let layout = Layout::new(observations, problem.camera_count(), problem.point_count());
+    let (cameras, points) = problem.counts();
+    let layout = Layout::new(observations, cameras, points);
     if !camera_elimination::is_worth_it(problem, &layout) {
         return descend(problem, &layout, options, stop);
     }
-    let layout = camera_elimination::layout(&layout, problem.camera_count());
+    let layout = camera_elimination::layout(&layout, cameras);
     let mut exchanged = CameraElimination(problem.clone());
     let report = descend(&mut exchanged, &layout, options, stop);
     *problem = exchanged.0;
@@ -159,12 +173,13 @@ pub(super) fn descend<const G: usize, const C: usize, const P: usize, T: Problem
     options: &Options,
     stop: &StopToken,
 ) -> Report {
+    let (cameras, points) = problem.counts();
     let mut dense = Dense {
         layout,
         loss: options.loss,
-        linearisation: Linearisation::new(layout, problem.camera_count()),
-        reduced: Reduced::new(layout, problem.camera_count()),
-        step: Step::zeros(problem.camera_count(), problem.point_count()),
+        linearisation: Linearisation::new(layout, cameras),
+        reduced: Reduced::new(layout, cameras),
+        step: Step::zeros(cameras, points),
         problem: PhantomData,
     };
     levenberg_marquardt::minimise(&mut dense, problem, &options.of_loop(MIN_DAMPING), stop)

@@ -1,8 +1,8 @@
 //! Projective bundle adjustment: free 3x4 cameras and homogeneous points.
 
-use nalgebra::{Matrix3x4, SMatrix, SVector, Vector2, Vector3, Vector4};
+use nalgebra::{Matrix3x4, SVector, Vector4};
 
-use super::engine::{Jacobian, Problem, ResidualVisitor, Step, minimise};
+use super::engine::{Jacobian, Problem, ResidualVisitor, Step, image, minimise, move_each, unit_norm};
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
 
@@ -17,26 +17,17 @@ pub(super) struct Projective {
 }
 
 impl Problem<0, CAMERA, POINT> for Projective {
-    fn camera_count(&self) -> usize {
-        self.cameras.len()
-    }
-
-    fn point_count(&self) -> usize {
-        self.points.len()
+    fn counts(&self) -> (usize, usize) {
+        (self.cameras.len(), self.points.len())
     }
 
     #[inline]
     fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<0, CAMERA, POINT>) {
         let camera = &self.cameras[observation.view];
         let point = &self.points[observation.point];
-        let seen = camera * point;
-        let image = Vector2::new(seen.x / seen.z, seen.y / seen.z);
+        let (image, by_seen) = image(&(camera * point));
         visitor.visit(image - observation.xy, || {
-            // Gradients of the two image coordinates with respect to `P X`.
-            let scale = seen.z.recip();
-            let by_seen = [Vector3::new(scale, 0.0, -image.x * scale), Vector3::new(0.0, scale, -image.y * scale)];
-            let mut jacobian: Jacobian<0, CAMERA, POINT> =
-                Jacobian { globals: SMatrix::zeros(), camera: SMatrix::zeros(), point: SMatrix::zeros() };
+            let mut jacobian = Jacobian::<0, CAMERA, POINT>::zeros();
             for (component, by_seen) in by_seen.iter().enumerate() {
                 for row in 0..3 {
                     for column in 0..4 {
@@ -50,12 +41,10 @@ impl Problem<0, CAMERA, POINT> for Projective {
     }
 
     fn retract(&mut self, from: &Self, step: &Step<0, CAMERA, POINT>) {
-        for ((camera, from), step) in self.cameras.iter_mut().zip(&from.cameras).zip(&step.cameras) {
-            *camera = unit_norm(&(from + Matrix3x4::from_row_slice(step.as_slice())));
-        }
-        for ((point, from), step) in self.points.iter_mut().zip(&from.points).zip(&step.points) {
-            *point = unit_norm(&(from + step));
-        }
+        move_each(&mut self.cameras, &from.cameras, &step.cameras, |camera, step| {
+            unit_norm(&(camera + Matrix3x4::from_row_slice(step.as_slice())))
+        });
+        move_each(&mut self.points, &from.points, &step.points, |point, step| unit_norm(&(point + step)));
     }
 
     fn camera_gauge(&self, camera: usize) -> SVector<f64, CAMERA> {
@@ -65,12 +54,6 @@ impl Problem<0, CAMERA, POINT> for Projective {
     fn point_gauge(&self, point: usize) -> SVector<f64, POINT> {
         self.points[point]
     }
-}
-
-/// The homogeneous quantity at unit norm; left alone where it has none.
-fn unit_norm<const R: usize, const C: usize>(homogeneous: &SMatrix<f64, R, C>) -> SMatrix<f64, R, C> {
-    let norm = homogeneous.norm();
-    if norm > 0.0 && norm.is_finite() { homogeneous / norm } else { *homogeneous }
 }
 
 /// Minimises the reprojection error over cameras and points of a projective reconstruction.
@@ -99,6 +82,8 @@ pub fn adjust(
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector2;
+
     use super::super::Loss;
     use super::super::testing::{self, NOISE};
     use super::*;

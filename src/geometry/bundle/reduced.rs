@@ -331,9 +331,9 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
             self.matrix[index * (self.dimension + 1)] +=
                 damping * diagonal(index) + GAUGE_DAMPING * mean + f64::MIN_POSITIVE;
         }
-        for camera in 0..problem.camera_count() {
+        for (camera, diagonal) in linearisation.camera_diagonals.iter().enumerate() {
             let gauge = problem.camera_gauge(camera);
-            let weight = linearisation.camera_diagonals[camera].sum() / C as f64;
+            let weight = diagonal.sum() / C as f64;
             let first = G + C * camera;
             for k in 0..C {
                 let start = (first + k) * self.dimension + first;

@@ -207,13 +207,14 @@ pub(super) fn check_jacobian<const G: usize, const C: usize, const P: usize>(
     // Central differences of values around 1: truncation 1e-12 and rounding 1e-10, times steep points.
     const TOLERANCE: f64 = 1e-7;
     let mut moved = problem.clone();
+    let (cameras, points) = problem.counts();
     let mut compared = 0;
     for seen in observations {
         let (_, jacobian) = at(problem, seen);
         let largest = jacobian.camera.amax().max(jacobian.point.amax()).max(1.0);
         let mut difference = |set: &dyn Fn(&mut Step<G, C, P>, f64)| {
             let mut side = |width: f64| {
-                let mut step = Step::zeros(problem.camera_count(), problem.point_count());
+                let mut step = Step::zeros(cameras, points);
                 set(&mut step, width);
                 moved.retract(problem, &step);
                 at(&moved, seen).0
