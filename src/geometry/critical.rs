@@ -10,6 +10,7 @@ use super::bundle::critical::{
     HOMOGRAPHIES_GAUGE, Homographies, Problem, ROTATING_GAUGE, Rotating, TRANSLATING_GAUGE, Translating, minimise,
 };
 use super::bundle::metric::Intrinsics;
+use super::daq::scan_focal;
 use super::fundamental::{Fundamental, Match};
 use super::homography::{self, Correspondences};
 use super::null_vector::smallest_eigenvector;
@@ -17,8 +18,7 @@ use super::observation::Observation;
 use super::statistics::median;
 use crate::domain::StopToken;
 
-/// Focal lengths from which a rotation is looked for, in image sides; neighbours are a fifth apart.
-const FOCAL_RANGE: (f64, f64) = (0.3, 5.0);
+/// Focal lengths from which a rotation is looked for; neighbours are a fifth apart.
 const FOCALS: usize = 16;
 /// Rounds of alternation for the depths of a translation's start; the adjustment does the rest.
 const DEPTH_ROUNDS: usize = 10;
@@ -89,9 +89,8 @@ fn adjusted<const G: usize, const C: usize, const P: usize, M: Problem<G, C, P>>
 
 /// The focal length, principal point in the centre, with which the homographies are nearest to rotations, and these.
 fn nearest_rotations(homographies: &[Matrix3<f64>]) -> (Intrinsics, Vec<Matrix3<f64>>) {
-    let ratio = (FOCAL_RANGE.1 / FOCAL_RANGE.0).ln() / (FOCALS - 1) as f64;
     let candidates = (0..FOCALS).map(|k| {
-        let intrinsics = Intrinsics::from_focal(FOCAL_RANGE.0 * (ratio * k as f64).exp());
+        let intrinsics = Intrinsics::from_focal(scan_focal(k, FOCALS));
         let forward = intrinsics.matrix();
         let back = Matrix3::new(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, intrinsics.focal) / intrinsics.focal;
         let (mut rotations, mut distance) = (Vec::with_capacity(homographies.len()), 0.0);

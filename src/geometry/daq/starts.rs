@@ -5,9 +5,9 @@ use nalgebra::{Matrix3, Matrix3x4, Matrix4, SMatrix, SVector, Vector3};
 use super::{Daq, residual};
 use crate::geometry::null_vector::smallest_eigenvector;
 
-/// Focal lengths of the scan, in image sides: from wider than any rectilinear lens (118 degrees) to a telephoto of
-/// 11 degrees.
-pub(super) const SCAN_RANGE: (f64, f64) = (0.3, 5.0);
+/// Focal lengths of a scan, in image sides: from wider than any rectilinear lens (118 degrees) to a telephoto of 11
+/// degrees.
+const SCAN_RANGE: (f64, f64) = (0.3, 5.0);
 /// Distinct entries of a symmetric 4x4 matrix.
 const ENTRIES: usize = 10;
 /// Deviations of the constraints of the linear DAQ after Pollefeys, Van Gool et al. 2004 (table 2): focal length
@@ -103,15 +103,10 @@ fn nearest_of_rank_three(quadric: &Matrix4<f64>) -> Matrix4<f64> {
     })
 }
 
-/// Plane at infinity from a second view when the calibration is known (Gherardi & Fusiello 2010, section 3).
+/// Plane at infinity from a second view when the focal lengths of both are known (Gherardi & Fusiello 2010, section 3).
 ///
 /// Two planes, one for each sign of the camera; none when the views share their centre.
-pub fn plane_from_second_view(camera: &Matrix3x4<f64>, focal: f64) -> Option<[Vector3<f64>; 2]> {
-    plane_from_focals(camera, focal, focal)
-}
-
-/// The same with a focal length of its own for each of the two views.
-pub(super) fn plane_from_focals(camera: &Matrix3x4<f64>, first: f64, second: f64) -> Option<[Vector3<f64>; 2]> {
+fn plane_from_focals(camera: &Matrix3x4<f64>, first: f64, second: f64) -> Option<[Vector3<f64>; 2]> {
     let calibration = Matrix3::from_diagonal(&Vector3::new(first, first, 1.0));
     let uncalibrate = |focal: f64| Matrix3::from_diagonal(&Vector3::new(focal.recip(), focal.recip(), 1.0));
     let translation = uncalibrate(second) * camera.column(3);
@@ -133,34 +128,41 @@ pub(super) fn plane_from_focals(camera: &Matrix3x4<f64>, first: f64, second: f64
     Some([plane(1.0), plane(-1.0)])
 }
 
-/// Views other than the first, those with the widest baseline to it first.
-pub fn widest_views(cameras: &[Matrix3x4<f64>]) -> Vec<usize> {
-    let mut order: Vec<usize> = (1..cameras.len()).collect();
-    order.sort_by(|&a, &b| cameras[b].column(3).norm().total_cmp(&cameras[a].column(3).norm()));
-    order
+/// One of the focal lengths of a scan of so many, evenly spaced in their logarithm.
+pub fn scan_focal(step: usize, focals: usize) -> f64 {
+    let spacing = (SCAN_RANGE.1 / SCAN_RANGE.0).ln() / focals.saturating_sub(1).max(1) as f64;
+    SCAN_RANGE.0 * (spacing * step as f64).exp()
 }
 
-/// Tries `focals` focal lengths, evenly spaced in their logarithm, each with the planes at infinity that the `views`
-/// widest views give in closed form. Returns them with their residual, best first.
+/// Tries `focals` focal lengths, each with the planes at infinity that the `views` views with the widest baseline to
+/// the first give in closed form. Returns them with their residual, best first.
 pub fn scan(cameras: &[Matrix3x4<f64>], focals: usize, views: usize) -> Vec<(Daq, f64)> {
-    let mut widest = widest_views(cameras);
-    widest.truncate(views);
-    let ratio = (SCAN_RANGE.1 / SCAN_RANGE.0).ln() / focals.saturating_sub(1).max(1) as f64;
-    let mut found = Vec::with_capacity(2 * focals * views);
-    for step in 0..focals {
-        let focal = SCAN_RANGE.0 * (ratio * step as f64).exp();
-        for &view in &widest {
-            for plane in plane_from_second_view(&cameras[view], focal).into_iter().flatten() {
-                let daq = Daq::new(focal, plane);
-                let cost = residual(cameras, &daq);
-                if cost.is_finite() && plane.iter().all(|value| value.is_finite()) {
-                    found.push((daq, cost));
-                }
-            }
+    ranked(scanned(cameras, focals, views, &[1.0]), |daq| residual(cameras, daq))
+}
+
+/// The quadrics of a scan.
+///
+/// * `ratios`: of the focal length of the other view to that of the first
+pub(super) fn scanned(cameras: &[Matrix3x4<f64>], focals: usize, views: usize, ratios: &[f64]) -> Vec<Daq> {
+    let mut widest: Vec<&Matrix3x4<f64>> = cameras.iter().skip(1).collect();
+    widest.sort_by(|a, b| b.column(3).norm().total_cmp(&a.column(3).norm()));
+    let mut found = Vec::new();
+    for focal in (0..focals).map(|step| scan_focal(step, focals)) {
+        for camera in widest.iter().take(views) {
+            let planes = ratios.iter().filter_map(|ratio| plane_from_focals(camera, focal, ratio * focal)).flatten();
+            let finite = planes.filter(|plane| plane.iter().all(|value| value.is_finite()));
+            found.extend(finite.map(|plane| Daq::new(focal, plane)));
         }
     }
-    found.sort_by(|a, b| a.1.total_cmp(&b.1));
     found
+}
+
+/// Quadrics with what each costs, best first; without those whose cost is no number.
+pub(super) fn ranked(found: Vec<Daq>, cost: impl Fn(&Daq) -> f64) -> Vec<(Daq, f64)> {
+    let costs = found.into_iter().map(|daq| (daq, cost(&daq)));
+    let mut ranked: Vec<(Daq, f64)> = costs.filter(|(_, cost)| cost.is_finite()).collect();
+    ranked.sort_by(|a, b| a.1.total_cmp(&b.1));
+    ranked
 }
 
 #[cfg(test)]
@@ -188,16 +190,17 @@ mod tests {
         let scene = testing::scene(4, 6, 20, 0.0);
         let (cameras, _) = testing::projectively_transformed(&scene, 4);
         let frame = to_canonical_frame(&cameras, &[]).expect("rank 3");
+        let focal = scene.intrinsics.focal;
         for camera in &frame.cameras[1..] {
-            let planes = plane_from_second_view(camera, scene.intrinsics.focal).expect("a baseline");
-            let costs = planes.map(|plane| residual(&frame.cameras, &Daq::new(scene.intrinsics.focal, plane)));
+            let planes = plane_from_focals(camera, focal, focal).expect("a baseline");
+            let costs = planes.map(|plane| residual(&frame.cameras, &Daq::new(focal, plane)));
             assert!(costs[0].min(costs[1]) < 1e-12, "{costs:?}");
         }
     }
 
     #[test]
     fn views_without_a_baseline_give_no_plane() {
-        assert_eq!(plane_from_second_view(&Matrix3x4::identity(), 1.0), None);
+        assert_eq!(plane_from_focals(&Matrix3x4::identity(), 1.0, 1.0), None);
         assert!(scan(&[Matrix3x4::identity(); 3], 4, 2).is_empty());
     }
 }

@@ -1,8 +1,8 @@
 //! The quadric where every view has a focal length of its own.
 
-use nalgebra::{Matrix3x4, Vector3};
+use nalgebra::Matrix3x4;
 
-use super::starts::{SCAN_RANGE, linear, plane_from_focals, widest_views};
+use super::starts::{linear, ranked, scanned};
 use super::{Daq, infinite_homography};
 
 /// Focal lengths of the first view that are tried, views that the plane at infinity is taken from, and the ratios of
@@ -29,22 +29,10 @@ pub fn view_focal(camera: &Matrix3x4<f64>, daq: &Daq) -> Option<(f64, f64)> {
 /// Quadrics to start from, best first: the linear one, which asks for no constant focal length, and the planes at
 /// infinity that pairs of focal lengths give in closed form. `daq.intrinsics` is the first view's.
 pub fn view_focal_starts(cameras: &[Matrix3x4<f64>]) -> Vec<(Daq, f64)> {
-    let cost =
-        |daq: &Daq| cameras.iter().map(|camera| view_focal(camera, daq).map_or(1.0, |(_, cost)| cost.min(1.0))).sum();
-    let mut found: Vec<(Daq, f64)> = linear(cameras).into_iter().map(|daq| (daq, cost(&daq))).collect();
-    let spacing = (SCAN_RANGE.1 / SCAN_RANGE.0).ln() / (FOCALS - 1) as f64;
-    for view in widest_views(cameras).into_iter().take(VIEWS) {
-        for step in 0..FOCALS {
-            let focal = SCAN_RANGE.0 * (spacing * step as f64).exp();
-            let planes = RATIOS.iter().filter_map(|ratio| plane_from_focals(&cameras[view], focal, ratio * focal));
-            for plane in planes.flatten().filter(|plane: &Vector3<f64>| plane.iter().all(|value| value.is_finite())) {
-                let daq = Daq::new(focal, plane);
-                found.push((daq, cost(&daq)));
-            }
-        }
-    }
-    found.sort_by(|a, b| a.1.total_cmp(&b.1));
-    found
+    let found = linear(cameras).into_iter().chain(scanned(cameras, FOCALS, VIEWS, &RATIOS)).collect();
+    ranked(found, |daq| {
+        cameras.iter().map(|camera| view_focal(camera, daq).map_or(1.0, |(_, cost)| cost.min(1.0))).sum()
+    })
 }
 
 #[cfg(test)]

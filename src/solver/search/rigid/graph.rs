@@ -1,9 +1,9 @@
 //! Which pairs of tracks are rigid at which focal length, and the sets that are rigid together.
 
-/// Focal lengths that are tried, in image sides: a grid whose steps of 9 % change a distance by less than a length
-/// tolerance allows.
+use crate::geometry::daq::scan_focal;
+
+/// Focal lengths that are tried: a grid whose steps of 9 % change a distance by less than a length tolerance allows.
 const FOCALS: usize = 33;
-const FOCAL_RANGE: (f64, f64) = (0.3, 5.0);
 /// Distance in tolerances below which a pair says nothing: near points are near in every view, right or wrong.
 const LEAST_DISTANCE: f64 = 3.0;
 /// Share of a core that a track must be rigid with to join it: at the gate's width a right pair is missed now and then.
@@ -58,7 +58,7 @@ pub struct Graph {
 
 impl Graph {
     fn focal(k: usize) -> f64 {
-        FOCAL_RANGE.0 * (FOCAL_RANGE.1 / FOCAL_RANGE.0).powf(k as f64 / (FOCALS - 1) as f64)
+        scan_focal(k, FOCALS)
     }
 
     /// The focal lengths with most rigid pairs, no two of them neighbours on the grid.
