@@ -15,6 +15,7 @@ use super::fundamental::{Fundamental, Match};
 use super::homography::{self, Correspondences};
 use super::null_vector::smallest_eigenvector;
 use super::observation::Observation;
+use super::procrustes::nearest_rotation;
 use super::statistics::median;
 use crate::domain::StopToken;
 
@@ -108,16 +109,6 @@ fn nearest_rotations(homographies: &[Matrix3<f64>]) -> (Intrinsics, Vec<Matrix3<
         || (Intrinsics::from_focal(1.0), vec![Matrix3::identity(); homographies.len()]),
         |(_, intrinsics, rotations)| (intrinsics, rotations),
     )
-}
-
-/// The rotation nearest to a matrix of positive determinant.
-fn nearest_rotation(matrix: &Matrix3<f64>) -> Option<Matrix3<f64>> {
-    if matrix.iter().any(|value| !value.is_finite()) {
-        return None;
-    }
-    let decomposition = matrix.svd(true, true);
-    let rotation = decomposition.u? * decomposition.v_t?;
-    (rotation.determinant() > 0.0).then_some(rotation)
 }
 
 /// Fits a camera that moves without turning.

@@ -72,12 +72,8 @@ impl Fundamental {
     /// Squared Sampson distance of a match (Hartley & Zisserman, eq. 11.9): to first order its squared distance in the
     /// units of the coordinates from the nearest match that fits exactly.
     pub fn sampson_squared(&self, seen: &Match) -> f64 {
-        let (error, gradient_squared) = self.algebraic(seen);
+        let (error, gradient_squared) = algebraic(&self.matrix, seen);
         if gradient_squared > f64::MIN_POSITIVE { error * error / gradient_squared } else { f64::INFINITY }
-    }
-
-    fn algebraic(&self, seen: &Match) -> (f64, f64) {
-        algebraic(&self.matrix, seen)
     }
 
     /// Projective depth of a match in the view `to` per unit of its depth in the view `from` (Sturm & Triggs 1996,
@@ -103,7 +99,8 @@ impl Fundamental {
     ///
     /// Returns `None` where fewer than [`LEAST_MATCHES`] have a weight, or as [`eight_point`] does.
     pub fn refitted(&self, matches: &[Match], weights: &[f64]) -> Option<Self> {
-        let weigh = |(seen, &weight): (&Match, &f64)| if weight > 0.0 { weight / self.algebraic(seen).1 } else { 0.0 };
+        let weigh =
+            |(seen, &weight): (&Match, &f64)| if weight > 0.0 { weight / algebraic(&self.matrix, seen).1 } else { 0.0 };
         let weights: Vec<f64> = matches.iter().zip(weights).map(weigh).collect();
         let weighted = weights.iter().filter(|&&weight| weight > 0.0).count();
         (weighted >= LEAST_MATCHES).then(|| eight_point(matches, &weights)).flatten()

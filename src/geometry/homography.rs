@@ -1,9 +1,9 @@
 //! Do homographies explain the views? Then the scene is planar or the camera only rotated, and nothing about
 //! calibration may be concluded.
 
-use nalgebra::{Matrix3, SMatrix, SVector, Vector2};
+use nalgebra::{Matrix3, SMatrix, Vector2};
 
-use super::null_vector::smallest_eigenvector;
+use super::null_vector::{projection_equations, smallest_eigenvector};
 use super::observation::Observation;
 use super::statistics::median;
 
@@ -133,11 +133,7 @@ fn robust(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<(Matrix3
 fn direct_linear_transform(pairs: &[(Vector2<f64>, Vector2<f64>)], weights: &[f64]) -> Option<Matrix3<f64>> {
     let mut normal = SMatrix::<f64, 9, 9>::zeros();
     for ((from, to), weight) in pairs.iter().zip(weights) {
-        let from = from.push(1.0);
-        for (row, target) in [to.x, to.y].into_iter().enumerate() {
-            let mut equation = SVector::<f64, 9>::zeros();
-            equation.fixed_rows_mut::<3>(3 * row).copy_from(&from);
-            equation.fixed_rows_mut::<3>(6).copy_from(&(-target * from));
+        for equation in projection_equations::<3, 9>(&from.push(1.0), to) {
             normal += equation * equation.transpose() * *weight;
         }
     }

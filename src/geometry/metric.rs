@@ -6,6 +6,7 @@ use super::bundle::critical::Translating;
 use super::bundle::metric::{Intrinsics, Pose, Reconstruction};
 use super::daq::{self, CanonicalFrame, Daq};
 use super::observation::Observation;
+use super::procrustes::nearest_rotation;
 use super::statistics::median;
 
 /// Distance at which points are held, in median depths: beyond it the depth of a point moves no observation, while a
@@ -97,14 +98,10 @@ fn oriented(mut reconstruction: Reconstruction, observations: &[Observation]) ->
 /// The rotation nearest to a 3x3 matrix up to scale, and the translation at that scale.
 fn pose(left: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Pose> {
     let sign = if left.determinant() < 0.0 { -1.0 } else { 1.0 };
-    if left.iter().any(|value| !value.is_finite()) {
-        return None;
-    }
-    let decomposition = (left * sign).svd(true, true);
-    let rotation = decomposition.u? * decomposition.v_t?;
-    let translation = right * (sign / decomposition.singular_values.mean());
-    let usable = rotation.determinant() > 0.0 && translation.iter().all(|value| value.is_finite());
-    usable.then_some(Pose { rotation, translation })
+    let rotation = nearest_rotation(&(left * sign))?;
+    // The matrix is this rotation stretched by its singular values, whose mean is the scale.
+    let translation = right * (3.0 / rotation.dot(left));
+    translation.iter().all(|value| value.is_finite()).then_some(Pose { rotation, translation })
 }
 
 /// Scales the scene to a median depth of 1 and holds far points at [`FARTHEST`].

@@ -1,7 +1,7 @@
 //! The direction that a small system of equations leaves nearly free.
 
 use nalgebra::allocator::Allocator;
-use nalgebra::{Const, DefaultAllocator, DimDiff, DimSub, Matrix4, SMatrix, SVector, U1, Vector4};
+use nalgebra::{Const, DefaultAllocator, DimDiff, DimSub, Matrix4, SMatrix, SVector, U1, Vector2, Vector4};
 
 /// What is added to the diagonal, as a share of the trace: it moves no eigenvector, and makes the factorisation of what
 /// rounding left singular or indefinite (1e-16 of the trace) safe.
@@ -59,6 +59,20 @@ where
     }
     let eigen = (matrix / trace).symmetric_eigen();
     Some(eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned())
+}
+
+/// Two equations of the direct linear transform (Hartley & Zisserman, eqs. 4.3 and 7.2): by which combinations of the
+/// entries of a matrix of three rows, row after row, its image of a homogeneous point misses `image`.
+pub(super) fn projection_equations<const D: usize, const N: usize>(
+    point: &SVector<f64, D>,
+    image: &Vector2<f64>,
+) -> [SVector<f64, N>; 2] {
+    [0, 1].map(|axis| {
+        let mut equation = SVector::<f64, N>::zeros();
+        equation.fixed_rows_mut::<D>(D * axis).copy_from(point);
+        equation.fixed_rows_mut::<D>(2 * D).copy_from(&(-image[axis] * point));
+        equation
+    })
 }
 
 #[cfg(test)]

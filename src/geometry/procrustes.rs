@@ -22,17 +22,19 @@ pub fn absolute_orientation(from: &[Vector3<f64>], to: &[Vector3<f64>], weights:
     for ((from, to), weight) in from.iter().zip(to).zip(weights) {
         covariance += *weight * (to - centre_to) * (from - centre_from).transpose();
     }
-    if covariance.iter().any(|entry| !entry.is_finite()) {
+    let rotation = nearest_rotation(&covariance)?;
+    Some(Pose { rotation, translation: centre_to - rotation * centre_from })
+}
+
+/// The rotation nearest to a matrix, whatever its scale; `None` where it holds what is no number.
+pub(super) fn nearest_rotation(matrix: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+    if matrix.iter().any(|entry| !entry.is_finite()) {
         return None;
     }
-    let decomposition = covariance.svd(true, true);
+    let decomposition = matrix.svd(true, true);
     let (left, right) = (decomposition.u?, decomposition.v_t?);
-    let mut signs = Vector3::repeat(1.0);
-    if (left * right).determinant() < 0.0 {
-        signs.z = -1.0;
-    }
-    let rotation = left * Matrix3::from_diagonal(&signs) * right;
-    Some(Pose { rotation, translation: centre_to - rotation * centre_from })
+    let sign = if (left * right).determinant() < 0.0 { -1.0 } else { 1.0 };
+    Some(left * Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, sign)) * right)
 }
 
 /// Rounds of [`generalised`]; noise of a tenth of the shape's size needs four to settle.

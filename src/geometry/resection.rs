@@ -3,7 +3,7 @@
 use nalgebra::{Matrix4, SMatrix, SVector, Vector2};
 use rand_chacha::ChaCha8Rng;
 
-use super::null_vector::{null_vector, smallest_eigenvector};
+use super::null_vector::{null_vector, projection_equations, smallest_eigenvector};
 use super::ransac::{self, Estimator, Refinable};
 use super::triangulation::reprojection;
 use super::{Camera, Point};
@@ -27,11 +27,8 @@ fn linear(points: &[Point], images: &[Vector2<f64>]) -> Option<Camera> {
     for (point, image) in points.iter().zip(images) {
         // Unit homogeneous vectors: no point weighs more for its scale.
         let unit = point.try_normalize(f64::MIN_POSITIVE)?;
-        for (axis, coordinate) in [(0, image.x), (1, image.y)] {
-            let mut row = SVector::<f64, 12>::zeros();
-            row.fixed_rows_mut::<4>(4 * axis).copy_from(&unit);
-            row.fixed_rows_mut::<4>(8).copy_from(&(-coordinate * unit));
-            normal += row * row.transpose();
+        for equation in projection_equations::<4, 12>(&unit, image) {
+            normal += equation * equation.transpose();
         }
     }
     let solution = smallest_eigenvector(&normal)?;
@@ -120,14 +117,7 @@ impl Refinable<12> for Resection<'_> {
         let (point, image) = (&self.points[datum], &self.images[datum]);
         let residual = reprojection(camera, point, image);
         let nearer = point / (camera.row(2) * point).x;
-        let projected = residual + image;
-        let gradient = |axis: usize| {
-            let mut gradient = SVector::<f64, 12>::zeros();
-            gradient.fixed_rows_mut::<4>(4 * axis).copy_from(&nearer);
-            gradient.fixed_rows_mut::<4>(8).copy_from(&(-projected[axis] * nearer));
-            gradient
-        };
-        Some((residual, [gradient(0), gradient(1)]))
+        Some((residual, projection_equations(&nearer, &(residual + image))))
     }
 
     fn weight(&self, datum: usize) -> f64 {
