@@ -90,9 +90,10 @@ impl Intrinsics {
         Vector2::new(self.focal * distorted.x, self.aspect * self.focal * distorted.y) + self.principal_point
     }
 
-    /// Derivatives of [`Self::project`]; infinite or not a number at depth zero.
+    /// Gradients of the two coordinates of [`Self::project`] by the intrinsics, in the order of [`Parameter`], and by the
+    /// point; infinite or not a number at depth zero.
     #[inline(always)]
-    pub(super) fn gradients(&self, seen: &Vector3<f64>) -> ImageGradients {
+    pub(super) fn gradients(&self, seen: &Vector3<f64>) -> ([[f64; Parameter::COUNT]; 2], [Vector3<f64>; 2]) {
         let scale = seen.z.recip();
         let (u, v) = (seen.x * scale, seen.y * scale);
         let (fx, fy) = (self.focal, self.aspect * self.focal);
@@ -114,8 +115,7 @@ impl Intrinsics {
             [fx * (radial + bend * u * u + 2.0 * p1 * v + 6.0 * p2 * u), fx * cross],
             [fy * cross, fy * (radial + bend * v * v + 6.0 * p1 * v + 2.0 * p2 * u)],
         ];
-        let by_seen = by_uv.map(|[by_u, by_v]| Vector3::new(by_u, by_v, -by_u * u - by_v * v) * scale);
-        ImageGradients { by_parameter, by_seen }
+        (by_parameter, by_uv.map(|[by_u, by_v]| Vector3::new(by_u, by_v, -by_u * u - by_v * v) * scale))
     }
 
     /// Whether a point at this squared tangent of the angle from the optical axis lies before the fold, if there is
@@ -153,33 +153,22 @@ impl Intrinsics {
         if !self.distorts() {
             return Some(*xy);
         }
-        let ray = self.undistorted_ray(xy)?;
+        let ray = self.ray(xy)?;
         let undone = self.principal_point + Vector2::new(self.focal * ray.x, self.aspect * self.focal * ray.y);
         undone.iter().all(|value| value.is_finite()).then_some(undone)
     }
 
     /// The direction `(u, v)` at unit depth that is imaged at `xy`; `None` where the lens images nothing.
     pub fn ray(&self, xy: &Vector2<f64>) -> Option<Vector2<f64>> {
-        match self.distorts() {
-            true => self.undistorted_ray(xy).filter(|ray| ray.iter().all(|value| value.is_finite())),
-            false => Some(self.distorted_ray(xy)),
-        }
-    }
-
-    /// The direction at unit depth in which a pinhole sees an image point.
-    fn distorted_ray(&self, xy: &Vector2<f64>) -> Vector2<f64> {
         let offset = xy - self.principal_point;
-        Vector2::new(offset.x / self.focal, offset.y / (self.aspect * self.focal))
-    }
-
-    fn undistorted_ray(&self, xy: &Vector2<f64>) -> Option<Vector2<f64>> {
-        let distorted = self.distorted_ray(xy);
+        let distorted = Vector2::new(offset.x / self.focal, offset.y / (self.aspect * self.focal));
+        if !self.distorts() {
+            return Some(distorted);
+        }
         let fold = self.fold().map(f64::sqrt);
         let mut ray = self.radially_undistorted(&distorted, fold)?;
-        if self.tangential == [0.0; 2] {
-            return Some(ray);
-        }
-        for _ in 0..TANGENTIAL_ROUNDS {
+        let rounds = if self.tangential == [0.0; 2] { 0 } else { TANGENTIAL_ROUNDS };
+        for _ in 0..rounds {
             let next = self.radially_undistorted(&(distorted - self.tangential_shift(ray.x, ray.y)), fold)?;
             let moved = (next - ray).norm();
             ray = next;
@@ -187,7 +176,7 @@ impl Intrinsics {
                 break;
             }
         }
-        Some(ray)
+        ray.iter().all(|value| value.is_finite()).then_some(ray)
     }
 
     /// The point that radial distortion alone moves to this one.
@@ -254,14 +243,6 @@ impl Intrinsics {
             Parameter::TangentialP2 => self.tangential[1] += by,
         }
     }
-}
-
-/// Gradients of the two coordinates of an image point.
-pub(super) struct ImageGradients {
-    /// With respect to the intrinsics, in the order of [`Parameter`].
-    pub by_parameter: [[f64; Parameter::COUNT]; 2],
-    /// With respect to the point in camera coordinates.
-    pub by_seen: [Vector3<f64>; 2],
 }
 
 #[cfg(test)]

@@ -4,7 +4,6 @@
 use nalgebra::{Matrix3, Matrix3x4, Rotation3, Vector2, Vector3};
 
 pub use super::covariance::{Information, Optimum};
-use super::intrinsics::ImageGradients;
 pub use super::intrinsics::Intrinsics;
 pub use super::intrinsics_model::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 use super::{Observation, Options, Report, sequence};
@@ -77,7 +76,7 @@ impl<'a> Projection<'a> {
 
     #[inline(always)]
     pub fn gradients(&self) -> ProjectionGradients {
-        let ImageGradients { by_parameter, by_seen } = self.intrinsics.gradients(&self.at);
+        let (by_parameter, by_seen) = self.intrinsics.gradients(&self.at);
         let by_pose = by_seen.map(|by_seen| {
             let turn = self.at.cross(&by_seen);
             [turn.x, turn.y, turn.z, by_seen.x, by_seen.y, by_seen.z]
