@@ -356,7 +356,7 @@ mod tests {
             let (rich, rich_cost) = adjusted(&constant, model, &prior);
             let information = Information::new(&rich, &scene.observations).expect("poses");
             let back = information.optimum(IntrinsicsModel::FOCAL, &[prior]);
-            let of_prior = prior.cost(model, &rich.intrinsics[0]);
+            let of_prior = prior.cost(&model.parameters(), &rich.intrinsics[0]);
             let error = (back.delta_cost - (cost - rich_cost + of_prior)).abs() / (0.0005 * 0.0005);
             assert!(error < 0.02 * (cost - rich_cost) / (0.0005 * 0.0005) + 0.2, "seed {seed}: {error}");
         }

@@ -229,14 +229,16 @@ impl IntrinsicsPrior {
 
     /// What the parameters of a model of each camera group cost where they are.
     pub fn cost_of(priors: &[Self], model: IntrinsicsModel, intrinsics: &[Intrinsics]) -> f64 {
-        priors.iter().zip(intrinsics).map(|(prior, intrinsics)| prior.cost(model, intrinsics)).sum()
+        let parameters = model.parameters();
+        priors.iter().zip(intrinsics).map(|(prior, intrinsics)| prior.cost(&parameters, intrinsics)).sum()
     }
 
-    /// What the parameters of a model cost where they are.
-    pub fn cost(&self, model: IntrinsicsModel, intrinsics: &Intrinsics) -> f64 {
-        let cost =
-            |parameter: Parameter| self.information[parameter as usize] * self.deviation(parameter, intrinsics).powi(2);
-        model.parameters().into_iter().map(cost).sum()
+    /// What these parameters cost where they are.
+    pub fn cost(&self, parameters: &[Parameter], intrinsics: &Intrinsics) -> f64 {
+        let cost = |parameter: &Parameter| {
+            self.information[*parameter as usize] * self.deviation(*parameter, intrinsics).powi(2)
+        };
+        parameters.iter().map(cost).sum()
     }
 }
 

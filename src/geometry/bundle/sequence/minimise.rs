@@ -83,15 +83,10 @@ fn cost(
     loss: Loss,
     pool: &WorkerPool,
 ) -> Option<f64> {
-    let mut sum = 0.0;
-    for (group, (prior, intrinsics)) in priors.iter().zip(&sequence.intrinsics).enumerate() {
-        for parameter in &layout.unknowns.parameters[group] {
-            sum += prior.information[*parameter as usize] * prior.deviation(*parameter, intrinsics).powi(2);
-        }
-    }
+    let groups = priors.iter().zip(&layout.unknowns.parameters).zip(&sequence.intrinsics);
+    let of_priors: f64 = groups.map(|((prior, parameters), intrinsics)| prior.cost(parameters, intrinsics)).sum();
     let of_point = |point: usize| Some(cost_of_point(sequence, layout.seen(point), &sequence.points[point], loss));
-    pool.of_points(layout, of_point)?.into_iter().for_each(|cost| sum += cost);
-    Some(sum)
+    Some(pool.of_points(layout, of_point)?.into_iter().fold(of_priors, |sum, cost| sum + cost))
 }
 
 /// Sum of the loss over the observations of one point, were it at this position.
