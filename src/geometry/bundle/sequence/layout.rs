@@ -6,6 +6,7 @@ use nalgebra::Vector2;
 
 use super::super::intrinsics_model::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
+use super::grouped::Grouped;
 use super::{CancellationCheck, Free, Observation, Reconstruction, holds};
 
 /// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free
@@ -123,32 +124,22 @@ impl Layout {
         cancellation: &mut CancellationCheck,
     ) -> Option<Self> {
         let points = sequence.points.len();
-        let usable = || observations.iter().filter(|seen| holds(sequence, seen));
-        let mut seen_starts = vec![0; points + 1];
+        let usable = observations.iter().enumerate().filter(|(_, seen)| holds(sequence, seen));
+        let by_point = Grouped::new(points, usable.map(|(k, seen)| (seen.point, k)));
         let mut sees = vec![false; sequence.poses.len()];
-        for observation in usable() {
+        let mut seen = Vec::with_capacity(by_point.members.len());
+        for &k in &by_point.members {
             if !cancellation.may_go_on(1) {
                 return None;
             }
-            seen_starts[observation.point + 1] += 1;
-            sees[observation.view] = true;
-        }
-        accumulate(&mut seen_starts);
-        let nothing = Seen { view: 0, xy: Vector2::zeros(), weight: 0.0, view_coupling: None, group_coupling: None };
-        let mut seen = vec![nothing; seen_starts[points]];
-        let mut next = seen_starts.clone();
-        for observation in usable() {
-            if !cancellation.may_go_on(1) {
-                return None;
-            }
-            let Observation { view, point, xy, weight } = *observation;
-            seen[next[point]] = Seen { view, xy, weight, ..nothing };
-            next[point] += 1;
+            let Observation { view, xy, weight, .. } = observations[k as usize];
+            sees[view] = true;
+            seen.push(Seen { view, xy, weight, view_coupling: None, group_coupling: None });
         }
         let mut layout = Self {
             unknowns: Unknowns::new(sequence, free, &sees),
             seen,
-            seen_starts,
+            seen_starts: by_point.starts,
             incident_blocks: Vec::new(),
             incident_block_starts: vec![0],
             coupling_starts: vec![0],
@@ -249,19 +240,9 @@ impl Layout {
         self.seen_starts[points.start]..self.seen_starts[points.end]
     }
 
-    /// Observations of each view, ascending: their starts and, one view after the other, where the observations are
-    /// among all.
-    pub fn seen_by_view(&self, views: usize) -> (Vec<usize>, Vec<u32>) {
-        let mut starts = vec![0; views + 1];
-        self.seen.iter().for_each(|seen| starts[seen.view + 1] += 1);
-        accumulate(&mut starts);
-        let mut next = starts.clone();
-        let mut by_view = vec![0; self.seen.len()];
-        for (k, seen) in self.seen.iter().enumerate() {
-            by_view[next[seen.view]] = k as u32;
-            next[seen.view] += 1;
-        }
-        (starts, by_view)
+    /// Where the observations of each view are among all.
+    pub fn seen_by_view(&self, views: usize) -> Grouped {
+        Grouped::new(views, self.seen.iter().enumerate().map(|(k, seen)| (seen.view, k)))
     }
 
     /// All observations, sorted by point.
@@ -269,29 +250,9 @@ impl Layout {
         &self.seen
     }
 
-    /// Points that are coupled with each block, ascending: their starts and, one block after the other, the points.
-    pub fn points_by_block(&self) -> (Vec<usize>, Vec<u32>) {
-        let mut starts = vec![0; self.unknowns.block_count() + 1];
-        for incident in &self.incident_blocks {
-            starts[incident.block as usize + 1] += 1;
-        }
-        accumulate(&mut starts);
-        let mut next = starts.clone();
-        let mut points = vec![0; self.incident_blocks.len()];
-        for point in 0..self.point_count() {
-            for incident in self.incident_blocks(point) {
-                let slot = &mut next[incident.block as usize];
-                points[*slot] = point as u32;
-                *slot += 1;
-            }
-        }
-        (starts, points)
-    }
-}
-
-/// Counts, each one place late, to starts.
-fn accumulate(counts: &mut [usize]) {
-    for k in 1..counts.len() {
-        counts[k] += counts[k - 1];
+    /// Points that are coupled with each block.
+    pub fn points_by_block(&self) -> Grouped {
+        let blocks = |point: usize| self.incident_blocks(point).iter().map(move |block| (block.block as usize, point));
+        Grouped::new(self.unknowns.block_count(), (0..self.point_count()).flat_map(blocks))
     }
 }

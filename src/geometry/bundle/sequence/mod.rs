@@ -7,6 +7,7 @@
 //! linear algebra.
 
 mod embedded_points;
+mod grouped;
 mod layout;
 mod minimise;
 mod normal;

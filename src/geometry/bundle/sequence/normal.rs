@@ -8,6 +8,7 @@ use nalgebra::Vector3;
 use super::super::Loss;
 use super::super::engine::usable_squared_norm;
 use super::super::metric::{IntrinsicsPrior, POSE, Parameter, Projection, ProjectionGradients, VIEW};
+use super::grouped::Grouped;
 use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
 use super::point::PointBlock;
@@ -72,8 +73,8 @@ pub(super) struct Cameras {
     pub gradient: Vec<f64>,
     /// Values and unknowns that belong to the views before each, and to all of them: the groups' come after these.
     before: Vec<(usize, usize)>,
-    /// Observations of each view: starts, and one view after the other where they are among all.
-    by_view: (Vec<usize>, Vec<u32>),
+    /// Where the observations of each view are among all.
+    by_view: Grouped,
 }
 
 /// The normal equations `J' J dx = -J' r`.
@@ -139,10 +140,9 @@ impl Normal {
         self.cameras.values.fill(0.0);
         self.cameras.gradient.fill(0.0);
         self.cameras.add_priors(sequence, layout, priors);
-        let mut begun = self.cameras.by_view.0.clone();
         pool.batches().all(|points| {
             self.linearise(sequence, layout, loss, pool, points.clone())
-                && self.cameras.add_batch(sequence, layout, pool, points, &self.rows, &mut begun)
+                && self.cameras.add_batch(sequence, layout, pool, points, &self.rows)
         })
     }
 
@@ -257,8 +257,6 @@ impl Cameras {
     }
 
     /// Adds the rows of a batch; `false` when it was stopped.
-    ///
-    /// * `begun`: how far the list of every view's observations is worked off
     fn add_batch(
         &mut self,
         sequence: &Reconstruction,
@@ -266,14 +264,10 @@ impl Cameras {
         pool: &WorkerPool,
         points: Range<usize>,
         rows: &[Option<Weighted>],
-        begun: &mut [usize],
     ) -> bool {
-        let Self { places, values, gradient, before, by_view: (starts, by_view), .. } = self;
+        let Self { places, values, gradient, before, by_view, .. } = self;
         let seen = layout.seen_range(points);
-        let of_batch = |view: usize| {
-            let left = &by_view[begun[view]..starts[view + 1]];
-            &left[..left.partition_point(|&k| (k as usize) < seen.end)]
-        };
+        let of_batch = |view: usize| by_view.within(view, &seen);
         let weights = (0..places.len()).map(|view| of_batch(view).len());
         let (mut values, mut gradient) = (values.as_mut_slice(), gradient.as_mut_slice());
         let cut = |ends: &[usize]| {
@@ -288,15 +282,12 @@ impl Cameras {
         // First, for nobody can share it.
         pieces.insert(0, Sums::Groups { values, gradient });
         let batch = Batch { places, before, parameters: &layout.unknowns.parameters, first: seen.start, rows };
-        let done = pool.threads.each(pieces, |piece: Sums| {
+        pool.threads.each(pieces, |piece: Sums| {
             vectorised(
                 #[inline(always)]
                 || batch.add(sequence, piece, &layout.all_seen()[seen.clone()], of_batch, pool.cancellation()),
             )
-        });
-        let ends: Vec<usize> = (0..places.len()).map(|view| begun[view] + of_batch(view).len()).collect();
-        begun[..ends.len()].copy_from_slice(&ends);
-        done
+        })
     }
 }
 

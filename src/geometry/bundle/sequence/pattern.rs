@@ -65,7 +65,7 @@ impl Pattern {
         let blocks = layout.unknowns.block_count();
         let mut group_of = vec![None; blocks];
         pairs.for_each(|(pose, group)| group_of[pose] = Some(group));
-        let (starts, points) = layout.points_by_block();
+        let points_by_block = layout.points_by_block();
         let (mut column_starts, mut rows) = (vec![0], Vec::new());
         // Column for which a row was listed last.
         let mut listed_for = vec![usize::MAX; blocks];
@@ -79,7 +79,7 @@ impl Pattern {
             };
             list(column);
             group_of[column].into_iter().for_each(&mut list);
-            for &point in &points[starts[column]..starts[column + 1]] {
+            for &point in points_by_block.of(column) {
                 let incident_blocks = layout.incident_blocks(point as usize);
                 // A look at a block costs a small part of what an observation's linearisation does.
                 if !cancellation.may_go_on(incident_blocks.len().div_ceil(8)) {

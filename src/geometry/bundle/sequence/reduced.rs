@@ -7,6 +7,7 @@ use nalgebra::Vector3;
 
 use super::super::metric::{POINT, POSE};
 use super::super::panel::{self, PANEL_SHARE};
+use super::grouped::Grouped;
 use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::{Column, Pattern};
@@ -28,8 +29,8 @@ pub(super) struct Reduced {
     pub values: Vec<f64>,
     /// Right-hand side, then solution.
     pub vector: Vec<f64>,
-    /// Points that are coupled with each block, ascending: starts, and one block after the other the points.
-    incident_points: (Vec<usize>, Vec<u32>),
+    /// Points that are coupled with each block.
+    incident_points: Grouped,
     /// Couplings of a batch of points, each times the inverse root of its point's block: one point's after the other,
     /// or the columns of a panel.
     whitened: Vec<f64>,
@@ -75,12 +76,11 @@ impl Reduced {
         for (slot, gradient) in self.vector.iter_mut().zip(&normal.cameras.gradient) {
             *slot = -gradient;
         }
-        let mut begun = self.incident_points.0.clone();
         pool.batches().all(|points| {
             self.whiten(layout, normal, damping, pool, points.clone())
                 && match self.by_panels {
                     true => self.subtract_panel(layout, points, pool.cancellation()),
-                    false => self.subtract(layout, pool, points, &mut begun),
+                    false => self.subtract(layout, pool, points),
                 }
         })
     }
@@ -135,14 +135,9 @@ impl Reduced {
         true
     }
 
-    /// * `begun`: how far the list of every block's points is worked off
-    fn subtract(&mut self, layout: &Layout, pool: &WorkerPool, points: Range<usize>, begun: &mut [usize]) -> bool {
+    fn subtract(&mut self, layout: &Layout, pool: &WorkerPool, points: Range<usize>) -> bool {
         let Self { pattern, values, vector, incident_points, whitened, whitened_gradients, .. } = self;
-        let (starts, incident_points) = incident_points;
-        let of_batch = |block: usize| {
-            let left = &incident_points[begun[block]..starts[block + 1]];
-            &left[..left.partition_point(|&point| (point as usize) < points.end)]
-        };
+        let of_batch = |block: usize| incident_points.within(block, &points);
         let weights = (0..pattern.block_count()).map(|block| of_batch(block).len());
         let (mut values, mut vector) = (values.as_mut_slice(), vector.as_mut_slice());
         let cut = |ends: &[usize]| {
@@ -158,16 +153,13 @@ impl Reduced {
             whitened,
             whitened_gradients,
         };
-        let done = pool.threads.each(pieces, |piece: Columns| {
+        pool.threads.each(pieces, |piece: Columns| {
             let mut cancellation = pool.cancellation();
             vectorised(
                 #[inline(always)]
                 || piece.subtract(layout, pattern, &batch, of_batch, &mut cancellation),
             )
-        });
-        let ends: Vec<usize> = (0..pattern.block_count()).map(|block| begun[block] + of_batch(block).len()).collect();
-        begun[..ends.len()].copy_from_slice(&ends);
-        done
+        })
     }
 
     /// Marquardt's damping, and what holds the gauge.
