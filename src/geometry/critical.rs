@@ -56,18 +56,14 @@ pub fn fit_without_parallax(
         .collect::<Option<_>>()?;
     let inverses: Vec<Matrix3<f64>> =
         homographies.iter().map(|homography| homography.try_inverse()).collect::<Option<_>>()?;
-    let mut positions = vec![None; points];
-    for seen in observations.iter().filter(|seen| seen.view < views && seen.point < points) {
-        let slot = &mut positions[seen.point];
-        if slot.is_none() || seen.view == reference {
-            let back = inverses[seen.view] * seen.xy.push(1.0);
-            *slot = Some(back.xy() / back.z).filter(|position| position.iter().all(|value| value.is_finite()));
-        }
-    }
+    let positions = positions(observations, views, points, reference, |seen| {
+        let back = inverses[seen.view] * seen.xy.push(1.0);
+        back.xy() / back.z
+    });
     let observed = positions.iter().flatten().count();
     let positions: Vec<Vector2<f64>> = positions.into_iter().map(Option::unwrap_or_default).collect();
 
-    let (intrinsics, rotations) = nearest_rotations(&homographies);
+    let (intrinsics, rotations) = nearest_rotations(&homographies)?;
     let back = |point: &Vector2<f64>| (point - intrinsics.principal_point) / intrinsics.focal;
     let rotating = Rotating { intrinsics, rotations, points: positions.iter().map(back).collect() };
     let plane = Homographies { views: homographies, points: positions };
@@ -75,6 +71,26 @@ pub fn fit_without_parallax(
         adjusted(plane, 8 * views + 2 * observed, HOMOGRAPHIES_GAUGE, observations, stop),
         adjusted(rotating, 3 * views + 3 + 2 * observed, ROTATING_GAUGE, observations, stop),
     ))
+}
+
+/// Where the reference view sees each point: as observed there, else by its first observation elsewhere.
+///
+/// * `back`: takes an observation into the reference view
+fn positions(
+    observations: &[Observation],
+    views: usize,
+    points: usize,
+    reference: usize,
+    back: impl Fn(&Observation) -> Vector2<f64>,
+) -> Vec<Option<Vector2<f64>>> {
+    let mut positions = vec![None; points];
+    for seen in observations.iter().filter(|seen| seen.view < views && seen.point < points) {
+        let slot = &mut positions[seen.point];
+        if slot.is_none() || seen.view == reference {
+            *slot = Some(back(seen)).filter(|position| position.iter().all(|value| value.is_finite())).or(*slot);
+        }
+    }
+    positions
 }
 
 fn adjusted<const G: usize, const C: usize, const P: usize, M: Problem<G, C, P>>(
@@ -89,7 +105,7 @@ fn adjusted<const G: usize, const C: usize, const P: usize, M: Problem<G, C, P>>
 }
 
 /// The focal length, principal point in the centre, with which the homographies are nearest to rotations, and these.
-fn nearest_rotations(homographies: &[Matrix3<f64>]) -> (Intrinsics, Vec<Matrix3<f64>>) {
+fn nearest_rotations(homographies: &[Matrix3<f64>]) -> Option<(Intrinsics, Vec<Matrix3<f64>>)> {
     let candidates = (0..FOCALS).map(|k| {
         let intrinsics = Intrinsics::from_focal(scan_focal(k, FOCALS));
         let forward = intrinsics.matrix();
@@ -104,11 +120,8 @@ fn nearest_rotations(homographies: &[Matrix3<f64>]) -> (Intrinsics, Vec<Matrix3<
         }
         (if distance.is_finite() { distance } else { f64::INFINITY }, intrinsics, rotations)
     });
-    let best = candidates.min_by(|a, b| a.0.total_cmp(&b.0));
-    best.map_or_else(
-        || (Intrinsics::from_focal(1.0), vec![Matrix3::identity(); homographies.len()]),
-        |(_, intrinsics, rotations)| (intrinsics, rotations),
-    )
+    let (_, intrinsics, rotations) = candidates.min_by(|a, b| a.0.total_cmp(&b.0))?;
+    Some((intrinsics, rotations))
 }
 
 /// Fits a camera that moves without turning.
@@ -137,27 +150,18 @@ pub fn fit_translation(
     if median(&mut residuals) > limit * noise {
         return None;
     }
-    let mut positions = vec![Vector3::new(0.0, 0.0, 1.0); points];
-    let mut observed = vec![false; points];
-    let usable =
-        |seen: &&Observation| seen.view < views && seen.point < points && seen.xy.iter().all(|value| value.is_finite());
-    for seen in observations.iter().filter(usable) {
-        let slot = &mut positions[seen.point];
-        if !observed[seen.point] || seen.view == reference {
-            (slot.x, slot.y) = (seen.xy.x, seen.xy.y);
-        }
-        observed[seen.point] = true;
-    }
-    let mut model = Translating { translations: epipoles, points: positions };
+    let positions = positions(observations, views, points, reference, |seen| seen.xy);
+    let observed = positions.iter().flatten().count();
+    let at_unit_depth = positions.into_iter().map(|position| position.unwrap_or_default().push(1.0));
+    let mut model = Translating { translations: epipoles, points: at_unit_depth.collect() };
     alternate(&mut model, observations, reference);
-    let observed = observed.iter().filter(|observed| **observed).count();
     Some(adjusted(model, 3 * views + 3 * observed, TRANSLATING_GAUGE, observations, stop))
 }
 
 /// The common epipole of two views that are not turned to each other: it lies on the line through each point's images.
-fn epipole(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Option<Vector3<f64>> {
+fn epipole(pairs: &[Match]) -> Option<Vector3<f64>> {
     let mut normal = Matrix3::zeros();
-    for (from, to) in pairs {
+    for Match { from, to } in pairs {
         let line = from.push(1.0).cross(&to.push(1.0));
         normal += line * line.transpose();
     }
@@ -165,10 +169,9 @@ fn epipole(pairs: &[(Vector2<f64>, Vector2<f64>)]) -> Option<Vector3<f64>> {
 }
 
 /// Median Sampson distance from the epipolar constraint `to . (e x from) = 0`.
-fn epipolar_residual(pairs: &[(Vector2<f64>, Vector2<f64>)], epipole: &Vector3<f64>) -> f64 {
+fn epipolar_residual(pairs: &[Match], epipole: &Vector3<f64>) -> f64 {
     let fundamental = Fundamental::of_translation(*epipole);
-    let distance = |&(from, to): &(Vector2<f64>, Vector2<f64>)| fundamental.sampson_squared(&Match { from, to }).sqrt();
-    let mut residuals: Vec<f64> = pairs.iter().map(distance).collect();
+    let mut residuals: Vec<f64> = pairs.iter().map(|seen| fundamental.sampson_squared(seen).sqrt()).collect();
     median(&mut residuals)
 }
 

@@ -3,6 +3,7 @@
 
 use nalgebra::{Matrix3, SMatrix, Vector2};
 
+use super::fundamental::Match;
 use super::null_vector::{projection_equations, smallest_eigenvector};
 use super::observation::Observation;
 use super::statistics::median;
@@ -80,18 +81,18 @@ impl Correspondences {
     ///
     /// # Panics
     /// When a view is out of range.
-    pub fn common(&self, first: usize, second: usize) -> Vec<(Vector2<f64>, Vector2<f64>)> {
+    pub fn common(&self, first: usize, second: usize) -> Vec<Match> {
         let second = &self.by_view[second];
         let found = self.by_view[first].iter().filter_map(|(point, xy)| {
             let at = second.binary_search_by_key(point, |(point, _)| *point).ok()?;
-            Some((*xy, second[at].1))
+            Some(Match { from: *xy, to: second[at].1 })
         });
         found.collect()
     }
 }
 
 /// How far the best homography between two views misses, in units of the noise and corrected for its eight unknowns.
-fn pair_residual(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<f64> {
+fn pair_residual(pairs: &[Match], noise: f64) -> Option<f64> {
     let noise = noise.max(f64::EPSILON);
     let (_, mut errors) = robust(pairs, noise)?;
     errors.sort_by(f64::total_cmp);
@@ -104,12 +105,12 @@ fn pair_residual(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<f
 /// The homography from the first to the second points of these pairs, by a reweighted direct linear transform.
 ///
 /// Returns `None` for fewer than [`LEAST_COMMON`] pairs and for pairs that determine none.
-pub fn between(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<Matrix3<f64>> {
+pub fn between(pairs: &[Match], noise: f64) -> Option<Matrix3<f64>> {
     robust(pairs, noise.max(f64::EPSILON)).map(|(homography, _)| homography)
 }
 
 /// The same with the distance by which it misses each point.
-fn robust(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<(Matrix3<f64>, Vec<f64>)> {
+fn robust(pairs: &[Match], noise: f64) -> Option<(Matrix3<f64>, Vec<f64>)> {
     if pairs.len() < LEAST_COMMON {
         return None;
     }
@@ -118,7 +119,7 @@ fn robust(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<(Matrix3
     let mut errors = vec![f64::INFINITY; pairs.len()];
     for _ in 0..ROUNDS {
         homography = direct_linear_transform(pairs, &weights)?;
-        for ((error, weight), (from, to)) in errors.iter_mut().zip(&mut weights).zip(pairs) {
+        for ((error, weight), Match { from, to }) in errors.iter_mut().zip(&mut weights).zip(pairs) {
             let moved = homography * from.push(1.0);
             *error = (moved.xy() / moved.z - to).norm();
             // The scale makes the algebraic error geometric, the rest bounds what one wrong point can do.
@@ -130,9 +131,9 @@ fn robust(pairs: &[(Vector2<f64>, Vector2<f64>)], noise: f64) -> Option<(Matrix3
 }
 
 /// The homography with the least weighted algebraic error, at unit norm.
-fn direct_linear_transform(pairs: &[(Vector2<f64>, Vector2<f64>)], weights: &[f64]) -> Option<Matrix3<f64>> {
+fn direct_linear_transform(pairs: &[Match], weights: &[f64]) -> Option<Matrix3<f64>> {
     let mut normal = SMatrix::<f64, 9, 9>::zeros();
-    for ((from, to), weight) in pairs.iter().zip(weights) {
+    for (Match { from, to }, weight) in pairs.iter().zip(weights) {
         for equation in projection_equations::<3, 9>(&from.push(1.0), to) {
             normal += equation * equation.transpose() * *weight;
         }
