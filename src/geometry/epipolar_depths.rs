@@ -5,7 +5,6 @@ use rand_chacha::ChaCha8Rng;
 
 use super::fundamental::{self, Fundamental, Match};
 use super::measurement::CompleteBlock;
-use super::ransac::Robust;
 use super::statistics::median;
 use crate::domain::StopToken;
 
@@ -41,43 +40,26 @@ pub fn epipolar_depths(block: &CompleteBlock, noise: f64, seed: u64, stop: &Stop
     }
     let mut references = vec![0, views / 2, views - 1];
     references.dedup();
-    type Star = Vec<Option<Robust<Fundamental>>>;
-    let mut best: Option<(usize, f64, Star)> = None;
-    for reference in references {
-        if let Some((cost, star)) = star(block, reference, noise, seed, stop)
-            && best.as_ref().is_none_or(|(_, least, _)| cost < *least)
-        {
-            best = Some((reference, cost, star));
-        }
-    }
-    if stop.is_stopped() {
-        return None;
-    }
-    let (reference, _, star) = best?;
+    let stars = references.into_iter().filter_map(|reference| star(block, reference, noise, seed, stop));
+    let best = stars.min_by(|a, b| a.cost.total_cmp(&b.cost)).filter(|_| !stop.is_stopped())?;
     let mut depths = vec![1.0; views * block.tracks()];
-    for (view, robust) in star.iter().enumerate() {
-        let Some(robust) = robust else { continue };
-        for (track, depth) in depths_in_view(block, reference, view, &robust.model, noise).into_iter().enumerate() {
-            depths[track * views + view] = depth;
-        }
+    for (view, fundamental) in &best.matrices {
+        let of_view = depths_in_view(block, best.reference, *view, fundamental, noise);
+        of_view.into_iter().enumerate().for_each(|(track, depth)| depths[track * views + view] = depth);
     }
     Some(depths)
 }
 
-/// The fundamental matrix from a reference view to every other one, with the sum of their costs; none of itself.
-fn star(
-    block: &CompleteBlock,
+/// Fundamental matrices from a reference view to every other one, with the sum of their costs.
+struct Star {
     reference: usize,
-    noise: f64,
-    seed: u64,
-    stop: &StopToken,
-) -> Option<(f64, Vec<Option<Robust<Fundamental>>>)> {
-    let (mut cost, mut star) = (0.0, Vec::with_capacity(block.views()));
-    for view in 0..block.views() {
-        if view == reference {
-            star.push(None);
-            continue;
-        }
+    cost: f64,
+    matrices: Vec<(usize, Fundamental)>,
+}
+
+fn star(block: &CompleteBlock, reference: usize, noise: f64, seed: u64, stop: &StopToken) -> Option<Star> {
+    let mut star = Star { reference, cost: 0.0, matrices: Vec::new() };
+    for view in (0..block.views()).filter(|&view| view != reference) {
         let count = block.tracks().min(MOST_MATCHES);
         let matches: Vec<Match> =
             (0..count).map(|k| match_of(block, reference, view, k * block.tracks() / count)).collect();
@@ -85,10 +67,10 @@ fn star(
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream((reference * block.views() + view) as u64);
         let robust = fundamental::robust(&matches, noise, &mut rng, stop)?;
-        cost += robust.cost;
-        star.push(Some(robust));
+        star.cost += robust.cost;
+        star.matrices.push((view, robust.model));
     }
-    Some((cost, star))
+    Some(star)
 }
 
 fn match_of(block: &CompleteBlock, from: usize, to: usize, track: usize) -> Match {

@@ -109,16 +109,10 @@ impl CompleteBlock {
     /// The measurement matrix, 3n x m: column j is track j, block row i is view i, entries `lambda (u, v, 1)`, with
     /// lambda = 1 where no depths were given.
     pub fn measurement_matrix(&self) -> DMatrix<f64> {
-        let mut matrix = DMatrix::zeros(3 * self.views, self.tracks);
-        for track in 0..self.tracks {
-            for (view, observation) in self.track(track).iter().enumerate() {
-                let depth = self.depths.as_ref().map_or(1.0, |depths| depths[track * self.views + view]);
-                matrix[(3 * view, track)] = depth * observation.xy.x;
-                matrix[(3 * view + 1, track)] = depth * observation.xy.y;
-                matrix[(3 * view + 2, track)] = depth;
-            }
-        }
-        matrix
+        DMatrix::from_fn(3 * self.views, self.tracks, |row, track| {
+            let depth = self.depths.as_ref().map_or(1.0, |depths| depths[track * self.views + row / 3]);
+            depth * self.point(row / 3, track).push(1.0)[row % 3]
+        })
     }
 
     /// Every view's points centred on their median and divided by 1.5 times the median absolute deviation:

@@ -64,7 +64,8 @@ impl<'a> Triangulator<'a> {
             }
         }
         let start = self.best_hypothesis(observations, all, gate);
-        let right = chosen(observations, &agreeing(cameras, observations, &start, gate));
+        let agrees = |seen: &&Observation| squared_in_front(cameras, seen, &start) < gate;
+        let right: Vec<Observation> = observations.iter().filter(agrees).copied().collect();
         if right.len() < 2 {
             return None;
         }
@@ -113,10 +114,6 @@ impl<'a> Triangulator<'a> {
         // Cameras at one centre have no epipolar lines: then nothing is ruled out.
         error * error <= gate * gradient_squared
     }
-}
-
-fn chosen(observations: &[Observation], which: &[bool]) -> Vec<Observation> {
-    observations.iter().zip(which).filter(|(_, chosen)| **chosen).map(|(observation, _)| *observation).collect()
 }
 
 fn agreeing(cameras: &[Camera], observations: &[Observation], point: &Point, gate: f64) -> Vec<bool> {
