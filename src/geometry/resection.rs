@@ -141,8 +141,21 @@ mod tests {
 
     use crate::geometry::bundle::testing;
 
+    const NOISE: f64 = 0.001;
+
+    fn found(points: &[Point], images: &[Vector2<f64>], weights: &[f64], least: usize) -> Option<(Camera, Vec<bool>)> {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        robust(points, images, weights, 13.8 * NOISE * NOISE, least, &mut rng, &StopToken::default())
+    }
+
+    /// Distance between the images of a point in two cameras.
+    fn apart(found: &Camera, truth: &Camera, point: &Point) -> f64 {
+        let expected = truth * point;
+        reprojection(found, point, &(expected.xy() / expected.z)).norm()
+    }
+
     fn problem(seed: u64, wrong: usize) -> (Camera, Vec<Point>, Vec<Vector2<f64>>) {
-        let scene = testing::scene(seed, 3, 40, 0.001);
+        let scene = testing::scene(seed, 3, 40, NOISE);
         let (cameras, points) = testing::projectively_transformed(&scene, seed);
         let mut images: Vec<Vector2<f64>> =
             scene.observations.iter().filter(|seen| seen.view == 2).map(|seen| seen.xy).collect();
@@ -157,17 +170,13 @@ mod tests {
         for seed in 0..5 {
             for wrong in [0, 12, 20] {
                 let (truth, points, images) = problem(seed, wrong);
-                let mut rng = ChaCha8Rng::seed_from_u64(seed);
-                let gate = 13.8 * 0.001f64.powi(2);
                 let (camera, agreeing) =
-                    robust(&points, &images, &vec![1.0; images.len()], gate, 10, &mut rng, &StopToken::default())
-                        .unwrap_or_else(|| panic!("seed {seed}, {wrong} wrong"));
+                    found(&points, &images, &[1.0; 40], 10).unwrap_or_else(|| panic!("seed {seed}, {wrong} wrong"));
                 assert!(agreeing[..wrong].iter().all(|&agrees| !agrees), "seed {seed}");
                 let right = agreeing[wrong..].iter().filter(|&&agrees| agrees).count();
                 assert!(right + 3 >= 40 - wrong, "seed {seed}: {right} of {}", 40 - wrong);
                 for point in &points {
-                    let (found, expected) = (camera * point, truth * point);
-                    let distance = (found.xy() / found.z - expected.xy() / expected.z).norm();
+                    let distance = apart(&camera, &truth, point);
                     assert!(distance < 0.005, "seed {seed}: {distance}");
                 }
             }
@@ -176,7 +185,7 @@ mod tests {
 
     /// Points, of which three in ten are seen where the camera has them, give or take the noise.
     fn contaminated(seed: u64, count: usize) -> (Vec<Point>, Vec<Vector2<f64>>, Camera) {
-        let scene = testing::scene(seed, 3, count, 0.001);
+        let scene = testing::scene(seed, 3, count, NOISE);
         let (cameras, points) = testing::projectively_transformed(&scene, seed);
         let of_last = scene.observations.iter().filter(|seen| seen.view == 2);
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -189,46 +198,32 @@ mod tests {
 
     #[test]
     fn three_right_images_in_ten_are_enough() {
-        let (mut found, mut right, mut seconds) = (0, 0.0, 0.0);
+        let (mut successes, mut right, mut seconds) = (0, 0.0, 0.0);
         for seed in 0..20 {
             for count in [40, 100, 600] {
                 let (points, images, truth) = contaminated(seed, count);
-                let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 let start = std::time::Instant::now();
-                let robust = robust(
-                    &points,
-                    &images,
-                    &vec![1.0; images.len()],
-                    13.8 * 0.001f64.powi(2),
-                    9,
-                    &mut rng,
-                    &StopToken::default(),
-                );
+                let robust = found(&points, &images, &vec![1.0; count], 9);
                 seconds += start.elapsed().as_secs_f64();
                 let Some((camera, agreeing)) = robust else { continue };
-                found += 1;
+                successes += 1;
                 let agree = (0..count).filter(|&k| agreeing[k] == (k % 10 < 3)).count();
                 right += agree as f64 / count as f64;
-                let missed = points.iter().map(|point| {
-                    let (seen, expected) = (camera * point, truth * point);
-                    (seen.xy() / seen.z - expected.xy() / expected.z).norm()
-                });
-                let missed = missed.sum::<f64>() / count as f64;
+                let missed = points.iter().map(|point| apart(&camera, &truth, point)).sum::<f64>() / count as f64;
                 assert!(missed < 0.005, "seed {seed}, {count} points: {missed}");
             }
         }
         println!(
-            "{found} of 60 found, {:.4} of their verdicts right, {:.1} ms each",
-            right / f64::from(found),
+            "{successes} of 60 found, {:.4} of their verdicts right, {:.1} ms each",
+            right / f64::from(successes),
             seconds / 60.0 * 1e3
         );
-        assert!(found >= 59 && right >= 0.99 * f64::from(found), "{found} found, {right}");
+        assert!(successes >= 59 && right >= 0.99 * f64::from(successes), "{successes} found, {right}");
     }
 
     /// Half of the images are ten times as noisy as the others: where that is known, they agree, and the camera is nearer.
     #[test]
     fn images_count_by_their_weight() {
-        const NOISE: f64 = 1e-3;
         let (mut weighted, mut plain) = (0.0, 0.0);
         for seed in 0..20 {
             let scene = testing::scene(seed, 3, 60, 0.0);
@@ -243,14 +238,9 @@ mod tests {
                 })
                 .collect();
             let weights: Vec<f64> = (0..images.len()).map(|k| 1.0 / (factor(k) * factor(k))).collect();
-            let mut away = |weights: &[f64]| {
-                let gate = 13.8 * NOISE * NOISE;
-                let found = robust(&points, &images, weights, gate, 10, &mut rng, &StopToken::default());
-                let (camera, agreeing) = found.expect("a camera");
-                let squared = |point: &Point| {
-                    let (seen, expected) = (camera * point, cameras[2] * point);
-                    (seen.xy() / seen.z - expected.xy() / expected.z).norm_squared()
-                };
+            let away = |weights: &[f64]| {
+                let (camera, agreeing) = found(&points, &images, weights, 10).expect("a camera");
+                let squared = |point: &Point| apart(&camera, &cameras[2], point).powi(2);
                 (points.iter().map(squared).sum::<f64>(), agreeing.into_iter().filter(|agrees| *agrees).count())
             };
             let (by_weights, by_all) = (away(&weights), away(&vec![1.0; images.len()]));
@@ -267,26 +257,19 @@ mod tests {
     fn a_point_without_coordinates_is_an_outlier() {
         let (_, mut points, images) = problem(1, 0);
         points[7] = Point::zeros();
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let (_, agreeing) =
-            robust(&points, &images, &vec![1.0; images.len()], 13.8e-6, 10, &mut rng, &StopToken::default())
-                .expect("a camera");
+        let (_, agreeing) = found(&points, &images, &[1.0; 40], 10).expect("a camera");
         assert!(!agreeing[7] && agreeing.iter().filter(|&&agrees| agrees).count() >= 37);
     }
 
     #[test]
     fn images_of_nothing_give_none() {
         let (_, points, images) = problem(1, 40);
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
         let scattered: Vec<Vector2<f64>> =
             (0..40).map(|k| Vector2::new((k as f64 * 1.7).sin(), (k as f64 * 2.9).cos())).collect();
-        assert!(
-            robust(&points, &scattered, &vec![1.0; scattered.len()], 1e-5, 10, &mut rng, &StopToken::default())
-                .is_none()
-        );
+        assert!(found(&points, &scattered, &[1.0; 40], 10).is_none());
         assert!(linear(&points[..5], &images[..5]).is_none());
         assert!(linear(&[Point::zeros(); 8], &images[..8]).is_none());
         let nan = vec![Point::from_element(f64::NAN); 8];
-        assert!(robust(&nan, &images[..8], &[1.0; 8], 1.0, 6, &mut rng, &StopToken::default()).is_none());
+        assert!(found(&nan, &images[..8], &[1.0; 8], 6).is_none());
     }
 }

@@ -148,10 +148,6 @@ mod tests {
 
     const GATE: f64 = 1e-4;
 
-    fn cameras(scene: &testing::TestScene) -> Vec<Camera> {
-        scene.poses.iter().map(|pose| pose.camera(&scene.intrinsics)).collect()
-    }
-
     /// Observations of one point, some of them moved far away.
     fn observations(scene: &testing::TestScene, point: usize, wrong: &[usize]) -> Vec<Observation> {
         let of_point = scene.observations.iter().filter(|seen| seen.point == point);
@@ -166,7 +162,7 @@ mod tests {
     fn a_run_of_three_is_found_among_wrong_observations() {
         for seed in 0..20 {
             let scene = testing::scene(seed, 8, 10, 1e-3);
-            let cameras = cameras(&scene);
+            let cameras = scene.cameras();
             for wrong in [vec![], vec![3], vec![0, 1], vec![0, 1, 5, 6, 7]] {
                 let observations = observations(&scene, seed as usize % 10, &wrong);
                 let found = Triangulator::new(&cameras).robust(&observations, GATE).expect("a point");
@@ -179,7 +175,7 @@ mod tests {
     #[test]
     fn what_no_two_observations_agree_on_is_no_point() {
         let scene = testing::scene(3, 2, 10, 0.0);
-        let cameras = cameras(&scene);
+        let cameras = scene.cameras();
         assert_eq!(Triangulator::new(&cameras).robust(&observations(&scene, 0, &[])[..1], GATE), None);
         // A point behind both cameras.
         let behind: Vec<Camera> = cameras.iter().map(|camera| -camera).collect();

@@ -166,12 +166,8 @@ mod tests {
     use super::*;
     use crate::domain::StopToken;
 
-    fn truth(scene: &TestScene) -> Reconstruction {
-        Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone())
-    }
-
     fn optimum(scene: &TestScene, model: IntrinsicsModel) -> Optimum {
-        let information = Information::new(&truth(scene), &scene.observations).expect("poses");
+        let information = Information::new(&scene.reconstruction(), &scene.observations).expect("poses");
         information.optimum(model, &[IntrinsicsPrior::NONE])
     }
 
@@ -253,7 +249,8 @@ mod tests {
 
     /// Standard deviations of the views' own log focal lengths at the truth.
     fn own_sigmas(scene: &TestScene, model: IntrinsicsModel) -> (Vec<Option<f64>>, Optimum) {
-        let information = Information::new(&truth(scene).with_own_focals(), &scene.observations).expect("poses");
+        let information =
+            Information::new(&scene.reconstruction().with_own_focals(), &scene.observations).expect("poses");
         let optimum = information.optimum(model, &[IntrinsicsPrior::NONE]);
         let sigma = |(variance, _): (Option<f64>, f64)| variance.map(|variance| variance.sqrt() * NOISE);
         (information.own_focals(&optimum).into_iter().map(sigma).collect(), optimum)
@@ -316,7 +313,7 @@ mod tests {
                 (start, report.cost)
             };
             let prior = IntrinsicsPrior::NONE.knowing(Parameter::PrincipalX, 0.001, 0.01, 0.0005);
-            let mut pinhole = truth(&scene);
+            let mut pinhole = scene.reconstruction();
             pinhole.intrinsics = vec![Intrinsics::from_focal(scene.intrinsics.focal)];
             let (simple, cost) = adjusted(&pinhole, IntrinsicsModel::FOCAL, &prior);
             let constant = simple.clone();
@@ -374,7 +371,8 @@ mod tests {
                 adjust(&mut start, &scene.observations, model, &priors, &options, &StopToken::default());
                 start
             };
-            let simple = adjusted(truth(&scene).in_groups(&[0, 0, 0, 0, 1, 1, 1, 1], 2), IntrinsicsModel::FOCAL);
+            let simple =
+                adjusted(scene.reconstruction().in_groups(&[0, 0, 0, 0, 1, 1, 1, 1], 2), IntrinsicsModel::FOCAL);
             let rich = adjusted(simple.clone(), model);
             let information = Information::new(&simple, &scene.observations).expect("poses");
             let predicted = information.optimum(model, &[IntrinsicsPrior::NONE; 2]);

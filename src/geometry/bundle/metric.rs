@@ -206,30 +206,14 @@ pub fn adjust(
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{self, NOISE, TestScene};
+    use super::super::testing::{self, NOISE};
     use super::*;
-
-    fn truth(scene: &TestScene) -> Reconstruction {
-        Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone())
-    }
-
-    fn perturbed(scene: &TestScene, deviation: f64, seed: u64) -> Reconstruction {
-        let mut start = truth(scene);
-        testing::perturb(std::iter::once(&mut start.intrinsics[0].focal), 10.0 * deviation, seed);
-        testing::perturb(start.points.iter_mut().flat_map(|point| point.iter_mut()), deviation, seed + 1);
-        testing::perturb(start.poses.iter_mut().flat_map(|pose| pose.translation.iter_mut()), deviation, seed + 2);
-        for (k, pose) in start.poses.iter_mut().enumerate() {
-            let turn = deviation * testing::direction::<3>(seed + 3 + k as u64);
-            pose.rotation = Rotation3::from_scaled_axis(turn) * pose.rotation;
-        }
-        start
-    }
 
     #[test]
     fn converges_from_a_perturbed_start_to_the_noise_floor() {
         for seed in 0..5 {
             let scene = testing::scene(seed, 8, 30, NOISE);
-            let mut start = perturbed(&scene, 0.02, seed);
+            let mut start = testing::perturbed(&scene.reconstruction(), 0.02, seed);
             let report = adjust(
                 &mut start,
                 &scene.observations,
@@ -256,7 +240,7 @@ mod tests {
     fn a_prior_moves_its_parameter_by_what_it_is_worth() {
         let scene = testing::scene(4, 6, 20, NOISE);
         let adjusted = |prior: &IntrinsicsPrior| {
-            let mut start = truth(&scene);
+            let mut start = scene.reconstruction();
             let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::default() };
             let report = adjust(
                 &mut start,
@@ -269,7 +253,7 @@ mod tests {
             (start.intrinsics[0].focal.ln(), report.cost)
         };
         let (free, cost) = adjusted(&IntrinsicsPrior::NONE);
-        let mut reconstruction = truth(&scene);
+        let mut reconstruction = scene.reconstruction();
         reconstruction.intrinsics[0].focal = free.exp();
         let information = Information::new(&reconstruction, &scene.observations).expect("poses");
         let optimum = information.optimum(IntrinsicsModel::FOCAL, &[IntrinsicsPrior::NONE]);
@@ -287,7 +271,7 @@ mod tests {
     #[test]
     fn fixed_intrinsics_stay_fixed() {
         let scene = testing::scene(2, 4, 12, NOISE);
-        let mut start = perturbed(&scene, 0.01, 2);
+        let mut start = testing::perturbed(&scene.reconstruction(), 0.01, 2);
         let before = start.intrinsics.clone();
         let options = Options::default();
         let (model, prior) = (IntrinsicsModel::FIXED, IntrinsicsPrior::NONE);
@@ -312,15 +296,15 @@ mod tests {
             start
         };
         run(Reconstruction::new(scene.intrinsics, vec![], vec![]), &scene.observations);
-        run(truth(&scene), &[]);
-        let mut odd = truth(&scene);
+        run(scene.reconstruction(), &[]);
+        let mut odd = scene.reconstruction();
         // Depth zero, far away, and a camera that sees a single point.
         odd.points[0] = odd.poses[0].rotation.tr_mul(&-odd.poses[0].translation);
         odd.points[1] *= 1e9;
         let few: Vec<_> = scene.observations.iter().filter(|seen| seen.view != 2 || seen.point == 3).copied().collect();
         let odd = run(odd, &few);
         assert!(odd.intrinsics[0].focal.is_finite() && odd.points.iter().all(|point| point.norm().is_finite()));
-        let mut broken = truth(&scene);
+        let mut broken = scene.reconstruction();
         broken.poses[1].translation.fill(f64::NAN);
         run(broken, &scene.observations);
     }

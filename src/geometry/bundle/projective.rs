@@ -100,6 +100,11 @@ mod tests {
         (problem, scene.observations)
     }
 
+    fn adjusted(problem: &mut Projective, observations: &[Observation]) -> Report {
+        let Projective { cameras, points } = problem;
+        adjust(cameras, points, observations, &Options::default(), &StopToken::default())
+    }
+
     #[test]
     fn jacobian_agrees_with_finite_differences() {
         let (problem, observations) = start(1, 0.01);
@@ -110,13 +115,7 @@ mod tests {
     fn converges_from_a_perturbed_start_to_the_noise_floor() {
         for seed in 0..5 {
             let (mut problem, observations) = start(seed, 0.003);
-            let report = adjust(
-                &mut problem.cameras,
-                &mut problem.points,
-                &observations,
-                &Options::default(),
-                &StopToken::default(),
-            );
+            let report = adjusted(&mut problem, &observations);
             let freedom = 2 * observations.len() - (11 * problem.cameras.len() + 3 * problem.points.len() - 15);
             let ratio = report.cost / (freedom as f64 * NOISE * NOISE);
             println!("seed {seed}: {report:?}, chi2 per degree of freedom {ratio:.3}");
@@ -147,13 +146,7 @@ mod tests {
         let (mut problem, mut observations) = start(4, 0.002);
         observations.retain(|seen| (seen.view + seen.point) % 3 != 0);
         observations.push(observations[5]);
-        let report = adjust(
-            &mut problem.cameras,
-            &mut problem.points,
-            &observations,
-            &Options::default(),
-            &StopToken::default(),
-        );
+        let report = adjusted(&mut problem, &observations);
         let per_coordinate = (report.cost / (2 * observations.len()) as f64).sqrt();
         assert!(per_coordinate < NOISE, "{per_coordinate}");
     }
@@ -162,13 +155,7 @@ mod tests {
     fn degenerate_input_neither_panics_nor_yields_nan() {
         let (problem, observations) = start(5, 0.003);
         let run = |mut problem: Projective, observations: &[Observation]| {
-            let report = adjust(
-                &mut problem.cameras,
-                &mut problem.points,
-                observations,
-                &Options::default(),
-                &StopToken::default(),
-            );
+            let report = adjusted(&mut problem, observations);
             assert!(report.cost.is_finite() && report.cost <= report.initial_cost, "{report:?}");
             problem
         };

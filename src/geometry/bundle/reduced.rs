@@ -391,8 +391,8 @@ mod tests {
         let mut seen: Vec<Observation> =
             scene.observations.iter().copied().filter(|seen| (seen.point + seen.view) % 7 != 0).collect();
         seen.push(Observation { xy: seen[0].xy + Vector2::new(0.01, 0.0), ..seen[0] });
-        let cameras = scene.poses.iter().map(|pose| pose.camera(&scene.intrinsics)).collect();
-        let problem = Projective { cameras, points: scene.points.iter().map(|point| point.push(1.0)).collect() };
+        let problem =
+            Projective { cameras: scene.cameras(), points: scene.points.iter().map(|point| point.push(1.0)).collect() };
         let layout = Layout::new(&seen, 5, 150);
         let mut linearisation = Linearisation::new(&layout, 5);
         linearisation.fill(&problem, &layout, Loss::Squared);

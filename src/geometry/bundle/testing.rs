@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::Observation;
 use super::engine::{Jacobian, Problem, ResidualVisitor, Step};
-use super::metric::{Intrinsics, Pose};
+use super::metric::{Intrinsics, Pose, Reconstruction};
 use crate::synthetic::{Scene, SceneOptions};
 
 /// Noise of the tests, one standard deviation as a share of the image: the paper's .3 %.
@@ -132,6 +132,11 @@ impl TestScene {
         self.observations.retain(|seen| count[seen.point] >= 3);
     }
 
+    /// The truth, one calibration for all views.
+    pub fn reconstruction(&self) -> Reconstruction {
+        Reconstruction::new(self.intrinsics, self.poses.clone(), self.points.clone())
+    }
+
     /// The true cameras, `K [R|t]`.
     pub fn cameras(&self) -> Vec<Matrix3x4<f64>> {
         self.poses.iter().map(|pose| pose.camera(&self.intrinsics)).collect()
@@ -171,6 +176,20 @@ pub(crate) fn perturb<'a>(values: impl Iterator<Item = &'a mut f64>, deviation: 
     for value in values {
         *value += deviation * normal(&mut rng);
     }
+}
+
+/// A reconstruction with points and poses moved by so much, focal lengths by ten times as much.
+pub(super) fn perturbed(truth: &Reconstruction, deviation: f64, seed: u64) -> Reconstruction {
+    let mut start = truth.clone();
+    perturb(start.intrinsics.iter_mut().map(|intrinsics| &mut intrinsics.focal), 10.0 * deviation, seed);
+    perturb(start.points.iter_mut().flat_map(|point| point.iter_mut()), deviation, seed + 1);
+    perturb(start.poses.iter_mut().flat_map(|pose| pose.translation.iter_mut()), deviation, seed + 2);
+    let mut turns = vec![Vector3::zeros(); start.poses.len()];
+    perturb(turns.iter_mut().flat_map(|turn: &mut Vector3<f64>| turn.iter_mut()), deviation, seed + 3);
+    for (pose, turn) in start.poses.iter_mut().zip(turns) {
+        pose.rotation = Rotation3::from_scaled_axis(turn) * pose.rotation;
+    }
+    start
 }
 
 /// Keeps the last residual and Jacobian: what the solver would have accumulated.

@@ -241,7 +241,7 @@ mod tests {
         for seed in 0..5 {
             let mut scene = testing::scene(seed, 30, 300, NOISE);
             scene.observations.retain(|seen| (seen.point % 26..seen.point % 26 + 5).contains(&seen.view));
-            let metric = Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone());
+            let metric = scene.reconstruction();
             let system = System::new(&metric, &scene.observations).expect("finite");
             let expected = WithoutViews::of_views::<POSE>(&system, &metric).expect("finite");
             let found = WithoutViews::by_factorisation(&system, &metric).expect("finite");

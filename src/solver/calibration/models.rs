@@ -339,7 +339,7 @@ mod tests {
             let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
             let (priors, stop) = (vec![problem.options.lenses.prior(NOISE, None, 1000.0)], StopToken::default());
             let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
-            let reconstruction = Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone());
+            let reconstruction = scene.reconstruction();
             let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 1.0 };
             for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
                 let minimum = start.adjusted(&problem, model, &priors, &stop);

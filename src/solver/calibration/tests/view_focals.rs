@@ -177,10 +177,7 @@ fn near_truth(scene: &TestScene, focals: &[f64], noise: f64) -> Outcome {
 
 /// The true reconstruction with these focal lengths.
 fn metric_of(scene: &TestScene, focals: &[f64]) -> Reconstruction {
-    let mut metric = Reconstruction {
-        focals: focals.to_vec(),
-        ..Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone())
-    };
+    let mut metric = Reconstruction { focals: focals.to_vec(), ..scene.reconstruction() };
     metric.average_focals();
     metric
 }

@@ -10,7 +10,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::super::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Pose, Reconstruction};
-use super::super::testing::{TestScene, normal, perturb};
+use super::super::testing::{TestScene, normal, perturbed};
 use super::super::{Options, Report};
 use super::{Free, Observation, Run, adjust};
 use crate::domain::StopToken;
@@ -65,25 +65,7 @@ fn observe(sequence: &Reconstruction, observations: &mut [Observation], noise: f
 }
 
 fn sequence_of(scene: &TestScene) -> (Reconstruction, Vec<Observation>) {
-    (reconstruction_of(scene), scene.observations.clone())
-}
-
-fn reconstruction_of(scene: &TestScene) -> Reconstruction {
-    Reconstruction::new(scene.intrinsics, scene.poses.clone(), scene.points.clone())
-}
-
-/// Moves points and poses by so much, focal lengths by ten times as much.
-fn perturbed(truth: &Reconstruction, deviation: f64, seed: u64) -> Reconstruction {
-    let mut start = truth.clone();
-    perturb(start.intrinsics.iter_mut().map(|intrinsics| &mut intrinsics.focal), 10.0 * deviation, seed);
-    perturb(start.points.iter_mut().flat_map(|point| point.iter_mut()), deviation, seed + 1);
-    perturb(start.poses.iter_mut().flat_map(|pose| pose.translation.iter_mut()), deviation, seed + 2);
-    let mut turns = vec![Vector3::zeros(); start.poses.len()];
-    perturb(turns.iter_mut().flat_map(|turn: &mut Vector3<f64>| turn.iter_mut()), deviation, seed + 3);
-    for (pose, turn) in start.poses.iter_mut().zip(turns) {
-        pose.rotation = Rotation3::from_scaled_axis(turn) * pose.rotation;
-    }
-    start
+    (scene.reconstruction(), scene.observations.clone())
 }
 
 /// The chain bent to an arc of so many radians, as a reconstruction drifts that grows view by view.
