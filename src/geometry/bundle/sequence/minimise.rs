@@ -64,17 +64,6 @@ pub fn adjust(
     report
 }
 
-/// Pattern of the reduced system of a layout; `None` when it was stopped.
-pub(super) fn pattern(
-    sequence: &Reconstruction,
-    layout: &Layout,
-    cancellation: &mut CancellationCheck,
-) -> Option<Pattern> {
-    let unknowns = &layout.unknowns;
-    let pair = |view: usize| unknowns.view_block[view].zip(unknowns.group_block_of_view(sequence, view));
-    Pattern::new(layout, (0..sequence.poses.len()).filter_map(pair), cancellation)
-}
-
 /// Sum of the loss over the observations and of what the priors add; `None` when it was stopped.
 fn cost(
     sequence: &Reconstruction,
@@ -122,7 +111,7 @@ impl<'a> Descent<'a> {
         heartbeat: &'a mut dyn FnMut(),
         cancellation: &mut CancellationCheck,
     ) -> Option<Self> {
-        let pattern = pattern(sequence, layout, cancellation)?;
+        let pattern = Pattern::new(sequence, layout, cancellation)?;
         Some(Self {
             layout,
             priors,

@@ -1,8 +1,8 @@
 //! Where the blocks of the reduced system are that are not zero.
 
 use super::super::panel::PANEL_SHARE;
-use super::CancellationCheck;
 use super::layout::{Layout, Unknowns};
+use super::{CancellationCheck, Reconstruction};
 
 /// Unknowns up to which a system is a square matrix, about forty views: its dense factorisation needs no analysis.
 const SQUARE_LIMIT: usize = 256;
@@ -42,34 +42,27 @@ pub(super) struct Place {
 impl Pattern {
     /// Blocks that a point links, and the pose of every view with the intrinsics of its group; all, in a square matrix,
     /// where they are few or most are linked. `None` when it was stopped.
-    ///
-    /// * `pairs`: pose block and group block of the views where both are free
-    pub fn new(
-        layout: &Layout,
-        pairs: impl Iterator<Item = (usize, usize)>,
-        cancellation: &mut CancellationCheck,
-    ) -> Option<Self> {
+    pub fn new(sequence: &Reconstruction, layout: &Layout, cancellation: &mut CancellationCheck) -> Option<Self> {
         let limit = if layout.coupled_share() >= PANEL_SHARE { SQUARE_LIMIT_OF_COUPLED } else { SQUARE_LIMIT };
         if layout.unknowns.count() <= limit {
             return Some(Self::square(&layout.unknowns));
         }
-        Self::sparse(layout, pairs, cancellation)
+        Self::sparse(sequence, layout, cancellation)
     }
 
     /// Without the blocks that are zero; `None` when it was stopped.
-    pub fn sparse(
-        layout: &Layout,
-        pairs: impl Iterator<Item = (usize, usize)>,
-        cancellation: &mut CancellationCheck,
-    ) -> Option<Self> {
-        let blocks = layout.unknowns.block_count();
+    pub fn sparse(sequence: &Reconstruction, layout: &Layout, cancellation: &mut CancellationCheck) -> Option<Self> {
+        let unknowns = &layout.unknowns;
+        let blocks = unknowns.block_count();
         let mut group_of = vec![None; blocks];
-        pairs.for_each(|(pose, group)| group_of[pose] = Some(group));
+        for (view, block) in unknowns.view_block.iter().enumerate() {
+            block.iter().for_each(|block| group_of[*block] = unknowns.group_block_of_view(sequence, view));
+        }
         let points_by_block = layout.points_by_block();
         let (mut column_starts, mut rows) = (vec![0], Vec::new());
         // Column for which a row was listed last.
         let mut listed_for = vec![usize::MAX; blocks];
-        for column in 0..blocks {
+        for (column, group) in group_of.into_iter().enumerate() {
             let first = rows.len();
             let mut list = |row: usize| {
                 if row >= column && listed_for[row] != column {
@@ -78,7 +71,7 @@ impl Pattern {
                 }
             };
             list(column);
-            group_of[column].into_iter().for_each(&mut list);
+            group.into_iter().for_each(&mut list);
             for &point in points_by_block.of(column) {
                 let incident_blocks = layout.incident_blocks(point as usize);
                 // A look at a block costs a small part of what an observation's linearisation does.
@@ -90,7 +83,7 @@ impl Pattern {
             rows[first..].sort_unstable();
             column_starts.push(rows.len());
         }
-        Some(Self::from_rows(layout.unknowns.offsets.clone(), column_starts, rows))
+        Some(Self::from_rows(unknowns.offsets.clone(), column_starts, rows))
     }
 
     /// A square matrix.

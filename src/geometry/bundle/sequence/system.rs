@@ -3,8 +3,8 @@
 use std::ops::Range;
 
 use super::layout::{Layout, Unknowns};
-use super::minimise::pattern;
 use super::normal::Normal;
+use super::pattern::Pattern;
 use super::reduced::Reduced;
 use super::worker_pool::WorkerPool;
 use super::{CancellationCheck, Free, Observation, Reconstruction};
@@ -30,7 +30,7 @@ impl System {
         let stop = StopToken::default();
         let mut cancellation = CancellationCheck::new(&stop);
         let layout = Layout::new(reconstruction, observations, &Free::all(&models), &mut cancellation)?;
-        let pattern = pattern(reconstruction, &layout, &mut cancellation)?;
+        let pattern = Pattern::new(reconstruction, &layout, &mut cancellation)?;
         let pool = WorkerPool::new(&layout, Threads::ONE, &stop);
         let mut normal = Normal::new(&layout, &pattern, reconstruction);
         normal.fill(reconstruction, &layout, &[], Loss::Squared, &pool);

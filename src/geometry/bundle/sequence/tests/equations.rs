@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::super::CancellationCheck;
 use super::super::layout::Layout;
-use super::super::minimise::{pattern, retract};
+use super::super::minimise::retract;
 use super::super::normal::Normal;
 use super::super::pattern::Pattern;
 use super::super::reduced::Reduced;
@@ -101,12 +101,11 @@ fn every_layout_of_the_system_is_the_same_system() {
     let models = [IntrinsicsModel::FOCAL];
     let layout = Layout::new(&sequence, &observations, &Free::all(&models), &mut cancellation).expect("goes on");
     let pool = WorkerPool::new(&layout, Threads::ONE, &stop);
-    let pairs = || (0..6).map(|view| (view, 6));
     let mut built = Vec::new();
     for by_panels in [None, Some(false), Some(true)] {
         let pattern = match by_panels {
-            None => Pattern::sparse(&layout, pairs(), &mut cancellation),
-            Some(_) => Pattern::new(&layout, pairs(), &mut cancellation),
+            None => Pattern::sparse(&sequence, &layout, &mut cancellation),
+            Some(_) => Pattern::new(&sequence, &layout, &mut cancellation),
         };
         let pattern = pattern.expect("goes on");
         assert_eq!(pattern.is_square, by_panels.is_some());
@@ -142,7 +141,7 @@ fn compare(
     let going = StopToken::default();
     let mut cancellation = CancellationCheck::new(&going);
     let layout = Layout::new(sequence, observations, &free, &mut cancellation).expect("goes on");
-    let pattern = pattern(sequence, &layout, &mut cancellation).expect("goes on");
+    let pattern = Pattern::new(sequence, &layout, &mut cancellation).expect("goes on");
     let cameras = pattern.dimension();
     assert_eq!(cameras, unknowns, "{what}");
     let mut normal = Normal::new(&layout, &pattern, sequence);
@@ -194,7 +193,7 @@ fn what_is_known_beforehand_takes_part() {
     let going = StopToken::default();
     let mut cancellation = CancellationCheck::new(&going);
     let layout = Layout::new(&sequence, &observations, &Free::all(&models), &mut cancellation).expect("goes on");
-    let pattern = pattern(&sequence, &layout, &mut cancellation).expect("goes on");
+    let pattern = Pattern::new(&sequence, &layout, &mut cancellation).expect("goes on");
     let with = |priors: &[IntrinsicsPrior]| {
         let mut normal = Normal::new(&layout, &pattern, &sequence);
         assert!(normal.fill(
@@ -222,7 +221,7 @@ fn a_stop_is_seen_within_one_linearisation() {
     let going = StopToken::default();
     let mut cancellation = CancellationCheck::new(&going);
     let layout = Layout::new(&sequence, &observations, &free, &mut cancellation).expect("goes on");
-    let pattern = pattern(&sequence, &layout, &mut cancellation).expect("goes on");
+    let pattern = Pattern::new(&sequence, &layout, &mut cancellation).expect("goes on");
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use super::super::CancellationCheck;
 use super::super::layout::Layout;
-use super::super::minimise::pattern;
+use super::super::pattern::Pattern;
 use super::super::solver::Solver;
 use super::*;
 
@@ -41,7 +41,7 @@ fn time_against_observations() {
             let (layout_seconds, layout) =
                 timed(|| Layout::new(&truth, &observations, &Free::all(&models), &mut cancellation).expect("goes on"));
             let (analysis_seconds, _) = timed(|| {
-                let pattern = pattern(&truth, &layout, &mut cancellation).expect("goes on");
+                let pattern = Pattern::new(&truth, &layout, &mut cancellation).expect("goes on");
                 Solver::new(&pattern).expect("memory")
             });
             drop(layout);
