@@ -94,18 +94,12 @@ pub(super) struct WhitenedViews<const C: usize> {
 }
 
 impl<const C: usize> WhitenedViews<C> {
-    /// * `matrix`: column-major, its lower triangle given: other unknowns, `first` of them, then `C` a view, of which
-    ///   those of its pose come first
+    /// * `matrix`: symmetric: other unknowns, `first` of them, then `C` a view, of which those of its pose come first
     ///
     /// `None` without views, or where the matrix holds what is no number.
-    pub fn new(matrix: &[f64], first: usize, poses: &[Pose]) -> Option<Self> {
+    pub fn new(matrix: &DMatrix<f64>, first: usize, poses: &[Pose]) -> Option<Self> {
         let n = C * poses.len();
-        let dimension = first + n;
-        let at = |row: usize, column: usize| {
-            let (row, column) = (first + row.max(column), first + row.min(column));
-            matrix[column * dimension + row]
-        };
-        let block = |a: usize, b: usize| SMatrix::<f64, C, C>::from_fn(|row, column| at(C * a + row, C * b + column));
+        let block = |a: usize, b: usize| matrix.fixed_view::<C, C>(first + C * a, first + C * b).into_owned();
         if n == 0 || matrix.iter().any(|value| !value.is_finite()) {
             return None;
         }

@@ -3,7 +3,7 @@
 use faer::prelude::Solve;
 use faer::sparse::{SparseColMat, Triplet};
 use faer::{Mat, Side};
-use nalgebra::{DMatrix, DVector, SVector};
+use nalgebra::{DMatrix, DVector, DVectorView};
 
 use super::intrinsics_model::Parameter;
 use super::metric::{POSE, Pose, Reconstruction, VIEW};
@@ -74,10 +74,10 @@ impl WithoutViews {
             unknowns.enumerate().for_each(|(k, unknown)| places[unknown] = first + C * view + k);
         }
         system.of_groups().for_each(|(group, parameter, unknown)| places[unknown] = place(group, parameter));
-        let (mut matrix, mut vector) = (vec![0.0; dimension * dimension], vec![0.0; dimension]);
+        let (mut matrix, mut vector) = (DMatrix::zeros(dimension, dimension), DVector::zeros(dimension));
         system.for_each(|row, column, value| {
-            let (row, column) = (places[row].max(places[column]), places[row].min(places[column]));
-            matrix[column * dimension + row] = value;
+            matrix[(places[row], places[column])] = value;
+            matrix[(places[column], places[row])] = value;
         });
         places.iter().zip(system.negative_gradient()).for_each(|(place, value)| vector[*place] = *value);
         Self::by_eigenvectors::<C>(&matrix, &vector, known, &metric.group_of, &metric.poses)
@@ -127,30 +127,27 @@ impl WithoutViews {
         Some(Self { matrix: information, negative_gradient, own_focals: None, known })
     }
 
-    /// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics;
-    /// its lower triangle is given. With it what the views' own focal lengths are, where they have them.
+    /// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics. With
+    /// it what the views' own focal lengths are, where they have them.
     ///
     /// A direction of the views on which rounding hides what the observations say, but which goes along with the
     /// intrinsics, is taken to be as free as it can be: the intrinsics have no information left along with it. Taken as
     /// known, it would make them certain.
     fn by_eigenvectors<const C: usize>(
-        matrix: &[f64],
-        vector: &[f64],
+        matrix: &DMatrix<f64>,
+        vector: &DVector<f64>,
         known: Vec<f64>,
         group_of: &[usize],
         poses: &[Pose],
     ) -> Option<Self> {
         let first = known.len();
-        let dimension = first + C * poses.len();
-        let at = |row: usize, column: usize| matrix[column * dimension + row];
-        let mut information = DMatrix::from_fn(first, first, |row, column| at(row.max(column), row.min(column)));
-        let mut negative_gradient = DVector::from_column_slice(&vector[..first]);
+        let mut information = matrix.view((0, 0), (first, first)).into_owned();
+        let mut negative_gradient = vector.rows(0, first).into_owned();
         let views = WhitenedViews::<C>::new(matrix, first, poses)?;
-        let of_view =
-            |view: usize, column: usize| SVector::<f64, C>::from_fn(|row, _| at(first + C * view + row, column));
-        let coupling: Vec<DVector<f64>> =
-            (0..first).map(|column| views.function(|view| of_view(view, column))).collect();
-        let gradient = views.function(|view| SVector::<f64, C>::from_fn(|row, _| vector[first + C * view + row]));
+        let of_column =
+            |column: DVectorView<f64>| views.function(|view| column.fixed_rows::<C>(first + C * view).into_owned());
+        let coupling: Vec<DVector<f64>> = matrix.column_iter().take(first).map(of_column).collect();
+        let gradient = of_column(vector.as_view());
         let directions: Vec<Direction> = views
             .directions()
             .map(|(information, vector)| Direction {
@@ -216,10 +213,11 @@ mod tests {
             matrix[(second, first)] = 1.0 - weak;
             matrix[(first, 0)] = coupled * (weak / 2.0).sqrt();
             matrix[(second, 0)] = -matrix[(first, 0)];
+            matrix.fill_upper_triangle_with_lower_triangle();
             let poses = [pose(0.0), pose(1.0)];
             WithoutViews::by_eigenvectors::<POSE>(
-                matrix.as_slice(),
-                &vec![0.0; dimension],
+                &matrix,
+                &DVector::zeros(dimension),
                 vec![1.0; PARAMETERS],
                 &[0; 2],
                 &poses,
