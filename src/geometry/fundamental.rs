@@ -51,14 +51,11 @@ pub fn algebraic(fundamental: &Matrix3<f64>, seen: &Match) -> (f64, f64) {
 
 /// `F` of two cameras, of any scale (Hartley & Zisserman, eq. 17.3): zero where their centres coincide.
 pub fn matrix_of_cameras(from: &Camera, to: &Camera) -> Matrix3<f64> {
+    let [from, to] = [from, to].map(|camera| [0, 1, 2].map(|row| camera.remove_row(row)));
     Matrix3::from_fn(|of_to, of_from| {
         let mut rows = Matrix4::zeros();
-        for (place, row) in (0..3).filter(|&row| row != of_from).enumerate() {
-            rows.set_row(place, &from.row(row));
-        }
-        for (place, row) in (0..3).filter(|&row| row != of_to).enumerate() {
-            rows.set_row(2 + place, &to.row(row));
-        }
+        rows.fixed_rows_mut::<2>(0).copy_from(&from[of_from]);
+        rows.fixed_rows_mut::<2>(2).copy_from(&to[of_to]);
         if (of_to + of_from) % 2 == 0 { rows.determinant() } else { -rows.determinant() }
     })
 }

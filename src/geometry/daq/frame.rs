@@ -1,6 +1,6 @@
 //! The frame of the first view.
 
-use nalgebra::{Matrix3, Matrix3x4, Matrix4, Vector3, Vector4};
+use nalgebra::{Matrix3x4, Matrix4, Vector4};
 
 /// Ratio of the smallest to the largest singular value below which a camera has no rank 3.
 const RANK_TOLERANCE: f64 = 1e-10;
@@ -58,9 +58,7 @@ pub fn to_canonical_frame(cameras: &[Matrix3x4<f64>], points: &[Vector4<f64>]) -
 /// The camera centre, by the minors of the camera: exact where a decomposition would round.
 fn centre(camera: &Matrix3x4<f64>) -> Vector4<f64> {
     Vector4::from_fn(|left_out, _| {
-        let columns: Vec<Vector3<f64>> =
-            (0..4).filter(|&column| column != left_out).map(|column| camera.column(column).into_owned()).collect();
-        let minor = Matrix3::from_columns(&columns).determinant();
+        let minor = camera.remove_column(left_out).determinant();
         if left_out % 2 == 0 { minor } else { -minor }
     })
 }
