@@ -228,11 +228,8 @@ impl Cameras {
         };
         let mut before = vec![(0, 0)];
         for block in &unknowns.view_block {
-            let (values, unknowns_before) = before[before.len() - 1];
-            before.push(match block {
-                Some(block) => (pattern.panels(0..block + 1).end, unknowns.range(*block).end),
-                None => (values, unknowns_before),
-            });
+            let last = before[before.len() - 1];
+            before.push(block.map_or(last, |block| (pattern.panels(0..block + 1).end, unknowns.range(block).end)));
         }
         Self {
             before,
@@ -285,36 +282,21 @@ impl Cameras {
         pool.threads.each(pieces, |piece: Sums| {
             vectorised(
                 #[inline(always)]
-                || batch.add(sequence, piece, &layout.all_seen()[seen.clone()], of_batch, pool.cancellation()),
+                || match piece {
+                    Sums::Views { range, values, gradient } => {
+                        batch.add_to_views(sequence, range, values, gradient, of_batch, pool.cancellation())
+                    }
+                    Sums::Groups { values, gradient } => {
+                        let seen = &layout.all_seen()[seen.clone()];
+                        batch.add_to_groups(sequence, seen, values, gradient, pool.cancellation())
+                    }
+                },
             )
         })
     }
 }
 
 impl Batch<'_> {
-    /// Adds to a piece; `false` when it was stopped.
-    ///
-    /// * `seen`: the observations of the batch
-    /// * `of_view`: those of a view, ascending
-    #[inline(always)]
-    fn add<'s>(
-        &self,
-        sequence: &Reconstruction,
-        piece: Sums,
-        seen: &[Seen],
-        of_view: impl Fn(usize) -> &'s [u32],
-        mut cancellation: CancellationCheck,
-    ) -> bool {
-        match piece {
-            Sums::Views { range, values, gradient } => {
-                self.add_to_views(sequence, range, values, gradient, of_view, &mut cancellation)
-            }
-            Sums::Groups { values, gradient } => {
-                self.add_to_groups(sequence, seen, values, gradient, &mut cancellation)
-            }
-        }
-    }
-
     /// Adds to the blocks of a run of views; `false` when it was stopped.
     ///
     /// * `values`, `gradient`: those of these views
@@ -327,7 +309,7 @@ impl Batch<'_> {
         values: &mut [f64],
         gradient: &mut [f64],
         seen: impl Fn(usize) -> &'s [u32],
-        cancellation: &mut CancellationCheck,
+        mut cancellation: CancellationCheck,
     ) -> bool {
         let (first_value, first_unknown) = self.before[views.start];
         let within = |place: Place| Place { start: place.start - first_value, ..place };
@@ -363,7 +345,7 @@ impl Batch<'_> {
         seen: &[Seen],
         values: &mut [f64],
         gradient: &mut [f64],
-        cancellation: &mut CancellationCheck,
+        mut cancellation: CancellationCheck,
     ) -> bool {
         let Some(&(first_value, first_unknown)) = self.before.last() else { return true };
         for (seen, row) in seen.iter().zip(self.rows) {
