@@ -89,16 +89,15 @@ impl Pattern {
     /// A square matrix.
     fn square(unknowns: &Unknowns) -> Self {
         let (offsets, blocks, n) = (unknowns.offsets.clone(), unknowns.block_count(), unknowns.count());
-        let mut column_starts = vec![0];
-        let (mut rows, mut heights) = (Vec::new(), Vec::new());
+        let (mut column_starts, mut rows) = (vec![0], Vec::new());
         for column in 0..blocks {
             rows.extend(column as u32..blocks as u32);
-            heights.extend((column..blocks).map(|row| (offsets[row] - offsets[column]) as u32));
             column_starts.push(rows.len());
         }
         let mut panel_starts: Vec<usize> = offsets.iter().map(|offset| offset * (n + 1)).collect();
         panel_starts[blocks] = n * n;
-        Self { is_square: true, offsets, column_starts, rows, heights, panel_starts, strides: vec![n; blocks] }
+        let lower = Self::from_rows(offsets, column_starts, rows);
+        Self { is_square: true, panel_starts, strides: vec![n; blocks], ..lower }
     }
 
     fn from_rows(offsets: Vec<usize>, column_starts: Vec<usize>, rows: Vec<u32>) -> Self {

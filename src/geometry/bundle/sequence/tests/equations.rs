@@ -34,6 +34,14 @@ fn mixed() -> (Reconstruction, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>
     (sequence, observations, models, views, points)
 }
 
+fn laid_out(sequence: &Reconstruction, observations: &[Observation], free: &Free) -> (Layout, Pattern) {
+    let going = StopToken::default();
+    let mut cancellation = CancellationCheck::new(&going);
+    let layout = Layout::new(sequence, observations, free, &mut cancellation).expect("goes on");
+    let pattern = Pattern::new(sequence, &layout, &mut cancellation).expect("goes on");
+    (layout, pattern)
+}
+
 /// Weighted residuals and their derivatives by central differences through the retraction: unknowns of the cameras,
 /// then of the free points.
 fn differentiate(
@@ -70,15 +78,7 @@ fn differentiate(
 #[test]
 fn normal_equations_agree_with_finite_differences() {
     let (sequence, observations, models, views, points) = mixed();
-    compare(
-        &sequence,
-        &observations,
-        &models,
-        &views,
-        &points,
-        6 * 6 + 9 + 3,
-        "six free views, nine and three intrinsics",
-    );
+    compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 9 + 3, "six views, nine and three intrinsics");
     // Two views with focal lengths of their own behind one lens.
     let (mut sequence, mut observations, mut models, views, points) = mixed();
     sequence.focals = vec![1.0, 1.1, 0.9, 1.0, 1.2, 1.3, 1.1];
@@ -138,10 +138,7 @@ fn compare(
     what: &str,
 ) {
     let free = Free { models, views: Some(views), points: Some(points) };
-    let going = StopToken::default();
-    let mut cancellation = CancellationCheck::new(&going);
-    let layout = Layout::new(sequence, observations, &free, &mut cancellation).expect("goes on");
-    let pattern = Pattern::new(sequence, &layout, &mut cancellation).expect("goes on");
+    let (layout, pattern) = laid_out(sequence, observations, &free);
     let cameras = pattern.dimension();
     assert_eq!(cameras, unknowns, "{what}");
     let mut normal = Normal::new(&layout, &pattern, sequence);
@@ -190,19 +187,12 @@ fn compare(
 fn what_is_known_beforehand_takes_part() {
     let (sequence, observations, models, ..) = mixed();
     let prior = IntrinsicsPrior::NONE.knowing(Parameter::LogFocal, 0.2, 0.1, 0.01);
-    let going = StopToken::default();
-    let mut cancellation = CancellationCheck::new(&going);
-    let layout = Layout::new(&sequence, &observations, &Free::all(&models), &mut cancellation).expect("goes on");
-    let pattern = Pattern::new(&sequence, &layout, &mut cancellation).expect("goes on");
+    let (layout, pattern) = laid_out(&sequence, &observations, &Free::all(&models));
     let with = |priors: &[IntrinsicsPrior]| {
         let mut normal = Normal::new(&layout, &pattern, &sequence);
-        assert!(normal.fill(
-            &sequence,
-            &layout,
-            priors,
-            Loss::Squared,
-            &WorkerPool::new(&layout, Threads::ONE, &StopToken::default())
-        ));
+        let stop = StopToken::default();
+        let pool = WorkerPool::new(&layout, Threads::ONE, &stop);
+        assert!(normal.fill(&sequence, &layout, priors, Loss::Squared, &pool));
         let block = layout.unknowns.group_block[2].expect("free");
         let unknown = layout.unknowns.range(block).start;
         (normal.cameras.values[normal.cameras.diagonal[unknown]], normal.cameras.gradient[unknown])
@@ -218,10 +208,7 @@ fn what_is_known_beforehand_takes_part() {
 fn a_stop_is_seen_within_one_linearisation() {
     let (sequence, observations) = chain(2, 10, 1 + BATCH / 20, 5, 0.001);
     let free = Free::all(&[IntrinsicsModel::FOCAL]);
-    let going = StopToken::default();
-    let mut cancellation = CancellationCheck::new(&going);
-    let layout = Layout::new(&sequence, &observations, &free, &mut cancellation).expect("goes on");
-    let pattern = Pattern::new(&sequence, &layout, &mut cancellation).expect("goes on");
+    let (layout, pattern) = laid_out(&sequence, &observations, &free);
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);
