@@ -12,7 +12,7 @@ use super::ransac::{self, Estimator, Robust};
 use crate::domain::StopToken;
 
 /// Correspondences that determine a fundamental matrix linearly.
-pub const LEAST_MATCHES: usize = 8;
+const LEAST_MATCHES: usize = 8;
 /// Samples of the robust estimate at most: enough where 43 % of the matches are right. At ninety per cent outliers
 /// 10⁸ would be, which nobody waits for.
 const MOST_SAMPLES: usize = 4_000;
@@ -95,7 +95,7 @@ impl Fundamental {
     /// * `weights`: one a match, not negative
     ///
     /// Returns `None` where fewer than [`LEAST_MATCHES`] have a weight, or as [`eight_point`] does.
-    pub fn refitted(&self, matches: &[Match], weights: &[f64]) -> Option<Self> {
+    fn refitted(&self, matches: &[Match], weights: &[f64]) -> Option<Self> {
         let weigh =
             |(seen, &weight): (&Match, &f64)| if weight > 0.0 { weight / algebraic(&self.matrix, seen).1 } else { 0.0 };
         let weights: Vec<f64> = matches.iter().zip(weights).map(weigh).collect();
@@ -119,7 +119,7 @@ impl Fundamental {
 ///
 /// # Pitfall
 /// Points on a plane, or views from one place, have a family of such matrices; one of it is returned.
-pub fn eight_point(matches: &[Match], weights: &[f64]) -> Option<Fundamental> {
+fn eight_point(matches: &[Match], weights: &[f64]) -> Option<Fundamental> {
     if matches.len() < LEAST_MATCHES || weights.len() != matches.len() {
         return None;
     }

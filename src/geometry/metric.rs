@@ -14,7 +14,7 @@ use super::statistics::median;
 const FARTHEST: f64 = 1e3;
 
 /// Homography `H` with `P H` metric and `H^-1 X` Euclidean: `[K 0; -n' K 1]`.
-pub fn upgrading_homography(daq: &Daq) -> Matrix4<f64> {
+fn upgrading_homography(daq: &Daq) -> Matrix4<f64> {
     let calibration = daq.intrinsics.matrix();
     let mut homography = Matrix4::identity();
     homography.fixed_view_mut::<3, 3>(0, 0).copy_from(&calibration);
