@@ -47,6 +47,10 @@ const WORTH_EXTENDING: f64 = 1.1;
 /// Subsets of a whole input that are tried before it is searched at length.
 const FIRST_SUBSETS: usize = 3;
 
+/// Evidence of a reconstruction, in that of one without a calibration, from which it is calibrated too: with less it is
+/// the same one, reached from elsewhere, or a part of it, and calibrating takes longer than all else.
+const NEW_EVIDENCE: f64 = 1.02;
+
 /// How subsets are searched, of which many are tried.
 const QUICK_SEED: Effort = Effort { is_seed: true, is_quick: true };
 
@@ -85,7 +89,8 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
     let cheap = if blocks.is_whole { FIRST_SUBSETS.min(subsets.len()) } else { subsets.len() };
     let (cheap, rest) = subsets.split_at(cheap);
     // Nothing else is searched of a whole input with depths: what it has found stands.
-    let mut best = by_projective_extension(problem, first, !is_quick, cheap, recorder)?;
+    let mut effort = Extensions { keeps_first: !is_quick, calibrates_each: metric.is_some() };
+    let mut best = by_projective_extension(problem, first, effort, cheap, recorder)?;
     if is_quick && metric.is_none() && !stands(&best) {
         let first = match blocks.by_calibration(problem, false, recorder)? {
             ControlFlow::Break(ended) => return Ok(ended),
@@ -94,17 +99,26 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
             }
             ControlFlow::Continue(ended) => ended.seed(),
         };
-        best = by_projective_extension(problem, first, false, rest, recorder)?;
+        effort.keeps_first = false;
+        best = by_projective_extension(problem, first, effort, rest, recorder)?;
     }
-    let Some(best) = best else { return Ok(metric.map_or(Ended::Block(None), Ended::Extended)) };
-    if metric.is_some() && !best.is_trusted() {
-        return Ok(metric.map_or(Ended::Block(None), Ended::Extended));
-    }
-    Ok(match (metric_of(problem, best, recorder)?, metric) {
-        (Ended::Extended(found), Some(metric)) if found.rank(problem) > metric.rank(problem) => Ended::Extended(found),
-        (_, Some(metric)) => Ended::Extended(metric),
-        (found, None) => found,
+    let best = best.filter(|best| metric.is_none() || best.is_trusted());
+    Ok(match (best.map(|best| metric_of(problem, best, recorder)).transpose()?, metric) {
+        (Some(Ended::Extended(found)), Some(metric)) if found.rank(problem) > metric.rank(problem) => {
+            Ended::Extended(found)
+        }
+        (_, Some(metric)) => Ended::Extended(Box::new(metric.doubted(problem))),
+        (found, None) => found.unwrap_or(Ended::Block(None)),
     })
+}
+
+/// What is made of projective extensions.
+#[derive(Debug, Clone, Copy)]
+struct Extensions {
+    /// Whether the first attempt stands as it is where its extension leaves too little.
+    keeps_first: bool,
+    /// Whether each is calibrated: the data carry a calibration, and another start may find the better minimum.
+    calibrates_each: bool,
 }
 
 impl Ended {
@@ -217,12 +231,10 @@ fn by_calibrated_blocks(
 
 /// The best of an attempt and of those on these sets of views, each extended to all views without a calibration and
 /// calibrated then; the first that is METRIC.
-///
-/// * `keeps_first`: whether the first stands as it is where its extension leaves too little
 fn by_projective_extension(
     problem: &Problem,
     first: Option<Attempt>,
-    keeps_first: bool,
+    effort: Extensions,
     sets: &[Vec<usize>],
     recorder: &mut Recorder,
 ) -> Result<Option<Attempt>, Error> {
@@ -233,7 +245,7 @@ fn by_projective_extension(
     for k in 0..starts {
         problem.stopped()?;
         let (mut attempt, keeps) = match first.take() {
-            Some(attempt) => (attempt, keeps_first),
+            Some(attempt) => (attempt, effort.keeps_first),
             None => {
                 recorder.begin_block(k, starts);
                 let views = &sets[k - (starts - sets.len())];
@@ -245,11 +257,15 @@ fn by_projective_extension(
             unsolved = unsolved.or(Some(attempt));
             continue;
         }
-        attempt::calibrate(problem, &mut attempt, None, recorder)?;
-        let rank = |attempt: &Attempt| {
-            let evidence = attempt.projective.as_ref().map_or(0.0, |found| found.evidence(problem.outlier_density));
-            (attempt.merit().0 >= attempt::WEAK_MERIT, evidence)
+        let evidence = |attempt: &Attempt| {
+            attempt.projective.as_ref().map_or(0.0, |found| found.evidence(problem.outlier_density))
         };
+        let is_known = |best: &Attempt| !best.is_calibrated() && evidence(&attempt) < NEW_EVIDENCE * evidence(best);
+        if !effort.calibrates_each && best.as_ref().is_some_and(is_known) {
+            continue;
+        }
+        attempt::calibrate(problem, &mut attempt, None, recorder)?;
+        let rank = |attempt: &Attempt| (attempt.is_calibrated(), evidence(attempt));
         if best.as_ref().is_none_or(|best| rank(&attempt) > rank(best)) {
             best = Some(attempt);
         }
