@@ -6,20 +6,13 @@
 use nalgebra::DMatrix;
 use rand_chacha::ChaCha8Rng;
 
+use super::options::{AffineOptions, SamplingOptions};
 use super::{Sampler, Seed, Shortlist};
 use crate::domain::StopToken;
 use crate::geometry::factorization;
 use crate::geometry::measurement::CompleteBlock;
 
-/// Tolerance of the truncated score in units of a view's spread (1.5 median absolute deviations).
-const TOLERANCE: f64 = 0.2;
-/// Sizes of the supports that a hypothesis is factorised from. Eight keeps out the wrong tracks, twelve conditions
-/// the factorisation: each wins on some scenes.
-const SUPPORT_SIZES: [usize; 2] = [8, 12];
-/// Samples between two looks at the stop token; they take about a millisecond at 10 views and 200 tracks.
-const SAMPLES_PER_LOOK: usize = 256;
-/// Shortest direction that still spans, in units of a view's spread.
-const LEAST_DIRECTION: f64 = 1e-6;
+const OPTIONS: AffineOptions = SamplingOptions::DEFAULT.affine;
 
 /// A minimal sample: the origin and an orthonormal basis of the three directions to the others.
 #[derive(Debug, Clone)]
@@ -53,7 +46,8 @@ impl Search {
     /// Draws `samples` samples and offers them to the shortlist.
     ///
     /// * `truncations`: what a hypothesis pays for each track that it leaves out, in units of the cost of a residual of
-    ///   [`TOLERANCE`]; more for tracks that a prior believes in (the logarithm of the posterior, up to a constant)
+    ///   [`AffineOptions::tolerance`]; more for tracks that a prior believes in (the logarithm of the posterior, up to
+    ///   a constant)
     pub fn run(
         &self,
         sampler: &Sampler,
@@ -64,7 +58,7 @@ impl Search {
         stop: &StopToken,
     ) {
         for k in 0..samples {
-            if k.is_multiple_of(SAMPLES_PER_LOOK) && stop.is_stopped() {
+            if k.is_multiple_of(OPTIONS.samples_per_look) && stop.is_stopped() {
                 return;
             }
             let Some(hypothesis) = sampler.draw(rng).and_then(|sample| self.span(sample)) else { continue };
@@ -87,7 +81,7 @@ impl Search {
                 }
             }
             let norm = dot(&direction, &direction).sqrt();
-            if norm < LEAST_DIRECTION {
+            if norm < OPTIONS.least_direction {
                 return None;
             }
             direction.iter_mut().for_each(|entry| *entry /= norm);
@@ -111,7 +105,7 @@ impl Search {
 
     /// Squared distance of a track that costs 1.
     fn unit(&self) -> f64 {
-        TOLERANCE * TOLERANCE * self.centred.nrows() as f64
+        OPTIONS.tolerance * OPTIONS.tolerance * self.centred.nrows() as f64
     }
 
     /// Squared distance of a track from the model.
@@ -148,7 +142,8 @@ impl Search {
 pub fn seeds_from_ranking(block: &CompleteBlock, costs: &[f64]) -> Vec<Seed> {
     let mut ranked: Vec<usize> = (0..block.tracks()).collect();
     ranked.sort_by(|&a, &b| costs[a].total_cmp(&costs[b]).then(a.cmp(&b)));
-    SUPPORT_SIZES
+    OPTIONS
+        .support_sizes
         .iter()
         .filter(|&&size| size <= ranked.len())
         .filter_map(|&size| seed(block, ranked[..size].to_vec()))

@@ -1,6 +1,7 @@
 //! Hypothesis search: minimal samples, drawn under a prior, scored against all tracks.
 
 pub mod affine;
+mod options;
 pub mod rigid;
 pub mod subspace;
 
@@ -8,9 +9,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::geometry::{Camera, Point};
-
-/// Share of the sampling weight that is spread over all tracks alike, whatever the prior says.
-const UNIFORM_SHARE: f64 = 0.1;
+use options::SamplingOptions;
 
 /// A hypothesis that growing can start from.
 #[derive(Debug, Clone)]
@@ -41,7 +40,7 @@ impl Sampler {
         let guided = capped(prior.iter().map(|&weight| usable(weight)).collect());
         let total: f64 = guided.iter().sum();
         let uniform = 1.0 / prior.len().max(1) as f64;
-        let share = if total > 0.0 { UNIFORM_SHARE } else { 1.0 };
+        let share = if total > 0.0 { SamplingOptions::DEFAULT.uniform_share } else { 1.0 };
         let mut sum = 0.0;
         let cumulative = guided
             .into_iter()

@@ -3,30 +3,18 @@
 use nalgebra::DMatrix;
 use rand_chacha::ChaCha8Rng;
 
+use super::options::{SamplingOptions, SubspaceOptions};
 use super::{Sampler, Seed, Shortlist};
 use crate::domain::StopToken;
 use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_residuals};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::{daq, triangulation};
 
+const OPTIONS: SubspaceOptions = SamplingOptions::DEFAULT.subspace;
 /// Dimension of the column space of a measurement matrix with right depths.
 pub const RANK: usize = 4;
-/// Tolerance of the residual (sine of the angle to the subspace) in units of the noise, from the ratio of residual to
-/// noise of right columns with a margin of two.
-const TOLERANCE_PER_NOISE: f64 = 4.0;
-/// Bounds of that tolerance: below, numerics; above, everything is close to a 4-dimensional subspace.
-const TOLERANCE_BOUNDS: (f64, f64) = (1e-4, 0.25);
-/// Tolerances of the local optimisation, in units of the final one.
-const LOCAL_TOLERANCES: [f64; 3] = [2.0, 1.5, 1.0];
-/// Refits at each of these tolerances.
-const LOCAL_ROUNDS: usize = 4;
 /// Columns that the subspace is refitted to at least: one more than it needs.
 const LEAST_COLUMNS: usize = RANK + 1;
-/// Weight of the DAQ residual in a hypothesis's cost, in columns. The residual, not the count, tells a right set of
-/// four from a chance one: mean F1 .68 -> .975 at 98 % outliers.
-const DAQ_WEIGHT: f64 = 20.0;
-/// Samples between two looks at the stop token.
-const SAMPLES_PER_LOOK: usize = 8;
 
 /// The balanced measurement matrix of a block with depths, ready to be searched.
 #[derive(Debug, Clone)]
@@ -46,7 +34,8 @@ impl Search {
 
     /// Searches on at another noise.
     pub fn set_noise(&mut self, noise: f64) {
-        self.tolerance = (TOLERANCE_PER_NOISE * noise).clamp(TOLERANCE_BOUNDS.0, TOLERANCE_BOUNDS.1);
+        self.tolerance =
+            (OPTIONS.tolerance_per_noise * noise).clamp(OPTIONS.tolerance_bounds.0, OPTIONS.tolerance_bounds.1);
     }
 
     /// The balanced measurement matrix, 3n x m.
@@ -65,7 +54,7 @@ impl Search {
     ) {
         let mut best = f64::INFINITY;
         for k in 0..samples {
-            if k.is_multiple_of(SAMPLES_PER_LOOK) && stop.is_stopped() {
+            if k.is_multiple_of(OPTIONS.samples_per_look) && stop.is_stopped() {
                 return;
             }
             let Some(sample) = sampler.draw(rng) else { continue };
@@ -94,7 +83,8 @@ impl Search {
 
     /// Truncated cost plus the weighted DAQ residual of the cameras in the subspace.
     fn cost(&self, basis: &DMatrix<f64>) -> f64 {
-        let penalty = if self.use_daq { DAQ_WEIGHT * daq::hypothesis_residual(&cameras_of(basis)) } else { 0.0 };
+        let penalty =
+            if self.use_daq { OPTIONS.daq_weight * daq::hypothesis_residual(&cameras_of(basis)) } else { 0.0 };
         self.truncated_cost(basis) + penalty
     }
 
@@ -102,9 +92,9 @@ impl Search {
     fn optimise_locally(&self, basis: DMatrix<f64>) -> DMatrix<f64> {
         let (mut best, mut best_cost) = (basis.clone(), self.truncated_cost(&basis));
         let mut current = basis;
-        for tolerance in LOCAL_TOLERANCES {
+        for tolerance in OPTIONS.local_tolerances {
             let mut kept: Vec<usize> = Vec::new();
-            for _ in 0..LOCAL_ROUNDS {
+            for _ in 0..OPTIONS.local_rounds {
                 let residuals = subspace_residuals(&self.balanced, &current);
                 let near = nearest(&residuals, tolerance * self.tolerance);
                 if near == kept {

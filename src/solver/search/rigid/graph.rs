@@ -1,15 +1,9 @@
 //! Which pairs of tracks are rigid at which focal length, and the sets that are rigid together.
 
 use crate::geometry::daq::scan_focal;
+use crate::solver::search::options::{RigidGraphOptions, RigidOptions};
 
-/// Focal lengths that are tried: a grid whose steps of 9 % change a distance by less than a length tolerance allows.
-const FOCALS: usize = 33;
-/// Distance in tolerances below which a pair says nothing: near points are near in every view, right or wrong.
-const LEAST_DISTANCE: f64 = 3.0;
-/// Share of a core that a track must be rigid with to join it: at the gate's width a right pair is missed now and then.
-const CORE_SHARE: f64 = 0.75;
-/// Tracks of a core at most; more do not make the poses better to start from.
-const MOST_CORE: usize = 30;
+const OPTIONS: RigidGraphOptions = RigidOptions::DEFAULT.graph;
 
 /// Moments over the views of the two parts of a pair's squared distance: `a`, which the focal length scales, and `b`,
 /// the depths'.
@@ -42,7 +36,7 @@ impl Pair {
         let second = g * g * self.aa + 2.0 * g * self.ab + self.bb;
         let variance = (second - squared_distance * squared_distance).max(0.0);
         // The deviation of a root is that of its square over twice the root.
-        squared_distance > (LEAST_DISTANCE * tolerance).powi(2)
+        squared_distance > (OPTIONS.least_distance * tolerance).powi(2)
             && variance < 4.0 * squared_distance * tolerance * tolerance
     }
 }
@@ -58,19 +52,19 @@ pub struct Graph {
 
 impl Graph {
     fn focal(k: usize) -> f64 {
-        scan_focal(k, FOCALS)
+        scan_focal(k, OPTIONS.focals)
     }
 
     /// The focal lengths with most rigid pairs, no two of them neighbours on the grid.
     pub fn best_focals(&self, count: usize) -> Vec<(f64, Edges)> {
-        let scales: [f64; FOCALS] = std::array::from_fn(|k| Self::focal(k).powi(-2));
-        let mut totals = [0usize; FOCALS];
+        let scales: [f64; OPTIONS.focals] = std::array::from_fn(|k| Self::focal(k).powi(-2));
+        let mut totals = [0usize; OPTIONS.focals];
         for pair in &self.pairs {
             for (total, g) in totals.iter_mut().zip(scales) {
                 *total += usize::from(pair.is_rigid(g, self.tolerance));
             }
         }
-        let mut ranked: Vec<usize> = (0..FOCALS).filter(|&k| totals[k] > 0).collect();
+        let mut ranked: Vec<usize> = (0..OPTIONS.focals).filter(|&k| totals[k] > 0).collect();
         ranked.sort_by(|&a, &b| totals[b].cmp(&totals[a]).then(a.cmp(&b)));
         let mut chosen: Vec<usize> = Vec::new();
         for k in ranked {
@@ -115,7 +109,7 @@ impl Edges {
         let mut core = vec![first];
         for track in candidates {
             let rigid = core.iter().filter(|&&member| self.adjacent[track][member]).count();
-            if rigid as f64 >= CORE_SHARE * core.len() as f64 && core.len() < MOST_CORE {
+            if rigid as f64 >= OPTIONS.core_share * core.len() as f64 && core.len() < OPTIONS.most_core {
                 core.push(track);
             }
         }

@@ -15,6 +15,7 @@ use nalgebra::Vector3;
 use golden::golden_section;
 use graph::{Graph, Pair};
 
+use super::options::RigidOptions;
 use crate::domain::StopToken;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
 use crate::geometry::measurement::CompleteBlock;
@@ -23,36 +24,9 @@ use crate::geometry::statistics::{DEVIATION_PER_MEDIAN, chi_square_gate, median}
 use crate::geometry::{Camera, Point};
 use crate::solver::a_contrario::ln_false_alarms_of;
 
-/// Standard deviation of a distance over the views, in units of the noise times the depth, below which a pair is
-/// rigid: a distance has the noise of two points in up to three coordinates, and the grid adds to it.
-const PAIR_TOLERANCE: f64 = 3.0;
-/// The same as a share of the depth that the grid's steps leave to exact pairs.
-const GRID_TOLERANCE: f64 = 0.005;
-/// Spreads of relative depths that are believed: below, the scene is a plane that faces all cameras, which must not
-/// make chance look impossible; above, depths mean nothing.
-const DEPTH_SPREADS: (f64, f64) = (1e-3, 0.5);
-/// Best focal lengths and best-connected tracks of each that a consensus is grown from: the right one was among the
-/// first on every scene that was looked at; the others are for strong noise.
-const FOCALS_GROWN: usize = 3;
-const CORES_GROWN: usize = 4;
-/// Noise that a core is grown at, in units of that its pairs were rigid at: strict pairs keep chance out of a core, a
-/// wide gate lets the right tracks in.
-const GROWN_NOISE: [f64; 3] = [1.0, 2.0, 4.0];
-/// Logarithm of the expected number of false alarms at which the search ends: far beyond what decides, for a better
-/// core costs little.
-const LN_NEVER_CHANCE: f64 = -100.0;
+const OPTIONS: RigidOptions = RigidOptions::DEFAULT;
 /// Tracks that leave six unknowns a view determined, with one to verify.
-pub const LEAST_TRACKS: usize = 4;
-/// Rounds of re-estimating the noise, and the least that is believed: a hundredth of a pixel of a thousand.
-const NOISE_ROUNDS: usize = 3;
-const LEAST_NOISE: f64 = 1e-5;
-/// Inflations of the gate while a consensus grows.
-const GATES: [f64; 6] = [64.0, 16.0, 4.0, 1.0, 1.0, 1.0];
-/// Steps of the golden section on the log focal length, and its half width: two steps of the grid.
-const FOCAL_STEPS: usize = 10;
-const FOCAL_HALF_WIDTH: f64 = 0.18;
-/// Tracks that take part in it: their distances tell the focal length well enough to gate by.
-const FOCAL_TRACKS: usize = 12;
+const LEAST_TRACKS: usize = 4;
 
 /// A rigid shape with the tracks that belong to it.
 #[derive(Debug, Clone)]
@@ -136,7 +110,8 @@ impl<'a> Search<'a> {
             return None;
         }
         let mut deviations: Vec<f64> = depths.iter().map(|depth| (depth / median_depth - 1.0).abs()).collect();
-        let depth_spread = (DEVIATION_PER_MEDIAN * median(&mut deviations)).clamp(DEPTH_SPREADS.0, DEPTH_SPREADS.1);
+        let depth_spread =
+            (DEVIATION_PER_MEDIAN * median(&mut deviations)).clamp(OPTIONS.depth_spreads.0, OPTIONS.depth_spreads.1);
         let spread = (image_spread.powi(2) * depth_spread).cbrt();
         Some(Self { block, depths, median_depth, spread, stop })
     }
@@ -150,22 +125,22 @@ impl<'a> Search<'a> {
     pub fn run(&self, noise: f64) -> Option<Rigid> {
         let graph = self.rigid_pairs(noise)?;
         let mut best: Option<Rigid> = None;
-        for (focal, edges) in graph.best_focals(FOCALS_GROWN) {
+        for (focal, edges) in graph.best_focals(OPTIONS.focals_grown) {
             let mut covered = vec![false; self.block.tracks()];
-            for _ in 0..CORES_GROWN {
+            for _ in 0..OPTIONS.cores_grown {
                 let core = edges.core(&covered);
                 if core.len() < LEAST_TRACKS {
                     break;
                 }
                 core.iter().for_each(|&track| covered[track] = true);
-                for factor in GROWN_NOISE {
+                for factor in OPTIONS.grown_noise {
                     let Some(grown) = self.grow(focal, core.clone(), factor * noise) else { continue };
                     let settled = self.settle(grown);
                     let certainty = settled.ln_false_alarms(self.spread);
                     if best.as_ref().is_none_or(|best| certainty < best.ln_false_alarms(self.spread)) {
                         best = Some(settled);
                     }
-                    if certainty < LN_NEVER_CHANCE {
+                    if certainty < OPTIONS.ln_never_chance {
                         return best;
                     }
                 }
@@ -178,15 +153,15 @@ impl<'a> Search<'a> {
     ///
     /// * `support`: tracks of this block to fit
     pub fn refit(&self, found: &Rigid, support: &[usize]) -> Option<Rigid> {
-        let noise = found.noise()?.max(LEAST_NOISE);
+        let noise = found.noise()?.max(OPTIONS.least_noise);
         self.grow(found.focal, support.to_vec(), noise).map(|grown| self.settle(grown))
     }
 
     /// Refits at the noise that the inliers show, while that makes chance less likely.
     fn settle(&self, found: Rigid) -> Rigid {
         let mut best = found;
-        for _ in 0..NOISE_ROUNDS {
-            let Some(settled) = best.noise().map(|noise| noise.max(LEAST_NOISE)) else { break };
+        for _ in 0..OPTIONS.noise_rounds {
+            let Some(settled) = best.noise().map(|noise| noise.max(OPTIONS.least_noise)) else { break };
             let support = (0..best.inlier.len()).filter(|&track| best.inlier[track]).collect();
             match self.grow(best.focal, support, settled) {
                 Some(refitted) if refitted.ln_false_alarms(self.spread) < best.ln_false_alarms(self.spread) => {
@@ -211,7 +186,7 @@ impl<'a> Search<'a> {
     /// Statistics of all pairs over the views, and how many are rigid at each focal length.
     fn rigid_pairs(&self, noise: f64) -> Option<Graph> {
         let (views, tracks) = (self.block.views(), self.block.tracks());
-        let tolerance = self.median_depth * (PAIR_TOLERANCE * noise + GRID_TOLERANCE);
+        let tolerance = self.median_depth * (OPTIONS.pair_tolerance * noise + OPTIONS.grid_tolerance);
         let mut graph = Graph { tracks, tolerance, pairs: Vec::with_capacity(tracks * (tracks - 1) / 2) };
         for a in 0..tracks {
             if self.stop.is_stopped() {
@@ -234,11 +209,11 @@ impl<'a> Search<'a> {
     fn grow(&self, focal: f64, core: Vec<usize>, noise: f64) -> Option<Rigid> {
         let (mut focal, mut support) = (focal, core);
         let mut best: Option<Rigid> = None;
-        for (step, inflation) in GATES.into_iter().enumerate() {
+        for (step, inflation) in OPTIONS.gates.into_iter().enumerate() {
             if self.stop.is_stopped() {
                 break;
             }
-            if step == 0 || step + 1 == GATES.len() {
+            if step == 0 || step + 1 == OPTIONS.gates.len() {
                 focal = self.best_focal(focal, &support);
             }
             let (poses, _) = self.fit(focal, &support)?;
@@ -281,7 +256,7 @@ impl<'a> Search<'a> {
 
     /// The focal length near `focal` under which the support is most rigid.
     fn best_focal(&self, focal: f64, support: &[usize]) -> f64 {
-        let count = support.len().min(FOCAL_TRACKS);
+        let count = support.len().min(OPTIONS.focal_tracks);
         let support: Vec<usize> = (0..count).map(|k| support[k * support.len() / count]).collect();
         let cost = |log_focal: f64| {
             let focal = log_focal.exp();
@@ -289,7 +264,7 @@ impl<'a> Search<'a> {
             let squared = |(k, &track): (usize, &usize)| self.squared(&poses, &shape[k], track, focal);
             support.iter().enumerate().map(squared).sum()
         };
-        golden_section(cost, focal.ln(), FOCAL_HALF_WIDTH, FOCAL_STEPS).exp()
+        golden_section(cost, focal.ln(), OPTIONS.focal_half_width, OPTIONS.focal_steps).exp()
     }
 
     /// Squared residual of a track at a position: image coordinates and relative depth, over all views.
