@@ -4,7 +4,7 @@
 //! calibration more exact, by the root of their number, so what was left aside joins once a consensus stands.
 
 use super::block::Block;
-use super::grow::{self, Consensus};
+use super::grow::{self, Consensus, ConsensusOptions};
 use super::problem::Problem;
 use super::view_selection::evenly;
 use crate::geometry::Point;
@@ -49,7 +49,11 @@ pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Opt
         let mut cameras = found.cameras.clone();
         let mut points: Vec<Point> = support.iter().map(|&track| found.points[track]).collect();
         let observations = grow::observations_of(&all.complete, &support);
-        let options = bundle::Options { max_iterations: ADJUSTMENTS, loss: grow::robust(noise), ..Default::default() };
+        let options = bundle::Options {
+            max_iterations: ADJUSTMENTS,
+            loss: ConsensusOptions::DEFAULT.loss(noise),
+            ..Default::default()
+        };
         projective::adjust(&mut cameras, &mut points, &observations, &options, problem.stop);
         found = judge(cameras, WIDENINGS.get(round).copied().unwrap_or(1.0) * noise);
         before = inliers;

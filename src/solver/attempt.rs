@@ -7,7 +7,7 @@ use super::calibration::{self, Outcome};
 use super::classification::Judged;
 use super::depths::{self, TrackWeights};
 use super::fusion::Estimate;
-use super::grow::{self, LEAST_INLIERS};
+use super::grow::{self, LEAST_INLIERS, NoiseOptions};
 use super::learned::TrackScores;
 use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
@@ -253,7 +253,7 @@ pub fn calibrate(
 /// The noise that a solve starts from, normalised units.
 fn initial_noise(problem: &Problem) -> f64 {
     let noise = problem.settings.noise_px.map_or(INITIAL_NOISE, |noise_px| noise_px / problem.scale_px);
-    noise.clamp(grow::NOISE_BOUNDS.0, grow::NOISE_BOUNDS.1)
+    NoiseOptions::DEFAULT.clamp(noise)
 }
 
 /// AUTO and GEOMETRY: a sample of the tracks without near-duplicates, and where that holds nothing, one of all.

@@ -4,7 +4,7 @@
 
 use super::attempt::{self, Attempt, Effort};
 use super::fusion::{self, Estimate};
-use super::grow::{self, Consensus, LEAST_SUPPORT};
+use super::grow::{self, Consensus, ConsensusOptions, LEAST_SUPPORT};
 use super::problem::Problem;
 use super::recorder::Recorder;
 use super::search::subspace;
@@ -130,8 +130,11 @@ pub fn reconstruct(block: &CompleteBlock, inlier: &[bool], noise: f64, stop: &St
     let mut noise = noise;
     // Once at the noise assumed, once at that of the set itself.
     for _ in 0..2 {
-        let options =
-            bundle::Options { max_iterations: ADJUSTMENT_ITERATIONS, loss: grow::robust(noise), ..Default::default() };
+        let options = bundle::Options {
+            max_iterations: ADJUSTMENT_ITERATIONS,
+            loss: ConsensusOptions::DEFAULT.loss(noise),
+            ..Default::default()
+        };
         projective::adjust(&mut cameras, &mut points, &observations, &options, stop);
         let judged = grow::judge(block, cameras.clone(), noise, stop);
         noise = grow::estimate_noise(&judged, &support);

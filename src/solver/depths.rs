@@ -6,7 +6,7 @@
 use super::block::Block;
 use super::calibration::{Outcome, few_inliers};
 use super::classification::{Geometry, Judged};
-use super::grow::{Consensus, NOISE_BOUNDS};
+use super::grow::{Consensus, NoiseOptions};
 use super::portfolio;
 use super::problem::Problem;
 use super::search::Seed;
@@ -51,7 +51,7 @@ pub fn consensus(block: &CompleteBlock, rigid: &Rigid, noise: f64) -> Consensus 
         points,
         squared,
         inlier: rigid.inlier.clone(),
-        noise: rigid.noise().unwrap_or(noise).clamp(NOISE_BOUNDS.0, NOISE_BOUNDS.1),
+        noise: NoiseOptions::DEFAULT.clamp(rigid.noise().unwrap_or(noise)),
         score: rigid.cost / block.tracks().max(1) as f64,
     }
 }
@@ -162,7 +162,7 @@ pub fn weights(
     if (shared as f64) < RIGID_SHARE * inliers.len() as f64 {
         return None;
     }
-    let noise = rigid.noise()?.clamp(NOISE_BOUNDS.0, NOISE_BOUNDS.1);
+    let noise = NoiseOptions::DEFAULT.clamp(rigid.noise()?);
     let freedom = (3 * block.views()) as f64 - 3.0;
     // A uniform distribution of that standard deviation is sqrt(12) times as wide.
     let ln_wrong = -freedom * (12f64.sqrt() * search.spread()).ln();

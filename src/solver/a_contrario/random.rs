@@ -94,7 +94,7 @@ impl<'a> RandomTracks<'a> {
             let drawn: Vec<_> = (0..some).map(|_| random_track(block, rng)).collect();
             let drawn: Vec<&[Observation]> = drawn.iter().map(Vec::as_slice).collect();
             let batch = Batch::new(cameras, &drawn);
-            let found = batch.refine(batch.linear(), |_| true, grow::POINT_STEPS);
+            let found = batch.refine(batch.linear(), |_| true, grow::ConsensusOptions::DEFAULT.point_steps);
             let finite = |cost: f64| if cost.is_finite() { cost } else { f64::MAX };
             squared.extend((0..batch.tracks()).map(|track| finite(found.cost(track))));
         }

@@ -16,10 +16,11 @@ use crate::geometry::bundle;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{Robust, Triangulator};
 use crate::geometry::{Camera, Point, resection};
+use crate::solver::Error;
+use crate::solver::grow::NoiseOptions;
 use crate::solver::per_track::each_track;
 use crate::solver::problem::{Problem, VERIFIED};
 use crate::solver::recorder::Recorder;
-use crate::solver::{Error, grow};
 
 const OPTIONS: GrowthOptions = GrowthOptions::PROJECTIVE;
 
@@ -175,7 +176,7 @@ impl<'a> Growing<'a> {
         let norms: Vec<f64> = standing.squared_residuals().into_iter().map(f64::sqrt).collect();
         let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();
         let noise = adjust::core_noise(norms, unknowns);
-        let (least, most) = grow::NOISE_BOUNDS;
+        let (least, most) = NoiseOptions::DEFAULT.bounds;
         noise.clamp(least, (OPTIONS.noise_growth * self.start_noise).min(most))
     }
 

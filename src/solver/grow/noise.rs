@@ -1,0 +1,85 @@
+//! The noise of a consensus, estimated by its residuals, and the consensus refitted at it.
+
+use super::options::{ConsensusOptions, NoiseOptions};
+use super::{Consensus, Fits, LEAST_INLIERS, constraint_count, judge};
+use crate::domain::StopToken;
+use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::statistics::{chi_square_median, median};
+use crate::solver::a_contrario;
+
+const OPTIONS: NoiseOptions = NoiseOptions::DEFAULT;
+
+/// Estimates the noise from the inliers and refits until both agree.
+///
+/// The estimate is `median(r^2) / median of chi-square`, with the degrees of freedom that cameras and points leave to
+/// a track, so a few wrong tracks among the inliers do not move it. Starting high is safe, starting low is not: a gate
+/// that is too narrow loses the scene.
+fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> Consensus {
+    let mut current = consensus;
+    for _ in 0..OPTIONS.rounds {
+        let inliers = current.inliers();
+        if inliers.len() < LEAST_INLIERS || stop.is_stopped() {
+            break;
+        }
+        let noise = estimate_noise(&current, &inliers);
+        let settled = (noise / current.noise - 1.0).abs() < OPTIONS.settled;
+        let mut fits = Fits::new(block, noise, stop);
+        let fitted = fits.refit(
+            &current,
+            &inliers,
+            ConsensusOptions::DEFAULT.loss(noise),
+            ConsensusOptions::DEFAULT.first_iterations,
+        );
+        let refitted = fits.polish(fitted);
+        // A noise level at which the consensus falls apart was estimated from a fit too flexible to trust.
+        if refitted.inlier_count() < LEAST_INLIERS {
+            break;
+        }
+        current = refitted;
+        if settled {
+            break;
+        }
+    }
+    current
+}
+
+/// The best of what settles from the consensus's noise and from higher ones, with the logarithm of its false alarms.
+///
+/// A consensus found at a noise that is too low has lost its worse tracks, and an estimate from those that remain stays
+/// too low; seen from higher up they come back. Of the outcomes the one least likely to be chance stands.
+///
+/// * `consensus`: polished at its own noise, as [`grow`](super::grow) returns it
+/// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]
+pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> (Consensus, f64) {
+    let higher = |factor: f64| {
+        let noise = (factor * consensus.noise).min(OPTIONS.bounds.1);
+        Fits::new(block, noise, stop).polish(judge(block, consensus.cameras.clone(), noise, stop))
+    };
+    let with_chance = |settled: Consensus| {
+        let ln_false_alarms = a_contrario::ln_false_alarms(block, &settled, spread, stop);
+        (settled, ln_false_alarms)
+    };
+    let mut best = with_chance(settle_noise(block, consensus.clone(), stop));
+    if best.0.noise < OPTIONS.surely_high * consensus.noise {
+        return best;
+    }
+    for factor in OPTIONS.higher {
+        let settled = settle_noise(block, higher(factor), stop);
+        // Most settle where the best one is: to try cameras takes longer than to settle, and they can only veto.
+        if settled.ln_false_alarms_by_residuals(spread) < best.1 {
+            let settled = with_chance(settled);
+            if settled.1 < best.1 {
+                best = settled;
+            }
+        }
+    }
+    best
+}
+
+/// Noise of a consensus by the median of these tracks' residuals.
+pub fn estimate_noise(consensus: &Consensus, inliers: &[usize]) -> f64 {
+    let views = consensus.cameras.len();
+    let per_track = (constraint_count(views, inliers.len()) / inliers.len() as f64).max(0.5);
+    let mut squared: Vec<f64> = inliers.iter().map(|&track| consensus.squared[track]).collect();
+    OPTIONS.clamp((median(&mut squared) / chi_square_median(per_track)).sqrt())
+}
