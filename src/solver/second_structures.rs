@@ -1,6 +1,6 @@
 //! Whether the tracks left out agree on a motion of their own.
 
-use super::a_contrario::{self, LN_DECISIVE};
+use super::a_contrario::{self, FalseAlarmOptions};
 use super::grow::{self, Consensus, Fits};
 use super::portfolio;
 use super::priors;
@@ -55,7 +55,7 @@ pub fn warning(second: &[usize], inlier: &[bool]) -> Option<Warning> {
 fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<Vec<usize>> {
     let search = rigid::Search::new(rest, portfolio::spread(rest), stop)?;
     let found = search.run(noise)?;
-    let is_decisive = found.ln_false_alarms(search.spread()) < LN_DECISIVE;
+    let is_decisive = found.ln_false_alarms(search.spread()) < FalseAlarmOptions::DEFAULT.ln_decisive;
     is_decisive.then(|| (0..found.inlier.len()).filter(|&track| found.inlier[track]).collect())
 }
 
@@ -77,7 +77,7 @@ fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option
         }
         let found = fits.polish(rough);
         let is_decisive = found.inlier_count() >= grow::LEAST_INLIERS
-            && a_contrario::ln_false_alarms(rest, &found, spread, stop) < LN_DECISIVE;
+            && a_contrario::ln_false_alarms(rest, &found, spread, stop) < FalseAlarmOptions::DEFAULT.ln_decisive;
         is_decisive.then(|| found.inliers())
     })
 }

@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::domain::{Input, Proposal, StopToken};
 use crate::geometry::measurement::CompleteBlock;
-use crate::solver::a_contrario::{self, LN_DECISIVE};
+use crate::solver::a_contrario::{self, FalseAlarmOptions};
 use crate::solver::grow::{self, Consensus};
 use crate::solver::learned::TrackScores;
 use crate::solver::portfolio::spread;
@@ -101,7 +101,7 @@ impl Study {
             if best.as_ref().is_none_or(|(least, _)| certainty < *least) {
                 best = Some((certainty, consensus));
             }
-            if best.as_ref().is_some_and(|(least, _)| *least < LN_DECISIVE) {
+            if best.as_ref().is_some_and(|(least, _)| *least < FalseAlarmOptions::DEFAULT.ln_decisive) {
                 break;
             }
         }

@@ -9,7 +9,10 @@
 //! Tracks that lie within the noise of each other in every view are one track for both, where they are more than lie
 //! there by chance: they tell nothing of the cameras that one of them does not.
 
+mod options;
 mod random;
+
+pub use options::FalseAlarmOptions;
 
 use nalgebra::Vector2;
 
@@ -20,41 +23,21 @@ use crate::geometry::statistics::{chi_square_gate, ln_choose};
 use crate::geometry::triangulation;
 use random::{RandomTracks, Tail, constraints_of_track, gate};
 
-/// Logarithm of the expected number of false alarms at which a consensus is decisive (e^-40: never by chance), and at
-/// which it may be accepted once the search has ended.
-pub const LN_DECISIVE: f64 = -40.0;
-pub const LN_ACCEPTABLE: f64 = -7.0;
-/// The same by the cameras, above which nothing is accepted: refining makes them fit more than the seven tracks that
-/// determine them. Of 200 entirely wrong inputs of 3 to 10 views none is answered, and eight right tracks among 200 in
-/// ten views are.
-const LN_BY_CAMERAS: f64 = -10.0;
-/// Random tracks that cameras are tried on: some milliseconds at 10 views, for the few consensuses that may be
-/// accepted.
-const RANDOM_TRACKS: usize = 500;
-/// What those residuals are at least, a constraint, as a share of the variance of the image points: cameras that do not
-/// bend the images of a set of tracks leave a fiftieth of random tracks .06 (three views) to .4 (ten) of it, and what
-/// bends them is allowed to take most of that. Cameras that verify by that much need not be tried.
-const LEAST_MEASURED: f64 = 0.01;
-/// Noise levels that a consensus is grown and settled at, each a test of its own: five of the search, three of the
-/// refinement.
-const NOISE_LEVELS: f64 = 8.0;
-/// Neighbours of a point that are no near-duplicates: as many as of points anywhere in the image, and two standard
-/// deviations of their number (Poisson's).
-const USUAL_SIGMAS: f64 = 2.0;
+const OPTIONS: FalseAlarmOptions = FalseAlarmOptions::DEFAULT;
 
 /// Natural logarithm of the number of such consensuses to be expected in data without structure: by residuals, and
-/// [`LN_ACCEPTABLE`] or more where the cameras say that it may be chance. They are asked only where the residuals would
-/// have it accepted.
+/// [`FalseAlarmOptions::ln_acceptable`] or more where the cameras say that it may be chance. They are asked only where
+/// the residuals would have it accepted.
 ///
 /// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]
 pub fn ln_false_alarms(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> f64 {
     let distinct = consensus.distinct_count(spread);
     let by_residuals = consensus.ln_by_residuals(spread, distinct);
-    if by_residuals >= LN_ACCEPTABLE {
+    if by_residuals >= OPTIONS.ln_acceptable {
         return by_residuals;
     }
     let by_cameras = by_cameras(block, consensus, distinct, spread, stop);
-    if by_cameras < LN_BY_CAMERAS { by_residuals } else { by_cameras.max(LN_ACCEPTABLE) }
+    if by_cameras < OPTIONS.ln_by_cameras { by_residuals } else { by_cameras.max(OPTIONS.ln_acceptable) }
 }
 
 /// The same by the cameras: a-contrario as by Moisan & Stival (2004, section 3). Of `k` inliers [`LEAST_SUPPORT`]
@@ -72,19 +55,20 @@ fn by_cameras(block: &CompleteBlock, consensus: &Consensus, inliers: usize, spre
     if inliers < LEAST_INLIERS {
         return f64::INFINITY;
     }
-    let tests = ln_choose(tracks, inliers) + ln_choose(inliers, LEAST_SUPPORT) + (tracks as f64 * NOISE_LEVELS).ln();
+    let tests =
+        ln_choose(tracks, inliers) + ln_choose(inliers, LEAST_SUPPORT) + (tracks as f64 * OPTIONS.noise_levels).ln();
     let at = |ln_by_chance: f64| tests + (inliers - LEAST_SUPPORT) as f64 * ln_by_chance;
     let constraints = constraints_of_track(block);
     let variance = spread * spread;
-    let measured = LEAST_MEASURED * constraints * variance;
+    let measured = OPTIONS.least_measured * constraints * variance;
     let least = Tail { constraints, variance, measured };
     let at_most = at(least.ln_below(gate(block, consensus)));
-    if at_most < LN_BY_CAMERAS {
+    if at_most < OPTIONS.ln_by_cameras {
         return at_most;
     }
     let mut random = RandomTracks::new(block, consensus, spread);
     // To stop is to accept nothing.
-    if !random.try_until(RANDOM_TRACKS, stop) {
+    if !random.try_until(OPTIONS.random_tracks, stop) {
         return f64::INFINITY;
     }
     at(random.ln_as_good())
@@ -156,7 +140,7 @@ impl Consensus {
         // Of normally distributed points in one view: those that are near in every view are fewer.
         let by_chance = -(-near / (4.0 * spread * spread * self.cameras.len() as f64)).exp_m1();
         let expected = by_chance * images.len() as f64;
-        let usual = expected + USUAL_SIGMAS * expected.sqrt();
+        let usual = expected + OPTIONS.usual_sigmas * expected.sqrt();
         let counted: f64 = neighbours.iter().map(|&count| 1.0 / (1.0 + (f64::from(count) - usual).max(0.0))).sum();
         counted.round() as usize
     }
@@ -200,9 +184,9 @@ mod tests {
                     let grown = grow::grow(&complete, start, noise, &stop);
                     let Some(consensus) = grown else { continue };
                     let mut random = RandomTracks::new(&complete, &consensus, spread);
-                    assert!(random.try_until(RANDOM_TRACKS, &stop));
+                    assert!(random.try_until(OPTIONS.random_tracks, &stop));
                     let share = random.measured() / (constraints_of_track(&complete) * spread * spread);
-                    assert!(share > LEAST_MEASURED, "{views} views, seed {seed}, outliers {outliers}: {share}");
+                    assert!(share > OPTIONS.least_measured, "{views} views, seed {seed}, outliers {outliers}: {share}");
                     (tried, least) = (tried + 1, share.min(least));
                 }
             }
@@ -242,7 +226,7 @@ mod tests {
         };
         let (near, apart) = (count(0.1 * noise), count(20.0 * noise));
         assert_eq!((near.0, apart.0), (11, 40));
-        assert!(near.1 > apart.1 && apart.1 < LN_DECISIVE, "{near:?} {apart:?}");
+        assert!(near.1 > apart.1 && apart.1 < OPTIONS.ln_decisive, "{near:?} {apart:?}");
     }
 
     /// Where the noise is a tenth of the image, what is anywhere is near something.

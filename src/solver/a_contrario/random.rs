@@ -3,6 +3,7 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use super::OPTIONS;
 use crate::domain::StopToken;
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::observation::Observation;
@@ -10,19 +11,8 @@ use crate::geometry::statistics::chi_square_quantile;
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::solver::grow::{self, Consensus};
 
-/// Share of random tracks whose residual is measured, of 500 known to a third; smaller ones are extrapolated from
-/// there.
-const MEASURED_SHARE: f64 = 0.02;
-/// Standard normal quantile of that share.
-const MEASURED_QUANTILE: f64 = -2.053_749;
 /// Where the random numbers begin: one consensus, one answer.
 const SEED: u64 = 0;
-/// Residuals that stand for those of the smallest share, and the least of them as a share of what the inliers leave:
-/// what is smaller has next to no probability. Ratios of 1.02 to 1.3 where cameras may be doubted.
-const EXTRAPOLATED: i32 = 64;
-const LEAST_EXTRAPOLATED: f64 = 0.25;
-/// Bisections of the tilt of the distribution: three digits.
-const TILT_STEPS: usize = 12;
 
 /// Constraints that a complete track leaves to cameras.
 pub fn constraints_of_track(block: &CompleteBlock) -> f64 {
@@ -42,7 +32,7 @@ pub struct Tail {
     pub constraints: f64,
     /// Variance of the coordinates, that of the image points at most: cameras that bend leave less.
     pub variance: f64,
-    /// The residual that [`MEASURED_SHARE`] of them have at most.
+    /// The residual that [`measured_share`](super::FalseAlarmOptions::measured_share) of them have at most.
     pub measured: f64,
 }
 
@@ -54,13 +44,13 @@ impl Tail {
     /// as many residuals below what was measured: too large a one would make small residuals too improbable.
     pub fn ln_below(&self, x: f64) -> f64 {
         // In units of the variance; beyond the mean of all it would be no tail.
-        let least = chi_square_quantile(self.constraints, MEASURED_QUANTILE).min(self.constraints);
+        let least = chi_square_quantile(self.constraints, OPTIONS.measured_quantile).min(self.constraints);
         let measured = (self.measured / self.variance).clamp(least, self.constraints);
         let ratio = x / self.measured;
         if ratio > 1.0 {
             return 0.0;
         }
-        MEASURED_SHARE.ln() + 0.5 * self.constraints * ratio.ln() + 0.5 * measured * (1.0 - ratio)
+        OPTIONS.measured_share.ln() + 0.5 * self.constraints * ratio.ln() + 0.5 * measured * (1.0 - ratio)
     }
 }
 
@@ -102,9 +92,10 @@ impl<'a> RandomTracks<'a> {
         true
     }
 
-    /// The residual that [`MEASURED_SHARE`] of those that were tried have at most.
+    /// The residual that [`measured_share`](super::FalseAlarmOptions::measured_share) of those that were tried have at
+    /// most.
     pub fn measured(&self) -> f64 {
-        self.squared[(MEASURED_SHARE * self.squared.len() as f64) as usize]
+        self.squared[(OPTIONS.measured_share * self.squared.len() as f64) as usize]
     }
 
     /// Natural logarithm of the probability `a` of which `a^n` bounds that `n` of them are all admitted and leave no
@@ -141,17 +132,17 @@ fn random_track(block: &CompleteBlock, rng: &mut ChaCha8Rng) -> Vec<Observation>
 fn ln_as_small(squared: &[f64], tail: &Tail, gate: f64, mean: f64) -> f64 {
     let largest = gate.min(tail.measured);
     // The share of each step stands at its lower end, that of the last at none at all: never too small a bound.
-    let step = (LEAST_EXTRAPOLATED * (mean / largest).min(1.0)).powf(f64::from(EXTRAPOLATED).recip());
+    let step = (OPTIONS.least_extrapolated * (mean / largest).min(1.0)).powf(f64::from(OPTIONS.extrapolated).recip());
     let end = |place: i32| largest * step.powi(place);
     let below = |place: i32| tail.ln_below(end(place)).exp();
-    let at = |place: i32| match place < EXTRAPOLATED {
+    let at = |place: i32| match place < OPTIONS.extrapolated {
         true => (end(place + 1), below(place) - below(place + 1)),
         false => (0.0, below(place)),
     };
     let counted = &squared[squared.partition_point(|&x| x <= tail.measured)..];
-    let share = (1.0 - MEASURED_SHARE) / counted.len() as f64;
+    let share = (1.0 - OPTIONS.measured_share) / counted.len() as f64;
     let tried = counted.iter().take_while(|&&x| x <= gate).map(|&x| (x, share));
-    let residuals: Vec<(f64, f64)> = (0..=EXTRAPOLATED).map(at).chain(tried).collect();
+    let residuals: Vec<(f64, f64)> = (0..=OPTIONS.extrapolated).map(at).chain(tried).collect();
     // Of the tilted distribution the probability, and whether its mean is below that of the inliers.
     let probability = |t: f64| residuals.iter().map(|(x, share)| share * (t * (mean - x)).exp()).sum::<f64>();
     let is_below =
@@ -161,7 +152,7 @@ fn ln_as_small(squared: &[f64], tail: &Tail, gate: f64, mean: f64) -> f64 {
     if !f64::is_finite(high) {
         return probability(0.0).ln();
     }
-    for _ in 0..TILT_STEPS {
+    for _ in 0..OPTIONS.tilt_steps {
         let middle = 0.5 * (low + high);
         if is_below(middle) { high = middle } else { low = middle }
     }
@@ -183,7 +174,7 @@ mod tests {
     fn distribution(constraints: usize, rng: &mut ChaCha8Rng) -> (Vec<f64>, Tail) {
         let mut squared = chi_square(constraints, 20_000, rng);
         squared.sort_by(f64::total_cmp);
-        let measured = squared[(MEASURED_SHARE * squared.len() as f64) as usize];
+        let measured = squared[(OPTIONS.measured_share * squared.len() as f64) as usize];
         (squared, Tail { constraints: constraints as f64, variance: 1.0, measured })
     }
 
@@ -219,8 +210,8 @@ mod tests {
     #[test]
     fn beyond_what_was_measured_a_tail_is_no_bound_but_one() {
         let tail = Tail { constraints: 3.0, variance: 1.0, measured: 0.03 };
-        assert_eq!(tail.ln_below(0.03), MEASURED_SHARE.ln());
-        assert!(tail.ln_below(0.02) < MEASURED_SHARE.ln() && tail.ln_below(0.04) == 0.0);
+        assert_eq!(tail.ln_below(0.03), OPTIONS.measured_share.ln());
+        assert!(tail.ln_below(0.02) < OPTIONS.measured_share.ln() && tail.ln_below(0.04) == 0.0);
     }
 
     /// Four that are all admitted and leave so little on average: as often as said at most, and not much more seldom.

@@ -1,11 +1,11 @@
 //! The best consensus so far, and when it is good enough.
 
+use super::OPTIONS;
 use crate::domain::Proposal;
-use crate::solver::a_contrario::{LN_ACCEPTABLE, LN_DECISIVE};
+use crate::solver::a_contrario::FalseAlarmOptions;
 use crate::solver::grow::{Consensus, LEAST_INLIERS};
 
-/// Gain in that logarithm below which two consensuses are the same: a single track more changes it by tens.
-pub const LN_MARGIN: f64 = 5.0;
+const VERIFICATION: FalseAlarmOptions = FalseAlarmOptions::DEFAULT;
 
 /// What a consensus was verified by.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -33,17 +33,18 @@ pub struct Best {
 
 impl Best {
     pub fn decides(&self) -> bool {
-        self.is_verified() && self.ln_false_alarms < LN_DECISIVE
+        self.is_verified() && self.ln_false_alarms < VERIFICATION.ln_decisive
     }
 
     pub fn is_acceptable(&self) -> bool {
-        self.is_verified() && self.ln_false_alarms < LN_ACCEPTABLE
+        self.is_verified() && self.ln_false_alarms < VERIFICATION.ln_acceptable
     }
 
     /// Its inliers and how many of them count, where that is what keeps it from being accepted.
     pub fn rejected_by_network(&self) -> Option<(usize, usize)> {
         let inliers = self.consensus.inlier_count();
-        let only_by_count = inliers >= LEAST_INLIERS && !self.is_verified() && self.ln_false_alarms < LN_ACCEPTABLE;
+        let only_by_count =
+            inliers >= LEAST_INLIERS && !self.is_verified() && self.ln_false_alarms < VERIFICATION.ln_acceptable;
         only_by_count.then_some((inliers, self.counted))
     }
 
@@ -66,7 +67,7 @@ impl Best {
             // What cannot be accepted keeps nothing out that can.
             _ if self.is_verified() != other.is_verified() => self.is_verified(),
             _ if self.is_acceptable() != other.is_acceptable() => self.is_acceptable(),
-            _ => self.ln_false_alarms < other.ln_false_alarms - LN_MARGIN,
+            _ => self.ln_false_alarms < other.ln_false_alarms - OPTIONS.ln_margin,
         }
     }
 }

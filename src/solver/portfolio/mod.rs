@@ -7,6 +7,7 @@
 //! and its first iterations took as long as everything else. Each proposal's own time is kept.
 
 mod best;
+mod options;
 mod proposals;
 mod spread;
 mod stats;
@@ -28,26 +29,11 @@ use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::network::{NetworkSettings, PriorNetwork};
 use best::Best;
 pub use best::VerifiedBy;
+use options::PortfolioOptions;
 pub use spread::{MOST_SPREAD, spread, spread_of};
 use stats::ProposalStats;
 
-/// Network iterations between two verifications of its ranking.
-const ITERATIONS_PER_ROUND: u32 = 25;
-/// Rounds without a network: as many samples as the longest search with one.
-const ROUNDS_WITHOUT_NETWORK: u32 = 16;
-/// Rounds of a quick search: the noise as assumed, which is rather too high.
-const QUICK_ROUNDS: u32 = 1;
-/// Samples a round and proposal, without depths (a sample costs microseconds) and with.
-const AFFINE_SAMPLES: (usize, usize) = (2_000, 6_000);
-const SUBSPACE_SAMPLES: (usize, usize) = (250, 1_000);
-/// Hypotheses a round and proposal that are grown.
-const SHORTLIST: usize = 2;
-/// Consensuses of near-duplicates after which a search is over: whatever includes one of so many explains all
-/// of it, and outbids what is right.
-const MOST_NEAR_DUPLICATES: usize = 4;
-/// Every other round grows at more noise than assumed, doubling up to sixteen times: a level that is twice too low
-/// loses the scene, and the caller may have given none.
-const NOISE_LADDER: [f64; 8] = [1.0, 2.0, 1.0, 4.0, 1.0, 8.0, 1.0, 16.0];
+const OPTIONS: PortfolioOptions = PortfolioOptions::DEFAULT;
 
 /// What the search found.
 #[derive(Default)]
@@ -134,7 +120,7 @@ impl<'a> Portfolio<'a> {
         Self { geometry_first, ..self }
     }
 
-    /// Whether the search ends after [`QUICK_ROUNDS`], without the paper's network.
+    /// Whether the search ends after [`PortfolioOptions::quick_rounds`], without the paper's network.
     pub fn quickly(self, is_quick: bool) -> Self {
         Self { is_quick, ..self }
     }
@@ -157,9 +143,9 @@ impl<'a> Portfolio<'a> {
     ) -> Result<Found, crate::network::Error> {
         let uses_network = self.settings.method.uses_network() && !self.is_quick;
         let rounds = match uses_network {
-            false if self.is_quick => QUICK_ROUNDS,
-            true => self.settings.iterations.div_ceil(ITERATIONS_PER_ROUND),
-            false => ROUNDS_WITHOUT_NETWORK,
+            false if self.is_quick => OPTIONS.quick_rounds,
+            true => self.settings.iterations.div_ceil(OPTIONS.iterations_per_round),
+            false => OPTIONS.rounds_without_network,
         };
         let mut network = None;
         self.ask(recorder, spread_weights);
@@ -213,7 +199,7 @@ impl<'a> Portfolio<'a> {
 
     /// The noise that a round searches and grows at.
     fn set_noise(&mut self, round: u32) {
-        self.noise = self.assumed_noise * NOISE_LADDER[round as usize % NOISE_LADDER.len()];
+        self.noise = self.assumed_noise * OPTIONS.noise_ladder[round as usize % OPTIONS.noise_ladder.len()];
         if let Search::Subspace(search) = &mut self.search {
             search.set_noise(self.noise);
         }
@@ -228,7 +214,7 @@ impl<'a> Portfolio<'a> {
     ) -> Result<(), crate::network::Error> {
         let begun = Instant::now();
         let iterations = self.settings.iterations;
-        let goal = (network.iteration() + ITERATIONS_PER_ROUND).min(iterations);
+        let goal = (network.iteration() + OPTIONS.iterations_per_round).min(iterations);
         while network.iteration() < goal && !self.stop.is_stopped() {
             let step = network.step()?;
             recorder.standing.iteration = step.iteration;
@@ -278,7 +264,7 @@ impl<'a> Portfolio<'a> {
     /// points and there are no depths to go by.
     fn is_over(&self) -> bool {
         let nothing_else = !self.best.as_ref().is_some_and(Best::is_acceptable) && !self.block.has_depths();
-        self.is_decisive() || (nothing_else && self.near_duplicate_count >= MOST_NEAR_DUPLICATES)
+        self.is_decisive() || (nothing_else && self.near_duplicate_count >= OPTIONS.most_near_duplicates)
     }
 
     /// Writes the best consensus into the progress.

@@ -3,10 +3,10 @@
 use std::time::Instant;
 
 use super::best::Best;
-use super::{AFFINE_SAMPLES, NOISE_LADDER, Portfolio, SHORTLIST, SUBSPACE_SAMPLES, Search, VerifiedBy};
+use super::{OPTIONS, Portfolio, Search, VerifiedBy};
 use crate::domain::Proposal;
 use crate::geometry::statistics::median;
-use crate::solver::a_contrario::{self, LN_DECISIVE};
+use crate::solver::a_contrario::{self, FalseAlarmOptions};
 use crate::solver::learned::TrackScores;
 use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid, subspace};
 use crate::solver::{depths, grow, priors};
@@ -19,7 +19,10 @@ impl Portfolio<'_> {
 
     /// Tracks whose distances stay the same, once a noise level: where depths are given and true up to one scale.
     pub(super) fn propose_rigid(&mut self, round: u32) {
-        let is_new = NOISE_LADDER.iter().position(|level| *level == NOISE_LADDER[round as usize % NOISE_LADDER.len()])
+        let is_new = OPTIONS
+            .noise_ladder
+            .iter()
+            .position(|level| *level == OPTIONS.noise_ladder[round as usize % OPTIONS.noise_ladder.len()])
             == Some(round as usize);
         // A zoom moves distances with the focal length.
         if !is_new || self.settings.focal_per_view || !self.is_wanted(Proposal::Rigidity) {
@@ -46,7 +49,7 @@ impl Portfolio<'_> {
             self.offer(found);
         }
         let certainty = |rigid: &rigid::Rigid| rigid.ln_false_alarms(search.spread());
-        let least = self.rigid.as_ref().map_or(LN_DECISIVE, certainty);
+        let least = self.rigid.as_ref().map_or(FalseAlarmOptions::DEFAULT.ln_decisive, certainty);
         if certainty(&rigid) < least {
             self.rigid = Some(rigid);
         }
@@ -74,7 +77,7 @@ impl Portfolio<'_> {
         }
         let Some(track_scores) = self.track_scores.clone() else { return };
         // The levels of the noise repeat, and so would what is grown from the same tracks.
-        if (round as usize) < NOISE_LADDER.len() && matches!(self.search, Search::Affine(_)) {
+        if (round as usize) < OPTIONS.noise_ladder.len() && matches!(self.search, Search::Affine(_)) {
             self.verify(Proposal::Learned, affine::seed(self.block, track_scores.start()).into_iter().collect());
         }
         self.propose(Proposal::Learned, &track_scores.probabilities(), Some(&track_scores.truncations()));
@@ -126,8 +129,8 @@ impl Portfolio<'_> {
         let samples = |(guided, free): (usize, usize)| if uniform { free } else { guided };
         let (seeds, drawn) = match &self.search {
             Search::Affine(search) => {
-                let mut shortlist = Shortlist::new(SHORTLIST);
-                let drawn = samples(AFFINE_SAMPLES);
+                let mut shortlist = Shortlist::new(OPTIONS.shortlist);
+                let drawn = samples(OPTIONS.affine_samples);
                 let even = search.even_truncations();
                 let truncations = truncations.unwrap_or(&even);
                 search.run(&sampler, truncations, drawn, &mut self.rng, &mut shortlist, self.stop);
@@ -137,8 +140,8 @@ impl Portfolio<'_> {
                 (seeds, drawn)
             }
             Search::Subspace(search) => {
-                let mut shortlist = Shortlist::new(SHORTLIST);
-                let drawn = samples(SUBSPACE_SAMPLES);
+                let mut shortlist = Shortlist::new(OPTIONS.shortlist);
+                let drawn = samples(OPTIONS.subspace_samples);
                 search.run(&sampler, drawn, &mut self.rng, &mut shortlist, self.stop);
                 (shortlist.into_entries().map(|basis| search.seed(self.block, &basis)).collect(), drawn)
             }

@@ -1,6 +1,7 @@
 //! What each proposal found and what that cost, so that a result can say what each alone would have needed.
 
-use super::best::{Best, LN_MARGIN};
+use super::OPTIONS;
+use super::best::Best;
 use crate::domain::Proposal;
 use crate::domain::result::PriorTime;
 
@@ -23,9 +24,6 @@ struct Record {
     ln_false_alarms: f64,
 }
 
-/// Share of the accepted consensus's inliers and certainty that counts as having found it.
-const SUFFICIENT_SHARE: f64 = 0.95;
-
 impl ProposalStats {
     pub fn new(proposal: Proposal) -> Self {
         Self { proposal, seconds: 0.0, work: 0, records: Vec::new() }
@@ -33,7 +31,7 @@ impl ProposalStats {
 
     /// Enters a consensus, if it is better than the last.
     pub fn record(&mut self, found: &Best) {
-        if self.records.last().is_none_or(|last| found.ln_false_alarms < last.ln_false_alarms - LN_MARGIN) {
+        if self.records.last().is_none_or(|last| found.ln_false_alarms < last.ln_false_alarms - OPTIONS.ln_margin) {
             self.records.push(Record {
                 seconds: self.seconds,
                 work: self.work,
@@ -46,8 +44,8 @@ impl ProposalStats {
     /// When this proposal first stood at a consensus as good as the accepted one.
     pub fn time(&self, accepted: Option<&Best>) -> PriorTime {
         let sufficient = accepted.and_then(|accepted| {
-            let inliers = SUFFICIENT_SHARE * accepted.consensus.inlier_count() as f64;
-            let certainty = SUFFICIENT_SHARE * accepted.ln_false_alarms;
+            let inliers = OPTIONS.sufficient_share * accepted.consensus.inlier_count() as f64;
+            let certainty = OPTIONS.sufficient_share * accepted.ln_false_alarms;
             let is_enough = |record: &&Record| record.inliers as f64 >= inliers && record.ln_false_alarms <= certainty;
             self.records.iter().find(is_enough)
         });

@@ -5,7 +5,7 @@ use super::options::GrowthOptions;
 use super::register;
 use super::{adjust, calibrate, components, growth, projective, structure};
 use crate::domain::{Grade, LeftOut, Stage, Task, Warning, WarningCode};
-use crate::solver::attempt::{self, Attempt};
+use crate::solver::attempt::{self, Attempt, AttemptOptions};
 use crate::solver::calibration::Outcome;
 use crate::solver::grow::LEAST_INLIERS;
 use crate::solver::problem::Problem;
@@ -131,7 +131,7 @@ impl Extended {
     /// calibration must be of one kind, too: those of a street of 60 or 120 views that was bent to a wrong focal length
     /// were not.
     pub fn is_settled(&self, problem: &Problem) -> bool {
-        let is_precise = self.model.noise <= attempt::INITIAL_NOISE;
+        let is_precise = self.model.noise <= AttemptOptions::DEFAULT.initial_noise;
         // Windows that differ a little warn of a mismatch of a METRIC one too.
         is_precise
             && self.holds_most_views()

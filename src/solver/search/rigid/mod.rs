@@ -299,7 +299,8 @@ impl<'a> Search<'a> {
 mod tests {
     use super::*;
     use crate::domain::{Input, Limits};
-    use crate::solver::{a_contrario, block, portfolio};
+    use crate::solver::a_contrario::FalseAlarmOptions;
+    use crate::solver::{block, portfolio};
     use crate::synthetic::{Scene, SceneOptions};
 
     fn found(options: &SceneOptions) -> (Scene, Option<Rigid>, f64) {
@@ -320,7 +321,7 @@ mod tests {
             let options = SceneOptions { outliers: 0.98, with_depths: true, seed, ..SceneOptions::default() };
             let (scene, rigid, certainty) = found(&options);
             let rigid = rigid.expect("four rigid tracks");
-            assert!(certainty < a_contrario::LN_DECISIVE, "seed {seed}: {certainty}");
+            assert!(certainty < FalseAlarmOptions::DEFAULT.ln_decisive, "seed {seed}: {certainty}");
             assert_eq!(rigid.inlier, scene.truth.inlier, "seed {seed}");
             let error = (rigid.focal * 1000.0 / scene.truth.focal_px).ln().abs();
             assert!(error < 0.1, "seed {seed}: {error}");
@@ -332,7 +333,7 @@ mod tests {
         for seed in 0..5 {
             let options = SceneOptions { outliers: 1.0, with_depths: true, seed, ..SceneOptions::default() };
             let (_, _, certainty) = found(&options);
-            assert!(certainty > a_contrario::LN_DECISIVE / 4.0, "seed {seed}: {certainty}");
+            assert!(certainty > FalseAlarmOptions::DEFAULT.ln_decisive / 4.0, "seed {seed}: {certainty}");
         }
     }
 }

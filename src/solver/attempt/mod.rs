@@ -1,6 +1,10 @@
 //! One block of views from search to calibration.
 
-use super::a_contrario::LN_ACCEPTABLE;
+mod options;
+
+pub use options::AttemptOptions;
+
+use super::a_contrario::FalseAlarmOptions;
 use super::baselines::{self, Decided};
 use super::block::Block;
 use super::calibration::{self, Outcome};
@@ -18,29 +22,11 @@ use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::geometry::statistics::median;
 
-/// Noise that growing starts from when the caller gives none, as a share of the image side. High on purpose: twice too
-/// low loses the scene, ten times too high costs nothing.
-pub const INITIAL_NOISE: f64 = 0.005;
-/// Tracks that a search looks at, at most and where there are many views: bundle adjustment costs their number times
-/// the square of the views, and more tracks make a consensus neither easier to find nor much more exact.
-const SEARCHED_TRACKS: (usize, usize) = (600, 200);
-/// Tracks times squared views that a search may hold between those two.
-const SEARCHED_WORK: usize = 60_000;
-/// Inlier tracks, and observations of them, that a calibration is made from: beyond, it takes minutes, and other errors
-/// than noise bound what it gives.
-const MOST_CALIBRATED: usize = 600;
-const CALIBRATED_OBSERVATIONS: usize = 20_000;
-/// Tracks that PAPER optimises weights for: the network holds some 40 kB a track at full width.
-const PAPER_TRACKS: usize = 5_000;
+const OPTIONS: AttemptOptions = AttemptOptions::DEFAULT;
 
 /// What is said of motions and scenes that carry no calibration.
 const CRITICAL: [WarningCode; 4] =
     [WarningCode::PureTranslation, WarningCode::PureRotation, WarningCode::PlanarScene, WarningCode::PlanarOrRotation];
-
-/// Median of the squared residuals over their mean, below which they are of several kinds; one normal noise gives .69.
-/// Measured on scenes of ten views and 200 tracks with depths: .60 to .80 in 150 of noise 3 to 11 %; .15 to .49 in the
-/// 46 that were first fitted at too high a noise of 120 with one to three wrong observations in every right track.
-const LEAST_MEDIAN_SHARE: f64 = 0.5;
 
 /// Merit of a WEAK attempt, see [`Attempt::merit`].
 pub const WEAK_MERIT: u8 = 3;
@@ -106,9 +92,10 @@ impl Attempt {
     }
 
     /// Whether the residuals are of several kinds, most small and some large: tracks that hold wrong observations were
-    /// fitted at too high a noise. Never up to [`INITIAL_NOISE`], where the gates keep wrong observations out.
+    /// fitted at too high a noise. Never up to [`AttemptOptions::initial_noise`], where the gates keep wrong
+    /// observations out.
     pub fn has_mixed_residuals(&self) -> bool {
-        let noisy = self.projective.as_ref().filter(|found| found.noise > INITIAL_NOISE);
+        let noisy = self.projective.as_ref().filter(|found| found.noise > OPTIONS.initial_noise);
         noisy.is_some_and(|found| are_mixed(found.squared_residuals()))
     }
 
@@ -180,7 +167,7 @@ impl Attempt {
 /// Whether squared residuals are of several kinds, most small and some large.
 pub fn are_mixed(mut squared: Vec<f64>) -> bool {
     let mean = squared.iter().sum::<f64>() / squared.len().max(1) as f64;
-    median(&mut squared) < LEAST_MEDIAN_SHARE * mean
+    median(&mut squared) < OPTIONS.least_median_share * mean
 }
 
 /// Solves a block, or as many of its tracks as its method can afford.
@@ -214,7 +201,7 @@ pub fn search_block(
     recorder.enter(Stage::Search);
     let mut attempt = match problem.settings.method {
         Method::Auto | Method::Geometry => searched(problem, &block, effort, recorder)?,
-        Method::Paper => decided(problem, block.sample(PAPER_TRACKS, problem.settings.seed), recorder)?,
+        Method::Paper => decided(problem, block.sample(OPTIONS.paper_tracks, problem.settings.seed), recorder)?,
         Method::Psfm => decided(problem, block, recorder)?,
     };
     problem.stopped()?;
@@ -252,16 +239,16 @@ pub fn calibrate(
 
 /// The noise that a solve starts from, normalised units.
 fn initial_noise(problem: &Problem) -> f64 {
-    let noise = problem.settings.noise_px.map_or(INITIAL_NOISE, |noise_px| noise_px / problem.scale_px);
+    let noise = problem.settings.noise_px.map_or(OPTIONS.initial_noise, |noise_px| noise_px / problem.scale_px);
     NoiseOptions::DEFAULT.clamp(noise)
 }
 
 /// AUTO and GEOMETRY: a sample of the tracks without near-duplicates, and where that holds nothing, one of all.
 fn searched(problem: &Problem, block: &Block, effort: Effort, recorder: &mut Recorder) -> Result<Attempt, Error> {
-    let most = if effort.is_seed {
-        SEARCHED_TRACKS.1
-    } else {
-        (SEARCHED_WORK / block.views.len().max(1).pow(2)).clamp(SEARCHED_TRACKS.1, SEARCHED_TRACKS.0)
+    let (most, of_many_views) = OPTIONS.searched_tracks;
+    let most = match effort.is_seed {
+        true => of_many_views,
+        false => (OPTIONS.searched_work / block.views.len().max(1).pow(2)).clamp(of_many_views, most),
     };
     if let Some(thinned) = near_duplicates::thinned(block, most, initial_noise(problem), problem.settings.seed) {
         let attempt = search(problem, thinned, None, effort, recorder)?;
@@ -312,7 +299,7 @@ fn search(
         return Ok(attempt);
     }
     // Another noise and other inliers than those that were accepted.
-    if ln_false_alarms >= LN_ACCEPTABLE {
+    if ln_false_alarms >= FalseAlarmOptions::DEFAULT.ln_acceptable {
         return Ok(attempt);
     }
     let second = second_structures::find(complete, &refined, problem.stop).unwrap_or_default();
@@ -375,7 +362,7 @@ fn calibrate_projective(
     projective: &Projective,
     prior: Option<FocalPrior>,
 ) -> Result<Outcome, Error> {
-    let most = MOST_CALIBRATED.min(CALIBRATED_OBSERVATIONS / projective.views.len().max(1));
+    let most = OPTIONS.most_calibrated.min(OPTIONS.calibrated_observations / projective.views.len().max(1));
     let some = projective.most_observed(most);
     let (group_of, cameras) = problem.cameras_of(&projective.views);
     let prior = prior.filter(|_| cameras.len() == 1);
