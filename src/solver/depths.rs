@@ -5,7 +5,7 @@
 
 use super::block::Block;
 use super::calibration::{Outcome, few_inliers};
-use super::classification::{Geometry, Judged};
+use super::classification::{ClassificationOptions, Geometry, Judged};
 use super::grow::{Consensus, NoiseOptions};
 use super::portfolio;
 use super::problem::Problem;
@@ -192,7 +192,8 @@ impl TrackWeights {
             let seen: Vec<(usize, Observation)> = registered.map(|k| (k, geometry.observation(problem, k))).collect();
             let observations: Vec<Observation> = seen.iter().map(|(_, observation)| *observation).collect();
             let start = triangulation::linear(&cameras, &observations);
-            let point = triangulation::refine(&cameras, &observations, start, POINT_STEPS).0;
+            let point =
+                triangulation::refine(&cameras, &observations, start, ClassificationOptions::DEFAULT.point_steps).0;
             for (k, observation) in seen {
                 let place = problem.input.caller_index(k);
                 let residual = triangulation::reprojection(&cameras[observation.view], &point, &observation.xy).norm();
@@ -206,6 +207,3 @@ impl TrackWeights {
         }
     }
 }
-
-/// Refinement steps of a point.
-const POINT_STEPS: usize = 10;

@@ -5,9 +5,11 @@
 //! dropped, at a price for each.
 
 mod noise;
+mod options;
 mod track_classifier;
 
 pub use noise::{NoiseModel, outlier_density, working_gate};
+pub use options::ClassificationOptions;
 
 use crate::domain::Input;
 use crate::domain::result::{ObservationResults, TrackResults};
@@ -19,6 +21,8 @@ use crate::geometry::{Camera, Point};
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 use crate::solver::problem::{LEAST_RETAINED_SHARE, Problem};
 use track_classifier::TrackClassifier;
+
+const OPTIONS: ClassificationOptions = ClassificationOptions::DEFAULT;
 
 /// The geometry to judge by, indexed by the input's views and tracks.
 pub struct Geometry {

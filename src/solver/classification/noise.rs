@@ -2,40 +2,21 @@
 
 use nalgebra::Vector2;
 
+use super::OPTIONS;
 use crate::geometry::statistics::median;
 use crate::solver::portfolio::{MOST_SPREAD, spread_of};
-
-/// Share of right observations in the tail, before it is known, and the tail's width in units of the core. Feature
-/// detectors have a core of .1 to .3 px and tails that a Gaussian of that width would call impossible; together with
-/// the uniform outliers this puts the gate at 12 to 17 core deviations, where real sequences want it (15 to 20).
-const TAIL_SHARE: f64 = 0.05;
-const TAIL_WIDTH: f64 = 3.0;
-/// Bounds of the share that is estimated: noise without a tail still has a rare blunder that is no wrong match.
-const TAIL_BOUNDS: (f64, f64) = (0.001, 0.2);
-/// Observations from which the share is estimated, and rounds of the estimation; it converges in five.
-const TAIL_OBSERVATIONS: usize = 100;
-/// Observations that it is estimated from at most, evenly taken: they tell a share of .05 to .0015.
-const MOST_TAIL_OBSERVATIONS: usize = 20_000;
-const TAIL_ROUNDS: usize = 10;
-/// Prior probability that a single observation of a right track is wrong.
-const WRONG_OBSERVATION: f64 = 0.05;
-
-/// Least spread of the points of an image, image sides: half of them within a thousandth are no picture of anything.
-const LEAST_SPREAD: f64 = 1e-3;
-/// Points from which a view has a say in it: the spread of eight is known to a third.
-const LEAST_POINTS: usize = 8;
 
 /// Density of a wrong coordinate in an image: one over the width of a uniform distribution that is spread like the
 /// points of a view, the median over the views with enough of them; without any, like all points.
 ///
 /// * `of_view`: places of each view's points among all
 pub fn outlier_density(of_view: &[Vec<u32>], points: &[Vector2<f64>]) -> f64 {
-    let views = of_view.iter().filter(|places| places.len() >= LEAST_POINTS);
+    let views = of_view.iter().filter(|places| places.len() >= OPTIONS.least_points);
     let mut spreads: Vec<f64> =
         views.map(|places| spread_of(&places.iter().map(|&k| points[k as usize]).collect::<Vec<_>>())).collect();
     let spread = if spreads.is_empty() { spread_of(points) } else { median(&mut spreads) };
     // A uniform distribution is so many standard deviations wide.
-    1.0 / (12.0f64.sqrt() * spread.clamp(LEAST_SPREAD, MOST_SPREAD))
+    1.0 / (12.0f64.sqrt() * spread.clamp(OPTIONS.least_spread, MOST_SPREAD))
 }
 
 /// Squared residual within which an observation is more likely right than wrong while nothing is known of the noise's
@@ -59,36 +40,36 @@ pub struct NoiseModel {
 impl NoiseModel {
     /// The model while nothing is known of the tail.
     pub fn new(core: f64, outlier_density: f64) -> Self {
-        Self { core, tail_share: TAIL_SHARE, outlier_density }
+        Self { core, tail_share: OPTIONS.tail_share, outlier_density }
     }
 
     /// The model with the tail that these squared residuals of right observations, in core variances, show: the share
     /// by expectation and maximisation. `None` for too few of them.
     pub fn with_tail(self, squared: &[f64]) -> Option<Self> {
-        if squared.len() < TAIL_OBSERVATIONS {
+        if squared.len() < OPTIONS.least_tail_observations {
             return None;
         }
-        let step = squared.len().div_ceil(MOST_TAIL_OBSERVATIONS).max(1);
+        let step = squared.len().div_ceil(OPTIONS.most_tail_observations).max(1);
         let squared: Vec<f64> = squared.iter().copied().step_by(step).collect();
-        let mut share = TAIL_SHARE;
-        for _ in 0..TAIL_ROUNDS {
+        let mut share = OPTIONS.tail_share;
+        for _ in 0..OPTIONS.tail_rounds {
             let of_tail = |squared: &f64| {
                 let core = (1.0 - share) * (-0.5 * squared).exp();
-                let tail = share * (-0.5 * squared / TAIL_WIDTH.powi(2)).exp() / TAIL_WIDTH.powi(2);
+                let tail = share * (-0.5 * squared / OPTIONS.tail_width.powi(2)).exp() / OPTIONS.tail_width.powi(2);
                 tail / (core + tail).max(f64::MIN_POSITIVE)
             };
             share = squared.iter().map(of_tail).sum::<f64>() / squared.len() as f64;
         }
-        Some(Self { tail_share: share.clamp(TAIL_BOUNDS.0, TAIL_BOUNDS.1), ..self })
+        Some(Self { tail_share: share.clamp(OPTIONS.tail_bounds.0, OPTIONS.tail_bounds.1), ..self })
     }
 
     /// Squared residual at which an observation is as likely wrong as right: by its core or by its tail, whichever
     /// reaches farther. Strong noise has a core that reaches farther than a rare tail.
     pub fn gate(&self) -> f64 {
-        let wrong = WRONG_OBSERVATION * self.outlier_density.powi(2);
+        let wrong = OPTIONS.wrong_observation * self.outlier_density.powi(2);
         let reach = |(share, width): (f64, f64)| {
             let variance = (width * self.core).powi(2);
-            let right = (1.0 - WRONG_OBSERVATION) * share / (std::f64::consts::TAU * variance);
+            let right = (1.0 - OPTIONS.wrong_observation) * share / (std::f64::consts::TAU * variance);
             2.0 * variance * (right / wrong).ln().max(0.0)
         };
         let [core, tail] = self.parts().map(reach);
@@ -97,10 +78,11 @@ impl NoiseModel {
 
     /// Probability that an observation with this squared residual is right, of a track that is.
     pub fn weight(&self, squared: f64) -> f64 {
-        let wrong = WRONG_OBSERVATION * self.outlier_density.powi(2);
+        let wrong = OPTIONS.wrong_observation * self.outlier_density.powi(2);
         let density = |(share, width): (f64, f64)| {
             let variance = (width * self.core).powi(2);
-            (1.0 - WRONG_OBSERVATION) * share * (-0.5 * squared / variance).exp() / (std::f64::consts::TAU * variance)
+            (1.0 - OPTIONS.wrong_observation) * share * (-0.5 * squared / variance).exp()
+                / (std::f64::consts::TAU * variance)
         };
         let right: f64 = self.parts().map(density).iter().sum();
         right / (right + wrong).max(f64::MIN_POSITIVE)
@@ -117,14 +99,15 @@ impl NoiseModel {
             share.ln() - 0.5 * dof * (std::f64::consts::TAU * variance).ln() - 0.5 * cost / variance
         };
         let [core, tail] = self.parts().map(ln_density);
-        let ln_right = core.max(tail) + (-(core - tail).abs()).exp().ln_1p() + dropped as f64 * WRONG_OBSERVATION.ln();
+        let ln_right =
+            core.max(tail) + (-(core - tail).abs()).exp().ln_1p() + dropped as f64 * OPTIONS.wrong_observation.ln();
         let ln_wrong = dof * self.outlier_density.ln();
         (share / (1.0 - share)).ln() + ln_right - ln_wrong
     }
 
     /// Share and width of the core and of the tail.
     fn parts(&self) -> [(f64, f64); 2] {
-        [(1.0 - self.tail_share, 1.0), (self.tail_share, TAIL_WIDTH)]
+        [(1.0 - self.tail_share, 1.0), (self.tail_share, OPTIONS.tail_width)]
     }
 }
 
@@ -156,22 +139,22 @@ mod tests {
             // A squared residual of two Gaussian coordinates is exponential, of mean 2 variances.
             let squared: Vec<f64> = (0..5_000)
                 .map(|_| {
-                    let width = if rng.random::<f64>() < share { TAIL_WIDTH } else { 1.0 };
+                    let width = if rng.random::<f64>() < share { OPTIONS.tail_width } else { 1.0 };
                     -2.0 * width * width * (1.0 - rng.random::<f64>()).ln()
                 })
                 .collect();
             let found = model.with_tail(&squared).expect("enough").tail_share;
-            let expected = share.clamp(TAIL_BOUNDS.0, TAIL_BOUNDS.1);
+            let expected = share.clamp(OPTIONS.tail_bounds.0, OPTIONS.tail_bounds.1);
             println!("seed {seed}: share {found} of {share}");
             assert!((found - expected).abs() < 0.01 + 0.2 * expected, "seed {seed}: {found} instead of {expected}");
-            assert_eq!(model.with_tail(&squared[..TAIL_OBSERVATIONS - 1]), None);
+            assert_eq!(model.with_tail(&squared[..OPTIONS.least_tail_observations - 1]), None);
         }
     }
 
     #[test]
     fn the_gate_lets_the_core_of_any_noise_through() {
         for core in [1e-4, 0.003, 0.02, 0.05] {
-            for tail_share in [TAIL_BOUNDS.0, TAIL_SHARE, TAIL_BOUNDS.1] {
+            for tail_share in [OPTIONS.tail_bounds.0, OPTIONS.tail_share, OPTIONS.tail_bounds.1] {
                 let noise = NoiseModel { core, tail_share, outlier_density: 1.0 };
                 let gate = noise.gate().sqrt() / core;
                 assert!((2.5..25.0).contains(&gate), "noise {core}, tail {tail_share}: {gate} deviations");

@@ -2,22 +2,12 @@
 
 use std::ops::Range;
 
-use super::{Geometry, Judged, NoiseModel, SplitPoint};
+use super::{Geometry, Judged, NoiseModel, OPTIONS, SplitPoint};
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::geometry::{Camera, Point, triangulation};
-use crate::solver::problem::Problem;
-
-/// Observations that a track must retain.
-const LEAST_RETAINED: usize = 3;
-/// Refinement steps of a point.
-const POINT_STEPS: usize = 10;
-/// The same before an observation far beyond the gate is dropped: which is the worst shows early, and of a wrong track
-/// four in ten observations are dropped one after the other.
-const DROPPING_STEPS: usize = 4;
-/// Gates from which on the further steps bring no observation back: twice the distance.
-const FAR_GATES: f64 = 4.0;
+use crate::solver::problem::{Problem, VERIFIED};
 
 /// The verdict on one track.
 #[derive(Debug, Clone)]
@@ -65,7 +55,7 @@ impl TrackClassifier<'_> {
         let observation = |&k: &usize| geometry.observation(problem, k);
         let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) = tracks
             .map(|track| (track, geometry.of_track(problem, track)))
-            .filter(|(_, seen)| seen.len() >= LEAST_RETAINED)
+            .filter(|(_, seen)| seen.len() >= VERIFIED)
             .unzip();
         let observations: Vec<Vec<Observation>> =
             seen.iter().map(|seen| seen.iter().map(observation).collect()).collect();
@@ -95,15 +85,16 @@ impl TrackClassifier<'_> {
             let is_left = |k: &usize| retained.binary_search(k).is_err();
             (0..observations.len()).filter(is_left).for_each(|k| batch.drop_observation(lane, k));
         }
-        let mut found = batch.refine(batch.linear(), |_| true, DROPPING_STEPS);
+        let mut found = batch.refine(batch.linear(), |_| true, OPTIONS.dropping_steps);
         while !self.problem.stop.is_stopped() {
             let worst = |squared: &[[f64; LANES]], lane: usize| {
                 let retained = retained.get(lane).and_then(Option::as_ref)?;
                 worst_beyond(retained, self.least_retained(tracks[lane]), gate, |k| squared[k][lane])
             };
             let squared = batch.squared_residuals(&found);
-            let is_near = |lane: usize| worst(&squared, lane).is_some_and(|(_, worst)| worst < FAR_GATES * gate);
-            found = batch.refine(found, is_near, POINT_STEPS);
+            let is_near =
+                |lane: usize| worst(&squared, lane).is_some_and(|(_, worst)| worst < OPTIONS.far_gates * gate);
+            found = batch.refine(found, is_near, OPTIONS.point_steps);
             let squared = batch.squared_residuals(&found);
             let dropped: [Option<usize>; LANES] =
                 std::array::from_fn(|lane| worst(&squared, lane).map(|(place, _)| place));
@@ -116,13 +107,13 @@ impl TrackClassifier<'_> {
                 }
             }
             let is_dropped = |lane: usize| dropped[lane].is_some();
-            found = batch.refine(batch.linear(), is_dropped, DROPPING_STEPS).or(is_dropped, found);
+            found = batch.refine(batch.linear(), is_dropped, OPTIONS.dropping_steps).or(is_dropped, found);
         }
         let can_be_right = |lane: usize| {
             let retained = retained.get(lane).and_then(Option::as_ref);
             retained.is_some_and(|retained| retained.len() >= self.least_retained(tracks[lane]))
         };
-        let found = batch.refine(found, can_be_right, POINT_STEPS);
+        let found = batch.refine(found, can_be_right, OPTIONS.point_steps);
         let verdict = |(lane, (observations, retained)): (usize, (&&[Observation], Option<Vec<usize>>))| match retained
         {
             Some(retained) => self.weigh(observations, &retained, found.point(lane), found.cost(lane)),
@@ -133,7 +124,7 @@ impl TrackClassifier<'_> {
 
     /// Observations that a track must retain.
     fn least_retained(&self, observations: &[Observation]) -> usize {
-        LEAST_RETAINED.max((self.least_share * observations.len() as f64).ceil() as usize)
+        VERIFIED.max((self.least_share * observations.len() as f64).ceil() as usize)
     }
 
     /// The verdict on a track by the observations that it retains.
@@ -149,7 +140,7 @@ impl TrackClassifier<'_> {
         for &k in retained {
             flags[k] = self.squared(&point, &observations[k]) <= gate;
         }
-        let whole = flags.iter().filter(|&&flag| flag).count() >= LEAST_RETAINED;
+        let whole = flags.iter().filter(|&&flag| flag).count() >= VERIFIED;
         Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
     }
 
@@ -199,7 +190,7 @@ impl TrackClassifier<'_> {
     fn others(&self, observations: &[Observation], verdict: &Verdict) -> Vec<Other> {
         let mut left: Vec<usize> = (0..observations.len()).filter(|&k| !verdict.retained[k]).collect();
         let mut others = Vec::new();
-        while left.len() >= LEAST_RETAINED && !self.problem.stop.is_stopped() {
+        while left.len() >= VERIFIED && !self.problem.stop.is_stopped() {
             let these = chosen(observations, &left);
             let Some(verdict) = self.judge(&[&these]).pop().filter(|verdict| verdict.inlier) else { break };
             let (of_other, rest): (Vec<_>, Vec<_>) = left.iter().zip(&verdict.retained).partition(|(_, kept)| **kept);
@@ -222,7 +213,7 @@ impl Verdict {
 /// Place among the retained observations of the one of the largest squared residual, and that, if it is beyond the
 /// gate. A track that cannot retain enough is wrong already and keeps the rest.
 fn worst_beyond(retained: &[usize], least: usize, gate: f64, squared: impl Fn(usize) -> f64) -> Option<(usize, f64)> {
-    if retained.len() < least.max(LEAST_RETAINED + 1) {
+    if retained.len() < least.max(VERIFIED + 1) {
         return None;
     }
     let residuals = retained.iter().map(|&k| squared(k)).enumerate();
