@@ -12,7 +12,7 @@ use super::reconstruction::{Reconstruction, own_verdicts};
 use super::recorder::Recorder;
 use super::second_structures;
 use super::sequence::Ended;
-use super::view_selection::{LEAST_TRACKS, LEAST_VIEWS};
+use super::view_selection::LEAST_VIEWS;
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter};
@@ -268,7 +268,7 @@ fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
             WarningCode::FewInliers,
             format!(
                 "no {} views share enough tracks: at least {}, of which none is another's copy, must be seen in all of them",
-                LEAST_VIEWS, LEAST_TRACKS
+                LEAST_VIEWS, LEAST_INLIERS
             ),
         ),
         Some(Attempt { decided: Some(decided), .. }) => Warning::new(

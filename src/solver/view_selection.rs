@@ -1,26 +1,57 @@
 //! Which views are searched together: all of them where their tracks are complete, blocks of views that share many
 //! tracks, and small subsets of either.
 
+use super::grow::LEAST_INLIERS;
 use super::problem::{Problem, camera_groups, observed_views};
 use crate::domain::{Input, StopToken};
 
-/// Tracks that a block should have: twice the eight that verification needs, for half of them may be wrong.
-const WANTED_TRACKS: usize = 16;
-/// Tracks below which no block is tried: verification needs eight inliers.
-pub const LEAST_TRACKS: usize = 8;
 /// Views below which a projective reconstruction carries no calibration worth searching for.
 pub const LEAST_VIEWS: usize = 3;
-/// Views that a block grows to. Real tracks are short: longer blocks hold few of them.
-const MOST_VIEWS: usize = 10;
-/// Views that are solved as one block where tracks are complete over all views; of more, these many evenly spread:
-/// bundle adjustment of a block is cubic in its views.
-const MOST_VIEWS_WHOLE: usize = 40;
-/// Tracks beyond which more of them do not make a block better.
-const ENOUGH_TRACKS: usize = 300;
-/// Views that blocks are begun from; of long sequences not every view needs its turn to find a few dense blocks.
-const MOST_FIRST_VIEWS: usize = 64;
-/// Blocks that are tried, best first, before the best result stands.
-const MOST_BLOCKS: usize = 4;
+
+/// Which sets of views are worth solving.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ViewSelectionOptions {
+    /// Tracks that a block should have, and those below which none is tried.
+    pub wanted_tracks: usize,
+    pub least_tracks: usize,
+    /// Views that a block grows to.
+    pub most_views: usize,
+    /// Views that are solved as one block where tracks are complete over all views; of more, these many evenly spread.
+    pub most_views_whole: usize,
+    /// Tracks beyond which more of them do not make a block better.
+    pub enough_tracks: usize,
+    /// Views that blocks are begun from.
+    pub most_first_views: usize,
+    /// Blocks that are tried, best first, before the best result stands.
+    pub most_blocks: usize,
+    /// Views of a subset.
+    pub subset_views: usize,
+    /// Subsets of one set, and of all sets together.
+    pub subsets_of_set: usize,
+    pub most_subsets: usize,
+}
+
+impl ViewSelectionOptions {
+    pub const DEFAULT: Self = Self {
+        // Half of them may be wrong.
+        wanted_tracks: 2 * LEAST_INLIERS,
+        least_tracks: LEAST_INLIERS,
+        // Real tracks are short: longer blocks hold few of them.
+        most_views: 10,
+        // Bundle adjustment of a block is cubic in its views.
+        most_views_whole: 40,
+        enough_tracks: 300,
+        // Of long sequences not every view needs its turn to find a few dense blocks.
+        most_first_views: 64,
+        most_blocks: 4,
+        // Of a track with three wrong observations of ten, four views are clean one time in six.
+        subset_views: 4,
+        subsets_of_set: 6,
+        most_subsets: 8,
+    };
+}
+
+const OPTIONS: ViewSelectionOptions = ViewSelectionOptions::DEFAULT;
 
 /// Sets of views worth solving, best first; empty when no three views share enough tracks.
 ///
@@ -45,7 +76,7 @@ pub fn blocks(problem: &Problem) -> Vec<Vec<usize>> {
 
 /// The views of the one block of an input whose tracks are complete; see [`complete_views`].
 pub fn whole(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
-    complete_views(input, ranges).map(|views| evenly(&views, MOST_VIEWS_WHOLE))
+    complete_views(input, ranges).map(|views| evenly(&views, OPTIONS.most_views_whole))
 }
 
 /// The same of incomplete tracks, each set of one camera group: those of the group with most observations first.
@@ -59,17 +90,17 @@ fn candidate_views_of_one_camera(input: &Input, ranges: &[usize], stop: &StopTok
     for group in order {
         let open: Vec<bool> = group_of.iter().map(|of| *of == group).collect();
         let enough = open.iter().filter(|&&open| open).count() >= LEAST_VIEWS;
-        if enough && found.len() < MOST_BLOCKS && !stop.is_stopped() {
+        if enough && found.len() < OPTIONS.most_blocks && !stop.is_stopped() {
             found.extend(candidate_views_among(input, ranges, &open, stop));
         }
     }
-    found.truncate(MOST_BLOCKS);
+    found.truncate(OPTIONS.most_blocks);
     found
 }
 
 /// The same of incomplete tracks, only of views that are `open` (one entry a view).
 pub fn candidate_views_among(input: &Input, ranges: &[usize], open: &[bool], stop: &StopToken) -> Vec<Vec<usize>> {
-    for least in [WANTED_TRACKS, LEAST_TRACKS] {
+    for least in [OPTIONS.wanted_tracks, OPTIONS.least_tracks] {
         let found = greedy_views(input, ranges, open, least, stop);
         if !found.is_empty() {
             return found;
@@ -78,32 +109,26 @@ pub fn candidate_views_among(input: &Input, ranges: &[usize], open: &[bool], sto
     Vec::new()
 }
 
-/// Views of a subset: of a track with three wrong observations of ten, four views are clean one time in six.
-const SUBSET_VIEWS: usize = 4;
-/// Subsets of one set, and of all sets together.
-const SUBSETS_OF_SET: usize = 6;
-const MOST_SUBSETS: usize = 8;
-
 /// Small subsets of these sets of views: runs and combs in turn, spread over the set; the first of each set first. A
 /// track with some wrong observations is clean in some of them.
 pub fn subsets(sets: &[Vec<usize>]) -> Vec<Vec<usize>> {
     let subset = |views: &[usize], k: usize| -> Vec<usize> {
-        let longest = (views.len() - 1) / (SUBSET_VIEWS - 1);
+        let longest = (views.len() - 1) / (OPTIONS.subset_views - 1);
         let step = if k.is_multiple_of(2) { 1 } else { longest };
-        let starts = views.len() - (SUBSET_VIEWS - 1) * step;
-        let first = (k * starts / SUBSETS_OF_SET).min(starts - 1);
-        (0..SUBSET_VIEWS).map(|i| views[first + i * step]).collect()
+        let starts = views.len() - (OPTIONS.subset_views - 1) * step;
+        let first = (k * starts / OPTIONS.subsets_of_set).min(starts - 1);
+        (0..OPTIONS.subset_views).map(|i| views[first + i * step]).collect()
     };
     let mut found: Vec<Vec<usize>> = Vec::new();
-    for k in 0..SUBSETS_OF_SET {
-        for views in sets.iter().filter(|views| views.len() > SUBSET_VIEWS) {
+    for k in 0..OPTIONS.subsets_of_set {
+        for views in sets.iter().filter(|views| views.len() > OPTIONS.subset_views) {
             let subset = subset(views, k);
             if !found.contains(&subset) {
                 found.push(subset);
             }
         }
     }
-    found.truncate(MOST_SUBSETS);
+    found.truncate(OPTIONS.most_subsets);
     found
 }
 
@@ -113,7 +138,7 @@ pub fn complete_views(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
     let views = observed_views(input);
     let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
     let complete = ranges.windows(2).filter(|range| range[1] - range[0] == views.len()).count();
-    (views.len() >= LEAST_VIEWS && complete >= LEAST_TRACKS && 2 * complete >= observed).then_some(views)
+    (views.len() >= LEAST_VIEWS && complete >= OPTIONS.least_tracks && 2 * complete >= observed).then_some(views)
 }
 
 /// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on
@@ -132,7 +157,7 @@ fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, st
         let mut views = vec![first];
         let mut tracks = seen;
         let mut best: Option<(usize, Vec<usize>)> = None;
-        while views.len() < MOST_VIEWS {
+        while views.len() < OPTIONS.most_views {
             let mut counts = vec![0usize; input.view_count()];
             for &track in &tracks {
                 for k in (ranges[track]..ranges[track + 1]).filter(|&k| open[input.view_of(k)]) {
@@ -150,7 +175,7 @@ fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, st
             views.push(next);
             tracks.retain(|&track| (ranges[track]..ranges[track + 1]).any(|k| input.view_of(k) == next));
             if views.len() >= LEAST_VIEWS {
-                let value = count.min(ENOUGH_TRACKS) * (views.len() - 2);
+                let value = count.min(OPTIONS.enough_tracks) * (views.len() - 2);
                 if best.as_ref().is_none_or(|(most, _)| value > *most) {
                     let mut sorted = views.clone();
                     sorted.sort_unstable();
@@ -169,7 +194,7 @@ fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, st
 /// sequence.
 fn first_views(tracks_of_view: &[Vec<usize>]) -> Vec<usize> {
     let seeing: Vec<usize> = (0..tracks_of_view.len()).filter(|&view| !tracks_of_view[view].is_empty()).collect();
-    evenly(&seeing, MOST_FIRST_VIEWS)
+    evenly(&seeing, OPTIONS.most_first_views)
 }
 
 /// At most `most` of the items, evenly spread.
@@ -178,8 +203,8 @@ pub fn evenly(items: &[usize], most: usize) -> Vec<usize> {
     (0..count).map(|k| items[k * items.len() / count]).collect()
 }
 
-/// At most [`MOST_BLOCKS`] of the ranked sets: those that share at most half of their views with every better one
-/// first, for a block that failed is not saved by changing one view.
+/// At most [`ViewSelectionOptions::most_blocks`] of the ranked sets: those that share at most half of their views with
+/// every better one first, for a block that failed is not saved by changing one view.
 fn diverse(ranked: Vec<Vec<usize>>) -> Vec<Vec<usize>> {
     let overlaps = |a: &[usize], b: &[usize]| 2 * a.iter().filter(|view| b.contains(view)).count() > a.len();
     let (mut chosen, mut similar): (Vec<Vec<usize>>, Vec<Vec<usize>>) = (Vec::new(), Vec::new());
@@ -188,7 +213,7 @@ fn diverse(ranked: Vec<Vec<usize>>) -> Vec<Vec<usize>> {
         list.push(views);
     }
     chosen.append(&mut similar);
-    chosen.truncate(MOST_BLOCKS);
+    chosen.truncate(OPTIONS.most_blocks);
     chosen
 }
 
@@ -221,7 +246,7 @@ mod tests {
         assert_eq!(candidate_views(&input, &ranges, &StopToken::default()), [(0..12).collect::<Vec<_>>()]);
         let long = self::input(100, &vec![(0..100).collect(); 20]);
         let views = &candidate_views(&long, &long.track_ranges(), &StopToken::default())[0];
-        assert_eq!((views.len(), views[0], views[39]), (MOST_VIEWS_WHOLE, 0, 97));
+        assert_eq!((views.len(), views[0], views[39]), (OPTIONS.most_views_whole, 0, 97));
     }
 
     #[test]
@@ -245,7 +270,7 @@ mod tests {
     #[test]
     fn subsets_are_runs_and_combs_of_each_set_in_turn() {
         let found = subsets(&[(0..10).collect(), (20..30).collect(), (0..4).collect()]);
-        assert_eq!(found.len(), MOST_SUBSETS);
+        assert_eq!(found.len(), OPTIONS.most_subsets);
         assert_eq!(found[..4], [[0, 1, 2, 3], [20, 21, 22, 23], [0, 3, 6, 9], [20, 23, 26, 29]]);
         assert!(found.iter().all(|views| views.is_sorted()));
         assert!(subsets(&[(0..4).collect()]).is_empty());
