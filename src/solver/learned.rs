@@ -9,32 +9,57 @@ use crate::domain::{Method, Proposal, SolveSettings};
 use crate::geometry::measurement::CompleteBlock;
 use crate::network::subspace::{self, Cloud, MOST_VIEWS};
 
-/// Logit that stands for even odds. Training counts the few right tracks of a scene more than the many wrong ones, by
-/// the square root of the odds against them: at 95 % outliers that adds 1.5 to every logit.
-const EVEN_LOGIT: f64 = 1.5;
-/// Cost by which one nat of the odds widens the truncation of a track's cost in the affine search, in units of the
-/// truncated cost of a track at even odds.
-const COST_PER_NAT: f64 = 0.15;
-/// Nats that count at most, either way: beyond, the network's confidence was not earned on scenes like this one.
-const MOST_NATS: f64 = 5.0;
-/// Logit above which a track belongs to the set that growing is started from, and the bounds of that set's size: what
-/// determines the cameras, and what a first adjustment can carry.
-const START_LOGIT: f64 = 1.0;
-const START_SIZES: (usize, usize) = (8, 60);
-/// Share of likely tracks above which a scene has statistics of its own: from a third on, reweighting and consistency
-/// rank right tracks first (average precision above .99 on real matches).
-const MANY: f64 = 1.0 / 3.0;
-/// Tracks that must be likely right before a ranking without verification is worth telling: entirely wrong input has up
-/// to three by chance.
-const LEAST_LIKELY: usize = 4;
+/// What the network's odds are worth.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrackScoreOptions {
+    /// Logit that stands for even odds.
+    pub even_logit: f64,
+    /// Cost by which one nat of the odds widens the truncation of a track's cost in the affine search, in units of the
+    /// truncated cost of a track at even odds.
+    pub cost_per_nat: f64,
+    /// Nats that count at most, either way.
+    pub most_nats: f64,
+    /// Logit above which a track belongs to the set that growing is started from, and the bounds of that set's size.
+    pub start_logit: f64,
+    pub start_sizes: (usize, usize),
+    /// Share of likely tracks above which a scene has statistics of its own.
+    pub many: f64,
+    /// Tracks that must be likely right before a ranking without verification is worth telling.
+    pub least_likely: usize,
+    /// Inliers from which on geometry needs no second opinion.
+    pub surely_enough: usize,
+    /// Odds against a track, in nats, at which it is held to be wrong.
+    pub rejection_nats: f64,
+    /// Tracks below which the network's doubts do not count.
+    pub least_judged: usize,
+}
 
-/// Inliers from which on geometry needs no second opinion: twice what it needs for any.
-pub const SURELY_ENOUGH: usize = 2 * LEAST_INLIERS;
-/// Odds against a track, in nats, at which it is held to be wrong: twenty to one.
-const REJECTION_NATS: f64 = 3.0;
-/// Tracks below which its doubts do not count: scenes have no fewer, and of ten right tracks alone the network takes
-/// but a few to be right.
-const LEAST_JUDGED: usize = 50;
+impl TrackScoreOptions {
+    pub const DEFAULT: Self = Self {
+        // Training counts the few right tracks of a scene more than the many wrong ones, by the square root of the odds
+        // against them: at 95 % outliers that adds 1.5 to every logit.
+        even_logit: 1.5,
+        cost_per_nat: 0.15,
+        // Beyond, the network's confidence was not earned on scenes like this one.
+        most_nats: 5.0,
+        start_logit: 1.0,
+        // What determines the cameras, and what a first adjustment can carry.
+        start_sizes: (8, 60),
+        // From a third on, reweighting and consistency rank right tracks first (average precision above .99 on real
+        // matches).
+        many: 1.0 / 3.0,
+        // Entirely wrong input has up to three by chance.
+        least_likely: 4,
+        // Twice what it needs for any.
+        surely_enough: 2 * LEAST_INLIERS,
+        // Twenty to one.
+        rejection_nats: 3.0,
+        // Scenes have no fewer, and of ten right tracks alone the network takes but a few to be right.
+        least_judged: 50,
+    };
+}
+
+const OPTIONS: TrackScoreOptions = TrackScoreOptions::DEFAULT;
 
 /// Whether these settings let the search ask the network.
 pub fn may_be_asked(settings: &SolveSettings) -> bool {
@@ -60,7 +85,7 @@ impl TrackScores {
             block.track(track).iter().for_each(|seen| points[seen.view * count + track] = seen.xy.into());
         }
         let scores = subspace::current().network.forward(&Cloud::new(views, count, &points, &vec![true; points.len()]));
-        let ln_odds: Vec<f64> = scores.tracks.iter().map(|&logit| f64::from(logit) - EVEN_LOGIT).collect();
+        let ln_odds: Vec<f64> = scores.tracks.iter().map(|&logit| f64::from(logit) - OPTIONS.even_logit).collect();
         // A network of finite numbers may still overflow; one that says nothing is not asked.
         ln_odds.iter().all(|odds| odds.is_finite()).then_some(Self { ln_odds })
     }
@@ -77,26 +102,27 @@ impl TrackScores {
 
     /// What it costs a hypothesis of the affine search to leave a track out, 1 at even odds.
     pub fn truncations(&self) -> Vec<f64> {
-        self.truncations_at(COST_PER_NAT)
+        self.truncations_at(OPTIONS.cost_per_nat)
     }
 
     /// The same at another cost of a nat.
     pub fn truncations_at(&self, per_nat: f64) -> Vec<f64> {
-        self.ln_odds.iter().map(|odds| 1.0 + per_nat * odds.clamp(-MOST_NATS, MOST_NATS)).collect()
+        self.ln_odds.iter().map(|odds| 1.0 + per_nat * odds.clamp(-OPTIONS.most_nats, OPTIONS.most_nats)).collect()
     }
 
     /// The tracks to grow from without any search, most likely first.
     pub fn start(&self) -> Vec<usize> {
         let mut ranked: Vec<usize> = (0..self.ln_odds.len()).collect();
         ranked.sort_by(|&a, &b| self.ln_odds[b].total_cmp(&self.ln_odds[a]).then(a.cmp(&b)));
-        let likely = ranked.iter().filter(|&&track| self.ln_odds[track] + EVEN_LOGIT > START_LOGIT).count();
-        ranked.truncate(likely.clamp(START_SIZES.0, START_SIZES.1));
+        let likely =
+            ranked.iter().filter(|&&track| self.ln_odds[track] + OPTIONS.even_logit > OPTIONS.start_logit).count();
+        ranked.truncate(likely.clamp(OPTIONS.start_sizes.0, OPTIONS.start_sizes.1));
         ranked
     }
 
     /// Whether it takes many of the tracks to be right.
     pub fn expects_many(&self) -> bool {
-        self.likely() as f64 > MANY * self.ln_odds.len() as f64
+        self.likely() as f64 > OPTIONS.many * self.ln_odds.len() as f64
     }
 
     /// How many tracks it holds to be right.
@@ -110,15 +136,15 @@ impl TrackScores {
     /// holds to be wrong do not count. With many, or where there are fewer tracks than it has ever been shown, geometry
     /// alone has the word.
     pub fn counted(&self, inliers: &[usize]) -> usize {
-        if inliers.len() >= SURELY_ENOUGH || self.ln_odds.len() < LEAST_JUDGED {
+        if inliers.len() >= OPTIONS.surely_enough || self.ln_odds.len() < OPTIONS.least_judged {
             return inliers.len();
         }
-        inliers.iter().filter(|&&track| self.ln_odds[track] > -REJECTION_NATS).count()
+        inliers.iter().filter(|&&track| self.ln_odds[track] > -OPTIONS.rejection_nats).count()
     }
 
     /// Whether enough tracks are likely right for their ranking to be reported where geometry verifies none.
     pub fn ranks(&self) -> bool {
-        self.likely() >= LEAST_LIKELY
+        self.likely() >= OPTIONS.least_likely
     }
 }
 
@@ -136,10 +162,13 @@ mod tests {
         assert!((truncations[0] - 0.25).abs() < 1e-12 && truncations[1] == 1.0, "{truncations:?}");
         assert!((truncations[2] - 1.75).abs() < 1e-12 && truncations.iter().all(|cost| *cost > 0.0));
         assert_eq!(track_scores.start(), [2, 3, 1, 0], "no more than there are");
-        let doubts = of([track_scores.ln_odds.clone(), vec![0.0; LEAST_JUDGED - 4]].concat());
-        assert_eq!((doubts.counted(&[0, 1, 3]), doubts.counted(&[0; SURELY_ENOUGH])), (2, SURELY_ENOUGH));
+        let doubts = of([track_scores.ln_odds.clone(), vec![0.0; OPTIONS.least_judged - 4]].concat());
+        assert_eq!(
+            (doubts.counted(&[0, 1, 3]), doubts.counted(&[0; OPTIONS.surely_enough])),
+            (2, OPTIONS.surely_enough)
+        );
         assert_eq!(track_scores.counted(&[0, 1, 3]), 3, "of so few tracks it knows nothing");
         assert!(!track_scores.ranks());
-        assert!(of(vec![0.1; LEAST_LIKELY]).ranks());
+        assert!(of(vec![0.1; OPTIONS.least_likely]).ranks());
     }
 }

@@ -8,10 +8,59 @@ use crate::domain::StopToken;
 use crate::geometry::factorization::{dominant_eigenvectors, dominant_subspace, subspace_residuals};
 use crate::geometry::statistics::median;
 
-/// Power that turns the consistency of a track into a sampling weight.
-const CONSISTENCY_POWER: i32 = 4;
-/// Least weight, so that no track is excluded by a prior alone.
-const LEAST_WEIGHT: f64 = 1e-6;
+/// How tracks are weighed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PriorOptions {
+    /// Power that turns the consistency of a track into a sampling weight.
+    pub consistency_power: i32,
+    /// Least weight, so that no track is excluded by a prior alone. A round that changes no weight by as much is the
+    /// last.
+    pub least_weight: f64,
+    /// The same of the network's weights.
+    pub network_floor: f64,
+    /// Rounds of reweighting.
+    pub irls_rounds: usize,
+    /// Floor of the residual scale at the start and at the end of the annealing (sines of angles).
+    pub irls_floors: (f64, f64),
+    /// Share of the rounds over which the floor is lowered.
+    pub irls_annealing: f64,
+    /// Shrinking of the residual scale a round without depths, and where all that is asked is whether many agree, a
+    /// second body say.
+    pub affine_shrink: f64,
+    pub affine_shrink_of_many: f64,
+    /// Floor of the residual without depths, in units of a view's spread.
+    pub affine_floor: f64,
+    /// Weight from which a track agrees with the subspace.
+    pub affine_agrees: f64,
+    /// Squared floors below which a scale tells who will agree.
+    pub clear_floors: f64,
+}
+
+impl PriorOptions {
+    pub const DEFAULT: Self = Self {
+        consistency_power: 4,
+        least_weight: 1e-6,
+        // A track the network has given up is still drawn now and then.
+        network_floor: 1e-3,
+        irls_rounds: 60,
+        irls_floors: (0.3, 1e-3),
+        irls_annealing: 0.7,
+        // From a view's spread to the floor in the first half of the rounds.
+        affine_shrink: 0.88,
+        // The usual pace of graduated non-convexity (Yang, Antonante, Tzoumas & Carlone 2020: 1.4 a round). Of forty
+        // scenes with a second body and forty without, the same are told apart as at the slow pace (a test), in half
+        // the rounds.
+        affine_shrink_of_many: 1.0 / 1.4,
+        // What perspective adds to right tracks at moderate depths.
+        affine_floor: 0.08,
+        // Its residual is within the scale of the round.
+        affine_agrees: 0.25,
+        // The tracks that do hold the subspace, others never did join them later.
+        clear_floors: 16.0,
+    };
+}
+
+const OPTIONS: PriorOptions = PriorOptions::DEFAULT;
 
 /// Consistency of the tracks' motion: `|mean_i z_ij|^2 / mean_i |z_ij|^2`, to the fourth power, with z the blocks of
 /// `rows_per_view` coordinates of a matrix whose views are centred.
@@ -31,17 +80,10 @@ pub fn consistency(centred: &DMatrix<f64>, rows_per_view: usize) -> Vec<f64> {
                 .sum();
             let energy = column.norm_squared() / views as f64;
             let share = if energy > f64::MIN_POSITIVE { mean_squared / energy } else { 0.0 };
-            share.powi(CONSISTENCY_POWER) + LEAST_WEIGHT
+            share.powi(OPTIONS.consistency_power) + OPTIONS.least_weight
         })
         .collect()
 }
-
-/// Rounds of reweighting.
-const IRLS_ROUNDS: usize = 60;
-/// Floor of the residual scale at the start and at the end of the annealing (sines of angles).
-const IRLS_FLOORS: (f64, f64) = (0.3, 1e-3);
-/// Share of the rounds over which the floor is lowered.
-const IRLS_ANNEALING: f64 = 0.7;
 
 /// Iteratively reweighted least squares on the dominant subspace, least sum of unsquared residuals
 /// (Lerman & Maunu 2018, fast median subspace), with annealed floor: weights `1 / max(r, floor)`.
@@ -53,7 +95,7 @@ const IRLS_ANNEALING: f64 = 0.7;
 pub fn irls(matrix: &DMatrix<f64>, rank: usize, stop: &StopToken) -> Option<Vec<f64>> {
     let mut weights = vec![1.0f64; matrix.ncols()];
     let mut residuals = vec![1.0; matrix.ncols()];
-    for round in 0..IRLS_ROUNDS {
+    for round in 0..OPTIONS.irls_rounds {
         if stop.is_stopped() {
             return None;
         }
@@ -63,30 +105,16 @@ pub fn irls(matrix: &DMatrix<f64>, rank: usize, stop: &StopToken) -> Option<Vec<
         }
         let basis = dominant_subspace(&weighted, rank)?;
         residuals = subspace_residuals(matrix, &basis);
-        let annealed = round as f64 / (IRLS_ROUNDS as f64 * IRLS_ANNEALING);
-        let floor = (IRLS_FLOORS.0 * (IRLS_FLOORS.1 / IRLS_FLOORS.0).powf(annealed)).max(IRLS_FLOORS.1);
+        let annealed = round as f64 / (OPTIONS.irls_rounds as f64 * OPTIONS.irls_annealing);
+        let floor = (OPTIONS.irls_floors.0 * (OPTIONS.irls_floors.1 / OPTIONS.irls_floors.0).powf(annealed))
+            .max(OPTIONS.irls_floors.1);
         for (weight, residual) in weights.iter_mut().zip(&residuals) {
             *weight = 1.0 / residual.max(floor);
         }
     }
-    Some(residuals.iter().map(|residual| 1.0 / residual.max(IRLS_FLOORS.1).powi(2)).collect())
+    Some(residuals.iter().map(|residual| 1.0 / residual.max(OPTIONS.irls_floors.1).powi(2)).collect())
 }
 
-/// Shrinking of the residual scale a round: from a view's spread to the floor in the first half of the rounds.
-const AFFINE_SHRINK: f64 = 0.88;
-/// The same where all that is asked is whether many agree, a second body say: the usual pace of graduated
-/// non-convexity (Yang, Antonante, Tzoumas & Carlone 2020: 1.4 a round). Of forty scenes with a second body
-/// and forty without, the same are told apart as at the slow pace (a test), in half the rounds.
-const AFFINE_SHRINK_OF_MANY: f64 = 1.0 / 1.4;
-/// Floor of the residual, in units of a view's spread: what perspective adds to right tracks at moderate depths.
-const AFFINE_FLOOR: f64 = 0.08;
-/// Largest change of a weight in a round at the floor after which no other follows: what every track keeps anyway.
-const AFFINE_SETTLED: f64 = LEAST_WEIGHT;
-/// Weight from which a track agrees with the subspace: its residual is within the scale of the round.
-const AFFINE_AGREES: f64 = 0.25;
-/// Squared floors below which a scale tells who will agree: the tracks that do hold the subspace, others never did
-/// join them later.
-const CLEAR_FLOORS: f64 = 16.0;
 /// Dimension of what right tracks span under affine cameras, about their mean.
 const AFFINE_RANK: usize = 3;
 
@@ -94,19 +122,19 @@ const AFFINE_RANK: usize = 3;
 /// graduated Geman-McClure weights. The floor is wide: perspective makes right tracks deviate from affine.
 ///
 /// * `centred`: 2n x m
-/// * `least`: tracks that must agree: the scale shrinks faster ([`AFFINE_SHRINK_OF_MANY`]) and the search ends early; 0:
-///   no such condition
+/// * `least`: tracks that must agree: the scale shrinks faster ([`PriorOptions::affine_shrink_of_many`]) and the search
+///   ends early; 0: no such condition
 ///
 /// Returns the weights of the last round; `None` when a decomposition fails or `stop` fires, or as soon as it is clear
 /// that fewer tracks will agree.
 pub fn affine_irls(centred: &DMatrix<f64>, least: usize, stop: &StopToken) -> Option<Vec<f64>> {
-    let shrink = if least > 0 { AFFINE_SHRINK_OF_MANY } else { AFFINE_SHRINK };
+    let shrink = if least > 0 { OPTIONS.affine_shrink_of_many } else { OPTIONS.affine_shrink };
     let rows = centred.nrows() as f64;
     let energy: Vec<f64> = centred.column_iter().map(|column| column.norm_squared()).collect();
     let mut weights = DVector::from_element(centred.ncols(), 1.0f64);
     let mut weighted = centred.clone();
     let mut scale = None;
-    for _ in 0..IRLS_ROUNDS {
+    for _ in 0..OPTIONS.irls_rounds {
         if stop.is_stopped() {
             return None;
         }
@@ -129,7 +157,7 @@ pub fn affine_irls(centred: &DMatrix<f64>, least: usize, stop: &StopToken) -> Op
                 (offset - (inside - &mean_inside).norm_squared()).max(0.0) / rows
             })
             .collect();
-        let floor = AFFINE_FLOOR.powi(2);
+        let floor = OPTIONS.affine_floor.powi(2);
         let next: f64 = match scale {
             None => median(&mut squared.clone()),
             Some(scale) => floor.max(shrink * scale),
@@ -141,28 +169,25 @@ pub fn affine_irls(centred: &DMatrix<f64>, least: usize, stop: &StopToken) -> Op
             moved = moved.max((reweighted - *weight).abs());
             *weight = reweighted;
         }
-        if next < CLEAR_FLOORS * floor && agreeing(weights.as_slice()) < least {
+        if next < OPTIONS.clear_floors * floor && agreeing(weights.as_slice()) < least {
             return None;
         }
-        if scale == Some(floor) && moved < AFFINE_SETTLED {
+        if scale == Some(floor) && moved < OPTIONS.least_weight {
             break;
         }
         scale = Some(next);
     }
-    Some(weights.iter().map(|weight| weight + LEAST_WEIGHT).collect())
+    Some(weights.iter().map(|weight| weight + OPTIONS.least_weight).collect())
 }
 
 /// Tracks that agree with an affine ranking.
 pub fn agreeing(ranking: &[f64]) -> usize {
-    ranking.iter().filter(|weight| **weight > AFFINE_AGREES).count()
+    ranking.iter().filter(|weight| **weight > OPTIONS.affine_agrees).count()
 }
-
-/// Floor of the network's weight as a prior: a track the network has given up is still drawn now and then.
-const NETWORK_FLOOR: f64 = 1e-3;
 
 /// The network's weights as a prior, `max(w, 1e-3)^2`.
 pub fn from_network(weights: &[f64]) -> Vec<f64> {
-    weights.iter().map(|weight| weight.max(NETWORK_FLOOR).powi(2)).collect()
+    weights.iter().map(|weight| weight.max(OPTIONS.network_floor).powi(2)).collect()
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@
 use super::Error;
 use super::attempt::Effort;
 use super::block::Block;
-use super::learned::{self, SURELY_ENOUGH, TrackScores};
+use super::learned::{self, TrackScoreOptions, TrackScores};
 use super::problem::Problem;
 
 /// Tracks times views that the network is asked about at a time: some 100 MB. Of more, each part is asked for itself.
@@ -31,7 +31,7 @@ pub fn sample(
         return Ok((sample, None));
     }
     let Some(track_scores) = TrackScores::of(&sample.complete) else { return Ok((sample, None)) };
-    if track_scores.likely() >= SURELY_ENOUGH {
+    if track_scores.likely() >= TrackScoreOptions::DEFAULT.surely_enough {
         return Ok((sample, Some(track_scores)));
     }
     let Some(ln_odds) = of_all(problem, block)? else { return Ok((sample, Some(track_scores))) };

@@ -31,7 +31,7 @@ pub use projective::Projective;
 
 use super::attempt::{self, Attempt, Effort};
 use super::grow::LEAST_INLIERS;
-use super::learned::SURELY_ENOUGH;
+use super::learned::TrackScoreOptions;
 use super::problem::Problem;
 use super::reconstruction::Reconstruction;
 use super::recorder::Recorder;
@@ -337,7 +337,7 @@ fn extend_projectively(
     recorder.enter(Stage::Extend);
     let by_depths = !attempt.judges_observations();
     // Of few tracks that depths have verified one more may agree by chance.
-    let least = if by_depths { SURELY_ENOUGH } else { LEAST_INLIERS };
+    let least = if by_depths { TrackScoreOptions::DEFAULT.surely_enough } else { LEAST_INLIERS };
     let before = (keeps || by_depths).then(|| start.clone());
     let mut options = GrowthOptions::PROJECTIVE;
     if keeps && start.views.len() < problem.observed_views().len() {
