@@ -10,57 +10,75 @@ use super::view_selection::evenly;
 use crate::geometry::Point;
 use crate::geometry::bundle::{self, projective};
 
-/// Tracks that are judged, and inliers among them that cameras are adjusted to: beyond, an adjustment takes seconds and
-/// other errors than noise bound what it gives.
-const MOST_TRACKS: usize = 5_000;
-const MOST_INLIERS: usize = 600;
-/// Iterations of an adjustment that starts at the noise.
-const ADJUSTMENTS: usize = 10;
-/// Rounds of judging, adjusting and estimating the noise, at most: those that judge wider, and as many again, of which
-/// two make the inliers stand still most of the time.
-const MOST_ROUNDS: usize = 7;
-/// Noise that the first rounds judge at, in units of what is estimated: the cameras were fitted to fewer tracks, and
-/// what they err adds to the residuals of the others. At the noise itself up to a third of the right ones stayed
-/// outside, and some for good.
-const WIDENINGS: [f64; 3] = [2.0, 1.5, 1.2];
-/// Share of the searched inliers that must remain, or the extension is given up.
-const LEAST_KEPT: f64 = 0.8;
+/// How what the search left aside is judged.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AllTracksOptions {
+    /// Tracks that are judged, and inliers among them that cameras are adjusted to.
+    pub most_tracks: usize,
+    pub most_inliers: usize,
+    /// Iterations of an adjustment.
+    pub iterations: usize,
+    /// Noise that the first rounds judge at, in units of what is estimated.
+    pub widenings: [f64; 3],
+    /// Rounds of judging, adjusting and estimating the noise, at most.
+    pub most_rounds: usize,
+    /// Share of the searched inliers that must remain, or the extension is given up.
+    pub least_kept: f64,
+}
+
+impl AllTracksOptions {
+    pub const DEFAULT: Self = Self {
+        // Beyond, an adjustment takes seconds and other errors than noise bound what it gives.
+        most_tracks: 5_000,
+        most_inliers: 600,
+        // It starts at the noise.
+        iterations: 10,
+        // The cameras were fitted to fewer tracks, and what they err adds to the residuals of the others. At the noise
+        // itself up to a third of the right ones stayed outside, and some for good.
+        widenings: [2.0, 1.5, 1.2],
+        // Those that judge wider, and as many again, of which two make the inliers stand still most of the time.
+        most_rounds: 7,
+        least_kept: 0.8,
+    };
+}
+
+const OPTIONS: AllTracksOptions = AllTracksOptions::DEFAULT;
 
 /// The block and its consensus with the tracks that the search left aside; `None` where there are none, or where what
 /// was found does not carry over.
 pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Option<(Block, Consensus)> {
-    let all = problem.block(&searched.views).sample_with(MOST_TRACKS, problem.settings.seed, &searched.tracks);
+    let all = problem.block(&searched.views).sample_with(OPTIONS.most_tracks, problem.settings.seed, &searched.tracks);
     if all.tracks.len() == searched.tracks.len() {
         return None;
     }
     let judge = |cameras, noise| grow::judge(&all.complete, cameras, noise, problem.stop);
-    let mut found = judge(consensus.cameras.clone(), WIDENINGS[0] * consensus.noise);
+    let mut found = judge(consensus.cameras.clone(), OPTIONS.widenings[0] * consensus.noise);
     let mut before = Vec::new();
-    for round in 1..=MOST_ROUNDS {
+    for round in 1..=OPTIONS.most_rounds {
         let inliers = found.inliers();
-        if round > WIDENINGS.len() && inliers == before {
+        if round > OPTIONS.widenings.len() && inliers == before {
             break;
         }
         if inliers.len() < grow::LEAST_INLIERS || problem.stop.is_stopped() {
             return None;
         }
         let noise = grow::estimate_noise(&found, &inliers);
-        let support = evenly(&inliers, MOST_INLIERS);
+        let support = evenly(&inliers, OPTIONS.most_inliers);
         let mut cameras = found.cameras.clone();
         let mut points: Vec<Point> = support.iter().map(|&track| found.points[track]).collect();
         let observations = grow::observations_of(&all.complete, &support);
         let options = bundle::Options {
-            max_iterations: ADJUSTMENTS,
+            max_iterations: OPTIONS.iterations,
             loss: ConsensusOptions::DEFAULT.loss(noise),
             ..Default::default()
         };
         projective::adjust(&mut cameras, &mut points, &observations, &options, problem.stop);
-        found = judge(cameras, WIDENINGS.get(round).copied().unwrap_or(1.0) * noise);
+        found = judge(cameras, OPTIONS.widenings.get(round).copied().unwrap_or(1.0) * noise);
         before = inliers;
     }
     let inliers = consensus.inliers();
     let is_kept =
         |track: &&usize| all.tracks.binary_search(&searched.tracks[**track]).is_ok_and(|place| found.inlier[place]);
     let kept = inliers.iter().filter(is_kept).count();
-    (kept as f64 >= LEAST_KEPT * inliers.len() as f64).then_some((all, found))
+    (kept as f64 >= OPTIONS.least_kept * inliers.len() as f64).then_some((all, found))
 }

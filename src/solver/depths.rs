@@ -3,6 +3,7 @@
 //! Four complete tracks leave ten projective cameras undetermined; with depths and one focal length they leave fifty
 //! constraints over. What stands on fewer tracks than image points can verify is never graded METRIC.
 
+use super::all_tracks::AllTracksOptions;
 use super::block::Block;
 use super::calibration::{Outcome, few_inliers};
 use super::classification::{ClassificationOptions, Geometry, Judged};
@@ -21,12 +22,42 @@ use crate::geometry::triangulation;
 
 /// Directions that no observation sees: a similarity's.
 const SIMILARITY: usize = 7;
-/// Constraints beyond the unknowns from which a focal length is looked for: its variance is then known to 45 %.
-const LEAST_FREEDOM: usize = 10;
-/// Distance in log focal between what depths and what image points say from which they contradict each other: by
-/// itself (depths alone are off by some per cent in strong noise), and in standard deviations of the latter.
-const MOST_STRAYED: f64 = 0.1;
-const STRAYED_SIGMAS: f64 = 4.0;
+
+/// When depths have a say.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DepthOptions {
+    /// Constraints beyond the unknowns from which a focal length is looked for.
+    pub least_freedom: usize,
+    /// Distance in log focal between what depths and what image points say from which they contradict each other: by
+    /// itself, and in standard deviations of the latter.
+    pub most_strayed: f64,
+    pub strayed_sigmas: f64,
+    /// Noise from which depths judge what image points have verified, normalised units.
+    pub strong_noise: f64,
+    /// Share of the consensus's inliers that must be rigid for depths to judge.
+    pub rigid_share: f64,
+    /// Tracks that are weighed at most.
+    pub most_weighed: usize,
+}
+
+impl DepthOptions {
+    pub const DEFAULT: Self = Self {
+        // Its variance is then known to 45 %.
+        least_freedom: 10,
+        // Depths alone are off by some per cent in strong noise.
+        most_strayed: 0.1,
+        strayed_sigmas: 4.0,
+        // Below, image points alone lose next to no track (mean F1 1.000 at 1 %, .997 at 2 %:
+        // `scpsfm evaluate --sweeps noise --depths none`), and the time is saved.
+        strong_noise: 0.015,
+        // Of depths that are not true to one scale next to none are.
+        rigid_share: 0.8,
+        // A fit of more takes seconds.
+        most_weighed: AllTracksOptions::DEFAULT.most_tracks,
+    };
+}
+
+const OPTIONS: DepthOptions = DepthOptions::DEFAULT;
 
 /// The seed that a rigid consensus gives to growing without depths.
 pub fn seed(rigid: &Rigid) -> Seed {
@@ -75,7 +106,7 @@ pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus
     let model = IntrinsicsModel::FOCAL;
     let unknowns = 6 * block.views() + 3 * inliers.len() + model.parameters().len() - SIMILARITY;
     let freedom = (2 * observations.len()).saturating_sub(unknowns);
-    if freedom < LEAST_FREEDOM {
+    if freedom < OPTIONS.least_freedom {
         let detail = format!("{} tracks leave {freedom} constraints for a focal length, too few", inliers.len());
         return refused(outcome, WarningCode::UnobservableFocal, detail);
     }
@@ -92,7 +123,7 @@ pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus
     let cheirality = crate::geometry::metric::cheirality(&found, &observations);
     // Image points and depths tell one story, or there is none.
     let strayed = (found.intrinsics[0].focal / focal).ln().abs();
-    if strayed.is_nan() || strayed > MOST_STRAYED.max(STRAYED_SIGMAS * sigma.unwrap_or(0.0)) {
+    if strayed.is_nan() || strayed > OPTIONS.most_strayed.max(OPTIONS.strayed_sigmas * sigma.unwrap_or(0.0)) {
         let detail = format!("image points alone give a focal length that differs by a factor of {:.2}", strayed.exp());
         return refused(outcome, WarningCode::ModelMismatch, detail);
     }
@@ -122,17 +153,6 @@ fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<Reconst
     Some(Reconstruction::new(intrinsics, poses, points))
 }
 
-/// Noise from which depths judge what image points have verified, normalised units: below, image points alone lose next
-/// to no track (mean F1 1.000 at 1 %, .997 at 2 %: `scpsfm evaluate --sweeps noise --depths none`), and the time is
-/// saved.
-pub const STRONG_NOISE: f64 = 0.015;
-/// Share of the consensus's inliers that must be rigid for depths to judge: of depths that are not true to one scale
-/// next to none are.
-const RIGID_SHARE: f64 = 0.8;
-
-/// Tracks that are weighed at most: a fit of more takes seconds.
-const MOST_WEIGHED: usize = 5_000;
-
 /// Probability of tracks to be right by image points and depths together.
 pub struct TrackWeights {
     /// Tracks of the input, increasing.
@@ -152,14 +172,14 @@ pub fn weights(
     consensus: &Consensus,
     found: &Option<Rigid>,
 ) -> Option<TrackWeights> {
-    let all = problem.block(&searched.views).sample_with(MOST_WEIGHED, problem.settings.seed, &searched.tracks);
+    let all = problem.block(&searched.views).sample_with(OPTIONS.most_weighed, problem.settings.seed, &searched.tracks);
     let block = &all.complete;
     let search = Search::new(block, portfolio::spread(block), problem.stop)?;
     let place = |track: usize| all.tracks.binary_search(&searched.tracks[track]).ok();
     let inliers: Vec<usize> = consensus.inliers().into_iter().filter_map(place).collect();
     let rigid = search.refit(found.as_ref()?, &inliers)?;
     let shared = inliers.iter().filter(|&&track| rigid.inlier[track]).count();
-    if (shared as f64) < RIGID_SHARE * inliers.len() as f64 {
+    if (shared as f64) < OPTIONS.rigid_share * inliers.len() as f64 {
         return None;
     }
     let noise = NoiseOptions::DEFAULT.clamp(rigid.noise()?);

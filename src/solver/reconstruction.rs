@@ -6,7 +6,7 @@ use super::attempt::Attempt;
 use super::baselines::Decided;
 use super::calibration::Outcome;
 use super::classification::{self, Geometry, Judged};
-use super::depths::STRONG_NOISE;
+use super::depths::DepthOptions;
 use super::problem::{Problem, camera_groups};
 use super::recorder::Recorder;
 use super::sequence::{Extended, verified};
@@ -116,7 +116,7 @@ impl Reconstruction {
         let mut progress = |verdicts| recorder.judged(verdicts, problem.tracks());
         let mut judged = classification::judge(problem, &self.geometry, &mut progress);
         // Once wrong observations are left out, the noise may be too low for depths to add anything.
-        let depths_say_more = !self.geometry.by_observation || self.geometry.noise > STRONG_NOISE;
+        let depths_say_more = !self.geometry.by_observation || self.geometry.noise > DepthOptions::DEFAULT.strong_noise;
         if let Some(weights) = seed.weights_by_depths.as_ref().filter(|_| depths_say_more) {
             weights.judge(problem, &self.geometry, &mut judged);
         }

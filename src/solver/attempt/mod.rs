@@ -9,7 +9,7 @@ use super::baselines::{self, Decided};
 use super::block::Block;
 use super::calibration::{self, Outcome};
 use super::classification::Judged;
-use super::depths::{self, TrackWeights};
+use super::depths::{self, DepthOptions, TrackWeights};
 use super::fusion::Estimate;
 use super::grow::{self, LEAST_INLIERS, NoiseOptions};
 use super::learned::TrackScores;
@@ -87,7 +87,9 @@ impl Attempt {
     /// [`LEAST_INLIERS`] tracks, whose residuals do not tell noise from wrong observations, and for mixed residuals.
     pub fn is_beyond_image_points(&self) -> bool {
         let by_depths = matches!(self.found.verified_by, VerifiedBy::Depths { .. });
-        let is_noisy = |found: &Projective| found.noise > depths::STRONG_NOISE && found.tracks.len() >= LEAST_INLIERS;
+        let is_noisy = |found: &Projective| {
+            found.noise > DepthOptions::DEFAULT.strong_noise && found.tracks.len() >= LEAST_INLIERS
+        };
         by_depths && self.projective.as_ref().is_some_and(is_noisy) && !self.has_mixed_residuals()
     }
 
@@ -317,7 +319,7 @@ fn search(
         (attempt.block, refined) = (block, consensus);
     }
     problem.stopped()?;
-    if refined.noise > depths::STRONG_NOISE {
+    if refined.noise > DepthOptions::DEFAULT.strong_noise {
         attempt.weights_by_depths = depths::weights(problem, &attempt.block, &refined, &attempt.found.rigid);
     }
     attempt.found.consensus = Some(refined);
