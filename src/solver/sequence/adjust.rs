@@ -3,7 +3,7 @@
 use super::components::FIRST;
 use super::growth;
 use super::model::{Lens, Model};
-use super::options::GrowthOptions;
+use super::options::{AdjustmentOptions, GrowthOptions};
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
 use crate::geometry::bundle::sequence::{self, Free, Run};
 use crate::geometry::observation::Observation;
@@ -12,14 +12,9 @@ use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 
 const OPTIONS: GrowthOptions = GrowthOptions::METRIC;
-/// Iterations around a new view, which start at what was adjusted before.
-const ITERATIONS_AROUND: usize = 3;
-/// Views that are free in the adjustment around a new one: those that share most points with it.
-const VIEWS_AROUND: usize = 6;
+const ADJUSTMENT: AdjustmentOptions = AdjustmentOptions::DEFAULT;
 /// Median of the norm of two independent normal coordinates (Rayleigh) in standard deviations.
 const RAYLEIGH_MEDIAN: f64 = 1.177_41;
-/// Least share of the observations' freedom that is left to the residuals, however few landmarks there are.
-const LEAST_FREEDOM: f64 = 0.2;
 
 /// What of a model is adjusted together.
 pub struct Extract {
@@ -128,7 +123,7 @@ impl Extract {
 /// freedom leaves of it.
 pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> f64 {
     let freedom = 1.0 - unknowns as f64 / (2 * norms.len()).max(1) as f64;
-    median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(LEAST_FREEDOM).sqrt()
+    median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(ADJUSTMENT.least_freedom).sqrt()
 }
 
 /// What is known of the intrinsics of a camera before any observation.
@@ -178,7 +173,7 @@ pub fn around(problem: &Problem, model: &mut Model, view: usize, is_new_lens: bo
         models[problem.camera_of[view]] = IntrinsicsModel::focal(problem.has_own_focals());
     }
     let free = Free { models: &models, views: Some(&moves), points: None };
-    extract.adjust(problem, model, &free, ITERATIONS_AROUND, recorder);
+    extract.adjust(problem, model, &free, ADJUSTMENT.iterations_around, recorder);
     if !problem.stop.is_stopped() {
         extract.write_back(model);
     }
@@ -194,7 +189,7 @@ fn neighbours(problem: &Problem, model: &Model, view: usize) -> Vec<usize> {
     }
     let mut views: Vec<usize> = (0..shared.len()).filter(|&view| shared[view] > 0).collect();
     views.sort_by_key(|&other| (other != view, std::cmp::Reverse(shared[other]), other));
-    views.truncate(VIEWS_AROUND);
+    views.truncate(ADJUSTMENT.views_around);
     views
 }
 

@@ -2,28 +2,18 @@
 
 use super::adjust::{self, Extract};
 use super::model::Model;
+use super::options::StretchOptions;
 use super::{own_focals, windows};
 use crate::domain::{FocalPrior, Task, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point};
 use crate::solver::calibration::{self, GradeOptions, Outcome, Uncalibrated};
-use crate::solver::problem::Problem;
+use crate::solver::problem::{Problem, VERIFIED};
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, view_selection};
 
-/// Views that a calibration is compared with projective cameras on at most, whose adjustment is cubic in them: of more,
-/// the stretch with most observations. A zoom is asked stretch after stretch.
-pub const MOST_VIEWS: usize = 40;
-/// Observations that a calibration is made from, and of one view at least and at most: other errors than noise bound
-/// what more of them would give.
-const OBSERVATIONS: usize = 6_000;
-const OF_VIEW: (usize, usize) = (50, 300);
-/// Squared standard deviations of the core within which an observation takes part: squares know no tails. The .999
-/// quantile of two coordinates.
-const CORE_SQUARED: f64 = 13.8;
-/// Observations that a track must keep to take part.
-const LEAST_KEPT: usize = 3;
+const OPTIONS: StretchOptions = StretchOptions::DEFAULT;
 
 /// Calibrates each camera from the landmarks and observations that fit best, takes the models over, adjusts everything
 /// under them and asks the windows; one outcome a camera.
@@ -36,7 +26,7 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     }
     let registered = model.registered();
     // All cameras together where they have few views, else each by itself.
-    let runs: Vec<Vec<usize>> = match registered.len() <= MOST_VIEWS {
+    let runs: Vec<Vec<usize>> = match registered.len() <= OPTIONS.most_views {
         true => vec![registered],
         false => (0..problem.cameras)
             .map(|camera| registered.iter().copied().filter(|&view| problem.camera_of[view] == camera).collect())
@@ -87,7 +77,7 @@ fn of_cameras(
     recorder: &mut Recorder,
 ) -> Result<Vec<(usize, Outcome)>, Error> {
     let mut extract = core(problem, model, views, of_view(views));
-    let stretch = (views.len() > MOST_VIEWS).then(|| {
+    let stretch = (views.len() > OPTIONS.most_views).then(|| {
         let stretch = densest(problem, model, views);
         core(problem, model, &stretch, of_view(&stretch))
     });
@@ -146,7 +136,7 @@ pub fn take_over(model: &mut Model, extract: &mut Extract, found: &[(usize, Outc
 
 /// Observations of each of these views that a calibration is made from.
 pub fn of_view(views: &[usize]) -> usize {
-    (OBSERVATIONS / views.len()).clamp(OF_VIEW.0, OF_VIEW.1)
+    (OPTIONS.observations / views.len()).clamp(OPTIONS.of_view.0, OPTIONS.of_view.1)
 }
 
 /// Raises sigma to what lies between the focal length that was graded and the one that all observations led to.
@@ -158,12 +148,12 @@ fn admit_difference(log_focal: f64, outcome: &mut Outcome, grades: &GradeOptions
     }
 }
 
-/// The run of at most [`MOST_VIEWS`] of these views that keeps most observations.
+/// The run of at most [`StretchOptions::most_views`] of these views that keeps most observations.
 fn densest(problem: &Problem, model: &Model, views: &[usize]) -> Vec<usize> {
     let kept = |view: &usize| problem.of_view[*view].iter().filter(|&&k| model.kept[k as usize]).count();
     let counts: Vec<usize> = views.iter().map(kept).collect();
     // No views have no runs.
-    let length = views.len().clamp(1, MOST_VIEWS);
+    let length = views.len().clamp(1, OPTIONS.most_views);
     let runs = views.windows(length).zip(counts.windows(length));
     let densest =
         runs.enumerate().max_by_key(|(start, (_, counts))| (counts.iter().sum::<usize>(), std::cmp::Reverse(*start)));
@@ -211,7 +201,7 @@ impl Projective {
 pub fn core(problem: &Problem, model: &Model, views: &[usize], of_view: usize) -> Extract {
     let tracks = adjust::covering(problem, model, views, of_view);
     let mut extract = Extract::new(problem, model, views, &tracks);
-    let limit = CORE_SQUARED * model.noise * model.noise;
+    let limit = OPTIONS.core_squared * model.noise * model.noise;
     let fits: Vec<bool> = extract
         .observations
         .iter()
@@ -222,6 +212,6 @@ pub fn core(problem: &Problem, model: &Model, views: &[usize], of_view: usize) -
         kept[seen.point] += usize::from(*fits);
     }
     let mut fits = fits.into_iter();
-    extract.observations.retain(|seen| fits.next().unwrap_or(false) && kept[seen.point] >= LEAST_KEPT);
+    extract.observations.retain(|seen| fits.next().unwrap_or(false) && kept[seen.point] >= VERIFIED);
     extract
 }

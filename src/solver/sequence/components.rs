@@ -3,7 +3,7 @@
 
 use super::growth::Trial;
 use super::model::Model;
-use super::options::GrowthOptions;
+use super::options::{ComponentOptions, GrowthOptions};
 use super::register;
 use super::structure;
 use crate::domain::{FocalPrior, Grade};
@@ -14,18 +14,11 @@ use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, view_selection};
 
+const OPTIONS: ComponentOptions = ComponentOptions::DEFAULT;
 /// How the block of a further component is searched.
 const SEED: Effort = Effort { is_seed: true, is_quick: false };
 /// The component that the calibration comes from.
 pub const FIRST: u32 = 0;
-/// Blocks that are tried for components at most, and how many may fail one after the other: the best come first, and an
-/// input without overlap has any number of hopeless ones.
-const MOST_COMPONENTS: u32 = 100;
-const MOST_FAILURES: usize = 3;
-/// Deviation of the log focal length that other components are given, at least, where the first has one: components
-/// differ by more than each admits. And where the first has none: it only keeps them from running away.
-const PRIOR_SIGMA: f64 = 0.02;
-const VAGUE_SIGMA: f64 = 0.5;
 
 /// The model that a block begins.
 pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Model {
@@ -56,9 +49,9 @@ pub fn others(
     let prior = prior_of(problem, seed, model, first_camera);
     let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
     let mut failures = 0;
-    for component in FIRST + 1..MOST_COMPONENTS {
+    for component in FIRST + 1..OPTIONS.most_components {
         problem.stopped()?;
-        if failures == MOST_FAILURES {
+        if failures == OPTIONS.most_failures {
             break;
         }
         let Some(views) = next_block(problem, &open) else { break };
@@ -109,7 +102,7 @@ fn prior_of(problem: &Problem, seed: &Attempt, model: &Model, camera: usize) -> 
     let calibration = seed.calibration.as_ref().filter(|_| !problem.has_own_focals())?;
     let sigma = calibration.sigma_log_focal.filter(|_| calibration.grade != Grade::ProjectiveOnly);
     let focal_px = model.lenses[camera].intrinsics.focal * problem.scale_px;
-    Some(FocalPrior { focal_px, sigma_log: sigma.map_or(VAGUE_SIGMA, |sigma| sigma.max(PRIOR_SIGMA)) })
+    Some(FocalPrior { focal_px, sigma_log: sigma.map_or(OPTIONS.vague_sigma, |sigma| sigma.max(OPTIONS.prior_sigma)) })
 }
 
 /// Takes back the views of a component that see too few of its points to be held by them, and the whole component if

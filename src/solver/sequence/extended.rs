@@ -1,7 +1,7 @@
 //! A block extended metrically to every view that can be registered, and what that is worth.
 
 use super::model::Model;
-use super::options::GrowthOptions;
+use super::options::{ExtensionOptions, GrowthOptions, StretchOptions};
 use super::register;
 use super::{adjust, calibrate, components, growth, projective, structure};
 use crate::domain::{Grade, LeftOut, Stage, Task, Warning, WarningCode};
@@ -12,12 +12,7 @@ use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, view_selection};
 
-/// Share of an extension's time before its calibration that registering takes, the rounds the rest: .71 and .67 as
-/// measured on 1,000 views with 350 and 87 observations a view.
-pub const SHARE_OF_REGISTERING: f64 = 0.7;
-/// Share of the views that an extension must register for no other seed to be tried: one that carries most of them is a
-/// component of whatever another would lead to.
-const ENOUGH_REGISTERED: f64 = 0.5;
+const OPTIONS: ExtensionOptions = ExtensionOptions::DEFAULT;
 
 /// A metric reconstruction that stands, with the block that it grew from.
 pub struct Extended {
@@ -41,7 +36,7 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
     let rounds = GrowthOptions::METRIC.final_rounds;
     for round in 0..rounds {
         problem.stopped()?;
-        let within = SHARE_OF_REGISTERING + (1.0 - SHARE_OF_REGISTERING) * round as f64 / rounds as f64;
+        let within = OPTIONS.share_of_registering + (1.0 - OPTIONS.share_of_registering) * round as f64 / rounds as f64;
         recorder.step(Task::Adjust, round + 1, rounds, within);
         adjust::all(problem, &mut model, recorder);
         structure::triangulate(problem, &mut model, recorder);
@@ -150,12 +145,12 @@ impl Extended {
 
     fn is_bent(&self, problem: &Problem) -> bool {
         let (views, tracks) = (self.model.registered(), adjust::verified(&self.model));
-        views.len() > calibrate::MOST_VIEWS
+        views.len() > StretchOptions::DEFAULT.most_views
             && attempt::are_mixed(adjust::Extract::new(problem, &self.model, &views, &tracks).squared_residuals())
     }
 
     pub fn holds_most_views(&self) -> bool {
         let registered = self.model.registered().len();
-        registered as f64 >= ENOUGH_REGISTERED * (registered + self.left_out.len()) as f64
+        registered as f64 >= OPTIONS.enough_registered * (registered + self.left_out.len()) as f64
     }
 }

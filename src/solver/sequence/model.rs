@@ -2,7 +2,7 @@
 
 use nalgebra::Vector3;
 
-use super::options::GrowthOptions;
+use super::options::{AdjustmentOptions, GrowthOptions};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
 use crate::geometry::observation::Observation;
@@ -68,9 +68,6 @@ pub struct Model {
     pub is_strained: bool,
 }
 
-/// Least noise that is believed, pixels: exact input would close every gate.
-const LEAST_NOISE_PX: f64 = 0.01;
-
 impl Model {
     /// A model of nothing yet, with this noise, all cameras like this one.
     pub fn new(problem: &Problem, intrinsics: Intrinsics, noise: f64) -> Self {
@@ -95,7 +92,7 @@ impl Model {
 
     /// Takes the noise that the residuals show, within bounds.
     pub fn set_noise(&mut self, problem: &Problem, noise: f64) {
-        let least = LEAST_NOISE_PX / problem.scale_px;
+        let least = AdjustmentOptions::DEFAULT.least_noise_px / problem.scale_px;
         let most = GrowthOptions::METRIC.noise_growth * self.seed_noise.max(least);
         if noise.is_finite() {
             self.is_strained = noise > most;

@@ -1,6 +1,10 @@
-//! The thresholds of growing a reconstruction, with their reasons.
+//! The thresholds of growing, adjusting and calibrating a sequence, with their reasons.
+
+use std::ops::RangeInclusive;
 
 use crate::geometry::bundle::{Loss, Options};
+use crate::solver::calibration::CalibrationOptions;
+use crate::solver::view_selection::ViewSelectionOptions;
 
 /// How views are added.
 #[derive(Debug, Clone, PartialEq)]
@@ -84,4 +88,133 @@ impl GrowthOptions {
         let loss = Loss::Cauchy { scale: self.cauchy_scale * noise };
         Options { max_iterations, relative_tolerance: self.tolerance, loss, ..Options::default() }
     }
+}
+
+/// How a metric reconstruction is adjusted and its noise bounded.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AdjustmentOptions {
+    /// Views that are free in the adjustment around a new one: those that share most points with it.
+    pub views_around: usize,
+    /// Iterations around a new view.
+    pub iterations_around: usize,
+    /// Least share of the observations' freedom that is left to the residuals, however few landmarks there are.
+    pub least_freedom: f64,
+    /// Least noise that is believed, pixels.
+    pub least_noise_px: f64,
+}
+
+impl AdjustmentOptions {
+    pub const DEFAULT: Self = Self {
+        views_around: 6,
+        // They start at what was adjusted before.
+        iterations_around: 3,
+        least_freedom: 0.2,
+        // Exact input would close every gate.
+        least_noise_px: 0.01,
+    };
+}
+
+/// How a block is extended metrically, and what is worth extending.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ExtensionOptions {
+    /// Angle between the rays from which the depth of a point is known well enough to support a pose, radians.
+    pub least_angle: f64,
+    /// The same for points that only two views see, which nothing verifies.
+    pub least_angle_of_two: f64,
+    /// Focal lengths that a view of a lens that is not known yet is tried with, in steps from that of another one, and
+    /// the steps of an octave.
+    pub other_focals: RangeInclusive<i32>,
+    pub focals_per_octave: f64,
+    /// Share of an extension's time before its calibration that registering takes, the rounds the rest.
+    pub share_of_registering: f64,
+    /// Share of the views that an extension must register for no other seed to be tried.
+    pub enough_registered: f64,
+}
+
+impl ExtensionOptions {
+    pub const DEFAULT: Self = Self {
+        // At .3 degrees half a pixel of a thousand in either ray leaves a seventh of the depth open.
+        least_angle: 0.005,
+        // A twenty-eighth.
+        least_angle_of_two: 0.02,
+        // From a third to three times.
+        other_focals: -6..=6,
+        focals_per_octave: 4.0,
+        // .71 and .67 as measured on 1,000 views with 350 and 87 observations a view.
+        share_of_registering: 0.7,
+        // One that carries most of them is a component of whatever another would lead to.
+        enough_registered: 0.5,
+    };
+}
+
+/// How further components are looked for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ComponentOptions {
+    /// Blocks that are tried for components at most, and how many may fail one after the other.
+    pub most_components: u32,
+    pub most_failures: usize,
+    /// Deviation of the log focal length that other components are given, at least, where the first has one, and where
+    /// it has none.
+    pub prior_sigma: f64,
+    pub vague_sigma: f64,
+}
+
+impl ComponentOptions {
+    pub const DEFAULT: Self = Self {
+        most_components: 100,
+        // The best come first, and an input without overlap has any number of hopeless ones.
+        most_failures: 3,
+        // Components differ by more than each admits.
+        prior_sigma: 0.02,
+        // It only keeps them from running away.
+        vague_sigma: 0.5,
+    };
+}
+
+/// What of a sequence its calibration is made from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StretchOptions {
+    /// Views that a calibration is compared with projective cameras on at most: of more, the stretch with most
+    /// observations. A zoom is asked stretch after stretch.
+    pub most_views: usize,
+    /// Observations that a calibration is made from, and of one view at least and at most.
+    pub observations: usize,
+    pub of_view: (usize, usize),
+    /// Squared standard deviations of the core within which an observation takes part: squares know no tails.
+    pub core_squared: f64,
+}
+
+impl StretchOptions {
+    pub const DEFAULT: Self = Self {
+        // The adjustment of projective cameras is cubic in them, as in those of a block.
+        most_views: ViewSelectionOptions::DEFAULT.most_views_whole,
+        // Other errors than noise bound what more of them would give.
+        observations: 6_000,
+        of_view: (50, 300),
+        // The .999 quantile of two coordinates, as where a model of two more unknowns is significant.
+        core_squared: CalibrationOptions::DEFAULT.models.significant_gain_of_two,
+    };
+}
+
+/// How a sequence is divided into windows that check its calibration.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WindowOptions {
+    /// Views of a window where there are many, and of the shortest one.
+    pub views: usize,
+    pub least_views: usize,
+    /// Windows at most, evenly spread over the sequence.
+    pub most_windows: usize,
+    /// Observations of a view that a window holds.
+    pub of_view: usize,
+}
+
+impl WindowOptions {
+    pub const DEFAULT: Self = Self {
+        views: 10,
+        // Below, a window says little of a focal length.
+        least_views: 4,
+        // A variance of 50 values is known to a fifth.
+        most_windows: 50,
+        of_view: 150,
+    };
 }

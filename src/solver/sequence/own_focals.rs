@@ -6,6 +6,7 @@
 use super::adjust::{self, Extract};
 use super::calibrate::{self, too_few};
 use super::model::Model;
+use super::options::StretchOptions;
 use super::{structure, windows};
 use crate::domain::{Grade, Task, Warning, WarningCode};
 use crate::geometry::statistics::root_mean_square;
@@ -59,7 +60,7 @@ fn runs(model: &Model) -> Vec<Vec<usize>> {
     let components = model.component_of.iter().copied().max().unwrap_or(0);
     let of_component = |component: u32| {
         let views = model.of_component(component);
-        let count = views.len().div_ceil(calibrate::MOST_VIEWS);
+        let count = views.len().div_ceil(StretchOptions::DEFAULT.most_views);
         (0..count).map(move |k| views[k * views.len() / count..(k + 1) * views.len() / count].to_vec())
     };
     (0..=components)

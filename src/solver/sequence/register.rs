@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::adjust;
 use super::growth::{self, Growth, Trial};
 use super::model::Model;
-use super::options::GrowthOptions;
+use super::options::{ExtensionOptions, GrowthOptions};
 use super::structure;
 use crate::domain::LeftOut;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
@@ -16,10 +16,7 @@ use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 
 const OPTIONS: GrowthOptions = GrowthOptions::METRIC;
-/// Focal lengths that a view of a lens that is not known yet is tried with, as factors on that of another one: a
-/// quarter of an octave apart, from a third to three times.
-const OTHER_FOCALS: std::ops::RangeInclusive<i32> = -6..=6;
-const FOCALS_PER_OCTAVE: f64 = 4.0;
+const EXTENSION: ExtensionOptions = ExtensionOptions::DEFAULT;
 
 /// A component of a model that grows.
 struct Component<'a> {
@@ -126,7 +123,7 @@ impl Growth for Component<'_> {
         recorder.standing.focal_px = Some(focal * problem.scale_px);
         recorder.registered(registered.len());
         let share = registered.len() as f64 / problem.observed_views().len() as f64;
-        recorder.report(super::extended::SHARE_OF_REGISTERING * share);
+        recorder.report(EXTENSION.share_of_registering * share);
         agreeing
     }
 
@@ -153,9 +150,9 @@ fn guesses(problem: &Problem, model: &Model, view: usize) -> Vec<Intrinsics> {
     let nearest = model.determined().into_iter().min_by_key(|other| other.abs_diff(view));
     let nearest = nearest.filter(|_| problem.has_own_focals());
     let about = nearest.map_or(lens.intrinsics, |nearest| model.intrinsics_of(problem, nearest));
-    let focal = |step: i32| about.focal * (f64::from(step) / FOCALS_PER_OCTAVE).exp2();
+    let focal = |step: i32| about.focal * (f64::from(step) / EXTENSION.focals_per_octave).exp2();
     // Of equals the first counts: from the middle outwards.
-    let mut steps: Vec<i32> = OTHER_FOCALS.collect();
+    let mut steps: Vec<i32> = EXTENSION.other_focals.collect();
     steps.sort_by_key(|step| (step.abs(), *step));
     let guess = |step: i32| match nearest {
         Some(_) => Intrinsics { focal: focal(step), ..about },

@@ -3,6 +3,7 @@
 use nalgebra::Vector3;
 
 use super::model::{Landmark, Model};
+use super::options::ExtensionOptions;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::{Camera, Point};
@@ -10,11 +11,7 @@ use crate::solver::per_track::each_track;
 use crate::solver::problem::{Problem, VERIFIED};
 use crate::solver::recorder::Recorder;
 
-/// Angle between the rays from which the depth of a point is known well enough to support a pose, radians: at .3
-/// degrees half a pixel of a thousand in either ray leaves a seventh of the depth open.
-const LEAST_ANGLE: f64 = 0.005;
-/// The same for points that only two views see, which nothing verifies: a twenty-eighth.
-const LEAST_ANGLE_OF_TWO: f64 = 0.02;
+const OPTIONS: ExtensionOptions = ExtensionOptions::DEFAULT;
 
 /// Triangulates every track anew.
 pub fn triangulate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) {
@@ -104,12 +101,12 @@ fn component_of_track(problem: &Problem, model: &Model, track: usize) -> Option<
 impl Landmark {
     /// Whether it may support the pose of a new view.
     pub fn supports(&self) -> bool {
-        self.angle > if self.support >= VERIFIED { LEAST_ANGLE } else { LEAST_ANGLE_OF_TWO }
+        self.angle > if self.support >= VERIFIED { OPTIONS.least_angle } else { OPTIONS.least_angle_of_two }
     }
 
     /// Whether it takes part in adjustments.
     pub fn is_verified(&self) -> bool {
-        self.support >= VERIFIED && self.angle > LEAST_ANGLE
+        self.support >= VERIFIED && self.angle > OPTIONS.least_angle
     }
 }
 

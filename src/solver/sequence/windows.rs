@@ -3,6 +3,7 @@
 use super::adjust;
 use super::calibrate::{self, Projective};
 use super::model::Model;
+use super::options::WindowOptions;
 use crate::domain::Task;
 use crate::solver::Error;
 use crate::solver::calibration::{self, Outcome};
@@ -10,13 +11,7 @@ use crate::solver::fusion::{Estimate, fuse, raise};
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 
-/// Views of a window where there are many, and of the shortest one: below, a window says little of a focal length.
-const VIEWS: usize = 10;
-const LEAST_VIEWS: usize = 4;
-/// Windows at most, evenly spread over the sequence: a variance of 50 values is known to a fifth.
-const MOST_WINDOWS: usize = 50;
-/// Observations of a view that a window holds.
-pub const OF_VIEW: usize = 150;
+const OPTIONS: WindowOptions = WindowOptions::DEFAULT;
 
 /// Raises the sigma of a sequence's calibration to what its windows admit, grades it anew and says so.
 pub fn reconcile(
@@ -76,7 +71,7 @@ fn estimates(
 
 /// By how much the log focal length of these views, their mean where each has its own, moves where they are alone.
 fn moved_alone(problem: &Problem, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
-    let extract = calibrate::core(problem, model, views, OF_VIEW);
+    let extract = calibrate::core(problem, model, views, OPTIONS.of_view);
     let (metric, _) = extract.block();
     let projective = Projective::of(&metric);
     let to_calibrate = projective.uncalibrated(problem, &metric, &extract.observations, &[None], model.noise);
@@ -95,21 +90,23 @@ fn shared(windows: &[Vec<usize>]) -> f64 {
 /// Runs of each of these runs of consecutive views, not overlapping but for the halves of a short one; one or none says
 /// nothing.
 fn windows(components: &[Vec<usize>]) -> Vec<Vec<usize>> {
-    let long: Vec<&Vec<usize>> = components.iter().filter(|views| views.len() >= LEAST_VIEWS).collect();
+    let long: Vec<&Vec<usize>> = components.iter().filter(|views| views.len() >= OPTIONS.least_views).collect();
     // One component is halved, so that there is something to compare; the halves of a short one overlap.
     if let [views] = long.as_slice()
-        && views.len() < 2 * LEAST_VIEWS
+        && views.len() < 2 * OPTIONS.least_views
     {
-        return [&views[..LEAST_VIEWS], &views[views.len() - LEAST_VIEWS..]].map(<[usize]>::to_vec).to_vec();
+        return [&views[..OPTIONS.least_views], &views[views.len() - OPTIONS.least_views..]]
+            .map(<[usize]>::to_vec)
+            .to_vec();
     }
     let least = if long.len() == 1 { 2 } else { 1 };
     let of_component = |views: &Vec<usize>| -> Vec<Vec<usize>> {
-        let count = (views.len() / VIEWS).max(least);
+        let count = (views.len() / OPTIONS.views).max(least);
         let run = |k: usize| views[k * views.len() / count..(k + 1) * views.len() / count].to_vec();
-        (0..count).map(run).filter(|run| run.len() >= LEAST_VIEWS).collect()
+        (0..count).map(run).filter(|run| run.len() >= OPTIONS.least_views).collect()
     };
     let all: Vec<Vec<usize>> = long.into_iter().flat_map(of_component).collect();
-    let step = all.len().div_ceil(MOST_WINDOWS).max(1);
+    let step = all.len().div_ceil(OPTIONS.most_windows).max(1);
     all.into_iter().step_by(step).collect()
 }
 
@@ -154,6 +151,6 @@ mod tests {
         assert_eq!(lengths(&[11]), [5, 6]);
         assert_eq!(lengths(&[40]), [10; 4]);
         assert_eq!(lengths(&[11, 10, 3]), [11, 10]);
-        assert_eq!(lengths(&[1000]).len(), MOST_WINDOWS);
+        assert_eq!(lengths(&[1000]).len(), OPTIONS.most_windows);
     }
 }
