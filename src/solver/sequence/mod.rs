@@ -38,14 +38,7 @@ use super::recorder::Recorder;
 use super::{Error, view_selection};
 use crate::domain::Stage;
 use extended::extend;
-use options::GrowthOptions;
-
-/// Growth of the retained observations, once each is judged by itself, from which a whole input is extended: with a
-/// tenth more of them sigma falls by a twentieth.
-const WORTH_EXTENDING: f64 = 1.1;
-
-/// Subsets of a whole input that are tried before it is searched at length.
-const FIRST_SUBSETS: usize = 3;
+use options::{ExtensionOptions, GrowthOptions};
 
 /// Evidence of a reconstruction, in that of one without a calibration, from which it is calibrated too: with less it is
 /// the same one, reached from elsewhere, or a part of it, and calibrating takes longer than all else.
@@ -86,7 +79,8 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
         ControlFlow::Continue(ended) => ended.seed(),
     };
     let subsets = view_selection::subsets(&blocks.sets);
-    let cheap = if blocks.is_whole { FIRST_SUBSETS.min(subsets.len()) } else { subsets.len() };
+    let cheap =
+        if blocks.is_whole { ExtensionOptions::DEFAULT.first_subsets.min(subsets.len()) } else { subsets.len() };
     let (cheap, rest) = subsets.split_at(cheap);
     // Nothing else is searched of a whole input with depths: what it has found stands.
     let mut effort = Extensions { keeps_first: !is_quick, calibrates_each: metric.is_some() };
@@ -308,7 +302,7 @@ fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder) ->
         let judged = found.judged(problem, &attempt, recorder);
         let retained: usize = attempt.block.tracks.iter().map(|&track| judged.retained[track].len()).sum();
         let known = attempt.projective.as_ref().map_or(0, |found| found.observations.len());
-        if retained as f64 <= WORTH_EXTENDING * known as f64 {
+        if retained as f64 <= ExtensionOptions::DEFAULT.worth_extending * known as f64 {
             attempt.judged = Some(judged);
             return Ok(Ended::Block(Some(Box::new(attempt))));
         }

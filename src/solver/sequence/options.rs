@@ -129,6 +129,10 @@ pub struct ExtensionOptions {
     pub share_of_registering: f64,
     /// Share of the views that an extension must register for no other seed to be tried.
     pub enough_registered: f64,
+    /// Growth of the retained observations, once each is judged by itself, from which a whole input is extended.
+    pub worth_extending: f64,
+    /// Subsets of a whole input that are tried before it is searched at length.
+    pub first_subsets: usize,
 }
 
 impl ExtensionOptions {
@@ -144,6 +148,9 @@ impl ExtensionOptions {
         share_of_registering: 0.7,
         // One that carries most of them is a component of whatever another would lead to.
         enough_registered: 0.5,
+        // With a tenth more of them sigma falls by a twentieth.
+        worth_extending: 1.1,
+        first_subsets: 3,
     };
 }
 
