@@ -152,6 +152,7 @@ mod tests {
 
     use super::super::bundle::testing;
     use super::*;
+    use crate::geometry::statistics::CHI_SQUARE_OF_TWO;
 
     /// Points of a scene and their exact images at unit depth in one view.
     fn correspondences(scene: &testing::TestScene, view: usize) -> (Vec<Vector3<f64>>, Vec<Vector2<f64>>) {
@@ -206,9 +207,15 @@ mod tests {
                     *image = Vector2::new(rng.random_range(-0.4..0.4), rng.random_range(-0.4..0.4));
                 }
             }
-            let found =
-                robust(&points, &seen, &vec![1.0; seen.len()], 13.8 * NOISE * NOISE, &mut rng, &StopToken::default())
-                    .expect("a pose");
+            let found = robust(
+                &points,
+                &seen,
+                &vec![1.0; seen.len()],
+                CHI_SQUARE_OF_TWO * NOISE * NOISE,
+                &mut rng,
+                &StopToken::default(),
+            )
+            .expect("a pose");
             let right = found.inlier.iter().enumerate().filter(|(k, inlier)| (k % 3 == 0) == **inlier).count();
             let away = distance(&found.model, &scene.poses[2]);
             println!("seed {seed}: {right} of 90 verdicts right, pose off by {away}");
@@ -231,7 +238,7 @@ mod tests {
             }
             let weights: Vec<f64> = (0..seen.len()).map(|k| 1.0 / (factor(k) * factor(k))).collect();
             let mut away = |weights: &[f64]| {
-                let gate = 13.8 * NOISE * NOISE;
+                let gate = CHI_SQUARE_OF_TWO * NOISE * NOISE;
                 let found = robust(&points, &seen, weights, gate, &mut rng, &StopToken::default()).expect("a pose");
                 (distance(&found.model, &scene.poses[2]), found.inlier_count())
             };

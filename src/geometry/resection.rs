@@ -137,6 +137,7 @@ impl Refinable<12> for Resection<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::statistics::CHI_SQUARE_OF_TWO;
     use rand::{Rng, SeedableRng};
 
     use crate::geometry::bundle::testing;
@@ -145,7 +146,7 @@ mod tests {
 
     fn found(points: &[Point], images: &[Vector2<f64>], weights: &[f64], least: usize) -> Option<(Camera, Vec<bool>)> {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        robust(points, images, weights, 13.8 * NOISE * NOISE, least, &mut rng, &StopToken::default())
+        robust(points, images, weights, CHI_SQUARE_OF_TWO * NOISE * NOISE, least, &mut rng, &StopToken::default())
     }
 
     /// Distance between the images of a point in two cameras.

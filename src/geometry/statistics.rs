@@ -3,6 +3,10 @@
 /// Standard normal quantile of .999, the level of every inlier gate: one right track in a thousand is lost.
 pub const GATE_QUANTILE: f64 = 3.090_232;
 
+/// Chi-square quantiles of .999 for one and two degrees of freedom: those of one unknown and of an image point.
+pub const CHI_SQUARE_OF_ONE: f64 = 10.8;
+pub const CHI_SQUARE_OF_TWO: f64 = 13.8;
+
 /// Normal consistency of the median absolute deviation.
 pub const DEVIATION_PER_MEDIAN: f64 = 1.4826;
 

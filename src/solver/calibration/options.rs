@@ -6,7 +6,7 @@
 use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle;
 use crate::geometry::bundle::metric::{Extension, IntrinsicsPrior, Parameter};
-use crate::geometry::statistics::chi_square_quantile;
+use crate::geometry::statistics::{CHI_SQUARE_OF_ONE, CHI_SQUARE_OF_TWO, GATE_QUANTILE, chi_square_quantile};
 use crate::solver::grow::LEAST_INLIERS;
 
 /// Thresholds of a calibration, by stage.
@@ -342,9 +342,9 @@ pub struct ModelOptions {
 impl ModelOptions {
     pub const DEFAULT: Self = Self {
         // The .999 quantiles of chi-square and of the normal distribution.
-        significant_gain_of_one: 10.8,
-        significant_gain_of_two: 13.8,
-        significance: 3.09,
+        significant_gain_of_one: CHI_SQUARE_OF_ONE,
+        significant_gain_of_two: CHI_SQUARE_OF_TWO,
+        significance: GATE_QUANTILE,
         worth_a_trial: 0.5,
         // A prior that is weighed by a misfit's noise is too strong: with a third radial term of .4, k1 to k3 were up
         // to 7.4 sigma off.
@@ -408,7 +408,7 @@ impl GradeOptions {
         least_in_front: 0.99,
         other_calibration: 0.02,
         // The .999 quantile for two degrees of freedom.
-        indistinguishable: 13.8,
+        indistinguishable: CHI_SQUARE_OF_TWO,
         // No lens is worse centred than that.
         principal_point_unobservable_above: 0.05,
         prior_contradicted: 3.0,

@@ -40,10 +40,6 @@ use crate::domain::Stage;
 use extended::extend;
 use options::{ExtensionOptions, GrowthOptions};
 
-/// Evidence of a reconstruction, in that of one without a calibration, from which it is calibrated too: with less it is
-/// the same one, reached from elsewhere, or a part of it, and calibrating takes longer than all else.
-const NEW_EVIDENCE: f64 = 1.02;
-
 /// How subsets are searched, of which many are tried.
 const QUICK_SEED: Effort = Effort { is_seed: true, is_quick: true };
 
@@ -254,7 +250,9 @@ fn by_projective_extension(
         let evidence = |attempt: &Attempt| {
             attempt.projective.as_ref().map_or(0.0, |found| found.evidence(problem.outlier_density))
         };
-        let is_known = |best: &Attempt| !best.is_calibrated() && evidence(&attempt) < NEW_EVIDENCE * evidence(best);
+        let is_known = |best: &Attempt| {
+            !best.is_calibrated() && evidence(&attempt) < ExtensionOptions::DEFAULT.new_evidence * evidence(best)
+        };
         if !effort.calibrates_each && best.as_ref().is_some_and(is_known) {
             continue;
         }

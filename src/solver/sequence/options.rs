@@ -3,7 +3,7 @@
 use std::ops::RangeInclusive;
 
 use crate::geometry::bundle::{Loss, Options};
-use crate::solver::calibration::CalibrationOptions;
+use crate::geometry::statistics::CHI_SQUARE_OF_TWO;
 use crate::solver::view_selection::ViewSelectionOptions;
 
 /// How views are added.
@@ -133,6 +133,8 @@ pub struct ExtensionOptions {
     pub worth_extending: f64,
     /// Subsets of a whole input that are tried before it is searched at length.
     pub first_subsets: usize,
+    /// Evidence of a reconstruction, in that of one without a calibration, from which it is calibrated too.
+    pub new_evidence: f64,
 }
 
 impl ExtensionOptions {
@@ -151,6 +153,9 @@ impl ExtensionOptions {
         // With a tenth more of them sigma falls by a twentieth.
         worth_extending: 1.1,
         first_subsets: 3,
+        // With less it is the same one, reached from elsewhere, or a part of it, and calibrating takes longer than all
+        // else.
+        new_evidence: 1.02,
     };
 }
 
@@ -198,8 +203,8 @@ impl StretchOptions {
         // Other errors than noise bound what more of them would give.
         observations: 6_000,
         of_view: (50, 300),
-        // The .999 quantile of two coordinates, as where a model of two more unknowns is significant.
-        core_squared: CalibrationOptions::DEFAULT.models.significant_gain_of_two,
+        // One observation in a thousand is left out.
+        core_squared: CHI_SQUARE_OF_TWO,
     };
 }
 

@@ -22,14 +22,11 @@ use crate::solver::per_track::each_track;
 use crate::solver::problem::{Problem, VERIFIED};
 use crate::solver::recorder::Recorder;
 
-const OPTIONS: GrowthOptions = GrowthOptions::PROJECTIVE;
-
 /// A reconstruction while it grows, indexed as the input is.
 struct Growing<'a> {
     problem: &'a Problem<'a>,
     rng: ChaCha8Rng,
-    /// See [`GrowthOptions::gives_points`].
-    gives_points: bool,
+    options: &'a GrowthOptions,
     cameras: Vec<Option<Camera>>,
     points: Vec<Option<Point>>,
     /// Observations that agree with the point of each track.
@@ -70,13 +67,13 @@ pub fn extend(
 }
 
 impl<'a> Growing<'a> {
-    fn new(problem: &'a Problem<'a>, start: Projective, options: &GrowthOptions) -> Self {
+    fn new(problem: &'a Problem<'a>, start: Projective, options: &'a GrowthOptions) -> Self {
         let mut cameras = vec![None; problem.of_view.len()];
         start.views.iter().zip(&start.cameras).for_each(|(&view, camera)| cameras[view] = Some(*camera));
         Self {
             problem,
             rng: ChaCha8Rng::seed_from_u64(problem.settings.seed),
-            gives_points: options.gives_points,
+            options,
             cameras,
             points: vec![None; problem.tracks()],
             support: vec![0; problem.tracks()],
@@ -155,11 +152,11 @@ impl<'a> Growing<'a> {
 
     /// Adjusts all registered views with the points that hold them best, and estimates the noise from what remains.
     fn adjust(&mut self, iterations: usize, recorder: &mut Recorder) {
-        let mut standing = self.standing(OPTIONS.of_view);
+        let mut standing = self.standing(self.options.of_view);
         if standing.observations.is_empty() {
             return;
         }
-        let options = OPTIONS.adjustment(iterations, self.noise);
+        let options = self.options.adjustment(iterations, self.noise);
         let Projective { cameras, points, observations, .. } = &mut standing;
         bundle::projective::adjust(cameras, points, observations, &options, self.problem.stop);
         recorder.heartbeat();
@@ -177,7 +174,7 @@ impl<'a> Growing<'a> {
         let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();
         let noise = adjust::core_noise(norms, unknowns);
         let (least, most) = NoiseOptions::DEFAULT.bounds;
-        noise.clamp(least, (OPTIONS.noise_growth * self.start_noise).min(most))
+        noise.clamp(least, (self.options.noise_growth * self.start_noise).min(most))
     }
 
     /// Takes back the views that too few points hold, and returns them.
@@ -187,7 +184,7 @@ impl<'a> Growing<'a> {
         for view in self.views() {
             let of_view = problem.of_view[view].iter().map(|&k| k as usize);
             let held = of_view.filter(|&k| self.kept[k] && self.is_verified(problem.track_of(k))).count();
-            if held < OPTIONS.least_agreeing {
+            if held < self.options.least_agreeing {
                 dropped.push(view);
                 self.cameras[view] = None;
                 for &k in &problem.of_view[view] {
@@ -232,13 +229,13 @@ impl Growth for Growing<'_> {
         let (points, seen): (Vec<Point>, Vec<_>) = seen.iter().filter_map(datum).unzip();
         let (images, weights): (Vec<Vector2<f64>>, Vec<f64>) = seen.into_iter().unzip();
         let gate = problem.gate(self.noise);
-        let least = OPTIONS.least_agreeing.max((OPTIONS.least_share * points.len() as f64).ceil() as usize);
+        let least = self.options.least_agreeing.max((self.options.least_share * points.len() as f64).ceil() as usize);
         let found = resection::robust(&points, &images, &weights, gate, least, &mut self.rng, problem.stop);
         let Some((camera, agrees)) = found else { return 0 };
         let depths = points.iter().zip(&agrees).filter(|(_, agrees)| **agrees);
         let sign: f64 = depths.map(|(point, _)| ((camera.row(2) * point).x * point.w).signum()).sum();
         self.cameras[view] = Some(if sign < 0.0 { -camera } else { camera });
-        if self.gives_points {
+        if self.options.gives_points {
             self.triangulate(Some(view), recorder);
         }
         recorder.registered(self.registered());
@@ -246,7 +243,7 @@ impl Growth for Growing<'_> {
     }
 
     fn settle(&mut self, recorder: &mut Recorder) {
-        self.adjust(OPTIONS.growing_iterations, recorder);
+        self.adjust(self.options.growing_iterations, recorder);
         self.triangulate(None, recorder);
     }
 }
