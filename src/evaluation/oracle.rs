@@ -8,7 +8,7 @@ use super::measures::{Measures, error_3d, true_image_px, true_points};
 use crate::domain::StopToken;
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
-    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
+    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter, Pose,
 };
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::chi_square_gate;
@@ -150,7 +150,8 @@ impl<'a> World<'a> {
             })
             .collect();
         let points = true_points(truth, &inliers);
-        let mut found = Reconstruction::new(Intrinsics::from_focal(self.focal), self.poses.clone(), points.clone());
+        let mut found =
+            MetricReconstruction::new(Intrinsics::from_focal(self.focal), self.poses.clone(), points.clone());
         let bound = Information::new(&found, &observations).and_then(|information| {
             information.optimum(IntrinsicsModel::FOCAL, &[IntrinsicsPrior::NONE]).variance_of(0, Parameter::LogFocal)
         });

@@ -7,7 +7,7 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::bundle::Options;
 use super::bundle::critical::{
-    HOMOGRAPHIES_GAUGE, Homographies, Problem, ROTATING_GAUGE, Rotating, TRANSLATING_GAUGE, Translating, minimise,
+    BundleProblem, HOMOGRAPHIES_GAUGE, Homographies, ROTATING_GAUGE, Rotating, TRANSLATING_GAUGE, Translating, minimise,
 };
 use super::bundle::metric::Intrinsics;
 use super::daq::scan_focal;
@@ -28,7 +28,7 @@ const ITERATIONS: usize = 30;
 
 /// A model at its minimum.
 #[derive(Debug, Clone)]
-pub struct Fit<M> {
+pub struct CriticalFit<M> {
     pub model: M,
     /// Sum of the squared residuals, normalised units.
     pub cost: f64,
@@ -45,7 +45,7 @@ pub fn fit_without_parallax(
     points: usize,
     noise: f64,
     stop: &StopToken,
-) -> Option<(Fit<Homographies>, Fit<Rotating>)> {
+) -> Option<(CriticalFit<Homographies>, CriticalFit<Rotating>)> {
     let seen = Correspondences::new(observations, views);
     let reference = seen.most_observed()?;
     let homographies: Vec<Matrix3<f64>> = (0..views)
@@ -93,15 +93,15 @@ fn positions(
     positions
 }
 
-fn adjusted<const G: usize, const C: usize, const P: usize, M: Problem<G, C, P>>(
+fn adjusted<const G: usize, const C: usize, const P: usize, M: BundleProblem<G, C, P>>(
     mut model: M,
     unknowns: usize,
     gauge: usize,
     observations: &[Observation],
     stop: &StopToken,
-) -> Fit<M> {
+) -> CriticalFit<M> {
     let report = minimise(&mut model, observations, &Options::squared(ITERATIONS), stop);
-    Fit { model, cost: report.cost, unknowns: unknowns.saturating_sub(gauge) }
+    CriticalFit { model, cost: report.cost, unknowns: unknowns.saturating_sub(gauge) }
 }
 
 /// The focal length, principal point in the centre, with which the homographies are nearest to rotations, and these.
@@ -137,7 +137,7 @@ pub fn fit_translation(
     noise: f64,
     limit: f64,
     stop: &StopToken,
-) -> Option<Fit<Translating>> {
+) -> Option<CriticalFit<Translating>> {
     let seen = Correspondences::new(observations, views);
     let reference = seen.most_observed()?;
     let mut epipoles = vec![Vector3::zeros(); views];

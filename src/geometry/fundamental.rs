@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::Camera;
 use super::null_vector::smallest_eigenvector;
-use super::ransac::{self, Estimator, Robust};
+use super::ransac::{self, Estimator, RobustModel};
 use crate::domain::StopToken;
 
 /// Correspondences that determine a fundamental matrix linearly.
@@ -171,7 +171,7 @@ pub(crate) fn robust(
     noise: f64,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
-) -> Option<Robust<Fundamental>> {
+) -> Option<RobustModel<Fundamental>> {
     ransac::estimate(&matches, squared_gate(noise), None, MOST_SAMPLES, rng, stop)
 }
 

@@ -20,7 +20,7 @@ const ACCEPTED_FACTORS: (f64, f64) = (0.2, 2.0);
 pub(crate) const MIN_DAMPING: f64 = 1e-10;
 
 /// What the loop asks of a sum of squares, or of a robust loss that is reweighted at every linearisation.
-pub(crate) trait Problem {
+pub(crate) trait LeastSquares {
     type State: Clone;
 
     /// The cost of a state; infinite or not a number where it has none.
@@ -36,15 +36,15 @@ pub(crate) trait Problem {
     fn step(&mut self, from: &Self::State, damping: f64, to: &mut Self::State) -> Option<f64>;
 
     /// The same with what the state moved to costs; may improve on a step that does not cost less than `present`.
-    fn attempt(&mut self, from: &Self::State, damping: f64, _present: f64, to: &mut Self::State) -> Option<Attempt> {
+    fn attempt(&mut self, from: &Self::State, damping: f64, _present: f64, to: &mut Self::State) -> Option<StepCost> {
         let predicted = self.step(from, damping, to)?;
-        Some(Attempt { cost: self.cost(to), predicted })
+        Some(StepCost { cost: self.cost(to), predicted })
     }
 }
 
 /// A step that was tried.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Attempt {
+pub(crate) struct StepCost {
     pub cost: f64,
     /// By how much the linearisation says that the cost is lower.
     pub predicted: f64,
@@ -76,7 +76,7 @@ pub struct Report {
 /// Minimises the cost from `state`, which is replaced by the best one found.
 ///
 /// The cost never rises. `stop` is asked before every damped solve.
-pub(crate) fn minimise<P: Problem>(
+pub(crate) fn minimise<P: LeastSquares>(
     problem: &mut P,
     state: &mut P::State,
     options: &Options,
@@ -99,7 +99,7 @@ pub(crate) fn minimise<P: Problem>(
             }
             lowered
         });
-        let Some(Attempt { cost, predicted }) = accepted else { break };
+        let Some(StepCost { cost, predicted }) = accepted else { break };
         std::mem::swap(state, &mut trial);
         let gain = report.cost - cost;
         damping = (damping * factor_after(gain / predicted)).max(options.min_damping);
@@ -160,7 +160,7 @@ mod tests {
     /// Rosenbrock's valley: `(10 (y - x²), 1 - x)`.
     struct Valley(Normal<2>);
 
-    impl Problem for Valley {
+    impl LeastSquares for Valley {
         type State = Vector2<f64>;
 
         fn cost(&self, at: &Vector2<f64>) -> f64 {

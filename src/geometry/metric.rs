@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
 use super::bundle::critical::Translating;
-use super::bundle::metric::{Intrinsics, Pose, Reconstruction};
+use super::bundle::metric::{Intrinsics, MetricReconstruction, Pose};
 use super::daq::{self, CanonicalFrame, Daq};
 use super::observation::Observation;
 use super::procrustes::nearest_rotation;
@@ -34,7 +34,7 @@ pub fn upgrade(
     daq: &Daq,
     own_focals: bool,
     observations: &[Observation],
-) -> Option<Reconstruction> {
+) -> Option<MetricReconstruction> {
     let homography = upgrading_homography(daq);
     let back = homography.try_inverse()?;
     let focals = match own_focals {
@@ -42,7 +42,7 @@ pub fn upgrade(
         false => Vec::new(),
     };
     let points = frame.points.iter().map(|point| euclidean(&(back * point))).collect();
-    let mut reconstruction = Reconstruction {
+    let mut reconstruction = MetricReconstruction {
         intrinsics: vec![daq.intrinsics],
         group_of: vec![0; frame.cameras.len()],
         focals,
@@ -67,11 +67,11 @@ pub fn upgrade_translation(
     translation: &Translating,
     focal: f64,
     observations: &[Observation],
-) -> Option<Reconstruction> {
+) -> Option<MetricReconstruction> {
     let back = Vector3::new(focal.recip(), focal.recip(), 1.0);
     let pose = |moved: &Vector3<f64>| Pose { rotation: Matrix3::identity(), translation: moved.component_mul(&back) };
     let point = |point: &Vector3<f64>| euclidean(&point.xy().push(1.0).component_mul(&back).push(point.z));
-    let reconstruction = Reconstruction::new(
+    let reconstruction = MetricReconstruction::new(
         Intrinsics::from_focal(focal),
         translation.translations.iter().map(pose).collect(),
         translation.points.iter().map(point).collect(),
@@ -86,7 +86,7 @@ fn euclidean(point: &Vector4<f64>) -> Vector3<f64> {
 }
 
 /// Of the two mirror images the one with more observations in front of their cameras, at a median depth of 1.
-fn oriented(mut reconstruction: Reconstruction, observations: &[Observation]) -> Option<Reconstruction> {
+fn oriented(mut reconstruction: MetricReconstruction, observations: &[Observation]) -> Option<MetricReconstruction> {
     if cheirality(&reconstruction, observations) < 0.5 {
         reconstruction.poses.iter_mut().for_each(|pose| pose.translation.neg_mut());
         reconstruction.points.iter_mut().for_each(|point| point.neg_mut());
@@ -105,7 +105,7 @@ fn pose(left: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Pose> {
 }
 
 /// Scales the scene to a median depth of 1 and holds far points at [`FARTHEST`].
-fn scale_to_median_depth(reconstruction: &mut Reconstruction, observations: &[Observation]) -> Option<()> {
+fn scale_to_median_depth(reconstruction: &mut MetricReconstruction, observations: &[Observation]) -> Option<()> {
     let mut depths: Vec<f64> = depths(reconstruction, observations).map(f64::abs).collect();
     let median = median(&mut depths);
     if !(median > f64::MIN_POSITIVE && median.is_finite()) {
@@ -122,7 +122,10 @@ fn scale_to_median_depth(reconstruction: &mut Reconstruction, observations: &[Ob
     Some(())
 }
 
-fn depths<'a>(reconstruction: &'a Reconstruction, observations: &'a [Observation]) -> impl Iterator<Item = f64> + 'a {
+fn depths<'a>(
+    reconstruction: &'a MetricReconstruction,
+    observations: &'a [Observation],
+) -> impl Iterator<Item = f64> + 'a {
     observations.iter().filter_map(|seen| {
         let (pose, point) = (reconstruction.poses.get(seen.view)?, reconstruction.points.get(seen.point)?);
         Some(pose.apply(point).z)
@@ -130,7 +133,7 @@ fn depths<'a>(reconstruction: &'a Reconstruction, observations: &'a [Observation
 }
 
 /// Share of the observations whose point lies in front of its camera; 0 without observations.
-pub fn cheirality(reconstruction: &Reconstruction, observations: &[Observation]) -> f64 {
+pub fn cheirality(reconstruction: &MetricReconstruction, observations: &[Observation]) -> f64 {
     let (count, front) = depths(reconstruction, observations)
         .fold((0usize, 0usize), |(count, front), depth| (count + 1, front + usize::from(depth > 0.0)));
     if count > 0 { front as f64 / count as f64 } else { 0.0 }

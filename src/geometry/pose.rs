@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::bundle::metric::{Intrinsics, Pose, Projection};
 use super::procrustes;
-use super::ransac::{self, Estimator, Refinable, Robust};
+use super::ransac::{self, Estimator, Refinable, RobustModel};
 use crate::domain::StopToken;
 
 /// Correspondences that determine a pose up to four solutions.
@@ -88,7 +88,7 @@ pub(crate) fn robust(
     gate: f64,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
-) -> Option<Robust<Pose>> {
+) -> Option<RobustModel<Pose>> {
     if points.len() != seen.len() || points.len() != weights.len() {
         return None;
     }

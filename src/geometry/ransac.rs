@@ -78,7 +78,7 @@ struct Refinement<'a, const N: usize, E> {
     normal: Normal<N>,
 }
 
-impl<const N: usize, E: Refinable<N>> levenberg_marquardt::Problem for Refinement<'_, N, E> {
+impl<const N: usize, E: Refinable<N>> levenberg_marquardt::LeastSquares for Refinement<'_, N, E> {
     type State = E::Model;
 
     fn cost(&self, model: &E::Model) -> f64 {
@@ -117,7 +117,7 @@ impl<const N: usize, E: Refinable<N>> levenberg_marquardt::Problem for Refinemen
 
 /// What most data agree on.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Robust<M> {
+pub(crate) struct RobustModel<M> {
     pub model: M,
     /// One a datum: whether its squared residual is within the gate.
     pub inlier: Vec<bool>,
@@ -125,7 +125,7 @@ pub(crate) struct Robust<M> {
     pub cost: f64,
 }
 
-impl<M> Robust<M> {
+impl<M> RobustModel<M> {
     pub fn inlier_count(&self) -> usize {
         self.inlier.iter().filter(|&&inlier| inlier).count()
     }
@@ -148,7 +148,7 @@ pub(crate) fn estimate<E: Estimator>(
     most_samples: usize,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
-) -> Option<Robust<E::Model>> {
+) -> Option<RobustModel<E::Model>> {
     if estimator.len() < E::SAMPLE || !(gate > 0.0 && gate.is_finite()) {
         return None;
     }
@@ -164,7 +164,7 @@ pub(crate) fn estimate<E: Estimator>(
     }
     let (model, cost) = search.best?;
     let inlier = (0..estimator.len()).map(|datum| estimator.squared_residual(&model, datum) < gate).collect();
-    Some(Robust { model, inlier, cost: cost / estimator.len() as f64 })
+    Some(RobustModel { model, inlier, cost: cost / estimator.len() as f64 })
 }
 
 struct Search<'a, E: Estimator> {

@@ -31,7 +31,7 @@ pub struct Triangulator<'a> {
 
 /// A point and the observations that agree with it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Robust {
+pub struct RobustPoint {
     pub point: Point,
     /// One an observation: within the gate and in front of the camera.
     pub agrees: Vec<bool>,
@@ -49,7 +49,7 @@ impl<'a> Triangulator<'a> {
     /// * `gate`: weighted squared residual within which an observation agrees
     ///
     /// Returns `None` where no two observations agree.
-    pub fn robust(&self, observations: &[Observation], gate: f64) -> Option<Robust> {
+    pub fn robust(&self, observations: &[Observation], gate: f64) -> Option<RobustPoint> {
         if observations.len() < 2 {
             return None;
         }
@@ -60,7 +60,7 @@ impl<'a> Triangulator<'a> {
             all = triangulation::refine(cameras, observations, all, POINT_STEPS).0;
             let agrees = agreeing(cameras, observations, &all, gate);
             if agrees.iter().all(|&agrees| agrees) {
-                return Some(Robust { point: all, agrees });
+                return Some(RobustPoint { point: all, agrees });
             }
         }
         let start = self.best_hypothesis(observations, all, gate);
@@ -71,7 +71,7 @@ impl<'a> Triangulator<'a> {
         }
         let (point, _) = triangulation::refine(cameras, &right, start, POINT_STEPS);
         let agrees = agreeing(cameras, observations, &point, gate);
-        (agrees.iter().filter(|&&agrees| agrees).count() >= 2).then_some(Robust { point, agrees })
+        (agrees.iter().filter(|&&agrees| agrees).count() >= 2).then_some(RobustPoint { point, agrees })
     }
 
     /// The cheapest of the point of all observations, of those of its runs and of that of its ends.

@@ -11,10 +11,10 @@ use super::grow::{Consensus, NoiseOptions};
 use super::portfolio;
 use super::problem::Problem;
 use super::search::Seed;
-use super::search::rigid::{Rigid, Search};
+use super::search::rigid::{Rigid, RigidSearch};
 use crate::domain::{Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{
-    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Pose, Reconstruction,
+    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter, Pose,
 };
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::observation::Observation;
@@ -138,7 +138,7 @@ pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus
 }
 
 /// The consensus as a metric reconstruction of its inliers.
-fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<Reconstruction> {
+fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<MetricReconstruction> {
     let intrinsics = Intrinsics::from_focal(focal);
     let uncalibrate = intrinsics.matrix().try_inverse()?;
     let poses = consensus
@@ -150,7 +150,7 @@ fn start(consensus: &Consensus, inliers: &[usize], focal: f64) -> Option<Reconst
         })
         .collect();
     let points = inliers.iter().map(|&track| consensus.points[track].xyz()).collect();
-    Some(Reconstruction::new(intrinsics, poses, points))
+    Some(MetricReconstruction::new(intrinsics, poses, points))
 }
 
 /// Probability of tracks to be right by image points and depths together.
@@ -174,7 +174,7 @@ pub fn weights(
 ) -> Option<TrackWeights> {
     let all = problem.block(&searched.views).sample_with(OPTIONS.most_weighed, problem.settings.seed, &searched.tracks);
     let block = &all.complete;
-    let search = Search::new(block, portfolio::spread(block), problem.stop)?;
+    let search = RigidSearch::new(block, portfolio::spread(block), problem.stop)?;
     let place = |track: usize| all.tracks.binary_search(&searched.tracks[track]).ok();
     let inliers: Vec<usize> = consensus.inliers().into_iter().filter_map(place).collect();
     let rigid = search.refit(found.as_ref()?, &inliers)?;

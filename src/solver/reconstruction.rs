@@ -12,7 +12,7 @@ use super::recorder::Recorder;
 use super::sequence::{Extended, verified};
 use crate::domain::result::TrackResults;
 use crate::domain::{Grade, LeftOut, Warning};
-use crate::geometry::bundle::metric::{Intrinsics, Pose, Reconstruction as Metric};
+use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction, Pose};
 use crate::geometry::daq::to_canonical_frame;
 
 /// A reconstruction in terms of the input's views and tracks.
@@ -40,7 +40,7 @@ impl Reconstruction {
         let mut poses = vec![None; problem.views()];
         let mut lenses = Vec::new();
         for (i, &view) in projective.views.iter().enumerate() {
-            let camera = |metric: &Metric| metric.poses[i].camera(&metric.intrinsics_of(i));
+            let camera = |metric: &MetricReconstruction| metric.poses[i].camera(&metric.intrinsics_of(i));
             cameras[view] = Some(metric.map_or(projective.cameras[i], camera));
         }
         // Where the first camera has no rank 3 the frame stays as it is.

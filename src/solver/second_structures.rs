@@ -53,7 +53,7 @@ pub fn warning(second: &[usize], inlier: &[bool]) -> Option<Warning> {
 
 /// Tracks of another rigid shape, where depths are given.
 fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<Vec<usize>> {
-    let search = rigid::Search::new(rest, portfolio::spread(rest), stop)?;
+    let search = rigid::RigidSearch::new(rest, portfolio::spread(rest), stop)?;
     let found = search.run(noise)?;
     let is_decisive = found.ln_false_alarms(search.spread()) < FalseAlarmOptions::DEFAULT.ln_decisive;
     is_decisive.then(|| (0..found.inlier.len()).filter(|&track| found.inlier[track]).collect())
@@ -66,7 +66,7 @@ fn by_depths(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<Vec<u
 /// cameras, and of wrong ones no fifth does (a test counts them); growing from those by chance took nearly as long as
 /// the rest of a solve.
 fn by_image_points(rest: &CompleteBlock, noise: f64, stop: &StopToken) -> Option<Vec<usize>> {
-    let ranking = priors::affine_irls(affine::Search::new(rest).centred(), grow::LEAST_SUPPORT, stop)?;
+    let ranking = priors::affine_irls(affine::AffineSearch::new(rest).centred(), grow::LEAST_SUPPORT, stop)?;
     let costs: Vec<f64> = ranking.iter().map(|weight| -weight).collect();
     let spread = portfolio::spread(rest);
     affine::seeds_from_ranking(rest, &costs).into_iter().find_map(|seed| {
@@ -114,10 +114,11 @@ mod tests {
             for seed in 30_000..30_008 {
                 let count = |second_motion: f64| {
                     let rest = left_out(&SceneOptions { second_motion, seed, ..options.clone() });
-                    let ranking = priors::affine_irls(affine::Search::new(&rest).centred(), 0, &StopToken::default());
+                    let ranking =
+                        priors::affine_irls(affine::AffineSearch::new(&rest).centred(), 0, &StopToken::default());
                     let count = priors::agreeing(&ranking.expect("finite points"));
                     let held = priors::affine_irls(
-                        affine::Search::new(&rest).centred(),
+                        affine::AffineSearch::new(&rest).centred(),
                         grow::LEAST_SUPPORT,
                         &StopToken::default(),
                     );

@@ -22,7 +22,7 @@ const NOISE: f64 = 0.005;
 /// A scene made ready for every prior.
 pub struct Study {
     block: CompleteBlock,
-    search: affine::Search,
+    search: affine::AffineSearch,
     stop: StopToken,
 }
 
@@ -45,7 +45,7 @@ impl Study {
     /// The input's tracks that are complete over all its views, their depths left aside.
     pub fn new(input: &Input, stop: &StopToken) -> Self {
         let block = block::of_all_views(input).complete;
-        Self { search: affine::Search::new(&block), block, stop: stop.clone() }
+        Self { search: affine::AffineSearch::new(&block), block, stop: stop.clone() }
     }
 
     /// Asks a prior; `None` for one that does not rank image points by themselves.

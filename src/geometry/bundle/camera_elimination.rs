@@ -7,7 +7,7 @@
 use nalgebra::{SVector, Vector2};
 
 use super::Observation;
-use super::engine::{Jacobian, Layout, Problem, ResidualVisitor, Step};
+use super::engine::{BundleProblem, Jacobian, Layout, ResidualVisitor, Step};
 
 /// Share of the unknowns of the cameras that those of the points may have at most: with as many of either, a camera's
 /// larger blocks cost more to eliminate.
@@ -16,7 +16,7 @@ const MOST_SHARE: f64 = 0.5;
 /// Whether it is cheaper to eliminate the cameras than the points, and every camera has as many residuals as unknowns:
 /// one that has fewer has no block of its own to eliminate.
 pub(super) fn is_worth_it<const G: usize, const C: usize, const P: usize>(
-    problem: &impl Problem<G, C, P>,
+    problem: &impl BundleProblem<G, C, P>,
     layout: &Layout,
 ) -> bool {
     let (cameras, points) = problem.counts();
@@ -57,7 +57,9 @@ impl<const G: usize, const C: usize, const P: usize, S: ResidualVisitor<G, P, C>
     }
 }
 
-impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> Problem<G, P, C> for CameraElimination<T> {
+impl<const G: usize, const C: usize, const P: usize, T: BundleProblem<G, C, P>> BundleProblem<G, P, C>
+    for CameraElimination<T>
+{
     fn counts(&self) -> (usize, usize) {
         let (cameras, points) = self.0.counts();
         (points, cameras)
@@ -94,7 +96,7 @@ mod tests {
 
     /// Adjusts a problem as it is and with cameras and points exchanged, from the same start.
     fn both_end_at_the_same_cost<const G: usize, const C: usize, const P: usize>(
-        problem: &impl Problem<G, C, P>,
+        problem: &impl BundleProblem<G, C, P>,
         observations: &[Observation],
         case: &str,
     ) {

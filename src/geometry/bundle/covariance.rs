@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use super::Observation;
 use super::intrinsics::Intrinsics;
 use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior, Parameter};
-use super::metric::Reconstruction;
+use super::metric::MetricReconstruction;
 use super::own_focals::Function;
 use super::sequence::System;
 use super::whitened::centre;
@@ -68,7 +68,7 @@ impl Information {
     ///
     /// The seven directions of a similarity are projected out. Returns `None` without poses, or where the system
     /// holds what is no number.
-    pub fn new(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
+    pub fn new(reconstruction: &MetricReconstruction, observations: &[Observation]) -> Option<Self> {
         let mut metric = reconstruction.clone();
         if metric.poses.is_empty() {
             return None;
@@ -304,7 +304,7 @@ mod tests {
             scene.intrinsics.principal_point = Vector2::new(0.002, -0.001);
             scene.intrinsics.radial[0] = 0.001;
             scene.observe(0.0005, &mut rand::SeedableRng::seed_from_u64(seed));
-            let adjusted = |start: &Reconstruction, model, prior: &IntrinsicsPrior| {
+            let adjusted = |start: &MetricReconstruction, model, prior: &IntrinsicsPrior| {
                 let mut start = start.clone();
                 let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
                 let stop = StopToken::default();
@@ -365,7 +365,7 @@ mod tests {
         for seed in 0..3 {
             println!("seed {seed}");
             let scene = testing::scene(seed, 8, 40, NOISE);
-            let adjusted = |mut start: Reconstruction, model: IntrinsicsModel| {
+            let adjusted = |mut start: MetricReconstruction, model: IntrinsicsModel| {
                 let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
                 let priors = [IntrinsicsPrior::NONE; 2];
                 adjust(&mut start, &scene.observations, model, &priors, &options, &StopToken::default());

@@ -7,8 +7,8 @@
 use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
 
 use super::Observation;
+pub(crate) use super::engine::{BundleProblem, minimise};
 use super::engine::{Jacobian, ResidualVisitor, Step, image, move_each, unit_norm};
-pub(crate) use super::engine::{Problem, minimise};
 use super::metric::Intrinsics;
 
 /// Views of a plane, or of anything from one centre: `x ~ H (x, y, 1)`.
@@ -42,7 +42,7 @@ pub const HOMOGRAPHIES_GAUGE: usize = 8;
 pub const ROTATING_GAUGE: usize = 3;
 pub const TRANSLATING_GAUGE: usize = 4;
 
-impl Problem<0, 9, 2> for Homographies {
+impl BundleProblem<0, 9, 2> for Homographies {
     fn counts(&self) -> (usize, usize) {
         (self.views.len(), self.points.len())
     }
@@ -74,7 +74,7 @@ impl Problem<0, 9, 2> for Homographies {
     }
 }
 
-impl Problem<3, 3, 2> for Rotating {
+impl BundleProblem<3, 3, 2> for Rotating {
     fn counts(&self) -> (usize, usize) {
         (self.rotations.len(), self.points.len())
     }
@@ -108,7 +108,7 @@ impl Problem<3, 3, 2> for Rotating {
     }
 }
 
-impl Problem<0, 3, 3> for Translating {
+impl BundleProblem<0, 3, 3> for Translating {
     fn counts(&self) -> (usize, usize) {
         (self.translations.len(), self.points.len())
     }

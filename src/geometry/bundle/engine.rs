@@ -54,7 +54,7 @@ impl<const G: usize, const C: usize, const P: usize> Step<G, C, P> {
 }
 
 /// A bundle adjustment: `G` unknowns shared by all views, `C` a camera, `P` a point.
-pub(crate) trait Problem<const G: usize, const C: usize, const P: usize>: Clone {
+pub(crate) trait BundleProblem<const G: usize, const C: usize, const P: usize>: Clone {
     /// How many cameras and points there are.
     fn counts(&self) -> (usize, usize);
     /// Hands the residual of one observation, and its Jacobian on demand, to `visitor`.
@@ -132,7 +132,7 @@ impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> fo
 }
 
 fn cost<const G: usize, const C: usize, const P: usize>(
-    problem: &impl Problem<G, C, P>,
+    problem: &impl BundleProblem<G, C, P>,
     layout: &Layout,
     loss: Loss,
 ) -> f64 {
@@ -149,7 +149,7 @@ fn cost<const G: usize, const C: usize, const P: usize>(
 /// The cost never rises. `stop` is asked before every damped solve; a stopped, stuck or degenerate problem keeps its
 /// last good state.
 pub(crate) fn minimise<const G: usize, const C: usize, const P: usize>(
-    problem: &mut impl Problem<G, C, P>,
+    problem: &mut impl BundleProblem<G, C, P>,
     observations: &[Observation],
     options: &Options,
     stop: &StopToken,
@@ -167,7 +167,7 @@ pub(crate) fn minimise<const G: usize, const C: usize, const P: usize>(
 }
 
 /// The loop, eliminating what the problem calls points.
-pub(super) fn descend<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>>(
+pub(super) fn descend<const G: usize, const C: usize, const P: usize, T: BundleProblem<G, C, P>>(
     problem: &mut T,
     layout: &Layout,
     options: &Options,
@@ -195,7 +195,7 @@ struct Dense<'a, const G: usize, const C: usize, const P: usize, T> {
     problem: PhantomData<T>,
 }
 
-impl<const G: usize, const C: usize, const P: usize, T: Problem<G, C, P>> levenberg_marquardt::Problem
+impl<const G: usize, const C: usize, const P: usize, T: BundleProblem<G, C, P>> levenberg_marquardt::LeastSquares
     for Dense<'_, G, C, P, T>
 {
     type State = T;

@@ -91,7 +91,7 @@ impl<'a> Projection<'a> {
 
 /// A metric reconstruction, up to a similarity.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Reconstruction {
+pub struct MetricReconstruction {
     /// One a camera group, whose views share it; where they have focal lengths of their own, with the geometric mean of
     /// these.
     pub intrinsics: Vec<Intrinsics>,
@@ -103,7 +103,7 @@ pub struct Reconstruction {
     pub points: Vec<Vector3<f64>>,
 }
 
-impl Reconstruction {
+impl MetricReconstruction {
     /// With one calibration for all views.
     pub fn new(intrinsics: Intrinsics, poses: Vec<Pose>, points: Vec<Vector3<f64>>) -> Self {
         Self { intrinsics: vec![intrinsics], group_of: vec![0; poses.len()], focals: Vec::new(), poses, points }
@@ -192,7 +192,7 @@ impl Reconstruction {
 /// # Pitfall
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
 pub fn adjust(
-    reconstruction: &mut Reconstruction,
+    reconstruction: &mut MetricReconstruction,
     observations: &[Observation],
     model: IntrinsicsModel,
     priors: &[IntrinsicsPrior],
@@ -283,7 +283,7 @@ mod tests {
     #[test]
     fn degenerate_input_neither_panics_nor_yields_nan() {
         let scene = testing::scene(3, 4, 8, NOISE);
-        let run = |mut start: Reconstruction, observations: &[Observation]| {
+        let run = |mut start: MetricReconstruction, observations: &[Observation]| {
             let options = Options::default();
             for model in [IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
                 let prior = IntrinsicsPrior::NONE;
@@ -295,7 +295,7 @@ mod tests {
             }
             start
         };
-        run(Reconstruction::new(scene.intrinsics, vec![], vec![]), &scene.observations);
+        run(MetricReconstruction::new(scene.intrinsics, vec![], vec![]), &scene.observations);
         run(scene.reconstruction(), &[]);
         let mut odd = scene.reconstruction();
         // Depth zero, far away, and a camera that sees a single point.

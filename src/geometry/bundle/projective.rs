@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3x4, SVector, Vector4};
 
-use super::engine::{Jacobian, Problem, ResidualVisitor, Step, image, minimise, move_each, unit_norm};
+use super::engine::{BundleProblem, Jacobian, ResidualVisitor, Step, image, minimise, move_each, unit_norm};
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
 
@@ -16,7 +16,7 @@ pub(super) struct Projective {
     pub points: Vec<Vector4<f64>>,
 }
 
-impl Problem<0, CAMERA, POINT> for Projective {
+impl BundleProblem<0, CAMERA, POINT> for Projective {
     fn counts(&self) -> (usize, usize) {
         (self.cameras.len(), self.points.len())
     }

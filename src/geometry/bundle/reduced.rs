@@ -8,7 +8,7 @@
 use nalgebra::{Cholesky, Matrix2, SMatrix, SVector, Vector2};
 
 use super::cholesky::CholeskySolver;
-use super::engine::{Jacobian, Layout, Problem, ResidualVisitor, Step, usable_squared_norm};
+use super::engine::{BundleProblem, Jacobian, Layout, ResidualVisitor, Step, usable_squared_norm};
 use super::panel::Panel;
 use super::{Loss, Observation};
 use crate::simd::vectorised;
@@ -78,7 +78,7 @@ impl<const G: usize, const C: usize, const P: usize> Linearisation<G, C, P> {
     }
 
     /// Linearises at the state of `problem`.
-    pub fn fill(&mut self, problem: &impl Problem<G, C, P>, layout: &Layout, loss: Loss) {
+    pub fn fill(&mut self, problem: &impl BundleProblem<G, C, P>, layout: &Layout, loss: Loss) {
         self.globals_diagonal = SVector::zeros();
         self.camera_diagonals.fill(SVector::zeros());
         self.point_blocks.fill(SMatrix::zeros());
@@ -133,7 +133,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     /// when the system is not positive definite.
     pub fn solve(
         &mut self,
-        problem: &impl Problem<G, C, P>,
+        problem: &impl BundleProblem<G, C, P>,
         layout: &Layout,
         linearisation: &Linearisation<G, C, P>,
         damping: f64,
@@ -156,7 +156,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     /// Eliminates the points; `false` when a point's block cannot be factored.
     pub fn build(
         &mut self,
-        problem: &impl Problem<G, C, P>,
+        problem: &impl BundleProblem<G, C, P>,
         layout: &Layout,
         linearisation: &Linearisation<G, C, P>,
         damping: f64,
@@ -170,7 +170,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     #[inline(always)]
     fn eliminate(
         &mut self,
-        problem: &impl Problem<G, C, P>,
+        problem: &impl BundleProblem<G, C, P>,
         layout: &Layout,
         linearisation: &Linearisation<G, C, P>,
         damping: f64,
@@ -318,7 +318,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     }
 
     /// Marquardt's damping, and what holds the gauge.
-    fn damp(&mut self, problem: &impl Problem<G, C, P>, linearisation: &Linearisation<G, C, P>, damping: f64) {
+    fn damp(&mut self, problem: &impl BundleProblem<G, C, P>, linearisation: &Linearisation<G, C, P>, damping: f64) {
         let diagonal = |index: usize| {
             if index < G {
                 linearisation.globals_diagonal[index]

@@ -5,8 +5,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::Observation;
-use super::engine::{Jacobian, Problem, ResidualVisitor, Step};
-use super::metric::{Intrinsics, Pose, Reconstruction};
+use super::engine::{BundleProblem, Jacobian, ResidualVisitor, Step};
+use super::metric::{Intrinsics, MetricReconstruction, Pose};
 use crate::synthetic::{Scene, SceneOptions};
 
 /// Noise of the tests, one standard deviation as a share of the image: the paper's .3 %.
@@ -133,8 +133,8 @@ impl TestScene {
     }
 
     /// The truth, one calibration for all views.
-    pub fn reconstruction(&self) -> Reconstruction {
-        Reconstruction::new(self.intrinsics, self.poses.clone(), self.points.clone())
+    pub fn reconstruction(&self) -> MetricReconstruction {
+        MetricReconstruction::new(self.intrinsics, self.poses.clone(), self.points.clone())
     }
 
     /// The true cameras, `K [R|t]`.
@@ -179,7 +179,7 @@ pub(crate) fn perturb<'a>(values: impl Iterator<Item = &'a mut f64>, deviation: 
 }
 
 /// A reconstruction with points and poses moved by so much, focal lengths by ten times as much.
-pub(super) fn perturbed(truth: &Reconstruction, deviation: f64, seed: u64) -> Reconstruction {
+pub(super) fn perturbed(truth: &MetricReconstruction, deviation: f64, seed: u64) -> MetricReconstruction {
     let mut start = truth.clone();
     perturb(start.intrinsics.iter_mut().map(|intrinsics| &mut intrinsics.focal), 10.0 * deviation, seed);
     perturb(start.points.iter_mut().flat_map(|point| point.iter_mut()), deviation, seed + 1);
@@ -206,7 +206,7 @@ impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> fo
 }
 
 fn at<const G: usize, const C: usize, const P: usize>(
-    problem: &impl Problem<G, C, P>,
+    problem: &impl BundleProblem<G, C, P>,
     seen: &Observation,
 ) -> (Vector2<f64>, Jacobian<G, C, P>) {
     let mut last = Last { residual: Vector2::zeros(), jacobian: None };
@@ -219,7 +219,7 @@ fn at<const G: usize, const C: usize, const P: usize>(
 /// # Panics
 /// When an entry is off by more than the differences can explain.
 pub(super) fn check_jacobian<const G: usize, const C: usize, const P: usize>(
-    problem: &impl Problem<G, C, P>,
+    problem: &impl BundleProblem<G, C, P>,
     observations: &[Observation],
 ) {
     const WIDTH: f64 = 1e-6;

@@ -6,7 +6,7 @@ use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector, DVectorView};
 
 use super::intrinsics_model::Parameter;
-use super::metric::{POSE, Pose, Reconstruction, VIEW};
+use super::metric::{MetricReconstruction, POSE, Pose, VIEW};
 use super::own_focals::{Direction, OwnFocals};
 use super::sequence::{GAUGE_DAMPING, System};
 use super::whitened::WhitenedViews;
@@ -37,7 +37,7 @@ pub(super) struct WithoutViews {
 
 /// The diagonal of the equations of the intrinsics were all else known; of a focal length that views have of their own,
 /// that of one for all.
-fn known(system: &System, metric: &Reconstruction) -> Vec<f64> {
+fn known(system: &System, metric: &MetricReconstruction) -> Vec<f64> {
     let mut known = vec![0.0; PARAMETERS * metric.intrinsics.len()];
     for (view, mut unknowns) in system.of_views() {
         if let Some(own_focal) = unknowns.nth(POSE) {
@@ -55,7 +55,7 @@ pub(super) fn scale_of(information: f64) -> f64 {
 
 impl WithoutViews {
     /// Eliminates the views; `None` where that leaves what is no number.
-    pub fn new(system: &System, metric: &Reconstruction) -> Option<Self> {
+    pub fn new(system: &System, metric: &MetricReconstruction) -> Option<Self> {
         match (metric.has_own_focals(), metric.poses.len() <= BY_EIGENVECTORS) {
             (true, _) => Self::of_views::<VIEW>(system, metric),
             (false, true) => Self::of_views::<POSE>(system, metric),
@@ -64,7 +64,7 @@ impl WithoutViews {
     }
 
     /// By the eigenvectors of views of `C` unknowns each.
-    fn of_views<const C: usize>(system: &System, metric: &Reconstruction) -> Option<Self> {
+    fn of_views<const C: usize>(system: &System, metric: &MetricReconstruction) -> Option<Self> {
         let known = known(system, metric);
         let first = known.len();
         let dimension = first + C * metric.poses.len();
@@ -86,7 +86,7 @@ impl WithoutViews {
     /// By a sparse factorisation of the poses, in time linear in the views where each shares points with a bounded
     /// number of others. Directions of the poses on which rounding hides what the observations say count as known;
     /// `None` without intrinsics, or where the poses' equations are not positive definite.
-    fn by_factorisation(system: &System, metric: &Reconstruction) -> Option<Self> {
+    fn by_factorisation(system: &System, metric: &MetricReconstruction) -> Option<Self> {
         let known = known(system, metric);
         let places: Vec<(usize, usize)> =
             system.of_groups().map(|(group, parameter, unknown)| (unknown, place(group, parameter))).collect();

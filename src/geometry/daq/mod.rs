@@ -13,7 +13,7 @@ pub use self::frame::{CanonicalFrame, oriented, to_canonical_frame};
 pub use self::starts::{linear, scan, scan_focal};
 pub use self::view_focals::{view_focal, view_focal_starts};
 use super::bundle::metric::Intrinsics;
-use super::levenberg_marquardt::{self, MIN_DAMPING, Normal, Problem};
+use super::levenberg_marquardt::{self, LeastSquares, MIN_DAMPING, Normal};
 use crate::domain::StopToken;
 
 /// Unknowns of the refinement: log focal and the plane at infinity.
@@ -146,7 +146,7 @@ struct Refinement<'a> {
     normal: Normal<UNKNOWNS>,
 }
 
-impl Problem for Refinement<'_> {
+impl LeastSquares for Refinement<'_> {
     type State = Daq;
 
     fn cost(&self, daq: &Daq) -> f64 {

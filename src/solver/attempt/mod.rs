@@ -16,10 +16,10 @@ use super::learned::TrackScores;
 use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
 use super::recorder::Recorder;
-use super::sequence::Projective;
+use super::sequence::ProjectiveReconstruction;
 use super::{Error, all_tracks, near_duplicates, second_structures, track_sampling};
 use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
-use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
+use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
 
 const OPTIONS: AttemptOptions = AttemptOptions::DEFAULT;
@@ -46,7 +46,7 @@ pub struct Attempt {
     /// What the search found, its consensus refined and over the tracks of the block; none when nothing stands.
     pub found: Found,
     /// The consensus as a reconstruction of its inliers, or what that was extended to; `None` when nothing stands.
-    pub projective: Option<Projective>,
+    pub projective: Option<ProjectiveReconstruction>,
     /// Every track and observation judged by it, where that was done already.
     pub judged: Option<Judged>,
     pub calibration: Option<Outcome>,
@@ -87,7 +87,7 @@ impl Attempt {
     /// [`LEAST_INLIERS`] tracks, whose residuals do not tell noise from wrong observations, and for mixed residuals.
     pub fn is_beyond_image_points(&self) -> bool {
         let by_depths = matches!(self.found.verified_by, VerifiedBy::Depths { .. });
-        let is_noisy = |found: &Projective| {
+        let is_noisy = |found: &ProjectiveReconstruction| {
             found.noise > DepthOptions::DEFAULT.strong_noise && found.tracks.len() >= LEAST_INLIERS
         };
         by_depths && self.projective.as_ref().is_some_and(is_noisy) && !self.has_mixed_residuals()
@@ -140,7 +140,7 @@ impl Attempt {
 
     /// Whether the calibration has found a lens that distorts.
     pub fn has_lens(&self) -> bool {
-        let distorts = |metric: &Reconstruction| metric.intrinsics.iter().any(Intrinsics::distorts);
+        let distorts = |metric: &MetricReconstruction| metric.intrinsics.iter().any(Intrinsics::distorts);
         self.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref()).is_some_and(distorts)
     }
 
@@ -207,9 +207,10 @@ pub fn search_block(
         Method::Psfm => decided(problem, block, recorder)?,
     };
     problem.stopped()?;
-    let projective = attempt.found.consensus.as_ref().map(|consensus| Projective::of_block(&attempt.block, consensus));
+    let projective =
+        attempt.found.consensus.as_ref().map(|consensus| ProjectiveReconstruction::of_block(&attempt.block, consensus));
     attempt.projective = match attempt.judges_observations() {
-        true => projective.map(Projective::oriented),
+        true => projective.map(ProjectiveReconstruction::oriented),
         false => projective,
     };
     Ok(attempt)
@@ -361,7 +362,7 @@ fn decided(problem: &Problem, block: Block, recorder: &mut Recorder) -> Result<A
 /// Calibrates from a reconstruction, or as much of it as a calibration takes; the worst of its cameras.
 fn calibrate_projective(
     problem: &Problem,
-    projective: &Projective,
+    projective: &ProjectiveReconstruction,
     prior: Option<FocalPrior>,
 ) -> Result<Outcome, Error> {
     let most = OPTIONS.most_calibrated.min(OPTIONS.calibrated_observations / projective.views.len().max(1));

@@ -6,7 +6,7 @@ use super::fit::Fit;
 use super::models::{Candidate, Choice};
 use super::options::FitOptions;
 use super::{Uncalibrated, observed_points};
-use crate::geometry::bundle::metric::{self, IntrinsicsPrior, Reconstruction};
+use crate::geometry::bundle::metric::{self, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::observation::Observation;
 
@@ -90,7 +90,7 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
 }
 
 /// The observations where pinholes would have made them; without those that the lens images nowhere.
-fn undistorted(metric: &Reconstruction, observations: &[Observation]) -> Vec<Observation> {
+fn undistorted(metric: &MetricReconstruction, observations: &[Observation]) -> Vec<Observation> {
     let of_pinhole = |seen: &Observation| {
         let xy = metric.intrinsics_of(seen.view).undistort(&seen.xy)?;
         Some(Observation { xy, ..*seen })

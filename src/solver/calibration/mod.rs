@@ -18,7 +18,7 @@ mod view_focals;
 use nalgebra::{Matrix3x4, Vector4};
 
 use crate::domain::{FocalPrior, Grade, StopToken, Warning, WarningCode};
-use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter, Reconstruction};
+use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::daq::to_canonical_frame;
 use crate::geometry::observation::Observation;
@@ -91,7 +91,7 @@ pub struct Outcome {
     pub group: usize,
     /// Of all groups. `None` when no metric reconstruction was found or looked for. With grade PROJECTIVE_ONLY it may
     /// stand but is not to be used as metric.
-    pub metric: Option<Reconstruction>,
+    pub metric: Option<MetricReconstruction>,
     /// With a focal length a view: these; the intrinsics of `metric` have the geometric mean of those that are
     /// determined.
     pub focals: Option<Vec<ViewFocal>>,
@@ -192,7 +192,7 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
 #[derive(Clone, Copy)]
 pub struct Stretch<'a> {
     pub problem: Uncalibrated<'a>,
-    pub metric: &'a Reconstruction,
+    pub metric: &'a MetricReconstruction,
 }
 
 /// Calibrates a reconstruction that is metric already, as a sequence is that grew from a calibrated block: its focal
@@ -206,7 +206,7 @@ pub struct Stretch<'a> {
 /// As [`calibrate`].
 pub fn from_metric(
     problem: &Uncalibrated,
-    metric: &Reconstruction,
+    metric: &MetricReconstruction,
     stretch: Option<Stretch>,
     scale_px: f64,
     stop: &StopToken,
@@ -243,7 +243,7 @@ pub fn from_metric(
 /// where each has its own, the rest of the lens held, and its standard deviation; `None` where that is not finite.
 pub fn focal_alone(
     problem: &Uncalibrated,
-    metric: &Reconstruction,
+    metric: &MetricReconstruction,
     prior: &IntrinsicsPrior,
     stop: &StopToken,
 ) -> Option<(f64, f64)> {

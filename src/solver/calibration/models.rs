@@ -7,7 +7,8 @@ use super::{Error, Uncalibrated};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
-    self, Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter, Reconstruction,
+    self, Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Optimum,
+    Parameter,
 };
 
 /// A metric reconstruction under one model, with what the observations say of the intrinsics there.
@@ -111,9 +112,9 @@ impl Choice<'_> {
     /// What a model that was chosen by more views makes of these alone.
     ///
     /// * `metric`: near its minimum
-    pub fn on_stretch(&self, chosen: &Candidate, metric: &Reconstruction) -> Candidate {
+    pub fn on_stretch(&self, chosen: &Candidate, metric: &MetricReconstruction) -> Candidate {
         let intrinsics = chosen.minimum.reconstruction.intrinsics.clone();
-        let reconstruction = Reconstruction { intrinsics, ..metric.clone() };
+        let reconstruction = MetricReconstruction { intrinsics, ..metric.clone() };
         let minimum = Minimum::near(reconstruction, self.problem, chosen.model, &chosen.priors, self.stop);
         Candidate::new(minimum, chosen.model, chosen.priors.clone(), self.problem)
     }

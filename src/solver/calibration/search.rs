@@ -9,7 +9,7 @@ use crate::domain::StopToken;
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::critical::Translating;
 use crate::geometry::bundle::metric::{
-    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Reconstruction,
+    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction,
 };
 use crate::geometry::daq::{self, CanonicalFrame, Daq, Free};
 use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
@@ -20,7 +20,7 @@ use crate::geometry::triangulation;
 /// A converged metric reconstruction.
 #[derive(Debug, Clone)]
 pub(super) struct Minimum {
-    pub reconstruction: Reconstruction,
+    pub reconstruction: MetricReconstruction,
     pub cost: f64,
     pub cheirality: f64,
 }
@@ -79,7 +79,7 @@ impl Minimum {
 
     /// Adjusts a reconstruction to convergence.
     pub fn near(
-        start: Reconstruction,
+        start: MetricReconstruction,
         problem: &Uncalibrated,
         model: IntrinsicsModel,
         priors: &[IntrinsicsPrior],
@@ -90,7 +90,7 @@ impl Minimum {
 
     fn by(
         options: &Options,
-        start: Reconstruction,
+        start: MetricReconstruction,
         problem: &Uncalibrated,
         model: IntrinsicsModel,
         priors: &[IntrinsicsPrior],
@@ -109,7 +109,7 @@ impl Minimum {
 /// * `factors`: on its focal length, to begin from; 1 for its own
 /// * `heartbeat`: called after each
 pub(super) fn minima_near(
-    metric: &Reconstruction,
+    metric: &MetricReconstruction,
     problem: &Uncalibrated,
     factors: &[f64],
     priors: &[IntrinsicsPrior],
@@ -175,7 +175,7 @@ fn minima_per_view(frame: &CanonicalFrame, problem: &Uncalibrated, stop: &StopTo
     let (model, priors) = (IntrinsicsModel::FOCAL_PER_VIEW, [IntrinsicsPrior::NONE]);
     let options = &problem.options.search;
     let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(options.starts);
-    let mut starts: Vec<Reconstruction> =
+    let mut starts: Vec<MetricReconstruction> =
         quadrics.filter_map(|(daq, _)| upgrade(frame, &daq, true, problem.observations)).collect();
     let of_one = minima_of_one(frame, problem, &priors, stop)?;
     starts.extend(of_one.into_iter().map(|minimum| minimum.reconstruction.with_own_focals()));

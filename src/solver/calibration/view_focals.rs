@@ -7,7 +7,7 @@ use super::options::{GradeOptions, LensOptions};
 use super::verdict::Verdict;
 use super::{Uncalibrated, ViewFocal};
 use crate::domain::{Grade, WarningCode};
-use crate::geometry::bundle::metric::{self, Extension, IntrinsicsModel, Reconstruction};
+use crate::geometry::bundle::metric::{self, Extension, IntrinsicsModel, MetricReconstruction};
 use crate::geometry::statistics::{median, root_mean_square};
 
 /// The focal length of each view, undetermined where it is.
@@ -77,7 +77,7 @@ pub(super) struct Differing {
 /// by more than chance; if so, what they are.
 ///
 /// * `own`: the fit of `metric`
-pub(super) fn differing(metric: &Reconstruction, own: &Fit, choice: &Choice) -> Option<Differing> {
+pub(super) fn differing(metric: &MetricReconstruction, own: &Fit, choice: &Choice) -> Option<Differing> {
     let problem: &Uncalibrated = choice.problem;
     let options = problem.options;
     let priors = vec![options.lenses.prior(own.noise, None, choice.scale_px); problem.groups()];

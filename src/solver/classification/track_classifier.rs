@@ -11,7 +11,7 @@ use crate::solver::problem::{Problem, VERIFIED};
 
 /// The verdict on one track.
 #[derive(Debug, Clone)]
-struct Verdict {
+struct TrackVerdict {
     weight: f64,
     inlier: bool,
     point: Point,
@@ -25,13 +25,13 @@ pub struct Finding {
     observations: Vec<Observation>,
     /// Of the observations, among the caller's observations.
     places: Vec<usize>,
-    verdict: Verdict,
+    verdict: TrackVerdict,
     others: Vec<Other>,
 }
 
 /// A further point that a track joins, with the observations that show it.
 struct Other {
-    verdict: Verdict,
+    verdict: TrackVerdict,
     observations: Vec<usize>,
 }
 
@@ -75,7 +75,7 @@ impl TrackClassifier<'_> {
 
     /// Drops the worst observation of each track as long as it is more likely wrong than right, then weighs what
     /// remains. No more tracks than a [`Batch`] takes.
-    fn judge(&self, tracks: &[&[Observation]]) -> Vec<Verdict> {
+    fn judge(&self, tracks: &[&[Observation]]) -> Vec<TrackVerdict> {
         let gate = self.noise.gate();
         let mut retained: Vec<Option<Vec<usize>>> =
             tracks.iter().map(|observations| self.retained_at_first(observations, gate)).collect();
@@ -117,7 +117,7 @@ impl TrackClassifier<'_> {
         let verdict = |(lane, (observations, retained)): (usize, (&&[Observation], Option<Vec<usize>>))| match retained
         {
             Some(retained) => self.weigh(observations, &retained, found.point(lane), found.cost(lane)),
-            None => Verdict::wrong(found.point(lane), observations.len()),
+            None => TrackVerdict::wrong(found.point(lane), observations.len()),
         };
         tracks.iter().zip(retained).enumerate().map(verdict).collect()
     }
@@ -128,7 +128,7 @@ impl TrackClassifier<'_> {
     }
 
     /// The verdict on a track by the observations that it retains.
-    fn weigh(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> Verdict {
+    fn weigh(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> TrackVerdict {
         let gate = self.noise.gate();
         let dropped = observations.len() - retained.len();
         // The density of two coordinates of weight w is w times as high where the residual is 0.
@@ -141,7 +141,7 @@ impl TrackClassifier<'_> {
             flags[k] = self.squared(&point, &observations[k]) <= gate;
         }
         let whole = flags.iter().filter(|&&flag| flag).count() >= VERIFIED;
-        Verdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
+        TrackVerdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
     }
 
     /// The observations that a verdict begins with: all, or those that agree where links may be wrong; `None` where
@@ -180,14 +180,14 @@ impl TrackClassifier<'_> {
         }
         for (number, other) in (1..).zip(others) {
             other.observations.iter().for_each(|&k| judged.observations.split[places[k]] = number);
-            let Verdict { weight, point, .. } = other.verdict;
+            let TrackVerdict { weight, point, .. } = other.verdict;
             let retained = chosen(observations, &other.observations);
             judged.splits.push(SplitPoint { track, number, weight, point, retained });
         }
     }
 
     /// Looks for the other points that a right track joins, among the observations that its own leaves.
-    fn others(&self, observations: &[Observation], verdict: &Verdict) -> Vec<Other> {
+    fn others(&self, observations: &[Observation], verdict: &TrackVerdict) -> Vec<Other> {
         let mut left: Vec<usize> = (0..observations.len()).filter(|&k| !verdict.retained[k]).collect();
         let mut others = Vec::new();
         while left.len() >= VERIFIED && !self.problem.stop.is_stopped() {
@@ -203,7 +203,7 @@ impl TrackClassifier<'_> {
     }
 }
 
-impl Verdict {
+impl TrackVerdict {
     /// On a track of which no two observations agree on a point in front of their cameras.
     fn wrong(point: Point, observations: usize) -> Self {
         Self { weight: 0.0, inlier: false, point, retained: vec![false; observations] }
@@ -264,7 +264,7 @@ mod tests {
         TrackClassifier { problem, cameras, triangulator: Triangulator::new(cameras), geometry, least_share, noise }
     }
 
-    fn judged(bench: &TrackClassifier, observations: &[Observation]) -> Verdict {
+    fn judged(bench: &TrackClassifier, observations: &[Observation]) -> TrackVerdict {
         bench.judge(&[observations]).pop().expect("a verdict")
     }
 

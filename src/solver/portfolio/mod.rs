@@ -57,8 +57,8 @@ pub struct Found {
 }
 
 enum Search {
-    Affine(affine::Search),
-    Subspace(subspace::Search),
+    Affine(affine::AffineSearch),
+    Subspace(subspace::SubspaceSearch),
 }
 
 /// Searches one block.
@@ -90,9 +90,9 @@ impl<'a> Portfolio<'a> {
     /// * `noise`: noise that growing starts from, normalised units; rather too high than too low
     pub fn new(block: &'a CompleteBlock, settings: &'a SolveSettings, noise: f64, stop: &'a StopToken) -> Self {
         let search = if block.has_depths() {
-            Search::Subspace(subspace::Search::new(block, noise, settings.use_daq))
+            Search::Subspace(subspace::SubspaceSearch::new(block, noise, settings.use_daq))
         } else {
-            Search::Affine(affine::Search::new(block))
+            Search::Affine(affine::AffineSearch::new(block))
         };
         Self {
             block,

@@ -28,7 +28,7 @@ impl Portfolio<'_> {
         if !is_new || self.settings.focal_per_view || !self.is_wanted(Proposal::Rigidity) {
             return;
         }
-        let Some(search) = rigid::Search::new(self.block, self.spread, self.stop) else { return };
+        let Some(search) = rigid::RigidSearch::new(self.block, self.spread, self.stop) else { return };
         let begun = Instant::now();
         let found = search.run(self.noise);
         let pairs = self.block.tracks() * (self.block.tracks() - 1) / 2;
@@ -118,7 +118,7 @@ impl Portfolio<'_> {
 
     /// Samples tracks by their weights and grows what that finds.
     ///
-    /// * `truncations`: see [`affine::Search::run`]; of a search with depths nothing depends on them
+    /// * `truncations`: see [`affine::AffineSearch::run`]; of a search with depths nothing depends on them
     pub(super) fn propose(&mut self, proposal: Proposal, weights: &[f64], truncations: Option<&[f64]>) {
         if !self.is_wanted(proposal) {
             return;

@@ -23,12 +23,12 @@ pub struct Hypothesis {
 
 /// The centred coordinates of a block, ready to be searched.
 #[derive(Debug, Clone)]
-pub struct Search {
+pub struct AffineSearch {
     /// 2n x m; columns are contiguous.
     centred: DMatrix<f64>,
 }
 
-impl Search {
+impl AffineSearch {
     pub fn new(block: &CompleteBlock) -> Self {
         Self { centred: block.centred_by_view() }
     }

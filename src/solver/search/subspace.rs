@@ -18,13 +18,13 @@ const LEAST_COLUMNS: usize = RANK + 1;
 
 /// The balanced measurement matrix of a block with depths, ready to be searched.
 #[derive(Debug, Clone)]
-pub struct Search {
+pub struct SubspaceSearch {
     balanced: DMatrix<f64>,
     tolerance: f64,
     use_daq: bool,
 }
 
-impl Search {
+impl SubspaceSearch {
     /// * `noise`: standard deviation of the image points in normalised units; depths are taken to be as good
     pub fn new(block: &CompleteBlock, noise: f64, use_daq: bool) -> Self {
         let mut search = Self { balanced: balance(&block.measurement_matrix()), tolerance: 0.0, use_daq };

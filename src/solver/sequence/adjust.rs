@@ -4,7 +4,7 @@ use super::components::FIRST;
 use super::growth;
 use super::model::{Lens, Model};
 use super::options::{AdjustmentOptions, GrowthOptions};
-use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, Reconstruction};
+use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::sequence::{self, Free, Run};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::median;
@@ -21,7 +21,7 @@ pub struct Extract {
     /// Views and tracks of the input, in the order of the sequence's poses and points.
     pub views: Vec<usize>,
     pub tracks: Vec<usize>,
-    pub sequence: Reconstruction,
+    pub sequence: MetricReconstruction,
     pub observations: Vec<Observation>,
 }
 
@@ -32,7 +32,7 @@ impl Extract {
         let mut extract = Self {
             views: Vec::with_capacity(views.len()),
             tracks: Vec::with_capacity(tracks.len()),
-            sequence: Reconstruction {
+            sequence: MetricReconstruction {
                 intrinsics: model.lenses.iter().map(|lens| lens.intrinsics).collect(),
                 focals: Vec::new(),
                 group_of: Vec::with_capacity(views.len()),
@@ -82,7 +82,7 @@ impl Extract {
     }
 
     /// The reconstruction with the groups of its views alone, and the cameras of the problem that these are.
-    pub fn block(&self) -> (Reconstruction, Vec<usize>) {
+    pub fn block(&self) -> (MetricReconstruction, Vec<usize>) {
         let mut reconstruction = self.sequence.clone();
         let mut cameras = reconstruction.group_of.clone();
         cameras.sort_unstable();

@@ -5,7 +5,7 @@ use super::model::Model;
 use super::options::StretchOptions;
 use super::{own_focals, windows};
 use crate::domain::{FocalPrior, Task, Warning, WarningCode};
-use crate::geometry::bundle::metric::{Intrinsics, Reconstruction};
+use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point};
 use crate::solver::calibration::{self, GradeOptions, Outcome, Uncalibrated};
@@ -99,10 +99,10 @@ pub fn of_extract(
 ) -> Result<Vec<(usize, Outcome)>, Error> {
     let (metric, of_group) = extract.block();
     let focal_priors: Vec<Option<FocalPrior>> = of_group.iter().map(|&camera| problem.focal_priors[camera]).collect();
-    let all = Projective::of(&metric);
+    let all = ProjectiveExtract::of(&metric);
     let stretch = stretch.map(|extract| {
         let (metric, _) = extract.block();
-        (Projective::of(&metric), metric, &extract.observations)
+        (ProjectiveExtract::of(&metric), metric, &extract.observations)
     });
     let stretch = stretch.as_ref().map(|(projective, metric, observations)| calibration::Stretch {
         problem: projective.uncalibrated(problem, metric, observations, &focal_priors, noise),
@@ -161,13 +161,13 @@ fn densest(problem: &Problem, model: &Model, views: &[usize]) -> Vec<usize> {
 }
 
 /// The cameras and points of a metric reconstruction without what makes it metric.
-pub struct Projective {
+pub struct ProjectiveExtract {
     cameras: Vec<Camera>,
     points: Vec<Point>,
 }
 
-impl Projective {
-    pub fn of(metric: &Reconstruction) -> Self {
+impl ProjectiveExtract {
+    pub fn of(metric: &MetricReconstruction) -> Self {
         Self { cameras: metric.cameras(), points: metric.points.iter().map(|point| point.push(1.0)).collect() }
     }
 
@@ -178,7 +178,7 @@ impl Projective {
     pub fn uncalibrated<'a>(
         &'a self,
         problem: &'a Problem,
-        metric: &'a Reconstruction,
+        metric: &'a MetricReconstruction,
         observations: &'a [Observation],
         focal_priors: &'a [Option<FocalPrior>],
         noise: f64,

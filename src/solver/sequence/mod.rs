@@ -27,7 +27,7 @@ use std::ops::ControlFlow;
 
 pub use adjust::verified;
 pub use extended::Extended;
-pub use projective::Projective;
+pub use projective::ProjectiveReconstruction;
 
 use super::attempt::{self, Attempt, Effort};
 use super::grow::LEAST_INLIERS;

@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::options::{AdjustmentOptions, GrowthOptions};
 use crate::geometry::Camera;
-use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, Pose, Reconstruction};
+use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, MetricReconstruction, Pose};
 use crate::geometry::observation::Observation;
 use crate::solver::calibration::ViewFocal;
 use crate::solver::problem::Problem;
@@ -134,7 +134,7 @@ impl Model {
         problem: &Problem,
         component: u32,
         views: &[usize],
-        metric: &Reconstruction,
+        metric: &MetricReconstruction,
         focals: Option<&[ViewFocal]>,
     ) {
         for (i, (&view, pose)) in views.iter().zip(&metric.poses).enumerate() {

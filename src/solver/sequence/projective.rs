@@ -15,7 +15,7 @@ const GAUGE_UNKNOWNS: usize = 15;
 
 /// Cameras and points up to a common projective transform, with the observations that agree with them.
 #[derive(Debug, Clone)]
-pub struct Projective {
+pub struct ProjectiveReconstruction {
     /// Registered views of the input, increasing.
     pub views: Vec<usize>,
     /// One a registered view.
@@ -31,7 +31,7 @@ pub struct Projective {
     pub tried: usize,
 }
 
-impl Projective {
+impl ProjectiveReconstruction {
     /// The inliers of a consensus, with all their observations.
     pub fn of_block(block: &Block, consensus: &Consensus) -> Self {
         let inliers = consensus.inliers();

@@ -11,10 +11,10 @@ use rand_chacha::ChaCha8Rng;
 use super::adjust;
 use super::growth::{self, Growth, Trial};
 use super::options::GrowthOptions;
-use super::projective::{CAMERA_UNKNOWNS, Projective};
+use super::projective::{CAMERA_UNKNOWNS, ProjectiveReconstruction};
 use crate::geometry::bundle;
 use crate::geometry::observation::Observation;
-use crate::geometry::robust_triangulation::{Robust, Triangulator};
+use crate::geometry::robust_triangulation::{RobustPoint, Triangulator};
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::Error;
 use crate::solver::grow::NoiseOptions;
@@ -43,10 +43,10 @@ struct Growing<'a> {
 /// [`Error::Stopped`].
 pub fn extend(
     problem: &Problem,
-    start: Projective,
+    start: ProjectiveReconstruction,
     options: &GrowthOptions,
     recorder: &mut Recorder,
-) -> Result<Projective, Error> {
+) -> Result<ProjectiveReconstruction, Error> {
     let mut growing = Growing::new(problem, start.oriented(), options);
     growing.triangulate(None, recorder);
     let mut trials = vec![Trial::default(); problem.views()];
@@ -67,7 +67,7 @@ pub fn extend(
 }
 
 impl<'a> Growing<'a> {
-    fn new(problem: &'a Problem<'a>, start: Projective, options: &'a GrowthOptions) -> Self {
+    fn new(problem: &'a Problem<'a>, start: ProjectiveReconstruction, options: &'a GrowthOptions) -> Self {
         let mut cameras = vec![None; problem.of_view.len()];
         start.views.iter().zip(&start.cameras).for_each(|(&view, camera)| cameras[view] = Some(*camera));
         Self {
@@ -115,7 +115,7 @@ impl<'a> Growing<'a> {
     }
 
     /// The point of a track, and the observations that it was looked for among.
-    fn point(&self, triangulator: &Triangulator, gate: f64, track: usize) -> Option<(Robust, Vec<usize>)> {
+    fn point(&self, triangulator: &Triangulator, gate: f64, track: usize) -> Option<(RobustPoint, Vec<usize>)> {
         let problem = self.problem;
         let seen: Vec<usize> =
             problem.of_track(track).filter(|&k| self.cameras[problem.view_of(k)].is_some()).collect();
@@ -126,7 +126,7 @@ impl<'a> Growing<'a> {
     }
 
     /// What is kept: the verified points of the longest tracks until every view has `of_view` observations.
-    fn standing(&self, of_view: usize) -> Projective {
+    fn standing(&self, of_view: usize) -> ProjectiveReconstruction {
         let problem = self.problem;
         let views = self.views();
         let mut place = vec![usize::MAX; self.cameras.len()];
@@ -139,7 +139,7 @@ impl<'a> Growing<'a> {
             kept.map(|k| Observation { view: place[problem.view_of(k)], point, ..problem.observation(k) })
                 .collect::<Vec<_>>()
         });
-        Projective {
+        ProjectiveReconstruction {
             cameras: views.iter().filter_map(|&view| self.cameras[view]).collect(),
             points: tracks.iter().filter_map(|&track| self.points[track]).collect(),
             observations: observations.collect(),
@@ -157,7 +157,7 @@ impl<'a> Growing<'a> {
             return;
         }
         let options = self.options.adjustment(iterations, self.noise);
-        let Projective { cameras, points, observations, .. } = &mut standing;
+        let ProjectiveReconstruction { cameras, points, observations, .. } = &mut standing;
         bundle::projective::adjust(cameras, points, observations, &options, self.problem.stop);
         recorder.heartbeat();
         if self.problem.stop.is_stopped() {
@@ -169,7 +169,7 @@ impl<'a> Growing<'a> {
     }
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
-    fn noise_of(&self, standing: &Projective) -> f64 {
+    fn noise_of(&self, standing: &ProjectiveReconstruction) -> f64 {
         let norms: Vec<f64> = standing.squared_residuals().into_iter().map(f64::sqrt).collect();
         let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();
         let noise = adjust::core_noise(norms, unknowns);
@@ -198,7 +198,7 @@ impl<'a> Growing<'a> {
         dropped
     }
 
-    fn finish(self) -> Projective {
+    fn finish(self) -> ProjectiveReconstruction {
         self.standing(usize::MAX)
     }
 }

@@ -1,7 +1,7 @@
 //! What windows of a sequence say of each other's focal length.
 
 use super::adjust;
-use super::calibrate::{self, Projective};
+use super::calibrate::{self, ProjectiveExtract};
 use super::model::Model;
 use super::options::WindowOptions;
 use crate::domain::Task;
@@ -73,7 +73,7 @@ fn estimates(
 fn moved_alone(problem: &Problem, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
     let extract = calibrate::core(problem, model, views, OPTIONS.of_view);
     let (metric, _) = extract.block();
-    let projective = Projective::of(&metric);
+    let projective = ProjectiveExtract::of(&metric);
     let to_calibrate = projective.uncalibrated(problem, &metric, &extract.observations, &[None], model.noise);
     let prior = adjust::intrinsics_prior(problem, camera, model.noise);
     let (log_focal, sigma) = calibration::focal_alone(&to_calibrate, &metric, &prior, problem.stop)?;

@@ -8,7 +8,7 @@
 use nalgebra::Vector3;
 
 use super::super::Loss;
-use super::Reconstruction;
+use super::MetricReconstruction;
 use super::layout::{Layout, Seen};
 use super::minimise::cost_of_point;
 use super::normal::Weighted;
@@ -23,7 +23,7 @@ const WORTHWHILE: f64 = 1e-2;
 /// Moves every free point towards its minimum with the cameras as they are; by how much that lowers the cost. `None`
 /// when it was stopped.
 pub(super) fn iterate_points(
-    sequence: &mut Reconstruction,
+    sequence: &mut MetricReconstruction,
     layout: &Layout,
     loss: Loss,
     pool: &WorkerPool,
@@ -42,7 +42,12 @@ pub(super) fn iterate_points(
 }
 
 /// A point nearer its minimum, and by how much it costs less there.
-fn iterate(sequence: &Reconstruction, seen: &[Seen], mut position: Vector3<f64>, loss: Loss) -> (Vector3<f64>, f64) {
+fn iterate(
+    sequence: &MetricReconstruction,
+    seen: &[Seen],
+    mut position: Vector3<f64>,
+    loss: Loss,
+) -> (Vector3<f64>, f64) {
     let initial_cost = cost_of_point(sequence, seen, &position, loss);
     let mut cost = initial_cost;
     for _ in 0..STEPS {

@@ -7,7 +7,7 @@ use nalgebra::Vector2;
 use super::super::intrinsics_model::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
 use super::grouped::Grouped;
-use super::{CancellationCheck, Free, Observation, Reconstruction, holds};
+use super::{CancellationCheck, Free, MetricReconstruction, Observation, holds};
 
 /// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free
 /// intrinsics.
@@ -24,7 +24,7 @@ pub(super) struct Unknowns {
 }
 
 impl Unknowns {
-    fn new(sequence: &Reconstruction, free: &Free, sees: &[bool]) -> Self {
+    fn new(sequence: &MetricReconstruction, free: &Free, sees: &[bool]) -> Self {
         let mut offsets = vec![0];
         let mut append = |size: usize| {
             let block = offsets.len() - 1;
@@ -50,7 +50,7 @@ impl Unknowns {
     }
 
     /// Block of the intrinsics of a view.
-    pub fn group_block_of_view(&self, sequence: &Reconstruction, view: usize) -> Option<usize> {
+    pub fn group_block_of_view(&self, sequence: &MetricReconstruction, view: usize) -> Option<usize> {
         *self.group_block.get(*sequence.group_of.get(view)?)?
     }
 
@@ -118,7 +118,7 @@ impl Layout {
     ///
     /// Returns `None` when it was stopped.
     pub fn new(
-        sequence: &Reconstruction,
+        sequence: &MetricReconstruction,
         observations: &[Observation],
         free: &Free,
         cancellation: &mut CancellationCheck,
@@ -150,7 +150,7 @@ impl Layout {
 
     /// Finds the blocks that each free point is linked with and gives them their places among the couplings; `false`
     /// when it was stopped.
-    fn link_blocks(&mut self, sequence: &Reconstruction, cancellation: &mut CancellationCheck) -> bool {
+    fn link_blocks(&mut self, sequence: &MetricReconstruction, cancellation: &mut CancellationCheck) -> bool {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
         let mut couplings = 0;

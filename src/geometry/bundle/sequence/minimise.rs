@@ -12,8 +12,8 @@ use super::pattern::Pattern;
 use super::reduced::{Reduced, substitute};
 use super::solver::Solver;
 use super::worker_pool::WorkerPool;
-use super::{CancellationCheck, Free, Observation, Reconstruction, Run};
-use crate::geometry::levenberg_marquardt::{self, Attempt, Problem};
+use super::{CancellationCheck, Free, MetricReconstruction, Observation, Run};
+use crate::geometry::levenberg_marquardt::{self, LeastSquares, StepCost};
 
 /// Least damping, as a share of the diagonal. Lower than for a block: the weakest directions of a long chain of views
 /// would hardly move at a block's. Where rounding takes the system's definiteness, the attempt fails and is repeated
@@ -39,7 +39,7 @@ const ITERATE_WITHIN: f64 = 2.0;
 /// # Pitfall
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
 pub fn adjust(
-    sequence: &mut Reconstruction,
+    sequence: &mut MetricReconstruction,
     observations: &[Observation],
     free: &Free,
     priors: &[IntrinsicsPrior],
@@ -66,7 +66,7 @@ pub fn adjust(
 
 /// Sum of the loss over the observations and of what the priors add; `None` when it was stopped.
 fn cost(
-    sequence: &Reconstruction,
+    sequence: &MetricReconstruction,
     layout: &Layout,
     priors: &[IntrinsicsPrior],
     loss: Loss,
@@ -79,7 +79,12 @@ fn cost(
 }
 
 /// Sum of the loss over the observations of one point, were it at this position.
-pub(super) fn cost_of_point(sequence: &Reconstruction, seen: &[Seen], position: &Vector3<f64>, loss: Loss) -> f64 {
+pub(super) fn cost_of_point(
+    sequence: &MetricReconstruction,
+    seen: &[Seen],
+    position: &Vector3<f64>,
+    loss: Loss,
+) -> f64 {
     let mut sum = 0.0;
     for seen in seen {
         let at = sequence.poses[seen.view].apply(position);
@@ -103,7 +108,7 @@ struct Descent<'a> {
 
 impl<'a> Descent<'a> {
     fn new(
-        sequence: &Reconstruction,
+        sequence: &MetricReconstruction,
         layout: &'a Layout,
         priors: &'a [IntrinsicsPrior],
         options: &Options,
@@ -125,19 +130,19 @@ impl<'a> Descent<'a> {
     }
 }
 
-impl Problem for Descent<'_> {
-    type State = Reconstruction;
+impl LeastSquares for Descent<'_> {
+    type State = MetricReconstruction;
 
-    fn cost(&self, sequence: &Reconstruction) -> f64 {
+    fn cost(&self, sequence: &MetricReconstruction) -> f64 {
         cost(sequence, self.layout, self.priors, self.loss, self.pool).unwrap_or(f64::INFINITY)
     }
 
     /// What is left unfinished when it is stopped is not used: no attempt follows.
-    fn linearise(&mut self, sequence: &Reconstruction) {
+    fn linearise(&mut self, sequence: &MetricReconstruction) {
         self.normal.fill(sequence, self.layout, self.priors, self.loss, self.pool);
     }
 
-    fn step(&mut self, from: &Reconstruction, damping: f64, to: &mut Reconstruction) -> Option<f64> {
+    fn step(&mut self, from: &MetricReconstruction, damping: f64, to: &mut MetricReconstruction) -> Option<f64> {
         let Self { layout, normal, reduced, pool, .. } = self;
         if !reduced.build(layout, normal, damping, pool) {
             return None;
@@ -154,25 +159,30 @@ impl Problem for Descent<'_> {
 
     fn attempt(
         &mut self,
-        from: &Reconstruction,
+        from: &MetricReconstruction,
         damping: f64,
         present: f64,
-        to: &mut Reconstruction,
-    ) -> Option<Attempt> {
-        let moved = self.step(from, damping, to).map(|predicted| Attempt { cost: self.cost(to), predicted });
+        to: &mut MetricReconstruction,
+    ) -> Option<StepCost> {
+        let moved = self.step(from, damping, to).map(|predicted| StepCost { cost: self.cost(to), predicted });
         (self.heartbeat)();
-        let Attempt { cost, predicted } = moved?;
+        let StepCost { cost, predicted } = moved?;
         if cost < present || cost > ITERATE_WITHIN * present {
-            return Some(Attempt { cost, predicted });
+            return Some(StepCost { cost, predicted });
         }
         // Cheaper than another system: most of what a long step spoils is the points' part of its curvature.
         let lowered = iterate_points(to, self.layout, self.loss, self.pool)?;
-        Some(Attempt { cost: cost - lowered, predicted })
+        Some(StepCost { cost: cost - lowered, predicted })
     }
 }
 
 /// Moves poses and intrinsics from where they are in `from`; `false` where a scale vanishes or nothing finite is left.
-pub(super) fn retract(moved: &mut Reconstruction, from: &Reconstruction, layout: &Layout, step: &[f64]) -> bool {
+pub(super) fn retract(
+    moved: &mut MetricReconstruction,
+    from: &MetricReconstruction,
+    layout: &Layout,
+    step: &[f64],
+) -> bool {
     let mut possible = true;
     let unknowns = &layout.unknowns;
     for (group, block) in unknowns.group_block.iter().enumerate() {

@@ -24,7 +24,7 @@ pub use self::minimise::adjust;
 pub(super) use self::reduced::GAUGE_DAMPING;
 pub use self::system::System;
 use super::Observation;
-use super::metric::{IntrinsicsModel, Reconstruction};
+use super::metric::{IntrinsicsModel, MetricReconstruction};
 use crate::domain::StopToken;
 use crate::parallel::Threads;
 
@@ -47,7 +47,7 @@ impl<'a> Free<'a> {
 }
 
 /// Whether an observation can be used.
-fn holds(reconstruction: &Reconstruction, seen: &Observation) -> bool {
+fn holds(reconstruction: &MetricReconstruction, seen: &Observation) -> bool {
     let has_intrinsics = |group: &usize| *group < reconstruction.intrinsics.len();
     seen.is_usable(reconstruction.poses.len(), reconstruction.points.len())
         && reconstruction.group_of.get(seen.view).is_some_and(has_intrinsics)

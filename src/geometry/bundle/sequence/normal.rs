@@ -13,7 +13,7 @@ use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
 use super::point::PointBlock;
 use super::worker_pool::{WorkerPool, split_off};
-use super::{CancellationCheck, Reconstruction};
+use super::{CancellationCheck, MetricReconstruction};
 use crate::parallel::even_cuts;
 use crate::simd::vectorised;
 
@@ -41,7 +41,7 @@ pub(super) struct Weighted {
 impl Weighted {
     /// `None` where the observation is undefined.
     #[inline(always)]
-    pub fn new(sequence: &Reconstruction, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
+    pub fn new(sequence: &MetricReconstruction, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
         let intrinsics = sequence.intrinsics_of(seen.view);
         let projection = Projection::new(&intrinsics, &sequence.poses[seen.view], point);
         let residual = projection.image - seen.xy;
@@ -116,7 +116,7 @@ struct Batch<'a> {
 }
 
 impl Normal {
-    pub fn new(layout: &Layout, pattern: &Pattern, sequence: &Reconstruction) -> Self {
+    pub fn new(layout: &Layout, pattern: &Pattern, sequence: &MetricReconstruction) -> Self {
         Self {
             cameras: Cameras::new(layout, pattern, sequence),
             couplings: vec![0.0; layout.coupling_count()],
@@ -131,7 +131,7 @@ impl Normal {
     /// own rows, in the order of the observations.
     pub fn fill(
         &mut self,
-        sequence: &Reconstruction,
+        sequence: &MetricReconstruction,
         layout: &Layout,
         priors: &[IntrinsicsPrior],
         loss: Loss,
@@ -148,7 +148,7 @@ impl Normal {
 
     fn linearise(
         &mut self,
-        sequence: &Reconstruction,
+        sequence: &MetricReconstruction,
         layout: &Layout,
         loss: Loss,
         pool: &WorkerPool,
@@ -184,7 +184,7 @@ impl Points<'_> {
     #[inline(always)]
     fn linearise(
         self,
-        sequence: &Reconstruction,
+        sequence: &MetricReconstruction,
         layout: &Layout,
         loss: Loss,
         mut cancellation: CancellationCheck,
@@ -213,7 +213,7 @@ impl Points<'_> {
 }
 
 impl Cameras {
-    fn new(layout: &Layout, pattern: &Pattern, sequence: &Reconstruction) -> Self {
+    fn new(layout: &Layout, pattern: &Pattern, sequence: &MetricReconstruction) -> Self {
         let unknowns = &layout.unknowns;
         let diagonal = |block: usize| Some((unknowns.range(block).start, pattern.place(block, block)?));
         let places = |view: usize| {
@@ -242,7 +242,7 @@ impl Cameras {
     }
 
     /// What is known of the intrinsics beforehand.
-    fn add_priors(&mut self, sequence: &Reconstruction, layout: &Layout, priors: &[IntrinsicsPrior]) {
+    fn add_priors(&mut self, sequence: &MetricReconstruction, layout: &Layout, priors: &[IntrinsicsPrior]) {
         for (group, prior) in priors.iter().enumerate().take(sequence.intrinsics.len()) {
             let Some(block) = layout.unknowns.group_block[group] else { continue };
             for (index, parameter) in layout.unknowns.range(block).zip(&layout.unknowns.parameters[group]) {
@@ -256,7 +256,7 @@ impl Cameras {
     /// Adds the rows of a batch; `false` when it was stopped.
     fn add_batch(
         &mut self,
-        sequence: &Reconstruction,
+        sequence: &MetricReconstruction,
         layout: &Layout,
         pool: &WorkerPool,
         points: Range<usize>,
@@ -304,7 +304,7 @@ impl Batch<'_> {
     #[inline(always)]
     fn add_to_views<'s>(
         &self,
-        sequence: &Reconstruction,
+        sequence: &MetricReconstruction,
         views: Range<usize>,
         values: &mut [f64],
         gradient: &mut [f64],
@@ -341,7 +341,7 @@ impl Batch<'_> {
     #[inline(always)]
     fn add_to_groups(
         &self,
-        sequence: &Reconstruction,
+        sequence: &MetricReconstruction,
         seen: &[Seen],
         values: &mut [f64],
         gradient: &mut [f64],

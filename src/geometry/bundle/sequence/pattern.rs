@@ -2,7 +2,7 @@
 
 use super::super::panel::PANEL_SHARE;
 use super::layout::{Layout, Unknowns};
-use super::{CancellationCheck, Reconstruction};
+use super::{CancellationCheck, MetricReconstruction};
 
 /// Unknowns up to which a system is a square matrix, about forty views: its dense factorisation needs no analysis.
 const SQUARE_LIMIT: usize = 256;
@@ -42,7 +42,7 @@ pub(super) struct Place {
 impl Pattern {
     /// Blocks that a point links, and the pose of every view with the intrinsics of its group; all, in a square matrix,
     /// where they are few or most are linked. `None` when it was stopped.
-    pub fn new(sequence: &Reconstruction, layout: &Layout, cancellation: &mut CancellationCheck) -> Option<Self> {
+    pub fn new(sequence: &MetricReconstruction, layout: &Layout, cancellation: &mut CancellationCheck) -> Option<Self> {
         let limit = if layout.coupled_share() >= PANEL_SHARE { SQUARE_LIMIT_OF_COUPLED } else { SQUARE_LIMIT };
         if layout.unknowns.count() <= limit {
             return Some(Self::square(&layout.unknowns));
@@ -51,7 +51,11 @@ impl Pattern {
     }
 
     /// Without the blocks that are zero; `None` when it was stopped.
-    pub fn sparse(sequence: &Reconstruction, layout: &Layout, cancellation: &mut CancellationCheck) -> Option<Self> {
+    pub fn sparse(
+        sequence: &MetricReconstruction,
+        layout: &Layout,
+        cancellation: &mut CancellationCheck,
+    ) -> Option<Self> {
         let unknowns = &layout.unknowns;
         let blocks = unknowns.block_count();
         let mut group_of = vec![None; blocks];

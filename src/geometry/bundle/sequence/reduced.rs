@@ -13,7 +13,7 @@ use super::normal::Normal;
 use super::pattern::{Column, Pattern};
 use super::solver::Solver;
 use super::worker_pool::{WorkerPool, split_off};
-use super::{CancellationCheck, Reconstruction};
+use super::{CancellationCheck, MetricReconstruction};
 use crate::parallel::even_cuts;
 use crate::simd::vectorised;
 
@@ -288,8 +288,8 @@ impl Columns<'_> {
 /// Moves the points of `moved` to where they belong after the step of poses and intrinsics: from where they are in
 /// `from` by `-V^-1 (Jp' r + Jp' Jc dc)`. `false` when that is no number, or it was stopped.
 pub(super) fn substitute(
-    moved: &mut Reconstruction,
-    from: &Reconstruction,
+    moved: &mut MetricReconstruction,
+    from: &MetricReconstruction,
     layout: &Layout,
     normal: &Normal,
     damping: f64,

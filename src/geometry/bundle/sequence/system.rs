@@ -7,7 +7,7 @@ use super::normal::Normal;
 use super::pattern::Pattern;
 use super::reduced::Reduced;
 use super::worker_pool::WorkerPool;
-use super::{CancellationCheck, Free, Observation, Reconstruction};
+use super::{CancellationCheck, Free, MetricReconstruction, Observation};
 use crate::domain::StopToken;
 use crate::geometry::bundle::Loss;
 use crate::geometry::bundle::metric::{IntrinsicsModel, Parameter};
@@ -24,7 +24,7 @@ pub struct System {
 
 impl System {
     /// Linearises; `None` where a point's block is no number.
-    pub fn new(reconstruction: &Reconstruction, observations: &[Observation]) -> Option<Self> {
+    pub fn new(reconstruction: &MetricReconstruction, observations: &[Observation]) -> Option<Self> {
         let model = IntrinsicsModel::focal(reconstruction.has_own_focals()).with_all_extensions();
         let models = vec![model; reconstruction.intrinsics.len()];
         let stop = StopToken::default();

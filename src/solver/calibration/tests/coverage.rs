@@ -158,7 +158,7 @@ fn calibrated_from_truth(scene: &TestScene) -> Outcome {
     let points_in_space: Vec<Vector4<f64>> = points.iter().map(|point| point.push(1.0)).collect();
     let cameras = scene.cameras();
     let problem = of_one_lens(&cameras, &points_in_space, &scene.observations, STRANGE_NOISE);
-    let metric = Reconstruction::new(intrinsics, poses, points);
+    let metric = MetricReconstruction::new(intrinsics, poses, points);
     only(from_metric(&problem, &metric, None, SIDE_PX, &StopToken::default(), &mut || ()))
 }
 

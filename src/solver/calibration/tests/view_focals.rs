@@ -176,8 +176,8 @@ fn near_truth(scene: &TestScene, focals: &[f64], noise: f64) -> Outcome {
 }
 
 /// The true reconstruction with these focal lengths.
-fn metric_of(scene: &TestScene, focals: &[f64]) -> Reconstruction {
-    let mut metric = Reconstruction { focals: focals.to_vec(), ..scene.reconstruction() };
+fn metric_of(scene: &TestScene, focals: &[f64]) -> MetricReconstruction {
+    let mut metric = MetricReconstruction { focals: focals.to_vec(), ..scene.reconstruction() };
     metric.average_focals();
     metric
 }

@@ -86,7 +86,7 @@ impl Rigid {
 }
 
 /// The image points and depths of a block, ready to be searched.
-pub struct Search<'a> {
+pub struct RigidSearch<'a> {
     block: &'a CompleteBlock,
     /// `depths[track * views + view]`.
     depths: &'a [f64],
@@ -96,7 +96,7 @@ pub struct Search<'a> {
     stop: &'a StopToken,
 }
 
-impl<'a> Search<'a> {
+impl<'a> RigidSearch<'a> {
     /// `None` where there are no depths, or too few tracks or views to be rigid.
     ///
     /// * `image_spread`: standard deviation of the image points, normalised units
@@ -309,7 +309,7 @@ mod tests {
         let block = block::of_all_views(&input);
         let spread = portfolio::spread(&block.complete);
         let stop = StopToken::default();
-        let search = Search::new(&block.complete, spread, &stop).expect("depths");
+        let search = RigidSearch::new(&block.complete, spread, &stop).expect("depths");
         let rigid = search.run(options.noise.max(0.001));
         let certainty = rigid.as_ref().map_or(0.0, |rigid| rigid.ln_false_alarms(search.spread()));
         (scene, rigid, certainty)

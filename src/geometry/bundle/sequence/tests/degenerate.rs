@@ -3,7 +3,7 @@
 use super::*;
 use crate::geometry::bundle::Loss;
 
-fn run(mut sequence: Reconstruction, observations: &[Observation]) -> Reconstruction {
+fn run(mut sequence: MetricReconstruction, observations: &[Observation]) -> MetricReconstruction {
     for model in
         [IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL, IntrinsicsModel::FOCAL_PER_VIEW, IntrinsicsModel::FULL]
     {
@@ -17,7 +17,7 @@ fn run(mut sequence: Reconstruction, observations: &[Observation]) -> Reconstruc
     sequence
 }
 
-fn is_finite(sequence: &Reconstruction) -> bool {
+fn is_finite(sequence: &MetricReconstruction) -> bool {
     let poses = sequence.poses.iter().flat_map(|pose| pose.rotation.iter().chain(pose.translation.iter()));
     let points = sequence.points.iter().flat_map(|point| point.iter());
     poses.chain(points).all(|value| value.is_finite())
@@ -29,8 +29,13 @@ fn little_or_odd_input_neither_panics_nor_yields_nan() {
     for views in [6, 60] {
         let (truth, observations) = chain(1, views, 4, 4, 0.001);
         assert!(is_finite(&run(truth.clone(), &[])));
-        let empty =
-            Reconstruction { intrinsics: vec![], focals: vec![], group_of: vec![], poses: vec![], points: vec![] };
+        let empty = MetricReconstruction {
+            intrinsics: vec![],
+            focals: vec![],
+            group_of: vec![],
+            poses: vec![],
+            points: vec![],
+        };
         run(empty, &observations);
         // One view a track: nothing is determined.
         let alone: Vec<Observation> =

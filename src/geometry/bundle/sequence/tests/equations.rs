@@ -16,7 +16,7 @@ use crate::geometry::bundle::Loss;
 use crate::geometry::bundle::metric::{Extension, Parameter};
 
 /// Three groups, one of them held, a held view and a held point, unequal weights.
-fn mixed() -> (Reconstruction, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>, Vec<bool>) {
+fn mixed() -> (MetricReconstruction, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>, Vec<bool>) {
     let (mut sequence, mut observations) = chain(1, 7, 3, 4, 0.003);
     sequence.group_of = vec![0, 0, 1, 1, 2, 2, 0];
     sequence.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.9), Intrinsics::from_focal(1.3)];
@@ -34,7 +34,7 @@ fn mixed() -> (Reconstruction, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>
     (sequence, observations, models, views, points)
 }
 
-fn laid_out(sequence: &Reconstruction, observations: &[Observation], free: &Free) -> (Layout, Pattern) {
+fn laid_out(sequence: &MetricReconstruction, observations: &[Observation], free: &Free) -> (Layout, Pattern) {
     let going = StopToken::default();
     let mut cancellation = CancellationCheck::new(&going);
     let layout = Layout::new(sequence, observations, free, &mut cancellation).expect("goes on");
@@ -45,13 +45,13 @@ fn laid_out(sequence: &Reconstruction, observations: &[Observation], free: &Free
 /// Weighted residuals and their derivatives by central differences through the retraction: unknowns of the cameras,
 /// then of the free points.
 fn differentiate(
-    sequence: &Reconstruction,
+    sequence: &MetricReconstruction,
     observations: &[Observation],
     layout: &Layout,
 ) -> (DVector<f64>, DMatrix<f64>) {
     const WIDTH: f64 = 1e-6;
     let cameras = layout.unknowns.offsets[layout.unknowns.block_count()];
-    let residuals = |sequence: &Reconstruction| {
+    let residuals = |sequence: &MetricReconstruction| {
         let weighted = |seen: &Observation| sequence.residual(seen) * seen.weight.sqrt();
         DVector::from_iterator(
             2 * observations.len(),
@@ -129,7 +129,7 @@ fn every_layout_of_the_system_is_the_same_system() {
 }
 
 fn compare(
-    sequence: &Reconstruction,
+    sequence: &MetricReconstruction,
     observations: &[Observation],
     models: &[IntrinsicsModel],
     views: &[bool],

@@ -9,7 +9,7 @@ use nalgebra::{Rotation3, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::super::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, Pose, Reconstruction};
+use super::super::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
 use super::super::testing::{TestScene, normal, perturbed};
 use super::super::{Options, Report};
 use super::{Free, Observation, Run, adjust};
@@ -30,7 +30,7 @@ fn chain(
     tracks_a_view: usize,
     length: usize,
     noise: f64,
-) -> (Reconstruction, Vec<Observation>) {
+) -> (MetricReconstruction, Vec<Observation>) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut uniform = |range: f64| rng.random_range(-range..range);
     let poses: Vec<Pose> = (0..views)
@@ -40,7 +40,7 @@ fn chain(
             Pose { rotation, translation: -rotation * centre }
         })
         .collect();
-    let mut sequence = Reconstruction::new(Intrinsics::from_focal(1.1), poses, vec![]);
+    let mut sequence = MetricReconstruction::new(Intrinsics::from_focal(1.1), poses, vec![]);
     let mut observations = Vec::new();
     for first in 0..=views - length {
         for _ in 0..tracks_a_view {
@@ -56,7 +56,7 @@ fn chain(
 }
 
 /// Draws the image points anew.
-fn observe(sequence: &Reconstruction, observations: &mut [Observation], noise: f64, seed: u64) {
+fn observe(sequence: &MetricReconstruction, observations: &mut [Observation], noise: f64, seed: u64) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
     for seen in observations {
         seen.xy = Vector2::zeros();
@@ -64,12 +64,12 @@ fn observe(sequence: &Reconstruction, observations: &mut [Observation], noise: f
     }
 }
 
-fn sequence_of(scene: &TestScene) -> (Reconstruction, Vec<Observation>) {
+fn sequence_of(scene: &TestScene) -> (MetricReconstruction, Vec<Observation>) {
     (scene.reconstruction(), scene.observations.clone())
 }
 
 /// The chain bent to an arc of so many radians, as a reconstruction drifts that grows view by view.
-fn bent(straight: &Reconstruction, angle: f64) -> Reconstruction {
+fn bent(straight: &MetricReconstruction, angle: f64) -> MetricReconstruction {
     let length = BASELINE * straight.poses.len() as f64;
     let radius = length / angle;
     // Rotation and shift of what is so far along the line.
@@ -99,7 +99,7 @@ fn thorough() -> Options {
 }
 
 fn adjusted(
-    sequence: &mut Reconstruction,
+    sequence: &mut MetricReconstruction,
     observations: &[Observation],
     models: &[IntrinsicsModel],
     options: &Options,
