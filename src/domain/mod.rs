@@ -3,7 +3,7 @@
 //! Pure data and rules: no I/O, no async, no linear algebra. Everything else may depend on this module; it depends
 //! on nothing of ours.
 
-pub mod copies;
+pub mod duplicates;
 pub mod error;
 pub mod input;
 mod input_digest;

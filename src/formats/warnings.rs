@@ -2,7 +2,7 @@
 
 use super::LabelledInput;
 use super::result_json::{track_label, view_label};
-use crate::domain::copies::Copies;
+use crate::domain::duplicates::Duplicates;
 use crate::domain::{Limits, Solution, Warning, WarningCode, left_out};
 
 /// The warnings of a result, views and tracks under the input's own ids or names; without the input, as the solver gave
@@ -17,9 +17,9 @@ pub fn named(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Warning>
     }
     if let Some(place) = warnings.iter().position(|warning| warning.code == WarningCode::DuplicateTracks) {
         // Above the limits of this program, as a server may allow, tracks keep their numbers.
-        let copies = input.check(&Limits::default()).ok().and_then(|checked| Copies::of(&checked));
-        if let Some(copies) = copies {
-            warnings[place] = copies.warning(|track| track_label(Some(input), track).shown());
+        let duplicates = input.check(&Limits::default()).ok().and_then(|checked| Duplicates::of(&checked));
+        if let Some(duplicates) = duplicates {
+            warnings[place] = duplicates.warning(|track| track_label(Some(input), track).shown());
         }
     }
     warnings
@@ -59,7 +59,7 @@ mod tests {
     }
 
     #[test]
-    fn copies_go_by_the_names_of_the_input() {
+    fn duplicates_go_by_the_names_of_the_input() {
         let (mut input, mut solution) = fixture::solved();
         for k in 0..input.raw.x.len() {
             let like = |j: &usize| input.raw.track[*j] == 4 && input.raw.view[*j] == input.raw.view[k];

@@ -267,7 +267,7 @@ fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
         None => Warning::new(
             WarningCode::FewInliers,
             format!(
-                "no {} views share enough tracks: at least {}, of which none is another's copy, must be seen in all of them",
+                "no {} views share enough tracks: at least {}, no two of them equal, must be seen in all of them",
                 LEAST_VIEWS, LEAST_INLIERS
             ),
         ),

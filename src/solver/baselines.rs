@@ -38,7 +38,7 @@ pub struct Decided {
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Option<Attempt>, Error> {
-    let candidates = view_selection::candidate_views(problem.input, &problem.ranges, problem.stop);
+    let candidates = view_selection::candidate_views(problem);
     let mut attempts: Vec<Attempt> = Vec::new();
     for (k, views) in candidates.iter().enumerate() {
         problem.stopped()?;

@@ -1,8 +1,8 @@
 //! Several estimates of one focal length as one, and what they say of each other.
 //!
 //! The formal uncertainty of one adjustment knows noise and nothing else; distortion beyond the model, a wrong track or
-//! a motion that hardly turns moves estimates apart by more than they admit. They are fused by information weight, with a
-//! common misfit that makes their chi-square what it should be (DerSimonian & Laird 1986).
+//! a motion that hardly turns moves estimates apart by more than they admit. They are fused by information weight, with
+//! a common misfit that makes their chi-square what it should be (DerSimonian & Laird 1986).
 
 use super::calibration::{GradeOptions, Outcome};
 use crate::domain::{Grade, Warning, WarningCode};

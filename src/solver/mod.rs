@@ -2,13 +2,13 @@
 //!
 //! Depends on `network`, `geometry` and `domain`; knows nothing of jobs, transport or files.
 //!
-//! The way through: [`copies`] keeps one of the tracks that stand in the input several times; [`problem`] is the input
-//! as all stages see it; [`view_selection`] chooses views whose tracks are complete: all of them, or a few; [`attempt`]
-//! searches such a block, by [`portfolio`] (proposals, [`search`], [`grow`]; [`near_duplicates`] are left aside, the
-//! [`track_sampling`] of many tracks searched, [`a_contrario`] verifies, [`all_tracks`] join; [`depths`] where those
-//! verify what image points cannot) or [`baselines`], and [`calibration`] upgrades it. [`sequence`] tries blocks in
-//! order of cost and extends what stands to the other views and tracks, projectively or metrically, observation by
-//! observation; [`assemble`] has [`classification`] judge every track and observation, and writes it down.
+//! The way through: [`duplicates`] keeps one of equal tracks; [`problem`] is the input as all stages see it;
+//! [`view_selection`] chooses views whose tracks are complete: all of them, or a few; [`attempt`] searches such a
+//! block, by [`portfolio`] (proposals, [`search`], [`grow`]; [`near_duplicates`] are left aside, the [`track_sampling`]
+//! of many tracks searched, [`a_contrario`] verifies, [`all_tracks`] join; [`depths`] where those verify what image
+//! points cannot) or [`baselines`], and [`calibration`] upgrades it. [`sequence`] tries blocks in order of cost and
+//! extends what stands to the other views and tracks, projectively or metrically, observation by observation;
+//! [`assemble`] has [`classification`] judge every track and observation, and writes it down.
 
 pub(crate) mod a_contrario;
 mod all_tracks;
@@ -18,8 +18,8 @@ mod baselines;
 pub(crate) mod block;
 pub(crate) mod calibration;
 mod classification;
-mod copies;
 mod depths;
+mod duplicates;
 mod fusion;
 pub(crate) mod grow;
 pub(crate) mod learned;
@@ -40,7 +40,7 @@ mod track_sampling;
 mod view_selection;
 mod views;
 
-use crate::domain::copies::Copies;
+use crate::domain::duplicates::Duplicates;
 use crate::domain::{Input, Observer, Solution, SolveSettings, StopReason, StopToken};
 use crate::parallel::Threads;
 use problem::Problem;
@@ -89,7 +89,7 @@ pub fn solve(
 /// them. By PAPER and PSFM the best block is solved, views outside it are left out with a warning, and blocks that
 /// disagree raise its uncertainty.
 ///
-/// Tracks that are [copies](Copies) of another count once, whatever the method.
+/// Tracks that are [duplicates](Duplicates) of another count once, whatever the method.
 ///
 /// # Errors
 /// [`Error::Stopped`] when `stop` fired, [`Error::Internal`] for a defect.
@@ -100,9 +100,9 @@ pub fn solve_on(
     observer: &mut dyn Observer,
     stop: &StopToken,
 ) -> Result<Solution, Error> {
-    let mut solution = match Copies::of(input) {
+    let mut solution = match Duplicates::of(input) {
         None => solve_views(threads, input, settings, observer, stop)?,
-        Some(found) => copies::solve_once(input, &found, observer, |rest, observer| {
+        Some(found) => duplicates::solve_once(input, &found, observer, |rest, observer| {
             solve_views(threads, rest, settings, observer, stop)
         })?,
     };

@@ -3,7 +3,7 @@
 
 use super::grow::LEAST_INLIERS;
 use super::problem::{Problem, camera_groups, observed_views};
-use crate::domain::{Input, StopToken};
+use crate::domain::Input;
 
 /// Views below which a projective reconstruction carries no calibration worth searching for.
 pub const LEAST_VIEWS: usize = 3;
@@ -56,42 +56,39 @@ const OPTIONS: ViewSelectionOptions = ViewSelectionOptions::DEFAULT;
 /// Sets of views worth solving, best first; empty when no three views share enough tracks.
 ///
 /// Once `stop` fires the answer is whatever was found by then.
-pub fn candidate_views(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec<Vec<usize>> {
-    if let Some(views) = whole(input, ranges) {
-        return vec![views];
-    }
-    candidate_views_among(input, ranges, &vec![true; input.view_count()], stop)
+pub fn candidate_views(problem: &Problem) -> Vec<Vec<usize>> {
+    let among_all = || candidate_views_among(problem, &vec![true; problem.views()]);
+    whole(problem).map_or_else(among_all, |views| vec![views])
 }
 
 /// Sets of views that a reconstruction may begin with, best first: each of one camera, or, of cameras too small for
 /// that, of several together.
 pub fn blocks(problem: &Problem) -> Vec<Vec<usize>> {
-    let (input, ranges, stop) = (problem.input, &problem.ranges, problem.stop);
     let of_one = match problem.has_own_focals() {
         true => Vec::new(),
-        false => candidate_views_of_one_camera(input, ranges, stop),
+        false => candidate_views_of_one_camera(problem),
     };
-    if of_one.is_empty() { candidate_views(input, ranges, stop) } else { of_one }
+    if of_one.is_empty() { candidate_views(problem) } else { of_one }
 }
 
 /// The views of the one block of an input whose tracks are complete; see [`complete_views`].
-pub fn whole(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
-    complete_views(input, ranges).map(|views| evenly(&views, OPTIONS.most_views_whole))
+pub fn whole(problem: &Problem) -> Option<Vec<usize>> {
+    complete_views(problem.input, &problem.ranges).map(|views| evenly(&views, OPTIONS.most_views_whole))
 }
 
 /// The same of incomplete tracks, each set of one camera group: those of the group with most observations first.
-fn candidate_views_of_one_camera(input: &Input, ranges: &[usize], stop: &StopToken) -> Vec<Vec<usize>> {
-    let (group_of, groups) = camera_groups(input);
+fn candidate_views_of_one_camera(problem: &Problem) -> Vec<Vec<usize>> {
+    let (group_of, groups) = camera_groups(problem.input);
     let mut observed = vec![0usize; groups];
-    (0..input.observation_count()).for_each(|k| observed[group_of[input.view_of(k)]] += 1);
+    problem.of_view.iter().zip(&group_of).for_each(|(seen, &group)| observed[group] += seen.len());
     let mut order: Vec<usize> = (0..groups).collect();
     order.sort_by_key(|&group| (std::cmp::Reverse(observed[group]), group));
     let mut found: Vec<Vec<usize>> = Vec::new();
     for group in order {
         let open: Vec<bool> = group_of.iter().map(|of| *of == group).collect();
         let enough = open.iter().filter(|&&open| open).count() >= LEAST_VIEWS;
-        if enough && found.len() < OPTIONS.most_blocks && !stop.is_stopped() {
-            found.extend(candidate_views_among(input, ranges, &open, stop));
+        if enough && found.len() < OPTIONS.most_blocks && !problem.stop.is_stopped() {
+            found.extend(candidate_views_among(problem, &open));
         }
     }
     found.truncate(OPTIONS.most_blocks);
@@ -99,14 +96,10 @@ fn candidate_views_of_one_camera(input: &Input, ranges: &[usize], stop: &StopTok
 }
 
 /// The same of incomplete tracks, only of views that are `open` (one entry a view).
-pub fn candidate_views_among(input: &Input, ranges: &[usize], open: &[bool], stop: &StopToken) -> Vec<Vec<usize>> {
-    for least in [OPTIONS.wanted_tracks, OPTIONS.least_tracks] {
-        let found = greedy_views(input, ranges, open, least, stop);
-        if !found.is_empty() {
-            return found;
-        }
-    }
-    Vec::new()
+pub fn candidate_views_among(problem: &Problem, open: &[bool]) -> Vec<Vec<usize>> {
+    let found =
+        [OPTIONS.wanted_tracks, OPTIONS.least_tracks].into_iter().map(|least| greedy_views(problem, open, least));
+    found.into_iter().find(|found| !found.is_empty()).unwrap_or_default()
 }
 
 /// Small subsets of these sets of views: runs and combs in turn, spread over the set; the first of each set first. A
@@ -143,27 +136,21 @@ pub fn complete_views(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
 
 /// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on
 /// the way, keeps the one with most constraints.
-fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, stop: &StopToken) -> Vec<Vec<usize>> {
-    let mut tracks_of_view: Vec<Vec<usize>> = vec![Vec::new(); input.view_count()];
-    for k in (0..input.observation_count()).filter(|&k| open[input.view_of(k)]) {
-        tracks_of_view[input.view_of(k)].push(input.track_of(k));
-    }
+fn greedy_views(problem: &Problem, open: &[bool], least: usize) -> Vec<Vec<usize>> {
+    let seeing: Vec<usize> =
+        (0..problem.views()).filter(|&view| open[view] && !problem.of_view[view].is_empty()).collect();
     let mut found: Vec<(usize, Vec<usize>)> = Vec::new();
-    for first in first_views(&tracks_of_view) {
-        if stop.is_stopped() {
+    for first in evenly(&seeing, OPTIONS.most_first_views) {
+        if problem.stop.is_stopped() {
             break;
         }
-        let seen = tracks_of_view[first].clone();
         let mut views = vec![first];
-        let mut tracks = seen;
+        let mut tracks: Vec<usize> = problem.of_view[first].iter().map(|&k| problem.track_of(k as usize)).collect();
         let mut best: Option<(usize, Vec<usize>)> = None;
         while views.len() < OPTIONS.most_views {
-            let mut counts = vec![0usize; input.view_count()];
-            for &track in &tracks {
-                for k in (ranges[track]..ranges[track + 1]).filter(|&k| open[input.view_of(k)]) {
-                    counts[input.view_of(k)] += 1;
-                }
-            }
+            let mut counts = vec![0usize; problem.views()];
+            let seen = tracks.iter().flat_map(|&track| problem.of_track(track)).map(|k| problem.view_of(k));
+            seen.filter(|&view| open[view]).for_each(|view| counts[view] += 1);
             for &view in &views {
                 counts[view] = 0;
             }
@@ -173,7 +160,7 @@ fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, st
                 break;
             }
             views.push(next);
-            tracks.retain(|&track| (ranges[track]..ranges[track + 1]).any(|k| input.view_of(k) == next));
+            tracks.retain(|&track| problem.of_track(track).any(|k| problem.view_of(k) == next));
             if views.len() >= LEAST_VIEWS {
                 let value = count.min(OPTIONS.enough_tracks) * (views.len() - 2);
                 if best.as_ref().is_none_or(|(most, _)| value > *most) {
@@ -188,13 +175,6 @@ fn greedy_views(input: &Input, ranges: &[usize], open: &[bool], least: usize, st
     found.sort_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
     found.dedup();
     diverse(found.into_iter().map(|(_, views)| views).collect())
-}
-
-/// The views that blocks are begun from: all that see something, or as many as are affordable, evenly along the
-/// sequence.
-fn first_views(tracks_of_view: &[Vec<usize>]) -> Vec<usize> {
-    let seeing: Vec<usize> = (0..tracks_of_view.len()).filter(|&view| !tracks_of_view[view].is_empty()).collect();
-    evenly(&seeing, OPTIONS.most_first_views)
 }
 
 /// At most `most` of the items, evenly spread.
@@ -220,9 +200,8 @@ fn diverse(ranked: Vec<Vec<usize>>) -> Vec<Vec<usize>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{Limits, RawInput, View, WarningCode};
-    use crate::solver::block;
-    use crate::solver::normalization::normalization;
+    use crate::domain::{Limits, RawInput, SolveSettings, StopToken, View, WarningCode};
+    use crate::parallel::Threads;
 
     /// Tracks given as lists of the views that see them.
     fn input(views: usize, tracks: &[Vec<usize>]) -> Input {
@@ -239,13 +218,16 @@ mod tests {
         Input::new(raw, &Limits::default(), "test").expect("valid")
     }
 
+    fn with_problem<T>(input: &Input, ask: impl FnOnce(&Problem) -> T) -> T {
+        ask(&Problem::new(input, &SolveSettings::default(), Threads::ONE, &StopToken::default()))
+    }
+
     #[test]
     fn complete_tracks_are_one_block_of_all_views() {
         let input = input(12, &vec![(0..12).collect(); 20]);
-        let ranges = input.track_ranges();
-        assert_eq!(candidate_views(&input, &ranges, &StopToken::default()), [(0..12).collect::<Vec<_>>()]);
+        assert_eq!(with_problem(&input, candidate_views), [(0..12).collect::<Vec<_>>()]);
         let long = self::input(100, &vec![(0..100).collect(); 20]);
-        let views = &candidate_views(&long, &long.track_ranges(), &StopToken::default())[0];
+        let views = &with_problem(&long, candidate_views)[0];
         assert_eq!((views.len(), views[0], views[39]), (OPTIONS.most_views_whole, 0, 97));
     }
 
@@ -254,13 +236,14 @@ mod tests {
         let mut tracks = vec![(0..5).collect::<Vec<_>>(); 30];
         tracks.extend(vec![(3..8).collect::<Vec<_>>(); 60]);
         let input = input(8, &tracks);
-        let ranges = input.track_ranges();
-        let candidates = candidate_views(&input, &ranges, &StopToken::default());
+        let (candidates, block, warning) = with_problem(&input, |problem| {
+            let candidates = candidate_views(problem);
+            let block = problem.block(&candidates[0]);
+            (candidates, block, problem.warnings[0].code)
+        });
         assert_eq!(candidates[0], [3, 4, 5, 6, 7]);
-        let (normalization, warnings) = normalization(&input);
-        let block = block::extract(&input, &ranges, &normalization, &candidates[0]);
         assert_eq!((block.complete.views(), block.tracks.len()), (5, 60));
-        assert_eq!(warnings[0].code, WarningCode::AssumedImageSize);
+        assert_eq!(warning, WarningCode::AssumedImageSize);
         let sampled = block.clone().sample(7, 1);
         assert_eq!((sampled.tracks.len(), sampled.complete.tracks()), (7, 7));
         let place = block.tracks.iter().position(|&track| track == sampled.tracks[3]).expect("a track of the block");
@@ -279,6 +262,6 @@ mod tests {
     #[test]
     fn views_that_share_nothing_make_no_block() {
         let input = input(4, &[vec![0, 1], vec![2, 3], vec![1, 2]]);
-        assert!(candidate_views(&input, &input.track_ranges(), &StopToken::default()).is_empty());
+        assert!(with_problem(&input, candidate_views).is_empty());
     }
 }

@@ -90,8 +90,8 @@ impl Intrinsics {
         Vector2::new(self.focal * distorted.x, self.aspect * self.focal * distorted.y) + self.principal_point
     }
 
-    /// Gradients of the two coordinates of [`Self::project`] by the intrinsics, in the order of [`Parameter`], and by the
-    /// point; infinite or not a number at depth zero.
+    /// Gradients of the two coordinates of [`Self::project`] by the intrinsics, in the order of [`Parameter`], and by
+    /// the point; infinite or not a number at depth zero.
     #[inline(always)]
     pub(super) fn gradients(&self, seen: &Vector3<f64>) -> ([[f64; Parameter::COUNT]; 2], [Vector3<f64>; 2]) {
         let scale = seen.z.recip();

@@ -127,8 +127,8 @@ impl WithoutViews {
         Some(Self { matrix: information, negative_gradient, own_focals: None, known })
     }
 
-    /// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics. With
-    /// it what the views' own focal lengths are, where they have them.
+    /// Eliminates the views, of `C` unknowns each, from the reduced system, whose first unknowns are the intrinsics.
+    /// With it what the views' own focal lengths are, where they have them.
     ///
     /// A direction of the views on which rounding hides what the observations say, but which goes along with the
     /// intrinsics, is taken to be as free as it can be: the intrinsics have no information left along with it. Taken as

@@ -74,12 +74,12 @@ fn by_cameras(block: &CompleteBlock, consensus: &Consensus, inliers: usize, spre
     at(random.ln_as_good())
 }
 
-/// Natural logarithm of the number of false alarms by residuals, `m C(m, k) p`: the sizes and sets of inliers, times the
-/// probability that unstructured coordinates leave residuals this small.
+/// Natural logarithm of the number of false alarms by residuals, `m C(m, k) p`: the sizes and sets of inliers, times
+/// the probability that unstructured coordinates leave residuals this small.
 ///
 /// * `tracks`, `inliers`: m and k
 /// * `constraints`: that the inliers leave over
-/// * `rms`: of the residuals, one coordinate; `spread`: standard deviation of unstructured coordinates, in the same unit
+/// * `rms`: of the residuals, one coordinate; `spread`: standard deviation of unstructured coordinates, same unit
 pub fn ln_false_alarms_of(tracks: usize, inliers: usize, constraints: f64, rms: f64, spread: f64) -> f64 {
     let ln_probability = 0.5 * constraints * (1.0 + 2.0 * (rms.max(f64::MIN_POSITIVE) / spread).ln()).min(0.0);
     ln_choose(tracks, inliers) + (tracks as f64).ln() + ln_probability

@@ -35,8 +35,8 @@ pub struct Geometry {
     pub component_of_track: Vec<u32>,
     /// Whether single observations may be wrong, be it that one wrong link joins two points: those that agree on one
     /// are looked for then, however few they are beside the others, and weigh by their sigmas. The cameras must be
-    /// metric, or oriented with the plane at infinity off the points. Otherwise the worst observation is dropped as long
-    /// as it is too far from the point of the others.
+    /// metric, or oriented with the plane at infinity off the points. Otherwise the worst observation is dropped as
+    /// long as it is too far from the point of the others.
     pub by_observation: bool,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,

@@ -92,7 +92,7 @@ fn next_block(problem: &Problem, open: &[bool]) -> Option<Vec<usize>> {
         if of_camera.iter().filter(|&&open| open).count() < view_selection::LEAST_VIEWS || problem.stop.is_stopped() {
             return None;
         }
-        let found = view_selection::candidate_views_among(problem.input, &problem.ranges, &of_camera, problem.stop);
+        let found = view_selection::candidate_views_among(problem, &of_camera);
         found.into_iter().next()
     })
 }

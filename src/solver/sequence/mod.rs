@@ -130,7 +130,7 @@ struct Blocks {
 
 impl Blocks {
     fn of(problem: &Problem) -> Self {
-        match view_selection::whole(problem.input, &problem.ranges) {
+        match view_selection::whole(problem) {
             Some(whole) => Self { sets: vec![whole], is_whole: true },
             None => Self { sets: view_selection::blocks(problem), is_whole: false },
         }

@@ -1,7 +1,7 @@
 //! Whole solves, from an input to a solution.
 
 mod a_contrario;
-mod copies;
+mod duplicates;
 mod learned;
 mod lenses;
 mod observations;

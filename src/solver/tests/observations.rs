@@ -20,8 +20,8 @@ fn right_tracks_that_each_hold_wrong_observations_calibrate() {
     }
 }
 
-/// Depths or none, an input goes one way: where an observation of every track is missing, blocks of complete tracks hold
-/// few of the views, and the others join them; what is wrong within right tracks is told apart.
+/// Depths or none, an input goes one way: where an observation of every track is missing, blocks of complete tracks
+/// hold few of the views, and the others join them; what is wrong within right tracks is told apart.
 #[test]
 fn tracks_with_depths_reach_every_view() {
     for (deleted_observations, wrong_observations) in [(1, 0), (1, 1), (0, 1), (0, 2), (0, 3)] {

@@ -12,19 +12,19 @@ use super::input::Input;
 use super::result::Solution;
 use super::warning::{Warning, WarningCode};
 
-/// Observations from which equal tracks are copies: one point says nothing that could be said twice.
+/// Observations from which equal tracks are duplicates: one point says nothing that could be said twice.
 const LEAST_OBSERVATIONS: usize = 2;
-/// Copies named in the warning.
+/// Duplicates named in the warning.
 const MOST_NAMED: usize = 5;
 
-/// The copies of an input.
+/// The duplicates of an input.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Copies {
+pub struct Duplicates {
     /// For each track the first that is like it: itself, for most.
     first: Vec<u32>,
 }
 
-impl Copies {
+impl Duplicates {
     /// `None` where every track stands once.
     pub fn of(input: &Input) -> Option<Self> {
         let ranges = ranges(input);
@@ -37,17 +37,17 @@ impl Copies {
                 first[pair[1]] = first[pair[0]];
             }
         }
-        let copies = Self { first };
-        let any = copies.list().next().is_some();
-        any.then_some(copies)
+        let duplicates = Self { first };
+        let any = duplicates.list().next().is_some();
+        any.then_some(duplicates)
     }
 
     /// Whether a track stands in the input before.
-    pub fn is_copy(&self, track: usize) -> bool {
+    pub fn is_duplicate(&self, track: usize) -> bool {
         self.first[track] as usize != track
     }
 
-    /// Each copy with the first track that it is like, ascending.
+    /// Each duplicate with the first track that it is like, ascending.
     pub fn list(&self) -> impl Iterator<Item = (usize, usize)> {
         let pairs = self.first.iter().enumerate().map(|(track, &first)| (track, first as usize));
         pairs.filter(|(track, first)| track != first)
@@ -72,22 +72,22 @@ impl Copies {
         Warning::new(WarningCode::DuplicateTracks, detail)
     }
 
-    /// Gives the copies the answer of their first track; but for the copies, the solution is of all the input.
+    /// Gives the duplicates the answer of their first track; but for them, the solution is of all the input.
     pub fn answer(&self, input: &Input, solution: &mut Solution) {
         let ranges = ranges(input);
         let tracks = &mut solution.tracks;
-        for (copy, first) in self.list() {
-            tracks.weight[copy] = tracks.weight[first];
-            tracks.inlier[copy] = tracks.inlier[first];
-            tracks.point[copy] = tracks.point[first];
+        for (duplicate, first) in self.list() {
+            tracks.weight[duplicate] = tracks.weight[first];
+            tracks.inlier[duplicate] = tracks.inlier[first];
+            tracks.point[duplicate] = tracks.point[first];
             if !tracks.network_weight.is_empty() {
-                tracks.network_weight[copy] = tracks.network_weight[first];
+                tracks.network_weight[duplicate] = tracks.network_weight[first];
             }
             if !tracks.part.is_empty() {
-                tracks.part[copy] = tracks.part[first];
+                tracks.part[duplicate] = tracks.part[first];
             }
             let observations = &mut solution.observations;
-            for (k, like) in ranges[copy].clone().zip(ranges[first].clone()) {
+            for (k, like) in ranges[duplicate].clone().zip(ranges[first].clone()) {
                 let (k, like) = (input.caller_index(k), input.caller_index(like));
                 observations.inlier[k] = observations.inlier[like];
                 observations.residual_px[k] = observations.residual_px[like];
@@ -96,22 +96,22 @@ impl Copies {
             }
         }
         let mut of_first: HashMap<u32, Vec<usize>> = HashMap::new();
-        for (copy, first) in self.list() {
-            of_first.entry(first as u32).or_default().push(copy);
+        for (duplicate, first) in self.list() {
+            of_first.entry(first as u32).or_default().push(duplicate);
         }
-        let split_copies: Vec<_> = solution
+        let split_duplicates: Vec<_> = solution
             .splits
             .iter()
             .flat_map(|split| {
-                let copies = of_first.get(&split.track).into_iter().flatten();
-                copies.map(move |&copy| {
+                let duplicates = of_first.get(&split.track).into_iter().flatten();
+                duplicates.map(move |&duplicate| {
                     let mut split = *split;
-                    split.track = copy as u32;
+                    split.track = duplicate as u32;
                     split
                 })
             })
             .collect();
-        solution.splits.extend(split_copies);
+        solution.splits.extend(split_duplicates);
         solution.splits.sort_by_key(|split| (split.track, split.number));
     }
 }
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn tracks_are_copies_to_the_last_bit_or_not_at_all() {
+    fn tracks_are_duplicates_to_the_last_bit_or_not_at_all() {
         let near = f64::from_bits(2.0f64.to_bits() + 1);
         let tracks: [&[(u32, f64, f64)]; 9] = [
             &[(0, 1.0, 2.0), (1, 3.0, 4.0)],
@@ -165,21 +165,21 @@ mod tests {
             &[(0, 7.0, 7.0)],
             &[],
         ];
-        let copies = Copies::of(&input(&tracks, |_| None)).expect("copies");
-        assert_eq!(copies.list().collect::<Vec<_>>(), [(2, 0), (5, 0)]);
-        assert!(copies.is_copy(5) && !copies.is_copy(0) && !copies.is_copy(8));
-        let warning = copies.warning(|track| format!("t{track}"));
+        let duplicates = Duplicates::of(&input(&tracks, |_| None)).expect("duplicates");
+        assert_eq!(duplicates.list().collect::<Vec<_>>(), [(2, 0), (5, 0)]);
+        assert!(duplicates.is_duplicate(5) && !duplicates.is_duplicate(0) && !duplicates.is_duplicate(8));
+        let warning = duplicates.warning(|track| format!("t{track}"));
         assert!(warning.detail.starts_with("2 of 9 tracks") && warning.detail.ends_with(": t2 (as t0), t5 (as t0)"));
         // Depths tell them apart too.
-        assert_eq!(Copies::of(&input(&tracks, |track| Some(1.0 + track as f64))), None);
-        assert_eq!(Copies::of(&input(&tracks[..2], |_| None)), None);
+        assert_eq!(Duplicates::of(&input(&tracks, |track| Some(1.0 + track as f64))), None);
+        assert_eq!(Duplicates::of(&input(&tracks[..2], |_| None)), None);
     }
 
     #[test]
-    fn many_copies_are_counted_and_few_named() {
+    fn many_duplicates_are_counted_and_few_named() {
         let track: &[(u32, f64, f64)] = &[(0, 1.0, 2.0), (1, 3.0, 4.0)];
-        let copies = Copies::of(&input(&[track; 9], |_| None)).expect("copies");
-        let detail = copies.warning(|track| track.to_string()).detail;
+        let duplicates = Duplicates::of(&input(&[track; 9], |_| None)).expect("duplicates");
+        let detail = duplicates.warning(|track| track.to_string()).detail;
         assert!(detail.starts_with("8 of 9 tracks") && detail.ends_with("5 (as 0), and 3 more"), "{detail}");
     }
 }

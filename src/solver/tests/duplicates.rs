@@ -4,8 +4,8 @@ use super::*;
 use crate::domain::result::TrackSplit;
 use crate::synthetic::{Sequence, SequenceOptions};
 
-/// The input with each of these tracks once more for every time that it is named; the copies are at the end.
-fn with_copies(raw: &RawInput, tracks: &[u32]) -> RawInput {
+/// The input with each of these tracks once more for every time that it is named; the duplicates are at the end.
+fn with_duplicates(raw: &RawInput, tracks: &[u32]) -> RawInput {
     let mut more = raw.clone();
     for (n, &track) in tracks.iter().enumerate() {
         for k in (0..raw.x.len()).filter(|&k| raw.track[k] == track) {
@@ -21,7 +21,7 @@ fn with_copies(raw: &RawInput, tracks: &[u32]) -> RawInput {
 }
 
 fn checked(raw: RawInput) -> Input {
-    Input::new(raw, &Limits::default(), "copies").expect("valid")
+    Input::new(raw, &Limits::default(), "duplicates").expect("valid")
 }
 
 fn duplicates(solution: &Solution) -> Option<&str> {
@@ -29,11 +29,11 @@ fn duplicates(solution: &Solution) -> Option<&str> {
     told.map(|warning| warning.detail.as_str())
 }
 
-/// Twelve copies of one wrong track, which agree on whatever geometry suits the one.
+/// Twelve duplicates of one wrong track, which agree on whatever geometry suits the one.
 #[test]
-fn copies_of_a_wrong_track_verify_nothing() {
+fn duplicates_of_a_wrong_track_verify_nothing() {
     let (input, _) = scene(SceneOptions { outliers: 1.0, ..SceneOptions::default() });
-    let raw = with_copies(&input.to_raw(), &[17; 12]);
+    let raw = with_duplicates(&input.to_raw(), &[17; 12]);
     assert_eq!(raw.track_count, 212);
     let settings = SolveSettings { method: Method::Geometry, ..SolveSettings::default() };
     let solution = solved(&checked(raw), &settings);
@@ -43,11 +43,11 @@ fn copies_of_a_wrong_track_verify_nothing() {
     assert!(detail.starts_with("12 of 212 tracks") && detail.contains("200 (as 17), "), "{detail}");
 }
 
-/// The answer is that of the input without the copies, which get the answer of the first.
+/// The answer is that of the input without the duplicates, which get the answer of the first.
 fn assert_folded(raw: &RawInput, copied: &[u32], settings: &SolveSettings) {
     let alone = solved(&checked(raw.clone()), settings);
     assert_eq!((alone.status, duplicates(&alone)), (Status::Solved, None));
-    let input = checked(with_copies(raw, copied));
+    let input = checked(with_duplicates(raw, copied));
     let both = solved(&input, settings);
     assert!(duplicates(&both).is_some());
     assert_eq!((&both.calibrations, both.grade, &both.views), (&alone.calibrations, alone.grade, &alone.views));
@@ -55,10 +55,10 @@ fn assert_folded(raw: &RawInput, copied: &[u32], settings: &SolveSettings) {
     let (tracks, observations) = (raw.track_count, raw.x.len());
     let mut more = observations;
     for (n, &track) in copied.iter().enumerate() {
-        let (copy, track) = (tracks + n, track as usize);
-        assert_eq!(both.tracks.weight[copy], alone.tracks.weight[track], "{track}");
-        assert_eq!(both.tracks.inlier[copy], alone.tracks.inlier[track], "{track}");
-        assert_eq!(both.tracks.point[copy], alone.tracks.point[track], "{track}");
+        let (duplicate, track) = (tracks + n, track as usize);
+        assert_eq!(both.tracks.weight[duplicate], alone.tracks.weight[track], "{track}");
+        assert_eq!(both.tracks.inlier[duplicate], alone.tracks.inlier[track], "{track}");
+        assert_eq!(both.tracks.point[duplicate], alone.tracks.point[track], "{track}");
         for k in (0..observations).filter(|&k| raw.track[k] as usize == track) {
             assert_eq!(both.observations.inlier[more], alone.observations.inlier[k], "{track}");
             assert_eq!(both.observations.residual_px[more], alone.observations.residual_px[k], "{track}");
@@ -70,7 +70,7 @@ fn assert_folded(raw: &RawInput, copied: &[u32], settings: &SolveSettings) {
             let splits = solution.splits.iter().filter(|split| split.track as usize == wanted);
             splits.map(|split| TrackSplit { track: 0, ..*split }).collect()
         };
-        assert_eq!(of(&both, copy), of(&alone, track), "{track}");
+        assert_eq!(of(&both, duplicate), of(&alone, track), "{track}");
     }
     let first = |solution: &Solution| {
         let (tracks, judged) = (&solution.tracks, &solution.observations);
@@ -85,7 +85,7 @@ fn assert_folded(raw: &RawInput, copied: &[u32], settings: &SolveSettings) {
 }
 
 #[test]
-fn copies_change_no_answer_and_share_it() {
+fn duplicates_change_no_answer_and_share_it() {
     let (input, scene) = scene(SceneOptions { tracks: 60, outliers: 0.5, ..SceneOptions::default() });
     let settings = SolveSettings { method: Method::Geometry, ..SolveSettings::default() };
     let right = scene.truth.inlier.iter().position(|&inlier| inlier).expect("a right track") as u32;
@@ -94,7 +94,7 @@ fn copies_change_no_answer_and_share_it() {
 }
 
 #[test]
-fn copies_of_a_split_track_are_split() {
+fn duplicates_of_a_split_track_are_split() {
     let options = SequenceOptions { tracks: 400, joined: 0.5, ..SequenceOptions::default() };
     let sequence = Sequence::generate(&options).expect("valid");
     let settings = SolveSettings { method: Method::Geometry, ..SolveSettings::default() };

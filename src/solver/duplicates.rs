@@ -1,35 +1,36 @@
 //! An input in which tracks stand several times, solved with one of each.
 //!
-//! Copies of one wrong track agree with each other on any geometry: eight of them verify what nothing else does. They
-//! count once, and the copies get the answer of the first.
+//! Duplicates of one wrong track agree with each other on any geometry: eight of them verify what nothing else does.
+//! They count once, and all get the answer of the first.
 
 use super::Error;
-use crate::domain::copies::Copies;
+use crate::domain::duplicates::Duplicates;
 use crate::domain::result::ObservationResults;
 use crate::domain::{Input, Limits, Observer, Progress, RawInput, Solution, Stage};
 
-/// Solves the input without its copies, by `solve`, and answers for all of it.
+/// Solves the input without its duplicates, by `solve`, and answers for all of it.
 ///
 /// # Errors
 /// Those of `solve`; [`Error::Internal`] where the rest is no valid input, which it is.
 pub fn solve_once(
     input: &Input,
-    copies: &Copies,
+    duplicates: &Duplicates,
     observer: &mut dyn Observer,
     solve: impl FnOnce(&Input, &mut dyn Observer) -> Result<Solution, Error>,
 ) -> Result<Solution, Error> {
-    let (rest, places) = without(input, copies)?;
-    let mut solution = solve(&rest, &mut Unfolding { observer, copies })?;
+    let (rest, places) = without(input, duplicates)?;
+    let mut solution = solve(&rest, &mut Unfolding { observer, duplicates })?;
     unfold(&mut solution, input.observation_count(), &places);
-    copies.answer(input, &mut solution);
-    solution.warnings.push(copies.warning(|track| track.to_string()));
+    duplicates.answer(input, &mut solution);
+    solution.warnings.push(duplicates.warning(|track| track.to_string()));
     Ok(solution)
 }
 
-/// The input without the observations of its copies, whose tracks are empty then; and where each observation that is
-/// left stood in the caller's order.
-fn without(input: &Input, copies: &Copies) -> Result<(Input, Vec<usize>), Error> {
-    let kept: Vec<usize> = (0..input.observation_count()).filter(|&k| !copies.is_copy(input.track_of(k))).collect();
+/// The input without the observations of its duplicates, whose tracks are empty then; and where each observation that
+/// is left stood in the caller's order.
+fn without(input: &Input, duplicates: &Duplicates) -> Result<(Input, Vec<usize>), Error> {
+    let kept: Vec<usize> =
+        (0..input.observation_count()).filter(|&k| !duplicates.is_duplicate(input.track_of(k))).collect();
     let raw = RawInput {
         views: input.views().to_vec(),
         track_count: input.track_count(),
@@ -60,7 +61,7 @@ fn unfold(solution: &mut Solution, count: usize, places: &[usize]) {
 /// Tells the caller of all tracks.
 struct Unfolding<'a> {
     observer: &'a mut dyn Observer,
-    copies: &'a Copies,
+    duplicates: &'a Duplicates,
 }
 
 impl Observer for Unfolding<'_> {
@@ -74,7 +75,7 @@ impl Observer for Unfolding<'_> {
 
     fn weights(&mut self, iteration: u32, weights: &[f32]) {
         let mut weights = weights.to_vec();
-        self.copies.list().for_each(|(copy, first)| weights[copy] = weights[first]);
+        self.duplicates.list().for_each(|(duplicate, first)| weights[duplicate] = weights[first]);
         self.observer.weights(iteration, &weights);
     }
 }
