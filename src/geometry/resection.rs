@@ -222,7 +222,8 @@ mod tests {
         assert!(successes >= 59 && right >= 0.99 * f64::from(successes), "{successes} found, {right}");
     }
 
-    /// Half of the images are ten times as noisy as the others: where that is known, they agree and the camera is nearer.
+    /// Half of the images are ten times as noisy as the others: where that is known, they agree, and the camera is
+    /// nearer.
     #[test]
     fn images_count_by_their_weight() {
         let (mut weighted, mut plain) = (0.0, 0.0);

@@ -3,7 +3,7 @@
 /// Standard normal quantile of .999, the level of every inlier gate: one right track in a thousand is lost.
 pub const GATE_QUANTILE: f64 = 3.090_232;
 
-/// Chi-square quantiles of .999 for one and two degrees of freedom: those of one unknown and of an image point.
+/// Chi-square quantiles of .999 for one and two degrees of freedom, rounded: of one unknown and of an image point.
 pub const CHI_SQUARE_OF_ONE: f64 = 10.8;
 pub const CHI_SQUARE_OF_TWO: f64 = 13.8;
 

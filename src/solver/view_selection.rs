@@ -11,9 +11,8 @@ pub const LEAST_VIEWS: usize = 3;
 /// Which sets of views are worth solving.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ViewSelectionOptions {
-    /// Tracks that a block should have, and those below which none is tried.
+    /// Tracks that a block should have; with fewer than [`LEAST_INLIERS`] none is tried.
     pub wanted_tracks: usize,
-    pub least_tracks: usize,
     /// Views that a block grows to.
     pub most_views: usize,
     /// Views that are solved as one block where tracks are complete over all views; of more, these many evenly spread.
@@ -35,7 +34,6 @@ impl ViewSelectionOptions {
     pub const DEFAULT: Self = Self {
         // Half of them may be wrong.
         wanted_tracks: 2 * LEAST_INLIERS,
-        least_tracks: LEAST_INLIERS,
         // Real tracks are short: longer blocks hold few of them.
         most_views: 10,
         // Bundle adjustment of a block is cubic in its views.
@@ -97,8 +95,7 @@ fn candidate_views_of_one_camera(problem: &Problem) -> Vec<Vec<usize>> {
 
 /// The same of incomplete tracks, only of views that are `open` (one entry a view).
 pub fn candidate_views_among(problem: &Problem, open: &[bool]) -> Vec<Vec<usize>> {
-    let found =
-        [OPTIONS.wanted_tracks, OPTIONS.least_tracks].into_iter().map(|least| greedy_views(problem, open, least));
+    let found = [OPTIONS.wanted_tracks, LEAST_INLIERS].into_iter().map(|least| greedy_views(problem, open, least));
     found.into_iter().find(|found| !found.is_empty()).unwrap_or_default()
 }
 
@@ -131,7 +128,7 @@ pub fn complete_views(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
     let views = observed_views(input);
     let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
     let complete = ranges.windows(2).filter(|range| range[1] - range[0] == views.len()).count();
-    (views.len() >= LEAST_VIEWS && complete >= OPTIONS.least_tracks && 2 * complete >= observed).then_some(views)
+    (views.len() >= LEAST_VIEWS && complete >= LEAST_INLIERS && 2 * complete >= observed).then_some(views)
 }
 
 /// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on

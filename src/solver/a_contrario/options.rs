@@ -44,14 +44,15 @@ impl FalseAlarmOptions {
         usual_sigmas: 2.0,
         // Some milliseconds at 10 views, for the few consensuses that may be accepted.
         random_tracks: 500,
-        // Of 500 known to a third.
+        // Ten of 500 tracks: known to a third.
         measured_share: 0.02,
         measured_quantile: -2.053_749,
         // Cameras that do not bend the images of a set of tracks leave a fiftieth of random tracks .06 (three views) to
         // .4 (ten) of it, and what bends them is allowed to take most of that.
         least_measured: 0.01,
-        // What is smaller has next to no probability. Ratios of 1.02 to 1.3 where cameras may be doubted.
+        // Ratios of 1.02 to 1.3 where cameras may be doubted.
         extrapolated: 64,
+        // What is smaller has next to no probability.
         least_extrapolated: 0.25,
         // Three digits.
         tilt_steps: 12,

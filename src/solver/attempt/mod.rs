@@ -78,6 +78,11 @@ impl Attempt {
         self.projective.as_ref().map_or(&[], |projective| &projective.views)
     }
 
+    /// Evidence of what stands, see [`ProjectiveReconstruction::evidence`]; 0 where nothing does.
+    pub fn evidence(&self, problem: &Problem) -> f64 {
+        self.projective.as_ref().map_or(0.0, |found| found.evidence(problem.outlier_density))
+    }
+
     /// Whether single observations are judged: where image points alone verify and the method decides nothing itself.
     pub fn judges_observations(&self) -> bool {
         matches!(self.found.verified_by, VerifiedBy::ImagePoints) && self.decided.is_none()

@@ -33,7 +33,7 @@ pub struct Geometry {
     /// The component of each view, and the one that each track is in: components have frames of their own.
     pub component_of_view: Vec<u32>,
     pub component_of_track: Vec<u32>,
-    /// Whether single observations may be wrong, be it that one wrong link joins two points: those that agree on one
+    /// Whether single observations may be wrong, for example after a wrong link: those that agree on one point
     /// are looked for then, however few they are beside the others, and weigh by their sigmas. The cameras must be
     /// metric, or oriented with the plane at infinity off the points. Otherwise the worst observation is dropped as
     /// long as it is too far from the point of the others.
@@ -45,7 +45,7 @@ pub struct Geometry {
 }
 
 impl Geometry {
-    /// Of every view, for what wants a slice: nothing is observed in unregistered views.
+    /// Cameras of all views, zero where not registered.
     pub fn all_cameras(&self) -> Vec<Camera> {
         self.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect()
     }

@@ -17,7 +17,7 @@ pub struct ClassificationOptions {
     pub wrong_observation: f64,
     /// Least spread of the points of an image, image sides.
     pub least_spread: f64,
-    /// Points from which a view has a say in it.
+    /// Points from which a view counts for the density of wrong observations.
     pub least_points: usize,
     /// Refinement steps of a point.
     pub point_steps: usize,

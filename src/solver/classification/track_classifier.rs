@@ -254,7 +254,7 @@ mod tests {
     }
 
     /// A classifier of tracks that are seen by cameras in a row, under an input of one track in so many views.
-    fn bench(cameras: &[Camera], by_observation: bool) -> TrackClassifier<'static> {
+    fn classifier(cameras: &[Camera], by_observation: bool) -> TrackClassifier<'static> {
         let (input, settings) = (Box::leak(Box::new(input(cameras.len()))), Box::leak(Box::default()));
         let problem = Box::leak(Box::new(Problem::new(input, settings, Threads::ONE, Box::leak(Box::default()))));
         let cameras: &[Camera] = Box::leak(cameras.to_vec().into_boxed_slice());
@@ -264,8 +264,8 @@ mod tests {
         TrackClassifier { problem, cameras, triangulator: Triangulator::new(cameras), geometry, least_share, noise }
     }
 
-    fn judged(bench: &TrackClassifier, observations: &[Observation]) -> TrackVerdict {
-        bench.judge(&[observations]).pop().expect("a verdict")
+    fn judged(classifier: &TrackClassifier, observations: &[Observation]) -> TrackVerdict {
+        classifier.judge(&[observations]).pop().expect("a verdict")
     }
 
     fn observations(cameras: &[Camera], shifts: &[f64]) -> Vec<Observation> {
@@ -284,8 +284,8 @@ mod tests {
     #[test]
     fn a_right_track_a_track_with_one_wrong_observation_and_a_wrong_track() {
         let cameras = cameras(6);
-        let bench = bench(&cameras, false);
-        let verdict = |shifts: [f64; 6]| judged(&bench, &observations(&cameras, &shifts));
+        let classifier = classifier(&cameras, false);
+        let verdict = |shifts: [f64; 6]| judged(&classifier, &observations(&cameras, &shifts));
         let right = verdict([0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001]);
         assert!(right.inlier && right.weight > 0.999 && right.retained.iter().all(|&kept| kept));
         let one_wrong = verdict([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]);
@@ -300,7 +300,7 @@ mod tests {
     fn tracks_side_by_side_get_the_verdicts_that_each_gets_alone() {
         let cameras = cameras(10);
         for by_observation in [false, true] {
-            let bench = bench(&cameras, by_observation);
+            let classifier = classifier(&cameras, by_observation);
             let shifts: [&[f64]; LANES] = [
                 &[0.001, -0.001, 0.0005, 0.0, -0.0005, 0.001],
                 &[0.0, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, -0.1, 0.0],
@@ -312,16 +312,24 @@ mod tests {
                 &[0.1, -0.3, 0.2],
             ];
             let tracks = shifts.map(|shifts| observations(&cameras, shifts));
-            let together = bench.judge(&tracks.each_ref().map(Vec::as_slice));
+            let together = classifier.judge(&tracks.each_ref().map(Vec::as_slice));
             assert_eq!(together.len(), tracks.len());
             let mut right = 0;
             for (track, together) in tracks.iter().zip(&together) {
-                let alone = judged(&bench, track);
-                assert_eq!((together.weight, together.point), (alone.weight, alone.point), "{by_observation}");
-                assert_eq!((together.inlier, &together.retained), (alone.inlier, &alone.retained), "{by_observation}");
+                let alone = judged(&classifier, track);
+                assert_eq!(
+                    (together.weight, together.point),
+                    (alone.weight, alone.point),
+                    "by observation: {by_observation}"
+                );
+                assert_eq!(
+                    (together.inlier, &together.retained),
+                    (alone.inlier, &alone.retained),
+                    "by observation: {by_observation}"
+                );
                 right += usize::from(alone.inlier);
             }
-            assert!((3..LANES).contains(&right), "{by_observation}, {right} are right");
+            assert!((3..LANES).contains(&right), "by observation: {by_observation}, {right} are right");
         }
     }
 
@@ -329,14 +337,14 @@ mod tests {
     #[test]
     fn a_track_that_joins_two_points_is_split_and_one_that_strays_is_not() {
         let cameras = cameras(8);
-        let bench = bench(&cameras, true);
+        let classifier = classifier(&cameras, true);
         let split = |observations: &[Observation]| {
-            let mut all = Judged::nothing(bench.problem.input, bench.noise);
-            let verdict = judged(&bench, observations);
+            let mut all = Judged::nothing(classifier.problem.input, classifier.noise);
+            let verdict = judged(&classifier, observations);
             assert!(verdict.inlier);
-            let others = bench.others(observations, &verdict);
+            let others = classifier.others(observations, &verdict);
             let (observations, places) = (observations.to_vec(), (0..8).collect());
-            bench.write(&mut all, &Finding { track: 0, observations, places, verdict, others });
+            classifier.write(&mut all, &Finding { track: 0, observations, places, verdict, others });
             (all.observations.split, all.splits.len())
         };
         let mut joined = observations(&cameras, &[0.0, 0.0005, -0.0005, 0.0, 0.31, 0.0, 0.0, 0.0]);
@@ -367,11 +375,11 @@ mod tests {
     fn of_a_linked_track_the_right_run_is_kept_and_nothing_behind_the_cameras() {
         let cameras = cameras(6);
         let joined = observations(&cameras, &[0.0, 0.0005, -0.0005, 0.2, -0.15, 0.31]);
-        let verdict = judged(&bench(&cameras, true), &joined);
+        let verdict = judged(&classifier(&cameras, true), &joined);
         assert!(verdict.inlier, "{}", verdict.weight);
         assert_eq!(verdict.retained, [true, true, true, false, false, false]);
         let behind: Vec<Camera> = cameras.iter().map(|camera| -camera).collect();
-        let verdict = judged(&bench(&behind, true), &observations(&cameras, &[0.0; 6]));
+        let verdict = judged(&classifier(&behind, true), &observations(&cameras, &[0.0; 6]));
         assert!(!verdict.inlier && verdict.weight == 0.0, "{}", verdict.weight);
     }
 }

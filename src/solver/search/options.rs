@@ -31,7 +31,7 @@ pub struct AffineOptions {
 
 impl AffineOptions {
     pub const DEFAULT: Self = Self {
-        // Perspective makes right tracks deviate from affine by some tenths of it.
+        // Perspective makes right tracks deviate from affine by some tenths of a view's spread.
         tolerance: 0.2,
         // Eight keeps out the wrong tracks, twelve conditions the factorisation: each wins on some scenes.
         support_sizes: [8, 12],
@@ -98,7 +98,7 @@ pub struct RigidOptions {
     /// Steps of the golden section on the log focal length, and its half width.
     pub focal_steps: usize,
     pub focal_half_width: f64,
-    /// Tracks that take part in it.
+    /// Tracks that the golden section uses.
     pub focal_tracks: usize,
 }
 

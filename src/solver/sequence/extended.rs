@@ -53,11 +53,7 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
     recorder.enter(Stage::Calibrate);
     let mut calibrations = calibrate::calibrate(problem, &mut model, recorder)?;
     if model.is_strained {
-        let detail = format!(
-            "the views together fit much worse than the block that they were registered against: more than {:.2} px",
-            model.noise * problem.scale_px
-        );
-        calibrations.iter_mut().for_each(|outcome| refuse(outcome, detail.clone()));
+        calibrations.iter_mut().for_each(|outcome| refuse(problem, &model, outcome));
     }
     problem.stopped()?;
     components::largest_first(&mut model);
@@ -66,7 +62,11 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
 }
 
 /// Takes back a calibration under which the sequence does not hold together.
-fn refuse(outcome: &mut Outcome, detail: String) {
+fn refuse(problem: &Problem, model: &Model, outcome: &mut Outcome) {
+    let detail = format!(
+        "the views together fit much worse than the block that they were registered against: more than {:.2} px",
+        model.noise * problem.scale_px
+    );
     outcome.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
     outcome.grade = Grade::ProjectiveOnly;
 }
@@ -132,15 +132,6 @@ impl Extended {
             && self.holds_most_views()
             && !(self.is_calibrated(problem) && self.is_bent(problem))
             && (self.fits() || self.grade(problem) == Grade::Metric)
-    }
-
-    /// The same without its calibration where the views are bent to it, and nothing better was found.
-    pub fn doubted(mut self, problem: &Problem) -> Self {
-        if self.is_calibrated(problem) && self.is_bent(problem) {
-            let detail = "most residuals are small and some large: the views are bent to the focal length".to_owned();
-            self.calibrations.iter_mut().for_each(|outcome| refuse(outcome, detail.clone()));
-        }
-        self
     }
 
     fn is_bent(&self, problem: &Problem) -> bool {

@@ -46,7 +46,7 @@ const QUICK_SEED: Effort = Effort { is_seed: true, is_quick: true };
 /// What came of an input.
 pub enum Ended {
     Extended(Box<Extended>),
-    /// Nothing metric stands beyond a block, if that: the best one that was tried.
+    /// A block, projective or not, that has no metric extension: the best one that was tried.
     Block(Option<Box<Attempt>>),
 }
 
@@ -79,8 +79,8 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
         if blocks.is_whole { ExtensionOptions::DEFAULT.first_subsets.min(subsets.len()) } else { subsets.len() };
     let (cheap, rest) = subsets.split_at(cheap);
     // Nothing else is searched of a whole input with depths: what it has found stands.
-    let mut effort = Extensions { keeps_first: !is_quick, calibrates_each: metric.is_some() };
-    let mut best = by_projective_extension(problem, first, effort, cheap, recorder)?;
+    let mut policy = ExtensionPolicy { keeps_first: !is_quick, calibrates_each: metric.is_some() };
+    let mut best = by_projective_extension(problem, first, policy, cheap, recorder)?;
     if is_quick && metric.is_none() && !stands(&best) {
         let first = match blocks.by_calibration(problem, false, recorder)? {
             ControlFlow::Break(ended) => return Ok(ended),
@@ -89,22 +89,22 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
             }
             ControlFlow::Continue(ended) => ended.seed(),
         };
-        effort.keeps_first = false;
-        best = by_projective_extension(problem, first, effort, rest, recorder)?;
+        policy.keeps_first = false;
+        best = by_projective_extension(problem, first, policy, rest, recorder)?;
     }
     let best = best.filter(|best| metric.is_none() || best.is_trusted());
     Ok(match (best.map(|best| metric_of(problem, best, recorder)).transpose()?, metric) {
         (Some(Ended::Extended(found)), Some(metric)) if found.rank(problem) > metric.rank(problem) => {
             Ended::Extended(found)
         }
-        (_, Some(metric)) => Ended::Extended(Box::new(metric.doubted(problem))),
+        (_, Some(metric)) => Ended::Extended(metric),
         (found, None) => found.unwrap_or(Ended::Block(None)),
     })
 }
 
 /// What is made of projective extensions.
 #[derive(Debug, Clone, Copy)]
-struct Extensions {
+struct ExtensionPolicy {
     /// Whether the first attempt stands as it is where its extension leaves too little.
     keeps_first: bool,
     /// Whether each is calibrated: the data carry a calibration, and another start may find the better minimum.
@@ -219,12 +219,12 @@ fn by_calibrated_blocks(
     }
 }
 
-/// The best of an attempt and of those on these sets of views, each extended to all views without a calibration and
-/// calibrated then; the first that is METRIC.
+/// The best of an attempt and of those on these sets of views, each extended to all views without a calibration and, where
+/// it is not known yet, calibrated then; the first that is METRIC.
 fn by_projective_extension(
     problem: &Problem,
     first: Option<Attempt>,
-    effort: Extensions,
+    policy: ExtensionPolicy,
     sets: &[Vec<usize>],
     recorder: &mut Recorder,
 ) -> Result<Option<Attempt>, Error> {
@@ -235,7 +235,7 @@ fn by_projective_extension(
     for k in 0..starts {
         problem.stopped()?;
         let (mut attempt, keeps) = match first.take() {
-            Some(attempt) => (attempt, effort.keeps_first),
+            Some(attempt) => (attempt, policy.keeps_first),
             None => {
                 recorder.begin_block(k, starts);
                 let views = &sets[k - (starts - sets.len())];
@@ -247,17 +247,17 @@ fn by_projective_extension(
             unsolved = unsolved.or(Some(attempt));
             continue;
         }
-        let evidence = |attempt: &Attempt| {
-            attempt.projective.as_ref().map_or(0.0, |found| found.evidence(problem.outlier_density))
-        };
+        // The same one, reached from elsewhere, or a part of it: calibrating takes longer than all else.
         let is_known = |best: &Attempt| {
-            !best.is_calibrated() && evidence(&attempt) < ExtensionOptions::DEFAULT.new_evidence * evidence(best)
+            let is_part = attempt.views().iter().all(|view| best.views().binary_search(view).is_ok());
+            let grown = attempt.evidence(problem) / best.evidence(problem);
+            is_part && !best.is_calibrated() && grown < ExtensionOptions::DEFAULT.least_evidence_growth
         };
-        if !effort.calibrates_each && best.as_ref().is_some_and(is_known) {
+        if !policy.calibrates_each && best.as_ref().is_some_and(is_known) {
             continue;
         }
         attempt::calibrate(problem, &mut attempt, None, recorder)?;
-        let rank = |attempt: &Attempt| (attempt.is_calibrated(), evidence(attempt));
+        let rank = |attempt: &Attempt| (attempt.is_calibrated(), attempt.evidence(problem));
         if best.as_ref().is_none_or(|best| rank(&attempt) > rank(best)) {
             best = Some(attempt);
         }
@@ -276,9 +276,11 @@ fn metric_of(problem: &Problem, attempt: Attempt, recorder: &mut Recorder) -> Re
     if !attempt.has_metric() || attempt.is_beyond_image_points() {
         return Ok(Ended::Block(Some(Box::new(attempt))));
     }
+    let was_calibrated = attempt.is_calibrated();
     let mut extended = extend(problem, attempt, recorder)?;
-    let known = extended.seed.projective.as_ref().map_or(0.0, |found| found.evidence(problem.outlier_density));
-    if extended.stands() && (extended.is_calibrated(problem) || extended.evidence(problem) > known) {
+    let explains_more = || extended.evidence(problem) > extended.seed.evidence(problem);
+    // One that takes a calibration back stands in any case: the seed would go on giving it.
+    if extended.stands() && (was_calibrated || extended.is_calibrated(problem) || explains_more()) {
         extended.seed.verified_by_image_points();
         Ok(Ended::Extended(Box::new(extended)))
     } else {

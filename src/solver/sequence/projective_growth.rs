@@ -216,11 +216,15 @@ impl Growth for Growing<'_> {
         self.supporting(view).len()
     }
 
-    /// Points of two views too, which nothing verifies: where views are linked by few tracks there are no others. Most
-    /// wrong tracks have none, and those that are too far off to tell do not agree.
+    /// Verified points, or, where these are too few, those of two views too: nothing verifies them, but views that are
+    /// linked by few tracks have no others.
     fn supporting(&self, view: usize) -> Vec<usize> {
-        let of_view = self.problem.of_view[view].iter().map(|&k| k as usize);
-        of_view.filter(|&k| self.points[self.problem.track_of(k)].is_some()).collect()
+        let of_view = || self.problem.of_view[view].iter().map(|&k| k as usize);
+        let verified: Vec<usize> = of_view().filter(|&k| self.is_verified(self.problem.track_of(k))).collect();
+        if verified.len() >= self.options.least_agreeing {
+            return verified;
+        }
+        of_view().filter(|&k| self.points[self.problem.track_of(k)].is_some()).collect()
     }
 
     fn register(&mut self, view: usize, seen: &[usize], recorder: &mut Recorder) -> usize {

@@ -44,17 +44,17 @@ fn duplicates_of_a_wrong_track_verify_nothing() {
 }
 
 /// The answer is that of the input without the duplicates, which get the answer of the first.
-fn assert_folded(raw: &RawInput, copied: &[u32], settings: &SolveSettings) {
+fn assert_folded(raw: &RawInput, duplicated: &[u32], settings: &SolveSettings) {
     let alone = solved(&checked(raw.clone()), settings);
     assert_eq!((alone.status, duplicates(&alone)), (Status::Solved, None));
-    let input = checked(with_duplicates(raw, copied));
+    let input = checked(with_duplicates(raw, duplicated));
     let both = solved(&input, settings);
     assert!(duplicates(&both).is_some());
     assert_eq!((&both.calibrations, both.grade, &both.views), (&alone.calibrations, alone.grade, &alone.views));
     assert_eq!(both.input_sha256, Some(input.to_raw().sha256()));
     let (tracks, observations) = (raw.track_count, raw.x.len());
     let mut more = observations;
-    for (n, &track) in copied.iter().enumerate() {
+    for (n, &track) in duplicated.iter().enumerate() {
         let (duplicate, track) = (tracks + n, track as usize);
         assert_eq!(both.tracks.weight[duplicate], alone.tracks.weight[track], "{track}");
         assert_eq!(both.tracks.inlier[duplicate], alone.tracks.inlier[track], "{track}");
