@@ -78,7 +78,7 @@ impl PageArgs {
             return false;
         }
         if !self.all {
-            eprintln!("more: --page-token {next_page_token}");
+            tell!("more: --page-token {next_page_token}");
         }
         self.page_token = next_page_token;
         self.all
@@ -177,7 +177,7 @@ pub fn cores() -> usize {
 /// Tells on stderr what reading changed or left out.
 pub fn tell_notes(input: &LabelledInput) {
     for note in &input.notes {
-        eprintln!("{}: {note}", input.display_path());
+        tell!("{}: {note}", input.display_path());
     }
 }
 
@@ -215,7 +215,7 @@ impl ExportArgs {
     /// A file that cannot be written or removed.
     pub fn write(&self, directory: &Path, solution: &Solution, input: Option<&LabelledInput>) -> Result<(), Failure> {
         if let Some(refused) = result_files::write(directory, solution, input, &self.exports())? {
-            eprintln!("warning: nothing was exported: {refused}");
+            tell!("warning: nothing was exported: {refused}");
         }
         Ok(())
     }

@@ -221,7 +221,7 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
     // The event that tells the result, or the end, came before.
     let job = client.get(name).await?;
     if last.is_none() {
-        eprintln!("nothing comes after event {after}: {} is {}", job.name, job.state.name());
+        tell!("nothing comes after event {after}: {} is {}", job.name, job.state.name());
     }
     client::ended_as(&job.name, job.state, job.failure.as_ref())?;
     Ok(job.summary.map_or(Exit::Done, |summary| Exit::of_status(summary.status)))

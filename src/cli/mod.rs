@@ -2,6 +2,15 @@
 //!
 //! May depend on everything; only `client.rs` and the commands that talk to a server see prost and tonic.
 
+/// Writes a line to standard error. That its reader has gone ends nothing: what is computed is worth more than its
+/// progress.
+macro_rules! tell {
+    ($($line:tt)*) => {{
+        use std::io::Write;
+        let _ = writeln!(std::io::stderr(), $($line)*);
+    }};
+}
+
 pub mod args;
 pub mod cancel;
 pub mod client;
@@ -89,7 +98,7 @@ pub fn run(cli: Cli) -> ExitCode {
     match dispatch(cli.command) {
         Ok(exit) => exit.into(),
         Err(failure) => {
-            eprintln!("error: {failure}");
+            tell!("error: {failure}");
             failure.exit.into()
         }
     }

@@ -48,7 +48,7 @@ impl ProgressView {
         match &self.shown {
             Shown::Nothing => {}
             Shown::Bar(bar) => bar.println(text),
-            Shown::Lines { .. } => eprintln!("{text}"),
+            Shown::Lines { .. } => tell!("{text}"),
         }
     }
 
@@ -65,7 +65,7 @@ impl ProgressView {
                 if last.is_none_or(|last| is_line_due(&last, progress)) {
                     *last = Some(*progress);
                     let percent = progress.fraction * 100.0;
-                    eprintln!("{:>9} {percent:3.0}% {}", progress.stage.name(), describe(progress));
+                    tell!("{:>9} {percent:3.0}% {}", progress.stage.name(), describe(progress));
                 }
             }
         }
@@ -83,7 +83,7 @@ impl ProgressView {
                     bar.set_message(text.to_owned());
                 }
             }
-            Shown::Lines { .. } => eprintln!("{text}"),
+            Shown::Lines { .. } => tell!("{text}"),
         }
     }
 

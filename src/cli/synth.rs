@@ -138,7 +138,7 @@ pub fn run(args: Args) -> Result<Exit, Failure> {
         let sequence = args.generate_sequence()?;
         write(&args.out, &sequence.input, &sequence.options, &sequence.truth)?;
         let right = sequence.truth.inlier.iter().filter(|&&inlier| inlier).count();
-        eprintln!(
+        tell!(
             "{} views, {} observations, {} tracks of {} to {} views of which {right} are right, {}: {}",
             args.scene.views,
             sequence.input.x.len(),
@@ -152,7 +152,7 @@ pub fn run(args: Args) -> Result<Exit, Failure> {
     }
     let scene = args.generate()?;
     write_scene(&args.out, &scene)?;
-    eprintln!("{}: {}", describe(&scene), args.out.display());
+    tell!("{}: {}", describe(&scene), args.out.display());
     Ok(Exit::Done)
 }
 

@@ -232,7 +232,7 @@ impl View {
 
     fn note(&self, line: &str) {
         if !self.quiet {
-            self.bar.suspend(|| eprintln!("{line}"));
+            self.bar.suspend(|| tell!("{line}"));
         }
     }
 }

@@ -72,23 +72,29 @@ pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
 pub fn admit_misfit(outcome: &mut Outcome, estimates: &[Estimate], grades: &GradeOptions) {
     let fused = fuse(estimates, 0.0).zip(outcome.sigma_log_focal);
     if let Some((fused, own)) = fused.filter(|_| outcome.grade != Grade::ProjectiveOnly) {
-        raise(outcome, own.hypot(fused.misfit), &fused, &format!("{} blocks of views", estimates.len()), grades);
+        let reason = fused.spread(&format!("{} blocks of views", estimates.len()));
+        raise(outcome, own.hypot(fused.misfit), &reason, grades);
     }
 }
 
-/// Raises the sigma of a calibration, grades it anew and says so.
-pub fn raise(outcome: &mut Outcome, sigma: f64, fused: &Fused, which: &str, grades: &GradeOptions) {
+impl Fused {
+    /// By how much these estimates, of `which`, differ.
+    pub fn spread(&self, which: &str) -> String {
+        format!(
+            "{which} differ in focal length by {:.2} % (one standard deviation beside their own), chi-square {:.1} a \
+             degree of freedom",
+            100.0 * self.misfit,
+            self.chi_square
+        )
+    }
+}
+
+/// Raises the sigma of a calibration, grades it anew and says so, with the reason.
+pub fn raise(outcome: &mut Outcome, sigma: f64, reason: &str, grades: &GradeOptions) {
     let Some(own) = outcome.sigma_log_focal else { return };
     outcome.raise_sigma(sigma, grades);
     if sigma > WORTH_A_WARNING * own && sigma > WORTH_MINDING {
-        let detail = format!(
-            "{which} differ in focal length by {:.2} % (one standard deviation beside their own), chi-square {:.1} a \
-             degree of freedom; sigma was raised from {:.3} to {:.3} %",
-            100.0 * fused.misfit,
-            fused.chi_square,
-            100.0 * own,
-            100.0 * sigma
-        );
+        let detail = format!("{reason}; sigma was raised from {:.3} to {:.3} %", 100.0 * own, 100.0 * sigma);
         outcome.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
     }
 }

@@ -134,7 +134,7 @@ impl Client {
             // Whether it is the right server can be asked once it has gone on for so long: one that is ended breaks
             // connections in the same way.
             let trouble = Error::from_status(&self.server, &status, true);
-            eprintln!("waiting up to {} s: {trouble}", Backoff::TOTAL.as_secs());
+            tell!("waiting up to {} s: {trouble}", Backoff::TOTAL.as_secs());
         }
         let error = self.error(status);
         if transient && backoff.pause().await {

@@ -218,6 +218,9 @@ pub struct WindowOptions {
     pub most_windows: usize,
     /// Observations of a view that a window holds.
     pub of_view: usize,
+    /// Distance of the windows' focal length from that of all views, in standard deviations of the former, beyond which
+    /// it is no chance.
+    pub significant_distance: f64,
 }
 
 impl WindowOptions {
@@ -228,5 +231,6 @@ impl WindowOptions {
         // A variance of 50 values is known to a fifth.
         most_windows: 50,
         of_view: 150,
+        significant_distance: 2.0,
     };
 }

@@ -27,9 +27,23 @@ pub fn reconcile(
     let apart = fused.log_focal - model.log_focal(camera, &of_camera(problem, model, camera));
     // The windows' own formal variance is taken off: only what lies beyond it raises the sigma of the whole.
     let beyond = |value: f64| (value.powi(2) - fused.formal.powi(2)).max(0.0).sqrt();
-    let sigma = own.hypot(beyond(fused.sigma)).max(beyond(apart));
-    let which = format!("{} windows of the sequence", estimates.len());
-    raise(outcome, sigma, &fused, &which, &problem.calibration_options.grades);
+    let by_spread = own.hypot(beyond(fused.sigma));
+    // Windows that know little are apart from the whole by chance.
+    let is_apart = apart.abs() > OPTIONS.significant_distance * fused.formal && beyond(apart) > by_spread;
+    let count = estimates.len();
+    let (sigma, reason) = match is_apart {
+        true => (
+            beyond(apart),
+            format!(
+                "{count} windows of the sequence together have a focal length that differs by {:.2} % from that of all \
+                 views, {:.1} standard deviations of theirs",
+                100.0 * apart.abs(),
+                apart.abs() / fused.formal
+            ),
+        ),
+        false => (by_spread, fused.spread(&format!("{count} windows of the sequence"))),
+    };
+    raise(outcome, sigma, &reason, &problem.calibration_options.grades);
     Ok(())
 }
 
