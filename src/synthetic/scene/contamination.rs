@@ -232,7 +232,7 @@ fn exchange(image: &mut [Observation], to: &[usize], from: &[usize]) {
 
 /// Image in `camera` of a point elsewhere on the ray from `reference` to this point. `None` where every point tried is
 /// too near to `camera` or behind it.
-fn slide(reference: &Camera, camera: &Camera, point: &Vector3<f64>, rng: &mut ChaCha8Rng) -> Option<[f64; 3]> {
+pub fn slide(reference: &Camera, camera: &Camera, point: &Vector3<f64>, rng: &mut ChaCha8Rng) -> Option<[f64; 3]> {
     let centre = reference.pose.centre();
     let [x, y, _] = camera.project(point);
     let mut farthest: Option<(f64, [f64; 3])> = None;

@@ -19,10 +19,10 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-pub(super) use self::camera::rows;
-use self::camera::{Camera, Lens};
+pub(super) use self::camera::{Camera, Lens, rows};
 use self::contamination::Contamination;
 pub use self::contamination::OutlierKind;
+pub(super) use self::contamination::slide;
 pub use self::motion::Motion;
 pub(super) use self::motion::Pose;
 pub use self::noise::NoiseKind;
@@ -133,7 +133,7 @@ impl Scene {
             focals_px: cameras.iter().map(|camera| camera.focal_px).collect(),
             principal_point_px: principal_point_px(options),
             principal_points_px: cameras.iter().map(|camera| camera.principal_point_px).collect(),
-            radial_k1: cameras.iter().map(|camera| camera.lens.k1).collect(),
+            radial_k1: cameras.iter().map(|camera| camera.lens.k1()).collect(),
             inlier: contamination.inlier(),
             second_body,
             observation_right,
@@ -163,7 +163,7 @@ fn draw_cameras(
     points: &[Vector3<f64>],
     rng: &mut ChaCha8Rng,
 ) -> Result<Vec<Camera>, InvalidInput> {
-    let lens = Lens { k1: options.radial_k1 };
+    let lens = Lens::of_k1(options.radial_k1);
     let principal_point_px = principal_point_px(options);
     let mut zoom_rng = Stream::Zoom.of(options.seed);
     let mut own_rng = Stream::OwnCameras.of(options.seed);
@@ -175,8 +175,9 @@ fn draw_cameras(
         Camera {
             pose,
             focal_px,
+            aspect: 1.0,
             principal_point_px: [principal_point_px[0] + shift_px * x, principal_point_px[1] + shift_px * y],
-            lens: Lens { k1: options.radial_k1 * (1.0 + OWN_RADIAL_K1 * bend) },
+            lens: Lens::of_k1(options.radial_k1 * (1.0 + OWN_RADIAL_K1 * bend)),
         }
     };
     let mut pose_camera = |pose| {
@@ -184,7 +185,7 @@ fn draw_cameras(
             return own(pose);
         }
         let zoom = options.zoom * zoom_rng.random_range(-1.0..1.0);
-        Camera { pose, focal_px: focal_px * (1.0 + zoom), principal_point_px, lens }
+        Camera { pose, focal_px: focal_px * (1.0 + zoom), aspect: 1.0, principal_point_px, lens }
     };
     Ok(motion::draw_poses(options, points, lens, rng)?.into_iter().map(&mut pose_camera).collect())
 }

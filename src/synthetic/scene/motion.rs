@@ -82,6 +82,12 @@ pub struct Pose {
 }
 
 impl Pose {
+    /// Of a camera at the origin that looks along `z`.
+    pub const IDENTITY: Self = Self {
+        rotation: Matrix3::new(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+        translation: Vector3::new(0.0, 0.0, 0.0),
+    };
+
     /// The moved point.
     pub fn apply(&self, point: &Vector3<f64>) -> Vector3<f64> {
         self.rotation * point + self.translation

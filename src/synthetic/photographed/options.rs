@@ -1,0 +1,297 @@
+//! What a scene shall be, and which wishes make no scene.
+
+use serde::{Deserialize, Serialize};
+
+use super::lens;
+use crate::domain::error::{InvalidInput, Violation, Violations};
+
+/// How the camera moves. Distances are in units of the world, points mostly 2 to 8 of them away.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PhotographedMotion {
+    /// On a circle about an object, looking at it.
+    Orbit,
+    /// On foot about an object, at changing distances and heights, looking roughly at it.
+    WalkAround,
+    /// From random places, looking at one part of a room; the order of the views means nothing.
+    HandHeld,
+    /// Forward through a corridor, with swings to either side.
+    Corridor,
+    /// Forward along a street with turns.
+    Drive,
+    /// Above ground, on a grid: the first half of the views looks down along one flight direction, the other half looks
+    /// obliquely along the other.
+    AerialGrid,
+    /// A turn on the spot whose centre moves by a few hundredths of the scene's distance.
+    NearRotation,
+    /// A turn about the camera's centre: constant intrinsics show, depths do not.
+    PureRotation,
+    /// Random places without any turn: critical, no calibration.
+    Translation,
+    /// Views of a plane from several sides.
+    PlanarScene,
+}
+
+impl PhotographedMotion {
+    pub const ALL: [Self; 10] = [
+        Self::Orbit,
+        Self::WalkAround,
+        Self::HandHeld,
+        Self::Corridor,
+        Self::Drive,
+        Self::AerialGrid,
+        Self::NearRotation,
+        Self::PureRotation,
+        Self::Translation,
+        Self::PlanarScene,
+    ];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Orbit => "orbit",
+            Self::WalkAround => "walk-around",
+            Self::HandHeld => "hand-held",
+            Self::Corridor => "corridor",
+            Self::Drive => "drive",
+            Self::AerialGrid => "aerial-grid",
+            Self::NearRotation => "near-rotation",
+            Self::PureRotation => "pure-rotation",
+            Self::Translation => "translation",
+            Self::PlanarScene => "planar-scene",
+        }
+    }
+
+    /// Whether the camera stays in one place but for [`PhotographedOptions::baseline`].
+    pub fn is_on_the_spot(self) -> bool {
+        matches!(self, Self::NearRotation | Self::PureRotation)
+    }
+}
+
+/// What the lens does; [`PhotographedOptions`] holds the numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LensKind {
+    Pinhole,
+    /// A little radial distortion of either sign, as of a phone.
+    Mild,
+    Barrel,
+    Pincushion,
+    /// A wide barrel that needs a second coefficient.
+    ActionCamera,
+    /// Equidistant, 150 degrees across the diagonal.
+    Fisheye,
+    /// A pinhole whose principal point is off the centre, as in a cropped image.
+    DisplacedPrincipalPoint,
+    /// A pinhole whose pixels are not square.
+    Aspect,
+}
+
+impl LensKind {
+    pub const ALL: [Self; 8] = [
+        Self::Pinhole,
+        Self::Mild,
+        Self::Barrel,
+        Self::Pincushion,
+        Self::ActionCamera,
+        Self::Fisheye,
+        Self::DisplacedPrincipalPoint,
+        Self::Aspect,
+    ];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Pinhole => "pinhole",
+            Self::Mild => "mild",
+            Self::Barrel => "barrel",
+            Self::Pincushion => "pincushion",
+            Self::ActionCamera => "action-camera",
+            Self::Fisheye => "fisheye",
+            Self::DisplacedPrincipalPoint => "displaced-principal-point",
+            Self::Aspect => "aspect",
+        }
+    }
+}
+
+/// How focal lengths differ between views.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FocalKind {
+    Constant,
+    /// Steadily from the first view to the last.
+    Drifting,
+    /// The views of two cameras in turns, each a camera group.
+    TwoGroups,
+}
+
+impl FocalKind {
+    pub const ALL: [Self; 3] = [Self::Constant, Self::Drifting, Self::TwoGroups];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Constant => "constant",
+            Self::Drifting => "drifting",
+            Self::TwoGroups => "two-groups",
+        }
+    }
+}
+
+/// Which of the views that a point is in front of observe it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum VisibilityKind {
+    /// Views in a row.
+    Banded,
+    /// Each with the same probability, whatever its place.
+    Scattered,
+}
+
+impl VisibilityKind {
+    pub const ALL: [Self; 2] = [Self::Banded, Self::Scattered];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Banded => "banded",
+            Self::Scattered => "scattered",
+        }
+    }
+}
+
+/// What is wrong with the wrong tracks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum WrongKind {
+    /// Nothing.
+    Clean,
+    /// Each observation is that of another wrong track in the same view.
+    Permuted,
+    /// From some view on, the observations slide along the epipolar lines of the track's first view.
+    Slid,
+    /// From some view on, the observations drift off in the image at a constant speed.
+    Drifting,
+    /// The observations stay in one place of the image: a watermark, dirt on the lens.
+    Static,
+    /// The points are of a second rigid body with a motion of its own.
+    SecondBody,
+    /// In fewer than half of the views, the observation is that of the same point of the neighbouring copy of a
+    /// repeated structure.
+    Repeated,
+    /// Copies of few wrong tracks, within .3 px.
+    NearDuplicates,
+    /// One wrong link: the track goes over to another point for good.
+    WrongLink,
+}
+
+impl WrongKind {
+    pub const ALL: [Self; 9] = [
+        Self::Clean,
+        Self::Permuted,
+        Self::Slid,
+        Self::Drifting,
+        Self::Static,
+        Self::SecondBody,
+        Self::Repeated,
+        Self::NearDuplicates,
+        Self::WrongLink,
+    ];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Clean => "clean",
+            Self::Permuted => "permuted",
+            Self::Slid => "slid",
+            Self::Drifting => "drifting",
+            Self::Static => "static",
+            Self::SecondBody => "second-body",
+            Self::Repeated => "repeated",
+            Self::NearDuplicates => "near-duplicates",
+            Self::WrongLink => "wrong-link",
+        }
+    }
+}
+
+/// What to generate: every choice, so that a record of them gives the scene again.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PhotographedOptions {
+    pub views: usize,
+    pub tracks: usize,
+    pub motion: PhotographedMotion,
+    /// How far the motion turns, in radians: all the way about the object or along the street, and otherwise the
+    /// largest turn of a view to either side.
+    pub turn_rad: f64,
+    /// How far the centre of a camera that turns on the spot moves to either side, as a share of the distance of the
+    /// scene; other motions do not look at it.
+    pub baseline: f64,
+    pub lens: LensKind,
+    /// Focal length of the middle view, or of the first camera of two, in pixels along x.
+    pub focal_px: f64,
+    pub focal: FocalKind,
+    /// The last focal length over the first, or that of the second camera over that of the first.
+    pub focal_ratio: f64,
+    /// Displacement of the principal point from the centre of the image, right and down, as a share of its width.
+    pub principal_point: [f64; 2],
+    /// Focal length along y over that along x.
+    pub aspect: f64,
+    /// `k1` and `k2`; a fisheye does not look at them.
+    pub radial: [f64; 2],
+    /// Standard deviation of the core of the noise in pixels.
+    pub noise_px: f64,
+    pub visibility: VisibilityKind,
+    /// Banded: views of a track, uniform between the two as far as its point is in view.
+    pub lifetime: (usize, usize),
+    /// Scattered: probability that a view which is before a point observes it.
+    pub seen_share: f64,
+    pub wrong: WrongKind,
+    /// Share of the tracks that are wrong.
+    pub wrong_share: f64,
+    pub seed: u64,
+}
+
+impl PhotographedOptions {
+    /// Views and tracks that one scene may have, so that a slip of the finger does not fill the memory.
+    pub const MAX_VIEWS: usize = 1_000;
+    pub const MAX_TRACKS: usize = 100_000;
+
+    /// The scene in a line: its motion, lens, focal lengths, visibility and what is wrong.
+    pub fn name(&self) -> String {
+        let Self { motion, lens, focal, visibility, wrong, .. } = self;
+        [motion.name(), lens.name(), focal.name(), visibility.name(), wrong.name()].join("/")
+    }
+
+    /// Checks every option.
+    ///
+    /// # Errors
+    /// Each violation names its option.
+    pub fn validate(&self) -> Result<(), InvalidInput> {
+        let mut found = Violations::default();
+        let mut within = |name: &str, value: f64, least: f64, most: f64| {
+            if !(least..=most).contains(&value) {
+                found.push(Violation::of(name, format!("{value} is not in {least}..={most}")));
+            }
+        };
+        within("views", self.views as f64, 2.0, Self::MAX_VIEWS as f64);
+        within("tracks", self.tracks as f64, 1.0, Self::MAX_TRACKS as f64);
+        within("turn_rad", self.turn_rad, 0.0, std::f64::consts::TAU);
+        within("baseline", self.baseline, 0.0, 0.5);
+        within("focal_px", self.focal_px, 100.0, 1e5);
+        within("focal_ratio", self.focal_ratio, 0.1, 10.0);
+        within("aspect", self.aspect, 0.5, 2.0);
+        within("noise_px", self.noise_px, 0.0, 100.0);
+        within("seen_share", self.seen_share, 0.01, 1.0);
+        within("wrong_share", self.wrong_share, 0.0, 1.0);
+        self.principal_point.iter().for_each(|&shift| within("principal_point", shift, -0.3, 0.3));
+        let (least, most) = self.lifetime;
+        if least < 2 || most < least {
+            let reason = format!("{least} to {most} is not a range of two views or more");
+            found.push(Violation::of("lifetime", reason));
+        }
+        found.into_result()?;
+        if !lens::images_all(self) {
+            let reason = format!(
+                "k1 {} and k2 {} fold the image at a focal length of {} px",
+                self.radial[0], self.radial[1], self.focal_px
+            );
+            return Err(Violation::of("radial", reason).into());
+        }
+        Ok(())
+    }
+}
