@@ -11,6 +11,7 @@ use sha2::{Digest, Sha256};
 use super::args::cores;
 use super::evaluate_choices::{ContestantArg, DepthsArg, SweepArg};
 use super::evaluate_observations::{self, ObservationArgs};
+use super::evaluate_photographed::{self, PhotographedArgs};
 use super::evaluate_priors::{self, PriorArgs, Work};
 use super::evaluate_real::{self, RealArgs};
 use super::exit::{self, Exit, Failure};
@@ -42,6 +43,7 @@ Examples:
   scpsfm evaluate --sweeps outliers --depths given,epipolar --methods paper,psfm --paper-width 1
   scpsfm evaluate --priors --seeds 20 --out priors
   scpsfm evaluate --observations --scenes complete --out observations
+  scpsfm evaluate --photographed --seeds 40 --scenes fisheye --out photographed
   scpsfm evaluate --real sequences --peer 'python peer.py' --out side-by-side
 
 Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
@@ -71,7 +73,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR", default_value = "scpsfm-evaluation")]
     pub out: PathBuf,
 
-    /// Scenes a cell [default: 20, with --quick 4]
+    /// Scenes a cell [default: 20, with --quick 4, with --photographed 300 in all]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=10_000))]
     pub seeds: Option<u64>,
 
@@ -123,6 +125,9 @@ pub struct Args {
 
     #[command(flatten)]
     pub observations: ObservationArgs,
+
+    #[command(flatten)]
+    pub photographed: PhotographedArgs,
 
     #[command(flatten)]
     pub real: RealArgs,
@@ -196,6 +201,12 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         let work = Work { out: &args.out, threads, quiet: args.quiet };
         let (scenes, peer) = (args.priors.scenes.as_deref(), args.real.peer_words()?);
         return evaluate_observations::run(scenes, seeds, peer, &work, args.json);
+    }
+    if args.photographed.photographed {
+        let work = Work { out: &args.out, threads, quiet: args.quiet };
+        let (scenes, peer) = (args.priors.scenes.as_deref(), args.real.peer_words()?);
+        let seeds = args.seeds.unwrap_or(evaluate_photographed::SEEDS);
+        return evaluate_photographed::run(scenes, seeds, peer, &work, args.json);
     }
     if args.priors.priors {
         return evaluate_priors::run(&args.priors, &args.out, seeds, threads, args.json, args.quiet).await;

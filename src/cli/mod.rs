@@ -19,6 +19,7 @@ pub mod demo;
 pub mod evaluate;
 pub mod evaluate_choices;
 pub mod evaluate_observations;
+pub mod evaluate_photographed;
 mod evaluate_priors;
 pub mod evaluate_real;
 pub mod exit;

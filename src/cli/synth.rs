@@ -5,14 +5,17 @@ use std::path::{Path, PathBuf};
 use super::exit::{Exit, Failure};
 pub use super::scene_args::SceneArgs;
 use super::scene_args::{CameraArgs, GeometryArgs, OutlierArgs};
-use crate::domain::RawInput;
 use crate::domain::error::quoted;
+use crate::domain::{ImageSize, RawInput};
 use crate::formats::observations;
 use crate::formats::publish::{create_directory, pretty, write_atomically};
 use crate::formats::result_files::OBSERVATIONS;
+use crate::synthetic::photographed::IMAGE_SIZE;
 pub use crate::synthetic::scene::IMAGE_SIDE_PX;
-use crate::synthetic::{Scene, Sequence, SequenceOptions};
+use crate::synthetic::{Photographed, PhotographedOptions, Scene, Sequence, SequenceOptions};
 
+/// Size of the images of all scenes but the photographed ones.
+const SQUARE: ImageSize = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
 /// Name of the file that holds what the scene was made of.
 pub const TRUTH: &str = "truth.json";
 
@@ -24,6 +27,7 @@ Examples:
   scpsfm synth --out scene --wrong-views 2 --second-motion 0.3   # partly wrong tracks, two bodies
   scpsfm synth --out scene --outliers 0.3 --wrong-observations 2   # right tracks that are wrong in 2 of 10 views
   scpsfm synth --out walk --sequence --views 100 --tracks 5000 --noise 0.0005 --outliers 0.5   # tracks of 3 to 10 views
+  scpsfm synth --out photographed --photographed --seed 7   # truth.json says what was drawn
   scpsfm solve scene/observations.csv --width 1000 --height 1000 --out answer";
 
 /// Make a contaminated scene whose truth is known
@@ -31,7 +35,7 @@ Examples:
 /// The generator of the paper's section 5.1: points in a box, cameras of one focal length around it, noise, and tracks
 /// whose image points are exchanged among each other; and departures from it, among them motions that no
 /// self-calibration survives. Writes observations.csv and truth.json; images are 1000 x 1000 px, and points are where
-/// the cameras project them, many of them outside.
+/// the cameras project them, many of them outside; those of --photographed are inside, of 1600 x 1200 px.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {
@@ -57,6 +61,15 @@ pub struct Args {
 
     #[command(flatten)]
     pub sequence: SequenceArgs,
+
+    /// A scene as people photograph it, all of whose choices (motion, lens, focal lengths, visible views, noise, what is
+    /// wrong) are drawn from --seed; images are 1600 x 1200 px. truth.json holds the choices and the camera group of
+    /// each view
+    #[arg(long, help_heading = "A photographed scene", conflicts_with_all = ["views", "tracks", "noise", "outliers", "rotation",
+        "shape", "motion", "roll", "outlier_kind", "wrong_views", "seen_views", "wrong_observations",
+        "deleted_observations", "second_motion", "noise_kind", "principal_point", "radial_k1", "zoom", "depths",
+        "sequence"])]
+    pub photographed: bool,
 }
 
 /// A camera that travels, instead of the paper's scene.
@@ -134,9 +147,12 @@ struct TruthJson<'a, O, T> {
 
 /// Runs the command.
 pub fn run(args: Args) -> Result<Exit, Failure> {
+    if args.photographed {
+        return photographed(&args);
+    }
     if args.sequence.sequence {
         let sequence = args.generate_sequence()?;
-        write(&args.out, &sequence.input, &sequence.options, &sequence.truth)?;
+        write(&args.out, SQUARE, &sequence.input, &sequence.options, &sequence.truth)?;
         let right = sequence.truth.inlier.iter().filter(|&&inlier| inlier).count();
         tell!(
             "{} views, {} observations, {} tracks of {} to {} views of which {right} are right, {}: {}",
@@ -153,6 +169,24 @@ pub fn run(args: Args) -> Result<Exit, Failure> {
     let scene = args.generate()?;
     write_scene(&args.out, &scene)?;
     tell!("{}: {}", describe(&scene), args.out.display());
+    Ok(Exit::Done)
+}
+
+/// Writes the photographed scene of the seed.
+fn photographed(args: &Args) -> Result<Exit, Failure> {
+    let options = PhotographedOptions::drawn(args.scene.seed);
+    let scene = Photographed::generate(&options).map_err(|error| Failure::usage(format!("--seed: {error}")))?;
+    write(&args.out, IMAGE_SIZE, &scene.input, &scene.options, &scene.truth)?;
+    let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
+    eprintln!(
+        "{}: {} views, {} observations, {} tracks of which {right} are right, {}: {}",
+        options.name(),
+        options.views,
+        scene.input.x.len(),
+        options.tracks,
+        focal(options.focal_px, 0.0),
+        args.out.display()
+    );
     Ok(Exit::Done)
 }
 
@@ -176,18 +210,19 @@ fn focal(focal_px: f64, zoom: f64) -> String {
 /// # Errors
 /// The file that cannot be written.
 pub fn write_scene(directory: &Path, scene: &Scene) -> Result<(), Failure> {
-    write(directory, &scene.input, &scene.options, &scene.truth)
+    write(directory, SQUARE, &scene.input, &scene.options, &scene.truth)
 }
 
 fn write<O: serde::Serialize, T: serde::Serialize>(
     directory: &Path,
+    size: ImageSize,
     input: &RawInput,
     options: &O,
     truth: &T,
 ) -> Result<(), Failure> {
     create_directory(directory)?;
     write_atomically(directory, OBSERVATIONS, observations::csv(input).as_bytes())?;
-    let truth = TruthJson { options, image_width_px: IMAGE_SIDE_PX, image_height_px: IMAGE_SIDE_PX, truth };
+    let truth = TruthJson { options, image_width_px: size.width_px, image_height_px: size.height_px, truth };
     write_atomically(directory, TRUTH, pretty(&truth)?.as_bytes())?;
     Ok(())
 }
@@ -199,7 +234,7 @@ mod tests {
     use clap::Parser;
 
     use super::*;
-    use crate::domain::{ImageSize, Limits};
+    use crate::domain::Limits;
     use crate::formats::{self, Reading};
     use crate::synthetic::{Motion, NoiseKind, OutlierKind, SceneOptions, Shape};
 
@@ -223,8 +258,7 @@ mod tests {
             let args = args(&out, more);
             let scene = args.generate().expect("valid options");
             assert_eq!(run(args), Ok(Exit::Done));
-            let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
-            let reading = Reading { size: Some(size), ..Reading::default() };
+            let reading = Reading { size: Some(SQUARE), ..Reading::default() };
             let read = formats::read(&out.join(OBSERVATIONS), &Limits::default(), &reading).expect("a valid file");
             assert_eq!(read.raw.views, scene.input.views);
             assert_eq!((&read.raw.view, &read.raw.track), (&scene.input.view, &scene.input.track));

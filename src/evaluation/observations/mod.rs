@@ -1,5 +1,6 @@
 //! Inputs that only an estimator which judges single observations can solve: this program, and another one beside it
-//! on the same files. [`conditions`] are the inputs, [`table`] shows the rows.
+//! on the same files. [`conditions`] are the inputs, [`table`] shows the rows. The photographed scenes are inputs, too;
+//! [`super::photographed`] has their plan and their tables.
 
 mod bound;
 pub mod conditions;
@@ -9,12 +10,14 @@ pub mod table;
 use serde::{Deserialize, Serialize};
 
 use crate::domain::error::InvalidInput;
-use crate::domain::{Grade, RawInput, StopToken};
+use crate::domain::{Grade, ImageSize, RawInput, StopToken};
 use crate::evaluation::real::Side;
 use crate::evaluation::records;
 use crate::geometry::statistics::median;
 use crate::synthetic::metrics::agreement;
-use crate::synthetic::{Scene, SceneOptions, Sequence, SequenceOptions};
+use crate::synthetic::photographed::{FocalKind, IMAGE_SIZE};
+use crate::synthetic::scene::IMAGE_SIDE_PX;
+use crate::synthetic::{Photographed, PhotographedOptions, Scene, SceneOptions, Sequence, SequenceOptions};
 pub use conditions::Condition;
 
 /// First seed: above those of the other evaluations.
@@ -25,6 +28,10 @@ const WRONG_FOCAL: f64 = 0.03;
 const WRONG_SIGMAS: f64 = 4.0;
 /// Standard deviations that a focal length shall be within.
 const COVERED_SIGMAS: f64 = 3.0;
+
+/// Right observations of tracks with three of them that a photographed view needs to count among those that shall be
+/// registered.
+const REGISTRABLE: usize = 15;
 
 /// The file of the records.
 pub const RECORDS: &str = "observations.jsonl";
@@ -38,6 +45,7 @@ pub type Records = records::Records<Run, Measured>;
 pub enum Generator {
     Scene(SceneOptions),
     Sequence(SequenceOptions),
+    Photographed(PhotographedOptions),
 }
 
 impl Generator {
@@ -46,6 +54,7 @@ impl Generator {
         match self {
             Generator::Scene(options) => Generator::Scene(SceneOptions { seed, ..options.clone() }),
             Generator::Sequence(options) => Generator::Sequence(SequenceOptions { seed, ..options.clone() }),
+            Generator::Photographed(_) => Generator::Photographed(PhotographedOptions::drawn(seed)),
         }
     }
 
@@ -53,15 +62,28 @@ impl Generator {
         Ok(match self {
             Generator::Scene(options) => {
                 let scene = Scene::generate(options)?;
-                let bounds = if options.own_cameras { bound::sigmas(&scene) } else { None };
+                let bounds = if options.own_cameras { bound::of_scene(&scene) } else { None };
                 let Scene { input, truth, .. } = scene;
-                let right = truth.observation_right;
-                Sample { input, inlier: truth.inlier, right, focals_px: truth.focals_px, bounds }
+                let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
+                Sample { bounds, ..Sample::new(size, input, truth.inlier, truth.observation_right, truth.focals_px) }
             }
             Generator::Sequence(options) => {
                 let Sequence { input, truth, .. } = Sequence::generate(options)?;
+                let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
+                Sample::new(size, input, truth.inlier, truth.observation_right, truth.focals_px)
+            }
+            Generator::Photographed(options) => {
+                let scene = Photographed::generate(options)?;
+                let bounds = bound::of_photographed(&scene);
+                let Photographed { input, truth, .. } = scene;
+                let wanted = truth.verifiable(&input.track);
+                let mut of_view = vec![0; input.views.len()];
+                let views = input.view.iter().zip(&wanted).filter(|(_, wanted)| **wanted);
+                views.for_each(|(&view, _)| of_view[view as usize] += 1);
+                let due = of_view.into_iter().map(|count| count >= REGISTRABLE).collect();
                 let right = truth.observation_right;
-                Sample { input, inlier: truth.inlier, right, focals_px: truth.focals_px, bounds: None }
+                let sample = Sample::new(IMAGE_SIZE, input, truth.inlier, right, truth.focals_px);
+                Sample { bounds, wanted, due, ..sample }
             }
         })
     }
@@ -70,11 +92,17 @@ impl Generator {
 /// An input and its truth.
 #[derive(Debug, Clone)]
 struct Sample {
+    /// Of all images.
+    size: ImageSize,
     input: RawInput,
     /// Whether a track is right.
     inlier: Vec<bool>,
     /// Whether an observation is right.
     right: Vec<bool>,
+    /// Whether an observation shall be kept.
+    wanted: Vec<bool>,
+    /// Whether a view shall be registered.
+    due: Vec<bool>,
     /// True focal length of each view.
     focals_px: Vec<f64>,
     /// Cramer-Rao bound of the standard deviation of each view's log focal length, where it is known.
@@ -82,6 +110,12 @@ struct Sample {
 }
 
 impl Sample {
+    /// Of all views, and of the right observations of right tracks, an answer is expected; no bound is known.
+    fn new(size: ImageSize, input: RawInput, inlier: Vec<bool>, right: Vec<bool>, focals_px: Vec<f64>) -> Self {
+        let wanted = right.iter().zip(&input.track).map(|(&right, &k)| right && inlier[k as usize]).collect();
+        Self { size, due: vec![true; input.views.len()], input, inlier, right, wanted, focals_px, bounds: None }
+    }
+
     /// True focal length of each view and the bound of its estimate.
     fn focals(&self) -> impl Iterator<Item = (f64, Option<f64>)> {
         let bound = |view: usize| self.bounds.as_ref().map(|bounds| bounds[view]);
@@ -99,6 +133,17 @@ pub enum Declared {
     FocalPerView,
 }
 
+impl Declared {
+    /// What a user knows of the cameras of a photographed scene.
+    fn of(options: &PhotographedOptions) -> Self {
+        match options.focal {
+            FocalKind::ConstantFocal => Declared::OneCamera,
+            FocalKind::DriftingFocal => Declared::FocalPerView,
+            FocalKind::TwoGroups => Declared::Groups,
+        }
+    }
+}
+
 /// One input given to one side.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Run {
@@ -108,18 +153,34 @@ pub struct Run {
     peer: Vec<String>,
 }
 
+impl Run {
+    /// A photographed scene given to a peer, or to this program where the peer has no words.
+    pub fn photographed(options: &PhotographedOptions, peer: &[String]) -> Self {
+        Self {
+            declared: Declared::of(options),
+            generator: Generator::Photographed(options.clone()),
+            peer: peer.to_vec(),
+        }
+    }
+
+    /// Whether the input can be given to a peer, which is told of one camera and no more.
+    pub fn is_for_peers(&self) -> bool {
+        self.declared == Declared::OneCamera
+    }
+}
+
 /// A focal length of a metric answer against the true one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FocalError {
     /// `ln(f / f_true)`
-    log_error: f64,
-    sigma: Option<f64>,
+    pub log_error: f64,
+    pub sigma: Option<f64>,
     /// The least that `sigma` can be, where it is known.
-    bound: Option<f64>,
+    pub bound: Option<f64>,
 }
 
 impl FocalError {
-    fn is_wrong(&self) -> bool {
+    pub fn is_wrong(&self) -> bool {
         self.log_error.abs() > WRONG_FOCAL.max(WRONG_SIGMAS * self.sigma.unwrap_or(0.0))
     }
 
@@ -132,22 +193,29 @@ impl FocalError {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Measured {
     /// Of the tracks.
-    f1: f64,
+    pub f1: f64,
     /// Share of right ones among the observations that were kept.
-    precision: f64,
-    /// Share of kept ones among the right observations of right tracks.
-    recall: f64,
-    /// Share of the views in the largest reconstruction.
-    views: f64,
+    pub precision: f64,
+    /// Share of kept ones among the right observations of right tracks; of photographed scenes, among the verifiable
+    /// ones.
+    pub recall: f64,
+    /// Share of the views in the largest reconstruction; of photographed scenes, of those that shall be registered.
+    pub views: f64,
     /// `None` without a reconstruction. A peer that gives a focal length counts as METRIC.
-    grade: Option<Grade>,
+    pub grade: Option<Grade>,
     /// Of a METRIC or WEAK answer: one a camera group, or one a view where each has its own.
-    focals: Vec<FocalError>,
+    pub focals: Vec<FocalError>,
     /// Whether the answer warns that the metric model does not fit.
-    mismatch: bool,
+    pub mismatch: bool,
     /// CPU time of the solve; of a peer its whole process, without what `--help` takes.
-    seconds: f64,
-    failure: Option<String>,
+    pub seconds: f64,
+    pub failure: Option<String>,
+    /// Largest Cramer-Rao bound of the log focal lengths, where it is known.
+    pub bound: Option<f64>,
+    /// Observations that were kept, that shall be, and views that shall be registered.
+    pub kept: usize,
+    pub wanted: usize,
+    pub due: usize,
 }
 
 /// What either side says of an input.
@@ -155,8 +223,8 @@ pub struct Measured {
 struct Answer {
     tracks: Vec<bool>,
     observations: Vec<bool>,
-    /// Views in the largest reconstruction.
-    views: usize,
+    /// Share of the views that shall be registered that are, in the largest reconstruction.
+    views: f64,
     grade: Option<Grade>,
     focals: Vec<FocalError>,
     mismatch: bool,
@@ -165,26 +233,31 @@ struct Answer {
 
 impl Measured {
     fn of(sample: &Sample, answer: Answer) -> Self {
-        let owned: Vec<bool> = sample
-            .right
-            .iter()
-            .zip(&sample.input.track)
-            .map(|(&right, &k)| right && sample.inlier[k as usize])
-            .collect();
         Self {
             f1: agreement(&answer.tracks, &sample.inlier).f1,
             precision: agreement(&answer.observations, &sample.right).precision,
-            recall: agreement(&answer.observations, &owned).recall,
-            views: answer.views as f64 / sample.focals_px.len() as f64,
+            recall: agreement(&answer.observations, &sample.wanted).recall,
+            views: answer.views,
             grade: answer.grade,
             focals: answer.focals,
             mismatch: answer.mismatch,
             seconds: answer.seconds,
-            failure: None,
+            kept: count(&answer.observations),
+            ..Self::without_answer(sample)
         }
     }
 
-    fn is_metric(&self) -> bool {
+    /// What is known of an input before any answer.
+    fn without_answer(sample: &Sample) -> Self {
+        Self {
+            bound: sample.bounds.as_ref().and_then(|bounds| bounds.iter().copied().reduce(f64::max)),
+            wanted: count(&sample.wanted),
+            due: count(&sample.due),
+            ..Self::default()
+        }
+    }
+
+    pub fn is_metric(&self) -> bool {
         self.grade == Some(Grade::Metric)
     }
 
@@ -192,6 +265,10 @@ impl Measured {
         let sum = self.precision + self.recall;
         if sum > 0.0 { 2.0 * self.precision * self.recall / sum } else { 0.0 }
     }
+}
+
+fn count(of: &[bool]) -> usize {
+    of.iter().filter(|&&is| is).count()
 }
 
 /// Some focal lengths against the true ones; relative.
@@ -324,7 +401,7 @@ pub fn measure(run: &Run, stop: &StopToken) -> Result<Option<Measured>, String> 
     };
     Ok(answer.map(|answer| match answer {
         Ok(answer) => Measured::of(&sample, answer),
-        Err(failure) => Measured { failure: Some(failure), ..Measured::default() },
+        Err(failure) => Measured { failure: Some(failure), ..Measured::without_answer(&sample) },
     }))
 }
 

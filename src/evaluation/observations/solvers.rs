@@ -1,17 +1,18 @@
 //! The two sides: this program in this process, and a peer in one of its own.
 
+use std::cmp::Reverse;
 use std::collections::HashSet;
 use std::process::Command;
 use std::time::Duration;
 
 use super::{Answer, Declared, FocalError, Sample};
-use crate::domain::{Grade, ImageSize, Input, Limits, Silent, Solution, SolveSettings, StopToken, WarningCode};
+use crate::domain::result::ViewResult;
+use crate::domain::{Grade, Input, Limits, Silent, Solution, SolveSettings, StopToken, WarningCode};
 use crate::evaluation::real::child::{self, Ended, Outcome};
 use crate::evaluation::real::peer;
 use crate::formats::observations;
 use crate::formats::result_files::OBSERVATIONS;
 use crate::solver;
-use crate::synthetic::scene::IMAGE_SIDE_PX;
 
 /// Wall time after which a peer is ended.
 const PEER_SECONDS: u64 = 600;
@@ -27,9 +28,10 @@ pub fn ours(sample: &Sample, declared: Declared, stop: &StopToken) -> Result<Opt
         Err(error) => return Err(error.to_string()),
     };
     let spent = begun.zip(child::thread_cpu_seconds()).map(|(begun, now)| now - begun);
-    let largest = (0..solution.part_count()).map(|part| views_of(&solution, part)).max();
+    let largest = (0..solution.part_count()).max_by_key(|&part| (views_of(&solution, part).count(), Reverse(part)));
+    let registered: Vec<usize> = largest.map_or_else(Vec::new, |part| views_of(&solution, part).collect());
     Ok(Some(Answer {
-        views: largest.unwrap_or(0),
+        views: share_of_due(sample, registered.iter().filter(|&&view| sample.due[view]).count()),
         grade: solution.grade,
         focals: focals(sample, &solution),
         mismatch: solution.warnings.iter().any(|warning| warning.code == WarningCode::ModelMismatch),
@@ -39,8 +41,15 @@ pub fn ours(sample: &Sample, declared: Declared, stop: &StopToken) -> Result<Opt
     }))
 }
 
-fn views_of(solution: &Solution, part: u32) -> usize {
-    solution.views.iter().filter(|view| view.projection.is_some() && view.part == part).count()
+fn views_of(solution: &Solution, part: u32) -> impl Iterator<Item = usize> {
+    let of_part = move |(_, view): &(usize, &ViewResult)| view.projection.is_some() && view.part == part;
+    solution.views.iter().enumerate().filter(of_part).map(|(index, _)| index)
+}
+
+/// So many of the views that shall be registered, as a share.
+fn share_of_due(sample: &Sample, count: usize) -> f64 {
+    let due = sample.due.iter().filter(|&&due| due).count();
+    count.min(due) as f64 / due.max(1) as f64
 }
 
 /// Every focal length that the answer gives: of views, or of camera groups (against each that its views have).
@@ -77,8 +86,7 @@ pub fn peer(sample: &Sample, words: &[String], stop: &StopToken) -> Result<Optio
     // What the program takes to start, its imports above all.
     let (program, arguments) = words.split_first().ok_or("the peer has no name")?;
     let Some(start) = run(Command::new(program).args(arguments).arg("--help"))? else { return Ok(None) };
-    let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
-    let Some(outcome) = run(&mut peer::command(words, &file, size, scratch.path()))? else { return Ok(None) };
+    let Some(outcome) = run(&mut peer::command(words, &file, sample.size, scratch.path()))? else { return Ok(None) };
     let Ended::Exited(status) = outcome.ended else {
         return Ok(Some(Err(format!("ended after {PEER_SECONDS} s, its limit"))));
     };
@@ -106,5 +114,7 @@ fn peer_answer(sample: &Sample, said: &peer::PeerFile) -> Answer {
     let errors = |focal: f64| truths.iter().map(move |truth| (focal / truth).ln());
     let focals =
         focal.into_iter().flat_map(errors).map(|log_error| FocalError { log_error, sigma, bound: None }).collect();
-    Answer { tracks, observations, views: said.views, grade: focal.map(|_| Grade::Metric), focals, ..Answer::default() }
+    // A peer says how many views it has registered, and need not say which.
+    let views = share_of_due(sample, said.views);
+    Answer { tracks, observations, views, grade: focal.map(|_| Grade::Metric), focals, ..Answer::default() }
 }

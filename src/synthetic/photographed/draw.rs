@@ -49,8 +49,8 @@ impl PhotographedOptions {
         let focal_ratio = draw_ratio(focal, rng);
         // A longer focal length is always possible: that of the lens is the shortest.
         let widest = match focal {
-            FocalKind::Constant => 1.0,
-            FocalKind::Drifting => focal_ratio.powf(-0.5).min(focal_ratio.sqrt()),
+            FocalKind::ConstantFocal => 1.0,
+            FocalKind::DriftingFocal => focal_ratio.powf(-0.5).min(focal_ratio.sqrt()),
             FocalKind::TwoGroups => focal_ratio.min(1.0),
         };
         let longest = rng.random_range(LONGEST.0..=LONGEST.1).min(views);
@@ -167,8 +167,8 @@ fn draw_turn(motion: PhotographedMotion, wide: bool, rng: &mut ChaCha8Rng) -> f6
 fn draw_ratio(focal: FocalKind, rng: &mut ChaCha8Rng) -> f64 {
     let (drift, other) = (rng.random_range(0.05..0.4), rng.random_range(0.15..0.6));
     let log_ratio: f64 = match focal {
-        FocalKind::Constant => 0.0,
-        FocalKind::Drifting => drift * sign(rng),
+        FocalKind::ConstantFocal => 0.0,
+        FocalKind::DriftingFocal => drift * sign(rng),
         FocalKind::TwoGroups => other * sign(rng),
     };
     if log_ratio == 0.0 { 1.0 } else { rounded(log_ratio.exp()) }

@@ -23,9 +23,9 @@ pub fn cameras(options: &PhotographedOptions, path: &Path) -> Vec<Camera> {
 /// Focal length of a view.
 fn focal_px(options: &PhotographedOptions, view: usize) -> f64 {
     let share = match options.focal {
-        FocalKind::Constant => 0.0,
+        FocalKind::ConstantFocal => 0.0,
         // By equal factors, with the middle of the logarithms in the middle of the views.
-        FocalKind::Drifting => view as f64 / (options.views - 1) as f64 - 0.5,
+        FocalKind::DriftingFocal => view as f64 / (options.views - 1) as f64 - 0.5,
         FocalKind::TwoGroups => (view % 2) as f64,
     };
     options.focal_px * options.focal_ratio.powf(share)

@@ -116,20 +116,20 @@ impl LensKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FocalKind {
-    Constant,
+    ConstantFocal,
     /// Steadily from the first view to the last.
-    Drifting,
+    DriftingFocal,
     /// The views of two cameras in turns, each a camera group.
     TwoGroups,
 }
 
 impl FocalKind {
-    pub const ALL: [Self; 3] = [Self::Constant, Self::Drifting, Self::TwoGroups];
+    pub const ALL: [Self; 3] = [Self::ConstantFocal, Self::DriftingFocal, Self::TwoGroups];
 
     pub fn name(self) -> &'static str {
         match self {
-            Self::Constant => "constant",
-            Self::Drifting => "drifting",
+            Self::ConstantFocal => "constant-focal",
+            Self::DriftingFocal => "drifting-focal",
             Self::TwoGroups => "two-groups",
         }
     }
@@ -167,7 +167,7 @@ pub enum WrongKind {
     /// From some view on, the observations slide along the epipolar lines of the track's first view.
     Slid,
     /// From some view on, the observations drift off in the image at a constant speed.
-    Drifting,
+    DriftingTracks,
     /// The observations stay in one place of the image: a watermark, dirt on the lens.
     Static,
     /// The points are of a second rigid body with a motion of its own.
@@ -186,7 +186,7 @@ impl WrongKind {
         Self::Clean,
         Self::Permuted,
         Self::Slid,
-        Self::Drifting,
+        Self::DriftingTracks,
         Self::Static,
         Self::SecondBody,
         Self::Repeated,
@@ -199,7 +199,7 @@ impl WrongKind {
             Self::Clean => "clean",
             Self::Permuted => "permuted",
             Self::Slid => "slid",
-            Self::Drifting => "drifting",
+            Self::DriftingTracks => "drifting-tracks",
             Self::Static => "static",
             Self::SecondBody => "second-body",
             Self::Repeated => "repeated",

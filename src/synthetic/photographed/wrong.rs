@@ -20,6 +20,10 @@ const DRIFT_PX: (f64, f64) = (4.0, 15.0);
 const STATIC_NOISE: f64 = 0.5;
 /// Distance of the copies of a repeated structure in the world, windows of a facade: far above the noise.
 const REPEATED_DISTANCE: (f64, f64) = (0.1 * DISTANCE, 0.25 * DISTANCE);
+/// Copies that a point is taken for, the first of them that is in the image and at least so many pixels away: far above
+/// the noise, but for a row of copies that leads away from the camera.
+const NEIGHBOURS: [f64; 6] = [1.0, -1.0, 2.0, -2.0, 3.0, -3.0];
+const REPEATED_PX: f64 = 15.0;
 /// Wrong tracks that near-duplicates are copies of, at most, and how far a copy is off along each axis.
 const ORIGINALS: usize = 3;
 const COPIED_WITHIN_PX: f64 = 0.3;
@@ -40,7 +44,7 @@ pub fn apply(options: &PhotographedOptions, path: &Path, cameras: &[Camera], tra
         WrongKind::Clean => {}
         WrongKind::Permuted => spoil.permute(tracks, &order),
         WrongKind::Slid => order.iter().for_each(|&track| spoil.slide(&mut tracks[track])),
-        WrongKind::Drifting => order.iter().for_each(|&track| spoil.drift(&mut tracks[track])),
+        WrongKind::DriftingTracks => order.iter().for_each(|&track| spoil.drift(&mut tracks[track])),
         WrongKind::Static => order.iter().for_each(|&track| spoil.hold(&mut tracks[track])),
         WrongKind::SecondBody => spoil.move_with_body(path, tracks, &order),
         WrongKind::Repeated => spoil.repeat(tracks, &order),
@@ -164,8 +168,11 @@ impl Spoil<'_> {
             let count = ((seen.len() - 1) / 2).max(1);
             for &place in places.partial_shuffle(&mut self.rng, count).0.iter() {
                 let camera = &self.cameras[seen[place].view];
-                let copy = points::image(camera, &(*point + shift), border_px(self.options))
-                    .or_else(|| points::image(camera, &(*point - shift), border_px(self.options)));
+                let own = seen[place].image;
+                let copy = NEIGHBOURS.iter().find_map(|&copies| {
+                    let image = points::image(camera, &(*point + shift * copies), border_px(self.options))?;
+                    ((image[0] - own[0]).hypot(image[1] - own[1]) >= REPEATED_PX).then_some(image)
+                });
                 let image = copy.unwrap_or_else(|| points::pixel(border_px(self.options), &mut self.rng));
                 seen[place] = seen[place].moved(image);
             }

@@ -1,0 +1,50 @@
+use super::*;
+use crate::evaluation::observations::FocalError;
+
+fn answer(grade: Option<Grade>, log_errors: &[f64], bound: Option<f64>) -> Measured {
+    let focal = |&log_error: &f64| FocalError { log_error, sigma: Some(0.01), bound };
+    Measured {
+        grade,
+        focals: log_errors.iter().map(focal).collect(),
+        bound,
+        kept: 10,
+        wanted: 10,
+        due: 3,
+        precision: 1.0,
+        recall: 0.5,
+        views: 1.0,
+        ..Measured::default()
+    }
+}
+
+#[test]
+fn a_row_tells_refused_from_impossible_and_belied_from_covered() {
+    let (metric, weak) = (Some(Grade::Metric), Some(Grade::Weak));
+    let nothing = Measured { kept: 0, precision: 0.0, recall: 0.0, views: 0.0, ..answer(None, &[], Some(0.005)) };
+    let answers = [
+        answer(metric, &[0.005], Some(0.005)),
+        answer(metric, &[0.035], Some(0.005)),
+        answer(metric, &[0.005, -0.05], Some(0.02)),
+        answer(weak, &[0.02], None),
+        nothing,
+    ];
+    let row = Row::of("all", Side::Scpsfm, &answers.iter().collect::<Vec<_>>());
+    assert_eq!((row.scenes, row.metric, row.weak), (5, 3, 1));
+    assert_eq!((row.carries, row.metric_of_carrying), (0.6, Some(2.0 / 3.0)));
+    // 3.5 sigma, and the root mean square of .5 and 5: beyond 3; off by more than 4 sigma only the latter.
+    assert_eq!((row.metric_belied, row.metric_wrong), (Some(2.0 / 3.0), 1));
+    assert_eq!((row.coverage, row.weak_belied), (Some(1.0 / 3.0), Some(0.0)));
+    // What keeps nothing makes no false claim, and finds nothing.
+    assert_eq!((row.precision, row.recall, row.views), (Some(1.0), Some(0.4), Some(0.8)));
+}
+
+#[test]
+fn a_text_chooses_scenes_and_peers_get_those_of_one_camera() {
+    let peer = vec!["peer".to_owned()];
+    let plan = Plan::new(60, None, peer.clone());
+    assert_eq!((plan.scene_count(), plan.runs().len()), (60, 60 + 20));
+    let chosen = Plan::new(60, Some("fisheye"), Vec::new());
+    assert!((7..=9).contains(&chosen.scene_count()), "{}", chosen.scene_count());
+    assert_eq!(chosen.runs().len(), chosen.scene_count());
+    assert_eq!(Plan::new(60, Some("no such scene"), peer).scene_count(), 0);
+}
