@@ -362,4 +362,14 @@ mod tests {
             assert!(parse(&["--paper-width", wrong]).is_err(), "{wrong}");
         }
     }
+    #[test]
+    fn photographed_scenes_are_a_suite_of_their_own() {
+        assert!(parse(&["--photographed", "--seeds", "3", "--scenes", "orbit", "--peer", "peer"]).is_ok());
+        let others: [&[&str]; 5] =
+            [&["--observations"], &["--quick"], &["--real", "sequences"], &["--priors"], &["--sweeps", "orbit"]];
+        for more in others {
+            let error = parse(&[&["--photographed"], more].concat()).err().unwrap_or_else(|| panic!("{more:?}"));
+            assert!(error.to_string().contains("--photographed"), "{error}");
+        }
+    }
 }

@@ -51,3 +51,17 @@ pub fn run(scenes: Option<&str>, seeds: u64, peer: Vec<String>, work: &Work, jso
     print(if json { text.trim_end().to_owned() } else { table::text(&tables) }.trim_end())?;
     Ok(Exit::Done)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_text_without_photographed_scenes_names_the_flag() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let work = Work { out: directory.path(), threads: 1, quiet: true };
+        let failure = run(Some("zeppelin"), 5, Vec::new(), &work, false).expect_err("no such scene");
+        assert_eq!(failure.exit, Exit::Usage);
+        assert!(failure.message.contains("--scenes zeppelin"), "{failure}");
+    }
+}

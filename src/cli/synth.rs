@@ -313,4 +313,28 @@ mod tests {
         assert_eq!(failure.exit, Exit::Usage);
         assert!(failure.message.contains("noise"), "{failure}");
     }
+    #[test]
+    fn a_photographed_scene_is_written_and_its_choices_are_the_seeds() {
+        #[derive(Debug, clap::Parser)]
+        struct Command {
+            #[command(flatten)]
+            args: Args,
+        }
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let base = ["synth", "--photographed", "--seed", "5", "--out"].map(OsStr::new).to_vec();
+        let base = [base, vec![directory.path().as_os_str()]].concat();
+        let args = Command::try_parse_from(&base).expect("valid arguments").args;
+        assert_eq!(run(args), Ok(Exit::Done));
+        let text = std::fs::read_to_string(directory.path().join(TRUTH)).expect("truth.json");
+        let truth: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+        let options = PhotographedOptions::drawn(5);
+        assert_eq!(truth["options"], serde_json::to_value(&options).expect("plain data"));
+        assert_eq!((truth["image_width_px"].as_u64(), truth["image_height_px"].as_u64()), (Some(1600), Some(1200)));
+        assert_eq!(truth["camera_groups"].as_array().map(Vec::len), Some(options.views));
+        for other in [&["--views", "5"][..], &["--sequence"], &["--radial-k1", "0.1"]] {
+            let arguments = [base.clone(), other.iter().map(OsStr::new).collect()].concat();
+            let error = Command::try_parse_from(arguments).expect_err("the seed draws it");
+            assert!(error.to_string().contains("--photographed"), "{error}");
+        }
+    }
 }

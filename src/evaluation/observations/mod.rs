@@ -4,21 +4,22 @@
 
 mod bound;
 pub mod conditions;
+mod sample;
 mod solvers;
 pub mod table;
 
 use serde::{Deserialize, Serialize};
 
-use crate::domain::error::InvalidInput;
-use crate::domain::{Grade, ImageSize, RawInput, StopToken};
+use crate::domain::{Grade, StopToken};
 use crate::evaluation::real::Side;
 use crate::evaluation::records;
 use crate::geometry::statistics::median;
+use crate::synthetic::PhotographedOptions;
 use crate::synthetic::metrics::agreement;
-use crate::synthetic::photographed::{FocalKind, IMAGE_SIZE};
-use crate::synthetic::scene::IMAGE_SIDE_PX;
-use crate::synthetic::{Photographed, PhotographedOptions, Scene, SceneOptions, Sequence, SequenceOptions};
+use crate::synthetic::photographed::FocalKind;
 pub use conditions::Condition;
+pub use sample::Generator;
+use sample::Sample;
 
 /// First seed: above those of the other evaluations.
 const FIRST_SEED: u64 = 700_000;
@@ -29,99 +30,11 @@ const WRONG_SIGMAS: f64 = 4.0;
 /// Standard deviations that a focal length shall be within.
 const COVERED_SIGMAS: f64 = 3.0;
 
-/// Right observations of tracks with three of them that a photographed view needs to count among those that shall be
-/// registered.
-const REGISTRABLE: usize = 15;
-
 /// The file of the records.
 pub const RECORDS: &str = "observations.jsonl";
 
 /// The records of the comparison.
 pub type Records = records::Records<Run, Measured>;
-
-/// What makes an input.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Generator {
-    Scene(SceneOptions),
-    Sequence(SequenceOptions),
-    Photographed(PhotographedOptions),
-}
-
-impl Generator {
-    /// The same with another seed.
-    fn with_seed(&self, seed: u64) -> Self {
-        match self {
-            Generator::Scene(options) => Generator::Scene(SceneOptions { seed, ..options.clone() }),
-            Generator::Sequence(options) => Generator::Sequence(SequenceOptions { seed, ..options.clone() }),
-            Generator::Photographed(_) => Generator::Photographed(PhotographedOptions::drawn(seed)),
-        }
-    }
-
-    fn generate(&self) -> Result<Sample, InvalidInput> {
-        Ok(match self {
-            Generator::Scene(options) => {
-                let scene = Scene::generate(options)?;
-                let bounds = if options.own_cameras { bound::of_scene(&scene) } else { None };
-                let Scene { input, truth, .. } = scene;
-                let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
-                Sample { bounds, ..Sample::new(size, input, truth.inlier, truth.observation_right, truth.focals_px) }
-            }
-            Generator::Sequence(options) => {
-                let Sequence { input, truth, .. } = Sequence::generate(options)?;
-                let size = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
-                Sample::new(size, input, truth.inlier, truth.observation_right, truth.focals_px)
-            }
-            Generator::Photographed(options) => {
-                let scene = Photographed::generate(options)?;
-                let bounds = bound::of_photographed(&scene);
-                let Photographed { input, truth, .. } = scene;
-                let wanted = truth.verifiable(&input.track);
-                let mut of_view = vec![0; input.views.len()];
-                let views = input.view.iter().zip(&wanted).filter(|(_, wanted)| **wanted);
-                views.for_each(|(&view, _)| of_view[view as usize] += 1);
-                let due = of_view.into_iter().map(|count| count >= REGISTRABLE).collect();
-                let right = truth.observation_right;
-                let sample = Sample::new(IMAGE_SIZE, input, truth.inlier, right, truth.focals_px);
-                Sample { bounds, wanted, due, ..sample }
-            }
-        })
-    }
-}
-
-/// An input and its truth.
-#[derive(Debug, Clone)]
-struct Sample {
-    /// Of all images.
-    size: ImageSize,
-    input: RawInput,
-    /// Whether a track is right.
-    inlier: Vec<bool>,
-    /// Whether an observation is right.
-    right: Vec<bool>,
-    /// Whether an observation shall be kept.
-    wanted: Vec<bool>,
-    /// Whether a view shall be registered.
-    due: Vec<bool>,
-    /// True focal length of each view.
-    focals_px: Vec<f64>,
-    /// Cramer-Rao bound of the standard deviation of each view's log focal length, where it is known.
-    bounds: Option<Vec<f64>>,
-}
-
-impl Sample {
-    /// Of all views, and of the right observations of right tracks, an answer is expected; no bound is known.
-    fn new(size: ImageSize, input: RawInput, inlier: Vec<bool>, right: Vec<bool>, focals_px: Vec<f64>) -> Self {
-        let wanted = right.iter().zip(&input.track).map(|(&right, &k)| right && inlier[k as usize]).collect();
-        Self { size, due: vec![true; input.views.len()], input, inlier, right, wanted, focals_px, bounds: None }
-    }
-
-    /// True focal length of each view and the bound of its estimate.
-    fn focals(&self) -> impl Iterator<Item = (f64, Option<f64>)> {
-        let bound = |view: usize| self.bounds.as_ref().map(|bounds| bounds[view]);
-        self.focals_px.iter().enumerate().map(move |(view, &focal_px)| (focal_px, bound(view)))
-    }
-}
 
 /// How the cameras are declared to the solver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
