@@ -20,14 +20,15 @@ const DRIFT_PX: (f64, f64) = (4.0, 15.0);
 const STATIC_NOISE: f64 = 0.5;
 /// Distance of the copies of a repeated structure in the world, windows of a facade: far above the noise.
 const REPEATED_DISTANCE: (f64, f64) = (0.1 * DISTANCE, 0.25 * DISTANCE);
-/// Copies that a point is taken for, the first of them that is in the image and at least so many pixels away: far above
-/// the noise, but for a row of copies that leads away from the camera.
+/// Copies that a point is taken for, the first of them that is in the image and far enough away.
 const NEIGHBOURS: [f64; 6] = [1.0, -1.0, 2.0, -2.0, 3.0, -3.0];
-const REPEATED_PX: f64 = 15.0;
+/// Pixels by which what slides or repeats must be off, or it is anywhere in the image instead: near an epipole, where a
+/// row of copies leads away from the camera, and under a camera that stays in place, it would hide in the noise.
+const LEAST_OFF_PX: f64 = 15.0;
 /// Wrong tracks that near-duplicates are copies of, at most, and how far a copy is off along each axis.
 const ORIGINALS: usize = 3;
 const COPIED_WITHIN_PX: f64 = 0.3;
-/// Second bodies drawn for one track before it is anywhere in the image instead.
+/// Points of the second body drawn for one track before it is anywhere in the images instead.
 const BODY_DRAWS: usize = 400;
 /// Other points drawn for a track that is to go over to one.
 const LINK_DRAWS: usize = 400;
@@ -99,7 +100,8 @@ impl Spoil<'_> {
         for seen in &mut track.seen[start..] {
             let camera = &self.cameras[seen.view];
             let slid = slide(reference, camera, &track.point, &mut self.rng).map(|[x, y, _]| [x, y]);
-            let inside = slid.filter(|&image| points::is_within(image, border_px(self.options)));
+            let inside =
+                slid.filter(|&image| is_off(image, seen.image) && points::is_within(image, border_px(self.options)));
             *seen = seen.moved(inside.unwrap_or_else(|| points::pixel(border_px(self.options), &mut self.rng)));
         }
     }
@@ -171,7 +173,7 @@ impl Spoil<'_> {
                 let own = seen[place].image;
                 let copy = NEIGHBOURS.iter().find_map(|&copies| {
                     let image = points::image(camera, &(*point + shift * copies), border_px(self.options))?;
-                    ((image[0] - own[0]).hypot(image[1] - own[1]) >= REPEATED_PX).then_some(image)
+                    is_off(image, own).then_some(image)
                 });
                 let image = copy.unwrap_or_else(|| points::pixel(border_px(self.options), &mut self.rng));
                 seen[place] = seen[place].moved(image);
@@ -188,7 +190,7 @@ impl Spoil<'_> {
             for seen in &mut tracks[track].seen {
                 let off = std::array::from_fn(|_| self.rng.random_range(-COPIED_WITHIN_PX..COPIED_WITHIN_PX));
                 let [x, y]: [f64; 2] = off;
-                // A copy has its original's error.
+                // About the exact place: the noise is the original's alone.
                 *seen = Seen { noise: 0.0, ..seen.moved([seen.image[0] + x, seen.image[1] + y]) };
             }
         }
@@ -225,4 +227,9 @@ impl Spoil<'_> {
             track.point = point;
         }
     }
+}
+
+/// Whether one place is far from another.
+fn is_off(image: [f64; 2], from: [f64; 2]) -> bool {
+    (image[0] - from[0]).hypot(image[1] - from[1]) >= LEAST_OFF_PX
 }
