@@ -62,11 +62,11 @@ pub struct Args {
     #[command(flatten)]
     pub sequence: SequenceArgs,
 
-    /// A scene as people photograph it, all of whose choices (motion, lens, focal lengths, visible views, noise, what is
-    /// wrong) are drawn from --seed; images are 1600 x 1200 px. truth.json holds the choices and the camera group of
+    /// A scene as people photograph it, all of whose choices (motion, lens, focal lengths, visible views, noise, what
+    /// is wrong) are drawn from --seed; images are 1600 x 1200 px. truth.json holds the choices and the camera group of
     /// each view
-    #[arg(long, help_heading = "A photographed scene", conflicts_with_all = ["views", "tracks", "noise", "outliers", "rotation",
-        "shape", "motion", "roll", "outlier_kind", "wrong_views", "seen_views", "wrong_observations",
+    #[arg(long, help_heading = "A photographed scene", conflicts_with_all = ["views", "tracks", "noise", "outliers",
+        "rotation", "shape", "motion", "roll", "outlier_kind", "wrong_views", "seen_views", "wrong_observations",
         "deleted_observations", "second_motion", "noise_kind", "principal_point", "radial_k1", "zoom", "depths",
         "sequence"])]
     pub photographed: bool,

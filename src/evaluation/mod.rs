@@ -4,8 +4,9 @@
 //! [`records`] does many and keeps them (and goes on where it was stopped), [`measures`] scores an answer, [`oracle`]
 //! does what the best could do who knows the truth, and [`summary`] makes numbers of the records, [`figures`] and
 //! [`page`] show them; [`priors`] compares what the search starts from; [`observations`] are inputs that need verdicts
-//! on single observations, [`photographed`] those among them that are as people photograph; [`real`] holds this program beside another one on real sequences. May depend on `solver`,
-//! `synthetic`, `geometry`, `formats`, `report` and `domain`; knows nothing of jobs or transport.
+//! on single observations, [`photographed`] those among them that are as people photograph; [`real`] holds this program
+//! beside another one on real sequences. May depend on `solver`, `synthetic`, `geometry`, `formats`, `report` and
+//! `domain`; knows nothing of jobs or transport.
 
 pub mod figures;
 pub mod measures;

@@ -1,7 +1,7 @@
 //! Scenes as people photograph them: cameras with a lens and an image border that move as a photographer, a car or a
-//! drone does, tracks that some of the views show, and wrong tracks of the kinds that feature matching makes. One file a
-//! subject: the options, how they are drawn from a seed, the motion, the points, the lens, which views observe a point,
-//! the noise, and what is wrong.
+//! drone does, tracks that some of the views show, and wrong tracks of the kinds that feature matching makes. One file
+//! a subject: the options, how they are drawn from a seed, the motion, the points, the lens, which views observe a
+//! point, the noise, and what is wrong.
 
 mod draw;
 mod lens;
@@ -106,7 +106,7 @@ impl Photographed {
         options.validate()?;
         let path = motion::draw(options);
         let cameras = lens::cameras(options, &path);
-        let mut tracks = visibility::draw_tracks(options, &path, &cameras)?;
+        let mut tracks = visibility::draw_tracks(options, &cameras)?;
         wrong::apply(options, &path, &cameras, &mut tracks);
         Ok(assemble(options, &cameras, &tracks))
     }

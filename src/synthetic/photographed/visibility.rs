@@ -4,7 +4,6 @@ use nalgebra::Vector3;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::motion::Path;
 use super::stream::Stream;
 use super::{PhotographedOptions, Seen, Track, VisibilityKind, points};
 use crate::domain::error::{InvalidInput, Violation};
@@ -24,8 +23,7 @@ pub fn border_px(options: &PhotographedOptions) -> f64 {
 ///
 /// # Errors
 /// A motion under which no two views see a common point.
-pub fn draw_tracks(options: &PhotographedOptions, path: &Path, cameras: &[Camera]) -> Result<Vec<Track>, InvalidInput> {
-    debug_assert_eq!(path.poses.len(), cameras.len());
+pub fn draw_tracks(options: &PhotographedOptions, cameras: &[Camera]) -> Result<Vec<Track>, InvalidInput> {
     let mut rng = Stream::Points.of(options.seed);
     (0..options.tracks).map(|_| draw_track(options, cameras, &mut rng)).collect()
 }
