@@ -178,7 +178,7 @@ fn photographed(args: &Args) -> Result<Exit, Failure> {
     let scene = Photographed::generate(&options).map_err(|error| Failure::usage(format!("--seed: {error}")))?;
     write(&args.out, IMAGE_SIZE, &scene.input, &scene.options, &scene.truth)?;
     let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
-    eprintln!(
+    tell!(
         "{}: {} views, {} observations, {} tracks of which {right} are right, {}: {}",
         options.name(),
         options.views,
