@@ -29,6 +29,11 @@ pub struct Triangulator<'a> {
     to_next: Vec<Matrix3<f64>>,
 }
 
+/// Cameras of all views, zero where a view has none: nothing is observed there, but a [`Triangulator`] wants a slice.
+pub fn or_zeros(cameras: &[Option<Camera>]) -> Vec<Camera> {
+    cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect()
+}
+
 /// A point and the observations that agree with it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RobustPoint {

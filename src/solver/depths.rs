@@ -18,6 +18,7 @@ use crate::geometry::bundle::metric::{
 };
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::observation::Observation;
+use crate::geometry::robust_triangulation::or_zeros;
 use crate::geometry::triangulation;
 
 /// Directions that no observation sees: a similarity's.
@@ -200,7 +201,7 @@ pub fn weights(
 impl TrackWeights {
     /// Puts these in place of what image points alone say of the tracks.
     pub fn judge(&self, problem: &Problem, geometry: &Geometry, judged: &mut Judged) {
-        let cameras = geometry.all_cameras();
+        let cameras = or_zeros(&geometry.cameras);
         for (&track, &weight) in self.tracks.iter().zip(&self.weights) {
             judged.tracks.weight[track] = weight as f32;
             let inlier = weight > 0.5;

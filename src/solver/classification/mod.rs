@@ -15,7 +15,7 @@ use crate::domain::Input;
 use crate::domain::result::{ObservationResults, TrackResults};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::observation::Observation;
-use crate::geometry::robust_triangulation::Triangulator;
+use crate::geometry::robust_triangulation::{self, Triangulator};
 use crate::geometry::triangulation::batch::LANES;
 use crate::geometry::{Camera, Point};
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
@@ -45,11 +45,6 @@ pub struct Geometry {
 }
 
 impl Geometry {
-    /// Cameras of all views, zero where not registered.
-    pub fn all_cameras(&self) -> Vec<Camera> {
-        self.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect()
-    }
-
     /// The observations of a track in the registered views of its component.
     pub fn of_track(&self, problem: &Problem, track: usize) -> Vec<usize> {
         let is_seen = |view: usize| {
@@ -128,7 +123,7 @@ fn whole_tracks(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Vec<
 }
 
 fn judge_under(problem: &Problem, geometry: &Geometry, noise: NoiseModel, progress: &mut dyn FnMut(usize)) -> Judged {
-    let cameras = geometry.all_cameras();
+    let cameras = robust_triangulation::or_zeros(&geometry.cameras);
     let triangulator = Triangulator::new(&cameras);
     let least_share = geometry.least_share(problem);
     let classifier = TrackClassifier { problem, cameras: &cameras, triangulator, geometry, least_share, noise };

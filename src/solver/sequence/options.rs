@@ -154,7 +154,7 @@ impl ExtensionOptions {
         // With a tenth more of them sigma falls by a twentieth.
         worth_extending: 1.1,
         first_subsets: 3,
-        // From nine seeds a walk reached reconstructions within a few thousandths of each other's evidence.
+        // One that holds the same tracks differs by a few observations; a fiftieth more are others.
         least_evidence_growth: 1.02,
     };
 }
@@ -231,6 +231,7 @@ impl WindowOptions {
         // A variance of 50 values is known to a fifth.
         most_windows: 50,
         of_view: 150,
+        // One in twenty is farther by chance.
         significant_distance: 2.0,
     };
 }

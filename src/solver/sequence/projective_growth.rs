@@ -14,7 +14,7 @@ use super::options::GrowthOptions;
 use super::projective::{CAMERA_UNKNOWNS, ProjectiveReconstruction};
 use crate::geometry::bundle;
 use crate::geometry::observation::Observation;
-use crate::geometry::robust_triangulation::{RobustPoint, Triangulator};
+use crate::geometry::robust_triangulation::{self, RobustPoint, Triangulator};
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::Error;
 use crate::solver::grow::NoiseOptions;
@@ -91,6 +91,15 @@ impl<'a> Growing<'a> {
         self.support[track] >= VERIFIED
     }
 
+    /// The observations of a view whose points may support its camera: the verified ones, or, where these are too few,
+    /// those of two views too. Nothing verifies them, but views that are linked by few tracks have no others.
+    fn points_for(&self, view: usize) -> impl Iterator<Item = usize> {
+        let verified = move |&k: &usize| self.is_verified(self.problem.track_of(k));
+        let of_view = move || self.problem.of_view[view].iter().map(|&k| k as usize);
+        let are_enough = of_view().filter(verified).count() >= self.options.least_agreeing;
+        of_view().filter(move |k| verified(k) || !are_enough && self.points[self.problem.track_of(*k)].is_some())
+    }
+
     /// Triangulates every track anew, or those that a view sees.
     fn triangulate(&mut self, of_view: Option<usize>, recorder: &mut Recorder) {
         let problem = self.problem;
@@ -98,7 +107,7 @@ impl<'a> Growing<'a> {
             Some(view) => problem.of_view[view].iter().map(|&k| problem.track_of(k as usize)).collect(),
             None => (0..problem.tracks()).collect(),
         };
-        let cameras: Vec<Camera> = self.cameras.iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+        let cameras = robust_triangulation::or_zeros(&self.cameras);
         let triangulator = Triangulator::new(&cameras);
         let gate = problem.gate(self.noise);
         let find = |growing: &Self, track: usize| growing.point(&triangulator, gate, track);
@@ -213,18 +222,11 @@ impl Growth for Growing<'_> {
     }
 
     fn support(&self, view: usize) -> usize {
-        self.supporting(view).len()
+        self.points_for(view).count()
     }
 
-    /// Verified points, or, where these are too few, those of two views too: nothing verifies them, but views that are
-    /// linked by few tracks have no others.
     fn supporting(&self, view: usize) -> Vec<usize> {
-        let of_view = || self.problem.of_view[view].iter().map(|&k| k as usize);
-        let verified: Vec<usize> = of_view().filter(|&k| self.is_verified(self.problem.track_of(k))).collect();
-        if verified.len() >= self.options.least_agreeing {
-            return verified;
-        }
-        of_view().filter(|&k| self.points[self.problem.track_of(k)].is_some()).collect()
+        self.points_for(view).collect()
     }
 
     fn register(&mut self, view: usize, seen: &[usize], recorder: &mut Recorder) -> usize {

@@ -4,9 +4,9 @@ use nalgebra::Vector3;
 
 use super::model::{Landmark, Model};
 use super::options::ExtensionOptions;
+use crate::geometry::Point;
 use crate::geometry::observation::Observation;
-use crate::geometry::robust_triangulation::Triangulator;
-use crate::geometry::{Camera, Point};
+use crate::geometry::robust_triangulation::{Triangulator, or_zeros};
 use crate::solver::per_track::each_track;
 use crate::solver::problem::{Problem, VERIFIED};
 use crate::solver::recorder::Recorder;
@@ -30,8 +30,7 @@ pub fn triangulate_seen(problem: &Problem, model: &mut Model, views: &[usize], r
 
 /// Triangulates these tracks anew from the registered views.
 fn triangulate_some(problem: &Problem, model: &mut Model, tracks: &[usize], recorder: &mut Recorder) {
-    let cameras: Vec<Camera> =
-        model.cameras(problem).into_iter().map(|camera| camera.unwrap_or_else(Camera::zeros)).collect();
+    let cameras = or_zeros(&model.cameras(problem));
     let triangulator = Triangulator::new(&cameras);
     let gate = problem.gate(model.noise);
     let find = |model: &Model, track: usize| landmark(problem, model, &triangulator, gate, track);

@@ -1,7 +1,8 @@
 //! Random numbers: one stream for each subject, so that an option changes nothing but its own subject.
 
-use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+
+use crate::synthetic::scene::stream;
 
 /// What random numbers are drawn for. Streams below 100 are those of the paper's scenes.
 #[derive(Debug, Clone, Copy)]
@@ -23,8 +24,6 @@ pub enum Stream {
 impl Stream {
     /// The stream of this seed, from its start.
     pub fn of(self, seed: u64) -> ChaCha8Rng {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(self as u64);
-        rng
+        stream::rng(self as u64, seed)
     }
 }

@@ -9,7 +9,7 @@ mod noise;
 mod options;
 mod second_body;
 mod shape;
-mod stream;
+pub(super) mod stream;
 #[cfg(test)]
 mod tests;
 mod visibility;

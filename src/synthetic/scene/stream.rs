@@ -25,8 +25,13 @@ pub enum Stream {
 impl Stream {
     /// The stream of this seed, from its start.
     pub fn of(self, seed: u64) -> ChaCha8Rng {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(self as u64);
-        rng
+        rng(self as u64, seed)
     }
+}
+
+/// A numbered stream of this seed, from its start.
+pub fn rng(stream: u64, seed: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(stream);
+    rng
 }
