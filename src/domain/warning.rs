@@ -6,11 +6,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum WarningCode {
-    /// Homographies explain the views, and the data do not tell a planar scene from a camera that only rotated.
+    /// Homographies explain the views, and the data do not tell a planar scene from a camera that only turned.
     PlanarOrRotation,
     /// The points of the consensus lie on a plane.
     PlanarScene,
-    /// The camera turned about its centre without moving.
+    /// The camera turned about its centre without moving: tracks have no points.
     PureRotation,
     /// The camera moved without turning: every focal length fits. Forward motion is a case of it; the detail says so.
     PureTranslation,
@@ -43,6 +43,8 @@ pub enum WarningCode {
     UnverifiedRanking,
     /// Tracks have the very same observations as others; they were solved as one.
     DuplicateTracks,
+    /// Tracks stay where they are in the image while others move, and no scene holds them.
+    StaticTracks,
     /// The deadline stopped the search; this is the best found by then. Not given yet: such a job expires.
     StoppedEarly,
 }
@@ -69,6 +71,7 @@ impl WarningCode {
             | WarningCode::CameraGroupsMerged
             | WarningCode::UnverifiedRanking
             | WarningCode::DuplicateTracks
+            | WarningCode::StaticTracks
             | WarningCode::StoppedEarly => false,
         }
     }
@@ -94,6 +97,7 @@ impl WarningCode {
             WarningCode::CameraGroupsMerged => "CAMERA_GROUPS_MERGED",
             WarningCode::UnverifiedRanking => "UNVERIFIED_RANKING",
             WarningCode::DuplicateTracks => "DUPLICATE_TRACKS",
+            WarningCode::StaticTracks => "STATIC_TRACKS",
             WarningCode::StoppedEarly => "STOPPED_EARLY",
         }
     }

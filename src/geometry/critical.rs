@@ -1,4 +1,4 @@
-//! Fits the motions and scenes that carry no calibration: a plane, a camera that only turns, one that only moves.
+//! Fits special motions and scenes: a plane, a camera that only turns, one that only moves.
 //!
 //! Each fit is a maximum-likelihood one with its number of unknowns, so that it can be tested against projective
 //! cameras, of which it is a special case.
@@ -7,12 +7,12 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::bundle::Options;
 use super::bundle::critical::{
-    BundleProblem, HOMOGRAPHIES_GAUGE, Homographies, ROTATING_GAUGE, Rotating, TRANSLATING_GAUGE, Translating, minimise,
+    BundleProblem, HOMOGRAPHIES_GAUGE, Homographies, TRANSLATING_GAUGE, Translating, minimise,
 };
-use super::bundle::metric::Intrinsics;
+use super::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
 use super::daq::scan_focal;
 use super::fundamental::{Fundamental, Match};
-use super::homography::{self, Correspondences};
+use super::homography::{Correspondences, LEAST_COMMON};
 use super::null_vector::smallest_eigenvector;
 use super::observation::Observation;
 use super::procrustes::nearest_rotation;
@@ -36,24 +36,26 @@ pub struct CriticalFit<M> {
     pub unknowns: usize,
 }
 
-/// Fits homographies and, with the same start, a camera that only turns.
+/// Fits homographies and, with the same start, a camera that only turns, whose intrinsics are all free.
 ///
-/// Returns `None` when no view has enough points in common with every other: nothing ties the homographies together.
+/// * `group_of`: camera group of each view
+/// * `focal_per_view`: whether every view has a focal length of its own
+/// * `priors`: of the intrinsics of each group
+///
+/// Returns `None` when some view has too few points in common with all others: nothing ties the homographies together.
 pub fn fit_without_parallax(
     observations: &[Observation],
-    views: usize,
+    group_of: &[usize],
+    focal_per_view: bool,
+    priors: &[IntrinsicsPrior],
     points: usize,
     noise: f64,
     stop: &StopToken,
-) -> Option<(CriticalFit<Homographies>, CriticalFit<Rotating>)> {
+) -> Option<(CriticalFit<Homographies>, CriticalFit<MetricReconstruction>)> {
+    let views = group_of.len();
     let seen = Correspondences::new(observations, views);
     let reference = seen.most_observed()?;
-    let homographies: Vec<Matrix3<f64>> = (0..views)
-        .map(|view| match view == reference {
-            true => Some(Matrix3::identity()),
-            false => homography::between(&seen.common(reference, view), noise),
-        })
-        .collect::<Option<_>>()?;
+    let homographies = seen.homographies_from(reference, noise)?;
     let inverses: Vec<Matrix3<f64>> =
         homographies.iter().map(|homography| homography.try_inverse()).collect::<Option<_>>()?;
     let positions = positions(observations, views, points, reference, |seen| {
@@ -63,14 +65,64 @@ pub fn fit_without_parallax(
     let observed = positions.iter().flatten().count();
     let positions: Vec<Vector2<f64>> = positions.into_iter().map(Option::unwrap_or_default).collect();
 
-    let (intrinsics, rotations) = nearest_rotations(&homographies)?;
-    let back = |point: &Vector2<f64>| (point - intrinsics.principal_point) / intrinsics.focal;
-    let rotating = Rotating { intrinsics, rotations, points: positions.iter().map(back).collect() };
+    let mut turning = turning(&homographies, observations, points)?;
+    turning.group_of = group_of.to_vec();
+    turning.intrinsics.resize(priors.len(), turning.intrinsics[0]);
+    if focal_per_view {
+        turning = turning.with_own_focals();
+    }
+    let simplest = IntrinsicsModel::focal(focal_per_view);
+    let model = simplest.with_all_extensions();
+    let options = Options::squared(ITERATIONS);
+    metric::adjust(&mut turning, observations, simplest, priors, &options, stop);
+    let report = metric::adjust(&mut turning, observations, model, priors, &options, stop);
+    let cost = report.cost - IntrinsicsPrior::cost_of(priors, model, &turning.intrinsics);
+    let unknowns = turning.unknowns(observed, model.parameters().len() * priors.len());
     let plane = Homographies { views: homographies, points: positions };
     Some((
-        adjusted(plane, 8 * views + 2 * observed, HOMOGRAPHIES_GAUGE, observations, stop),
-        adjusted(rotating, 3 * views + 3 + 2 * observed, ROTATING_GAUGE, observations, stop),
+        fit_homographies(plane, observed, observations, ITERATIONS, stop),
+        CriticalFit { model: turning, cost, unknowns },
     ))
+}
+
+/// What a camera that only turns sees, by homographies.
+pub fn homographies_of(turning: &MetricReconstruction) -> Homographies {
+    let first = turning.poses.first().map_or_else(Matrix3::identity, |pose| pose.rotation);
+    let view = |(view, pose): (usize, &Pose)| turning.intrinsics_of(view).matrix() * pose.rotation * first.transpose();
+    let point = |direction: &Vector3<f64>| {
+        let seen = first * direction;
+        seen.xy() / seen.z
+    };
+    Homographies {
+        views: turning.poses.iter().enumerate().map(view).collect(),
+        points: turning.points.iter().map(point).collect(),
+    }
+}
+
+/// Fits homographies from here.
+pub fn fit_homographies(
+    start: Homographies,
+    observed: usize,
+    observations: &[Observation],
+    iterations: usize,
+    stop: &StopToken,
+) -> CriticalFit<Homographies> {
+    let unknowns = 8 * start.views.len() + 2 * observed;
+    adjusted(start, unknowns, HOMOGRAPHIES_GAUGE, iterations, observations, stop)
+}
+
+/// The camera that only turns which these homographies are nearest to, its principal point in the centre.
+fn turning(homographies: &[Matrix3<f64>], observations: &[Observation], points: usize) -> Option<MetricReconstruction> {
+    let (intrinsics, rotations) = nearest_rotations(homographies)?;
+    let mut directions: Vec<Option<Vector3<f64>>> = vec![None; points];
+    for seen in observations.iter().filter(|seen| seen.is_usable(rotations.len(), points)) {
+        directions[seen.point]
+            .get_or_insert_with(|| rotations[seen.view].tr_mul(&(seen.xy / intrinsics.focal).push(1.0)).normalize());
+    }
+    let pose = |rotation: Matrix3<f64>| Pose { rotation, translation: Vector3::zeros() };
+    let directions = directions.into_iter().map(|direction| direction.unwrap_or_else(Vector3::z)).collect();
+    let turning = MetricReconstruction::new(intrinsics, rotations.into_iter().map(pose).collect(), directions);
+    Some(MetricReconstruction { has_common_centre: true, ..turning })
 }
 
 /// Where the reference view sees each point: as observed there, else by its first observation elsewhere.
@@ -97,10 +149,11 @@ fn adjusted<const G: usize, const C: usize, const P: usize, M: BundleProblem<G, 
     mut model: M,
     unknowns: usize,
     gauge: usize,
+    iterations: usize,
     observations: &[Observation],
     stop: &StopToken,
 ) -> CriticalFit<M> {
-    let report = minimise(&mut model, observations, &Options::squared(ITERATIONS), stop);
+    let report = minimise(&mut model, observations, &Options::squared(iterations), stop);
     CriticalFit { model, cost: report.cost, unknowns: unknowns.saturating_sub(gauge) }
 }
 
@@ -155,7 +208,7 @@ pub fn fit_translation(
     let at_unit_depth = positions.into_iter().map(|position| position.unwrap_or_default().push(1.0));
     let mut model = Translating { translations: epipoles, points: at_unit_depth.collect() };
     alternate(&mut model, observations, reference);
-    Some(adjusted(model, 3 * views + 3 * observed, TRANSLATING_GAUGE, observations, stop))
+    Some(adjusted(model, 3 * views + 3 * observed, TRANSLATING_GAUGE, ITERATIONS, observations, stop))
 }
 
 /// The common epipole of two views that are not turned to each other: it lies on the line through each point's images.
@@ -165,7 +218,7 @@ fn epipole(pairs: &[Match]) -> Option<Vector3<f64>> {
         let line = from.push(1.0).cross(&to.push(1.0));
         normal += line * line.transpose();
     }
-    if pairs.len() < homography::LEAST_COMMON { None } else { smallest_eigenvector(&normal) }
+    if pairs.len() < LEAST_COMMON { None } else { smallest_eigenvector(&normal) }
 }
 
 /// Median Sampson distance from the epipolar constraint `to . (e x from) = 0`.
@@ -223,14 +276,16 @@ mod tests {
     use super::super::bundle::testing::{self, Motion, NOISE, TestScene};
     use super::*;
 
+    const PRIORS: [IntrinsicsPrior; 1] = [IntrinsicsPrior::NONE];
+
     /// Chi-square over degrees of freedom of each model: homographies, rotation, translation.
     fn ratios(scene: &TestScene, noise: f64) -> [f64; 3] {
         let (views, points) = (scene.poses.len(), scene.points.len());
         let stop = StopToken::default();
         let reduced =
             |cost: f64, unknowns: usize| cost / (noise * noise * (2 * scene.observations.len() - unknowns) as f64);
-        let (plane, turning) =
-            fit_without_parallax(&scene.observations, views, points, noise, &stop).expect("complete tracks");
+        let fits = fit_without_parallax(&scene.observations, &vec![0; views], false, &PRIORS, points, noise, &stop);
+        let (plane, turning) = fits.expect("complete tracks");
         let moving = fit_translation(&scene.observations, views, points, noise, f64::INFINITY, &stop);
         let moving = moving.expect("complete tracks");
         [
@@ -271,12 +326,12 @@ mod tests {
         assert!((0.6..1.4).contains(&ratio), "{ratio}");
         let stop = StopToken::default();
         assert!(fit_translation(&[], 0, 0, NOISE, 5.0, &stop).is_none());
-        assert!(fit_without_parallax(&[], 3, 0, NOISE, &stop).is_none());
+        assert!(fit_without_parallax(&[], &[0; 3], false, &PRIORS, 0, NOISE, &stop).is_none());
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(f64::NAN, 1e200));
         assert!(fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop).is_none());
-        assert!(fit_without_parallax(&scene.observations, 8, 40, NOISE, &stop).is_none());
+        assert!(fit_without_parallax(&scene.observations, &[0; 8], false, &PRIORS, 40, NOISE, &stop).is_none());
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(0.25, 0.5));
         fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop);
-        fit_without_parallax(&scene.observations, 8, 40, NOISE, &stop);
+        fit_without_parallax(&scene.observations, &[0; 8], false, &PRIORS, 40, NOISE, &stop);
     }
 }

@@ -1,5 +1,4 @@
-//! Do homographies explain the views? Then the scene is planar or the camera only rotated, and nothing about
-//! calibration may be concluded.
+//! Homographies between views, and whether they explain them: then the scene is planar or the camera only turned.
 
 use nalgebra::{Matrix3, SMatrix, Vector2};
 
@@ -59,6 +58,34 @@ pub struct Correspondences {
 }
 
 impl Correspondences {
+    /// Homographies from one view to every view, each by way of the views that share most points.
+    ///
+    /// * `noise`: standard deviation of a coordinate
+    ///
+    /// Returns `None` where some view shares too few points with all others.
+    pub fn homographies_from(&self, reference: usize, noise: f64) -> Option<Vec<Matrix3<f64>>> {
+        let views = self.by_view.len();
+        let mut found: Vec<Option<Matrix3<f64>>> = vec![None; views];
+        *found.get_mut(reference)? = Some(Matrix3::identity());
+        // The view of the tree that each view outside of it shares most points with (Prim's algorithm), the reference
+        // first among equals.
+        let mut links: Vec<(Vec<Match>, usize)> = (0..views).map(|_| (Vec::new(), reference)).collect();
+        let mut joined = reference;
+        for _ in 1..views {
+            let outside = || (0..views).filter(|&view| found[view].is_none());
+            for view in outside() {
+                let shared = self.common(joined, view);
+                if shared.len() > links[view].0.len() {
+                    links[view] = (shared, joined);
+                }
+            }
+            joined = outside().max_by_key(|&view| (links[view].0.len(), std::cmp::Reverse(view)))?;
+            let (shared, from) = &links[joined];
+            found[joined] = Some(between(shared, noise)? * found[*from]?);
+        }
+        found.into_iter().collect()
+    }
+
     /// Sorts the observations; views out of range and what is no number are left out.
     pub fn new(observations: &[Observation], views: usize) -> Self {
         let mut by_view: Vec<Vec<(usize, Vector2<f64>)>> = vec![Vec::new(); views];

@@ -48,6 +48,7 @@ pub fn upgrade(
         focals,
         poses: Vec::new(),
         points,
+        has_common_centre: false,
     };
     for (view, camera) in frame.cameras.iter().enumerate() {
         let uncalibrate = reconstruction.intrinsics_of(view).matrix().try_inverse()?;
@@ -86,7 +87,10 @@ fn euclidean(point: &Vector4<f64>) -> Vector3<f64> {
 }
 
 /// Of the two mirror images the one with more observations in front of their cameras, at a median depth of 1.
-fn oriented(mut reconstruction: MetricReconstruction, observations: &[Observation]) -> Option<MetricReconstruction> {
+pub(super) fn oriented(
+    mut reconstruction: MetricReconstruction,
+    observations: &[Observation],
+) -> Option<MetricReconstruction> {
     if cheirality(&reconstruction, observations) < 0.5 {
         reconstruction.poses.iter_mut().for_each(|pose| pose.translation.neg_mut());
         reconstruction.points.iter_mut().for_each(|point| point.neg_mut());

@@ -15,6 +15,7 @@ pub mod measurement;
 pub mod metric;
 mod null_vector;
 pub mod observation;
+pub mod planar;
 pub mod pose;
 pub mod procrustes;
 mod ransac;

@@ -128,7 +128,9 @@ fn agreeing(cameras: &[Camera], observations: &[Observation], point: &Point, gat
 /// Weighted squared residual, infinite behind the camera.
 fn squared_in_front(cameras: &[Camera], observation: &Observation, point: &Point) -> f64 {
     let camera = &cameras[observation.view];
-    let depth = (camera.row(2) * point).x * point.w.signum();
+    let depth = (camera.row(2) * point).x;
+    // A direction, with `w` of zero, is oriented as it is.
+    let depth = if point.w < 0.0 { -depth } else { depth };
     if depth > 0.0 { triangulation::weighted_squared(camera, point, observation) } else { f64::INFINITY }
 }
 

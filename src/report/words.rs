@@ -6,11 +6,13 @@ use crate::domain::{Grade, Solution, Status, WarningCode};
 pub fn warning(code: WarningCode) -> &'static str {
     match code {
         WarningCode::PlanarOrRotation => {
-            "The points lie on one plane, or the camera only turned. Such views carry no calibration."
+            "The points lie on one plane, or the camera only turned: such views show little depth."
         }
-        WarningCode::PlanarScene => "The points lie on one plane. Such views carry no calibration.",
+        WarningCode::PlanarScene => {
+            "The points lie on one plane. Views that are tilted against each other tell a focal length all the same."
+        }
         WarningCode::PureRotation => {
-            "The camera only turned and did not move. Such views show no depth, and no calibration is taken from them."
+            "The camera only turned and did not move. Such views show no depth: there are directions but no points."
         }
         WarningCode::PureTranslation => {
             "The camera moved but did not turn. Such views carry no focal length: every value fits them alike."
@@ -39,6 +41,9 @@ pub fn warning(code: WarningCode) -> &'static str {
         WarningCode::CameraGroupsMerged => "Views of different cameras or sizes were treated as one camera.",
         WarningCode::UnverifiedRanking => {
             "Too few tracks hold together for geometry to verify them; their weights are the trained network's scores."
+        }
+        WarningCode::StaticTracks => {
+            "Tracks that stay where they are in the image are no part of the scene: dirt, a watermark, the carrier of the camera."
         }
         WarningCode::DuplicateTracks => {
             "Some tracks stand in the input several times; they count once, and all have the same answer."

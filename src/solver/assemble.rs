@@ -10,9 +10,9 @@ use super::portfolio::Found;
 use super::problem::{Problem, camera_groups};
 use super::reconstruction::{Reconstruction, own_verdicts};
 use super::recorder::Recorder;
-use super::second_structures;
 use super::sequence::Ended;
 use super::view_selection::LEAST_VIEWS;
+use super::{second_structures, static_tracks};
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter};
@@ -60,6 +60,7 @@ impl Reconstruction {
     ) -> Solution {
         warnings.extend(self.warnings.iter().cloned());
         warnings.extend(second_structures::warning(&seed.second_structure, &judged.tracks.inlier));
+        warnings.extend(static_tracks::warning(problem, &judged.tracks.inlier));
         let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
         // Depths verify fewer, and PAPER and PSFM keep what they keep.
         if seed.judges_observations() && inliers < LEAST_INLIERS {

@@ -9,7 +9,7 @@ use super::block::{self, Block};
 use super::calibration::CalibrationOptions;
 use super::normalization::normalization;
 use super::view_selection::complete_views;
-use super::{Error, classification};
+use super::{Error, classification, static_tracks};
 use crate::domain::{FocalPrior, Input, Method, SolveSettings, StopToken, View, Warning, WarningCode};
 use crate::geometry::measurement::Normalization;
 use crate::geometry::observation::Observation;
@@ -36,6 +36,8 @@ pub struct Problem<'a> {
     pub xy: Vec<Vector2<f64>>,
     /// See [`Observation::weight`]; one an observation.
     pub weights: Vec<f64>,
+    /// Whether each track is static: left aside in a search.
+    pub is_static: Vec<bool>,
     /// Observations of each view.
     pub of_view: Vec<Vec<u32>>,
     /// Camera of each view, each of which gets a calibration: the camera groups, counted from 0 in rising order of the
@@ -82,6 +84,7 @@ impl<'a> Problem<'a> {
             focal_priors: (0..cameras).map(of_camera).collect(),
             outlier_density: classification::outlier_density(&of_view, &xy),
             least_share: if complete_views(input, &ranges).is_some() { LEAST_RETAINED_SHARE } else { 0.0 },
+            is_static: static_tracks::find(&ranges, &xy),
             input,
             settings,
             ranges,

@@ -142,7 +142,8 @@ fn greedy_views(problem: &Problem, open: &[bool], least: usize) -> Vec<Vec<usize
             break;
         }
         let mut views = vec![first];
-        let mut tracks: Vec<usize> = problem.of_view[first].iter().map(|&k| problem.track_of(k as usize)).collect();
+        let seen = problem.of_view[first].iter().map(|&k| problem.track_of(k as usize));
+        let mut tracks: Vec<usize> = seen.filter(|&track| !problem.is_static[track]).collect();
         let mut best: Option<(usize, Vec<usize>)> = None;
         while views.len() < OPTIONS.most_views {
             let mut counts = vec![0usize; problem.views()];

@@ -63,6 +63,7 @@ pub fn of_scene(scene: &Scene) -> Option<Vec<f64>> {
         focals: Vec::new(),
         poses: poses(&truth.rotations, &truth.translations),
         points: truth.points.iter().map(|point| Vector3::from(*point)).collect(),
+        has_common_centre: false,
     };
     let right = |k: &usize| truth.observation_right[*k] && truth.inlier[scene.input.track[*k] as usize];
     let observations: Vec<Observation> = (0..scene.input.x.len())
@@ -100,6 +101,7 @@ pub fn of_photographed(scene: &Photographed) -> Option<Vec<f64>> {
         focals: if model.is_per_view() { own_focals() } else { Vec::new() },
         poses: poses(&truth.rotations, &truth.translations),
         points: truth.points.iter().map(|point| Vector3::from(*point)).collect(),
+        has_common_centre: false,
     };
     let ids = scene.input.view.iter().zip(&scene.input.track);
     let verifiable = ids.zip(truth.verifiable(&scene.input.track)).filter(|(_, verifiable)| *verifiable);

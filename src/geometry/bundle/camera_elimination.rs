@@ -87,12 +87,13 @@ impl<const G: usize, const C: usize, const P: usize, T: BundleProblem<G, C, P>> 
 #[cfg(test)]
 mod tests {
     use super::super::Options;
-    use super::super::critical::Rotating;
+    use super::super::critical::Homographies;
     use super::super::engine::{descend, minimise};
     use super::super::projective::Projective;
     use super::super::testing::{self, Motion, NOISE};
     use super::*;
     use crate::domain::StopToken;
+    use crate::geometry::homography::Correspondences;
 
     /// Adjusts a problem as it is and with cameras and points exchanged, from the same start.
     fn both_end_at_the_same_cost<const G: usize, const C: usize, const P: usize>(
@@ -130,22 +131,13 @@ mod tests {
                 testing::perturb(problem.points.iter_mut().flat_map(|point| point.iter_mut()), 0.003, seed + 1);
                 both_end_at_the_same_cost::<0, 12, 4>(&problem, &scene.observations, &case);
 
-                let turning = testing::scene_of(seed, 10, 7, NOISE, Motion::Rotation, false);
-                let start = &turning.poses[0].rotation;
-                let mut problem = Rotating {
-                    intrinsics: turning.intrinsics,
-                    rotations: turning.poses.iter().map(|pose| pose.rotation * start.transpose()).collect(),
-                    points: turning
-                        .points
-                        .iter()
-                        .map(|point| {
-                            let seen = start * point;
-                            seen.xy() / seen.z
-                        })
-                        .collect(),
-                };
+                let plane = testing::scene_of(seed, 10, tracks, NOISE, Motion::General, true);
+                let points = plane.observations.iter().filter(|seen| seen.view == 0).map(|seen| seen.xy);
+                let seen = Correspondences::new(&plane.observations, 10);
+                let views = seen.homographies_from(0, NOISE).expect("complete tracks");
+                let mut problem = Homographies { views, points: points.collect() };
                 testing::perturb(problem.points.iter_mut().flat_map(|point| point.iter_mut()), 0.01, seed);
-                both_end_at_the_same_cost::<3, 3, 2>(&problem, &turning.observations, &case);
+                both_end_at_the_same_cost::<0, 9, 2>(&problem, &plane.observations, &case);
             }
         }
     }

@@ -1,29 +1,20 @@
-//! Bundle adjustment of the motions and scenes that carry no metric reconstruction: models with fewer unknowns than
-//! projective cameras, to be tested against them.
+//! Bundle adjustment of planes and of cameras that do not turn: models with fewer unknowns than projective cameras, to be
+//! tested against them.
 //!
 //! A point is `(x, y, 1)`, and `(x, y, 1, w)` where it has an inverse depth `w`, in the frame of the view in which the
 //! starts were taken: that keeps points at infinity apart from nothing.
 
-use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
 
 use super::Observation;
 pub(crate) use super::engine::{BundleProblem, minimise};
 use super::engine::{Jacobian, ResidualVisitor, Step, image, move_each, unit_norm};
-use super::metric::Intrinsics;
 
 /// Views of a plane, or of anything from one centre: `x ~ H (x, y, 1)`.
 #[derive(Debug, Clone)]
 pub struct Homographies {
     /// One a view, any scale.
     pub views: Vec<Matrix3<f64>>,
-    pub points: Vec<Vector2<f64>>,
-}
-
-/// A camera that turns about its centre: `x ~ K R (x, y, 1)`, with focal length and principal point of `K` free.
-#[derive(Debug, Clone)]
-pub struct Rotating {
-    pub intrinsics: Intrinsics,
-    pub rotations: Vec<Matrix3<f64>>,
     pub points: Vec<Vector2<f64>>,
 }
 
@@ -37,9 +28,8 @@ pub struct Translating {
     pub points: Vec<Vector3<f64>>,
 }
 
-/// Unknowns that no observation determines: homographies of the plane; a rotation of everything; position and scale.
+/// Unknowns that no observation determines: homographies of the plane; position and scale.
 pub const HOMOGRAPHIES_GAUGE: usize = 8;
-pub const ROTATING_GAUGE: usize = 3;
 pub const TRANSLATING_GAUGE: usize = 4;
 
 impl BundleProblem<0, 9, 2> for Homographies {
@@ -74,40 +64,6 @@ impl BundleProblem<0, 9, 2> for Homographies {
     }
 }
 
-impl BundleProblem<3, 3, 2> for Rotating {
-    fn counts(&self) -> (usize, usize) {
-        (self.rotations.len(), self.points.len())
-    }
-
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<3, 3, 2>) {
-        let rotation = &self.rotations[observation.view];
-        let turned = rotation * self.points[observation.point].push(1.0);
-        let (direction, by_turned) = image(&turned);
-        let Intrinsics { focal, principal_point, .. } = self.intrinsics;
-        visitor.visit(direction * focal + principal_point - observation.xy, || {
-            let mut jacobian = Jacobian::<3, 3, 2>::zeros();
-            for (component, by_turned) in by_turned.iter().enumerate() {
-                let by_turned = by_turned * focal;
-                jacobian.globals[(0, component)] = focal * direction[component];
-                jacobian.globals[(1 + component, component)] = 1.0;
-                jacobian.camera.set_column(component, &turned.cross(&by_turned));
-                jacobian.point.set_column(component, &rotation.tr_mul(&by_turned).xy());
-            }
-            jacobian
-        });
-    }
-
-    fn retract(&mut self, from: &Self, step: &Step<3, 3, 2>) {
-        self.intrinsics.focal = from.intrinsics.focal * step.globals[0].exp();
-        self.intrinsics.principal_point =
-            from.intrinsics.principal_point + Vector2::new(step.globals[1], step.globals[2]);
-        move_each(&mut self.rotations, &from.rotations, &step.cameras, |rotation, step| {
-            Rotation3::from_scaled_axis(*step) * rotation
-        });
-        move_each(&mut self.points, &from.points, &step.points, |point, step| point + step);
-    }
-}
-
 impl BundleProblem<0, 3, 3> for Translating {
     fn counts(&self) -> (usize, usize) {
         (self.translations.len(), self.points.len())
@@ -135,6 +91,8 @@ impl BundleProblem<0, 3, 3> for Translating {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Rotation3;
+
     use super::super::testing::{self, NOISE};
     use super::*;
 
@@ -146,12 +104,6 @@ mod tests {
         let points: Vec<Vector2<f64>> = scene.observations[..8].iter().map(|seen| seen.xy).collect();
         testing::check_jacobian(
             &Homographies { views: (0..4).map(turned).collect(), points: points.clone() },
-            &scene.observations,
-        );
-        let mut intrinsics = Intrinsics::from_focal(1.2);
-        intrinsics.principal_point = Vector2::new(0.03, -0.02);
-        testing::check_jacobian(
-            &Rotating { intrinsics, rotations: (0..4).map(turned).collect(), points: points.clone() },
             &scene.observations,
         );
         let with_depths = points.iter().enumerate().map(|(j, point)| point.push(0.2 + 0.05 * j as f64)).collect();

@@ -101,12 +101,22 @@ pub struct MetricReconstruction {
     pub focals: Vec<f64>,
     pub poses: Vec<Pose>,
     pub points: Vec<Vector3<f64>>,
+    /// Whether the camera only turned: all poses are at the origin of the world and stay there, and points are
+    /// directions, of which no observation tells the length.
+    pub has_common_centre: bool,
 }
 
 impl MetricReconstruction {
     /// With one calibration for all views.
     pub fn new(intrinsics: Intrinsics, poses: Vec<Pose>, points: Vec<Vector3<f64>>) -> Self {
-        Self { intrinsics: vec![intrinsics], group_of: vec![0; poses.len()], focals: Vec::new(), poses, points }
+        Self {
+            intrinsics: vec![intrinsics],
+            group_of: vec![0; poses.len()],
+            focals: Vec::new(),
+            poses,
+            points,
+            has_common_centre: false,
+        }
     }
 
     /// The same with a focal length of each view, that of its group unless it has these already.
@@ -127,6 +137,14 @@ impl MetricReconstruction {
         self.average_focals();
         self.focals.clear();
         self
+    }
+
+    /// Unknowns that observations of so many points could determine, the gauge taken off.
+    ///
+    /// * `shared`: free intrinsics of all camera groups together
+    pub fn unknowns(&self, points: usize, shared: usize) -> usize {
+        let (of_view, of_point, gauge) = if self.has_common_centre { (3, 2, 3) } else { (6, 3, 7) };
+        (of_view * self.poses.len() + of_point * points + self.focals.len() + shared).saturating_sub(gauge)
     }
 
     /// Whether every view has a focal length of its own.

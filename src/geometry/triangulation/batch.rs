@@ -177,6 +177,7 @@ impl Batch {
                 axis += 1;
             }
         }
+        normal.hold_unseen();
         let shift = normal.trace() * SHIFT;
         for diagonal in DIAGONAL {
             normal.0[diagonal] += shift;
@@ -246,6 +247,7 @@ impl Batch {
             }
             // The scale of the homogeneous point is free: pin it.
             normal.add_square(normal.trace(), points);
+            normal.hold_unseen();
             for diagonal in DIAGONAL {
                 normal.0[diagonal] *= F64x8::ONE + damping;
             }

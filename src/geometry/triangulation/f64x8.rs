@@ -143,6 +143,14 @@ pub struct Symmetric(pub [F64x8; 10]);
 impl Symmetric {
     pub const ZERO: Self = Self([F64x8::ZERO; 10]);
 
+    /// Where no camera tells the last unknown, as of cameras that are all at the origin, it stays what it is.
+    #[inline(always)]
+    pub fn hold_unseen(&mut self) {
+        let last = &DIAGONAL[3];
+        let is_unseen = self.0[*last].compare(F64x8::ZERO, |a, b| a == b);
+        self.0[*last] = self.trace().or(is_unseen, self.0[*last]);
+    }
+
     /// Adds `weight` times the outer product of a vector with itself.
     #[inline(always)]
     pub fn add_square(&mut self, weight: F64x8, v: Points) {

@@ -44,13 +44,25 @@ pub fn squared_residual(cameras: &[Camera], point: &Point, observations: &[Obser
 /// Linear triangulation (Hartley & Zisserman, section 12.2): the unit 4-vector that is least inconsistent with
 /// `x (P3 X) = P1 X`, `y (P3 X) = P2 X` over all observations, each camera's rows scaled by the norm of its third.
 ///
-/// Needs two observations or more; with fewer the point returned is one of many.
+/// Needs two observations or more; with fewer the point returned is one of many. Of cameras that are all at the origin
+/// of the frame, which tell no depth, it is the direction, a point at infinity.
 pub fn linear(cameras: &[Camera], observations: &[Observation]) -> Point {
-    let normal = vectorised(
+    let mut normal = vectorised(
         #[inline(always)]
         || inconsistency(cameras, observations),
     );
-    null_vector(&normal).unwrap_or(Point::new(0.0, 0.0, 0.0, 1.0))
+    let are_directions = normal.m44 == 0.0;
+    if are_directions {
+        normal.m44 = normal.trace();
+    }
+    let point = null_vector(&normal).unwrap_or(Point::new(0.0, 0.0, 0.0, 1.0));
+    if are_directions { in_front(cameras, observations, point) } else { point }
+}
+
+/// The direction or its opposite, whichever is in front of more of the cameras.
+fn in_front(cameras: &[Camera], observations: &[Observation], direction: Point) -> Point {
+    let depths = observations.iter().map(|seen| (cameras[seen.view].row(2) * direction).x.signum());
+    if depths.sum::<f64>() < 0.0 { -direction } else { direction }
 }
 
 /// The quadratic form whose least direction [`linear`] wants.
@@ -105,6 +117,10 @@ fn descend(cameras: &[Camera], observations: &[Observation], start: Point, itera
         let mut normal = Matrix4::from(normal);
         // The scale of the homogeneous point is free: pin it.
         normal += point * point.transpose() * normal.trace();
+        if normal.m44 == 0.0 {
+            // Cameras at the origin: a direction stays one.
+            normal.m44 = normal.trace();
+        }
         for k in 0..4 {
             normal[(k, k)] *= 1.0 + damping;
         }

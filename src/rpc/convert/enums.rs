@@ -75,6 +75,7 @@ twins! {
         StoppedEarly,
         UnverifiedRanking,
         DuplicateTracks,
+        StaticTracks,
     }
 }
 
@@ -114,6 +115,7 @@ mod tests {
             WarningCode::CameraGroupsMerged,
             WarningCode::UnverifiedRanking,
             WarningCode::DuplicateTracks,
+            WarningCode::StaticTracks,
         ] {
             let wire = proto::WarningCode::try_from(code.to_wire()).expect("known");
             assert_eq!(wire.as_str_name(), format!("WARNING_CODE_{}", code.name()));

@@ -17,14 +17,14 @@ use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
 use super::recorder::Recorder;
 use super::sequence::ProjectiveReconstruction;
-use super::{Error, all_tracks, near_duplicates, second_structures, track_sampling};
+use super::{Error, all_tracks, near_duplicates, second_structures, static_tracks, track_sampling};
 use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
 
 const OPTIONS: AttemptOptions = AttemptOptions::DEFAULT;
 
-/// What is said of motions and scenes that carry no calibration.
+/// What describes motions and scenes that are special cases.
 const CRITICAL: [WarningCode; 4] =
     [WarningCode::PureTranslation, WarningCode::PureRotation, WarningCode::PlanarScene, WarningCode::PlanarOrRotation];
 
@@ -136,6 +136,12 @@ impl Attempt {
     /// Whether there is a metric reconstruction, whatever it is worth.
     pub fn has_metric(&self) -> bool {
         self.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some())
+    }
+
+    /// Whether its camera only turned, so that its points are directions: nothing can be registered against them.
+    pub fn has_common_centre(&self) -> bool {
+        let metric = self.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref());
+        metric.is_some_and(|metric| metric.has_common_centre)
     }
 
     /// Whether there is a calibration that may be used.
@@ -251,15 +257,19 @@ fn initial_noise(problem: &Problem) -> f64 {
     NoiseOptions::DEFAULT.clamp(noise)
 }
 
-/// AUTO and GEOMETRY: a sample of the tracks without near-duplicates, and where that holds nothing, one of all.
+/// AUTO and GEOMETRY: a sample of the tracks without static ones and near-duplicates, and where that holds nothing, one
+/// of all.
 fn searched(problem: &Problem, block: &Block, effort: Effort, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let (most, of_many_views) = OPTIONS.searched_tracks;
     let most = match effort.is_seed {
         true => of_many_views,
         false => (OPTIONS.searched_work / block.views.len().max(1).pow(2)).clamp(of_many_views, most),
     };
-    if let Some(thinned) = near_duplicates::thinned(block, most, initial_noise(problem), problem.settings.seed) {
-        let attempt = search(problem, thinned, None, effort, recorder)?;
+    let (noise, seed) = (initial_noise(problem), problem.settings.seed);
+    let moving = static_tracks::without(problem, block);
+    let thinned = near_duplicates::thinned(moving.as_ref().unwrap_or(block), most, noise, seed);
+    if let Some(some) = thinned.or_else(|| moving.map(|moving| moving.sample(most, seed))) {
+        let attempt = search(problem, some, None, effort, recorder)?;
         if attempt.found.consensus.is_some() {
             return Ok(attempt);
         }

@@ -1,74 +1,108 @@
-//! Motions and scenes that carry no calibration, and which of them it is.
+//! Motions and scenes of which projective cameras do not tell the calibration, and which of them it is.
 
 use nalgebra::{Matrix3, Vector3};
 
 use super::Uncalibrated;
 use super::fit::Fit;
+use super::models::Choice;
 use super::options::{CalibrationOptions, CriticalOptions};
-use crate::domain::{StopToken, Warning, WarningCode};
-use crate::geometry::bundle::critical::{Rotating, Translating};
+use crate::domain::{Warning, WarningCode};
+use crate::geometry::bundle::critical::{Homographies, Translating};
+use crate::geometry::bundle::metric::MetricReconstruction;
 use crate::geometry::critical;
 use crate::geometry::homography;
 
-/// What carries no calibration, as far as the views show.
+/// What kind of motion and scene the views show.
 pub(super) struct Critical {
-    /// Empty where nothing speaks against a calibration.
+    /// What describes it; empty where it is nothing special.
     pub warnings: Vec<Warning>,
-    /// The reconstruction of a camera that moved without turning, where its scene has depth: a focal length that is
-    /// known otherwise makes it metric.
-    pub translation: Option<Translating>,
+    pub upgrade: Upgrade,
 }
 
-/// Whether the views of this consensus carry no calibration, and why.
+/// What a metric reconstruction may be found from.
+pub(super) enum Upgrade {
+    /// The dual absolute quadric of projective cameras, and, where the scene may be a plane behind a lens, or nearly
+    /// one, its homographies.
+    Quadric(Option<Homographies>),
+    /// Homographies: a plane (Triggs 1998).
+    Plane(Homographies),
+    /// A camera that only turned (Hartley 1997), and the fit of what it is a special case of.
+    Turning { metric: MetricReconstruction, free: Fit },
+    /// A camera that moved without turning, where its scene has depth: a focal length that is known otherwise makes it
+    /// metric.
+    Translation(Translating),
+    /// Nothing.
+    None,
+}
+
+/// What kind of motion and scene the views of this consensus show.
 ///
 /// * `fit`: the projective cameras that every model is tested against
-pub(super) fn find(problem: &Uncalibrated, fit: &Fit, scale_px: f64, stop: &StopToken) -> Critical {
+pub(super) fn find(choice: &Choice, fit: &Fit) -> Critical {
+    let Choice { problem, stop, .. } = *choice;
     let (observations, views) = (problem.observations, problem.cameras.len());
     let points = problem.points.len();
     let CalibrationOptions { critical: options, fit: fit_options, .. } = problem.options;
     let translation = critical::fit_translation(observations, views, points, fit.noise, options.epipolar_limit, stop)
         .filter(|found| !fit.refutes(&Fit::new(found.cost, found.unknowns, problem), fit_options));
-    let flat = homography::median_residual(observations, views, fit.noise, options.homography_limit)
-        .and_then(|residual| without_parallax(problem, fit, residual, translation.is_some(), scale_px, stop));
-    if let Some(flat) = flat {
-        return Critical { warnings: vec![flat], translation: None };
+    let mut plane = None;
+    if let Some(residual) = homography::median_residual(observations, views, fit.noise, options.lens_limit) {
+        match without_parallax(choice, fit, residual, translation.is_some()) {
+            Ok(flat) => return flat,
+            Err(homographies) => plane = homographies,
+        }
     }
-    let Some(translation) = translation else { return Critical { warnings: Vec::new(), translation: None } };
-    let detail = "a camera that does not turn leaves the focal length free";
-    let warnings =
-        vec![pure_translation(&translation.model, options), Warning::new(WarningCode::UnobservableFocal, detail)];
-    Critical { warnings, translation: Some(translation.model) }
+    let Some(translation) = translation else {
+        return Critical { warnings: Vec::new(), upgrade: Upgrade::Quadric(plane) };
+    };
+    let warnings = vec![pure_translation(&translation.model, options), not_turning()];
+    Critical { warnings, upgrade: Upgrade::Translation(translation.model) }
 }
 
-/// What is said where homographies nearly explain the views; `None` where the baselines are short but show depth.
+fn not_turning() -> Warning {
+    Warning::new(WarningCode::UnobservableFocal, "a camera that does not turn leaves the focal length free")
+}
+
+/// What the views show where homographies nearly explain them; otherwise the homographies, if there are any.
 ///
+/// * `residual`: by how much homographies miss, see [`homography::median_residual`]
 /// * `translates`: whether a camera that does not turn explains the views
 fn without_parallax(
-    problem: &Uncalibrated,
+    choice: &Choice,
     fit: &Fit,
     residual: f64,
     translates: bool,
-    scale_px: f64,
-    stop: &StopToken,
-) -> Option<Warning> {
+) -> Result<Critical, Option<Homographies>> {
+    let Choice { problem, scale_px, stop } = *choice;
+    let CalibrationOptions { critical: options, fit: fit_options, .. } = problem.options;
+    let is_flat = residual < options.homography_limit;
     let missed = format!(
         "homographies between the views miss by a median of {residual:.1} standard deviations of the noise ({:.2} px)",
         fit.noise * scale_px
     );
-    let (views, points) = (problem.cameras.len(), problem.points.len());
-    let fits = critical::fit_without_parallax(problem.observations, views, points, fit.noise, stop);
+    let Uncalibrated { observations, group_of, focal_per_view, points, .. } = *problem;
+    let priors = choice.priors(fit.noise);
+    let fits =
+        critical::fit_without_parallax(observations, group_of, focal_per_view, &priors, points.len(), fit.noise, stop);
     let Some((plane, turning)) = fits else {
+        if !is_flat {
+            return Err(None);
+        }
         let detail = format!("{missed}: the scene is planar, or the camera hardly did more than turn");
-        return Some(Warning::new(WarningCode::PlanarOrRotation, detail));
+        let warnings = vec![Warning::new(WarningCode::PlanarOrRotation, detail)];
+        return Ok(Critical { warnings, upgrade: Upgrade::None });
     };
-    // The homographies themselves may miss by a little; what a rotation loses is counted from there.
+    // The homographies themselves may miss by a little; what a rotation loses is counted from there. No homography
+    // knows a lens, though.
     let by_plane = Fit::new(plane.cost, plane.unknowns, problem);
     let by_turning = Fit::new(turning.cost, turning.unknowns, problem);
-    let deviations = by_plane.loss_deviations(by_turning.cost, by_turning.freedom);
-    let turns = deviations < problem.options.fit.misfit_deviations;
-    let plane_deviations = problem.options.critical.plane_deviations;
-    if translates && !turns && fit.loss_deviations(by_plane.cost, by_plane.freedom) > plane_deviations {
-        return None;
+    let free = if is_flat { by_plane } else { *fit };
+    let deviations = free.loss_deviations(by_turning.cost, by_turning.freedom);
+    let turns = deviations < fit_options.misfit_deviations;
+    let plane_deviations = options.plane_deviations;
+    let has_depth = || fit.loss_deviations(by_plane.cost, by_plane.freedom) > plane_deviations;
+    if !turns && (!is_flat || translates && has_depth()) {
+        return Err(Some(plane.model));
     }
     let worse = format!("a camera that only turns fits worse than homographies by {deviations:.1} standard deviations");
     let (code, because) = match (turns, translates) {
@@ -76,10 +110,9 @@ fn without_parallax(
             WarningCode::PlanarOrRotation,
             "the camera hardly moved, and a turn explains the views as well as a shift".to_owned(),
         ),
-        (true, false) => (WarningCode::PureRotation, rotation_in_words(&turning.model, scale_px)),
-        (false, _) if problem.focal_per_view => (
-            WarningCode::PlanarOrRotation,
-            "with a focal length a view, a planar scene and a camera that only turns are not told apart".to_owned(),
+        (true, false) => (
+            WarningCode::PureRotation,
+            "a camera that only turns explains the views as well as any homographies do".to_owned(),
         ),
         (false, _) if deviations < plane_deviations => (
             WarningCode::PlanarOrRotation,
@@ -87,14 +120,16 @@ fn without_parallax(
         ),
         (false, _) => (WarningCode::PlanarScene, format!("the scene is planar; {worse}")),
     };
-    Some(Warning::new(code, format!("{missed}: {because}")))
-}
-
-fn rotation_in_words(turning: &Rotating, scale_px: f64) -> String {
-    format!(
-        "a camera that only turns, with a focal length near {:.0} px, explains the views as well as any homographies do",
-        turning.intrinsics.focal * scale_px
-    )
+    let mut warnings = vec![Warning::new(code, format!("{missed}: {because}"))];
+    let upgrade = match (turns, translates) {
+        (true, false) => Upgrade::Turning { metric: turning.model, free },
+        (false, false) => Upgrade::Plane(plane.model),
+        (_, true) => {
+            warnings.push(not_turning());
+            Upgrade::None
+        }
+    };
+    Ok(Critical { warnings, upgrade })
 }
 
 fn pure_translation(translation: &Translating, options: &CriticalOptions) -> Warning {

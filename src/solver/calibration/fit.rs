@@ -2,7 +2,7 @@
 
 use super::Uncalibrated;
 use super::options::FitOptions;
-use crate::geometry::bundle::metric::IntrinsicsModel;
+use crate::geometry::bundle::metric::{IntrinsicsModel, MetricReconstruction};
 
 /// The fit of a model that others are compared with.
 #[derive(Debug, Clone, Copy)]
@@ -31,12 +31,15 @@ impl Fit {
         Self::new(cost, (11 * problem.cameras.len() + 3 * inliers + others).saturating_sub(15), problem)
     }
 
-    /// The fit of metric cameras with these intrinsics of each group free, and points.
-    pub fn metric(cost: f64, model: IntrinsicsModel, problem: &Uncalibrated) -> Self {
-        let of_view = if model.is_per_view() { 7 } else { 6 };
-        let inliers = super::observed_points(problem);
-        let unknowns = of_view * problem.cameras.len() + 3 * inliers + model.parameters().len() * problem.groups();
-        Self::new(cost, unknowns.saturating_sub(7), problem)
+    /// The fit of a metric reconstruction with these intrinsics of each group free.
+    pub fn metric(
+        cost: f64,
+        reconstruction: &MetricReconstruction,
+        model: IntrinsicsModel,
+        problem: &Uncalibrated,
+    ) -> Self {
+        let shared = model.parameters().len() * problem.groups();
+        Self::new(cost, reconstruction.unknowns(super::observed_points(problem), shared), problem)
     }
 
     /// How much worse a special case of this model fits than chance would have it, in standard deviations of the F

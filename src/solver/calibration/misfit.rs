@@ -8,6 +8,7 @@ use super::options::FitOptions;
 use super::{Uncalibrated, observed_points};
 use crate::geometry::bundle::metric::{self, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::{Options, projective};
+use crate::geometry::critical;
 use crate::geometry::observation::Observation;
 
 /// A metric reconstruction, compared with the projective one.
@@ -78,15 +79,25 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
     for lens in &mut pinhole.intrinsics {
         (lens.radial, lens.tangential) = ([0.0; 3], [0.0; 2]);
     }
-    let mut cameras = pinhole.cameras();
-    let mut points: Vec<Vector4<f64>> = pinhole.points.iter().map(|point| point.push(1.0)).collect();
-    let report = projective::adjust(&mut cameras, &mut points, &observations, &options, choice.stop);
-    let projective = Fit::projective(report.cost, problem, observed_points(problem), terms);
+    let observed = observed_points(problem);
+    let projective = match pinhole.has_common_centre {
+        true => {
+            let (start, iterations) = (critical::homographies_of(&pinhole), options.max_iterations);
+            let found = critical::fit_homographies(start, observed, &observations, iterations, choice.stop);
+            Fit::new(found.cost, found.unknowns + terms, problem)
+        }
+        false => {
+            let mut cameras = pinhole.cameras();
+            let mut points: Vec<Vector4<f64>> = pinhole.points.iter().map(|point| point.push(1.0)).collect();
+            let report = projective::adjust(&mut cameras, &mut points, &observations, &options, choice.stop);
+            Fit::projective(report.cost, problem, observed, terms)
+        }
+    };
 
     let model = best.model.without_lens();
     let report = metric::adjust(&mut pinhole, &observations, model, &best.priors, &options, choice.stop);
     let of_priors = IntrinsicsPrior::cost_of(&best.priors, model, &pinhole.intrinsics);
-    Some((projective, Fit::metric(report.cost - of_priors, best.model, problem)))
+    Some((projective, Fit::metric(report.cost - of_priors, &pinhole, best.model, problem)))
 }
 
 /// The observations where pinholes would have made them; without those that the lens images nowhere.

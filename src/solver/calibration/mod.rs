@@ -18,12 +18,15 @@ mod view_focals;
 use nalgebra::{Matrix3x4, Vector4};
 
 use crate::domain::{FocalPrior, Grade, StopToken, Warning, WarningCode};
+use crate::geometry::bundle::critical::Homographies;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::daq::to_canonical_frame;
 use crate::geometry::observation::Observation;
+use crate::geometry::planar;
 
 use super::Error;
+use critical::Upgrade;
 use fit::Fit;
 use options::FitOptions;
 pub use options::{CalibrationOptions, GradeOptions};
@@ -165,21 +168,34 @@ impl Outcome {
 /// [`Error::Stopped`] when `stop` fired; what stands by then is not worth returning.
 pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Error> {
     let problem = &problem.with_least_noise();
-    let Compared { cameras, points, fit, critical, mut warnings } =
+    let Compared { cameras, points, mut fit, critical, mut warnings } =
         Compared::new(problem, problem, scale_px, stop, &mut || ())?;
-    let is_critical = !critical.warnings.is_empty();
     warnings.extend(critical.warnings);
     let choice = models::Choice { problem, scale_px, stop };
     let priors = choice.priors(fit.noise);
-    let minima = match (critical.translation, problem.focal_priors) {
-        (Some(translation), [Some(focal)]) => {
+    let from_plane = |plane: &Homographies| {
+        let group_of = if problem.focal_per_view { &vec![0; problem.cameras.len()] } else { problem.group_of };
+        let starts = planar::upgrades(plane, group_of, problem.observations, problem.options.search.planar_starts);
+        search::minima_from(starts, problem, &priors, stop)
+    };
+    let minima = match (critical.upgrade, problem.focal_priors) {
+        (Upgrade::Quadric(plane), _) => {
+            let mut found = match to_canonical_frame(&cameras, &points) {
+                Some(frame) => search::minima(&frame, problem, &priors, stop)?,
+                None => Vec::new(),
+            };
+            found.extend(plane.as_ref().map(from_plane).transpose()?.into_iter().flatten());
+            search::distinct(found, problem)
+        }
+        (Upgrade::Plane(plane), _) => from_plane(&plane)?,
+        (Upgrade::Turning { metric, free }, _) => {
+            fit = free;
+            search::minima_from(vec![metric], problem, &priors, stop)?
+        }
+        (Upgrade::Translation(translation), [Some(focal)]) => {
             search::known_focal(&translation, focal.focal_px / scale_px, problem, &priors, stop)
         }
-        _ if is_critical => return Ok(problem.refused(&warnings)),
-        _ => match to_canonical_frame(&cameras, &points) {
-            Some(frame) => search::minima(&frame, problem, &priors, stop)?,
-            None => Vec::new(),
-        },
+        (Upgrade::Translation(_) | Upgrade::None, _) => return Ok(problem.refused(&warnings)),
     };
     if minima.is_empty() {
         warnings.push(no_start());
@@ -216,11 +232,8 @@ pub fn from_metric(
     let stretch = stretch.map(|stretch| Stretch { problem: stretch.problem.with_least_noise(), ..stretch });
     let on = stretch.as_ref().map_or(problem, |stretch| &stretch.problem);
     let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on, scale_px, stop, heartbeat)?;
-    // A plane under tilted views determines a focal length (Triggs 1998): of a reconstruction that is metric already,
-    // sigma says how well, and the warning describes the scene.
-    let is_critical = critical.warnings.iter().any(|warning| warning.code != WarningCode::PlanarScene);
     warnings.extend(critical.warnings);
-    if is_critical {
+    if !matches!(critical.upgrade, Upgrade::Quadric(_) | Upgrade::Plane(_)) {
         return Ok(problem.refused(&warnings));
     }
     let choice = models::Choice { problem, scale_px, stop };
@@ -298,7 +311,7 @@ impl Compared {
         let fit = Fit::projective(report.cost, on, observed_points(on), 0);
         Error::check(stop)?;
         heartbeat();
-        let critical = critical::find(on, &fit, scale_px, stop);
+        let critical = critical::find(&models::Choice { problem: on, scale_px, stop }, &fit);
         Error::check(stop)?;
         heartbeat();
         Ok(Self { cameras, points, fit, critical, warnings })

@@ -26,7 +26,7 @@ impl Candidate {
     /// * `minimum`: of this model with these priors
     pub fn new(minimum: Minimum, model: IntrinsicsModel, priors: Vec<IntrinsicsPrior>, problem: &Uncalibrated) -> Self {
         let of_priors = IntrinsicsPrior::cost_of(&priors, model, &minimum.reconstruction.intrinsics);
-        let fit = Fit::metric(minimum.cost - of_priors, model, problem);
+        let fit = Fit::metric(minimum.cost - of_priors, &minimum.reconstruction, model, problem);
         let information = Information::new(&minimum.reconstruction, problem.observations);
         Self { model, priors, minimum, fit, information }
     }

@@ -88,6 +88,8 @@ pub struct CriticalOptions {
     /// Median homography residual, in units of the noise, below which the scene counts as planar or the camera as only
     /// rotating.
     pub homography_limit: f64,
+    /// The same up to which they may do so behind a lens, which no homography knows, or a scene be nearly planar.
+    pub lens_limit: f64,
     /// Median distance from the epipolar lines of a translation, in units of the noise, above which the motion is none
     /// and nothing is adjusted.
     pub epipolar_limit: f64,
@@ -107,6 +109,8 @@ impl CriticalOptions {
     pub const DEFAULT: Self = Self {
         // Measured: 1.1 to 1.8 for those, above 11 for general motion.
         homography_limit: 3.0,
+        // From here on a plane or a turn is nowhere near.
+        lens_limit: 12.0,
         // A translation has about .7; the epipoles are only a start.
         epipolar_limit: 3.0,
         // Before a plane the projective model is singular and fits 3 to 5 deviations better than it should; depth, even
@@ -166,6 +170,8 @@ pub struct SearchOptions {
     pub other_focals: [f64; 4],
     /// Iterations in which poses and points follow a focal length that is held.
     pub following_iterations: usize,
+    /// Starts from a plane that are adjusted.
+    pub planar_starts: usize,
 }
 
 impl SearchOptions {
@@ -202,6 +208,8 @@ impl SearchOptions {
         // A forward motion has them half or twice as far.
         other_focals: [0.5, 0.75, 1.33, 2.0],
         following_iterations: 12,
+        // The plane's equations have few minima, and sorted by these the right one is among the first.
+        planar_starts: 4,
     };
 
     /// The first adjustment of a start.

@@ -54,7 +54,7 @@ impl Minimum {
         let model = IntrinsicsModel::FOCAL_PER_VIEW;
         let information = Information::new(&self.reconstruction, problem.observations);
         let Some(information) = information else { return vec![true; views] };
-        let noise = Fit::metric(self.cost, model, problem).noise;
+        let noise = Fit::metric(self.cost, &self.reconstruction, model, problem).noise;
         let sigmas = information
             .own_focals(&information.optimum(model, &vec![IntrinsicsPrior::NONE; problem.groups()]))
             .into_iter();
@@ -238,6 +238,27 @@ fn minima_of_one(
     Ok(distinct(converged, problem))
 }
 
+/// What starts that were found otherwise than by the quadric converge to, cheapest first.
+pub(super) fn minima_from(
+    starts: Vec<MetricReconstruction>,
+    problem: &Uncalibrated,
+    priors: &[IntrinsicsPrior],
+    stop: &StopToken,
+) -> Result<Vec<Minimum>, Error> {
+    let model = IntrinsicsModel::focal(problem.focal_per_view);
+    let mut found = Vec::with_capacity(starts.len());
+    for mut start in starts {
+        Error::check(stop)?;
+        start.intrinsics.iter_mut().for_each(|intrinsics| *intrinsics = Intrinsics::from_focal(intrinsics.focal));
+        let start = match problem.focal_per_view {
+            true => start.with_own_focals(),
+            false => start.in_groups(problem.group_of, problem.groups()),
+        };
+        found.push(Minimum::near(start, problem, model, priors, stop));
+    }
+    Ok(distinct(found, problem))
+}
+
 /// The metric reconstruction of a camera that moved without turning, from a focal length that is known otherwise; empty
 /// where there is none.
 pub(super) fn known_focal(
@@ -253,7 +274,7 @@ pub(super) fn known_focal(
 }
 
 /// Cheapest first, without those that repeat a cheaper one.
-fn distinct(mut found: Vec<Minimum>, problem: &Uncalibrated) -> Vec<Minimum> {
+pub(super) fn distinct(mut found: Vec<Minimum>, problem: &Uncalibrated) -> Vec<Minimum> {
     let options = &problem.options.search;
     found.retain(|minimum| minimum.cost.is_finite() && minimum.log_focal().is_finite());
     found.sort_by(|a, b| a.cost.total_cmp(&b.cost));

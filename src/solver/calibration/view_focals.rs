@@ -85,7 +85,7 @@ pub(super) fn differing(metric: &MetricReconstruction, own: &Fit, choice: &Choic
     let mut freed = metric.clone().with_own_focals();
     let report =
         metric::adjust(&mut freed, problem.observations, model, &priors, &options.search.to_convergence(), choice.stop);
-    if !Fit::metric(report.cost, model, problem).refutes(own, &options.fit) {
+    if !Fit::metric(report.cost, &freed, model, problem).refutes(own, &options.fit) {
         return None;
     }
     let shift = |(view, focal): (usize, &f64)| (focal / metric.intrinsics_of(view).focal).ln();

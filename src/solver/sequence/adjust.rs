@@ -38,6 +38,7 @@ impl Extract {
                 group_of: Vec::with_capacity(views.len()),
                 poses: Vec::with_capacity(views.len()),
                 points: Vec::with_capacity(tracks.len()),
+                has_common_centre: false,
             },
             observations: Vec::new(),
         };

@@ -6,6 +6,7 @@ mod learned;
 mod lenses;
 mod observations;
 mod sequences;
+mod special_scenes;
 
 use super::*;
 use crate::domain::{

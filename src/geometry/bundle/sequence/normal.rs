@@ -48,11 +48,13 @@ impl Weighted {
         let squared = usable_squared_norm(&residual)? * seen.weight;
         let root = seen.weight.sqrt() * loss.root_weight(squared);
         let ProjectionGradients { by_parameter, by_pose, by_point } = projection.gradients();
+        let of_shift = if sequence.has_common_centre { 0.0 } else { root };
         Some(Self {
             residual: [residual.x * root, residual.y * root],
             view: std::array::from_fn(|component| {
                 let [a, b, c, x, y, z] = by_pose[component];
-                [a, b, c, x, y, z, by_parameter[component][Parameter::LogFocal as usize]].map(|value| value * root)
+                let focal = by_parameter[component][Parameter::LogFocal as usize] * root;
+                [a * root, b * root, c * root, x * of_shift, y * of_shift, z * of_shift, focal]
             }),
             point: by_point.map(|row| row * root),
             by_parameter: by_parameter.map(|row| row.map(|value| value * root)),

@@ -35,6 +35,7 @@ fn little_or_odd_input_neither_panics_nor_yields_nan() {
             group_of: vec![],
             poses: vec![],
             points: vec![],
+            has_common_centre: false,
         };
         run(empty, &observations);
         // One view a track: nothing is determined.
