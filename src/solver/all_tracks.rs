@@ -5,6 +5,7 @@
 
 use super::block::Block;
 use super::grow::{self, Consensus, ConsensusOptions};
+use super::near_duplicates;
 use super::problem::Problem;
 use super::view_selection::evenly;
 use crate::geometry::Point;
@@ -47,7 +48,12 @@ const OPTIONS: AllTracksOptions = AllTracksOptions::DEFAULT;
 /// The block and its consensus with the tracks that the search left aside; `None` where there are none, or where what
 /// was found does not carry over.
 pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Option<(Block, Consensus)> {
-    let all = problem.block(&searched.views).sample_with(OPTIONS.most_tracks, problem.settings.seed, &searched.tracks);
+    let block = problem.block(&searched.views);
+    let all = near_duplicates::without(problem, &block).into_owned().sample_with(
+        OPTIONS.most_tracks,
+        problem.settings.seed,
+        &searched.tracks,
+    );
     if all.tracks.len() == searched.tracks.len() {
         return None;
     }

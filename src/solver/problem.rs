@@ -9,7 +9,7 @@ use super::block::{self, Block};
 use super::calibration::CalibrationOptions;
 use super::normalization::normalization;
 use super::view_selection::complete_views;
-use super::{Error, classification, static_tracks};
+use super::{Error, classification, near_duplicates, static_tracks};
 use crate::domain::{FocalPrior, Input, Method, SolveSettings, StopToken, View, Warning, WarningCode};
 use crate::geometry::measurement::Normalization;
 use crate::geometry::observation::Observation;
@@ -38,6 +38,8 @@ pub struct Problem<'a> {
     pub weights: Vec<f64>,
     /// Whether each track is static: left aside in a search.
     pub is_static: Vec<bool>,
+    /// The track that stands for each until all are judged: itself, but for near-duplicates.
+    pub stands_for: Vec<usize>,
     /// Observations of each view.
     pub of_view: Vec<Vec<u32>>,
     /// Camera of each view, each of which gets a calibration: the camera groups, counted from 0 in rising order of the
@@ -85,6 +87,10 @@ impl<'a> Problem<'a> {
             outlier_density: classification::outlier_density(&of_view, &xy),
             least_share: if complete_views(input, &ranges).is_some() { LEAST_RETAINED_SHARE } else { 0.0 },
             is_static: static_tracks::find(&ranges, &xy),
+            stands_for: match is_searched(settings) {
+                true => near_duplicates::find(&ranges, |k| input.view_of(k), &xy),
+                false => (0..input.track_count()).collect(),
+            },
             input,
             settings,
             ranges,
@@ -170,10 +176,15 @@ impl<'a> Problem<'a> {
         self.ranges[track]..self.ranges[track + 1]
     }
 
+    /// Whether another track stands for this one.
+    pub fn is_duplicate(&self, track: usize) -> bool {
+        self.stands_for[track] != track
+    }
+
     /// How many tracks these views see so often that they may be verified.
     pub fn verifiable(&self, is_registered: impl Fn(usize) -> bool) -> usize {
         let seen = |track: usize| self.of_track(track).filter(|&k| is_registered(self.view_of(k))).count();
-        (0..self.tracks()).filter(|&track| seen(track) >= VERIFIED).count()
+        (0..self.tracks()).filter(|&track| !self.is_duplicate(track) && seen(track) >= VERIFIED).count()
     }
 
     /// The views in which anything is observed, increasing.

@@ -21,8 +21,10 @@ pub struct StaticTrackOptions {
     pub moving_quantile: f64,
     /// Share of that which a static track spreads by at most.
     pub most_share: f64,
-    /// Static tracks below which they hide nothing, and others that a search needs.
+    /// Static tracks, and share of all, below which they hide nothing.
     pub least_static: usize,
+    pub least_share: f64,
+    /// Others that a search needs.
     pub least_moving: usize,
 }
 
@@ -34,6 +36,8 @@ impl StaticTrackOptions {
         // What moves by less than twenty times the noise of a static track determines little either way.
         most_share: 0.05,
         least_static: LEAST_INLIERS,
+        // Of a drive some tracks in twenty are far away, straight ahead, and say how the camera turns.
+        least_share: 0.1,
         // Half of them may be wrong.
         least_moving: 2 * LEAST_INLIERS,
     };
@@ -56,7 +60,8 @@ pub fn find(ranges: &[usize], xy: &[Vector2<f64>]) -> Vec<bool> {
     let most = (OPTIONS.most_share * moving).min(OPTIONS.most_spread);
     let is_static: Vec<bool> = spreads.iter().map(|spread| spread.is_some_and(|spread| spread < most)).collect();
     let count = is_static.iter().filter(|is_static| **is_static).count();
-    match count >= OPTIONS.least_static && sorted.len() - count >= OPTIONS.least_moving {
+    let are_many = count >= OPTIONS.least_static && count as f64 >= OPTIONS.least_share * sorted.len() as f64;
+    match are_many && sorted.len() - count >= OPTIONS.least_moving {
         true => is_static,
         false => vec![false; is_static.len()],
     }
@@ -113,6 +118,7 @@ mod tests {
         assert_eq!(found(50, OPTIONS.least_moving - 1, 0.05), 0, "too few others");
         assert_eq!(found(90, 16, 0.05), 0, "the camera stands still, and little moves");
         assert_eq!(found(OPTIONS.least_static - 1, 40, 0.05), 0, "too few to hide anything");
+        assert_eq!(found(OPTIONS.least_static, 80, 0.05), 0, "too few of all");
         assert_eq!(find(&[0], &[]), Vec::<bool>::new());
     }
 }

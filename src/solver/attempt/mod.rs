@@ -257,19 +257,16 @@ fn initial_noise(problem: &Problem) -> f64 {
     NoiseOptions::DEFAULT.clamp(noise)
 }
 
-/// AUTO and GEOMETRY: a sample of the tracks without static ones and near-duplicates, and where that holds nothing, one
-/// of all.
+/// AUTO and GEOMETRY: a sample of the tracks that move, and where that holds nothing, one of all.
 fn searched(problem: &Problem, block: &Block, effort: Effort, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let (most, of_many_views) = OPTIONS.searched_tracks;
     let most = match effort.is_seed {
         true => of_many_views,
         false => (OPTIONS.searched_work / block.views.len().max(1).pow(2)).clamp(of_many_views, most),
     };
-    let (noise, seed) = (initial_noise(problem), problem.settings.seed);
-    let moving = static_tracks::without(problem, block);
-    let thinned = near_duplicates::thinned(moving.as_ref().unwrap_or(block), most, noise, seed);
-    if let Some(some) = thinned.or_else(|| moving.map(|moving| moving.sample(most, seed))) {
-        let attempt = search(problem, some, None, effort, recorder)?;
+    let block = &*near_duplicates::without(problem, block);
+    if let Some(moving) = static_tracks::without(problem, block) {
+        let attempt = search(problem, moving.sample(most, problem.settings.seed), None, effort, recorder)?;
         if attempt.found.consensus.is_some() {
             return Ok(attempt);
         }

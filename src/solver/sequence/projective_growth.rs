@@ -103,10 +103,11 @@ impl<'a> Growing<'a> {
     /// Triangulates every track anew, or those that a view sees.
     fn triangulate(&mut self, of_view: Option<usize>, recorder: &mut Recorder) {
         let problem = self.problem;
-        let tracks: Vec<usize> = match of_view {
+        let mut tracks: Vec<usize> = match of_view {
             Some(view) => problem.of_view[view].iter().map(|&k| problem.track_of(k as usize)).collect(),
             None => (0..problem.tracks()).collect(),
         };
+        tracks.retain(|&track| !problem.is_duplicate(track));
         let cameras = robust_triangulation::or_zeros(&self.cameras);
         let triangulator = Triangulator::new(&cameras);
         let gate = problem.gate(self.noise);

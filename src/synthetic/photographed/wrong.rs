@@ -183,7 +183,12 @@ impl Spoil<'_> {
 
     fn duplicate(&mut self, tracks: &mut [Track], wrong: &[usize]) {
         let originals: Vec<usize> = wrong.iter().copied().take(ORIGINALS).collect();
-        self.permute(tracks, &originals);
+        // Exchanging their points would make them right tracks of each other's.
+        for &track in &originals {
+            for k in 0..tracks[track].seen.len() {
+                tracks[track].seen[k] = tracks[track].seen[k].moved(self.anywhere());
+            }
+        }
         for (k, &track) in wrong.iter().enumerate().skip(ORIGINALS) {
             let seen = tracks[originals[k % ORIGINALS]].seen.clone();
             tracks[track].seen = seen;
