@@ -145,7 +145,7 @@ fn positions(
     positions
 }
 
-fn adjusted<const G: usize, const C: usize, const P: usize, M: BundleProblem<G, C, P>>(
+fn adjusted<const C: usize, const P: usize, M: BundleProblem<C, P>>(
     mut model: M,
     unknowns: usize,
     gauge: usize,

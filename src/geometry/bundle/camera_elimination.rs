@@ -15,10 +15,7 @@ const MOST_SHARE: f64 = 0.5;
 
 /// Whether it is cheaper to eliminate the cameras than the points, and every camera has as many residuals as unknowns:
 /// one that has fewer has no block of its own to eliminate.
-pub(super) fn is_worth_it<const G: usize, const C: usize, const P: usize>(
-    problem: &impl BundleProblem<G, C, P>,
-    layout: &Layout,
-) -> bool {
+pub(super) fn is_worth_it<const C: usize, const P: usize>(problem: &impl BundleProblem<C, P>, layout: &Layout) -> bool {
     let (cameras, points) = problem.counts();
     if (P * points) as f64 > MOST_SHARE * (C * cameras) as f64 {
         return false;
@@ -45,34 +42,29 @@ pub(super) struct CameraElimination<T>(pub T);
 /// Hands on what a problem says, cameras and points exchanged.
 struct Exchanging<'a, S>(&'a mut S);
 
-impl<const G: usize, const C: usize, const P: usize, S: ResidualVisitor<G, P, C>> ResidualVisitor<G, C, P>
-    for Exchanging<'_, S>
-{
+impl<const C: usize, const P: usize, S: ResidualVisitor<P, C>> ResidualVisitor<C, P> for Exchanging<'_, S> {
     #[inline]
-    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<C, P>) {
         self.0.visit(residual, || {
-            let Jacobian { globals, camera, point } = jacobian();
-            Jacobian { globals, camera: point, point: camera }
+            let Jacobian { camera, point } = jacobian();
+            Jacobian { camera: point, point: camera }
         });
     }
 }
 
-impl<const G: usize, const C: usize, const P: usize, T: BundleProblem<G, C, P>> BundleProblem<G, P, C>
-    for CameraElimination<T>
-{
+impl<const C: usize, const P: usize, T: BundleProblem<C, P>> BundleProblem<P, C> for CameraElimination<T> {
     fn counts(&self) -> (usize, usize) {
         let (cameras, points) = self.0.counts();
         (points, cameras)
     }
 
     #[inline]
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<G, P, C>) {
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<P, C>) {
         self.0.evaluate(&exchanged(observation), &mut Exchanging(visitor));
     }
 
-    fn retract(&mut self, from: &Self, step: &Step<G, P, C>) {
-        let Step { globals, cameras, points } = step;
-        self.0.retract(&from.0, &Step { globals: *globals, cameras: points.clone(), points: cameras.clone() });
+    fn retract(&mut self, from: &Self, step: &Step<P, C>) {
+        self.0.retract(&from.0, &Step { cameras: step.points.clone(), points: step.cameras.clone() });
     }
 
     fn camera_gauge(&self, camera: usize) -> SVector<f64, P> {
@@ -96,8 +88,8 @@ mod tests {
     use crate::geometry::homography::Correspondences;
 
     /// Adjusts a problem as it is and with cameras and points exchanged, from the same start.
-    fn both_end_at_the_same_cost<const G: usize, const C: usize, const P: usize>(
-        problem: &impl BundleProblem<G, C, P>,
+    fn both_end_at_the_same_cost<const C: usize, const P: usize>(
+        problem: &impl BundleProblem<C, P>,
         observations: &[Observation],
         case: &str,
     ) {
@@ -129,7 +121,7 @@ mod tests {
                 let mut problem = Projective { cameras, points };
                 testing::perturb(problem.cameras.iter_mut().flat_map(|camera| camera.iter_mut()), 0.003, seed);
                 testing::perturb(problem.points.iter_mut().flat_map(|point| point.iter_mut()), 0.003, seed + 1);
-                both_end_at_the_same_cost::<0, 12, 4>(&problem, &scene.observations, &case);
+                both_end_at_the_same_cost::<12, 4>(&problem, &scene.observations, &case);
 
                 let plane = testing::scene_of(seed, 10, tracks, NOISE, Motion::General, true);
                 let points = plane.observations.iter().filter(|seen| seen.view == 0).map(|seen| seen.xy);
@@ -137,7 +129,7 @@ mod tests {
                 let views = seen.homographies_from(0, NOISE).expect("complete tracks");
                 let mut problem = Homographies { views, points: points.collect() };
                 testing::perturb(problem.points.iter_mut().flat_map(|point| point.iter_mut()), 0.01, seed);
-                both_end_at_the_same_cost::<0, 9, 2>(&problem, &plane.observations, &case);
+                both_end_at_the_same_cost::<9, 2>(&problem, &plane.observations, &case);
             }
         }
     }

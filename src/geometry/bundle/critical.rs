@@ -32,17 +32,17 @@ pub struct Translating {
 pub const HOMOGRAPHIES_GAUGE: usize = 8;
 pub const TRANSLATING_GAUGE: usize = 4;
 
-impl BundleProblem<0, 9, 2> for Homographies {
+impl BundleProblem<9, 2> for Homographies {
     fn counts(&self) -> (usize, usize) {
         (self.views.len(), self.points.len())
     }
 
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<0, 9, 2>) {
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<9, 2>) {
         let homography = &self.views[observation.view];
         let point = self.points[observation.point].push(1.0);
         let (image, by_seen) = image(&(homography * point));
         visitor.visit(image - observation.xy, || {
-            let mut jacobian = Jacobian::<0, 9, 2>::zeros();
+            let mut jacobian = Jacobian::<9, 2>::zeros();
             for (component, by_seen) in by_seen.iter().enumerate() {
                 let by_entry = SMatrix::<f64, 9, 1>::from_fn(|k, _| by_seen[k / 3] * point[k % 3]);
                 jacobian.camera.set_column(component, &by_entry);
@@ -52,7 +52,7 @@ impl BundleProblem<0, 9, 2> for Homographies {
         });
     }
 
-    fn retract(&mut self, from: &Self, step: &Step<0, 9, 2>) {
+    fn retract(&mut self, from: &Self, step: &Step<9, 2>) {
         move_each(&mut self.views, &from.views, &step.cameras, |view, step| {
             unit_norm(&(view + Matrix3::from_row_slice(step.as_slice())))
         });
@@ -64,17 +64,17 @@ impl BundleProblem<0, 9, 2> for Homographies {
     }
 }
 
-impl BundleProblem<0, 3, 3> for Translating {
+impl BundleProblem<3, 3> for Translating {
     fn counts(&self) -> (usize, usize) {
         (self.translations.len(), self.points.len())
     }
 
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<0, 3, 3>) {
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<3, 3>) {
         let translation = &self.translations[observation.view];
         let point = &self.points[observation.point];
         let (image, by_seen) = image(&(point.xy().push(1.0) + translation * point.z));
         visitor.visit(image - observation.xy, || {
-            let mut jacobian = Jacobian::<0, 3, 3>::zeros();
+            let mut jacobian = Jacobian::<3, 3>::zeros();
             for (component, by_seen) in by_seen.iter().enumerate() {
                 jacobian.camera.set_column(component, &(by_seen * point.z));
                 jacobian.point.set_column(component, &by_seen.xy().push(by_seen.dot(translation)));
@@ -83,7 +83,7 @@ impl BundleProblem<0, 3, 3> for Translating {
         });
     }
 
-    fn retract(&mut self, from: &Self, step: &Step<0, 3, 3>) {
+    fn retract(&mut self, from: &Self, step: &Step<3, 3>) {
         move_each(&mut self.translations, &from.translations, &step.cameras, |translation, step| translation + step);
         move_each(&mut self.points, &from.points, &step.points, |point, step| point + step);
     }

@@ -16,8 +16,7 @@ pub(super) const UNDEFINED_SQUARED: f64 = 1e12;
 
 /// Derivatives of one residual, transposed: column `k` is the gradient of residual component `k`.
 #[derive(Debug, Clone)]
-pub(crate) struct Jacobian<const G: usize, const C: usize, const P: usize> {
-    pub globals: SMatrix<f64, G, 2>,
+pub(crate) struct Jacobian<const C: usize, const P: usize> {
     pub camera: SMatrix<f64, C, 2>,
     pub point: SMatrix<f64, P, 2>,
 }
@@ -26,41 +25,36 @@ pub(crate) struct Jacobian<const G: usize, const C: usize, const P: usize> {
 ///
 /// A problem writes residual and Jacobian once; the cost, the normal equations and the test by finite differences
 /// are visitors of the same code.
-pub(crate) trait ResidualVisitor<const G: usize, const C: usize, const P: usize> {
-    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>);
+pub(crate) trait ResidualVisitor<const C: usize, const P: usize> {
+    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<C, P>);
 }
 
 /// A change of the unknowns in the tangent space.
 #[derive(Debug, Clone)]
-pub(crate) struct Step<const G: usize, const C: usize, const P: usize> {
-    pub globals: SVector<f64, G>,
+pub(crate) struct Step<const C: usize, const P: usize> {
     pub cameras: Vec<SVector<f64, C>>,
     pub points: Vec<SVector<f64, P>>,
 }
 
-impl<const G: usize, const C: usize, const P: usize> Step<G, C, P> {
+impl<const C: usize, const P: usize> Step<C, P> {
     pub fn zeros(cameras: usize, points: usize) -> Self {
-        Self {
-            globals: SVector::zeros(),
-            cameras: vec![SVector::zeros(); cameras],
-            points: vec![SVector::zeros(); points],
-        }
+        Self { cameras: vec![SVector::zeros(); cameras], points: vec![SVector::zeros(); points] }
     }
 
     fn is_finite(&self) -> bool {
-        let Self { globals, cameras, points } = self;
-        globals.iter().chain(cameras.iter().flatten()).chain(points.iter().flatten()).all(|value| value.is_finite())
+        let Self { cameras, points } = self;
+        cameras.iter().flatten().chain(points.iter().flatten()).all(|value| value.is_finite())
     }
 }
 
-/// A bundle adjustment: `G` unknowns shared by all views, `C` a camera, `P` a point.
-pub(crate) trait BundleProblem<const G: usize, const C: usize, const P: usize>: Clone {
+/// A bundle adjustment: `C` unknowns a camera, `P` a point.
+pub(crate) trait BundleProblem<const C: usize, const P: usize>: Clone {
     /// How many cameras and points there are.
     fn counts(&self) -> (usize, usize);
     /// Hands the residual of one observation, and its Jacobian on demand, to `visitor`.
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<G, C, P>);
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<C, P>);
     /// Overwrites `self` with `from` moved by `step`; both have the same counts.
-    fn retract(&mut self, from: &Self, step: &Step<G, C, P>);
+    fn retract(&mut self, from: &Self, step: &Step<C, P>);
     /// Direction in which a homogeneous camera moves without changing any residual; zero where there is none.
     fn camera_gauge(&self, _camera: usize) -> SVector<f64, C> {
         SVector::zeros()
@@ -124,18 +118,14 @@ struct Cost {
     sum: f64,
 }
 
-impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> for Cost {
+impl<const C: usize, const P: usize> ResidualVisitor<C, P> for Cost {
     #[inline]
-    fn visit(&mut self, residual: Vector2<f64>, _jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+    fn visit(&mut self, residual: Vector2<f64>, _jacobian: impl FnOnce() -> Jacobian<C, P>) {
         self.sum += self.loss.cost(self.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
     }
 }
 
-fn cost<const G: usize, const C: usize, const P: usize>(
-    problem: &impl BundleProblem<G, C, P>,
-    layout: &Layout,
-    loss: Loss,
-) -> f64 {
+fn cost<const C: usize, const P: usize>(problem: &impl BundleProblem<C, P>, layout: &Layout, loss: Loss) -> f64 {
     let mut total = Cost { loss, weight: 1.0, sum: 0.0 };
     for seen in &layout.observations {
         total.weight = seen.weight;
@@ -148,8 +138,8 @@ fn cost<const G: usize, const C: usize, const P: usize>(
 ///
 /// The cost never rises. `stop` is asked before every damped solve; a stopped, stuck or degenerate problem keeps its
 /// last good state.
-pub(crate) fn minimise<const G: usize, const C: usize, const P: usize>(
-    problem: &mut impl BundleProblem<G, C, P>,
+pub(crate) fn minimise<const C: usize, const P: usize>(
+    problem: &mut impl BundleProblem<C, P>,
     observations: &[Observation],
     options: &Options,
     stop: &StopToken,
@@ -167,7 +157,7 @@ pub(crate) fn minimise<const G: usize, const C: usize, const P: usize>(
 }
 
 /// The loop, eliminating what the problem calls points.
-pub(super) fn descend<const G: usize, const C: usize, const P: usize, T: BundleProblem<G, C, P>>(
+pub(super) fn descend<const C: usize, const P: usize, T: BundleProblem<C, P>>(
     problem: &mut T,
     layout: &Layout,
     options: &Options,
@@ -186,18 +176,16 @@ pub(super) fn descend<const G: usize, const C: usize, const P: usize, T: BundleP
 }
 
 /// A problem with its normal equations, whose reduced system is dense.
-struct Dense<'a, const G: usize, const C: usize, const P: usize, T> {
+struct Dense<'a, const C: usize, const P: usize, T> {
     layout: &'a Layout,
     loss: Loss,
-    linearisation: Linearisation<G, C, P>,
-    reduced: Reduced<G, C, P>,
-    step: Step<G, C, P>,
+    linearisation: Linearisation<C, P>,
+    reduced: Reduced<C, P>,
+    step: Step<C, P>,
     problem: PhantomData<T>,
 }
 
-impl<const G: usize, const C: usize, const P: usize, T: BundleProblem<G, C, P>> levenberg_marquardt::LeastSquares
-    for Dense<'_, G, C, P, T>
-{
+impl<const C: usize, const P: usize, T: BundleProblem<C, P>> levenberg_marquardt::LeastSquares for Dense<'_, C, P, T> {
     type State = T;
 
     fn cost(&self, problem: &T) -> f64 {

@@ -42,10 +42,10 @@ impl<const C: usize, const P: usize> Panel<C, P> {
 
     /// Appends a point's columns.
     #[inline(always)]
-    pub fn push<const G: usize>(
+    pub fn push(
         &mut self,
         observations: &[Observation],
-        jacobians: &[Jacobian<G, C, P>],
+        jacobians: &[Jacobian<C, P>],
         whitened: &[SMatrix<f64, P, 2>],
     ) {
         let first = self.values.len();
@@ -68,23 +68,18 @@ impl<const C: usize, const P: usize> Panel<C, P> {
         }
     }
 
-    /// Subtracts the product with its transpose from the lower triangle of `matrix` below and right of `offset`, and
-    /// empties the panel.
-    pub fn subtract(&mut self, matrix: &mut [f64], offset: usize) {
-        subtract(&self.values, self.rows, matrix, offset + self.rows);
+    /// Subtracts the product with its transpose from the lower triangle of `matrix`, and empties the panel.
+    pub fn subtract(&mut self, matrix: &mut [f64]) {
+        subtract(&self.values, self.rows, matrix);
         self.values.clear();
     }
 }
 
-/// Subtracts the product of a panel with its transpose from the lower triangle of the last `rows` rows and columns of a
-/// square matrix.
+/// Subtracts the product of a panel with its transpose from the lower triangle of a square matrix.
 ///
-/// * `panel`: column-major, of so many rows
-/// * `matrix`: column-major, `dimension x dimension`
-pub(super) fn subtract(panel: &[f64], rows: usize, matrix: &mut [f64], dimension: usize) {
-    let offset = dimension - rows;
-    let mut block =
-        MatMut::from_column_major_slice_mut(matrix, dimension, dimension).submatrix_mut(offset, offset, rows, rows);
+/// * `panel`, `matrix`: column-major, of so many rows
+pub(super) fn subtract(panel: &[f64], rows: usize, matrix: &mut [f64]) {
+    let mut block = MatMut::from_column_major_slice_mut(matrix, rows, rows);
     for columns in panel.chunks(PANEL_COLUMNS * rows.max(1)) {
         let columns = MatRef::from_column_major_slice(columns, rows, columns.len() / rows.max(1));
         triangular::matmul(

@@ -16,18 +16,18 @@ pub(super) struct Projective {
     pub points: Vec<Vector4<f64>>,
 }
 
-impl BundleProblem<0, CAMERA, POINT> for Projective {
+impl BundleProblem<CAMERA, POINT> for Projective {
     fn counts(&self) -> (usize, usize) {
         (self.cameras.len(), self.points.len())
     }
 
     #[inline]
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<0, CAMERA, POINT>) {
+    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<CAMERA, POINT>) {
         let camera = &self.cameras[observation.view];
         let point = &self.points[observation.point];
         let (image, by_seen) = image(&(camera * point));
         visitor.visit(image - observation.xy, || {
-            let mut jacobian = Jacobian::<0, CAMERA, POINT>::zeros();
+            let mut jacobian = Jacobian::<CAMERA, POINT>::zeros();
             for (component, by_seen) in by_seen.iter().enumerate() {
                 for row in 0..3 {
                     for column in 0..4 {
@@ -40,7 +40,7 @@ impl BundleProblem<0, CAMERA, POINT> for Projective {
         });
     }
 
-    fn retract(&mut self, from: &Self, step: &Step<0, CAMERA, POINT>) {
+    fn retract(&mut self, from: &Self, step: &Step<CAMERA, POINT>) {
         move_each(&mut self.cameras, &from.cameras, &step.cameras, |camera, step| {
             unit_norm(&(camera + Matrix3x4::from_row_slice(step.as_slice())))
         });

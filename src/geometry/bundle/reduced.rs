@@ -20,33 +20,31 @@ const GAUGE_DAMPING: f64 = 1e-9;
 pub(super) const POINT_DAMPING: f64 = 1e-12;
 
 /// Residuals and Jacobians at one state, with their robust weights, and the diagonal blocks of `J' J`.
-pub(super) struct Linearisation<const G: usize, const C: usize, const P: usize> {
+pub(super) struct Linearisation<const C: usize, const P: usize> {
     residuals: Vec<Vector2<f64>>,
-    jacobians: Vec<Jacobian<G, C, P>>,
-    globals_diagonal: SVector<f64, G>,
+    jacobians: Vec<Jacobian<C, P>>,
     camera_diagonals: Vec<SVector<f64, C>>,
     point_blocks: Vec<SMatrix<f64, P, P>>,
 }
 
 /// Writes one observation's weighted residual and Jacobian in place; an undefined one becomes zero.
-struct Entry<'a, const G: usize, const C: usize, const P: usize> {
+struct Entry<'a, const C: usize, const P: usize> {
     loss: Loss,
     /// Of the observation.
     weight: f64,
     residual: &'a mut Vector2<f64>,
-    jacobian: &'a mut Jacobian<G, C, P>,
+    jacobian: &'a mut Jacobian<C, P>,
 }
 
-impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> for Entry<'_, G, C, P> {
+impl<const C: usize, const P: usize> ResidualVisitor<C, P> for Entry<'_, C, P> {
     #[inline]
-    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<C, P>) {
         match usable_squared_norm(&residual) {
             Some(squared) => {
                 let weight = self.weight.sqrt() * self.loss.root_weight(self.weight * squared);
                 *self.residual = residual * weight;
                 *self.jacobian = jacobian();
                 if weight != 1.0 {
-                    self.jacobian.globals *= weight;
                     self.jacobian.camera *= weight;
                     self.jacobian.point *= weight;
                 }
@@ -59,35 +57,31 @@ impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> fo
     }
 }
 
-impl<const G: usize, const C: usize, const P: usize> Jacobian<G, C, P> {
+impl<const C: usize, const P: usize> Jacobian<C, P> {
     pub fn zeros() -> Self {
-        Self { globals: SMatrix::zeros(), camera: SMatrix::zeros(), point: SMatrix::zeros() }
+        Self { camera: SMatrix::zeros(), point: SMatrix::zeros() }
     }
 }
 
-impl<const G: usize, const C: usize, const P: usize> Linearisation<G, C, P> {
+impl<const C: usize, const P: usize> Linearisation<C, P> {
     pub fn new(layout: &Layout, cameras: usize) -> Self {
         let observations = layout.observations.len();
         Self {
             residuals: vec![Vector2::zeros(); observations],
             jacobians: vec![Jacobian::zeros(); observations],
-            globals_diagonal: SVector::zeros(),
             camera_diagonals: vec![SVector::zeros(); cameras],
             point_blocks: vec![SMatrix::zeros(); layout.starts.len() - 1],
         }
     }
 
     /// Linearises at the state of `problem`.
-    pub fn fill(&mut self, problem: &impl BundleProblem<G, C, P>, layout: &Layout, loss: Loss) {
-        self.globals_diagonal = SVector::zeros();
+    pub fn fill(&mut self, problem: &impl BundleProblem<C, P>, layout: &Layout, loss: Loss) {
         self.camera_diagonals.fill(SVector::zeros());
         self.point_blocks.fill(SMatrix::zeros());
         for (k, seen) in layout.observations.iter().enumerate() {
             let (residual, jacobian) = (&mut self.residuals[k], &mut self.jacobians[k]);
             problem.evaluate(seen, &mut Entry { loss, weight: seen.weight, residual, jacobian });
             for component in 0..2 {
-                let globals = jacobian.globals.column(component);
-                self.globals_diagonal += globals.component_mul(&globals);
                 let camera = jacobian.camera.column(component);
                 self.camera_diagonals[seen.view] += camera.component_mul(&camera);
             }
@@ -97,9 +91,9 @@ impl<const G: usize, const C: usize, const P: usize> Linearisation<G, C, P> {
 }
 
 /// The reduced system and the scratch to build and solve it, reused from step to step.
-pub(super) struct Reduced<const G: usize, const C: usize, const P: usize> {
+pub(super) struct Reduced<const C: usize, const P: usize> {
     dimension: usize,
-    /// Column-major `dimension x dimension`, lower triangle; unknowns are the globals, then camera after camera.
+    /// Column-major `dimension x dimension`, lower triangle; unknowns camera after camera.
     pub matrix: Vec<f64>,
     /// Right-hand side, then solution.
     pub vector: Vec<f64>,
@@ -113,9 +107,9 @@ pub(super) struct Reduced<const G: usize, const C: usize, const P: usize> {
     solver: CholeskySolver,
 }
 
-impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
+impl<const C: usize, const P: usize> Reduced<C, P> {
     pub fn new(layout: &Layout, cameras: usize) -> Self {
-        let dimension = G + C * cameras;
+        let dimension = C * cameras;
         let longest = layout.starts.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(0);
         Self {
             dimension,
@@ -133,11 +127,11 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     /// when the system is not positive definite.
     pub fn solve(
         &mut self,
-        problem: &impl BundleProblem<G, C, P>,
+        problem: &impl BundleProblem<C, P>,
         layout: &Layout,
-        linearisation: &Linearisation<G, C, P>,
+        linearisation: &Linearisation<C, P>,
         damping: f64,
-        step: &mut Step<G, C, P>,
+        step: &mut Step<C, P>,
     ) -> Option<f64> {
         if !self.build(problem, layout, linearisation, damping) {
             return None;
@@ -146,8 +140,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         if !self.solver.solve(&mut self.matrix, &mut self.vector) {
             return None;
         }
-        step.globals.copy_from_slice(&self.vector[..G]);
-        for (camera, values) in step.cameras.iter_mut().zip(self.vector[G..].chunks_exact(C)) {
+        for (camera, values) in step.cameras.iter_mut().zip(self.vector.chunks_exact(C)) {
             camera.copy_from_slice(values);
         }
         Some(self.substitute_points(layout, linearisation, step))
@@ -156,9 +149,9 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     /// Eliminates the points; `false` when a point's block cannot be factored.
     pub fn build(
         &mut self,
-        problem: &impl BundleProblem<G, C, P>,
+        problem: &impl BundleProblem<C, P>,
         layout: &Layout,
-        linearisation: &Linearisation<G, C, P>,
+        linearisation: &Linearisation<C, P>,
         damping: f64,
     ) -> bool {
         vectorised(
@@ -170,9 +163,9 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     #[inline(always)]
     fn eliminate(
         &mut self,
-        problem: &impl BundleProblem<G, C, P>,
+        problem: &impl BundleProblem<C, P>,
         layout: &Layout,
-        linearisation: &Linearisation<G, C, P>,
+        linearisation: &Linearisation<C, P>,
         damping: f64,
     ) -> bool {
         self.matrix.fill(0.0);
@@ -194,7 +187,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
                 factor.l_dirty().solve_lower_triangular_mut(&mut whitened);
                 self.whitened.push(whitened);
             }
-            self.add_globals_and_gradient(
+            self.add_gradient(
                 &layout.observations[range.clone()],
                 &linearisation.jacobians[range.clone()],
                 &linearisation.residuals[range.clone()],
@@ -204,7 +197,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
                 Some(panel) => {
                     panel.push(observations, jacobians, &self.whitened);
                     if panel.is_full() {
-                        panel.subtract(&mut self.matrix, G);
+                        panel.subtract(&mut self.matrix);
                     }
                     self.add_cameras(observations, jacobians);
                 }
@@ -212,65 +205,39 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
             }
         }
         if let Some(panel) = &mut self.panel {
-            panel.subtract(&mut self.matrix, G);
+            panel.subtract(&mut self.matrix);
         }
         true
     }
 
     /// `Jc' Jc`, all that the camera blocks are but for the points.
     #[inline(always)]
-    fn add_cameras(&mut self, observations: &[Observation], jacobians: &[Jacobian<G, C, P>]) {
+    fn add_cameras(&mut self, observations: &[Observation], jacobians: &[Jacobian<C, P>]) {
         for (seen, jacobian) in observations.iter().zip(jacobians) {
             self.add_block(seen.view, seen.view, &jacobian.camera, &Matrix2::identity(), &jacobian.camera);
         }
     }
 
-    /// Right-hand side, and the rows and columns of the globals: linear in the observations of the point.
+    /// The right-hand side.
     #[inline(always)]
-    fn add_globals_and_gradient(
-        &mut self,
-        observations: &[Observation],
-        jacobians: &[Jacobian<G, C, P>],
-        residuals: &[Vector2<f64>],
-    ) {
+    fn add_gradient(&mut self, observations: &[Observation], jacobians: &[Jacobian<C, P>], residuals: &[Vector2<f64>]) {
         let mut whitened_gradient = SVector::<f64, P>::zeros();
-        let mut coupling = SMatrix::<f64, P, G>::zeros();
-        for ((whitened, jacobian), residual) in self.whitened.iter().zip(jacobians).zip(residuals) {
+        for (whitened, residual) in self.whitened.iter().zip(residuals) {
             whitened_gradient += whitened * residual;
-            coupling += whitened * jacobian.globals.transpose();
         }
         for (k, (seen, jacobian)) in observations.iter().zip(jacobians).enumerate() {
             let left = residuals[k] - self.whitened[k].tr_mul(&whitened_gradient);
-            let first = G + C * seen.view;
+            let first = C * seen.view;
             let gradient = jacobian.camera * left;
             for (slot, value) in self.vector[first..first + C].iter_mut().zip(gradient.iter()) {
                 *slot -= value;
-            }
-            if G == 0 {
-                continue;
-            }
-            let gradient = jacobian.globals * left;
-            for (slot, value) in self.vector[..G].iter_mut().zip(gradient.iter()) {
-                *slot -= value;
-            }
-            let left = jacobian.globals.transpose() - self.whitened[k].tr_mul(&coupling);
-            let among_globals = jacobian.globals * left;
-            let with_camera = jacobian.camera * left;
-            for global in 0..G {
-                let column = &mut self.matrix[global * self.dimension..(global + 1) * self.dimension];
-                for (slot, value) in column[..G].iter_mut().zip(among_globals.column(global).iter()) {
-                    *slot += value;
-                }
-                for (slot, value) in column[first..first + C].iter_mut().zip(with_camera.column(global).iter()) {
-                    *slot += value;
-                }
             }
         }
     }
 
     /// The blocks between the cameras that see the point, lower triangle.
     #[inline(always)]
-    fn add_camera_pairs(&mut self, observations: &[Observation], jacobians: &[Jacobian<G, C, P>]) {
+    fn add_camera_pairs(&mut self, observations: &[Observation], jacobians: &[Jacobian<C, P>]) {
         for a in 0..observations.len() {
             for b in 0..=a {
                 let mut through = -self.whitened[a].tr_mul(&self.whitened[b]);
@@ -297,7 +264,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         through: &Matrix2<f64>,
         right: &SMatrix<f64, C, 2>,
     ) {
-        let (row, column) = (G + C * row, G + C * column);
+        let (row, column) = (C * row, C * column);
         let ([first, second], [u, v]) = (&left.data.0, &right.data.0);
         // Loops by hand over arrays: this is the innermost loop of every search, and iterators cost four times as
         // much in builds for tests, which barely optimise.
@@ -318,14 +285,8 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
     }
 
     /// Marquardt's damping, and what holds the gauge.
-    fn damp(&mut self, problem: &impl BundleProblem<G, C, P>, linearisation: &Linearisation<G, C, P>, damping: f64) {
-        let diagonal = |index: usize| {
-            if index < G {
-                linearisation.globals_diagonal[index]
-            } else {
-                linearisation.camera_diagonals[(index - G) / C][(index - G) % C]
-            }
-        };
+    fn damp(&mut self, problem: &impl BundleProblem<C, P>, linearisation: &Linearisation<C, P>, damping: f64) {
+        let diagonal = |index: usize| linearisation.camera_diagonals[index / C][index % C];
         let mean = (0..self.dimension).map(diagonal).sum::<f64>() / self.dimension as f64;
         for index in 0..self.dimension {
             self.matrix[index * (self.dimension + 1)] +=
@@ -334,7 +295,7 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         for (camera, diagonal) in linearisation.camera_diagonals.iter().enumerate() {
             let gauge = problem.camera_gauge(camera);
             let weight = diagonal.sum() / C as f64;
-            let first = G + C * camera;
+            let first = C * camera;
             for k in 0..C {
                 let start = (first + k) * self.dimension + first;
                 for (slot, value) in self.matrix[start..start + C].iter_mut().zip(gauge.iter()) {
@@ -344,14 +305,14 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
         }
     }
 
-    /// The points' part of the step, `-V^-1 Jp' (r + Jc dc + Jg dg)`.
+    /// The points' part of the step, `-V^-1 Jp' (r + Jc dc)`.
     ///
     /// Returns by how much the linearised residuals shrink under the whole step, `|r|^2 - |r + J d|^2`.
     fn substitute_points(
         &mut self,
         layout: &Layout,
-        linearisation: &Linearisation<G, C, P>,
-        step: &mut Step<G, C, P>,
+        linearisation: &Linearisation<C, P>,
+        step: &mut Step<C, P>,
     ) -> f64 {
         let mut predicted = 0.0;
         for (point, factor) in self.factors.iter().enumerate() {
@@ -359,9 +320,8 @@ impl<const G: usize, const C: usize, const P: usize> Reduced<G, C, P> {
             self.moved.clear();
             for k in layout.starts[point]..layout.starts[point + 1] {
                 let jacobian = &linearisation.jacobians[k];
-                let moved = linearisation.residuals[k]
-                    + jacobian.globals.tr_mul(&step.globals)
-                    + jacobian.camera.tr_mul(&step.cameras[layout.observations[k].view]);
+                let moved =
+                    linearisation.residuals[k] + jacobian.camera.tr_mul(&step.cameras[layout.observations[k].view]);
                 gradient -= jacobian.point * moved;
                 self.moved.push(moved);
             }

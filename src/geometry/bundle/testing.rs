@@ -193,22 +193,22 @@ pub(super) fn perturbed(truth: &MetricReconstruction, deviation: f64, seed: u64)
 }
 
 /// Keeps the last residual and Jacobian: what the solver would have accumulated.
-struct Last<const G: usize, const C: usize, const P: usize> {
+struct Last<const C: usize, const P: usize> {
     residual: Vector2<f64>,
-    jacobian: Option<Jacobian<G, C, P>>,
+    jacobian: Option<Jacobian<C, P>>,
 }
 
-impl<const G: usize, const C: usize, const P: usize> ResidualVisitor<G, C, P> for Last<G, C, P> {
-    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<G, C, P>) {
+impl<const C: usize, const P: usize> ResidualVisitor<C, P> for Last<C, P> {
+    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<C, P>) {
         self.residual = residual;
         self.jacobian = Some(jacobian());
     }
 }
 
-fn at<const G: usize, const C: usize, const P: usize>(
-    problem: &impl BundleProblem<G, C, P>,
+fn at<const C: usize, const P: usize>(
+    problem: &impl BundleProblem<C, P>,
     seen: &Observation,
-) -> (Vector2<f64>, Jacobian<G, C, P>) {
+) -> (Vector2<f64>, Jacobian<C, P>) {
     let mut last = Last { residual: Vector2::zeros(), jacobian: None };
     problem.evaluate(seen, &mut last);
     (last.residual, last.jacobian.expect("the problem hands over a Jacobian"))
@@ -218,8 +218,8 @@ fn at<const G: usize, const C: usize, const P: usize>(
 ///
 /// # Panics
 /// When an entry is off by more than the differences can explain.
-pub(super) fn check_jacobian<const G: usize, const C: usize, const P: usize>(
-    problem: &impl BundleProblem<G, C, P>,
+pub(super) fn check_jacobian<const C: usize, const P: usize>(
+    problem: &impl BundleProblem<C, P>,
     observations: &[Observation],
 ) {
     const WIDTH: f64 = 1e-6;
@@ -231,7 +231,7 @@ pub(super) fn check_jacobian<const G: usize, const C: usize, const P: usize>(
     for seen in observations {
         let (_, jacobian) = at(problem, seen);
         let largest = jacobian.camera.amax().max(jacobian.point.amax()).max(1.0);
-        let mut difference = |set: &dyn Fn(&mut Step<G, C, P>, f64)| {
+        let mut difference = |set: &dyn Fn(&mut Step<C, P>, f64)| {
             let mut side = |width: f64| {
                 let mut step = Step::zeros(cameras, points);
                 set(&mut step, width);
@@ -246,10 +246,6 @@ pub(super) fn check_jacobian<const G: usize, const C: usize, const P: usize>(
             assert!(error < TOLERANCE * largest, "{what} {k}: analytic {analytic}, numeric {numeric}");
         };
         let row = |matrix: &[f64], rows: usize, k: usize| Vector2::new(matrix[k], matrix[rows + k]);
-        for k in 0..G {
-            let numeric = difference(&|step, width| step.globals[k] = width);
-            compare(row(jacobian.globals.as_slice(), G, k), numeric, "global", k);
-        }
         for k in 0..C {
             let numeric = difference(&|step, width| step.cameras[seen.view][k] = width);
             compare(row(jacobian.camera.as_slice(), C, k), numeric, "camera", k);
@@ -259,7 +255,7 @@ pub(super) fn check_jacobian<const G: usize, const C: usize, const P: usize>(
             compare(row(jacobian.point.as_slice(), P, k), numeric, "point", k);
         }
     }
-    assert_eq!(compared, observations.len() * (G + C + P));
+    assert_eq!(compared, observations.len() * (C + P));
 }
 
 /// A vector of small random numbers, for tests that need a direction.

@@ -127,7 +127,7 @@ impl Reduced {
             return false;
         }
         let whitened = &self.whitened[..POINT * rows * coupled.clone().count()];
-        panel::subtract(whitened, rows, &mut self.values, rows);
+        panel::subtract(whitened, rows, &mut self.values);
         let gradients = coupled.flat_map(|point| self.whitened_gradients[point].iter());
         for (column, gradient) in whitened.chunks_exact(rows.max(1)).zip(gradients) {
             self.vector.iter_mut().zip(column).for_each(|(slot, value)| *slot += value * gradient);
