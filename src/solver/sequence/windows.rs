@@ -5,6 +5,7 @@ use super::calibrate::{self, ProjectiveExtract};
 use super::model::Model;
 use super::options::WindowOptions;
 use crate::domain::Task;
+use crate::geometry::statistics::chi_square_quantile;
 use crate::solver::Error;
 use crate::solver::calibration::{self, Outcome};
 use crate::solver::fusion::{Estimate, fuse, raise};
@@ -27,8 +28,10 @@ pub fn reconcile(
     let apart = fused.log_focal - model.log_focal(camera, &of_camera(problem, model, camera));
     // The windows' own formal variance is taken off: only what lies beyond it raises the sigma of the whole.
     let beyond = |value: f64| (value.powi(2) - fused.formal.powi(2)).max(0.0).sqrt();
-    let by_spread = own.hypot(beyond(fused.sigma));
-    // Windows that know little are apart from the whole by chance.
+    // Windows that know little differ, and are apart from the whole, by chance.
+    let freedom = (estimates.len() - 1) as f64;
+    let differ = fused.chi_square * freedom > chi_square_quantile(freedom, OPTIONS.significant_spread);
+    let by_spread = if differ { own.hypot(beyond(fused.sigma)) } else { own };
     let is_apart = apart.abs() > OPTIONS.significant_distance * fused.formal && beyond(apart) > by_spread;
     let count = estimates.len();
     let (sigma, reason) = match is_apart {
