@@ -10,7 +10,7 @@ pub enum WarningCode {
     PlanarOrRotation,
     /// The points of the consensus lie on a plane.
     PlanarScene,
-    /// The camera turned about its centre without moving: tracks have no points.
+    /// The camera turned about its centre without moving: in a metric result tracks have no points.
     PureRotation,
     /// The camera moved without turning: every focal length fits. Forward motion is a case of it; the detail says so.
     PureTranslation,
@@ -53,17 +53,17 @@ impl WarningCode {
     /// Whether it can be why there is no focal length; the others tell of what was assumed or left out.
     pub fn refuses(self) -> bool {
         match self {
-            WarningCode::PlanarOrRotation
-            | WarningCode::PlanarScene
-            | WarningCode::PureRotation
-            | WarningCode::PureTranslation
+            WarningCode::PureTranslation
             | WarningCode::UnobservableFocal
             | WarningCode::SecondMinimum
             | WarningCode::ModelMismatch
             | WarningCode::FewInliers
             | WarningCode::Cheirality
             | WarningCode::NoConsensus => true,
-            WarningCode::PrincipalPointUnobservable
+            WarningCode::PlanarOrRotation
+            | WarningCode::PlanarScene
+            | WarningCode::PureRotation
+            | WarningCode::PrincipalPointUnobservable
             | WarningCode::SecondStructure
             | WarningCode::ViewsLeftOut
             | WarningCode::AssumedImageSize

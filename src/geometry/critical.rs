@@ -3,7 +3,7 @@
 //! Each fit is a maximum-likelihood one with its number of unknowns, so that it can be tested against projective
 //! cameras, of which it is a special case.
 
-use nalgebra::{Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector2, Vector3};
 
 use super::bundle::Options;
 use super::bundle::critical::{
@@ -42,7 +42,7 @@ pub struct CriticalFit<M> {
 /// * `focal_per_view`: whether every view has a focal length of its own
 /// * `priors`: of the intrinsics of each group
 ///
-/// Returns `None` when some view has too few points in common with all others: nothing ties the homographies together.
+/// Returns `None` where common points do not tie all views together, and where a group has no prior.
 pub fn fit_without_parallax(
     observations: &[Observation],
     group_of: &[usize],
@@ -53,6 +53,9 @@ pub fn fit_without_parallax(
     stop: &StopToken,
 ) -> Option<(CriticalFit<Homographies>, CriticalFit<MetricReconstruction>)> {
     let views = group_of.len();
+    if group_of.iter().any(|&group| group >= priors.len()) {
+        return None;
+    }
     let seen = Correspondences::new(observations, views);
     let reference = seen.most_observed()?;
     let homographies = seen.homographies_from(reference, noise)?;
@@ -65,38 +68,40 @@ pub fn fit_without_parallax(
     let observed = positions.iter().flatten().count();
     let positions: Vec<Vector2<f64>> = positions.into_iter().map(Option::unwrap_or_default).collect();
 
-    let mut turning = turning(&homographies, observations, points)?;
-    turning.group_of = group_of.to_vec();
-    turning.intrinsics.resize(priors.len(), turning.intrinsics[0]);
+    let mut rotation = nearest_rotation_of(&homographies, observations, points)?;
+    rotation.group_of = group_of.to_vec();
+    rotation.intrinsics.resize(priors.len(), rotation.intrinsics[0]);
     if focal_per_view {
-        turning = turning.with_own_focals();
+        rotation = rotation.with_own_focals();
     }
     let simplest = IntrinsicsModel::focal(focal_per_view);
     let model = simplest.with_all_extensions();
     let options = Options::squared(ITERATIONS);
-    metric::adjust(&mut turning, observations, simplest, priors, &options, stop);
-    let report = metric::adjust(&mut turning, observations, model, priors, &options, stop);
-    let cost = report.cost - IntrinsicsPrior::cost_of(priors, model, &turning.intrinsics);
-    let unknowns = turning.unknowns(observed, model.parameters().len() * priors.len());
+    metric::adjust(&mut rotation, observations, simplest, priors, &options, stop);
+    let report = metric::adjust(&mut rotation, observations, model, priors, &options, stop);
+    let cost = report.cost - IntrinsicsPrior::cost_of(priors, model, &rotation.intrinsics);
+    let unknowns = rotation.unknowns(observed, model.parameters().len() * priors.len());
     let plane = Homographies { views: homographies, points: positions };
     Some((
         fit_homographies(plane, observed, observations, ITERATIONS, stop),
-        CriticalFit { model: turning, cost, unknowns },
+        CriticalFit { model: rotation, cost, unknowns },
     ))
 }
 
-/// What a camera that only turns sees, by homographies.
-pub fn homographies_of(turning: &MetricReconstruction) -> Homographies {
-    let first = turning.poses.first().map_or_else(Matrix3::identity, |pose| pose.rotation);
-    let view = |(view, pose): (usize, &Pose)| turning.intrinsics_of(view).matrix() * pose.rotation * first.transpose();
+/// What a camera that only turns sees, by homographies from the plane across the mean of its directions; `None` where a
+/// direction does not meet that.
+pub fn homographies_of(rotation: &MetricReconstruction) -> Option<Homographies> {
+    let mean: Vector3<f64> = rotation.points.iter().filter_map(|point| point.try_normalize(f64::MIN_POSITIVE)).sum();
+    let frame = Rotation3::rotation_between(&mean, &Vector3::z())?.into_inner();
+    let view = |(view, pose): (usize, &Pose)| rotation.intrinsics_of(view).matrix() * pose.rotation * frame.transpose();
     let point = |direction: &Vector3<f64>| {
-        let seen = first * direction;
-        seen.xy() / seen.z
+        let seen = frame * direction;
+        (seen.z > 0.0).then(|| seen.xy() / seen.z)
     };
-    Homographies {
-        views: turning.poses.iter().enumerate().map(view).collect(),
-        points: turning.points.iter().map(point).collect(),
-    }
+    Some(Homographies {
+        views: rotation.poses.iter().enumerate().map(view).collect(),
+        points: rotation.points.iter().map(point).collect::<Option<_>>()?,
+    })
 }
 
 /// Fits homographies from here.
@@ -112,7 +117,11 @@ pub fn fit_homographies(
 }
 
 /// The camera that only turns which these homographies are nearest to, its principal point in the centre.
-fn turning(homographies: &[Matrix3<f64>], observations: &[Observation], points: usize) -> Option<MetricReconstruction> {
+fn nearest_rotation_of(
+    homographies: &[Matrix3<f64>],
+    observations: &[Observation],
+    points: usize,
+) -> Option<MetricReconstruction> {
     let (intrinsics, rotations) = nearest_rotations(homographies)?;
     let mut directions: Vec<Option<Vector3<f64>>> = vec![None; points];
     for seen in observations.iter().filter(|seen| seen.is_usable(rotations.len(), points)) {
@@ -121,8 +130,8 @@ fn turning(homographies: &[Matrix3<f64>], observations: &[Observation], points: 
     }
     let pose = |rotation: Matrix3<f64>| Pose { rotation, translation: Vector3::zeros() };
     let directions = directions.into_iter().map(|direction| direction.unwrap_or_else(Vector3::z)).collect();
-    let turning = MetricReconstruction::new(intrinsics, rotations.into_iter().map(pose).collect(), directions);
-    Some(MetricReconstruction { has_common_centre: true, ..turning })
+    let rotation = MetricReconstruction::new(intrinsics, rotations.into_iter().map(pose).collect(), directions);
+    Some(MetricReconstruction { has_common_centre: true, ..rotation })
 }
 
 /// Where the reference view sees each point: as observed there, else by its first observation elsewhere.

@@ -62,7 +62,7 @@ impl Correspondences {
     ///
     /// * `noise`: standard deviation of a coordinate
     ///
-    /// Returns `None` where some view shares too few points with all others.
+    /// Returns `None` where views that share enough points do not tie all views together.
     pub fn homographies_from(&self, reference: usize, noise: f64) -> Option<Vec<Matrix3<f64>>> {
         let views = self.by_view.len();
         let mut found: Vec<Option<Matrix3<f64>>> = vec![None; views];
@@ -132,7 +132,7 @@ fn pair_residual(pairs: &[Match], noise: f64) -> Option<f64> {
 /// The homography from the first to the second points of these pairs, by a reweighted direct linear transform.
 ///
 /// Returns `None` for fewer than [`LEAST_COMMON`] pairs and for pairs that determine none.
-pub fn between(pairs: &[Match], noise: f64) -> Option<Matrix3<f64>> {
+fn between(pairs: &[Match], noise: f64) -> Option<Matrix3<f64>> {
     robust(pairs, noise.max(f64::EPSILON)).map(|(homography, _)| homography)
 }
 
@@ -193,6 +193,29 @@ mod tests {
                 assert!(beyond(general) && !beyond(1.01 * general), "seed {seed}, {tracks} tracks: {general}");
             }
         }
+    }
+
+    /// By way of others where views share nothing with the reference.
+    #[test]
+    fn homographies_are_chained() {
+        let mut scene = testing::scene_of(1, 12, 120, 0.0, Motion::Rotation, false);
+        let expected = |view: usize| {
+            let calibration = scene.intrinsics.matrix();
+            let turned = scene.poses[view].rotation * scene.poses[0].rotation.transpose();
+            (calibration * turned * calibration.try_inverse().expect("a focal length")).normalize()
+        };
+        let expected: Vec<Matrix3<f64>> = (0..12).map(expected).collect();
+        scene.observations.retain(|seen| (seen.point % 9..seen.point % 9 + 4).contains(&seen.view));
+        let seen = Correspondences::new(&scene.observations, 12);
+        assert!(seen.common(0, 11).is_empty());
+        for (view, found) in seen.homographies_from(0, 1e-6).expect("a chain").iter().enumerate() {
+            let found = found.normalize();
+            let apart = (found - expected[view]).norm().min((found + expected[view]).norm());
+            assert!(apart < 1e-6, "view {view}: {found} {}", expected[view]);
+        }
+        scene.observations.retain(|seen| (seen.view < 6) == (seen.point % 9 < 3));
+        scene.observations.retain(|seen| seen.view < 6 || seen.point % 9 > 5);
+        assert!(Correspondences::new(&scene.observations, 12).homographies_from(0, 1e-6).is_none());
     }
 
     #[test]

@@ -15,8 +15,8 @@ use super::observation::Observation;
 use super::procrustes::nearest_rotation;
 use crate::domain::StopToken;
 
-/// Focal lengths and normals that are tried, in tilts to the optical axis and turns about it: 15 degrees apart at most,
-/// and up to where a plane is seen at its edge. The refinement pulls in what is nearer than half of that.
+/// Focal lengths and normals that are tried, in tilts to the optical axis, up to 75 degrees, and turns about it:
+/// neighbours are some 15 degrees apart, and the refinement pulls in what is nearer than half of that.
 const FOCALS: usize = 16;
 const TILTS: usize = 6;
 const TILT_STEP: f64 = std::f64::consts::PI / 12.0;
@@ -27,7 +27,7 @@ const OPTIONS: levenberg_marquardt::Options = levenberg_marquardt::Options {
     initial_damping: 1e-3,
     min_damping: MIN_DAMPING,
 };
-/// Log focal lengths and normals that are nearer than this are the same start.
+/// Log focal lengths and normals that are nearer than this are the same start: adjustment takes them to one minimum.
 const SAME: f64 = 0.05;
 
 /// The focal length of each group and the plane in the reference view.
@@ -40,7 +40,7 @@ struct Plane {
 
 /// A homography from the reference view to another.
 #[derive(Debug, Clone, Copy)]
-struct View {
+struct ViewHomography {
     homography: Matrix3<f64>,
     group: usize,
 }
@@ -57,18 +57,17 @@ impl Plane {
 
     /// What a homography is between directions of the cameras.
     ///
-    /// * `reference`: group of the reference view
-    fn of_directions(&self, view: &View, reference: usize) -> Matrix3<f64> {
+    fn of_directions(&self, view: &ViewHomography, reference_group: usize) -> Matrix3<f64> {
         let calibration = |group: usize| Vector3::new(self.log_focals[group].exp(), self.log_focals[group].exp(), 1.0);
-        let (from, to) = (calibration(reference), calibration(view.group));
+        let (from, to) = (calibration(reference_group), calibration(view.group));
         Matrix3::from_fn(|row, column| view.homography[(row, column)] * from[column] / to[row])
     }
 
     /// By how much what a view sees of the plane's two directions is not of one length and at right angles: zero where
     /// focal lengths and plane are right. With it the derivatives by the log focal length of the reference view, by
     /// that of the view, and by turns of the basis about its two directions.
-    fn residuals(&self, view: &View, reference: usize) -> [(f64, [f64; 2 + TURNS]); 2] {
-        let map = self.of_directions(view, reference);
+    fn residuals(&self, view: &ViewHomography, reference_group: usize) -> [(f64, [f64; 2 + TURNS]); 2] {
+        let map = self.of_directions(view, reference_group);
         // Of the map by the log focal lengths.
         let of_image = |k: usize| f64::from(u8::from(k < 2));
         let by_reference = Matrix3::from_fn(|row, column| map[(row, column)] * of_image(column));
@@ -110,18 +109,18 @@ impl Plane {
 
 /// The equations of all views.
 struct Equations {
-    views: Vec<View>,
-    /// Group of the reference view.
-    reference: usize,
+    views: Vec<ViewHomography>,
+    /// Of the reference view.
+    reference_group: usize,
     matrix: DMatrix<f64>,
     /// Half the gradient of the cost.
     gradient: DVector<f64>,
 }
 
 impl Equations {
-    fn new(views: Vec<View>, reference: usize, groups: usize) -> Self {
+    fn new(views: Vec<ViewHomography>, reference_group: usize, groups: usize) -> Self {
         let unknowns = groups + TURNS;
-        Self { views, reference, matrix: DMatrix::zeros(unknowns, unknowns), gradient: DVector::zeros(unknowns) }
+        Self { views, reference_group, matrix: DMatrix::zeros(unknowns, unknowns), gradient: DVector::zeros(unknowns) }
     }
 }
 
@@ -129,18 +128,19 @@ impl LeastSquares for Equations {
     type State = Plane;
 
     fn cost(&self, plane: &Plane) -> f64 {
-        let squares = |view| plane.residuals(view, self.reference).map(|(residual, _)| residual * residual);
+        let squares = |view| plane.residuals(view, self.reference_group).map(|(residual, _)| residual * residual);
         self.views.iter().flat_map(squares).sum()
     }
 
     fn linearise(&mut self, plane: &Plane) {
         let groups = plane.log_focals.len();
-        (self.matrix.fill(0.0), self.gradient.fill(0.0));
+        self.matrix.fill(0.0);
+        self.gradient.fill(0.0);
         let mut row = self.gradient.clone();
         for view in &self.views {
-            for (residual, [by_reference, by_view, turns @ ..]) in plane.residuals(view, self.reference) {
+            for (residual, [by_reference, by_view, turns @ ..]) in plane.residuals(view, self.reference_group) {
                 row.fill(0.0);
-                row[self.reference] += by_reference;
+                row[self.reference_group] += by_reference;
                 row[view.group] += by_view;
                 row.rows_mut(groups, TURNS).copy_from_slice(&turns);
                 self.matrix.ger(1.0, &row, &row, 1.0);
@@ -168,17 +168,18 @@ impl LeastSquares for Equations {
 /// * `group_of`: camera group of each view
 /// * `observations`: of the points of the plane
 pub fn upgrades(
-    plane: &Homographies,
+    homographies: &Homographies,
     group_of: &[usize],
     observations: &[Observation],
     most: usize,
 ) -> Vec<MetricReconstruction> {
-    let Some(first) = plane.views.first() else { return Vec::new() };
+    let Some(first) = homographies.views.first() else { return Vec::new() };
     let (Some(back), Some(&last)) = (first.try_inverse(), group_of.iter().max()) else { return Vec::new() };
     let groups = 1 + last;
-    let view = |(view, &group): (&Matrix3<f64>, &usize)| View { homography: view * back, group };
-    let mut equations = Equations::new(plane.views.iter().zip(group_of).map(view).collect(), group_of[0], groups);
-    let turns = |tilt: usize| if tilt == 0 { 1 } else { 4 * tilt };
+    let view = |(view, &group): (&Matrix3<f64>, &usize)| ViewHomography { homography: view * back, group };
+    let mut equations =
+        Equations::new(homographies.views.iter().zip(group_of).map(view).collect(), group_of[0], groups);
+    let turns = |tilt: usize| if tilt == 0 { 1 } else { 6 * tilt };
     let normals: Vec<(f64, f64)> = (0..TILTS)
         .flat_map(|tilt| {
             let turn = move |k: usize| std::f64::consts::TAU * k as f64 / turns(tilt) as f64;
@@ -206,7 +207,7 @@ pub fn upgrades(
         let seen = first * point.push(1.0);
         seen.xy() / seen.z
     };
-    let positions: Vec<Vector2<f64>> = plane.points.iter().map(position).collect();
+    let positions: Vec<Vector2<f64>> = homographies.points.iter().map(position).collect();
     chosen.iter().filter_map(|start| upgrade(start, &equations, &positions, observations)).collect()
 }
 
@@ -219,8 +220,8 @@ fn upgrade(
     positions: &[Vector2<f64>],
     observations: &[Observation],
 ) -> Option<MetricReconstruction> {
-    let Equations { views, reference, .. } = equations;
-    let focal = start.log_focals[*reference].exp();
+    let Equations { views, reference_group, .. } = equations;
+    let focal = start.log_focals[*reference_group].exp();
     // Where the ray of an image point meets the plane at distance 1, in the plane's own coordinates.
     let on_plane = |seen: &Vector2<f64>| {
         let ray = start.basis.tr_mul(&(seen / focal).push(1.0));
@@ -228,11 +229,11 @@ fn upgrade(
     };
     let points: Vec<Vector3<f64>> = positions.iter().map(|seen| on_plane(seen).unwrap_or_default()).collect();
     let maps: Vec<Matrix3<f64>> =
-        views.iter().map(|view| start.of_directions(view, *reference) * start.basis).collect();
+        views.iter().map(|view| start.of_directions(view, *reference_group) * start.basis).collect();
     let mut depths = vec![0.0; maps.len()];
     for seen in observations.iter().filter(|seen| seen.is_usable(maps.len(), points.len())) {
         let point = &points[seen.point];
-        depths[seen.view] += (maps[seen.view].row(2) * Vector3::new(point.x, point.y, 1.0)).x;
+        depths[seen.view] += (maps[seen.view].row(2) * Vector3::new(point.x, point.y, 1.0)).x.signum();
     }
     let pose = |(map, depth): (&Matrix3<f64>, &f64)| {
         // A homography's sign is free: the points are in front.
@@ -274,7 +275,7 @@ mod tests {
         let mut at = Plane::new(2, 0.3, 0.5, 1.0);
         at.log_focals[1] = 0.2;
         for homography in plane.views {
-            let view = View { homography, group: 1 };
+            let view = ViewHomography { homography, group: 1 };
             for (component, (_, derivative)) in at.residuals(&view, 0).into_iter().enumerate() {
                 for k in 0..4 {
                     let side = |width: f64| {

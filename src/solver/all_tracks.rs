@@ -48,12 +48,8 @@ const OPTIONS: AllTracksOptions = AllTracksOptions::DEFAULT;
 /// The block and its consensus with the tracks that the search left aside; `None` where there are none, or where what
 /// was found does not carry over.
 pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Option<(Block, Consensus)> {
-    let block = problem.block(&searched.views);
-    let all = near_duplicates::without(problem, &block).into_owned().sample_with(
-        OPTIONS.most_tracks,
-        problem.settings.seed,
-        &searched.tracks,
-    );
+    let block = near_duplicates::without(problem, problem.block(&searched.views));
+    let all = block.sample_with(OPTIONS.most_tracks, problem.settings.seed, &searched.tracks);
     if all.tracks.len() == searched.tracks.len() {
         return None;
     }

@@ -6,10 +6,15 @@
 
 use super::calibration::{GradeOptions, Outcome};
 use crate::domain::{Grade, Warning, WarningCode};
+use crate::geometry::statistics::chi_square_quantile;
 
 /// Growth of sigma from which a warning says why, and the sigma from which anyone minds: a quarter of a METRIC one.
 const WORTH_A_WARNING: f64 = 3.0;
 const WORTH_MINDING: f64 = 0.005;
+
+/// Level of the chi-square of their differences beyond which these are no chance, one in twenty, as a quantile of the
+/// normal distribution.
+const SIGNIFICANT: f64 = 1.645;
 
 /// Log focal length and its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -27,8 +32,9 @@ pub struct Fused {
     pub formal: f64,
     /// Standard deviation of what each has beside its own sigma.
     pub misfit: f64,
-    /// Chi-square per degree of freedom without it.
+    /// Chi-square per degree of freedom without it, and the degrees.
     pub chi_square: f64,
+    pub freedom: f64,
 }
 
 /// Fuses estimates that have this share of their observations in common, and so err alike by as much; `None` for fewer
@@ -65,19 +71,32 @@ pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
         weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.log_focal).sum::<f64>() / total;
     let sigma = variance_of_sum(&weight, misfit).sqrt() / total;
     let usable = sigma.is_finite() && misfit.is_finite() && log_focal.is_finite();
-    usable.then_some(Fused { log_focal, sigma, formal, misfit, chi_square: statistic / expected })
+    usable.then_some(Fused {
+        log_focal,
+        sigma,
+        formal,
+        misfit,
+        chi_square: statistic / expected,
+        freedom: (estimates.len() - 1) as f64,
+    })
 }
 
 /// Raises the sigma of one block's calibration by what the estimates of all blocks have beside their own.
 pub fn admit_misfit(outcome: &mut Outcome, estimates: &[Estimate], grades: &GradeOptions) {
     let fused = fuse(estimates, 0.0).zip(outcome.sigma_log_focal);
-    if let Some((fused, own)) = fused.filter(|_| outcome.grade != Grade::ProjectiveOnly) {
+    let fused = fused.filter(|(fused, _)| outcome.grade != Grade::ProjectiveOnly && fused.differ());
+    if let Some((fused, own)) = fused {
         let reason = fused.spread(&format!("{} blocks of views", estimates.len()));
         raise(outcome, own.hypot(fused.misfit), &reason, grades);
     }
 }
 
 impl Fused {
+    /// Whether the estimates differ by more than chance explains.
+    pub fn differ(&self) -> bool {
+        self.chi_square * self.freedom > chi_square_quantile(self.freedom, SIGNIFICANT)
+    }
+
     /// By how much these estimates, of `which`, differ.
     pub fn spread(&self, which: &str) -> String {
         format!(
@@ -120,6 +139,16 @@ mod tests {
         let fused = fuse(&estimates(&[(0.1, 0.001), (-0.1, 0.001), (0.1, 0.001), (-0.1, 0.001)]), 0.0).expect("four");
         // Four values of standard deviation .115: their mean is known to half of that.
         assert!((fused.misfit - 0.1155).abs() < 1e-3 && (fused.sigma - 0.0577).abs() < 1e-3, "{fused:?}");
+        assert!(fused.differ());
+        // A little more than expected is chance, of two and of many.
+        let of = |by: f64, count: usize| {
+            let values: Vec<_> = (0..count).map(|k| (if k.is_multiple_of(2) { by } else { -by }, 0.01)).collect();
+            fuse(&estimates(&values), 0.0).expect("several")
+        };
+        for (by, count, differ) in [(0.012, 2, false), (0.015, 2, true), (0.011, 20, false), (0.014, 20, true)] {
+            let fused = of(by, count);
+            assert!(fused.misfit > 0.0 && fused.differ() == differ, "{by}, {count}: {fused:?}");
+        }
         // One that knows nothing refutes nothing.
         let fused = fuse(&estimates(&[(0.0, 0.001), (0.5, 0.6)]), 0.0).expect("two");
         assert_eq!(fused.misfit, 0.0);

@@ -2,13 +2,14 @@
 //!
 //! Depends on `network`, `geometry` and `domain`; knows nothing of jobs, transport or files.
 //!
-//! The way through: [`duplicates`] keeps one of equal tracks; [`problem`] is the input as all stages see it;
-//! [`view_selection`] chooses views whose tracks are complete: all of them, or a few; [`attempt`] searches such a
-//! block, by [`portfolio`] (proposals, [`search`], [`grow`]; [`static_tracks`] are left aside, [`near_duplicates`] until
-//! all are judged, the [`track_sampling`] of many tracks searched, [`a_contrario`] verifies, [`all_tracks`] join; [`depths`] where those verify what image
-//! points cannot) or [`baselines`], and [`calibration`] upgrades it. [`sequence`] tries blocks in order of cost and
-//! extends what stands to the other views and tracks, projectively or metrically, observation by observation;
-//! [`assemble`] has [`classification`] judge every track and observation, and writes it down.
+//! The way through: [`duplicates`] keeps one of equal tracks; [`problem`] is the input as all stages see it, in which
+//! one track represents its [`near_duplicates`] until all are judged; [`view_selection`] chooses views whose tracks are
+//! complete: all of them, or a few; [`attempt`] searches such a block, its [`static_tracks`] last, by [`portfolio`]
+//! (proposals, [`search`], [`grow`]; the [`track_sampling`] of many tracks searched, [`a_contrario`] verifies,
+//! [`all_tracks`] join; [`depths`] where those verify what image points cannot) or [`baselines`], and [`calibration`]
+//! upgrades it. [`sequence`] tries blocks in order of cost and extends what stands to the other views and tracks,
+//! projectively or metrically, observation by observation; [`assemble`] has [`classification`] judge every track and
+//! observation, and writes it down.
 
 pub(crate) mod a_contrario;
 mod all_tracks;

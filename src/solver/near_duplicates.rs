@@ -5,137 +5,216 @@
 //! explain all of it, and so does a camera that one of them moved. One of each group therefore stands for the others
 //! until a reconstruction stands, which judges them all.
 
-use std::borrow::Cow;
-use std::collections::HashMap;
+use std::cmp::Reverse;
+use std::ops::Range;
 
 use nalgebra::Vector2;
 
 use super::block::Block;
 use super::grow::LEAST_INLIERS;
 use super::problem::{Problem, VERIFIED};
+use crate::domain::StopToken;
 
 /// What counts as near-duplicates.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NearDuplicateOptions {
-    /// Distance in every view that both are in, normalised units.
+    /// Root mean square distance over the views that both are in, up to which they are, in units of the noise that the
+    /// solve starts from.
     pub near: f64,
+    /// Share of the views of the shorter one that both must be in.
+    pub least_common: f64,
     /// Tracks of the least group: as many as geometry takes to verify anything.
     pub least_group: usize,
     /// Tracks that must remain: twice those that verify anything.
     pub least_remaining: usize,
+    /// Tracks that each is compared with, at most: of more in one place some are of one group.
+    pub most_compared: usize,
 }
 
 impl NearDuplicateOptions {
-    pub const DEFAULT: Self = Self { near: 0.004, least_group: LEAST_INLIERS, least_remaining: 2 * LEAST_INLIERS };
+    pub const DEFAULT: Self = Self {
+        // Two observations of one point are 1.4 apart.
+        near: 2.0,
+        least_common: 0.5,
+        least_group: LEAST_INLIERS,
+        least_remaining: 2 * LEAST_INLIERS,
+        most_compared: 200,
+    };
 }
 
 const OPTIONS: NearDuplicateOptions = NearDuplicateOptions::DEFAULT;
 
-/// A view and a square of its image, as wide as near-duplicates may be apart.
-type Cell = (u32, i64, i64);
+/// Tracks between two questions to the stop token.
+const TRACKS_A_QUESTION: usize = 1 << 10;
 
-/// The track that stands for each: itself, but for near-duplicates.
+/// All tracks, to be compared.
+struct Tracks<'a, V: Fn(usize) -> usize> {
+    /// Observations of each.
+    ranges: &'a [usize],
+    /// View of each observation.
+    views: V,
+    /// Normalised image points.
+    xy: &'a [Vector2<f64>],
+    /// Largest root mean square distance.
+    near: f64,
+    /// Observation after observation, the place in its view and its track, sorted.
+    places: Vec<(Place, u32)>,
+}
+
+/// A view and a square of its image.
+type Place = (u32, i32, i32);
+
+/// The representative of each track: itself, but for near-duplicates. Of tracks whose first, middle or last observations
+/// are near each other the longest is that of the others. Once `stop` fires, every track represents itself.
 ///
 /// * `ranges`: observations of each track
 /// * `views`: view of each observation
 /// * `xy`: normalised image points
-pub fn find(ranges: &[usize], views: impl Fn(usize) -> usize, xy: &[Vector2<f64>]) -> Vec<usize> {
-    let tracks = ranges.len().saturating_sub(1);
-    let place = |k: usize| xy[k].map(|x| (x / OPTIONS.near).floor() as i64);
-    // The first track of each group that is in a cell.
-    let mut firsts: HashMap<Cell, Vec<u32>> = HashMap::new();
-    let mut first_of: Vec<usize> = (0..tracks).collect();
-    for track in 0..tracks {
-        let seen = ranges[track]..ranges[track + 1];
-        let Some(k) = seen.clone().next().filter(|_| seen.len() >= VERIFIED) else { continue };
-        let (view, at) = (views(k) as u32, place(k));
-        let around = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (view, at.x + dx, at.y + dy)));
-        let candidates = around.filter_map(|cell| firsts.get(&cell)).flatten();
-        let near = candidates
-            .map(|&first| first as usize)
-            .find(|&first| are_near(&(ranges[first]..ranges[first + 1]), &seen, &views, xy));
-        match near {
-            Some(first) => first_of[track] = first,
-            None => seen.for_each(|k| {
-                let at = place(k);
-                firsts.entry((views(k) as u32, at.x, at.y)).or_default().push(track as u32);
-            }),
-        }
-    }
-    let mut size = vec![0; tracks];
-    first_of.iter().for_each(|&first| size[first] += 1);
-    let stands_for: Vec<usize> = (0..tracks)
-        .map(|track| if size[first_of[track]] >= OPTIONS.least_group { first_of[track] } else { track })
-        .collect();
-    let remaining = (0..tracks).filter(|&track| stands_for[track] == track).count();
-    if remaining >= OPTIONS.least_remaining { stands_for } else { (0..tracks).collect() }
-}
-
-/// Whether two tracks are near each other in every view that both are in, and in enough of them to say so.
-fn are_near(
-    a: &std::ops::Range<usize>,
-    b: &std::ops::Range<usize>,
-    views: &impl Fn(usize) -> usize,
+/// * `noise`: normalised, that the solve starts from
+pub fn representatives(
+    ranges: &[usize],
+    views: impl Fn(usize) -> usize,
     xy: &[Vector2<f64>],
-) -> bool {
-    let (mut j, mut common) = (a.start, 0);
-    for k in b.clone() {
-        while j < a.end && views(j) < views(k) {
-            j += 1;
+    noise: f64,
+    stop: &StopToken,
+) -> Vec<usize> {
+    let tracks = Tracks::new(ranges, views, xy, OPTIONS.near * noise);
+    let count = ranges.len().saturating_sub(1);
+    let themselves = || (0..count).collect();
+    let mut representative: Vec<usize> = themselves();
+    let mut order: Vec<usize> = (0..count).filter(|&track| tracks.of(track).len() >= VERIFIED).collect();
+    order.sort_by_key(|&track| Reverse(tracks.of(track).len()));
+    let mut is_first = vec![false; count];
+    for (k, &track) in order.iter().enumerate() {
+        if k.is_multiple_of(TRACKS_A_QUESTION) && stop.is_stopped() {
+            return themselves();
         }
-        if j < a.end && views(j) == views(k) {
-            if (xy[j] - xy[k]).amax() > OPTIONS.near {
-                return false;
-            }
-            common += 1;
+        match tracks.candidates(track).filter(|&first| is_first[first]).find(|&first| tracks.are_near(first, track)) {
+            Some(first) => representative[track] = first,
+            None => is_first[track] = true,
         }
     }
-    common >= VERIFIED
+    let mut size = vec![0; count];
+    representative.iter().for_each(|&first| size[first] += 1);
+    for (track, representative) in representative.iter_mut().enumerate() {
+        if size[*representative] < OPTIONS.least_group {
+            *representative = track;
+        }
+    }
+    let remaining = representative.iter().enumerate().filter(|(track, representative)| track == *representative);
+    if remaining.count() >= OPTIONS.least_remaining { representative } else { themselves() }
 }
 
-/// The block without what others stand for.
-pub fn without<'a>(problem: &Problem, block: &'a Block) -> Cow<'a, Block> {
-    let kept: Vec<usize> = (0..block.tracks.len()).filter(|&k| !problem.is_duplicate(block.tracks[k])).collect();
-    if kept.len() == block.tracks.len() { Cow::Borrowed(block) } else { Cow::Owned(block.select(&kept)) }
+impl<'a, V: Fn(usize) -> usize> Tracks<'a, V> {
+    fn new(ranges: &'a [usize], views: V, xy: &'a [Vector2<f64>], near: f64) -> Self {
+        let mut tracks = Self { ranges, views, xy, near, places: Vec::new() };
+        let of_track = |track: usize| tracks.of(track).map(move |k| (k, track as u32));
+        let observations = (0..ranges.len().saturating_sub(1)).flat_map(of_track);
+        let mut places: Vec<(Place, u32)> = observations.map(|(k, track)| (tracks.place(k), track)).collect();
+        places.sort_unstable();
+        tracks.places = places;
+        tracks
+    }
+
+    fn of(&self, track: usize) -> Range<usize> {
+        self.ranges[track]..self.ranges[track + 1]
+    }
+
+    /// Squares are so wide that what is near by twice the mean is in the next one at most.
+    fn place(&self, k: usize) -> Place {
+        let [x, y] = [self.xy[k].x, self.xy[k].y].map(|x| (x / (2.0 * self.near)).floor() as i32);
+        ((self.views)(k) as u32, x, y)
+    }
+
+    /// Tracks that may be near this one.
+    fn candidates(&self, track: usize) -> impl Iterator<Item = usize> {
+        let seen = self.of(track);
+        let ends = [seen.start, seen.start + seen.len() / 2, seen.end - 1];
+        let around = ends.into_iter().flat_map(|k| {
+            let (view, x, y) = self.place(k);
+            (-1..=1).flat_map(move |dx: i32| {
+                (-1..=1).map(move |dy: i32| (view, x.saturating_add(dx), y.saturating_add(dy)))
+            })
+        });
+        let in_place = |place: Place| {
+            let first = self.places.partition_point(|(other, _)| *other < place);
+            self.places[first..].iter().take_while(move |(other, _)| *other == place).map(|(_, track)| *track as usize)
+        };
+        around.flat_map(in_place).take(OPTIONS.most_compared)
+    }
+
+    /// Whether two tracks are near each other where both are seen, and are so often enough to say so.
+    fn are_near(&self, long: usize, short: usize) -> bool {
+        let (long, short) = (self.of(long), self.of(short));
+        let least = VERIFIED.max((OPTIONS.least_common * short.len() as f64).ceil() as usize);
+        let (mut j, mut common, mut sum) = (long.start, 0, 0.0);
+        for k in short {
+            let view = (self.views)(k);
+            while j < long.end && (self.views)(j) < view {
+                j += 1;
+            }
+            if j < long.end && (self.views)(j) == view {
+                sum += (self.xy[j] - self.xy[k]).norm_squared();
+                common += 1;
+            }
+        }
+        common >= least && sum <= common as f64 * self.near * self.near
+    }
+}
+
+/// The block without what others represent.
+pub fn without(problem: &Problem, block: Block) -> Block {
+    let kept: Vec<usize> = (0..block.tracks.len()).filter(|&k| !problem.is_near_duplicate(block.tracks[k])).collect();
+    if kept.len() == block.tracks.len() { block } else { block.select(&kept) }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Tracks of three views, at the same place in all but the last.
-    fn duplicates(tracks: &[[f64; 3]]) -> Vec<usize> {
-        let xy: Vec<Vector2<f64>> = tracks
-            .iter()
-            .flat_map(|&[x, y, later]| [Vector2::new(x, y), Vector2::new(x, y), Vector2::new(x, later)])
-            .collect();
-        let ranges: Vec<usize> = (0..=tracks.len()).map(|track| 3 * track).collect();
-        let found = find(&ranges, |k| k % 3, &xy);
-        (0..tracks.len()).filter(|&track| found[track] != track).collect()
+    const NOISE: f64 = 0.005;
+
+    /// Tracks of these views, at a place that a track may leave in its last view; the representative of each that has
+    /// another.
+    fn found(tracks: &[(Range<usize>, [f64; 3])]) -> Vec<(usize, usize)> {
+        let (mut ranges, mut views, mut xy) = (vec![0], Vec::new(), Vec::new());
+        for (of_track, [x, y, later]) in tracks {
+            for view in of_track.clone() {
+                views.push(view);
+                xy.push(Vector2::new(*x, if view + 1 == of_track.end { *later } else { *y }));
+            }
+            ranges.push(views.len());
+        }
+        let found = representatives(&ranges, |k| views[k], &xy, NOISE, &StopToken::default());
+        found.into_iter().enumerate().filter(|(track, representative)| track != representative).collect()
+    }
+
+    fn apart(count: usize) -> Vec<(Range<usize>, [f64; 3])> {
+        (0..count).map(|k| (0..3, [0.05 * k as f64, 0.0, 0.0])).collect()
     }
 
     #[test]
-    fn of_a_group_one_is_kept_and_of_fewer_all() {
-        let apart = (0..20).map(|k| [0.05 * f64::from(k), 0.0, 0.0]);
-        let group = (0..OPTIONS.least_group).map(|k| [0.5 + 1e-4 * k as f64, 0.3, 0.3]);
-        let pair = (0..2).map(|k| [0.1 + 1e-4 * f64::from(k), 0.3, 0.3]);
-        // Near the group in two views, and not in the third.
-        let stranger = [0.5, 0.3, 0.4];
-        let tracks: Vec<[f64; 3]> = apart.chain(group).chain(pair).chain([stranger]).collect();
-        assert_eq!(duplicates(&tracks), (21..20 + OPTIONS.least_group).collect::<Vec<_>>());
+    fn the_longest_of_a_group_represents_it_and_fewer_represent_themselves() {
+        let mut tracks = apart(20);
+        tracks.extend((0..OPTIONS.least_group - 1).map(|k| (2..6, [0.5 + 1e-3 * k as f64, 0.3, 0.3])));
+        tracks.push((0..8, [0.501, 0.3, 0.3]));
+        tracks.extend((0..2).map(|k| (0..3, [0.1 + 1e-3 * f64::from(k), 0.3, 0.3])));
+        // Near the group where it begins, and not where it ends; in too few of its views.
+        tracks.push((2..6, [0.5, 0.3, 0.4]));
+        tracks.push((6..20, [0.5, 0.3, 0.3]));
+        let longest = 20 + OPTIONS.least_group - 1;
+        assert_eq!(found(&tracks), (20..longest).map(|track| (track, longest)).collect::<Vec<_>>());
     }
 
     #[test]
     fn nothing_is_left_aside_without_a_group_or_beside_too_little() {
-        let apart: Vec<[f64; 3]> = (0..20).map(|k| [0.05 * f64::from(k), 0.0, 0.0]).collect();
-        assert!(duplicates(&apart).is_empty());
-        let mut group: Vec<[f64; 3]> = vec![[0.5, 0.3, 0.3]; 40];
-        group.extend(&apart[..OPTIONS.least_remaining - 2]);
-        assert!(duplicates(&group).is_empty());
-        group.push(apart[19]);
-        assert_eq!(duplicates(&group).len(), 39);
-        assert!(find(&[], |_| 0, &[]).is_empty());
-        let far = [Vector2::new(f64::MAX, -f64::MAX); 3];
-        assert_eq!(find(&[0, 3], |k| k, &far), [0]);
+        assert!(found(&apart(20)).is_empty());
+        let mut group = vec![(0..3, [0.5, 0.3, 0.3]); 40];
+        group.extend(apart(OPTIONS.least_remaining - 2));
+        assert!(found(&group).is_empty());
+        group.push((0..3, [0.9, -0.3, -0.3]));
+        assert_eq!(found(&group), (1..40).map(|track| (track, 0)).collect::<Vec<_>>());
+        assert!(found(&[]).is_empty());
+        assert!(found(&vec![(0..3, [f64::MAX, -f64::MAX, f64::MIN]); 3]).is_empty());
     }
 }

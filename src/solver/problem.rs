@@ -5,8 +5,10 @@ use std::collections::BTreeSet;
 
 use nalgebra::Vector2;
 
+use super::attempt::AttemptOptions;
 use super::block::{self, Block};
 use super::calibration::CalibrationOptions;
+use super::grow::NoiseOptions;
 use super::normalization::normalization;
 use super::view_selection::complete_views;
 use super::{Error, classification, near_duplicates, static_tracks};
@@ -32,14 +34,16 @@ pub struct Problem<'a> {
     pub normalization: Normalization,
     /// Length of a normalised unit in pixels.
     pub scale_px: f64,
+    /// The noise that a solve starts from, normalised: that of the settings, or a guess.
+    pub initial_noise: f64,
     /// Normalised image points, one an observation.
     pub xy: Vec<Vector2<f64>>,
     /// See [`Observation::weight`]; one an observation.
     pub weights: Vec<f64>,
     /// Whether each track is static: left aside in a search.
     pub is_static: Vec<bool>,
-    /// The track that stands for each until all are judged: itself, but for near-duplicates.
-    pub stands_for: Vec<usize>,
+    /// The track that represents each until all are judged: itself, but for near-duplicates.
+    pub representative: Vec<usize>,
     /// Observations of each view.
     pub of_view: Vec<Vec<u32>>,
     /// Camera of each view, each of which gets a calibration: the camera groups, counted from 0 in rising order of the
@@ -78,6 +82,7 @@ impl<'a> Problem<'a> {
             true => camera_groups(input),
             false => (vec![0; input.view_count()], 1),
         };
+        let initial_noise = initial_noise(settings, normalization.scale_px);
         let of_camera = |camera: usize| {
             let views = input.views().iter().zip(&camera_of).filter(|(_, of)| **of == camera);
             focal_prior(views.map(|(view, _)| view)).filter(|_| !settings.focal_per_view)
@@ -86,11 +91,15 @@ impl<'a> Problem<'a> {
             focal_priors: (0..cameras).map(of_camera).collect(),
             outlier_density: classification::outlier_density(&of_view, &xy),
             least_share: if complete_views(input, &ranges).is_some() { LEAST_RETAINED_SHARE } else { 0.0 },
-            is_static: static_tracks::find(&ranges, &xy),
-            stands_for: match is_searched(settings) {
-                true => near_duplicates::find(&ranges, |k| input.view_of(k), &xy),
+            is_static: match is_searched(settings) {
+                true => static_tracks::find(&ranges, &xy),
+                false => vec![false; input.track_count()],
+            },
+            representative: match is_searched(settings) {
+                true => near_duplicates::representatives(&ranges, |k| input.view_of(k), &xy, initial_noise, stop),
                 false => (0..input.track_count()).collect(),
             },
+            initial_noise,
             input,
             settings,
             ranges,
@@ -176,21 +185,26 @@ impl<'a> Problem<'a> {
         self.ranges[track]..self.ranges[track + 1]
     }
 
-    /// Whether another track stands for this one.
-    pub fn is_duplicate(&self, track: usize) -> bool {
-        self.stands_for[track] != track
+    /// Whether another track represents this one.
+    pub fn is_near_duplicate(&self, track: usize) -> bool {
+        self.representative[track] != track
     }
 
-    /// How many tracks these views see so often that they may be verified.
+    /// How many tracks, near-duplicates left out, these views see so often that they may be verified.
     pub fn verifiable(&self, is_registered: impl Fn(usize) -> bool) -> usize {
         let seen = |track: usize| self.of_track(track).filter(|&k| is_registered(self.view_of(k))).count();
-        (0..self.tracks()).filter(|&track| !self.is_duplicate(track) && seen(track) >= VERIFIED).count()
+        (0..self.tracks()).filter(|&track| !self.is_near_duplicate(track) && seen(track) >= VERIFIED).count()
     }
 
     /// The views in which anything is observed, increasing.
     pub fn observed_views(&self) -> Vec<usize> {
         (0..self.views()).filter(|&view| !self.of_view[view].is_empty()).collect()
     }
+}
+
+fn initial_noise(settings: &SolveSettings, scale_px: f64) -> f64 {
+    let noise = settings.noise_px.map_or(AttemptOptions::DEFAULT.initial_noise, |noise_px| noise_px / scale_px);
+    NoiseOptions::DEFAULT.clamp(noise)
 }
 
 fn is_searched(settings: &SolveSettings) -> bool {

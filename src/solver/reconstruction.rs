@@ -87,7 +87,7 @@ impl Reconstruction {
         let grade = extended.grade(problem);
         let is_reported = |view: &usize| grade != Grade::ProjectiveOnly && model.is_determined(*view);
         let component =
-            |track: usize| model.landmarks[problem.stands_for[track]].as_ref().map_or(0, |point| point.component);
+            |track: usize| model.landmarks[problem.representative[track]].as_ref().map_or(0, |point| point.component);
         let calibrated = calibrations.iter().enumerate().map(|(camera, outcome)| {
             let intrinsics = model.lenses[camera].intrinsics;
             (Some(intrinsics).filter(|_| grade != Grade::ProjectiveOnly), outcome.clone())

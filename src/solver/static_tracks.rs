@@ -16,8 +16,8 @@ use crate::domain::{Warning, WarningCode};
 pub struct StaticTrackOptions {
     /// What a static track spreads by at most, normalised units.
     pub most_spread: f64,
-    /// How far the others move, as a quantile of how far tracks spread about their mean: of the moving tracks when up to
-    /// this share is static.
+    /// How far the others move, as a quantile of how far tracks spread about their mean: that of a moving track as long
+    /// as no larger share is static.
     pub moving_quantile: f64,
     /// Share of that which a static track spreads by at most.
     pub most_share: f64,
@@ -32,6 +32,7 @@ impl StaticTrackOptions {
     pub const DEFAULT: Self = Self {
         // What a detector errs by: two pixels in a thousand.
         most_spread: 0.002,
+        // Where more is static, hardly anything is left to find.
         moving_quantile: 0.8,
         // What moves by less than twenty times the noise of a static track determines little either way.
         most_share: 0.05,

@@ -143,7 +143,7 @@ fn greedy_views(problem: &Problem, open: &[bool], least: usize) -> Vec<Vec<usize
         }
         let mut views = vec![first];
         let seen = problem.of_view[first].iter().map(|&k| problem.track_of(k as usize));
-        let is_searched = |track: &usize| !problem.is_static[*track] && !problem.is_duplicate(*track);
+        let is_searched = |track: &usize| !problem.is_static[*track] && !problem.is_near_duplicate(*track);
         let mut tracks: Vec<usize> = seen.filter(is_searched).collect();
         let mut best: Option<(usize, Vec<usize>)> = None;
         while views.len() < OPTIONS.most_views {

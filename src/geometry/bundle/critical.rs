@@ -1,5 +1,5 @@
-//! Bundle adjustment of planes and of cameras that do not turn: models with fewer unknowns than projective cameras, to be
-//! tested against them.
+//! Bundle adjustment of planes and of cameras that do not turn: models with fewer unknowns than projective cameras, to
+//! be tested against them.
 //!
 //! A point is `(x, y, 1)`, and `(x, y, 1, w)` where it has an inverse depth `w`, in the frame of the view in which the
 //! starts were taken: that keeps points at infinity apart from nothing.

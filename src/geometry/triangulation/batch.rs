@@ -118,7 +118,7 @@ impl Batch {
         (weight.0[track], xy[0].0[track], xy[1].0[track]) = (0.0, 0.0, 0.0);
     }
 
-    /// As [`linear`](super::linear), every track.
+    /// As [`linear`](super::linear), every track, but for the sign of a direction, which no residual tells.
     pub fn linear(&self) -> Triangulated {
         vectorised(
             #[inline(always)]

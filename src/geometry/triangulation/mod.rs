@@ -208,6 +208,33 @@ mod tests {
         }
     }
 
+    /// Cameras at the origin see directions, of which no observation tells how far away they end.
+    #[test]
+    fn cameras_that_only_turn_see_directions_in_front_of_them() {
+        let turned = |view: usize| {
+            let turn = nalgebra::Rotation3::from_euler_angles(0.1 * view as f64, -0.15 * view as f64, 0.05);
+            Camera::from_fn(|row, column| if column < 3 { turn[(row, column)] } else { 0.0 })
+        };
+        let cameras: Vec<Camera> = (0..4).map(turned).collect();
+        let truth = Point::new(0.3, -0.2, 1.0, 0.0).normalize();
+        for shift in [0.0, 0.01] {
+            let seen = observations(&cameras, &truth, shift);
+            let found = linear(&cameras, &seen);
+            let (refined, cost) = refine(&cameras, &seen, found, 20);
+            let alone = batch::Batch::new(&cameras, &[&seen]);
+            let beside = alone.refine(alone.linear(), |_| true, 20);
+            for point in [found, refined, beside.point(0)] {
+                assert_eq!(point.w, 0.0);
+                assert!((point.dot(&truth).abs() - 1.0).abs() < 0.1 * shift + 1e-9, "{point} {truth}");
+            }
+            assert!(found.dot(&truth) > 0.0 && refined.dot(&truth) > 0.0, "in front");
+            assert!(
+                cost <= squared_residual(&cameras, &found, &seen)
+                    && (beside.cost(0) - cost).abs() < 1e-3 * cost + 1e-18
+            );
+        }
+    }
+
     #[test]
     fn degenerate_cameras_give_finite_points() {
         let flat = vec![Camera::zeros(); 3];

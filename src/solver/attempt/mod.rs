@@ -11,7 +11,7 @@ use super::calibration::{self, Outcome};
 use super::classification::Judged;
 use super::depths::{self, DepthOptions, TrackWeights};
 use super::fusion::Estimate;
-use super::grow::{self, LEAST_INLIERS, NoiseOptions};
+use super::grow::{self, LEAST_INLIERS};
 use super::learned::TrackScores;
 use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
@@ -156,8 +156,8 @@ impl Attempt {
     }
 
     /// Whether nothing says that observations within the tracks are wrong: a calibration that fits as well as
-    /// projective cameras do, or a motion or scene found that carries none, which wrong observations would refute; and
-    /// residuals of one kind.
+    /// projective cameras do, or a plane or special motion found, which wrong observations would refute; and residuals of
+    /// one kind.
     pub fn is_trusted(&self) -> bool {
         self.calibration.as_ref().is_some_and(|calibration| {
             let warns =
@@ -251,12 +251,6 @@ pub fn calibrate(
     Ok(())
 }
 
-/// The noise that a solve starts from, normalised units.
-fn initial_noise(problem: &Problem) -> f64 {
-    let noise = problem.settings.noise_px.map_or(OPTIONS.initial_noise, |noise_px| noise_px / problem.scale_px);
-    NoiseOptions::DEFAULT.clamp(noise)
-}
-
 /// AUTO and GEOMETRY: a sample of the tracks that move, and where that holds nothing, one of all.
 fn searched(problem: &Problem, block: &Block, effort: Effort, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let (most, of_many_views) = OPTIONS.searched_tracks;
@@ -264,9 +258,10 @@ fn searched(problem: &Problem, block: &Block, effort: Effort, recorder: &mut Rec
         true => of_many_views,
         false => (OPTIONS.searched_work / block.views.len().max(1).pow(2)).clamp(of_many_views, most),
     };
-    let block = &*near_duplicates::without(problem, block);
+    let block = &near_duplicates::without(problem, block.clone());
     if let Some(moving) = static_tracks::without(problem, block) {
-        let attempt = search(problem, moving.sample(most, problem.settings.seed), None, effort, recorder)?;
+        let (sample, track_scores) = track_sampling::sample(problem, &moving, most, effort)?;
+        let attempt = search(problem, sample, track_scores, effort, recorder)?;
         if attempt.found.consensus.is_some() {
             return Ok(attempt);
         }
@@ -286,7 +281,7 @@ fn search(
 ) -> Result<Attempt, Error> {
     let mut attempt = Attempt::new(block);
     let (complete, tracks) = (&attempt.block.complete, &attempt.block.tracks);
-    attempt.found = Portfolio::new(complete, problem.settings, initial_noise(problem), problem.stop)
+    attempt.found = Portfolio::new(complete, problem.settings, problem.initial_noise, problem.stop)
         .geometry_first(effort.is_seed)
         .quickly(effort.is_quick)
         .with_track_scores(track_scores)
@@ -351,7 +346,7 @@ fn carry_over(weights: &[f64], searched: &Block, block: &Block) -> Vec<f64> {
 /// PAPER and PSFM: the method's own set of tracks, reconstructed as it is.
 fn decided(problem: &Problem, block: Block, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let mut attempt = Attempt::new(block);
-    let noise = initial_noise(problem);
+    let noise = problem.initial_noise;
     let completed = baselines::with_epipolar_depths(problem, &attempt.block.complete, noise);
     problem.stopped()?;
     let complete = completed.as_ref().unwrap_or(&attempt.block.complete);

@@ -4,6 +4,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::Uncalibrated;
 use super::fit::Fit;
+use super::misfit;
 use super::models::Choice;
 use super::options::{CalibrationOptions, CriticalOptions};
 use crate::domain::{Warning, WarningCode};
@@ -27,7 +28,7 @@ pub(super) enum Upgrade {
     /// Homographies: a plane (Triggs 1998).
     Plane(Homographies),
     /// A camera that only turned (Hartley 1997), and the fit of what it is a special case of.
-    Turning { metric: MetricReconstruction, free: Fit },
+    Rotation { metric: MetricReconstruction, free: Fit },
     /// A camera that moved without turning, where its scene has depth: a focal length that is known otherwise makes it
     /// metric.
     Translation(Translating),
@@ -84,24 +85,33 @@ fn without_parallax(
     let priors = choice.priors(fit.noise);
     let fits =
         critical::fit_without_parallax(observations, group_of, focal_per_view, &priors, points.len(), fit.noise, stop);
-    let Some((plane, turning)) = fits else {
+    let Some((plane, rotation)) = fits else {
         if !is_flat {
             return Err(None);
         }
         let detail = format!("{missed}: the scene is planar, or the camera hardly did more than turn");
-        let warnings = vec![Warning::new(WarningCode::PlanarOrRotation, detail)];
+        let reason = "the views share too few points for homographies to tie them together";
+        let warnings = vec![
+            Warning::new(WarningCode::PlanarOrRotation, detail),
+            Warning::new(WarningCode::UnobservableFocal, reason),
+        ];
         return Ok(Critical { warnings, upgrade: Upgrade::None });
     };
-    // The homographies themselves may miss by a little; what a rotation loses is counted from there. No homography
-    // knows a lens, though.
+    // The homographies themselves may miss by a little; what a rotation loses is counted from there. They are those of
+    // pinholes, though.
     let by_plane = Fit::new(plane.cost, plane.unknowns, problem);
-    let by_turning = Fit::new(turning.cost, turning.unknowns, problem);
+    let by_rotation = Fit::new(rotation.cost, rotation.unknowns, problem);
     let free = if is_flat { by_plane } else { *fit };
-    let deviations = free.loss_deviations(by_turning.cost, by_turning.freedom);
-    let turns = deviations < fit_options.misfit_deviations;
+    let deviations = free.loss_deviations(by_rotation.cost, by_rotation.freedom);
     let plane_deviations = options.plane_deviations;
-    let has_depth = || fit.loss_deviations(by_plane.cost, by_plane.freedom) > plane_deviations;
-    if !turns && (!is_flat || translates && has_depth()) {
+    // Of few views it may have more unknowns than what it is tested against, and neither shows parallax behind a lens:
+    // projective cameras do, once that is undone.
+    let turns = by_rotation.freedom > free.freedom && deviations < fit_options.misfit_deviations && {
+        let by_views = misfit::projective_without_lens(&rotation.model, problem, stop);
+        by_views.loss_deviations(by_rotation.cost, by_rotation.freedom) < plane_deviations
+    };
+    let has_depth = fit.loss_deviations(by_plane.cost, by_plane.freedom) > plane_deviations;
+    if !turns && (!is_flat || translates && has_depth) {
         return Err(Some(plane.model));
     }
     let worse = format!("a camera that only turns fits worse than homographies by {deviations:.1} standard deviations");
@@ -112,7 +122,12 @@ fn without_parallax(
         ),
         (true, false) => (
             WarningCode::PureRotation,
-            "a camera that only turns explains the views as well as any homographies do".to_owned(),
+            match is_flat {
+                true => "a camera that only turns explains the views as well as they do".to_owned(),
+                false => {
+                    "a camera that only turns, behind a lens, explains the views as well as free cameras".to_owned()
+                }
+            },
         ),
         (false, _) if deviations < plane_deviations => (
             WarningCode::PlanarOrRotation,
@@ -122,7 +137,8 @@ fn without_parallax(
     };
     let mut warnings = vec![Warning::new(code, format!("{missed}: {because}"))];
     let upgrade = match (turns, translates) {
-        (true, false) => Upgrade::Turning { metric: turning.model, free },
+        (true, false) => Upgrade::Rotation { metric: rotation.model, free },
+        (false, false) if has_depth => Upgrade::Quadric(Some(plane.model)),
         (false, false) => Upgrade::Plane(plane.model),
         (_, true) => {
             warnings.push(not_turning());
@@ -141,8 +157,8 @@ fn pure_translation(translation: &Translating, options: &CriticalOptions) -> War
         None => "",
     };
     let detail = format!(
-        "the camera moved without turning{direction}: cameras that are not turned to each other explain the views as well \
-         as free ones, and every focal length does so alike"
+        "the camera moved without turning{direction}: cameras that are not turned to each other explain the views as \
+         well as free ones, and every focal length does so alike"
     );
     Warning::new(WarningCode::PureTranslation, detail)
 }

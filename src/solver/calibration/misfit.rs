@@ -6,10 +6,11 @@ use super::fit::Fit;
 use super::models::{Candidate, Choice};
 use super::options::FitOptions;
 use super::{Uncalibrated, observed_points};
-use crate::geometry::bundle::metric::{self, IntrinsicsPrior, MetricReconstruction};
+use crate::domain::StopToken;
+use crate::geometry::bundle::metric::{self, Extension, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::{Options, projective};
-use crate::geometry::critical;
 use crate::geometry::observation::Observation;
+use crate::geometry::{Camera, Point, critical};
 
 /// A metric reconstruction, compared with the projective one.
 #[derive(Debug, Clone, Copy)]
@@ -79,18 +80,16 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
     for lens in &mut pinhole.intrinsics {
         (lens.radial, lens.tangential) = ([0.0; 3], [0.0; 2]);
     }
-    let observed = observed_points(problem);
     let projective = match pinhole.has_common_centre {
         true => {
-            let (start, iterations) = (critical::homographies_of(&pinhole), options.max_iterations);
+            let (start, iterations) = (critical::homographies_of(&pinhole)?, options.max_iterations);
+            let observed = observed_points(problem);
             let found = critical::fit_homographies(start, observed, &observations, iterations, choice.stop);
             Fit::new(found.cost, found.unknowns + terms, problem)
         }
         false => {
-            let mut cameras = pinhole.cameras();
-            let mut points: Vec<Vector4<f64>> = pinhole.points.iter().map(|point| point.push(1.0)).collect();
-            let report = projective::adjust(&mut cameras, &mut points, &observations, &options, choice.stop);
-            Fit::projective(report.cost, problem, observed, terms)
+            let points: Vec<Vector4<f64>> = pinhole.points.iter().map(|point| point.push(1.0)).collect();
+            projective_fit(&pinhole.cameras(), &points, terms, problem, &options, choice.stop)
         }
     };
 
@@ -98,6 +97,32 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
     let report = metric::adjust(&mut pinhole, &observations, model, &best.priors, &options, choice.stop);
     let of_priors = IntrinsicsPrior::cost_of(&best.priors, model, &pinhole.intrinsics);
     Some((projective, Fit::metric(report.cost - of_priors, &pinhole, best.model, problem)))
+}
+
+/// The fit of projective cameras to the points of the images without the lens that this reconstruction has.
+pub(super) fn projective_without_lens(metric: &MetricReconstruction, problem: &Uncalibrated, stop: &StopToken) -> Fit {
+    let observations = undistorted(metric, problem.observations);
+    let problem = &Uncalibrated { observations: &observations, ..*problem };
+    let of_lens = Extension::ALL.into_iter().filter(|extension| extension.is_of_lens());
+    let terms = problem.groups() * of_lens.map(|extension| extension.parameters().len()).sum::<usize>();
+    let options = Options::squared(problem.options.critical.parallax_iterations);
+    projective_fit(problem.cameras, problem.points, terms, problem, &options, stop)
+}
+
+/// The fit of projective cameras from here.
+///
+/// * `terms`: of the lens that was undone before
+fn projective_fit(
+    cameras: &[Camera],
+    points: &[Point],
+    terms: usize,
+    problem: &Uncalibrated,
+    options: &Options,
+    stop: &StopToken,
+) -> Fit {
+    let (mut cameras, mut points) = (cameras.to_vec(), points.to_vec());
+    let report = projective::adjust(&mut cameras, &mut points, problem.observations, options, stop);
+    Fit::projective(report.cost, problem, observed_points(problem), terms)
 }
 
 /// The observations where pinholes would have made them; without those that the lens images nowhere.

@@ -1,7 +1,8 @@
 //! Self-calibration of a projective reconstruction, with what it is worth.
 //!
 //! The DAQ residual finds starts, metric bundle adjustment with one calibration for all views decides among them, and
-//! nothing is returned without a grade: a motion or scene that carries no calibration is said to.
+//! nothing is returned without a grade. Planes and rotations have starts of their own; what leaves the focal length free
+//! is refused with the reason.
 
 mod critical;
 mod fit;
@@ -172,6 +173,9 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
         Compared::new(problem, problem, scale_px, stop, &mut || ())?;
     warnings.extend(critical.warnings);
     let choice = models::Choice { problem, scale_px, stop };
+    if let Upgrade::Rotation { free, .. } = &critical.upgrade {
+        fit = *free;
+    }
     let priors = choice.priors(fit.noise);
     let from_plane = |plane: &Homographies| {
         let group_of = if problem.focal_per_view { &vec![0; problem.cameras.len()] } else { problem.group_of };
@@ -188,10 +192,7 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
             search::distinct(found, problem)
         }
         (Upgrade::Plane(plane), _) => from_plane(&plane)?,
-        (Upgrade::Turning { metric, free }, _) => {
-            fit = free;
-            search::minima_from(vec![metric], problem, &priors, stop)?
-        }
+        (Upgrade::Rotation { metric, .. }, _) => search::minima_from(vec![metric], problem, &priors, stop)?,
         (Upgrade::Translation(translation), [Some(focal)]) => {
             search::known_focal(&translation, focal.focal_px / scale_px, problem, &priors, stop)
         }
@@ -234,6 +235,10 @@ pub fn from_metric(
     let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on, scale_px, stop, heartbeat)?;
     warnings.extend(critical.warnings);
     if !matches!(critical.upgrade, Upgrade::Quadric(_) | Upgrade::Plane(_)) {
+        if let Upgrade::Rotation { .. } = critical.upgrade {
+            let detail = "the views together are those of a camera that only turned: its points tell nothing more";
+            warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
+        }
         return Ok(problem.refused(&warnings));
     }
     let choice = models::Choice { problem, scale_px, stop };

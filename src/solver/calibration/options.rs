@@ -82,14 +82,17 @@ impl FitOptions {
     }
 }
 
-/// How motions and scenes are told that carry no calibration.
+/// How motions and scenes are told of which projective cameras do not tell the calibration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CriticalOptions {
     /// Median homography residual, in units of the noise, below which the scene counts as planar or the camera as only
     /// rotating.
     pub homography_limit: f64,
-    /// The same up to which they may do so behind a lens, which no homography knows, or a scene be nearly planar.
+    /// The same up to which the views may still be those of a plane or of a rotation behind a lens, or of a scene that is
+    /// nearly a plane.
     pub lens_limit: f64,
+    /// Iterations of the projective cameras that a rotation behind a lens is tested against.
+    pub parallax_iterations: usize,
     /// Median distance from the epipolar lines of a translation, in units of the noise, above which the motion is none
     /// and nothing is adjusted.
     pub epipolar_limit: f64,
@@ -109,8 +112,11 @@ impl CriticalOptions {
     pub const DEFAULT: Self = Self {
         // Measured: 1.1 to 1.8 for those, above 11 for general motion.
         homography_limit: 3.0,
-        // From here on a plane or a turn is nowhere near.
+        // A little beyond the least of general motion: the tests that follow tell it from these, and a scene that is
+        // nearly a plane has starts from both.
         lens_limit: 12.0,
+        // They start where the lens was not undone.
+        parallax_iterations: 30,
         // A translation has about .7; the epipoles are only a start.
         epipolar_limit: 3.0,
         // Before a plane the projective model is singular and fits 3 to 5 deviations better than it should; depth, even

@@ -256,6 +256,7 @@ pub(super) fn minima_from(
         };
         found.push(Minimum::near(start, problem, model, priors, stop));
     }
+    Error::check(stop)?;
     Ok(distinct(found, problem))
 }
 

@@ -67,6 +67,7 @@ pub fn others(
             .calibration
             .as_ref()
             .filter(usable)
+            .filter(|_| !attempt.has_common_centre())
             .and_then(|calibration| Some((calibration, calibration.metric.as_ref()?)))
         else {
             failures += 1;

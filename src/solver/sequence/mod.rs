@@ -219,8 +219,8 @@ fn by_calibrated_blocks(
     }
 }
 
-/// The best of an attempt and of those on these sets of views, each extended to all views without a calibration and, where
-/// it is not known yet, calibrated then; the first that is METRIC.
+/// The best of an attempt and of those on these sets of views, each extended to all views without a calibration and,
+/// where it is not known yet, calibrated then; the first that is METRIC.
 fn by_projective_extension(
     problem: &Problem,
     first: Option<Attempt>,
@@ -270,8 +270,9 @@ fn by_projective_extension(
 
 /// Extends an attempt metrically where it has a metric reconstruction and that stands.
 ///
-/// A camera that only turned has none: it is extended projectively. An attempt without a calibration has the focal length that happens to fit best, which other views may refute: its
-/// extension stands only where it explains more than the projective reconstruction that it began from.
+/// A camera that only turned has points at infinity, and nothing is registered against these. An attempt without a
+/// calibration has the focal length that happens to fit best, which other views may refute: its extension stands only
+/// where it explains more than the projective reconstruction that it began from.
 fn metric_of(problem: &Problem, attempt: Attempt, recorder: &mut Recorder) -> Result<Ended, Error> {
     if !attempt.has_metric() || attempt.has_common_centre() || attempt.is_beyond_image_points() {
         return Ok(Ended::Block(Some(Box::new(attempt))));
@@ -307,7 +308,7 @@ fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder) ->
             return Ok(Ended::Block(Some(Box::new(attempt))));
         }
     }
-    if !attempt.has_metric() {
+    if !attempt.has_metric() || attempt.has_common_centre() {
         extend_projectively(problem, &mut attempt, true, recorder)?;
         attempt::calibrate(problem, &mut attempt, None, recorder)?;
     }

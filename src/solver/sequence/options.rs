@@ -221,9 +221,6 @@ pub struct WindowOptions {
     /// Distance of the windows' focal length from that of all views, in standard deviations of the former, beyond which
     /// it is no chance.
     pub significant_distance: f64,
-    /// Level, as a quantile of the normal distribution, of the chi-square of their differences beyond which these are no
-    /// chance.
-    pub significant_spread: f64,
 }
 
 impl WindowOptions {
@@ -236,7 +233,5 @@ impl WindowOptions {
         of_view: 150,
         // One in twenty is farther by chance.
         significant_distance: 2.0,
-        // The same.
-        significant_spread: 1.645,
     };
 }

@@ -107,7 +107,7 @@ impl<'a> Growing<'a> {
             Some(view) => problem.of_view[view].iter().map(|&k| problem.track_of(k as usize)).collect(),
             None => (0..problem.tracks()).collect(),
         };
-        tracks.retain(|&track| !problem.is_duplicate(track));
+        tracks.retain(|&track| !problem.is_near_duplicate(track));
         let cameras = robust_triangulation::or_zeros(&self.cameras);
         let triangulator = Triangulator::new(&cameras);
         let gate = problem.gate(self.noise);

@@ -5,7 +5,6 @@ use super::calibrate::{self, ProjectiveExtract};
 use super::model::Model;
 use super::options::WindowOptions;
 use crate::domain::Task;
-use crate::geometry::statistics::chi_square_quantile;
 use crate::solver::Error;
 use crate::solver::calibration::{self, Outcome};
 use crate::solver::fusion::{Estimate, fuse, raise};
@@ -29,9 +28,7 @@ pub fn reconcile(
     // The windows' own formal variance is taken off: only what lies beyond it raises the sigma of the whole.
     let beyond = |value: f64| (value.powi(2) - fused.formal.powi(2)).max(0.0).sqrt();
     // Windows that know little differ, and are apart from the whole, by chance.
-    let freedom = (estimates.len() - 1) as f64;
-    let differ = fused.chi_square * freedom > chi_square_quantile(freedom, OPTIONS.significant_spread);
-    let by_spread = if differ { own.hypot(beyond(fused.sigma)) } else { own };
+    let by_spread = if fused.differ() { own.hypot(beyond(fused.sigma)) } else { own };
     let is_apart = apart.abs() > OPTIONS.significant_distance * fused.formal && beyond(apart) > by_spread;
     let count = estimates.len();
     let (sigma, reason) = match is_apart {

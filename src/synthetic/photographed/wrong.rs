@@ -77,8 +77,8 @@ impl Spoil<'_> {
             here.shuffle(&mut self.rng);
             let images: Vec<[f64; 2]> = here.iter().map(|&(track, place)| tracks[track].seen[place].image).collect();
             for (k, &(track, place)) in here.iter().enumerate() {
-                // The only one has none to exchange with.
-                let image = if here.len() > 1 { images[(k + 1) % here.len()] } else { self.anywhere() };
+                // Few would become right tracks of each other's points.
+                let image = if here.len() > 3 { images[(k + 1) % here.len()] } else { self.anywhere() };
                 let seen = &mut tracks[track].seen[place];
                 *seen = seen.moved(image);
             }
@@ -183,12 +183,7 @@ impl Spoil<'_> {
 
     fn duplicate(&mut self, tracks: &mut [Track], wrong: &[usize]) {
         let originals: Vec<usize> = wrong.iter().copied().take(ORIGINALS).collect();
-        // Exchanging their points would make them right tracks of each other's.
-        for &track in &originals {
-            for k in 0..tracks[track].seen.len() {
-                tracks[track].seen[k] = tracks[track].seen[k].moved(self.anywhere());
-            }
-        }
+        self.permute(tracks, &originals);
         for (k, &track) in wrong.iter().enumerate().skip(ORIGINALS) {
             let seen = tracks[originals[k % ORIGINALS]].seen.clone();
             tracks[track].seen = seen;
