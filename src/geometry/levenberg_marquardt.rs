@@ -1,9 +1,10 @@
 //! The Levenberg-Marquardt method (Madsen, Nielsen & Tingleff 2004, section 3.2): one loop, one damping policy.
 //!
 //! A problem says what a state costs, linearises, and solves its damped normal equations; [`Normal`] does the latter
-//! for problems of a few unknowns.
+//! for problems whose number of unknowns is known beforehand.
 
-use nalgebra::{SMatrix, SVector};
+use nalgebra::allocator::Allocator;
+use nalgebra::{DefaultAllocator, Dim, OMatrix, OVector, SMatrix, SVector};
 
 use crate::domain::StopToken;
 
@@ -141,14 +142,29 @@ impl<const N: usize> Normal<N> {
 
     /// The damped step and the decrease of the cost that it promises; `None` where the matrix is not positive definite.
     pub fn solve(&self, damping: f64) -> Option<(SVector<f64, N>, f64)> {
-        let mut damped = self.matrix;
-        for k in 0..N {
-            damped[(k, k)] += damping * self.matrix[(k, k)] + f64::MIN_POSITIVE;
-        }
-        let step = damped.cholesky()?.solve(&-self.gradient);
-        let predicted = -step.dot(&(2.0 * self.gradient + self.matrix * step));
-        Some((step, predicted))
+        damped_step(&self.matrix, &self.gradient, damping)
     }
+}
+
+/// The step that normal equations lead to, damped relative to their diagonal, and the decrease of the cost that it
+/// promises; `None` where the matrix is not positive definite.
+///
+/// * `gradient`: half the gradient of the cost
+pub(crate) fn damped_step<D: Dim>(
+    matrix: &OMatrix<f64, D, D>,
+    gradient: &OVector<f64, D>,
+    damping: f64,
+) -> Option<(OVector<f64, D>, f64)>
+where
+    DefaultAllocator: Allocator<D, D> + Allocator<D>,
+{
+    let mut damped = matrix.clone();
+    for k in 0..damped.nrows() {
+        damped[(k, k)] += damping * matrix[(k, k)] + f64::MIN_POSITIVE;
+    }
+    let step = damped.cholesky()?.solve(&-gradient);
+    let predicted = -step.dot(&(gradient * 2.0 + matrix * &step));
+    Some((step, predicted))
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Rotation3, Vector2, Vector3};
 use super::bundle::critical::Homographies;
 use super::bundle::metric::{Intrinsics, MetricReconstruction, Pose};
 use super::daq::scan_focal;
-use super::levenberg_marquardt::{self, LeastSquares, MIN_DAMPING};
+use super::levenberg_marquardt::{self, LeastSquares, MIN_DAMPING, damped_step};
 use super::metric::oriented;
 use super::observation::Observation;
 use super::procrustes::nearest_rotation;
@@ -56,7 +56,6 @@ impl Plane {
     }
 
     /// What a homography is between directions of the cameras.
-    ///
     fn of_directions(&self, view: &ViewHomography, reference_group: usize) -> Matrix3<f64> {
         let calibration = |group: usize| Vector3::new(self.log_focals[group].exp(), self.log_focals[group].exp(), 1.0);
         let (from, to) = (calibration(reference_group), calibration(view.group));
@@ -64,9 +63,17 @@ impl Plane {
     }
 
     /// By how much what a view sees of the plane's two directions is not of one length and at right angles: zero where
-    /// focal lengths and plane are right. With it the derivatives by the log focal length of the reference view, by
-    /// that of the view, and by turns of the basis about its two directions.
-    fn residuals(&self, view: &ViewHomography, reference_group: usize) -> [(f64, [f64; 2 + TURNS]); 2] {
+    /// focal lengths and plane are right.
+    fn residuals(&self, view: &ViewHomography, reference_group: usize) -> [f64; 2] {
+        let map = self.of_directions(view, reference_group);
+        let [a, b] = [0, 1].map(|k| map * self.basis.column(k));
+        let (aa, bb) = (a.norm_squared(), b.norm_squared());
+        [(aa - bb) / (aa + bb), 2.0 * a.dot(&b) / (aa + bb)]
+    }
+
+    /// Derivatives of both residuals by the log focal length of the reference view, by that of the view, and by turns
+    /// of the basis about its two directions.
+    fn derivatives(&self, view: &ViewHomography, reference_group: usize) -> [[f64; 2 + TURNS]; 2] {
         let map = self.of_directions(view, reference_group);
         // Of the map by the log focal lengths.
         let of_image = |k: usize| f64::from(u8::from(k < 2));
@@ -86,10 +93,7 @@ impl Plane {
             let of_angle = 2.0 * (ab_by * sum - ab * (aa_by + bb_by)) / (sum * sum);
             (of_length, of_angle)
         };
-        [
-            ((aa - bb) / sum, std::array::from_fn(|k| derivatives(k).0)),
-            (2.0 * ab / sum, std::array::from_fn(|k| derivatives(k).1)),
-        ]
+        [std::array::from_fn(|k| derivatives(k).0), std::array::from_fn(|k| derivatives(k).1)]
     }
 
     /// * `step`: of the log focal lengths, then the turns of the basis about its two directions
@@ -128,7 +132,7 @@ impl LeastSquares for Equations {
     type State = Plane;
 
     fn cost(&self, plane: &Plane) -> f64 {
-        let squares = |view| plane.residuals(view, self.reference_group).map(|(residual, _)| residual * residual);
+        let squares = |view| plane.residuals(view, self.reference_group).map(|residual| residual * residual);
         self.views.iter().flat_map(squares).sum()
     }
 
@@ -138,7 +142,9 @@ impl LeastSquares for Equations {
         self.gradient.fill(0.0);
         let mut row = self.gradient.clone();
         for view in &self.views {
-            for (residual, [by_reference, by_view, turns @ ..]) in plane.residuals(view, self.reference_group) {
+            let residuals = plane.residuals(view, self.reference_group);
+            let derivatives = plane.derivatives(view, self.reference_group);
+            for (residual, [by_reference, by_view, turns @ ..]) in residuals.into_iter().zip(derivatives) {
                 row.fill(0.0);
                 row[self.reference_group] += by_reference;
                 row[view.group] += by_view;
@@ -150,13 +156,9 @@ impl LeastSquares for Equations {
     }
 
     fn step(&mut self, from: &Plane, damping: f64, to: &mut Plane) -> Option<f64> {
-        let mut damped = self.matrix.clone();
-        for k in 0..damped.nrows() {
-            damped[(k, k)] += damping * self.matrix[(k, k)] + f64::MIN_POSITIVE;
-        }
-        let step = damped.cholesky()?.solve(&-&self.gradient);
+        let (step, predicted) = damped_step(&self.matrix, &self.gradient, damping)?;
         *to = from.moved(&step);
-        Some(-step.dot(&(2.0 * &self.gradient + &self.matrix * &step)))
+        Some(predicted)
     }
 }
 
@@ -172,6 +174,7 @@ pub fn upgrades(
     group_of: &[usize],
     observations: &[Observation],
     most: usize,
+    stop: &StopToken,
 ) -> Vec<MetricReconstruction> {
     let Some(first) = homographies.views.first() else { return Vec::new() };
     let (Some(back), Some(&last)) = (first.try_inverse(), group_of.iter().max()) else { return Vec::new() };
@@ -192,7 +195,7 @@ pub fn upgrades(
             let planes = normals.iter().map(|(tilt, turn)| Plane::new(groups, log_focal, *tilt, *turn));
             let costs = planes.map(|plane| (equations.cost(&plane), plane));
             let (_, mut best) = costs.min_by(|a, b| a.0.total_cmp(&b.0))?;
-            let report = levenberg_marquardt::minimise(&mut equations, &mut best, &OPTIONS, &StopToken::default());
+            let report = levenberg_marquardt::minimise(&mut equations, &mut best, &OPTIONS, stop);
             report.cost.is_finite().then_some((report.cost, best))
         })
         .collect();
@@ -276,12 +279,12 @@ mod tests {
         at.log_focals[1] = 0.2;
         for homography in plane.views {
             let view = ViewHomography { homography, group: 1 };
-            for (component, (_, derivative)) in at.residuals(&view, 0).into_iter().enumerate() {
+            for (component, derivative) in at.derivatives(&view, 0).into_iter().enumerate() {
                 for k in 0..4 {
                     let side = |width: f64| {
                         let mut step = DVector::zeros(4);
                         step[k] = width;
-                        at.moved(&step).residuals(&view, 0)[component].0
+                        at.moved(&step).residuals(&view, 0)[component]
                     };
                     let numeric = (side(1e-6) - side(-1e-6)) / 2e-6;
                     assert!((numeric - derivative[k]).abs() < 1e-7, "{component}, {k}: {numeric}, {}", derivative[k]);
@@ -295,7 +298,7 @@ mod tests {
         for (noise, within) in [(0.0, 1e-4), (NOISE, 0.2)] {
             for seed in 0..20 {
                 let (scene, plane) = homographies(seed, 8, noise);
-                let found = upgrades(&plane, &[0; 8], &scene.observations, 4);
+                let found = upgrades(&plane, &[0; 8], &scene.observations, 4, &StopToken::default());
                 let error = |metric: &MetricReconstruction| (metric.intrinsics[0].focal / scene.intrinsics.focal).ln();
                 let errors: Vec<f64> = found.iter().map(error).collect();
                 println!("seed {seed}, noise {noise}: log focal off by {errors:.4?}");
@@ -308,10 +311,11 @@ mod tests {
 
     #[test]
     fn nothing_and_nonsense_give_nothing() {
-        assert!(upgrades(&Homographies { views: vec![], points: vec![] }, &[], &[], 4).is_empty());
+        let found = |plane: &Homographies, group_of: &[usize]| upgrades(plane, group_of, &[], 4, &StopToken::default());
+        assert!(found(&Homographies { views: vec![], points: vec![] }, &[]).is_empty());
         let broken = Homographies { views: vec![Matrix3::from_element(f64::NAN); 3], points: vec![] };
-        assert!(upgrades(&broken, &[0; 3], &[], 4).is_empty());
+        assert!(found(&broken, &[0; 3]).is_empty());
         let singular = Homographies { views: vec![Matrix3::zeros(); 3], points: vec![Vector2::zeros()] };
-        assert!(upgrades(&singular, &[0; 3], &[], 4).is_empty());
+        assert!(found(&singular, &[0; 3]).is_empty());
     }
 }

@@ -35,6 +35,7 @@ impl NearDuplicateOptions {
     pub const DEFAULT: Self = Self {
         // Two observations of one point are 1.4 apart.
         near: 2.0,
+        // A detector that fires many times loses some of them at times; of two tracks that only cross fewer are near.
         least_common: 0.5,
         least_group: LEAST_INLIERS,
         least_remaining: 2 * LEAST_INLIERS,

@@ -36,6 +36,7 @@ impl StaticTrackOptions {
         moving_quantile: 0.8,
         // What moves by less than twenty times the noise of a static track determines little either way.
         most_share: 0.05,
+        // As many as make a consensus of their own.
         least_static: LEAST_INLIERS,
         // Of a drive some tracks in twenty are far away, straight ahead, and say how the camera turns.
         least_share: 0.1,

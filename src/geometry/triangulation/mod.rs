@@ -51,12 +51,20 @@ pub fn linear(cameras: &[Camera], observations: &[Observation]) -> Point {
         #[inline(always)]
         || inconsistency(cameras, observations),
     );
-    let are_directions = normal.m44 == 0.0;
-    if are_directions {
-        normal.m44 = normal.trace();
-    }
+    let are_directions = hold_unseen(&mut normal);
     let point = null_vector(&normal).unwrap_or(Point::new(0.0, 0.0, 0.0, 1.0));
     if are_directions { in_front(cameras, observations, point) } else { point }
+}
+
+/// Where no camera tells the last unknown, as of cameras that are all at the origin, it stays what it is; whether that
+/// is so.
+#[inline(always)]
+fn hold_unseen(normal: &mut Matrix4<f64>) -> bool {
+    let is_unseen = normal.m44 == 0.0;
+    if is_unseen {
+        normal.m44 = normal.trace();
+    }
+    is_unseen
 }
 
 /// The direction or its opposite, whichever is in front of more of the cameras.
@@ -117,10 +125,7 @@ fn descend(cameras: &[Camera], observations: &[Observation], start: Point, itera
         let mut normal = Matrix4::from(normal);
         // The scale of the homogeneous point is free: pin it.
         normal += point * point.transpose() * normal.trace();
-        if normal.m44 == 0.0 {
-            // Cameras at the origin: a direction stays one.
-            normal.m44 = normal.trace();
-        }
+        hold_unseen(&mut normal);
         for k in 0..4 {
             normal[(k, k)] *= 1.0 + damping;
         }

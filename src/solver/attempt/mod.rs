@@ -213,7 +213,7 @@ pub fn search_block(
 ) -> Result<Attempt, Error> {
     recorder.enter(Stage::Search);
     let mut attempt = match problem.settings.method {
-        Method::Auto | Method::Geometry => searched(problem, &block, effort, recorder)?,
+        Method::Auto | Method::Geometry => searched(problem, block, effort, recorder)?,
         Method::Paper => decided(problem, block.sample(OPTIONS.paper_tracks, problem.settings.seed), recorder)?,
         Method::Psfm => decided(problem, block, recorder)?,
     };
@@ -252,14 +252,14 @@ pub fn calibrate(
 }
 
 /// AUTO and GEOMETRY: a sample of the tracks that move, and where that holds nothing, one of all.
-fn searched(problem: &Problem, block: &Block, effort: Effort, recorder: &mut Recorder) -> Result<Attempt, Error> {
+fn searched(problem: &Problem, block: Block, effort: Effort, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let (most, of_many_views) = OPTIONS.searched_tracks;
     let most = match effort.is_seed {
         true => of_many_views,
         false => (OPTIONS.searched_work / block.views.len().max(1).pow(2)).clamp(of_many_views, most),
     };
-    let block = &near_duplicates::without(problem, block.clone());
-    if let Some(moving) = static_tracks::without(problem, block) {
+    let block = near_duplicates::without(problem, block);
+    if let Some(moving) = static_tracks::without(problem, &block) {
         let (sample, track_scores) = track_sampling::sample(problem, &moving, most, effort)?;
         let attempt = search(problem, sample, track_scores, effort, recorder)?;
         if attempt.found.consensus.is_some() {
@@ -267,7 +267,7 @@ fn searched(problem: &Problem, block: &Block, effort: Effort, recorder: &mut Rec
         }
         recorder.begin_again();
     }
-    let (sample, track_scores) = track_sampling::sample(problem, block, most, effort)?;
+    let (sample, track_scores) = track_sampling::sample(problem, &block, most, effort)?;
     search(problem, sample, track_scores, effort, recorder)
 }
 

@@ -179,7 +179,8 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
     let priors = choice.priors(fit.noise);
     let from_plane = |plane: &Homographies| {
         let group_of = if problem.focal_per_view { &vec![0; problem.cameras.len()] } else { problem.group_of };
-        let starts = planar::upgrades(plane, group_of, problem.observations, problem.options.search.planar_starts);
+        let starts =
+            planar::upgrades(plane, group_of, problem.observations, problem.options.search.planar_starts, stop);
         search::minima_from(starts, problem, &priors, stop)
     };
     let minima = match (critical.upgrade, problem.focal_priors) {
