@@ -36,56 +36,92 @@ pub struct CriticalFit<M> {
     pub unknowns: usize,
 }
 
-/// Fits homographies and, with the same start, a camera that only turns, whose intrinsics are all free.
+/// Homographies from a reference view, and where it sees each point: what fits without parallax start from.
+#[derive(Debug, Clone)]
+pub struct Transfers {
+    views: Vec<Matrix3<f64>>,
+    positions: Vec<Option<Vector2<f64>>>,
+}
+
+impl Transfers {
+    /// Returns `None` where common points do not tie all views together.
+    pub fn new(observations: &[Observation], views: usize, points: usize, noise: f64) -> Option<Self> {
+        let seen = Correspondences::new(observations, views);
+        let reference = seen.most_observed()?;
+        let homographies = seen.homographies_from(reference, noise)?;
+        let inverses: Vec<Matrix3<f64>> =
+            homographies.iter().map(|homography| homography.try_inverse()).collect::<Option<_>>()?;
+        let positions = positions(observations, views, points, reference, |seen| {
+            let back = inverses[seen.view] * seen.xy.push(1.0);
+            back.xy() / back.z
+        });
+        Some(Self { views: homographies, positions })
+    }
+
+    /// The points that are alone in telling of depth: the homographies explain the views but for them, of which no view
+    /// has more than one.
+    ///
+    /// Behind homographies the fourth column of a camera is free, and takes up any one track of its view, wrong or
+    /// right.
+    pub fn lone_points(&self, observations: &[Observation]) -> Vec<bool> {
+        let usable = || observations.iter().filter(|seen| seen.is_usable(self.views.len(), self.positions.len()));
+        let missed = |seen: &Observation| {
+            let moved = self.views[seen.view] * self.positions[seen.point].unwrap_or_default().push(1.0);
+            (moved.xy() / moved.z - seen.xy).norm_squared()
+        };
+        let mut of_view = vec![0.0; self.views.len()];
+        usable().for_each(|seen| of_view[seen.view] += missed(seen));
+        let mut counts = vec![(0, 0); self.positions.len()];
+        for seen in usable() {
+            let (alone, observed) = &mut counts[seen.point];
+            *alone += usize::from(missed(seen) > of_view[seen.view] / 2.0);
+            *observed += 1;
+        }
+        counts.into_iter().map(|(alone, observed)| 2 * alone > observed).collect()
+    }
+
+    fn observed(&self) -> usize {
+        self.positions.iter().flatten().count()
+    }
+}
+
+/// Fits a plane.
+pub fn fit_plane(start: &Transfers, observations: &[Observation], stop: &StopToken) -> CriticalFit<Homographies> {
+    let points = start.positions.iter().map(|position| position.unwrap_or_default()).collect();
+    let plane = Homographies { views: start.views.clone(), points };
+    fit_homographies(plane, start.observed(), observations, ITERATIONS, stop)
+}
+
+/// Fits a camera that only turns, first with its focal length alone free, then with this model.
 ///
 /// * `group_of`: camera group of each view
-/// * `focal_per_view`: whether every view has a focal length of its own
 /// * `priors`: of the intrinsics of each group
 ///
-/// Returns `None` where common points do not tie all views together, and where a group has no prior.
-pub fn fit_without_parallax(
+/// Returns `None` where the homographies are none of a rotation's, and where a group has no prior.
+pub fn fit_rotation(
+    start: &Transfers,
     observations: &[Observation],
     group_of: &[usize],
-    focal_per_view: bool,
+    model: IntrinsicsModel,
     priors: &[IntrinsicsPrior],
-    points: usize,
-    noise: f64,
     stop: &StopToken,
-) -> Option<(CriticalFit<Homographies>, CriticalFit<MetricReconstruction>)> {
-    let views = group_of.len();
-    if group_of.iter().any(|&group| group >= priors.len()) {
+) -> Option<CriticalFit<MetricReconstruction>> {
+    if group_of.len() != start.views.len() || group_of.iter().any(|&group| group >= priors.len()) {
         return None;
     }
-    let seen = Correspondences::new(observations, views);
-    let reference = seen.most_observed()?;
-    let homographies = seen.homographies_from(reference, noise)?;
-    let inverses: Vec<Matrix3<f64>> =
-        homographies.iter().map(|homography| homography.try_inverse()).collect::<Option<_>>()?;
-    let positions = positions(observations, views, points, reference, |seen| {
-        let back = inverses[seen.view] * seen.xy.push(1.0);
-        back.xy() / back.z
-    });
-    let observed = positions.iter().flatten().count();
-    let positions: Vec<Vector2<f64>> = positions.into_iter().map(Option::unwrap_or_default).collect();
-
-    let mut rotation = nearest_rotation_of(&homographies, observations, points)?;
+    let mut rotation = nearest_rotation_of(&start.views, observations, start.positions.len())?;
     rotation.group_of = group_of.to_vec();
     rotation.intrinsics.resize(priors.len(), rotation.intrinsics[0]);
-    if focal_per_view {
+    if model.is_per_view() {
         rotation = rotation.with_own_focals();
     }
-    let simplest = IntrinsicsModel::focal(focal_per_view);
-    let model = simplest.with_all_extensions();
+    let simplest = IntrinsicsModel::focal(model.is_per_view());
     let options = Options::squared(ITERATIONS);
     metric::adjust(&mut rotation, observations, simplest, priors, &options, stop);
     let report = metric::adjust(&mut rotation, observations, model, priors, &options, stop);
     let cost = report.cost - IntrinsicsPrior::cost_of(priors, model, &rotation.intrinsics);
-    let unknowns = rotation.unknowns(observed, model.parameters().len() * priors.len());
-    let plane = Homographies { views: homographies, points: positions };
-    Some((
-        fit_homographies(plane, observed, observations, ITERATIONS, stop),
-        CriticalFit { model: rotation, cost, unknowns },
-    ))
+    let unknowns = rotation.unknowns(start.observed(), model.parameters().len() * priors.len());
+    Some(CriticalFit { model: rotation, cost, unknowns })
 }
 
 /// What a camera that only turns sees, by homographies from the plane across the mean of its directions; `None` where a
@@ -286,6 +322,7 @@ mod tests {
     use super::*;
 
     const PRIORS: [IntrinsicsPrior; 1] = [IntrinsicsPrior::NONE];
+    const FULL: IntrinsicsModel = IntrinsicsModel::FULL;
 
     /// Chi-square over degrees of freedom of each model: homographies, rotation, translation.
     fn ratios(scene: &TestScene, noise: f64) -> [f64; 3] {
@@ -293,8 +330,9 @@ mod tests {
         let stop = StopToken::default();
         let reduced =
             |cost: f64, unknowns: usize| cost / (noise * noise * (2 * scene.observations.len() - unknowns) as f64);
-        let fits = fit_without_parallax(&scene.observations, &vec![0; views], false, &PRIORS, points, noise, &stop);
-        let (plane, turning) = fits.expect("complete tracks");
+        let start = Transfers::new(&scene.observations, views, points, noise).expect("complete tracks");
+        let plane = fit_plane(&start, &scene.observations, &stop);
+        let turning = fit_rotation(&start, &scene.observations, &vec![0; views], FULL, &PRIORS, &stop).expect("turns");
         let moving = fit_translation(&scene.observations, views, points, noise, f64::INFINITY, &stop);
         let moving = moving.expect("complete tracks");
         [
@@ -335,12 +373,16 @@ mod tests {
         assert!((0.6..1.4).contains(&ratio), "{ratio}");
         let stop = StopToken::default();
         assert!(fit_translation(&[], 0, 0, NOISE, 5.0, &stop).is_none());
-        assert!(fit_without_parallax(&[], &[0; 3], false, &PRIORS, 0, NOISE, &stop).is_none());
+        assert!(Transfers::new(&[], 3, 0, NOISE).is_none());
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(f64::NAN, 1e200));
         assert!(fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop).is_none());
-        assert!(fit_without_parallax(&scene.observations, &[0; 8], false, &PRIORS, 40, NOISE, &stop).is_none());
+        assert!(Transfers::new(&scene.observations, 8, 40, NOISE).is_none());
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(0.25, 0.5));
         fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop);
-        fit_without_parallax(&scene.observations, &[0; 8], false, &PRIORS, 40, NOISE, &stop);
+        if let Some(start) = Transfers::new(&scene.observations, 8, 40, NOISE) {
+            fit_plane(&start, &scene.observations, &stop);
+            fit_rotation(&start, &scene.observations, &[0; 8], FULL, &PRIORS, &stop);
+            assert!(fit_rotation(&start, &scene.observations, &[1; 8], FULL, &PRIORS, &stop).is_none());
+        }
     }
 }

@@ -1,5 +1,7 @@
 //! Motions and scenes of which projective cameras do not tell the calibration, and which of them it is.
 
+use std::ops::ControlFlow;
+
 use nalgebra::{Matrix3, Vector3};
 
 use super::Uncalibrated;
@@ -9,9 +11,10 @@ use super::models::Choice;
 use super::options::{CalibrationOptions, CriticalOptions};
 use crate::domain::{Warning, WarningCode};
 use crate::geometry::bundle::critical::{Homographies, Translating};
-use crate::geometry::bundle::metric::MetricReconstruction;
-use crate::geometry::critical;
+use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
+use crate::geometry::critical::{self, Transfers};
 use crate::geometry::homography;
+use crate::geometry::observation::Observation;
 
 /// What kind of motion and scene the views show.
 pub(super) struct Critical {
@@ -36,6 +39,17 @@ pub(super) enum Upgrade {
     None,
 }
 
+/// The observations without the points that alone tell of depth where homographies nearly explain the views; `None`
+/// where there are none.
+pub(super) fn without_lone_points(problem: &Uncalibrated) -> Option<Vec<Observation>> {
+    let Uncalibrated { observations, noise, .. } = *problem;
+    let (views, points) = (problem.cameras.len(), problem.points.len());
+    homography::median_residual(observations, views, noise, problem.options.critical.lens_limit)?;
+    let is_lone = Transfers::new(observations, views, points, noise)?.lone_points(observations);
+    let is_told_by_more = |seen: &&Observation| !is_lone.get(seen.point).copied().unwrap_or(false);
+    is_lone.contains(&true).then(|| observations.iter().filter(is_told_by_more).copied().collect())
+}
+
 /// What kind of motion and scene the views of this consensus show.
 ///
 /// * `fit`: the projective cameras that every model is tested against
@@ -49,8 +63,8 @@ pub(super) fn find(choice: &Choice, fit: &Fit) -> Critical {
     let mut plane = None;
     if let Some(residual) = homography::median_residual(observations, views, fit.noise, options.lens_limit) {
         match without_parallax(choice, fit, residual, translation.is_some()) {
-            Ok(flat) => return flat,
-            Err(homographies) => plane = homographies,
+            ControlFlow::Break(found) => return found,
+            ControlFlow::Continue(homographies) => plane = homographies,
         }
     }
     let Some(translation) = translation else {
@@ -64,6 +78,13 @@ fn not_turning() -> Warning {
     Warning::new(WarningCode::UnobservableFocal, "a camera that does not turn leaves the focal length free")
 }
 
+/// Either a plane or a rotation, and which of them decides on the focal length.
+fn undecided(detail: String, reason: &str) -> Critical {
+    let warnings =
+        vec![Warning::new(WarningCode::PlanarOrRotation, detail), Warning::new(WarningCode::UnobservableFocal, reason)];
+    Critical { warnings, upgrade: Upgrade::None }
+}
+
 /// What the views show where homographies nearly explain them; otherwise the homographies, if there are any.
 ///
 /// * `residual`: by how much homographies miss, see [`homography::median_residual`]
@@ -73,7 +94,7 @@ fn without_parallax(
     fit: &Fit,
     residual: f64,
     translates: bool,
-) -> Result<Critical, Option<Homographies>> {
+) -> ControlFlow<Critical, Option<Homographies>> {
     let Choice { problem, scale_px, stop } = *choice;
     let CalibrationOptions { critical: options, fit: fit_options, .. } = problem.options;
     let is_flat = residual < options.homography_limit;
@@ -81,38 +102,42 @@ fn without_parallax(
         "homographies between the views miss by a median of {residual:.1} standard deviations of the noise ({:.2} px)",
         fit.noise * scale_px
     );
-    let Uncalibrated { observations, group_of, focal_per_view, points, .. } = *problem;
+    let Uncalibrated { observations, group_of, focal_per_view, .. } = *problem;
+    let (views, points) = (problem.cameras.len(), problem.points.len());
     let priors = choice.priors(fit.noise);
-    let fits =
-        critical::fit_without_parallax(observations, group_of, focal_per_view, &priors, points.len(), fit.noise, stop);
-    let Some((plane, rotation)) = fits else {
+    let fits = Transfers::new(observations, views, points, fit.noise).and_then(|start| {
+        let model = IntrinsicsModel::focal(focal_per_view).with_all_extensions();
+        let rotation = critical::fit_rotation(&start, observations, group_of, model, &priors, stop)?;
+        Some((critical::fit_plane(&start, observations, stop), rotation, start))
+    });
+    let Some((plane, rotation, start)) = fits else {
         if !is_flat {
-            return Err(None);
+            return ControlFlow::Continue(None);
         }
         let detail = format!("{missed}: the scene is planar, or the camera hardly did more than turn");
         let reason = "the views share too few points for homographies to tie them together";
-        let warnings = vec![
-            Warning::new(WarningCode::PlanarOrRotation, detail),
-            Warning::new(WarningCode::UnobservableFocal, reason),
-        ];
-        return Ok(Critical { warnings, upgrade: Upgrade::None });
+        return ControlFlow::Break(undecided(detail, reason));
     };
-    // The homographies themselves may miss by a little; what a rotation loses is counted from there. They are those of
-    // pinholes, though.
     let by_plane = Fit::new(plane.cost, plane.unknowns, problem);
     let by_rotation = Fit::new(rotation.cost, rotation.unknowns, problem);
-    let free = if is_flat { by_plane } else { *fit };
+    let has_depth = fit.parallax_deviations(&by_plane, problem) > options.plane_deviations;
+    // What a rotation loses is counted from homographies where these hold: they may miss by a little themselves.
+    let free = if has_depth { *fit } else { by_plane };
     let deviations = free.loss_deviations(by_rotation.cost, by_rotation.freedom);
-    let plane_deviations = options.plane_deviations;
     // Of few views it may have more unknowns than what it is tested against, and neither shows parallax behind a lens:
     // projective cameras do, once that is undone.
     let turns = by_rotation.freedom > free.freedom && deviations < fit_options.misfit_deviations && {
         let by_views = misfit::projective_without_lens(&rotation.model, problem, stop);
-        by_views.loss_deviations(by_rotation.cost, by_rotation.freedom) < plane_deviations
+        by_views.parallax_deviations(&by_rotation, problem) < options.plane_deviations
     };
-    let has_depth = fit.loss_deviations(by_plane.cost, by_plane.freedom) > plane_deviations;
     if !turns && (!is_flat || translates && has_depth) {
-        return Err(Some(plane.model));
+        return ControlFlow::Continue(Some(plane.model));
+    }
+    if !turns && !has_depth && !focal_per_view && turns_and_zooms(choice, &start, &by_plane, &priors) {
+        let detail = format!("{missed}: a camera that turns and zooms explains the views as well as they do");
+        let reason = "a camera that turned and zoomed has other focal lengths than one that moved before a plane: solve \
+                      with a focal length a view (focal_per_view) if it zoomed";
+        return ControlFlow::Break(undecided(detail, reason));
     }
     let worse = format!("a camera that only turns fits worse than homographies by {deviations:.1} standard deviations");
     let (code, because) = match (turns, translates) {
@@ -120,16 +145,12 @@ fn without_parallax(
             WarningCode::PlanarOrRotation,
             "the camera hardly moved, and a turn explains the views as well as a shift".to_owned(),
         ),
-        (true, false) => (
-            WarningCode::PureRotation,
-            match is_flat {
-                true => "a camera that only turns explains the views as well as they do".to_owned(),
-                false => {
-                    "a camera that only turns, behind a lens, explains the views as well as free cameras".to_owned()
-                }
-            },
-        ),
-        (false, _) if deviations < plane_deviations => (
+        (true, false) => {
+            let better = "a camera that only turns, behind a lens, explains the views as well as free cameras";
+            let as_well = "a camera that only turns explains the views as well as they do";
+            (WarningCode::PureRotation, if has_depth { better } else { as_well }.to_owned())
+        }
+        (false, _) if deviations < options.plane_deviations => (
             WarningCode::PlanarOrRotation,
             format!("a planar scene is more likely than a camera that only turns; {worse}"),
         ),
@@ -145,7 +166,20 @@ fn without_parallax(
             Upgrade::None
         }
     };
-    Ok(Critical { warnings, upgrade })
+    ControlFlow::Break(Critical { warnings, upgrade })
+}
+
+/// Whether a camera that only turns, with a focal length of each view, fits as well as homographies.
+fn turns_and_zooms(choice: &Choice, start: &Transfers, by_plane: &Fit, priors: &[IntrinsicsPrior]) -> bool {
+    let Choice { problem, stop, .. } = *choice;
+    // What a lens adds to these would explain a plane too.
+    let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint);
+    let of_one = vec![0; problem.cameras.len()];
+    let found = critical::fit_rotation(start, problem.observations, &of_one, model, &priors[..1], stop);
+    found.is_some_and(|found| {
+        let fit = Fit::new(found.cost, found.unknowns, problem);
+        fit.freedom > by_plane.freedom && !by_plane.refutes(&fit, &problem.options.fit)
+    })
 }
 
 fn pure_translation(translation: &Translating, options: &CriticalOptions) -> Warning {

@@ -51,6 +51,17 @@ impl Fit {
         (self.statistic(cost, freedom) - 1.0) / (2.0 / added + 2.0 / self.freedom.max(1) as f64).sqrt()
     }
 
+    /// The same of a special case without parallax, a plane or a rotation.
+    ///
+    /// Before it this model is singular: the epipoles of `m` views and the parallaxes of `n` points fit noise as the
+    /// first singular vectors of a random matrix do. They take `(sqrt(3 m) + sqrt(n))²` of its squares off the cost,
+    /// and not the `3 m + n` of as many unknowns.
+    pub fn parallax_deviations(&self, special: &Fit, problem: &Uncalibrated) -> f64 {
+        let (views, points) = (problem.cameras.len() as f64, super::observed_points(problem) as f64);
+        let by_chance = 2.0 * (3.0 * views * points).sqrt();
+        self.loss_deviations(special.cost - by_chance * self.noise * self.noise, special.freedom)
+    }
+
     /// The F statistic of a special case of this model: what each degree of freedom that it has more adds to the cost,
     /// over what noise would add.
     pub fn statistic(&self, cost: f64, freedom: usize) -> f64 {

@@ -168,7 +168,9 @@ impl Outcome {
 /// # Errors
 /// [`Error::Stopped`] when `stop` fired; what stands by then is not worth returning.
 pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Error> {
-    let problem = &problem.with_least_noise();
+    let problem = problem.with_least_noise();
+    let told_by_many = critical::without_lone_points(&problem);
+    let problem = &Uncalibrated { observations: told_by_many.as_deref().unwrap_or(problem.observations), ..problem };
     let Compared { cameras, points, mut fit, critical, mut warnings } =
         Compared::new(problem, problem, scale_px, stop, &mut || ())?;
     warnings.extend(critical.warnings);

@@ -116,6 +116,47 @@ fn a_camera_that_moves_a_little_behind_a_lens_is_not_taken_for_one_that_only_tur
     assert!(beyond <= 1, "{beyond} of 60 beyond four sigma");
 }
 
+/// One wrong track is explained by the fourth column of each camera, which a rotation leaves free.
+#[test]
+fn one_wrong_track_gives_a_rotation_no_depth() {
+    for seed in 0..10 {
+        let mut scene = testing::scene_of(seed, 10, 60, NOISE, Motion::Rotation, false);
+        let wrong = scene.points.len();
+        let place = |view: usize| Vector2::new((2.3 * view as f64).sin(), (4.1 * view as f64).cos()) * 0.3;
+        scene.observations.extend((0..10).map(|view| Observation::new(view, wrong, place(view))));
+        let mut cameras = scene.cameras();
+        for (view, camera) in cameras.iter_mut().enumerate() {
+            camera.set_column(3, &place(view).push(1.0));
+        }
+        let centre = scene.poses[0].rotation.tr_mul(&-scene.poses[0].translation);
+        let directions = scene.points.iter().map(|point| (point - centre).push(0.0));
+        let points: Vec<Vector4<f64>> = directions.chain([Vector4::w()]).collect();
+        let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
+        let outcome = only(calibrate(&problem, SIDE_PX, &StopToken::default()));
+        println!("seed {seed}: {:?}, {:?}", outcome.grade, outcome.warnings);
+        assert!(codes(&outcome).contains(&"PURE_ROTATION"), "seed {seed}: {:?}", outcome.warnings);
+        let (error, sigma) = (focal_error(&outcome, &scene), outcome.sigma_log_focal.expect("graded"));
+        assert!(error < 4.0 * sigma, "seed {seed}: {error}, {sigma}");
+    }
+}
+
+/// Homographies of a plane have room for a focal length of each view of a camera that only turns.
+#[test]
+fn a_camera_that_turns_and_zooms_is_not_taken_for_one_before_a_plane() {
+    for seed in 0..10 {
+        for zoom in [0.01, 0.1] {
+            let mut scene = testing::scene_of(seed, 8, 60, NOISE, Motion::Rotation, false);
+            let factor = |view: usize| 1.0 + zoom * (1.7 * view as f64).sin();
+            scene.observations.iter_mut().for_each(|seen| seen.xy *= factor(seen.view));
+            let outcome = calibrated(&scene, seed, NOISE);
+            println!("seed {seed}, zoom {zoom}: {:?}, {:?}", outcome.grade, outcome.warnings);
+            let is_refused = outcome.grade == Grade::ProjectiveOnly && outcome.warnings.len() == 2;
+            let is_told = outcome.warnings.last().is_some_and(|warning| warning.detail.contains("focal_per_view"));
+            assert!(is_refused && is_told, "seed {seed}, zoom {zoom}: {:?}", outcome.warnings);
+        }
+    }
+}
+
 /// Of two camera groups each gets its own, before a plane and from one centre.
 #[test]
 fn two_groups_before_a_plane_and_from_one_centre_are_told_apart() {
