@@ -190,6 +190,12 @@ impl<'a> Problem<'a> {
         self.representative[track] != track
     }
 
+    /// Whether a track may support cameras while a reconstruction grows: not where another represents it, nor where it is
+    /// static, unless the reconstruction is one of static tracks.
+    pub fn supports_growth(&self, track: usize, of_static: bool) -> bool {
+        !self.is_near_duplicate(track) && (of_static || !self.is_static[track])
+    }
+
     /// How many tracks, near-duplicates left out, these views see so often that they may be verified.
     pub fn verifiable(&self, is_registered: impl Fn(usize) -> bool) -> usize {
         let seen = |track: usize| self.of_track(track).filter(|&k| is_registered(self.view_of(k))).count();

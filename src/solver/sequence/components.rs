@@ -30,6 +30,8 @@ pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Mode
         let focals = seed.calibration.as_ref().and_then(|calibration| calibration.focals.as_deref());
         model.add_component(problem, FIRST, seed.views(), metric, focals);
     }
+    let tracks = seed.projective.iter().flat_map(|found| &found.tracks);
+    model.of_static = tracks.into_iter().any(|&track| problem.is_static[track]);
     structure::triangulate(problem, &mut model, recorder);
     model
 }

@@ -66,6 +66,8 @@ pub struct Model {
     seed_noise: f64,
     /// Whether the residuals would have asked for more noise than it may have.
     pub is_strained: bool,
+    /// Whether it began from static tracks.
+    pub of_static: bool,
 }
 
 impl Model {
@@ -87,6 +89,7 @@ impl Model {
             noise,
             seed_noise: noise,
             is_strained: false,
+            of_static: false,
         }
     }
 

@@ -231,7 +231,7 @@ impl WindowOptions {
         // A variance of 50 values is known to a fifth.
         most_windows: 50,
         of_view: 150,
-        // One in twenty is farther by chance.
-        significant_distance: 2.0,
+        // Chance takes one in four hundred that far.
+        significant_distance: 3.0,
     };
 }

@@ -35,6 +35,8 @@ struct Growing<'a> {
     kept: Vec<bool>,
     noise: f64,
     start_noise: f64,
+    /// Whether it began from static tracks.
+    of_static: bool,
 }
 
 /// Grows a reconstruction to every view that can be registered, and every track that points are found for.
@@ -80,6 +82,7 @@ impl<'a> Growing<'a> {
             kept: vec![false; problem.xy.len()],
             noise: start.noise,
             start_noise: start.noise,
+            of_static: start.tracks.iter().any(|&track| problem.is_static[track]),
         }
     }
 
@@ -107,7 +110,7 @@ impl<'a> Growing<'a> {
             Some(view) => problem.of_view[view].iter().map(|&k| problem.track_of(k as usize)).collect(),
             None => (0..problem.tracks()).collect(),
         };
-        tracks.retain(|&track| !problem.is_near_duplicate(track));
+        tracks.retain(|&track| problem.supports_growth(track, self.of_static));
         let cameras = robust_triangulation::or_zeros(&self.cameras);
         let triangulator = Triangulator::new(&cameras);
         let gate = problem.gate(self.noise);

@@ -15,14 +15,15 @@ const OPTIONS: ExtensionOptions = ExtensionOptions::DEFAULT;
 
 /// Triangulates every track anew.
 pub fn triangulate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) {
-    let tracks: Vec<usize> = (0..problem.tracks()).filter(|&track| !problem.is_near_duplicate(track)).collect();
+    let supports = |track: &usize| problem.supports_growth(*track, model.of_static);
+    let tracks: Vec<usize> = (0..problem.tracks()).filter(supports).collect();
     triangulate_some(problem, model, &tracks, recorder);
 }
 
 /// Triangulates every track that these views see anew.
 pub fn triangulate_seen(problem: &Problem, model: &mut Model, views: &[usize], recorder: &mut Recorder) {
     let seen = views.iter().flat_map(|&view| &problem.of_view[view]).map(|&k| problem.track_of(k as usize));
-    let mut tracks: Vec<usize> = seen.filter(|&track| !problem.is_near_duplicate(track)).collect();
+    let mut tracks: Vec<usize> = seen.filter(|&track| problem.supports_growth(track, model.of_static)).collect();
     tracks.sort_unstable();
     tracks.dedup();
     triangulate_some(problem, model, &tracks, recorder);
