@@ -95,6 +95,69 @@ pub(crate) fn robust(
     ransac::estimate(&Correspondences { points, seen, weights }, gate, None, MOST_SAMPLES, rng, stop)
 }
 
+/// The same of a camera at the origin, which sees directions: its pose has no translation.
+///
+/// Returns `None` for fewer than two correspondences or when no sample gives a rotation.
+pub(crate) fn robust_rotation(
+    directions: &[Vector3<f64>],
+    seen: &[Vector2<f64>],
+    weights: &[f64],
+    gate: f64,
+    rng: &mut ChaCha8Rng,
+    stop: &StopToken,
+) -> Option<RobustModel<Pose>> {
+    if directions.len() != seen.len() || directions.len() != weights.len() {
+        return None;
+    }
+    let correspondences = Correspondences { points: directions, seen, weights };
+    ransac::estimate(&Directions(correspondences), gate, None, MOST_SAMPLES, rng, stop)
+}
+
+/// Points at infinity, from a camera at the origin.
+#[derive(Clone, Copy)]
+struct Directions<'a>(Correspondences<'a>);
+
+impl Estimator for Directions<'_> {
+    type Model = Pose;
+
+    const SAMPLE: usize = 2;
+    const SAMPLE_GATES: f64 = Correspondences::SAMPLE_GATES;
+
+    fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    fn minimal(&self, sample: &[usize]) -> impl IntoIterator<Item = Pose> {
+        let onto =
+            |&datum: &usize| self.0.seen[datum].push(1.0).normalize() * self.0.points[datum].normalize().transpose();
+        let rotation = procrustes::nearest_rotation(&sample.iter().map(onto).sum());
+        rotation.map(|rotation| Pose { rotation, translation: Vector3::zeros() })
+    }
+
+    fn squared_residual(&self, pose: &Pose, datum: usize) -> f64 {
+        self.0.squared_residual(pose, datum)
+    }
+
+    fn refined(&self, pose: &Pose, gate: f64) -> Option<Pose> {
+        Some(ransac::refined(self, pose, gate))
+    }
+}
+
+impl Refinable<3> for Directions<'_> {
+    fn residual(&self, pose: &Pose, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 3>; 2])> {
+        let (residual, gradients) = self.0.residual(pose, datum)?;
+        Some((residual, gradients.map(|gradient| gradient.fixed_rows::<3>(0).into_owned())))
+    }
+
+    fn weight(&self, datum: usize) -> f64 {
+        self.0.weight(datum)
+    }
+
+    fn moved(&self, pose: &Pose, step: &SVector<f64, 3>) -> Option<Pose> {
+        Some(Pose { translation: Vector3::zeros(), ..pose.moved([step.x, step.y, step.z, 0.0, 0.0, 0.0]) })
+    }
+}
+
 #[derive(Clone, Copy)]
 struct Correspondences<'a> {
     points: &'a [Vector3<f64>],
@@ -179,6 +242,43 @@ mod tests {
                 assert!(found.len() <= 4 && nearest < 1e-5, "seed {seed}, {first}: {} poses, {nearest}", found.len());
             }
         }
+    }
+
+    #[test]
+    fn a_camera_that_turns_is_found_among_wrong_directions() {
+        const NOISE: f64 = 1e-3;
+        for seed in 0..10 {
+            let scene = testing::scene(seed, 4, 60, NOISE);
+            let turned = scene.poses[1].rotation;
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let directions: Vec<Vector3<f64>> =
+                scene.points.iter().map(|point| turned.tr_mul(&scene.poses[1].apply(point))).collect();
+            let mut seen: Vec<Vector2<f64>> = directions
+                .iter()
+                .map(|direction| {
+                    let placed = turned * direction;
+                    let noise = Vector2::new(rng.random::<f64>() - 0.5, rng.random::<f64>() - 0.5) * NOISE;
+                    placed.xy() / placed.z + noise
+                })
+                .collect();
+            seen[..36].rotate_left(7);
+            let gate = CHI_SQUARE_OF_TWO * NOISE * NOISE;
+            let found = robust_rotation(&directions, &seen, &[1.0; 60], gate, &mut rng, &StopToken::default());
+            let RobustModel { model, inlier, .. } = found.expect("a rotation");
+            let off = (model.rotation - turned).norm();
+            println!("seed {seed}: off by {off:.1e}, {} inliers", inlier.iter().filter(|inlier| **inlier).count());
+            assert!(off < 3.0 * NOISE && model.translation == Vector3::zeros(), "seed {seed}: {off}");
+            assert!(inlier[36..].iter().all(|inlier| *inlier), "seed {seed}: {inlier:?}");
+        }
+        let nothing = robust_rotation(
+            &[Vector3::z()],
+            &[Vector2::zeros()],
+            &[1.0],
+            1e-4,
+            &mut ChaCha8Rng::seed_from_u64(1),
+            &StopToken::default(),
+        );
+        assert_eq!(nothing, None);
     }
 
     #[test]

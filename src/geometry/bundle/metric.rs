@@ -254,6 +254,34 @@ mod tests {
         }
     }
 
+    /// No observation tells how long a direction is, and of one on the optical axis hardly anything does by its depth.
+    #[test]
+    fn directions_keep_their_length() {
+        for seed in 0..10 {
+            let mut scene = testing::scene_of(seed, 5, 40, 0.0, testing::Motion::Rotation, false);
+            scene.observe(NOISE, &mut rand::SeedableRng::seed_from_u64(seed));
+            let mut start = scene.reconstruction();
+            let centre = start.poses[0].rotation.tr_mul(&-start.poses[0].translation);
+            start.points.iter_mut().for_each(|point| *point = (*point - centre).normalize());
+            start.poses.iter_mut().for_each(|pose| pose.translation = Vector3::zeros());
+            start.has_common_centre = true;
+            let axis = start.poses[0].rotation.tr_mul(&Vector3::z());
+            start.points.push(axis);
+            let mut observations = scene.observations.clone();
+            for view in 0..3 {
+                let seen = Observation::new(view, start.points.len() - 1, Vector2::zeros());
+                observations.push(Observation { xy: start.residual(&seen), ..seen });
+            }
+            let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::default() };
+            let (model, priors) = (IntrinsicsModel::FOCAL, [IntrinsicsPrior::NONE]);
+            adjust(&mut start, &observations, model, &priors, &options, &StopToken::default());
+            for (k, point) in start.points.iter().enumerate() {
+                assert!((point.norm() - 1.0).abs() < 0.05, "seed {seed}, point {k}: {point}");
+            }
+            assert!(start.poses.iter().all(|pose| pose.translation == Vector3::zeros()), "seed {seed}");
+        }
+    }
+
     #[test]
     fn a_prior_moves_its_parameter_by_what_it_is_worth() {
         let scene = testing::scene(4, 6, 20, NOISE);

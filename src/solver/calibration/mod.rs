@@ -237,13 +237,19 @@ pub fn from_metric(
     let on = stretch.as_ref().map_or(problem, |stretch| &stretch.problem);
     let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on, scale_px, stop, heartbeat)?;
     warnings.extend(critical.warnings);
-    if !matches!(critical.upgrade, Upgrade::Quadric(_) | Upgrade::Plane(_)) {
-        if let Upgrade::Rotation { .. } = critical.upgrade {
-            let detail = "the views together are those of a camera that only turned: its points tell nothing more";
+    let fit = match (critical.upgrade, metric.has_common_centre) {
+        (Upgrade::Rotation { free, .. }, true) => free,
+        (Upgrade::Quadric(_) | Upgrade::Plane(_), false) => fit,
+        (upgrade, has_common_centre) => {
+            let detail = match (upgrade, has_common_centre) {
+                (Upgrade::Rotation { .. }, _) => "the views together are those of a camera that only turned",
+                (_, true) => "the views together are not those of a camera that only turned",
+                _ => return Ok(problem.refused(&warnings)),
+            };
             warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
+            return Ok(problem.refused(&warnings));
         }
-        return Ok(problem.refused(&warnings));
-    }
+    };
     let choice = models::Choice { problem, scale_px, stop };
     let priors = choice.priors(fit.noise);
     let mut factors: Vec<f64> = std::iter::once(1.0).chain(problem.options.search.other_focals).collect();

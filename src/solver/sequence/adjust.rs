@@ -38,7 +38,7 @@ impl Extract {
                 group_of: Vec::with_capacity(views.len()),
                 poses: Vec::with_capacity(views.len()),
                 points: Vec::with_capacity(tracks.len()),
-                has_common_centre: false,
+                has_common_centre: model.has_common_centre,
             },
             observations: Vec::new(),
         };
@@ -112,11 +112,9 @@ impl Extract {
     }
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
-    fn noise(&self, problem: &Problem) -> f64 {
+    fn noise(&self) -> f64 {
         let norms = self.squared_residuals().into_iter().map(f64::sqrt).collect();
-        let of_view = if problem.has_own_focals() { 7 } else { 6 };
-        let unknowns = of_view * self.views.len() + 3 * self.tracks.len();
-        core_noise(norms, unknowns)
+        core_noise(norms, self.sequence.unknowns(self.tracks.len(), 0))
     }
 }
 
@@ -209,7 +207,7 @@ fn finish(problem: &Problem, model: &mut Model, extract: &Extract) {
         return;
     }
     extract.write_back(model);
-    model.set_noise(problem, extract.noise(problem));
+    model.set_noise(problem, extract.noise());
 }
 
 /// Tracks with a verified landmark, increasing.

@@ -4,6 +4,8 @@ use super::adjust::{self, Extract};
 use super::model::Model;
 use super::options::StretchOptions;
 use super::{own_focals, windows};
+use nalgebra::Vector3;
+
 use crate::domain::{FocalPrior, Task, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::observation::Observation;
@@ -14,6 +16,9 @@ use crate::solver::recorder::Recorder;
 use crate::solver::{Error, view_selection};
 
 const OPTIONS: StretchOptions = StretchOptions::DEFAULT;
+/// How far off their common centre cameras begin, and how near points at infinity do: their product moves an image by
+/// less than the noise.
+const OFF_CENTRE: f64 = 0.01;
 
 /// Calibrates each camera from the landmarks and observations that fit best, takes the models over, adjusts everything
 /// under them and asks the windows; one outcome a camera.
@@ -168,7 +173,15 @@ pub struct ProjectiveExtract {
 
 impl ProjectiveExtract {
     pub fn of(metric: &MetricReconstruction) -> Self {
-        Self { cameras: metric.cameras(), points: metric.points.iter().map(|point| point.push(1.0)).collect() }
+        let mut cameras = metric.cameras();
+        if metric.has_common_centre {
+            // At one centre the cost is stationary in what parallax would need, a minimum or not: off it, it shows.
+            let aside = |view: usize| Vector3::new(view as f64, 2.0 * view as f64, 3.0 * view as f64).map(f64::sin);
+            cameras.iter_mut().enumerate().for_each(|(view, camera)| camera.set_column(3, &(aside(view) * OFF_CENTRE)));
+        }
+        let nearness = |point: usize| if metric.has_common_centre { OFF_CENTRE * (point as f64).cos() } else { 1.0 };
+        let points = metric.points.iter().enumerate().map(|(k, point)| point.push(nearness(k))).collect();
+        Self { cameras, points }
     }
 
     /// What there is to calibrate.

@@ -27,6 +27,7 @@ pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Mode
     let intrinsics = metric.map_or_else(|| Intrinsics::from_focal(1.0), |metric| metric.intrinsics[0]);
     let mut model = Model::new(problem, intrinsics, noise);
     if let Some(metric) = metric {
+        model.has_common_centre = metric.has_common_centre;
         let focals = seed.calibration.as_ref().and_then(|calibration| calibration.focals.as_deref());
         model.add_component(problem, FIRST, seed.views(), metric, focals);
     }
@@ -69,7 +70,7 @@ pub fn others(
             .calibration
             .as_ref()
             .filter(usable)
-            .filter(|_| !attempt.has_common_centre())
+            .filter(|_| attempt.has_common_centre() == model.has_common_centre)
             .and_then(|calibration| Some((calibration, calibration.metric.as_ref()?)))
         else {
             failures += 1;

@@ -104,7 +104,8 @@ impl Extended {
         let model = &self.model;
         let verified = adjust::verified(model);
         let observations = verified.iter().filter_map(|&track| model.landmarks[track]).map(|point| point.support).sum();
-        let unknowns = 6 * model.registered().len() + 3 * verified.len();
+        let (of_view, of_point) = if model.has_common_centre { (3, 2) } else { (6, 3) };
+        let unknowns = of_view * model.registered().len() + of_point * verified.len();
         projective::evidence(observations, unknowns, model.noise, problem.outlier_density)
     }
 

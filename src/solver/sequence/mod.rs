@@ -193,7 +193,7 @@ fn by_calibrated_blocks(
         problem.stopped()?;
         recorder.begin_block(k, candidates.len());
         let attempt = attempt::solve_block(problem, problem.block(views), effort, None, recorder)?;
-        if attempt.is_good() && !attempt.has_common_centre() {
+        if attempt.is_good() {
             let extended = extend(problem, attempt, recorder)?;
             if !extended.stands() {
                 unextended = better(unextended, extended.seed);
@@ -270,11 +270,10 @@ fn by_projective_extension(
 
 /// Extends an attempt metrically where it has a metric reconstruction and that stands.
 ///
-/// A camera that only turned has points at infinity, and nothing is registered against these. An attempt without a
-/// calibration has the focal length that happens to fit best, which other views may refute: its extension stands only
-/// where it explains more than the projective reconstruction that it began from.
+/// An attempt without a calibration has the focal length that happens to fit best, which other views may refute: its
+/// extension stands only where it explains more than the projective reconstruction that it began from.
 fn metric_of(problem: &Problem, attempt: Attempt, recorder: &mut Recorder) -> Result<Ended, Error> {
-    if !attempt.has_metric() || attempt.has_common_centre() || attempt.is_beyond_image_points() {
+    if !attempt.has_metric() || attempt.is_beyond_image_points() {
         return Ok(Ended::Block(Some(Box::new(attempt))));
     }
     let was_calibrated = attempt.is_calibrated();
@@ -308,7 +307,7 @@ fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder) ->
             return Ok(Ended::Block(Some(Box::new(attempt))));
         }
     }
-    if !attempt.has_metric() || attempt.has_common_centre() {
+    if !attempt.has_metric() {
         extend_projectively(problem, &mut attempt, true, recorder)?;
         attempt::calibrate(problem, &mut attempt, None, recorder)?;
     }

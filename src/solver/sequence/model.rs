@@ -13,7 +13,7 @@ use crate::solver::problem::Problem;
 #[derive(Debug, Clone, Copy)]
 pub struct Landmark {
     pub position: Vector3<f64>,
-    /// Largest angle between the rays that see it, radians.
+    /// Largest angle between the rays that see it, radians; of a direction, which no ray places, half a turn.
     pub angle: f64,
     /// Observations that agree with it.
     pub support: usize,
@@ -68,6 +68,8 @@ pub struct Model {
     pub is_strained: bool,
     /// Whether it began from static tracks.
     pub of_static: bool,
+    /// Whether the camera only turned: poses have no translation, and landmarks are unit directions.
+    pub has_common_centre: bool,
 }
 
 impl Model {
@@ -90,6 +92,7 @@ impl Model {
             seed_noise: noise,
             is_strained: false,
             of_static: false,
+            has_common_centre: false,
         }
     }
 

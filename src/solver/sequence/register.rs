@@ -176,6 +176,7 @@ fn robust_pose(
     let (points, seen): (Vec<_>, Vec<_>) = seen.iter().filter_map(datum).unzip();
     let (rays, weights): (Vec<_>, Vec<_>) = seen.into_iter().unzip();
     let gate = problem.gate(model.noise) / intrinsics.focal.powi(2);
-    let found = pose::robust(&points, &rays, &weights, gate, rng, problem.stop)?;
+    let robust = if model.has_common_centre { pose::robust_rotation } else { pose::robust };
+    let found = robust(&points, &rays, &weights, gate, rng, problem.stop)?;
     Some((found.model, found.inlier_count()))
 }

@@ -63,13 +63,13 @@ fn landmark(
     }
     let observations: Vec<Observation> = seen.iter().map(|(_, observation)| *observation).collect();
     let found = triangulator.robust(&observations, gate)?;
-    let position = euclidean(&found.point)?;
+    let position = if model.has_common_centre { found.point.xyz().normalize() } else { euclidean(&found.point)? };
     let agreeing = || seen.iter().zip(&found.agrees).filter(|(_, agrees)| **agrees).map(|(seen, _)| seen);
     let rays = agreeing().filter_map(|(_, observation)| {
         let pose = model.poses[observation.view]?;
         Some((position + pose.rotation.tr_mul(&pose.translation)).normalize())
     });
-    let angle = widest_angle(&rays.collect::<Vec<_>>());
+    let angle = if model.has_common_centre { std::f64::consts::PI } else { widest_angle(&rays.collect::<Vec<_>>()) };
     let agreeing: Vec<usize> = agreeing().map(|(k, _)| *k).collect();
     let is_enough = agreeing.len() as f64 >= problem.least_share * seen.len() as f64;
     is_enough.then_some((Landmark { position, angle, component, support: agreeing.len() }, agreeing))

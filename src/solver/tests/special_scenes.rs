@@ -1,8 +1,11 @@
 //! Whole solves of planes, of cameras that only turn, and of tracks that stay where they are in the image.
 
-use nalgebra::{Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector2, Vector3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::domain::ImageSize;
 use crate::synthetic::{Motion, Shape};
 
 fn warns(solution: &Solution, code: WarningCode) -> bool {
@@ -65,6 +68,58 @@ fn a_camera_that_only_turns_is_calibrated_by_its_directions() {
         println!("seed {seed}: {} transfers, {rms:.2} px", squared.len());
         // Two observations of one pixel of noise a coordinate are 2 apart, and a turn magnifies towards the edges.
         assert!(squared.len() > 500 && rms < 2.6, "seed {seed}: {rms} px");
+    }
+}
+
+/// All around, no view sees what the others see: each joins by the directions that its neighbours know.
+#[test]
+fn a_full_turn_registers_every_view() {
+    const VIEWS: usize = 24;
+    const FOCAL_PX: f64 = 1000.0;
+    for seed in 0..3 {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut noise = || (0..4).map(|_| rng.random::<f64>() - 0.5).sum::<f64>();
+        let rotation = |view: usize| {
+            let turn = std::f64::consts::TAU * view as f64 / VIEWS as f64;
+            Rotation3::from_euler_angles(0.1 * (2.0 * turn).sin(), 0.0, 0.05 * (3.0 * turn).cos())
+                * Rotation3::from_axis_angle(&Vector3::y_axis(), turn)
+        };
+        let sized = View { size: Some(ImageSize { width_px: 1600, height_px: 1200 }), ..View::default() };
+        let mut raw = RawInput { views: vec![sized; VIEWS], track_count: 900, ..RawInput::default() };
+        for track in 0..raw.track_count {
+            let around = std::f64::consts::TAU * (track as f64 * 0.618).fract();
+            let direction = Vector3::new(around.sin(), 0.8 * noise(), around.cos());
+            for view in 0..VIEWS {
+                let seen = rotation(view) * direction;
+                let image = seen.xy() / seen.z * FOCAL_PX;
+                if seen.z > 0.0 && image.x.abs() < 790.0 && image.y.abs() < 590.0 {
+                    // Three in ten have nothing to do with a direction.
+                    let wrong = if track % 10 < 3 { 200.0 } else { 0.0 };
+                    raw.view.push(view as u32);
+                    raw.track.push(track as u32);
+                    raw.x.push(799.5 + image.x + (0.5 + wrong) * noise());
+                    raw.y.push(599.5 + image.y + (0.5 + wrong) * noise());
+                }
+            }
+        }
+        let input = Input::new(raw, &Limits::default(), "turn").expect("valid input");
+        let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+        let found = &solution.calibrations[0];
+        println!("seed {seed}: {:?}, {found:?}, {:?}", solution.grade, solution.warnings);
+        assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}: {:?}", solution.warnings);
+        let (error, sigma) = ((found.focal_px / FOCAL_PX).ln().abs(), found.sigma_log_focal.expect("observable"));
+        assert!(error < 3.5 * sigma, "seed {seed}: {error}, {sigma}");
+        assert!(warns(&solution, WarningCode::PureRotation), "seed {seed}: {:?}", solution.warnings);
+        let registered = solution.views.iter().filter(|view| view.rotation.is_some()).count();
+        assert_eq!(registered, VIEWS, "seed {seed}: {:?}", solution.warnings);
+        assert!(solution.views.iter().all(|view| view.translation == Some([0.0; 3])), "seed {seed}");
+        // Two observations of a direction verify each other as little as two of a point.
+        let ranges = input.track_ranges();
+        let verifiable: Vec<usize> =
+            (0..input.track_count()).filter(|&track| ranges[track + 1] - ranges[track] >= 3).collect();
+        let of = |holds: &dyn Fn(usize) -> bool| verifiable.iter().map(|&track| holds(track)).collect::<Vec<bool>>();
+        let f1 = agreement(&of(&|track| solution.tracks.inlier[track]), &of(&|track| track % 10 >= 3)).f1;
+        assert!(f1 > 0.98, "seed {seed}: F1 {f1}");
     }
 }
 

@@ -55,6 +55,9 @@ fn iterate(
         for row in seen.iter().filter_map(|seen| Weighted::new(sequence, &position, seen, loss)) {
             block.add(&row.point, row.residual);
         }
+        if sequence.has_common_centre {
+            block.hold_length(&position);
+        }
         let Some(factor) = block.factor(0.0) else { break };
         let moved = position - factor.unwhiten(&factor.whiten(&block.gradient));
         let moved_cost = cost_of_point(sequence, seen, &moved, loss);

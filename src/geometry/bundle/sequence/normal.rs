@@ -208,6 +208,9 @@ impl Points<'_> {
                     row.link_blocks(seen, layout.unknowns.of_view(seen.view), parameters, couplings);
                 }
             }
+            if sequence.has_common_centre {
+                block.hold_length(&sequence.points[point]);
+            }
             *slot = block;
         }
         true

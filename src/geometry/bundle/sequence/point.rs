@@ -29,6 +29,14 @@ impl PointBlock {
         self.gradient += a * residual[0] + b * residual[1];
     }
 
+    /// Holds the length of a direction, which no observation tells: rounding would step along it by any amount.
+    #[inline(always)]
+    pub fn hold_length(&mut self, direction: &Vector3<f64>) {
+        let [m00, _, _, m11, _, m22] = self.matrix;
+        let scale = ((m00 + m11 + m22) / direction.norm_squared().max(f64::MIN_POSITIVE)).sqrt();
+        self.add(&[direction * scale, Vector3::zeros()], [0.0; 2]);
+    }
+
     /// Factors the block with Marquardt's damping; `None` when it is not positive definite.
     #[inline(always)]
     pub fn factor(&self, damping: f64) -> Option<PointFactor> {
