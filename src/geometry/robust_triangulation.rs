@@ -126,7 +126,7 @@ fn agreeing(cameras: &[Camera], observations: &[Observation], point: &Point, gat
 }
 
 /// Weighted squared residual, infinite behind the camera.
-fn squared_in_front(cameras: &[Camera], observation: &Observation, point: &Point) -> f64 {
+pub fn squared_in_front(cameras: &[Camera], observation: &Observation, point: &Point) -> f64 {
     let camera = &cameras[observation.view];
     let depth = (camera.row(2) * point).x;
     // A direction, with `w` of zero, is oriented as it is.

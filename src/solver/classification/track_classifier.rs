@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use super::{Geometry, Judged, NoiseModel, OPTIONS, SplitPoint};
 use crate::geometry::observation::Observation;
-use crate::geometry::robust_triangulation::Triangulator;
+use crate::geometry::robust_triangulation::{Triangulator, squared_in_front};
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::geometry::{Camera, Point, triangulation};
 use crate::solver::problem::{Problem, VERIFIED};
@@ -130,6 +130,7 @@ impl TrackClassifier<'_> {
     /// The verdict on a track by the observations that it retains.
     fn weigh(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> TrackVerdict {
         let gate = self.noise.gate();
+        let (point, cost) = self.not_behind(observations, retained, point).unwrap_or((point, cost));
         let dropped = observations.len() - retained.len();
         // The density of two coordinates of weight w is w times as high where the residual is 0.
         let of_weights: f64 = retained.iter().map(|&k| observations[k].weight.ln()).sum();
@@ -138,10 +139,31 @@ impl TrackClassifier<'_> {
         let weight = if enough { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
         let mut flags = vec![false; observations.len()];
         for &k in retained {
-            flags[k] = self.squared(&point, &observations[k]) <= gate;
+            flags[k] = self.seen_squared(&point, &observations[k]) <= gate;
         }
         let whole = flags.iter().filter(|&&flag| flag).count() >= VERIFIED;
         TrackVerdict { weight, inlier: weight > 0.5 && whole, point, retained: flags }
+    }
+
+    /// The point at infinity in place of one that lies behind a camera that retains it, and its cost: what is so far
+    /// away that noise has it pass through infinity is seen as well there. `None` for any other point.
+    fn not_behind(&self, observations: &[Observation], retained: &[usize], point: Point) -> Option<(Point, f64)> {
+        let seen = || retained.iter().map(|&k| &observations[k]);
+        if seen().all(|seen| self.seen_squared(&point, seen).is_finite()) {
+            return None;
+        }
+        let depths = seen().map(|seen| (self.cameras[seen.view].fixed_view::<1, 3>(2, 0) * point.xyz()).x.signum());
+        let direction = point.xyz() * if depths.sum::<f64>() < 0.0 { -1.0 } else { 1.0 };
+        let far = direction.push(0.0).try_normalize(f64::MIN_POSITIVE)?;
+        Some((far, seen().map(|seen| self.seen_squared(&far, seen)).sum()))
+    }
+
+    /// Weighted squared residual of an observation of a point, infinite behind a metric camera.
+    fn seen_squared(&self, point: &Point, seen: &Observation) -> f64 {
+        match self.geometry.is_metric() {
+            true => squared_in_front(self.cameras, seen, point),
+            false => self.squared(point, seen),
+        }
     }
 
     /// The observations that a verdict begins with: all, or those that agree where links may be wrong; `None` where
@@ -230,6 +252,7 @@ mod tests {
     use nalgebra::Vector2;
 
     use crate::domain::{Input, Limits, RawInput, View};
+    use crate::geometry::bundle::metric::Intrinsics;
     use crate::parallel::Threads;
 
     fn cameras(views: usize) -> Vec<Camera> {
@@ -331,6 +354,27 @@ mod tests {
             }
             assert!((3..LANES).contains(&right), "by observation: {by_observation}, {right} are right");
         }
+    }
+
+    /// Noise has the rays to a far point part: they meet behind the cameras, or nowhere.
+    #[test]
+    fn what_is_beyond_infinity_is_at_infinity_and_what_is_behind_is_wrong() {
+        let cameras = cameras(6);
+        let lenses = vec![Intrinsics::from_focal(1.2); cameras.len()];
+        let metric = Box::leak(Box::new(Geometry { lenses, ..geometry(true) }));
+        let classifier = TrackClassifier { geometry: metric, ..classifier(&cameras, true) };
+        let verdict = |point: Point| {
+            let image = |camera: &Camera| (camera * point).xy() / (camera * point).z;
+            let seen = cameras.iter().enumerate().map(|(view, camera)| Observation::new(view, 0, image(camera)));
+            judged(&classifier, &seen.collect::<Vec<_>>())
+        };
+        let near = verdict(Point::new(0.1, 0.2, 1.0, 0.2));
+        assert!(near.inlier && near.point.w != 0.0, "{near:?}");
+        let beyond = verdict(Point::new(0.1, 0.2, 1.0, -0.0002));
+        assert!(beyond.inlier && beyond.retained == [true; 6], "{beyond:?}");
+        assert!(beyond.point.w == 0.0 && beyond.point.z > 0.0, "{beyond:?}");
+        let behind = verdict(Point::new(0.1, 0.2, -10.0, 1.0));
+        assert!(!behind.inlier, "{behind:?}");
     }
 
     /// A track that goes over to another point, and one wrong observation between the two.
