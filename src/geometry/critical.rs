@@ -16,7 +16,7 @@ use super::homography::{Correspondences, LEAST_COMMON};
 use super::null_vector::smallest_eigenvector;
 use super::observation::Observation;
 use super::procrustes::nearest_rotation;
-use super::statistics::median;
+use super::statistics::{CHI_SQUARE_OF_TWO, median};
 use crate::domain::StopToken;
 
 /// Focal lengths from which a rotation is looked for; neighbours are a fifth apart.
@@ -38,12 +38,12 @@ pub struct CriticalFit<M> {
 
 /// Homographies from a reference view, and where it sees each point: what fits without parallax start from.
 #[derive(Debug, Clone)]
-pub struct Transfers {
+pub struct ReferenceHomographies {
     views: Vec<Matrix3<f64>>,
     positions: Vec<Option<Vector2<f64>>>,
 }
 
-impl Transfers {
+impl ReferenceHomographies {
     /// Returns `None` where common points do not tie all views together.
     pub fn new(observations: &[Observation], views: usize, points: usize, noise: f64) -> Option<Self> {
         let seen = Correspondences::new(observations, views);
@@ -58,26 +58,31 @@ impl Transfers {
         Some(Self { views: homographies, positions })
     }
 
-    /// The points that are alone in telling of depth: the homographies explain the views but for them, of which no view
-    /// has more than one.
+    /// The points of which each alone makes up most of what the homographies miss in most of its views: no view has more
+    /// than one.
     ///
     /// Behind homographies the fourth column of a camera is free, and takes up any one track of its view, wrong or
-    /// right.
-    pub fn lone_points(&self, observations: &[Observation]) -> Vec<bool> {
+    /// right. What noise explains is never dominant.
+    ///
+    /// * `noise`: one standard deviation of a coordinate, normalised units
+    pub fn dominant_points(&self, observations: &[Observation], noise: f64) -> Vec<bool> {
         let usable = || observations.iter().filter(|seen| seen.is_usable(self.views.len(), self.positions.len()));
         let missed = |seen: &Observation| {
             let moved = self.views[seen.view] * self.positions[seen.point].unwrap_or_default().push(1.0);
-            (moved.xy() / moved.z - seen.xy).norm_squared()
+            Some((moved.xy() / moved.z - seen.xy).norm_squared()).filter(|missed| missed.is_finite())
         };
+        // Of two observations, the one in the reference view and this one.
+        let by_noise = 2.0 * CHI_SQUARE_OF_TWO * noise * noise;
         let mut of_view = vec![0.0; self.views.len()];
-        usable().for_each(|seen| of_view[seen.view] += missed(seen));
+        usable().for_each(|seen| of_view[seen.view] += missed(seen).unwrap_or(0.0));
         let mut counts = vec![(0, 0); self.positions.len()];
         for seen in usable() {
-            let (alone, observed) = &mut counts[seen.point];
-            *alone += usize::from(missed(seen) > of_view[seen.view] / 2.0);
+            let (dominant, observed) = &mut counts[seen.point];
+            let is_dominant = |missed: f64| missed > by_noise && missed > of_view[seen.view] / 2.0;
+            *dominant += usize::from(missed(seen).is_some_and(is_dominant));
             *observed += 1;
         }
-        counts.into_iter().map(|(alone, observed)| 2 * alone > observed).collect()
+        counts.into_iter().map(|(dominant, observed)| 2 * dominant > observed).collect()
     }
 
     fn observed(&self) -> usize {
@@ -86,7 +91,11 @@ impl Transfers {
 }
 
 /// Fits a plane.
-pub fn fit_plane(start: &Transfers, observations: &[Observation], stop: &StopToken) -> CriticalFit<Homographies> {
+pub fn fit_plane(
+    start: &ReferenceHomographies,
+    observations: &[Observation],
+    stop: &StopToken,
+) -> CriticalFit<Homographies> {
     let points = start.positions.iter().map(|position| position.unwrap_or_default()).collect();
     let plane = Homographies { views: start.views.clone(), points };
     fit_homographies(plane, start.observed(), observations, ITERATIONS, stop)
@@ -97,9 +106,9 @@ pub fn fit_plane(start: &Transfers, observations: &[Observation], stop: &StopTok
 /// * `group_of`: camera group of each view
 /// * `priors`: of the intrinsics of each group
 ///
-/// Returns `None` where the homographies are none of a rotation's, and where a group has no prior.
+/// Returns `None` where a view has no group or a group no prior, and where the homographies are no numbers.
 pub fn fit_rotation(
-    start: &Transfers,
+    start: &ReferenceHomographies,
     observations: &[Observation],
     group_of: &[usize],
     model: IntrinsicsModel,
@@ -330,7 +339,7 @@ mod tests {
         let stop = StopToken::default();
         let reduced =
             |cost: f64, unknowns: usize| cost / (noise * noise * (2 * scene.observations.len() - unknowns) as f64);
-        let start = Transfers::new(&scene.observations, views, points, noise).expect("complete tracks");
+        let start = ReferenceHomographies::new(&scene.observations, views, points, noise).expect("complete tracks");
         let plane = fit_plane(&start, &scene.observations, &stop);
         let turning = fit_rotation(&start, &scene.observations, &vec![0; views], FULL, &PRIORS, &stop).expect("turns");
         let moving = fit_translation(&scene.observations, views, points, noise, f64::INFINITY, &stop);
@@ -373,13 +382,13 @@ mod tests {
         assert!((0.6..1.4).contains(&ratio), "{ratio}");
         let stop = StopToken::default();
         assert!(fit_translation(&[], 0, 0, NOISE, 5.0, &stop).is_none());
-        assert!(Transfers::new(&[], 3, 0, NOISE).is_none());
+        assert!(ReferenceHomographies::new(&[], 3, 0, NOISE).is_none());
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(f64::NAN, 1e200));
         assert!(fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop).is_none());
-        assert!(Transfers::new(&scene.observations, 8, 40, NOISE).is_none());
+        assert!(ReferenceHomographies::new(&scene.observations, 8, 40, NOISE).is_none());
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(0.25, 0.5));
         fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop);
-        if let Some(start) = Transfers::new(&scene.observations, 8, 40, NOISE) {
+        if let Some(start) = ReferenceHomographies::new(&scene.observations, 8, 40, NOISE) {
             fit_plane(&start, &scene.observations, &stop);
             fit_rotation(&start, &scene.observations, &[0; 8], FULL, &PRIORS, &stop);
             assert!(fit_rotation(&start, &scene.observations, &[1; 8], FULL, &PRIORS, &stop).is_none());

@@ -97,6 +97,9 @@ pub(crate) fn robust(
 
 /// The same of a camera at the origin, which sees directions: its pose has no translation.
 ///
+/// * `directions`: of any length, in the frame that the rotation is of
+/// * `seen`, `weights`, `gate`: as [`robust`] has them
+///
 /// Returns `None` for fewer than two correspondences or when no sample gives a rotation.
 pub(crate) fn robust_rotation(
     directions: &[Vector3<f64>],
@@ -269,6 +272,8 @@ mod tests {
             println!("seed {seed}: off by {off:.1e}, {} inliers", inlier.iter().filter(|inlier| **inlier).count());
             assert!(off < 3.0 * NOISE && model.translation == Vector3::zeros(), "seed {seed}: {off}");
             assert!(inlier[36..].iter().all(|inlier| *inlier), "seed {seed}: {inlier:?}");
+            let by_chance = inlier[..36].iter().filter(|inlier| **inlier).count();
+            assert!(by_chance <= 2, "seed {seed}: {by_chance} wrong ones agree");
         }
         let nothing = robust_rotation(
             &[Vector3::z()],

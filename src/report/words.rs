@@ -6,7 +6,7 @@ use crate::domain::{Grade, Solution, Status, WarningCode};
 pub fn warning(code: WarningCode) -> &'static str {
     match code {
         WarningCode::PlanarOrRotation => {
-            "The points lie on one plane, or the camera only turned: such views show little depth."
+            "The points lie on one plane, or the camera only turned, or turned and zoomed: such views show little depth."
         }
         WarningCode::PlanarScene => {
             "The points lie on one plane. Views that are tilted against each other tell a focal length all the same."

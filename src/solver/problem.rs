@@ -190,16 +190,21 @@ impl<'a> Problem<'a> {
         self.representative[track] != track
     }
 
-    /// Whether a track may support cameras while a reconstruction grows: not where another represents it, nor where it is
-    /// static, unless the reconstruction is one of static tracks.
+    /// Whether a reconstruction began from static tracks: whether these, which it is of, hold any.
+    pub fn is_of_static(&self, tracks: &[usize]) -> bool {
+        tracks.iter().any(|&track| self.is_static[track])
+    }
+
+    /// Whether a track may support cameras until all are judged: not where another represents it, nor where it is static,
+    /// unless the reconstruction is one of static tracks.
     pub fn supports_growth(&self, track: usize, of_static: bool) -> bool {
         !self.is_near_duplicate(track) && (of_static || !self.is_static[track])
     }
 
-    /// How many tracks, near-duplicates left out, these views see so often that they may be verified.
-    pub fn verifiable(&self, is_registered: impl Fn(usize) -> bool) -> usize {
+    /// How many of the tracks that may support cameras these views see so often that they may be verified.
+    pub fn verifiable(&self, of_static: bool, is_registered: impl Fn(usize) -> bool) -> usize {
         let seen = |track: usize| self.of_track(track).filter(|&k| is_registered(self.view_of(k))).count();
-        (0..self.tracks()).filter(|&track| !self.is_near_duplicate(track) && seen(track) >= VERIFIED).count()
+        (0..self.tracks()).filter(|&track| self.supports_growth(track, of_static) && seen(track) >= VERIFIED).count()
     }
 
     /// The views in which anything is observed, increasing.

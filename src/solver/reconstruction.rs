@@ -9,7 +9,7 @@ use super::classification::{self, Geometry, Judged};
 use super::depths::DepthOptions;
 use super::problem::{Problem, camera_groups};
 use super::recorder::Recorder;
-use super::sequence::{Extended, verified};
+use super::sequence::{Extended, component_of_track, verified};
 use crate::domain::result::TrackResults;
 use crate::domain::{Grade, LeftOut, Warning};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction, Pose};
@@ -64,6 +64,7 @@ impl Reconstruction {
         let geometry = Geometry {
             cameras,
             lenses,
+            is_metric: metric.is_some(),
             component_of_view: vec![0; problem.views()],
             component_of_track: vec![0; problem.tracks()],
             by_observation: attempt.judges_observations(),
@@ -86,8 +87,10 @@ impl Reconstruction {
         let Extended { seed, model, calibrations, left_out } = extended;
         let grade = extended.grade(problem);
         let is_reported = |view: &usize| grade != Grade::ProjectiveOnly && model.is_determined(*view);
-        let component =
-            |track: usize| model.landmarks[problem.representative[track]].as_ref().map_or(0, |point| point.component);
+        let component = |track: usize| match &model.landmarks[problem.representative[track]] {
+            Some(landmark) => landmark.component,
+            None => component_of_track(problem, model, track).unwrap_or(0),
+        };
         let calibrated = calibrations.iter().enumerate().map(|(camera, outcome)| {
             let intrinsics = model.lenses[camera].intrinsics;
             (Some(intrinsics).filter(|_| grade != Grade::ProjectiveOnly), outcome.clone())
@@ -95,11 +98,15 @@ impl Reconstruction {
         let geometry = Geometry {
             cameras: model.cameras(problem),
             lenses: (0..problem.views()).map(|view| model.intrinsics_of(problem, view)).collect(),
+            is_metric: grade != Grade::ProjectiveOnly,
             component_of_view: model.component_of.clone(),
             component_of_track: (0..problem.tracks()).map(component).collect(),
             by_observation: seed.judges_observations(),
             noise: model.noise,
-            inlier_share: share(verified(model).len(), problem.verifiable(|view| model.poses[view].is_some())),
+            inlier_share: share(
+                verified(model).len(),
+                problem.verifiable(model.of_static, |view| model.poses[view].is_some()),
+            ),
         };
         Self {
             geometry,

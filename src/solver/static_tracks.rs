@@ -1,8 +1,8 @@
 //! Tracks that stay where they are in the image while others move: dirt, a watermark, the camera's own carrier.
 //!
-//! They agree on a camera that stands still, before any scene, and where they are many a search finds nothing else, and a
-//! view that joins is held by them. Both therefore look at the others first; what they find judges all of them, so that the far points of a drive and the
-//! middle of an orbit, which stay in place too, are not lost.
+//! They agree on a camera that stands still, before any scene. Where they are many, a search finds nothing else, and they
+//! hold every view that joins. Both therefore look at the others alone. What comes of these judges all tracks in the end,
+//! so that the far points of a drive and the middle of an orbit, which stay in place too, are not lost.
 
 use nalgebra::Vector2;
 

@@ -139,11 +139,17 @@ impl MetricReconstruction {
         self
     }
 
+    /// Unknowns of a view's pose and of a point.
+    pub fn unknowns_each(has_common_centre: bool) -> (usize, usize) {
+        if has_common_centre { (3, 2) } else { (6, 3) }
+    }
+
     /// Unknowns that observations of so many points could determine, the gauge taken off.
     ///
     /// * `shared`: free intrinsics of all camera groups together
     pub fn unknowns(&self, points: usize, shared: usize) -> usize {
-        let (of_view, of_point, gauge) = if self.has_common_centre { (3, 2, 3) } else { (6, 3, 7) };
+        let (of_view, of_point) = Self::unknowns_each(self.has_common_centre);
+        let gauge = if self.has_common_centre { 3 } else { 7 };
         (of_view * self.poses.len() + of_point * points + self.focals.len() + shared).saturating_sub(gauge)
     }
 

@@ -138,7 +138,7 @@ impl Attempt {
         self.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some())
     }
 
-    /// Whether its camera only turned, so that its points are directions: nothing can be registered against them.
+    /// Whether its camera only turned, so that its points are directions.
     pub fn has_common_centre(&self) -> bool {
         let metric = self.calibration.as_ref().and_then(|calibration| calibration.metric.as_ref());
         metric.is_some_and(|metric| metric.has_common_centre)

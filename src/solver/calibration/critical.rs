@@ -12,7 +12,7 @@ use super::options::{CalibrationOptions, CriticalOptions};
 use crate::domain::{Warning, WarningCode};
 use crate::geometry::bundle::critical::{Homographies, Translating};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
-use crate::geometry::critical::{self, Transfers};
+use crate::geometry::critical::{self, ReferenceHomographies};
 use crate::geometry::homography;
 use crate::geometry::observation::Observation;
 
@@ -39,15 +39,16 @@ pub(super) enum Upgrade {
     None,
 }
 
-/// The observations without the points that alone tell of depth where homographies nearly explain the views; `None`
+/// The observations without those of points that alone tell of depth where homographies nearly explain the views; `None`
 /// where there are none.
-pub(super) fn without_lone_points(problem: &Uncalibrated) -> Option<Vec<Observation>> {
+pub(super) fn without_dominant_points(problem: &Uncalibrated) -> Option<Vec<Observation>> {
     let Uncalibrated { observations, noise, .. } = *problem;
     let (views, points) = (problem.cameras.len(), problem.points.len());
     homography::median_residual(observations, views, noise, problem.options.critical.lens_limit)?;
-    let is_lone = Transfers::new(observations, views, points, noise)?.lone_points(observations);
-    let is_told_by_more = |seen: &&Observation| !is_lone.get(seen.point).copied().unwrap_or(false);
-    is_lone.contains(&true).then(|| observations.iter().filter(is_told_by_more).copied().collect())
+    let start = ReferenceHomographies::new(observations, views, points, noise)?;
+    let is_dominant = start.dominant_points(observations, noise);
+    let is_kept = |seen: &&Observation| !is_dominant.get(seen.point).copied().unwrap_or(false);
+    is_dominant.contains(&true).then(|| observations.iter().filter(is_kept).copied().collect())
 }
 
 /// What kind of motion and scene the views of this consensus show.
@@ -105,7 +106,7 @@ fn without_parallax(
     let Uncalibrated { observations, group_of, focal_per_view, .. } = *problem;
     let (views, points) = (problem.cameras.len(), problem.points.len());
     let priors = choice.priors(fit.noise);
-    let fits = Transfers::new(observations, views, points, fit.noise).and_then(|start| {
+    let fits = ReferenceHomographies::new(observations, views, points, fit.noise).and_then(|start| {
         let model = IntrinsicsModel::focal(focal_per_view).with_all_extensions();
         let rotation = critical::fit_rotation(&start, observations, group_of, model, &priors, stop)?;
         Some((critical::fit_plane(&start, observations, stop), rotation, start))
@@ -133,22 +134,23 @@ fn without_parallax(
     if !turns && (!is_flat || translates && has_depth) {
         return ControlFlow::Continue(Some(plane.model));
     }
-    if !turns && !has_depth && !focal_per_view && turns_and_zooms(choice, &start, &by_plane, &priors) {
+    if !turns && !translates && !has_depth && !focal_per_view && turns_and_zooms(choice, &start, &by_plane, &priors) {
         let detail = format!("{missed}: a camera that turns and zooms explains the views as well as they do");
         let reason = "a camera that turned and zoomed has other focal lengths than one that moved before a plane: solve \
                       with a focal length a view (focal_per_view) if it zoomed";
         return ControlFlow::Break(undecided(detail, reason));
     }
-    let worse = format!("a camera that only turns fits worse than homographies by {deviations:.1} standard deviations");
+    let reference = if has_depth { "free cameras" } else { "homographies" };
+    let worse = format!("a camera that only turns fits worse than {reference} by {deviations:.1} standard deviations");
     let (code, because) = match (turns, translates) {
         (true, true) => (
             WarningCode::PlanarOrRotation,
             "the camera hardly moved, and a turn explains the views as well as a shift".to_owned(),
         ),
         (true, false) => {
-            let better = "a camera that only turns, behind a lens, explains the views as well as free cameras";
+            let behind_lens = "a camera that only turns, behind a lens, explains the views as well as free cameras";
             let as_well = "a camera that only turns explains the views as well as they do";
-            (WarningCode::PureRotation, if has_depth { better } else { as_well }.to_owned())
+            (WarningCode::PureRotation, if has_depth { behind_lens } else { as_well }.to_owned())
         }
         (false, _) if deviations < options.plane_deviations => (
             WarningCode::PlanarOrRotation,
@@ -170,7 +172,7 @@ fn without_parallax(
 }
 
 /// Whether a camera that only turns, with a focal length of each view, fits as well as homographies.
-fn turns_and_zooms(choice: &Choice, start: &Transfers, by_plane: &Fit, priors: &[IntrinsicsPrior]) -> bool {
+fn turns_and_zooms(choice: &Choice, start: &ReferenceHomographies, by_plane: &Fit, priors: &[IntrinsicsPrior]) -> bool {
     let Choice { problem, stop, .. } = *choice;
     // What a lens adds to these would explain a plane too.
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint);

@@ -169,8 +169,9 @@ impl Outcome {
 /// [`Error::Stopped`] when `stop` fired; what stands by then is not worth returning.
 pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Error> {
     let problem = problem.with_least_noise();
-    let told_by_many = critical::without_lone_points(&problem);
-    let problem = &Uncalibrated { observations: told_by_many.as_deref().unwrap_or(problem.observations), ..problem };
+    let without_dominant = critical::without_dominant_points(&problem);
+    let problem =
+        &Uncalibrated { observations: without_dominant.as_deref().unwrap_or(problem.observations), ..problem };
     let Compared { cameras, points, mut fit, critical, mut warnings } =
         Compared::new(problem, problem, scale_px, stop, &mut || ())?;
     warnings.extend(critical.warnings);
@@ -243,7 +244,9 @@ pub fn from_metric(
         (upgrade, has_common_centre) => {
             let detail = match (upgrade, has_common_centre) {
                 (Upgrade::Rotation { .. }, _) => "the views together are those of a camera that only turned",
-                (_, true) => "the views together are not those of a camera that only turned",
+                (Upgrade::Quadric(_) | Upgrade::Plane(_) | Upgrade::Translation(_), true) => {
+                    "the views together are not those of a camera that only turned"
+                }
                 _ => return Ok(problem.refused(&warnings)),
             };
             warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));

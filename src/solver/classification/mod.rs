@@ -28,8 +28,10 @@ const OPTIONS: ClassificationOptions = ClassificationOptions::DEFAULT;
 pub struct Geometry {
     /// Normalised pinhole of every view; `None`: not registered.
     pub cameras: Vec<Option<Camera>>,
-    /// The lens of each view, whose distortion is undone before the cameras are asked; empty of projective cameras.
+    /// The lens of each view, whose distortion is undone before the cameras are asked; empty: all are pinholes.
     pub lenses: Vec<Intrinsics>,
+    /// Whether a calibration is given, so that a point is in front of a camera or not.
+    pub is_metric: bool,
     /// The component of each view, and the one that each track is in: components have frames of their own.
     pub component_of_view: Vec<u32>,
     pub component_of_track: Vec<u32>,
@@ -59,11 +61,6 @@ impl Geometry {
         let undone = self.lenses.get(seen.view).and_then(|lens| lens.undistort(&seen.xy));
         let weight = if self.by_observation { seen.weight } else { 1.0 };
         Observation { xy: undone.unwrap_or(seen.xy), weight, ..seen }
-    }
-
-    /// Whether the cameras are metric, so that a point is in front of one or not.
-    fn is_metric(&self) -> bool {
-        !self.lenses.is_empty()
     }
 
     /// Share of its observations in registered views that a right track retains.

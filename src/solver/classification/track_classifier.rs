@@ -130,13 +130,13 @@ impl TrackClassifier<'_> {
     /// The verdict on a track by the observations that it retains.
     fn weigh(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> TrackVerdict {
         let gate = self.noise.gate();
-        let (point, cost) = self.not_behind(observations, retained, point).unwrap_or((point, cost));
+        let (point, cost) = self.at_infinity_if_behind(observations, retained, point).unwrap_or((point, cost));
         let dropped = observations.len() - retained.len();
         // The density of two coordinates of weight w is w times as high where the residual is 0.
         let of_weights: f64 = retained.iter().map(|&k| observations[k].weight.ln()).sum();
         let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share) + of_weights;
         let enough = retained.len() >= self.least_retained(observations);
-        let weight = if enough { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
+        let weight = if enough && cost.is_finite() { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
         let mut flags = vec![false; observations.len()];
         for &k in retained {
             flags[k] = self.seen_squared(&point, &observations[k]) <= gate;
@@ -147,9 +147,14 @@ impl TrackClassifier<'_> {
 
     /// The point at infinity in place of one that lies behind a camera that retains it, and its cost: what is so far
     /// away that noise has it pass through infinity is seen as well there. `None` for any other point.
-    fn not_behind(&self, observations: &[Observation], retained: &[usize], point: Point) -> Option<(Point, f64)> {
+    fn at_infinity_if_behind(
+        &self,
+        observations: &[Observation],
+        retained: &[usize],
+        point: Point,
+    ) -> Option<(Point, f64)> {
         let seen = || retained.iter().map(|&k| &observations[k]);
-        if seen().all(|seen| self.seen_squared(&point, seen).is_finite()) {
+        if !self.geometry.is_metric || seen().all(|seen| self.seen_squared(&point, seen).is_finite()) {
             return None;
         }
         let depths = seen().map(|seen| (self.cameras[seen.view].fixed_view::<1, 3>(2, 0) * point.xyz()).x.signum());
@@ -160,7 +165,7 @@ impl TrackClassifier<'_> {
 
     /// Weighted squared residual of an observation of a point, infinite behind a metric camera.
     fn seen_squared(&self, point: &Point, seen: &Observation) -> f64 {
-        match self.geometry.is_metric() {
+        match self.geometry.is_metric {
             true => squared_in_front(self.cameras, seen, point),
             false => self.squared(point, seen),
         }
@@ -192,7 +197,8 @@ impl TrackClassifier<'_> {
             judged.observations.residual_px[place] =
                 Some((squared / observation.weight).sqrt() * self.problem.scale_px)
                     .filter(|residual| residual.is_finite());
-            judged.observations.weight[place] = self.noise.weight(squared) as f32;
+            let is_in_front = self.seen_squared(&verdict.point, observation).is_finite();
+            judged.observations.weight[place] = if is_in_front { self.noise.weight(squared) as f32 } else { 0.0 };
             judged.observations.inlier[place] = verdict.inlier && retained;
         }
         if verdict.inlier {
@@ -252,7 +258,6 @@ mod tests {
     use nalgebra::Vector2;
 
     use crate::domain::{Input, Limits, RawInput, View};
-    use crate::geometry::bundle::metric::Intrinsics;
     use crate::parallel::Threads;
 
     fn cameras(views: usize) -> Vec<Camera> {
@@ -268,6 +273,7 @@ mod tests {
         Geometry {
             cameras: Vec::new(),
             lenses: Vec::new(),
+            is_metric: false,
             component_of_view: Vec::new(),
             component_of_track: Vec::new(),
             by_observation,
@@ -360,21 +366,37 @@ mod tests {
     #[test]
     fn what_is_beyond_infinity_is_at_infinity_and_what_is_behind_is_wrong() {
         let cameras = cameras(6);
-        let lenses = vec![Intrinsics::from_focal(1.2); cameras.len()];
-        let metric = Box::leak(Box::new(Geometry { lenses, ..geometry(true) }));
+        let metric = Box::leak(Box::new(Geometry { is_metric: true, ..geometry(true) }));
         let classifier = TrackClassifier { geometry: metric, ..classifier(&cameras, true) };
         let verdict = |point: Point| {
             let image = |camera: &Camera| (camera * point).xy() / (camera * point).z;
             let seen = cameras.iter().enumerate().map(|(view, camera)| Observation::new(view, 0, image(camera)));
-            judged(&classifier, &seen.collect::<Vec<_>>())
+            classifier.weigh(&seen.collect::<Vec<_>>(), &[0, 1, 2, 3, 4, 5], point.normalize(), 0.0)
         };
         let near = verdict(Point::new(0.1, 0.2, 1.0, 0.2));
-        assert!(near.inlier && near.point.w != 0.0, "{near:?}");
+        assert!(near.inlier && near.point.w > 0.0, "{near:?}");
         let beyond = verdict(Point::new(0.1, 0.2, 1.0, -0.0002));
         assert!(beyond.inlier && beyond.retained == [true; 6], "{beyond:?}");
         assert!(beyond.point.w == 0.0 && beyond.point.z > 0.0, "{beyond:?}");
         let behind = verdict(Point::new(0.1, 0.2, -10.0, 1.0));
         assert!(!behind.inlier, "{behind:?}");
+    }
+
+    /// No point is in front of cameras that look away from each other, wherever it is.
+    #[test]
+    fn what_no_camera_has_in_front_weighs_nothing() {
+        let ahead = Camera::new(1.2, 0.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.2, 0.0, 0.0, 1.0, 1.0);
+        let back = Camera::new(-1.2, 0.0, 0.0, 0.1, 0.0, 1.2, 0.0, 0.1, 0.0, 0.0, -1.0, -2.0);
+        let cameras = [ahead, back, ahead];
+        let metric = Box::leak(Box::new(Geometry { is_metric: true, ..geometry(true) }));
+        let classifier = TrackClassifier { geometry: metric, ..classifier(&cameras, true) };
+        for (x, y) in [(0.0, 0.0), (0.1, -0.2), (0.3, 0.1)] {
+            let seen = (0..3).map(|view| Observation::new(view, 0, Vector2::new(x, y + 0.01 * view as f64)));
+            let observations: Vec<Observation> = seen.collect();
+            let point = Point::new(x, y, 1.0, 0.1);
+            let verdict = classifier.weigh(&observations, &[0, 1, 2], point, 1e-6);
+            assert!(verdict.weight == 0.0 && !verdict.inlier, "{verdict:?}");
+        }
     }
 
     /// A track that goes over to another point, and one wrong observation between the two.

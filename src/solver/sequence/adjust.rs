@@ -230,7 +230,12 @@ pub fn covering(problem: &Problem, model: &Model, views: &[usize], of_view: usiz
 }
 
 /// Scales a component so that its median depth becomes 1: scale is free, and adjustments damp best near unit lengths.
+///
+/// Directions have no scale.
 pub fn rescale(problem: &Problem, model: &mut Model, component: u32) {
+    if model.has_common_centre {
+        return;
+    }
     let views = model.of_component(component);
     let mut depths: Vec<f64> = views
         .iter()

@@ -31,8 +31,7 @@ pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Mode
         let focals = seed.calibration.as_ref().and_then(|calibration| calibration.focals.as_deref());
         model.add_component(problem, FIRST, seed.views(), metric, focals);
     }
-    let tracks = seed.projective.iter().flat_map(|found| &found.tracks);
-    model.of_static = tracks.into_iter().any(|&track| problem.is_static[track]);
+    model.of_static = seed.projective.as_ref().is_some_and(|found| problem.is_of_static(&found.tracks));
     structure::triangulate(problem, &mut model, recorder);
     model
 }
@@ -71,6 +70,10 @@ pub fn others(
             .as_ref()
             .filter(usable)
             .filter(|_| attempt.has_common_centre() == model.has_common_centre)
+            .filter(|_| {
+                let found = attempt.projective.as_ref();
+                model.of_static || !found.is_some_and(|found| problem.is_of_static(&found.tracks))
+            })
             .and_then(|calibration| Some((calibration, calibration.metric.as_ref()?)))
         else {
             failures += 1;

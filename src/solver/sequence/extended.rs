@@ -5,6 +5,7 @@ use super::options::{ExtensionOptions, GrowthOptions, StretchOptions};
 use super::register;
 use super::{adjust, calibrate, components, growth, projective, structure};
 use crate::domain::{Grade, LeftOut, Stage, Task, Warning, WarningCode};
+use crate::geometry::bundle::metric::MetricReconstruction;
 use crate::solver::attempt::{self, Attempt, AttemptOptions};
 use crate::solver::calibration::Outcome;
 use crate::solver::grow::LEAST_INLIERS;
@@ -104,7 +105,7 @@ impl Extended {
         let model = &self.model;
         let verified = adjust::verified(model);
         let observations = verified.iter().filter_map(|&track| model.landmarks[track]).map(|point| point.support).sum();
-        let (of_view, of_point) = if model.has_common_centre { (3, 2) } else { (6, 3) };
+        let (of_view, of_point) = MetricReconstruction::unknowns_each(model.has_common_centre);
         let unknowns = of_view * model.registered().len() + of_point * verified.len();
         projective::evidence(observations, unknowns, model.noise, problem.outlier_density)
     }

@@ -28,6 +28,7 @@ use std::ops::ControlFlow;
 pub use adjust::verified;
 pub use extended::Extended;
 pub use projective::ProjectiveReconstruction;
+pub use structure::component_of_track;
 
 use super::attempt::{self, Attempt, Effort};
 use super::grow::LEAST_INLIERS;

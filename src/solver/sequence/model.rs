@@ -68,7 +68,7 @@ pub struct Model {
     pub is_strained: bool,
     /// Whether it began from static tracks.
     pub of_static: bool,
-    /// Whether the camera only turned: poses have no translation, and landmarks are unit directions.
+    /// Whether the camera only turned: poses have no translation, and landmarks are directions.
     pub has_common_centre: bool,
 }
 

@@ -82,7 +82,7 @@ impl<'a> Growing<'a> {
             kept: vec![false; problem.xy.len()],
             noise: start.noise,
             start_noise: start.noise,
-            of_static: start.tracks.iter().any(|&track| problem.is_static[track]),
+            of_static: problem.is_of_static(&start.tracks),
         }
     }
 
@@ -157,7 +157,7 @@ impl<'a> Growing<'a> {
             points: tracks.iter().filter_map(|&track| self.points[track]).collect(),
             observations: observations.collect(),
             noise: self.noise,
-            tried: problem.verifiable(|view| self.cameras[view].is_some()),
+            tried: problem.verifiable(self.of_static, |view| self.cameras[view].is_some()),
             views,
             tracks,
         }

@@ -82,7 +82,7 @@ fn forget(problem: &Problem, model: &mut Model, track: usize) {
 }
 
 /// The component in whose views a track has most observations, the first of equals; `None`: in none.
-fn component_of_track(problem: &Problem, model: &Model, track: usize) -> Option<u32> {
+pub fn component_of_track(problem: &Problem, model: &Model, track: usize) -> Option<u32> {
     let mut counts: Vec<(u32, usize)> = Vec::new();
     for k in problem.of_track(track) {
         let view = problem.view_of(k);

@@ -71,7 +71,7 @@ fn a_camera_that_only_turns_is_calibrated_by_its_directions() {
     }
 }
 
-/// All around, no view sees what the others see: each joins by the directions that its neighbours know.
+/// All around, most views share nothing: each joins by the directions that its neighbours know.
 #[test]
 fn a_full_turn_registers_every_view() {
     const VIEWS: usize = 24;
