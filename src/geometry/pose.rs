@@ -89,10 +89,7 @@ pub(crate) fn robust(
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<RobustModel<Pose>> {
-    if points.len() != seen.len() || points.len() != weights.len() {
-        return None;
-    }
-    ransac::estimate(&Correspondences { points, seen, weights }, gate, None, MOST_SAMPLES, rng, stop)
+    ransac::estimate(&Correspondences::new(points, seen, weights)?, gate, None, MOST_SAMPLES, rng, stop)
 }
 
 /// The same of a camera at the origin, which sees directions: its pose has no translation.
@@ -109,10 +106,7 @@ pub(crate) fn robust_rotation(
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<RobustModel<Pose>> {
-    if directions.len() != seen.len() || directions.len() != weights.len() {
-        return None;
-    }
-    let correspondences = Correspondences { points: directions, seen, weights };
+    let correspondences = Correspondences::new(directions, seen, weights)?;
     ransac::estimate(&Directions(correspondences), gate, None, MOST_SAMPLES, rng, stop)
 }
 
@@ -166,6 +160,14 @@ struct Correspondences<'a> {
     points: &'a [Vector3<f64>],
     seen: &'a [Vector2<f64>],
     weights: &'a [f64],
+}
+
+impl<'a> Correspondences<'a> {
+    /// `None` where they are not as many of each.
+    fn new(points: &'a [Vector3<f64>], seen: &'a [Vector2<f64>], weights: &'a [f64]) -> Option<Self> {
+        let are_as_many = points.len() == seen.len() && points.len() == weights.len();
+        are_as_many.then_some(Self { points, seen, weights })
+    }
 }
 
 impl Estimator for Correspondences<'_> {

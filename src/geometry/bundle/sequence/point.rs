@@ -91,3 +91,30 @@ impl PointFactor {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What rounding leaves of the gradient along a direction moves it by its size, and without the hold by any amount.
+    #[test]
+    fn a_direction_is_not_stepped_along() {
+        let direction = Vector3::new(0.3, -0.4, 1.2);
+        let across = [Vector3::new(4.0, 3.0, 0.0), Vector3::new(0.0, 3.0, 1.0)];
+        let step = |is_held: bool| {
+            let mut block = PointBlock::ZERO;
+            block.add(&across, [1e-3, -2e-3]);
+            block.gradient += direction * 1e-6;
+            if is_held {
+                block.hold_length(&direction);
+            }
+            let factor = block.factor(0.0).expect("positive definite");
+            factor.unwhiten(&factor.whiten(&block.gradient))
+        };
+        assert!(across.iter().all(|row| row.dot(&direction).abs() < 1e-12));
+        assert!(step(false).dot(&direction).abs() > 1.0, "{}", step(false));
+        assert!(step(true).dot(&direction).abs() < 1e-6, "{}", step(true));
+        let shift = step(true) - step(false);
+        assert!(shift.cross(&direction).norm() < 1e-3 * shift.norm(), "{shift}");
+    }
+}
