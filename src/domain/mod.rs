@@ -25,7 +25,7 @@ pub use left_out::LeftOut;
 pub use limits::Limits;
 pub use progress::{Course, Losses, Observer, Progress, Silent, Stage, Step, Task};
 pub use quota::{Oversize, Quota};
-pub use result::{Calibration, Grade, Proposal, Solution, Status};
+pub use result::{Calibration, Grade, LensProjection, Proposal, Solution, Status};
 pub use settings::{Backend, Method, SolveSettings};
 pub use stop::{StopReason, StopToken};
 pub use warning::{Warning, WarningCode};

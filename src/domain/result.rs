@@ -92,11 +92,24 @@ impl Proposal {
     }
 }
 
+/// How a lens images the angle from its optical axis, before distortion.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum LensProjection {
+    /// By its tangent.
+    #[default]
+    Perspective,
+    /// By the angle itself.
+    Fisheye,
+}
+
 /// Intrinsics of one camera group, with their uncertainty.
 ///
 /// A point at `(u, v, 1)` in camera coordinates, with `r^2 = u^2 + v^2` and `s = 1 + k1 r^2 + k2 r^4 + k3 r^6`, is
 /// imaged at `x = f (u s + 2 p1 u v + p2 (r^2 + 2 u^2)) + px`, `y = aspect f (v s + p1 (r^2 + 2 v^2) + 2 p2 u v) + py`:
-/// Brown's model (1971) under OpenCV's names. A coefficient is 0 (all: a pinhole) unless the data asked for more.
+/// Brown's model (1971) under OpenCV's names. Behind a fisheye `s = t (1 + k1 t^2 + k2 t^4 + k3 t^6) / r` with the angle
+/// `t = atan r` from the optical axis, and p1, p2 are 0: Kannala and Brandt's model (2006), OpenCV's fisheye. A
+/// coefficient is 0 (all: a pinhole, or an equidistant fisheye) unless the data asked for more.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
     /// Horizontal focal length; the geometric mean where every view has its own, see [`ViewResult::focal_px`].
@@ -108,6 +121,8 @@ pub struct Calibration {
     /// Vertical over horizontal focal length; 1 (square pixels) unless the data asked for more.
     #[serde(default = "square_pixels")]
     pub aspect: f64,
+    #[serde(default)]
+    pub lens_projection: LensProjection,
     /// Radial distortion: the first coefficient, `k1`.
     #[serde(default)]
     pub radial_k1: f64,
@@ -155,7 +170,15 @@ impl Calibration {
     /// length, aspect and principal point then take to pixels.
     pub fn distort(&self, u: f64, v: f64) -> [f64; 2] {
         let squared = u * u + v * v;
-        let s = 1.0 + squared * (self.radial_k1 + squared * (self.radial_k2 + squared * self.radial_k3));
+        let polynomial =
+            |squared: f64| 1.0 + squared * (self.radial_k1 + squared * (self.radial_k2 + squared * self.radial_k3));
+        let s = match self.lens_projection {
+            LensProjection::Fisheye if squared > 0.0 => {
+                let (radius, angle) = (squared.sqrt(), squared.sqrt().atan());
+                angle / radius * polynomial(angle * angle)
+            }
+            _ => polynomial(squared),
+        };
         let (p1, p2) = (self.tangential_p1, self.tangential_p2);
         [
             u * s + 2.0 * p1 * u * v + p2 * (squared + 2.0 * u * u),
@@ -229,7 +252,7 @@ impl TrackResults {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ObservationResults {
     pub inlier: Vec<bool>,
-    /// Reprojection error in pixels, a lens's distortion undone; `None` where the observation was not judged.
+    /// Reprojection error in pixels of the image, of a lens that distorts to first order; `None` where the observation was not judged.
     pub residual_px: Vec<Option<f64>>,
     /// Probability that the observation shows its track's point, if the track is right: times the track's weight, that
     /// it is right. 0 where it was not judged.

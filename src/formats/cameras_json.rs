@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::result_json::view_label;
 use super::{Label, LabelledInput, warnings};
 use crate::domain::result::ViewResult;
-use crate::domain::{Calibration, LeftOut, Solution, Status, Warning};
+use crate::domain::{Calibration, LeftOut, LensProjection, Solution, Status, Warning};
 
 /// `cameras.json`.
 #[derive(Debug, Clone, Serialize)]
@@ -32,6 +32,7 @@ pub struct CameraJson {
     pub K: Option<[[f64; 3]; 3]>,
     pub R: Option<[[f64; 3]; 3]>,
     pub t: Option<[f64; 3]>,
+    pub lens_projection: Option<LensProjection>,
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
     pub radial_k3: Option<f64>,
@@ -90,6 +91,7 @@ impl CamerasJson {
                 K: calibration.map(|shared| intrinsics(shared, view.focal_px)),
                 R: view.rotation.filter(|_| is_metric),
                 t: view.translation.filter(|_| is_metric),
+                lens_projection: calibration.map(|calibration| calibration.lens_projection),
                 radial_k1: calibration.map(|calibration| calibration.radial_k1),
                 radial_k2: calibration.map(|calibration| calibration.radial_k2),
                 radial_k3: calibration.map(|calibration| calibration.radial_k3),

@@ -4,7 +4,7 @@ use nalgebra::{Rotation3, Vector3};
 use serde_json::Value;
 
 use super::*;
-use crate::domain::{Calibration, ImageSize};
+use crate::domain::{Calibration, ImageSize, LensProjection};
 use crate::formats::{Label, fixture, result_files};
 
 /// The model of a result in one part.
@@ -39,8 +39,8 @@ fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
     assert!(paths.iter().all(|path| !path.exists()) && mine.exists());
 }
 
-/// Where OpenSfM's formulas put every point of the file in every shot, against the observations (its `perspective` and
-/// `brown` models, doc/source/geometry.rst).
+/// Where OpenSfM's formulas put every point of the file in every shot, against the observations (its `perspective`,
+/// `brown`, `fisheye` and `fisheye_opencv` models, doc/source/geometry.rst).
 fn worst_of_opensfm(json: &Value, input: &LabelledInput, solution: &Solution) -> f64 {
     let number = |value: &Value| value.as_f64().expect("a number");
     let three = |value: &Value| Vector3::from_fn(|axis, _| number(&value[axis]));
@@ -66,6 +66,22 @@ fn worst_of_opensfm(json: &Value, input: &LabelledInput, solution: &Solution) ->
                     number(&camera["focal_x"]) * (x * d + x_shift) + number(&camera["c_x"]),
                     number(&camera["focal_y"]) * (y * d + y_shift) + number(&camera["c_y"]),
                 )
+            }
+            Some(kind @ ("fisheye" | "fisheye_opencv")) => {
+                let radius = squared.sqrt();
+                let angle = radius.atan();
+                let d = 1.0 + number(&camera["k1"]) * angle.powi(2) + number(&camera["k2"]) * angle.powi(4);
+                if kind == "fisheye" {
+                    let scale = number(&camera["focal"]) * d * angle / radius;
+                    (scale * x, scale * y)
+                } else {
+                    let fourth = number(&camera["k4"]) * angle.powi(8);
+                    let scale = (d + number(&camera["k3"]) * angle.powi(6) + fourth) * angle / radius;
+                    (
+                        number(&camera["focal_x"]) * scale * x + number(&camera["c_x"]),
+                        number(&camera["focal_y"]) * scale * y + number(&camera["c_y"]),
+                    )
+                }
             }
             other => panic!("{other:?} is not a type of ours"),
         };
@@ -98,6 +114,12 @@ fn scene_of(calibration: Calibration, size: ImageSize) -> (LabelledInput, Soluti
     (input, solution)
 }
 
+/// Under a fisheye, which has no tangential distortion.
+fn fisheye(aspect: f64, radial: [f64; 3], principal_point_px: [f64; 2]) -> Calibration {
+    let [k1, k2, k3] = radial;
+    Calibration { lens_projection: LensProjection::Fisheye, ..lens(aspect, [k1, k2, k3, 0.0, 0.0], principal_point_px) }
+}
+
 /// * `coefficients`: `k1`, `k2`, `k3`, `p1`, `p2`
 fn lens(aspect: f64, coefficients: [f64; 5], principal_point_px: [f64; 2]) -> Calibration {
     let [radial_k1, radial_k2, radial_k3, tangential_p1, tangential_p2] = coefficients;
@@ -106,6 +128,7 @@ fn lens(aspect: f64, coefficients: [f64; 5], principal_point_px: [f64; 2]) -> Ca
         sigma_log_focal: Some(0.01),
         principal_point_px,
         aspect,
+        lens_projection: LensProjection::Perspective,
         radial_k1,
         radial_k2,
         radial_k3,
@@ -128,6 +151,10 @@ fn opensfm_sees_the_points_where_they_were_observed() {
         (lens(1.0, [0.0, 0.0, 0.0, 0.01, 0.0], middle), "brown"),
         (lens(1.0, [0.0, 0.0, 0.0, 0.0, 0.02], middle), "brown"),
         (lens(1.1, [-0.05, 0.01, 0.02, 0.01, -0.02], [440.0, 610.0]), "brown"),
+        (fisheye(1.0, [0.0; 3], middle), "fisheye"),
+        (fisheye(1.0, [-0.05, 0.01, 0.0], middle), "fisheye"),
+        (fisheye(1.0, [-0.05, 0.01, 0.02], middle), "fisheye_opencv"),
+        (fisheye(1.1, [-0.05, 0.0, 0.0], [440.0, 610.0]), "fisheye_opencv"),
     ] {
         let (input, solution) = scene_of(calibration, size);
         let json = opensfm::reconstruction::json(&[model_of(&solution, &input)]);
@@ -146,7 +173,8 @@ fn opensfm_sees_the_points_where_they_were_observed() {
 #[test]
 fn colmap_gets_the_simplest_camera_that_says_the_same_half_a_pixel_on() {
     let size = ImageSize { width_px: 900, height_px: 1200 };
-    for (aspect, coefficients, model, parameters) in [
+    let centre = [449.5, 599.5];
+    let perspectives = [
         (1.0, [0.0; 5], "SIMPLE_PINHOLE", "900 450 600"),
         (1.25, [0.0; 5], "PINHOLE", "900 1125 450 600"),
         (1.0, [0.5, 0.0, 0.0, 0.0, 0.0], "SIMPLE_RADIAL", "900 450 600 0.5"),
@@ -157,8 +185,22 @@ fn colmap_gets_the_simplest_camera_that_says_the_same_half_a_pixel_on() {
         (1.0, [0.0, 0.0, 0.0, 0.0, 0.125], "OPENCV", "900 900 450 600 0 0 0 0.125"),
         (1.0, [0.5, 0.25, 2.0, 0.0, 0.0], "FULL_OPENCV", "900 900 450 600 0.5 0.25 0 0 2 0 0 0"),
         (1.25, [0.0, 0.0, 2.0, 0.125, -0.5], "FULL_OPENCV", "900 1125 450 600 0 0 0.125 -0.5 2 0 0 0"),
-    ] {
-        let (input, solution) = scene_of(lens(aspect, coefficients, [449.5, 599.5]), size);
+    ];
+    let fisheyes = [
+        (1.0, [0.0; 3], "SIMPLE_RADIAL_FISHEYE", "900 450 600 0"),
+        (1.0, [0.5, 0.0, 0.0], "SIMPLE_RADIAL_FISHEYE", "900 450 600 0.5"),
+        (1.0, [0.5, -0.25, 0.0], "RADIAL_FISHEYE", "900 450 600 0.5 -0.25"),
+        (1.0, [0.5, 0.25, 2.0], "OPENCV_FISHEYE", "900 900 450 600 0.5 0.25 2 0"),
+        (1.25, [0.0; 3], "OPENCV_FISHEYE", "900 1125 450 600 0 0 0 0"),
+    ];
+    let perspectives = perspectives
+        .into_iter()
+        .map(|(aspect, coefficients, model, parameters)| (lens(aspect, coefficients, centre), model, parameters));
+    let fisheyes = fisheyes
+        .into_iter()
+        .map(|(aspect, radial, model, parameters)| (fisheye(aspect, radial, centre), model, parameters));
+    for (calibration, model, parameters) in perspectives.chain(fisheyes) {
+        let (input, solution) = scene_of(calibration, size);
         let of_result = model_of(&solution, &input);
         let [cameras, ..] = colmap::write::text(&of_result);
         assert_eq!(cameras.lines().nth(1), Some(format!("1 {model} 900 1200 {parameters}").as_str()));

@@ -6,8 +6,8 @@ use std::path::Path;
 use super::{Label, LabelledInput};
 use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{
-    Calibration, Course, Grade, LeftOut, Losses, Method, Progress, Proposal, Solution, Stage, Status, Warning,
-    WarningCode,
+    Calibration, Course, Grade, LeftOut, LensProjection, Losses, Method, Progress, Proposal, Solution, Stage, Status,
+    Warning, WarningCode,
 };
 use crate::synthetic::{Scene, SceneOptions, Sequence, SequenceOptions};
 
@@ -186,6 +186,7 @@ fn solution(scene: &Scene) -> Solution {
             sigma_log_focal: Some(0.004),
             principal_point_px: truth.principal_point_px,
             aspect: 1.0,
+            lens_projection: LensProjection::Perspective,
             radial_k1: -0.02,
             radial_k2: 0.0,
             radial_k3: 0.0,

@@ -5,7 +5,7 @@ use serde_json::Value;
 
 use super::*;
 use crate::domain::result::{ObservationResults, Sigmas};
-use crate::domain::{Calibration, Grade, LeftOut, Status, Warning, WarningCode};
+use crate::domain::{Calibration, Grade, LeftOut, LensProjection, Status, Warning, WarningCode};
 use crate::formats::fixture;
 use crate::formats::manifest::Manifest;
 use crate::formats::windows::{self, Table};
@@ -45,6 +45,7 @@ fn the_fields_of_result_json_are_a_contract() {
         "focal_unobservable",
         "principal_point_px",
         "aspect",
+        "lens_projection",
         "radial_k1",
         "radial_k2",
         "radial_k3",
@@ -125,6 +126,7 @@ fn a_projective_result_gives_no_calibration_and_says_why() {
         "sigma_log_focal",
         "principal_point_px",
         "aspect",
+        "lens_projection",
         "radial_k1",
         "radial_k2",
         "radial_k3",
@@ -150,6 +152,7 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
         sigma_log_focal: None,
         principal_point_px: [1.0, 2.0],
         aspect: 1.25,
+        lens_projection: LensProjection::Fisheye,
         radial_k1: 0.01,
         radial_k2: 0.002,
         radial_k3: -0.0005,
@@ -184,6 +187,7 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
         "focal_unobservable",
         "principal_point_px",
         "aspect",
+        "lens_projection",
         "radial_k1",
         "radial_k2",
         "radial_k3",

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use crate::domain::result::PriorTime;
-use crate::domain::{Calibration, Grade, Method, Solution, Status, Warning, WarningCode};
+use crate::domain::{Calibration, Grade, LensProjection, Method, Solution, Status, Warning, WarningCode};
 
 use super::{Label, LabelledInput, warnings};
 
@@ -26,6 +26,7 @@ pub struct ResultJson {
     /// Vertical over horizontal focal length.
     pub aspect: Option<f64>,
     /// Of the lens, see [`Calibration`] for the model.
+    pub lens_projection: Option<LensProjection>,
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
     pub radial_k3: Option<f64>,
@@ -81,6 +82,7 @@ pub struct CameraGroupJson {
     pub focal_unobservable: Option<bool>,
     pub principal_point_px: Option<[f64; 2]>,
     pub aspect: Option<f64>,
+    pub lens_projection: Option<LensProjection>,
     pub radial_k1: Option<f64>,
     pub radial_k2: Option<f64>,
     pub radial_k3: Option<f64>,
@@ -140,6 +142,7 @@ pub fn camera_groups(solution: &Solution) -> Vec<CameraGroupJson> {
             },
             principal_point_px: calibration.map(|of| of.principal_point_px),
             aspect: calibration.map(|of| of.aspect),
+            lens_projection: calibration.map(|of| of.lens_projection),
             radial_k1: calibration.map(|of| of.radial_k1),
             radial_k2: calibration.map(|of| of.radial_k2),
             radial_k3: calibration.map(|of| of.radial_k3),
@@ -179,6 +182,7 @@ impl ResultJson {
                 .then(|| solution.is_focal_unobservable()),
             principal_point_px: first.and_then(|camera| camera.principal_point_px),
             aspect: first.and_then(|camera| camera.aspect),
+            lens_projection: first.and_then(|camera| camera.lens_projection),
             radial_k1: first.and_then(|camera| camera.radial_k1),
             radial_k2: first.and_then(|camera| camera.radial_k2),
             radial_k3: first.and_then(|camera| camera.radial_k3),

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use super::chart::{WIDTH, anchor};
 use super::html::{escape, short};
 use super::words;
-use crate::domain::Solution;
+use crate::domain::{LensProjection, Solution};
 use crate::formats::result_json::{CameraGroupJson, camera_groups};
 
 /// Camera groups drawn and listed; a page is read by a person.
@@ -45,7 +45,8 @@ pub fn section(solution: &Solution) -> String {
     html.push_str(
         "<p class=\"note\">Errors are one standard deviation; what has none was not estimated but taken to be in \
          order, or an older version solved it, which did not tell. Aspect is vertical over horizontal focal length; \
-         k1, k2 and k3 are the radial distortion, p1 and p2 the tangential one, all 0 for a pinhole. k3, p1 and p2 each \
+         k1, k2 and k3 are the radial distortion, p1 and p2 the tangential one, all 0 for a pinhole; those of a fisheye scale powers of \
+         the angle from the optical axis instead of its tangent. k3, p1 and p2 each \
          have a column only where a group has a value other than 0.</p>\n",
     );
     html.push_str(&own_focals(solution));
@@ -72,7 +73,7 @@ fn columns(groups: &[CameraGroupJson]) -> Vec<usize> {
 
 /// * `columns`: the coefficients to show
 fn row(group: &CameraGroupJson, columns: &[usize]) -> String {
-    let focal = group.focal_px.map_or_else(
+    let mut focal = group.focal_px.map_or_else(
         || "none".to_owned(),
         |focal_px| match group.sigma_log_focal {
             // A small deviation of the logarithm is one of the ratio.
@@ -80,6 +81,9 @@ fn row(group: &CameraGroupJson, columns: &[usize]) -> String {
             None => format!("{focal_px:.1} (unobservable)"),
         },
     );
+    if group.lens_projection == Some(LensProjection::Fisheye) {
+        focal.push_str(", fisheye");
+    }
     let number = |value: Option<f64>, sigma: Option<f64>| {
         let error = sigma.map_or_else(String::new, |sigma| format!(" \u{b1} {}", short(sigma)));
         value.map_or_else(|| "-".into(), |value| short(value) + &error)
@@ -201,6 +205,7 @@ mod tests {
             focal_px: 2000.0,
             sigma_log_focal: Some(0.01),
             principal_point_px: [640.0, 480.5],
+            lens_projection: LensProjection::Fisheye,
             aspect: 1.002,
             radial_k1: -0.125,
             radial_k2: 0.25,

@@ -6,7 +6,7 @@ use super::chart::{self, LineChart, Series};
 use super::html::{escape, short};
 use super::words;
 use crate::domain::result::PriorTime;
-use crate::domain::{Calibration, Grade, Losses, Progress, Solution, Status};
+use crate::domain::{Calibration, Grade, LensProjection, Losses, Progress, Solution, Status};
 use crate::formats::LabelledInput;
 use crate::formats::warnings::named;
 
@@ -64,7 +64,7 @@ pub fn headline(solution: &Solution) -> String {
     html
 }
 
-/// Name, figure and note of the lens's distortions that are not 0.
+/// Name, figure and note of a fisheye and of the lens's distortions that are not 0.
 fn distortions(calibration: &Calibration) -> Vec<(&'static str, String, String)> {
     let sigmas = &calibration.sigmas;
     let radial = [
@@ -77,6 +77,9 @@ fn distortions(calibration: &Calibration) -> Vec<(&'static str, String, String)>
         ("p2", calibration.tangential_p2, sigmas.tangential_p2),
     ];
     let mut cards = Vec::new();
+    if calibration.lens_projection == LensProjection::Fisheye {
+        cards.push(("lens", "fisheye".to_owned(), "equidistant, before distortion".to_owned()));
+    }
     for (name, coefficients) in [("radial distortion", &radial[..]), ("tangential distortion", &tangential[..])] {
         let (mut figures, mut errors) = (Vec::new(), Vec::new());
         for (name, value, sigma) in coefficients.iter().filter(|(_, value, _)| *value != 0.0) {

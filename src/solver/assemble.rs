@@ -332,6 +332,7 @@ fn pixel_calibration(intrinsics: &Intrinsics, outcome: &Outcome, problem: &Probl
         sigma_log_focal: outcome.sigma_log_focal,
         principal_point_px: (problem.normalization.centres_px[view] + offset).into(),
         aspect: intrinsics.aspect,
+        lens_projection: intrinsics.projection,
         radial_k1: intrinsics.radial[0],
         radial_k2: intrinsics.radial[1],
         radial_k3: intrinsics.radial[2],

@@ -2,6 +2,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector2, Vector3};
 
+use crate::domain::LensProjection;
 use crate::geometry::bundle::metric::{
     Extension, Intrinsics, IntrinsicsModel, MetricReconstruction, Parameter, Pose, Projection,
 };
@@ -75,11 +76,10 @@ pub fn of_scene(scene: &Scene) -> Option<Vec<f64>> {
 }
 
 /// The bound of a photographed scene from the verifiable observations, under the smallest model of intrinsics and
-/// geometry that holds the truth, with the solver's priors. `None`: unobservable, or no model of the solver holds the
-/// truth.
+/// geometry that holds the truth, with the solver's priors. `None`: unobservable.
 pub fn of_photographed(scene: &Photographed) -> Option<Vec<f64>> {
     let (truth, options) = (&scene.truth, &scene.options);
-    let model = smallest_model(scene)?;
+    let model = smallest_model(scene);
     let scale_px = f64::from(IMAGE_SIZE.width_px.max(IMAGE_SIZE.height_px));
     let groups = 1 + truth.camera_groups.iter().copied().max().unwrap_or(0);
     let intrinsics = |group: u32| {
@@ -90,6 +90,10 @@ pub fn of_photographed(scene: &Photographed) -> Option<Vec<f64>> {
                 options.principal_point.map(|shift| shift * f64::from(IMAGE_SIZE.width_px) / scale_px),
             ),
             aspect: options.aspect,
+            projection: match options.lens {
+                LensKind::Fisheye => LensProjection::Fisheye,
+                _ => LensProjection::Perspective,
+            },
             radial: [options.radial[0], options.radial[1], 0.0],
             ..Intrinsics::from_focal((logs.iter().sum::<f64>() / logs.len() as f64).exp())
         }
@@ -115,7 +119,7 @@ pub fn of_photographed(scene: &Photographed) -> Option<Vec<f64>> {
 }
 
 /// The smallest model of intrinsics that holds the truth, of those that the solver knows.
-fn smallest_model(scene: &Photographed) -> Option<IntrinsicsModel> {
+fn smallest_model(scene: &Photographed) -> IntrinsicsModel {
     let options = &scene.options;
     let needed = [
         (Extension::PrincipalPoint, options.principal_point != [0.0; 2]),
@@ -125,7 +129,7 @@ fn smallest_model(scene: &Photographed) -> Option<IntrinsicsModel> {
     ];
     let simplest = IntrinsicsModel::focal(super::Declared::of(options) == super::Declared::FocalPerView);
     let with = |model: IntrinsicsModel, (extension, needed)| if needed { model.with(extension) } else { model };
-    (options.lens != LensKind::Fisheye).then(|| needed.into_iter().fold(simplest, with))
+    needed.into_iter().fold(simplest, with)
 }
 
 fn poses(rotations: &[[[f64; 3]; 3]], translations: &[[f64; 3]]) -> Vec<Pose> {

@@ -16,12 +16,13 @@ pub struct Model {
     pub name: &'static str,
     /// How many parameters it has.
     pub parameters: usize,
-    /// Whether its first parameter is the horizontal focal length of a perspective camera.
-    pub is_perspective: bool,
+    /// Whether the solver has the like: its first parameter is the horizontal focal length on the optical axis of a
+    /// perspective camera or of a fisheye with radial distortion.
+    pub is_solved: bool,
 }
 
-const fn model(id: i64, name: &'static str, parameters: usize, is_perspective: bool) -> Model {
-    Model { id, name, parameters, is_perspective }
+const fn model(id: i64, name: &'static str, parameters: usize, is_solved: bool) -> Model {
+    Model { id, name, parameters, is_solved }
 }
 
 /// Every model of COLMAP 4 (`src/colmap/sensor/models.h`).
@@ -31,17 +32,17 @@ pub const MODELS: [Model; 18] = [
     model(2, "SIMPLE_RADIAL", 4, true),
     model(3, "RADIAL", 5, true),
     model(4, "OPENCV", 8, true),
-    model(5, "OPENCV_FISHEYE", 8, false),
+    model(5, "OPENCV_FISHEYE", 8, true),
     model(6, "FULL_OPENCV", 12, true),
     model(7, "FOV", 5, false),
-    model(8, "SIMPLE_RADIAL_FISHEYE", 4, false),
-    model(9, "RADIAL_FISHEYE", 5, false),
+    model(8, "SIMPLE_RADIAL_FISHEYE", 4, true),
+    model(9, "RADIAL_FISHEYE", 5, true),
     model(10, "THIN_PRISM_FISHEYE", 12, false),
     model(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16, false),
     model(12, "SIMPLE_DIVISION", 4, true),
     model(13, "DIVISION", 5, true),
-    model(14, "SIMPLE_FISHEYE", 3, false),
-    model(15, "FISHEYE", 4, false),
+    model(14, "SIMPLE_FISHEYE", 3, true),
+    model(15, "FISHEYE", 4, true),
     model(16, "EUCM", 6, false),
     model(17, "EQUIRECTANGULAR", 2, false),
 ];
@@ -84,7 +85,7 @@ impl Camera {
 
     /// Whether rays and pixels are related otherwise than the solver supposes.
     pub fn is_foreign(&self) -> bool {
-        self.model.is_none_or(|model| !model.is_perspective)
+        self.model.is_none_or(|model| !model.is_solved)
     }
 
     /// The camera with its first parameter as a focal length known beforehand; without, where the parameter makes no

@@ -7,6 +7,7 @@ use std::fmt::Write;
 
 use super::FIRST_PIXEL;
 use super::cameras::Model as CameraModel;
+use crate::domain::LensProjection;
 use crate::formats::metric::{Camera, Image, Model, Point};
 
 /// What the text files begin with; other programs write other comments.
@@ -103,9 +104,14 @@ fn parameters(camera: &Camera) -> (&'static str, Vec<f64>) {
     let [cx, cy] = intrinsics.principal_point_px.map(|centre| centre + FIRST_PIXEL);
     let radial = [intrinsics.radial_k1, intrinsics.radial_k2, intrinsics.radial_k3];
     let ([k1, k2, k3], p1, p2) = (radial, intrinsics.tangential_p1, intrinsics.tangential_p2);
+    let is_fisheye = intrinsics.lens_projection == LensProjection::Fisheye;
     let radial_terms = radial.iter().rposition(|term| *term != 0.0).map_or(0, |last| last + 1);
     let (is_square, is_centred) = (intrinsics.aspect == 1.0, p1 == 0.0 && p2 == 0.0);
     match radial_terms {
+        0 | 1 if is_fisheye && is_square => ("SIMPLE_RADIAL_FISHEYE", vec![fx, cx, cy, k1]),
+        2 if is_fisheye && is_square => ("RADIAL_FISHEYE", vec![fx, cx, cy, k1, k2]),
+        // The last is a fourth term, which our model does not have.
+        _ if is_fisheye => ("OPENCV_FISHEYE", vec![fx, fy, cx, cy, k1, k2, k3, 0.0]),
         0 if is_centred && is_square => ("SIMPLE_PINHOLE", vec![fx, cx, cy]),
         0 if is_centred => ("PINHOLE", vec![fx, fy, cx, cy]),
         1 if is_centred && is_square => ("SIMPLE_RADIAL", vec![fx, cx, cy, k1]),

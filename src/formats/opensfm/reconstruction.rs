@@ -3,6 +3,7 @@
 use serde_json::{Map, Value, json};
 
 use super::frame;
+use crate::domain::LensProjection;
 use crate::formats::metric::{Camera, Image, Model, Point};
 
 /// Distance of a principal point from the middle of the image below which it is the middle, in pixels: what is left of
@@ -38,8 +39,8 @@ fn camera_name(camera: &Camera) -> String {
     format!("scpsfm camera {}", camera.id)
 }
 
-/// `perspective` where the principal point is the middle, pixels are square and two radial coefficients are all of the
-/// distortion, else `brown`, whose coefficients are those of our model.
+/// `perspective` or `fisheye` where the principal point is the middle, pixels are square and two radial coefficients are
+/// all of the distortion, else `brown` or `fisheye_opencv`, whose coefficients are those of our model.
 fn camera(camera: &Camera) -> Value {
     let intrinsics = &camera.intrinsics;
     let (middle_px, side_px) = frame(camera.size);
@@ -49,19 +50,26 @@ fn camera(camera: &Camera) -> Value {
     let is_middle = offset_px.iter().all(|offset| offset.abs() < MIDDLE_PX);
     let (width, height) = (camera.size.width_px, camera.size.height_px);
     let others = [intrinsics.radial_k3, intrinsics.tangential_p1, intrinsics.tangential_p2];
+    let is_fisheye = intrinsics.lens_projection == LensProjection::Fisheye;
     if is_middle && intrinsics.aspect == 1.0 && others == [0.0; 3] {
         return json!({
-            "projection_type": "perspective", "width": width, "height": height,
+            "projection_type": if is_fisheye { "fisheye" } else { "perspective" }, "width": width, "height": height,
             "focal": focal, "k1": intrinsics.radial_k1, "k2": intrinsics.radial_k2,
         });
     }
-    json!({
-        "projection_type": "brown", "width": width, "height": height,
+    let mut camera = json!({
+        "projection_type": if is_fisheye { "fisheye_opencv" } else { "brown" }, "width": width, "height": height,
         "focal_x": focal, "focal_y": focal * intrinsics.aspect,
         "c_x": offset_px[0] / side_px, "c_y": offset_px[1] / side_px,
         "k1": intrinsics.radial_k1, "k2": intrinsics.radial_k2, "k3": intrinsics.radial_k3,
-        "p1": intrinsics.tangential_p1, "p2": intrinsics.tangential_p2,
-    })
+    });
+    let last = match is_fisheye {
+        // A fourth radial term, which our model does not have.
+        true => vec![("k4", 0.0)],
+        false => vec![("p1", intrinsics.tangential_p1), ("p2", intrinsics.tangential_p2)],
+    };
+    last.into_iter().for_each(|(name, value)| camera[name] = value.into());
+    camera
 }
 
 fn shot(image: &Image, model: &Model) -> Value {

@@ -1,8 +1,12 @@
-//! Intrinsics with radial distortion.
+//! Intrinsics of a perspective or fisheye lens with distortion.
+
+use std::f64::consts::FRAC_PI_2;
 
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::intrinsics_model::Parameter;
+use crate::domain::LensProjection;
+use crate::geometry::observation::Observation;
 
 /// Steps that undo the radial distortion: Newton's method converges quadratically, and where it would leave what
 /// encloses the radius, halving settles 64 bits.
@@ -17,30 +21,66 @@ const TANGENTIAL_ROUNDS: usize = 20;
 const LEAST_INVERSE_FOLD: f64 = 1e-6;
 /// Doublings of the radius after which one that is imaged so far out is not looked for any more.
 const WIDEST_DOUBLINGS: usize = 64;
+/// Squared radius below which a fisheye's angle and scale are their series': rounding would leave nothing of the scale's
+/// slope, and the next terms are below rounding in what they are multiplied with.
+const NEAR_AXIS: f64 = 1e-6;
+/// Radii at which a fisheye is fitted to another lens.
+const FITTED_RADII: usize = 32;
 
-/// Intrinsics in normalised image units, without skew, behind a lens that distorts radially and tangentially (Brown
-/// 1971).
+/// Intrinsics in normalised image units, without skew, behind a lens that distorts.
 ///
-/// A point at `(u, v, 1)` in front of the camera, with `r^2 = u^2 + v^2` and `s = 1 + k1 r^2 + k2 r^4 + k3 r^6`, is
-/// imaged at `x = f (u s + 2 p1 u v + p2 (r^2 + 2 u^2)) + px`, `y = a f (v s + p1 (r^2 + 2 v^2) + 2 p2 u v) + py`.
+/// A point at `(u, v, 1)` in front of the camera, with `r^2 = u^2 + v^2`, is imaged at
+/// * perspective (Brown 1971): `x = f (u s + 2 p1 u v + p2 (r^2 + 2 u^2)) + px`, `y = a f (v s + p1 (r^2 + 2 v^2) + 2 p2
+///   u v) + py` with `s = 1 + k1 r^2 + k2 r^4 + k3 r^6`;
+/// * fisheye (Kannala & Brandt 2006): `x = f u s + px`, `y = a f v s + py` with `s = t (1 + k1 t^2 + k2 t^4 + k3 t^6) / r`
+///   and the angle `t = atan r` from the optical axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
+    pub projection: LensProjection,
     pub focal: f64,
     /// Relative to the guessed principal point, which is the origin of normalised coordinates.
     pub principal_point: Vector2<f64>,
     /// Height of the pixels' scale over its width: 1 for square pixels.
     pub aspect: f64,
     /// Radial distortion `k1`, `k2`, `k3`, without unit: they scale powers of the squared tangent of the angle from the
-    /// optical axis. All 0 for a pinhole, `k1` below for a barrel.
+    /// optical axis, of a fisheye those of the squared angle. All 0 for a pinhole and for an equidistant fisheye, `k1`
+    /// below for a barrel.
     pub radial: [f64; 3],
-    /// Tangential distortion `p1`, `p2`, of lenses that are not centred on one axis.
+    /// Tangential distortion `p1`, `p2`, of perspective lenses that are not centred on one axis; a fisheye does not look
+    /// at it.
     pub tangential: [f64; 2],
 }
 
 impl Intrinsics {
     /// A pinhole with square pixels and the principal point where it was guessed.
     pub fn from_focal(focal: f64) -> Self {
-        Self { focal, principal_point: Vector2::zeros(), aspect: 1.0, radial: [0.0; 3], tangential: [0.0; 2] }
+        Self {
+            projection: LensProjection::Perspective,
+            focal,
+            principal_point: Vector2::zeros(),
+            aspect: 1.0,
+            radial: [0.0; 3],
+            tangential: [0.0; 2],
+        }
+    }
+
+    /// The pinhole that sees what this lens sees once its distortion is undone.
+    pub fn pinhole(&self) -> Self {
+        Self { projection: LensProjection::Perspective, radial: [0.0; 3], tangential: [0.0; 2], ..*self }
+    }
+
+    /// The equidistant fisheye, its focal length free, whose image is nearest to this lens's within a radius at unit
+    /// depth.
+    pub fn nearest_fisheye(&self, radius: f64) -> Self {
+        let (mut product, mut squares) = (0.0, 0.0);
+        for k in 1..=FITTED_RADII {
+            let radius = radius * k as f64 / FITTED_RADII as f64;
+            let angle = radius.atan();
+            product += angle * radius * self.scale(radius * radius);
+            squares += angle * angle;
+        }
+        let focal = self.focal * product / squares;
+        Self { projection: LensProjection::Fisheye, focal, radial: [0.0; 3], tangential: [0.0; 2], ..*self }
     }
 
     /// The calibration matrix `K`, which knows no distortion.
@@ -49,35 +89,110 @@ impl Intrinsics {
         Matrix3::new(self.focal, 0.0, px, 0.0, self.aspect * self.focal, py, 0.0, 0.0, 1.0)
     }
 
-    /// Whether the lens distorts.
+    /// The fisheye that images a camera with these intrinsics as one lens behind another does.
+    ///
+    /// * `lens`: images what a camera with these intrinsics would image
+    /// * `radius`: of its images, up to which the fisheye is fitted
+    pub fn behind(&self, lens: &Self, radius: f64) -> Self {
+        let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+        for k in 1..=FITTED_RADII {
+            let imaged = radius * k as f64 / FITTED_RADII as f64;
+            let inner = |lens: &Self, imaged: f64| Some(lens.ray(&Vector2::new(lens.focal * imaged, 0.0))?.x);
+            let centred = |lens: &Self| Self { principal_point: Vector2::zeros(), ..*lens };
+            let undone = inner(&centred(lens), imaged / lens.focal).map(|ray| ray * lens.focal);
+            let Some(ray) = undone.and_then(|undone| inner(&centred(self), undone / self.focal)) else { break };
+            // imaged = f t (1 + k1 t^2 + k2 t^4 + k3 t^6)
+            let angle = ray.atan();
+            let squared = angle * angle;
+            let powers = Vector3::new(squared, squared.powi(2), squared.powi(3)) * angle;
+            normal += powers * powers.transpose();
+            right += powers * (imaged / self.focal - angle);
+        }
+        let radial = normal.lu().solve(&right).map_or([0.0; 3], Into::into);
+        Self { projection: LensProjection::Fisheye, radial, tangential: [0.0; 2], ..*self }
+    }
+
+    /// Whether it images other than a pinhole.
     pub fn distorts(&self) -> bool {
-        self.radial != [0.0; 3] || self.tangential != [0.0; 2]
+        self.is_fisheye() || self.radial != [0.0; 3] || self.tangential != [0.0; 2]
+    }
+
+    #[inline(always)]
+    pub fn is_fisheye(&self) -> bool {
+        self.projection == LensProjection::Fisheye
+    }
+
+    /// The polynomial `1 + k1 t^2 + k2 t^4 + k3 t^6`.
+    ///
+    /// * `squared`: of the radius, of a fisheye that of the angle
+    #[inline(always)]
+    fn polynomial(&self, squared: f64) -> f64 {
+        let [k1, k2, k3] = self.radial;
+        1.0 + squared * (k1 + squared * (k2 + squared * k3))
+    }
+
+    /// Derivative of the polynomial by its argument, `t^2`.
+    #[inline(always)]
+    fn polynomial_slope(&self, squared: f64) -> f64 {
+        let [k1, k2, k3] = self.radial;
+        k1 + squared * (2.0 * k2 + squared * 3.0 * k3)
+    }
+
+    /// Derivative of `t` times the polynomial by `t`: positive before the fold.
+    #[inline(always)]
+    fn argument_slope(&self, squared: f64) -> f64 {
+        self.polynomial(squared) + 2.0 * squared * self.polynomial_slope(squared)
+    }
+
+    /// What the polynomial is of at a squared radius, and what it is multiplied by: the squared radius and 1, or the
+    /// squared angle and `t / r`.
+    #[inline(always)]
+    fn argument(&self, squared: f64) -> (f64, f64) {
+        match self.projection {
+            LensProjection::Perspective => (squared, 1.0),
+            LensProjection::Fisheye if squared < NEAR_AXIS => (squared, 1.0 - squared / 3.0),
+            LensProjection::Fisheye => {
+                let radius = squared.sqrt();
+                let angle = radius.atan();
+                (angle * angle, angle / radius)
+            }
+        }
     }
 
     /// The radial scale `s` at a squared radius.
     #[inline(always)]
     fn scale(&self, squared: f64) -> f64 {
-        let [k1, k2, k3] = self.radial;
-        1.0 + squared * (k1 + squared * (k2 + squared * k3))
+        let (argument, factor) = self.argument(squared);
+        factor * self.polynomial(argument)
     }
 
     /// Derivative of the scale by the squared radius.
     #[inline(always)]
     fn scale_slope(&self, squared: f64) -> f64 {
-        let [k1, k2, k3] = self.radial;
-        k1 + squared * (2.0 * k2 + squared * 3.0 * k3)
+        match self.projection {
+            LensProjection::Perspective => self.polynomial_slope(squared),
+            LensProjection::Fisheye if squared < NEAR_AXIS => self.radial[0] - 1.0 / 3.0,
+            LensProjection::Fisheye => (self.radius_slope(squared) - self.scale(squared)) / (2.0 * squared),
+        }
     }
 
     /// Derivative of the imaged radius `r s` by the radius: positive before the fold.
     #[inline(always)]
     pub(super) fn radius_slope(&self, squared: f64) -> f64 {
-        self.scale(squared) + 2.0 * squared * self.scale_slope(squared)
+        let slope = self.argument_slope(self.argument(squared).0);
+        if self.is_fisheye() { slope / (1.0 + squared) } else { slope }
+    }
+
+    /// `p1` and `p2` of a perspective lens.
+    #[inline(always)]
+    fn decentring(&self) -> [f64; 2] {
+        if self.is_fisheye() { [0.0; 2] } else { self.tangential }
     }
 
     /// What tangential distortion adds to a point at unit depth.
     #[inline(always)]
     fn tangential_shift(&self, u: f64, v: f64) -> Vector2<f64> {
-        let [p1, p2] = self.tangential;
+        let [p1, p2] = self.decentring();
         let squared = u * u + v * v;
         Vector2::new(2.0 * p1 * u * v + p2 * (squared + 2.0 * u * u), p1 * (squared + 2.0 * v * v) + 2.0 * p2 * u * v)
     }
@@ -97,16 +212,22 @@ impl Intrinsics {
         let scale = seen.z.recip();
         let (u, v) = (seen.x * scale, seen.y * scale);
         let (fx, fy) = (self.focal, self.aspect * self.focal);
-        let [p1, p2] = self.tangential;
+        let [p1, p2] = self.decentring();
         let squared = u * u + v * v;
-        let radial = self.scale(squared);
+        let (argument, factor) = self.argument(squared);
+        let radial = factor * self.polynomial(argument);
         let shift = self.tangential_shift(u, v);
         let (x, y) = (fx * (u * radial + shift.x), fy * (v * radial + shift.y));
-        let (first_x, first_y) = (fx * u * squared, fy * v * squared);
-        let (fourth, uv) = (squared * squared, 2.0 * u * v);
+        let first = factor * argument;
+        let (first_x, first_y) = (fx * u * first, fy * v * first);
+        let fourth = argument * argument;
+        // By p1 and p2: what a fisheye does not look at moves nothing.
+        let decentred = if self.is_fisheye() { 0.0 } else { 1.0 };
+        let (uv, px, py) =
+            (2.0 * u * v * decentred, (squared + 2.0 * u * u) * decentred, (squared + 2.0 * v * v) * decentred);
         let by_parameter = [
-            [x, 1.0, 0.0, 0.0, first_x, first_x * squared, first_x * fourth, fx * uv, fx * (squared + 2.0 * u * u)],
-            [y, 0.0, 1.0, y, first_y, first_y * squared, first_y * fourth, fy * (squared + 2.0 * v * v), fy * uv],
+            [x, 1.0, 0.0, 0.0, first_x, first_x * argument, first_x * fourth, fx * uv, fx * px],
+            [y, 0.0, 1.0, y, first_y, first_y * argument, first_y * fourth, fy * py, fy * uv],
         ];
         // Of the two image coordinates by u and v; by z the image moves as by -u and -v.
         let bend = 2.0 * self.scale_slope(squared);
@@ -122,11 +243,12 @@ impl Intrinsics {
     /// one.
     #[cfg(test)]
     pub fn images(&self, squared: f64) -> bool {
-        self.fold().is_none_or(|fold| squared < fold)
+        self.fold().is_none_or(|fold| self.argument(squared).0 < fold)
     }
 
-    /// Squared radius at which the image folds back: the least at which the derivative of `r s`, the cubic `1 + 3 k1 t
-    /// + 5 k2 t^2 + 7 k3 t^3` of it, vanishes. Tangential terms, which are small before the radial ones, are left out.
+    /// Squared radius, of a fisheye squared angle, at which the image folds back: the least at which the derivative of
+    /// `t` times the polynomial, the cubic `1 + 3 k1 t^2 + 5 k2 t^4 + 7 k3 t^6`, vanishes. Tangential terms, which are
+    /// small before the radial ones, are left out.
     ///
     /// It is the inverse of the largest root of `s^3 + 3 k1 s^2 + 5 k2 s + 7 k3`, which has a closed form (Cardano's,
     /// and Viete's where there are three).
@@ -146,16 +268,20 @@ impl Intrinsics {
         Some(root - k1).filter(|inverse| *inverse > LEAST_INVERSE_FOLD).map(f64::recip)
     }
 
-    /// Where a pinhole with this `K` would see what the lens images at `xy`.
+    /// The observation where a pinhole with this `K` would have made it; `None` where the lens images nothing.
     ///
-    /// Returns `None` where nothing is imaged: beyond the circle at which the distortion folds the image back.
-    pub fn undistort(&self, xy: &Vector2<f64>) -> Option<Vector2<f64>> {
+    /// Undoing the distortion scales noise as it scales areas, a fisheye's 40-fold at 75 degrees from the axis. The weight
+    /// makes up for that, so that weighted residuals are those of the image to first order, and as a geometric mean
+    /// where radial and tangential scales differ.
+    pub fn undistorted(&self, seen: &Observation) -> Option<Observation> {
         if !self.distorts() {
-            return Some(*xy);
+            return Some(*seen);
         }
-        let ray = self.ray(xy)?;
-        let undone = self.principal_point + Vector2::new(self.focal * ray.x, self.aspect * self.focal * ray.y);
-        undone.iter().all(|value| value.is_finite()).then_some(undone)
+        let ray = self.ray(&seen.xy)?;
+        let xy = self.principal_point + Vector2::new(self.focal * ray.x, self.aspect * self.focal * ray.y);
+        let squared = ray.norm_squared();
+        let area = self.scale(squared) * self.radius_slope(squared);
+        xy.iter().all(|value| value.is_finite()).then_some(Observation { xy, weight: seen.weight * area, ..*seen })
     }
 
     /// The direction `(u, v)` at unit depth that is imaged at `xy`; `None` where the lens images nothing.
@@ -167,7 +293,7 @@ impl Intrinsics {
         }
         let fold = self.fold().map(f64::sqrt);
         let mut ray = self.radially_undistorted(&distorted, fold)?;
-        let rounds = if self.tangential == [0.0; 2] { 0 } else { TANGENTIAL_ROUNDS };
+        let rounds = if self.decentring() == [0.0; 2] { 0 } else { TANGENTIAL_ROUNDS };
         for _ in 0..rounds {
             let next = self.radially_undistorted(&(distorted - self.tangential_shift(ray.x, ray.y)), fold)?;
             let moved = (next - ray).norm();
@@ -181,12 +307,21 @@ impl Intrinsics {
 
     /// The point that radial distortion alone moves to this one.
     fn radially_undistorted(&self, distorted: &Vector2<f64>, fold: Option<f64>) -> Option<Vector2<f64>> {
-        Some(distorted / self.scale(self.undistorted_radius(distorted.norm(), fold)?.powi(2)))
+        let imaged = distorted.norm();
+        let argument = self.undistorted_argument(imaged, fold)?;
+        match self.projection {
+            LensProjection::Perspective => Some(distorted / self.polynomial(argument.powi(2))),
+            // Beyond a right angle from the axis nothing is in front of the camera.
+            LensProjection::Fisheye if argument >= FRAC_PI_2 => None,
+            LensProjection::Fisheye if imaged == 0.0 => Some(*distorted),
+            LensProjection::Fisheye => Some(distorted * (argument.tan() / imaged)),
+        }
     }
 
-    /// The radius before the fold that is imaged at this one: the root of a function that rises, enclosed.
-    fn undistorted_radius(&self, distorted: f64, fold: Option<f64>) -> Option<f64> {
-        let imaged = |radius: f64| radius * self.scale(radius * radius);
+    /// The radius, of a fisheye the angle, before the fold that is imaged at this radius: the root of a function that
+    /// rises, enclosed.
+    fn undistorted_argument(&self, distorted: f64, fold: Option<f64>) -> Option<f64> {
+        let imaged = |radius: f64| radius * self.polynomial(radius * radius);
         let high = match fold {
             Some(fold) => Some(fold).filter(|fold| distorted <= imaged(*fold)),
             None => (0..WIDEST_DOUBLINGS)
@@ -202,7 +337,7 @@ impl Intrinsics {
             } else {
                 low = radius;
             }
-            let newton = radius - excess / self.radius_slope(radius * radius);
+            let newton = radius - excess / self.argument_slope(radius * radius);
             let next = if newton >= low && newton <= high { newton } else { 0.5 * (low + high) };
             let moved = (next - radius).abs();
             radius = next;
@@ -249,6 +384,11 @@ impl Intrinsics {
 mod tests {
     use super::*;
 
+    /// Where a pinhole would have seen it.
+    fn undone(lens: &Intrinsics, xy: Vector2<f64>) -> Option<Vector2<f64>> {
+        lens.undistorted(&Observation::new(0, 0, xy)).map(|seen| seen.xy)
+    }
+
     #[test]
     fn undistorting_inverts_the_projection_up_to_the_fold() {
         let radial = [
@@ -264,9 +404,17 @@ mod tests {
             [-0.2, -0.1, 0.1],
             [0.1, 0.1, -0.1],
         ];
+        let kinds = [
+            (LensProjection::Perspective, [0.0; 2]),
+            (LensProjection::Perspective, [0.004, -0.003]),
+            (LensProjection::Perspective, [-0.02, 0.01]),
+            // A fisheye does not look at tangential terms.
+            (LensProjection::Fisheye, [0.3, 0.2]),
+        ];
         for radial in radial {
-            for tangential in [[0.0; 2], [0.004, -0.003], [-0.02, 0.01]] {
+            for (projection, tangential) in kinds {
                 let intrinsics = Intrinsics {
+                    projection,
                     principal_point: Vector2::new(0.03, -0.02),
                     aspect: 1.1,
                     radial,
@@ -274,10 +422,12 @@ mod tests {
                     ..Intrinsics::from_focal(1.3)
                 };
                 for k in 0..10 {
-                    let seen = Vector3::new(0.08 * f64::from(k), -0.04 * f64::from(k), 1.0);
+                    // Fisheyes to 52 degrees off the axis: the strongest barrel folds at 1.05 radians.
+                    let reach = if intrinsics.is_fisheye() { 0.13 } else { 0.08 };
+                    let seen = Vector3::new(reach * f64::from(k), -0.5 * reach * f64::from(k), 1.0);
                     let pinhole = intrinsics.matrix() * seen;
                     let image = intrinsics.project(&seen);
-                    let undone = intrinsics.undistort(&image).expect("below the fold");
+                    let undone = undone(&intrinsics, image).expect("below the fold");
                     let ray = intrinsics.ray(&image).expect("below the fold");
                     let off = (undone - pinhole.xy()).norm().max((ray - seen.xy()).norm());
                     assert!(off < 1e-9, "radial {radial:?}, tangential {tangential:?}, {k}: {off}");
@@ -285,17 +435,64 @@ mod tests {
             }
         }
         let barrel = Intrinsics { radial: [-0.3, 0.0, 0.0], ..Intrinsics::from_focal(1.0) };
-        assert_eq!(barrel.undistort(&Vector2::new(0.71, 0.0)), None, "beyond 2/3 / sqrt(.9)");
-        assert!(barrel.undistort(&Vector2::new(0.70, 0.0)).is_some());
+        assert_eq!(undone(&barrel, Vector2::new(0.71, 0.0)), None, "beyond 2/3 / sqrt(.9)");
+        assert!(undone(&barrel, Vector2::new(0.70, 0.0)).is_some());
         assert!(barrel.images(1.11) && !barrel.images(1.12), "the fold at 1 / .9");
         // 1 + 1.5 r^2 - 2.5 r^4 vanishes at 1, where r s is 1.
         let bent = Intrinsics { radial: [0.5, -0.5, 0.0], ..Intrinsics::from_focal(1.0) };
         assert!(bent.images(0.99) && !bent.images(1.01));
-        assert_eq!(bent.undistort(&Vector2::new(1.001, 0.0)), None);
-        assert!(bent.undistort(&Vector2::new(0.999, 0.0)).is_some());
+        assert_eq!(undone(&bent, Vector2::new(1.001, 0.0)), None);
+        assert!(undone(&bent, Vector2::new(0.999, 0.0)).is_some());
         // A second term that holds the first: nothing folds.
         let held = Intrinsics { radial: [-0.3, 0.05, 0.0], ..Intrinsics::from_focal(1.0) };
         assert!(held.images(1e6));
+    }
+
+    #[test]
+    fn an_equidistant_fisheye_images_the_angle() {
+        let fisheye = Intrinsics { projection: LensProjection::Fisheye, ..Intrinsics::from_focal(0.5) };
+        for degrees in [0.0f64, 1e-5, 0.05, 0.06, 10.0, 45.0, 80.0, 89.0] {
+            let angle = degrees.to_radians();
+            let image = fisheye.project(&Vector3::new(0.6 * angle.sin(), 0.8 * angle.sin(), angle.cos()));
+            let expected = Vector2::new(0.3 * angle, 0.4 * angle);
+            assert!((image - expected).norm() < 1e-15, "{degrees} degrees: {image}");
+        }
+        assert_eq!(fisheye.ray(&Vector2::new(0.79, 0.0)), None, "beyond a right angle");
+        assert_eq!(fisheye.ray(&Vector2::zeros()), Some(Vector2::zeros()));
+    }
+
+    /// A square about a point, as small as its noise, imaged and undone.
+    #[test]
+    fn weights_undo_what_undistorting_does_to_noise() {
+        let barrel = Intrinsics { radial: [-0.2, 0.02, 0.0], ..Intrinsics::from_focal(0.7) };
+        let fisheye = Intrinsics { projection: LensProjection::Fisheye, ..Intrinsics::from_focal(0.5) };
+        for lens in [barrel, fisheye] {
+            for xy in [Vector2::new(0.1, 0.05), Vector2::new(-0.3, 0.3), Vector2::new(0.5, 0.1)] {
+                const SIDE: f64 = 1e-5;
+                let at = |x: f64, y: f64| undone(&lens, xy + SIDE * Vector2::new(x, y)).expect("imaged");
+                let (right, down) = (at(0.5, 0.0) - at(-0.5, 0.0), at(0.0, 0.5) - at(0.0, -0.5));
+                let area = right.perp(&down) / (SIDE * SIDE);
+                let weight = lens.undistorted(&Observation::new(0, 0, xy)).expect("imaged").weight;
+                assert!((weight * area - 1.0).abs() < 1e-6, "{lens:?} at {xy}: {weight} of {area}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_lens_behind_another_is_one_fisheye() {
+        let outer = Intrinsics { projection: LensProjection::Fisheye, ..Intrinsics::from_focal(0.47) };
+        for focal in [0.4, 0.5, 0.7] {
+            let inner = Intrinsics { radial: [0.03, 0.0, 0.0], ..Intrinsics::from_focal(focal) };
+            let both = inner.behind(&outer, 0.6);
+            for k in 0..=12 {
+                let pinhole = Vector2::new(0.04, 0.03) * f64::from(k);
+                let of_outer = outer.project(&(pinhole / outer.focal).push(1.0));
+                let ray = inner.ray(&pinhole).expect("nothing folds");
+                let off = (both.project(&ray.push(1.0)) - of_outer).norm();
+                // Half a pixel of 1,000.
+                assert!(off < 5e-4, "focal {focal}, {k}: {off}");
+            }
+        }
     }
 
     /// 1 - 7 t^3 / 7 vanishes at 1; (1 - t) (1 - t/2) (1 - t/3) at 1, 2 and 3; (1 + t)^3 nowhere.

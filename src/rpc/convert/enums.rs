@@ -1,7 +1,7 @@
 //! Enums: the domain's and the wire's have the same variants, but for the wire's `UNSPECIFIED`.
 
 use crate::domain::job::{AttemptEnd, JobState};
-use crate::domain::{Backend, Grade, Method, Proposal, Stage, Status, Task, Violation, WarningCode};
+use crate::domain::{Backend, Grade, LensProjection, Method, Proposal, Stage, Status, Task, Violation, WarningCode};
 use crate::rpc::proto;
 
 /// A domain enum that has a twin on the wire.
@@ -52,6 +52,7 @@ twins! {
     Task = Task { Adjust, Cameras, Windows, Judge }
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
+    LensProjection = LensProjection { Perspective, Fisheye }
     Proposal = Prior { Network, Irls, Consistency, Rigidity, Uniform, Learned }
     JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, Expired }
     AttemptEnd = AttemptEnd { Ended, GivenBack, Lost }

@@ -5,7 +5,8 @@ use super::{progress, required};
 use crate::domain::job::JobName;
 use crate::domain::result::{ObservationResults, PriorTime, Sigmas, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{
-    Calibration, Grade, LeftOut, Method, Proposal, Solution, Stage, Status, Violation, Warning, WarningCode,
+    Calibration, Grade, LeftOut, LensProjection, Method, Proposal, Solution, Stage, Status, Violation, Warning,
+    WarningCode,
 };
 use crate::rpc::proto;
 
@@ -117,6 +118,7 @@ fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
         principal_point_x_px: calibration.principal_point_px[0],
         principal_point_y_px: calibration.principal_point_px[1],
         aspect: calibration.aspect,
+        lens_projection: calibration.lens_projection.to_wire(),
         radial_k1: Some(calibration.radial_k1),
         radial_k2: Some(calibration.radial_k2),
         grade: optional_to_wire(calibration.grade),
@@ -140,6 +142,8 @@ fn calibration_from_wire(calibration: &proto::Calibration) -> Result<Calibration
         sigma_log_focal: calibration.sigma_log_focal,
         principal_point_px: [calibration.principal_point_x_px, calibration.principal_point_y_px],
         aspect: calibration.aspect,
+        lens_projection: LensProjection::from_wire(calibration.lens_projection, "calibrations.lens_projection")?
+            .unwrap_or_default(),
         radial_k1: calibration.radial_k1.unwrap_or(0.0),
         radial_k2: calibration.radial_k2.unwrap_or(0.0),
         radial_k3: calibration.radial_k3.unwrap_or(0.0),

@@ -3,7 +3,7 @@
 use prost::Message;
 
 use super::*;
-use crate::domain::{Course, Losses, Progress};
+use crate::domain::{Course, LensProjection, Losses, Progress};
 
 fn name() -> JobName {
     JobName { tenant: "default".into(), job: "a".into() }
@@ -37,6 +37,7 @@ pub(super) fn rich() -> Solution {
                 sigma_log_focal: Some(0.05),
                 principal_point_px: [499.5, 399.5],
                 aspect: 1.25,
+                lens_projection: LensProjection::Fisheye,
                 radial_k1: -0.05,
                 radial_k2: 0.01,
                 radial_k3: -0.003,
@@ -58,6 +59,7 @@ pub(super) fn rich() -> Solution {
                 sigma_log_focal: None,
                 principal_point_px: [0.0, 0.0],
                 aspect: 1.0,
+                lens_projection: LensProjection::Perspective,
                 radial_k1: 0.0,
                 radial_k2: 0.0,
                 radial_k3: 0.0,

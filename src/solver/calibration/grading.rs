@@ -118,10 +118,15 @@ fn chosen(
     let problem = choice.problem;
     let first = minima.remove(best_in_front(&minima, problem, fit));
     let simplest = IntrinsicsModel::focal(first.reconstruction.has_own_focals());
-    let mut best = choice.richest(Candidate::new(first, simplest, choice.priors(fit.noise), problem), warnings)?;
-    if best.model == simplest {
+    let mut of_model = Vec::new();
+    let mut best = choice.richest(Candidate::new(first, simplest, choice.priors(fit.noise), problem), &mut of_model)?;
+    if let Some(fisheye) = choice.behind_fisheye(&best, &mut minima, &mut of_model)? {
+        best = fisheye;
+    } else if best.model == simplest {
+        warnings.extend(of_model);
         return Ok((best, minima));
     }
+    warnings.extend(of_model);
     let least_in_front = problem.options.grades.least_in_front;
     for minimum in &mut minima {
         Error::check(choice.stop)?;

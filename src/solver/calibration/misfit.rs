@@ -7,7 +7,7 @@ use super::models::{Candidate, Choice};
 use super::options::FitOptions;
 use super::{Uncalibrated, observed_points};
 use crate::domain::StopToken;
-use crate::geometry::bundle::metric::{self, Extension, IntrinsicsPrior, MetricReconstruction};
+use crate::geometry::bundle::metric::{self, Extension, Intrinsics, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point, critical};
@@ -69,7 +69,7 @@ impl Comparison {
 fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
     let of_lens = best.model.extensions().filter(|extension| extension.is_of_lens());
     let terms = choice.problem.groups() * of_lens.map(|extension| extension.parameters().len()).sum::<usize>();
-    if terms == 0 {
+    if !best.minimum.reconstruction.intrinsics.iter().any(Intrinsics::distorts) {
         return None;
     }
     let observations = undistorted(&best.minimum.reconstruction, choice.problem.observations);
@@ -77,9 +77,7 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
     let options = Options::squared(problem.options.fit.undistorted_iterations);
 
     let mut pinhole = best.minimum.reconstruction.clone();
-    for lens in &mut pinhole.intrinsics {
-        (lens.radial, lens.tangential) = ([0.0; 3], [0.0; 2]);
-    }
+    pinhole.intrinsics.iter_mut().for_each(|lens| *lens = lens.pinhole());
     let projective = match pinhole.has_common_centre {
         true => {
             let (start, iterations) = (critical::homographies_of(&pinhole)?, options.max_iterations);
@@ -126,10 +124,6 @@ fn projective_fit(
 }
 
 /// The observations where pinholes would have made them; without those that the lens images nowhere.
-fn undistorted(metric: &MetricReconstruction, observations: &[Observation]) -> Vec<Observation> {
-    let of_pinhole = |seen: &Observation| {
-        let xy = metric.intrinsics_of(seen.view).undistort(&seen.xy)?;
-        Some(Observation { xy, ..*seen })
-    };
-    observations.iter().filter_map(of_pinhole).collect()
+pub(super) fn undistorted(metric: &MetricReconstruction, observations: &[Observation]) -> Vec<Observation> {
+    observations.iter().filter_map(|seen| metric.intrinsics_of(seen.view).undistorted(seen)).collect()
 }

@@ -235,7 +235,10 @@ pub fn from_metric(
 ) -> Result<Vec<Outcome>, Error> {
     let problem = &problem.with_least_noise();
     let stretch = stretch.map(|stretch| Stretch { problem: stretch.problem.with_least_noise(), ..stretch });
-    let on = stretch.as_ref().map_or(problem, |stretch| &stretch.problem);
+    let (on, of_stretch) = stretch.as_ref().map_or((problem, metric), |stretch| (&stretch.problem, stretch.metric));
+    // Neither projective cameras nor homographies have a lens.
+    let observations = misfit::undistorted(of_stretch, on.observations);
+    let on = &Uncalibrated { observations: &observations, ..*on };
     let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on, scale_px, stop, heartbeat)?;
     warnings.extend(critical.warnings);
     let fit = match (critical.upgrade, metric.has_common_centre) {

@@ -139,6 +139,53 @@ impl Choice<'_> {
         }
     }
 
+    /// The richest candidate behind a fisheye in place of this one's barrel, if it fits better for as many parameters.
+    ///
+    /// The two series of distortion are not nested: each parameter counts what an extension of one must gain, and so does
+    /// giving up the perspective lens.
+    ///
+    /// * `minima`: others, put behind the same fisheyes
+    pub fn behind_fisheye(
+        &self,
+        best: &Candidate,
+        minima: &mut [Minimum],
+        warnings: &mut Vec<Warning>,
+    ) -> Result<Option<Candidate>, Error> {
+        let radii = self.wide_barrels(&best.minimum.reconstruction);
+        if radii.iter().all(Option::is_none) {
+            return Ok(None);
+        }
+        let from = best.minimum.behind_fisheye(&radii);
+        let simplest = IntrinsicsModel::focal(best.model.is_per_view());
+        let mut of_fisheye = Vec::new();
+        let found = self.richest(self.adjusted(&from, simplest, best.fit.noise), &mut of_fisheye)?;
+        let parameters = |candidate: &Candidate| candidate.model.parameters().len() as f64;
+        let added = 1.0 + (parameters(&found) - parameters(best)) * self.problem.groups() as f64;
+        let gain = (best.minimum.cost - found.minimum.cost) / best.fit.noise.min(found.fit.noise).powi(2);
+        let is_better = gain > added * self.problem.options.models.significant_gain_of_one;
+        if is_better {
+            *warnings = of_fisheye;
+            minima.iter_mut().for_each(|minimum| *minimum = minimum.behind_fisheye(&radii));
+        }
+        Ok(is_better.then_some(found))
+    }
+
+    /// The largest radius at unit depth that each group behind a perspective barrel observes, where a fisheye may stand
+    /// in its place.
+    fn wide_barrels(&self, reconstruction: &MetricReconstruction) -> Vec<Option<f64>> {
+        let mut radii = vec![0.0f64; self.problem.groups()];
+        for seen in self.problem.observations {
+            if let Some(ray) = reconstruction.intrinsics_of(seen.view).ray(&seen.xy) {
+                let radius = &mut radii[reconstruction.group_of[seen.view]];
+                *radius = radius.max(ray.norm());
+            }
+        }
+        let is_barrel = |lens: &Intrinsics| !lens.is_fisheye() && lens.radial[0] < 0.0;
+        let least = self.problem.options.models.fisheye_from;
+        let lenses = reconstruction.intrinsics.iter().zip(radii);
+        lenses.map(|(lens, radius)| Some(radius).filter(|radius| is_barrel(lens) && *radius > least)).collect()
+    }
+
     /// Extensions that the linearisation foretells to be significant, with the gain beyond what is, largest first.
     fn promising(&self, best: &Candidate) -> Vec<(Extension, f64)> {
         let Some(here) = best.optimum(best.model, &best.priors) else { return Vec::new() };

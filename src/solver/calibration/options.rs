@@ -344,6 +344,8 @@ pub struct ModelOptions {
     pub sigma_inflation: f64,
     /// Shift of the log focal length between models, in standard deviations, that speaks of a wrong model.
     pub model_shift: f64,
+    /// Radius at unit depth that a barrel's images must exceed for a fisheye to be tried in its place.
+    pub fisheye_from: f64,
     /// Weight of a model below which it has no say in whether the focal length is observable.
     pub negligible: f64,
     /// Where the profile of the cost is sampled, in standard deviations to either side and at most in log focal.
@@ -367,6 +369,8 @@ impl ModelOptions {
         noise_rounds: 4,
         sigma_inflation: 3.0,
         model_shift: 3.0,
+        // 35 degrees: up to there three radial terms image an equidistant fisheye to 2e-5 of a focal length.
+        fisheye_from: 0.7,
         negligible: 1e-3,
         profile_deviations: 3.0,
         // A factor of 1.35.

@@ -66,6 +66,22 @@ impl Minimum {
         if determined.contains(&true) { determined } else { vec![true; views] }
     }
 
+    /// The same behind the fisheyes that image nearest to some of its lenses, still to be adjusted.
+    ///
+    /// * `radii`: largest radius at unit depth that each group observes; `None` where its lens stays
+    pub fn behind_fisheye(&self, radii: &[Option<f64>]) -> Self {
+        let mut found = self.clone();
+        let reconstruction = &mut found.reconstruction;
+        for (lens, radius) in reconstruction.intrinsics.iter_mut().zip(radii) {
+            let Some(radius) = *radius else { continue };
+            let of_perspective = lens.focal;
+            *lens = lens.nearest_fisheye(radius);
+            // Views of their own focal lengths are those of one group.
+            reconstruction.focals.iter_mut().for_each(|focal| *focal *= lens.focal / of_perspective);
+        }
+        found
+    }
+
     /// Adjusts to convergence from here with this model.
     pub fn adjusted(
         &self,
@@ -122,10 +138,9 @@ pub(super) fn minima_near(
     for &factor in factors {
         Error::check(stop)?;
         let mut reconstruction = metric.clone();
-        reconstruction
-            .intrinsics
-            .iter_mut()
-            .for_each(|intrinsics| *intrinsics = Intrinsics::from_focal(intrinsics.focal));
+        for lens in &mut reconstruction.intrinsics {
+            *lens = Intrinsics { projection: lens.projection, ..Intrinsics::from_focal(lens.focal) };
+        }
         reconstruction.scale_focals(factor);
         if factor != 1.0 {
             let following = Options { max_iterations: options.following_iterations, ..Options::default() };

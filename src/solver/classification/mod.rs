@@ -58,9 +58,13 @@ impl Geometry {
     /// Observation `k` where a pinhole would see it; what a lens images nowhere stays where it is, far from any point.
     pub fn observation(&self, problem: &Problem, k: usize) -> Observation {
         let seen = problem.observation(k);
-        let undone = self.lenses.get(seen.view).and_then(|lens| lens.undistort(&seen.xy));
-        let weight = if self.by_observation { seen.weight } else { 1.0 };
-        Observation { xy: undone.unwrap_or(seen.xy), weight, ..seen }
+        let seen = Observation { weight: self.given_weight(problem, k), ..seen };
+        self.lenses.get(seen.view).and_then(|lens| lens.undistorted(&seen)).unwrap_or(seen)
+    }
+
+    /// Weight of observation `k` by the sigma that it came with.
+    fn given_weight(&self, problem: &Problem, k: usize) -> f64 {
+        if self.by_observation { problem.weights[k] } else { 1.0 }
     }
 
     /// Share of its observations in registered views that a right track retains.
@@ -114,12 +118,13 @@ pub fn judge(problem: &Problem, geometry: &Geometry, progress: &mut dyn FnMut(us
 /// Weighted squared residuals, in core variances, of the tracks that are right as a whole: a track with a dropped
 /// observation may be wrong in others.
 fn whole_tracks(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Vec<f64> {
-    let weight = |k: usize| if geometry.by_observation { problem.weights[k] } else { 1.0 };
     (0..problem.tracks())
         .filter(|&track| judged.tracks.inlier[track])
         .filter(|&track| judged.retained[track].len() == problem.of_track(track).len())
         .flat_map(|track| problem.of_track(track))
-        .filter_map(|k| Some((weight(k), judged.observations.residual_px[problem.input.caller_index(k)]?)))
+        .filter_map(|k| {
+            Some((geometry.given_weight(problem, k), judged.observations.residual_px[problem.input.caller_index(k)]?))
+        })
         .map(|(weight, residual)| weight * (residual / problem.scale_px / geometry.noise).powi(2))
         .collect()
 }

@@ -132,8 +132,9 @@ impl TrackClassifier<'_> {
         let gate = self.noise.gate();
         let (point, cost) = self.at_infinity_if_behind(observations, retained, point).unwrap_or((point, cost));
         let dropped = observations.len() - retained.len();
-        // The density of two coordinates of weight w is w times as high where the residual is 0.
-        let of_weights: f64 = retained.iter().map(|&k| observations[k].weight.ln()).sum();
+        // The density of two coordinates of weight w is w times as high where the residual is 0. What a lens weighs them by
+        // goes for wrong observations, too.
+        let of_weights: f64 = retained.iter().map(|&k| self.given_weight(&observations[k]).ln()).sum();
         let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share) + of_weights;
         let enough = retained.len() >= self.least_retained(observations);
         let weight = if enough && cost.is_finite() { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
@@ -161,6 +162,15 @@ impl TrackClassifier<'_> {
         let direction = point.xyz() * if depths.sum::<f64>() < 0.0 { -1.0 } else { 1.0 };
         let far = direction.push(0.0).try_normalize(f64::MIN_POSITIVE)?;
         Some((far, seen().map(|seen| self.seen_squared(&far, seen)).sum()))
+    }
+
+    /// Weight by the sigma that an observation came with, without that of the lens.
+    fn given_weight(&self, seen: &Observation) -> f64 {
+        if !self.problem.input.has_sigmas() {
+            return 1.0;
+        }
+        let given = self.problem.of_track(seen.point).find(|&k| self.problem.view_of(k) == seen.view);
+        given.map_or(1.0, |k| self.geometry.given_weight(self.problem, k))
     }
 
     /// Weighted squared residual of an observation of a point, infinite behind a metric camera.
@@ -195,7 +205,7 @@ impl TrackClassifier<'_> {
         for ((&place, observation), &retained) in places.iter().zip(observations).zip(&verdict.retained) {
             let squared = self.squared(&verdict.point, observation);
             judged.observations.residual_px[place] =
-                Some((squared / observation.weight).sqrt() * self.problem.scale_px)
+                Some((squared / self.given_weight(observation)).sqrt() * self.problem.scale_px)
                     .filter(|residual| residual.is_finite());
             let is_in_front = self.seen_squared(&verdict.point, observation).is_finite();
             judged.observations.weight[place] = if is_in_front { self.noise.weight(squared) as f32 } else { 0.0 };

@@ -244,7 +244,6 @@ impl Model {
     pub fn observation(&self, problem: &Problem, k: usize) -> Option<Observation> {
         let view = problem.view_of(k);
         self.poses[view]?;
-        let seen = problem.observation(k);
-        Some(Observation { xy: self.intrinsics_of(problem, view).undistort(&seen.xy)?, ..seen })
+        self.intrinsics_of(problem, view).undistorted(&problem.observation(k))
     }
 }

@@ -11,7 +11,7 @@ use super::super::reduced::Reduced;
 use super::super::worker_pool::BATCH;
 use super::super::worker_pool::WorkerPool;
 use super::*;
-use crate::domain::StopReason;
+use crate::domain::{LensProjection, StopReason};
 use crate::geometry::bundle::Loss;
 use crate::geometry::bundle::metric::{Extension, Parameter};
 
@@ -85,6 +85,11 @@ fn normal_equations_agree_with_finite_differences() {
     models[2] = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1);
     observe(&sequence, &mut observations, 0.003, 1);
     compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 2 + 9 + 1, "two more unknowns of views");
+    sequence.intrinsics.iter_mut().for_each(|lens| lens.projection = LensProjection::Fisheye);
+    observe(&sequence, &mut observations, 0.003, 1);
+    compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 2 + 9 + 1, "fisheyes");
+    sequence.intrinsics.iter_mut().for_each(|lens| lens.projection = LensProjection::Perspective);
+    observe(&sequence, &mut observations, 0.003, 1);
     models[2] = IntrinsicsModel::FOCAL_PER_VIEW.with_all_extensions();
     compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 2 + 9 + 8, "all that a lens has");
 }
