@@ -1,12 +1,13 @@
 //! A set of views with the tracks that are seen in all of them.
 
+use nalgebra::Vector2;
 use rand::SeedableRng;
 use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 
 use super::normalization::normalization;
 use crate::domain::Input;
-use crate::geometry::measurement::{CompleteBlock, Normalization};
+use crate::geometry::measurement::CompleteBlock;
 
 /// A set of views with the tracks that are seen in all of them.
 #[derive(Debug, Clone)]
@@ -48,11 +49,14 @@ impl Block {
 /// The block of all views of an input.
 pub fn of_all_views(input: &Input) -> Block {
     let (normalization, _) = normalization(input);
-    extract(input, &input.track_ranges(), &normalization, &(0..input.view_count()).collect::<Vec<_>>())
+    let xy = |k| normalization.normalize(input.view_of(k), input.point_px(k));
+    extract(input, &input.track_ranges(), xy, &(0..input.view_count()).collect::<Vec<_>>())
 }
 
 /// The block of these views: all tracks that are complete over them.
-pub fn extract(input: &Input, ranges: &[usize], normalization: &Normalization, views: &[usize]) -> Block {
+///
+/// * `xy`: normalised image point of an observation
+pub fn extract(input: &Input, ranges: &[usize], xy: impl Fn(usize) -> Vector2<f64>, views: &[usize]) -> Block {
     let mut place = vec![None; input.view_count()];
     for (i, &view) in views.iter().enumerate() {
         place[view] = Some(i);
@@ -67,7 +71,7 @@ pub fn extract(input: &Input, ranges: &[usize], normalization: &Normalization, v
         if inside.len() == views.len() {
             tracks.push(track);
             for k in inside {
-                points.push(normalization.normalize(input.view_of(k), input.point_px(k)));
+                points.push(xy(k));
                 depths.extend(input.depth(k));
             }
         }

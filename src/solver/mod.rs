@@ -131,9 +131,9 @@ fn solve_views(
     let settings = &SolveSettings { use_daq: settings.use_daq && !settings.focal_per_view, ..settings.clone() };
     let problem = Problem::new(input, settings, threads, stop);
     let mut recorder = Recorder::new(observer, problem.observed_views().len());
-    let ended = match problem.is_searched() {
-        true => sequence::solve(&problem, &mut recorder)?,
-        false => Ended::Block(baselines::solve(&problem, &mut recorder)?.map(Box::new)),
+    let (ended, problem) = match problem.is_searched() {
+        true => sequence::solve(problem, &mut recorder)?,
+        false => (Ended::Block(baselines::solve(&problem, &mut recorder)?.map(Box::new)), problem),
     };
     problem.stopped()?;
     let solution = assemble::solution(ended, &problem, recorder);

@@ -13,6 +13,7 @@ use super::normalization::normalization;
 use super::view_selection::complete_views;
 use super::{Error, classification, near_duplicates, static_tracks};
 use crate::domain::{FocalPrior, Input, Method, SolveSettings, StopToken, View, Warning, WarningCode};
+use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::Normalization;
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::median;
@@ -26,6 +27,7 @@ pub const LEAST_RETAINED_SHARE: f64 = 0.6;
 pub const VERIFIED: usize = 3;
 
 /// What every stage of one solve works on; observations keep the input's sorted order (track, view).
+#[derive(Clone)]
 pub struct Problem<'a> {
     pub input: &'a Input,
     pub settings: &'a SolveSettings,
@@ -40,6 +42,8 @@ pub struct Problem<'a> {
     pub xy: Vec<Vector2<f64>>,
     /// See [`Observation::weight`]; one an observation.
     pub weights: Vec<f64>,
+    /// The lenses that are undone before anything projective is looked for.
+    pub undone: Option<Undone>,
     /// Whether each track is static: left aside in a search.
     pub is_static: Vec<bool>,
     /// The track that represents each until all are judged: itself, but for near-duplicates.
@@ -63,6 +67,25 @@ pub struct Problem<'a> {
     pub warnings: Vec<Warning>,
     pub threads: Threads,
     pub stop: &'a StopToken,
+}
+
+/// Lenses that are undone, a hypothesis.
+#[derive(Clone)]
+pub struct Undone {
+    /// One a camera; a pinhole where none is undone.
+    pub lenses: Vec<Intrinsics>,
+    /// Largest radius of an observation, normalised.
+    radius: f64,
+    /// Where pinholes would have made them.
+    observations: Vec<Observation>,
+}
+
+impl Undone {
+    /// The lens of the images of a camera for which these intrinsics are found once its lens is undone.
+    pub fn behind(&self, camera: usize, found: &Intrinsics) -> Intrinsics {
+        let lens = &self.lenses[camera];
+        if lens.distorts() { found.behind(lens, self.radius) } else { *found }
+    }
 }
 
 impl<'a> Problem<'a> {
@@ -107,6 +130,7 @@ impl<'a> Problem<'a> {
             normalization,
             xy,
             weights: weights(input),
+            undone: None,
             of_view,
             camera_of,
             cameras,
@@ -115,6 +139,18 @@ impl<'a> Problem<'a> {
             threads,
             stop,
         }
+    }
+
+    /// The same with this lens of a camera undone before anything projective is looked for; `None` where it does not
+    /// image all of its observations.
+    pub fn undoing(&self, camera: usize, lens: Intrinsics) -> Option<Self> {
+        let pinholes = || vec![Intrinsics::from_focal(1.0); self.cameras];
+        let mut lenses = self.undone.as_ref().map_or_else(pinholes, |undone| undone.lenses.clone());
+        lenses[camera] = lens;
+        let undone = |k: usize| lenses[self.camera_of[self.view_of(k)]].undistorted(&self.observation(k));
+        let observations = (0..self.xy.len()).map(undone).collect::<Option<Vec<Observation>>>()?;
+        let radius = self.xy.iter().map(|xy| xy.norm()).fold(0.0, f64::max);
+        Some(Self { undone: Some(Undone { lenses, radius, observations }), ..self.clone() })
     }
 
     /// `Err` once the token asks for a stop.
@@ -148,7 +184,7 @@ impl<'a> Problem<'a> {
 
     /// The tracks that are complete over these views.
     pub fn block(&self, views: &[usize]) -> Block {
-        block::extract(self.input, &self.ranges, &self.normalization, views)
+        block::extract(self.input, &self.ranges, |k| self.pinhole_observation(k).xy, views)
     }
 
     /// Weights of some tracks as weights of all, 0 elsewhere.
@@ -178,6 +214,11 @@ impl<'a> Problem<'a> {
 
     pub fn observation(&self, k: usize) -> Observation {
         Observation { weight: self.weights[k], ..Observation::new(self.view_of(k), self.track_of(k), self.xy[k]) }
+    }
+
+    /// The observation where a pinhole would have made it, if the lens is one that is undone.
+    pub fn pinhole_observation(&self, k: usize) -> Observation {
+        self.undone.as_ref().map_or_else(|| self.observation(k), |undone| undone.observations[k])
     }
 
     /// Observations of a track.

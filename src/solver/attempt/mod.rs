@@ -221,7 +221,7 @@ pub fn search_block(
     let projective =
         attempt.found.consensus.as_ref().map(|consensus| ProjectiveReconstruction::of_block(&attempt.block, consensus));
     attempt.projective = match attempt.judges_observations() {
-        true => projective.map(ProjectiveReconstruction::oriented),
+        true => projective.map(|found| found.weighed(problem).oriented()),
         false => projective,
     };
     Ok(attempt)
@@ -388,6 +388,13 @@ fn calibrate_projective(
         focal_priors: &focal_priors,
         options: &problem.calibration_options,
     };
-    let outcomes = calibration::calibrate(&to_calibrate, problem.scale_px, problem.stop)?;
+    let mut outcomes = calibration::calibrate(&to_calibrate, problem.scale_px, problem.stop)?;
+    if let Some(undone) = &problem.undone {
+        for metric in outcomes.iter_mut().filter_map(|outcome| outcome.metric.as_mut()) {
+            for (lens, &camera) in metric.intrinsics.iter_mut().zip(&cameras) {
+                *lens = undone.behind(camera, lens);
+            }
+        }
+    }
     Ok(Outcome::worst(outcomes).unwrap_or_else(|| Outcome::refused(Vec::new())))
 }

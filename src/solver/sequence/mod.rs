@@ -14,6 +14,7 @@ mod calibrate;
 mod components;
 mod extended;
 mod growth;
+mod lens;
 mod model;
 mod options;
 mod own_focals;
@@ -51,6 +52,21 @@ pub enum Ended {
     Block(Option<Box<Attempt>>),
 }
 
+/// Solves an input, behind a lens where a pinhole has no calibration of most views and seeds are better behind it; what
+/// came of it, and the problem that it is of.
+///
+/// # Errors
+/// [`Error::Stopped`]; [`Error::Internal`] for defects.
+pub fn solve<'a>(problem: Problem<'a>, recorder: &mut Recorder) -> Result<(Ended, Problem<'a>), Error> {
+    let ended = of_blocks(&problem, recorder)?;
+    let Some(behind) = lens::behind_lenses(&problem, &ended, recorder)? else { return Ok((ended, problem)) };
+    let found = of_blocks(&behind, recorder)?;
+    let is_better =
+        // The calibration of a block takes the undone lens for known.
+        matches!(found, Ended::Extended(_)) && found.is_calibrated(&behind) && lens::stands_behind(found.evidence(&behind), ended.evidence(&problem));
+    Ok(if is_better { (found, behind) } else { (ended, problem) })
+}
+
 /// Solves and extends block after block until one carries a reconstruction of most of the views.
 ///
 /// In order of cost: the blocks, searched quickly, calibrated and extended metrically; what they found and small
@@ -60,7 +76,7 @@ pub enum Ended {
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
-pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
+fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
     let blocks = Blocks::of(problem);
     // In the one block of a whole input depths decide in the first round or take all of them. Other blocks are several,
     // of which another may do.
@@ -113,6 +129,32 @@ struct ExtensionPolicy {
 }
 
 impl Ended {
+    /// Whether there is a reconstruction without a calibration of most views, which a lens may be missing from.
+    fn asks_for_lens(&self, problem: &Problem) -> bool {
+        match self {
+            Ended::Extended(extended) => !extended.is_calibrated(problem) || !extended.holds_most_views(),
+            Ended::Block(attempt) => attempt.as_ref().is_some_and(|attempt| {
+                let leaves_most = 2 * attempt.views().len() < problem.observed_views().len();
+                attempt.judges_observations() && (!attempt.is_calibrated() || leaves_most)
+            }),
+        }
+    }
+
+    fn is_calibrated(&self, problem: &Problem) -> bool {
+        match self {
+            Ended::Extended(extended) => extended.is_calibrated(problem),
+            Ended::Block(attempt) => attempt.as_ref().is_some_and(|attempt| attempt.is_calibrated()),
+        }
+    }
+
+    /// How well the observations fit, see [`projective::evidence`].
+    fn evidence(&self, problem: &Problem) -> f64 {
+        match self {
+            Ended::Extended(extended) => extended.evidence(problem),
+            Ended::Block(attempt) => attempt.as_ref().map_or(0.0, |attempt| attempt.evidence(problem)),
+        }
+    }
+
     /// What it began from.
     fn seed(self) -> Option<Attempt> {
         match self {

@@ -2,11 +2,14 @@
 
 use nalgebra::{Matrix4, Vector4};
 
+use super::adjust;
+
 use crate::geometry::observation::Observation;
 use crate::geometry::triangulation::weighted_squared;
 use crate::geometry::{Camera, Point};
 use crate::solver::block::Block;
 use crate::solver::grow::{self, Consensus};
+use crate::solver::problem::Problem;
 use crate::solver::view_selection::evenly;
 
 /// Unknowns of a projective camera, and of the frame that none of them tells.
@@ -46,6 +49,26 @@ impl ProjectiveReconstruction {
         }
     }
 
+    /// The same with the weights that a lens gives observations which is undone, and the noise of the image.
+    pub fn weighed(mut self, problem: &Problem) -> Self {
+        if problem.undone.is_none() {
+            return self;
+        }
+        for seen in &mut self.observations {
+            let (view, track) = (self.views[seen.view], self.tracks[seen.point]);
+            if let Some(k) = problem.of_track(track).find(|&k| problem.view_of(k) == view) {
+                seen.weight = problem.pinhole_observation(k).weight;
+            }
+        }
+        let norms = self.squared_residuals().into_iter().map(f64::sqrt).collect();
+        self.noise = adjust::core_noise(norms, self.unknowns());
+        self
+    }
+
+    fn unknowns(&self) -> usize {
+        CAMERA_UNKNOWNS * self.views.len() + 3 * self.tracks.len() - GAUGE_UNKNOWNS
+    }
+
     /// The tracks with most observations, evenly among equals: a calibration takes no more than these.
     pub fn most_observed(&self, most: usize) -> Self {
         let mut support = vec![0usize; self.tracks.len()];
@@ -82,8 +105,7 @@ impl ProjectiveReconstruction {
 
     /// How much better the observations fit than points anywhere in the image would, see [`evidence`].
     pub fn evidence(&self, outlier_density: f64) -> f64 {
-        let unknowns = CAMERA_UNKNOWNS * self.views.len() + 3 * self.tracks.len() - GAUGE_UNKNOWNS;
-        evidence(self.observations.len(), unknowns, self.noise, outlier_density)
+        evidence(self.observations.len(), self.unknowns(), self.noise, outlier_density)
     }
 
     /// Squared reprojection residual of each observation, weighted.

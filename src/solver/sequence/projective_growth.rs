@@ -132,7 +132,7 @@ impl<'a> Growing<'a> {
         let problem = self.problem;
         let seen: Vec<usize> =
             problem.of_track(track).filter(|&k| self.cameras[problem.view_of(k)].is_some()).collect();
-        let observations: Vec<Observation> = seen.iter().map(|&k| problem.observation(k)).collect();
+        let observations: Vec<Observation> = seen.iter().map(|&k| problem.pinhole_observation(k)).collect();
         let found = triangulator.robust(&observations, gate)?;
         let agreeing = found.agrees.iter().filter(|&&agrees| agrees).count();
         (agreeing as f64 >= problem.least_share * seen.len() as f64).then_some((found, seen))
@@ -149,7 +149,7 @@ impl<'a> Growing<'a> {
         let tracks = growth::covering(problem, verified, |track| self.support[track], &self.kept, &wanted);
         let observations = tracks.iter().enumerate().flat_map(|(point, &track)| {
             let kept = problem.of_track(track).filter(|&k| self.kept[k]);
-            kept.map(|k| Observation { view: place[problem.view_of(k)], point, ..problem.observation(k) })
+            kept.map(|k| Observation { view: place[problem.view_of(k)], point, ..problem.pinhole_observation(k) })
                 .collect::<Vec<_>>()
         });
         ProjectiveReconstruction {
@@ -235,7 +235,10 @@ impl Growth for Growing<'_> {
 
     fn register(&mut self, view: usize, seen: &[usize], recorder: &mut Recorder) -> usize {
         let problem = self.problem;
-        let datum = |&k: &usize| Some((self.points[problem.track_of(k)]?, (problem.xy[k], problem.weights[k])));
+        let datum = |&k: &usize| {
+            let seen = problem.pinhole_observation(k);
+            Some((self.points[problem.track_of(k)]?, (seen.xy, seen.weight)))
+        };
         let (points, seen): (Vec<Point>, Vec<_>) = seen.iter().filter_map(datum).unzip();
         let (images, weights): (Vec<Vector2<f64>>, Vec<f64>) = seen.into_iter().unzip();
         let gate = problem.gate(self.noise);

@@ -135,17 +135,22 @@ impl Growth for Component<'_> {
     }
 }
 
-/// Lenses to try a view with: its camera's own, or, of one that is not known yet, pinholes of what the input says, give
-/// or take its deviation, or of a scan. Where views have focal lengths of their own, the scan is about that of the
+/// Lenses to try a view with: its camera's own, or, of one that is not known yet, pinholes, behind the lens that
+/// is undone, of what the input says, give or take its deviation, or of a scan. Where views have focal lengths of their own, the scan is about that of the
 /// nearest view, behind the lens that they share: a zoom takes time.
 fn guesses(problem: &Problem, model: &Model, view: usize) -> Vec<Intrinsics> {
-    let lens = &model.lenses[problem.camera_of[view]];
+    let camera = problem.camera_of[view];
+    let lens = &model.lenses[camera];
     if !model.is_focal_unknown(problem, view) {
         return vec![lens.intrinsics];
     }
+    let behind_undone = |focal: f64| {
+        let pinhole = Intrinsics::from_focal(focal);
+        problem.undone.as_ref().map_or(pinhole, |undone| undone.behind(camera, &pinhole))
+    };
     if let Some(prior) = problem.input.views()[view].focal_prior.filter(|_| !problem.has_own_focals()) {
         let focal = prior.focal_px / problem.scale_px;
-        return [0.0, -1.0, 1.0].map(|by| Intrinsics::from_focal(focal * (by * prior.sigma_log).exp())).to_vec();
+        return [0.0, -1.0, 1.0].map(|by| behind_undone(focal * (by * prior.sigma_log).exp())).to_vec();
     }
     let nearest = model.determined().into_iter().min_by_key(|other| other.abs_diff(view));
     let nearest = nearest.filter(|_| problem.has_own_focals());
@@ -156,7 +161,7 @@ fn guesses(problem: &Problem, model: &Model, view: usize) -> Vec<Intrinsics> {
     steps.sort_by_key(|step| (step.abs(), *step));
     let guess = |step: i32| match nearest {
         Some(_) => Intrinsics { focal: focal(step), ..about },
-        None => Intrinsics::from_focal(focal(step)),
+        None => behind_undone(focal(step)),
     };
     steps.into_iter().map(guess).collect()
 }
@@ -170,8 +175,9 @@ fn robust_pose(
     rng: &mut ChaCha8Rng,
 ) -> Option<(Pose, usize)> {
     let datum = |&k: &usize| {
-        let ray = intrinsics.ray(&problem.xy[k])?;
-        Some((model.landmarks[problem.track_of(k)]?.position, (ray, problem.weights[k])))
+        let undone = intrinsics.undistorted(&problem.observation(k))?;
+        let ray = intrinsics.pinhole().ray(&undone.xy)?;
+        Some((model.landmarks[problem.track_of(k)]?.position, (ray, undone.weight)))
     };
     let (points, seen): (Vec<_>, Vec<_>) = seen.iter().filter_map(datum).unzip();
     let (rays, weights): (Vec<_>, Vec<_>) = seen.into_iter().unzip();

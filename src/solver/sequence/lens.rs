@@ -1,0 +1,151 @@
+//! The lens as part of a hypothesis: what no pinhole explains is searched once more behind the fisheye that explains
+//! seeds best.
+//!
+//! Sampling the lens serves a search as well as minimal solvers that know of one (Tzamos, Kocur, Ding, Sattler & Kukelova 2024). A
+//! lens that bends little is found from a pinhole's seed; behind one that bends much a pinhole's seed is small, or wrong,
+//! and a plane or a turning camera looks like a scene with depth.
+
+use std::f64::consts::SQRT_2;
+
+use super::projective::{self, ProjectiveReconstruction};
+use super::{Ended, QUICK_SEED};
+use crate::domain::LensProjection;
+use crate::geometry::bundle::metric::Intrinsics;
+use crate::geometry::homography;
+use crate::solver::problem::Problem;
+use crate::solver::recorder::Recorder;
+use crate::solver::{Error, attempt, view_selection};
+
+/// Which lenses are sampled, and when one is searched behind.
+struct LensSearchOptions {
+    /// Focal lengths of the equidistant fisheyes, in units of the longer image side.
+    focals: [f64; 6],
+    /// Factors by which the best of them is moved to either side, one after the other.
+    refining: [f64; 3],
+    /// Sets of views that are searched quickly behind each.
+    sets: usize,
+    /// Least gain in log evidence over a pinhole, beside what it has.
+    least_gain: f64,
+    /// Share of the pinhole's evidence that the gain must exceed, too.
+    least_share: f64,
+    /// Share of the evidence of what stands without that a calibration behind lenses must have: that of projective
+    /// cameras, which take up some of what lenses bend, is not far below.
+    least_kept: f64,
+}
+
+/// Unknowns of the homography between two views.
+const HOMOGRAPHY_UNKNOWNS: usize = 8;
+
+const OPTIONS: LensSearchOptions = LensSearchOptions {
+    // From 85 degrees off the axis at the corner of a 4:3 image to where a third radial term is as good as any. A step
+    // leaves a quarter of the distortion, which seeds bear.
+    focals: [0.42, 0.47, 0.53, 0.6, 0.68, 0.78],
+    // Half, a quarter and an eighth of a step: homographies at 75 degrees off the axis tell one from the other.
+    refining: [1.06, 1.03, 1.015],
+    sets: 2,
+    // A factor of twenty thousand: seeds are searched at random.
+    least_gain: 10.0,
+    // What other samples, or another noise, make of a seed without any lens.
+    least_share: 0.05,
+    least_kept: 0.9,
+};
+
+/// Whether what was found behind lenses stands in place of what was found without: without a calibration nobody is told
+/// of the lenses, and one of a part of what stood is none of the input.
+pub fn stands_behind(evidence: f64, of_pinholes: f64) -> bool {
+    evidence > OPTIONS.least_kept * of_pinholes
+}
+
+/// The problem behind the lenses that explain quick seeds of each camera better than pinholes do; `None` where no camera
+/// has one, and where pinholes have a calibration of most views.
+///
+/// # Errors
+/// [`Error::Stopped`]; [`Error::Internal`] for defects.
+pub fn behind_lenses<'a>(
+    problem: &Problem<'a>,
+    ended: &Ended,
+    recorder: &mut Recorder,
+) -> Result<Option<Problem<'a>>, Error> {
+    if problem.input.has_depths() || !ended.asks_for_lens(problem) {
+        return Ok(None);
+    }
+    let mut best: Option<Problem> = None;
+    for camera in 0..problem.cameras {
+        let open: Vec<bool> = problem.camera_of.iter().map(|of| *of == camera).collect();
+        let sets = view_selection::candidate_views_among(problem, &open);
+        let subsets = view_selection::subsets(&sets);
+        let sets: Vec<Vec<usize>> = subsets.into_iter().chain(sets).take(OPTIONS.sets).collect();
+        let of_pinhole = evidence(problem, &sets, recorder)?;
+        let others = best.take();
+        let without = others.as_ref().unwrap_or(problem);
+        let mut found = Best { focal: f64::NAN, evidence: of_pinhole, behind: None };
+        for focal in OPTIONS.focals {
+            found.offer(focal, without, camera, &sets, recorder)?;
+        }
+        for factor in OPTIONS.refining {
+            let focal = found.focal;
+            for focal in [focal * factor, focal / factor] {
+                found.offer(focal, without, camera, &sets, recorder)?;
+            }
+        }
+        let least = of_pinhole + OPTIONS.least_gain.max(OPTIONS.least_share * of_pinhole);
+        best = found.behind.filter(|_| found.evidence > least);
+        best = best.or(others);
+    }
+    Ok(best)
+}
+
+/// The lens of a camera that explains its seeds best.
+struct Best<'a> {
+    /// Not a number as long as a pinhole does.
+    focal: f64,
+    evidence: f64,
+    behind: Option<Problem<'a>>,
+}
+
+impl<'a> Best<'a> {
+    /// Takes an equidistant fisheye of this focal length where it is better.
+    ///
+    /// * `without`: the problem with the camera's lens not undone
+    fn offer(
+        &mut self,
+        focal: f64,
+        without: &Problem<'a>,
+        camera: usize,
+        sets: &[Vec<usize>],
+        recorder: &mut Recorder,
+    ) -> Result<(), Error> {
+        let lens = Intrinsics { projection: LensProjection::Fisheye, ..Intrinsics::from_focal(focal) };
+        let Some(behind) = without.undoing(camera, lens) else { return Ok(()) };
+        let evidence = evidence(&behind, sets, recorder)?;
+        if evidence > self.evidence {
+            *self = Self { focal, evidence, behind: Some(behind) };
+        }
+        Ok(())
+    }
+}
+
+/// Evidence of quick seeds on these sets of views together.
+fn evidence(problem: &Problem, sets: &[Vec<usize>], recorder: &mut Recorder) -> Result<f64, Error> {
+    let mut evidence = 0.0;
+    for views in sets {
+        problem.stopped()?;
+        let attempt = attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder)?;
+        if let Some(found) = &attempt.projective {
+            evidence +=
+                f64::max(found.evidence(problem.outlier_density), by_homographies(problem, found).unwrap_or(0.0));
+        }
+    }
+    Ok(evidence)
+}
+
+/// Evidence of the homographies between the views of a reconstruction: projective cameras take up much of what a lens
+/// bends where a camera only turns or the scene is a plane, and homographies take up nothing. `None` where there are none.
+fn by_homographies(problem: &Problem, found: &ProjectiveReconstruction) -> Option<f64> {
+    let (views, observations) = (found.cameras.len(), &found.observations);
+    let residual = homography::median_residual(observations, views, found.noise, f64::INFINITY)?;
+    // Of two views.
+    let noise = residual * found.noise / SQRT_2;
+    let unknowns = HOMOGRAPHY_UNKNOWNS * (views - 1) + 2 * found.points.len();
+    Some(projective::evidence(observations.len(), unknowns, noise, problem.outlier_density))
+}
