@@ -233,16 +233,17 @@ pub struct SettingsArgs {
     #[arg(long, default_value_t = 0, value_parser = parse_whole::<u64>)]
     pub seed: u64,
 
-    #[arg(long, value_name = "N", default_value_t = SolveSettings::DEFAULT_ITERATIONS,
-        help = format!("Network iterations at most, 1 to {}; `auto` usually stops earlier", SolveSettings::MAX_ITERATIONS),
+    #[arg(long, value_name = "N", help = format!("Network iterations at most, 1 to {}; `auto` usually stops earlier, \
+        `scpsfm` does so many several times [default: {}; scpsfm: {}]", SolveSettings::MAX_ITERATIONS,
+        SolveSettings::DEFAULT_ITERATIONS, SolveSettings::DEFAULT_HEAD_ITERATIONS),
         value_parser = clap::value_parser!(u32).range(1..=i64::from(SolveSettings::MAX_ITERATIONS)))]
-    pub iterations: u32,
+    pub iterations: Option<u32>,
 
     /// Leave the DAQ residual (self-calibration) out of the losses and scores
     #[arg(long)]
     pub no_daq: bool,
 
-    /// With `paper` and `psfm`, for an input without depths: estimate projective depths from fundamental matrices and
+    /// With `paper`, `scpsfm` and `psfm`, for an input without depths: estimate projective depths from fundamental matrices and
     /// epipoles, instead of taking them as 1; needs about half of the tracks to be right
     #[arg(long)]
     pub epipolar_depths: bool,
@@ -291,15 +292,16 @@ impl SettingsArgs {
     /// # Errors
     /// A value out of range, as wrong usage.
     pub fn settings(&self) -> Result<SolveSettings, Failure> {
+        let method = self.method.into();
         let settings = SolveSettings {
-            method: self.method.into(),
+            method,
             use_daq: !self.no_daq,
             alpha: self.alpha,
             beta: self.beta,
             min_inliers: self.min_inliers,
             kappa: self.kappa,
             learning_rate: self.learning_rate,
-            iterations: self.iterations,
+            iterations: self.iterations.unwrap_or(SolveSettings::default_iterations(method)),
             network_width: self.network_width,
             epipolar_depths: self.epipolar_depths,
             seed: self.seed,
@@ -309,8 +311,8 @@ impl SettingsArgs {
             ..SolveSettings::default()
         };
         settings.validate().map_err(Failure::usage)?;
-        if self.epipolar_depths && !matches!(self.method, MethodArg::Paper | MethodArg::Psfm) {
-            return Err(Failure::usage("--epipolar-depths is of use with --method paper and psfm only"));
+        if self.epipolar_depths && !matches!(self.method, MethodArg::Paper | MethodArg::Scpsfm | MethodArg::Psfm) {
+            return Err(Failure::usage("--epipolar-depths is of use with --method paper, scpsfm and psfm only"));
         }
         Ok(settings)
     }
@@ -327,6 +329,8 @@ pub enum MethodArg {
     Geometry,
     /// Plain projective factorisation (Sturm and Triggs 1996)
     Psfm,
+    /// The paper's network by itself under a continued objective: the best of up to 16 optimisations, thresholded at 1/2
+    Scpsfm,
 }
 
 impl From<MethodArg> for Method {
@@ -336,6 +340,7 @@ impl From<MethodArg> for Method {
             MethodArg::Paper => Method::Paper,
             MethodArg::Geometry => Method::Geometry,
             MethodArg::Psfm => Method::Psfm,
+            MethodArg::Scpsfm => Method::Scpsfm,
         }
     }
 }

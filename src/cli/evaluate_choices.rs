@@ -55,6 +55,10 @@ pub enum ContestantArg {
     Paper,
     /// The paper's method without its self-calibration term
     PaperWithoutDaq,
+    /// The paper's network by itself under a continued objective
+    Scpsfm,
+    /// The same without its self-calibration term
+    ScpsfmWithoutDaq,
     /// Plain projective factorisation at its best threshold
     Psfm,
 }
@@ -77,6 +81,8 @@ impl From<ContestantArg> for Contestant {
             ContestantArg::Geometry => Contestant::Geometry,
             ContestantArg::Paper => Contestant::Paper,
             ContestantArg::PaperWithoutDaq => Contestant::PaperWithoutDaq,
+            ContestantArg::Scpsfm => Contestant::Scpsfm,
+            ContestantArg::ScpsfmWithoutDaq => Contestant::ScpsfmWithoutDaq,
             ContestantArg::Psfm => Contestant::Psfm,
         }
     }

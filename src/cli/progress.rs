@@ -188,6 +188,7 @@ fn whereabouts(progress: &Progress) -> String {
         (Some(Step { task: Task::Cameras, .. }), _) => String::new(),
         (Some(Step { task: Task::Windows, step, steps }), _) => format!("comparing: window {step} of {steps}, "),
         (Some(Step { task: Task::Judge, step, steps }), _) => format!("judging: {step} of {steps} verdicts, "),
+        (Some(Step { task: Task::Heads, step, steps }), _) => format!("optimising: head {step} of {steps}, "),
         (None, Stage::Extend) => format!("registering: {registered_views} of {views} views{of_part}, "),
         // Of one block there is nothing to say, unless it is a further part's.
         (None, Stage::Search | Stage::Refine | Stage::Calibrate) if part > 0 => {
@@ -276,6 +277,7 @@ mod tests {
         assert_eq!(said(Stage::Calibrate, step(Task::Cameras)), "calibrating: 3 of 7, ");
         assert_eq!(said(Stage::Calibrate, step(Task::Windows)), "comparing: window 3 of 7, ");
         assert_eq!(said(Stage::Judge, step(Task::Judge)), "judging: 3 of 7 verdicts, ");
+        assert_eq!(said(Stage::Search, step(Task::Heads)), "optimising: head 3 of 7, ");
         assert_eq!(said(Stage::Calibrate, walk), "");
     }
 }

@@ -61,6 +61,8 @@ pub enum Task {
     Windows,
     /// Judging; steps are verdicts, up to two a track.
     Judge,
+    /// Optimising the network from new weights; steps are heads.
+    Heads,
 }
 
 /// How far a [`Task`] is.
@@ -97,14 +99,15 @@ pub struct Progress {
     pub stage: Stage,
     /// Share of the work done, 0 to 1, never decreasing within an attempt.
     pub fraction: f64,
-    /// Iterations of the paper's network done so far; AUTO needs none where the search is decided without it.
+    /// Iterations of the paper's network done so far, over all heads and blocks; AUTO needs none where the search is
+    /// decided without it.
     pub iteration: u32,
     /// Losses of that iteration; none before the first.
     pub losses: Option<Losses>,
     /// Inlier tracks of the best hypothesis so far.
     pub inliers: u32,
-    /// Current estimate of the focal length in pixels: under PAPER the network's while it is optimised; else none until
-    /// the calibration.
+    /// Current estimate of the focal length in pixels: under PAPER and SCPSFM the network's while it is optimised; else
+    /// none until the calibration.
     pub focal_px: Option<f64>,
     /// Truncated cost of the best hypothesis so far, as a share of the cost of calling every track an outlier:
     /// 0 is a perfect consensus of all tracks, 1 is none.

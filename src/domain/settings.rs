@@ -18,11 +18,14 @@ pub enum Method {
     Geometry,
     /// ...plain projective factorisation (Sturm & Triggs 1996) with a residual threshold.
     Psfm,
+    /// ...the paper's network by itself under a continued objective: the weights of the best of several optimisations,
+    /// thresholded at 1/2.
+    Scpsfm,
 }
 
 impl Method {
     /// Every method, in the order of the API's enum.
-    pub const ALL: [Method; 4] = [Method::Auto, Method::Paper, Method::Geometry, Method::Psfm];
+    pub const ALL: [Method; 5] = [Method::Auto, Method::Paper, Method::Geometry, Method::Psfm, Method::Scpsfm];
 
     /// The method's name in files and on the command line.
     pub fn name(self) -> &'static str {
@@ -31,12 +34,13 @@ impl Method {
             Method::Paper => "PAPER",
             Method::Geometry => "GEOMETRY",
             Method::Psfm => "PSFM",
+            Method::Scpsfm => "SCPSFM",
         }
     }
 
     /// Whether the method optimises the network.
     pub fn uses_network(self) -> bool {
-        matches!(self, Method::Auto | Method::Paper)
+        matches!(self, Method::Auto | Method::Paper | Method::Scpsfm)
     }
 }
 
@@ -58,21 +62,21 @@ pub struct SolveSettings {
     pub method: Method,
     /// Whether the DAQ residual takes part: as a loss of the network and as a score of hypotheses.
     pub use_daq: bool,
-    /// Weight of L_proj.
+    /// Weight of L_proj; of SCPSFM, at the first iteration.
     pub alpha: f64,
     /// Weight of L_DAQ.
     pub beta: f64,
-    /// Least number of inliers that L_num asks for, the paper's `t`.
+    /// Least number of inliers that L_num asks for, the paper's `t`; of SCPSFM, at the first iteration.
     pub min_inliers: f64,
-    /// Slope of the sigmoid in L_num.
+    /// Slope of the sigmoid in L_num; SCPSFM has no such sigmoid.
     pub kappa: f64,
     /// Adam's learning rate.
     pub learning_rate: f64,
-    /// Network iterations at most; AUTO usually stops earlier, at a decisive consensus.
+    /// Network iterations at most; AUTO usually stops earlier, at a decisive consensus. Of SCPSFM, those of each head.
     pub iterations: u32,
     /// Width of the PointNet as a share of the original (64-64-64-128-1024).
     pub network_width: f64,
-    /// Whether PAPER and PSFM estimate projective depths from fundamental matrices and epipoles where the input brings
+    /// Whether PAPER, SCPSFM and PSFM estimate projective depths from fundamental matrices and epipoles where the input brings
     /// none, as the paper does on real tracks; otherwise such depths are 1. The other methods need none, and an input's
     /// own depths are never replaced: there it changes nothing.
     pub epipolar_depths: bool,
@@ -105,6 +109,8 @@ impl SolveSettings {
     pub const DEFAULT_LEARNING_RATE: f64 = 1e-3;
     /// The weights converge within 300 to 500 iterations.
     pub const DEFAULT_ITERATIONS: u32 = 400;
+    /// The same of a head of SCPSFM, whose continuation passes through three phases.
+    pub const DEFAULT_HEAD_ITERATIONS: u32 = 500;
     /// A quarter of the PointNet (about 1e5 parameters) ranks tracks as well as the whole (1.5e6) at a fraction of
     /// the time.
     pub const DEFAULT_NETWORK_WIDTH: f64 = 0.25;
@@ -119,6 +125,19 @@ impl SolveSettings {
     /// Noise in pixels above which another unit was meant: solvers assume a tenth of the image at most, and no image is
     /// ten times as long.
     pub const MAX_NOISE_PX: f64 = 10_000.0;
+
+    /// The defaults of a method.
+    pub fn of_method(method: Method) -> Self {
+        Self { method, iterations: Self::default_iterations(method), ..Self::default() }
+    }
+
+    /// Iterations where none are asked for.
+    pub fn default_iterations(method: Method) -> u32 {
+        match method {
+            Method::Scpsfm => Self::DEFAULT_HEAD_ITERATIONS,
+            Method::Auto | Method::Paper | Method::Geometry | Method::Psfm => Self::DEFAULT_ITERATIONS,
+        }
+    }
 
     /// Checks every field.
     ///

@@ -41,6 +41,8 @@ fn stroke(contestant: Contestant) -> (&'static str, &'static str) {
         Contestant::Geometry => ("#0072b2", ""),
         Contestant::Paper => ("#009e73", ""),
         Contestant::PaperWithoutDaq => ("#009e73", "5 3"),
+        Contestant::Scpsfm => ("#e69f00", ""),
+        Contestant::ScpsfmWithoutDaq => ("#e69f00", "5 3"),
         Contestant::Psfm => ("#cc79a7", ""),
         Contestant::AutoWithoutDaq => ("#d55e00", "8 3"),
         Contestant::AutoWithoutIrls => ("#56b4e9", ""),

@@ -20,13 +20,13 @@ pub fn page(plan: &Plan, cells: &[Cell], coverage: &[Coverage]) -> String {
          reprojections from the true image points. 3D error: mean relative distance after the best similarity. Focal \
          error: |ln(f / f true)|. Of psfm, F1 is that of the best threshold.",
     );
-    let _ = writeln!(body, " The network of paper has {} of the original's width.</p>", plan.paper_width);
+    let _ = writeln!(body, " The network of paper and scpsfm has {} of the original's width.</p>", plan.paper_width);
     let has_figure = plan.sweeps.iter().any(|sweep| sweep.names.is_empty());
     for &depths in plan.depths.iter().filter(|_| has_figure) {
         let what = match depths {
             Depths::Given => "Depths given",
             Depths::None => "No depths: image points alone",
-            Depths::Epipolar => "No depths given: estimated from fundamental matrices and epipoles, by paper and psfm",
+            Depths::Epipolar => "No depths given: estimated from fundamental matrices and epipoles, by paper, scpsfm and psfm",
         };
         let _ = write!(body, "<h2>{what}</h2>\n<figure>{}</figure>\n", figures::svg(plan, cells, depths));
     }

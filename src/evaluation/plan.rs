@@ -44,6 +44,10 @@ pub enum Contestant {
     Paper,
     /// The same without it.
     PaperWithoutDaq,
+    /// The paper's network by itself under a continued objective.
+    Scpsfm,
+    /// The same without the DAQ term.
+    ScpsfmWithoutDaq,
     /// Plain projective factorisation (Sturm & Triggs 1996) at the threshold that suits the scene best.
     Psfm,
     /// AUTO with the DAQ residual in neither losses nor scores.
@@ -75,12 +79,14 @@ impl Contestant {
         Contestant::LearnedAlone,
     ];
     /// The contestants of the paper's figure.
-    pub const ALL: [Contestant; 6] = [
+    pub const ALL: [Contestant; 8] = [
         Contestant::Oracle,
         Contestant::Auto,
         Contestant::Geometry,
         Contestant::Paper,
         Contestant::PaperWithoutDaq,
+        Contestant::Scpsfm,
+        Contestant::ScpsfmWithoutDaq,
         Contestant::Psfm,
     ];
 
@@ -91,6 +97,8 @@ impl Contestant {
             Contestant::Geometry => "geometry",
             Contestant::Paper => "paper",
             Contestant::PaperWithoutDaq => "paper-without-daq",
+            Contestant::Scpsfm => "scpsfm",
+            Contestant::ScpsfmWithoutDaq => "scpsfm-without-daq",
             Contestant::Psfm => "psfm",
             Contestant::AutoWithoutDaq => "auto-without-daq",
             Contestant::AutoWithoutIrls => "auto-without-irls",
@@ -104,7 +112,7 @@ impl Contestant {
     }
 
     /// Whether this contestant has anything to say of such a scene: the oracle knows pinholes only, rigidity needs
-    /// depths, and epipolar ones are made use of by PAPER and PSFM alone.
+    /// depths, and epipolar ones are made use of by PAPER, SCPSFM and PSFM alone.
     pub fn takes_part(self, scene: &SceneOptions, depths: Depths) -> bool {
         if depths == Depths::Epipolar && !self.is_paper() && self != Contestant::Psfm {
             return false;
@@ -132,7 +140,8 @@ impl Contestant {
 
     /// Whether its answer is that of the paper's network, whose width is the evaluation's to choose.
     fn is_paper(self) -> bool {
-        matches!(self, Contestant::Paper | Contestant::PaperWithoutDaq)
+        use Contestant::{Paper, PaperWithoutDaq, Scpsfm, ScpsfmWithoutDaq};
+        matches!(self, Paper | PaperWithoutDaq | Scpsfm | ScpsfmWithoutDaq)
     }
 }
 
@@ -149,7 +158,7 @@ pub struct Run {
     /// Whether it estimates depths from epipolar geometry.
     #[serde(default)]
     pub epipolar_depths: bool,
-    /// Width of the network of the PAPER contestants, as a share of the original; `None` for the others.
+    /// Width of the network of the PAPER and SCPSFM contestants, as a share of the original; `None` for the others.
     #[serde(default)]
     pub paper_width: Option<f64>,
 }
@@ -168,6 +177,8 @@ impl Run {
             Contestant::Geometry => (Method::Geometry, true),
             Contestant::Paper => (Method::Paper, true),
             Contestant::PaperWithoutDaq => (Method::Paper, false),
+            Contestant::Scpsfm => (Method::Scpsfm, true),
+            Contestant::ScpsfmWithoutDaq => (Method::Scpsfm, false),
             Contestant::Psfm => (Method::Psfm, true),
             Contestant::AutoWithoutDaq => (Method::Auto, false),
             Contestant::AutoWithoutIrls
@@ -179,13 +190,12 @@ impl Run {
             | Contestant::LearnedAlone => (Method::Auto, true),
         };
         Some(SolveSettings {
-            method,
             excluded_priors: self.contestant.excluded_priors(),
             use_daq,
             seed: self.scene.seed,
             epipolar_depths: self.epipolar_depths,
             network_width: self.paper_width.unwrap_or(SolveSettings::DEFAULT_NETWORK_WIDTH),
-            ..SolveSettings::default()
+            ..SolveSettings::of_method(method)
         })
     }
 
@@ -202,7 +212,7 @@ pub struct Plan {
     pub depths: Vec<Depths>,
     pub contestants: Vec<Contestant>,
     pub seeds: u64,
-    /// Width of the network of the PAPER contestants, as a share of the original.
+    /// Width of the network of the PAPER and SCPSFM contestants, as a share of the original.
     pub paper_width: f64,
 }
 
@@ -280,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn epipolar_depths_are_for_paper_and_psfm_on_the_scenes_without_depths() {
+    fn epipolar_depths_are_for_paper_scpsfm_and_psfm_on_the_scenes_without_depths() {
         let plan = |depths: &[Depths]| Plan {
             sweeps: Sweep::paper().into_iter().filter(|sweep| sweep.name == "outliers").collect(),
             depths: depths.to_vec(),
@@ -289,10 +299,10 @@ mod tests {
             paper_width: 1.0,
         };
         let (none, epipolar) = (plan(&[Depths::None]).runs(), plan(&[Depths::Epipolar]).runs());
-        assert_eq!((none.len(), epipolar.len()), (8 * 6, 8 * 3));
+        assert_eq!((none.len(), epipolar.len()), (8 * 8, 8 * 5));
         for run in &epipolar {
             let settings = run.settings().expect("no oracle");
-            assert!(settings.epipolar_depths && matches!(settings.method, Method::Paper | Method::Psfm));
+            assert!(settings.epipolar_depths && !matches!(settings.method, Method::Auto | Method::Geometry));
             assert!(none.iter().any(|other| other.scene == run.scene && other.contestant == run.contestant));
         }
         assert!(none.iter().filter_map(Run::settings).all(|settings| !settings.epipolar_depths));

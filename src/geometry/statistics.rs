@@ -38,6 +38,17 @@ pub fn median(values: &mut [f64]) -> f64 {
     *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
+/// The median, of an even number of values the mean of the middle two: of a handful of values the lower of the two is
+/// biased. 0 for none.
+pub fn midpoint_median(values: &mut [f64]) -> f64 {
+    let lower = median(values);
+    if values.is_empty() || values.len() % 2 == 1 {
+        return lower;
+    }
+    let upper = values[values.len() / 2..].iter().copied().fold(f64::INFINITY, f64::min);
+    0.5 * (lower + upper)
+}
+
 /// `None` for no values.
 pub fn root_mean_square(values: &[f64]) -> Option<f64> {
     let mean = values.iter().map(|value| value * value).sum::<f64>() / values.len() as f64;
@@ -85,5 +96,8 @@ mod tests {
         assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
         assert_eq!(median(&mut [4.0, 1.0, 3.0, 2.0]), 2.0);
         assert_eq!(median(&mut []), 0.0);
+        assert_eq!(midpoint_median(&mut [3.0, 1.0, 2.0]), 2.0);
+        assert_eq!(midpoint_median(&mut [4.0, 1.0, 3.0, 2.0]), 2.5);
+        assert_eq!(midpoint_median(&mut []), 0.0);
     }
 }

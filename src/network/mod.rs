@@ -33,6 +33,8 @@
 //! The weights rank tracks well and separate them badly: the paper's `t = 15` makes some fifteen to twenty kept
 //! tracks the optimum whatever the true number. The solver therefore takes them as a prior for guided search.
 
+mod cloud;
+pub mod continuation;
 mod lanes;
 pub mod losses;
 mod parameter;

@@ -4,10 +4,10 @@
 //! first-level cache, where a tape would take a pass over the whole array for every operation (a test compares with
 //! burn's). Arrays are features x columns, row by row.
 //!
-//! A normalised layer is `Y = max(0, s ⊙ R + b)` with `R = W X`, `s = gain / sqrt(var(R) + ε)`, all rows of X of zero
-//! mean. With `D` the derivative with respect to `s ⊙ R + b` (0 where the maximum is 0) and `p = Σ_j D_j R_j` along
-//! rows: `db = Σ_j D_j`, `dgain = p / sqrt(var + ε)`, `dR = s ⊙ D - s p / (m (var + ε)) ⊙ R`, `dW = dR Xᵀ`, `dX = Wᵀ
-//! dR`.
+//! A normalised layer is `Y = ρ(s ⊙ R + b)` with `R = W X`, `s = gain / sqrt(var(R) + ε)`, all rows of X of zero mean,
+//! and `ρ(x) = max(0, x) + slope · min(0, x)`: ReLU with slope 0. With `D` the derivative with respect to `s ⊙ R + b`
+//! and `p = Σ_j D_j R_j` along rows: `db = Σ_j D_j`, `dgain = p / sqrt(var + ε)`, `dR = s ⊙ D - s p / (m (var + ε)) ⊙
+//! R`, `dW = dR Xᵀ`, `dX = Wᵀ dR`.
 
 use burn::tensor::{Device, Tensor};
 
@@ -49,6 +49,8 @@ struct Normalised {
     /// `W X`.
     response: Vec<f32>,
     statistics: Statistics,
+    /// Of the rectifier below 0.
+    slope: f32,
 }
 
 /// The last layer of the trunk, of which only each row's largest response matters.
@@ -82,19 +84,20 @@ type Arrays = Layer<Option<Vec<f32>>>;
 impl PointNet<Parameter> {
     /// Runs the network on a cloud (rows x m) whose rows have mean 0.
     ///
-    /// With `plane_apart` no gradient of the plane will reach the trunk, only the classification head.
+    /// With `plane_apart` no gradient of the plane will reach the trunk, only the classification head. `slope` is that of
+    /// the segmentation head's rectifiers below 0; those of the other layers are ReLU.
     ///
     /// # Errors
     /// [`Error::Backend`] for a defect of burn.
-    pub fn forward(&self, centred: &Tensor<2>, plane_apart: bool, device: &Device) -> Result<Pass, Error> {
+    pub fn forward(&self, centred: &Tensor<2>, plane_apart: bool, slope: f32, device: &Device) -> Result<Pass, Error> {
         let columns = centred.dims()[1];
         let (lower, upper) = self.trunk.split_at(LOCAL_LAYER + 1);
-        let (trunk, local) = chain(lower, centred.clone(), true, device)?;
-        let (segmentation, features) = chain(&self.segmentation, local.clone(), false, device)?;
+        let (trunk, local) = chain(lower, centred.clone(), true, 0.0, device)?;
+        let (segmentation, features) = chain(&self.segmentation, local.clone(), false, slope, device)?;
         let (logit, logits) = self.logit.affine(features, device)?;
 
         let (last, upper) = upper.split_last().ok_or_else(|| Error::Backend("a trunk without layers".into()))?;
-        let (mut upper, local) = chain(upper, local, true, device)?;
+        let (mut upper, local) = chain(upper, local, true, 0.0, device)?;
         let (pooled, mut global) = last.pooled(local, device)?;
         let upper_depth = upper.len() + 1;
         if plane_apart {
@@ -104,7 +107,7 @@ impl PointNet<Parameter> {
         for layer in &self.classification {
             let input = constant(global, [layer.weight.shape()[1], 1], device);
             let (trace, mut output) = layer.affine(input, device)?;
-            output.iter_mut().for_each(|value| *value = rectified(*value));
+            output.iter_mut().for_each(|value| *value = rectified(*value, 0.0));
             classification.push(trace);
             global = output;
         }
@@ -175,12 +178,13 @@ fn chain(
     layers: &[Layer<Parameter>],
     mut input: Tensor<2>,
     centred: bool,
+    slope: f32,
     device: &Device,
 ) -> Result<(Vec<Normalised>, Tensor<2>), Error> {
     let mut traces = Vec::with_capacity(layers.len());
     for (place, layer) in layers.iter().enumerate() {
         let columns = input.dims()[1];
-        let (trace, features) = layer.normalised(input, centred || place + 1 < layers.len(), device)?;
+        let (trace, features) = layer.normalised(input, centred || place + 1 < layers.len(), slope, device)?;
         input = constant(features, [layer.weight.shape()[0], columns], device);
         traces.push(trace);
     }
@@ -212,8 +216,8 @@ fn unreached(normalised: bool) -> Arrays {
 
 /// Not `max`: that would make 0 of what is not a number.
 #[inline(always)]
-fn rectified(value: f32) -> f32 {
-    if value <= 0.0 { 0.0 } else { value }
+fn rectified(value: f32, slope: f32) -> f32 {
+    if value <= 0.0 { slope * value } else { value }
 }
 
 impl Layer<Parameter> {
@@ -229,7 +233,13 @@ impl Layer<Parameter> {
     }
 
     /// The layer's output, its rows less their means if `centred`.
-    fn normalised(&self, input: Tensor<2>, centred: bool, device: &Device) -> Result<(Normalised, Vec<f32>), Error> {
+    fn normalised(
+        &self,
+        input: Tensor<2>,
+        centred: bool,
+        slope: f32,
+        device: &Device,
+    ) -> Result<(Normalised, Vec<f32>), Error> {
         let weight = self.weight.tensor(device);
         let columns = input.dims()[1];
         let response = values_of(weight.clone().matmul(input.clone()))?;
@@ -242,7 +252,7 @@ impl Layer<Parameter> {
                 for (k, (output, response)) in rows.enumerate() {
                     let (scale, bias) = (statistics.scale[k], statistics.bias[k]);
                     for (output, response) in output.iter_mut().zip(response) {
-                        *output = rectified(response * scale + bias);
+                        *output = rectified(response * scale + bias, slope);
                     }
                     if centred {
                         let mean = sum(output) / columns as f32;
@@ -251,7 +261,7 @@ impl Layer<Parameter> {
                 }
             },
         );
-        Ok((Normalised { weight, input, response, statistics }, output))
+        Ok((Normalised { weight, input, response, statistics, slope }, output))
     }
 
     /// The largest output of every row.
@@ -272,7 +282,7 @@ impl Layer<Parameter> {
             );
             let place = row.iter().position(|value| value * sign == highest).unwrap_or(0);
             largest.push((place, row[place]));
-            output.push(rectified(row[place] * scale + bias));
+            output.push(rectified(row[place] * scale + bias, 0.0));
         }
         Ok((Pooled { weight, input, statistics, largest }, output))
     }
@@ -318,6 +328,7 @@ impl Normalised {
         let Statistics { deviation, scale, bias } = &self.statistics;
         let rows = scale.len();
         let (mut on_gain, mut on_bias) = (Vec::with_capacity(rows), Vec::with_capacity(rows));
+        let below = self.slope;
         vectorised(
             #[inline(always)]
             || {
@@ -327,7 +338,7 @@ impl Normalised {
                     let (scale, bias, deviation) = (scale[k], bias[k], deviation[k]);
                     let mean = if centred { sum(slopes) / columns as f32 } else { 0.0 };
                     for (slope, response) in slopes.iter_mut().zip(response) {
-                        *slope = if response * scale + bias > 0.0 { *slope - mean } else { 0.0 };
+                        *slope = if response * scale + bias > 0.0 { *slope - mean } else { below * (*slope - mean) };
                     }
                     let pull = dot(slopes, response);
                     let along = scale * pull / (columns as f32 * deviation * deviation);

@@ -38,17 +38,18 @@ impl PointNet<Parameter> {
 impl PointNet<Tensor<2>> {
     /// Runs the network on a cloud (rows x m) whose rows have mean 0.
     ///
-    /// With `plane_apart` no gradient of the plane reaches the trunk, only the classification head.
-    fn forward_on_tape(&self, centred: Tensor<2>, plane_apart: bool) -> Output {
-        let mut features = self.trunk[0].normalised(centred);
+    /// With `plane_apart` no gradient of the plane reaches the trunk, only the classification head. `slope`: of the
+    /// segmentation head's rectifiers below 0.
+    fn forward_on_tape(&self, centred: Tensor<2>, plane_apart: bool, slope: f64) -> Output {
+        let mut features = self.trunk[0].normalised(centred, 0.0);
         for layer in &self.trunk[1..=LOCAL_LAYER] {
-            features = layer.normalised(centre(features));
+            features = layer.normalised(centre(features), 0.0);
         }
         let local = centre(features);
 
-        let mut features = self.segmentation[0].normalised(local.clone());
+        let mut features = self.segmentation[0].normalised(local.clone(), slope);
         for layer in &self.segmentation[1..] {
-            features = layer.normalised(centre(features));
+            features = layer.normalised(centre(features), slope);
         }
         let logits = self.logit.affine(features);
 
@@ -72,7 +73,7 @@ fn global_feature(layers: &[Layer<Tensor<2>>], local: Tensor<2>) -> Tensor<2> {
     let mut features = local;
     for (index, layer) in layers.iter().enumerate() {
         let input = if index == 0 { features } else { centre(features) };
-        features = layer.normalised(input);
+        features = layer.normalised(input, 0.0);
     }
     features.max_dim(1)
 }
@@ -89,8 +90,9 @@ impl Layer<Tensor<2>> {
         self.weight.clone().matmul(input) + self.bias.clone()
     }
 
-    /// `max(0, gain · W X / sqrt(var(W X) + ε) + b)` for an X whose rows have mean 0, so that those of W X have, too.
-    fn normalised(&self, centred: Tensor<2>) -> Tensor<2> {
+    /// `gain · W X / sqrt(var(W X) + ε) + b`, rectified with this slope below 0, for an X whose rows have mean 0, so that
+    /// those of W X have, too.
+    fn normalised(&self, centred: Tensor<2>, slope: f64) -> Tensor<2> {
         let response = self.weight.clone().matmul(centred);
         let columns = response.dims()[1] as f64;
         let variance = (response.clone() * response.clone()).sum_dim(1).div_scalar(columns);
@@ -99,7 +101,8 @@ impl Layer<Tensor<2>> {
             Some(gain) => gain.clone() / deviation,
             None => deviation.recip(),
         };
-        relu(response * scale + self.bias.clone())
+        let output = response * scale + self.bias.clone();
+        relu(output.clone()) - relu(-output).mul_scalar(slope)
     }
 }
 
@@ -132,11 +135,12 @@ fn cloud(rows: usize, columns: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     values
 }
 
-/// Output and derivatives of both, with the plane apart and not; 37 columns leave a remainder in every sum.
+/// Output and derivatives of both, with the plane apart and not, ReLU and leaky; 37 columns leave a remainder in every
+/// sum.
 #[test]
 fn the_pass_written_out_agrees_with_the_tape() {
     const SHAPE: [usize; 2] = [12, 37];
-    for (seed, plane_apart) in [(1, true), (2, false)] {
+    for (seed, plane_apart, slope) in [(1, true, 0.0), (2, false, 0.0), (3, false, 0.1)] {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut network = PointNet::new(SHAPE[0], 0.25, seed);
         // Gains and biases off their symmetric start, some gains negative.
@@ -155,7 +159,7 @@ fn the_pass_written_out_agrees_with_the_tape() {
 
         let device = Device::flex().autodiff();
         let leaves = network.leaves(&device);
-        let output = leaves.forward_on_tape(constant(values.clone(), SHAPE, &device), plane_apart);
+        let output = leaves.forward_on_tape(constant(values.clone(), SHAPE, &device), plane_apart, slope);
         let surrogate = (output.logits.clone() * constant(on_logits.clone(), [1, SHAPE[1]], &device)).sum()
             + (output.plane.clone() * constant(on_plane.to_vec(), [3, 1], &device)).sum();
         let mut reached = surrogate.backward();
@@ -165,7 +169,7 @@ fn the_pass_written_out_agrees_with_the_tape() {
             .collect();
 
         let device = Device::flex();
-        let pass = network.forward(&constant(values, SHAPE, &device), plane_apart, &device).expect("a pass");
+        let pass = network.forward(&constant(values, SHAPE, &device), plane_apart, slope as f32, &device).expect("a pass");
         assert_near(&pass.logits, &values_of(output.logits.inner()).expect("f32"), "logits");
         assert_near(&pass.plane, &values_of(output.plane.inner()).expect("f32"), "plane");
         let gradient = pass.backward(on_logits, Some(on_plane)).expect("a gradient");
@@ -204,8 +208,8 @@ fn the_global_feature_cancels_in_the_segmentation_head() {
 
     let every_column = global.repeat_dim(1, COLUMNS);
     let concatenated = layer(Tensor::cat(vec![on_local.clone(), on_global], 1))
-        .normalised(centre(Tensor::cat(vec![local.clone(), every_column], 0)));
-    let alone = layer(on_local).normalised(centre(local));
+        .normalised(centre(Tensor::cat(vec![local.clone(), every_column], 0)), 0.0);
+    let alone = layer(on_local).normalised(centre(local), 0.0);
     let pair = values_of(concatenated).expect("f32").into_iter().zip(values_of(alone).expect("f32"));
     assert!(pair.clone().any(|(a, _)| a > 1.0));
     for (a, b) in pair {

@@ -3,6 +3,7 @@
 use nalgebra::{Matrix3, Matrix4};
 
 use super::attempt::Attempt;
+use super::baselines::Decided;
 use super::calibration::Outcome;
 use super::classification::{self, Judged};
 use super::grow::{LEAST_INLIERS, LEAST_SUPPORT};
@@ -62,7 +63,7 @@ impl Reconstruction {
         warnings.extend(second_structures::warning(&seed.second_structure, &judged.tracks.inlier));
         warnings.extend(static_tracks::warning(problem, &judged.tracks.inlier));
         let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
-        // Depths verify fewer, and PAPER and PSFM keep what they keep.
+        // Depths verify fewer, and PAPER, SCPSFM and PSFM keep what they keep.
         if seed.judges_observations() && inliers < LEAST_INLIERS {
             let detail = format!("{inliers} tracks hold under the final geometry; {LEAST_INLIERS} can be verified");
             warnings.push(Warning::new(WarningCode::FewInliers, detail));
@@ -270,6 +271,14 @@ fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
             format!(
                 "no {} views share enough tracks: at least {}, no two of them equal, must be seen in all of them",
                 LEAST_VIEWS, LEAST_INLIERS
+            ),
+        ),
+        Some(Attempt { decided: Some(Decided { is_verified: false, inlier, .. }), .. }) => Warning::new(
+            WarningCode::UnverifiedRanking,
+            format!(
+                "the best of the network's heads keeps {} tracks, which neither stand apart from the others nor fit one \
+                 calibration: `weight` of the tracks is what it gives them, nothing has checked it",
+                inlier.iter().filter(|&&inlier| inlier).count()
             ),
         ),
         Some(Attempt { decided: Some(decided), .. }) => Warning::new(

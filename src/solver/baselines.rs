@@ -30,6 +30,8 @@ pub struct Decided {
     pub inlier: Vec<bool>,
     /// The method's own weights, one a track of the block.
     pub weights: Vec<f64>,
+    /// Whether the method itself takes its answer for one; else nothing is reconstructed.
+    pub is_verified: bool,
 }
 
 /// Solves the densest blocks of views, one at least and until one is METRIC; the best of them. Blocks that disagree
@@ -99,7 +101,8 @@ pub fn paper(
         }
     }
     let weights = network.weights().to_vec();
-    Ok(Decided { inlier: weights.iter().map(|&weight| weight > PAPER_THRESHOLD).collect(), weights })
+    let inlier = weights.iter().map(|&weight| weight > PAPER_THRESHOLD).collect();
+    Ok(Decided { inlier, weights, is_verified: true })
 }
 
 /// PSFM: the dominant subspace of all columns (Sturm & Triggs 1996), and the tracks that lie close to it.
@@ -111,6 +114,7 @@ pub fn psfm(block: &CompleteBlock, noise: f64) -> Decided {
     Decided {
         inlier: residuals.iter().map(|&residual| residual < threshold).collect(),
         weights: residuals.iter().map(|&residual| 1.0 / (1.0 + (residual / threshold).powi(2))).collect(),
+        is_verified: true,
     }
 }
 

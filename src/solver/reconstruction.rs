@@ -140,7 +140,7 @@ fn share(right: usize, tried: usize) -> f64 {
     (right as f64 + 1.0) / (tried.max(right) as f64 + 2.0)
 }
 
-/// PAPER and PSFM: the method's own weights and verdicts in place of the geometry's.
+/// PAPER, SCPSFM and PSFM: the method's own weights and verdicts in place of the geometry's.
 pub fn own_verdicts(block_tracks: &[usize], decided: &Decided, tracks: &mut TrackResults) {
     tracks.weight.fill(0.0);
     tracks.inlier.fill(false);

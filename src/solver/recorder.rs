@@ -184,9 +184,14 @@ impl<'a> Recorder<'a> {
 
     /// Begins a step of a task, or tells how many are done; see [`Step`]. `within` as for [`Self::report`].
     pub fn step(&mut self, task: Task, step: usize, steps: usize, within: f64) {
-        self.course.step = Some(Step { task, step: step as u32, steps: steps as u32 });
+        self.begin_step(task, step, steps);
         self.advance(within);
         self.heartbeat();
+    }
+
+    /// The same, to be told with the next report.
+    pub fn begin_step(&mut self, task: Task, step: usize, steps: usize) {
+        self.course.step = Some(Step { task, step: step as u32, steps: steps as u32 });
     }
 
     /// Tells how many verdicts there are; `tracks`: how many are judged.

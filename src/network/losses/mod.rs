@@ -7,7 +7,10 @@
 //! * `L_proj = Σ_{k>=5} σ_k(A)`, in `spectrum.rs`,
 //! * `L_DAQ = Σ_i | S_i/|S_i| - ω/|ω| |` over the views, in the cameras that `gauge.rs` reads off the span of
 //!   the first four eigenvectors.
+//!
+//! `continued.rs` has what becomes of them in a continuation.
 
+mod continued;
 mod daq;
 mod gauge;
 #[cfg(test)]
@@ -20,6 +23,7 @@ use nalgebra::{DMatrix, Vector3};
 
 use super::Error;
 use crate::domain::Losses;
+pub use continued::{RankTerm, evaluate_continued};
 use spectrum::Spectrum;
 
 /// Largest exponent of L_num: e³⁰ is about 1e13, and its gradient still fits into the f32 of the network. The gradient
@@ -115,6 +119,15 @@ impl RankTerms {
 pub fn rank_terms(columns: &DMatrix<f64>, w: &[f64], settings: &LossSettings) -> Result<RankTerms, Error> {
     debug_assert_eq!(columns.ncols(), w.len());
     Ok(RankTerms::of(&Spectrum::of(columns, w)?, w, settings))
+}
+
+/// The sum of the singular values past the fourth of a matrix as it is.
+///
+/// # Errors
+/// [`Error::NoDecomposition`] when its scatter matrix overflows.
+pub fn tail_sum(matrix: &DMatrix<f64>) -> Result<f64, Error> {
+    let w = vec![1.0; matrix.ncols()];
+    Ok(Spectrum::of(matrix, &w)?.tail_sum(&w).0)
 }
 
 /// L_num and its derivative `-κ s_j (1 - s_j) L_num`.

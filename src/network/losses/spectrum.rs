@@ -69,6 +69,24 @@ impl Spectrum {
         (sigma.iter().sum(), gradient.collect())
     }
 
+    /// The sum of the first four singular values and its derivative: what [`Self::tail_sum`] lacks to the nuclear norm.
+    pub fn leading_sum(&self, w: &[f64]) -> (f64, Vec<f64>) {
+        let sigma: Vec<f64> = self.values[..RANK].iter().map(|value| (value + EIGENVALUE_FLOOR).sqrt()).collect();
+        let gradient = self.coordinates.column_iter().zip(w).map(|(column, w)| {
+            w * column.iter().zip(&sigma).map(|(coordinate, sigma)| coordinate.powi(2) / sigma).sum::<f64>()
+        });
+        (sigma.iter().sum(), gradient.collect())
+    }
+
+    /// The squared Frobenius distance to the nearest matrix of rank 4 (paper, eq. 8), `Σ_{k>=5} σ_k²`, and its
+    /// derivative `2 w_j Σ_{k>=5} (u_kᵀ m_j)²`.
+    pub fn tail_energy(&self, w: &[f64]) -> (f64, Vec<f64>) {
+        let gradient = self.coordinates.column_iter().zip(w).map(|(column, w)| {
+            2.0 * w * column.iter().skip(RANK).map(|coordinate| coordinate.powi(2)).sum::<f64>()
+        });
+        (self.values[RANK..].iter().sum(), gradient.collect())
+    }
+
     /// Derivative with respect to the weights of a function of the span whose derivative with respect to
     /// [`Self::span`] is `grad_span` (3n x 4).
     ///

@@ -46,10 +46,10 @@ macro_rules! twins {
 }
 
 twins! {
-    Method = Method { Auto, Paper, Geometry, Psfm }
+    Method = Method { Auto, Paper, Geometry, Psfm, Scpsfm }
     Backend = Backend { Flex, Ndarray }
     Stage = Stage { Prepare, Search, Refine, Calibrate, Extend, Judge }
-    Task = Task { Adjust, Cameras, Windows, Judge }
+    Task = Task { Adjust, Cameras, Windows, Judge, Heads }
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
     LensProjection = LensProjection { Perspective, Fisheye }

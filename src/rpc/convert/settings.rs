@@ -10,9 +10,10 @@ use crate::rpc::proto;
 /// Violations of `settings.<field>`.
 pub fn from_wire(settings: Option<proto::SolveSettings>) -> Result<SolveSettings, InvalidInput> {
     let given = settings.unwrap_or_default();
-    let default = SolveSettings::default();
+    let method = Method::from_wire(given.method, "settings.method")?.unwrap_or_default();
+    let default = SolveSettings::of_method(method);
     let settings = SolveSettings {
-        method: Method::from_wire(given.method, "settings.method")?.unwrap_or_default(),
+        method,
         use_daq: given.use_daq.unwrap_or(default.use_daq),
         alpha: given.alpha.unwrap_or(default.alpha),
         beta: given.beta.unwrap_or(default.beta),
@@ -62,6 +63,8 @@ mod tests {
     #[test]
     fn what_is_left_out_is_the_default_and_what_is_given_comes_back() {
         assert_eq!(from_wire(None), Ok(SolveSettings::default()));
+        let scpsfm = proto::SolveSettings { method: Method::Scpsfm.to_wire(), ..Default::default() };
+        assert_eq!(from_wire(Some(scpsfm)), Ok(SolveSettings::of_method(Method::Scpsfm)));
         let given = SolveSettings {
             method: Method::Paper,
             use_daq: false,

@@ -17,7 +17,7 @@ use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
 use super::recorder::Recorder;
 use super::sequence::ProjectiveReconstruction;
-use super::{Error, all_tracks, near_duplicates, second_structures, static_tracks, track_sampling};
+use super::{Error, all_tracks, near_duplicates, scpsfm, second_structures, static_tracks, track_sampling};
 use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
@@ -54,7 +54,7 @@ pub struct Attempt {
     pub second_structure: Vec<usize>,
     /// Probability of tracks to be right by image points and depths together; `None` where depths say nothing more.
     pub weights_by_depths: Option<TrackWeights>,
-    /// The method's own verdicts where it searches nothing (PAPER, PSFM).
+    /// The method's own verdicts where it searches nothing (PAPER, SCPSFM, PSFM).
     pub decided: Option<Decided>,
 }
 
@@ -214,7 +214,7 @@ pub fn search_block(
     recorder.enter(Stage::Search);
     let mut attempt = match problem.settings.method {
         Method::Auto | Method::Geometry => searched(problem, block, effort, recorder)?,
-        Method::Paper => decided(problem, block.sample(OPTIONS.paper_tracks, problem.settings.seed), recorder)?,
+        Method::Paper | Method::Scpsfm => decided(problem, block.sample(OPTIONS.paper_tracks, problem.settings.seed), recorder)?,
         Method::Psfm => decided(problem, block, recorder)?,
     };
     problem.stopped()?;
@@ -343,24 +343,28 @@ fn carry_over(weights: &[f64], searched: &Block, block: &Block) -> Vec<f64> {
     block.tracks.iter().map(weight).collect()
 }
 
-/// PAPER and PSFM: the method's own set of tracks, reconstructed as it is.
+/// PAPER, SCPSFM and PSFM: the method's own set of tracks, reconstructed as it is.
 fn decided(problem: &Problem, block: Block, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let mut attempt = Attempt::new(block);
     let noise = problem.initial_noise;
     let completed = baselines::with_epipolar_depths(problem, &attempt.block.complete, noise);
     problem.stopped()?;
     let complete = completed.as_ref().unwrap_or(&attempt.block.complete);
+    let tracks = &attempt.block.tracks;
     let decided = match problem.settings.method {
-        Method::Psfm => baselines::psfm(complete, noise),
-        _ => baselines::paper(problem, complete, &attempt.block.tracks, recorder)
-            .map_err(|error| Error::Internal(error.to_string()))?,
+        Method::Psfm => Ok(baselines::psfm(complete, noise)),
+        Method::Scpsfm => scpsfm::decide(problem, complete, tracks, recorder),
+        _ => baselines::paper(problem, complete, tracks, recorder),
     };
+    let decided = decided.map_err(|error| Error::Internal(error.to_string()))?;
     problem.stopped()?;
     recorder.enter(Stage::Refine);
     if problem.settings.method.uses_network() {
         attempt.found.network_weights = decided.weights.clone();
     }
-    attempt.found.consensus = baselines::reconstruct(complete, &decided.inlier, noise, problem.stop);
+    if decided.is_verified {
+        attempt.found.consensus = baselines::reconstruct(complete, &decided.inlier, noise, problem.stop);
+    }
     attempt.decided = Some(decided);
     recorder.report(1.0);
     Ok(attempt)

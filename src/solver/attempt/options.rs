@@ -12,7 +12,7 @@ pub struct AttemptOptions {
     /// Inlier tracks, and observations of them, that a calibration is made from.
     pub most_calibrated: usize,
     pub calibrated_observations: usize,
-    /// Tracks that PAPER optimises weights for.
+    /// Tracks that PAPER and SCPSFM optimise weights for.
     pub paper_tracks: usize,
     /// Median of the squared residuals over their mean, below which they are of several kinds.
     pub least_median_share: f64,

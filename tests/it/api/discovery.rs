@@ -106,7 +106,7 @@ async fn capabilities_tell_limits_and_defaults() {
     assert_eq!(capabilities.max_connections, 77);
     assert_eq!(
         capabilities.methods().collect::<Vec<_>>(),
-        [Method::Auto, Method::Paper, Method::Geometry, Method::Psfm]
+        [Method::Auto, Method::Paper, Method::Geometry, Method::Psfm, Method::Scpsfm]
     );
     assert_eq!(convert::settings::from_wire(capabilities.default_settings), Ok(SolveSettings::default()));
     assert_eq!(capabilities.version, env!("CARGO_PKG_VERSION"));

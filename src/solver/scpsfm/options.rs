@@ -1,0 +1,42 @@
+//! The constants of the choice among heads, with their reasons.
+
+/// How many heads are optimised, how they differ, and when one is accepted.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HeadOptions {
+    /// Heads at most.
+    pub heads: usize,
+    /// Alpha at the end of the relaxation and the least that the consensus may set, in turn over the heads.
+    pub alphas: [(f64, f64); 4],
+    /// Standard deviation of the logarithm of the factor that reweights each view in the relaxation; the first head has
+    /// all views alike.
+    pub view_scale_deviation: f64,
+    /// Tracks at least that are accepted by rank alone, and those that are where the DAQ residual says so, too.
+    pub accepted_by_rank: usize,
+    pub accepted_by_daq: usize,
+    /// Residual of the consensus, as a share of the median residual of all other tracks, below which it stands apart.
+    pub separation: f64,
+    /// DAQ residual below which a consensus can be that of one constant calibration.
+    pub daq_acceptable: f64,
+    /// Weight of the DAQ residual in the choice, in tracks.
+    pub daq_weight: f64,
+}
+
+impl HeadOptions {
+    pub const DEFAULT: Self = Self {
+        // To 96 % wrong tracks the first suffices, at 98 % the eighth on average.
+        heads: 16,
+        // The first is best where one head has to do; of hard scenes other values find what it does not.
+        alphas: [(14.0, 10.0), (20.0, 20.0), (10.0, 10.0), (30.0, 20.0)],
+        // Without it, new network weights alone: F1 .80 for .86 at 98 %.
+        view_scale_deviation: 0.7,
+        // Any four tracks have rank 4, so that a few more say little; eight leave four to contradict.
+        accepted_by_rank: 8,
+        accepted_by_daq: 4,
+        // Wrong consensuses leave about as much as they were selected by; right ones, noise.
+        separation: 0.4,
+        // The true consensus reaches .1 in noise; wrong ones were above 2 in scenes without a right track.
+        daq_acceptable: 0.2,
+        // In tracks: a wrong set of about one residual more does not pay.
+        daq_weight: 3.0,
+    };
+}
