@@ -220,12 +220,12 @@ pub struct ViewResult {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrackResults {
     /// AUTO, GEOMETRY: probability that the track is an inlier, under `UNVERIFIED_RANKING` by the trained
-    /// network alone; PAPER: the network's own weight; PSFM: closeness to the
-    /// subspace. 0 for tracks that were not judged.
+    /// network alone; PAPER, SCPSFM: the network's own weight; PSFM: closeness to the subspace. 0 for tracks that were
+    /// not judged.
     pub weight: Vec<f32>,
     pub inlier: Vec<bool>,
-    /// What a network says of each track by itself (AUTO: the one trained beforehand, PAPER: the paper's), 0 for tracks
-    /// that it was not shown; empty where none ran.
+    /// What a network says of each track by itself (AUTO: the one trained beforehand, PAPER, SCPSFM: the paper's), 0 for
+    /// tracks that it was not shown; empty where none ran.
     pub network_weight: Vec<f32>,
     /// Point of each track: metric where the result is metric, else in the projective frame (dehomogenised).
     /// `None` for tracks that are not inliers.

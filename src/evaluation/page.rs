@@ -26,7 +26,9 @@ pub fn page(plan: &Plan, cells: &[Cell], coverage: &[Coverage]) -> String {
         let what = match depths {
             Depths::Given => "Depths given",
             Depths::None => "No depths: image points alone",
-            Depths::Epipolar => "No depths given: estimated from fundamental matrices and epipoles, by paper, scpsfm and psfm",
+            Depths::Epipolar => {
+                "No depths given: estimated from fundamental matrices and epipoles, by paper, scpsfm and psfm"
+            }
         };
         let _ = write!(body, "<h2>{what}</h2>\n<figure>{}</figure>\n", figures::svg(plan, cells, depths));
     }

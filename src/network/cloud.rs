@@ -4,7 +4,7 @@ use burn::tensor::{Device, Tensor};
 use nalgebra::DMatrix;
 
 use super::parameter::Parameter;
-use super::pass::Pass;
+use super::pass::{Pass, PlaneUse};
 use super::pointnet::{self, PointNet};
 use super::{Error, PriorNetwork};
 use crate::domain::Backend;
@@ -14,6 +14,9 @@ use crate::domain::Backend;
 /// 70 and 90 % outliers (20 scenes each): 1.2, 1.9 and 6.0 % at the network's rate, .1, .2 and .5 % at five times, no
 /// better at twenty.
 const FOCAL_RATE: f32 = 5.0;
+
+/// Stands for a plane at infinity that was not computed.
+const NO_PLANE: [f32; 3] = [0.0; 3];
 
 /// A PointNet and the columns it is shown.
 pub struct CloudNetwork {
@@ -31,6 +34,7 @@ pub struct Output {
     pub pass: Pass,
     /// Weights, one a column, in [0, 1].
     pub weights: Vec<f64>,
+    /// 0 where it was not wanted: about where freshly drawn networks have it.
     pub plane_at_infinity: [f64; 3],
 }
 
@@ -42,13 +46,7 @@ impl CloudNetwork {
     ///
     /// # Errors
     /// [`Error::TooFewColumns`], [`Error::WrongRows`] or [`Error::NotFinite`].
-    pub fn new(
-        balanced: &DMatrix<f64>,
-        width: f64,
-        slope: f32,
-        seed: u64,
-        backend: Backend,
-    ) -> Result<Self, Error> {
+    pub fn new(balanced: &DMatrix<f64>, width: f64, slope: f32, seed: u64, backend: Backend) -> Result<Self, Error> {
         check(balanced)?;
         let device = device(backend);
         let (rows, columns) = balanced.shape();
@@ -61,19 +59,20 @@ impl CloudNetwork {
         })
     }
 
-    /// Runs the network; with `plane_apart` no gradient of the plane will reach the trunk.
+    /// Runs the network.
     ///
     /// * `iteration`: counted from 1, for the error
     ///
     /// # Errors
     /// [`Error::Diverged`] when the output is not finite, [`Error::Backend`] for a defect of burn.
-    pub fn forward(&self, plane_apart: bool, iteration: u32) -> Result<Output, Error> {
-        let pass = self.network.forward(&self.cloud, plane_apart, self.slope, &self.device)?;
-        if pass.logits.iter().chain(&pass.plane).any(|value| !value.is_finite()) {
+    pub fn forward(&self, plane_use: PlaneUse, iteration: u32) -> Result<Output, Error> {
+        let pass = self.network.forward(&self.cloud, plane_use, self.slope, &self.device)?;
+        let plane = pass.plane().unwrap_or(&NO_PLANE);
+        if pass.logits.iter().chain(plane).any(|value| !value.is_finite()) {
             return Err(Error::Diverged { iteration });
         }
         let weights = pass.logits.iter().map(|&logit| sigmoid(f64::from(logit))).collect();
-        let plane_at_infinity = [0, 1, 2].map(|axis| f64::from(pass.plane[axis]));
+        let plane_at_infinity = [0, 1, 2].map(|axis| f64::from(plane[axis]));
         Ok(Output { pass, weights, plane_at_infinity })
     }
 

@@ -20,25 +20,40 @@ use crate::simd::vectorised;
 /// Derivatives of one loss with respect to every array; `None` where it does not reach the array.
 pub type Gradient = PointNet<Option<Vec<f32>>>;
 
+/// What the plane at infinity is wanted for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PlaneUse {
+    /// Nothing: it is not computed.
+    None,
+    /// Its gradient reaches the classification head, not the trunk.
+    Apart,
+    /// Its gradient reaches the trunk, too.
+    Joint,
+}
+
 /// What the network said of a cloud, and what its derivatives need.
 pub struct Pass {
     /// Logits of the weights, one a column.
     pub logits: Vec<f32>,
-    /// Plane at infinity.
-    pub plane: Vec<f32>,
     device: Device,
     columns: usize,
     trunk: Vec<Normalised>,
     segmentation: Vec<Normalised>,
     logit: Affine,
-    /// Layers of the trunk above the local feature.
-    upper_depth: usize,
-    /// These layers but for the last; empty where the plane is apart.
+    /// Layers of the trunk above the local feature, and of the classification head.
+    depths: (usize, usize),
+    plane: Option<PlanePass>,
+}
+
+/// The way from the local feature to the plane at infinity.
+struct PlanePass {
+    plane: Vec<f32>,
+    /// The trunk's upper layers but for the last; empty where the plane is apart.
     upper: Vec<Normalised>,
     /// The trunk's last layer; `None` where the plane is apart.
     pooled: Option<Pooled>,
     classification: Vec<Affine>,
-    plane_layer: Affine,
+    layer: Affine,
 }
 
 /// A layer with batch statistics.
@@ -84,23 +99,37 @@ type Arrays = Layer<Option<Vec<f32>>>;
 impl PointNet<Parameter> {
     /// Runs the network on a cloud (rows x m) whose rows have mean 0.
     ///
-    /// With `plane_apart` no gradient of the plane will reach the trunk, only the classification head. `slope` is that of
-    /// the segmentation head's rectifiers below 0; those of the other layers are ReLU.
+    /// `slope` is that of the segmentation head's rectifiers below 0; those of the other layers are ReLU.
     ///
     /// # Errors
     /// [`Error::Backend`] for a defect of burn.
-    pub fn forward(&self, centred: &Tensor<2>, plane_apart: bool, slope: f32, device: &Device) -> Result<Pass, Error> {
+    pub fn forward(
+        &self,
+        centred: &Tensor<2>,
+        plane_use: PlaneUse,
+        slope: f32,
+        device: &Device,
+    ) -> Result<Pass, Error> {
         let columns = centred.dims()[1];
         let (lower, upper) = self.trunk.split_at(LOCAL_LAYER + 1);
         let (trunk, local) = chain(lower, centred.clone(), true, 0.0, device)?;
         let (segmentation, features) = chain(&self.segmentation, local.clone(), false, slope, device)?;
         let (logit, logits) = self.logit.affine(features, device)?;
+        let depths = (upper.len(), self.classification.len());
+        let plane = match plane_use {
+            PlaneUse::None => None,
+            _ => Some(self.plane_pass(local, plane_use == PlaneUse::Apart, device)?),
+        };
+        Ok(Pass { logits, device: device.clone(), columns, trunk, segmentation, logit, depths, plane })
+    }
 
+    /// From the local feature, centred, to the plane at infinity.
+    fn plane_pass(&self, local: Tensor<2>, apart: bool, device: &Device) -> Result<PlanePass, Error> {
+        let (_, upper) = self.trunk.split_at(LOCAL_LAYER + 1);
         let (last, upper) = upper.split_last().ok_or_else(|| Error::Backend("a trunk without layers".into()))?;
         let (mut upper, local) = chain(upper, local, true, 0.0, device)?;
         let (pooled, mut global) = last.pooled(local, device)?;
-        let upper_depth = upper.len() + 1;
-        if plane_apart {
+        if apart {
             upper.clear();
         }
         let mut classification = Vec::with_capacity(self.classification.len());
@@ -112,26 +141,19 @@ impl PointNet<Parameter> {
             global = output;
         }
         let input = constant(global, [self.plane.weight.shape()[1], 1], device);
-        let (plane_layer, plane) = self.plane.affine(input, device)?;
-        Ok(Pass {
-            logits,
-            plane,
-            device: device.clone(),
-            columns,
-            trunk,
-            segmentation,
-            logit,
-            upper_depth,
-            upper,
-            pooled: (!plane_apart).then_some(pooled),
-            classification,
-            plane_layer,
-        })
+        let (layer, plane) = self.plane.affine(input, device)?;
+        Ok(PlanePass { plane, upper, pooled: (!apart).then_some(pooled), classification, layer })
     }
 }
 
 impl Pass {
-    /// Derivatives of a loss from those with respect to the logits and, where it depends on it, the plane at infinity.
+    /// The plane at infinity; `None` where it was not wanted.
+    pub fn plane(&self) -> Option<&[f32]> {
+        Some(&self.plane.as_ref()?.plane)
+    }
+
+    /// Derivatives of a loss from those with respect to the logits and, where it depends on it and was computed, the
+    /// plane at infinity.
     ///
     /// # Errors
     /// [`Error::Backend`] for a defect of burn.
@@ -140,15 +162,14 @@ impl Pass {
         let (logit, on_features) = self.logit.backward(on_logits, columns, &device)?;
         let (segmentation, mut on_local) = backward_chain(self.segmentation, on_features, false, columns, &device)?;
 
-        let depth = self.classification.len();
         let mut plane = unreached(false);
-        let mut classification: Vec<Arrays> = (0..depth).map(|_| unreached(false)).collect();
-        let mut upper: Vec<Arrays> = (0..self.upper_depth).map(|_| unreached(true)).collect();
-        if let Some(on_plane) = on_plane {
-            let (arrays, mut on_global) = self.plane_layer.backward(on_plane.to_vec(), 1, &device)?;
+        let mut upper: Vec<Arrays> = (0..self.depths.0).map(|_| unreached(true)).collect();
+        let mut classification: Vec<Arrays> = (0..self.depths.1).map(|_| unreached(false)).collect();
+        if let (Some(on_plane), Some(pass)) = (on_plane, self.plane) {
+            let (arrays, mut on_global) = pass.layer.backward(on_plane.to_vec(), 1, &device)?;
             plane = arrays;
-            let mut output = values_of(self.plane_layer.input)?;
-            for (place, layer) in self.classification.into_iter().enumerate().rev() {
+            let mut output = values_of(pass.layer.input)?;
+            for (place, layer) in pass.classification.into_iter().enumerate().rev() {
                 for (slope, value) in on_global.iter_mut().zip(&output) {
                     *slope = if *value > 0.0 { *slope } else { 0.0 };
                 }
@@ -157,9 +178,9 @@ impl Pass {
                 output = values_of(layer.input)?;
                 on_global = on_input;
             }
-            if let Some(pooled) = self.pooled {
+            if let Some(pooled) = pass.pooled {
                 let (last, on_input) = pooled.backward(&on_global, columns, &device)?;
-                let (arrays, on_input) = backward_chain(self.upper, on_input, true, columns, &device)?;
+                let (arrays, on_input) = backward_chain(pass.upper, on_input, true, columns, &device)?;
                 upper = arrays;
                 upper.push(last);
                 for (slope, other) in on_local.iter_mut().zip(on_input) {
@@ -214,10 +235,11 @@ fn unreached(normalised: bool) -> Arrays {
     Layer { weight: None, gain: normalised.then_some(None), bias: None }
 }
 
-/// Not `max`: that would make 0 of what is not a number.
+/// Not `max`: that would make 0 of what is not a number. A product in both cases: a branch would keep the loops around
+/// it from being vectorised.
 #[inline(always)]
 fn rectified(value: f32, slope: f32) -> f32 {
-    if value <= 0.0 { slope * value } else { value }
+    value * if value <= 0.0 { slope } else { 1.0 }
 }
 
 impl Layer<Parameter> {
@@ -250,7 +272,7 @@ impl Layer<Parameter> {
             || {
                 let rows = output.chunks_exact_mut(columns).zip(response.chunks_exact(columns));
                 for (k, (output, response)) in rows.enumerate() {
-                    let (scale, bias) = (statistics.scale[k], statistics.bias[k]);
+                    let (scale, bias, slope) = (statistics.scale[k], statistics.bias[k], slope);
                     for (output, response) in output.iter_mut().zip(response) {
                         *output = rectified(response * scale + bias, slope);
                     }
@@ -335,10 +357,11 @@ impl Normalised {
                 let all = slopes.chunks_exact_mut(columns).zip(self.response.chunks_exact(columns));
                 for (k, (slopes, response)) in all.enumerate() {
                     // By value: behind references they would be read again for every number.
-                    let (scale, bias, deviation) = (scale[k], bias[k], deviation[k]);
+                    let (scale, bias, deviation, below) = (scale[k], bias[k], deviation[k], below);
                     let mean = if centred { sum(slopes) / columns as f32 } else { 0.0 };
                     for (slope, response) in slopes.iter_mut().zip(response) {
-                        *slope = if response * scale + bias > 0.0 { *slope - mean } else { below * (*slope - mean) };
+                        // A product in both cases: a branch would keep the loop from being vectorised.
+                        *slope = (*slope - mean) * if response * scale + bias > 0.0 { 1.0 } else { below };
                     }
                     let pull = dot(slopes, response);
                     let along = scale * pull / (columns as f32 * deviation * deviation);

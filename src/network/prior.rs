@@ -4,6 +4,7 @@ use nalgebra::DMatrix;
 
 use super::cloud::{CloudNetwork, Output, finite};
 use super::losses::{self, Evaluation, LossSettings};
+use super::pass::PlaneUse;
 use super::{Error, NetworkSettings};
 use crate::domain::Losses;
 
@@ -129,8 +130,8 @@ impl PriorNetwork {
     /// output; its derivative is passed on.
     pub(super) fn differentiate(&mut self) -> Result<Slope, Error> {
         let daq_on_weights = self.daq_acts_on_weights();
-        let Output { pass, weights, plane_at_infinity } =
-            self.network.forward(!daq_on_weights, self.iteration + 1)?;
+        let plane_use = if daq_on_weights { PlaneUse::Joint } else { PlaneUse::Apart };
+        let Output { pass, weights, plane_at_infinity } = self.network.forward(plane_use, self.iteration + 1)?;
         (self.weights, self.plane_at_infinity) = (weights, plane_at_infinity);
         let evaluation = losses::evaluate(
             &self.balanced,

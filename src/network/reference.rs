@@ -6,6 +6,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::parameter::Parameter;
+use super::pass::PlaneUse;
 use super::pointnet::{LOCAL_LAYER, Layer, PointNet, VARIANCE_FLOOR, constant, standard_normal, values_of};
 
 /// What the network says of a cloud of m columns.
@@ -140,7 +141,7 @@ fn cloud(rows: usize, columns: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
 #[test]
 fn the_pass_written_out_agrees_with_the_tape() {
     const SHAPE: [usize; 2] = [12, 37];
-    for (seed, plane_apart, slope) in [(1, true, 0.0), (2, false, 0.0), (3, false, 0.1)] {
+    for (seed, plane_use, slope) in [(1, PlaneUse::Apart, 0.0), (2, PlaneUse::Joint, 0.0), (3, PlaneUse::Joint, 0.1)] {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut network = PointNet::new(SHAPE[0], 0.25, seed);
         // Gains and biases off their symmetric start, some gains negative.
@@ -159,7 +160,8 @@ fn the_pass_written_out_agrees_with_the_tape() {
 
         let device = Device::flex().autodiff();
         let leaves = network.leaves(&device);
-        let output = leaves.forward_on_tape(constant(values.clone(), SHAPE, &device), plane_apart, slope);
+        let output =
+            leaves.forward_on_tape(constant(values.clone(), SHAPE, &device), plane_use == PlaneUse::Apart, slope);
         let surrogate = (output.logits.clone() * constant(on_logits.clone(), [1, SHAPE[1]], &device)).sum()
             + (output.plane.clone() * constant(on_plane.to_vec(), [3, 1], &device)).sum();
         let mut reached = surrogate.backward();
@@ -169,9 +171,14 @@ fn the_pass_written_out_agrees_with_the_tape() {
             .collect();
 
         let device = Device::flex();
-        let pass = network.forward(&constant(values, SHAPE, &device), plane_apart, slope as f32, &device).expect("a pass");
+        let pass = network
+            .forward(&constant(values.clone(), SHAPE, &device), plane_use, slope as f32, &device)
+            .expect("a pass");
         assert_near(&pass.logits, &values_of(output.logits.inner()).expect("f32"), "logits");
-        assert_near(&pass.plane, &values_of(output.plane.inner()).expect("f32"), "plane");
+        assert_near(pass.plane().expect("computed"), &values_of(output.plane.inner()).expect("f32"), "plane");
+        let unused =
+            network.forward(&constant(values, SHAPE, &device), PlaneUse::None, slope as f32, &device).expect("a pass");
+        assert_eq!((&unused.logits, unused.plane()), (&pass.logits, None));
         let gradient = pass.backward(on_logits, Some(on_plane)).expect("a gradient");
         assert_eq!(gradient.arrays().count(), expected.len());
         for (index, (found, expected)) in gradient.arrays().zip(&expected).enumerate() {

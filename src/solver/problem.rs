@@ -158,7 +158,7 @@ impl<'a> Problem<'a> {
         Error::check(self.stop)
     }
 
-    /// Whether the method searches, and judges every observation by itself; PAPER and PSFM decide by themselves.
+    /// Whether the method searches, and judges every observation by itself; PAPER, SCPSFM and PSFM do not.
     pub fn is_searched(&self) -> bool {
         is_searched(self.settings)
     }

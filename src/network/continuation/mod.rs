@@ -33,6 +33,7 @@ use nalgebra::DMatrix;
 
 use super::cloud::{CloudNetwork, Output, finite};
 use super::losses::{self, RankTerm};
+use super::pass::PlaneUse;
 use super::{Error, NetworkSettings};
 use crate::domain::Losses;
 use crate::geometry::factorization::{dominant_subspace, subspace_residuals};
@@ -97,7 +98,7 @@ pub struct HeadIteration {
     /// Counted from 1.
     pub iteration: u32,
     pub phase: Phase,
-    /// Unweighted. L_DAQ is reported even where it is not optimised.
+    /// Unweighted. L_DAQ is reported even where it is not optimised, then at the focal length and plane of the start.
     pub losses: Losses,
 }
 
@@ -148,8 +149,8 @@ impl Head {
     pub fn step(&mut self) -> Result<HeadIteration, Error> {
         let phase = self.phase();
         let moves_calibration = self.settings.use_daq && phase != Phase::Relaxation;
-        let Output { pass, weights, plane_at_infinity } =
-            self.network.forward(!moves_calibration, self.iteration + 1)?;
+        let plane_use = if moves_calibration { PlaneUse::Joint } else { PlaneUse::None };
+        let Output { pass, weights, plane_at_infinity } = self.network.forward(plane_use, self.iteration + 1)?;
         self.weights = weights;
         self.begin_phases()?;
         let (matrix, alpha, term) = self.objective(phase);
@@ -187,7 +188,7 @@ impl Head {
     /// # Errors
     /// As [`Self::step`].
     pub fn finish(mut self) -> Result<Finished, Error> {
-        self.weights = self.network.forward(true, self.iteration)?.weights;
+        self.weights = self.network.forward(PlaneUse::None, self.iteration)?.weights;
         Ok(Finished { weights: self.weights, tolerance: self.tolerance, focal: self.network.log_focal().exp() })
     }
 

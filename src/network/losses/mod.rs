@@ -11,6 +11,8 @@
 //! `continued.rs` has what becomes of them in a continuation.
 
 mod continued;
+#[cfg(test)]
+mod continued_tests;
 mod daq;
 mod gauge;
 #[cfg(test)]

@@ -81,9 +81,10 @@ impl Spectrum {
     /// The squared Frobenius distance to the nearest matrix of rank 4 (paper, eq. 8), `Σ_{k>=5} σ_k²`, and its
     /// derivative `2 w_j Σ_{k>=5} (u_kᵀ m_j)²`.
     pub fn tail_energy(&self, w: &[f64]) -> (f64, Vec<f64>) {
-        let gradient = self.coordinates.column_iter().zip(w).map(|(column, w)| {
-            2.0 * w * column.iter().skip(RANK).map(|coordinate| coordinate.powi(2)).sum::<f64>()
-        });
+        let gradient =
+            self.coordinates.column_iter().zip(w).map(|(column, w)| {
+                2.0 * w * column.iter().skip(RANK).map(|coordinate| coordinate.powi(2)).sum::<f64>()
+            });
         (self.values[RANK..].iter().sum(), gradient.collect())
     }
 

@@ -5,6 +5,7 @@ mod duplicates;
 mod learned;
 mod lenses;
 mod observations;
+mod scpsfm;
 mod sequences;
 mod special_scenes;
 
