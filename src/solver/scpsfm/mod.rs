@@ -9,9 +9,10 @@
 //! distance at the noise, its self-calibration constraint as the DAQ residual `e = 1/2 min Σ_i | S_i/|S_i| - ω/|ω| |²`
 //! over K and the plane at infinity; the paper sums the norms). Without the DAQ term: no e. The lowest J is chosen.
 //!
-//! Heads end with one that is accepted: its tracks stand apart from all others, and they are eight, or four and more
-//! whose e is small. What no head is accepted for is an answer that nothing has verified: it is told as such and not
-//! reconstructed.
+//! Heads end with one that is accepted: its tracks stand apart from all others and e is small, or without the DAQ term
+//! they are eight and more. Where none is, eight and more of the chosen head that stand apart are verified as well: a
+//! motion near a degenerate one has a large e with right tracks, too. The rest is an answer that nothing has verified:
+//! it is told as such and not reconstructed.
 
 mod options;
 #[cfg(test)]
@@ -104,7 +105,7 @@ pub struct Told<'a> {
 pub struct Answer {
     /// Of the chosen head, one a column of the matrix.
     pub weights: Vec<f64>,
-    /// Whether that head was accepted.
+    /// Whether its tracks can be taken for right.
     pub is_verified: bool,
     /// Heads that were optimised.
     pub heads: usize,
@@ -174,12 +175,12 @@ impl Search<'_> {
             candidates.push(self.candidate(&balanced, finished));
             chosen = self.choice(&candidates);
             if self.is_accepted(&candidates[chosen]) {
-                answer.is_verified = true;
                 break;
             }
         }
         answer.heads = candidates.len();
         if let Some(chosen) = candidates.get(chosen) {
+            answer.is_verified = self.is_accepted(chosen) || self.is_of_low_rank(chosen);
             scatter(&chosen.weights, &columns, &mut answer.weights);
         }
         Ok(answer)
@@ -262,12 +263,18 @@ impl Search<'_> {
         (0..objectives.len()).min_by(|&a, &b| objectives[a].total_cmp(&objectives[b])).unwrap_or(0)
     }
 
+    /// Whether no further head is needed: with the DAQ term, where the tracks stand apart and fit one calibration.
     fn is_accepted(&self, candidate: &Candidate) -> bool {
-        let by_rank = candidate.kept >= self.options.accepted_by_rank;
-        let by_daq = self.settings.use_daq
-            && candidate.kept >= self.options.accepted_by_daq
-            && candidate.daq_residual < self.options.daq_acceptable;
-        candidate.is_separate && (by_rank || by_daq)
+        if !self.settings.use_daq {
+            return self.is_of_low_rank(candidate);
+        }
+        let fits = candidate.daq_residual < self.options.daq_acceptable;
+        candidate.is_separate && candidate.kept >= self.options.accepted_by_daq && fits
+    }
+
+    /// Whether the tracks stand apart and are so many that their rank says something.
+    fn is_of_low_rank(&self, candidate: &Candidate) -> bool {
+        candidate.is_separate && candidate.kept >= self.options.accepted_by_rank
     }
 }
 
