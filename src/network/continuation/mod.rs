@@ -293,7 +293,8 @@ impl Head {
     }
 
     /// The residual at which growth ends: so many standard deviations of the consensus' own, its degrees of freedom
-    /// counted.
+    /// counted, but no more than a share of the median residual of the other tracks. Above that, wrong tracks are worth
+    /// their cost, and all of them may join.
     fn tolerance_of_consensus(&self, gate: f64) -> f64 {
         let (least, most) = self.options.tolerance;
         let kept: Vec<usize> = (0..self.weights.len()).filter(|&j| self.weights[j] > THRESHOLD).collect();
@@ -302,9 +303,18 @@ impl Head {
         }
         let consensus = self.balanced.select_columns(&kept);
         let Some(basis) = dominant_subspace(&consensus, RANK) else { return least };
-        let mut squared: Vec<f64> = subspace_residuals(&consensus, &basis).iter().map(|r| r.powi(2)).collect();
+        let residuals = subspace_residuals(&self.balanced, &basis);
+        let mut own: Vec<f64> = kept.iter().map(|&j| residuals[j].powi(2)).collect();
+        let mut others: Vec<f64> =
+            (0..residuals.len()).filter(|&j| self.weights[j] <= THRESHOLD).map(|j| residuals[j]).collect();
         let freedom = (kept.len() - RANK) as f64 / kept.len() as f64;
-        (gate * (midpoint_median(&mut squared) / freedom).sqrt()).clamp(least, most)
+        let tolerance = gate * (midpoint_median(&mut own) / freedom).sqrt();
+        let most = if others.is_empty() {
+            most
+        } else {
+            most.min(self.options.share_of_others * midpoint_median(&mut others))
+        };
+        tolerance.min(most).max(least)
     }
 }
 
