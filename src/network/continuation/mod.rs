@@ -293,8 +293,8 @@ impl Head {
     }
 
     /// The residual at which growth ends: so many standard deviations of the consensus' own, its degrees of freedom
-    /// counted, but no more than a share of the median residual of the other tracks. Above that, wrong tracks are worth
-    /// their cost, and all of them may join.
+    /// counted, but no more than a share of what wrong tracks leave. Above that they are worth their cost, and all of
+    /// them may join.
     fn tolerance_of_consensus(&self, gate: f64) -> f64 {
         let (least, most) = self.options.tolerance;
         let kept: Vec<usize> = (0..self.weights.len()).filter(|&j| self.weights[j] > THRESHOLD).collect();
@@ -303,19 +303,31 @@ impl Head {
         }
         let consensus = self.balanced.select_columns(&kept);
         let Some(basis) = dominant_subspace(&consensus, RANK) else { return least };
-        let residuals = subspace_residuals(&self.balanced, &basis);
-        let mut own: Vec<f64> = kept.iter().map(|&j| residuals[j].powi(2)).collect();
-        let mut others: Vec<f64> =
-            (0..residuals.len()).filter(|&j| self.weights[j] <= THRESHOLD).map(|j| residuals[j]).collect();
+        let mut squared: Vec<f64> = subspace_residuals(&consensus, &basis).iter().map(|r| r.powi(2)).collect();
         let freedom = (kept.len() - RANK) as f64 / kept.len() as f64;
-        let tolerance = gate * (midpoint_median(&mut own) / freedom).sqrt();
-        let most = if others.is_empty() {
-            most
-        } else {
-            most.min(self.options.share_of_others * midpoint_median(&mut others))
-        };
-        tolerance.min(most).max(least)
+        let tolerance = gate * (midpoint_median(&mut squared) / freedom).sqrt();
+        let of_wrong = wrong_residual(&self.balanced, &self.weights, &basis);
+        tolerance.min(most).min(self.options.wrong_share * of_wrong).max(least)
     }
+}
+
+/// What wrong tracks leave beside the span of a consensus: the median residual of the tracks that are not in it, or of
+/// its own with their observations mismatched, whichever is less.
+///
+/// The mismatched columns take view i from the i-th next track of the consensus. Where all is kept, or nearly all, they
+/// are what there is to compare with: beside the span of wrong tracks they leave as much as the tracks themselves.
+///
+/// * `balanced`: 3n x m
+/// * `weights`: one a column; above [`THRESHOLD`] it is in the consensus
+/// * `basis`: of the consensus' span, orthonormal, 3n x 4
+pub fn wrong_residual(balanced: &DMatrix<f64>, weights: &[f64], basis: &DMatrix<f64>) -> f64 {
+    let (kept, others): (Vec<usize>, Vec<usize>) = (0..weights.len()).partition(|&j| weights[j] > THRESHOLD);
+    let consensus = balanced.select_columns(&kept);
+    let count = consensus.ncols();
+    let mismatched = DMatrix::from_fn(balanced.nrows(), count, |row, j| consensus[(row, (j + row / 3) % count)]);
+    let left = |columns: &DMatrix<f64>| midpoint_median(&mut subspace_residuals(columns, basis));
+    let of_mismatched = left(&mismatched);
+    if others.is_empty() { of_mismatched } else { of_mismatched.min(left(&balanced.select_columns(&others))) }
 }
 
 /// What a head ended with.

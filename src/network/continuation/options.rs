@@ -28,8 +28,8 @@ pub struct ContinuationOptions {
     pub first_gate_factor: f64,
     /// Bounds of that residual.
     pub tolerance: (f64, f64),
-    /// The same as a share of the median residual of the tracks outside the consensus.
-    pub share_of_others: f64,
+    /// The same as a share of what wrong tracks leave.
+    pub wrong_share: f64,
     /// Shape of the matrix that every alpha is for: columns over rows beyond rank 4.
     pub reference_shape: f64,
     /// Slope below 0 of the rectifiers in the segmentation head.
@@ -60,9 +60,9 @@ impl ContinuationOptions {
         first_gate_factor: 1.25,
         // Below, the exact rank of a set of five or six would shut every other track out; above, wrong ones pass.
         tolerance: (0.02, 0.25),
-        // The gate times the share below which a consensus stands apart from the others: none is let in that no
-        // consensus with them could be told from. Without it, up to all of 200 wrong tracks are kept.
-        share_of_others: 0.8,
+        // The gate times the share below which a consensus stands apart: beyond, it could not be told from a wrong one.
+        // Without it, all of 200 wrong tracks are kept in one of ten scenes without a right one.
+        wrong_share: 0.8,
         // 10 views and 200 tracks. Singular values of wrong columns grow as the square root of their number.
         reference_shape: 200.0 / 26.0,
         // With ReLU features of the few right tracks die before the consensus is found.

@@ -121,3 +121,15 @@ fn hostile_matrices_are_refused_or_survived() {
         assert!(finished.tolerance > 0.0 && finished.focal.is_finite());
     }
 }
+
+/// Beside the span of right tracks mismatched ones leave much more than these, beside that of wrong ones about as much.
+#[test]
+fn mismatched_tracks_tell_a_right_consensus_from_a_wrong_one() {
+    for (outliers, is_right) in [(0.0, true), (1.0, false)] {
+        let matrix = balanced_matrix(&contaminated_scene(10, 100, outliers, 6));
+        let basis = dominant_subspace(&matrix, RANK).expect("finite");
+        let own = midpoint_median(&mut subspace_residuals(&matrix, &basis));
+        let of_wrong = wrong_residual(&matrix, &[1.0; 100], &basis);
+        assert_eq!(own < 0.4 * of_wrong, is_right, "{own} {of_wrong}");
+    }
+}

@@ -9,7 +9,7 @@
 //! distance at the noise, its self-calibration constraint as the DAQ residual `e = 1/2 min Σ_i | S_i/|S_i| - ω/|ω| |²`
 //! over K and the plane at infinity; the paper sums the norms). Without the DAQ term: no e. The lowest J is chosen.
 //!
-//! Heads end with one that is accepted: its tracks stand apart from all others and e is small, or without the DAQ term
+//! Heads end with one that is accepted: its tracks stand apart from wrong ones and e is small, or without the DAQ term
 //! they are eight and more. Where none is, eight and more of the chosen head that stand apart are verified as well: a
 //! motion near a degenerate one has a large e with right tracks, too. The rest is an answer that nothing has verified:
 //! it is told as such and not reconstructed.
@@ -30,7 +30,9 @@ use crate::geometry::daq::hypothesis_residual;
 use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_residuals};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::statistics::midpoint_median;
-use crate::network::continuation::{ContinuationOptions, Finished, Head, HeadIteration, HeadStart, THRESHOLD};
+use crate::network::continuation::{
+    ContinuationOptions, Finished, Head, HeadIteration, HeadStart, THRESHOLD, wrong_residual,
+};
 use crate::network::{Error, NetworkSettings, PriorNetwork, standard_normal};
 
 pub use options::HeadOptions;
@@ -127,7 +129,7 @@ struct Candidate {
     tolerance: f64,
     /// `Σ_{k>=5} σ_k²` of the kept columns.
     energy: f64,
-    /// Whether the kept tracks stand apart from the others.
+    /// Whether the kept tracks stand apart from wrong ones.
     is_separate: bool,
     daq_residual: f64,
 }
@@ -235,15 +237,12 @@ impl Search<'_> {
         if kept.len() < RANK {
             return candidate;
         }
-        let Some(basis) = dominant_subspace(&balanced.select_columns(&kept), RANK) else { return candidate };
-        let (mut own, mut others) = (Vec::new(), Vec::new());
-        for (residual, w) in subspace_residuals(balanced, &basis).into_iter().zip(&candidate.weights) {
-            if *w > THRESHOLD { own.push(residual) } else { others.push(residual) }
-        }
-        candidate.energy = own.iter().map(|residual| residual.powi(2)).sum();
-        let freedom = own.len().saturating_sub(RANK).max(1) as f64;
-        candidate.is_separate = others.is_empty()
-            || (candidate.energy / freedom).sqrt() < self.options.separation * midpoint_median(&mut others);
+        let consensus = balanced.select_columns(&kept);
+        let Some(basis) = dominant_subspace(&consensus, RANK) else { return candidate };
+        candidate.energy = subspace_residuals(&consensus, &basis).iter().map(|residual| residual.powi(2)).sum();
+        let freedom = kept.len().saturating_sub(RANK).max(1) as f64;
+        let of_wrong = wrong_residual(balanced, &candidate.weights, &basis);
+        candidate.is_separate = (candidate.energy / freedom).sqrt() < self.options.separation * of_wrong;
         if self.settings.use_daq {
             candidate.daq_residual = hypothesis_residual(&cameras_of(&basis));
         }

@@ -13,7 +13,7 @@ pub struct HeadOptions {
     /// Tracks at least that are verified by rank alone, and those that are where the DAQ residual says so, too.
     pub accepted_by_rank: usize,
     pub accepted_by_daq: usize,
-    /// Residual of the consensus, as a share of the median residual of all other tracks, below which it stands apart.
+    /// Residual of the consensus, as a share of what wrong tracks leave, below which it stands apart.
     pub separation: f64,
     /// DAQ residual below which a consensus can be that of one constant calibration.
     pub daq_acceptable: f64,
