@@ -276,8 +276,8 @@ fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
         Some(Attempt { decided: Some(Decided { is_verified: false, inlier, .. }), .. }) => Warning::new(
             WarningCode::UnverifiedRanking,
             format!(
-                "the best of the network's heads keeps {} tracks, which neither stand apart from the others nor fit one \
-                 calibration: `weight` of the tracks is what it gives them, nothing has checked it",
+                "the best of the network's heads keeps {} tracks; they are too few, too like wrong ones or too far from \
+                 one calibration to be verified: `weight` of the tracks is what it gives them, nothing has checked it",
                 inlier.iter().filter(|&&inlier| inlier).count()
             ),
         ),

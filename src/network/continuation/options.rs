@@ -1,7 +1,7 @@
 //! The constants of the continuation, with their reasons.
 
 /// When the terms of the objective change, and into what. Figures: mean F1 of `w > 1/2` in 10 views, 200 tracks, .3 %
-/// noise, true depths, 10 scenes or more; "with all of it" is 1.0 to 96 %, .99 at 97 %, .91 at 98 % outliers.
+/// noise, true depths, 10 scenes or more; with all of it 1.0 to 97 %, .93 at 98 % outliers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ContinuationOptions {
     /// Share of the iterations after which L_proj has become the rank-4 tail, and from which on L_DAQ moves the
@@ -40,7 +40,7 @@ impl ContinuationOptions {
     pub const DEFAULT: Self = Self {
         // Nothing that is convex in w is left by then; without the relaxation F1 is .86 at 96 % and .70 at 97 %.
         relaxation_end: 0.6,
-        // Over 60 iterations: about what Adam needs to follow.
+        // 60 of 500 iterations, as many as a step of Adam at 1e-3 needs to move a weight by its own size.
         alpha_ramp: 0.12,
         // Two stretches of a tenth each: the second measures the noise of what the first has grown to.
         growth_start: 0.8,
@@ -52,7 +52,7 @@ impl ContinuationOptions {
         // Fewer columns have too little of a tail to measure.
         least_consensus: 8,
         consensus_share: 0.5,
-        // Beyond, a single true track of three times the noise is refused.
+        // Where the tail vanishes, alpha would have no bound.
         most_alpha: 40.0,
         // 2.5 standard deviations, then 2; with depths of 1 perspective adds to the noise (F1 .97 at 50 %).
         gate: 2.0,

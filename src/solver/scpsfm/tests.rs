@@ -121,6 +121,7 @@ fn the_choice_weighs_size_rank_and_calibration() {
     assert_eq!(chosen(&[candidate(5, 0.001, 0.1), candidate(6, 0.03, 0.1)]), 0);
     assert_eq!(chosen(&[candidate(5, 0.001, 2.0), candidate(5, 0.001, 0.1)]), 1);
     assert_eq!(chosen(&[candidate(3, 0.0, WORST_DAQ), candidate(4, 0.0, 3.0)]), 1);
+    assert!(search.is_verified(&candidate(5, 0.0, 0.1)) && !search.is_verified(&candidate(4, 0.0, 0.1)));
     assert!(search.is_accepted(&candidate(4, 0.0, 0.1)) && !search.is_accepted(&candidate(8, 0.0, 0.5)));
     let without = Search { settings: NetworkSettings { use_daq: false, ..search.settings.clone() }, ..search };
     assert_eq!(without.choice(&[candidate(5, 0.001, 2.0), candidate(5, 0.001, 0.1)]), 0, "the first of equals");
