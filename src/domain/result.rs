@@ -107,8 +107,8 @@ pub enum LensProjection {
 ///
 /// A point at `(u, v, 1)` in camera coordinates, with `r^2 = u^2 + v^2` and `s = 1 + k1 r^2 + k2 r^4 + k3 r^6`, is
 /// imaged at `x = f (u s + 2 p1 u v + p2 (r^2 + 2 u^2)) + px`, `y = aspect f (v s + p1 (r^2 + 2 v^2) + 2 p2 u v) + py`:
-/// Brown's model (1971) under OpenCV's names. Behind a fisheye `s = t (1 + k1 t^2 + k2 t^4 + k3 t^6) / r` with the angle
-/// `t = atan r` from the optical axis, and p1, p2 are 0: Kannala and Brandt's model (2006), OpenCV's fisheye. A
+/// Brown's model (1971) under OpenCV's names. Behind a fisheye `s = t (1 + k1 t^2 + k2 t^4 + k3 t^6) / r` with the
+/// angle `t = atan r` from the optical axis, and p1, p2 are 0: Kannala and Brandt's model (2006), OpenCV's fisheye. A
 /// coefficient is 0 (all: a pinhole, or an equidistant fisheye) unless the data asked for more.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
@@ -177,9 +177,12 @@ impl Calibration {
                 let (radius, angle) = (squared.sqrt(), squared.sqrt().atan());
                 angle / radius * polynomial(angle * angle)
             }
-            _ => polynomial(squared),
+            LensProjection::Perspective | LensProjection::Fisheye => polynomial(squared),
         };
-        let (p1, p2) = (self.tangential_p1, self.tangential_p2);
+        let (p1, p2) = match self.lens_projection {
+            LensProjection::Perspective => (self.tangential_p1, self.tangential_p2),
+            LensProjection::Fisheye => (0.0, 0.0),
+        };
         [
             u * s + 2.0 * p1 * u * v + p2 * (squared + 2.0 * u * u),
             v * s + p1 * (squared + 2.0 * v * v) + 2.0 * p2 * u * v,
@@ -224,8 +227,8 @@ pub struct TrackResults {
     /// not judged.
     pub weight: Vec<f32>,
     pub inlier: Vec<bool>,
-    /// What a network says of each track by itself (AUTO: the one trained beforehand, PAPER, SCPSFM: the paper's), 0 for
-    /// tracks that it was not shown; empty where none ran.
+    /// What a network says of each track by itself (AUTO: the one trained beforehand, PAPER, SCPSFM: the paper's), 0
+    /// for tracks that it was not shown; empty where none ran.
     pub network_weight: Vec<f32>,
     /// Point of each track: metric where the result is metric, else in the projective frame (dehomogenised).
     /// `None` for tracks that are not inliers.
@@ -252,7 +255,8 @@ impl TrackResults {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ObservationResults {
     pub inlier: Vec<bool>,
-    /// Reprojection error in pixels of the image, of a lens that distorts to first order; `None` where the observation was not judged.
+    /// Reprojection error in pixels of the image, to first order where the lens distorts; `None` where the observation
+    /// was not judged.
     pub residual_px: Vec<Option<f64>>,
     /// Probability that the observation shows its track's point, if the track is right: times the track's weight, that
     /// it is right. 0 where it was not judged.

@@ -228,7 +228,7 @@ mod tests {
         let html = section(&solution);
         let sigma = format!("{:.1} \u{b1} {} (0.4 %)", first.focal_px, short(first.focal_px * 0.004));
         assert!(html.contains(&format!("<tr><td>4</td><td>2 of 2</td><td>{sigma}</td>")), "{html}");
-        let row = "<tr><td>9</td><td>2 of 3</td><td>2000.0 \u{b1} 20 (1 %)</td><td>640.0 \u{b1} 2.5, 480.5 \u{b1} 3</td><td>1.002</td>\
+        let row = "<tr><td>9</td><td>2 of 3</td><td>2000.0 \u{b1} 20 (1 %), fisheye</td><td>640.0 \u{b1} 2.5, 480.5 \u{b1} 3</td><td>1.002</td>\
                    <td>-0.125 \u{b1} 0.004</td><td>0.25 \u{b1} 0.03</td><td>WEAK</td><td>CHEIRALITY</td></tr>";
         assert!(html.contains(row) && html.contains("<th>k2</th><th>grade</th>"), "{html}");
         assert_eq!(html.matches("<circle").count(), 2);

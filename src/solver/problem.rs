@@ -74,8 +74,8 @@ pub struct Problem<'a> {
 pub struct Undone {
     /// One a camera; a pinhole where none is undone.
     pub lenses: Vec<Intrinsics>,
-    /// Largest radius of an observation, normalised.
-    radius: f64,
+    /// Largest radius of the observations of each camera, normalised.
+    radii: Vec<f64>,
     /// Where pinholes would have made them.
     observations: Vec<Observation>,
 }
@@ -84,7 +84,7 @@ impl Undone {
     /// The lens of the images of a camera for which these intrinsics are found once its lens is undone.
     pub fn behind(&self, camera: usize, found: &Intrinsics) -> Intrinsics {
         let lens = &self.lenses[camera];
-        if lens.distorts() { found.behind(lens, self.radius) } else { *found }
+        if lens.distorts() { found.behind(lens, self.radii[camera]) } else { *found }
     }
 }
 
@@ -149,8 +149,12 @@ impl<'a> Problem<'a> {
         lenses[camera] = lens;
         let undone = |k: usize| lenses[self.camera_of[self.view_of(k)]].undistorted(&self.observation(k));
         let observations = (0..self.xy.len()).map(undone).collect::<Option<Vec<Observation>>>()?;
-        let radius = self.xy.iter().map(|xy| xy.norm()).fold(0.0, f64::max);
-        Some(Self { undone: Some(Undone { lenses, radius, observations }), ..self.clone() })
+        let mut radii = vec![0.0f64; self.cameras];
+        for (k, xy) in self.xy.iter().enumerate() {
+            let radius = &mut radii[self.camera_of[self.view_of(k)]];
+            *radius = radius.max(xy.norm());
+        }
+        Some(Self { undone: Some(Undone { lenses, radii, observations }), ..self.clone() })
     }
 
     /// `Err` once the token asks for a stop.

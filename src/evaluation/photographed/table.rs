@@ -6,13 +6,12 @@ use super::{Row, Table};
 
 const LEGEND: &str = "\
 bound<: share of the scenes with a Cramer-Rao bound of the log focal length below .01 (true cameras, verifiable
-observations, the smallest model that holds the truth, the solver's priors; a fisheye has no model); METR%: share of
-METRIC answers among these. METR: METRIC answers; of these >3sg %: share beyond 3 sigma; off: number off by more than
-3 % and 4 sigma; in 1sg: share within 1 sigma (.68 where sigma is right). WEAK: WEAK answers and their share beyond
-3 sigma. obs P: precision over the observations that were kept, of answers that keep any. obs R: recall over the
-verifiable observations, the right ones of tracks with at least three. views: registered share of those with 15
-verifiable observations or more. CPU s: mean; a peer's without what its start takes. A peer gets the scenes of one
-focal length.
+observations, the smallest model that holds the truth, the solver's priors); METR%: share of METRIC answers among
+these. METR: METRIC answers; of these >3sg %: share beyond 3 sigma; off: number off by more than 3 % and 4 sigma; in
+1sg: share within 1 sigma (.68 where sigma is right). WEAK: WEAK answers and their share beyond 3 sigma. obs P:
+precision over the observations that were kept, of answers that keep any. obs R: recall over the verifiable
+observations, the right ones of tracks with at least three. views: registered share of those with 15 verifiable
+observations or more. CPU s: mean; a peer's without what its start takes. A peer gets the scenes of one focal length.
 ";
 
 /// A line a row.

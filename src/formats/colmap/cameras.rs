@@ -16,8 +16,8 @@ pub struct Model {
     pub name: &'static str,
     /// How many parameters it has.
     pub parameters: usize,
-    /// Whether the solver has the like: its first parameter is the horizontal focal length on the optical axis of a
-    /// perspective camera or of a fisheye with radial distortion.
+    /// Whether the solver fits a similar lens: its first parameter is the horizontal focal length on the optical axis
+    /// of a perspective camera or of a fisheye with radial distortion.
     pub is_solved: bool,
 }
 

@@ -125,14 +125,14 @@ impl Images {
         }
     }
 
-    /// A note on cameras whose like the solver does not have.
+    /// A note on cameras of models that the solver does not fit.
     fn foreign_cameras(&self) -> Option<String> {
         let used: HashSet<u32> = self.images.iter().map(|image| image.camera).collect();
         let foreign = self.cameras.iter().find(|(id, camera)| used.contains(id) && camera.is_foreign())?;
         let name = foreign.1.model.map_or("an unknown model", |model| model.name);
         Some(format!(
-            "camera {} is of COLMAP's model {name}; its images are solved as those of a perspective or fisheye \
-             lens with radial distortion",
+            "camera {} is of COLMAP's model {name}; its images are solved as those of a perspective lens with \
+             radial and tangential distortion or of a fisheye with radial distortion",
             foreign.0
         ))
     }

@@ -39,8 +39,8 @@ fn camera_name(camera: &Camera) -> String {
     format!("scpsfm camera {}", camera.id)
 }
 
-/// `perspective` or `fisheye` where the principal point is the middle, pixels are square and two radial coefficients are
-/// all of the distortion, else `brown` or `fisheye_opencv`, whose coefficients are those of our model.
+/// `perspective` or `fisheye` where the principal point is the middle, pixels are square and two radial coefficients
+/// are all of the distortion, else `brown` or `fisheye_opencv`, whose coefficients are those of our model.
 fn camera(camera: &Camera) -> Value {
     let intrinsics = &camera.intrinsics;
     let (middle_px, side_px) = frame(camera.size);

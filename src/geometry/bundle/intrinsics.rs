@@ -21,8 +21,8 @@ const TANGENTIAL_ROUNDS: usize = 20;
 const LEAST_INVERSE_FOLD: f64 = 1e-6;
 /// Doublings of the radius after which one that is imaged so far out is not looked for any more.
 const WIDEST_DOUBLINGS: usize = 64;
-/// Squared radius below which a fisheye's angle and scale are their series': rounding would leave nothing of the scale's
-/// slope, and the next terms are below rounding in what they are multiplied with.
+/// Squared radius below which a fisheye's angle and scale are replaced by their series: above it the difference that is
+/// the scale's slope keeps ten digits, below it the next terms are under rounding in what they are multiplied with.
 const NEAR_AXIS: f64 = 1e-6;
 /// Radii at which a fisheye is fitted to another lens.
 const FITTED_RADII: usize = 32;
@@ -30,10 +30,10 @@ const FITTED_RADII: usize = 32;
 /// Intrinsics in normalised image units, without skew, behind a lens that distorts.
 ///
 /// A point at `(u, v, 1)` in front of the camera, with `r^2 = u^2 + v^2`, is imaged at
-/// * perspective (Brown 1971): `x = f (u s + 2 p1 u v + p2 (r^2 + 2 u^2)) + px`, `y = a f (v s + p1 (r^2 + 2 v^2) + 2 p2
-///   u v) + py` with `s = 1 + k1 r^2 + k2 r^4 + k3 r^6`;
-/// * fisheye (Kannala & Brandt 2006): `x = f u s + px`, `y = a f v s + py` with `s = t (1 + k1 t^2 + k2 t^4 + k3 t^6) / r`
-///   and the angle `t = atan r` from the optical axis.
+/// * perspective (Brown 1971): `x = f (u s + 2 p1 u v + p2 (r^2 + 2 u^2)) + px`, `y = a f (v s + p1 (r^2 + 2 v^2) + 2
+///   p2 u v) + py` with `s = 1 + k1 r^2 + k2 r^4 + k3 r^6`;
+/// * fisheye (Kannala & Brandt 2006): `x = f u s + px`, `y = a f v s + py` with `s = t (1 + k1 t^2 + k2 t^4 + k3 t^6) /
+///   r` and the angle `t = atan r` from the optical axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
     pub projection: LensProjection,
@@ -46,8 +46,7 @@ pub struct Intrinsics {
     /// optical axis, of a fisheye those of the squared angle. All 0 for a pinhole and for an equidistant fisheye, `k1`
     /// below for a barrel.
     pub radial: [f64; 3],
-    /// Tangential distortion `p1`, `p2`, of perspective lenses that are not centred on one axis; a fisheye does not look
-    /// at it.
+    /// Tangential distortion `p1`, `p2`, of perspective lenses that are not centred on one axis; ignored for a fisheye.
     pub tangential: [f64; 2],
 }
 
@@ -89,9 +88,9 @@ impl Intrinsics {
         Matrix3::new(self.focal, 0.0, px, 0.0, self.aspect * self.focal, py, 0.0, 0.0, 1.0)
     }
 
-    /// The fisheye that images a camera with these intrinsics as one lens behind another does.
+    /// One fisheye that approximates another lens applied to the images of a camera with these intrinsics.
     ///
-    /// * `lens`: images what a camera with these intrinsics would image
+    /// * `lens`: what is applied
     /// * `radius`: of its images, up to which the fisheye is fitted
     pub fn behind(&self, lens: &Self, radius: f64) -> Self {
         let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
@@ -144,8 +143,8 @@ impl Intrinsics {
         self.polynomial(squared) + 2.0 * squared * self.polynomial_slope(squared)
     }
 
-    /// What the polynomial is of at a squared radius, and what it is multiplied by: the squared radius and 1, or the
-    /// squared angle and `t / r`.
+    /// The polynomial's argument at a squared radius and the factor before it: `r^2` and 1, or of a fisheye `t^2` and
+    /// `t / r`.
     #[inline(always)]
     fn argument(&self, squared: f64) -> (f64, f64) {
         match self.projection {
@@ -221,7 +220,7 @@ impl Intrinsics {
         let first = factor * argument;
         let (first_x, first_y) = (fx * u * first, fy * v * first);
         let fourth = argument * argument;
-        // By p1 and p2: what a fisheye does not look at moves nothing.
+        // By p1 and p2: zero for a fisheye, which has none.
         let decentred = if self.is_fisheye() { 0.0 } else { 1.0 };
         let (uv, px, py) =
             (2.0 * u * v * decentred, (squared + 2.0 * u * u) * decentred, (squared + 2.0 * v * v) * decentred);
@@ -270,9 +269,9 @@ impl Intrinsics {
 
     /// The observation where a pinhole with this `K` would have made it; `None` where the lens images nothing.
     ///
-    /// Undoing the distortion scales noise as it scales areas, a fisheye's 40-fold at 75 degrees from the axis. The weight
-    /// makes up for that, so that weighted residuals are those of the image to first order, and as a geometric mean
-    /// where radial and tangential scales differ.
+    /// Undoing the distortion scales noise as it scales areas, a fisheye's 40-fold at 75 degrees from the axis. The
+    /// weight makes up for that, so that weighted residuals are those of the image to first order, and as a geometric
+    /// mean where radial and tangential scales differ; tangential terms, which are small, take no part in it.
     pub fn undistorted(&self, seen: &Observation) -> Option<Observation> {
         if !self.distorts() {
             return Some(*seen);

@@ -120,13 +120,15 @@ fn chosen(
     let simplest = IntrinsicsModel::focal(first.reconstruction.has_own_focals());
     let mut of_model = Vec::new();
     let mut best = choice.richest(Candidate::new(first, simplest, choice.priors(fit.noise), problem), &mut of_model)?;
-    if let Some(fisheye) = choice.behind_fisheye(&best, &mut minima, &mut of_model)? {
-        best = fisheye;
-    } else if best.model == simplest {
-        warnings.extend(of_model);
-        return Ok((best, minima));
+    let fisheye = choice.behind_fisheyes(&best, &mut minima)?;
+    let is_simplest = fisheye.is_none() && best.model == simplest;
+    if let Some(fisheye) = fisheye {
+        (best, of_model) = fisheye;
     }
     warnings.extend(of_model);
+    if is_simplest {
+        return Ok((best, minima));
+    }
     let least_in_front = problem.options.grades.least_in_front;
     for minimum in &mut minima {
         Error::check(choice.stop)?;

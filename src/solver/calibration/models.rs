@@ -139,51 +139,50 @@ impl Choice<'_> {
         }
     }
 
-    /// The richest candidate behind a fisheye in place of this one's barrel, if it fits better for as many parameters.
+    /// The richest candidate behind fisheyes instead of this one's barrels, with what is to be warned of, where the
+    /// chi-square falls by a significant gain for the other projection and for each parameter more; it may rise by as
+    /// much for each parameter fewer. The two series of distortion are not nested.
     ///
-    /// The two series of distortion are not nested: each parameter counts what an extension of one must gain, and so does
-    /// giving up the perspective lens.
-    ///
-    /// * `minima`: others, put behind the same fisheyes
-    pub fn behind_fisheye(
+    /// * `minima`: others, put behind fisheyes where those are taken
+    pub fn behind_fisheyes(
         &self,
         best: &Candidate,
         minima: &mut [Minimum],
-        warnings: &mut Vec<Warning>,
-    ) -> Result<Option<Candidate>, Error> {
+    ) -> Result<Option<(Candidate, Vec<Warning>)>, Error> {
         let radii = self.wide_barrels(&best.minimum.reconstruction);
         if radii.iter().all(Option::is_none) {
             return Ok(None);
         }
-        let from = best.minimum.behind_fisheye(&radii);
+        let from = best.minimum.behind_fisheyes(&radii);
         let simplest = IntrinsicsModel::focal(best.model.is_per_view());
-        let mut of_fisheye = Vec::new();
-        let found = self.richest(self.adjusted(&from, simplest, best.fit.noise), &mut of_fisheye)?;
+        let mut warnings = Vec::new();
+        let found = self.richest(self.adjusted(&from, simplest, best.fit.noise), &mut warnings)?;
         let parameters = |candidate: &Candidate| candidate.model.parameters().len() as f64;
         let added = 1.0 + (parameters(&found) - parameters(best)) * self.problem.groups() as f64;
-        let gain = (best.minimum.cost - found.minimum.cost) / best.fit.noise.min(found.fit.noise).powi(2);
-        let is_better = gain > added * self.problem.options.models.significant_gain_of_one;
-        if is_better {
-            *warnings = of_fisheye;
-            minima.iter_mut().for_each(|minimum| *minimum = minimum.behind_fisheye(&radii));
+        let gain = (best.fit.cost - found.fit.cost) / best.fit.noise.min(found.fit.noise).powi(2);
+        if gain <= added * self.problem.options.models.significant_gain_of_one {
+            return Ok(None);
         }
-        Ok(is_better.then_some(found))
+        minima.iter_mut().for_each(|minimum| *minimum = minimum.behind_fisheyes(&radii));
+        Ok(Some((found, warnings)))
     }
 
-    /// The largest radius at unit depth that each group behind a perspective barrel observes, where a fisheye may stand
-    /// in its place.
+    /// The largest radius in the image at which each group behind a perspective barrel observes, where that is so wide
+    /// that a fisheye may stand in its place.
     fn wide_barrels(&self, reconstruction: &MetricReconstruction) -> Vec<Option<f64>> {
-        let mut radii = vec![0.0f64; self.problem.groups()];
+        let mut radii = vec![(0.0f64, 0.0f64); self.problem.groups()];
         for seen in self.problem.observations {
-            if let Some(ray) = reconstruction.intrinsics_of(seen.view).ray(&seen.xy) {
-                let radius = &mut radii[reconstruction.group_of[seen.view]];
-                *radius = radius.max(ray.norm());
+            let lens = reconstruction.intrinsics_of(seen.view);
+            if let Some(ray) = lens.ray(&seen.xy) {
+                let (imaged, at_unit_depth) = &mut radii[reconstruction.group_of[seen.view]];
+                *imaged = imaged.max((seen.xy - lens.principal_point).norm());
+                *at_unit_depth = at_unit_depth.max(ray.norm());
             }
         }
         let is_barrel = |lens: &Intrinsics| !lens.is_fisheye() && lens.radial[0] < 0.0;
         let least = self.problem.options.models.fisheye_from;
         let lenses = reconstruction.intrinsics.iter().zip(radii);
-        lenses.map(|(lens, radius)| Some(radius).filter(|radius| is_barrel(lens) && *radius > least)).collect()
+        lenses.map(|(lens, (imaged, ray))| Some(imaged).filter(|_| is_barrel(lens) && ray > least)).collect()
     }
 
     /// Extensions that the linearisation foretells to be significant, with the gain beyond what is, largest first.

@@ -1,6 +1,6 @@
 //! The search for the metric reconstruction: many starts, few that converge.
 
-use nalgebra::Vector3;
+use nalgebra::{Vector2, Vector3};
 
 use super::fit::Fit;
 use super::options::SearchOptions;
@@ -66,17 +66,19 @@ impl Minimum {
         if determined.contains(&true) { determined } else { vec![true; views] }
     }
 
-    /// The same behind the fisheyes that image nearest to some of its lenses, still to be adjusted.
+    /// The same behind the fisheyes that image nearest to some of its lenses, still to be adjusted, with nothing but
+    /// the focal length beside what is taken to be in order.
     ///
-    /// * `radii`: largest radius at unit depth that each group observes; `None` where its lens stays
-    pub fn behind_fisheye(&self, radii: &[Option<f64>]) -> Self {
+    /// * `radii`: largest radius, in the image, at which each group observes; `None` where its lens stays perspective
+    pub fn behind_fisheyes(&self, radii: &[Option<f64>]) -> Self {
         let mut found = self.clone();
         let reconstruction = &mut found.reconstruction;
         for (lens, radius) in reconstruction.intrinsics.iter_mut().zip(radii) {
-            let Some(radius) = *radius else { continue };
             let of_perspective = lens.focal;
-            *lens = lens.nearest_fisheye(radius);
-            // Views of their own focal lengths are those of one group.
+            let ray = radius.and_then(|radius| lens.ray(&(lens.principal_point + Vector2::new(radius, 0.0))));
+            let nearest = ray.map_or(*lens, |ray| lens.nearest_fisheye(ray.x));
+            *lens = Intrinsics { projection: nearest.projection, ..Intrinsics::from_focal(nearest.focal) };
+            // Views have focal lengths of their own only where they are of one group.
             reconstruction.focals.iter_mut().for_each(|focal| *focal *= lens.focal / of_perspective);
         }
         found

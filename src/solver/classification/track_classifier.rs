@@ -132,8 +132,8 @@ impl TrackClassifier<'_> {
         let gate = self.noise.gate();
         let (point, cost) = self.at_infinity_if_behind(observations, retained, point).unwrap_or((point, cost));
         let dropped = observations.len() - retained.len();
-        // The density of two coordinates of weight w is w times as high where the residual is 0. What a lens weighs them by
-        // goes for wrong observations, too.
+        // The density of two coordinates of weight w is w times as high where the residual is 0. What a lens weighs
+        // them by goes for wrong observations, too.
         let of_weights: f64 = retained.iter().map(|&k| self.given_weight(&observations[k]).ln()).sum();
         let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share) + of_weights;
         let enough = retained.len() >= self.least_retained(observations);

@@ -1,9 +1,9 @@
-//! The lens as part of a hypothesis: what no pinhole explains is searched once more behind the fisheye that explains
+//! Search over lenses: an input that pinholes do not calibrate is searched again behind the fisheyes that explain its
 //! seeds best.
 //!
-//! Sampling the lens serves a search as well as minimal solvers that know of one (Tzamos, Kocur, Ding, Sattler & Kukelova 2024). A
-//! lens that bends little is found from a pinhole's seed; behind one that bends much a pinhole's seed is small, or wrong,
-//! and a plane or a turning camera looks like a scene with depth.
+//! Sampled lenses serve as well as minimal solvers with a lens parameter (Tzamos, Kocur, Ding, Sattler & Kukelova
+//! 2024). With weak distortion a pinhole's seed suffices. With strong distortion it is small or wrong, and a plane or a
+//! turning camera looks like a scene with depth.
 
 use std::f64::consts::SQRT_2;
 
@@ -37,27 +37,27 @@ struct LensSearchOptions {
 const HOMOGRAPHY_UNKNOWNS: usize = 8;
 
 const OPTIONS: LensSearchOptions = LensSearchOptions {
-    // From 85 degrees off the axis at the corner of a 4:3 image to where a third radial term is as good as any. A step
-    // leaves a quarter of the distortion, which seeds bear.
+    // From 85 degrees off the axis at the corner of a 4:3 image to where a third radial term is as good as any. At
+    // most a quarter of the distortion remains between two; seeds tolerate that.
     focals: [0.42, 0.47, 0.53, 0.6, 0.68, 0.78],
     // Half, a quarter and an eighth of a step: homographies at 75 degrees off the axis tell one from the other.
     refining: [1.06, 1.03, 1.015],
     sets: 2,
     // A factor of twenty thousand: seeds are searched at random.
     least_gain: 10.0,
-    // What other samples, or another noise, make of a seed without any lens.
+    // Seeds of one input from other samples differ by about that, without any lens.
     least_share: 0.05,
     least_kept: 0.9,
 };
 
-/// Whether what was found behind lenses stands in place of what was found without: without a calibration nobody is told
-/// of the lenses, and one of a part of what stood is none of the input.
-pub fn stands_behind(evidence: f64, of_pinholes: f64) -> bool {
+/// Whether the answer behind lenses replaces the one without: it must explain nearly as much, so that a calibration of
+/// a part does not replace a reconstruction of the whole.
+pub fn replaces(evidence: f64, of_pinholes: f64) -> bool {
     evidence > OPTIONS.least_kept * of_pinholes
 }
 
-/// The problem behind the lenses that explain quick seeds of each camera better than pinholes do; `None` where no camera
-/// has one, and where pinholes have a calibration of most views.
+/// The problem behind the lenses that explain quick seeds of each camera better than pinholes do; `None` where no
+/// camera has one, and where pinholes have a calibration of most views.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
@@ -78,12 +78,12 @@ pub fn behind_lenses<'a>(
         let of_pinhole = evidence(problem, &sets, recorder)?;
         let others = best.take();
         let without = others.as_ref().unwrap_or(problem);
-        let mut found = Best { focal: f64::NAN, evidence: of_pinhole, behind: None };
+        let mut found = Best { focal: None, evidence: of_pinhole, behind: None };
         for focal in OPTIONS.focals {
             found.offer(focal, without, camera, &sets, recorder)?;
         }
         for factor in OPTIONS.refining {
-            let focal = found.focal;
+            let Some(focal) = found.focal else { break };
             for focal in [focal * factor, focal / factor] {
                 found.offer(focal, without, camera, &sets, recorder)?;
             }
@@ -97,8 +97,8 @@ pub fn behind_lenses<'a>(
 
 /// The lens of a camera that explains its seeds best.
 struct Best<'a> {
-    /// Not a number as long as a pinhole does.
-    focal: f64,
+    /// `None`: a pinhole does.
+    focal: Option<f64>,
     evidence: f64,
     behind: Option<Problem<'a>>,
 }
@@ -119,7 +119,7 @@ impl<'a> Best<'a> {
         let Some(behind) = without.undoing(camera, lens) else { return Ok(()) };
         let evidence = evidence(&behind, sets, recorder)?;
         if evidence > self.evidence {
-            *self = Self { focal, evidence, behind: Some(behind) };
+            *self = Self { focal: Some(focal), evidence, behind: Some(behind) };
         }
         Ok(())
     }
@@ -139,13 +139,15 @@ fn evidence(problem: &Problem, sets: &[Vec<usize>], recorder: &mut Recorder) -> 
     Ok(evidence)
 }
 
-/// Evidence of the homographies between the views of a reconstruction: projective cameras take up much of what a lens
-/// bends where a camera only turns or the scene is a plane, and homographies take up nothing. `None` where there are none.
+/// Evidence of the homographies between the views of a reconstruction: where a camera only turns or the scene is a
+/// plane, projective cameras fit much of what a lens distorts, and homographies nothing. `None` where there are none.
 fn by_homographies(problem: &Problem, found: &ProjectiveReconstruction) -> Option<f64> {
     let (views, observations) = (found.cameras.len(), &found.observations);
     let residual = homography::median_residual(observations, views, found.noise, f64::INFINITY)?;
+    // Homographies are fitted where pinholes would see the points: back in the image by the mean scale of the lens.
+    let ln_scale = observations.iter().map(|seen| 0.5 * seen.weight.ln()).sum::<f64>() / observations.len() as f64;
     // Of two views.
-    let noise = residual * found.noise / SQRT_2;
+    let noise = residual * found.noise / SQRT_2 * ln_scale.exp();
     let unknowns = HOMOGRAPHY_UNKNOWNS * (views - 1) + 2 * found.points.len();
     Some(projective::evidence(observations.len(), unknowns, noise, problem.outlier_density))
 }

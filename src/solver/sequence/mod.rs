@@ -52,8 +52,8 @@ pub enum Ended {
     Block(Option<Box<Attempt>>),
 }
 
-/// Solves an input, behind a lens where a pinhole has no calibration of most views and seeds are better behind it; what
-/// came of it, and the problem that it is of.
+/// Solves an input. Where pinholes give no calibration of most views, solves it once more behind the lenses that
+/// explain seeds better. Returns what came of it and the problem that it belongs to.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
@@ -61,10 +61,10 @@ pub fn solve<'a>(problem: Problem<'a>, recorder: &mut Recorder) -> Result<(Ended
     let ended = of_blocks(&problem, recorder)?;
     let Some(behind) = lens::behind_lenses(&problem, &ended, recorder)? else { return Ok((ended, problem)) };
     let found = of_blocks(&behind, recorder)?;
-    let is_better =
-        // The calibration of a block takes the undone lens for known.
-        matches!(found, Ended::Extended(_)) && found.is_calibrated(&behind) && lens::stands_behind(found.evidence(&behind), ended.evidence(&problem));
-    Ok(if is_better { (found, behind) } else { (ended, problem) })
+    // The calibration of a block takes the undone lens as exact; only an extension adjusts it in the images.
+    let is_extended = matches!(found, Ended::Extended(_)) && found.is_calibrated(&behind);
+    let stands = is_extended && lens::replaces(found.evidence(&behind), ended.evidence(&problem));
+    Ok(if stands { (found, behind) } else { (ended, problem) })
 }
 
 /// Solves and extends block after block until one carries a reconstruction of most of the views.
@@ -135,7 +135,9 @@ impl Ended {
             Ended::Extended(extended) => !extended.is_calibrated(problem) || !extended.holds_most_views(),
             Ended::Block(attempt) => attempt.as_ref().is_some_and(|attempt| {
                 let leaves_most = 2 * attempt.views().len() < problem.observed_views().len();
-                attempt.judges_observations() && (!attempt.is_calibrated() || leaves_most)
+                attempt.projective.is_some()
+                    && attempt.judges_observations()
+                    && (!attempt.is_calibrated() || leaves_most)
             }),
         }
     }

@@ -3,7 +3,6 @@
 use nalgebra::{Matrix4, Vector4};
 
 use super::adjust;
-
 use crate::geometry::observation::Observation;
 use crate::geometry::triangulation::weighted_squared;
 use crate::geometry::{Camera, Point};
@@ -49,7 +48,7 @@ impl ProjectiveReconstruction {
         }
     }
 
-    /// The same with the weights that a lens gives observations which is undone, and the noise of the image.
+    /// The same with the weights of the undone lens, so that the noise is that of the image.
     pub fn weighed(mut self, problem: &Problem) -> Self {
         if problem.undone.is_none() {
             return self;
@@ -57,7 +56,7 @@ impl ProjectiveReconstruction {
         for seen in &mut self.observations {
             let (view, track) = (self.views[seen.view], self.tracks[seen.point]);
             if let Some(k) = problem.of_track(track).find(|&k| problem.view_of(k) == view) {
-                seen.weight = problem.pinhole_observation(k).weight;
+                seen.weight = problem.pinhole_observation(k).weight / problem.weights[k];
             }
         }
         let norms = self.squared_residuals().into_iter().map(f64::sqrt).collect();

@@ -136,8 +136,8 @@ impl Growth for Component<'_> {
 }
 
 /// Lenses to try a view with: its camera's own, or, of one that is not known yet, pinholes, behind the lens that
-/// is undone, of what the input says, give or take its deviation, or of a scan. Where views have focal lengths of their own, the scan is about that of the
-/// nearest view, behind the lens that they share: a zoom takes time.
+/// is undone, of what the input says, give or take its deviation, or of a scan. Where views have focal lengths of their
+/// own, the scan is about that of the nearest view, behind the lens that they share: a zoom takes time.
 fn guesses(problem: &Problem, model: &Model, view: usize) -> Vec<Intrinsics> {
     let camera = problem.camera_of[view];
     let lens = &model.lenses[camera];
