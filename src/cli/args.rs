@@ -234,8 +234,8 @@ pub struct SettingsArgs {
     pub seed: u64,
 
     #[arg(long, value_name = "N", help = format!("Network iterations at most, 1 to {}; `auto` usually stops earlier, \
-        `scpsfm` does so many several times [default: {}; scpsfm: {}]", SolveSettings::MAX_ITERATIONS,
-        SolveSettings::DEFAULT_ITERATIONS, SolveSettings::DEFAULT_HEAD_ITERATIONS),
+        `scpsfm` does up to so many in each of up to 16 optimisations [default: {}; scpsfm: {}]",
+        SolveSettings::MAX_ITERATIONS, SolveSettings::DEFAULT_ITERATIONS, SolveSettings::DEFAULT_HEAD_ITERATIONS),
         value_parser = clap::value_parser!(u32).range(1..=i64::from(SolveSettings::MAX_ITERATIONS)))]
     pub iterations: Option<u32>,
 

@@ -226,6 +226,8 @@ pub struct TrackResults {
     /// network alone; PAPER, SCPSFM: the network's own weight; PSFM: closeness to the subspace. 0 for tracks that were
     /// not judged.
     pub weight: Vec<f32>,
+    /// Whether the track is right. By PAPER, SCPSFM and PSFM the method's own decision, given also where nothing is
+    /// reconstructed; it is unverified then.
     pub inlier: Vec<bool>,
     /// What a network says of each track by itself (AUTO: the one trained beforehand, PAPER, SCPSFM: the paper's), 0
     /// for tracks that it was not shown; empty where none ran.

@@ -273,14 +273,20 @@ fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
                 LEAST_VIEWS, LEAST_INLIERS
             ),
         ),
-        Some(Attempt { decided: Some(Decided { is_verified: false, inlier, .. }), .. }) => Warning::new(
-            WarningCode::UnverifiedRanking,
-            format!(
-                "the best of the network's heads keeps {} tracks; they are too few, too like wrong ones or too far from \
-                 one calibration to be verified: `weight` of the tracks is what it gives them, nothing has checked it",
-                inlier.iter().filter(|&&inlier| inlier).count()
-            ),
-        ),
+        // All 0: too little is observed for a head to run.
+        Some(Attempt { decided: Some(Decided { is_verified: false, inlier, weights }), .. })
+            if weights.iter().any(|&weight| weight > 0.0) =>
+        {
+            Warning::new(
+                WarningCode::UnverifiedRanking,
+                format!(
+                    "the best of the network's heads keeps {} tracks; they are too few, too like wrong ones or too far \
+                     from one calibration to be verified: `weight` of the tracks is what it gives them, nothing has \
+                     checked it",
+                    inlier.iter().filter(|&&inlier| inlier).count()
+                ),
+            )
+        }
         Some(Attempt { decided: Some(decided), .. }) => Warning::new(
             WarningCode::FewInliers,
             format!(

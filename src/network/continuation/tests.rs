@@ -122,6 +122,20 @@ fn hostile_matrices_are_refused_or_survived() {
     }
 }
 
+/// The caller may give the tracks in the order of the image, so that neighbours are nearly alike.
+#[test]
+fn a_right_consensus_is_separate_in_the_order_of_the_image_too() {
+    let matrix = balanced_matrix(&contaminated_scene(10, 100, 0.0, 6));
+    let mut order: Vec<usize> = (0..matrix.ncols()).collect();
+    let x_of_view_0 = |&track: &usize| matrix[(0, track)] / matrix[(2, track)];
+    order.sort_by(|a, b| x_of_view_0(a).total_cmp(&x_of_view_0(b)));
+    let sorted = matrix.select_columns(&order);
+    let basis = dominant_subspace(&sorted, RANK).expect("finite");
+    let own = midpoint_median(&mut subspace_residuals(&sorted, &basis));
+    let of_wrong = wrong_residual(&sorted, &[1.0; 100], &basis);
+    assert!(own < 0.4 * of_wrong, "{own} {of_wrong}");
+}
+
 /// Beside the span of right tracks mismatched ones leave much more than these, beside that of wrong ones about as much.
 #[test]
 fn mismatched_tracks_tell_a_right_consensus_from_a_wrong_one() {

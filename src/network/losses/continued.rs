@@ -16,8 +16,8 @@ pub enum RankTerm {
     Energy,
 }
 
-/// The losses at one point and their derivatives, none of them weighted. L_DAQ has none by the weights: it moves the
-/// calibration only.
+/// The losses at one point and their derivatives, none of them weighted. L_DAQ has none by the weights, but moves the
+/// plane at infinity through layers that the weights share.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ContinuedEvaluation {
     pub losses: Losses,
@@ -51,9 +51,9 @@ pub fn evaluate_continued(
     let (proj, grad_w_proj) = match term {
         RankTerm::SingularValues { leading } => {
             let (tail, mut gradient) = spectrum.tail_sum(w);
-            let (head, of_head) = spectrum.leading_sum(w);
-            gradient.iter_mut().zip(of_head).for_each(|(entry, of_head)| *entry += leading * of_head);
-            (tail + leading * head, gradient)
+            let (leading_sum, of_leading) = spectrum.leading_sum(w);
+            gradient.iter_mut().zip(of_leading).for_each(|(entry, of_leading)| *entry += leading * of_leading);
+            (tail + leading * leading_sum, gradient)
         }
         RankTerm::Energy => spectrum.tail_energy(w),
     };

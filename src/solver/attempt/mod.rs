@@ -214,9 +214,8 @@ pub fn search_block(
     recorder.enter(Stage::Search);
     let mut attempt = match problem.settings.method {
         Method::Auto | Method::Geometry => searched(problem, block, effort, recorder)?,
-        Method::Paper | Method::Scpsfm => {
-            decided(problem, block.sample(OPTIONS.paper_tracks, problem.settings.seed), recorder)?
-        }
+        Method::Paper => decided(problem, block.sample(OPTIONS.paper_tracks, problem.settings.seed), recorder)?,
+        Method::Scpsfm => decided(problem, block.sample(OPTIONS.scpsfm_tracks, problem.settings.seed), recorder)?,
         Method::Psfm => decided(problem, block, recorder)?,
     };
     problem.stopped()?;

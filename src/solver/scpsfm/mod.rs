@@ -1,18 +1,18 @@
-//! SCPSFM: the paper's network by itself. Several heads of the continued objective ([`crate::network::continuation`]),
-//! and the choice among them by the paper's eq. 10.
+//! SCPSFM: the paper's network by itself. Several heads, optimisations of the continued objective
+//! ([`crate::network::continuation`] says what a head is), and the choice among them by the paper's eq. 10.
 //!
 //! The decision is `w > 1/2` of the chosen head. It samples nothing and adjusts nothing, and nothing later changes it:
 //! with a handful of right tracks any four columns have rank 4, and a refit of the consensus lowers F1 at 98 % wrong
-//! tracks from .86 to .68.
+//! tracks from .864 to .68 (seeds 0 to 9).
 //!
 //! A head of kept tracks S has `J = -|S| + Σ_{k>=5} σ_k²(M_S) / tau² + 3 e` (eq. 10, its rank constraint as eq. 8's
 //! distance at the noise, its self-calibration constraint as the DAQ residual `e = 1/2 min Σ_i | S_i/|S_i| - ω/|ω| |²`
 //! over K and the plane at infinity; the paper sums the norms). Without the DAQ term: no e. The lowest J is chosen.
 //!
-//! Heads end with one that is accepted: its tracks stand apart from wrong ones and e is small, or without the DAQ term
-//! they are eight and more. Where none is, eight and more of the chosen head that stand apart are verified as well: a
-//! motion near a degenerate one has a large e with right tracks, too. The rest is an answer that nothing has verified:
-//! it is told as such and not reconstructed.
+//! Heads end with one that is accepted: at least four tracks that stand apart from wrong ones and whose e is small, or
+//! without the DAQ term at least eight that stand apart. A chosen head is verified where it is accepted with at least
+//! five tracks, or where at least eight stand apart: a motion near a degenerate one has a large e with right tracks,
+//! too. The rest is an answer that nothing has verified: it is told as such and not reconstructed.
 
 mod options;
 #[cfg(test)]
@@ -39,11 +39,11 @@ pub use options::HeadOptions;
 
 /// Rank of a noise-free measurement matrix.
 const RANK: usize = 4;
-/// Views below which there is nothing to reconstruct.
-const LEAST_VIEWS: usize = 2;
-/// J of a head that keeps fewer tracks than the rank, beside what else it has: worse than any other.
+/// Views below which the network has nothing to compare.
+const NETWORK_LEAST_VIEWS: usize = 2;
+/// Added to J of a head that keeps fewer than four tracks: more than any set near rank 4 has.
 const TOO_FEW: f64 = 100.0;
-/// Their DAQ residual; there are no cameras to take it of.
+/// DAQ residual of such a head; there are no cameras to take it of.
 const WORST_DAQ: f64 = 10.0;
 /// Between the seeds of two heads' networks: callers' seeds are small numbers, which must not meet.
 const SEED_STRIDE: u64 = 1 << 32;
@@ -63,7 +63,7 @@ pub fn decide(
     recorder: &mut Recorder,
 ) -> Result<Decided, Error> {
     let settings = problem.settings;
-    let search = Search {
+    let search = HeadSearch {
         settings: NetworkSettings::from(settings),
         has_depths: block.has_depths(),
         stop: problem.stop,
@@ -72,30 +72,30 @@ pub fn decide(
     };
     let heads = search.options.heads;
     let mut earlier = 0;
-    let answer = search.run(&block.measurement_matrix(), &mut |head, step, told| {
+    let choice = search.run(&block.measurement_matrix(), &mut |head, step, reported| {
         let HeadIteration { iteration, losses, .. } = *step;
         if iteration == 1 {
             earlier = recorder.standing.iteration;
         }
         recorder.standing.iteration = earlier + iteration;
         recorder.standing.losses = Some(losses);
-        recorder.standing.inliers = told.weights.iter().filter(|&&w| w > THRESHOLD).count() as u32;
+        recorder.standing.inliers = reported.weights.iter().filter(|&&w| w > THRESHOLD).count() as u32;
         if settings.use_daq {
-            recorder.standing.focal_px = Some(told.focal * problem.scale_px);
+            recorder.standing.focal_px = Some(reported.focal * problem.scale_px);
         }
         let within = f64::from(iteration) / f64::from(settings.iterations);
         recorder.begin_step(Task::Heads, head + 1, heads);
         recorder.report((head as f64 + within) / heads as f64);
         if settings.weights_every > 0 && iteration.is_multiple_of(settings.weights_every) {
-            recorder.weights(&problem.scatter(told.weights, tracks));
+            recorder.weights(&problem.scatter(reported.weights, tracks));
         }
     })?;
-    let inlier = answer.weights.iter().map(|&weight| weight > THRESHOLD).collect();
-    Ok(Decided { inlier, weights: answer.weights, is_verified: answer.is_verified })
+    let inlier = choice.weights.iter().map(|&weight| weight > THRESHOLD).collect();
+    Ok(Decided { inlier, weights: choice.weights, is_verified: choice.is_verified })
 }
 
-/// What an observer of a search is told beside the iteration.
-pub struct Told<'a> {
+/// State of the head that is being optimised, reported with every iteration.
+pub struct HeadProgress<'a> {
     /// One a column of the whole matrix.
     pub weights: &'a [f64],
     /// In the units of the matrix.
@@ -104,7 +104,7 @@ pub struct Told<'a> {
 
 /// What a search ended with.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Answer {
+pub struct HeadChoice {
     /// Of the chosen head, one a column of the matrix.
     pub weights: Vec<f64>,
     /// Whether its tracks can be taken for right.
@@ -114,7 +114,7 @@ pub struct Answer {
 }
 
 /// Heads on one measurement matrix.
-pub struct Search<'a> {
+pub struct HeadSearch<'a> {
     pub settings: NetworkSettings,
     pub has_depths: bool,
     pub stop: &'a StopToken,
@@ -123,7 +123,7 @@ pub struct Search<'a> {
 }
 
 /// A head that ended, and what the choice goes by.
-struct Candidate {
+struct FinishedHead {
     weights: Vec<f64>,
     kept: usize,
     tolerance: f64,
@@ -134,33 +134,33 @@ struct Candidate {
     daq_residual: f64,
 }
 
-impl Search<'_> {
+impl HeadSearch<'_> {
     /// Optimises heads until one is accepted; the one to choose.
     ///
     /// Rows and columns without an observation are left out beforehand, so that padding with zeros changes nothing;
     /// such columns get weight 0. When stopped, the answer is that of the heads before.
     ///
     /// * `matrix`: 3n x m, not balanced
-    /// * `observe`: told of every iteration and the head, from 0, that it is of
+    /// * `report`: called with every iteration and the head, from 0, that it is of
     ///
     /// # Errors
     /// The network's own.
     pub fn run(
         &self,
         matrix: &DMatrix<f64>,
-        observe: &mut dyn FnMut(usize, &HeadIteration, Told),
-    ) -> Result<Answer, Error> {
+        report: &mut dyn FnMut(usize, &HeadIteration, HeadProgress),
+    ) -> Result<HeadChoice, Error> {
         let columns: Vec<usize> =
             (0..matrix.ncols()).filter(|&j| matrix.column(j).iter().any(|&entry| entry != 0.0)).collect();
         let rows: Vec<usize> = (0..matrix.nrows())
             .filter(|&row| matrix.rows(row - row % 3, 3).iter().any(|&entry| entry != 0.0))
             .collect();
-        let mut answer = Answer { weights: vec![0.0; matrix.ncols()], is_verified: false, heads: 0 };
-        if columns.len() < PriorNetwork::MIN_COLUMNS || rows.len() < 3 * LEAST_VIEWS {
-            return Ok(answer);
+        let mut choice = HeadChoice { weights: vec![0.0; matrix.ncols()], is_verified: false, heads: 0 };
+        if columns.len() < PriorNetwork::MIN_COLUMNS || rows.len() < 3 * NETWORK_LEAST_VIEWS {
+            return Ok(choice);
         }
         let balanced = balance(&matrix.select_columns(&columns).select_rows(&rows));
-        let mut candidates: Vec<Candidate> = Vec::new();
+        let mut heads: Vec<FinishedHead> = Vec::new();
         let mut rng = ChaCha8Rng::seed_from_u64(self.settings.seed);
         rng.set_stream(VIEW_SCALES);
         let mut chosen = 0;
@@ -169,23 +169,23 @@ impl Search<'_> {
             let mut all = vec![0.0; matrix.ncols()];
             let Some(finished) = self.optimise(&balanced, start, &mut |step, head| {
                 scatter(head.weights(), &columns, &mut all);
-                observe(place, step, Told { weights: &all, focal: head.focal() });
+                report(place, step, HeadProgress { weights: &all, focal: head.focal() });
             })?
             else {
                 break;
             };
-            candidates.push(self.candidate(&balanced, finished));
-            chosen = self.choice(&candidates);
-            if self.is_accepted(&candidates[chosen]) {
+            heads.push(self.judged(&balanced, finished));
+            chosen = self.choice(&heads);
+            if self.is_accepted(&heads[chosen]) {
                 break;
             }
         }
-        answer.heads = candidates.len();
-        if let Some(chosen) = candidates.get(chosen) {
-            answer.is_verified = self.is_verified(chosen);
-            scatter(&chosen.weights, &columns, &mut answer.weights);
+        choice.heads = heads.len();
+        if let Some(chosen) = heads.get(chosen) {
+            choice.is_verified = self.is_verified(chosen);
+            scatter(&chosen.weights, &columns, &mut choice.weights);
         }
-        Ok(answer)
+        Ok(choice)
     }
 
     /// Where a head starts; `place` counts from 0.
@@ -210,7 +210,7 @@ impl Search<'_> {
         &self,
         balanced: &DMatrix<f64>,
         start: HeadStart,
-        observe: &mut dyn FnMut(&HeadIteration, &Head),
+        report: &mut dyn FnMut(&HeadIteration, &Head),
     ) -> Result<Option<Finished>, Error> {
         let mut head = Head::new(balanced, &self.settings, start, self.continuation.clone())?;
         while !head.is_finished() {
@@ -218,15 +218,16 @@ impl Search<'_> {
                 return Ok(None);
             }
             let step = head.step()?;
-            observe(&step, &head);
+            report(&step, &head);
         }
         head.finish().map(Some)
     }
 
-    fn candidate(&self, balanced: &DMatrix<f64>, finished: Finished) -> Candidate {
+    /// A head with what the choice goes by.
+    fn judged(&self, balanced: &DMatrix<f64>, finished: Finished) -> FinishedHead {
         let Finished { weights, tolerance, .. } = finished;
         let kept: Vec<usize> = (0..weights.len()).filter(|&j| weights[j] > THRESHOLD).collect();
-        let mut candidate = Candidate {
+        let mut head = FinishedHead {
             weights,
             kept: kept.len(),
             tolerance,
@@ -235,51 +236,51 @@ impl Search<'_> {
             daq_residual: WORST_DAQ,
         };
         if kept.len() < RANK {
-            return candidate;
+            return head;
         }
         let consensus = balanced.select_columns(&kept);
-        let Some(basis) = dominant_subspace(&consensus, RANK) else { return candidate };
-        candidate.energy = subspace_residuals(&consensus, &basis).iter().map(|residual| residual.powi(2)).sum();
+        let Some(basis) = dominant_subspace(&consensus, RANK) else { return head };
+        head.energy = subspace_residuals(&consensus, &basis).iter().map(|residual| residual.powi(2)).sum();
         let freedom = kept.len().saturating_sub(RANK).max(1) as f64;
-        let of_wrong = wrong_residual(balanced, &candidate.weights, &basis);
-        candidate.is_separate = (candidate.energy / freedom).sqrt() < self.options.separation * of_wrong;
+        let of_wrong = wrong_residual(balanced, &head.weights, &basis);
+        head.is_separate = (head.energy / freedom).sqrt() < self.options.separation * of_wrong;
         if self.settings.use_daq {
-            candidate.daq_residual = hypothesis_residual(&cameras_of(&basis));
+            head.daq_residual = hypothesis_residual(&cameras_of(&basis));
         }
-        candidate
+        head
     }
 
-    /// Place of the candidate of least J; of equals the first.
-    fn choice(&self, candidates: &[Candidate]) -> usize {
-        let mut tolerances: Vec<f64> = candidates.iter().map(|candidate| candidate.tolerance).collect();
+    /// Place of the head of least J; of equals the first.
+    fn choice(&self, heads: &[FinishedHead]) -> usize {
+        let mut tolerances: Vec<f64> = heads.iter().map(|head| head.tolerance).collect();
         let tolerance = midpoint_median(&mut tolerances);
-        let objective = |candidate: &Candidate| {
-            let daq = if self.settings.use_daq { self.options.daq_weight * candidate.daq_residual } else { 0.0 };
-            let too_few = if candidate.kept < RANK { TOO_FEW } else { 0.0 };
-            candidate.energy / tolerance.powi(2) - candidate.kept as f64 + daq + too_few
+        let objective = |head: &FinishedHead| {
+            let daq = if self.settings.use_daq { self.options.daq_weight * head.daq_residual } else { 0.0 };
+            let too_few = if head.kept < RANK { TOO_FEW } else { 0.0 };
+            head.energy / tolerance.powi(2) - head.kept as f64 + daq + too_few
         };
-        let objectives: Vec<f64> = candidates.iter().map(objective).collect();
+        let objectives: Vec<f64> = heads.iter().map(objective).collect();
         (0..objectives.len()).min_by(|&a, &b| objectives[a].total_cmp(&objectives[b])).unwrap_or(0)
     }
 
     /// Whether no further head is needed: with the DAQ term, where the tracks stand apart and fit one calibration.
-    fn is_accepted(&self, candidate: &Candidate) -> bool {
+    fn is_accepted(&self, head: &FinishedHead) -> bool {
         if !self.settings.use_daq {
-            return self.is_of_low_rank(candidate);
+            return self.is_of_low_rank(head);
         }
-        let fits = candidate.daq_residual < self.options.daq_acceptable;
-        candidate.is_separate && candidate.kept >= self.options.accepted_by_daq && fits
+        let fits = head.daq_residual < self.options.daq_acceptable;
+        head.is_separate && head.kept >= self.options.accepted_by_daq && fits
     }
 
     /// Whether the tracks can be taken for right. Any four have rank 4 and stand apart: of these a small e, which one of
     /// sixteen heads on twenty scenes without a right track has by chance, ends the heads but is no evidence.
-    fn is_verified(&self, candidate: &Candidate) -> bool {
-        candidate.kept > RANK && (self.is_accepted(candidate) || self.is_of_low_rank(candidate))
+    fn is_verified(&self, head: &FinishedHead) -> bool {
+        head.kept > RANK && (self.is_accepted(head) || self.is_of_low_rank(head))
     }
 
     /// Whether the tracks stand apart and are so many that their rank says something.
-    fn is_of_low_rank(&self, candidate: &Candidate) -> bool {
-        candidate.is_separate && candidate.kept >= self.options.accepted_by_rank
+    fn is_of_low_rank(&self, head: &FinishedHead) -> bool {
+        head.is_separate && head.kept >= self.options.accepted_by_rank
     }
 }
 

@@ -14,8 +14,8 @@ fn scene(outliers: f64, seed: u64) -> (DMatrix<f64>, Vec<bool>) {
     (of_all_views(&input).complete.measurement_matrix(), scene.truth.inlier)
 }
 
-fn search(stop: &StopToken, iterations: u32, heads: usize) -> Search<'_> {
-    Search {
+fn search(stop: &StopToken, iterations: u32, heads: usize) -> HeadSearch<'_> {
+    HeadSearch {
         settings: NetworkSettings { iterations, ..NetworkSettings::default() },
         has_depths: true,
         stop,
@@ -24,7 +24,7 @@ fn search(stop: &StopToken, iterations: u32, heads: usize) -> Search<'_> {
     }
 }
 
-fn run(search: &Search, matrix: &DMatrix<f64>) -> Answer {
+fn run(search: &HeadSearch, matrix: &DMatrix<f64>) -> HeadChoice {
     search.run(matrix, &mut |_, _, _| ()).expect("an answer")
 }
 
@@ -33,10 +33,10 @@ fn the_first_head_is_accepted_where_it_stands_apart() {
     let stop = StopToken::default();
     for outliers in [0.9, 0.96] {
         let (matrix, inlier) = scene(outliers, 2);
-        let answer = run(&search(&stop, 500, 2), &matrix);
-        let kept: Vec<bool> = answer.weights.iter().map(|&w| w > THRESHOLD).collect();
+        let choice = run(&search(&stop, 500, 2), &matrix);
+        let kept: Vec<bool> = choice.weights.iter().map(|&w| w > THRESHOLD).collect();
         assert!(agreement(&kept, &inlier).f1 > 0.99, "{outliers}");
-        assert_eq!((answer.is_verified, answer.heads), (true, 1), "{outliers}");
+        assert_eq!((choice.is_verified, choice.heads), (true, 1), "{outliers}");
     }
 }
 
@@ -44,8 +44,8 @@ fn the_first_head_is_accepted_where_it_stands_apart() {
 fn nothing_is_accepted_where_every_track_is_wrong() {
     let stop = StopToken::default();
     let (matrix, _) = scene(1.0, 5);
-    let answer = run(&search(&stop, 200, 3), &matrix);
-    assert_eq!((answer.is_verified, answer.heads), (false, 3));
+    let choice = run(&search(&stop, 200, 3), &matrix);
+    assert_eq!((choice.is_verified, choice.heads), (false, 3));
 }
 
 /// Views and tracks without observations: the others get the same bits, such tracks weight 0.
@@ -58,11 +58,11 @@ fn padding_with_zeros_changes_nothing() {
     let mut padded = DMatrix::zeros(matrix.nrows() + 6, matrix.ncols() + 7);
     padded.view_mut((0, 0), (12, matrix.ncols())).copy_from(&matrix.rows(0, 12));
     padded.view_mut((15, 0), (matrix.nrows() - 12, matrix.ncols())).copy_from(&matrix.rows(12, matrix.nrows() - 12));
-    let answer = run(&search, &padded);
+    let choice = run(&search, &padded);
     let bits = |weights: &[f64]| weights.iter().map(|w| w.to_bits()).collect::<Vec<_>>();
-    assert_eq!(bits(&answer.weights[..matrix.ncols()]), bits(&plain.weights));
-    assert!(answer.weights[matrix.ncols()..].iter().all(|&w| w == 0.0));
-    assert_eq!((answer.is_verified, answer.heads), (plain.is_verified, plain.heads));
+    assert_eq!(bits(&choice.weights[..matrix.ncols()]), bits(&plain.weights));
+    assert!(choice.weights[matrix.ncols()..].iter().all(|&w| w == 0.0));
+    assert_eq!((choice.is_verified, choice.heads), (plain.is_verified, plain.heads));
 }
 
 #[test]
@@ -83,23 +83,23 @@ fn one_seed_one_answer() {
 fn a_stop_ends_the_search_at_once() {
     let stop = StopToken::default();
     let (matrix, _) = scene(0.98, 3);
-    let mut told = Vec::new();
-    let answer = search(&stop, 30, 16).run(&matrix, &mut |place, step, _| {
-        told.push((place, step.iteration));
+    let mut reported = Vec::new();
+    let choice = search(&stop, 30, 16).run(&matrix, &mut |place, step, _| {
+        reported.push((place, step.iteration));
         if (place, step.iteration) == (1, 7) {
             stop.stop(StopReason::Cancelled);
         }
     });
-    assert_eq!(answer.expect("an answer").heads, 1);
-    assert_eq!((told.len(), told.last()), (37, Some(&(1, 7))));
+    assert_eq!(choice.expect("an answer").heads, 1);
+    assert_eq!((reported.len(), reported.last()), (37, Some(&(1, 7))));
 }
 
 #[test]
 fn hardly_anything_observed_is_no_answer() {
     let stop = StopToken::default();
     for matrix in [DMatrix::zeros(30, 20), DMatrix::from_element(3, 20, 1.0), DMatrix::from_element(30, 4, 1.0)] {
-        let answer = run(&search(&stop, 30, 2), &matrix);
-        assert_eq!(answer, Answer { weights: vec![0.0; matrix.ncols()], is_verified: false, heads: 0 });
+        let choice = run(&search(&stop, 30, 2), &matrix);
+        assert_eq!(choice, HeadChoice { weights: vec![0.0; matrix.ncols()], is_verified: false, heads: 0 });
     }
 }
 
@@ -108,7 +108,7 @@ fn hardly_anything_observed_is_no_answer() {
 fn the_choice_weighs_size_rank_and_calibration() {
     let stop = StopToken::default();
     let search = search(&stop, 30, 2);
-    let candidate = |kept, energy, daq_residual| Candidate {
+    let head = |kept, energy, daq_residual| FinishedHead {
         weights: Vec::new(),
         kept,
         tolerance: 0.1,
@@ -116,14 +116,14 @@ fn the_choice_weighs_size_rank_and_calibration() {
         is_separate: true,
         daq_residual,
     };
-    let chosen = |candidates: &[Candidate]| search.choice(candidates);
-    assert_eq!(chosen(&[candidate(5, 0.001, 0.1), candidate(6, 0.001, 0.1)]), 1);
-    assert_eq!(chosen(&[candidate(5, 0.001, 0.1), candidate(6, 0.03, 0.1)]), 0);
-    assert_eq!(chosen(&[candidate(5, 0.001, 2.0), candidate(5, 0.001, 0.1)]), 1);
-    assert_eq!(chosen(&[candidate(3, 0.0, WORST_DAQ), candidate(4, 0.0, 3.0)]), 1);
-    assert!(search.is_verified(&candidate(5, 0.0, 0.1)) && !search.is_verified(&candidate(4, 0.0, 0.1)));
-    assert!(search.is_accepted(&candidate(4, 0.0, 0.1)) && !search.is_accepted(&candidate(8, 0.0, 0.5)));
-    let without = Search { settings: NetworkSettings { use_daq: false, ..search.settings.clone() }, ..search };
-    assert_eq!(without.choice(&[candidate(5, 0.001, 2.0), candidate(5, 0.001, 0.1)]), 0, "the first of equals");
-    assert!(!without.is_accepted(&candidate(7, 0.0, 0.0)) && without.is_accepted(&candidate(8, 0.0, 0.0)));
+    let chosen = |heads: &[FinishedHead]| search.choice(heads);
+    assert_eq!(chosen(&[head(5, 0.001, 0.1), head(6, 0.001, 0.1)]), 1);
+    assert_eq!(chosen(&[head(5, 0.001, 0.1), head(6, 0.03, 0.1)]), 0);
+    assert_eq!(chosen(&[head(5, 0.001, 2.0), head(5, 0.001, 0.1)]), 1);
+    assert_eq!(chosen(&[head(3, 0.0, WORST_DAQ), head(4, 0.0, 3.0)]), 1);
+    assert!(search.is_verified(&head(5, 0.0, 0.1)) && !search.is_verified(&head(4, 0.0, 0.1)));
+    assert!(search.is_accepted(&head(4, 0.0, 0.1)) && !search.is_accepted(&head(8, 0.0, 0.5)));
+    let without = HeadSearch { settings: NetworkSettings { use_daq: false, ..search.settings.clone() }, ..search };
+    assert_eq!(without.choice(&[head(5, 0.001, 2.0), head(5, 0.001, 0.1)]), 0, "the first of equals");
+    assert!(!without.is_accepted(&head(7, 0.0, 0.0)) && without.is_accepted(&head(8, 0.0, 0.0)));
 }

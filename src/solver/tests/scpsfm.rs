@@ -57,6 +57,7 @@ fn empty_views_and_tracks_change_nothing() {
     assert_eq!(padded.tracks.weight[..60], plain.tracks.weight);
     assert!(padded.tracks.weight[60..].iter().all(|&weight| weight == 0.0));
     let focal = |solution: &Solution| solution.calibrations.first().map(|calibration| calibration.focal_px.to_bits());
+    assert!(focal(&plain).is_some(), "{:?}", plain.warnings);
     assert_eq!(focal(&padded), focal(&plain));
 }
 
