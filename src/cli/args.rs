@@ -94,10 +94,11 @@ pub struct InputArgs {
     /// The kind is told from the name and the first bytes; --format overrides.
     ///
     /// In the CSV, a line is an observation, in pixels; the centre of the top-left pixel is (0, 0); sigma is one
-    /// standard deviation of a coordinate. Ids are whole numbers from 0, other columns are ignored. OpenSfM's coordinates
-    /// are relative to the image size, which is read from exif/IMAGE.exif beside the file; --width and --height give
-    /// that of images without one. Of a database, matches are joined into tracks; a match that would put two keypoints
-    /// of one image into one track is cut. A model gives its tracks; its poses, points and calibration are not used.
+    /// standard deviation of a coordinate. Ids are whole numbers from 0, other columns are ignored. OpenSfM's
+    /// coordinates are relative to the image size, which is read from exif/IMAGE.exif beside the file; --width and
+    /// --height give that of images without one. Of a database, matches are joined into tracks; a match that would put
+    /// two keypoints of one image into one track is cut. A model gives its tracks; its poses, points and calibration
+    /// are not used.
     #[arg(value_name = "INPUT")]
     pub input: PathBuf,
 
@@ -243,8 +244,8 @@ pub struct SettingsArgs {
     #[arg(long)]
     pub no_daq: bool,
 
-    /// With `paper`, `scpsfm` and `psfm`, for an input without depths: estimate projective depths from fundamental matrices and
-    /// epipoles, instead of taking them as 1; needs about half of the tracks to be right
+    /// With `paper`, `scpsfm` and `psfm`, for an input without depths: estimate projective depths from fundamental
+    /// matrices and epipoles, instead of taking them as 1; needs about half of the tracks to be right
     #[arg(long)]
     pub epipolar_depths: bool,
 
@@ -329,7 +330,8 @@ pub enum MethodArg {
     Geometry,
     /// Plain projective factorisation (Sturm and Triggs 1996)
     Psfm,
-    /// The paper's network by itself under a continued objective: the best of up to 16 optimisations, thresholded at 1/2
+    /// The paper's network by itself under a continued objective: the best of up to 16 optimisations, thresholded at
+    /// 1/2
     Scpsfm,
 }
 

@@ -105,8 +105,8 @@ pub struct Args {
     #[arg(long, value_enum, value_delimiter = ',', value_name = "METHOD")]
     pub methods: Vec<ContestantArg>,
 
-    /// Width of the network in `paper` and `scpsfm`, with the DAQ term and without, as a share of the original PointNet;
-    /// 1 is the paper's
+    /// Width of the network in `paper` and `scpsfm`, with the DAQ term and without, as a share of the original
+    /// PointNet; 1 is the paper's
     #[arg(long, value_name = "SHARE", value_parser = width, default_value_t = SolveSettings::DEFAULT_NETWORK_WIDTH)]
     pub paper_width: f64,
 

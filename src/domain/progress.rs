@@ -44,8 +44,8 @@ pub struct Losses {
     /// `exp(t - sum_j s(kappa (w_j - 1/2)))`: too few inliers. By SCPSFM `exp(t - N)` with `N = sum_j w_j`, and from
     /// `N = t` on its tangent `1 + t - N`, which may be negative.
     pub num: f64,
-    /// `sum_{k>=5} sigma_k(M diag(w))`: distance from rank 4. By SCPSFM it begins as the sum over all k, and is the sum of
-    /// their squares over `k >= 5` in the last fifth of a head's iterations.
+    /// `sum_{k>=5} sigma_k(M diag(w))`: distance from rank 4. By SCPSFM it begins as the sum over all k, and is the sum
+    /// of their squares over `k >= 5` in the last fifth of a head's iterations.
     pub proj: f64,
     /// `sum_i | S_i/|S_i| - omega/|omega| |`: distance from one constant calibration.
     pub daq: f64,

@@ -76,9 +76,9 @@ pub struct SolveSettings {
     pub iterations: u32,
     /// Width of the PointNet as a share of the original (64-64-64-128-1024).
     pub network_width: f64,
-    /// Whether PAPER, SCPSFM and PSFM estimate projective depths from fundamental matrices and epipoles where the input brings
-    /// none, as the paper does on real tracks; otherwise such depths are 1. The other methods need none, and an input's
-    /// own depths are never replaced: there it changes nothing.
+    /// Whether PAPER, SCPSFM and PSFM estimate projective depths from fundamental matrices and epipoles where the input
+    /// brings none, as the paper does on real tracks; otherwise such depths are 1. The other methods need none, and an
+    /// input's own depths are never replaced: there it changes nothing.
     pub epipolar_depths: bool,
     /// Seed of every random choice: one seed, one answer.
     pub seed: u64,

@@ -39,7 +39,8 @@ pub enum WarningCode {
     PointsOutsideImage,
     /// Views of several camera groups or sizes were treated as one camera.
     CameraGroupsMerged,
-    /// Nothing was verified; the weights are the trained network's scores of the tracks, by SCPSFM the paper's network's.
+    /// Nothing was verified; the weights are the trained network's scores of the tracks, by SCPSFM the paper's
+    /// network's.
     UnverifiedRanking,
     /// Tracks have the very same observations as others; they were solved as one.
     DuplicateTracks,

@@ -91,8 +91,8 @@ impl Layer<Tensor<2>> {
         self.weight.clone().matmul(input) + self.bias.clone()
     }
 
-    /// `gain · W X / sqrt(var(W X) + ε) + b`, rectified with this slope below 0, for an X whose rows have mean 0, so that
-    /// those of W X have, too.
+    /// `gain · W X / sqrt(var(W X) + ε) + b`, rectified with this slope below 0, for an X whose rows have mean 0, so
+    /// that those of W X have, too.
     fn normalised(&self, centred: Tensor<2>, slope: f64) -> Tensor<2> {
         let response = self.weight.clone().matmul(centred);
         let columns = response.dims()[1] as f64;

@@ -6,10 +6,10 @@
 //! one track represents its [`near_duplicates`] until all are judged; [`view_selection`] chooses views whose tracks are
 //! complete: all of them, or a few; [`attempt`] searches such a block, its [`static_tracks`] last, by [`portfolio`]
 //! (proposals, [`search`], [`grow`]; the [`track_sampling`] of many tracks searched, [`a_contrario`] verifies,
-//! [`all_tracks`] join; [`depths`] where those verify what image points cannot), [`scpsfm`] or [`baselines`], and [`calibration`]
-//! upgrades it. [`sequence`] tries blocks in order of cost and extends what stands to the other views and tracks,
-//! projectively or metrically, observation by observation; [`assemble`] has [`classification`] judge every track and
-//! observation, and writes it down.
+//! [`all_tracks`] join; [`depths`] where those verify what image points cannot), [`scpsfm`] or [`baselines`], and
+//! [`calibration`] upgrades it. [`sequence`] tries blocks in order of cost and extends what stands to the other views
+//! and tracks, projectively or metrically, observation by observation; [`assemble`] has [`classification`] judge every
+//! track and observation, and writes it down.
 
 pub(crate) mod a_contrario;
 mod all_tracks;
@@ -89,8 +89,8 @@ pub fn solve(
 ///
 /// AUTO and GEOMETRY judge every observation by itself, but where depths alone verify, and extend a block to every view
 /// that can be registered: all views at once where their tracks are complete and that decides quickly, else few of
-/// them. By PAPER, SCPSFM and PSFM the best block is solved, views outside it are left out with a warning, and blocks that
-/// disagree raise its uncertainty.
+/// them. By PAPER, SCPSFM and PSFM the best block is solved, views outside it are left out with a warning, and blocks
+/// that disagree raise its uncertainty.
 ///
 /// Tracks that are [duplicates](Duplicates) of another count once, whatever the method.
 ///

@@ -272,8 +272,8 @@ impl HeadSearch<'_> {
         head.is_separate && head.kept >= self.options.accepted_by_daq && fits
     }
 
-    /// Whether the tracks can be taken for right. Any four have rank 4 and stand apart: of these a small e, which one of
-    /// sixteen heads on twenty scenes without a right track has by chance, ends the heads but is no evidence.
+    /// Whether the tracks can be taken for right. Any four have rank 4 and stand apart: of these a small e, which one
+    /// of sixteen heads on twenty scenes without a right track has by chance, ends the heads but is no evidence.
     fn is_verified(&self, head: &FinishedHead) -> bool {
         head.kept > RANK && (self.is_accepted(head) || self.is_of_low_rank(head))
     }

@@ -25,7 +25,8 @@ pub struct HeadOptions {
 
 impl HeadOptions {
     pub const DEFAULT: Self = Self {
-        // To 96 % wrong tracks the first suffices, at 97 % the second; at 98 % the best of 16 still is not always right.
+        // To 96 % wrong tracks the first suffices, at 97 % the second; at 98 % the best of 16 still is not always
+        // right.
         heads: 16,
         // The first is best where one head has to do; of hard scenes other values find what it does not.
         alphas: [(14.0, 10.0), (20.0, 20.0), (10.0, 10.0), (30.0, 20.0)],
