@@ -236,9 +236,11 @@ pub fn from_metric(
     let problem = &problem.with_least_noise();
     let stretch = stretch.map(|stretch| Stretch { problem: stretch.problem.with_least_noise(), ..stretch });
     let (on, of_stretch) = stretch.as_ref().map_or((problem, metric), |stretch| (&stretch.problem, stretch.metric));
-    // Neither projective cameras nor homographies have a lens.
-    let observations = misfit::undistorted(of_stretch, on.observations);
-    let on = &Uncalibrated { observations: &observations, ..*on };
+    // Behind a fisheye neither projective cameras nor homographies hold. Behind a perspective lens they nearly do, and a
+    // ratio to what they leave there refuses no calibration for the little that a lens of few terms does not fit.
+    let is_fisheye = of_stretch.intrinsics.iter().any(Intrinsics::is_fisheye);
+    let undistorted = is_fisheye.then(|| misfit::undistorted(of_stretch, on.observations));
+    let on = &Uncalibrated { observations: undistorted.as_deref().unwrap_or(on.observations), ..*on };
     let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on, scale_px, stop, heartbeat)?;
     warnings.extend(critical.warnings);
     let fit = match (critical.upgrade, metric.has_common_centre) {
