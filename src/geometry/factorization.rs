@@ -5,6 +5,9 @@ use nalgebra::{DMatrix, DVector};
 use super::measurement::CompleteBlock;
 use super::{Camera, Point};
 
+/// Rank of a noise-free measurement matrix with right depths.
+pub const RANK: usize = 4;
+
 /// Orthonormal basis of the dominant `rank`-dimensional subspace of the column space, d x rank, by the
 /// eigen-decomposition of `M M^T` (d x d; d is far smaller than the number of columns here).
 ///

@@ -55,6 +55,9 @@ pub use prior::PriorNetwork;
 use prior::{DAQ_ONSET, Iteration};
 pub use settings::NetworkSettings;
 
+/// Weight above which the paper calls a track an inlier.
+pub const THRESHOLD: f64 = 0.5;
+
 /// Why the network could not be built or could not go on.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {

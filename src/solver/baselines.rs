@@ -7,18 +7,15 @@ use super::fusion::{self, Estimate};
 use super::grow::{self, Consensus, ConsensusOptions, LEAST_SUPPORT};
 use super::problem::Problem;
 use super::recorder::Recorder;
-use super::search::subspace;
 use super::{Error, view_selection};
-use crate::domain::StopToken;
+use crate::domain::{Losses, StopToken};
 use crate::geometry::bundle::{self, projective};
 use crate::geometry::epipolar_depths::epipolar_depths;
-use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_residuals};
+use crate::geometry::factorization::{RANK, cameras_of, dominant_subspace, subspace_residuals};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::triangulation;
-use crate::network::{NetworkSettings, PriorNetwork};
+use crate::network::{NetworkSettings, PriorNetwork, THRESHOLD};
 
-/// Weight above which the paper calls a track an inlier.
-const PAPER_THRESHOLD: f64 = 0.5;
 /// Residual (sine of the angle to the subspace) per unit of noise below which plain factorisation calls a track an
 /// inlier; the same scale as the search's tolerance.
 const PSFM_THRESHOLD_PER_NOISE: f64 = 4.0;
@@ -87,28 +84,53 @@ pub fn paper(
     let settings = problem.settings;
     let matrix = balance(&block.measurement_matrix());
     let mut network = PriorNetwork::new(&matrix, &NetworkSettings::from(settings))?;
+    let earlier = recorder.standing.iteration;
     while network.iteration() < settings.iterations && !problem.stop.is_stopped() {
         let step = network.step()?;
-        recorder.standing.iteration = step.iteration;
-        recorder.standing.losses = Some(step.losses);
-        recorder.standing.inliers = network.weights().iter().filter(|&&w| w > PAPER_THRESHOLD).count() as u32;
-        if settings.use_daq {
-            recorder.standing.focal_px = Some(network.focal() * problem.scale_px);
-        }
-        recorder.report(f64::from(step.iteration) / f64::from(settings.iterations));
-        if settings.weights_every > 0 && step.iteration.is_multiple_of(settings.weights_every) {
-            recorder.weights(&problem.scatter(network.weights(), tracks));
-        }
+        let within = f64::from(step.iteration) / f64::from(settings.iterations);
+        let (iteration, losses) = (step.iteration, step.losses);
+        let step = NetworkIteration { iteration, earlier, losses, weights: network.weights(), focal: network.focal() };
+        report(problem, tracks, &step, within, recorder);
     }
     let weights = network.weights().to_vec();
-    let inlier = weights.iter().map(|&weight| weight > PAPER_THRESHOLD).collect();
+    let inlier = weights.iter().map(|&weight| weight > THRESHOLD).collect();
     Ok(Decided { inlier, weights, is_verified: true })
+}
+
+/// An iteration of the network where it decides by itself.
+pub struct NetworkIteration<'a> {
+    /// Of this optimisation, counted from 1, and how many there were in those before.
+    pub iteration: u32,
+    pub earlier: u32,
+    pub losses: Losses,
+    /// One a track of the block.
+    pub weights: &'a [f64],
+    /// In the units of the measurement matrix.
+    pub focal: f64,
+}
+
+/// Reports an iteration of the network.
+///
+/// * `tracks`: those of the input that the block's are
+/// * `within`: share of the work on this block that is done
+pub fn report(problem: &Problem, tracks: &[usize], step: &NetworkIteration, within: f64, recorder: &mut Recorder) {
+    let settings = problem.settings;
+    recorder.standing.iteration = step.earlier + step.iteration;
+    recorder.standing.losses = Some(step.losses);
+    recorder.standing.inliers = step.weights.iter().filter(|&&weight| weight > THRESHOLD).count() as u32;
+    if settings.use_daq {
+        recorder.standing.focal_px = Some(step.focal * problem.scale_px);
+    }
+    recorder.report(within);
+    if settings.weights_every > 0 && step.iteration.is_multiple_of(settings.weights_every) {
+        recorder.weights(&problem.scatter(step.weights, tracks));
+    }
 }
 
 /// PSFM: the dominant subspace of all columns (Sturm & Triggs 1996), and the tracks that lie close to it.
 pub fn psfm(block: &CompleteBlock, noise: f64) -> Decided {
     let matrix = balance(&block.measurement_matrix());
-    let residuals = dominant_subspace(&matrix, subspace::RANK)
+    let residuals = dominant_subspace(&matrix, RANK)
         .map_or_else(|| vec![1.0; block.tracks()], |basis| subspace_residuals(&matrix, &basis));
     let threshold = PSFM_THRESHOLD_PER_NOISE * noise;
     Decided {
@@ -127,7 +149,7 @@ pub fn reconstruct(block: &CompleteBlock, inlier: &[bool], noise: f64, stop: &St
         return None;
     }
     let matrix = balance(&block.measurement_matrix()).select_columns(&support);
-    let mut cameras = cameras_of(&dominant_subspace(&matrix, subspace::RANK)?);
+    let mut cameras = cameras_of(&dominant_subspace(&matrix, RANK)?);
     let mut points: Vec<_> = support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();
     let observations = grow::observations_of(block, &support);
     let mut consensus = None;

@@ -130,11 +130,11 @@ fn solve_views(
 ) -> Result<Solution, Error> {
     // The DAQ loss assumes constant intrinsics, so it is disabled when the focal length varies.
     let settings = &SolveSettings { use_daq: settings.use_daq && !settings.focal_per_view, ..settings.clone() };
-    let problem = Problem::new(input, settings, threads, stop);
+    let mut problem = Problem::new(input, settings, threads, stop);
     let mut recorder = Recorder::new(observer, problem.observed_views().len());
-    let (ended, problem) = match problem.is_searched() {
-        true => sequence::solve(problem, &mut recorder)?,
-        false => (Ended::Block(baselines::solve(&problem, &mut recorder)?.map(Box::new)), problem),
+    let ended = match problem.is_searched() {
+        true => sequence::solve(&mut problem, &mut recorder)?,
+        false => Ended::Block(baselines::solve(&problem, &mut recorder)?.map(Box::new)),
     };
     problem.stopped()?;
     let solution = assemble::solution(ended, &problem, recorder);

@@ -27,7 +27,6 @@ pub const LEAST_RETAINED_SHARE: f64 = 0.6;
 pub const VERIFIED: usize = 3;
 
 /// What every stage of one solve works on; observations keep the input's sorted order (track, view).
-#[derive(Clone)]
 pub struct Problem<'a> {
     pub input: &'a Input,
     pub settings: &'a SolveSettings,
@@ -70,10 +69,9 @@ pub struct Problem<'a> {
 }
 
 /// Lenses that are undone, a hypothesis.
-#[derive(Clone)]
 pub struct Undone {
     /// One a camera; a pinhole where none is undone.
-    pub lenses: Vec<Intrinsics>,
+    lenses: Vec<Intrinsics>,
     /// Largest radius of the observations of each camera, normalised.
     radii: Vec<f64>,
     /// Where pinholes would have made them.
@@ -81,6 +79,23 @@ pub struct Undone {
 }
 
 impl Undone {
+    /// This lens of a camera undone beside what is undone already; `None` where it does not image all of its
+    /// observations.
+    pub fn new(problem: &Problem, already: Option<&Self>, camera: usize, lens: Intrinsics) -> Option<Self> {
+        let pinholes = || vec![Intrinsics::from_focal(1.0); problem.cameras];
+        let mut lenses = already.map_or_else(pinholes, |undone| undone.lenses.clone());
+        lenses[camera] = lens;
+        let camera_of = |k: usize| problem.camera_of[problem.view_of(k)];
+        let undone = |k: usize| lenses[camera_of(k)].undistorted(&problem.observation(k));
+        let observations = (0..problem.xy.len()).map(undone).collect::<Option<Vec<Observation>>>()?;
+        let mut radii = vec![0.0f64; problem.cameras];
+        for (k, xy) in problem.xy.iter().enumerate() {
+            let radius = &mut radii[camera_of(k)];
+            *radius = radius.max(xy.norm());
+        }
+        Some(Self { lenses, radii, observations })
+    }
+
     /// The lens of the images of a camera for which these intrinsics are found once its lens is undone.
     pub fn behind(&self, camera: usize, found: &Intrinsics) -> Intrinsics {
         let lens = &self.lenses[camera];
@@ -139,22 +154,6 @@ impl<'a> Problem<'a> {
             threads,
             stop,
         }
-    }
-
-    /// The same with this lens of a camera undone before anything projective is looked for; `None` where it does not
-    /// image all of its observations.
-    pub fn undoing(&self, camera: usize, lens: Intrinsics) -> Option<Self> {
-        let pinholes = || vec![Intrinsics::from_focal(1.0); self.cameras];
-        let mut lenses = self.undone.as_ref().map_or_else(pinholes, |undone| undone.lenses.clone());
-        lenses[camera] = lens;
-        let undone = |k: usize| lenses[self.camera_of[self.view_of(k)]].undistorted(&self.observation(k));
-        let observations = (0..self.xy.len()).map(undone).collect::<Option<Vec<Observation>>>()?;
-        let mut radii = vec![0.0f64; self.cameras];
-        for (k, xy) in self.xy.iter().enumerate() {
-            let radius = &mut radii[self.camera_of[self.view_of(k)]];
-            *radius = radius.max(xy.norm());
-        }
-        Some(Self { undone: Some(Undone { lenses, radii, observations }), ..self.clone() })
     }
 
     /// `Err` once the token asks for a stop.

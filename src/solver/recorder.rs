@@ -189,7 +189,7 @@ impl<'a> Recorder<'a> {
         self.heartbeat();
     }
 
-    /// The same, to be told with the next report.
+    /// The same, reported with the next [`Self::report`].
     pub fn begin_step(&mut self, task: Task, step: usize, steps: usize) {
         self.course.step = Some(Step { task, step: step as u32, steps: steps as u32 });
     }

@@ -24,8 +24,6 @@ const WIDEST_DOUBLINGS: usize = 64;
 /// Squared radius below which a fisheye's angle and scale are replaced by their series: above it the difference that is
 /// the scale's slope keeps ten digits, below it the next terms are under rounding in what they are multiplied with.
 const NEAR_AXIS: f64 = 1e-6;
-/// Radii at which a fisheye is fitted to another lens.
-const FITTED_RADII: usize = 32;
 
 /// Intrinsics in normalised image units, without skew, behind a lens that distorts.
 ///
@@ -63,52 +61,25 @@ impl Intrinsics {
         }
     }
 
+    /// An equidistant fisheye, with square pixels and the principal point where it was guessed.
+    pub fn equidistant(focal: f64) -> Self {
+        Self { projection: LensProjection::Fisheye, ..Self::from_focal(focal) }
+    }
+
+    /// The lens of this projection and focal length of which nothing else is known.
+    pub fn simplest(&self) -> Self {
+        Self { projection: self.projection, ..Self::from_focal(self.focal) }
+    }
+
     /// The pinhole that sees what this lens sees once its distortion is undone.
     pub fn pinhole(&self) -> Self {
         Self { projection: LensProjection::Perspective, radial: [0.0; 3], tangential: [0.0; 2], ..*self }
-    }
-
-    /// The equidistant fisheye, its focal length free, whose image is nearest to this lens's within a radius at unit
-    /// depth.
-    pub fn nearest_fisheye(&self, radius: f64) -> Self {
-        let (mut product, mut squares) = (0.0, 0.0);
-        for k in 1..=FITTED_RADII {
-            let radius = radius * k as f64 / FITTED_RADII as f64;
-            let angle = radius.atan();
-            product += angle * radius * self.scale(radius * radius);
-            squares += angle * angle;
-        }
-        let focal = self.focal * product / squares;
-        Self { projection: LensProjection::Fisheye, focal, radial: [0.0; 3], tangential: [0.0; 2], ..*self }
     }
 
     /// The calibration matrix `K`, which knows no distortion.
     pub fn matrix(&self) -> Matrix3<f64> {
         let [px, py] = [self.principal_point.x, self.principal_point.y];
         Matrix3::new(self.focal, 0.0, px, 0.0, self.aspect * self.focal, py, 0.0, 0.0, 1.0)
-    }
-
-    /// One fisheye that approximates another lens applied to the images of a camera with these intrinsics.
-    ///
-    /// * `lens`: what is applied
-    /// * `radius`: of its images, up to which the fisheye is fitted
-    pub fn behind(&self, lens: &Self, radius: f64) -> Self {
-        let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
-        for k in 1..=FITTED_RADII {
-            let imaged = radius * k as f64 / FITTED_RADII as f64;
-            let inner = |lens: &Self, imaged: f64| Some(lens.ray(&Vector2::new(lens.focal * imaged, 0.0))?.x);
-            let centred = |lens: &Self| Self { principal_point: Vector2::zeros(), ..*lens };
-            let undone = inner(&centred(lens), imaged / lens.focal).map(|ray| ray * lens.focal);
-            let Some(ray) = undone.and_then(|undone| inner(&centred(self), undone / self.focal)) else { break };
-            // imaged = f t (1 + k1 t^2 + k2 t^4 + k3 t^6)
-            let angle = ray.atan();
-            let squared = angle * angle;
-            let powers = Vector3::new(squared, squared.powi(2), squared.powi(3)) * angle;
-            normal += powers * powers.transpose();
-            right += powers * (imaged / self.focal - angle);
-        }
-        let radial = normal.lu().solve(&right).map_or([0.0; 3], Into::into);
-        Self { projection: LensProjection::Fisheye, radial, tangential: [0.0; 2], ..*self }
     }
 
     /// Whether it images other than a pinhole.
@@ -160,7 +131,7 @@ impl Intrinsics {
 
     /// The radial scale `s` at a squared radius.
     #[inline(always)]
-    fn scale(&self, squared: f64) -> f64 {
+    pub(super) fn scale(&self, squared: f64) -> f64 {
         let (argument, factor) = self.argument(squared);
         factor * self.polynomial(argument)
     }
@@ -449,7 +420,7 @@ mod tests {
 
     #[test]
     fn an_equidistant_fisheye_images_the_angle() {
-        let fisheye = Intrinsics { projection: LensProjection::Fisheye, ..Intrinsics::from_focal(0.5) };
+        let fisheye = Intrinsics::equidistant(0.5);
         for degrees in [0.0f64, 1e-5, 0.05, 0.06, 10.0, 45.0, 80.0, 89.0] {
             let angle = degrees.to_radians();
             let image = fisheye.project(&Vector3::new(0.6 * angle.sin(), 0.8 * angle.sin(), angle.cos()));
@@ -464,7 +435,7 @@ mod tests {
     #[test]
     fn weights_undo_what_undistorting_does_to_noise() {
         let barrel = Intrinsics { radial: [-0.2, 0.02, 0.0], ..Intrinsics::from_focal(0.7) };
-        let fisheye = Intrinsics { projection: LensProjection::Fisheye, ..Intrinsics::from_focal(0.5) };
+        let fisheye = Intrinsics::equidistant(0.5);
         for lens in [barrel, fisheye] {
             for xy in [Vector2::new(0.1, 0.05), Vector2::new(-0.3, 0.3), Vector2::new(0.5, 0.1)] {
                 const SIDE: f64 = 1e-5;
@@ -477,20 +448,22 @@ mod tests {
         }
     }
 
+    /// On both sides of where the series begins, against central differences.
     #[test]
-    fn a_lens_behind_another_is_one_fisheye() {
-        let outer = Intrinsics { projection: LensProjection::Fisheye, ..Intrinsics::from_focal(0.47) };
-        for focal in [0.4, 0.5, 0.7] {
-            let inner = Intrinsics { radial: [0.03, 0.0, 0.0], ..Intrinsics::from_focal(focal) };
-            let both = inner.behind(&outer, 0.6);
-            for k in 0..=12 {
-                let pinhole = Vector2::new(0.04, 0.03) * f64::from(k);
-                let of_outer = outer.project(&(pinhole / outer.focal).push(1.0));
-                let ray = inner.ray(&pinhole).expect("nothing folds");
-                let off = (both.project(&ray.push(1.0)) - of_outer).norm();
-                // Half a pixel of 1,000.
-                assert!(off < 5e-4, "focal {focal}, {k}: {off}");
-            }
+    fn the_slope_of_a_fisheyes_scale_has_no_seam() {
+        let lens = Intrinsics { radial: [0.1, -0.05, 0.02], ..Intrinsics::equidistant(0.5) };
+        for squared in [1e-9, 0.9 * NEAR_AXIS, 1.1 * NEAR_AXIS, 1e-3, 0.5, 9.0] {
+            // Of the angle over the radius in twice the digits that differences of the scale leave near the axis.
+            let expected = if squared < 1e-3 {
+                // s = (1 - r^2/3 + r^4/5) (1 + k1 t^2 + k2 t^4) with t^2 = r^2 - 2/3 r^4
+                let [k1, k2, _] = lens.radial;
+                (k1 - 1.0 / 3.0) + 2.0 * squared * (0.2 - k1 + k2)
+            } else {
+                let width = 1e-4 * squared;
+                (lens.scale(squared + width) - lens.scale(squared - width)) / (2.0 * width)
+            };
+            let slope = lens.scale_slope(squared);
+            assert!((slope - expected).abs() < 1e-6, "{squared}: {slope}, {expected}");
         }
     }
 

@@ -12,6 +12,7 @@ mod cholesky;
 mod covariance;
 pub mod critical;
 mod engine;
+mod fisheye;
 mod intrinsics;
 mod intrinsics_model;
 pub mod metric;

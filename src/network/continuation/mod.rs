@@ -37,17 +37,12 @@ use nalgebra::DMatrix;
 use super::cloud::{CloudNetwork, Output, finite};
 use super::losses::{self, RankTerm};
 use super::pass::PlaneUse;
-use super::{Error, NetworkSettings};
+use super::{Error, NetworkSettings, THRESHOLD};
 use crate::domain::Losses;
-use crate::geometry::factorization::{dominant_subspace, subspace_residuals};
+use crate::geometry::factorization::{RANK, dominant_subspace, subspace_residuals};
 use crate::geometry::statistics::midpoint_median;
 
 pub use options::ContinuationOptions;
-
-/// Rank of a noise-free measurement matrix.
-const RANK: usize = 4;
-/// Weight above which a track is in the consensus, the paper's.
-pub const THRESHOLD: f64 = 0.5;
 
 /// Which objective is optimised.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -41,7 +41,7 @@ impl ContinuationOptions {
     pub const DEFAULT: Self = Self {
         // Nothing that is convex in w is left by then; without the relaxation F1 is .86 at 96 % and .70 at 97 %.
         relaxation_end: 0.6,
-        // 60 of 500 iterations, as many as a step of Adam at 1e-3 needs to move a weight by its own size.
+        // Without a ramp the objective would jump. The length is that of the prototype and was not swept.
         alpha_ramp: 0.12,
         // Two stretches of a tenth each: the second measures the noise of what the first has grown to.
         growth_start: 0.8,
@@ -52,6 +52,7 @@ impl ContinuationOptions {
         cost_per_track: 0.15,
         // Fewer columns have too little of a tail to measure.
         least_consensus: 8,
+        // Weights are not near 0 and 1 yet: half of the largest parts them. Of the prototype, not swept.
         consensus_share: 0.5,
         // Where the tail vanishes, alpha would have no bound.
         most_alpha: 40.0,

@@ -4,9 +4,8 @@ use faer::{Mat, Side};
 use nalgebra::{DMatrix, MatrixXx4};
 
 use super::Error;
+use crate::geometry::factorization::RANK;
 
-/// Rank of a noise-free measurement matrix.
-const RANK: usize = 4;
 /// Added under the square root of an eigenvalue: keeps the derivative of a vanishing singular value finite. Columns
 /// have unit norm, so this is far below any noise.
 const EIGENVALUE_FLOOR: f64 = 1e-10;

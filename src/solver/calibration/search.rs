@@ -76,8 +76,7 @@ impl Minimum {
         for (lens, radius) in reconstruction.intrinsics.iter_mut().zip(radii) {
             let of_perspective = lens.focal;
             let ray = radius.and_then(|radius| lens.ray(&(lens.principal_point + Vector2::new(radius, 0.0))));
-            let nearest = ray.map_or(*lens, |ray| lens.nearest_fisheye(ray.x));
-            *lens = Intrinsics { projection: nearest.projection, ..Intrinsics::from_focal(nearest.focal) };
+            *lens = ray.map_or_else(|| lens.simplest(), |ray| lens.nearest_fisheye(ray.x));
             // Views have focal lengths of their own only where they are of one group.
             reconstruction.focals.iter_mut().for_each(|focal| *focal *= lens.focal / of_perspective);
         }
@@ -140,9 +139,7 @@ pub(super) fn minima_near(
     for &factor in factors {
         Error::check(stop)?;
         let mut reconstruction = metric.clone();
-        for lens in &mut reconstruction.intrinsics {
-            *lens = Intrinsics { projection: lens.projection, ..Intrinsics::from_focal(lens.focal) };
-        }
+        reconstruction.intrinsics.iter_mut().for_each(|lens| *lens = lens.simplest());
         reconstruction.scale_focals(factor);
         if factor != 1.0 {
             let following = Options { max_iterations: options.following_iterations, ..Options::default() };

@@ -5,10 +5,11 @@ use std::time::Instant;
 use super::best::Best;
 use super::{OPTIONS, Portfolio, Search, VerifiedBy};
 use crate::domain::Proposal;
+use crate::geometry::factorization::RANK;
 use crate::geometry::statistics::median;
 use crate::solver::a_contrario::{self, FalseAlarmOptions};
 use crate::solver::learned::TrackScores;
-use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid, subspace};
+use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid};
 use crate::solver::{depths, grow, priors};
 
 impl Portfolio<'_> {
@@ -97,7 +98,7 @@ impl Portfolio<'_> {
         let begun = Instant::now();
         let irls = match &self.search {
             Search::Affine(search) => priors::affine_irls(search.centred(), 0, self.stop),
-            Search::Subspace(search) => priors::irls(search.balanced(), subspace::RANK, self.stop),
+            Search::Subspace(search) => priors::irls(search.balanced(), RANK, self.stop),
         };
         self.stats(Proposal::Irls).seconds += begun.elapsed().as_secs_f64();
         if let Some(weights) = irls {

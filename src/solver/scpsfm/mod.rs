@@ -12,7 +12,7 @@
 //! Heads end with one that is accepted: at least four tracks that stand apart from wrong ones and whose e is small, or
 //! without the DAQ term at least eight that stand apart. A chosen head is verified where it is accepted with at least
 //! five tracks, or where at least eight stand apart: a motion near a degenerate one has a large e with right tracks,
-//! too. The rest is an answer that nothing has verified: it is told as such and not reconstructed.
+//! too. The rest is an answer that nothing has verified: it is reported as such and not reconstructed.
 
 mod options;
 #[cfg(test)]
@@ -22,23 +22,19 @@ use nalgebra::DMatrix;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::baselines::Decided;
+use super::baselines::{self, Decided, NetworkIteration};
 use super::problem::Problem;
 use super::recorder::Recorder;
 use crate::domain::{StopToken, Task};
 use crate::geometry::daq::hypothesis_residual;
-use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_residuals};
+use crate::geometry::factorization::{RANK, cameras_of, dominant_subspace, subspace_residuals};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::statistics::midpoint_median;
-use crate::network::continuation::{
-    ContinuationOptions, Finished, Head, HeadIteration, HeadStart, THRESHOLD, wrong_residual,
-};
-use crate::network::{Error, NetworkSettings, PriorNetwork, standard_normal};
+use crate::network::continuation::{ContinuationOptions, Finished, Head, HeadIteration, HeadStart, wrong_residual};
+use crate::network::{Error, NetworkSettings, PriorNetwork, THRESHOLD, standard_normal};
 
 pub use options::HeadOptions;
 
-/// Rank of a noise-free measurement matrix.
-const RANK: usize = 4;
 /// Views below which the network has nothing to compare.
 const NETWORK_LEAST_VIEWS: usize = 2;
 /// Added to J of a head that keeps fewer than four tracks: more than any set near rank 4 has.
@@ -77,18 +73,11 @@ pub fn decide(
         if iteration == 1 {
             earlier = recorder.standing.iteration;
         }
-        recorder.standing.iteration = earlier + iteration;
-        recorder.standing.losses = Some(losses);
-        recorder.standing.inliers = reported.weights.iter().filter(|&&w| w > THRESHOLD).count() as u32;
-        if settings.use_daq {
-            recorder.standing.focal_px = Some(reported.focal * problem.scale_px);
-        }
-        let within = f64::from(iteration) / f64::from(settings.iterations);
         recorder.begin_step(Task::Heads, head + 1, heads);
-        recorder.report((head as f64 + within) / heads as f64);
-        if settings.weights_every > 0 && iteration.is_multiple_of(settings.weights_every) {
-            recorder.weights(&problem.scatter(reported.weights, tracks));
-        }
+        let HeadProgress { weights, focal } = reported;
+        let within = (head as f64 + f64::from(iteration) / f64::from(settings.iterations)) / heads as f64;
+        let step = NetworkIteration { iteration, earlier, losses, weights, focal };
+        baselines::report(problem, tracks, &step, within, recorder);
     })?;
     let inlier = choice.weights.iter().map(|&weight| weight > THRESHOLD).collect();
     Ok(Decided { inlier, weights: choice.weights, is_verified: choice.is_verified })

@@ -6,13 +6,11 @@ use rand_chacha::ChaCha8Rng;
 use super::options::{SamplingOptions, SubspaceOptions};
 use super::{Sampler, Seed, Shortlist};
 use crate::domain::StopToken;
-use crate::geometry::factorization::{cameras_of, dominant_subspace, subspace_residuals};
+use crate::geometry::factorization::{RANK, cameras_of, dominant_subspace, subspace_residuals};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::{daq, triangulation};
 
 const OPTIONS: SubspaceOptions = SamplingOptions::DEFAULT.subspace;
-/// Dimension of the column space of a measurement matrix with right depths.
-pub const RANK: usize = 4;
 /// Columns that the subspace is refitted to at least: one more than it needs.
 const LEAST_COLUMNS: usize = RANK + 1;
 

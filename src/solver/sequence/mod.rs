@@ -52,19 +52,24 @@ pub enum Ended {
     Block(Option<Box<Attempt>>),
 }
 
-/// Solves an input. Where pinholes give no calibration of most views, solves it once more behind the lenses that
-/// explain seeds better. Returns what came of it and the problem that it belongs to.
+/// Solves an input. Where pinholes give no calibration of most views, solves it once more with the lenses undone that
+/// explain seeds better; these stay undone in the problem where that answer stands.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
-pub fn solve<'a>(problem: Problem<'a>, recorder: &mut Recorder) -> Result<(Ended, Problem<'a>), Error> {
-    let ended = of_blocks(&problem, recorder)?;
-    let Some(behind) = lens::behind_lenses(&problem, &ended, recorder)? else { return Ok((ended, problem)) };
-    let found = of_blocks(&behind, recorder)?;
+pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
+    let ended = of_blocks(problem, recorder)?;
+    if !lens::undo(problem, &ended, recorder)? {
+        return Ok(ended);
+    }
+    let found = of_blocks(problem, recorder)?;
     // The calibration of a block takes the undone lens as exact; only an extension adjusts it in the images.
-    let is_extended = matches!(found, Ended::Extended(_)) && found.is_calibrated(&behind);
-    let stands = is_extended && lens::replaces(found.evidence(&behind), ended.evidence(&problem));
-    Ok(if stands { (found, behind) } else { (ended, problem) })
+    let is_extended = matches!(found, Ended::Extended(_)) && found.is_calibrated(problem);
+    if is_extended && lens::replaces(found.evidence(problem), ended.evidence(problem)) {
+        return Ok(found);
+    }
+    problem.undone = None;
+    Ok(ended)
 }
 
 /// Solves and extends block after block until one carries a reconstruction of most of the views.

@@ -171,7 +171,7 @@ fn fisheye(motion: PhotographedMotion, seed: u64) -> PhotographedOptions {
     }
 }
 
-/// A plane, a turning camera and a scene with depth; seeds of pinholes hold in neither of the first two.
+/// A scene with depth, a turning camera and a plane; the turning camera is refused without a search behind lenses.
 #[test]
 fn a_fisheye_is_found_and_calibrated() {
     for motion in [PhotographedMotion::Orbit, PhotographedMotion::PureRotation, PhotographedMotion::PlanarScene] {
