@@ -216,6 +216,16 @@ impl AttemptEnd {
     }
 }
 
+/// The `Solve` calls that a job depends on, counted over all servers of a store: it is cancelled once each of them was
+/// disconnected. The calls of a server that died never detach, so that their job runs to its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AttachedCalls {
+    /// Calls that have attached so far: the one that created the job, and later ones with its request id.
+    pub attached: u64,
+    /// Those of them that were disconnected since.
+    pub detached: u64,
+}
+
 /// A job as its owner sees it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Job {
@@ -246,16 +256,22 @@ pub struct Job {
     pub failure: Option<Failure>,
     /// A cancel was asked for and has not yet reached the worker.
     pub cancel_requested: bool,
+    /// The calls that it is cancelled without; `None`: it does not depend on any caller.
+    pub attached_calls: Option<AttachedCalls>,
     /// When an ended job is removed; `None` while it has not ended, or where it is kept for good.
     pub expire_time: Option<SystemTime>,
 }
 
 impl Job {
-    /// Changes whenever the job does, but for its latest progress: another one after each event, and another job's of
-    /// the same name, which was created at another time, is another.
+    /// Changes whenever the job does, but for its latest progress: another one after each event and each change of
+    /// `attached_calls`, and another job's of the same name, which was created at another time, is another.
     pub fn etag(&self) -> String {
         let created = self.create_time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_micros();
-        format!("{created:x}-{:x}-{}", self.last_sequence, u8::from(self.cancel_requested))
+        let mut etag = format!("{created:x}-{:x}-{}", self.last_sequence, u8::from(self.cancel_requested));
+        if let Some(AttachedCalls { attached, detached }) = self.attached_calls {
+            etag.push_str(&format!("-{attached:x}-{detached:x}"));
+        }
+        etag
     }
 }
 

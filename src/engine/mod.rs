@@ -283,6 +283,15 @@ impl Engine {
         finished(tokio::spawn(async move { inner.cancel(&name, etag.as_deref()).await })).await
     }
 
+    /// Counts that a call was disconnected whose submission had `cancel_on_disconnect`; `created` is the job's time of
+    /// creation. Whether the job goes on without it is the caller's to decide, by [`Job::attached_calls`].
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    pub async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error> {
+        Ok(self.inner.store.detach(name, created).await?)
+    }
+
     /// Removes an ended job with its events, input, result and request ids; with an etag, only where it is the job's.
     ///
     /// # Errors

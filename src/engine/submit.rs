@@ -53,6 +53,9 @@ pub struct NewJob {
     pub labels: BTreeMap<String, String>,
     /// W3C `traceparent` of the call.
     pub trace_parent: Option<String>,
+    /// Whether the call attaches to the job, see [`Engine::detach`](super::Engine::detach). No part of what makes two
+    /// requests the same.
+    pub cancel_on_disconnect: bool,
 }
 
 impl NewJob {
@@ -68,6 +71,7 @@ impl NewJob {
             priority: 0,
             labels: BTreeMap::new(),
             trace_parent: None,
+            cancel_on_disconnect: false,
         }
     }
 
@@ -140,6 +144,7 @@ impl NewJob {
             priority: self.priority,
             labels: self.labels,
             trace_parent: self.trace_parent,
+            cancel_on_disconnect: self.cancel_on_disconnect,
         })
     }
 

@@ -10,7 +10,7 @@ use tracing::Instrument;
 use super::caller::Caller;
 use super::convert::enums::Twin;
 use super::convert::{job, settings};
-use super::follow::{Follower, Followers};
+use super::disconnect::{AttachedCall, DisconnectTracker};
 use super::inputs::MAX_CHUNK_BYTES;
 use super::jobs::MAX_BATCH;
 use super::submission::Submission;
@@ -37,14 +37,14 @@ pub struct Calibration {
     engine: Engine,
     limits: Limits,
     bounds: Bounds,
-    followers: Followers,
+    disconnects: DisconnectTracker,
 }
 
 impl Calibration {
-    /// `grace`: how long after the last `Solve` that follows a job was dropped the job is cancelled.
+    /// `grace`: how long after every `Solve` that is attached to a job was disconnected the job is cancelled.
     pub fn new(engine: Engine, limits: Limits, bounds: Bounds, grace: Duration) -> Self {
-        let followers = Followers::new(engine.clone(), grace);
-        Self { engine, limits, bounds, followers }
+        let disconnects = DisconnectTracker::new(engine.clone(), grace);
+        Self { engine, limits, bounds, disconnects }
     }
 
     /// Reads the whole of a stream.
@@ -65,12 +65,13 @@ impl Calibration {
         Ok(submission)
     }
 
-    /// Stores the job and follows it.
-    async fn submit(&self, new: engine::NewJob) -> Result<Follower, Status> {
-        let (engine, followers) = (self.engine.clone(), self.followers.clone());
-        // In a task of its own: if this call is dropped while the job is being stored, the follower is made all the
-        // same, is dropped with the task's outcome, and cancels the job.
-        let stored = async move { engine.submit(new).await.map(|job| followers.follow(job.name)) };
+    /// Stores the job and attaches to it.
+    async fn submit(&self, new: engine::NewJob) -> Result<AttachedCall, Status> {
+        let (engine, disconnects) = (self.engine.clone(), self.disconnects.clone());
+        let new = engine::NewJob { cancel_on_disconnect: true, ..new };
+        // In a task of its own: if this call is dropped while the job is being stored, it attaches all the same, and
+        // detaches when the task's outcome is dropped.
+        let stored = async move { engine.submit(new).await.map(|job| disconnects.attached(job)) };
         let outcome = tokio::spawn(stored.in_current_span()).await;
         outcome.map_err(|error| status::internal(&error))?.map_err(status::from_engine)
     }
@@ -118,22 +119,20 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             let submission = self.receive(&caller, request.into_inner()).await?;
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let new = submission.close(trace_parent).await?;
-            let follower = self.submit(new).await?;
-            telemetry::tracing::record_job(&span, follower.job());
-            Ok::<_, Status>(follower)
+            let call = self.submit(new).await?;
+            telemetry::tracing::record_job(&span, call.job());
+            Ok::<_, Status>(call)
         };
-        let mut follower = accepted.instrument(span.clone()).await?;
-        let watch = follower.watch().await.map_err(status::from_engine)?;
+        let mut call = accepted.instrument(span.clone()).await?;
+        let watch = call.watch().await.map_err(status::from_engine)?;
         let watching = telemetry::metrics::watcher();
         let events = watch.into_stream().map(move |event| {
             let _ = &watching;
             match &event {
                 Ok(event) if matches!(event.body, EventBody::State { state, .. } if state.is_terminal()) => {
-                    follower.release();
+                    call.job_ended();
                 }
-                // Ours to answer for, not the caller's: the job lives on, for a caller that comes again with the same
-                // request id.
-                Err(_) => follower.release(),
+                Err(_) => call.failed(),
                 _ => {}
             }
             event.map(job::event_to_wire).map_err(status::from_engine)

@@ -56,7 +56,7 @@ pub struct Options {
     pub limits: Limits,
     /// Largest message that is taken.
     pub max_message_bytes: usize,
-    /// How long after a `Solve` was dropped its job is cancelled.
+    /// How long after every `Solve` that is attached to a job was disconnected the job is cancelled.
     pub solve_grace: Duration,
     /// `None`: connections are not encrypted.
     pub tls: Option<tls::Files>,

@@ -115,7 +115,8 @@ pub trait Store: Send + Sync + 'static {
     }
 
     /// The same for several jobs, all or none; the answers are in their order. A request id that comes twice with the
-    /// same body is one job.
+    /// same body is one job: with [`NewRecord::cancel_on_disconnect`] the call attaches to it, as far as it depends on
+    /// its calls ([`Job::attached_calls`]), and without it does not depend on any from then on.
     ///
     /// # Errors
     /// As [`Store::create_job`], of the first job that is refused.
@@ -198,6 +199,13 @@ pub trait Store: Send + Sync + 'static {
     /// # Errors
     /// [`Error::NotFound`], [`Error::EtagMismatch`].
     async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error>;
+
+    /// Counts that a call was disconnected that had attached to the job, unless it no longer depends on its calls or is
+    /// another one of the same name, which was not `created` then. Returns the job as it stands then.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error>;
 
     /// Removes an ended job with its events, attempts, input, result and request ids. With an `etag`, only where it is
     /// the job's.

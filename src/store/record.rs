@@ -23,6 +23,8 @@ pub struct NewRecord {
     pub labels: BTreeMap<String, String>,
     /// W3C `traceparent` of the call that created the job, so that its trace goes on after a restart.
     pub trace_parent: Option<String>,
+    /// Whether the job depends on the call that creates it; see [`crate::store::Store::create_jobs`].
+    pub cancel_on_disconnect: bool,
 }
 
 /// What a job works on.

@@ -105,6 +105,11 @@ impl<S: Store> Store for Timed<S> {
         self.0.request_cancel(name, etag, now).await
     }
 
+    async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error> {
+        let _timer = store_operation("detach");
+        self.0.detach(name, created).await
+    }
+
     async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
         let _timer = store_operation("delete_job");
         self.0.delete_job(name, etag).await

@@ -57,6 +57,7 @@ async fn an_input_that_cannot_be_read_fails_its_job() {
         priority: 0,
         labels: Default::default(),
         trace_parent: None,
+        cancel_on_disconnect: false,
     };
     let name = broken.name.clone();
     let room = &bench.engine.inner.options.queue;

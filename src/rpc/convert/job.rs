@@ -65,6 +65,8 @@ pub fn from_wire(job: proto::Job) -> Result<Job, InvalidInput> {
         summary: job.summary.as_ref().map(summary_from_wire).transpose()?,
         failure: job.error.map(failure_from_wire).transpose()?,
         cancel_requested: job.cancel_requested,
+        // Not told: only servers need it.
+        attached_calls: None,
         expire_time: optional_time(job.expire_time, "expire_time")?,
     })
 }
@@ -263,6 +265,7 @@ mod tests {
             summary: Some(summary()),
             failure: Some(Failure::new("INTERNAL", "a defect")),
             cancel_requested: true,
+            attached_calls: None,
             expire_time: Some(time(4)),
         };
         assert_eq!(from_wire(to_wire(&job)), Ok(job.clone()));

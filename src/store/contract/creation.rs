@@ -38,6 +38,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
         summary: None,
         failure: None,
         cancel_requested: false,
+        attached_calls: None,
         expire_time: None,
     };
     assert_eq!(created.job, expected);
@@ -212,4 +213,34 @@ pub(in crate::store) async fn a_batch_that_never_fits_is_told_so(store: &dyn Sto
     let batch = vec![known.clone(), fresh.clone(), fresh.clone(), known.clone(), fresh];
     let created = store.create_jobs(batch, &bounds, time(1)).await.expect("one more fits");
     assert_eq!(created.iter().filter(|created| created.new).count(), 1);
+}
+
+pub(in crate::store) async fn only_a_job_that_its_call_created_depends_on_calls(store: &dyn Store) {
+    let of = |id: &str, cancel_on_disconnect| {
+        let request = Some(Request { id: id.into(), digest: [1; 32] });
+        NewRecord { request, cancel_on_disconnect, ..record(id) }
+    };
+    let calls = |job: &Job| job.attached_calls.map(|calls| (calls.attached, calls.detached));
+    let detach = async |job: &Job| store.detach(&job.name, job.create_time).await.expect("exists");
+
+    let solved = create(store, of("solved", true), 0).await;
+    assert_eq!(calls(&solved), Some((1, 0)));
+    let again = create(store, of("solved", true), 1).await;
+    assert_eq!((&again.name, calls(&again)), (&solved.name, Some((2, 0))));
+    assert_ne!(again.etag(), solved.etag());
+    for expected in [(2, 1), (2, 2), (2, 2)] {
+        assert_eq!(calls(&detach(&solved).await), Some(expected), "no more go than have come");
+    }
+    assert_eq!(calls(&create(store, of("solved", true), 2).await), Some((3, 2)));
+    let stranger = store.detach(&solved.name, time(9)).await.expect("exists");
+    assert_eq!(calls(&stranger), Some((3, 2)), "of a job that was created at another time");
+    assert_eq!(calls(&create(store, of("solved", false), 3).await), None, "someone wants it without a call");
+    assert_eq!(calls(&create(store, of("solved", true), 4).await), None);
+
+    let created = create(store, of("created", false), 0).await;
+    assert_eq!(calls(&created), None);
+    assert_eq!(calls(&create(store, of("created", true), 1).await), None, "it was there before the call");
+    assert_eq!(calls(&detach(&created).await), None);
+    let nothing = store.detach(&record("none").name, time(0)).await;
+    assert_eq!(nothing, Err(Error::NotFound(record("none").name)));
 }

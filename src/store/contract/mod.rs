@@ -42,6 +42,7 @@ macro_rules! store_contract {
             creation::a_batch_is_stored_whole_or_not_at_all,
             creation::a_batch_knows_its_request_ids,
             creation::a_batch_that_never_fits_is_told_so,
+            creation::only_a_job_that_its_call_created_depends_on_calls,
             removal::an_ended_job_goes_with_all_that_it_had,
             removal::what_waits_or_runs_is_not_deleted,
             removal::an_etag_is_honoured_and_changes_with_the_job,
@@ -101,6 +102,7 @@ pub(super) fn record(job: &str) -> NewRecord {
         priority: 0,
         labels: BTreeMap::new(),
         trace_parent: None,
+        cancel_on_disconnect: false,
     }
 }
 

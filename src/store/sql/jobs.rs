@@ -45,7 +45,7 @@ pub(super) async fn create<C: Connection>(
                     let delete = Statement::new("DELETE FROM inputs WHERE id = $1 AND input IS NULL");
                     connection.execute(delete.bind(input)).await?;
                 }
-                created.push(Created { job, new: false });
+                created.push(Created { job: attach(connection, job, new.cancel_on_disconnect).await?, new: false });
             }
             None => {
                 let input = match input {
@@ -195,6 +195,38 @@ async fn earlier<C: Connection>(connection: &mut C, tenant: &str, request: &Requ
     connection.optional_row(select).await?.as_ref().map(rows::job).transpose()
 }
 
+/// What becomes of a job whose request came again: a call that is to cancel it on disconnect attaches, as far as the
+/// job depends on its calls at all; after any other one it depends on none.
+async fn attach<C: Connection>(connection: &mut C, job: Job, cancel_on_disconnect: bool) -> Result<Job, Error> {
+    if job.attached_calls.is_none() || job.state.is_terminal() {
+        return Ok(job);
+    }
+    let update = if cancel_on_disconnect {
+        returning_job!("UPDATE jobs SET attached_calls = attached_calls + 1 WHERE tenant = $1 AND job = $2")
+    } else {
+        returning_job!("UPDATE jobs SET attached_calls = NULL, detached_calls = 0 WHERE tenant = $1 AND job = $2")
+    };
+    let row = connection.row(Statement::new(update).bind(&job.name.tenant).bind(&job.name.job)).await?;
+    rows::job(&row)
+}
+
+/// One of the calls that a job depends on was disconnected; see [`crate::store::Store::detach`].
+pub(super) async fn detach<C: Connection>(
+    connection: &mut C,
+    name: &JobName,
+    created: SystemTime,
+) -> Result<Job, Error> {
+    let update = Statement::new(returning_job!(
+        "UPDATE jobs SET detached_calls = detached_calls + 1 \
+         WHERE tenant = $1 AND job = $2 AND create_time = $3 AND attached_calls > detached_calls"
+    ));
+    let update = update.bind(&name.tenant).bind(&name.job).bind(micros(created));
+    match connection.optional_row(update).await? {
+        Some(row) => rows::job(&row),
+        None => get(connection, name).await,
+    }
+}
+
 /// The row of a job's input: one that is stored now, or that of an uploaded one.
 async fn input_of<C: Connection>(connection: &mut C, new: &NewRecord, now: SystemTime) -> Result<i64, Error> {
     match &new.input {
@@ -235,8 +267,8 @@ pub(super) async fn insert_input<C: Connection>(
 fn insert_job(new: &NewRecord, input_id: i64, now: SystemTime) -> Result<Statement, Error> {
     let insert = Statement::new(returning_job!(
         "INSERT INTO jobs (tenant, job, state, priority, create_time, queue_time, deadline, input_id, input_bytes, \
-         view_count, track_count, observation_count, settings, labels, trace_parent, uploaded_input, \
-         last_sequence) VALUES ($1, $2, 'QUEUED', $3, $4, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, 1)"
+         view_count, track_count, observation_count, settings, labels, trace_parent, uploaded_input, attached_calls, \
+         last_sequence) VALUES ($1, $2, 'QUEUED', $3, $4, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, 1)"
     ));
     Ok(insert
         .bind(&new.name.tenant)
@@ -252,7 +284,8 @@ fn insert_job(new: &NewRecord, input_id: i64, now: SystemTime) -> Result<Stateme
         .bind(payload::encode(&new.settings)?)
         .bind(payload::encode(&new.labels)?)
         .bind(new.trace_parent.as_deref())
-        .bind(new.input.uploaded()))
+        .bind(new.input.uploaded())
+        .bind(new.cancel_on_disconnect.then_some(1_i64)))
 }
 
 /// One job by its name.

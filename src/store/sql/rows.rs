@@ -4,7 +4,7 @@ use std::time::{Duration, SystemTime};
 
 use super::{Change, Connection, Row, Statement};
 use crate::domain::InputName;
-use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, Summary};
+use crate::domain::job::{AttachedCalls, AttemptEnd, EventBody, Failure, Job, JobName, JobState, Summary};
 use crate::domain::progress::Progress;
 use crate::store::query::Cursor;
 use crate::store::record::Lease;
@@ -15,7 +15,7 @@ macro_rules! job_columns {
     () => {
         "id, tenant, job, state, attempt, settings, view_count, track_count, observation_count, labels, priority, \
          create_time, start_time, end_time, deadline, progress, last_sequence, summary, failure, cancel_requested, \
-         trace_parent, queue_time, uploaded_input"
+         trace_parent, queue_time, uploaded_input, attached_calls, detached_calls"
     };
 }
 pub(super) use job_columns;
@@ -84,6 +84,11 @@ fn name(row: &impl Row) -> Result<JobName, Error> {
     Ok(JobName { tenant: row.text("tenant")?, job: row.text("job")? })
 }
 
+fn attached_calls(row: &impl Row) -> Result<Option<AttachedCalls>, Error> {
+    let Some(_) = row.optional_integer("attached_calls")? else { return Ok(None) };
+    Ok(Some(AttachedCalls { attached: number(row, "attached_calls")?, detached: number(row, "detached_calls")? }))
+}
+
 /// A job from a row of `select_jobs!`.
 pub(super) fn job(row: &impl Row) -> Result<Job, Error> {
     let name = name(row)?;
@@ -108,6 +113,7 @@ pub(super) fn job(row: &impl Row) -> Result<Job, Error> {
         summary: optional_record(row, "summary")?,
         failure: optional_record(row, "failure")?,
         cancel_requested: row.flag("cancel_requested")?,
+        attached_calls: attached_calls(row)?,
         // Retention is the engine's; it says until when.
         expire_time: None,
     })

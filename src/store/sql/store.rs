@@ -162,6 +162,10 @@ impl<D: Database> Store for D {
         })
     }
 
+    async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error> {
+        writes!(self, Size::Small, Moves::Ends(0), [name], |connection| jobs::detach(connection, &name, created))
+    }
+
     async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
         let etag = etag.map(str::to_owned);
         writes!(self, Size::Payload, Moves::Ends(ANY_BYTES), [name, etag], |connection| {

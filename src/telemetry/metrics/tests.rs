@@ -60,6 +60,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
         summary: succeeded.then_some(summary),
         failure: (state == JobState::Failed).then(|| Failure::new("INTERNAL", "test")),
         cancel_requested: false,
+        attached_calls: None,
         expire_time: None,
     }
 }

@@ -1,13 +1,18 @@
 //! `CalibrationService.Solve`: one call from input to result.
 
+use std::sync::Arc;
 use std::time::Duration;
 
+use scpsfm::domain::job::Job;
+use scpsfm::engine::Engine;
 use scpsfm::rpc::convert;
-use scpsfm::rpc::follow::Followers;
+use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::{self, JobState, create_job_request::Input, job_event::Body, solve_request::Message};
-use scpsfm::rpc::server::Options;
+use scpsfm::rpc::server::{Options, Server};
+use scpsfm::store::postgres::{DatabaseUrl, Postgres};
 use tonic::Streaming;
 
+use crate::support::postgres;
 use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::{held, quick};
 use crate::support::wire::{all, create, create_tracks, matrix, raw, solve_request, state_of};
@@ -102,20 +107,77 @@ async fn two_calls_with_one_request_id_follow_one_job() {
 }
 
 #[tokio::test]
-async fn a_job_that_is_followed_again_within_the_grace_period_goes_on() {
-    const GRACE: Duration = Duration::from_millis(100);
+async fn only_a_job_that_solve_created_is_cancelled_by_a_disconnect() {
+    let (solver, hold) = held();
+    let options = Options { solve_grace: Duration::ZERO, ..Options::default() };
+    let server = TestServer::start_with(solver, options, one_worker()).await;
+    let request = |id: &str| proto::CreateJobRequest { request_id: id.into(), ..create_tracks() };
+    let (mut jobs, mut calibration) = (server.jobs().await, server.calibration().await);
+    // One that CreateJob made and two that Solve made, one of which CreateJob has answered with since.
+    let created = jobs.create_job(request("created")).await.expect("a job").into_inner().name;
+    let mut streams = Vec::new();
+    for id in ["created", "kept", "solved"] {
+        let messages = tokio_stream::once(solve_request(Message::Config(request(id))));
+        let mut stream = calibration.solve(messages).await.expect("a solve").into_inner();
+        let name = soon(stream.message()).await.expect("an event").expect("the first event").name;
+        streams.push((name, stream));
+    }
+    assert_eq!(jobs.create_job(request("kept")).await.expect("a job").into_inner().name, streams[1].0);
+    let names: Vec<String> = streams.into_iter().map(|(name, _)| name).collect();
+    assert_eq!(names[0], created);
+    // The disconnect of the last one is noticed last.
+    assert_eq!(states(&server, &names[2]).await.last(), Some(&JobState::Cancelled));
+    hold.let_go();
+    for name in &names[..2] {
+        assert_eq!(states(&server, name).await.last(), Some(&JobState::Succeeded), "{name}");
+    }
+}
+
+#[tokio::test]
+async fn two_calls_on_two_servers_of_one_database_are_attached_to_one_job() {
+    let Some(cluster) = postgres::shared("a Solve that comes back to another server") else { return };
+    let url: DatabaseUrl = cluster.database().await.parse().expect("an address");
     let (solver, _hold) = held();
-    let server = TestServer::start(solver).await;
-    let created = server.jobs().await.create_job(create_tracks()).await.expect("a job").into_inner();
-    let name = convert::names::job(&created.name).expect("a name");
-    let followers = Followers::new(server.engine.clone(), GRACE);
-    drop(followers.follow(name.clone()));
-    let follower = followers.follow(name.clone());
-    tokio::time::sleep(3 * GRACE).await;
-    let job = server.engine.job(&name).await.expect("a job");
+    let options = Options { solve_grace: Duration::ZERO, ..Options::default() };
+    let mut servers = Vec::new();
+    for _ in 0..2 {
+        let store = Arc::new(Postgres::open(&url).await.expect("a store"));
+        let engine = Engine::start(one_worker(), store, Arc::clone(&solver)).await.expect("an engine");
+        let server = Server::bind(options.clone(), engine.clone()).await.expect("a server");
+        servers.push((server, engine));
+    }
+    let attach = async |server: &Server| {
+        let url = format!("http://{}", server.address());
+        let mut client = CalibrationServiceClient::connect(url).await.expect("a connection");
+        let config = proto::CreateJobRequest { request_id: "again".into(), ..create_tracks() };
+        let messages = tokio_stream::once(solve_request(Message::Config(config)));
+        let mut stream = client.solve(messages).await.expect("a solve").into_inner();
+        let name = soon(stream.message()).await.expect("an event").expect("the first event").name;
+        (convert::names::job(&name).expect("a name"), stream)
+    };
+    let (name, first) = attach(&servers[0].0).await;
+    let (same, second) = attach(&servers[1].0).await;
+    assert_eq!(name, same);
+    let engine = &servers[1].1;
+    let until = async |holds: fn(&Job) -> bool| {
+        soon(async {
+            loop {
+                let job = engine.job(&name).await.expect("a job");
+                if holds(&job) {
+                    break job;
+                }
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        })
+        .await
+    };
+    drop(first);
+    let job = until(|job| job.attached_calls.is_some_and(|calls| calls.detached == 1)).await;
     assert!(!job.state.is_terminal() && !job.cancel_requested, "{job:?}");
-    drop(follower);
-    assert_eq!(states(&server, &created.name).await.last(), Some(&JobState::Cancelled));
+    drop(second);
+    let job = until(|job| job.state.is_terminal()).await;
+    assert_eq!(job.state, scpsfm::domain::job::JobState::Cancelled);
+    assert_eq!(job.attached_calls.map(|calls| (calls.attached, calls.detached)), Some((2, 2)));
 }
 
 #[tokio::test]
