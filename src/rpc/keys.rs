@@ -9,6 +9,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer};
 use sha2::{Digest as _, Sha256};
+use subtle::ConstantTimeEq;
 
 use crate::domain::job::JobName;
 
@@ -51,13 +52,28 @@ pub enum Error {
 }
 
 impl KeyRing {
-    /// Reads a file of keys.
+    /// Reads a file of keys, which may hold none.
     ///
     /// # Errors
     /// A sentence that names the file, and the entry by its number.
     pub fn read(path: &Path) -> Result<Self, String> {
         let text = std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
-        text.parse().map_err(|error| format!("{}: {error}", path.display()))
+        Self::parse(&text).map_err(|error| format!("{}: {error}", path.display()))
+    }
+
+    /// Entries on lines of their own or separated by commas; `#` begins a comment.
+    fn parse(text: &str) -> Result<Self, Error> {
+        let lines = text.lines().map(|line| line.split_once('#').map_or(line, |(entry, _)| entry));
+        let entries = lines.flat_map(|line| line.split(',')).map(str::trim).filter(|entry| !entry.is_empty());
+        let mut keys: Vec<(Digest, String)> = Vec::new();
+        for (k, entry) in entries.enumerate() {
+            let parsed = parse(entry).map_err(|problem| Error::Entry { entry: k + 1, problem })?;
+            if let Some(first) = keys.iter().position(|(known, _)| *known == parsed.0) {
+                return Err(Error::Repeated { first: first + 1, second: k + 1 });
+            }
+            keys.push(parsed);
+        }
+        Ok(Self { keys })
     }
 
     /// The keys of both.
@@ -76,9 +92,7 @@ impl KeyRing {
     pub fn tenant_of_hash(&self, key: &Hash) -> Option<&str> {
         let mut found = None;
         for (known, tenant) in &self.keys {
-            let difference = known.iter().zip(&key.0).fold(0, |sum, (a, b)| sum | (a ^ b));
-            // Opaque to the optimiser, which might otherwise end the comparison early.
-            if std::hint::black_box(difference) == 0 {
+            if bool::from(known.ct_eq(&key.0)) {
                 found = Some(tenant.as_str());
             }
         }
@@ -102,19 +116,10 @@ fn digest(bytes: &[u8]) -> Digest {
 impl FromStr for KeyRing {
     type Err = Error;
 
-    /// Entries on lines of their own or separated by commas; `#` begins a comment.
+    /// The keys of a configuration, of which there is one at least: see [`KeyRing::parse`] for their form.
     fn from_str(text: &str) -> Result<Self, Error> {
-        let lines = text.lines().map(|line| line.split_once('#').map_or(line, |(entry, _)| entry));
-        let entries = lines.flat_map(|line| line.split(',')).map(str::trim).filter(|entry| !entry.is_empty());
-        let mut keys: Vec<(Digest, String)> = Vec::new();
-        for (k, entry) in entries.enumerate() {
-            let parsed = parse(entry).map_err(|problem| Error::Entry { entry: k + 1, problem })?;
-            if let Some(first) = keys.iter().position(|(known, _)| *known == parsed.0) {
-                return Err(Error::Repeated { first: first + 1, second: k + 1 });
-            }
-            keys.push(parsed);
-        }
-        if keys.is_empty() { Err(Error::Empty) } else { Ok(Self { keys }) }
+        let ring = Self::parse(text)?;
+        if ring.is_empty() { Err(Error::Empty) } else { Ok(ring) }
     }
 }
 
@@ -184,7 +189,7 @@ impl Sources {
         self.file.is_some() || self.fixed.is_some()
     }
 
-    /// Every key there is now.
+    /// Every key there is now: none where the file lost its last one, which locks everyone out.
     ///
     /// # Errors
     /// See [`KeyRing::read`]; a key that the two give to different tenants.
@@ -196,6 +201,17 @@ impl Sources {
         match ring.keys.iter().any(disputed) {
             true => Err("auth.keys and auth.keys_file give one key to two tenants".into()),
             false => Ok(ring.with(fixed)),
+        }
+    }
+
+    /// The keys of a server that starts: without any it is not what its configuration means.
+    ///
+    /// # Errors
+    /// See [`Sources::load`]; no key at all.
+    pub fn load_some(&self) -> Result<KeyRing, String> {
+        match (self.load()?, &self.file) {
+            (ring, Some(path)) if ring.is_empty() => Err(format!("{}: {}", path.display(), Error::Empty)),
+            (ring, _) => Ok(ring),
         }
     }
 }
@@ -235,6 +251,13 @@ mod tests {
         assert_eq!((both.tenant_of(A), both.tenant_of(B)), (Some("north"), Some("south")));
         let error = load(&format!("south:{A}")).expect_err("disputed");
         assert!(error.contains("two tenants") && !error.contains(A), "{error}");
+        // A file without keys adds none, and is no beginning where there is nothing else.
+        std::fs::write(&path, "# none\n").expect("written");
+        assert_eq!(load(&format!("south:{B}")).expect("one key").tenant_of(B), Some("south"));
+        let alone = Sources { file: Some(path.clone()), fixed: None };
+        assert!(alone.load().expect("no key").is_empty());
+        let error = alone.load_some().expect_err("no key");
+        assert!(error.contains("keys.txt") && error.contains("no key"), "{error}");
     }
 
     #[test]

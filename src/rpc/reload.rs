@@ -7,6 +7,8 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 use tokio::sync::watch;
 
+use crate::telemetry::metrics::{Reloaded, reload_failed};
+
 /// Between two looks at the files. A change counts once two looks found the same, so that what is half written is not
 /// taken: it is in force two to four seconds after its last byte.
 pub const LOOK_EVERY: Duration = Duration::from_secs(2);
@@ -23,14 +25,13 @@ fn fingerprint(files: &[PathBuf]) -> Fingerprint {
 }
 
 /// Loads what the files hold, and again whenever they change, as long as anyone holds what is returned. What cannot be
-/// loaded changes nothing and is logged.
+/// loaded changes nothing, is logged and stands in the metrics until it can.
 ///
-/// * `what`: for log lines, such as "certificates"
 /// * `load`: its error is a sentence that may be shown
 ///
 /// # Errors
 /// When the files cannot be loaded now.
-pub async fn keep<T, L>(what: &'static str, files: Vec<PathBuf>, every: Duration, load: L) -> Result<Current<T>, String>
+pub async fn keep<T, L>(what: Reloaded, files: Vec<PathBuf>, every: Duration, load: L) -> Result<Current<T>, String>
 where
     T: Send + Sync + 'static,
     L: Fn() -> Result<T, String> + Clone + Send + Sync + 'static,
@@ -46,7 +47,7 @@ where
 }
 
 async fn follow<T, L>(
-    what: &'static str,
+    what: Reloaded,
     files: Vec<PathBuf>,
     every: Duration,
     load: L,
@@ -73,9 +74,13 @@ async fn follow<T, L>(
         match off_thread(load).await.and_then(|loaded| loaded) {
             Ok(value) => {
                 current.send_replace(Arc::new(value));
+                reload_failed(what, false);
                 tracing::info!("the {what} changed and are in force");
             }
-            Err(error) => tracing::error!(error, "the {what} changed and cannot be used; the old ones stay in force"),
+            Err(error) => {
+                reload_failed(what, true);
+                tracing::error!(error, "the {what} changed and cannot be used; the old ones stay in force");
+            }
         }
         loaded.clone_from(&seen);
     }
@@ -102,7 +107,7 @@ mod tests {
             text.parse::<u32>().map_err(|error| error.to_string())
         };
         let every = Duration::from_millis(5);
-        let mut current = keep("numbers", vec![path.clone()], every, load.clone()).await.expect("a number");
+        let mut current = keep(Reloaded::Keys, vec![path.clone()], every, load.clone()).await.expect("a number");
         assert_eq!(**current.borrow_and_update(), 1);
         for (text, number) in [("2", 2), ("3", 3)] {
             // In between what is none, and no file at all: neither is ever in force.
@@ -115,6 +120,6 @@ mod tests {
             assert_eq!(**current.borrow_and_update(), number);
         }
         write("none");
-        assert!(keep("numbers", vec![path], every, load).await.is_err());
+        assert!(keep(Reloaded::Keys, vec![path], every, load).await.is_err());
     }
 }

@@ -30,6 +30,7 @@ use super::reload::{self, Current};
 use super::{door, tls};
 use crate::domain::Limits;
 use crate::engine::{Engine, StoreState};
+use crate::telemetry::metrics::{Reloaded, locked_out};
 
 /// Services whose health is told one by one; the empty name is the server's own.
 const HEALTH_NAMES: [&str; 4] = ["", "scpsfm.v1.CalibrationService", "scpsfm.v1.JobService", "scpsfm.v1.InputService"];
@@ -101,7 +102,7 @@ impl Options {
     /// [`Error::Certificates`], [`Error::Keys`].
     pub fn check_access(&self) -> Result<(), Error> {
         self.tls.iter().try_for_each(|files| files.load().map(drop)).map_err(Error::Certificates)?;
-        self.keys.load().map(drop).map_err(Error::Keys)
+        self.keys.load_some().map(drop).map_err(Error::Keys)
     }
 }
 
@@ -278,7 +279,7 @@ async fn certificates(options: &Options) -> Result<Option<Current<ServerConfig>>
     let Some(files) = options.tls.clone() else { return Ok(None) };
     let load = move || files.load();
     let paths = options.tls.iter().flat_map(tls::Files::paths).collect();
-    let kept = reload::keep("certificates", paths, options.look_every, load).await;
+    let kept = reload::keep(Reloaded::Certificates, paths, options.look_every, load).await;
     kept.map(Some).map_err(Error::Certificates)
 }
 
@@ -288,8 +289,17 @@ async fn keys(options: &Options) -> Result<Option<Current<KeyRing>>, Error> {
     if !sources.is_on() {
         return Ok(None);
     }
+    sources.load_some().map_err(Error::Keys)?;
     let paths = sources.file.iter().cloned().collect();
-    let kept = reload::keep("API keys", paths, options.look_every, move || sources.load()).await;
+    let load = move || {
+        let ring = sources.load()?;
+        locked_out(ring.is_empty());
+        if ring.is_empty() {
+            tracing::error!("the last API key is gone: every call is refused until auth.keys_file has a key again");
+        }
+        Ok(ring)
+    };
+    let kept = reload::keep(Reloaded::Keys, paths, options.look_every, load).await;
     kept.map(Some).map_err(Error::Keys)
 }
 

@@ -1,4 +1,4 @@
-//! The only code that incident_blocks the metrics of the [`catalogue`].
+//! The only code that changes the metrics of the [`catalogue`].
 //!
 //! The rest of the program says what happened through the typed functions below. Before [`install`] (and in a
 //! command that has no scrape port) they do nothing.
@@ -18,7 +18,7 @@ use crate::domain::{Grade, Proposal, Stage};
 
 pub use catalogue::*;
 pub use guards::{Held, RpcCall, StoreTimer};
-pub use labels::{AttemptLost, Deletion, GivenUp, Refusal, UploadRefusal};
+pub use labels::{AttemptLost, Deletion, GivenUp, Refusal, Reloaded, UploadRefusal};
 use labels::{NONE, grade_name};
 
 /// Installs the process-wide recorder, once; later calls return the same handle.
@@ -108,6 +108,9 @@ fn create_known_series() {
     }
     for refusal in UploadRefusal::ALL {
         counter!(UPLOAD_REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
+    }
+    for files in Reloaded::ALL {
+        gauge!(RELOAD_FAILED.name, "files" => files.name()).set(0.0);
     }
     for reason in AttemptLost::ALL {
         counter!(ATTEMPTS_LOST.name, "reason" => reason.name()).absolute(0);
@@ -234,6 +237,16 @@ pub fn connection_refused() {
 /// A connection was closed because nobody who may call had called over it in time.
 pub fn stranger_closed() {
     counter!(STRANGERS_CLOSED.name).increment(1);
+}
+
+/// Tells whether files that changed cannot be used.
+pub fn reload_failed(files: Reloaded, failed: bool) {
+    gauge!(RELOAD_FAILED.name, "files" => files.name()).set(f64::from(u8::from(failed)));
+}
+
+/// Tells whether calls need a key and there is none.
+pub fn locked_out(locked_out: bool) {
+    gauge!(LOCKED_OUT.name).set(f64::from(u8::from(locked_out)));
 }
 
 /// Method label of a call to something that this server does not offer.

@@ -225,7 +225,6 @@ pub const CONNECTIONS_REFUSED: Metric = Metric {
     labels: &[],
     help: "Connections refused because as many speak as may.",
 };
-
 pub const STRANGERS_CLOSED: Metric = Metric {
     name: "scpsfm_strangers_closed_total",
     kind: Kind::Counter,
@@ -233,8 +232,21 @@ pub const STRANGERS_CLOSED: Metric = Metric {
     help: "Connections closed because nobody who may call had called over them in time.",
 };
 
+pub const RELOAD_FAILED: Metric = Metric {
+    name: "scpsfm_reload_failed",
+    kind: Kind::Gauge,
+    labels: &["files"],
+    help: "1 while changed files of certificates or keys cannot be used and the old ones stay in force.",
+};
+pub const LOCKED_OUT: Metric = Metric {
+    name: "scpsfm_locked_out",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "1 while calls need an API key and there is none: every call is refused.",
+};
+
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 33] = [
+pub const ALL: [Metric; 35] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -268,4 +280,6 @@ pub const ALL: [Metric; 33] = [
     CONNECTIONS,
     CONNECTIONS_REFUSED,
     STRANGERS_CLOSED,
+    RELOAD_FAILED,
+    LOCKED_OUT,
 ];

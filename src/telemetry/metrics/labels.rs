@@ -97,6 +97,35 @@ impl Deletion {
     }
 }
 
+/// Files that are read again when they change.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reloaded {
+    /// The server's certificate, its key and the authorities of its clients.
+    Certificates,
+    /// The API keys.
+    Keys,
+}
+
+impl Reloaded {
+    pub(super) const ALL: [Reloaded; 2] = [Reloaded::Certificates, Reloaded::Keys];
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Reloaded::Certificates => "CERTIFICATES",
+            Reloaded::Keys => "KEYS",
+        }
+    }
+}
+
+impl std::fmt::Display for Reloaded {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Reloaded::Certificates => "certificates",
+            Reloaded::Keys => "API keys",
+        })
+    }
+}
+
 /// Why an upload was given up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GivenUp {

@@ -3,16 +3,20 @@
 use std::fs::File;
 use std::path::Path;
 use std::process::Stdio;
+use std::time::Duration;
 
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState};
 use sha2::{Digest, Sha256};
 use tempfile::TempDir;
+use tonic::Code;
 use tonic::transport::{Certificate, ClientTlsConfig, Endpoint};
 
 use crate::support::certificates::{Authority, written};
 use crate::support::keys::{NORTH, SOUTH, keyed};
 use crate::support::program::{Run, Serving, program, run};
+use crate::support::scrape::Page;
+use crate::support::server::soon;
 use crate::support::wire::create_tracks;
 
 /// A key that no server knows.
@@ -36,6 +40,69 @@ fn an_open_address_is_refused_and_the_error_says_what_to_do() {
         }
         assert_eq!(run.stdout, "");
     }
+}
+
+/// Asks a server as that tenant until it answers so.
+async fn until_answered(server: &Serving, key: &'static str, parent: &str, expected: Code) {
+    let channel = Endpoint::from_shared(server.grpc.clone()).expect("a URL").connect().await.expect("a connection");
+    let mut jobs = JobServiceClient::new(keyed(&channel, key));
+    let asking = async {
+        let list = || proto::ListJobsRequest { parent: parent.into(), ..Default::default() };
+        while jobs.list_jobs(list()).await.map_or_else(|status| status.code(), |_| Code::Ok) != expected {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    soon(asking).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_file_without_keys_locks_everyone_out_and_one_that_cannot_be_read_changes_nothing() {
+    let directory = TempDir::new().expect("a temporary directory");
+    let at = directory.path();
+    let write = |content: &str| written(at, "keys.txt", content);
+    let keys = write("# none yet\n");
+    let (data, flags) = (at.join("data"), ["--keys-file", text(&keys)]);
+    let serve = ["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--data-dir", text(&data)];
+    let refused = run(serve.into_iter().chain(flags));
+    assert!(refused.code == Some(64) && refused.stderr.contains("there is no key in it"), "{refused:?}");
+
+    write(&format!("north:{NORTH}\n"));
+    let log = at.join("log");
+    let server = Serving::start_more(&data, &flags, &[], File::create(&log).expect("a log"));
+    let page = || tokio::task::block_in_place(|| Page::parse(&server.page("/metrics")));
+    let until_page = async |series: &str, expected: f64| {
+        let asking = async {
+            while page().value(series) != expected {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        };
+        soon(asking).await;
+    };
+    let (locked_out, failed) = ("scpsfm_locked_out", "scpsfm_reload_failed{files=\"KEYS\"}");
+    until_answered(&server, NORTH, "tenants/north", Code::Ok).await;
+    assert_eq!((page().value(locked_out), page().value(failed)), (0.0, 0.0));
+
+    for without in ["", "# the last one is gone\n"] {
+        write(without);
+        until_answered(&server, NORTH, "tenants/north", Code::Unauthenticated).await;
+        assert_eq!((page().value(locked_out), page().value(failed)), (1.0, 0.0));
+        write(&format!("south:{SOUTH}\nnorth:{NORTH}\n"));
+        until_answered(&server, SOUTH, "tenants/south", Code::Ok).await;
+        assert_eq!(page().value(locked_out), 0.0);
+    }
+    let logged = std::fs::read_to_string(&log).expect("a log");
+    let errors = logged.lines().filter(|line| line.contains("ERROR") && line.contains("the last API key is gone"));
+    assert_eq!(errors.count(), 2, "{logged}");
+
+    std::fs::remove_file(&keys).expect("removed");
+    until_page(failed, 1.0).await;
+    until_answered(&server, NORTH, "tenants/north", Code::Ok).await;
+    assert_eq!(page().value(locked_out), 0.0);
+    let logged = std::fs::read_to_string(&log).expect("a log");
+    assert!(logged.lines().any(|line| line.contains("ERROR") && line.contains("cannot be used")), "{logged}");
+    write(&format!("north:{NORTH}\n"));
+    until_page(failed, 0.0).await;
+    until_answered(&server, SOUTH, "tenants/south", Code::Unauthenticated).await;
 }
 
 /// Runs a command with these variables.
