@@ -4,6 +4,7 @@
 //! for some, in a flag. An unknown key is an error: a misspelt limit must not silently be no limit.
 
 mod exposure;
+mod file;
 mod retention;
 mod sections;
 
@@ -100,7 +101,7 @@ impl Config {
     ) -> Result<Self, Error> {
         let mut sources = config::Config::builder();
         if let Some(path) = file {
-            sources = sources.add_source(config::File::from(path).format(config::FileFormat::Toml));
+            sources = sources.add_source(file::TomlFile::new(path));
         }
         sources = sources.add_source(
             config::Environment::with_prefix(PREFIX.trim_end_matches('_'))

@@ -146,6 +146,24 @@ fn errors_name_the_key_and_what_would_be_right() {
 }
 
 #[test]
+fn errors_show_a_files_path_as_it_was_given() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    // Nobody who rewrites a path keeps this form of it.
+    let path = directory.path().join("./scpsfm.toml");
+    let shown = path.display().to_string();
+    let errors =
+        [("[store]\nurl = \"", "line 2"), ("[engine]\nworkers = \"many\"\n", "engine.workers"), ("", "cannot read")];
+    for (text, part) in errors {
+        match text {
+            "" => std::fs::remove_file(&path).expect("removed"),
+            text => std::fs::write(&path, text).expect("written"),
+        }
+        let error = Config::from_sources(Some(&path), vec![], &[]).expect_err(part).to_string();
+        assert!(error.contains(part) && error.contains(&shown), "{shown} is not in {error}");
+    }
+}
+
+#[test]
 fn bounds_are_refused_by_key_and_what_is_within_them_is_taken() {
     let given = |name: &str, value: &str| Config::from_sources(None, variables(&[(name, value)]), &[]);
     for (name, key) in
