@@ -179,6 +179,7 @@ fn server_options(config: &Config) -> server::Options {
         listen: config.server.listen,
         limits: config.limits.clone(),
         max_message_bytes: config.server.max_message_bytes,
+        max_inflight_bytes: config.server.max_inflight_bytes,
         max_connections: config.server.max_connections,
         first_call_timeout: match config.server.first_call_seconds {
             0 => None,
@@ -216,7 +217,7 @@ mod tests {
         let of = |options: server::Options| {
             let keys = options.keys.is_on();
             let connections = (options.max_connections, options.first_call_timeout);
-            let bounds = (options.limits, options.max_message_bytes, connections);
+            let bounds = (options.limits, options.max_message_bytes, options.max_inflight_bytes, connections);
             (bounds, options.solve_grace, options.tls, keys, options.reflection)
         };
         assert_eq!(of(server_options(&config)), of(server::Options::default()));

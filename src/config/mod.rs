@@ -151,6 +151,13 @@ impl Config {
                 right: "a number from 1049600 on (a chunk of an upload)",
             });
         }
+        if self.server.max_inflight_bytes < self.server.max_message_bytes as u64 {
+            return Err(Error::Value {
+                key: "server.max_inflight_bytes",
+                found: self.server.max_inflight_bytes.to_string(),
+                right: "a number from server.max_message_bytes on",
+            });
+        }
         at_least_one("server.max_connections", self.server.max_connections as u64)?;
         at_least_one("engine.queue_capacity", self.engine.queue_capacity as u64)?;
         at_least_one("engine.queue_bytes", self.engine.queue_bytes)?;

@@ -23,6 +23,10 @@ pub struct Server {
     pub listen: SocketAddr,
     /// Largest message taken; at least [`Server::LEAST_MESSAGE_BYTES`].
     pub max_message_bytes: usize,
+    /// Bytes that calls hold together at most, messages and inputs on their way in and results on their way out; a call
+    /// that would hold more is refused. At least [`Server::max_message_bytes`]; a call that needs more than all of it
+    /// is served while no other holds any.
+    pub max_inflight_bytes: u64,
     /// Connections that speak at once; one more is refused. Those that say nothing yet are bounded apart.
     pub max_connections: usize,
     /// Seconds that a connection may take to its first call with a key, or to its first call where none is asked for;
@@ -50,6 +54,7 @@ impl Default for Server {
             // Loopback: whoever opens the service to a network should have meant to. 50051 is gRPC's customary port.
             listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 50051),
             max_message_bytes: rpc::server::Options::MAX_MESSAGE_BYTES,
+            max_inflight_bytes: rpc::server::Options::MAX_INFLIGHT_BYTES,
             max_connections: rpc::server::Options::MAX_CONNECTIONS,
             first_call_seconds: rpc::server::Options::FIRST_CALL_TIMEOUT.as_secs(),
             reflection: true,

@@ -179,6 +179,9 @@ fn bounds_are_refused_by_key_and_what_is_within_them_is_taken() {
         assert!(error.contains("server.max_message_bytes") && error.contains(&least.to_string()), "{error}");
     }
     assert!(given("SCPSFM_SERVER__MAX_MESSAGE_BYTES", &least.to_string()).is_ok());
+    let error = given("SCPSFM_SERVER__MAX_INFLIGHT_BYTES", "67108863").expect_err("less than a message").to_string();
+    assert!(error.contains("server.max_inflight_bytes") && error.contains("server.max_message_bytes"), "{error}");
+    assert!(given("SCPSFM_SERVER__MAX_INFLIGHT_BYTES", "67108864").is_ok());
 }
 
 #[test]

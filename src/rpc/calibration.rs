@@ -11,6 +11,7 @@ use super::caller::Caller;
 use super::convert::enums::Twin;
 use super::convert::{job, settings};
 use super::disconnect::{AttachedCall, DisconnectTracker};
+use super::inflight::Permit;
 use super::inputs::MAX_CHUNK_BYTES;
 use super::jobs::MAX_BATCH;
 use super::submission::Submission;
@@ -51,6 +52,7 @@ impl Calibration {
     async fn receive(
         &self,
         caller: &Caller,
+        permit: &Permit,
         mut messages: Streaming<proto::SolveRequest>,
     ) -> Result<Submission, Status> {
         let Some(proto::SolveRequest { message: Some(proto::solve_request::Message::Config(config)) }) =
@@ -58,20 +60,24 @@ impl Calibration {
         else {
             return Err(status::invalid(&super::violation("config", "is not the first message")));
         };
-        let mut submission = Submission::open(caller, config, &self.limits)?;
+        permit.next_message();
+        let mut submission = Submission::open(caller, config, &self.limits, permit)?;
         while let Some(message) = next(&mut messages).await? {
             submission.append(message)?;
         }
         Ok(submission)
     }
 
-    /// Stores the job and attaches to it.
-    async fn submit(&self, new: engine::NewJob) -> Result<AttachedCall, Status> {
+    /// Stores the job and attaches to it; the permit is held until then.
+    async fn submit(&self, new: engine::NewJob, permit: Permit) -> Result<AttachedCall, Status> {
         let (engine, disconnects) = (self.engine.clone(), self.disconnects.clone());
         let new = engine::NewJob { cancel_on_disconnect: true, ..new };
         // In a task of its own: if this call is dropped while the job is being stored, it attaches all the same, and
         // detaches when the task's outcome is dropped.
-        let stored = async move { engine.submit(new).await.map(|job| disconnects.attached(job)) };
+        let stored = async move {
+            let _permit = permit;
+            engine.submit(new).await.map(|job| disconnects.attached(job))
+        };
         let outcome = tokio::spawn(stored.in_current_span()).await;
         outcome.map_err(|error| status::internal(&error))?.map_err(status::from_engine)
     }
@@ -116,10 +122,11 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
         let caller = Caller::of(&request)?;
         let span = telemetry::tracing::submit_span("Solve", caller.trace_parent());
         let accepted = async {
-            let submission = self.receive(&caller, request.into_inner()).await?;
+            let permit = Permit::of(&request)?;
+            let submission = self.receive(&caller, &permit, request.into_inner()).await?;
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let new = submission.close(trace_parent).await?;
-            let call = self.submit(new).await?;
+            let call = self.submit(new, permit).await?;
             telemetry::tracing::record_job(&span, call.job());
             Ok::<_, Status>(call)
         };

@@ -9,6 +9,7 @@ use tracing::Instrument;
 
 use super::caller::Caller;
 use super::convert::{self, input};
+use super::inflight::{Permit, WORKING_COPIES};
 use super::parts::{self, Parts};
 use super::{proto, status, violation};
 use crate::domain::{InputName, Limits};
@@ -27,8 +28,11 @@ const WRITE_BYTES: usize = MAX_CHUNK_BYTES;
 /// How long a stream may be silent, as in `Solve`.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Uploads that are decoded at a time: each takes as much memory as the largest input.
+/// Uploads that are decoded at a time, so that others are not kept waiting for the processor; more wait for their turn.
 const DECODED_AT_ONCE: usize = 2;
+
+/// What an upload holds while it comes in: what is gathered, a chunk on top, and what is being stored.
+const RECEPTION_BYTES: u64 = (2 * WRITE_BYTES + MAX_CHUNK_BYTES) as u64;
 
 /// The service.
 #[derive(Debug, Clone)]
@@ -47,23 +51,25 @@ impl Inputs {
     async fn receive(
         &self,
         caller: &Caller,
+        permit: &Permit,
         mut messages: Streaming<proto::UploadInputRequest>,
     ) -> Result<proto::Input, Status> {
-        let Some(Message::Start(start)) = next(&mut messages).await? else {
+        let Some(Message::Start(start)) = next(&mut messages, permit).await? else {
             return Err(status::invalid(&violation("start", "is not the first message")));
         };
         let new = Self::read_start(caller, start)?;
+        permit.hold(RECEPTION_BYTES)?;
         let upload = match self.engine.begin_upload(new).await.map_err(status::from_engine)? {
             Begun::Finished(input) => return Ok(input::uploaded_to_wire(&input)),
             Begun::Open(upload) => upload,
         };
         let mut reception = Reception { upload, gathered: Vec::new() };
-        let finish = reception.until_finish(&mut messages).await;
+        let finish = reception.until_finish(&mut messages, permit).await;
         // Whatever ended the stream: what came before is kept.
         let kept = reception.store().await;
         let sha256 = finish?;
         kept?;
-        self.finish(reception.upload, sha256).await
+        self.finish(reception.upload, sha256, permit).await
     }
 
     fn read_start(caller: &Caller, start: proto::UploadStart) -> Result<NewUpload, Status> {
@@ -83,8 +89,10 @@ impl Inputs {
     }
 
     /// Makes an input of the bytes that are stored, if they are one.
-    async fn finish(&self, upload: Upload, sha256: [u8; 32]) -> Result<proto::Input, Status> {
+    async fn finish(&self, upload: Upload, sha256: [u8; 32], permit: &Permit) -> Result<proto::Input, Status> {
         let _turn = self.decoders.acquire().await.map_err(|error| status::internal(&error))?;
+        let largest = self.limits.max_observations as u64 * input::OBSERVATION_BYTES;
+        permit.hold(WORKING_COPIES * upload.bytes().min(largest))?;
         let length = usize::try_from(upload.bytes()).map_err(|error| status::internal(&error))?;
         let (sender, reader) = Parts::new(length);
         let limits = self.limits.clone();
@@ -123,9 +131,13 @@ struct Reception {
 
 impl Reception {
     /// Takes chunks until the last message; returns the SHA-256 that it names.
-    async fn until_finish(&mut self, messages: &mut Streaming<proto::UploadInputRequest>) -> Result<[u8; 32], Status> {
+    async fn until_finish(
+        &mut self,
+        messages: &mut Streaming<proto::UploadInputRequest>,
+        permit: &Permit,
+    ) -> Result<[u8; 32], Status> {
         loop {
-            match next(messages).await? {
+            match next(messages, permit).await? {
                 Some(Message::Chunk(chunk)) => self.take(chunk).await?,
                 Some(Message::Finish(finish)) => return self.check_finish(&finish),
                 Some(Message::Start(_)) => {
@@ -197,11 +209,12 @@ impl Reception {
     }
 }
 
-async fn next(messages: &mut Streaming<proto::UploadInputRequest>) -> Result<Option<Message>, Status> {
+async fn next(messages: &mut Streaming<proto::UploadInputRequest>, permit: &Permit) -> Result<Option<Message>, Status> {
     let message = match tokio::time::timeout(PATIENCE, messages.message()).await {
         Ok(message) => message?,
         Err(_) => return Err(status::input_stalled(PATIENCE)),
     };
+    permit.next_message();
     match message {
         None => Ok(None),
         Some(proto::UploadInputRequest { message: Some(message) }) => Ok(Some(message)),
@@ -233,9 +246,10 @@ impl proto::input_service_server::InputService for Inputs {
         request: Request<Streaming<proto::UploadInputRequest>>,
     ) -> Result<Response<proto::Input>, Status> {
         let caller = Caller::of(&request)?;
+        let permit = Permit::of(&request)?;
         let (inputs, messages) = (self.clone(), request.into_inner());
         // In a task of its own: if this call is dropped with its connection, what has come is stored all the same.
-        let receiving = async move { inputs.receive(&caller, messages).await };
+        let receiving = async move { inputs.receive(&caller, &permit, messages).await };
         let outcome = tokio::spawn(receiving.in_current_span()).await;
         outcome.map_err(|error| status::internal(&error))?.map(Response::new)
     }

@@ -10,9 +10,11 @@ use tracing::Instrument;
 
 use super::caller::Caller;
 use super::convert::{job, list, result};
-use super::submission::Submission;
+use super::inflight::{Permit, WORKING_COPIES};
+use super::submission::{self, Submission};
 use super::{proto, status};
 use crate::domain::Limits;
+use crate::domain::job::JobName;
 use crate::engine::{Engine, NewJob};
 use crate::telemetry;
 
@@ -42,6 +44,7 @@ impl Jobs {
         parent: &str,
         requests: Vec<proto::CreateJobRequest>,
         trace_parent: Option<String>,
+        permit: &Permit,
     ) -> Result<Vec<NewJob>, Status> {
         caller.parent(parent)?;
         if requests.is_empty() || requests.len() > MAX_BATCH {
@@ -58,11 +61,31 @@ impl Jobs {
                     let text = format!("is neither left out nor the batch's {parent}");
                     return Err(status::invalid(&super::violation("parent", text)));
                 }
-                Submission::open(caller, request, &self.limits)?.close(trace_parent.clone()).await
+                Submission::open(caller, request, &self.limits, permit)?.close(trace_parent.clone()).await
             };
             news.push(read.await.map_err(|found| status::of_request(index, &found))?);
         }
         Ok(news)
+    }
+}
+
+impl Jobs {
+    /// The encoded result of a job, charged to the permit.
+    async fn read_result(&self, name: JobName, permit: Permit) -> Result<Bytes, Status> {
+        let engine = self.engine.clone();
+        // In a task of its own: what is read and encoded is held to its end, also when the call is dropped.
+        let reading = async move {
+            let summary = engine.job(&name).await.map_err(status::from_engine)?.summary;
+            let stored_bytes = summary.map_or(0, |summary| summary.result_bytes);
+            permit.hold(WORKING_COPIES.saturating_mul(stored_bytes))?;
+            let solution = engine.result(&name).await.map_err(status::from_engine)?;
+            let encode = move || Bytes::from(result::to_wire(&name, &solution).encode_to_vec());
+            let encoded = super::blocking(encode).await?;
+            permit.hold(encoded.len() as u64)?;
+            Ok::<_, Status>(encoded)
+        };
+        let read = tokio::spawn(reading.in_current_span()).await;
+        read.map_err(|error| status::internal(&error))?
     }
 }
 
@@ -74,10 +97,12 @@ impl proto::job_service_server::JobService for Jobs {
         let caller = Caller::of(&request)?;
         let span = telemetry::tracing::submit_span("CreateJob", caller.trace_parent());
         let created = async {
-            let submission = Submission::open(&caller, request.into_inner(), &self.limits)?;
+            let permit = Permit::of(&request)?;
+            let submission = Submission::open(&caller, request.into_inner(), &self.limits, &permit)?;
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let new = submission.close(trace_parent).await?;
-            let created = self.engine.submit(new).await.map_err(status::from_engine)?;
+            let stored = submission::store(&self.engine, vec![new], permit).await?.pop();
+            let created = stored.ok_or_else(|| status::internal(&"one job was to be stored, none was"))?;
             telemetry::tracing::record_job(&span, &created.name);
             Ok(Response::new(job::to_wire(&created)))
         };
@@ -91,10 +116,11 @@ impl proto::job_service_server::JobService for Jobs {
         let caller = Caller::of(&request)?;
         let span = telemetry::tracing::submit_span("BatchCreateJobs", caller.trace_parent());
         let created = async {
+            let permit = Permit::of(&request)?;
             let proto::BatchCreateJobsRequest { parent, requests } = request.into_inner();
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
-            let news = self.read_batch(&caller, &parent, requests, trace_parent).await?;
-            let created = self.engine.submit_batch(news).await.map_err(status::from_engine)?;
+            let news = self.read_batch(&caller, &parent, requests, trace_parent, &permit).await?;
+            let created = submission::store(&self.engine, news, permit).await?;
             Ok(Response::new(proto::BatchCreateJobsResponse { jobs: created.iter().map(job::to_wire).collect() }))
         };
         created.instrument(span.clone()).await
@@ -162,14 +188,17 @@ impl proto::job_service_server::JobService for Jobs {
     ) -> Result<Response<Self::ReadJobResultStream>, Status> {
         let name = Caller::of(&request)?.job(&request.get_ref().name)?;
         let offset = request.get_ref().offset;
-        let solution = self.engine.result(&name).await.map_err(status::from_engine)?;
-        let encode = move || Bytes::from(result::to_wire(&name, &solution).encode_to_vec());
-        let encoded = super::blocking(encode).await?;
+        let permit = Permit::of(&request)?;
+        let encoded = self.read_result(name, permit.clone()).await?;
         let Some(from) = usize::try_from(offset).ok().filter(|&from| from <= encoded.len()) else {
             let text = format!("{offset} is not within the {} bytes of the result", encoded.len());
             return Err(status::invalid(&super::violation("offset", text)));
         };
-        let chunks = result_chunks(encoded, from).map(Ok);
+        let chunks = result_chunks(encoded, from).map(move |chunk| {
+            // Held for as long as the stream lives.
+            let _ = &permit;
+            Ok(chunk)
+        });
         Ok(Response::new(Box::pin(tokio_stream::iter(chunks))))
     }
 }

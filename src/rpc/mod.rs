@@ -9,6 +9,7 @@ pub mod convert;
 pub mod disconnect;
 mod door;
 pub mod explain;
+pub mod inflight;
 pub mod inputs;
 pub mod jobs;
 pub mod keys;

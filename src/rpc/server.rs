@@ -18,6 +18,7 @@ use tower::layer::util::{Identity, Stack};
 use super::auth::Authenticate;
 use super::calibration::{self, Calibration};
 use super::explain::Explain;
+use super::inflight::{Budget, Inflight};
 use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
@@ -57,6 +58,8 @@ pub struct Options {
     pub limits: Limits,
     /// Largest message that is taken.
     pub max_message_bytes: usize,
+    /// What calls may hold together, in bytes: see [`super::inflight`].
+    pub max_inflight_bytes: u64,
     /// How long after every `Solve` that is attached to a job was disconnected the job is cancelled.
     pub solve_grace: Duration,
     /// `None`: connections are not encrypted.
@@ -90,6 +93,10 @@ impl Options {
     /// Two million observations of at most 33 bytes; a larger input goes in chunks.
     pub const MAX_MESSAGE_BYTES: usize = 64 << 20;
 
+    /// Twice the largest input by the default limits on its way into the store (4,000,000 observations of 40 bytes,
+    /// three times), or a thousand small ones, on a machine with a few gigabytes.
+    pub const MAX_INFLIGHT_BYTES: u64 = 1 << 30;
+
     /// See [`door::MAX_SPEAKING`].
     pub const MAX_CONNECTIONS: usize = door::MAX_SPEAKING;
 
@@ -113,6 +120,7 @@ impl Default for Options {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
             limits: Limits::default(),
             max_message_bytes: Self::MAX_MESSAGE_BYTES,
+            max_inflight_bytes: Self::MAX_INFLIGHT_BYTES,
             solve_grace: Self::SOLVE_GRACE,
             tls: None,
             keys: keys::Sources::default(),
@@ -304,7 +312,7 @@ async fn keys(options: &Options) -> Result<Option<Current<KeyRing>>, Error> {
 }
 
 /// What goes around every service; the first to be added, [`Meter`], is outermost.
-type Layers = Stack<Authenticate, Stack<Explain, Stack<Meter, Identity>>>;
+type Layers = Stack<Inflight, Stack<Authenticate, Stack<Explain, Stack<Meter, Identity>>>>;
 
 /// Every service but health.
 fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Result<Router<Layers>, Error> {
@@ -327,6 +335,7 @@ fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Resu
         .layer(Meter)
         .layer(Explain)
         .layer(authenticate)
+        .layer(Inflight::new(Budget::new(options.max_inflight_bytes)))
         .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
         .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
         .http2_keepalive_interval(Some(options.keepalive))

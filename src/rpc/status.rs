@@ -20,6 +20,7 @@
 //! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.limits.max_message_bytes`, packed or not |
 //! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
 //! | `INVALID_ARGUMENT` | `BATCH_TOO_LARGE` | the batch alone is more than the queue's bound of `metadata["bound"]` ever allows, named as for `QUEUE_FULL`; `metadata` has `key`, `asked` and `max` too |
+//! | `RESOURCE_EXHAUSTED` | `MEMORY` | the calls under way hold as many bytes as they may together; `RetryInfo`. Nothing was stored but the chunks of an upload |
 //! | `RESOURCE_EXHAUSTED` | `STORE_FULL` | the server's disk is full and nothing was stored; `RetryInfo`. What was acknowledged before is there |
 //! | `FAILED_PRECONDITION` | `JOB_NOT_ENDED` | a job that waits or runs is not deleted; cancel it first |
 //! | `ABORTED` | `ETAG_MISMATCH` | the job changed since its etag was read |
@@ -55,6 +56,9 @@ const DRAINING_RETRY: Duration = Duration::from_secs(5);
 
 /// Pause that a caller is told while the store is away: a database that restarts takes a few seconds.
 const STORE_RETRY: Duration = Duration::from_secs(2);
+
+/// Pause that a caller is told while others hold the memory for calls: most inputs and results are through in less.
+const MEMORY_RETRY: Duration = Duration::from_secs(2);
 
 /// Pause that a caller is told while the disk is full: somebody has to make room.
 const SPACE_RETRY: Duration = Duration::from_secs(60);
@@ -173,6 +177,12 @@ pub fn hash_mismatch(told: &[u8; 32], found: &[u8; 32]) -> Status {
     let message =
         format!("finish.sha256: the bytes have the SHA-256 {}, not {}; the upload is given up", hex(found), hex(told));
     status(Code::DataLoss, "HASH_MISMATCH", message, ErrorDetails::new())
+}
+
+/// The calls under way hold as many bytes as they may, this one's included.
+pub fn memory_full(max_bytes: u64) -> Status {
+    let message = format!("the calls under way hold the {max_bytes} bytes that they may hold together; come back soon");
+    status(Code::ResourceExhausted, "MEMORY", message, ErrorDetails::with_retry_info(Some(MEMORY_RETRY)))
 }
 
 /// The messages of a `Solve` or of an upload stopped coming.

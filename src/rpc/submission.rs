@@ -1,14 +1,17 @@
 //! What `CreateJob` and `Solve` share: from a request to a job that the engine may store. Nothing is stored before
-//! everything is checked.
+//! everything is checked, and its memory is charged to the call's permit.
 
 use tonic::Status;
+use tracing::Instrument;
 
 use super::caller::Caller;
 use super::convert::create::{self, Description};
 use super::convert::input::Draft;
+use super::inflight::{Permit, WORKING_COPIES};
 use super::{proto, status};
+use crate::domain::job::Job;
 use crate::domain::{InputName, InvalidInput, Limits};
-use crate::engine::{JobInput, NewJob};
+use crate::engine::{Engine, JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
 use proto::create_job_request::Input as Inline;
 
@@ -17,6 +20,9 @@ pub struct Submission {
     tenant: String,
     description: Description,
     input: Source,
+    permit: Permit,
+    /// What the permit is charged for the input.
+    charged_bytes: u64,
 }
 
 /// Where the input comes from.
@@ -29,8 +35,14 @@ impl Submission {
     /// Checks everything that a request holds but the input's numbers.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT`, `NOT_FOUND` for another tenant, or for an uploaded input of another tenant.
-    pub fn open(caller: &Caller, request: proto::CreateJobRequest, limits: &Limits) -> Result<Self, Status> {
+    /// `INVALID_ARGUMENT`, `NOT_FOUND` for another tenant, or for an uploaded input of another tenant;
+    /// `RESOURCE_EXHAUSTED` for want of memory.
+    pub fn open(
+        caller: &Caller,
+        request: proto::CreateJobRequest,
+        limits: &Limits,
+        permit: &Permit,
+    ) -> Result<Self, Status> {
         let tenant = caller.parent(&request.parent)?;
         let description =
             create::from_wire(request.job_id, request.request_id, request.job).map_err(|error| invalid(&error))?;
@@ -38,15 +50,18 @@ impl Submission {
             Some(Inline::InputName(name)) => Source::Uploaded(caller.input(&name, "input_name")?),
             input => Source::Draft(Draft::begin(input, limits).map_err(|error| invalid(&error))?),
         };
-        let submission = Self { tenant, description, input };
+        let permit = permit.clone();
+        let mut submission = Self { tenant, description, input, permit, charged_bytes: 0 };
         submission.check_size()?;
+        submission.charge(1)?;
         Ok(submission)
     }
 
     /// Adds one more message of a `Solve`.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` for a chunk of the wrong kind, a second config, or more than the limits allow.
+    /// `INVALID_ARGUMENT` for a chunk of the wrong kind, a second config, or more than the limits allow;
+    /// `RESOURCE_EXHAUSTED` for want of memory.
     pub fn append(&mut self, message: proto::SolveRequest) -> Result<(), Status> {
         use proto::solve_request::Message;
         match (message.message, &mut self.input) {
@@ -62,20 +77,28 @@ impl Submission {
             }
         }
         .map_err(|error| invalid(&error))?;
-        self.check_size()
+        self.check_size()?;
+        self.permit.next_message();
+        self.charge(1)
     }
 
     /// Checks the input and hands over the job.
     ///
     /// # Errors
-    /// `INVALID_ARGUMENT` with every violation found.
-    pub async fn close(self, trace_parent: Option<String>) -> Result<NewJob, Status> {
-        let Self { tenant, description, input } = self;
+    /// `INVALID_ARGUMENT` with every violation found; `RESOURCE_EXHAUSTED` for want of memory.
+    pub async fn close(mut self, trace_parent: Option<String>) -> Result<NewJob, Status> {
+        self.charge(WORKING_COPIES)?;
+        let Self { tenant, description, input, permit, .. } = self;
         let input = match input {
             Source::Uploaded(name) => JobInput::Uploaded(name),
             Source::Draft(draft) => {
                 // Sorting millions of observations takes a second: not on a thread that serves others.
-                let checked = super::blocking(move || draft.finish()).await?;
+                let finish = move || {
+                    // Held here as well: what computes goes on when the call is dropped.
+                    let _permit = permit;
+                    draft.finish()
+                };
+                let checked = super::blocking(finish).await?;
                 JobInput::Inline(checked.map_err(|error| invalid(&error))?)
             }
         };
@@ -89,6 +112,15 @@ impl Submission {
         Ok(job)
     }
 
+    /// Charges that many copies of the input.
+    fn charge(&mut self, copies: u64) -> Result<(), Status> {
+        let Source::Draft(draft) = &self.input else { return Ok(()) };
+        let bytes = copies * draft.bytes();
+        self.permit.hold_more(bytes.saturating_sub(self.charged_bytes))?;
+        self.charged_bytes = self.charged_bytes.max(bytes);
+        Ok(())
+    }
+
     fn check_size(&self) -> Result<(), Status> {
         let Source::Draft(draft) = &self.input else { return Ok(()) };
         draft.check_size().map_err(|error| {
@@ -96,6 +128,21 @@ impl Submission {
             status::invalid(&error)
         })
     }
+}
+
+/// Has jobs stored. In a task of its own, which holds what they take until they are, or are refused: a call that is
+/// dropped meanwhile ends neither.
+///
+/// # Errors
+/// As [`Engine::submit_batch`].
+pub async fn store(engine: &Engine, news: Vec<NewJob>, permit: Permit) -> Result<Vec<Job>, Status> {
+    let engine = engine.clone();
+    let storing = async move {
+        let _permit = permit;
+        engine.submit_batch(news).await
+    };
+    let stored = tokio::spawn(storing.in_current_span()).await;
+    stored.map_err(|error| status::internal(&error))?.map_err(status::from_engine)
 }
 
 fn invalid(error: &InvalidInput) -> Status {

@@ -158,7 +158,7 @@ pub fn jobs_deleted(reason: Deletion, count: u32) {
     counter!(JOBS_DELETED.name, "reason" => reason.name()).increment(u64::from(count));
 }
 
-/// A job was refused.
+/// A job was refused, or, for want of memory, a call of any kind.
 pub fn refused(refusal: Refusal) {
     counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).increment(1);
 }
@@ -237,6 +237,16 @@ pub fn connection_refused() {
 /// A connection was closed because nobody who may call had called over it in time.
 pub fn stranger_closed() {
     counter!(STRANGERS_CLOSED.name).increment(1);
+}
+
+/// Tells how many bytes calls hold.
+pub fn inflight_bytes(bytes: u64) {
+    gauge!(INFLIGHT_BYTES.name).set(bytes as f64);
+}
+
+/// Tells how many bytes calls may hold together; once, at the start of the server.
+pub fn inflight_capacity(bytes: u64) {
+    gauge!(INFLIGHT_CAPACITY.name).set(bytes as f64);
 }
 
 /// Tells whether files that changed cannot be used.

@@ -11,6 +11,9 @@ use proto::create_job_request::Input as Inline;
 /// Name of a track set in violations.
 const TRACK_SET: &str = "track_set";
 
+/// Bytes of an observation in memory at most: a view, a track, and four reals.
+pub const OBSERVATION_BYTES: u64 = 2 * 4 + 4 * 8;
+
 /// Observations in one chunk that a client sends: at most 2.8 MB, well below any server's message limit.
 const CHUNK_OBSERVATIONS: usize = 65_536;
 
@@ -82,6 +85,20 @@ impl Draft {
         match &self.body {
             Body::TrackSet(set) => check_track_set_size(set, &self.limits),
             Body::Matrix(matrix) => matrix::check_size(matrix, &self.limits),
+        }
+    }
+
+    /// Bytes that its arrays take in memory.
+    pub fn bytes(&self) -> u64 {
+        fn of<T>(array: &Vec<T>) -> u64 {
+            (array.capacity() * size_of::<T>()) as u64
+        }
+        match &self.body {
+            Body::TrackSet(set) => {
+                let reals = [&set.x, &set.y, &set.sigma, &set.depth].map(of).into_iter().sum::<u64>();
+                of(&set.views) + of(&set.view) + of(&set.track) + reals
+            }
+            Body::Matrix(matrix) => of(&matrix.views) + of(&matrix.values) + of(&matrix.visibility),
         }
     }
 

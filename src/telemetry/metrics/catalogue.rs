@@ -137,7 +137,7 @@ pub const REFUSALS: Metric = Metric {
     name: "scpsfm_admission_refusals_total",
     kind: Kind::Counter,
     labels: &["reason", "bound"],
-    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL and BATCH_TOO_LARGE, by the bound that was hit.",
+    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL and BATCH_TOO_LARGE, by the bound that was hit. MEMORY counts calls of every kind.",
 };
 pub const UPLOADED_BYTES: Metric = Metric {
     name: "scpsfm_uploaded_bytes_total",
@@ -232,6 +232,18 @@ pub const STRANGERS_CLOSED: Metric = Metric {
     help: "Connections closed because nobody who may call had called over them in time.",
 };
 
+pub const INFLIGHT_BYTES: Metric = Metric {
+    name: "scpsfm_inflight_bytes",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Bytes that calls hold: messages and inputs on their way in, results on their way out.",
+};
+pub const INFLIGHT_CAPACITY: Metric = Metric {
+    name: "scpsfm_inflight_capacity_bytes",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Bytes that calls may hold together; a call that would hold more is refused.",
+};
 pub const RELOAD_FAILED: Metric = Metric {
     name: "scpsfm_reload_failed",
     kind: Kind::Gauge,
@@ -246,7 +258,7 @@ pub const LOCKED_OUT: Metric = Metric {
 };
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 35] = [
+pub const ALL: [Metric; 37] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -280,6 +292,8 @@ pub const ALL: [Metric; 35] = [
     CONNECTIONS,
     CONNECTIONS_REFUSED,
     STRANGERS_CLOSED,
+    INFLIGHT_BYTES,
+    INFLIGHT_CAPACITY,
     RELOAD_FAILED,
     LOCKED_OUT,
 ];

@@ -18,13 +18,15 @@ pub enum Refusal {
     TooLarge,
     /// The server is draining.
     Draining,
+    /// The calls under way hold as many bytes as they may.
+    Memory,
 }
 
 impl Refusal {
     pub(super) fn all() -> impl Iterator<Item = Refusal> {
         let by_bound =
             Quota::OF_QUEUE.into_iter().flat_map(|quota| [Refusal::QueueFull(quota), Refusal::BatchTooLarge(quota)]);
-        by_bound.chain([Refusal::Invalid, Refusal::TooLarge, Refusal::Draining])
+        by_bound.chain([Refusal::Invalid, Refusal::TooLarge, Refusal::Draining, Refusal::Memory])
     }
 
     pub(super) fn reason(self) -> &'static str {
@@ -34,6 +36,7 @@ impl Refusal {
             Refusal::Invalid => "INVALID",
             Refusal::TooLarge => "TOO_LARGE",
             Refusal::Draining => "DRAINING",
+            Refusal::Memory => "MEMORY",
         }
     }
 
@@ -41,7 +44,7 @@ impl Refusal {
     pub(super) fn bound(self) -> &'static str {
         match self {
             Refusal::QueueFull(quota) | Refusal::BatchTooLarge(quota) => quota.name(),
-            Refusal::Invalid | Refusal::TooLarge | Refusal::Draining => NONE,
+            Refusal::Invalid | Refusal::TooLarge | Refusal::Draining | Refusal::Memory => NONE,
         }
     }
 }

@@ -3,3 +3,4 @@
 mod bytes;
 mod decoder;
 mod http2;
+mod memory;

@@ -1,0 +1,276 @@
+//! The memory of calls: what their messages, inputs and results take is counted against one budget, whoever calls, and
+//! a call that would go beyond it is refused at once. What a job takes later, in the store and in the solver, is
+//! bounded there.
+
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
+
+use http_body::{Body as HttpBody, Frame, SizeHint};
+use prost::bytes::Bytes;
+use tonic::Status;
+use tonic::body::Body;
+use tonic::codegen::http::Request;
+use tower::{Layer, Service};
+
+use super::status;
+use crate::telemetry::metrics::{Refusal, inflight_bytes, inflight_capacity, refused};
+
+/// How often an input is in memory while it is checked and stored: as it came, sorted, and encoded. A result likewise
+/// while it is read: as it is stored, decoded, and encoded.
+pub const WORKING_COPIES: u64 = 3;
+
+/// The bytes that all calls of a server may hold together.
+#[derive(Debug)]
+pub struct Budget {
+    max_bytes: u64,
+    used_bytes: Mutex<u64>,
+}
+
+impl Budget {
+    pub fn new(max_bytes: u64) -> Arc<Self> {
+        inflight_capacity(max_bytes);
+        Arc::new(Self { max_bytes, used_bytes: Mutex::new(0) })
+    }
+
+    /// Takes `after` bytes in place of `before`, both of one call, if they fit. Fewer always do.
+    fn exchange(&self, before: u64, after: u64) -> bool {
+        let mut used = locked(&self.used_bytes);
+        let others = used.saturating_sub(before);
+        if after > before && others.saturating_add(after) > self.max_bytes {
+            return false;
+        }
+        *used = others + after;
+        inflight_bytes(*used);
+        true
+    }
+}
+
+/// Locks a number that is whole at every moment: a panic elsewhere under the lock leaves nothing half done.
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// What one call holds. Dropped with the last clone, which travels with whatever holds the bytes.
+#[derive(Debug, Clone)]
+pub struct Permit {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    budget: Arc<Budget>,
+    charge: Mutex<Charge>,
+}
+
+/// The bytes of one call.
+#[derive(Debug, Clone, Copy, Default)]
+struct Charge {
+    /// Of the message that is on its way in.
+    message: u64,
+    /// Of the largest message so far: the transport keeps a buffer of that length.
+    largest_message: u64,
+    /// Of everything else, as the call says.
+    held: u64,
+}
+
+impl Charge {
+    fn bytes(self) -> u64 {
+        self.largest_message.saturating_add(self.held)
+    }
+}
+
+impl Permit {
+    fn new(budget: Arc<Budget>) -> Self {
+        Self { shared: Arc::new(Shared { budget, charge: Mutex::default() }) }
+    }
+
+    /// The permit of a call that came through [`Inflight`].
+    ///
+    /// # Errors
+    /// `INTERNAL` for one that did not: a service outside of the layer would be bounded by nothing.
+    pub fn of<T>(request: &tonic::Request<T>) -> Result<Self, Status> {
+        let found = request.extensions().get().cloned();
+        found.ok_or_else(|| status::internal(&"a request reached a service without a permit for its bytes"))
+    }
+
+    /// The call holds so many bytes from here on, apart from its messages. More than the whole budget counts as the
+    /// whole: such a call is served when no other holds anything.
+    ///
+    /// # Errors
+    /// `RESOURCE_EXHAUSTED`, reason `MEMORY`, where they do not fit; the call holds what it held before.
+    pub fn hold(&self, bytes: u64) -> Result<(), Status> {
+        self.change(|charge| charge.held = bytes)
+    }
+
+    /// The call holds so many bytes more.
+    ///
+    /// # Errors
+    /// As [`Permit::hold`].
+    pub fn hold_more(&self, bytes: u64) -> Result<(), Status> {
+        self.change(|charge| charge.held = charge.held.saturating_add(bytes))
+    }
+
+    /// A message was taken, and the next one begins.
+    pub fn next_message(&self) {
+        locked(&self.shared.charge).message = 0;
+    }
+
+    /// More of a message came.
+    fn receive(&self, bytes: u64) -> Result<(), Status> {
+        self.change(|charge| {
+            charge.message = charge.message.saturating_add(bytes);
+            charge.largest_message = charge.largest_message.max(charge.message);
+        })
+    }
+
+    fn change(&self, change: impl FnOnce(&mut Charge)) -> Result<(), Status> {
+        let Shared { budget, charge } = &*self.shared;
+        let mut charge = locked(charge);
+        let mut changed = *charge;
+        change(&mut changed);
+        let bytes = |charge: Charge| charge.bytes().min(budget.max_bytes);
+        if !budget.exchange(bytes(*charge), bytes(changed)) {
+            refused(Refusal::Memory);
+            return Err(status::memory_full(budget.max_bytes));
+        }
+        *charge = changed;
+        Ok(())
+    }
+}
+
+impl Drop for Shared {
+    fn drop(&mut self) {
+        let charge = self.charge.get_mut().unwrap_or_else(PoisonError::into_inner);
+        self.budget.exchange(charge.bytes().min(self.budget.max_bytes), 0);
+    }
+}
+
+/// The layer that gives every call a [`Permit`] and charges the messages on their way in to it.
+#[derive(Debug, Clone)]
+pub struct Inflight {
+    budget: Arc<Budget>,
+}
+
+impl Inflight {
+    pub fn new(budget: Arc<Budget>) -> Self {
+        Self { budget }
+    }
+}
+
+impl<S> Layer<S> for Inflight {
+    type Service = Charged<S>;
+
+    fn layer(&self, inner: S) -> Charged<S> {
+        Charged { inner, budget: Arc::clone(&self.budget) }
+    }
+}
+
+/// A service whose calls are charged.
+#[derive(Debug, Clone)]
+pub struct Charged<S> {
+    inner: S,
+    budget: Arc<Budget>,
+}
+
+impl<S: Service<Request<Body>>> Service<Request<Body>> for Charged<S> {
+    type Response = S::Response;
+    type Error = S::Error;
+    type Future = S::Future;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
+        self.inner.poll_ready(context)
+    }
+
+    fn call(&mut self, mut request: Request<Body>) -> S::Future {
+        let permit = Permit::new(Arc::clone(&self.budget));
+        request.extensions_mut().insert(permit.clone());
+        self.inner.call(request.map(|body| Body::new(ChargedBody { body, permit })))
+    }
+}
+
+/// The frames of a request, as long as the budget holds them.
+struct ChargedBody {
+    body: Body,
+    permit: Permit,
+}
+
+impl HttpBody for ChargedBody {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        let frame = Pin::new(&mut self.body).poll_frame(context);
+        if let Poll::Ready(Some(Ok(frame))) = &frame
+            && let Some(data) = frame.data_ref()
+            && let Err(refusal) = self.permit.receive(data.len() as u64)
+        {
+            return Poll::Ready(Some(Err(refusal)));
+        }
+        frame
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tonic_types::StatusExt;
+
+    use super::*;
+
+    fn used(budget: &Budget) -> u64 {
+        *locked(&budget.used_bytes)
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused_and_everything_is_given_back() {
+        let budget = Budget::new(100);
+        let (first, second) = (Permit::new(Arc::clone(&budget)), Permit::new(Arc::clone(&budget)));
+        first.hold(60).expect("fits");
+        second.receive(30).expect("fits");
+        let status = second.receive(11).expect_err("101 bytes");
+        assert_eq!(status.code(), tonic::Code::ResourceExhausted);
+        assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "MEMORY");
+        assert!(status.get_details_retry_info().is_some_and(|retry| retry.retry_delay.is_some()));
+        assert_eq!(used(&budget), 90, "nothing changed");
+        second.receive(10).expect("fits");
+        first.hold(20).expect("less always fits");
+        let clone = first.clone();
+        drop(first);
+        assert_eq!(used(&budget), 60, "a clone holds it");
+        drop((clone, second));
+        assert_eq!(used(&budget), 0);
+    }
+
+    #[test]
+    fn a_stream_is_charged_its_largest_message_and_what_it_holds() {
+        let budget = Budget::new(100);
+        let permit = Permit::new(Arc::clone(&budget));
+        for (message, held) in [(10, 10), (20, 20), (5, 5)] {
+            permit.receive(message).expect("fits");
+            permit.next_message();
+            permit.hold_more(held).expect("fits");
+        }
+        assert_eq!(used(&budget), 55);
+    }
+
+    #[test]
+    fn more_than_the_budget_is_served_alone() {
+        let budget = Budget::new(100);
+        let (large, other) = (Permit::new(Arc::clone(&budget)), Permit::new(Arc::clone(&budget)));
+        other.hold(1).expect("fits");
+        assert!(large.hold(1_000).is_err());
+        drop(other);
+        large.hold(1_000).expect("alone");
+        assert_eq!(used(&budget), 100);
+        large.hold(40).expect("less always fits");
+        assert_eq!(used(&budget), 40);
+    }
+}
