@@ -217,6 +217,19 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     follow_store(&ready, service.store_state());
     ready.set(true);
     let scheme = if config.tls.files().is_some() { "https" } else { "http" };
+    let store = match &config.store.url {
+        Some(url) => url.to_string(),
+        None => config.store.data_dir.display().to_string(),
+    };
+    tracing::info!(
+        version = env!("CARGO_PKG_VERSION"),
+        store,
+        grpc = %service.address(),
+        scheme,
+        metrics = %metrics.address(),
+        recovered_jobs = service.recovered_jobs(),
+        "serving"
+    );
     print(&format!("grpc {scheme}://{}", service.address()))?;
     print(&format!("metrics http://{}/metrics", metrics.address()))?;
     let failed = tokio::select! {

@@ -83,6 +83,11 @@ impl Service {
         self.server.address()
     }
 
+    /// Jobs that dead processes had left running, which the start took back.
+    pub fn recovered_jobs(&self) -> usize {
+        self.engine.recovered_jobs()
+    }
+
     /// What can be done with the store.
     pub fn store_state(&self) -> tokio::sync::watch::Receiver<engine::StoreState> {
         self.engine.store_state()

@@ -13,7 +13,7 @@ use super::observe::{self, Attempt, AttemptLost};
 use super::worker::{Assignment, Heard, Opening, Report, Verdict, Worker};
 use super::{Inner, Options, locked};
 use crate::domain::job::{Failure, Job, JobName, JobState};
-use crate::domain::{Progress, StopReason, StopToken};
+use crate::domain::{Grade, Progress, StopReason, StopToken};
 use crate::store::{self, Ending, Lease, Outcome, Store};
 
 /// Least time between two stored progress events of a job: twice a second is as fast as people look, and a commit
@@ -416,7 +416,13 @@ impl Course {
         }
         match (committed, ended_in) {
             (Some(job), Some(state)) => {
-                tracing::info!(state = state.name(), "job ended");
+                let seconds = job.start_time.zip(job.end_time).and_then(|(start, end)| end.duration_since(start).ok());
+                tracing::info!(
+                    state = state.name(),
+                    grade = job.summary.as_ref().and_then(|summary| summary.grade).map(Grade::name),
+                    seconds = seconds.map(|seconds| seconds.as_secs_f64()),
+                    "job ended"
+                );
                 self.inner.ended(&job);
                 self.inner.crew_finished_one();
             }

@@ -189,6 +189,8 @@ struct Inner {
     /// What the last sweep found.
     store_state: channel::Sender<StoreState>,
     pool: Mutex<drain::WorkerPool>,
+    /// Jobs that dead processes had left and the start took back.
+    recovered_jobs: usize,
 }
 
 impl Engine {
@@ -211,6 +213,7 @@ impl Engine {
             hurried: CancellationToken::new(),
             store_state: channel::Sender::new(StoreState::Sound),
             pool: Mutex::default(),
+            recovered_jobs: recovered.len(),
             options,
         });
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
@@ -300,6 +303,11 @@ impl Engine {
         self.inner.store.delete_job(name, etag).await?;
         observe::jobs_deleted(observe::Deletion::Requested, 1);
         Ok(())
+    }
+
+    /// Jobs that dead processes had left running, which the start took back.
+    pub fn recovered_jobs(&self) -> usize {
+        self.inner.recovered_jobs
     }
 
     /// How this engine works.

@@ -1,6 +1,7 @@
 //! Metrics, logs and traces of the real program: what a solved, a failed and a cancelled job change.
 
 use std::fs::File;
+use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
@@ -35,6 +36,15 @@ async fn scrape_until(server: &Serving, wanted: impl Fn(&Page) -> bool) -> Page 
         }
     })
     .await
+}
+
+/// The one line of a log in JSON with this message.
+fn logged(log: &Path, message: &str) -> serde_json::Value {
+    let log = std::fs::read_to_string(log).expect("a log");
+    let lines = log.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON"));
+    let mut found: Vec<_> = lines.filter(|line| line["message"] == message).collect();
+    assert_eq!(found.len(), 1, "{message} in {log}");
+    found.remove(0)
 }
 
 /// Asserts by how much each of these series grew.
@@ -148,7 +158,9 @@ async fn a_job_that_takes_its_server_down_fails_and_is_counted_by_the_next() {
     // Killed without a warning, as by a power cut.
     drop(server);
 
-    let server = Serving::start_with(&data_dir, &once, Stdio::null());
+    let log = directory.path().join("log");
+    let server = Serving::start_with(&data_dir, &once, File::create(&log).expect("a log file"));
+    assert_eq!(logged(&log, "serving")["recovered_jobs"], 1);
     let mut jobs = connected(&server).await;
     reaches(&mut jobs, &name, &[JobState::Failed]).await;
     // Counters begin at 0 with the process: what stands there is what this one did.
@@ -199,6 +211,13 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
         assert!(of_stage.all(|span| span.parent_span_id == attempt.span_id), "{stage}");
     }
 
+    let serving = logged(&log, "serving");
+    assert_eq!((&serving["version"], &serving["recovered_jobs"]), (&env!("CARGO_PKG_VERSION").into(), &0.into()));
+    assert_eq!(serving["store"], data_dir.display().to_string());
+    assert_eq!(format!("http://{}", serving["grpc"].as_str().expect("an address")), server.grpc);
+    assert_eq!(serving["metrics"], server.metrics);
+    let ended = logged(&log, "job ended");
+    assert!(ended["state"] == "SUCCEEDED" && ended["grade"].is_string() && ended["seconds"].is_f64(), "{ended}");
     let log = std::fs::read_to_string(&log).expect("a log");
     let lines = log.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON"));
     let of_attempt: Vec<_> = lines.filter(|line| line["target"] == "scpsfm::engine::course").collect();
