@@ -20,6 +20,9 @@ use crate::telemetry::metrics::{Refusal, inflight_bytes, inflight_capacity, refu
 /// while it is read: as it is stored, decoded, and encoded.
 pub const WORKING_COPIES: u64 = 3;
 
+/// How often a message is in memory: as it came, in a buffer that the transport keeps for the next one, and decoded.
+const MESSAGE_COPIES: u64 = 2;
+
 /// The bytes that all calls of a server may hold together.
 #[derive(Debug)]
 pub struct Budget {
@@ -68,7 +71,7 @@ struct Shared {
 struct Charge {
     /// Of the message that is on its way in.
     message: u64,
-    /// Of the largest message so far: the transport keeps a buffer of that length.
+    /// Of the largest message so far.
     largest_message: u64,
     /// Of everything else, as the call says.
     held: u64,
@@ -76,7 +79,7 @@ struct Charge {
 
 impl Charge {
     fn bytes(self) -> u64 {
-        self.largest_message.saturating_add(self.held)
+        MESSAGE_COPIES.saturating_mul(self.largest_message).saturating_add(self.held)
     }
 }
 
@@ -234,13 +237,12 @@ mod tests {
         let budget = Budget::new(100);
         let (first, second) = (Permit::new(Arc::clone(&budget)), Permit::new(Arc::clone(&budget)));
         first.hold(60).expect("fits");
-        second.receive(30).expect("fits");
-        let status = second.receive(11).expect_err("101 bytes");
+        second.receive(20).expect("fits, twice");
+        let status = second.receive(1).expect_err("102 bytes");
         assert_eq!(status.code(), tonic::Code::ResourceExhausted);
         assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "MEMORY");
         assert!(status.get_details_retry_info().is_some_and(|retry| retry.retry_delay.is_some()));
-        assert_eq!(used(&budget), 90, "nothing changed");
-        second.receive(10).expect("fits");
+        assert_eq!(used(&budget), 100, "nothing changed");
         first.hold(20).expect("less always fits");
         let clone = first.clone();
         drop(first);
@@ -258,7 +260,7 @@ mod tests {
             permit.next_message();
             permit.hold_more(held).expect("fits");
         }
-        assert_eq!(used(&budget), 55);
+        assert_eq!(used(&budget), 75);
     }
 
     #[test]

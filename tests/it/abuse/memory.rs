@@ -31,8 +31,8 @@ const BUDGET: u64 = 16 << 20;
 /// Callers that each send most of an input and then nothing.
 const STREAMS: usize = 20;
 
-/// What each of them holds at least: 40,000 observations of two indices and two reals.
-const CHUNK_BYTES: f64 = 40_000.0 * (2 * 4 + 2 * 8) as f64;
+/// What each of them is charged at least, once its chunk of 40,000 observations was taken; less is charged before.
+const CHUNK_BYTES: f64 = 2e6;
 
 fn is_refusal(status: &Status) -> bool {
     let refused = status.code() == Code::ResourceExhausted && reason(status) == "MEMORY";
