@@ -234,11 +234,11 @@ pub struct SettingsArgs {
     #[arg(long, default_value_t = 0, value_parser = parse_whole::<u64>)]
     pub seed: u64,
 
-    #[arg(long, value_name = "N", help = format!("Network iterations at most, 1 to {}; `auto` usually stops earlier, \
-        `scpsfm` does up to so many in each of up to 16 optimisations [default: {}; scpsfm: {}]",
-        SolveSettings::MAX_ITERATIONS, SolveSettings::DEFAULT_ITERATIONS, SolveSettings::DEFAULT_HEAD_ITERATIONS),
+    #[arg(long, value_name = "N", help = format!("Iterations of each optimisation of the network, 1 to {}; `scpsfm` \
+        does up to 16 of them, `paper` one, `auto` usually none", SolveSettings::MAX_ITERATIONS),
+        default_value_t = SolveSettings::DEFAULT_ITERATIONS,
         value_parser = clap::value_parser!(u32).range(1..=i64::from(SolveSettings::MAX_ITERATIONS)))]
-    pub iterations: Option<u32>,
+    pub iterations: u32,
 
     /// Leave the DAQ residual (self-calibration) out of the losses and scores
     #[arg(long)]
@@ -262,19 +262,19 @@ pub struct SettingsArgs {
     #[arg(long, value_enum)]
     pub backend: Option<BackendArg>,
 
-    /// Weight of the loss L_proj
-    #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_ALPHA)]
-    pub alpha: f64,
+    #[arg(long, hide_short_help = true, help = format!("Weight of the loss L_proj, but with `paper` that of the first \
+        iteration [default: {}; paper: {}]", SolveSettings::DEFAULT_ALPHA, SolveSettings::PAPER_ALPHA))]
+    pub alpha: Option<f64>,
 
     /// Weight of the loss L_DAQ
     #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_BETA)]
     pub beta: f64,
 
-    /// Least number of inliers that the loss L_num asks for, the paper's t
+    /// Least number of inliers that the loss L_num asks for, the paper's t; but with `paper` that of the first iteration
     #[arg(long, hide_short_help = true, value_name = "T", default_value_t = SolveSettings::DEFAULT_MIN_INLIERS)]
     pub min_inliers: f64,
 
-    /// Slope of the sigmoid in L_num
+    /// Slope of the sigmoid in L_num, with `paper` only; 1 is as printed and may let all weights collapse to 0
     #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_KAPPA)]
     pub kappa: f64,
 
@@ -297,12 +297,12 @@ impl SettingsArgs {
         let settings = SolveSettings {
             method,
             use_daq: !self.no_daq,
-            alpha: self.alpha,
+            alpha: self.alpha.unwrap_or(SolveSettings::default_alpha(method)),
             beta: self.beta,
             min_inliers: self.min_inliers,
             kappa: self.kappa,
             learning_rate: self.learning_rate,
-            iterations: self.iterations.unwrap_or(SolveSettings::default_iterations(method)),
+            iterations: self.iterations,
             network_width: self.network_width,
             epipolar_depths: self.epipolar_depths,
             seed: self.seed,
@@ -324,7 +324,7 @@ impl SettingsArgs {
 pub enum MethodArg {
     /// The network's prior and geometry together
     Auto,
-    /// The paper's own output: the network's weights, thresholded at 1/2
+    /// The paper's network under its objective as printed, for comparison: one optimisation, thresholded at 1/2
     Paper,
     /// Geometry alone, no network
     Geometry,

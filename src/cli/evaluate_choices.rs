@@ -51,9 +51,9 @@ pub enum ContestantArg {
     Auto,
     /// Geometry alone
     Geometry,
-    /// The paper's method
+    /// The paper's network under its objective as printed
     Paper,
-    /// The paper's method without its self-calibration term
+    /// The same without its self-calibration term
     PaperWithoutDaq,
     /// The paper's network by itself under a continued objective
     Scpsfm,

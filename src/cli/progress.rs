@@ -172,6 +172,18 @@ fn describe(progress: &Progress) -> String {
             progress.iteration, losses.num, losses.proj, losses.daq
         ));
     }
+    if let Some(head) = progress.head {
+        if let Some(phase) = head.phase {
+            text.push_str(&format!(", {}", phase.name()));
+        }
+        text.push_str(&format!(", N {:.1}", head.weight_sum));
+        if let Some(tolerance) = head.tolerance {
+            text.push_str(&format!(", tau {tolerance:.3}"));
+        }
+        if let Some(residual) = head.best_daq_residual {
+            text.push_str(&format!(", DAQ residual of the best head {residual:.3}"));
+        }
+    }
     text.push_str(&format!(", {:.1} s", progress.elapsed_seconds));
     text
 }
@@ -210,6 +222,7 @@ mod tests {
             fraction,
             iteration: 0,
             losses: None,
+            head: None,
             inliers: 0,
             focal_px: None,
             best_score: None,
@@ -244,6 +257,7 @@ mod tests {
             fraction: 0.5,
             iteration: 120,
             losses: None,
+            head: None,
             inliers: 19,
             focal_px: None,
             best_score: None,

@@ -23,7 +23,7 @@ pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
 pub use input_name::InputName;
 pub use left_out::LeftOut;
 pub use limits::Limits;
-pub use progress::{Course, Losses, Observer, Progress, Silent, Stage, Step, Task};
+pub use progress::{Course, HeadProgress, Losses, Observer, Phase, Progress, Silent, Stage, Step, Task};
 pub use quota::{Oversize, Quota};
 pub use result::{Calibration, Grade, LensProjection, Proposal, Solution, Status};
 pub use settings::{Backend, Method, SolveSettings};

@@ -41,14 +41,73 @@ impl Stage {
 /// The three terms of the paper's loss (its eq. 11), unweighted, at the network's latest iteration.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Losses {
-    /// `exp(t - sum_j s(kappa (w_j - 1/2)))`: too few inliers. By SCPSFM `exp(t - N)` with `N = sum_j w_j`, and from
-    /// `N = t` on its tangent `1 + t - N`, which may be negative.
+    /// Too few inliers: `exp(t - N)` with `N = sum_j w_j`, and from `N = t` on its tangent `1 + t - N`, which may be
+    /// negative; by PAPER `exp(t - sum_j s(kappa (w_j - 1/2)))`.
     pub num: f64,
-    /// `sum_{k>=5} sigma_k(M diag(w))`: distance from rank 4. By SCPSFM it begins as the sum over all k, and is the sum
-    /// of their squares over `k >= 5` in the last fifth of a head's iterations.
+    /// Distance from rank 4, `sum_{k>=5} sigma_k(M diag(w))`. It begins as the sum over all k, and is the sum of their
+    /// squares over `k >= 5` in the last [`Phase`]; by PAPER it stays the same.
     pub proj: f64,
     /// `sum_i | S_i/|S_i| - omega/|omega| |`: distance from one constant calibration.
     pub daq: f64,
+}
+
+/// Which part of the continued objective a head of the network is in, see `network::head`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum Phase {
+    /// L_proj goes from the nuclear norm, convex in the weights, to the rank-4 tail.
+    Relaxation,
+    /// L_proj is the rank-4 tail, its weight set by the consensus.
+    Rank,
+    /// L_proj is the energy of the tail, its weight set by the noise of the consensus, which grows.
+    Growth,
+}
+
+impl Phase {
+    /// The phase's name in files and on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Phase::Relaxation => "relaxation",
+            Phase::Rank => "rank",
+            Phase::Growth => "growth",
+        }
+    }
+}
+
+/// The optimisation of the network from one set of new weights, at its latest iteration.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct HeadProgress {
+    /// From 1.
+    pub head: u32,
+    /// Of this head, from 1.
+    pub iteration: u32,
+    /// None by PAPER, whose objective stays the same.
+    pub phase: Option<Phase>,
+    /// `N = sum_j w_j`.
+    pub weight_sum: f64,
+    /// Tracks by weight, in equal intervals of [0, 1].
+    pub weight_histogram: [u32; HeadProgress::BINS],
+    /// Residual of a track (sine of the angle to the consensus' span) at which it leaves the consensus, tau; none
+    /// before the growth.
+    pub tolerance: Option<f64>,
+    /// DAQ residual of the best head so far; none before one has ended, and without the DAQ term.
+    pub best_daq_residual: Option<f64>,
+}
+
+impl HeadProgress {
+    /// Intervals of the histogram.
+    pub const BINS: usize = 10;
+
+    /// Tracks by weight.
+    ///
+    /// * `weights`: one a track, in [0, 1]
+    pub fn histogram(weights: &[f64]) -> [u32; Self::BINS] {
+        let mut histogram = [0; Self::BINS];
+        for weight in weights {
+            histogram[((weight * Self::BINS as f64) as usize).min(Self::BINS - 1)] += 1;
+        }
+        histogram
+    }
 }
 
 /// What a stage does many times over.
@@ -106,6 +165,10 @@ pub struct Progress {
     pub iteration: u32,
     /// Losses of that iteration; none before the first.
     pub losses: Option<Losses>,
+    /// The head that iteration is of; none where there is no iteration, and in records that were stored before there
+    /// was such a thing.
+    #[serde(default)]
+    pub head: Option<HeadProgress>,
     /// Inlier tracks of the best hypothesis so far.
     pub inliers: u32,
     /// Current estimate of the focal length in pixels: under PAPER and SCPSFM the network's while it is optimised; else

@@ -12,7 +12,7 @@ pub enum Method {
     /// ...the network's prior and geometry together: the network proposes, geometry disposes.
     #[default]
     Auto,
-    /// ...the paper's own output: the network's weights, thresholded at 1/2.
+    /// ...the paper's network under the paper's objective as printed: its weights, thresholded at 1/2.
     Paper,
     /// ...geometry alone, no network.
     Geometry,
@@ -62,17 +62,17 @@ pub struct SolveSettings {
     pub method: Method,
     /// Whether the DAQ residual takes part: as a loss of the network and as a score of hypotheses.
     pub use_daq: bool,
-    /// Weight of L_proj; of SCPSFM, at the first iteration.
+    /// Weight of L_proj; but of PAPER, at a head's first iteration.
     pub alpha: f64,
     /// Weight of L_DAQ.
     pub beta: f64,
-    /// Least number of inliers that L_num asks for, the paper's `t`; of SCPSFM, at the first iteration.
+    /// Least number of inliers that L_num asks for, the paper's `t`; but of PAPER, at a head's first iteration.
     pub min_inliers: f64,
-    /// Slope of the sigmoid in L_num; SCPSFM has no such sigmoid.
+    /// Slope of the sigmoid in L_num of PAPER; the other methods have no such sigmoid.
     pub kappa: f64,
     /// Adam's learning rate.
     pub learning_rate: f64,
-    /// Network iterations at most; AUTO usually stops earlier, at a decisive consensus. Of SCPSFM, those of each head.
+    /// Iterations of each head of the network.
     pub iterations: u32,
     /// Width of the PointNet as a share of the original (64-64-64-128-1024).
     pub network_width: f64,
@@ -97,20 +97,20 @@ pub struct SolveSettings {
 }
 
 impl SolveSettings {
-    /// Ten times the paper's 1: with alpha 1 mean F1 at 90 % outliers is worse as soon as the DAQ term joins.
+    /// Where the continuation starts; see [`crate::network`] for what follows.
     pub const DEFAULT_ALPHA: f64 = 10.0;
+    /// The paper's value.
+    pub const PAPER_ALPHA: f64 = 1.0;
     /// The paper's value.
     pub const DEFAULT_BETA: f64 = 1.0;
     /// The paper's value.
     pub const DEFAULT_MIN_INLIERS: f64 = 15.0;
-    /// The paper's literal sigmoid (slope 1) lets all weights collapse to 0; 20 to 50 work.
-    pub const DEFAULT_KAPPA: f64 = 20.0;
+    /// The paper's sigmoid has no slope. All weights may collapse to 0; with 20 to 50 they do not.
+    pub const DEFAULT_KAPPA: f64 = 1.0;
     /// The paper's value.
     pub const DEFAULT_LEARNING_RATE: f64 = 1e-3;
     /// The weights converge within 300 to 500 iterations.
-    pub const DEFAULT_ITERATIONS: u32 = 400;
-    /// The same of a head of SCPSFM, whose continuation passes through three phases.
-    pub const DEFAULT_HEAD_ITERATIONS: u32 = 500;
+    pub const DEFAULT_ITERATIONS: u32 = 500;
     /// A quarter of the PointNet (about 1e5 parameters) ranks tracks as well as the whole (1.5e6) at a fraction of
     /// the time.
     pub const DEFAULT_NETWORK_WIDTH: f64 = 0.25;
@@ -128,14 +128,14 @@ impl SolveSettings {
 
     /// The defaults of a method.
     pub fn of_method(method: Method) -> Self {
-        Self { method, iterations: Self::default_iterations(method), ..Self::default() }
+        Self { method, alpha: Self::default_alpha(method), ..Self::default() }
     }
 
-    /// Iterations where none are asked for.
-    pub fn default_iterations(method: Method) -> u32 {
+    /// Weight of L_proj where none is asked for.
+    pub fn default_alpha(method: Method) -> f64 {
         match method {
-            Method::Scpsfm => Self::DEFAULT_HEAD_ITERATIONS,
-            Method::Auto | Method::Paper | Method::Geometry | Method::Psfm => Self::DEFAULT_ITERATIONS,
+            Method::Paper => Self::PAPER_ALPHA,
+            Method::Auto | Method::Scpsfm | Method::Geometry | Method::Psfm => Self::DEFAULT_ALPHA,
         }
     }
 

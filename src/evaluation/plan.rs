@@ -40,7 +40,7 @@ pub enum Contestant {
     Oracle,
     Auto,
     Geometry,
-    /// The paper's method, with the DAQ loss.
+    /// The paper's network under its objective as printed, with the DAQ loss.
     Paper,
     /// The same without it.
     PaperWithoutDaq,

@@ -6,8 +6,8 @@ use std::path::Path;
 use super::{Label, LabelledInput};
 use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{
-    Calibration, Course, Grade, LeftOut, LensProjection, Losses, Method, Progress, Proposal, Solution, Stage, Status,
-    Warning, WarningCode,
+    Calibration, Course, Grade, HeadProgress, LeftOut, LensProjection, Losses, Method, Phase, Progress, Proposal,
+    Solution, Stage, Status, Warning, WarningCode,
 };
 use crate::synthetic::{Scene, SceneOptions, Sequence, SequenceOptions};
 
@@ -245,6 +245,7 @@ fn history(focal_px: f64) -> Vec<Progress> {
                     proj: 3.0 - 2.0 * share,
                     daq: 0.5 + (1.0 - share),
                 }),
+                head: Some(head(iteration)),
                 inliers: (20.0 * share) as u32,
                 focal_px: (iteration > 30)
                     .then(|| focal_px * (1.0 + 0.1 * (1.0 - share) * (f64::from(iteration)).sin())),
@@ -254,4 +255,25 @@ fn history(focal_px: f64) -> Vec<Progress> {
             }
         })
         .collect()
+}
+
+/// Two heads of 75 iterations each, whose weights part.
+fn head(iteration: u32) -> HeadProgress {
+    let (head, iteration) = (iteration / 75 + 1, iteration % 75 + 1);
+    let share = f64::from(iteration) / 75.0;
+    let phase = match share {
+        share if share < 0.6 => Phase::Relaxation,
+        share if share < 0.8 => Phase::Rank,
+        _ => Phase::Growth,
+    };
+    let wrong = (1000.0 * (0.5 - 0.5 * share)) as u32;
+    HeadProgress {
+        head,
+        iteration,
+        phase: Some(phase),
+        weight_sum: 40.0 - 20.0 * share,
+        weight_histogram: [60 - wrong / 10, 0, 0, 0, 0, wrong / 10, 0, 0, 0, 20],
+        tolerance: (phase == Phase::Growth).then_some(0.04),
+        best_daq_residual: (head > 1).then_some(0.3),
+    }
 }

@@ -4,9 +4,9 @@ use burn::tensor::{Device, Tensor};
 use nalgebra::DMatrix;
 
 use super::parameter::Parameter;
-use super::pass::{Pass, PlaneUse};
+use super::pass::Pass;
 use super::pointnet::{self, PointNet};
-use super::{Error, PriorNetwork};
+use super::{Error, MIN_COLUMNS};
 use crate::domain::Backend;
 
 /// Learning rate of log f as a multiple of the network's. Adam moves a parameter by about one rate a step, and log f
@@ -61,12 +61,13 @@ impl CloudNetwork {
 
     /// Runs the network.
     ///
+    /// * `with_plane`: whether the plane at infinity is computed
     /// * `iteration`: counted from 1, for the error
     ///
     /// # Errors
     /// [`Error::Diverged`] when the output is not finite, [`Error::Backend`] for a defect of burn.
-    pub fn forward(&self, plane_use: PlaneUse, iteration: u32) -> Result<Output, Error> {
-        let pass = self.network.forward(&self.cloud, plane_use, self.slope, &self.device)?;
+    pub fn forward(&self, with_plane: bool, iteration: u32) -> Result<Output, Error> {
+        let pass = self.network.forward(&self.cloud, with_plane, self.slope, &self.device)?;
         let plane = pass.plane().unwrap_or(&NO_PLANE);
         if pass.logits.iter().chain(plane).any(|value| !value.is_finite()) {
             return Err(Error::Diverged { iteration });
@@ -119,7 +120,7 @@ fn check(balanced: &DMatrix<f64>) -> Result<(), Error> {
     if rows < 6 || !rows.is_multiple_of(3) {
         return Err(Error::WrongRows { rows });
     }
-    if columns < PriorNetwork::MIN_COLUMNS {
+    if columns < MIN_COLUMNS {
         return Err(Error::TooFewColumns { columns });
     }
     for column in 0..columns {

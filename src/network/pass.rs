@@ -20,17 +20,6 @@ use crate::simd::vectorised;
 /// Derivatives of one loss with respect to every array; `None` where it does not reach the array.
 pub type Gradient = PointNet<Option<Vec<f32>>>;
 
-/// What the plane at infinity is wanted for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum PlaneUse {
-    /// Nothing: it is not computed.
-    None,
-    /// Its gradient reaches the classification head, not the trunk.
-    Apart,
-    /// Its gradient reaches the trunk, too.
-    Joint,
-}
-
 /// What the network said of a cloud, and what its derivatives need.
 pub struct Pass {
     /// Logits of the weights, one a column.
@@ -48,10 +37,10 @@ pub struct Pass {
 /// The way from the local feature to the plane at infinity.
 struct PlanePass {
     plane: Vec<f32>,
-    /// The trunk's upper layers but for the last; empty where the plane is apart.
+    /// The trunk's upper layers but for the last.
     upper: Vec<Normalised>,
-    /// The trunk's last layer; `None` where the plane is apart.
-    pooled: Option<Pooled>,
+    /// The trunk's last layer.
+    pooled: Pooled,
     classification: Vec<Affine>,
     layer: Affine,
 }
@@ -99,39 +88,28 @@ type Arrays = Layer<Option<Vec<f32>>>;
 impl PointNet<Parameter> {
     /// Runs the network on a cloud (rows x m) whose rows have mean 0.
     ///
-    /// `slope` is that of the segmentation head's rectifiers below 0; those of the other layers are ReLU.
+    /// * `with_plane`: whether the plane at infinity is computed
+    /// * `slope`: of the segmentation head's rectifiers below 0; those of the other layers are ReLU
     ///
     /// # Errors
     /// [`Error::Backend`] for a defect of burn.
-    pub fn forward(
-        &self,
-        centred: &Tensor<2>,
-        plane_use: PlaneUse,
-        slope: f32,
-        device: &Device,
-    ) -> Result<Pass, Error> {
+    pub fn forward(&self, centred: &Tensor<2>, with_plane: bool, slope: f32, device: &Device) -> Result<Pass, Error> {
         let columns = centred.dims()[1];
         let (lower, upper) = self.trunk.split_at(LOCAL_LAYER + 1);
         let (trunk, local) = chain(lower, centred.clone(), true, 0.0, device)?;
         let (segmentation, features) = chain(&self.segmentation, local.clone(), false, slope, device)?;
         let (logit, logits) = self.logit.affine(features, device)?;
         let depths = (upper.len(), self.classification.len());
-        let plane = match plane_use {
-            PlaneUse::None => None,
-            _ => Some(self.plane_pass(local, plane_use == PlaneUse::Apart, device)?),
-        };
+        let plane = if with_plane { Some(self.plane_pass(local, device)?) } else { None };
         Ok(Pass { logits, device: device.clone(), columns, trunk, segmentation, logit, depths, plane })
     }
 
     /// From the local feature, centred, to the plane at infinity.
-    fn plane_pass(&self, local: Tensor<2>, apart: bool, device: &Device) -> Result<PlanePass, Error> {
+    fn plane_pass(&self, local: Tensor<2>, device: &Device) -> Result<PlanePass, Error> {
         let (_, upper) = self.trunk.split_at(LOCAL_LAYER + 1);
         let (last, upper) = upper.split_last().ok_or_else(|| Error::Backend("a trunk without layers".into()))?;
-        let (mut upper, local) = chain(upper, local, true, 0.0, device)?;
+        let (upper, local) = chain(upper, local, true, 0.0, device)?;
         let (pooled, mut global) = last.pooled(local, device)?;
-        if apart {
-            upper.clear();
-        }
         let mut classification = Vec::with_capacity(self.classification.len());
         for layer in &self.classification {
             let input = constant(global, [layer.weight.shape()[1], 1], device);
@@ -142,7 +120,7 @@ impl PointNet<Parameter> {
         }
         let input = constant(global, [self.plane.weight.shape()[1], 1], device);
         let (layer, plane) = self.plane.affine(input, device)?;
-        Ok(PlanePass { plane, upper, pooled: (!apart).then_some(pooled), classification, layer })
+        Ok(PlanePass { plane, upper, pooled, classification, layer })
     }
 }
 
@@ -178,14 +156,12 @@ impl Pass {
                 output = values_of(layer.input)?;
                 on_global = on_input;
             }
-            if let Some(pooled) = pass.pooled {
-                let (last, on_input) = pooled.backward(&on_global, columns, &device)?;
-                let (arrays, on_input) = backward_chain(pass.upper, on_input, true, columns, &device)?;
-                upper = arrays;
-                upper.push(last);
-                for (slope, other) in on_local.iter_mut().zip(on_input) {
-                    *slope += other;
-                }
+            let (last, on_input) = pass.pooled.backward(&on_global, columns, &device)?;
+            let (arrays, on_input) = backward_chain(pass.upper, on_input, true, columns, &device)?;
+            upper = arrays;
+            upper.push(last);
+            for (slope, other) in on_local.iter_mut().zip(on_input) {
+                *slope += other;
             }
         }
         let (mut trunk, _) = backward_chain(self.trunk, on_local, true, columns, &device)?;

@@ -6,7 +6,6 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::parameter::Parameter;
-use super::pass::PlaneUse;
 use super::pointnet::{LOCAL_LAYER, Layer, PointNet, VARIANCE_FLOOR, constant, standard_normal, values_of};
 
 /// What the network says of a cloud of m columns.
@@ -39,9 +38,8 @@ impl PointNet<Parameter> {
 impl PointNet<Tensor<2>> {
     /// Runs the network on a cloud (rows x m) whose rows have mean 0.
     ///
-    /// With `plane_apart` no gradient of the plane reaches the trunk, only the classification head. `slope`: of the
-    /// segmentation head's rectifiers below 0.
-    fn forward_on_tape(&self, centred: Tensor<2>, plane_apart: bool, slope: f64) -> Output {
+    /// `slope`: of the segmentation head's rectifiers below 0.
+    fn forward_on_tape(&self, centred: Tensor<2>, slope: f64) -> Output {
         let mut features = self.trunk[0].normalised(centred, 0.0);
         for layer in &self.trunk[1..=LOCAL_LAYER] {
             features = layer.normalised(centre(features), 0.0);
@@ -55,13 +53,7 @@ impl PointNet<Tensor<2>> {
         let logits = self.logit.affine(features);
 
         let upper = &self.trunk[LOCAL_LAYER + 1..];
-        let mut global = if plane_apart {
-            // Off the graph, which would only keep what no gradient asks for.
-            let upper: Vec<_> = upper.iter().map(Layer::untracked).collect();
-            Tensor::from_inner(global_feature(&upper, local.inner()))
-        } else {
-            global_feature(upper, local)
-        };
+        let mut global = global_feature(upper, local);
         for layer in &self.classification {
             global = relu(layer.affine(global));
         }
@@ -80,12 +72,6 @@ fn global_feature(layers: &[Layer<Tensor<2>>], local: Tensor<2>) -> Tensor<2> {
 }
 
 impl Layer<Tensor<2>> {
-    /// The same values outside the graph.
-    fn untracked(&self) -> Self {
-        let inner = |tensor: &Tensor<2>| tensor.clone().inner();
-        Self { weight: inner(&self.weight), gain: self.gain.as_ref().map(inner), bias: inner(&self.bias) }
-    }
-
     /// `W X + b`.
     fn affine(&self, input: Tensor<2>) -> Tensor<2> {
         self.weight.clone().matmul(input) + self.bias.clone()
@@ -136,12 +122,11 @@ fn cloud(rows: usize, columns: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     values
 }
 
-/// Output and derivatives of both, with the plane apart and not, ReLU and leaky; 37 columns leave a remainder in every
-/// sum.
+/// Output and derivatives of both, ReLU and leaky; 37 columns leave a remainder in every sum.
 #[test]
 fn the_pass_written_out_agrees_with_the_tape() {
     const SHAPE: [usize; 2] = [12, 37];
-    for (seed, plane_use, slope) in [(1, PlaneUse::Apart, 0.0), (2, PlaneUse::Joint, 0.0), (3, PlaneUse::Joint, 0.1)] {
+    for (seed, slope) in [(2, 0.0), (3, 0.1)] {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut network = PointNet::new(SHAPE[0], 0.25, seed);
         // Gains and biases off their symmetric start, some gains negative.
@@ -160,8 +145,7 @@ fn the_pass_written_out_agrees_with_the_tape() {
 
         let device = Device::flex().autodiff();
         let leaves = network.leaves(&device);
-        let output =
-            leaves.forward_on_tape(constant(values.clone(), SHAPE, &device), plane_use == PlaneUse::Apart, slope);
+        let output = leaves.forward_on_tape(constant(values.clone(), SHAPE, &device), slope);
         let surrogate = (output.logits.clone() * constant(on_logits.clone(), [1, SHAPE[1]], &device)).sum()
             + (output.plane.clone() * constant(on_plane.to_vec(), [3, 1], &device)).sum();
         let mut reached = surrogate.backward();
@@ -171,13 +155,11 @@ fn the_pass_written_out_agrees_with_the_tape() {
             .collect();
 
         let device = Device::flex();
-        let pass = network
-            .forward(&constant(values.clone(), SHAPE, &device), plane_use, slope as f32, &device)
-            .expect("a pass");
+        let pass =
+            network.forward(&constant(values.clone(), SHAPE, &device), true, slope as f32, &device).expect("a pass");
         assert_near(&pass.logits, &values_of(output.logits.inner()).expect("f32"), "logits");
         assert_near(pass.plane().expect("computed"), &values_of(output.plane.inner()).expect("f32"), "plane");
-        let unused =
-            network.forward(&constant(values, SHAPE, &device), PlaneUse::None, slope as f32, &device).expect("a pass");
+        let unused = network.forward(&constant(values, SHAPE, &device), false, slope as f32, &device).expect("a pass");
         assert_eq!((&unused.logits, unused.plane()), (&pass.logits, None));
         let gradient = pass.backward(on_logits, Some(on_plane)).expect("a gradient");
         assert_eq!(gradient.arrays().count(), expected.len());

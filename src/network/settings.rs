@@ -7,21 +7,21 @@ use crate::domain::{Backend, SolveSettings};
 pub struct NetworkSettings {
     /// Width of the PointNet as a share of the original.
     pub width: f64,
-    /// Weight of L_proj.
+    /// Weight of L_proj; of the continued objective, at the first iteration.
     pub alpha: f64,
     /// Weight of L_DAQ.
     pub beta: f64,
-    /// The paper's `t`.
+    /// The paper's `t`; of the continued objective, at the first iteration.
     pub min_inliers: f64,
-    /// Slope of the sigmoid in L_num.
+    /// Slope of the sigmoid in L_num; the continued objective has none.
     pub kappa: f64,
     /// Adam's learning rate.
     pub learning_rate: f64,
-    /// Iterations planned in total. More may be run; this only places the onset of L_DAQ.
+    /// Iterations of a head.
     pub iterations: u32,
     /// Whether L_DAQ is optimised. Its value is reported either way.
     pub use_daq: bool,
-    /// Seed of the initial weights.
+    /// Of the initial weights, and of how heads differ.
     pub seed: u64,
     pub backend: Backend,
 }

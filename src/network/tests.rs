@@ -4,9 +4,9 @@ use nalgebra::DMatrix;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{DAQ_ONSET, Error, Iteration, NetworkSettings, PriorNetwork};
+use super::head::{Head, HeadIteration, HeadObjective};
+use super::{Error, NetworkSettings};
 use crate::domain::Backend;
-use crate::synthetic::metrics::agreement;
 use crate::synthetic::scene::IMAGE_SIDE_PX;
 use crate::synthetic::{Scene, SceneOptions};
 
@@ -51,16 +51,17 @@ pub fn random_weights(columns: usize, seed: u64) -> Vec<f64> {
     (0..columns).map(|_| rng.random_range(0.05..0.95)).collect()
 }
 
-/// Quarter width, the default of jobs.
+/// Quarter width, the default of jobs; a slope of the sigmoid and an alpha with which weights do not collapse.
 fn settings(backend: Backend, seed: u64) -> NetworkSettings {
-    NetworkSettings { backend, seed, iterations: 300, ..NetworkSettings::default() }
+    NetworkSettings { backend, seed, iterations: 300, alpha: 10.0, kappa: 20.0, ..NetworkSettings::default() }
 }
 
-fn network(matrix: &DMatrix<f64>, settings: &NetworkSettings) -> PriorNetwork {
-    PriorNetwork::new(matrix, settings).expect("a valid matrix")
+/// By the literal objective.
+fn network(matrix: &DMatrix<f64>, settings: &NetworkSettings) -> Head {
+    Head::new(matrix, settings, settings.seed, HeadObjective::Literal).expect("a valid matrix")
 }
 
-fn run(network: &mut PriorNetwork, steps: u32) -> Iteration {
+fn run(network: &mut Head, steps: u32) -> HeadIteration {
     (0..steps).map(|_| network.step().expect("a step")).last().expect("at least one step")
 }
 
@@ -94,28 +95,22 @@ fn the_largest_weights_belong_to_inliers() {
     }
 }
 
-/// The paper's own output, weights above 1/2 and the focal length: over 20 seeds at 90 % outliers the mean F1 is .99
-/// and the median focal error .5 %.
+/// With the paper's own alpha and sigmoid nothing asks for a track: 200 weights of 0 count as 76, more than its t.
 #[test]
-fn a_full_run_separates_and_calibrates() {
-    for seed in 0..2 {
-        let scene = contaminated_scene(10, 200, 0.9, seed);
-        let mut network = network(&balanced_matrix(&scene), &settings(Backend::Flex, seed));
-        let last = run(&mut network, 300);
-        let kept: Vec<bool> = network.weights().iter().map(|&w| w > 0.5).collect();
-        let score = agreement(&kept, &scene.truth.inlier);
-        let focal_error = network.focal() * f64::from(IMAGE_SIDE_PX) / scene.truth.focal_px - 1.0;
-        assert!(score.f1 > 0.9, "seed {seed}: {score:?}");
-        assert!(focal_error.abs() < 0.05, "seed {seed}: focal length off by {focal_error}");
-        assert!(last.losses.daq < 1.0, "seed {seed}: L_DAQ {}", last.losses.daq);
-    }
+fn as_printed_the_weights_collapse() {
+    let scene = contaminated_scene(10, 200, 0.9, 0);
+    let as_printed = NetworkSettings { alpha: 1.0, kappa: 1.0, use_daq: false, ..settings(Backend::Flex, 0) };
+    let mut network = network(&balanced_matrix(&scene), &as_printed);
+    run(&mut network, 300);
+    let sum: f64 = network.weights().iter().sum();
+    assert!(sum < 5.0, "20 tracks are right, the weights sum up to {sum}");
 }
 
 /// Weights of the backends apart after twenty iterations; 1e-7 was measured, a few units in the last place of f32. The
 /// room is for other processors' order of summation.
 const MAX_BACKEND_DRIFT: f64 = 1e-3;
 
-/// Forward and backward of one iteration, then twenty with L_DAQ from the first.
+/// Forward and backward of one iteration, then twenty.
 #[test]
 fn backends_agree() {
     let scene = contaminated_scene(6, 80, 0.7, 4);
@@ -158,28 +153,24 @@ fn one_seed_one_network() {
     assert_ne!(bits(3), bits(4));
 }
 
-/// Before its onset L_DAQ moves the focal length and the plane and leaves the weights alone; without it nothing moves.
+/// Without the setting nothing of the calibration moves, and L_DAQ has no part in the weights.
 #[test]
-fn daq_acts_on_the_weights_only_after_its_onset() {
+fn daq_acts_on_the_weights_and_the_calibration_where_it_is_asked_for() {
     let matrix = balanced_matrix(&contaminated_scene(5, 60, 0.7, 1));
-    let mut with = network(&matrix, &NetworkSettings { iterations: 40, ..settings(Backend::Flex, 0) });
-    let mut without =
-        network(&matrix, &NetworkSettings { iterations: 40, use_daq: false, ..settings(Backend::Flex, 0) });
-    let onset = (DAQ_ONSET * 40.0) as u32;
-    run(&mut with, onset);
-    run(&mut without, onset);
-    assert_eq!(with.weights(), without.weights());
-    assert!((with.focal() - 1.5).abs() > 1e-3);
-    assert!((without.focal() - 1.5).abs() < 1e-6);
-    assert_ne!(with.plane_at_infinity(), without.plane_at_infinity());
-    run(&mut with, 2);
-    run(&mut without, 2);
+    let of = |use_daq| {
+        let mut network = network(&matrix, &NetworkSettings { use_daq, ..settings(Backend::Flex, 0) });
+        run(&mut network, 10);
+        network
+    };
+    let (with, without) = (of(true), of(false));
     assert_ne!(with.weights(), without.weights());
+    assert!((with.focal() - 1.5).abs() > 1e-3 && (without.focal() - 1.5).abs() < 1e-6);
+    assert_ne!(with.plane_at_infinity(), without.plane_at_infinity());
 }
 
 #[test]
 fn hostile_matrices_are_refused_or_survived() {
-    let build = |matrix: &DMatrix<f64>| PriorNetwork::new(matrix, &settings(Backend::Flex, 0)).err();
+    let build = |matrix: &DMatrix<f64>| Head::new(matrix, &settings(Backend::Flex, 0), 0, HeadObjective::Literal).err();
     let matrix = balanced_matrix(&contaminated_scene(5, 12, 0.0, 1));
     assert_eq!(build(&matrix.columns(0, 4).into_owned()), Some(Error::TooFewColumns { columns: 4 }));
     assert_eq!(build(&matrix.rows(0, 14).into_owned()), Some(Error::WrongRows { rows: 14 }));

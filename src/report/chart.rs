@@ -34,7 +34,7 @@ pub struct LineChart<'a> {
     /// Bounds that values are clipped to before the axis is chosen, so that a wild start hides nothing.
     pub clip: Option<(f64, f64)>,
     /// Vertical marks: position and name.
-    pub marks: Vec<(f64, &'a str)>,
+    pub marks: Vec<(f64, String)>,
 }
 
 /// A range of values on an axis and where it lies in the drawing.
@@ -233,6 +233,50 @@ pub fn histogram(title: &str, x_label: &str, kinds: [(&str, &[f64]); 2]) -> Stri
     close(svg)
 }
 
+/// Counts in equal intervals of 0..1 over time, as columns of cells that are the darker the larger their share of the
+/// column.
+///
+/// * `columns`: position, increasing, and counts; all of the same length
+pub fn heat_map(title: &str, x_label: &str, y_label: &str, columns: &[(f64, &[u32])]) -> String {
+    /// Columns that are drawn; of those that share one, the first is.
+    const DRAWN: usize = 80;
+    let x = axis(columns.iter().map(|(at, _)| *at), LEFT, WIDTH - RIGHT, 0.0);
+    let y = Axis { low: 0.0, high: 1.0, from: HEIGHT - BOTTOM, to: TOP };
+    let mut svg = open(title);
+    let width = (x.to - x.from) / DRAWN as f64;
+    let mut free_from = f64::NEG_INFINITY;
+    for (at, counts) in columns {
+        let left = x.from + width * ((x.place(*at) - x.from) / width).floor().min(DRAWN as f64 - 1.0);
+        if left < free_from {
+            continue;
+        }
+        free_from = left + 0.5 * width;
+        let total = counts.iter().sum::<u32>().max(1);
+        let cell = 1.0 / counts.len() as f64;
+        for (place, &count) in counts.iter().enumerate().filter(|(_, count)| **count > 0) {
+            let top = y.place(cell * (place + 1) as f64);
+            let height = y.place(cell * place as f64) - top;
+            // Square roots, so that few tracks stay visible.
+            let shade = (f64::from(count) / f64::from(total)).sqrt();
+            let _ = write!(
+                svg,
+                "<rect class=\"cell\" x=\"{left:.1}\" y=\"{top:.1}\" width=\"{width:.2}\" height=\"{height:.1}\" \
+                 opacity=\"{shade:.2}\"/>"
+            );
+        }
+    }
+    for tick in [0.0, 0.5, 1.0] {
+        text(&mut svg, LEFT - 6.0, y.place(tick) + 3.5, "end", "tick", &short(tick));
+    }
+    for tick in x.ticks() {
+        let at = x.place(tick);
+        text(&mut svg, at, HEIGHT - BOTTOM + 14.0, anchor(at), "tick", &short(tick));
+    }
+    text(&mut svg, LEFT, TOP - 5.0, "end", "mute", y_label);
+    text(&mut svg, (LEFT + WIDTH - RIGHT) / 2.0, HEIGHT - 5.0, "middle", "mute", x_label);
+    close(svg)
+}
+
 /// The range of values, widened by a share on both sides; a single value gets a range of its own size.
 fn axis(values: impl Iterator<Item = f64>, from: f64, to: f64, margin: f64) -> Axis {
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
@@ -266,7 +310,8 @@ mod tests {
 
     fn chart(points: Vec<(f64, f64)>, logarithmic: bool) -> String {
         let series = vec![Series { name: "a<b", points: points.clone() }, Series { name: "c", points }];
-        LineChart { title: "t", x_label: "x", series, logarithmic, clip: None, marks: vec![(1.0, "m")] }.svg()
+        LineChart { title: "t", x_label: "x", series, logarithmic, clip: None, marks: vec![(1.0, "m".to_owned())] }
+            .svg()
     }
 
     #[test]

@@ -6,12 +6,13 @@ use super::chart::{self, LineChart, Series};
 use super::html::{escape, short};
 use super::words;
 use crate::domain::result::PriorTime;
-use crate::domain::{Calibration, Grade, LensProjection, Losses, Progress, Solution, Status};
+use crate::domain::{Calibration, Grade, HeadProgress, LensProjection, Losses, Progress, Solution, Status};
 use crate::formats::LabelledInput;
 use crate::formats::warnings::named;
 
 /// A focal length beyond this factor of the final one is drawn at the edge of its chart.
 const FOCAL_CLIP: f64 = 2.5;
+const NETWORK_ITERATION: &str = "network iteration";
 
 /// Title, outcome and the figures that matter.
 pub fn headline(solution: &Solution) -> String {
@@ -139,7 +140,7 @@ pub fn convergence(solution: &Solution) -> String {
     };
     let losses = LineChart {
         title: "Losses (logarithmic)",
-        x_label: "network iteration",
+        x_label: NETWORK_ITERATION,
         series: vec![
             Series { name: "L_num", points: loss(|losses| losses.num) },
             Series { name: "L_proj", points: loss(|losses| losses.proj) },
@@ -147,7 +148,7 @@ pub fn convergence(solution: &Solution) -> String {
         ],
         logarithmic: true,
         clip: None,
-        marks: Vec::new(),
+        marks: phase_starts(history, &iterations),
     };
     let single = |title: &'static str, points: Vec<(f64, f64)>, clip: Option<(f64, f64)>| LineChart {
         title,
@@ -168,12 +169,66 @@ pub fn convergence(solution: &Solution) -> String {
             None,
         ),
     ];
-    let svgs: Vec<String> = charts.iter().map(|chart| format!("<figure>{}</figure>\n", chart.svg())).collect();
+    let mut svgs: Vec<String> = charts.iter().map(LineChart::svg).collect();
+    svgs.extend(of_heads(history, &iterations));
+    let figures: Vec<String> = svgs.iter().map(|svg| format!("<figure>{svg}</figure>\n")).collect();
     format!(
         "<section id=\"convergence\">\n<h2>Convergence</h2>\n<div class=\"grid\">\n{}</div>\n{}</section>\n",
-        svgs.concat(),
+        figures.concat(),
         prior_times(solution)
     )
+}
+
+/// What the heads of the network went through: their weights, and what their continuation and their choice go by.
+/// Nothing where no head was optimised.
+fn of_heads(history: &[Progress], iterations: &[f64]) -> Vec<String> {
+    let heads: Vec<(f64, &HeadProgress)> =
+        history.iter().zip(iterations).filter_map(|(record, &at)| Some((at, record.head.as_ref()?))).collect();
+    if heads.is_empty() {
+        return Vec::new();
+    }
+    let curve = |pick: fn(&HeadProgress) -> Option<f64>| -> Vec<(f64, f64)> {
+        heads.iter().filter_map(|&(at, head)| Some((at, pick(head)?))).collect()
+    };
+    let chart = |title, series, logarithmic| LineChart {
+        title,
+        x_label: NETWORK_ITERATION,
+        series,
+        logarithmic,
+        clip: None,
+        marks: phase_starts(history, iterations),
+    };
+    let sums = vec![Series { name: "N", points: curve(|head| Some(head.weight_sum)) }];
+    let residuals = vec![
+        Series { name: "tau", points: curve(|head| head.tolerance) },
+        Series { name: "best DAQ", points: curve(|head| head.best_daq_residual) },
+    ];
+    let histograms: Vec<(f64, &[u32])> = heads.iter().map(|&(at, head)| (at, &head.weight_histogram[..])).collect();
+    let mut svgs = vec![
+        chart("Sum N of the weights", sums, false).svg(),
+        chart::heat_map("Weights of the tracks over the iterations", NETWORK_ITERATION, "weight", &histograms),
+    ];
+    if residuals.iter().any(|series| !series.points.is_empty()) {
+        let title = "Residual tau of a track that leaves, DAQ residual of the best head";
+        svgs.push(chart(title, residuals, true).svg());
+    }
+    svgs
+}
+
+/// Where among the network's iterations each head and each phase of its continuation began.
+fn phase_starts(history: &[Progress], iterations: &[f64]) -> Vec<(f64, String)> {
+    let mut marks = Vec::new();
+    let mut last = None;
+    for (record, &at) in history.iter().zip(iterations) {
+        let Some(HeadProgress { head, phase, .. }) = record.head else { continue };
+        if last.is_none_or(|(of, _)| of != head) {
+            marks.push((at, format!("head {head}")));
+        } else if last != Some((head, phase)) {
+            marks.push((at, phase.map_or_else(String::new, |phase| phase.name().to_owned())));
+        }
+        last = Some((head, phase));
+    }
+    marks
 }
 
 /// The network's iterations over all tries; each try counts its own from 0.
@@ -190,9 +245,12 @@ fn iterations_in_all(history: &[Progress]) -> Vec<f64> {
 }
 
 /// Where among the reports each stage began.
-fn stage_starts(history: &[Progress]) -> Vec<(f64, &'static str)> {
+fn stage_starts(history: &[Progress]) -> Vec<(f64, String)> {
     let begins = |step: usize| step == 0 || history[step - 1].stage != history[step].stage;
-    (0..history.len()).filter(|&step| begins(step)).map(|step| (step as f64, history[step].stage.name())).collect()
+    (0..history.len())
+        .filter(|&step| begins(step))
+        .map(|step| (step as f64, history[step].stage.name().to_owned()))
+        .collect()
 }
 
 /// What each prior alone would have needed, on one line: it holds times.
@@ -265,8 +323,25 @@ mod tests {
             (record.iteration, record.stage) = (iteration, stage);
         }
         assert_eq!(iterations_in_all(&history), [25.0, 50.0, 75.0, 80.0]);
-        assert_eq!(stage_starts(&history), [(0.0, "search"), (1.0, "refine"), (2.0, "search")]);
+        let starts = [(0.0, "search"), (1.0, "refine"), (2.0, "search")].map(|(at, name)| (at, name.to_owned()));
+        assert_eq!(stage_starts(&history), starts);
         assert!(iterations_in_all(&[]).is_empty() && stage_starts(&[]).is_empty());
+    }
+
+    #[test]
+    fn heads_and_phases_are_marked_where_they_begin() {
+        let (_, solution) = fixture::solved();
+        let history = &solution.history;
+        let iterations = iterations_in_all(history);
+        let named: Vec<String> = phase_starts(history, &iterations).into_iter().map(|(_, name)| name).collect();
+        assert_eq!(named, ["head 1", "rank", "growth", "head 2", "rank", "growth"]);
+        let svgs = of_heads(history, &iterations);
+        assert_eq!(svgs.len(), 3);
+        assert!(svgs[0].contains("growth"), "{}", svgs[0]);
+        // All tracks of the first record are of middling weight, most of the last are wrong.
+        assert!(svgs[1].contains("<rect"), "{}", svgs[1]);
+        let without: Vec<Progress> = history.iter().map(|record| Progress { head: None, ..*record }).collect();
+        assert!(of_heads(&without, &iterations).is_empty() && phase_starts(&without, &iterations).is_empty());
     }
 
     #[test]

@@ -1,6 +1,4 @@
-//! The methods without search: the paper's own thresholded weights, and plain projective factorisation.
-//!
-//! Where PAPER departs from the paper, and on what evidence, is listed in [`crate::network`].
+//! The methods without search (PAPER, SCPSFM and PSFM): what they have in common, and plain projective factorisation.
 
 use super::attempt::{self, Attempt, Effort};
 use super::fusion::{self, Estimate};
@@ -8,13 +6,12 @@ use super::grow::{self, Consensus, ConsensusOptions, LEAST_SUPPORT};
 use super::problem::Problem;
 use super::recorder::Recorder;
 use super::{Error, view_selection};
-use crate::domain::{Losses, StopToken};
+use crate::domain::StopToken;
 use crate::geometry::bundle::{self, projective};
 use crate::geometry::epipolar_depths::epipolar_depths;
 use crate::geometry::factorization::{RANK, cameras_of, dominant_subspace, subspace_residuals};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::triangulation;
-use crate::network::{NetworkSettings, PriorNetwork, THRESHOLD};
 
 /// Residual (sine of the angle to the subspace) per unit of noise below which plain factorisation calls a track an
 /// inlier; the same scale as the search's tolerance.
@@ -67,64 +64,6 @@ pub fn with_epipolar_depths(problem: &Problem, block: &CompleteBlock, noise: f64
         return None;
     }
     epipolar_depths(block, noise, settings.seed, problem.stop).map(|depths| block.with_depths(depths))
-}
-
-/// PAPER: optimises the network to the end and thresholds its weights.
-///
-/// * `tracks`: those of the input that the block's are
-///
-/// # Errors
-/// The network's own, which are defects: a block has more columns than it asks for.
-pub fn paper(
-    problem: &Problem,
-    block: &CompleteBlock,
-    tracks: &[usize],
-    recorder: &mut Recorder,
-) -> Result<Decided, crate::network::Error> {
-    let settings = problem.settings;
-    let matrix = balance(&block.measurement_matrix());
-    let mut network = PriorNetwork::new(&matrix, &NetworkSettings::from(settings))?;
-    let earlier = recorder.standing.iteration;
-    while network.iteration() < settings.iterations && !problem.stop.is_stopped() {
-        let step = network.step()?;
-        let within = f64::from(step.iteration) / f64::from(settings.iterations);
-        let (iteration, losses) = (step.iteration, step.losses);
-        let step = NetworkIteration { iteration, earlier, losses, weights: network.weights(), focal: network.focal() };
-        report(problem, tracks, &step, within, recorder);
-    }
-    let weights = network.weights().to_vec();
-    let inlier = weights.iter().map(|&weight| weight > THRESHOLD).collect();
-    Ok(Decided { inlier, weights, is_verified: true })
-}
-
-/// An iteration of the network where it decides by itself.
-pub struct NetworkIteration<'a> {
-    /// Of this optimisation, counted from 1, and how many there were in those before.
-    pub iteration: u32,
-    pub earlier: u32,
-    pub losses: Losses,
-    /// One a track of the block.
-    pub weights: &'a [f64],
-    /// In the units of the measurement matrix.
-    pub focal: f64,
-}
-
-/// Reports an iteration of the network.
-///
-/// * `tracks`: those of the input that the block's are
-/// * `within`: share of the work on this block that is done
-pub fn report(problem: &Problem, tracks: &[usize], step: &NetworkIteration, within: f64, recorder: &mut Recorder) {
-    let settings = problem.settings;
-    recorder.standing.iteration = step.earlier + step.iteration;
-    recorder.standing.losses = Some(step.losses);
-    recorder.standing.inliers = step.weights.iter().filter(|&&weight| weight > THRESHOLD).count() as u32;
-    if settings.use_daq {
-        recorder.standing.focal_px = Some(step.focal * problem.scale_px);
-    }
-    recorder.report(within);
-    if settings.weights_every > 0 && step.iteration.is_multiple_of(settings.weights_every) {
-        recorder.weights(&problem.scatter(step.weights, tracks));
-    }
 }
 
 /// PSFM: the dominant subspace of all columns (Sturm & Triggs 1996), and the tracks that lie close to it.

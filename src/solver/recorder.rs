@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use crate::domain::result::StageTime;
-use crate::domain::{Course, Losses, Observer, Progress, Solution, Stage, Step, Task};
+use crate::domain::{Course, HeadProgress, Losses, Observer, Progress, Solution, Stage, Step, Task};
 
 /// Share of the whole that is done when each stage begins; the rest of each interval fills as the stage goes on.
 /// From the measured shares of time at 10 views, 200 tracks, 90 % outliers.
@@ -41,6 +41,7 @@ const JUDGED_TIMES: usize = 2;
 pub struct Standing {
     pub iteration: u32,
     pub losses: Option<Losses>,
+    pub head: Option<HeadProgress>,
     pub inliers: u32,
     pub focal_px: Option<f64>,
     pub best_score: Option<f64>,
@@ -147,6 +148,13 @@ impl<'a> Recorder<'a> {
         self.course.part = 0;
     }
 
+    /// An iteration of the network is done; told with the next [`Self::report`].
+    pub fn optimised(&mut self, head: HeadProgress, losses: Losses) {
+        self.standing.iteration += 1;
+        self.standing.losses = Some(losses);
+        self.standing.head = Some(head);
+    }
+
     /// Records what stands now instead of what the search found: after every step that changes it, and before
     /// [`Self::finish`] with the numbers of the solution.
     ///
@@ -221,6 +229,7 @@ impl<'a> Recorder<'a> {
             fraction: self.fraction,
             iteration: self.iteration(),
             losses: self.standing.losses,
+            head: self.standing.head,
             inliers: self.standing.inliers,
             focal_px: self.standing.focal_px,
             best_score: self.standing.best_score,

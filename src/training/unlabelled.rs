@@ -25,16 +25,18 @@ use super::Error;
 use super::objective::{Loss, importance};
 use super::tape::{Output, constant, numbers};
 use crate::network::NetworkSettings;
-use crate::network::losses::{LossSettings, rank_terms};
+use crate::network::losses::{CountTerm, RankTerm, rank_term};
+
+/// Slope of the sigmoid in L_num: the paper's 1 lets all weights collapse to 0, 20 to 50 do not.
+const KAPPA: f64 = 20.0;
 
 /// The loss of what the network said; its parts are L_num and L_proj by the last block, means over the scenes.
 ///
 /// # Errors
 /// [`Error::Backend`] for a defect of burn; [`Error::NoDecomposition`] for columns that are not finite.
 pub fn loss(output: Output, dtype: DType) -> Result<Loss, Error> {
-    // The terms, their weights and `t` are those of the paper's network in its own use.
-    let NetworkSettings { alpha, min_inliers, kappa, .. } = NetworkSettings::default();
-    let settings = LossSettings { min_inliers, kappa };
+    let NetworkSettings { alpha, min_inliers, .. } = NetworkSettings::default();
+    let count = CountTerm::Sigmoid { min_inliers, kappa: KAPPA };
     let matrices = matrices(&output.columns)?;
     let device = output.columns.device();
     let blocks = output.tracks.len();
@@ -48,9 +50,10 @@ pub fn loss(output: Output, dtype: DType) -> Result<Loss, Error> {
         let mut slopes = Vec::with_capacity(values.len());
         parts = [0.0; 2];
         for (matrix, w) in matrices.iter().zip(values.chunks_exact(tracks)) {
-            let terms = rank_terms(matrix, w, &settings).map_err(|_| Error::NoDecomposition)?;
-            parts = [parts[0] + share * terms.num, parts[1] + share * terms.proj];
-            let both = terms.grad_w_num.iter().zip(&terms.grad_w_proj);
+            let (num, grad_num) = count.evaluate(w);
+            let (proj, grad_proj) = rank_term(matrix, w, RankTerm::TAIL).map_err(|_| Error::NoDecomposition)?;
+            parts = [parts[0] + share * num, parts[1] + share * proj];
+            let both = grad_num.iter().zip(&grad_proj);
             slopes.extend(both.map(|(num, proj)| share * (num + alpha * proj)));
         }
         // A plane through the loss: its value and its slope, which is all that a step takes.

@@ -105,6 +105,7 @@ fn progress(iteration: u32) -> Progress {
         fraction: 0.1,
         iteration,
         losses: None,
+        head: None,
         inliers: 2,
         focal_px: None,
         best_score: None,

@@ -3,21 +3,19 @@
 //! Pure functions of the balanced matrix, the weights and the calibration; nothing here knows of the network.
 //!
 //! With `A = M diag(w)` and the eigen-decomposition `A Aᵀ = U Λ Uᵀ`:
-//! * `L_num = exp(t - Σ_j s(κ (w_j - 1/2)))`,
-//! * `L_proj = Σ_{k>=5} σ_k(A)`, in `spectrum.rs`,
+//! * L_num, `exp(t - Σ_j s(κ (w_j - 1/2)))` or another [`CountTerm`],
+//! * L_proj, `Σ_{k>=5} σ_k(A)` or another [`RankTerm`],
 //! * `L_DAQ = Σ_i | S_i/|S_i| - ω/|ω| |` over the views, in the cameras that `gauge.rs` reads off the span of
 //!   the first four eigenvectors.
-//!
-//! `continued.rs` has what becomes of them in a continuation.
 
-mod continued;
-#[cfg(test)]
-mod continued_tests;
+mod count;
 mod daq;
 mod gauge;
 #[cfg(test)]
 mod reference_tests;
 mod spectrum;
+#[cfg(test)]
+mod term_tests;
 #[cfg(test)]
 mod tests;
 
@@ -25,20 +23,15 @@ use nalgebra::{DMatrix, Vector3};
 
 use super::Error;
 use crate::domain::Losses;
-pub use continued::{RankTerm, evaluate_continued};
+pub use count::CountTerm;
+pub use spectrum::RankTerm;
 use spectrum::Spectrum;
 
-/// Largest exponent of L_num: e³⁰ is about 1e13, and its gradient still fits into the f32 of the network. The gradient
-/// keeps the capped value instead of vanishing, or weights that collapsed could never come back.
-const MAX_EXPONENT: f64 = 30.0;
-
-/// Settings that the losses themselves contain; alpha and beta only weigh them.
+/// What L_num and L_proj are at a point of an optimisation; L_DAQ is always the same.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LossSettings {
-    /// The paper's `t`.
-    pub min_inliers: f64,
-    /// Slope of the sigmoid in L_num.
-    pub kappa: f64,
+pub struct Terms {
+    pub count: CountTerm,
+    pub rank: RankTerm,
 }
 
 /// The losses at one point and their derivatives, none of them weighted by alpha or beta.
@@ -75,11 +68,12 @@ pub fn evaluate(
     w: &[f64],
     log_focal: f64,
     n_inf: [f64; 3],
-    settings: &LossSettings,
+    terms: Terms,
 ) -> Result<Evaluation, Error> {
     debug_assert_eq!(balanced.ncols(), w.len());
     let spectrum = Spectrum::of(balanced, w)?;
-    let RankTerms { num, proj, grad_w_num, grad_w_proj } = RankTerms::of(&spectrum, w, settings);
+    let (num, grad_w_num) = terms.count.evaluate(w);
+    let (proj, grad_w_proj) = spectrum.rank_term(terms.rank, w);
     let cameras = gauge::CanonicalCameras::of(spectrum.span());
     let daq = daq::residual(&cameras, log_focal, &Vector3::from(n_inf));
     let grad_span = cameras.pull_back(&daq.grad_rotational, &daq.grad_translational);
@@ -94,48 +88,14 @@ pub fn evaluate(
     })
 }
 
-/// The two terms that know of no calibration, and their derivatives, one entry a column.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RankTerms {
-    pub num: f64,
-    pub proj: f64,
-    pub grad_w_num: Vec<f64>,
-    pub grad_w_proj: Vec<f64>,
-}
-
-impl RankTerms {
-    fn of(spectrum: &Spectrum, w: &[f64], settings: &LossSettings) -> Self {
-        let (num, grad_w_num) = inlier_count(w, settings);
-        let (proj, grad_w_proj) = spectrum.tail_sum(w);
-        Self { num, proj, grad_w_num, grad_w_proj }
-    }
-}
-
-/// L_num and L_proj alone, for points whose coordinates no calibration is known to fit.
+/// L_proj alone and its derivative, one entry a column.
 ///
 /// * `columns`: 3n x m, each of comparable length, for L_proj is in their unit
 /// * `w`: one weight a column
 ///
 /// # Errors
 /// [`Error::NoDecomposition`] when the weighted matrix overflows.
-pub fn rank_terms(columns: &DMatrix<f64>, w: &[f64], settings: &LossSettings) -> Result<RankTerms, Error> {
+pub fn rank_term(columns: &DMatrix<f64>, w: &[f64], term: RankTerm) -> Result<(f64, Vec<f64>), Error> {
     debug_assert_eq!(columns.ncols(), w.len());
-    Ok(RankTerms::of(&Spectrum::of(columns, w)?, w, settings))
-}
-
-/// The sum of the singular values past the fourth of a matrix as it is.
-///
-/// # Errors
-/// [`Error::NoDecomposition`] when its scatter matrix overflows.
-pub fn tail_sum(matrix: &DMatrix<f64>) -> Result<f64, Error> {
-    let w = vec![1.0; matrix.ncols()];
-    Ok(Spectrum::of(matrix, &w)?.tail_sum(&w).0)
-}
-
-/// L_num and its derivative `-κ s_j (1 - s_j) L_num`.
-fn inlier_count(w: &[f64], settings: &LossSettings) -> (f64, Vec<f64>) {
-    let soft: Vec<f64> = w.iter().map(|w| 1.0 / (1.0 + (-settings.kappa * (w - 0.5)).exp())).collect();
-    let value = (settings.min_inliers - soft.iter().sum::<f64>()).min(MAX_EXPONENT).exp();
-    let gradient = soft.iter().map(|s| -settings.kappa * s * (1.0 - s) * value).collect();
-    (value, gradient)
+    Ok(Spectrum::of(columns, w)?.rank_term(term, w))
 }

@@ -13,7 +13,13 @@ use super::*;
 
 const VIEWS: usize = 3;
 const TRACKS: usize = 12;
-const SETTINGS: LossSettings = LossSettings { min_inliers: 6.0, kappa: 20.0 };
+/// The paper's own but for the slope of the sigmoid.
+const TERMS: Terms = terms(20.0);
+
+const fn terms(kappa: f64) -> Terms {
+    Terms { count: CountTerm::Sigmoid { min_inliers: 6.0, kappa }, rank: RankTerm::TAIL }
+}
+
 /// Logarithm of the focal length and plane at infinity at which the derivatives were taken and the descent began.
 const LOG_FOCAL: f64 = 0.3;
 const PLANE: [f64; 3] = [0.2, -0.1, 0.3];
@@ -152,7 +158,7 @@ fn assert_close(what: &str, found: &[f64], expected: &[f64], tolerance: f64) {
 #[test]
 fn losses_and_derivatives_are_those_of_the_reference() {
     let (matrix, w) = (matrix(), weights(&logits()));
-    let found = evaluate(&matrix, &w, LOG_FOCAL, PLANE, &SETTINGS).expect("a finite matrix");
+    let found = evaluate(&matrix, &w, LOG_FOCAL, PLANE, TERMS).expect("a finite matrix");
     let Losses { num, proj, daq } = found.losses;
     assert_close("losses", &[num, proj, daq], &[NUM, PROJ, DAQ], LOSS_TOLERANCE);
     assert_close("dL_num/dw", &found.grad_w_num, &SLOPE_NUM, SLOPE_TOLERANCE);
@@ -161,8 +167,7 @@ fn losses_and_derivatives_are_those_of_the_reference() {
     assert_close("dL_DAQ/d log f", &[found.grad_log_focal], &[SLOPE_LOG_FOCAL], SLOPE_TOLERANCE);
     assert_close("dL_DAQ/dn", &found.grad_n_inf, &SLOPE_PLANE, SLOPE_TOLERANCE);
 
-    let literal = LossSettings { kappa: 1.0, ..SETTINGS };
-    let found = evaluate(&matrix, &w, LOG_FOCAL, PLANE, &literal).expect("a finite matrix");
+    let found = evaluate(&matrix, &w, LOG_FOCAL, PLANE, terms(1.0)).expect("a finite matrix");
     assert_close("literal L_num", &[found.losses.num], &[NUM_LITERAL], LOSS_TOLERANCE);
     assert_close("its slope", &found.grad_w_num, &SLOPE_NUM_LITERAL, SLOPE_TOLERANCE);
 }
@@ -175,7 +180,7 @@ fn a_descent_takes_the_path_of_the_reference() {
     let (mut logits, mut log_focal, mut plane) = (logits(), LOG_FOCAL, PLANE);
     for (step, expected) in TRACE.iter().enumerate() {
         let w = weights(&logits);
-        let found = evaluate(&matrix, &w, log_focal, plane, &SETTINGS).expect("a finite matrix");
+        let found = evaluate(&matrix, &w, log_focal, plane, TERMS).expect("a finite matrix");
         let Losses { num, proj, daq } = found.losses;
         assert_close(&format!("losses before step {step}"), &[num, proj, daq], expected, TRACE_TOLERANCE);
         if step + 1 == TRACE.len() {

@@ -15,6 +15,21 @@ const RELATIVE_GAP_FLOOR: f64 = 1e-3;
 /// The same where even the fourth eigenvalue vanishes.
 const ABSOLUTE_GAP_FLOOR: f64 = 1e-12;
 
+/// What L_proj is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum RankTerm {
+    /// `Σ_{k>=5} σ_k + leading · Σ_{k<=4} σ_k` of `M diag(w)`: with 1 the nuclear norm, convex in w, with 0 the paper's
+    /// L_proj (eq. 11).
+    SingularValues { leading: f64 },
+    /// `Σ_{k>=5} σ_k²`, the squared distance to the nearest matrix of rank 4 (paper, eq. 8).
+    Energy,
+}
+
+impl RankTerm {
+    /// The paper's own.
+    pub const TAIL: Self = Self::SingularValues { leading: 0.0 };
+}
+
 /// `M diag(w)² Mᵀ = U Λ Uᵀ`, eigenvalues in descending order, with the columns of M in the basis U.
 pub struct Spectrum {
     values: Vec<f64>,
@@ -58,33 +73,26 @@ impl Spectrum {
         self.vectors.fixed_columns::<RANK>(0).into_owned()
     }
 
-    /// L_proj, the sum of the singular values past the fourth, and its derivative
-    /// `w_j Σ_{k>=5} (u_kᵀ m_j)² / σ_k`.
-    pub fn tail_sum(&self, w: &[f64]) -> (f64, Vec<f64>) {
-        let sigma: Vec<f64> = self.values[RANK..].iter().map(|value| (value + EIGENVALUE_FLOOR).sqrt()).collect();
+    /// L_proj and its derivative by each weight: `w_j Σ_k f_k (u_kᵀ m_j)²`, where f_k is `1 / σ_k` of a singular value
+    /// that counts once, and 2 of one that counts squared.
+    pub fn rank_term(&self, term: RankTerm, w: &[f64]) -> (f64, Vec<f64>) {
+        let sigma = |value: &f64| (value + EIGENVALUE_FLOOR).sqrt();
+        let (value, factors): (f64, Vec<f64>) = match term {
+            RankTerm::SingularValues { leading } => {
+                let share = |k: usize| if k < RANK { leading } else { 1.0 };
+                let shared = self.values.iter().enumerate().map(|(k, value)| (share(k), sigma(value)));
+                let value = shared.clone().map(|(share, sigma)| share * sigma).sum();
+                (value, shared.map(|(share, sigma)| share / sigma).collect())
+            }
+            RankTerm::Energy => {
+                let factor = |k: usize| if k < RANK { 0.0 } else { 2.0 };
+                (self.values[RANK..].iter().sum(), (0..self.values.len()).map(factor).collect())
+            }
+        };
         let gradient = self.coordinates.column_iter().zip(w).map(|(column, w)| {
-            w * column.iter().skip(RANK).zip(&sigma).map(|(coordinate, sigma)| coordinate.powi(2) / sigma).sum::<f64>()
+            w * column.iter().zip(&factors).map(|(coordinate, factor)| factor * coordinate.powi(2)).sum::<f64>()
         });
-        (sigma.iter().sum(), gradient.collect())
-    }
-
-    /// The sum of the first four singular values and its derivative: what [`Self::tail_sum`] lacks to the nuclear norm.
-    pub fn leading_sum(&self, w: &[f64]) -> (f64, Vec<f64>) {
-        let sigma: Vec<f64> = self.values[..RANK].iter().map(|value| (value + EIGENVALUE_FLOOR).sqrt()).collect();
-        let gradient = self.coordinates.column_iter().zip(w).map(|(column, w)| {
-            w * column.iter().zip(&sigma).map(|(coordinate, sigma)| coordinate.powi(2) / sigma).sum::<f64>()
-        });
-        (sigma.iter().sum(), gradient.collect())
-    }
-
-    /// The squared Frobenius distance to the nearest matrix of rank 4 (paper, eq. 8), `Σ_{k>=5} σ_k²`, and its
-    /// derivative `2 w_j Σ_{k>=5} (u_kᵀ m_j)²`.
-    pub fn tail_energy(&self, w: &[f64]) -> (f64, Vec<f64>) {
-        let gradient =
-            self.coordinates.column_iter().zip(w).map(|(column, w)| {
-                2.0 * w * column.iter().skip(RANK).map(|coordinate| coordinate.powi(2)).sum::<f64>()
-            });
-        (self.values[RANK..].iter().sum(), gradient.collect())
+        (value, gradient.collect())
     }
 
     /// Derivative with respect to the weights of a function of the span whose derivative with respect to

@@ -7,7 +7,7 @@ use crate::network::tests::{balanced_matrix, contaminated_scene, random_weights}
 use crate::synthetic::scene::IMAGE_SIDE_PX;
 use crate::synthetic::{Scene, SceneOptions, Truth};
 
-const SETTINGS: LossSettings = LossSettings { min_inliers: 15.0, kappa: 20.0 };
+const TERMS: Terms = Terms { count: CountTerm::Sigmoid { min_inliers: 15.0, kappa: 20.0 }, rank: RankTerm::TAIL };
 /// Step of the central differences: their own error is then about 1e-9 of the second derivative's scale.
 const STEP: f64 = 1e-5;
 
@@ -27,7 +27,7 @@ impl Point {
     }
 
     fn evaluate(&self) -> Evaluation {
-        evaluate(&self.balanced, &self.w, self.log_focal, self.n_inf, &SETTINGS).expect("a finite matrix")
+        evaluate(&self.balanced, &self.w, self.log_focal, self.n_inf, TERMS).expect("a finite matrix")
     }
 
     /// Central differences of a loss in every weight.
@@ -109,7 +109,7 @@ fn the_truth_is_a_zero_of_proj_and_daq() {
         let log_focal = (scene.truth.focal_px / f64::from(IMAGE_SIDE_PX)).ln();
         let cameras = gauge::CanonicalCameras::of(Spectrum::of(&balanced, &w).expect("finite").span());
         let n_inf = true_plane_at_infinity(&cameras, &scene.truth, log_focal.exp());
-        let at = |log_focal: f64| evaluate(&balanced, &w, log_focal, n_inf, &SETTINGS).expect("finite").losses;
+        let at = |log_focal: f64| evaluate(&balanced, &w, log_focal, n_inf, TERMS).expect("finite").losses;
         let truth = at(log_focal);
         assert!(truth.num < 1e-6, "30 inliers are more than 15: {}", truth.num);
         assert!(truth.proj < 1e-3, "seed {seed}: L_proj {}", truth.proj);
@@ -143,9 +143,9 @@ fn true_plane_at_infinity(cameras: &gauge::CanonicalCameras, truth: &Truth, foca
 #[test]
 fn collapsed_weights_are_pushed_up() {
     let balanced = balanced_matrix(&contaminated_scene(5, 40, 0.3, 2));
-    let settings = LossSettings { min_inliers: 500.0, kappa: 20.0 };
-    let evaluation = evaluate(&balanced, &[0.4; 40], 0.0, [0.0; 3], &settings).expect("a finite matrix");
-    assert_eq!(evaluation.losses.num, MAX_EXPONENT.exp());
+    let terms = Terms { count: CountTerm::Sigmoid { min_inliers: 500.0, kappa: 20.0 }, ..TERMS };
+    let evaluation = evaluate(&balanced, &[0.4; 40], 0.0, [0.0; 3], terms).expect("a finite matrix");
+    assert_eq!(evaluation.losses.num, count::MAX_EXPONENT.exp());
     assert!(evaluation.grad_w_num.iter().all(|&gradient| gradient < -1.0 && (gradient as f32).is_finite()));
 }
 
@@ -166,12 +166,12 @@ fn degenerate_input_gives_finite_numbers() {
     balanced.column_mut(2).fill(0.0);
     let weights = [vec![0.0; 7], vec![1.0; 7], vec![1e-160; 7], vec![0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]];
     for w in weights {
-        let evaluation = evaluate(&balanced, &w, 0.4, [0.1; 3], &SETTINGS).expect("a finite matrix");
+        let evaluation = evaluate(&balanced, &w, 0.4, [0.1; 3], TERMS).expect("a finite matrix");
         assert!(finite(&evaluation), "weights {w:?}: {evaluation:?}");
     }
     balanced.fill(0.0);
-    assert!(finite(&evaluate(&balanced, &[0.5; 7], 0.4, [0.1; 3], &SETTINGS).expect("a finite matrix")));
+    assert!(finite(&evaluate(&balanced, &[0.5; 7], 0.4, [0.1; 3], TERMS).expect("a finite matrix")));
     balanced.fill(1e200);
-    let error = evaluate(&balanced, &[0.5; 7], 0.4, [0.1; 3], &SETTINGS).expect_err("the scatter overflows");
+    let error = evaluate(&balanced, &[0.5; 7], 0.4, [0.1; 3], TERMS).expect_err("the scatter overflows");
     assert_eq!(error, Error::NoDecomposition { rows: 15 });
 }

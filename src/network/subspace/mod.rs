@@ -1,6 +1,6 @@
 //! The soft-subspace network: a set network that has seen many scenes and says of a new one which tracks are right.
 //!
-//! Where the [PointNet](super::PriorNetwork) is optimised on each request from random weights, this network was trained
+//! Where the [PointNet](super::head) is optimised on each request from random weights, this network was trained
 //! once, by `scpsfm train-prior`, and is only run. It needs no depths, knows neither the number of views nor that of
 //! tracks, and skips what is unobserved.
 //!

@@ -1,7 +1,9 @@
 //! Enums: the domain's and the wire's have the same variants, but for the wire's `UNSPECIFIED`.
 
 use crate::domain::job::{AttemptEnd, JobState};
-use crate::domain::{Backend, Grade, LensProjection, Method, Proposal, Stage, Status, Task, Violation, WarningCode};
+use crate::domain::{
+    Backend, Grade, LensProjection, Method, Phase, Proposal, Stage, Status, Task, Violation, WarningCode,
+};
 use crate::rpc::proto;
 
 /// A domain enum that has a twin on the wire.
@@ -49,6 +51,7 @@ twins! {
     Method = Method { Auto, Paper, Geometry, Psfm, Scpsfm }
     Backend = Backend { Flex, Ndarray }
     Stage = Stage { Prepare, Search, Refine, Calibrate, Extend, Judge }
+    Phase = Phase { Relaxation, Rank, Growth }
     Task = Task { Adjust, Cameras, Windows, Judge, Heads }
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }

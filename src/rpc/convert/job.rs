@@ -228,6 +228,7 @@ mod tests {
             fraction: 0.5,
             iteration: 3,
             losses: None,
+            head: None,
             inliers: 4,
             focal_px: None,
             best_score: Some(0.0),

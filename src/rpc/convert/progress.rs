@@ -1,7 +1,7 @@
 //! Progress records.
 
 use super::enums::Twin;
-use crate::domain::{Course, Losses, Progress, Stage, Step, Task, Violation};
+use crate::domain::{Course, HeadProgress, Losses, Phase, Progress, Stage, Step, Task, Violation};
 use crate::rpc::proto;
 
 pub fn to_wire(progress: &Progress) -> proto::Progress {
@@ -15,6 +15,7 @@ pub fn to_wire(progress: &Progress) -> proto::Progress {
         best_score: progress.best_score,
         elapsed_seconds: progress.elapsed_seconds,
         course: Some(course_to_wire(&progress.course)),
+        head: progress.head.as_ref().map(head_to_wire),
     }
 }
 
@@ -31,7 +32,30 @@ pub fn from_wire(progress: &proto::Progress) -> Result<Progress, Violation> {
         best_score: progress.best_score,
         elapsed_seconds: progress.elapsed_seconds,
         course: progress.course.as_ref().map(course_from_wire).unwrap_or_default(),
+        head: progress.head.as_ref().map(head_from_wire),
     })
+}
+
+fn head_to_wire(progress: &HeadProgress) -> proto::HeadProgress {
+    let HeadProgress { head, iteration, phase, weight_sum, weight_histogram, tolerance, best_daq_residual } = *progress;
+    proto::HeadProgress {
+        head,
+        iteration,
+        phase: super::enums::optional_to_wire(phase),
+        weight_sum,
+        weight_histogram: weight_histogram.to_vec(),
+        tolerance,
+        best_daq_residual,
+    }
+}
+
+/// As [`course_from_wire`], of phases.
+fn head_from_wire(progress: &proto::HeadProgress) -> HeadProgress {
+    let proto::HeadProgress { head, iteration, phase, weight_sum, tolerance, best_daq_residual, .. } = *progress;
+    let phase = Phase::from_wire(phase, "progress.head.phase").ok().flatten();
+    let bin = |k: usize| progress.weight_histogram.get(k).copied().unwrap_or(0);
+    let weight_histogram = std::array::from_fn(bin);
+    HeadProgress { head, iteration, phase, weight_sum, weight_histogram, tolerance, best_daq_residual }
 }
 
 fn course_to_wire(course: &Course) -> proto::Course {

@@ -3,7 +3,7 @@
 use prost::Message;
 
 use super::*;
-use crate::domain::{Course, LensProjection, Losses, Progress};
+use crate::domain::{Course, HeadProgress, LensProjection, Losses, Phase, Progress};
 
 fn name() -> JobName {
     JobName { tenant: "default".into(), job: "a".into() }
@@ -18,6 +18,15 @@ pub(super) fn rich() -> Solution {
         fraction: 0.3,
         iteration: 7,
         losses: Some(Losses { num: 1.0, proj: 2.0, daq: 3.0 }),
+        head: Some(HeadProgress {
+            head: 2,
+            iteration: 7,
+            phase: Some(Phase::Growth),
+            weight_sum: 19.5,
+            weight_histogram: [1, 2, 3, 4, 5, 6, 7, 8, 9, 10],
+            tolerance: Some(0.04),
+            best_daq_residual: Some(0.5),
+        }),
         inliers: 20,
         focal_px: Some(1200.5),
         best_score: Some(0.9),
@@ -116,7 +125,7 @@ pub(super) fn rich() -> Solution {
             PriorTime { prior: Proposal::Network, seconds: Some(0.5), iterations: 80 },
             PriorTime { prior: Proposal::Uniform, seconds: None, iterations: 6000 },
         ],
-        history: vec![progress, Progress { losses: None, focal_px: None, best_score: None, ..progress }],
+        history: vec![progress, Progress { losses: None, head: None, focal_px: None, best_score: None, ..progress }],
         trained_network: Some("5ea1".into()),
         input_sha256: Some("d16e57".into()),
     }

@@ -214,8 +214,9 @@ pub fn search_block(
     recorder.enter(Stage::Search);
     let mut attempt = match problem.settings.method {
         Method::Auto | Method::Geometry => searched(problem, block, effort, recorder)?,
-        Method::Paper => decided(problem, block.sample(OPTIONS.paper_tracks, problem.settings.seed), recorder)?,
-        Method::Scpsfm => decided(problem, block.sample(OPTIONS.scpsfm_tracks, problem.settings.seed), recorder)?,
+        Method::Paper | Method::Scpsfm => {
+            decided(problem, block.sample(OPTIONS.network_tracks, problem.settings.seed), recorder)?
+        }
         Method::Psfm => decided(problem, block, recorder)?,
     };
     problem.stopped()?;
@@ -354,8 +355,7 @@ fn decided(problem: &Problem, block: Block, recorder: &mut Recorder) -> Result<A
     let tracks = &attempt.block.tracks;
     let decided = match problem.settings.method {
         Method::Psfm => Ok(baselines::psfm(complete, noise)),
-        Method::Scpsfm => scpsfm::decide(problem, complete, tracks, recorder),
-        _ => baselines::paper(problem, complete, tracks, recorder),
+        _ => scpsfm::decide(problem, complete, tracks, recorder),
     };
     let decided = decided.map_err(|error| Error::Internal(error.to_string()))?;
     problem.stopped()?;

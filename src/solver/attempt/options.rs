@@ -12,10 +12,8 @@ pub struct AttemptOptions {
     /// Inlier tracks, and observations of them, that a calibration is made from.
     pub most_calibrated: usize,
     pub calibrated_observations: usize,
-    /// Tracks that PAPER optimises weights for.
-    pub paper_tracks: usize,
-    /// Tracks that SCPSFM optimises weights for, in up to 16 optimisations a block.
-    pub scpsfm_tracks: usize,
+    /// Tracks that PAPER and SCPSFM optimise weights for, in up to 16 optimisations a block.
+    pub network_tracks: usize,
     /// Median of the squared residuals over their mean, below which they are of several kinds.
     pub least_median_share: f64,
 }
@@ -31,10 +29,8 @@ impl AttemptOptions {
         // Beyond, it takes minutes, and other errors than noise bound what it gives.
         most_calibrated: 600,
         calibrated_observations: 20_000,
-        // The network holds some 40 kB a track at full width.
-        paper_tracks: 5_000,
         // The most that the recipe was measured with (20 views).
-        scpsfm_tracks: 1_000,
+        network_tracks: 1_000,
         // One normal noise gives .69. Measured on scenes of ten views and 200 tracks with depths: .60 to .80 in 150 of
         // noise 3 to 11 %; .15 to .49 in the 46 that were first fitted at too high a noise of 120 with one to three
         // wrong observations in every right track.

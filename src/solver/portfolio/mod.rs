@@ -1,10 +1,9 @@
 //! The portfolio: proposals rank tracks, guided search verifies, the best consensus stands.
 //!
 //! What is cheap goes first: rigid distances where depths are given, the scores of the network that was trained
-//! beforehand, reweighting, consistency. Where they decide nothing, the paper's network is optimised a few iterations
-//! at a time; between, its ranking is verified by geometry, and so is uniform sampling, which needs no ranking to be
-//! right. A decisive consensus ends the search: the paper's network would say nothing after it that anyone waits for,
-//! and its first iterations took as long as everything else. Each proposal's own time is kept.
+//! beforehand, reweighting, consistency, and uniform sampling, which needs no ranking to be right. Where they decide
+//! nothing, heads of the paper's network are optimised ([`super::scpsfm`]), and what each keeps is verified by geometry.
+//! A decisive consensus ends the search: a head takes longer than everything else. Each proposal's own time is kept.
 
 mod best;
 mod options;
@@ -19,14 +18,14 @@ use rand_chacha::ChaCha8Rng;
 
 use super::grow::{Consensus, LEAST_INLIERS};
 use super::learned::{self, TrackScores};
-use super::priors;
 use super::recorder::Recorder;
+use super::scpsfm::{HeadOptions, HeadSearch};
 use super::search::rigid::Rigid;
 use super::search::{affine, subspace};
 use crate::domain::result::PriorTime;
 use crate::domain::{Proposal, SolveSettings, StopToken};
-use crate::geometry::measurement::{CompleteBlock, balance};
-use crate::network::{NetworkSettings, PriorNetwork};
+use crate::geometry::measurement::CompleteBlock;
+use crate::network::NetworkSettings;
 use best::Best;
 pub use best::VerifiedBy;
 use options::PortfolioOptions;
@@ -50,8 +49,8 @@ pub struct Found {
     pub near_duplicates: Option<(usize, usize)>,
     /// What the trained network says of the block; `None` where it was not asked.
     pub track_scores: Option<TrackScores>,
-    /// The weights of the network that was trained beforehand, or where it was not asked the last ones of the paper's,
-    /// one a track of the block; empty without a network.
+    /// The weights of the network that was trained beforehand, or where it was not asked those of the best head of the
+    /// paper's, one a track of the block; empty without a network.
     pub network_weights: Vec<f64>,
     pub prior_times: Vec<PriorTime>,
 }
@@ -132,56 +131,47 @@ impl<'a> Portfolio<'a> {
 
     /// Runs the search; `spread_weights` maps the block's weights to the caller's tracks.
     ///
-    /// The paper's network's own focal length is not reported: nothing of a search has verified it.
+    /// The focal length of a head is not reported: nothing of a search has verified it.
     ///
     /// # Errors
-    /// The network's own, which are defects: a block has more columns than it asks for.
+    /// The network's own, which are defects.
     pub fn run(
         mut self,
         recorder: &mut Recorder,
         spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
     ) -> Result<Found, crate::network::Error> {
-        let uses_network = self.settings.method.uses_network() && !self.is_quick;
-        let rounds = match uses_network {
-            false if self.is_quick => OPTIONS.quick_rounds,
-            true => self.settings.iterations.div_ceil(OPTIONS.iterations_per_round),
-            false => OPTIONS.rounds_without_network,
-        };
-        let mut network = None;
+        let rounds = if self.is_quick { OPTIONS.quick_rounds } else { OPTIONS.rounds };
+        let mut heads = None;
         self.ask(recorder, spread_weights);
         for round in 0..rounds {
             self.set_noise(round);
             self.propose_rigid(round);
             self.propose_at_once(round);
-            self.stand(recorder);
-            if uses_network && !self.is_over() && !self.stop.is_stopped() {
-                let network = match &mut network {
-                    Some(network) => network,
-                    none => none.insert(self.paper_network()?),
-                };
-                self.optimise(network, recorder, spread_weights)?;
-                self.propose(Proposal::Network, &priors::from_network(network.weights()), None);
-            }
             self.propose(Proposal::Uniform, &vec![1.0; self.block.tracks()], None);
             self.stand(recorder);
+            if round >= OPTIONS.first_head_round && self.may_optimise() {
+                let heads = heads.get_or_insert_with(|| self.head_search());
+                if (round - OPTIONS.first_head_round).is_multiple_of(OPTIONS.rounds_per_head) {
+                    self.optimise_head(heads, recorder, spread_weights)?;
+                }
+                self.propose_head(&heads.latest_weights());
+                self.stand(recorder);
+            }
             recorder.report(f64::from(round + 1) / f64::from(rounds));
             if self.is_over() || self.stop.is_stopped() {
                 break;
             }
         }
-        Ok(self.finish(network))
+        Ok(self.finish(heads))
     }
 
-    /// The paper's network on this block, before its first iteration.
-    fn paper_network(&mut self) -> Result<PriorNetwork, crate::network::Error> {
-        let begun = Instant::now();
-        let matrix = match &self.search {
-            Search::Subspace(search) => search.balanced().clone(),
-            Search::Affine(_) => balance(&self.block.measurement_matrix()),
-        };
-        let network = PriorNetwork::new(&matrix, &NetworkSettings::from(self.settings))?;
-        self.stats(Proposal::Network).seconds += begun.elapsed().as_secs_f64();
-        Ok(network)
+    /// Whether heads of the network may be optimised.
+    fn may_optimise(&self) -> bool {
+        self.settings.method.uses_network() && !self.is_quick && self.is_wanted(Proposal::Network)
+    }
+
+    fn head_search(&self) -> HeadSearch {
+        HeadSearch::continued(self.block, NetworkSettings::from(self.settings), HeadOptions::DEFAULT)
     }
 
     /// Asks the network that was trained beforehand.
@@ -205,29 +195,30 @@ impl<'a> Portfolio<'a> {
         }
     }
 
-    /// One round of the network.
-    fn optimise(
+    /// One more head, where there is to be one.
+    fn optimise_head(
         &mut self,
-        network: &mut PriorNetwork,
+        heads: &mut HeadSearch,
         recorder: &mut Recorder,
         spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
     ) -> Result<(), crate::network::Error> {
-        let begun = Instant::now();
-        let iterations = self.settings.iterations;
-        let goal = (network.iteration() + OPTIONS.iterations_per_round).min(iterations);
-        while network.iteration() < goal && !self.stop.is_stopped() {
-            let step = network.step()?;
-            recorder.standing.iteration = step.iteration;
-            recorder.standing.losses = Some(step.losses);
-            recorder.report(f64::from(step.iteration) / f64::from(iterations));
-            let every = self.settings.weights_every;
-            if every > 0 && step.iteration.is_multiple_of(every) {
-                recorder.weights(&spread_weights(network.weights()));
-            }
+        if heads.is_over() {
+            return Ok(());
         }
+        let begun = Instant::now();
+        let every = self.settings.weights_every;
+        let mut work = 0;
+        heads.optimise_next(self.stop, &mut |step| {
+            work += 1;
+            recorder.optimised(step.head, step.losses);
+            recorder.report(0.0);
+            if every > 0 && step.head.iteration.is_multiple_of(every) {
+                recorder.weights(&spread_weights(step.weights));
+            }
+        })?;
         let stats = self.stats(Proposal::Network);
         stats.seconds += begun.elapsed().as_secs_f64();
-        stats.work = network.iteration();
+        stats.work += work;
         Ok(())
     }
 
@@ -280,7 +271,7 @@ impl<'a> Portfolio<'a> {
         &mut self.stats[place]
     }
 
-    fn finish(self, network: Option<PriorNetwork>) -> Found {
+    fn finish(self, heads: Option<HeadSearch>) -> Found {
         let with_network = self.settings.method.uses_network();
         let with_depths = self.block.has_depths();
         let Self { best, near_duplicates, stats, rigid, track_scores, .. } = self;
@@ -302,9 +293,9 @@ impl<'a> Portfolio<'a> {
             winning_prior,
             rejected_by_network,
             near_duplicates,
-            network_weights: match (&track_scores, network) {
+            network_weights: match (&track_scores, heads) {
                 (Some(track_scores), _) => track_scores.probabilities(),
-                (None, Some(network)) => network.weights().to_vec(),
+                (None, Some(heads)) => heads.weights(),
                 (None, None) => Vec::new(),
             },
             track_scores,

@@ -5,8 +5,9 @@ use std::time::Instant;
 use super::best::Best;
 use super::{OPTIONS, Portfolio, Search, VerifiedBy};
 use crate::domain::Proposal;
-use crate::geometry::factorization::RANK;
+use crate::geometry::factorization::{RANK, dominant_subspace};
 use crate::geometry::statistics::median;
+use crate::network::THRESHOLD;
 use crate::solver::a_contrario::{self, FalseAlarmOptions};
 use crate::solver::learned::TrackScores;
 use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid};
@@ -14,7 +15,7 @@ use crate::solver::{depths, grow, priors};
 
 impl Portfolio<'_> {
     /// Whether this proposal may find anything yet.
-    fn is_wanted(&self, proposal: Proposal) -> bool {
+    pub(super) fn is_wanted(&self, proposal: Proposal) -> bool {
         !self.is_over() && !self.stop.is_stopped() && !self.settings.excluded_priors.contains(&proposal)
     }
 
@@ -153,6 +154,21 @@ impl Portfolio<'_> {
             stats.work += drawn as u32;
         }
         self.verify(proposal, seeds);
+    }
+
+    /// What a head keeps, grown as it stands, then searched from its ranking.
+    ///
+    /// * `weights`: of the head, one a track
+    pub(super) fn propose_head(&mut self, weights: &[f64]) {
+        let kept: Vec<usize> = (0..weights.len()).filter(|&track| weights[track] > THRESHOLD).collect();
+        let seed = match &self.search {
+            _ if kept.len() < RANK => None,
+            Search::Affine(_) => affine::seed(self.block, kept),
+            Search::Subspace(search) => dominant_subspace(&search.balanced().select_columns(&kept), RANK)
+                .map(|basis| search.seed(self.block, &basis)),
+        };
+        self.verify(Proposal::Network, seed.into_iter().collect());
+        self.propose(Proposal::Network, &priors::from_network(weights), None);
     }
 
     /// Grows the tracks of most weight, without sampling.

@@ -1,5 +1,5 @@
 //! SCPSFM: the paper's network by itself. Several heads, optimisations of the continued objective
-//! ([`crate::network::continuation`] says what a head is), and the choice among them by the paper's eq. 10.
+//! ([`crate::network::head`] says what a head is), and the choice among them by the paper's eq. 10.
 //!
 //! The decision is `w > 1/2` of the chosen head. It samples nothing and adjusts nothing, and nothing later changes it:
 //! with a handful of right tracks any four columns have rank 4, and a refit of the consensus lowers F1 at 98 % wrong
@@ -22,16 +22,16 @@ use nalgebra::DMatrix;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::baselines::{self, Decided, NetworkIteration};
+use super::baselines::Decided;
 use super::problem::Problem;
 use super::recorder::Recorder;
-use crate::domain::{StopToken, Task};
+use crate::domain::{HeadProgress, Losses, Method, StopToken, Task};
 use crate::geometry::daq::hypothesis_residual;
 use crate::geometry::factorization::{RANK, cameras_of, dominant_subspace, subspace_residuals};
 use crate::geometry::measurement::{CompleteBlock, balance};
 use crate::geometry::statistics::midpoint_median;
-use crate::network::continuation::{ContinuationOptions, Finished, Head, HeadIteration, HeadStart, wrong_residual};
-use crate::network::{Error, NetworkSettings, PriorNetwork, THRESHOLD, standard_normal};
+use crate::network::head::{ContinuationOptions, ContinuedStart, Head, HeadObjective, wrong_residual};
+use crate::network::{Error, MIN_COLUMNS, NetworkSettings, THRESHOLD, standard_normal};
 
 pub use options::HeadOptions;
 
@@ -41,12 +41,14 @@ const NETWORK_LEAST_VIEWS: usize = 2;
 const TOO_FEW: f64 = 100.0;
 /// DAQ residual of such a head; there are no cameras to take it of.
 const WORST_DAQ: f64 = 10.0;
+/// Tolerance of a single head by the literal objective, which is compared with no other.
+const ANY_TOLERANCE: f64 = 1.0;
 /// Between the seeds of two heads' networks: callers' seeds are small numbers, which must not meet.
 const SEED_STRIDE: u64 = 1 << 32;
 /// Stream of the view scales, apart from that of the networks.
 const VIEW_SCALES: u64 = 1;
 
-/// Decides which tracks of a block are right.
+/// PAPER and SCPSFM: decides which tracks of a block are right.
 ///
 /// * `tracks`: those of the input that the block's are
 ///
@@ -59,56 +61,69 @@ pub fn decide(
     recorder: &mut Recorder,
 ) -> Result<Decided, Error> {
     let settings = problem.settings;
-    let search = HeadSearch {
-        settings: NetworkSettings::from(settings),
-        has_depths: block.has_depths(),
-        stop: problem.stop,
-        options: HeadOptions::DEFAULT,
-        continuation: ContinuationOptions::DEFAULT,
+    let mut search = match settings.method {
+        Method::Paper => HeadSearch::literal(block, NetworkSettings::from(settings)),
+        _ => HeadSearch::continued(block, NetworkSettings::from(settings), HeadOptions::DEFAULT),
     };
-    let heads = search.options.heads;
-    let mut earlier = 0;
-    let choice = search.run(&block.measurement_matrix(), &mut |head, step, reported| {
-        let HeadIteration { iteration, losses, .. } = *step;
-        if iteration == 1 {
-            earlier = recorder.standing.iteration;
+    while !search.is_over() {
+        let is_done = search.optimise_next(problem.stop, &mut |step| {
+            report(problem, tracks, step, recorder);
+        })?;
+        if !is_done {
+            break;
         }
-        recorder.begin_step(Task::Heads, head + 1, heads);
-        let HeadProgress { weights, focal } = reported;
-        let within = (head as f64 + f64::from(iteration) / f64::from(settings.iterations)) / heads as f64;
-        let step = NetworkIteration { iteration, earlier, losses, weights, focal };
-        baselines::report(problem, tracks, &step, within, recorder);
-    })?;
-    let inlier = choice.weights.iter().map(|&weight| weight > THRESHOLD).collect();
-    Ok(Decided { inlier, weights: choice.weights, is_verified: choice.is_verified })
+    }
+    let weights = search.weights();
+    let inlier = weights.iter().map(|&weight| weight > THRESHOLD).collect();
+    Ok(Decided { inlier, weights, is_verified: search.is_verified() })
+}
+
+/// Reports an iteration of a head that decides by itself.
+fn report(problem: &Problem, tracks: &[usize], step: &HeadReport, recorder: &mut Recorder) {
+    let settings = problem.settings;
+    let iteration = step.head.iteration;
+    recorder.begin_step(Task::Heads, step.head.head as usize, step.heads);
+    recorder.optimised(step.head, step.losses);
+    recorder.standing.inliers = step.weights.iter().filter(|&&weight| weight > THRESHOLD).count() as u32;
+    if settings.use_daq {
+        recorder.standing.focal_px = Some(step.focal * problem.scale_px);
+    }
+    let done = f64::from(step.head.head - 1) + f64::from(iteration) / f64::from(settings.iterations);
+    recorder.report(done / step.heads as f64);
+    if settings.weights_every > 0 && iteration.is_multiple_of(settings.weights_every) {
+        recorder.weights(&problem.scatter(step.weights, tracks));
+    }
 }
 
 /// State of the head that is being optimised, reported with every iteration.
-pub struct HeadProgress<'a> {
+pub struct HeadReport<'a> {
+    pub head: HeadProgress,
+    /// How many there will be at most.
+    pub heads: usize,
+    pub losses: Losses,
     /// One a column of the whole matrix.
     pub weights: &'a [f64],
     /// In the units of the matrix.
     pub focal: f64,
 }
 
-/// What a search ended with.
-#[derive(Debug, Clone, PartialEq)]
-pub struct HeadChoice {
-    /// Of the chosen head, one a column of the matrix.
-    pub weights: Vec<f64>,
-    /// Whether its tracks can be taken for right.
-    pub is_verified: bool,
-    /// Heads that were optimised.
-    pub heads: usize,
-}
-
-/// Heads on one measurement matrix.
-pub struct HeadSearch<'a> {
-    pub settings: NetworkSettings,
-    pub has_depths: bool,
-    pub stop: &'a StopToken,
-    pub options: HeadOptions,
-    pub continuation: ContinuationOptions,
+/// Heads on one measurement matrix, one after the other, and the choice among them.
+///
+/// Rows and columns without an observation are left out beforehand, so that padding with zeros changes nothing; such
+/// columns have weight 0.
+pub struct HeadSearch {
+    settings: NetworkSettings,
+    options: HeadOptions,
+    /// `None`: the literal objective.
+    continuation: Option<ContinuationOptions>,
+    has_depths: bool,
+    /// Columns of the whole matrix, and those with an observation.
+    width: usize,
+    columns: Vec<usize>,
+    balanced: DMatrix<f64>,
+    /// Of the view scales.
+    rng: ChaCha8Rng,
+    heads: Vec<FinishedHead>,
 }
 
 /// A head that ended, and what the choice goes by.
@@ -123,103 +138,133 @@ struct FinishedHead {
     daq_residual: f64,
 }
 
-impl HeadSearch<'_> {
-    /// Optimises heads until one is accepted; the one to choose.
-    ///
-    /// Rows and columns without an observation are left out beforehand, so that padding with zeros changes nothing;
-    /// such columns get weight 0. When stopped, the answer is that of the heads before.
-    ///
+impl HeadSearch {
+    /// One head by the paper's objective as printed.
+    pub fn literal(block: &CompleteBlock, settings: NetworkSettings) -> Self {
+        let options = HeadOptions { heads: 1, ..HeadOptions::DEFAULT };
+        Self { continuation: None, ..Self::continued(block, settings, options) }
+    }
+
+    /// Heads by the continued objective.
+    pub fn continued(block: &CompleteBlock, settings: NetworkSettings, options: HeadOptions) -> Self {
+        Self::of_matrix(&block.measurement_matrix(), block.has_depths(), settings, options)
+    }
+
     /// * `matrix`: 3n x m, not balanced
-    /// * `report`: called with every iteration and the head, from 0, that it is of
-    ///
-    /// # Errors
-    /// The network's own.
-    pub fn run(
-        &self,
-        matrix: &DMatrix<f64>,
-        report: &mut dyn FnMut(usize, &HeadIteration, HeadProgress),
-    ) -> Result<HeadChoice, Error> {
+    fn of_matrix(matrix: &DMatrix<f64>, has_depths: bool, settings: NetworkSettings, options: HeadOptions) -> Self {
         let columns: Vec<usize> =
             (0..matrix.ncols()).filter(|&j| matrix.column(j).iter().any(|&entry| entry != 0.0)).collect();
         let rows: Vec<usize> = (0..matrix.nrows())
             .filter(|&row| matrix.rows(row - row % 3, 3).iter().any(|&entry| entry != 0.0))
             .collect();
-        let mut choice = HeadChoice { weights: vec![0.0; matrix.ncols()], is_verified: false, heads: 0 };
-        if columns.len() < PriorNetwork::MIN_COLUMNS || rows.len() < 3 * NETWORK_LEAST_VIEWS {
-            return Ok(choice);
-        }
-        let balanced = balance(&matrix.select_columns(&columns).select_rows(&rows));
-        let mut heads: Vec<FinishedHead> = Vec::new();
-        let mut rng = ChaCha8Rng::seed_from_u64(self.settings.seed);
+        let mut rng = ChaCha8Rng::seed_from_u64(settings.seed);
         rng.set_stream(VIEW_SCALES);
-        let mut chosen = 0;
-        for place in 0..self.options.heads {
-            let start = self.start(place, rows.len() / 3, &mut rng);
-            let mut all = vec![0.0; matrix.ncols()];
-            let Some(finished) = self.optimise(&balanced, start, &mut |step, head| {
-                scatter(head.weights(), &columns, &mut all);
-                report(place, step, HeadProgress { weights: &all, focal: head.focal() });
-            })?
-            else {
-                break;
-            };
-            heads.push(self.judged(&balanced, finished));
-            chosen = self.choice(&heads);
-            if self.is_accepted(&heads[chosen]) {
-                break;
-            }
+        Self {
+            settings,
+            options,
+            continuation: Some(ContinuationOptions::DEFAULT),
+            has_depths,
+            width: matrix.ncols(),
+            balanced: balance(&matrix.select_columns(&columns).select_rows(&rows)),
+            columns,
+            rng,
+            heads: Vec::new(),
         }
-        choice.heads = heads.len();
-        if let Some(chosen) = heads.get(chosen) {
-            choice.is_verified = self.is_verified(chosen);
-            scatter(&chosen.weights, &columns, &mut choice.weights);
-        }
-        Ok(choice)
     }
 
-    /// Where a head starts; `place` counts from 0.
-    fn start(&self, place: usize, views: usize, rng: &mut ChaCha8Rng) -> HeadStart {
+    /// Whether no further head is to be optimised: one is accepted, all are done, or the matrix is too small for any.
+    pub fn is_over(&self) -> bool {
+        let is_too_small = self.columns.len() < MIN_COLUMNS || self.balanced.nrows() < 3 * NETWORK_LEAST_VIEWS;
+        is_too_small || self.heads.len() >= self.options.heads || self.best().is_some_and(|best| self.is_accepted(best))
+    }
+
+    /// Optimises one more head to its end; false when stopped before that, and then as if it had not begun.
+    ///
+    /// * `report`: called with every iteration
+    ///
+    /// # Errors
+    /// The network's own.
+    pub fn optimise_next(&mut self, stop: &StopToken, report: &mut dyn FnMut(&HeadReport)) -> Result<bool, Error> {
+        let place = self.heads.len();
+        let seed = self.settings.seed.wrapping_add(place as u64 * SEED_STRIDE);
+        let objective = self.objective(place);
+        let mut head = Head::new(&self.balanced, &self.settings, seed, objective)?;
+        let best_daq_residual = self.best().map(|best| best.daq_residual).filter(|_| self.settings.use_daq);
+        let mut all = vec![0.0; self.width];
+        while !head.is_finished() {
+            if stop.is_stopped() {
+                return Ok(false);
+            }
+            let step = head.step()?;
+            scatter(head.weights(), &self.columns, &mut all);
+            let progress = HeadProgress {
+                head: place as u32 + 1,
+                iteration: step.iteration,
+                phase: step.phase,
+                weight_sum: head.weights().iter().sum(),
+                weight_histogram: HeadProgress::histogram(head.weights()),
+                tolerance: step.tolerance,
+                best_daq_residual,
+            };
+            let heads = self.options.heads;
+            report(&HeadReport { head: progress, heads, losses: step.losses, weights: &all, focal: head.focal() });
+        }
+        head.update_weights()?;
+        let finished = self.judged(&head);
+        self.heads.push(finished);
+        Ok(true)
+    }
+
+    /// Weights of the chosen head, one a column of the whole matrix; 0 where none has ended.
+    pub fn weights(&self) -> Vec<f64> {
+        let mut all = vec![0.0; self.width];
+        if let Some(best) = self.best() {
+            scatter(&best.weights, &self.columns, &mut all);
+        }
+        all
+    }
+
+    /// Weights of the head that ended last, as [`Self::weights`].
+    pub fn latest_weights(&self) -> Vec<f64> {
+        let mut all = vec![0.0; self.width];
+        if let Some(latest) = self.heads.last() {
+            scatter(&latest.weights, &self.columns, &mut all);
+        }
+        all
+    }
+
+    /// Whether the tracks of the chosen head can be taken for right. Any four have rank 4 and stand apart: of these a
+    /// small e, which one of sixteen heads on twenty scenes without a right track has by chance, ends the heads but is
+    /// no evidence.
+    pub fn is_verified(&self) -> bool {
+        self.best().is_some_and(|head| head.kept > RANK && (self.is_accepted(head) || self.is_of_low_rank(head)))
+    }
+
+    /// What a head optimises; `place` counts from 0.
+    fn objective(&mut self, place: usize) -> HeadObjective {
+        let Some(options) = self.continuation.clone() else { return HeadObjective::Literal };
         let (relaxed_alpha, least_alpha) = self.options.alphas[place % self.options.alphas.len()];
         let deviation = self.options.view_scale_deviation;
         let view_scales = match place {
             0 => Vec::new(),
-            _ => (0..views).map(|_| (deviation * standard_normal(rng)).exp()).collect(),
-        };
-        HeadStart {
-            seed: self.settings.seed.wrapping_add(place as u64 * SEED_STRIDE),
-            view_scales,
-            relaxed_alpha,
-            least_alpha,
-            has_depths: self.has_depths,
-        }
-    }
-
-    /// Optimises one head to its end; `None` when stopped.
-    fn optimise(
-        &self,
-        balanced: &DMatrix<f64>,
-        start: HeadStart,
-        report: &mut dyn FnMut(&HeadIteration, &Head),
-    ) -> Result<Option<Finished>, Error> {
-        let mut head = Head::new(balanced, &self.settings, start, self.continuation.clone())?;
-        while !head.is_finished() {
-            if self.stop.is_stopped() {
-                return Ok(None);
+            _ => {
+                let views = self.balanced.nrows() / 3;
+                (0..views).map(|_| (deviation * standard_normal(&mut self.rng)).exp()).collect()
             }
-            let step = head.step()?;
-            report(&step, &head);
-        }
-        head.finish().map(Some)
+        };
+        let start = ContinuedStart { view_scales, relaxed_alpha, least_alpha, has_depths: self.has_depths };
+        HeadObjective::Continued { start, options }
     }
 
-    /// A head with what the choice goes by.
-    fn judged(&self, balanced: &DMatrix<f64>, finished: Finished) -> FinishedHead {
-        let Finished { weights, tolerance, .. } = finished;
+    /// A head that ended, with what the choice goes by.
+    fn judged(&self, head: &Head) -> FinishedHead {
+        let balanced = &self.balanced;
+        let weights = head.weights().to_vec();
         let kept: Vec<usize> = (0..weights.len()).filter(|&j| weights[j] > THRESHOLD).collect();
         let mut head = FinishedHead {
             weights,
             kept: kept.len(),
-            tolerance,
+            tolerance: head.tolerance().unwrap_or(ANY_TOLERANCE),
             energy: 0.0,
             is_separate: false,
             daq_residual: WORST_DAQ,
@@ -239,17 +284,16 @@ impl HeadSearch<'_> {
         head
     }
 
-    /// Place of the head of least J; of equals the first.
-    fn choice(&self, heads: &[FinishedHead]) -> usize {
-        let mut tolerances: Vec<f64> = heads.iter().map(|head| head.tolerance).collect();
+    /// The head of least J; of equals the first.
+    fn best(&self) -> Option<&FinishedHead> {
+        let mut tolerances: Vec<f64> = self.heads.iter().map(|head| head.tolerance).collect();
         let tolerance = midpoint_median(&mut tolerances);
         let objective = |head: &FinishedHead| {
             let daq = if self.settings.use_daq { self.options.daq_weight * head.daq_residual } else { 0.0 };
             let too_few = if head.kept < RANK { TOO_FEW } else { 0.0 };
             head.energy / tolerance.powi(2) - head.kept as f64 + daq + too_few
         };
-        let objectives: Vec<f64> = heads.iter().map(objective).collect();
-        (0..objectives.len()).min_by(|&a, &b| objectives[a].total_cmp(&objectives[b])).unwrap_or(0)
+        self.heads.iter().min_by(|a, b| objective(a).total_cmp(&objective(b)))
     }
 
     /// Whether no further head is needed: with the DAQ term, where the tracks stand apart and fit one calibration.
@@ -259,12 +303,6 @@ impl HeadSearch<'_> {
         }
         let fits = head.daq_residual < self.options.daq_acceptable;
         head.is_separate && head.kept >= self.options.accepted_by_daq && fits
-    }
-
-    /// Whether the tracks can be taken for right. Any four have rank 4 and stand apart: of these a small e, which one
-    /// of sixteen heads on twenty scenes without a right track has by chance, ends the heads but is no evidence.
-    fn is_verified(&self, head: &FinishedHead) -> bool {
-        head.kept > RANK && (self.is_accepted(head) || self.is_of_low_rank(head))
     }
 
     /// Whether the tracks stand apart and are so many that their rank says something.

@@ -34,7 +34,7 @@ fn its_own_weights_decide_and_the_rest_is_calibrated() {
     assert_eq!((solution.status, solution.grade), (Status::Solved, Some(Grade::Metric)));
     assert!(agreement(&solution.tracks.inlier, &scene.truth.inlier).f1 > 0.99);
     assert!(focal_error(&solution, &scene) < 0.03);
-    assert_eq!(solution.iterations, SolveSettings::DEFAULT_HEAD_ITERATIONS);
+    assert_eq!(solution.iterations, SolveSettings::DEFAULT_ITERATIONS);
     for (track, weight) in solution.tracks.weight.iter().enumerate() {
         assert_eq!((*weight > 0.5, *weight), (solution.tracks.inlier[track], solution.tracks.network_weight[track]));
     }

@@ -120,6 +120,7 @@ fn progress(iteration: u32) -> Progress {
         fraction: 0.5,
         iteration,
         losses: None,
+        head: None,
         inliers: 12,
         focal_px: Some(1234.5),
         best_score: Some(f64::INFINITY),

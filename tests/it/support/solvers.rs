@@ -65,6 +65,7 @@ fn progress(fraction: f64) -> Progress {
         fraction,
         iteration: 10,
         losses: None,
+        head: None,
         inliers: 3,
         focal_px: Some(1000.0),
         best_score: Some(0.5),
