@@ -11,36 +11,25 @@ use super::view_selection::evenly;
 use crate::geometry::Point;
 use crate::geometry::bundle::{self, projective};
 
-/// How what the search left aside is judged.
-#[derive(Debug, Clone, PartialEq)]
-pub struct AllTracksOptions {
-    /// Tracks that are judged, and inliers among them that cameras are adjusted to.
-    pub most_tracks: usize,
-    pub most_inliers: usize,
-    /// Iterations of an adjustment.
-    pub iterations: usize,
-    /// Noise that the first rounds judge at, in units of what is estimated.
-    pub widenings: [f64; 3],
-    /// Rounds of judging, adjusting and estimating the noise, at most.
-    pub most_rounds: usize,
-    /// Share of the searched inliers that must remain, or the extension is given up.
-    pub least_kept: f64,
-}
-
-impl AllTracksOptions {
-    pub const DEFAULT: Self = Self {
-        // Beyond, an adjustment takes seconds and other errors than noise bound what it gives.
-        most_tracks: 5_000,
-        most_inliers: 600,
-        // It starts at the noise.
-        iterations: 10,
-        // The cameras were fitted to fewer tracks, and what they err adds to the residuals of the others. At the noise
-        // itself up to a third of the right ones stayed outside, and some for good.
-        widenings: [2.0, 1.5, 1.2],
-        // Those that judge wider, and as many again, of which two make the inliers stand still most of the time.
-        most_rounds: 7,
-        least_kept: 0.8,
-    };
+options! {
+    /// How what the search left aside is judged.
+    pub struct AllTracksOptions {
+        /// Tracks that are judged, and inliers among them that cameras are adjusted to. Beyond, an adjustment takes
+        /// seconds and other errors than noise bound what it gives.
+        most_tracks: usize = 5_000,
+        most_inliers: usize = 600,
+        /// Iterations of an adjustment. It starts at the noise.
+        iterations: usize = 10,
+        /// Noise that the first rounds judge at, in units of what is estimated. The cameras were fitted to fewer
+        /// tracks, and what they err adds to the residuals of the others. At the noise itself up to a third of the
+        /// right ones stayed outside, and some for good.
+        widenings: [f64; 3] = [2.0, 1.5, 1.2],
+        /// Rounds of judging, adjusting and estimating the noise, at most. Those that judge wider, and as many again,
+        /// of which two make the inliers stand still most of the time.
+        most_rounds: usize = 7,
+        /// Share of the searched inliers that must remain, or the extension is given up.
+        least_kept: f64 = 0.8,
+    }
 }
 
 const OPTIONS: AllTracksOptions = AllTracksOptions::DEFAULT;

@@ -24,38 +24,25 @@ use crate::geometry::triangulation;
 /// Directions that no observation sees: a similarity's.
 const SIMILARITY: usize = 7;
 
-/// When depths have a say.
-#[derive(Debug, Clone, PartialEq)]
-pub struct DepthOptions {
-    /// Constraints beyond the unknowns from which a focal length is looked for.
-    pub least_freedom: usize,
-    /// Distance in log focal between what depths and what image points say from which they contradict each other: by
-    /// itself, and in standard deviations of the latter.
-    pub most_strayed: f64,
-    pub strayed_sigmas: f64,
-    /// Noise from which depths judge what image points have verified, normalised units.
-    pub strong_noise: f64,
-    /// Share of the consensus's inliers that must be rigid for depths to judge.
-    pub rigid_share: f64,
-    /// Tracks that are weighed at most.
-    pub most_weighed: usize,
-}
-
-impl DepthOptions {
-    pub const DEFAULT: Self = Self {
-        // Its variance is then known to 45 %.
-        least_freedom: 10,
-        // Depths alone are off by some per cent in strong noise.
-        most_strayed: 0.1,
-        strayed_sigmas: 4.0,
-        // Below, image points alone lose next to no track (mean F1 1.000 at 1 %, .997 at 2 %:
-        // `scpsfm evaluate --sweeps noise --depths none`), and the time is saved.
-        strong_noise: 0.015,
-        // Of depths that are not true to one scale next to none are.
-        rigid_share: 0.8,
-        // A fit of more takes seconds.
-        most_weighed: AllTracksOptions::DEFAULT.most_tracks,
-    };
+options! {
+    /// When depths have a say.
+    pub struct DepthOptions {
+        /// Constraints beyond the unknowns from which a focal length is looked for. Its variance is then known to 45 %.
+        least_freedom: usize = 10,
+        /// Distance in log focal between what depths and what image points say from which they contradict each other:
+        /// by itself, and in standard deviations of the latter. Depths alone are off by some per cent in strong noise.
+        most_strayed: f64 = 0.1,
+        strayed_sigmas: f64 = 4.0,
+        /// Noise from which depths judge what image points have verified, normalised units. Below, image points alone
+        /// lose next to no track (mean F1 1.000 at 1 %, .997 at 2 %: `scpsfm evaluate --sweeps noise --depths none`),
+        /// and the time is saved.
+        strong_noise: f64 = 0.015,
+        /// Share of the consensus's inliers that must be rigid for depths to judge. Of depths that are not true to one
+        /// scale next to none are.
+        rigid_share: f64 = 0.8,
+        /// Tracks that are weighed at most. A fit of more takes seconds.
+        most_weighed: usize = AllTracksOptions::DEFAULT.most_tracks,
+    }
 }
 
 const OPTIONS: DepthOptions = DepthOptions::DEFAULT;

@@ -9,54 +9,37 @@ use crate::domain::{Method, Proposal, SolveSettings};
 use crate::geometry::measurement::CompleteBlock;
 use crate::network::subspace::{self, Cloud, MOST_VIEWS};
 
-/// What the network's odds are worth.
-#[derive(Debug, Clone, PartialEq)]
-pub struct TrackScoreOptions {
-    /// Logit that stands for even odds.
-    pub even_logit: f64,
-    /// Cost by which one nat of the odds widens the truncation of a track's cost in the affine search, in units of the
-    /// truncated cost of a track at even odds.
-    pub cost_per_nat: f64,
-    /// Nats that count at most, either way.
-    pub most_nats: f64,
-    /// Logit above which a track belongs to the set that growing is started from, and the bounds of that set's size.
-    pub start_logit: f64,
-    pub start_sizes: (usize, usize),
-    /// Share of likely tracks above which a scene has statistics of its own.
-    pub many: f64,
-    /// Tracks that must be likely right before a ranking without verification is worth telling.
-    pub least_likely: usize,
-    /// Inliers from which on geometry needs no second opinion.
-    pub surely_enough: usize,
-    /// Odds against a track, in nats, at which it is held to be wrong.
-    pub rejection_nats: f64,
-    /// Tracks below which the network's doubts do not count.
-    pub least_judged: usize,
-}
-
-impl TrackScoreOptions {
-    pub const DEFAULT: Self = Self {
-        // Training counts the few right tracks of a scene more than the many wrong ones, by the square root of the odds
-        // against them: at 95 % outliers that adds 1.5 to every logit.
-        even_logit: 1.5,
-        cost_per_nat: 0.15,
-        // Beyond, the network's confidence was not earned on scenes like this one.
-        most_nats: 5.0,
-        start_logit: 1.0,
-        // What determines the cameras, and what a first adjustment can carry.
-        start_sizes: (8, 60),
-        // From a third on, reweighting and consistency rank right tracks first (average precision above .99 on real
-        // matches).
-        many: 1.0 / 3.0,
-        // Entirely wrong input has up to three by chance.
-        least_likely: 4,
-        // Twice what it needs for any.
-        surely_enough: 2 * LEAST_INLIERS,
-        // Twenty to one.
-        rejection_nats: 3.0,
-        // Scenes have no fewer, and of ten right tracks alone the network takes but a few to be right.
-        least_judged: 50,
-    };
+options! {
+    /// What the network's odds are worth.
+    pub struct TrackScoreOptions {
+        /// Logit that stands for even odds. Training counts the few right tracks of a scene more than the many wrong
+        /// ones, by the square root of the odds against them: at 95 % outliers that adds 1.5 to every logit.
+        even_logit: f64 = 1.5,
+        /// Cost by which one nat of the odds widens the truncation of a track's cost in the affine search, in units of
+        /// the truncated cost of a track at even odds.
+        cost_per_nat: f64 = 0.15,
+        /// Nats that count at most, either way. Beyond, the network's confidence was not earned on scenes like this
+        /// one.
+        most_nats: f64 = 5.0,
+        /// Logit above which a track belongs to the set that growing is started from, and the bounds of that set's
+        /// size.
+        start_logit: f64 = 1.0,
+        /// What determines the cameras, and what a first adjustment can carry.
+        start_sizes: (usize, usize) = (8, 60),
+        /// Share of likely tracks above which a scene has statistics of its own. From a third on, reweighting and
+        /// consistency rank right tracks first (average precision above .99 on real matches).
+        many: f64 = 1.0 / 3.0,
+        /// Tracks that must be likely right before a ranking without verification is worth telling. Entirely wrong
+        /// input has up to three by chance.
+        least_likely: usize = 4,
+        /// Inliers from which on geometry needs no second opinion. Twice what it needs for any.
+        surely_enough: usize = 2 * LEAST_INLIERS,
+        /// Odds against a track, in nats, at which it is held to be wrong. Twenty to one.
+        rejection_nats: f64 = 3.0,
+        /// Tracks below which the network's doubts do not count. Scenes have no fewer, and of ten right tracks alone
+        /// the network takes but a few to be right.
+        least_judged: usize = 50,
+    }
 }
 
 const OPTIONS: TrackScoreOptions = TrackScoreOptions::DEFAULT;

@@ -15,32 +15,22 @@ use super::grow::LEAST_INLIERS;
 use super::problem::{Problem, VERIFIED};
 use crate::domain::StopToken;
 
-/// What counts as near-duplicates.
-#[derive(Debug, Clone, PartialEq)]
-pub struct NearDuplicateOptions {
-    /// Root mean square distance over the views that both are in, up to which they are, in units of the noise that the
-    /// solve starts from.
-    pub near: f64,
-    /// Share of the views of the shorter one that both must be in.
-    pub least_common: f64,
-    /// Tracks of the least group: as many as geometry takes to verify anything.
-    pub least_group: usize,
-    /// Tracks that must remain: twice those that verify anything.
-    pub least_remaining: usize,
-    /// Tracks that each is compared with, at most: of more in one place some are of one group.
-    pub most_compared: usize,
-}
-
-impl NearDuplicateOptions {
-    pub const DEFAULT: Self = Self {
-        // Two observations of one point are 1.4 apart.
-        near: 2.0,
-        // A detector that fires many times loses some of them at times; of two tracks that only cross fewer are near.
-        least_common: 0.5,
-        least_group: LEAST_INLIERS,
-        least_remaining: 2 * LEAST_INLIERS,
-        most_compared: 200,
-    };
+options! {
+    /// What counts as near-duplicates.
+    pub struct NearDuplicateOptions {
+        /// Root mean square distance over the views that both are in, up to which they are, in units of the noise that
+        /// the solve starts from. Two observations of one point are 1.4 apart.
+        near: f64 = 2.0,
+        /// Share of the views of the shorter one that both must be in. A detector that fires many times loses some of
+        /// them at times; of two tracks that only cross fewer are near.
+        least_common: f64 = 0.5,
+        /// Tracks of the least group: as many as geometry takes to verify anything.
+        least_group: usize = LEAST_INLIERS,
+        /// Tracks that must remain: twice those that verify anything.
+        least_remaining: usize = 2 * LEAST_INLIERS,
+        /// Tracks that each is compared with, at most: of more in one place some are of one group.
+        most_compared: usize = 200,
+    }
 }
 
 const OPTIONS: NearDuplicateOptions = NearDuplicateOptions::DEFAULT;

@@ -8,56 +8,38 @@ use crate::domain::StopToken;
 use crate::geometry::factorization::{dominant_eigenvectors, dominant_subspace, subspace_residuals};
 use crate::geometry::statistics::median;
 
-/// How tracks are weighed.
-#[derive(Debug, Clone, PartialEq)]
-pub struct PriorOptions {
-    /// Power that turns the consistency of a track into a sampling weight.
-    pub consistency_power: i32,
-    /// Least weight, so that no track is excluded by a prior alone. A round that changes no weight by as much is the
-    /// last.
-    pub least_weight: f64,
-    /// The same of the network's weights.
-    pub network_floor: f64,
-    /// Rounds of reweighting.
-    pub irls_rounds: usize,
-    /// Floor of the residual scale at the start and at the end of the annealing (sines of angles).
-    pub irls_floors: (f64, f64),
-    /// Share of the rounds over which the floor is lowered.
-    pub irls_annealing: f64,
-    /// Shrinking of the residual scale a round without depths, and where all that is asked is whether many agree, a
-    /// second body say.
-    pub affine_shrink: f64,
-    pub affine_shrink_of_many: f64,
-    /// Floor of the residual without depths, in units of a view's spread.
-    pub affine_floor: f64,
-    /// Weight from which a track agrees with the subspace.
-    pub affine_agrees: f64,
-    /// Squared floors below which a scale tells who will agree.
-    pub clear_floors: f64,
-}
-
-impl PriorOptions {
-    pub const DEFAULT: Self = Self {
-        consistency_power: 4,
-        least_weight: 1e-6,
-        // A track the network has given up is still drawn now and then.
-        network_floor: 1e-3,
-        irls_rounds: 60,
-        irls_floors: (0.3, 1e-3),
-        irls_annealing: 0.7,
-        // From a view's spread to the floor in the first half of the rounds.
-        affine_shrink: 0.88,
-        // The usual pace of graduated non-convexity (Yang, Antonante, Tzoumas & Carlone 2020: 1.4 a round). Of forty
-        // scenes with a second body and forty without, the same are told apart as at the slow pace (a test), in half
-        // the rounds.
-        affine_shrink_of_many: 1.0 / 1.4,
-        // What perspective adds to right tracks at moderate depths.
-        affine_floor: 0.08,
-        // Its residual is within the scale of the round.
-        affine_agrees: 0.25,
-        // The tracks that do hold the subspace, others never did join them later.
-        clear_floors: 16.0,
-    };
+options! {
+    /// How tracks are weighed.
+    pub struct PriorOptions {
+        /// Power that turns the consistency of a track into a sampling weight.
+        consistency_power: i32 = 4,
+        /// Least weight, so that no track is excluded by a prior alone. A round that changes no weight by as much is
+        /// the last.
+        least_weight: f64 = 1e-6,
+        /// The same of the network's weights. A track the network has given up is still drawn now and then.
+        network_floor: f64 = 1e-3,
+        /// Rounds of reweighting.
+        irls_rounds: usize = 60,
+        /// Floor of the residual scale at the start and at the end of the annealing (sines of angles).
+        irls_floors: (f64, f64) = (0.3, 1e-3),
+        /// Share of the rounds over which the floor is lowered.
+        irls_annealing: f64 = 0.7,
+        /// Shrinking of the residual scale a round without depths, and where all that is asked is whether many agree, a
+        /// second body say. From a view's spread to the floor in the first half of the rounds.
+        affine_shrink: f64 = 0.88,
+        /// The usual pace of graduated non-convexity (Yang, Antonante, Tzoumas & Carlone 2020: 1.4 a round). Of forty
+        /// scenes with a second body and forty without, the same are told apart as at the slow pace (a test), in half
+        /// the rounds.
+        affine_shrink_of_many: f64 = 1.0 / 1.4,
+        /// Floor of the residual without depths, in units of a view's spread. What perspective adds to right tracks at
+        /// moderate depths.
+        affine_floor: f64 = 0.08,
+        /// Weight from which a track agrees with the subspace. Its residual is within the scale of the round.
+        affine_agrees: f64 = 0.25,
+        /// Squared floors below which a scale tells who will agree. The tracks that do hold the subspace, others never
+        /// did join them later.
+        clear_floors: f64 = 16.0,
+    }
 }
 
 const OPTIONS: PriorOptions = PriorOptions::DEFAULT;

@@ -11,38 +11,24 @@ use super::grow::LEAST_INLIERS;
 use super::problem::{Problem, VERIFIED};
 use crate::domain::{Warning, WarningCode};
 
-/// What counts as static.
-#[derive(Debug, Clone, PartialEq)]
-pub struct StaticTrackOptions {
-    /// What a static track spreads by at most, normalised units.
-    pub most_spread: f64,
-    /// How far the others move, as a quantile of how far tracks spread about their mean: that of a moving track as long
-    /// as no larger share is static.
-    pub moving_quantile: f64,
-    /// Share of that which a static track spreads by at most.
-    pub most_share: f64,
-    /// Static tracks, and share of all, below which they hide nothing.
-    pub least_static: usize,
-    pub least_share: f64,
-    /// Others that a search needs.
-    pub least_moving: usize,
-}
-
-impl StaticTrackOptions {
-    pub const DEFAULT: Self = Self {
-        // What a detector errs by: two pixels in a thousand.
-        most_spread: 0.002,
-        // Where more is static, hardly anything is left to find.
-        moving_quantile: 0.8,
-        // What moves by less than twenty times the noise of a static track determines little either way.
-        most_share: 0.05,
-        // As many as make a consensus of their own.
-        least_static: LEAST_INLIERS,
-        // Of a drive some tracks in twenty are far away, straight ahead, and say how the camera turns.
-        least_share: 0.1,
-        // Half of them may be wrong.
-        least_moving: 2 * LEAST_INLIERS,
-    };
+options! {
+    /// What counts as static.
+    pub struct StaticTrackOptions {
+        /// What a static track spreads by at most, normalised units. What a detector errs by: two pixels in a thousand.
+        most_spread: f64 = 0.002,
+        /// How far the others move, as a quantile of how far tracks spread about their mean: that of a moving track as
+        /// long as no larger share is static. Where more is static, hardly anything is left to find.
+        moving_quantile: f64 = 0.8,
+        /// Share of that which a static track spreads by at most. What moves by less than twenty times the noise of a
+        /// static track determines little either way.
+        most_share: f64 = 0.05,
+        /// Static tracks, and share of all, below which they hide nothing. As many as make a consensus of their own.
+        least_static: usize = LEAST_INLIERS,
+        /// Of a drive some tracks in twenty are far away, straight ahead, and say how the camera turns.
+        least_share: f64 = 0.1,
+        /// Others that a search needs. Half of them may be wrong.
+        least_moving: usize = 2 * LEAST_INLIERS,
+    }
 }
 
 const OPTIONS: StaticTrackOptions = StaticTrackOptions::DEFAULT;

@@ -8,45 +8,29 @@ use crate::domain::Input;
 /// Views below which a projective reconstruction carries no calibration worth searching for.
 pub const LEAST_VIEWS: usize = 3;
 
-/// Which sets of views are worth solving.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ViewSelectionOptions {
-    /// Tracks that a block should have; with fewer than [`LEAST_INLIERS`] none is tried.
-    pub wanted_tracks: usize,
-    /// Views that a block grows to.
-    pub most_views: usize,
-    /// Views that are solved as one block where tracks are complete over all views; of more, these many evenly spread.
-    pub most_views_whole: usize,
-    /// Tracks beyond which more of them do not make a block better.
-    pub enough_tracks: usize,
-    /// Views that blocks are begun from.
-    pub most_first_views: usize,
-    /// Blocks that are tried, best first, before the best result stands.
-    pub most_blocks: usize,
-    /// Views of a subset.
-    pub subset_views: usize,
-    /// Subsets of one set, and of all sets together.
-    pub subsets_of_set: usize,
-    pub most_subsets: usize,
-}
-
-impl ViewSelectionOptions {
-    pub const DEFAULT: Self = Self {
-        // Half of them may be wrong.
-        wanted_tracks: 2 * LEAST_INLIERS,
-        // Real tracks are short: longer blocks hold few of them.
-        most_views: 10,
-        // Bundle adjustment of a block is cubic in its views.
-        most_views_whole: 40,
-        enough_tracks: 300,
-        // Of long sequences not every view needs its turn to find a few dense blocks.
-        most_first_views: 64,
-        most_blocks: 4,
-        // Of a track with three wrong observations of ten, four views are clean one time in six.
-        subset_views: 4,
-        subsets_of_set: 6,
-        most_subsets: 8,
-    };
+options! {
+    /// Which sets of views are worth solving.
+    pub struct ViewSelectionOptions {
+        /// Tracks that a block should have; with fewer than [`LEAST_INLIERS`] none is tried. Half of them may be wrong.
+        wanted_tracks: usize = 2 * LEAST_INLIERS,
+        /// Views that a block grows to. Real tracks are short: longer blocks hold few of them.
+        most_views: usize = 10,
+        /// Views that are solved as one block where tracks are complete over all views; of more, these many evenly
+        /// spread. Bundle adjustment of a block is cubic in its views.
+        most_views_whole: usize = 40,
+        /// Tracks beyond which more of them do not make a block better.
+        enough_tracks: usize = 300,
+        /// Views that blocks are begun from. Of long sequences not every view needs its turn to find a few dense
+        /// blocks.
+        most_first_views: usize = 64,
+        /// Blocks that are tried, best first, before the best result stands.
+        most_blocks: usize = 4,
+        /// Views of a subset. Of a track with three wrong observations of ten, four views are clean one time in six.
+        subset_views: usize = 4,
+        /// Subsets of one set, and of all sets together.
+        subsets_of_set: usize = 6,
+        most_subsets: usize = 8,
+    }
 }
 
 const OPTIONS: ViewSelectionOptions = ViewSelectionOptions::DEFAULT;

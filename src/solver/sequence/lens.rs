@@ -15,41 +15,35 @@ use crate::solver::problem::{Problem, Undone};
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, attempt, view_selection};
 
-/// Which lenses are sampled, and when one is searched behind.
-struct LensSearchOptions {
-    /// Focal lengths of the equidistant fisheyes, in units of the longer image side.
-    focals: [f64; 6],
-    /// Factors by which the best of them is moved to either side, one after the other.
-    refining: [f64; 3],
-    /// Sets of views that are searched quickly behind each.
-    sets: usize,
-    /// Least gain in log evidence over a pinhole, beside what it has.
-    least_gain: f64,
-    /// Share of the pinhole's evidence that the gain must exceed, too.
-    least_share: f64,
-    /// Share of the evidence of what stands without that a calibration behind lenses must have: that of projective
-    /// cameras, which take up some of what lenses bend, is not far below.
-    least_kept: f64,
+options! {
+    /// Which lenses are sampled, and when one is searched behind.
+    struct LensSearchOptions {
+        /// Focal lengths of the equidistant fisheyes, in units of the longer image side. From 85 degrees off the axis
+        /// at the corner of a 4:3 image to where a third radial term is as good as any. From one to the next the
+        /// distortion changes by a quarter.
+        focals: [f64; 6] = [0.42, 0.47, 0.53, 0.6, 0.68, 0.78],
+        /// Factors by which the best of them is moved to either side, one after the other. Half, a quarter and an
+        /// eighth of a step: homographies at 75 degrees off the axis tell one from the other.
+        refining: [f64; 3] = [1.06, 1.03, 1.015],
+        /// Sets of views that are searched quickly behind each. One may be of views that hardly move, or hold few right
+        /// tracks.
+        sets: usize = 2,
+        /// Least gain in log evidence over a pinhole, beside what it has. A factor of twenty thousand: seeds are
+        /// searched at random.
+        least_gain: f64 = 10.0,
+        /// Share of the pinhole's evidence that the gain must exceed, too. Of four turning fisheyes the best lens
+        /// gained 7 to 20 %, most lenses far from it less than 2 %.
+        least_share: f64 = 0.05,
+        /// Share of the evidence of what stands without that a calibration behind lenses must have: that of projective
+        /// cameras, which take up some of what lenses bend, is not far below. Where all views were calibrated it was
+        /// .96 and .99, where a part was, .03 and .25 (two scenes each).
+        least_kept: f64 = 0.9,
+    }
 }
 
+const OPTIONS: LensSearchOptions = LensSearchOptions::DEFAULT;
 /// Unknowns of the homography between two views.
 const HOMOGRAPHY_UNKNOWNS: usize = 8;
-
-const OPTIONS: LensSearchOptions = LensSearchOptions {
-    // From 85 degrees off the axis at the corner of a 4:3 image to where a third radial term is as good as any. From
-    // one to the next the distortion changes by a quarter.
-    focals: [0.42, 0.47, 0.53, 0.6, 0.68, 0.78],
-    // Half, a quarter and an eighth of a step: homographies at 75 degrees off the axis tell one from the other.
-    refining: [1.06, 1.03, 1.015],
-    // One may be of views that hardly move, or hold few right tracks.
-    sets: 2,
-    // A factor of twenty thousand: seeds are searched at random.
-    least_gain: 10.0,
-    // Of four turning fisheyes the best lens gained 7 to 20 %, most lenses far from it less than 2 %.
-    least_share: 0.05,
-    // Where all views were calibrated it was .96 and .99, where a part was, .03 and .25 (two scenes each).
-    least_kept: 0.9,
-};
 
 /// Whether the answer behind lenses replaces the one without: it must explain nearly as much, so that a calibration of
 /// a part does not replace a reconstruction of the whole.
