@@ -163,13 +163,12 @@ pub(super) fn descend<const C: usize, const P: usize, T: BundleProblem<C, P>>(
     options: &Options,
     stop: &StopToken,
 ) -> Report {
-    let (cameras, points) = problem.counts();
+    let (cameras, _) = problem.counts();
     let mut dense = Dense {
         layout,
         loss: options.loss,
         linearisation: Linearisation::new(layout, cameras),
         reduced: Reduced::new(layout, cameras),
-        step: Step::zeros(cameras, points),
         problem: PhantomData,
     };
     levenberg_marquardt::minimise(&mut dense, problem, &options.of_loop(MIN_DAMPING), stop)
@@ -179,9 +178,8 @@ pub(super) fn descend<const C: usize, const P: usize, T: BundleProblem<C, P>>(
 struct Dense<'a, const C: usize, const P: usize, T> {
     layout: &'a Layout,
     loss: Loss,
-    linearisation: Linearisation<C, P>,
+    linearisation: Linearisation<'a, C, P>,
     reduced: Reduced<C, P>,
-    step: Step<C, P>,
     problem: PhantomData<T>,
 }
 
@@ -193,12 +191,13 @@ impl<const C: usize, const P: usize, T: BundleProblem<C, P>> levenberg_marquardt
     }
 
     fn linearise(&mut self, problem: &T) {
-        self.linearisation.fill(problem, self.layout, self.loss);
+        self.linearisation.fill(problem, self.loss);
     }
 
     fn step(&mut self, from: &T, damping: f64, to: &mut T) -> Option<f64> {
-        let predicted = self.reduced.solve(from, self.layout, &self.linearisation, damping, &mut self.step)?;
-        self.step.is_finite().then(|| to.retract(from, &self.step))?;
+        let predicted = self.reduced.solve(from, &self.linearisation, damping)?;
+        let step = &self.reduced.step;
+        step.is_finite().then(|| to.retract(from, step))?;
         Some(predicted)
     }
 }

@@ -20,7 +20,8 @@ const GAUGE_DAMPING: f64 = 1e-9;
 pub(super) const POINT_DAMPING: f64 = 1e-12;
 
 /// Residuals and Jacobians at one state, with their robust weights, and the diagonal blocks of `J' J`.
-pub(super) struct Linearisation<const C: usize, const P: usize> {
+pub(super) struct Linearisation<'a, const C: usize, const P: usize> {
+    layout: &'a Layout,
     residuals: Vec<Vector2<f64>>,
     jacobians: Vec<Jacobian<C, P>>,
     camera_diagonals: Vec<SVector<f64, C>>,
@@ -63,10 +64,11 @@ impl<const C: usize, const P: usize> Jacobian<C, P> {
     }
 }
 
-impl<const C: usize, const P: usize> Linearisation<C, P> {
-    pub fn new(layout: &Layout, cameras: usize) -> Self {
+impl<'a, const C: usize, const P: usize> Linearisation<'a, C, P> {
+    pub fn new(layout: &'a Layout, cameras: usize) -> Self {
         let observations = layout.observations.len();
         Self {
+            layout,
             residuals: vec![Vector2::zeros(); observations],
             jacobians: vec![Jacobian::zeros(); observations],
             camera_diagonals: vec![SVector::zeros(); cameras],
@@ -75,10 +77,10 @@ impl<const C: usize, const P: usize> Linearisation<C, P> {
     }
 
     /// Linearises at the state of `problem`.
-    pub fn fill(&mut self, problem: &impl BundleProblem<C, P>, layout: &Layout, loss: Loss) {
+    pub fn fill(&mut self, problem: &impl BundleProblem<C, P>, loss: Loss) {
         self.camera_diagonals.fill(SVector::zeros());
         self.point_blocks.fill(SMatrix::zeros());
-        for (k, seen) in layout.observations.iter().enumerate() {
+        for (k, seen) in self.layout.observations.iter().enumerate() {
             let (residual, jacobian) = (&mut self.residuals[k], &mut self.jacobians[k]);
             problem.evaluate(seen, &mut Entry { loss, weight: seen.weight, residual, jacobian });
             for component in 0..2 {
@@ -105,6 +107,8 @@ pub(super) struct Reduced<const C: usize, const P: usize> {
     /// `None` where a point is seen by few of the cameras: pair by pair is then cheaper.
     panel: Option<Panel<C, P>>,
     solver: CholeskySolver,
+    /// What was solved for last.
+    pub step: Step<C, P>,
 }
 
 impl<const C: usize, const P: usize> Reduced<C, P> {
@@ -120,59 +124,42 @@ impl<const C: usize, const P: usize> Reduced<C, P> {
             moved: Vec::with_capacity(longest),
             panel: Panel::<C, P>::is_worth_it(layout, cameras).then(|| Panel::new(cameras)),
             solver: CholeskySolver::new(dimension),
+            step: Step::zeros(cameras, layout.starts.len() - 1),
         }
     }
 
     /// Solves for the step at this damping. Returns the decrease of the cost that the linearisation predicts; `None`
     /// when the system is not positive definite.
-    pub fn solve(
-        &mut self,
-        problem: &impl BundleProblem<C, P>,
-        layout: &Layout,
-        linearisation: &Linearisation<C, P>,
-        damping: f64,
-        step: &mut Step<C, P>,
-    ) -> Option<f64> {
-        if !self.build(problem, layout, linearisation, damping) {
+    pub fn solve(&mut self, problem: &impl BundleProblem<C, P>, at: &Linearisation<C, P>, damping: f64) -> Option<f64> {
+        if !self.build(problem, at, damping) {
             return None;
         }
-        self.damp(problem, linearisation, damping);
+        self.damp(problem, at, damping);
         if !self.solver.solve(&mut self.matrix, &mut self.vector) {
             return None;
         }
-        for (camera, values) in step.cameras.iter_mut().zip(self.vector.chunks_exact(C)) {
+        for (camera, values) in self.step.cameras.iter_mut().zip(self.vector.chunks_exact(C)) {
             camera.copy_from_slice(values);
         }
-        Some(self.substitute_points(layout, linearisation, step))
+        Some(self.substitute_points(at))
     }
 
     /// Eliminates the points; `false` when a point's block cannot be factored.
-    pub fn build(
-        &mut self,
-        problem: &impl BundleProblem<C, P>,
-        layout: &Layout,
-        linearisation: &Linearisation<C, P>,
-        damping: f64,
-    ) -> bool {
+    pub fn build(&mut self, problem: &impl BundleProblem<C, P>, at: &Linearisation<C, P>, damping: f64) -> bool {
         vectorised(
             #[inline(always)]
-            || self.eliminate(problem, layout, linearisation, damping),
+            || self.eliminate(problem, at, damping),
         )
     }
 
     #[inline(always)]
-    fn eliminate(
-        &mut self,
-        problem: &impl BundleProblem<C, P>,
-        layout: &Layout,
-        linearisation: &Linearisation<C, P>,
-        damping: f64,
-    ) -> bool {
+    fn eliminate(&mut self, problem: &impl BundleProblem<C, P>, at: &Linearisation<C, P>, damping: f64) -> bool {
+        let layout = at.layout;
         self.matrix.fill(0.0);
         self.vector.fill(0.0);
         for point in 0..self.factors.len() {
             let range = layout.starts[point]..layout.starts[point + 1];
-            let mut block = linearisation.point_blocks[point];
+            let mut block = at.point_blocks[point];
             let trace = block.trace();
             for k in 0..P {
                 block[(k, k)] += damping * block[(k, k)] + POINT_DAMPING * trace + f64::MIN_POSITIVE;
@@ -182,17 +169,13 @@ impl<const C: usize, const P: usize> Reduced<C, P> {
             self.factors[point] = Cholesky::new(block);
             let Some(factor) = &self.factors[point] else { return false };
             self.whitened.clear();
-            for jacobian in &linearisation.jacobians[range.clone()] {
+            for jacobian in &at.jacobians[range.clone()] {
                 let mut whitened = jacobian.point;
                 factor.l_dirty().solve_lower_triangular_mut(&mut whitened);
                 self.whitened.push(whitened);
             }
-            self.add_gradient(
-                &layout.observations[range.clone()],
-                &linearisation.jacobians[range.clone()],
-                &linearisation.residuals[range.clone()],
-            );
-            let (observations, jacobians) = (&layout.observations[range.clone()], &linearisation.jacobians[range]);
+            let (observations, jacobians) = (&layout.observations[range.clone()], &at.jacobians[range.clone()]);
+            self.add_gradient(observations, jacobians, &at.residuals[range]);
             match &mut self.panel {
                 Some(panel) => {
                     panel.push(observations, jacobians, &self.whitened);
@@ -285,14 +268,14 @@ impl<const C: usize, const P: usize> Reduced<C, P> {
     }
 
     /// Marquardt's damping, and what holds the gauge.
-    fn damp(&mut self, problem: &impl BundleProblem<C, P>, linearisation: &Linearisation<C, P>, damping: f64) {
-        let diagonal = |index: usize| linearisation.camera_diagonals[index / C][index % C];
+    fn damp(&mut self, problem: &impl BundleProblem<C, P>, at: &Linearisation<C, P>, damping: f64) {
+        let diagonal = |index: usize| at.camera_diagonals[index / C][index % C];
         let mean = (0..self.dimension).map(diagonal).sum::<f64>() / self.dimension as f64;
         for index in 0..self.dimension {
             self.matrix[index * (self.dimension + 1)] +=
                 damping * diagonal(index) + GAUGE_DAMPING * mean + f64::MIN_POSITIVE;
         }
-        for (camera, diagonal) in linearisation.camera_diagonals.iter().enumerate() {
+        for (camera, diagonal) in at.camera_diagonals.iter().enumerate() {
             let gauge = problem.camera_gauge(camera);
             let weight = diagonal.sum() / C as f64;
             let first = C * camera;
@@ -308,20 +291,15 @@ impl<const C: usize, const P: usize> Reduced<C, P> {
     /// The points' part of the step, `-V^-1 Jp' (r + Jc dc)`.
     ///
     /// Returns by how much the linearised residuals shrink under the whole step, `|r|^2 - |r + J d|^2`.
-    fn substitute_points(
-        &mut self,
-        layout: &Layout,
-        linearisation: &Linearisation<C, P>,
-        step: &mut Step<C, P>,
-    ) -> f64 {
+    fn substitute_points(&mut self, at: &Linearisation<C, P>) -> f64 {
+        let (layout, step) = (at.layout, &mut self.step);
         let mut predicted = 0.0;
         for (point, factor) in self.factors.iter().enumerate() {
             let mut gradient = SVector::<f64, P>::zeros();
             self.moved.clear();
             for k in layout.starts[point]..layout.starts[point + 1] {
-                let jacobian = &linearisation.jacobians[k];
-                let moved =
-                    linearisation.residuals[k] + jacobian.camera.tr_mul(&step.cameras[layout.observations[k].view]);
+                let jacobian = &at.jacobians[k];
+                let moved = at.residuals[k] + jacobian.camera.tr_mul(&step.cameras[layout.observations[k].view]);
                 gradient -= jacobian.point * moved;
                 self.moved.push(moved);
             }
@@ -330,8 +308,8 @@ impl<const C: usize, const P: usize> Reduced<C, P> {
             }
             step.points[point] = gradient;
             for (k, moved) in (layout.starts[point]..).zip(&self.moved) {
-                let left = moved + linearisation.jacobians[k].point.tr_mul(&gradient);
-                predicted += linearisation.residuals[k].norm_squared() - left.norm_squared();
+                let left = moved + at.jacobians[k].point.tr_mul(&gradient);
+                predicted += at.residuals[k].norm_squared() - left.norm_squared();
             }
         }
         predicted
@@ -355,11 +333,11 @@ mod tests {
             Projective { cameras: scene.cameras(), points: scene.points.iter().map(|point| point.push(1.0)).collect() };
         let layout = Layout::new(&seen, 5, 150);
         let mut linearisation = Linearisation::new(&layout, 5);
-        linearisation.fill(&problem, &layout, Loss::Squared);
+        linearisation.fill(&problem, Loss::Squared);
         let build = |by_panels: bool| {
             let mut reduced = Reduced::new(&layout, 5);
             reduced.panel = by_panels.then(|| Panel::new(5));
-            assert!(reduced.build(&problem, &layout, &linearisation, 1e-3));
+            assert!(reduced.build(&problem, &linearisation, 1e-3));
             (reduced.matrix, reduced.vector)
         };
         let ((panels, right), (pairs, expected)) = (build(true), build(false));

@@ -9,7 +9,7 @@ use nalgebra::Vector3;
 
 use super::super::Loss;
 use super::MetricReconstruction;
-use super::layout::{Layout, Seen};
+use super::layout::Seen;
 use super::minimise::cost_of_point;
 use super::normal::Weighted;
 use super::point::PointBlock;
@@ -22,15 +22,10 @@ const WORTHWHILE: f64 = 1e-2;
 
 /// Moves every free point towards its minimum with the cameras as they are; by how much that lowers the cost. `None`
 /// when it was stopped.
-pub(super) fn iterate_points(
-    sequence: &mut MetricReconstruction,
-    layout: &Layout,
-    loss: Loss,
-    pool: &WorkerPool,
-) -> Option<f64> {
-    let iterated = pool.of_points(layout, |point| {
-        let (seen, position) = (layout.seen(point), sequence.points[point]);
-        let moves = !seen.is_empty() && layout.free_points[point];
+pub(super) fn iterate_points(sequence: &mut MetricReconstruction, loss: Loss, pool: &WorkerPool) -> Option<f64> {
+    let iterated = pool.of_points(|point| {
+        let (seen, position) = (pool.layout.seen(point), sequence.points[point]);
+        let moves = !seen.is_empty() && pool.layout.free_points[point];
         Some(if moves { iterate(sequence, seen, position, loss) } else { (position, 0.0) })
     })?;
     let mut lowered = 0.0;

@@ -51,31 +51,30 @@ pub fn adjust(
     let unknown = Report { initial_cost: f64::INFINITY, cost: f64::INFINITY, iterations: 0 };
     let Some(layout) = Layout::new(sequence, observations, free, &mut cancellation) else { return unknown };
     let pool = WorkerPool::new(&layout, threads, stop);
-    let descent = match layout.is_empty() {
-        true => None,
-        false => Descent::new(sequence, &layout, priors, options, &pool, heartbeat, &mut cancellation),
+    let loss = options.loss;
+    let solvable = || {
+        let pattern = Pattern::new(sequence, &layout, &mut cancellation)?;
+        Some((Solver::new(&pattern)?, pattern))
     };
-    let Some(mut descent) = descent else {
-        let cost = cost(sequence, &layout, priors, options.loss, &pool).unwrap_or(f64::INFINITY);
+    let Some((solver, pattern)) = (!layout.is_empty()).then(solvable).flatten() else {
+        let cost = cost(sequence, priors, loss, &pool).unwrap_or(f64::INFINITY);
         return Report { initial_cost: cost, cost, iterations: 0 };
     };
+    let normal = Normal::new(&layout, &pattern, sequence);
+    let reduced = Reduced::new(&layout, pattern);
+    let mut descent = Descent { priors, loss, normal, reduced, solver, pool: &pool, heartbeat };
     let report = levenberg_marquardt::minimise(&mut descent, sequence, &options.of_loop(MIN_DAMPING), stop);
     sequence.average_focals();
     report
 }
 
 /// Sum of the loss over the observations and of what the priors add; `None` when it was stopped.
-fn cost(
-    sequence: &MetricReconstruction,
-    layout: &Layout,
-    priors: &[IntrinsicsPrior],
-    loss: Loss,
-    pool: &WorkerPool,
-) -> Option<f64> {
+fn cost(sequence: &MetricReconstruction, priors: &[IntrinsicsPrior], loss: Loss, pool: &WorkerPool) -> Option<f64> {
+    let layout = pool.layout;
     let groups = priors.iter().zip(&layout.unknowns.parameters).zip(&sequence.intrinsics);
     let of_priors: f64 = groups.map(|((prior, parameters), intrinsics)| prior.cost(parameters, intrinsics)).sum();
     let of_point = |point: usize| Some(cost_of_point(sequence, layout.seen(point), &sequence.points[point], loss));
-    Some(pool.of_points(layout, of_point)?.into_iter().fold(of_priors, |sum, cost| sum + cost))
+    Some(pool.of_points(of_point)?.into_iter().fold(of_priors, |sum, cost| sum + cost))
 }
 
 /// Sum of the loss over the observations of one point, were it at this position.
@@ -96,7 +95,6 @@ pub(super) fn cost_of_point(
 
 /// What the steps need from one to the next.
 struct Descent<'a> {
-    layout: &'a Layout,
     priors: &'a [IntrinsicsPrior],
     loss: Loss,
     normal: Normal,
@@ -106,45 +104,21 @@ struct Descent<'a> {
     heartbeat: &'a mut dyn FnMut(),
 }
 
-impl<'a> Descent<'a> {
-    fn new(
-        sequence: &MetricReconstruction,
-        layout: &'a Layout,
-        priors: &'a [IntrinsicsPrior],
-        options: &Options,
-        pool: &'a WorkerPool<'a>,
-        heartbeat: &'a mut dyn FnMut(),
-        cancellation: &mut CancellationCheck,
-    ) -> Option<Self> {
-        let pattern = Pattern::new(sequence, layout, cancellation)?;
-        Some(Self {
-            layout,
-            priors,
-            loss: options.loss,
-            solver: Solver::new(&pattern)?,
-            normal: Normal::new(layout, &pattern, sequence),
-            reduced: Reduced::new(layout, pattern),
-            pool,
-            heartbeat,
-        })
-    }
-}
-
 impl LeastSquares for Descent<'_> {
     type State = MetricReconstruction;
 
     fn cost(&self, sequence: &MetricReconstruction) -> f64 {
-        cost(sequence, self.layout, self.priors, self.loss, self.pool).unwrap_or(f64::INFINITY)
+        cost(sequence, self.priors, self.loss, self.pool).unwrap_or(f64::INFINITY)
     }
 
     /// What is left unfinished when it is stopped is not used: no attempt follows.
     fn linearise(&mut self, sequence: &MetricReconstruction) {
-        self.normal.fill(sequence, self.layout, self.priors, self.loss, self.pool);
+        self.normal.fill(sequence, self.priors, self.loss, self.pool);
     }
 
     fn step(&mut self, from: &MetricReconstruction, damping: f64, to: &mut MetricReconstruction) -> Option<f64> {
-        let Self { layout, normal, reduced, pool, .. } = self;
-        if !reduced.build(layout, normal, damping, pool) {
+        let Self { normal, reduced, pool, .. } = self;
+        if !reduced.build(normal, damping, pool) {
             return None;
         }
         reduced.damp(normal, damping);
@@ -152,7 +126,7 @@ impl LeastSquares for Descent<'_> {
             return None;
         }
         let step = &reduced.vector;
-        let possible = retract(to, from, layout, step) && substitute(to, from, layout, normal, damping, step, pool);
+        let possible = retract(to, from, pool.layout, step) && substitute(to, from, normal, damping, step, pool);
         // The rows of the Jacobian are not kept: what they predict is not known.
         possible.then_some(f64::NAN)
     }
@@ -171,7 +145,7 @@ impl LeastSquares for Descent<'_> {
             return Some(StepCost { cost, predicted });
         }
         // Cheaper than another system: most of what a long step spoils is the points' part of its curvature.
-        let lowered = iterate_points(to, self.layout, self.loss, self.pool)?;
+        let lowered = iterate_points(to, self.loss, self.pool)?;
         Some(StepCost { cost: cost - lowered, predicted })
     }
 }

@@ -8,12 +8,12 @@ use nalgebra::Vector3;
 use super::super::Loss;
 use super::super::engine::usable_squared_norm;
 use super::super::metric::{IntrinsicsPrior, POSE, Parameter, Projection, ProjectionGradients, VIEW};
+use super::MetricReconstruction;
 use super::grouped::Grouped;
 use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
 use super::point::PointBlock;
 use super::worker_pool::{WorkerPool, split_off};
-use super::{CancellationCheck, MetricReconstruction};
 use crate::parallel::even_cuts;
 use crate::simd::vectorised;
 
@@ -112,9 +112,12 @@ struct Batch<'a> {
     before: &'a [(usize, usize)],
     /// Free intrinsics of each group.
     parameters: &'a [Vec<Parameter>],
+    /// Group of each view.
+    group_of: &'a [usize],
     /// Where the batch begins among all observations.
     first: usize,
     rows: &'a [Option<Weighted>],
+    pool: &'a WorkerPool<'a>,
 }
 
 impl Normal {
@@ -134,28 +137,27 @@ impl Normal {
     pub fn fill(
         &mut self,
         sequence: &MetricReconstruction,
-        layout: &Layout,
         priors: &[IntrinsicsPrior],
         loss: Loss,
         pool: &WorkerPool,
     ) -> bool {
         self.cameras.values.fill(0.0);
         self.cameras.gradient.fill(0.0);
-        self.cameras.add_priors(sequence, layout, priors);
+        self.cameras.add_priors(sequence, pool.layout, priors);
         pool.batches().all(|points| {
-            self.linearise(sequence, layout, loss, pool, points.clone())
-                && self.cameras.add_batch(sequence, layout, pool, points, &self.rows)
+            self.linearise(sequence, loss, pool, points.clone())
+                && self.cameras.add_batch(sequence, pool, points, &self.rows)
         })
     }
 
     fn linearise(
         &mut self,
         sequence: &MetricReconstruction,
-        layout: &Layout,
         loss: Loss,
         pool: &WorkerPool,
         points: Range<usize>,
     ) -> bool {
+        let layout = pool.layout;
         let seen = layout.seen_range(points.clone()).len();
         // What is left from another batch is written over before it is read.
         self.rows.resize_with(self.rows.len().max(seen), || None);
@@ -171,11 +173,11 @@ impl Normal {
                 range,
             }
         };
-        let pieces = pool.cut(layout, points).windows(2).map(cut).collect();
+        let pieces = pool.cut(points).windows(2).map(cut).collect();
         pool.threads.each(pieces, |piece: Points| {
             vectorised(
                 #[inline(always)]
-                || piece.linearise(sequence, layout, loss, pool.cancellation()),
+                || piece.linearise(sequence, loss, pool),
             )
         })
     }
@@ -184,13 +186,8 @@ impl Normal {
 impl Points<'_> {
     /// `false` when it was stopped.
     #[inline(always)]
-    fn linearise(
-        self,
-        sequence: &MetricReconstruction,
-        layout: &Layout,
-        loss: Loss,
-        mut cancellation: CancellationCheck,
-    ) -> bool {
+    fn linearise(self, sequence: &MetricReconstruction, loss: Loss, pool: &WorkerPool) -> bool {
+        let (layout, mut cancellation) = (pool.layout, pool.cancellation());
         let (mut rows, mut couplings) = (self.rows, self.couplings);
         for (point, slot) in self.range.zip(self.blocks) {
             let seen = layout.seen(point);
@@ -262,12 +259,12 @@ impl Cameras {
     fn add_batch(
         &mut self,
         sequence: &MetricReconstruction,
-        layout: &Layout,
         pool: &WorkerPool,
         points: Range<usize>,
         rows: &[Option<Weighted>],
     ) -> bool {
         let Self { places, values, gradient, before, by_view, .. } = self;
+        let layout = pool.layout;
         let seen = layout.seen_range(points);
         let of_batch = |view: usize| by_view.within(view, &seen);
         let weights = (0..places.len()).map(|view| of_batch(view).len());
@@ -283,17 +280,15 @@ impl Cameras {
         let mut pieces: Vec<Sums> = even_cuts(pool.threads.pieces(), weights).windows(2).map(cut).collect();
         // First, for nobody can share it.
         pieces.insert(0, Sums::Groups { values, gradient });
-        let batch = Batch { places, before, parameters: &layout.unknowns.parameters, first: seen.start, rows };
+        let (parameters, group_of) = (layout.unknowns.parameters.as_slice(), sequence.group_of.as_slice());
+        let batch = Batch { places, before, parameters, group_of, first: seen.start, rows, pool };
         pool.threads.each(pieces, |piece: Sums| {
             vectorised(
                 #[inline(always)]
                 || match piece {
-                    Sums::Views { range, values, gradient } => {
-                        batch.add_to_views(sequence, range, values, gradient, of_batch, pool.cancellation())
-                    }
+                    Sums::Views { range, values, gradient } => batch.add_to_views(range, values, gradient, of_batch),
                     Sums::Groups { values, gradient } => {
-                        let seen = &layout.all_seen()[seen.clone()];
-                        batch.add_to_groups(sequence, seen, values, gradient, pool.cancellation())
+                        batch.add_to_groups(&layout.all_seen()[seen.clone()], values, gradient)
                     }
                 },
             )
@@ -309,19 +304,18 @@ impl Batch<'_> {
     #[inline(always)]
     fn add_to_views<'s>(
         &self,
-        sequence: &MetricReconstruction,
         views: Range<usize>,
         values: &mut [f64],
         gradient: &mut [f64],
         seen: impl Fn(usize) -> &'s [u32],
-        mut cancellation: CancellationCheck,
     ) -> bool {
+        let mut cancellation = self.pool.cancellation();
         let (first_value, first_unknown) = self.before[views.start];
         let within = |place: Place| Place { start: place.start - first_value, ..place };
         for view in views {
             let ViewPlaces { view: Some((first, unknowns, place)), cross, .. } = self.places[view] else { continue };
             let gradient = &mut gradient[first - first_unknown..];
-            let parameters = &self.parameters[sequence.group_of[view]];
+            let parameters = &self.parameters[self.group_of[view]];
             for &k in seen(view) {
                 if !cancellation.may_go_on(1) {
                     return false;
@@ -344,21 +338,15 @@ impl Batch<'_> {
     /// * `values`, `gradient`: those of the groups
     /// * `seen`: the observations of the batch
     #[inline(always)]
-    fn add_to_groups(
-        &self,
-        sequence: &MetricReconstruction,
-        seen: &[Seen],
-        values: &mut [f64],
-        gradient: &mut [f64],
-        mut cancellation: CancellationCheck,
-    ) -> bool {
+    fn add_to_groups(&self, seen: &[Seen], values: &mut [f64], gradient: &mut [f64]) -> bool {
+        let mut cancellation = self.pool.cancellation();
         let Some(&(first_value, first_unknown)) = self.before.last() else { return true };
         for (seen, row) in seen.iter().zip(self.rows) {
             if !cancellation.may_go_on(1) {
                 return false;
             }
             let (Some((first, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };
-            let parameters = &self.parameters[sequence.group_of[seen.view]];
+            let parameters = &self.parameters[self.group_of[seen.view]];
             let free = row.free(parameters);
             let free = chosen(&free, parameters);
             add_product(values, Place { start: place.start - first_value, ..place }, free, free);

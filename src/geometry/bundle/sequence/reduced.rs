@@ -7,13 +7,13 @@ use nalgebra::Vector3;
 
 use super::super::metric::{POINT, POSE};
 use super::super::panel::{self, PANEL_SHARE};
+use super::MetricReconstruction;
 use super::grouped::Grouped;
 use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::{Column, Pattern};
 use super::solver::Solver;
 use super::worker_pool::{WorkerPool, split_off};
-use super::{CancellationCheck, MetricReconstruction};
 use crate::parallel::even_cuts;
 use crate::simd::vectorised;
 
@@ -71,29 +71,22 @@ impl Reduced {
     ///
     /// Batch by batch: first the points are whitened, each by itself, then every block column takes from them what they
     /// subtract from it, in their order; by panels, one product does.
-    pub fn build(&mut self, layout: &Layout, normal: &Normal, damping: f64, pool: &WorkerPool) -> bool {
+    pub fn build(&mut self, normal: &Normal, damping: f64, pool: &WorkerPool) -> bool {
         self.values.copy_from_slice(&normal.cameras.values);
         for (slot, gradient) in self.vector.iter_mut().zip(&normal.cameras.gradient) {
             *slot = -gradient;
         }
         pool.batches().all(|points| {
-            self.whiten(layout, normal, damping, pool, points.clone())
+            self.whiten(normal, damping, pool, points.clone())
                 && match self.by_panels {
-                    true => self.subtract_panel(layout, points, pool.cancellation()),
-                    false => self.subtract(layout, pool, points),
+                    true => self.subtract_panel(pool, points),
+                    false => self.subtract(pool, points),
                 }
         })
     }
 
-    fn whiten(
-        &mut self,
-        layout: &Layout,
-        normal: &Normal,
-        damping: f64,
-        pool: &WorkerPool,
-        points: Range<usize>,
-    ) -> bool {
-        let (by_panels, rows) = (self.by_panels, self.pattern.dimension());
+    fn whiten(&mut self, normal: &Normal, damping: f64, pool: &WorkerPool, points: Range<usize>) -> bool {
+        let (layout, by_panels, rows) = (pool.layout, self.by_panels, self.pattern.dimension());
         let length = |points: Range<usize>| match by_panels {
             true => POINT * rows * points.filter(|point| layout.is_coupled(*point)).count(),
             false => layout.couplings_of(points).len(),
@@ -108,22 +101,22 @@ impl Reduced {
             let whitened = split_off(&mut whitened, length(range.clone()));
             Points { whitened_gradients: split_off(&mut whitened_gradients, range.len()), range, whitened }
         };
-        let pieces = pool.cut(layout, points).windows(2).map(cut).collect();
+        let pieces = pool.cut(points).windows(2).map(cut).collect();
         let pattern = &self.pattern;
         pool.threads.each(pieces, |piece: Points| {
             vectorised(
                 #[inline(always)]
-                || piece.whiten(layout, normal, damping, pattern, by_panels, pool.cancellation()),
+                || piece.whiten(normal, damping, pattern, by_panels, pool),
             )
         })
     }
 
     /// Takes from the system what the points of a batch subtract, as columns of a panel; `false` when it was stopped.
-    fn subtract_panel(&mut self, layout: &Layout, points: Range<usize>, mut cancellation: CancellationCheck) -> bool {
+    fn subtract_panel(&mut self, pool: &WorkerPool, points: Range<usize>) -> bool {
         let rows = self.pattern.dimension();
         let first = points.start;
-        let coupled = points.filter(|point| layout.is_coupled(*point)).map(|point| point - first);
-        if !cancellation.may_go_on(1) {
+        let coupled = points.filter(|point| pool.layout.is_coupled(*point)).map(|point| point - first);
+        if !pool.cancellation().may_go_on(1) {
             return false;
         }
         let whitened = &self.whitened[..POINT * rows * coupled.clone().count()];
@@ -135,7 +128,7 @@ impl Reduced {
         true
     }
 
-    fn subtract(&mut self, layout: &Layout, pool: &WorkerPool, points: Range<usize>) -> bool {
+    fn subtract(&mut self, pool: &WorkerPool, points: Range<usize>) -> bool {
         let Self { pattern, values, vector, incident_points, whitened, whitened_gradients, .. } = self;
         let of_batch = |block: usize| incident_points.within(block, &points);
         let weights = (0..pattern.block_count()).map(|block| of_batch(block).len());
@@ -149,15 +142,14 @@ impl Reduced {
         let pieces = even_cuts(pool.threads.pieces(), weights).windows(2).map(cut).collect();
         let batch = Whitened {
             first: points.start,
-            points: layout.couplings_of(points.clone()).start,
+            points: pool.layout.couplings_of(points.clone()).start,
             whitened,
             whitened_gradients,
         };
         pool.threads.each(pieces, |piece: Columns| {
-            let mut cancellation = pool.cancellation();
             vectorised(
                 #[inline(always)]
-                || piece.subtract(layout, pattern, &batch, of_batch, &mut cancellation),
+                || piece.subtract(pattern, &batch, of_batch, pool),
             )
         })
     }
@@ -181,15 +173,8 @@ impl Reduced {
 impl Points<'_> {
     /// `false` when a block cannot be factored, or it was stopped.
     #[inline(always)]
-    fn whiten(
-        self,
-        layout: &Layout,
-        normal: &Normal,
-        damping: f64,
-        pattern: &Pattern,
-        by_panels: bool,
-        mut cancellation: CancellationCheck,
-    ) -> bool {
+    fn whiten(self, normal: &Normal, damping: f64, pattern: &Pattern, by_panels: bool, pool: &WorkerPool) -> bool {
+        let (layout, mut cancellation) = (pool.layout, pool.cancellation());
         let mut whitened = self.whitened;
         for (point, whitened_gradient) in self.range.zip(self.whitened_gradients) {
             let incident_blocks = layout.incident_blocks(point);
@@ -238,12 +223,12 @@ impl Columns<'_> {
     #[inline(always)]
     fn subtract<'t>(
         self,
-        layout: &Layout,
         pattern: &Pattern,
         batch: &Whitened,
         incident_points: impl Fn(usize) -> &'t [u32],
-        cancellation: &mut CancellationCheck,
+        pool: &WorkerPool,
     ) -> bool {
+        let (layout, mut cancellation) = (pool.layout, pool.cancellation());
         let (first_value, first_unknown) =
             (pattern.panels(self.range.clone()).start, pattern.offsets[self.range.start]);
         for column in self.range {
@@ -290,12 +275,12 @@ impl Columns<'_> {
 pub(super) fn substitute(
     moved: &mut MetricReconstruction,
     from: &MetricReconstruction,
-    layout: &Layout,
     normal: &Normal,
     damping: f64,
     step: &[f64],
     pool: &WorkerPool,
 ) -> bool {
+    let layout = pool.layout;
     let place = |point: usize| {
         if layout.seen(point).is_empty() || !layout.free_points[point] {
             return Some(from.points[point]);
@@ -314,13 +299,7 @@ pub(super) fn substitute(
         let shift: Vector3<f64> = factor.unwhiten(&factor.whiten(&gradient));
         shift.iter().all(|value| value.is_finite()).then(|| from.points[point] - shift)
     };
-    match pool.of_points(layout, place) {
-        Some(points) => {
-            moved.points = points;
-            true
-        }
-        None => false,
-    }
+    pool.of_points(place).map(|points| moved.points = points).is_some()
 }
 
 #[inline(always)]

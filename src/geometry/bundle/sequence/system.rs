@@ -33,9 +33,9 @@ impl System {
         let pattern = Pattern::new(reconstruction, &layout, &mut cancellation)?;
         let pool = WorkerPool::new(&layout, Threads::ONE, &stop);
         let mut normal = Normal::new(&layout, &pattern, reconstruction);
-        normal.fill(reconstruction, &layout, &[], Loss::Squared, &pool);
+        normal.fill(reconstruction, &[], Loss::Squared, &pool);
         let mut reduced = Reduced::new(&layout, pattern);
-        let possible = reduced.build(&layout, &normal, 0.0, &pool);
+        let possible = reduced.build(&normal, 0.0, &pool);
         let known = normal.cameras.diagonal.iter().map(|&index| normal.cameras.values[index]).collect();
         possible.then_some(Self { unknowns: layout.unknowns, reduced, known })
     }

@@ -15,6 +15,7 @@ pub(super) const BATCH: usize = 16_384;
 
 /// The threads of an adjustment, and the cuts of its points.
 pub(super) struct WorkerPool<'a> {
+    pub layout: &'a Layout,
     pub threads: Threads,
     stop: &'a StopToken,
     /// First points of the batches, and the end.
@@ -22,7 +23,7 @@ pub(super) struct WorkerPool<'a> {
 }
 
 impl<'a> WorkerPool<'a> {
-    pub fn new(layout: &Layout, threads: Threads, stop: &'a StopToken) -> Self {
+    pub fn new(layout: &'a Layout, threads: Threads, stop: &'a StopToken) -> Self {
         let observations = layout.seen_range(0..layout.point_count()).len();
         let (mut batches, mut sum) = (vec![0], 0);
         for point in 0..layout.point_count() {
@@ -33,7 +34,7 @@ impl<'a> WorkerPool<'a> {
             sum += layout.seen(point).len();
         }
         batches.push(layout.point_count());
-        Self { threads: threads.if_worth(observations >= WORTH_A_THREAD), stop, batches }
+        Self { layout, threads: threads.if_worth(observations >= WORTH_A_THREAD), stop, batches }
     }
 
     /// For one piece of work: asks the stop token at once, and then now and then.
@@ -47,15 +48,16 @@ impl<'a> WorkerPool<'a> {
     }
 
     /// Cuts a run of points into pieces of about as many observations each; where each begins, and the end.
-    pub fn cut(&self, layout: &Layout, points: Range<usize>) -> Vec<usize> {
+    pub fn cut(&self, points: Range<usize>) -> Vec<usize> {
         let first = points.start;
-        let cuts = even_cuts(self.threads.pieces(), points.map(|point| layout.seen(point).len()));
+        let cuts = even_cuts(self.threads.pieces(), points.map(|point| self.layout.seen(point).len()));
         cuts.into_iter().map(|cut| first + cut).collect()
     }
 
     /// What `work` makes of every point, in their order; `None` where it made nothing of one, or it was stopped.
-    pub fn of_points<T: Send>(&self, layout: &Layout, work: impl Fn(usize) -> Option<T> + Sync) -> Option<Vec<T>> {
-        let cuts = self.cut(layout, 0..layout.point_count());
+    pub fn of_points<T: Send>(&self, work: impl Fn(usize) -> Option<T> + Sync) -> Option<Vec<T>> {
+        let layout = self.layout;
+        let cuts = self.cut(0..layout.point_count());
         let of_piece = |piece: usize| -> Option<Vec<T>> {
             let mut cancellation = self.cancellation();
             let points = cuts[piece]..cuts[piece + 1];

@@ -115,10 +115,10 @@ fn every_layout_of_the_system_is_the_same_system() {
         let pattern = pattern.expect("goes on");
         assert_eq!(pattern.is_square, by_panels.is_some());
         let mut normal = Normal::new(&layout, &pattern, &sequence);
-        assert!(normal.fill(&sequence, &layout, &[], Loss::Squared, &pool));
+        assert!(normal.fill(&sequence, &[], Loss::Squared, &pool));
         let mut reduced = Reduced::new(&layout, pattern);
         reduced.by_panels = by_panels == Some(true);
-        assert!(reduced.build(&layout, &normal, 1e-3, &pool));
+        assert!(reduced.build(&normal, 1e-3, &pool));
         let mut matrix = DMatrix::zeros(37, 37);
         reduced.pattern.for_each(|row, column, index| {
             if row >= column {
@@ -148,7 +148,7 @@ fn compare(
     assert_eq!(cameras, unknowns, "{what}");
     let mut normal = Normal::new(&layout, &pattern, sequence);
     let stop = StopToken::default();
-    assert!(normal.fill(sequence, &layout, &[], Loss::Squared, &WorkerPool::new(&layout, Threads::ONE, &stop)));
+    assert!(normal.fill(sequence, &[], Loss::Squared, &WorkerPool::new(&layout, Threads::ONE, &stop)));
     let (residuals, jacobian) = differentiate(sequence, observations, &layout);
     let information = jacobian.transpose() * &jacobian;
     let gradient = jacobian.transpose() * residuals;
@@ -197,7 +197,7 @@ fn what_is_known_beforehand_takes_part() {
         let mut normal = Normal::new(&layout, &pattern, &sequence);
         let stop = StopToken::default();
         let pool = WorkerPool::new(&layout, Threads::ONE, &stop);
-        assert!(normal.fill(&sequence, &layout, priors, Loss::Squared, &pool));
+        assert!(normal.fill(&sequence, priors, Loss::Squared, &pool));
         let block = layout.unknowns.group_block[2].expect("free");
         let unknown = layout.unknowns.range(block).start;
         (normal.cameras.values[normal.cameras.diagonal[unknown]], normal.cameras.gradient[unknown])
@@ -220,8 +220,8 @@ fn a_stop_is_seen_within_one_linearisation() {
     assert!(observations.len() > BATCH);
     for threads in [1, 3] {
         let pool = WorkerPool::new(&layout, Threads::new(threads), &stop);
-        assert!(!normal.fill(&sequence, &layout, &[], Loss::Squared, &pool), "{threads} threads");
-        assert_eq!(pool.of_points(&layout, Some), None, "{threads} threads");
+        assert!(!normal.fill(&sequence, &[], Loss::Squared, &pool), "{threads} threads");
+        assert_eq!(pool.of_points(Some), None, "{threads} threads");
     }
     let mut start = sequence.clone();
     let report = adjust(&mut start, &observations, &free, &[], &Options::default(), quiet(&stop, &mut || ()));
