@@ -132,7 +132,7 @@ fn chosen(
     let least_in_front = problem.options.grades.least_in_front;
     for minimum in &mut minima {
         Error::check(choice.stop)?;
-        *minimum = minimum.adjusted(problem, best.model, &best.priors, choice.stop);
+        *minimum = choice.search(&best.priors).converged(minimum.reconstruction.clone(), best.model);
         // A model that is wrong may rank the minima wrongly.
         if minimum.cost < best.minimum.cost && minimum.cheirality >= least_in_front.min(best.minimum.cheirality) {
             let better = Candidate::new(minimum.clone(), best.model, best.priors.clone(), problem);

@@ -31,6 +31,7 @@ use critical::Upgrade;
 use fit::Fit;
 use options::FitOptions;
 pub use options::{CalibrationOptions, GradeOptions};
+use search::Search;
 
 /// A projective reconstruction to calibrate; inliers only.
 #[derive(Debug, Clone, Copy)]
@@ -180,25 +181,26 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
         fit = *free;
     }
     let priors = choice.priors(fit.noise);
+    let search = choice.search(&priors);
     let from_plane = |plane: &Homographies| {
         let group_of = if problem.focal_per_view { &vec![0; problem.cameras.len()] } else { problem.group_of };
         let starts =
             planar::upgrades(plane, group_of, problem.observations, problem.options.search.planar_starts, stop);
-        search::minima_from(starts, problem, &priors, stop)
+        search.minima_from(starts)
     };
     let minima = match (critical.upgrade, problem.focal_priors) {
         (Upgrade::Quadric(plane), _) => {
             let mut found = match to_canonical_frame(&cameras, &points) {
-                Some(frame) => search::minima(&frame, problem, &priors, stop)?,
+                Some(frame) => search.minima(&frame)?,
                 None => Vec::new(),
             };
             found.extend(plane.as_ref().map(from_plane).transpose()?.into_iter().flatten());
             search::distinct(found, problem)
         }
         (Upgrade::Plane(plane), _) => from_plane(&plane)?,
-        (Upgrade::Rotation { metric, .. }, _) => search::minima_from(vec![metric], problem, &priors, stop)?,
+        (Upgrade::Rotation { metric, .. }, _) => search.minima_from(vec![metric])?,
         (Upgrade::Translation(translation), [Some(focal)]) => {
-            search::known_focal(&translation, focal.focal_px / scale_px, problem, &priors, stop)
+            search.known_focal(&translation, focal.focal_px / scale_px)
         }
         (Upgrade::Translation(_) | Upgrade::None, _) => return Ok(problem.refused(&warnings)),
     };
@@ -261,13 +263,14 @@ pub fn from_metric(
     };
     let choice = models::Choice { problem, scale_px, stop };
     let priors = choice.priors(fit.noise);
+    let search = choice.search(&priors);
     let mut factors: Vec<f64> = std::iter::once(1.0).chain(problem.options.search.other_focals).collect();
     if let Some(Stretch { problem, metric }) = &stretch {
         // Many views are adjusted from where few of them end, instead of from everywhere.
-        let found = search::minima_near(metric, problem, &factors, &priors, stop, heartbeat)?;
+        let found = Search { problem, ..search }.minima_near(metric, &factors, heartbeat)?;
         factors = found.iter().map(|minimum| (minimum.log_focal() - metric.log_focal()).exp()).collect();
     }
-    let minima = search::minima_near(metric, problem, &factors, &priors, stop, heartbeat)?;
+    let minima = search.minima_near(metric, &factors, heartbeat)?;
     if minima.is_empty() {
         warnings.push(no_start());
         return Ok(problem.refused(&warnings));
@@ -285,7 +288,7 @@ pub fn focal_alone(
 ) -> Option<(f64, f64)> {
     let priors = vec![prior.forgetting(Parameter::LogFocal)];
     let model = IntrinsicsModel::focal(metric.has_own_focals());
-    let minimum = search::Minimum::near(metric.clone(), problem, model, &priors, stop);
+    let minimum = Search { problem, priors: &priors, stop }.converged(metric.clone(), model);
     let candidate = models::Candidate::new(minimum, model, priors, problem);
     let sigma = candidate.sigma(0, Parameter::LogFocal, model, &candidate.priors)?;
     let log_focal = candidate.minimum.log_focal();

@@ -2,7 +2,7 @@
 
 use super::fit::Fit;
 use super::options::{CalibrationOptions, GradeOptions};
-use super::search::Minimum;
+use super::search::{Minimum, Search};
 use super::{Error, Uncalibrated};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::Options;
@@ -83,6 +83,11 @@ impl Choice<'_> {
         self.problem.focal_priors.iter().map(of_group).collect()
     }
 
+    /// What minima are searched by with these priors.
+    pub fn search<'s>(&'s self, priors: &'s [IntrinsicsPrior]) -> Search<'s> {
+        Search { problem: self.problem, priors, stop: self.stop }
+    }
+
     fn significant_gain(&self, extension: Extension) -> f64 {
         let freedom = self.problem.groups() * extension.parameters().len();
         self.problem.options.models.significant_gain(freedom)
@@ -94,7 +99,7 @@ impl Choice<'_> {
     fn adjusted(&self, from: &Minimum, model: IntrinsicsModel, mut noise: f64) -> Candidate {
         let adjusted = |from: &Minimum, noise: f64| {
             let priors = self.priors(noise);
-            let minimum = from.adjusted(self.problem, model, &priors, self.stop);
+            let minimum = self.search(&priors).converged(from.reconstruction.clone(), model);
             Candidate::new(minimum, model, priors, self.problem)
         };
         let mut found = adjusted(from, noise);
@@ -115,7 +120,7 @@ impl Choice<'_> {
     pub fn on_stretch(&self, chosen: &Candidate, metric: &MetricReconstruction) -> Candidate {
         let intrinsics = chosen.minimum.reconstruction.intrinsics.clone();
         let reconstruction = MetricReconstruction { intrinsics, ..metric.clone() };
-        let minimum = Minimum::near(reconstruction, self.problem, chosen.model, &chosen.priors, self.stop);
+        let minimum = self.search(&chosen.priors).converged(reconstruction, chosen.model);
         Candidate::new(minimum, chosen.model, chosen.priors.clone(), self.problem)
     }
 
@@ -387,9 +392,8 @@ mod tests {
             let (priors, stop) = (vec![problem.options.lenses.prior(NOISE, None, 1000.0)], StopToken::default());
             let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
             let reconstruction = scene.reconstruction();
-            let start = Minimum { reconstruction, cost: f64::INFINITY, cheirality: 1.0 };
             for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
-                let minimum = start.adjusted(&problem, model, &priors, &stop);
+                let minimum = choice.search(&priors).converged(reconstruction.clone(), model);
                 let best = Candidate::new(minimum, model, priors.clone(), &problem);
                 let sigma = best.sigma_log_focal().expect("observable");
                 let profiled = choice.profiled(sigma, &best);

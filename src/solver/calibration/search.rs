@@ -82,210 +82,172 @@ impl Minimum {
         }
         found
     }
+}
 
-    /// Adjusts to convergence from here with this model.
-    pub fn adjusted(
+/// What minima are searched by.
+#[derive(Clone, Copy)]
+pub(super) struct Search<'a> {
+    pub problem: &'a Uncalibrated<'a>,
+    /// What is known of the intrinsics of each group beforehand.
+    pub priors: &'a [IntrinsicsPrior],
+    pub stop: &'a StopToken,
+}
+
+impl Search<'_> {
+    /// The minimum that a reconstruction converges to with this model.
+    pub fn converged(&self, start: MetricReconstruction, model: IntrinsicsModel) -> Minimum {
+        self.adjusted(&self.problem.options.search.to_convergence(), start, model)
+    }
+
+    fn adjusted(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> Minimum {
+        let (mut reconstruction, observations) = (start, self.problem.observations);
+        let report = metric::adjust(&mut reconstruction, observations, model, self.priors, options, self.stop);
+        let cheirality = cheirality(&reconstruction, observations);
+        Minimum { reconstruction, cost: report.cost, cheirality }
+    }
+
+    /// Minima from a reconstruction that is metric already, cheapest first: those that other focal lengths lead to, once
+    /// its poses and points have followed, for freed at once these would only go back to where they were.
+    ///
+    /// * `factors`: on its focal length, to begin from; 1 for its own
+    /// * `heartbeat`: called after each
+    pub fn minima_near(
         &self,
-        problem: &Uncalibrated,
-        model: IntrinsicsModel,
-        priors: &[IntrinsicsPrior],
-        stop: &StopToken,
-    ) -> Self {
-        Self::near(self.reconstruction.clone(), problem, model, priors, stop)
-    }
-
-    /// Adjusts a reconstruction to convergence.
-    pub fn near(
-        start: MetricReconstruction,
-        problem: &Uncalibrated,
-        model: IntrinsicsModel,
-        priors: &[IntrinsicsPrior],
-        stop: &StopToken,
-    ) -> Self {
-        Self::by(&problem.options.search.to_convergence(), start, problem, model, priors, stop)
-    }
-
-    fn by(
-        options: &Options,
-        start: MetricReconstruction,
-        problem: &Uncalibrated,
-        model: IntrinsicsModel,
-        priors: &[IntrinsicsPrior],
-        stop: &StopToken,
-    ) -> Self {
-        let mut reconstruction = start;
-        let report = metric::adjust(&mut reconstruction, problem.observations, model, priors, options, stop);
-        let cheirality = cheirality(&reconstruction, problem.observations);
-        Self { reconstruction, cost: report.cost, cheirality }
-    }
-}
-
-/// Minima from a reconstruction that is metric already, cheapest first: those that other focal lengths lead to, once
-/// its poses and points have followed, for freed at once these would only go back to where they were.
-///
-/// * `factors`: on its focal length, to begin from; 1 for its own
-/// * `heartbeat`: called after each
-pub(super) fn minima_near(
-    metric: &MetricReconstruction,
-    problem: &Uncalibrated,
-    factors: &[f64],
-    priors: &[IntrinsicsPrior],
-    stop: &StopToken,
-    heartbeat: &mut dyn FnMut(),
-) -> Result<Vec<Minimum>, Error> {
-    let model = IntrinsicsModel::focal(metric.has_own_focals());
-    let mut found = Vec::new();
-    let options = &problem.options.search;
-    for &factor in factors {
-        Error::check(stop)?;
-        let mut reconstruction = metric.clone();
-        reconstruction.intrinsics.iter_mut().for_each(|lens| *lens = lens.simplest());
-        reconstruction.scale_focals(factor);
-        if factor != 1.0 {
-            let following = Options { max_iterations: options.following_iterations, ..Options::default() };
-            metric::adjust(&mut reconstruction, problem.observations, IntrinsicsModel::FIXED, priors, &following, stop);
-        }
-        found.push(Minimum::near(reconstruction, problem, model, priors, stop));
-        heartbeat();
-    }
-    Error::check(stop)?;
-    Ok(distinct(found, problem))
-}
-
-/// Metric reconstructions with the focal length free, or one of each view, that different starts converge to, cheapest
-/// first.
-pub(super) fn minima(
-    frame: &CanonicalFrame,
-    problem: &Uncalibrated,
-    priors: &[IntrinsicsPrior],
-    stop: &StopToken,
-) -> Result<Vec<Minimum>, Error> {
-    match problem.focal_per_view {
-        true => minima_per_view(frame, problem, stop),
-        false if problem.groups() > 1 => minima_of_groups(frame, problem, priors, stop),
-        false => minima_of_one(frame, problem, priors, stop),
-    }
-}
-
-/// With a focal length a camera group: from what one of each view leads to.
-fn minima_of_groups(
-    frame: &CanonicalFrame,
-    problem: &Uncalibrated,
-    priors: &[IntrinsicsPrior],
-    stop: &StopToken,
-) -> Result<Vec<Minimum>, Error> {
-    let alone = Uncalibrated { group_of: &vec![0; frame.cameras.len()], focal_priors: &[None], ..*problem };
-    let mut found = minima_per_view(frame, &alone, stop)?;
-    for minimum in &mut found {
-        Error::check(stop)?;
-        minimum.reconstruction = minimum.reconstruction.clone().in_groups(problem.group_of, problem.groups());
-        *minimum = minimum.adjusted(problem, IntrinsicsModel::FOCAL, priors, stop);
-    }
-    Ok(distinct(found, problem))
-}
-
-/// With a focal length a view: from the quadrics that allow for that, and from what one for all leads to.
-fn minima_per_view(frame: &CanonicalFrame, problem: &Uncalibrated, stop: &StopToken) -> Result<Vec<Minimum>, Error> {
-    let (model, priors) = (IntrinsicsModel::FOCAL_PER_VIEW, [IntrinsicsPrior::NONE]);
-    let options = &problem.options.search;
-    let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(options.starts);
-    let mut starts: Vec<MetricReconstruction> =
-        quadrics.filter_map(|(daq, _)| upgrade(frame, &daq, true, problem.observations)).collect();
-    let of_one = minima_of_one(frame, problem, &priors, stop)?;
-    starts.extend(of_one.into_iter().map(|minimum| minimum.reconstruction.with_own_focals()));
-    let mut found = Vec::with_capacity(starts.len());
-    for reconstruction in starts {
-        Error::check(stop)?;
-        found.push(Minimum::by(&options.first(), reconstruction, problem, model, &priors, stop));
-    }
-    let mut found = distinct(found, problem);
-    found.truncate(options.converged);
-    for minimum in &mut found {
-        Error::check(stop)?;
-        *minimum = minimum.adjusted(problem, model, &priors, stop);
-    }
-    Ok(distinct(found, problem))
-}
-
-/// With one focal length for all views.
-fn minima_of_one(
-    frame: &CanonicalFrame,
-    problem: &Uncalibrated,
-    priors: &[IntrinsicsPrior],
-    stop: &StopToken,
-) -> Result<Vec<Minimum>, Error> {
-    let model = IntrinsicsModel::FOCAL;
-    let options = &problem.options.search;
-    let (subset, chosen) = subsample(frame, problem.observations, options);
-    let searched = &Uncalibrated { observations: subset.as_deref().unwrap_or(problem.observations), ..*problem };
-    let mut found: Vec<Minimum> = Vec::new();
-    for start in starts(frame, options) {
-        Error::check(stop)?;
-        let Some(mut reconstruction) = upgrade(frame, &start, false, searched.observations) else { continue };
-        let report = metric::adjust(&mut reconstruction, searched.observations, model, priors, &options.first(), stop);
-        found.push(Minimum { cheirality: 0.0, cost: report.cost, reconstruction });
-    }
-    let mut found = distinct(found, problem);
-    found.truncate(options.converged);
-    let mut converged: Vec<Minimum> = Vec::with_capacity(found.len());
-    let mut cheapest = f64::INFINITY;
-    for mut start in found {
-        Error::check(stop)?;
-        if start.cost > options.hopeless_cost * cheapest {
-            let tried = Minimum::by(&options.first(), start.reconstruction, searched, model, priors, stop);
-            let pace =
-                (tried.cost / start.cost).powf(options.final_iterations as f64 / options.first_iterations as f64);
-            if pace * tried.cost > options.hopeless_cost * cheapest {
-                continue;
+        metric: &MetricReconstruction,
+        factors: &[f64],
+        heartbeat: &mut dyn FnMut(),
+    ) -> Result<Vec<Minimum>, Error> {
+        let model = IntrinsicsModel::focal(metric.has_own_focals());
+        let max_iterations = self.problem.options.search.following_iterations;
+        let mut found = Vec::new();
+        for &factor in factors {
+            Error::check(self.stop)?;
+            let mut reconstruction = metric.clone();
+            reconstruction.intrinsics.iter_mut().for_each(|lens| *lens = lens.simplest());
+            reconstruction.scale_focals(factor);
+            if factor != 1.0 {
+                let following = Options { max_iterations, ..Options::default() };
+                reconstruction = self.adjusted(&following, reconstruction, IntrinsicsModel::FIXED).reconstruction;
             }
-            start = tried;
+            found.push(self.converged(reconstruction, model));
+            heartbeat();
         }
-        let mut minimum = start.adjusted(searched, model, priors, stop);
-        cheapest = cheapest.min(minimum.cost);
-        if let Some(chosen) = &chosen {
-            fill_points(&mut minimum, chosen, problem.observations);
-            minimum = minimum.adjusted(problem, model, priors, stop);
+        Error::check(self.stop)?;
+        Ok(distinct(found, self.problem))
+    }
+
+    /// Metric reconstructions with the focal length free, or one of each view, that different starts converge to,
+    /// cheapest first.
+    pub fn minima(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
+        match self.problem.focal_per_view {
+            true => self.minima_per_view(frame),
+            false if self.problem.groups() > 1 => self.minima_of_groups(frame),
+            false => self.minima_of_one(frame),
         }
-        converged.push(minimum);
     }
-    Error::check(stop)?;
-    Ok(distinct(converged, problem))
-}
 
-/// What starts that were found otherwise than by the quadric converge to, cheapest first.
-pub(super) fn minima_from(
-    starts: Vec<MetricReconstruction>,
-    problem: &Uncalibrated,
-    priors: &[IntrinsicsPrior],
-    stop: &StopToken,
-) -> Result<Vec<Minimum>, Error> {
-    let model = IntrinsicsModel::focal(problem.focal_per_view);
-    let mut found = Vec::with_capacity(starts.len());
-    for mut start in starts {
-        Error::check(stop)?;
-        start.intrinsics.iter_mut().for_each(|intrinsics| *intrinsics = Intrinsics::from_focal(intrinsics.focal));
-        let start = match problem.focal_per_view {
-            true => start.with_own_focals(),
-            false => start.in_groups(problem.group_of, problem.groups()),
-        };
-        found.push(Minimum::near(start, problem, model, priors, stop));
+    /// With a focal length a camera group: from what one of each view leads to.
+    fn minima_of_groups(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
+        let problem = self.problem;
+        let alone = Uncalibrated { group_of: &vec![0; frame.cameras.len()], focal_priors: &[None], ..*problem };
+        let mut found = Search { problem: &alone, ..*self }.minima_per_view(frame)?;
+        for minimum in &mut found {
+            Error::check(self.stop)?;
+            let in_groups = minimum.reconstruction.clone().in_groups(problem.group_of, problem.groups());
+            *minimum = self.converged(in_groups, IntrinsicsModel::FOCAL);
+        }
+        Ok(distinct(found, problem))
     }
-    Error::check(stop)?;
-    Ok(distinct(found, problem))
-}
 
-/// The metric reconstruction of a camera that moved without turning, from a focal length that is known otherwise; empty
-/// where there is none.
-pub(super) fn known_focal(
-    translation: &Translating,
-    focal: f64,
-    problem: &Uncalibrated,
-    priors: &[IntrinsicsPrior],
-    stop: &StopToken,
-) -> Vec<Minimum> {
-    let start = upgrade_translation(translation, focal, problem.observations);
-    let minimum = start.map(|start| Minimum::near(start, problem, IntrinsicsModel::FOCAL, priors, stop));
-    distinct(minimum.into_iter().collect(), problem)
+    /// With a focal length a view, of which nothing is known: from the quadrics that allow for that, and from what one
+    /// for all leads to.
+    fn minima_per_view(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
+        let (model, search) = (IntrinsicsModel::FOCAL_PER_VIEW, Search { priors: &[IntrinsicsPrior::NONE], ..*self });
+        let (problem, options) = (self.problem, &self.problem.options.search);
+        let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(options.starts);
+        let mut starts: Vec<MetricReconstruction> =
+            quadrics.filter_map(|(daq, _)| upgrade(frame, &daq, true, problem.observations)).collect();
+        let of_one = search.minima_of_one(frame)?;
+        starts.extend(of_one.into_iter().map(|minimum| minimum.reconstruction.with_own_focals()));
+        let mut found = Vec::with_capacity(starts.len());
+        for reconstruction in starts {
+            Error::check(self.stop)?;
+            found.push(search.adjusted(&options.first(), reconstruction, model));
+        }
+        let mut found = distinct(found, problem);
+        found.truncate(options.converged);
+        for minimum in &mut found {
+            Error::check(self.stop)?;
+            *minimum = search.converged(minimum.reconstruction.clone(), model);
+        }
+        Ok(distinct(found, problem))
+    }
+
+    /// With one focal length for all views.
+    fn minima_of_one(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
+        let (model, problem) = (IntrinsicsModel::FOCAL, self.problem);
+        let options = &problem.options.search;
+        let (subset, chosen) = subsample(frame, problem.observations, options);
+        let subset = Uncalibrated { observations: subset.as_deref().unwrap_or(problem.observations), ..*problem };
+        let on_subset = Search { problem: &subset, ..*self };
+        let mut found: Vec<Minimum> = Vec::new();
+        for start in starts(frame, options) {
+            Error::check(self.stop)?;
+            let Some(start) = upgrade(frame, &start, false, subset.observations) else { continue };
+            found.push(on_subset.adjusted(&options.first(), start, model));
+        }
+        let mut found = distinct(found, problem);
+        found.truncate(options.converged);
+        let mut converged: Vec<Minimum> = Vec::with_capacity(found.len());
+        let mut cheapest = f64::INFINITY;
+        for mut start in found {
+            Error::check(self.stop)?;
+            if start.cost > options.hopeless_cost * cheapest {
+                let tried = on_subset.adjusted(&options.first(), start.reconstruction, model);
+                let pace =
+                    (tried.cost / start.cost).powf(options.final_iterations as f64 / options.first_iterations as f64);
+                if pace * tried.cost > options.hopeless_cost * cheapest {
+                    continue;
+                }
+                start = tried;
+            }
+            let mut minimum = on_subset.converged(start.reconstruction, model);
+            cheapest = cheapest.min(minimum.cost);
+            if let Some(chosen) = &chosen {
+                fill_points(&mut minimum, chosen, problem.observations);
+                minimum = self.converged(minimum.reconstruction, model);
+            }
+            converged.push(minimum);
+        }
+        Error::check(self.stop)?;
+        Ok(distinct(converged, problem))
+    }
+
+    /// What starts that were found otherwise than by the quadric converge to, cheapest first.
+    pub fn minima_from(&self, starts: Vec<MetricReconstruction>) -> Result<Vec<Minimum>, Error> {
+        let problem = self.problem;
+        let model = IntrinsicsModel::focal(problem.focal_per_view);
+        let mut found = Vec::with_capacity(starts.len());
+        for mut start in starts {
+            Error::check(self.stop)?;
+            start.intrinsics.iter_mut().for_each(|intrinsics| *intrinsics = Intrinsics::from_focal(intrinsics.focal));
+            let start = match problem.focal_per_view {
+                true => start.with_own_focals(),
+                false => start.in_groups(problem.group_of, problem.groups()),
+            };
+            found.push(self.converged(start, model));
+        }
+        Error::check(self.stop)?;
+        Ok(distinct(found, problem))
+    }
+
+    /// The metric reconstruction of a camera that moved without turning, from a focal length that is known otherwise;
+    /// empty where there is none.
+    pub fn known_focal(&self, translation: &Translating, focal: f64) -> Vec<Minimum> {
+        let start = upgrade_translation(translation, focal, self.problem.observations);
+        let minimum = start.map(|start| self.converged(start, IntrinsicsModel::FOCAL));
+        distinct(minimum.into_iter().collect(), self.problem)
+    }
 }
 
 /// Cheapest first, without those that repeat a cheaper one.

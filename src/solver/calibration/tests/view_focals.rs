@@ -212,8 +212,7 @@ fn with_choice<T>(
     let (prior, stop) = (problem.options.lenses.prior(NOISE, None, SIDE_PX), StopToken::default());
     let choice = super::super::models::Choice { problem: &problem, scale_px: SIDE_PX, stop: &stop };
     let start = metric_of(scene, &vec![scene.intrinsics.focal; scene.poses.len()]);
-    let start = search::Minimum { reconstruction: start, cost: f64::INFINITY, cheirality: 0.0 };
-    let best = start.adjusted(&problem, IntrinsicsModel::FOCAL_PER_VIEW, &[prior], &stop);
+    let best = choice.search(&[prior]).converged(start, IntrinsicsModel::FOCAL_PER_VIEW);
     let fit = Fit::metric(best.cost, &best.reconstruction, IntrinsicsModel::FOCAL_PER_VIEW, &problem);
     ask(&choice, &fit, &best)
 }
