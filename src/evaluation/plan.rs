@@ -90,25 +90,32 @@ impl Contestant {
         Contestant::Psfm,
     ];
 
-    pub fn name(self) -> &'static str {
+    /// Its name, its method (the oracle has none), whether it has the DAQ loss, and the proposals that it does without.
+    fn definition(self) -> (&'static str, Option<Method>, bool, Vec<Proposal>) {
         match self {
-            Contestant::Oracle => "oracle",
-            Contestant::Auto => "auto",
-            Contestant::Geometry => "geometry",
-            Contestant::Paper => "paper",
-            Contestant::PaperWithoutDaq => "paper-without-daq",
-            Contestant::Scpsfm => "scpsfm",
-            Contestant::ScpsfmWithoutDaq => "scpsfm-without-daq",
-            Contestant::Psfm => "psfm",
-            Contestant::AutoWithoutDaq => "auto-without-daq",
-            Contestant::AutoWithoutIrls => "auto-without-irls",
-            Contestant::AutoWithoutConsistency => "auto-without-consistency",
-            Contestant::AutoWithoutRigidity => "auto-without-rigidity",
-            Contestant::AutoWithoutUniform => "auto-without-uniform",
-            Contestant::AutoWithoutLearned => "auto-without-learned",
-            Contestant::NetworkAlone => "network-alone",
-            Contestant::LearnedAlone => "learned-alone",
+            Self::Oracle => ("oracle", None, true, vec![]),
+            Self::Auto => ("auto", Some(Method::Auto), true, vec![]),
+            Self::Geometry => ("geometry", Some(Method::Geometry), true, vec![]),
+            Self::Paper => ("paper", Some(Method::Paper), true, vec![]),
+            Self::PaperWithoutDaq => ("paper-without-daq", Some(Method::Paper), false, vec![]),
+            Self::Scpsfm => ("scpsfm", Some(Method::Scpsfm), true, vec![]),
+            Self::ScpsfmWithoutDaq => ("scpsfm-without-daq", Some(Method::Scpsfm), false, vec![]),
+            Self::Psfm => ("psfm", Some(Method::Psfm), true, vec![]),
+            Self::AutoWithoutDaq => ("auto-without-daq", Some(Method::Auto), false, vec![]),
+            Self::AutoWithoutIrls => ("auto-without-irls", Some(Method::Auto), true, vec![Proposal::Irls]),
+            Self::AutoWithoutConsistency => {
+                ("auto-without-consistency", Some(Method::Auto), true, vec![Proposal::Consistency])
+            }
+            Self::AutoWithoutRigidity => ("auto-without-rigidity", Some(Method::Auto), true, vec![Proposal::Rigidity]),
+            Self::AutoWithoutUniform => ("auto-without-uniform", Some(Method::Auto), true, vec![Proposal::Uniform]),
+            Self::AutoWithoutLearned => ("auto-without-learned", Some(Method::Auto), true, vec![Proposal::Learned]),
+            Self::NetworkAlone => ("network-alone", Some(Method::Auto), true, all_but(Proposal::Network)),
+            Self::LearnedAlone => ("learned-alone", Some(Method::Auto), true, all_but(Proposal::Learned)),
         }
+    }
+
+    pub fn name(self) -> &'static str {
+        self.definition().0
     }
 
     /// Whether this contestant has anything to say of such a scene: the oracle knows pinholes only, rigidity needs
@@ -121,20 +128,6 @@ impl Contestant {
             Contestant::Oracle => scene.radial_k1 == 0.0 && scene.zoom == 0.0,
             Contestant::AutoWithoutRigidity => depths == Depths::Given,
             _ => true,
-        }
-    }
-
-    /// Priors that this contestant does without.
-    fn excluded_priors(self) -> Vec<Proposal> {
-        match self {
-            Contestant::AutoWithoutIrls => vec![Proposal::Irls],
-            Contestant::AutoWithoutConsistency => vec![Proposal::Consistency],
-            Contestant::AutoWithoutRigidity => vec![Proposal::Rigidity],
-            Contestant::AutoWithoutUniform => vec![Proposal::Uniform],
-            Contestant::AutoWithoutLearned => vec![Proposal::Learned],
-            Contestant::NetworkAlone => all_but(Proposal::Network),
-            Contestant::LearnedAlone => all_but(Proposal::Learned),
-            _ => Vec::new(),
         }
     }
 
@@ -171,31 +164,14 @@ impl Run {
 
     /// The settings that the contestant solves with; `None` for the oracle, which does not solve.
     pub fn settings(&self) -> Option<SolveSettings> {
-        let (method, use_daq) = match self.contestant {
-            Contestant::Oracle => return None,
-            Contestant::Auto => (Method::Auto, true),
-            Contestant::Geometry => (Method::Geometry, true),
-            Contestant::Paper => (Method::Paper, true),
-            Contestant::PaperWithoutDaq => (Method::Paper, false),
-            Contestant::Scpsfm => (Method::Scpsfm, true),
-            Contestant::ScpsfmWithoutDaq => (Method::Scpsfm, false),
-            Contestant::Psfm => (Method::Psfm, true),
-            Contestant::AutoWithoutDaq => (Method::Auto, false),
-            Contestant::AutoWithoutIrls
-            | Contestant::AutoWithoutConsistency
-            | Contestant::AutoWithoutRigidity
-            | Contestant::AutoWithoutUniform
-            | Contestant::AutoWithoutLearned
-            | Contestant::NetworkAlone
-            | Contestant::LearnedAlone => (Method::Auto, true),
-        };
+        let (_, method, use_daq, excluded_priors) = self.contestant.definition();
         Some(SolveSettings {
-            excluded_priors: self.contestant.excluded_priors(),
+            excluded_priors,
             use_daq,
             seed: self.scene.seed,
             epipolar_depths: self.epipolar_depths,
             network_width: self.paper_width.unwrap_or(SolveSettings::DEFAULT_NETWORK_WIDTH),
-            ..SolveSettings::of_method(method)
+            ..SolveSettings::of_method(method?)
         })
     }
 

@@ -74,40 +74,41 @@ fn positive_roots(quartic: &[f64; 5]) -> Vec<f64> {
     real.map(|root| polish(root.re)).filter(|root| *root > 0.0).collect()
 }
 
+/// Points in the world and where a calibrated camera sees them, as many of each.
+#[derive(Clone, Copy)]
+pub(crate) struct Correspondences<'a> {
+    /// Of a camera at the origin, directions of any length.
+    pub points: &'a [Vector3<f64>],
+    /// Images `(u, v)` at unit depth, distortion undone.
+    pub seen: &'a [Vector2<f64>],
+    /// Of the squared distances, see [`Observation::weight`](super::observation::Observation::weight).
+    pub weights: &'a [f64],
+}
+
 /// The pose that most correspondences agree with, refined on those that do; an inlier is in front of the camera.
 ///
-/// * `seen`: images `(u, v)` at unit depth, distortion undone
-/// * `weights`: of the squared distances, see [`Observation::weight`](super::observation::Observation::weight)
 /// * `gate`: squared distance, in the same units, within which an image of weight 1 agrees
 ///
 /// Returns `None` for fewer than three correspondences or when no sample gives a pose.
 pub(crate) fn robust(
-    points: &[Vector3<f64>],
-    seen: &[Vector2<f64>],
-    weights: &[f64],
+    seen: &Correspondences,
     gate: f64,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<RobustModel<Pose>> {
-    ransac::estimate(&Correspondences::new(points, seen, weights)?, gate, None, MOST_SAMPLES, rng, stop)
+    ransac::estimate(seen, gate, None, MOST_SAMPLES, rng, stop)
 }
 
 /// The same of a camera at the origin, which sees directions: its pose has no translation.
 ///
-/// * `directions`: of any length, in the frame that the rotation is of
-/// * `seen`, `weights`, `gate`: as [`robust`] has them
-///
 /// Returns `None` for fewer than two correspondences or when no sample gives a rotation.
 pub(crate) fn robust_rotation(
-    directions: &[Vector3<f64>],
-    seen: &[Vector2<f64>],
-    weights: &[f64],
+    seen: &Correspondences,
     gate: f64,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<RobustModel<Pose>> {
-    let correspondences = Correspondences::new(directions, seen, weights)?;
-    ransac::estimate(&Directions(correspondences), gate, None, MOST_SAMPLES, rng, stop)
+    ransac::estimate(&Directions(*seen), gate, None, MOST_SAMPLES, rng, stop)
 }
 
 /// Points at infinity, from a camera at the origin.
@@ -152,21 +153,6 @@ impl Refinable<3> for Directions<'_> {
 
     fn moved(&self, pose: &Pose, step: &SVector<f64, 3>) -> Option<Pose> {
         Some(Pose { translation: Vector3::zeros(), ..pose.moved([step.x, step.y, step.z, 0.0, 0.0, 0.0]) })
-    }
-}
-
-#[derive(Clone, Copy)]
-struct Correspondences<'a> {
-    points: &'a [Vector3<f64>],
-    seen: &'a [Vector2<f64>],
-    weights: &'a [f64],
-}
-
-impl<'a> Correspondences<'a> {
-    /// `None` where they are not as many of each.
-    fn new(points: &'a [Vector3<f64>], seen: &'a [Vector2<f64>], weights: &'a [f64]) -> Option<Self> {
-        let are_as_many = points.len() == seen.len() && points.len() == weights.len();
-        are_as_many.then_some(Self { points, seen, weights })
     }
 }
 
@@ -231,6 +217,10 @@ mod tests {
         (scene.points.clone(), seen.collect())
     }
 
+    fn of<'a>(points: &'a [Vector3<f64>], seen: &'a [Vector2<f64>], weights: &'a [f64]) -> Correspondences<'a> {
+        Correspondences { points, seen, weights }
+    }
+
     fn distance(a: &Pose, b: &Pose) -> f64 {
         (a.rotation - b.rotation).norm() + (a.translation - b.translation).norm()
     }
@@ -268,7 +258,7 @@ mod tests {
                 .collect();
             seen[..36].rotate_left(7);
             let gate = CHI_SQUARE_OF_TWO * NOISE * NOISE;
-            let found = robust_rotation(&directions, &seen, &[1.0; 60], gate, &mut rng, &StopToken::default());
+            let found = robust_rotation(&of(&directions, &seen, &[1.0; 60]), gate, &mut rng, &StopToken::default());
             let RobustModel { model, inlier, .. } = found.expect("a rotation");
             let off = (model.rotation - turned).norm();
             println!("seed {seed}: off by {off:.1e}, {} inliers", inlier.iter().filter(|inlier| **inlier).count());
@@ -277,15 +267,9 @@ mod tests {
             let by_chance = inlier[..36].iter().filter(|inlier| **inlier).count();
             assert!(by_chance <= 2, "seed {seed}: {by_chance} wrong ones agree");
         }
-        let nothing = robust_rotation(
-            &[Vector3::z()],
-            &[Vector2::zeros()],
-            &[1.0],
-            1e-4,
-            &mut ChaCha8Rng::seed_from_u64(1),
-            &StopToken::default(),
-        );
-        assert_eq!(nothing, None);
+        let (direction, image, mut rng) = ([Vector3::z()], [Vector2::zeros()], ChaCha8Rng::seed_from_u64(1));
+        let one = of(&direction, &image, &[1.0]);
+        assert_eq!(robust_rotation(&one, 1e-4, &mut rng, &StopToken::default()), None);
     }
 
     #[test]
@@ -296,9 +280,9 @@ mod tests {
         assert!(three_points(&[nan, same, same * 2.0], &[Vector2::zeros(); 3]).is_empty());
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let stop = StopToken::default();
-        assert_eq!(robust(&[same; 2], &[Vector2::zeros(); 2], &[1.0; 2], 1e-4, &mut rng, &stop), None);
-        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9], 1e-4, &mut rng, &stop), None);
-        assert_eq!(robust(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9], f64::NAN, &mut rng, &stop), None);
+        assert_eq!(robust(&of(&[same; 2], &[Vector2::zeros(); 2], &[1.0; 2]), 1e-4, &mut rng, &stop), None);
+        assert_eq!(robust(&of(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9]), 1e-4, &mut rng, &stop), None);
+        assert_eq!(robust(&of(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9]), f64::NAN, &mut rng, &stop), None);
     }
 
     #[test]
@@ -314,15 +298,8 @@ mod tests {
                     *image = Vector2::new(rng.random_range(-0.4..0.4), rng.random_range(-0.4..0.4));
                 }
             }
-            let found = robust(
-                &points,
-                &seen,
-                &vec![1.0; seen.len()],
-                CHI_SQUARE_OF_TWO * NOISE * NOISE,
-                &mut rng,
-                &StopToken::default(),
-            )
-            .expect("a pose");
+            let (gate, weights) = (CHI_SQUARE_OF_TWO * NOISE * NOISE, vec![1.0; seen.len()]);
+            let found = robust(&of(&points, &seen, &weights), gate, &mut rng, &StopToken::default()).expect("a pose");
             let right = found.inlier.iter().enumerate().filter(|(k, inlier)| (k % 3 == 0) == **inlier).count();
             let away = distance(&found.model, &scene.poses[2]);
             println!("seed {seed}: {right} of 90 verdicts right, pose off by {away}");
@@ -346,7 +323,8 @@ mod tests {
             let weights: Vec<f64> = (0..seen.len()).map(|k| 1.0 / (factor(k) * factor(k))).collect();
             let mut away = |weights: &[f64]| {
                 let gate = CHI_SQUARE_OF_TWO * NOISE * NOISE;
-                let found = robust(&points, &seen, weights, gate, &mut rng, &StopToken::default()).expect("a pose");
+                let found =
+                    robust(&of(&points, &seen, weights), gate, &mut rng, &StopToken::default()).expect("a pose");
                 (distance(&found.model, &scene.poses[2]), found.inlier_count())
             };
             let (by_weights, by_all) = (away(&weights), away(&vec![1.0; seen.len()]));
@@ -380,8 +358,8 @@ mod tests {
                     *image = placed.xy() / placed.z + 3.0 * NOISE * Vector2::new(angle.cos(), angle.sin());
                 }
             }
-            let found =
-                robust(&points, &seen, &vec![1.0; seen.len()], gate, &mut rng, &StopToken::default()).expect("a pose");
+            let found = robust(&of(&points, &seen, &vec![1.0; seen.len()]), gate, &mut rng, &StopToken::default())
+                .expect("a pose");
             let kept = found.inlier[..40].iter().filter(|&&inlier| inlier).count();
             right += usize::from(kept == 40);
         }

@@ -10,7 +10,7 @@ use super::options::{ExtensionOptions, GrowthOptions};
 use super::structure;
 use crate::domain::LeftOut;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
-use crate::geometry::pose;
+use crate::geometry::pose::{self, Correspondences};
 use crate::solver::Error;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
@@ -183,6 +183,6 @@ fn robust_pose(
     let (rays, weights): (Vec<_>, Vec<_>) = seen.into_iter().unzip();
     let gate = problem.gate(model.noise) / intrinsics.focal.powi(2);
     let robust = if model.has_common_centre { pose::robust_rotation } else { pose::robust };
-    let found = robust(&points, &rays, &weights, gate, rng, problem.stop)?;
+    let found = robust(&Correspondences { points: &points, seen: &rays, weights: &weights }, gate, rng, problem.stop)?;
     Some((found.model, found.inlier_count()))
 }
