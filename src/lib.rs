@@ -19,6 +19,9 @@
 //! (but for `formats`, which reads COLMAP's databases), only `network` sees burn; `geometry` is plain f64 linear
 //! algebra.
 
+#[macro_use]
+mod lists;
+
 pub mod cli;
 pub mod config;
 pub mod domain;

@@ -7,28 +7,17 @@ use super::sweeps::Sweep;
 use crate::domain::{Method, Proposal, SolveSettings};
 use crate::synthetic::SceneOptions;
 
-/// How projective depths come to the contestants.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Depths {
-    /// True up to noise, as in the paper's synthetic experiments.
-    Given,
-    /// None: image points alone, as real tracks come.
-    None,
-    /// None given; the contestants estimate them from fundamental matrices and epipoles (Sturm & Triggs 1996), as the
-    /// paper does on real tracks. The scenes are those of [`Depths::None`].
-    Epipolar,
-}
-
-impl Depths {
-    pub const ALL: [Depths; 3] = [Depths::Given, Depths::None, Depths::Epipolar];
-
-    pub fn name(self) -> &'static str {
-        match self {
-            Depths::Given => "given",
-            Depths::None => "none",
-            Depths::Epipolar => "epipolar",
-        }
+named! {
+    /// How projective depths come to the contestants.
+    #[derive(PartialOrd, Ord)]
+    pub enum Depths {
+        /// True up to noise, as in the paper's synthetic experiments.
+        Given = "given",
+        /// None: image points alone, as real tracks come.
+        None = "none",
+        /// None given; the contestants estimate them from fundamental matrices and epipoles (Sturm & Triggs 1996), as
+        /// the paper does on real tracks. The scenes are those of [`Depths::None`].
+        Epipolar = "epipolar",
     }
 }
 

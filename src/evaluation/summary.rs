@@ -8,6 +8,7 @@ use super::measures::Measures;
 use super::plan::{Contestant, Depths, Plan, Run};
 use super::runner::Records;
 use crate::domain::Grade;
+use crate::geometry::statistics::midpoint_median;
 use crate::synthetic::{Motion, SceneOptions, Shape};
 
 /// Resamples of a bootstrap interval, its seed, and the share on either side that it leaves out.
@@ -133,13 +134,7 @@ fn mean(values: Vec<f64>) -> Option<f64> {
 
 /// Median, the mean of the two middle ones for an even number; `None` without values.
 pub fn median(mut values: Vec<f64>) -> Option<f64> {
-    values.sort_by(f64::total_cmp);
-    let middle = values.len() / 2;
-    match values.len() {
-        0 => None,
-        count if count % 2 == 1 => Some(values[middle]),
-        _ => Some((values[middle - 1] + values[middle]) / 2.0),
-    }
+    (!values.is_empty()).then(|| midpoint_median(&mut values))
 }
 
 fn ratio_of_medians(pairs: &[(f64, f64)]) -> Option<f64> {

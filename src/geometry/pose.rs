@@ -142,13 +142,9 @@ impl Estimator for Directions<'_> {
 }
 
 impl Refinable<3> for Directions<'_> {
-    fn residual(&self, pose: &Pose, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 3>; 2])> {
-        let (residual, gradients) = self.0.residual(pose, datum)?;
-        Some((residual, gradients.map(|gradient| gradient.fixed_rows::<3>(0).into_owned())))
-    }
-
-    fn weight(&self, datum: usize) -> f64 {
-        self.0.weight(datum)
+    fn residual(&self, pose: &Pose, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 3>; 2], f64)> {
+        let (residual, gradients, weight) = self.0.residual(pose, datum)?;
+        Some((residual, gradients.map(|gradient| gradient.fixed_rows::<3>(0).into_owned()), weight))
     }
 
     fn moved(&self, pose: &Pose, step: &SVector<f64, 3>) -> Option<Pose> {
@@ -183,15 +179,11 @@ impl Estimator for Correspondences<'_> {
 }
 
 impl Refinable<6> for Correspondences<'_> {
-    fn residual(&self, pose: &Pose, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 6>; 2])> {
+    fn residual(&self, pose: &Pose, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 6>; 2], f64)> {
         let intrinsics = Intrinsics::from_focal(1.0);
         let projection = Projection::new(&intrinsics, pose, &self.points[datum]);
         let gradients = projection.gradients().by_pose.map(SVector::from);
-        (projection.at.z > 0.0).then(|| (projection.image - self.seen[datum], gradients))
-    }
-
-    fn weight(&self, datum: usize) -> f64 {
-        self.weights[datum]
+        (projection.at.z > 0.0).then(|| (projection.image - self.seen[datum], gradients, self.weights[datum]))
     }
 
     fn moved(&self, pose: &Pose, step: &SVector<f64, 6>) -> Option<Pose> {

@@ -38,11 +38,9 @@ pub(crate) trait Estimator {
 
 /// An estimator whose models are refined by the gradients of its residuals of two coordinates, by `N` unknowns.
 pub(crate) trait Refinable<const N: usize>: Estimator {
-    /// Residual, in the units of a datum of weight 1, and its gradients; `None` where a datum has none.
-    fn residual(&self, model: &Self::Model, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, N>; 2])>;
-
-    /// Weight of the squared residual of a datum.
-    fn weight(&self, datum: usize) -> f64;
+    /// Residual, in the units of a datum of weight 1, its gradients and the weight of its square; `None` where a datum
+    /// has none.
+    fn residual(&self, model: &Self::Model, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, N>; 2], f64)>;
 
     /// The model moved by a step; `None` where that is none.
     fn moved(&self, model: &Self::Model, step: &SVector<f64, N>) -> Option<Self::Model>;
@@ -90,8 +88,7 @@ impl<const N: usize, E: Refinable<N>> levenberg_marquardt::LeastSquares for Refi
     fn linearise(&mut self, model: &E::Model) {
         self.normal = Normal::zeros();
         for datum in 0..self.estimator.len() {
-            let Some((residual, gradients)) = self.estimator.residual(model, datum) else { continue };
-            let weight = self.estimator.weight(datum);
+            let Some((residual, gradients, weight)) = self.estimator.residual(model, datum) else { continue };
             let squared = weight * residual.norm_squared();
             // Written so that NaN is left out.
             let is_near = squared < WEIGHED_GATES * self.gate;

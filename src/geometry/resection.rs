@@ -113,15 +113,11 @@ impl Estimator for Resection<'_> {
 }
 
 impl Refinable<12> for Resection<'_> {
-    fn residual(&self, camera: &Camera, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 12>; 2])> {
+    fn residual(&self, camera: &Camera, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 12>; 2], f64)> {
         let (point, image) = (&self.points[datum], &self.images[datum]);
         let residual = reprojection(camera, point, image);
         let nearer = point / (camera.row(2) * point).x;
-        Some((residual, projection_equations(&nearer, &(residual + image))))
-    }
-
-    fn weight(&self, datum: usize) -> f64 {
-        self.weights[datum]
+        Some((residual, projection_equations(&nearer, &(residual + image)), self.weights[datum]))
     }
 
     fn moved(&self, camera: &Camera, step: &SVector<f64, 12>) -> Option<Camera> {

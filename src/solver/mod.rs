@@ -11,9 +11,6 @@
 //! and tracks, projectively or metrically, observation by observation; [`assemble`] has [`classification`] judge every
 //! track and observation, and writes it down.
 
-#[macro_use]
-mod options;
-
 pub(crate) mod a_contrario;
 mod all_tracks;
 mod assemble;

@@ -29,56 +29,45 @@ const ZOOM_STREAM: u64 = 1;
 /// Draws of one point before its views are called impossible.
 const MOST_DRAWS: usize = 1_000;
 
-/// What to generate.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct SequenceOptions {
-    pub views: usize,
-    pub tracks: usize,
-    /// Views that a track lives, uniform between the two.
-    pub lifetime: (usize, usize),
-    /// Standard deviation of the noise as a share of the image width.
-    pub noise: f64,
-    /// Share of the tracks that are wrong: each observation is anywhere in its image.
-    pub outliers: f64,
-    /// Share of the observations of the other tracks that are anywhere in their image.
-    #[serde(alias = "wrong_observations")]
-    pub wrong_share: f64,
-    /// Share of the right tracks, of those that are long enough, that go over to another point on their way: one wrong
-    /// link joins two points.
-    pub joined: f64,
-    /// Radial distortion, as in [`SceneOptions::radial_k1`].
-    pub radial_k1: f64,
-    /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
+options! {
+    /// What to generate.
+    #[derive(Serialize, Deserialize)]
     #[serde(default)]
-    pub zoom: f64,
-    /// Whether the focal length grows steadily over that range instead.
-    #[serde(default)]
-    pub ramp: bool,
-    /// Views, the first ones, in which the camera travels and does not turn: what they show is the same under a wrong
-    /// calibration.
-    #[serde(default)]
-    pub straight: usize,
-    pub seed: u64,
+    pub struct SequenceOptions {
+        views: usize = 20,
+        tracks: usize = 1_000,
+        /// Views that a track lives, uniform between the two.
+        lifetime: (usize, usize) = (3, 10),
+        /// Standard deviation of the noise as a share of the image width.
+        noise: f64 = 0.0005,
+        /// Share of the tracks that are wrong: each observation is anywhere in its image.
+        outliers: f64 = 0.3,
+        /// Share of the observations of the other tracks that are anywhere in their image.
+        #[serde(alias = "wrong_observations")]
+        wrong_share: f64 = 0.05,
+        /// Share of the right tracks, of those that are long enough, that go over to another point on their way: one
+        /// wrong link joins two points.
+        joined: f64 = 0.0,
+        /// Radial distortion, as in [`SceneOptions::radial_k1`].
+        radial_k1: f64 = 0.0,
+        /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
+        #[serde(default)]
+        zoom: f64 = 0.0,
+        /// Whether the focal length grows steadily over that range instead.
+        #[serde(default)]
+        ramp: bool = false,
+        /// Views, the first ones, in which the camera travels and does not turn: what they show is the same under a
+        /// wrong calibration.
+        #[serde(default)]
+        straight: usize = 0,
+        seed: u64 = 0,
+    }
 }
 
 impl Default for SequenceOptions {
     /// A short walk: tracks and noise as feature matching gives them.
     fn default() -> Self {
-        Self {
-            views: 20,
-            tracks: 1_000,
-            lifetime: Self::lifetime_within(20),
-            noise: 0.0005,
-            outliers: 0.3,
-            wrong_share: 0.05,
-            joined: 0.0,
-            radial_k1: 0.0,
-            zoom: 0.0,
-            ramp: false,
-            straight: 0,
-            seed: 0,
-        }
+        Self::DEFAULT
     }
 }
 

@@ -1,6 +1,7 @@
 //! What the network is shown: image points in units of their view's own spread.
 
 use super::{MOST_OFFSET, SPREAD_PER_DEVIATION};
+use crate::geometry::statistics::midpoint_median;
 
 /// Least unit of length of a view, in the units of its points: all in one place are not spread apart.
 const LEAST_SPREAD: f64 = 1e-6;
@@ -57,9 +58,9 @@ impl Cloud {
 /// One view: `place` gets all x, then all y.
 fn normalise(points: &[[f64; 2]], visible: &[bool], place: &mut [f32]) {
     let seen = || points.iter().zip(visible).filter(|(_, seen)| **seen).map(|(point, _)| point);
-    let centre = [0, 1].map(|axis| middle(seen().map(|point| point[axis]).collect()));
-    let offsets = seen().flat_map(|point| [0, 1].map(|axis| (point[axis] - centre[axis]).abs())).collect();
-    let unit = (SPREAD_PER_DEVIATION * middle(offsets)).max(LEAST_SPREAD);
+    let centre = [0, 1].map(|axis| midpoint_median(&mut seen().map(|point| point[axis]).collect::<Vec<_>>()));
+    let offsets = seen().flat_map(|point| [0, 1].map(|axis| (point[axis] - centre[axis]).abs()));
+    let unit = (SPREAD_PER_DEVIATION * midpoint_median(&mut offsets.collect::<Vec<_>>())).max(LEAST_SPREAD);
     let most = f64::from(MOST_OFFSET);
     for (track, (point, _)) in points.iter().zip(visible).enumerate().filter(|(_, (_, seen))| **seen) {
         for axis in [0, 1] {
@@ -67,18 +68,6 @@ fn normalise(points: &[[f64; 2]], visible: &[bool], place: &mut [f32]) {
             place[axis * points.len() + track] = offset as f32;
         }
     }
-}
-
-/// Median, the mean of the two in the middle of an even number; 0 of nothing.
-fn middle(mut values: Vec<f64>) -> f64 {
-    let half = values.len() / 2;
-    if values.is_empty() {
-        return 0.0;
-    }
-    let even = values.len().is_multiple_of(2);
-    let (below, upper, _) = values.select_nth_unstable_by(half, f64::total_cmp);
-    let lower = if even { below.iter().copied().fold(f64::NEG_INFINITY, f64::max) } else { *upper };
-    0.5 * (lower + *upper)
 }
 
 #[cfg(test)]

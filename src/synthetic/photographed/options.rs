@@ -5,207 +5,102 @@ use serde::{Deserialize, Serialize};
 use super::lens;
 use crate::domain::error::{InvalidInput, Violation, Violations};
 
-/// How the camera moves. Distances are in units of the world, points mostly 2 to 8 of them away.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum PhotographedMotion {
-    /// On a circle about an object, looking at it.
-    Orbit,
-    /// On foot about an object, at changing distances and heights, looking roughly at it.
-    WalkAround,
-    /// From random places, looking at one part of a room; the order of the views means nothing.
-    HandHeld,
-    /// Forward through a corridor, with swings to either side.
-    Corridor,
-    /// Forward along a street with turns.
-    Drive,
-    /// Above ground, on a grid: the first half of the views looks down along one flight direction, the other half looks
-    /// obliquely along the other.
-    AerialGrid,
-    /// A turn on the spot whose centre moves by a few hundredths of the scene's distance.
-    NearRotation,
-    /// A turn about the camera's centre: constant intrinsics show, depths do not.
-    PureRotation,
-    /// Random places without any turn: critical, no calibration.
-    Translation,
-    /// Views of a plane from several sides.
-    PlanarScene,
+named! {
+    /// How the camera moves. Distances are in units of the world, points mostly 2 to 8 of them away.
+    pub enum PhotographedMotion {
+        /// On a circle about an object, looking at it.
+        Orbit = "orbit",
+        /// On foot about an object, at changing distances and heights, looking roughly at it.
+        WalkAround = "walk-around",
+        /// From random places, looking at one part of a room; the order of the views means nothing.
+        HandHeld = "hand-held",
+        /// Forward through a corridor, with swings to either side.
+        Corridor = "corridor",
+        /// Forward along a street with turns.
+        Drive = "drive",
+        /// Above ground, on a grid: the first half of the views looks down along one flight direction, the other half
+        /// looks obliquely along the other.
+        AerialGrid = "aerial-grid",
+        /// A turn on the spot whose centre moves by a few hundredths of the scene's distance.
+        NearRotation = "near-rotation",
+        /// A turn about the camera's centre: constant intrinsics show, depths do not.
+        PureRotation = "pure-rotation",
+        /// Random places without any turn: critical, no calibration.
+        Translation = "translation",
+        /// Views of a plane from several sides.
+        PlanarScene = "planar-scene",
+    }
 }
 
 impl PhotographedMotion {
-    pub const ALL: [Self; 10] = [
-        Self::Orbit,
-        Self::WalkAround,
-        Self::HandHeld,
-        Self::Corridor,
-        Self::Drive,
-        Self::AerialGrid,
-        Self::NearRotation,
-        Self::PureRotation,
-        Self::Translation,
-        Self::PlanarScene,
-    ];
-
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Orbit => "orbit",
-            Self::WalkAround => "walk-around",
-            Self::HandHeld => "hand-held",
-            Self::Corridor => "corridor",
-            Self::Drive => "drive",
-            Self::AerialGrid => "aerial-grid",
-            Self::NearRotation => "near-rotation",
-            Self::PureRotation => "pure-rotation",
-            Self::Translation => "translation",
-            Self::PlanarScene => "planar-scene",
-        }
-    }
-
     /// Whether the camera stays in one place but for [`PhotographedOptions::baseline`].
     pub fn is_on_the_spot(self) -> bool {
         matches!(self, Self::NearRotation | Self::PureRotation)
     }
 }
 
-/// What the lens does; [`PhotographedOptions`] holds the numbers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum LensKind {
-    Pinhole,
-    /// A little radial distortion of either sign, as of a phone.
-    Mild,
-    Barrel,
-    Pincushion,
-    /// A wide barrel that needs a second coefficient.
-    ActionCamera,
-    /// Equidistant, 150 degrees across the diagonal.
-    Fisheye,
-    /// A pinhole whose principal point is off the centre, as in a cropped image.
-    DisplacedPrincipalPoint,
-    /// A pinhole whose pixels are not square.
-    Aspect,
-}
-
-impl LensKind {
-    pub const ALL: [Self; 8] = [
-        Self::Pinhole,
-        Self::Mild,
-        Self::Barrel,
-        Self::Pincushion,
-        Self::ActionCamera,
-        Self::Fisheye,
-        Self::DisplacedPrincipalPoint,
-        Self::Aspect,
-    ];
-
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Pinhole => "pinhole",
-            Self::Mild => "mild",
-            Self::Barrel => "barrel",
-            Self::Pincushion => "pincushion",
-            Self::ActionCamera => "action-camera",
-            Self::Fisheye => "fisheye",
-            Self::DisplacedPrincipalPoint => "displaced-principal-point",
-            Self::Aspect => "aspect",
-        }
+named! {
+    /// What the lens does; [`PhotographedOptions`] holds the numbers.
+    pub enum LensKind {
+        Pinhole = "pinhole",
+        /// A little radial distortion of either sign, as of a phone.
+        Mild = "mild",
+        Barrel = "barrel",
+        Pincushion = "pincushion",
+        /// A wide barrel that needs a second coefficient.
+        ActionCamera = "action-camera",
+        /// Equidistant, 150 degrees across the diagonal.
+        Fisheye = "fisheye",
+        /// A pinhole whose principal point is off the centre, as in a cropped image.
+        DisplacedPrincipalPoint = "displaced-principal-point",
+        /// A pinhole whose pixels are not square.
+        Aspect = "aspect",
     }
 }
 
-/// How focal lengths differ between views.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum FocalKind {
-    ConstantFocal,
-    /// Steadily from the first view to the last.
-    DriftingFocal,
-    /// The views of two cameras in turns, each a camera group.
-    TwoGroups,
-}
-
-impl FocalKind {
-    pub const ALL: [Self; 3] = [Self::ConstantFocal, Self::DriftingFocal, Self::TwoGroups];
-
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::ConstantFocal => "constant-focal",
-            Self::DriftingFocal => "drifting-focal",
-            Self::TwoGroups => "two-groups",
-        }
+named! {
+    /// How focal lengths differ between views.
+    pub enum FocalKind {
+        ConstantFocal = "constant-focal",
+        /// Steadily from the first view to the last.
+        DriftingFocal = "drifting-focal",
+        /// The views of two cameras in turns, each a camera group.
+        TwoGroups = "two-groups",
     }
 }
 
-/// Which of the views that a point is in front of observe it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum VisibilityKind {
-    /// Views in a row.
-    Banded,
-    /// Each with the same probability, whatever its place.
-    Scattered,
-}
-
-impl VisibilityKind {
-    pub const ALL: [Self; 2] = [Self::Banded, Self::Scattered];
-
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Banded => "banded",
-            Self::Scattered => "scattered",
-        }
+named! {
+    /// Which of the views that a point is in front of observe it.
+    pub enum VisibilityKind {
+        /// Views in a row.
+        Banded = "banded",
+        /// Each with the same probability, whatever its place.
+        Scattered = "scattered",
     }
 }
 
-/// What is wrong with the wrong tracks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum WrongKind {
-    /// Nothing.
-    Clean,
-    /// Each observation is that of another wrong track in the same view.
-    Permuted,
-    /// From some view on, the observations slide along the epipolar lines of the track's first view.
-    Slid,
-    /// From some view on, the observations drift off in the image at a constant speed.
-    DriftingTracks,
-    /// The observations stay in one place of the image: a watermark, dirt on the lens.
-    Static,
-    /// The points are of a second rigid body with a motion of its own.
-    SecondBody,
-    /// In fewer than half of the views, the observation is that of the same point of the neighbouring copy of a
-    /// repeated structure.
-    Repeated,
-    /// Copies of few wrong tracks, within .3 px.
-    NearDuplicates,
-    /// One wrong link: the track goes over to another point for good.
-    WrongLink,
-}
-
-impl WrongKind {
-    pub const ALL: [Self; 9] = [
-        Self::Clean,
-        Self::Permuted,
-        Self::Slid,
-        Self::DriftingTracks,
-        Self::Static,
-        Self::SecondBody,
-        Self::Repeated,
-        Self::NearDuplicates,
-        Self::WrongLink,
-    ];
-
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Clean => "clean",
-            Self::Permuted => "permuted",
-            Self::Slid => "slid",
-            Self::DriftingTracks => "drifting-tracks",
-            Self::Static => "static",
-            Self::SecondBody => "second-body",
-            Self::Repeated => "repeated",
-            Self::NearDuplicates => "near-duplicates",
-            Self::WrongLink => "wrong-link",
-        }
+named! {
+    /// What is wrong with the wrong tracks.
+    pub enum WrongKind {
+        /// Nothing.
+        Clean = "clean",
+        /// Each observation is that of another wrong track in the same view.
+        Permuted = "permuted",
+        /// From some view on, the observations slide along the epipolar lines of the track's first view.
+        Slid = "slid",
+        /// From some view on, the observations drift off in the image at a constant speed.
+        DriftingTracks = "drifting-tracks",
+        /// The observations stay in one place of the image: a watermark, dirt on the lens.
+        Static = "static",
+        /// The points are of a second rigid body with a motion of its own.
+        SecondBody = "second-body",
+        /// In fewer than half of the views, the observation is that of the same point of the neighbouring copy of a
+        /// repeated structure.
+        Repeated = "repeated",
+        /// Copies of few wrong tracks, within .3 px.
+        NearDuplicates = "near-duplicates",
+        /// One wrong link: the track goes over to another point for good.
+        WrongLink = "wrong-link",
     }
 }
 

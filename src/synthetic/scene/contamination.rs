@@ -4,7 +4,6 @@ use nalgebra::Vector3;
 use rand::Rng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 
 use super::camera::Camera;
 use super::noise::Observation;
@@ -22,37 +21,28 @@ const LEAST_SLIDE_PX: f64 = 0.02 * IMAGE_SIDE_PX as f64;
 /// Slides tried for one observation; near an epipole none moves the image far, and the farthest is taken.
 const SLIDE_DRAWS: usize = 50;
 
-/// What the wrong observations of an outlier track are. All but the uniform ones bring the depth of what they show.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum OutlierKind {
-    /// Image points of other outlier tracks in the same view, by a random permutation (paper, section 5.1). Where whole
-    /// tracks are permuted, a few points stay where they are, as in the paper; else none does.
-    #[default]
-    Permuted,
-    /// Anywhere in the image, with the depth of a random track.
-    Uniform,
-    /// Slid along the epipolar lines of view 0: in view 0 the track is right, and in every wrong view it is the image
-    /// of a point on the same ray of view 0, at another depth in each. Each view agrees with view 0, but no point
-    /// agrees with all views. Near an epipole (the middle of the image in forward motion) and in cameras near the first
-    /// a slide moves the image little, and what is called wrong may hide in the noise.
-    Slid,
-    /// Taken for its like: shifted by one constant vector, the same in all views and tracks, of .1 to .2 of the width.
-    /// Without a number of wrong views, half of a track's views are.
-    Repeated,
+named! {
+    /// What the wrong observations of an outlier track are. All but the uniform ones bring the depth of what they show.
+    #[derive(Default)]
+    pub enum OutlierKind {
+        /// Image points of other outlier tracks in the same view, by a random permutation (paper, section 5.1). Where
+        /// whole tracks are permuted, a few points stay where they are, as in the paper; else none does.
+        #[default]
+        Permuted = "permuted",
+        /// Anywhere in the image, with the depth of a random track.
+        Uniform = "uniform",
+        /// Slid along the epipolar lines of view 0: in view 0 the track is right, and in every wrong view it is the
+        /// image of a point on the same ray of view 0, at another depth in each. Each view agrees with view 0, but no
+        /// point agrees with all views. Near an epipole (the middle of the image in forward motion) and in cameras near
+        /// the first a slide moves the image little, and what is called wrong may hide in the noise.
+        Slid = "slid",
+        /// Taken for its like: shifted by one constant vector, the same in all views and tracks, of .1 to .2 of the
+        /// width. Without a number of wrong views, half of a track's views are.
+        Repeated = "repeated",
+    }
 }
 
 impl OutlierKind {
-    /// The kind's name in files and on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            OutlierKind::Permuted => "permuted",
-            OutlierKind::Uniform => "uniform",
-            OutlierKind::Slid => "slid",
-            OutlierKind::Repeated => "repeated",
-        }
-    }
-
     /// The first view that can be wrong: what is slid has view 0 as its reference.
     fn first_wrong_view(self) -> usize {
         usize::from(self == OutlierKind::Slid)

@@ -6,7 +6,6 @@
 use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 
 use super::SceneOptions;
 use super::camera::Lens;
@@ -23,51 +22,38 @@ const ORBIT_ABOVE_RAD: f64 = 0.5;
 /// the paper's 2 to 4.
 const ORBIT_DISTANCE: (f64, f64) = (2.5, 4.0);
 
-/// How the cameras of a scene move. Sizes are those of the scene, whose box has sides of 2 at a distance of 3.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Motion {
-    /// Rotations uniform in `+-max_rotation_rad` about each axis, translations uniform in `[-1, 1]^3` (paper, section
-    /// 5.1); with rotations above 0.5 the cameras turn about the scene's centre instead of their own.
-    #[default]
-    General,
-    /// Around the scene, the optical axes through its centre: rotations as above, the distance to the centre uniform in
-    /// `[2.5, 4]`.
-    Orbit,
-    /// Around the scene about one axis, the vertical, at a distance of 3, the optical axes in one plane and through the
-    /// centre: a turntable.
-    Turntable,
-    /// One rotation for all views, translations uniform in `[-1, 1]^3`: images of the plane at infinity do not move,
-    /// and no more than an affine reconstruction exists. Critical.
-    PureTranslation,
-    /// Along the optical axis by at most 1 either way, without turning: critical as above, and with points near the
-    /// axis that show no parallax.
-    Forward,
-    /// Side by side without turning, on a square grid with sides of 2 across the optical axis, row by row: critical as
-    /// above.
-    Grid,
-    /// Rotations about a camera centre that stays: a homography relates any two views, and depths do not show.
-    PureRotation,
-    /// Anywhere on a sphere about the scene, of radius 3, the optical axes through its centre: rotations uniform among
-    /// all there are, rolls included. The largest rotation does not matter.
-    Sphere,
+named! {
+    /// How the cameras of a scene move. Sizes are those of the scene, whose box has sides of 2 at a distance of 3.
+    #[derive(Default)]
+    pub enum Motion {
+        /// Rotations uniform in `+-max_rotation_rad` about each axis, translations uniform in `[-1, 1]^3` (paper,
+        /// section 5.1); with rotations above 0.5 the cameras turn about the scene's centre instead of their own.
+        #[default]
+        General = "general",
+        /// Around the scene, the optical axes through its centre: rotations as above, the distance to the centre
+        /// uniform in `[2.5, 4]`.
+        Orbit = "orbit",
+        /// Around the scene about one axis, the vertical, at a distance of 3, the optical axes in one plane and through
+        /// the centre: a turntable.
+        Turntable = "turntable",
+        /// One rotation for all views, translations uniform in `[-1, 1]^3`: images of the plane at infinity do not
+        /// move, and no more than an affine reconstruction exists. Critical.
+        PureTranslation = "pure-translation",
+        /// Along the optical axis by at most 1 either way, without turning: critical as above, and with points near the
+        /// axis that show no parallax.
+        Forward = "forward",
+        /// Side by side without turning, on a square grid with sides of 2 across the optical axis, row by row: critical
+        /// as above.
+        Grid = "grid",
+        /// Rotations about a camera centre that stays: a homography relates any two views, and depths do not show.
+        PureRotation = "pure-rotation",
+        /// Anywhere on a sphere about the scene, of radius 3, the optical axes through its centre: rotations uniform
+        /// among all there are, rolls included. The largest rotation does not matter.
+        Sphere = "sphere",
+    }
 }
 
 impl Motion {
-    /// The motion's name in files and on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            Motion::General => "general",
-            Motion::Orbit => "orbit",
-            Motion::Turntable => "turntable",
-            Motion::PureTranslation => "pure-translation",
-            Motion::Forward => "forward",
-            Motion::Grid => "grid",
-            Motion::PureRotation => "pure-rotation",
-            Motion::Sphere => "sphere",
-        }
-    }
-
     /// Whether the cameras would all be the same without rotations.
     pub fn needs_rotation(self) -> bool {
         matches!(self, Motion::Orbit | Motion::Turntable | Motion::PureRotation)

@@ -9,61 +9,63 @@ use super::noise::NoiseKind;
 use super::shape::Shape;
 use crate::domain::error::{InvalidInput, Violation, Violations};
 
-/// What to generate. The defaults are the paper's scenes (its section 5.1); a field that a file lacks has its default.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct SceneOptions {
-    pub views: usize,
-    pub tracks: usize,
-    /// Standard deviation of the noise as a share of the image width (of the depth, for depths).
-    pub noise: f64,
-    /// How the noise is distributed.
-    pub noise_kind: NoiseKind,
-    /// Share of the tracks that are outliers, those of the second body among them.
-    pub outliers: f64,
-    /// What the wrong observations of outliers are.
-    pub outlier_kind: OutlierKind,
-    /// In how many views an outlier track is wrong, random ones for each track; 0: in all that the kind can spoil (half
-    /// for [`OutlierKind::Repeated`]).
-    pub wrong_views: usize,
-    /// How many views observe a track, those whose cameras are nearest to that of a random view; 0: all. An outlier
-    /// that is wrong in a number of views may be so where it is not observed.
-    pub seen_views: usize,
-    /// How many observations of every right track are replaced by uniform points in the image, in random views for each
-    /// track, whose depth is that of a random track. The tracks stay right.
-    pub wrong_observations: usize,
-    /// How many observations of every track are left out, random ones for each track, whether right or wrong.
-    pub deleted_observations: usize,
-    /// Share of all tracks that belong to a second rigid body, which in every view has a small random motion of its own
-    /// (up to 0.2 rad about each axis and 0.3 along it). They count among the outliers; the outliers that are left are
-    /// of the kind above.
-    pub second_motion: f64,
-    /// How the points lie.
-    pub shape: Shape,
-    /// How the cameras move.
-    pub motion: Motion,
-    /// Largest rotation about each axis that the motion turns about, in radians.
-    pub max_rotation_rad: f64,
-    /// Largest roll: each camera is turned about its optical axis as well, uniform in `+-max_roll_rad`, whatever the
-    /// motion.
-    pub max_roll_rad: f64,
-    /// Range of the focal length in pixels.
-    pub focal_range_px: (f64, f64),
-    /// Whether every view has a camera of its own, and is a camera group: a focal length in that range, a principal
-    /// point up to .02 of the width off the common one along each axis, and a distortion within 5 % of the common one;
-    /// a zoom does not matter then.
-    pub own_cameras: bool,
-    /// Displacement of the principal point from the image's centre, right and down, as a share of the image width.
-    pub principal_point: [f64; 2],
-    /// Radial distortion, `x_d = x_n (1 + k1 r^2)` with `x_n` and its length `r` in normalised camera coordinates
-    /// (focal lengths from the principal point); negative: a barrel. Cameras for which the image of the scene would
-    /// fold are drawn again.
-    pub radial_k1: f64,
-    /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
-    pub zoom: f64,
-    /// Whether projective depths are part of the input.
-    pub with_depths: bool,
-    pub seed: u64,
+options! {
+    /// What to generate. The defaults are the paper's scenes (its section 5.1); a field that a file lacks has its own.
+    #[derive(Serialize, Deserialize)]
+    #[serde(default)]
+    pub struct SceneOptions {
+        views: usize = 10,
+        tracks: usize = 200,
+        /// Standard deviation of the noise as a share of the image width (of the depth, for depths).
+        noise: f64 = 0.003,
+        /// How the noise is distributed.
+        noise_kind: NoiseKind = NoiseKind::Gaussian,
+        /// Share of the tracks that are outliers, those of the second body among them.
+        outliers: f64 = 0.9,
+        /// What the wrong observations of outliers are.
+        outlier_kind: OutlierKind = OutlierKind::Permuted,
+        /// In how many views an outlier track is wrong, random ones for each track; 0: in all that the kind can spoil
+        /// (half for [`OutlierKind::Repeated`]).
+        wrong_views: usize = 0,
+        /// How many views observe a track, those whose cameras are nearest to that of a random view; 0: all. An outlier
+        /// that is wrong in a number of views may be so where it is not observed.
+        seen_views: usize = 0,
+        /// How many observations of every right track are replaced by uniform points in the image, in random views for
+        /// each track, whose depth is that of a random track. The tracks stay right.
+        wrong_observations: usize = 0,
+        /// How many observations of every track are left out, random ones for each track, whether right or wrong.
+        deleted_observations: usize = 0,
+        /// Share of all tracks that belong to a second rigid body, which in every view has a small random motion of its
+        /// own (up to 0.2 rad about each axis and 0.3 along it). They count among the outliers; the outliers that are
+        /// left are of the kind above.
+        second_motion: f64 = 0.0,
+        /// How the points lie.
+        shape: Shape = Shape::Box,
+        /// How the cameras move.
+        motion: Motion = Motion::General,
+        /// Largest rotation about each axis that the motion turns about, in radians.
+        max_rotation_rad: f64 = 0.4,
+        /// Largest roll: each camera is turned about its optical axis as well, uniform in `+-max_roll_rad`, whatever
+        /// the motion.
+        max_roll_rad: f64 = 0.0,
+        /// Range of the focal length in pixels.
+        focal_range_px: (f64, f64) = FOCAL_RANGE_PX,
+        /// Whether every view has a camera of its own, and is a camera group: a focal length in that range, a principal
+        /// point up to .02 of the width off the common one along each axis, and a distortion within 5 % of the common
+        /// one; a zoom does not matter then.
+        own_cameras: bool = false,
+        /// Displacement of the principal point from the image's centre, right and down, as a share of the image width.
+        principal_point: [f64; 2] = [0.0, 0.0],
+        /// Radial distortion, `x_d = x_n (1 + k1 r^2)` with `x_n` and its length `r` in normalised camera coordinates
+        /// (focal lengths from the principal point); negative: a barrel. Cameras for which the image of the scene would
+        /// fold are drawn again.
+        radial_k1: f64 = 0.0,
+        /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
+        zoom: f64 = 0.0,
+        /// Whether projective depths are part of the input.
+        with_depths: bool = false,
+        seed: u64 = 0,
+    }
 }
 
 impl SceneOptions {
@@ -86,30 +88,7 @@ impl SceneOptions {
 impl Default for SceneOptions {
     /// The paper's centre of all sweeps, without depths.
     fn default() -> Self {
-        Self {
-            views: 10,
-            tracks: 200,
-            noise: 0.003,
-            noise_kind: NoiseKind::Gaussian,
-            outliers: 0.9,
-            outlier_kind: OutlierKind::Permuted,
-            wrong_views: 0,
-            seen_views: 0,
-            wrong_observations: 0,
-            deleted_observations: 0,
-            second_motion: 0.0,
-            shape: Shape::Box,
-            motion: Motion::General,
-            max_rotation_rad: 0.4,
-            max_roll_rad: 0.0,
-            focal_range_px: FOCAL_RANGE_PX,
-            own_cameras: false,
-            principal_point: [0.0, 0.0],
-            radial_k1: 0.0,
-            zoom: 0.0,
-            with_depths: false,
-            seed: 0,
-        }
+        Self::DEFAULT
     }
 }
 
