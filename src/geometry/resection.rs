@@ -3,8 +3,9 @@
 use nalgebra::{Matrix4, SMatrix, SVector, Vector2};
 use rand_chacha::ChaCha8Rng;
 
-use super::null_vector::{null_vector, projection_equations, smallest_eigenvector};
+use super::null_vector::{projection_equations, smallest_eigenvector};
 use super::ransac::{self, Estimator, Refinable};
+use super::triangulation::f64xn::{F64xN, Symmetric};
 use super::triangulation::reprojection;
 use super::{Camera, Point};
 use crate::domain::StopToken;
@@ -43,15 +44,15 @@ fn linear(points: &[Point], images: &[Vector2<f64>]) -> Option<Camera> {
 /// Returns `None` where four of the points are on a plane, or what comes is no finite number.
 fn six_points(points: &[Point; LEAST_POINTS], images: &[Vector2<f64>; LEAST_POINTS]) -> Option<Camera> {
     let into_basis = Matrix4::from_columns(&[points[0], points[1], points[2], points[3]]).try_inverse()?;
-    let mut normal = Matrix4::zeros();
+    let mut normal = Symmetric::<1>::ZERO;
     for (point, image) in points[4..].iter().zip(&images[4..]) {
         let weights = (into_basis * point).normalize();
         for axis in [0, 1] {
-            let equation = Point::from_fn(|k, _| weights[k] * (images[k][axis] - image[axis]));
-            normal += equation * equation.transpose();
+            let equation = [0, 1, 2, 3].map(|k| F64xN([weights[k] * (images[k][axis] - image[axis])]));
+            normal.add_square(F64xN::ONE, equation);
         }
     }
-    let depths = null_vector(&normal)?;
+    let depths = normal.null_vectors().map(|depth| depth.0[0]);
     let camera = Camera::from_fn(|row, k| depths[k] * images[k].push(1.0)[row]) * into_basis;
     camera.try_normalize(f64::MIN_POSITIVE).filter(|camera| camera.iter().all(|entry| entry.is_finite()))
 }

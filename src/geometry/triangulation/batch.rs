@@ -1,37 +1,48 @@
-//! Several tracks triangulated side by side.
+//! Tracks triangulated side by side: eight, or one.
 //!
-//! The equations are those of [`linear`](super::linear) and [`refine`](super::refine) for one track (a test compares).
 //! Tracks need not be seen by the same views: their `k`-th observations stand side by side, whatever the cameras. What
 //! one comes to does not depend on its neighbours, to the last bit: a track that has arrived stands still while others
 //! go on.
 
-pub use super::f64x8::LANES;
-use super::f64x8::{DIAGONAL, F64x8, Mask, Points, Symmetric, choose, dot, normalised};
-use super::{DAMPING_DOWN, DAMPING_UP, INITIAL_DAMPING, RELATIVE_TOLERANCE};
-use crate::geometry::null_vector::{MOST_ITERATIONS, SHIFT, SQUARINGS, TOLERANCE};
+use super::f64xn::{DIAGONAL, F64xN, Mask, Points, Symmetric, choose, dot, normalised};
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point};
 use crate::simd::vectorised;
 
+/// Tracks of a batch: two of the vectors of four that most processors have, so that one is computed with while the other
+/// is on its way.
+pub const LANES: usize = 8;
+
+/// As many tracks as are worth their while side by side.
+pub type Batch = SideBySide<LANES>;
+
+/// Levenberg damping at the start of a refinement, relative to the diagonal.
+const INITIAL_DAMPING: f64 = 1e-3;
+/// Factors on the damping after a step that is taken, and after one that is not.
+const DAMPING_DOWN: f64 = 0.2;
+const DAMPING_UP: f64 = 10.0;
+/// Gain below which a refinement has arrived: ranking and gates do not see a part in a thousand.
+const RELATIVE_TOLERANCE: f64 = 1e-3;
+
 #[inline(always)]
-fn away_from_zero(depth: F64x8) -> F64x8 {
+fn away_from_zero<const N: usize>(depth: F64xN<N>) -> F64xN<N> {
     depth.map(super::away_from_zero)
 }
 
 /// The `k`-th observation of every track.
 #[derive(Clone, Copy)]
-struct BatchedObservation {
+struct BatchedObservation<const N: usize> {
     /// The camera's columns, rows within.
-    camera: [[F64x8; 3]; 4],
-    xy: [F64x8; 2],
+    camera: [[F64xN<N>; 3]; 4],
+    xy: [F64xN<N>; 2],
     /// That of the observation; 0 where the track has none, or does without it.
-    weight: F64x8,
+    weight: F64xN<N>,
 }
 
-impl BatchedObservation {
+impl<const N: usize> BatchedObservation<N> {
     /// The point's image, homogeneous.
     #[inline(always)]
-    fn image(&self, point: &Points) -> [F64x8; 3] {
+    fn image(&self, point: &Points<N>) -> [F64xN<N>; 3] {
         let row = |r: usize| {
             let [a, b, c, d] = &self.camera;
             a[r] * point[0] + b[r] * point[1] + c[r] * point[2] + d[r] * point[3]
@@ -40,7 +51,7 @@ impl BatchedObservation {
     }
 
     #[inline(always)]
-    fn squared_residual(&self, point: &Points) -> F64x8 {
+    fn squared_residual(&self, point: &Points<N>) -> F64xN<N> {
         let [x, y, z] = self.image(point);
         let nearness = away_from_zero(z).recip();
         let (x, y) = (x * nearness - self.xy[0], y * nearness - self.xy[1]);
@@ -48,20 +59,20 @@ impl BatchedObservation {
     }
 }
 
-/// Up to [`LANES`] tracks.
-pub struct Batch {
-    batched: Vec<BatchedObservation>,
+/// Up to `N` tracks.
+pub struct SideBySide<const N: usize> {
+    batched: Vec<BatchedObservation<N>>,
     tracks: usize,
 }
 
 /// A point for every track of a batch, and what it leaves.
 #[derive(Debug, Clone, Copy)]
-pub struct Triangulated {
-    points: Points,
-    costs: F64x8,
+pub struct Triangulated<const N: usize> {
+    points: Points<N>,
+    costs: F64xN<N>,
 }
 
-impl Triangulated {
+impl<const N: usize> Triangulated<N> {
     /// The point of the `track`-th of the batch, of unit norm.
     pub fn point(&self, track: usize) -> Point {
         Point::new(self.points[0].0[track], self.points[1].0[track], self.points[2].0[track], self.points[3].0[track])
@@ -79,13 +90,13 @@ impl Triangulated {
     }
 }
 
-impl Batch {
-    /// These tracks, [`LANES`] at most; what is beyond is left out.
+impl<const N: usize> SideBySide<N> {
+    /// These tracks, `N` at most; what is beyond is left out.
     pub fn new(cameras: &[Camera], tracks: &[&[Observation]]) -> Self {
         let longest = tracks.iter().map(|track| track.len()).max().unwrap_or(0);
-        let nothing = BatchedObservation { camera: [[F64x8::ZERO; 3]; 4], xy: [F64x8::ZERO; 2], weight: F64x8::ZERO };
+        let nothing = BatchedObservation { camera: [[F64xN::ZERO; 3]; 4], xy: [F64xN::ZERO; 2], weight: F64xN::ZERO };
         let mut batched = vec![nothing; longest];
-        for lane in 0..LANES {
+        for lane in 0..N {
             // A lane without a track repeats the first one, and a place without an observation has the camera of the
             // track's first: numbers that count nowhere, but are of a usual size.
             let Some(track) = tracks.get(lane).or(tracks.first()) else { continue };
@@ -104,7 +115,7 @@ impl Batch {
                 }
             }
         }
-        Self { batched, tracks: tracks.len().min(LANES) }
+        Self { batched, tracks: tracks.len().min(N) }
     }
 
     pub fn tracks(&self) -> usize {
@@ -118,8 +129,12 @@ impl Batch {
         (weight.0[track], xy[0].0[track], xy[1].0[track]) = (0.0, 0.0, 0.0);
     }
 
-    /// As [`linear`](super::linear), every track, but for the sign of a direction, which no residual tells.
-    pub fn linear(&self) -> Triangulated {
+    /// Linear triangulation (Hartley & Zisserman, section 12.2): the unit 4-vector that is least inconsistent with
+    /// `x (P3 X) = P1 X`, `y (P3 X) = P2 X` over all observations, each camera's rows scaled by the norm of its third.
+    ///
+    /// Of cameras that are all at the origin of the frame, which tell no depth, it is the direction, a point at
+    /// infinity, but for the sign, which no residual tells.
+    pub fn linear(&self) -> Triangulated<N> {
         vectorised(
             #[inline(always)]
             || {
@@ -129,8 +144,20 @@ impl Batch {
         )
     }
 
-    /// As [`refine`](super::refine), the tracks of which `is_wanted` says so; the others stay where they are.
-    pub fn refine(&self, start: Triangulated, is_wanted: impl Fn(usize) -> bool, iterations: usize) -> Triangulated {
+    /// This point for every track.
+    pub fn at(&self, point: &Point) -> Triangulated<N> {
+        let points = [0, 1, 2, 3].map(|k| F64xN([point[k]; N]));
+        Triangulated { points, costs: self.costs(&points) }
+    }
+
+    /// Refines the points of the tracks of which `is_wanted` says so by Levenberg-Marquardt on their weighted squared
+    /// reprojection residuals, at most `iterations` steps; the others stay where they are. Never worse than the start.
+    pub fn refine(
+        &self,
+        start: Triangulated<N>,
+        is_wanted: impl Fn(usize) -> bool,
+        iterations: usize,
+    ) -> Triangulated<N> {
         let going = std::array::from_fn(|track| track < self.tracks && is_wanted(track));
         vectorised(
             #[inline(always)]
@@ -140,7 +167,7 @@ impl Batch {
 
     /// Weighted squared reprojection residuals of the tracks' `k`-th observations, for each `k`; 0 of those that they
     /// do without.
-    pub fn squared_residuals(&self, found: &Triangulated) -> Vec<[f64; LANES]> {
+    pub fn squared_residuals(&self, found: &Triangulated<N>) -> Vec<[f64; N]> {
         vectorised(
             #[inline(always)]
             || self.batched.iter().map(|seen| seen.squared_residual(&found.points).0).collect(),
@@ -148,8 +175,8 @@ impl Batch {
     }
 
     #[inline(always)]
-    fn costs(&self, points: &Points) -> F64x8 {
-        let mut costs = F64x8::ZERO;
+    fn costs(&self, points: &Points<N>) -> F64xN<N> {
+        let mut costs = F64xN::ZERO;
         for seen in &self.batched {
             costs += seen.squared_residual(points);
         }
@@ -157,7 +184,7 @@ impl Batch {
     }
 
     #[inline(always)]
-    fn null_vectors(&self) -> Points {
+    fn null_vectors(&self) -> Points<N> {
         let mut normal = Symmetric::ZERO;
         for seen in &self.batched {
             let [a, b, c, d] = seen.camera;
@@ -178,51 +205,21 @@ impl Batch {
             }
         }
         normal.hold_unseen();
-        let shift = normal.trace() * SHIFT;
-        for diagonal in DIAGONAL {
-            normal.0[diagonal] += shift;
-        }
-        let mut power = normal.factor().inverse();
-        for _ in 0..SQUARINGS {
-            power = power.scaled(power.trace().recip()).squared();
-        }
-        let [first, others @ ..] = power.columns();
-        let (mut vector, mut longest) = (first, power.0[DIAGONAL[0]]);
-        for (column, place) in others.into_iter().zip(&DIAGONAL[1..]) {
-            let diagonal = power.0[*place];
-            let is_longer = diagonal.compare(longest, |a, b| a > b);
-            vector = choose(is_longer, column, vector);
-            longest = diagonal.or(is_longer, longest);
-        }
-        let mut vector = normalised(vector);
-        let mut going = [true; LANES];
-        for _ in 0..MOST_ITERATIONS {
-            let next = normalised(power.times(vector));
-            let moved = [next[0] - vector[0], next[1] - vector[1], next[2] - vector[2], next[3] - vector[3]];
-            vector = choose(going, next, vector);
-            let moves = dot(moved, moved);
-            for (going, moved) in going.iter_mut().zip(moves.0) {
-                // Not a number has arrived, too.
-                *going &= moved >= TOLERANCE * TOLERANCE;
-            }
-            if going == [false; LANES] {
-                break;
-            }
-        }
+        let vector = normal.null_vectors();
         let known = dot(vector, vector).0.map(f64::is_finite);
-        choose(known, vector, [F64x8::ZERO, F64x8::ZERO, F64x8::ZERO, F64x8::ONE])
+        choose(known, vector, [F64xN::ZERO, F64xN::ZERO, F64xN::ZERO, F64xN::ONE])
     }
 
     #[inline(always)]
-    fn descend(&self, start: Triangulated, mut going: Mask, iterations: usize) -> Triangulated {
+    fn descend(&self, start: Triangulated<N>, mut going: Mask<N>, iterations: usize) -> Triangulated<N> {
         let Triangulated { mut points, mut costs } = start;
-        let mut damping = F64x8::ONE * INITIAL_DAMPING;
+        let mut damping = F64xN::ONE * INITIAL_DAMPING;
         for _ in 0..iterations {
-            if going == [false; LANES] {
+            if going == [false; N] {
                 break;
             }
             let mut normal = Symmetric::ZERO;
-            let mut gradient = [F64x8::ZERO; 4];
+            let mut gradient = [F64xN::ZERO; 4];
             for seen in &self.batched {
                 let image = seen.image(&points);
                 let nearness = away_from_zero(image[2]).recip();
@@ -249,14 +246,14 @@ impl Batch {
             normal.add_square(normal.trace(), points);
             normal.hold_unseen();
             for diagonal in DIAGONAL {
-                normal.0[diagonal] *= F64x8::ONE + damping;
+                normal.0[diagonal] *= F64xN::ONE + damping;
             }
             let step = normal.factor().solve(gradient);
             let candidates =
                 normalised([points[0] - step[0], points[1] - step[1], points[2] - step[2], points[3] - step[3]]);
             let candidate_costs = self.costs(&candidates);
-            let mut accepted = [false; LANES];
-            for lane in 0..LANES {
+            let mut accepted = [false; N];
+            for lane in 0..N {
                 let (cost, candidate) = (costs.0[lane], candidate_costs.0[lane]);
                 accepted[lane] = going[lane] && candidate < cost;
                 damping.0[lane] *= if accepted[lane] { DAMPING_DOWN } else { DAMPING_UP };
@@ -325,7 +322,7 @@ mod tests {
                     let expected = squared_residual(&cameras, &alone, track);
                     let apart = |found: f64, expected: f64| (found - expected).abs() > 1e-6 * expected + 1e-18;
                     assert!(!apart(start.cost(k), expected), "seed {seed}: {} {expected}", start.cost(k));
-                    let (refined, least) = refine(&cameras, track, alone, ITERATIONS);
+                    let (refined, least) = refine(&cameras, track, start.point(k), ITERATIONS);
                     let expected = if k == 1 { expected } else { least };
                     assert!(!apart(found.cost(k), expected), "seed {seed}: {} {expected}", found.cost(k));
                     if k != 1 {

@@ -1,22 +1,16 @@
 //! Points from cameras and image points: of one track here, of many side by side in [`batch`].
 
 pub mod batch;
-mod f64x8;
+pub(super) mod f64xn;
 
-use nalgebra::{Matrix4, Vector2};
+use nalgebra::Vector2;
 
-use super::null_vector::null_vector;
+use self::batch::SideBySide;
 use super::observation::Observation;
 use super::{Camera, Point};
-use crate::simd::vectorised;
 
 /// Smallest homogeneous depth that is divided by; points nearer to the principal plane have no image.
 const MIN_DEPTH: f64 = 1e-9;
-/// Levenberg damping at the start of a refinement, relative to the diagonal.
-const INITIAL_DAMPING: f64 = 1e-3;
-/// Factors on the damping after a step that is taken, and after one that is not.
-const DAMPING_DOWN: f64 = 0.2;
-const DAMPING_UP: f64 = 10.0;
 
 /// Reprojection residual, projected minus observed, in the units of the image points.
 ///
@@ -41,30 +35,12 @@ pub fn squared_residual(cameras: &[Camera], point: &Point, observations: &[Obser
     observations.iter().map(|seen| weighted_squared(&cameras[seen.view], point, seen)).sum()
 }
 
-/// Linear triangulation (Hartley & Zisserman, section 12.2): the unit 4-vector that is least inconsistent with
-/// `x (P3 X) = P1 X`, `y (P3 X) = P2 X` over all observations, each camera's rows scaled by the norm of its third.
+/// Linear triangulation of one track, see [`SideBySide::linear`]; a direction is oriented.
 ///
-/// Needs two observations or more; with fewer the point returned is one of many. Of cameras that are all at the origin
-/// of the frame, which tell no depth, it is the direction, a point at infinity.
+/// Needs two observations or more; with fewer the point returned is one of many.
 pub fn linear(cameras: &[Camera], observations: &[Observation]) -> Point {
-    let mut normal = vectorised(
-        #[inline(always)]
-        || inconsistency(cameras, observations),
-    );
-    let are_directions = hold_unseen(&mut normal);
-    let point = null_vector(&normal).unwrap_or(Point::new(0.0, 0.0, 0.0, 1.0));
-    if are_directions { in_front(cameras, observations, point) } else { point }
-}
-
-/// Where no camera tells the last unknown, as of cameras that are all at the origin, it stays what it is; whether that
-/// is so.
-#[inline(always)]
-fn hold_unseen(normal: &mut Matrix4<f64>) -> bool {
-    let is_unseen = normal.m44 == 0.0;
-    if is_unseen {
-        normal.m44 = normal.trace();
-    }
-    is_unseen
+    let point = SideBySide::<1>::new(cameras, &[observations]).linear().point(0);
+    if point.w == 0.0 { in_front(cameras, observations, point) } else { point }
 }
 
 /// The direction or its opposite, whichever is in front of more of the cameras.
@@ -73,90 +49,11 @@ fn in_front(cameras: &[Camera], observations: &[Observation], direction: Point) 
     if depths.sum::<f64>() < 0.0 { -direction } else { direction }
 }
 
-/// The quadratic form whose least direction [`linear`] wants.
-#[inline(always)]
-fn inconsistency(cameras: &[Camera], observations: &[Observation]) -> Matrix4<f64> {
-    let mut normal = [[0.0; 4]; 4];
-    for observation in observations {
-        let columns: &[[f64; 3]; 4] = cameras[observation.view].as_ref();
-        let third = columns.map(|column| column[2]);
-        let of_direction: f64 = third[..3].iter().map(|entry| entry * entry).sum();
-        let of_all = of_direction + third[3] * third[3];
-        let weight = observation.weight / (of_direction + f64::EPSILON * of_all).max(f64::MIN_POSITIVE);
-        for (axis, coordinate) in [observation.xy.x, observation.xy.y].into_iter().enumerate() {
-            let row = columns.map(|column| column[2] * coordinate - column[axis]);
-            accumulate(&mut normal, row.map(|entry| weight * entry), row);
-        }
-    }
-    Matrix4::from(normal)
-}
-
-/// Refines a point by Levenberg-Marquardt on its weighted squared reprojection residuals, at most `iterations` steps.
-///
-/// Returns the point, of unit norm, and its sum of squared residuals; never worse than the start.
+/// Refines the point of one track, see [`SideBySide::refine`]; returns it, of unit norm, and its sum of squared residuals.
 pub fn refine(cameras: &[Camera], observations: &[Observation], start: Point, iterations: usize) -> (Point, f64) {
-    vectorised(
-        #[inline(always)]
-        || descend(cameras, observations, start, iterations),
-    )
-}
-
-#[inline(always)]
-fn descend(cameras: &[Camera], observations: &[Observation], start: Point, iterations: usize) -> (Point, f64) {
-    let mut point = start.normalize();
-    let mut cost = squared_residual(cameras, &point, observations);
-    let mut damping = INITIAL_DAMPING;
-    for _ in 0..iterations {
-        let mut normal = [[0.0; 4]; 4];
-        let mut gradient = Point::zeros();
-        for observation in observations {
-            let camera = &cameras[observation.view];
-            let columns: &[[f64; 3]; 4] = camera.as_ref();
-            let image = camera * point;
-            let nearness = away_from_zero(image.z).recip();
-            for axis in [0, 1] {
-                let projected = image[axis] * nearness;
-                let slope = columns.map(|column| (column[axis] - projected * column[2]) * nearness);
-                let weighted = slope.map(|entry| observation.weight * entry);
-                accumulate(&mut normal, weighted, slope);
-                gradient += Point::from(weighted) * (projected - observation.xy[axis]);
-            }
-        }
-        let mut normal = Matrix4::from(normal);
-        // The scale of the homogeneous point is free: pin it.
-        normal += point * point.transpose() * normal.trace();
-        hold_unseen(&mut normal);
-        for k in 0..4 {
-            normal[(k, k)] *= 1.0 + damping;
-        }
-        let Some(step) = normal.cholesky().map(|factor| factor.solve(&gradient)) else { break };
-        let candidate = (point - step).normalize();
-        let candidate_cost = squared_residual(cameras, &candidate, observations);
-        if candidate_cost < cost {
-            let gain = (cost - candidate_cost) / cost;
-            (point, cost) = (candidate, candidate_cost);
-            damping *= DAMPING_DOWN;
-            if gain < RELATIVE_TOLERANCE {
-                break;
-            }
-        } else {
-            damping *= DAMPING_UP;
-        }
-    }
-    (point, cost)
-}
-
-/// Gain below which a refinement has arrived: ranking and gates do not see a part in a thousand.
-const RELATIVE_TOLERANCE: f64 = 1e-3;
-
-/// Adds the product of a column and a row.
-#[inline(always)]
-fn accumulate(sum: &mut [[f64; 4]; 4], column: [f64; 4], row: [f64; 4]) {
-    for (sums, factor) in sum.iter_mut().zip(column) {
-        for (sum, entry) in sums.iter_mut().zip(row) {
-            *sum += factor * entry;
-        }
-    }
+    let alone = SideBySide::<1>::new(cameras, &[observations]);
+    let found = alone.refine(alone.at(&start.normalize()), |_| true, iterations);
+    (found.point(0), found.cost(0))
 }
 
 #[inline(always)]
