@@ -237,7 +237,7 @@ pub fn histogram(title: &str, x_label: &str, kinds: [(&str, &[f64]); 2]) -> Stri
 /// column.
 ///
 /// * `columns`: position, increasing, and counts; all of the same length
-pub fn heat_map(title: &str, x_label: &str, y_label: &str, columns: &[(f64, &[u32])]) -> String {
+pub fn heat_map(title: &str, x_label: &str, columns: &[(f64, &[u32])]) -> String {
     /// Columns that are drawn; of those that share one, the first is.
     const DRAWN: usize = 80;
     let x = axis(columns.iter().map(|(at, _)| *at), LEFT, WIDTH - RIGHT, 0.0);
@@ -272,7 +272,6 @@ pub fn heat_map(title: &str, x_label: &str, y_label: &str, columns: &[(f64, &[u3
         let at = x.place(tick);
         text(&mut svg, at, HEIGHT - BOTTOM + 14.0, anchor(at), "tick", &short(tick));
     }
-    text(&mut svg, LEFT, TOP - 5.0, "end", "mute", y_label);
     text(&mut svg, (LEFT + WIDTH - RIGHT) / 2.0, HEIGHT - 5.0, "middle", "mute", x_label);
     close(svg)
 }

@@ -201,16 +201,15 @@ fn of_heads(history: &[Progress], iterations: &[f64]) -> Vec<String> {
     let sums = vec![Series { name: "N", points: curve(|head| Some(head.weight_sum)) }];
     let residuals = vec![
         Series { name: "tau", points: curve(|head| head.tolerance) },
-        Series { name: "best DAQ", points: curve(|head| head.best_daq_residual) },
+        Series { name: "DAQ", points: curve(|head| head.best_daq_residual) },
     ];
     let histograms: Vec<(f64, &[u32])> = heads.iter().map(|&(at, head)| (at, &head.weight_histogram[..])).collect();
     let mut svgs = vec![
         chart("Sum N of the weights", sums, false).svg(),
-        chart::heat_map("Weights of the tracks over the iterations", NETWORK_ITERATION, "weight", &histograms),
+        chart::heat_map("Weights of the tracks over the iterations", NETWORK_ITERATION, &histograms),
     ];
     if residuals.iter().any(|series| !series.points.is_empty()) {
-        let title = "Residual tau of a track that leaves, DAQ residual of the best head";
-        svgs.push(chart(title, residuals, true).svg());
+        svgs.push(chart("Residuals: tau, DAQ of the best head", residuals, true).svg());
     }
     svgs
 }
