@@ -3,8 +3,8 @@
 use nalgebra::allocator::Allocator;
 use nalgebra::{Const, DefaultAllocator, DimDiff, DimSub, SMatrix, SVector, U1, Vector2};
 
-/// The unit eigenvector to the smallest eigenvalue of a symmetric positive semidefinite matrix, down to the last bits, by
-/// a full decomposition.
+/// The unit eigenvector to the smallest eigenvalue of a symmetric positive semidefinite matrix, down to the last bits,
+/// by a full decomposition.
 ///
 /// Returns `None` where the matrix holds what is no number, or is zero.
 pub fn smallest_eigenvector<const N: usize>(matrix: &SMatrix<f64, N, N>) -> Option<SVector<f64, N>>

@@ -9,8 +9,8 @@ use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point};
 use crate::simd::vectorised;
 
-/// Tracks of a batch: two of the vectors of four that most processors have, so that one is computed with while the other
-/// is on its way.
+/// Tracks of a batch: two of the vectors of four that most processors have, so that one is computed with while the
+/// other is on its way.
 pub const LANES: usize = 8;
 
 /// As many tracks as are worth their while side by side.

@@ -49,7 +49,8 @@ fn in_front(cameras: &[Camera], observations: &[Observation], direction: Point) 
     if depths.sum::<f64>() < 0.0 { -direction } else { direction }
 }
 
-/// Refines the point of one track, see [`SideBySide::refine`]; returns it, of unit norm, and its sum of squared residuals.
+/// Refines the point of one track, see [`SideBySide::refine`]; returns it, of unit norm, and its sum of squared
+/// residuals.
 pub fn refine(cameras: &[Camera], observations: &[Observation], start: Point, iterations: usize) -> (Point, f64) {
     let alone = SideBySide::<1>::new(cameras, &[observations]);
     let found = alone.refine(alone.at(&start.normalize()), |_| true, iterations);

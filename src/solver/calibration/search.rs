@@ -106,8 +106,8 @@ impl Search<'_> {
         Minimum { reconstruction, cost: report.cost, cheirality }
     }
 
-    /// Minima from a reconstruction that is metric already, cheapest first: those that other focal lengths lead to, once
-    /// its poses and points have followed, for freed at once these would only go back to where they were.
+    /// Minima from a reconstruction that is metric already, cheapest first: those that other focal lengths lead to,
+    /// once its poses and points have followed, for freed at once these would only go back to where they were.
     ///
     /// * `factors`: on its focal length, to begin from; 1 for its own
     /// * `heartbeat`: called after each
