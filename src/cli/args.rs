@@ -262,15 +262,16 @@ pub struct SettingsArgs {
     #[arg(long, value_enum)]
     pub backend: Option<BackendArg>,
 
-    #[arg(long, hide_short_help = true, help = format!("Weight of the loss L_proj, but with `paper` that of the first \
-        iteration [default: {}; paper: {}]", SolveSettings::DEFAULT_ALPHA, SolveSettings::PAPER_ALPHA))]
+    #[arg(long, hide_short_help = true, help = format!("Weight of the loss L_proj at the first iteration; with \
+        `paper`, at every iteration [default: {}; paper: {}]", SolveSettings::DEFAULT_ALPHA, SolveSettings::PAPER_ALPHA))]
     pub alpha: Option<f64>,
 
     /// Weight of the loss L_DAQ
     #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_BETA)]
     pub beta: f64,
 
-    /// Least number of inliers that the loss L_num asks for, the paper's t; but with `paper` that of the first iteration
+    /// Least number of inliers that the loss L_num asks for (the paper's t) at the first iteration; with `paper`, at
+    /// every iteration
     #[arg(long, hide_short_help = true, value_name = "T", default_value_t = SolveSettings::DEFAULT_MIN_INLIERS)]
     pub min_inliers: f64,
 

@@ -62,11 +62,12 @@ pub struct SolveSettings {
     pub method: Method,
     /// Whether the DAQ residual takes part: as a loss of the network and as a score of hypotheses.
     pub use_daq: bool,
-    /// Weight of L_proj; but of PAPER, at a head's first iteration.
+    /// Weight of L_proj at the first iteration of a head; by PAPER, at every iteration.
     pub alpha: f64,
     /// Weight of L_DAQ.
     pub beta: f64,
-    /// Least number of inliers that L_num asks for, the paper's `t`; but of PAPER, at a head's first iteration.
+    /// Least number of inliers that L_num asks for, the paper's `t`, at the first iteration of a head; by PAPER, at
+    /// every iteration.
     pub min_inliers: f64,
     /// Slope of the sigmoid in L_num of PAPER; the other methods have no such sigmoid.
     pub kappa: f64,
