@@ -263,7 +263,8 @@ pub struct SettingsArgs {
     pub backend: Option<BackendArg>,
 
     #[arg(long, hide_short_help = true, help = format!("Weight of the loss L_proj at the first iteration; with \
-        `paper`, at every iteration [default: {}; paper: {}]", SolveSettings::DEFAULT_ALPHA, SolveSettings::PAPER_ALPHA))]
+        `paper`, at every iteration [default: {}; paper: {}]",
+        SolveSettings::DEFAULT_ALPHA, SolveSettings::PAPER_ALPHA))]
     pub alpha: Option<f64>,
 
     /// Weight of the loss L_DAQ

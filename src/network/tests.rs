@@ -95,8 +95,8 @@ fn the_largest_weights_belong_to_inliers() {
     }
 }
 
-/// With the paper's own alpha and sigmoid L_num asks for no track: 200 weights of 0 count as 76, more than its t. L_proj
-/// then takes all of them down, the right ones last.
+/// With the paper's own alpha and sigmoid L_num asks for no track: 200 weights of 0 count as 76, more than its t.
+/// L_proj then takes all of them down, the right ones last.
 #[test]
 fn as_printed_nothing_holds_the_weights_up() {
     let scene = contaminated_scene(10, 200, 0.9, 0);

@@ -6,7 +6,7 @@ pub struct PortfolioOptions {
     /// Rounds of a search, and of a quick one.
     pub rounds: u32,
     pub quick_rounds: u32,
-    /// Round, counted from 0, from which heads of the network are optimised, and after how many rounds there is another.
+    /// Round, counted from 0, from which heads of the network are optimised, and rounds after which there is another.
     pub first_head_round: u32,
     pub rounds_per_head: u32,
     /// Samples a round, of a proposal and of uniform sampling, without depths and with.
