@@ -20,7 +20,7 @@ use crate::telemetry::metrics::{Refusal, inflight_bytes, inflight_capacity, refu
 /// while it is read: as it is stored, decoded, and encoded.
 pub const WORKING_COPIES: u64 = 3;
 
-/// How often a message is in memory: as it came, in a buffer that the transport keeps for the next one, and decoded.
+/// How often a message is in memory: decoded, and as it came, in a buffer that the transport keeps for the next one.
 const MESSAGE_COPIES: u64 = 2;
 
 /// The bytes that all calls of a server may hold together.

@@ -30,8 +30,8 @@ impl PortfolioOptions {
         rounds: 16,
         // The noise as assumed, which is rather too high.
         quick_rounds: 1,
-        // Once all that is cheaper has decided nothing at any noise of the ladder; two heads, each verified at four of
-        // the noises, take as long as everything before. Four instead of two found no more (5 to 11 % noise).
+        // Once all that is cheaper has decided nothing at any noise of the ladder. Two heads, each verified at four of
+        // the noises: four found no more (5 to 11 % noise, two scenes each).
         first_head_round: 8,
         rounds_per_head: 4,
         // A sample costs microseconds.

@@ -232,8 +232,8 @@ pub(in crate::store) async fn only_a_job_that_its_call_created_depends_on_calls(
         assert_eq!(calls(&detach(&solved).await), Some(expected), "no more go than have come");
     }
     assert_eq!(calls(&create(store, of("solved", true), 2).await), Some((3, 2)));
-    let stranger = store.detach(&solved.name, time(9)).await.expect("exists");
-    assert_eq!(calls(&stranger), Some((3, 2)), "of a job that was created at another time");
+    let unchanged = store.detach(&solved.name, time(9)).await.expect("exists");
+    assert_eq!(calls(&unchanged), Some((3, 2)), "of a job that was created at another time");
     assert_eq!(calls(&create(store, of("solved", false), 3).await), None, "someone wants it without a call");
     assert_eq!(calls(&create(store, of("solved", true), 4).await), None);
 
