@@ -132,6 +132,7 @@ pub fn warnings(solution: &Solution, input: Option<&LabelledInput>) -> String {
 pub fn convergence(solution: &Solution) -> String {
     let history = &solution.history;
     let iterations = iterations_in_all(history);
+    let phases = phase_starts(history, &iterations);
     let loss = |pick: fn(&Losses) -> f64| -> Vec<(f64, f64)> {
         history.iter().zip(&iterations).filter_map(|(record, &at)| Some((at, pick(record.losses.as_ref()?)))).collect()
     };
@@ -148,7 +149,7 @@ pub fn convergence(solution: &Solution) -> String {
         ],
         logarithmic: true,
         clip: None,
-        marks: phase_starts(history, &iterations),
+        marks: phases.clone(),
     };
     let single = |title: &'static str, points: Vec<(f64, f64)>, clip: Option<(f64, f64)>| LineChart {
         title,
@@ -170,7 +171,7 @@ pub fn convergence(solution: &Solution) -> String {
         ),
     ];
     let mut svgs: Vec<String> = charts.iter().map(LineChart::svg).collect();
-    svgs.extend(of_heads(history, &iterations));
+    svgs.extend(of_heads(history, &iterations, &phases));
     let figures: Vec<String> = svgs.iter().map(|svg| format!("<figure>{svg}</figure>\n")).collect();
     format!(
         "<section id=\"convergence\">\n<h2>Convergence</h2>\n<div class=\"grid\">\n{}</div>\n{}</section>\n",
@@ -181,7 +182,9 @@ pub fn convergence(solution: &Solution) -> String {
 
 /// What the heads of the network went through: their weights, and what their continuation and their choice go by.
 /// Nothing where no head was optimised.
-fn of_heads(history: &[Progress], iterations: &[f64]) -> Vec<String> {
+///
+/// * `phases`: see [`phase_starts`]
+fn of_heads(history: &[Progress], iterations: &[f64], phases: &[(f64, String)]) -> Vec<String> {
     let heads: Vec<(f64, &HeadProgress)> =
         history.iter().zip(iterations).filter_map(|(record, &at)| Some((at, record.head.as_ref()?))).collect();
     if heads.is_empty() {
@@ -196,7 +199,7 @@ fn of_heads(history: &[Progress], iterations: &[f64]) -> Vec<String> {
         series,
         logarithmic,
         clip: None,
-        marks: phase_starts(history, iterations),
+        marks: phases.to_vec(),
     };
     let sums = vec![Series { name: "N", points: curve(|head| Some(head.weight_sum)) }];
     let residuals = vec![
@@ -332,15 +335,16 @@ mod tests {
         let (_, solution) = fixture::solved();
         let history = &solution.history;
         let iterations = iterations_in_all(history);
-        let named: Vec<String> = phase_starts(history, &iterations).into_iter().map(|(_, name)| name).collect();
+        let phases = phase_starts(history, &iterations);
+        let named: Vec<&str> = phases.iter().map(|(_, name)| name.as_str()).collect();
         assert_eq!(named, ["head 1", "rank", "growth", "head 2", "rank", "growth"]);
-        let svgs = of_heads(history, &iterations);
+        let svgs = of_heads(history, &iterations, &phases);
         assert_eq!(svgs.len(), 3);
         assert!(svgs[0].contains("head 2"), "{}", svgs[0]);
         // Three kinds of weights in each of the columns.
         assert!(svgs[1].matches("<rect class=\"cell\"").count() > 100, "{}", svgs[1]);
         let without: Vec<Progress> = history.iter().map(|record| Progress { head: None, ..*record }).collect();
-        assert!(of_heads(&without, &iterations).is_empty() && phase_starts(&without, &iterations).is_empty());
+        assert!(of_heads(&without, &iterations, &[]).is_empty() && phase_starts(&without, &iterations).is_empty());
     }
 
     #[test]

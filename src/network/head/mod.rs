@@ -67,8 +67,6 @@ struct Objective<'a> {
     terms: Terms,
     /// Weight of L_proj.
     alpha: f64,
-    /// Whether L_DAQ moves the weights, too.
-    daq_moves_weights: bool,
 }
 
 /// The losses at one point and the derivatives of their weighted sum with respect to every array of the network.
@@ -195,13 +193,12 @@ impl Head {
         let evaluation =
             losses::evaluate(objective.matrix, &self.weights, log_focal, plane_at_infinity, objective.terms)?;
         let beta = self.settings.beta;
-        let beta_weights = if moves_calibration && objective.daq_moves_weights { beta } else { 0.0 };
         // What is not finite becomes 0 and is counted.
         let mut replaced = 0;
         let on_logits = self.weights.iter().enumerate().map(|(column, w)| {
             let on_weight = evaluation.grad_w_num[column]
                 + objective.alpha * evaluation.grad_w_proj[column]
-                + beta_weights * evaluation.grad_w_daq[column];
+                + beta * evaluation.grad_w_daq[column];
             finite(on_weight * w * (1.0 - w), &mut replaced)
         });
         let on_logits = on_logits.collect();
@@ -215,19 +212,17 @@ impl Head {
 
     /// What the coming step optimises.
     fn objective(&self) -> Objective<'_> {
-        let NetworkSettings { alpha, min_inliers, kappa, .. } = self.settings;
+        let NetworkSettings { alpha, min_inliers, kappa, use_daq, .. } = self.settings;
         match &self.continuation {
-            None => Objective {
-                matrix: &self.balanced,
-                terms: Terms { count: CountTerm::Sigmoid { min_inliers, kappa }, rank: RankTerm::TAIL },
-                alpha,
-                daq_moves_weights: true,
-            },
+            None => {
+                let count = CountTerm::Sigmoid { min_inliers, kappa };
+                let terms = Terms { count, rank: RankTerm::TAIL, daq_moves_weights: use_daq };
+                Objective { matrix: &self.balanced, terms, alpha }
+            }
             Some(continuation) => {
-                let min_inliers = continuation.min_inliers(self.iteration);
+                let count = CountTerm::Tangent { min_inliers: continuation.min_inliers(self.iteration) };
                 let (matrix, alpha, rank) = continuation.rank_term(self.iteration, &self.balanced);
-                let terms = Terms { count: CountTerm::Tangent { min_inliers }, rank };
-                Objective { matrix, terms, alpha, daq_moves_weights: false }
+                Objective { matrix, terms: Terms { count, rank, daq_moves_weights: false }, alpha }
             }
         }
     }

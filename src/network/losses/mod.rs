@@ -27,11 +27,13 @@ pub use count::CountTerm;
 pub use spectrum::RankTerm;
 use spectrum::Spectrum;
 
-/// What L_num and L_proj are at a point of an optimisation; L_DAQ is always the same.
+/// What the losses are at a point of an optimisation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Terms {
     pub count: CountTerm,
     pub rank: RankTerm,
+    /// Whether L_DAQ has a derivative by the weights; its value is always the same.
+    pub daq_moves_weights: bool,
 }
 
 /// The losses at one point and their derivatives, none of them weighted by alpha or beta.
@@ -42,7 +44,7 @@ pub struct Evaluation {
     pub grad_w_num: Vec<f64>,
     /// dL_proj/dw, one entry a column.
     pub grad_w_proj: Vec<f64>,
-    /// dL_DAQ/dw through the span, one entry a column.
+    /// dL_DAQ/dw through the span, one entry a column; 0 where it has none.
     pub grad_w_daq: Vec<f64>,
     /// dL_DAQ/d log f.
     pub grad_log_focal: f64,
@@ -76,8 +78,10 @@ pub fn evaluate(
     let (proj, grad_w_proj) = spectrum.rank_term(terms.rank, w);
     let cameras = gauge::CanonicalCameras::of(spectrum.span());
     let daq = daq::residual(&cameras, log_focal, &Vector3::from(n_inf));
-    let grad_span = cameras.pull_back(&daq.grad_rotational, &daq.grad_translational);
-    let grad_w_daq = spectrum.pull_back_span(&grad_span, w);
+    let grad_w_daq = match terms.daq_moves_weights {
+        true => spectrum.pull_back_span(&cameras.pull_back(&daq.grad_rotational, &daq.grad_translational), w),
+        false => vec![0.0; w.len()],
+    };
     Ok(Evaluation {
         losses: Losses { num, proj, daq: daq.value },
         grad_w_num,

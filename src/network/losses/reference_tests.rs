@@ -17,7 +17,7 @@ const TRACKS: usize = 12;
 const TERMS: Terms = terms(20.0);
 
 const fn terms(kappa: f64) -> Terms {
-    Terms { count: CountTerm::Sigmoid { min_inliers: 6.0, kappa }, rank: RankTerm::TAIL }
+    Terms { count: CountTerm::Sigmoid { min_inliers: 6.0, kappa }, rank: RankTerm::TAIL, daq_moves_weights: true }
 }
 
 /// Logarithm of the focal length and plane at infinity at which the derivatives were taken and the descent began.

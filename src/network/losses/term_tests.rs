@@ -22,7 +22,7 @@ fn point(seed: u64) -> (DMatrix<f64>, Vec<f64>) {
 
 /// On the tangent or before it.
 fn at(matrix: &DMatrix<f64>, w: &[f64], min_inliers: f64, rank: RankTerm) -> Evaluation {
-    let terms = Terms { count: CountTerm::Tangent { min_inliers }, rank };
+    let terms = Terms { count: CountTerm::Tangent { min_inliers }, rank, daq_moves_weights: false };
     evaluate(matrix, w, LOG_FOCAL, PLANE, terms).expect("a finite matrix")
 }
 

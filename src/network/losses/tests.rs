@@ -7,7 +7,11 @@ use crate::network::tests::{balanced_matrix, contaminated_scene, random_weights}
 use crate::synthetic::scene::IMAGE_SIDE_PX;
 use crate::synthetic::{Scene, SceneOptions, Truth};
 
-const TERMS: Terms = Terms { count: CountTerm::Sigmoid { min_inliers: 15.0, kappa: 20.0 }, rank: RankTerm::TAIL };
+const TERMS: Terms = Terms {
+    count: CountTerm::Sigmoid { min_inliers: 15.0, kappa: 20.0 },
+    rank: RankTerm::TAIL,
+    daq_moves_weights: true,
+};
 /// Step of the central differences: their own error is then about 1e-9 of the second derivative's scale.
 const STEP: f64 = 1e-5;
 

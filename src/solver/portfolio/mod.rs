@@ -153,7 +153,8 @@ impl<'a> Portfolio<'a> {
             if round >= OPTIONS.first_head_round && self.may_optimise() {
                 let heads = heads.get_or_insert_with(|| self.head_search());
                 if (round - OPTIONS.first_head_round).is_multiple_of(OPTIONS.rounds_per_head) {
-                    self.optimise_head(heads, recorder, spread_weights)?;
+                    let within = |share: f64| (f64::from(round) + share) / f64::from(rounds);
+                    self.optimise_head(heads, recorder, spread_weights, &within)?;
                 }
                 self.propose_head(&heads.latest_weights());
                 self.stand(recorder);
@@ -197,22 +198,25 @@ impl<'a> Portfolio<'a> {
     }
 
     /// One more head, where there is to be one.
+    ///
+    /// * `within`: share of the search that is done where this share of the head is
     fn optimise_head(
         &mut self,
         heads: &mut HeadSearch,
         recorder: &mut Recorder,
         spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
+        within: &dyn Fn(f64) -> f64,
     ) -> Result<(), crate::network::Error> {
         if heads.is_over() {
             return Ok(());
         }
         let begun = Instant::now();
-        let every = self.settings.weights_every;
+        let SolveSettings { weights_every: every, iterations, .. } = *self.settings;
         let mut work = 0;
         heads.optimise_next(self.stop, &mut |step| {
             work += 1;
             recorder.optimised(step.head, step.losses);
-            recorder.report(0.0);
+            recorder.report(within(f64::from(work) / f64::from(iterations)));
             if every > 0 && step.head.iteration.is_multiple_of(every) {
                 recorder.weights(&spread_weights(step.weights));
             }

@@ -217,18 +217,18 @@ impl HeadSearch {
 
     /// Weights of the chosen head, one a column of the whole matrix; 0 where none has ended.
     pub fn weights(&self) -> Vec<f64> {
-        let mut all = vec![0.0; self.width];
-        if let Some(best) = self.best() {
-            scatter(&best.weights, &self.columns, &mut all);
-        }
-        all
+        self.weights_of(self.best())
     }
 
     /// Weights of the head that ended last, as [`Self::weights`].
     pub fn latest_weights(&self) -> Vec<f64> {
+        self.weights_of(self.heads.last())
+    }
+
+    fn weights_of(&self, head: Option<&FinishedHead>) -> Vec<f64> {
         let mut all = vec![0.0; self.width];
-        if let Some(latest) = self.heads.last() {
-            scatter(&latest.weights, &self.columns, &mut all);
+        if let Some(head) = head {
+            scatter(&head.weights, &self.columns, &mut all);
         }
         all
     }
