@@ -4,23 +4,22 @@ use std::error::Error;
 use std::path::PathBuf;
 use std::{env, fs};
 
-use protox::prost::Message;
-
 /// The files that nothing else imports; the others follow from them.
 const ROOTS: [&str; 3] =
     ["scpsfm/v1/calibration_service.proto", "scpsfm/v1/input_service.proto", "scpsfm/v1/job_service.proto"];
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");
-    let files = protox::compile(ROOTS, ["proto"])?;
-    // What the reflection service answers from.
+    let mut compiler = protox::Compiler::new(["proto"])?;
+    compiler.include_imports(true).include_source_info(true).open_files(ROOTS)?;
+    // What reflection and JSON over HTTP answer from; encoded by protox, since prost forgets the annotations.
     let descriptors = PathBuf::from(env::var("OUT_DIR")?).join("scpsfm_descriptors.bin");
-    fs::write(descriptors, files.encode_to_vec())?;
+    fs::write(descriptors, compiler.encode_file_descriptor_set())?;
     tonic_prost_build::configure()
         // Maps in key order, so that the same message has the same bytes.
         .btree_map(".")
         // A result is cut into chunks without copying it.
-        .bytes(".scpsfm.v1.ResultChunk.data")
-        .compile_fds(files)?;
+        .bytes(".scpsfm.v1.ResultChunk")
+        .compile_fds(compiler.file_descriptor_set())?;
     Ok(())
 }

@@ -10,7 +10,7 @@ use crate::formats;
 pub const HELP: &str = "\
 Exit codes:
     0  done; of a solve: solved (the grade may still be PROJECTIVE_ONLY: see result.json)
-    1  internal or I/O error, or a job that failed or expired
+    1  internal or I/O error, or a job that failed or exceeded its deadline
     2  wrong usage
     3  no reconstruction: the result files were written and say why
    64  bad configuration

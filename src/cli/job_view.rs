@@ -44,8 +44,8 @@ impl GivenName {
     }
 }
 
-/// Why a job expired.
-const EXPIRED: &str = "  its deadline passed before a result stood";
+/// What ended a job that is DEADLINE_EXCEEDED.
+const DEADLINE_EXCEEDED: &str = "  its deadline passed before a result stood";
 
 /// A job in a line.
 pub fn job_line(job: &Job) -> String {
@@ -55,8 +55,8 @@ pub fn job_line(job: &Job) -> String {
         line.push_str(&format!("  {}", summary_words(summary)));
     } else if let Some(failure) = &job.failure {
         line.push_str(&format!("  {}: {}", failure.reason, failure.message));
-    } else if job.state == JobState::Expired {
-        line.push_str(EXPIRED);
+    } else if job.state == JobState::DeadlineExceeded {
+        line.push_str(DEADLINE_EXCEEDED);
     } else if let Some(progress) = job.progress.filter(|_| job.state == JobState::Running) {
         line.push_str(&format!("  {} {:.0} %", progress.stage.name(), 100.0 * progress.fraction));
     }

@@ -1,6 +1,7 @@
 //! `scpsfm list`: a server's jobs.
 
 use clap::ValueEnum;
+use clap::builder::PossibleValue;
 
 use super::args::{PageArgs, ServerArgs};
 use super::exit::{Exit, Failure};
@@ -25,9 +26,9 @@ pub struct Args {
 
     /// Only jobs in this state; may be given more than once
     #[arg(long = "state", value_enum, ignore_case = true)]
-    pub states: Vec<StateArg>,
+    pub states: Vec<JobState>,
 
-    /// Only jobs that match, such as 'labels.site = "north"' or 'state = FAILED OR state = EXPIRED': terms joined by
+    /// Only jobs that match, such as 'labels.site = "north"' or 'state = FAILED OR state = CANCELLED': terms joined by
     /// AND, states also by OR
     #[arg(long, default_value = "")]
     pub filter: String,
@@ -40,27 +41,20 @@ pub struct Args {
     pub json: bool,
 }
 
-/// [`JobState`] on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum StateArg {
-    Queued,
-    Running,
-    Succeeded,
-    Failed,
-    Cancelled,
-    Expired,
-}
+impl ValueEnum for JobState {
+    fn value_variants<'a>() -> &'a [Self] {
+        &Self::ALL
+    }
 
-impl From<StateArg> for JobState {
-    fn from(state: StateArg) -> Self {
-        match state {
-            StateArg::Queued => JobState::Queued,
-            StateArg::Running => JobState::Running,
-            StateArg::Succeeded => JobState::Succeeded,
-            StateArg::Failed => JobState::Failed,
-            StateArg::Cancelled => JobState::Cancelled,
-            StateArg::Expired => JobState::Expired,
-        }
+    fn to_possible_value(&self) -> Option<PossibleValue> {
+        Some(PossibleValue::new(match self {
+            Self::DeadlineExceeded => "deadline-exceeded",
+            Self::Queued => "queued",
+            Self::Running => "running",
+            Self::Succeeded => "succeeded",
+            Self::Failed => "failed",
+            Self::Cancelled => "cancelled",
+        }))
     }
 }
 
@@ -80,8 +74,7 @@ pub async fn run(mut args: Args) -> Result<Exit, Failure> {
 
 /// States and filter together.
 fn filter(args: &Args) -> String {
-    let states: Vec<String> =
-        args.states.iter().map(|&state| format!("state = {}", JobState::from(state).name())).collect();
+    let states: Vec<String> = args.states.iter().map(|state| format!("state = {}", state.name())).collect();
     let terms = [states.join(" OR "), args.filter.clone()];
     terms.into_iter().filter(|term| !term.trim().is_empty()).collect::<Vec<_>>().join(" AND ")
 }

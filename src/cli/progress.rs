@@ -4,7 +4,7 @@ use std::io::IsTerminal;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::domain::{Course, Observer, Progress, Stage, Step, Task};
+use crate::domain::{Observer, Progress, ReconstructionProgress, Stage, Step, Task};
 
 /// Steps of the bar: finer than any terminal is wide.
 const BAR_STEPS: u64 = 1_000;
@@ -190,7 +190,7 @@ fn describe(progress: &Progress) -> String {
 
 /// Where a solve is, with a comma behind it; nothing where the stage says it all.
 fn whereabouts(progress: &Progress) -> String {
-    let Course { block, blocks, part, registered_views, views, step } = progress.course;
+    let ReconstructionProgress { block, blocks, part, registered_views, views, step } = progress.reconstruction;
     let of_part = if part > 0 { format!(", part {part}") } else { String::new() };
     match (step, progress.stage) {
         (Some(Step { task: Task::Adjust, step, steps }), _) => format!("adjusting: round {step} of {steps}, "),
@@ -214,7 +214,7 @@ fn whereabouts(progress: &Progress) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{Course, Losses, Stage};
+    use crate::domain::{Losses, ReconstructionProgress, Stage};
 
     fn at(stage: Stage, fraction: f64, elapsed_seconds: f64) -> Progress {
         Progress {
@@ -227,7 +227,7 @@ mod tests {
             focal_px: None,
             best_score: None,
             elapsed_seconds,
-            course: Course::default(),
+            reconstruction: ReconstructionProgress::default(),
         }
     }
 
@@ -262,7 +262,7 @@ mod tests {
             focal_px: None,
             best_score: None,
             elapsed_seconds: 1.25,
-            course: Course::default(),
+            reconstruction: ReconstructionProgress::default(),
         };
         assert_eq!(describe(&progress), "19 inliers, 1.2 s");
         progress.focal_px = Some(1204.26);
@@ -276,17 +276,27 @@ mod tests {
 
     #[test]
     fn a_line_says_where_a_solve_is() {
-        let said = |stage: Stage, course: Course| {
-            let line = describe(&Progress { course, ..at(stage, 0.5, 1.25) });
+        let said = |stage: Stage, reconstruction: ReconstructionProgress| {
+            let line = describe(&Progress { reconstruction, ..at(stage, 0.5, 1.25) });
             line.strip_suffix("0 inliers, 1.2 s").expect("the rest as ever").to_owned()
         };
-        let walk = Course { block: 2, blocks: 4, registered_views: 120, views: 300, ..Course::default() };
+        let walk = ReconstructionProgress {
+            block: 2,
+            blocks: 4,
+            registered_views: 120,
+            views: 300,
+            ..ReconstructionProgress::default()
+        };
         assert_eq!(said(Stage::Search, walk), "block 2 of 4, ");
-        assert_eq!(said(Stage::Search, Course { block: 1, blocks: 1, ..walk }), "");
-        assert_eq!(said(Stage::Refine, Course { part: 1, ..walk }), "trying a block for part 1, ");
+        assert_eq!(said(Stage::Search, ReconstructionProgress { block: 1, blocks: 1, ..walk }), "");
+        assert_eq!(said(Stage::Refine, ReconstructionProgress { part: 1, ..walk }), "trying a block for part 1, ");
         assert_eq!(said(Stage::Extend, walk), "registering: 120 of 300 views, ");
-        assert_eq!(said(Stage::Extend, Course { part: 1, ..walk }), "registering: 120 of 300 views, part 1, ");
-        let step = |task: Task| Course { part: 1, step: Some(Step { task, step: 3, steps: 7 }), ..walk };
+        assert_eq!(
+            said(Stage::Extend, ReconstructionProgress { part: 1, ..walk }),
+            "registering: 120 of 300 views, part 1, "
+        );
+        let step =
+            |task: Task| ReconstructionProgress { part: 1, step: Some(Step { task, step: 3, steps: 7 }), ..walk };
         assert_eq!(said(Stage::Extend, step(Task::Adjust)), "adjusting: round 3 of 7, ");
         assert_eq!(said(Stage::Calibrate, step(Task::Cameras)), "calibrating: 3 of 7, ");
         assert_eq!(said(Stage::Calibrate, step(Task::Windows)), "comparing: window 3 of 7, ");

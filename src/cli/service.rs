@@ -11,6 +11,7 @@ use tokio::time::timeout;
 use super::exit::Failure;
 use crate::config::{self, Config};
 use crate::engine::{self, Engine};
+use crate::rpc::convert::result::encode as encode_result;
 use crate::rpc::keys::Sources;
 use crate::rpc::server::{self, Server};
 use crate::store::postgres::Postgres;
@@ -51,7 +52,7 @@ impl Service {
         let solver = engine::solver_on(config.compute.threads());
         let started = tokio::select! {
             biased;
-            started = Engine::start(engine_options(config), store.clone(), solver) => started,
+            started = Engine::start(engine_options(config), store.clone(), solver, encode_result) => started,
             // It waits for the store, and for nothing once jobs begin.
             () = ended => {
                 close(&*store).await;

@@ -56,8 +56,8 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
     if solution.iterations > 0 {
         spent.push_str(&format!(", {} network iterations", solution.iterations));
     }
-    if let Some(prior) = solution.winning_prior {
-        spent.push_str(&format!(", found by the prior `{}`", prior.name()));
+    if let Some(proposal) = solution.winning_proposal {
+        spent.push_str(&format!(", found by the proposal `{}`", proposal.name()));
     }
     fact("solve", spent);
     for warning in warnings::named(solution, input) {

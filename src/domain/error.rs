@@ -5,7 +5,7 @@ use std::fmt;
 /// One rule that one field breaks.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Violation {
-    /// Path of the field in the API's spelling, without an index: `track_set.x`, `settings.alpha`.
+    /// Path of the field in the API's spelling, without an index: `track_set.xs`, `settings.alpha`.
     pub field: String,
     /// Element of a repeated field, counted from 0.
     pub index: Option<usize>,
@@ -24,7 +24,7 @@ impl Violation {
         Self { field: field.into(), index: Some(index), description: description.into() }
     }
 
-    /// The field with its index, as it is shown to callers: `track_set.x[17]`.
+    /// The field with its index, as it is shown to callers: `track_set.xs[17]`.
     pub fn path(&self) -> String {
         match self.index {
             Some(index) => format!("{}[{index}]", self.field),

@@ -1,8 +1,10 @@
 //! The one type that every kind of input ends as: observations of tracks in views.
 
+use std::collections::HashMap;
+
 use serde::{Deserialize, Serialize};
 
-use super::error::{InvalidInput, Violation, Violations};
+use super::error::{InvalidInput, Violation, Violations, quoted};
 use super::limits::Limits;
 
 /// Width and height of an image in pixels.
@@ -28,11 +30,34 @@ pub struct FocalPrior {
 /// One image.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct View {
+    /// The image's name, such as its file's; no two views have the same.
+    pub name: Option<Box<str>>,
     /// The image's size; where unknown, the extent of the points stands in, with a warning.
     pub size: Option<ImageSize>,
     /// Views of one group share one constant calibration.
     pub camera_group: u32,
     pub focal_prior: Option<FocalPrior>,
+}
+
+impl View {
+    /// Longest name in bytes: paths have at most 4,096 on the usual systems.
+    pub const MAX_NAME_BYTES: usize = 4096;
+
+    /// Whether a text can be a view's name.
+    ///
+    /// # Errors
+    /// Empty, too long, or with control characters, which would break the lines of result files.
+    pub fn check_name(name: &str) -> Result<(), String> {
+        if name.is_empty() {
+            Err("has no name".into())
+        } else if name.len() > Self::MAX_NAME_BYTES {
+            Err(format!("the name {} is longer than {} bytes", quoted(name), Self::MAX_NAME_BYTES))
+        } else if name.chars().any(char::is_control) {
+            Err(format!("the name {} holds control characters", quoted(name)))
+        } else {
+            Ok(())
+        }
+    }
 }
 
 /// An input as a caller states it, before any check. Structure of arrays: one entry an observation.
@@ -70,8 +95,6 @@ pub struct Input {
     depth: Option<Vec<f64>>,
     /// Position of each observation in the caller's order.
     caller_order: Vec<u32>,
-    /// Added later: older stored inputs lack it.
-    #[serde(default)]
     sigma: Option<Vec<f64>>,
 }
 
@@ -223,7 +246,7 @@ fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String
     };
     bound("views", raw.views.len(), limits.max_views, "views");
     bound("track_count", raw.track_count, limits.max_tracks, "tracks");
-    bound("x", raw.x.len(), limits.max_observations, "observations");
+    bound("xs", raw.x.len(), limits.max_observations, "observations");
     if raw.views.len() < 2 {
         found.push(Violation::of(field("views"), too_few_views(raw.views.len())));
     }
@@ -231,22 +254,22 @@ fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String
         found.push(Violation::of(field("track_count"), "no tracks given, at least 1 is needed"));
     }
     if raw.x.is_empty() {
-        found.push(Violation::of(field("x"), "no observations given"));
+        found.push(Violation::of(field("xs"), "no observations given"));
     }
-    let lengths = [("view", raw.view.len()), ("track", raw.track.len()), ("y", raw.y.len())];
+    let lengths = [("view_indices", raw.view.len()), ("track_indices", raw.track.len()), ("ys", raw.y.len())];
     for (name, length) in lengths {
         if length != raw.x.len() {
             found.push(Violation::of(
                 field(name),
-                format!("has {length} entries where x has {}; all must have one an observation", raw.x.len()),
+                format!("has {length} entries where xs has {}; all must have one an observation", raw.x.len()),
             ));
         }
     }
-    for (name, values) in [("depth", &raw.depth), ("sigma", &raw.sigma)] {
+    for (name, values) in [("depths", &raw.depth), ("sigmas_px", &raw.sigma)] {
         if !values.is_empty() && values.len() != raw.x.len() {
             found.push(Violation::of(
                 field(name),
-                format!("has {} entries where x has {}; give one an observation or none", values.len(), raw.x.len()),
+                format!("has {} entries where xs has {}; give one an observation or none", values.len(), raw.x.len()),
             ));
         }
     }
@@ -259,7 +282,17 @@ pub(crate) fn too_few_views(count: usize) -> String {
 }
 
 fn check_views(views: &[View], field: &impl Fn(&str) -> String, found: &mut Violations) {
+    let mut names = HashMap::new();
     for (index, view) in views.iter().enumerate() {
+        if let Some(name) = view.name.as_deref() {
+            if let Err(description) = View::check_name(name) {
+                found.push(Violation::at(field("views"), index, description));
+            }
+            if let Some(first) = names.insert(name, index) {
+                let description = format!("the name {} is that of view {first} too", quoted(name));
+                found.push(Violation::at(field("views"), index, description));
+            }
+        }
         if let Some(size) = view.size {
             let sides = [size.width_px, size.height_px];
             if sides.iter().any(|&side| side == 0 || side > ImageSize::MAX_SIDE_PX) {
@@ -295,19 +328,19 @@ fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &m
     for k in 0..raw.x.len() {
         if raw.view[k] as usize >= raw.views.len() {
             found.push(Violation::at(
-                field("view"),
+                field("view_indices"),
                 k,
                 format!("view {} is outside the {} views given", raw.view[k], raw.views.len()),
             ));
         }
         if raw.track[k] as usize >= raw.track_count {
             found.push(Violation::at(
-                field("track"),
+                field("track_indices"),
                 k,
                 format!("track {} is outside the declared count of {}", raw.track[k], raw.track_count),
             ));
         }
-        for (name, value) in [("x", raw.x[k]), ("y", raw.y[k])] {
+        for (name, value) in [("xs", raw.x[k]), ("ys", raw.y[k])] {
             if !value.is_finite() {
                 found.push(Violation::at(field(name), k, format!("{value} is not a finite number")));
             } else if value.abs() > Input::MAX_COORDINATE_PX {
@@ -323,7 +356,7 @@ fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &m
             && !(least..=most).contains(&depth.abs())
         {
             found.push(Violation::at(
-                field("depth"),
+                field("depths"),
                 k,
                 format!("{depth} is not of a size within {least:e}..={most:e}; leave an unobserved point out"),
             ));
@@ -333,7 +366,7 @@ fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &m
             && !(least..=most).contains(sigma)
         {
             let what = format!("{sigma} px is no standard deviation within {least:e}..={most:e} px");
-            found.push(Violation::at(field("sigma"), k, what));
+            found.push(Violation::at(field("sigmas_px"), k, what));
         }
     }
 }
@@ -343,7 +376,7 @@ fn check_duplicates(raw: &RawInput, order: &[u32], field: &impl Fn(&str) -> Stri
         let (first, second) = (pair[0] as usize, pair[1] as usize);
         if raw.track[first] == raw.track[second] && raw.view[first] == raw.view[second] {
             found.push(Violation::at(
-                field("track"),
+                field("track_indices"),
                 second,
                 format!(
                     "track {} is observed a second time in view {} (first at index {first})",
@@ -363,7 +396,7 @@ fn check_views_with_observations(raw: &RawInput, field: &impl Fn(&str) -> String
     }
     let count = seen.iter().filter(|&&seen| seen).count();
     if count < 2 {
-        found.push(Violation::of(field("view"), "all observations lie in one view, at least 2 are needed"));
+        found.push(Violation::of(field("view_indices"), "all observations lie in one view, at least 2 are needed"));
     }
 }
 
@@ -407,27 +440,27 @@ pub(super) mod tests {
             change(&mut raw);
             violations(raw)
         };
-        assert_eq!(with(&|raw| raw.x[2] = f64::NAN), ["track_set.x[2]"]);
-        assert_eq!(with(&|raw| raw.y[3] = f64::INFINITY), ["track_set.y[3]"]);
-        assert_eq!(with(&|raw| raw.y[1] = 1e300), ["track_set.y[1]"]);
-        assert_eq!(with(&|raw| raw.track[0] = 2), ["track_set.track[0]"]);
-        assert_eq!(with(&|raw| raw.view[3] = 7), ["track_set.view[3]"]);
-        assert_eq!(with(&|raw| raw.track[1] = 0), ["track_set.track[2]"]);
-        assert_eq!(with(&|raw| raw.depth = vec![1.0, 0.0, 1.0, 1.0]), ["track_set.depth[1]"]);
-        assert_eq!(with(&|raw| raw.depth = vec![1.0]), ["track_set.depth"]);
+        assert_eq!(with(&|raw| raw.x[2] = f64::NAN), ["track_set.xs[2]"]);
+        assert_eq!(with(&|raw| raw.y[3] = f64::INFINITY), ["track_set.ys[3]"]);
+        assert_eq!(with(&|raw| raw.y[1] = 1e300), ["track_set.ys[1]"]);
+        assert_eq!(with(&|raw| raw.track[0] = 2), ["track_set.track_indices[0]"]);
+        assert_eq!(with(&|raw| raw.view[3] = 7), ["track_set.view_indices[3]"]);
+        assert_eq!(with(&|raw| raw.track[1] = 0), ["track_set.track_indices[2]"]);
+        assert_eq!(with(&|raw| raw.depth = vec![1.0, 0.0, 1.0, 1.0]), ["track_set.depths[1]"]);
+        assert_eq!(with(&|raw| raw.depth = vec![1.0]), ["track_set.depths"]);
         assert_eq!(
             with(&|raw| raw.sigma = vec![1.0, 0.5, f64::NAN, 0.0]),
-            ["track_set.sigma[2]", "track_set.sigma[3]"]
+            ["track_set.sigmas_px[2]", "track_set.sigmas_px[3]"]
         );
-        assert_eq!(with(&|raw| raw.sigma = vec![1.0]), ["track_set.sigma"]);
-        assert_eq!(with(&|raw| raw.y.truncate(3)), ["track_set.y"]);
+        assert_eq!(with(&|raw| raw.sigma = vec![1.0]), ["track_set.sigmas_px"]);
+        assert_eq!(with(&|raw| raw.y.truncate(3)), ["track_set.ys"]);
         assert_eq!(with(&|raw| raw.track_count = 0), ["track_set.track_count"]);
         assert_eq!(with(&|raw| raw.views.truncate(1)), ["track_set.views"]);
         let half_a_size = View { size: Some(ImageSize { width_px: 640, height_px: 0 }), ..View::default() };
         assert_eq!(with(&|raw| raw.views[1] = half_a_size.clone()), ["track_set.views[1]"]);
         assert_eq!(
             with(&|raw| raw.view = vec![0, 0, 0, 0]),
-            ["track_set.track[3]", "track_set.track[1]", "track_set.view"]
+            ["track_set.track_indices[3]", "track_set.track_indices[1]", "track_set.view_indices"]
         );
     }
 

@@ -67,7 +67,7 @@ pub enum JobState {
     Failed,
     Cancelled,
     /// The deadline passed before a result stood.
-    Expired,
+    DeadlineExceeded,
 }
 
 impl JobState {
@@ -78,7 +78,7 @@ impl JobState {
         JobState::Succeeded,
         JobState::Failed,
         JobState::Cancelled,
-        JobState::Expired,
+        JobState::DeadlineExceeded,
     ];
 
     /// The state's name in files, metrics, filters and the store.
@@ -89,7 +89,7 @@ impl JobState {
             JobState::Succeeded => "SUCCEEDED",
             JobState::Failed => "FAILED",
             JobState::Cancelled => "CANCELLED",
-            JobState::Expired => "EXPIRED",
+            JobState::DeadlineExceeded => "DEADLINE_EXCEEDED",
         }
     }
 
@@ -124,7 +124,7 @@ pub struct Summary {
     pub inlier_tracks: u32,
     pub registered_views: u32,
     pub reprojection_rms_px: Option<f64>,
-    pub winning_prior: Option<Proposal>,
+    pub winning_proposal: Option<Proposal>,
     pub iterations: u32,
     pub seconds: f64,
     /// Size of the stored result in bytes; `ReadJobResult` streams about as much.

@@ -23,7 +23,9 @@ pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
 pub use input_name::InputName;
 pub use left_out::LeftOut;
 pub use limits::Limits;
-pub use progress::{Course, HeadProgress, Losses, Observer, Phase, Progress, Silent, Stage, Step, Task};
+pub use progress::{
+    HeadProgress, Losses, Observer, Phase, Progress, ReconstructionProgress, Silent, Stage, Step, Task,
+};
 pub use quota::{Oversize, Quota};
 pub use result::{Calibration, Grade, LensProjection, Proposal, Solution, Status};
 pub use settings::{Backend, Method, SolveSettings};

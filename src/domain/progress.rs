@@ -138,8 +138,7 @@ pub struct Step {
 
 /// Where a solve is on its way through the views of its input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(default)]
-pub struct Course {
+pub struct ReconstructionProgress {
     /// The block of views that is tried, from 1, and how many are tried at most; 0 before the first.
     pub block: u32,
     pub blocks: u32,
@@ -165,9 +164,7 @@ pub struct Progress {
     pub iteration: u32,
     /// Losses of that iteration; none before the first.
     pub losses: Option<Losses>,
-    /// The head that iteration is of; none where there is no iteration, and in records that were stored before there
-    /// was such a thing.
-    #[serde(default)]
+    /// The head that iteration is of; none where there is no iteration.
     pub head: Option<HeadProgress>,
     /// Inlier tracks of the best hypothesis so far.
     pub inliers: u32,
@@ -179,9 +176,7 @@ pub struct Progress {
     pub best_score: Option<f64>,
     /// Seconds since the attempt began.
     pub elapsed_seconds: f64,
-    /// None of it in records that were stored before there was such a thing.
-    #[serde(default)]
-    pub course: Course,
+    pub reconstruction: ReconstructionProgress,
 }
 
 /// Told of every iteration. Implementations must be quick: they run inside the optimisation.
@@ -203,17 +198,4 @@ pub struct Silent;
 
 impl Observer for Silent {
     fn progress(&mut self, _progress: &Progress) {}
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn records_of_before_there_was_a_course_are_read() {
-        let written = r#"{"stage": "REFINE", "fraction": 0.5, "iteration": 3, "losses": null, "inliers": 4,
-            "focal_px": null, "best_score": 0.25, "elapsed_seconds": 2.0}"#;
-        let read: Progress = serde_json::from_str(written).expect("a record");
-        assert_eq!((read.inliers, read.course), (4, Course::default()));
-    }
 }

@@ -69,7 +69,7 @@ pub enum Proposal {
 }
 
 impl Proposal {
-    /// Every prior.
+    /// Every proposal.
     pub const ALL: [Proposal; 6] = [
         Proposal::Learned,
         Proposal::Network,
@@ -79,7 +79,7 @@ impl Proposal {
         Proposal::Uniform,
     ];
 
-    /// The prior's name in files, metrics and logs.
+    /// The proposal's name in files, metrics and logs.
     pub fn name(self) -> &'static str {
         match self {
             Proposal::Network => "network",
@@ -119,31 +119,22 @@ pub struct Calibration {
     pub sigma_log_focal: Option<f64>,
     pub principal_point_px: [f64; 2],
     /// Vertical over horizontal focal length; 1 (square pixels) unless the data asked for more.
-    #[serde(default = "square_pixels")]
     pub aspect: f64,
-    #[serde(default)]
     pub lens_projection: LensProjection,
     /// Radial distortion: the first coefficient, `k1`.
-    #[serde(default)]
     pub radial_k1: f64,
     /// The second coefficient, `k2`.
-    #[serde(default)]
     pub radial_k2: f64,
     /// The third coefficient, `k3`.
-    #[serde(default)]
     pub radial_k3: f64,
     /// Tangential distortion: the first coefficient, `p1`.
-    #[serde(default)]
     pub tangential_p1: f64,
     /// The second coefficient, `p2`.
-    #[serde(default)]
     pub tangential_p2: f64,
-    /// How far the group's own calibration can be relied on; that of the result is the worst of its groups. `None`: an
-    /// older server did not say.
-    #[serde(default)]
+    /// How far the group's own calibration can be relied on; that of the result is the worst of its groups. `None`: it
+    /// has too few views of its own.
     pub grade: Option<Grade>,
     /// Of the intrinsics beside the focal length.
-    #[serde(default)]
     pub sigmas: Sigmas,
 }
 
@@ -151,10 +142,8 @@ pub struct Calibration {
 ///
 /// They come of the covariance that [`Calibration::sigma_log_focal`] comes of, the doubt about the model included, and
 /// what raises that one (a model that does not fit, a contradicted prior, views that disagree) raises them in the same
-/// proportion. `None`: it was not estimated, see [`Calibration`] for the value that it was taken to have, or an older
-/// server did not say.
+/// proportion. `None`: it was not estimated, see [`Calibration`] for the value that it was taken to have.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
 pub struct Sigmas {
     pub principal_point_px: Option<[f64; 2]>,
     pub aspect: Option<f64>,
@@ -190,13 +179,11 @@ impl Calibration {
     }
 }
 
-fn square_pixels() -> f64 {
-    1.0
-}
-
 /// One view of the result.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ViewResult {
+    /// The view's name in the input.
+    pub name: Option<Box<str>>,
     /// 3x4 projective camera in pixels, row by row, in the frame `P1 = [I|0]` of the first registered view of
     /// its part. `None`: the view is not registered.
     pub projection: Option<[[f64; 4]; 3]>,
@@ -205,17 +192,13 @@ pub struct ViewResult {
     pub rotation: Option<[[f64; 3]; 3]>,
     pub translation: Option<[f64; 3]>,
     /// The view's own focal length; `None` where that of the calibration is every view's, and where there is no pose.
-    #[serde(default)]
     pub focal_px: Option<f64>,
     /// Which reconstruction the view belongs to, the largest first: views that share no tracks have frames and scales
     /// of their own. 0 where there is one, and for views that are not registered.
-    #[serde(default)]
     pub part: u32,
     /// The view's camera group, by the input's number.
-    #[serde(default)]
     pub camera_group: u32,
     /// Why the view is not registered; `None` where it is, and where nothing was reconstructed.
-    #[serde(default)]
     pub left_out: Option<LeftOut>,
 }
 
@@ -236,7 +219,6 @@ pub struct TrackResults {
     /// `None` for tracks that are not inliers.
     pub point: Vec<Option<[f64; 3]>>,
     /// Reconstruction in whose frame each track's point is, see [`ViewResult::part`]; empty: all are in that of part 0.
-    #[serde(default)]
     pub part: Vec<u32>,
 }
 
@@ -262,11 +244,9 @@ pub struct ObservationResults {
     pub residual_px: Vec<Option<f64>>,
     /// Probability that the observation shows its track's point, if the track is right: times the track's weight, that
     /// it is right. 0 where it was not judged.
-    #[serde(default)]
     pub weight: Vec<f32>,
     /// 0, or which of the other points that its track joins the observation shows: see [`TrackSplit::number`]. Such an
     /// observation is no inlier of its track.
-    #[serde(default)]
     pub split: Vec<u32>,
 }
 
@@ -303,11 +283,11 @@ pub struct StageTime {
     pub seconds: f64,
 }
 
-/// When a prior, verified alone, first stood at a consensus as good as the accepted one.
+/// When a proposal, verified alone, first stood at a consensus as good as the accepted one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct PriorTime {
-    pub prior: Proposal,
-    /// Seconds of that prior's own work, proposing and verifying; `None`: it never did within the search.
+pub struct ProposalTime {
+    pub proposal: Proposal,
+    /// Seconds of that proposal's own work, proposing and verifying; `None`: it never did within the search.
     pub seconds: Option<f64>,
     /// Network iterations (network) or hypotheses (others) it had used by then.
     pub iterations: u32,
@@ -320,8 +300,8 @@ pub struct Solution {
     /// `None` without a reconstruction.
     pub grade: Option<Grade>,
     pub method: Method,
-    /// Prior whose sample led to the accepted consensus; `None` where nothing was accepted or nothing was sampled.
-    pub winning_prior: Option<Proposal>,
+    /// Proposal whose sample led to the accepted consensus; `None` where nothing was accepted or nothing was sampled.
+    pub winning_proposal: Option<Proposal>,
     /// Network iterations spent.
     pub iterations: u32,
     pub seed: u64,
@@ -334,7 +314,6 @@ pub struct Solution {
     pub tracks: TrackResults,
     pub observations: ObservationResults,
     /// The other points of tracks that join several, by track and number.
-    #[serde(default)]
     pub splits: Vec<TrackSplit>,
     /// Estimated observation noise, one standard deviation of a coordinate, in pixels.
     pub noise_px: Option<f64>,
@@ -344,15 +323,13 @@ pub struct Solution {
     pub warnings: Vec<Warning>,
     pub seconds: f64,
     pub stages: Vec<StageTime>,
-    /// Debug output: what each prior alone would have needed.
-    pub prior_times: Vec<PriorTime>,
+    /// Debug output: what each proposal alone would have needed.
+    pub proposal_times: Vec<ProposalTime>,
     /// Curves for the report: progress records thinned to at most [`Solution::MAX_HISTORY`].
     pub history: Vec<Progress>,
     /// SHA-256 of the trained network that AUTO had at hand, hexadecimal; `None` where it was not to be asked.
-    #[serde(default)]
     pub trained_network: Option<String>,
-    /// [`RawInput::sha256`](super::RawInput::sha256) of the input; `None` in results of older versions.
-    #[serde(default)]
+    /// [`RawInput::sha256`](super::RawInput::sha256) of the input; `None` before it was hashed.
     pub input_sha256: Option<String>,
 }
 

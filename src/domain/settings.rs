@@ -94,7 +94,7 @@ pub struct SolveSettings {
     /// Backend of the network; `None` takes the server's.
     pub backend: Option<Backend>,
     /// Priors that AUTO and GEOMETRY leave out: for ablations, not for callers.
-    pub excluded_priors: Vec<Proposal>,
+    pub excluded_proposals: Vec<Proposal>,
 }
 
 impl SolveSettings {
@@ -213,7 +213,7 @@ impl Default for SolveSettings {
             focal_per_view: false,
             weights_every: 0,
             backend: None,
-            excluded_priors: Vec::new(),
+            excluded_proposals: Vec::new(),
         }
     }
 }

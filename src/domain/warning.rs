@@ -46,8 +46,6 @@ pub enum WarningCode {
     DuplicateTracks,
     /// Tracks stay where they are in the image while others move, and no scene holds them.
     StaticTracks,
-    /// The deadline stopped the search; this is the best found by then. Not given yet: such a job expires.
-    StoppedEarly,
 }
 
 impl WarningCode {
@@ -72,8 +70,7 @@ impl WarningCode {
             | WarningCode::CameraGroupsMerged
             | WarningCode::UnverifiedRanking
             | WarningCode::DuplicateTracks
-            | WarningCode::StaticTracks
-            | WarningCode::StoppedEarly => false,
+            | WarningCode::StaticTracks => false,
         }
     }
 
@@ -99,7 +96,6 @@ impl WarningCode {
             WarningCode::UnverifiedRanking => "UNVERIFIED_RANKING",
             WarningCode::DuplicateTracks => "DUPLICATE_TRACKS",
             WarningCode::StaticTracks => "STATIC_TRACKS",
-            WarningCode::StoppedEarly => "STOPPED_EARLY",
         }
     }
 }

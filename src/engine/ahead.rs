@@ -11,7 +11,7 @@ use std::time::SystemTime;
 
 use tokio::sync::oneshot;
 
-use super::course::{Wait, stop_token};
+use super::execution::{Wait, stop_token};
 use super::worker::{Assignment, Began, Heard, Opening, Worker};
 use super::{Inner, Phase, locked};
 use crate::domain::job::{Job, JobName};

@@ -7,7 +7,7 @@ use tracing::{Instrument, Span};
 
 use super::Inner;
 use super::ahead::Ahead;
-use super::course::{Course, End, Leasing, Wait};
+use super::execution::{End, JobExecution, Leasing, Wait};
 use super::observe::Attempt;
 use super::worker::{Began, Verdict, Worker};
 use crate::store::Claimed;
@@ -22,7 +22,7 @@ pub(super) enum Ready {
 
 /// An attempt whose input is read.
 pub(super) struct Begun {
-    course: Course,
+    execution: JobExecution,
     attempt: Attempt,
     /// Or why there is nothing to solve.
     input: Result<Vec<u8>, Verdict>,
@@ -36,9 +36,9 @@ pub(super) async fn begin(inner: &Arc<Inner>, claimed: Claimed) -> Ready {
     // All of it inside the span, so that every line carries the job's name.
     let span = attempt.span().clone();
     async {
-        let mut course = Course::begin(inner.clone(), job, lease, wait);
-        let input = course.prepare().await;
-        Ready::Claimed(Box::new(Begun { course, attempt, input }))
+        let mut execution = JobExecution::begin(inner.clone(), job, lease, wait);
+        let input = execution.prepare().await;
+        Ready::Claimed(Box::new(Begun { execution, attempt, input }))
     }
     .instrument(span)
     .await
@@ -58,25 +58,26 @@ impl Ready {
     pub(super) async fn run(self, worker: &Worker) -> Ran {
         match self {
             Self::Claimed(begun) => {
-                let Begun { mut course, attempt, input } = *begun;
+                let Begun { mut execution, attempt, input } = *begun;
                 let span = attempt.span().clone();
                 let end = match input {
-                    Ok(input) => course.run(worker, attempt, input).instrument(span.clone()).await,
+                    Ok(input) => execution.run(worker, attempt, input).instrument(span.clone()).await,
                     Err(verdict) => End { verdict, latest: None, attempt: Some(attempt) },
                 };
-                Ran::Done(Box::new(Done { course, end, span }))
+                Ran::Done(Box::new(Done { execution, end, span }))
             }
             Self::Foreseen(ahead) => {
                 let Ahead { job, lease, wait, reserved, stop, begun, heard } = *ahead;
                 let Ok(Began { span, at, time }) = begun.await else { return Ran::Gone };
                 // Where another slot has it by now, what the worker has begun is stopped.
-                let Some(mut course) = Course::foreseen(job, lease, wait, stop.token().clone(), reserved) else {
+                let Some(mut execution) = JobExecution::foreseen(job, lease, wait, stop.token().clone(), reserved)
+                else {
                     return Ran::Gone;
                 };
                 stop.keep();
-                let (leasing, end) = course.run_foreseen(at, time, heard).instrument(span.clone()).await;
+                let (leasing, end) = execution.run_foreseen(at, time, heard).instrument(span.clone()).await;
                 match leasing {
-                    Leasing::Leased => Ran::Done(Box::new(Done { course, end, span })),
+                    Leasing::Leased => Ran::Done(Box::new(Done { execution, end, span })),
                     Leasing::Gone => Ran::Gone,
                     Leasing::Failed => Ran::NotLeased,
                 }
@@ -87,7 +88,7 @@ impl Ready {
 
 /// An attempt that is over, and that the store does not know of yet.
 pub(super) struct Done {
-    course: Course,
+    execution: JobExecution,
     end: End,
     span: Span,
 }
@@ -95,6 +96,6 @@ pub(super) struct Done {
 impl Done {
     /// Commits what it came to, on a task of its own.
     pub(super) fn commit(self) -> JoinHandle<()> {
-        tokio::spawn(self.course.conclude(self.end).instrument(self.span))
+        tokio::spawn(self.execution.conclude(self.end).instrument(self.span))
     }
 }

@@ -9,7 +9,7 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use super::worker::Worker;
-use super::{Error, Inner, Phase, Solver, locked, slot};
+use super::{Error, Inner, Phase, ResultEncoder, Solver, locked, slot};
 use crate::domain::StopReason;
 
 /// How long a job that was asked to stop may take to do so: ten times the solver's promise of 200 ms, and a slow disk.
@@ -39,12 +39,12 @@ pub(super) struct WorkerPool {
 
 impl Inner {
     /// Starts worker threads, their slots and the sweeper.
-    pub(super) fn hire(self: &Arc<Self>, solver: Solver) -> Result<(), Error> {
+    pub(super) fn hire(self: &Arc<Self>, solver: &Solver, encode: ResultEncoder) -> Result<(), Error> {
         let (alive, threads_ended) = mpsc::channel(1);
         let mut pool = WorkerPool { threads_ended: Some(threads_ended), ..WorkerPool::default() };
         let mut workers = Vec::new();
         for index in 0..self.options.workers.max(1) {
-            let (worker, thread) = Worker::start(index, solver.clone(), alive.clone())
+            let (worker, thread) = Worker::start(index, solver.clone(), encode, alive.clone())
                 .map_err(|error| Error::Internal(format!("cannot start worker thread {index}: {error}")))?;
             workers.push(worker);
             pool.threads.push(thread);

@@ -4,9 +4,9 @@
 
 mod ahead;
 mod attempt;
-mod course;
 mod drain;
 mod error;
+mod execution;
 mod hints;
 mod hub;
 mod observe;
@@ -27,8 +27,8 @@ use tokio::sync::{Notify, watch as channel};
 use tokio_util::sync::CancellationToken;
 
 pub use crate::store::{
-    InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, StoredInput, UploadBounds,
-    UploadStatus,
+    EncodedResult, InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, StoredInput,
+    UploadBounds, UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;
 pub use drain::Drained;
@@ -41,11 +41,14 @@ use crate::domain::job::{Job, JobName, JobState};
 use crate::domain::{Backend, Input, Observer, Solution, SolveSettings, StopToken};
 use crate::parallel::Threads;
 use crate::solver;
-use crate::store::{Lease, Store, payload};
+use crate::store::{self, Lease, Store};
 
 /// What workers run; [`default_solver`] in earnest, a stand-in in tests.
 pub type Solver =
     Arc<dyn Fn(&Input, &SolveSettings, &mut dyn Observer, &StopToken) -> Result<Solution, solver::Error> + Send + Sync>;
+
+/// How a result is encoded, once, for all who read it: what it means is theirs to know.
+pub type ResultEncoder = fn(&JobName, &Solution) -> Vec<u8>;
 
 /// The real solver, each job on its worker's thread alone.
 pub fn default_solver() -> Solver {
@@ -199,7 +202,12 @@ impl Engine {
     ///
     /// # Errors
     /// [`Error::Internal`] when the store or a thread refuses.
-    pub async fn start(mut options: Options, store: Arc<dyn Store>, solver: Solver) -> Result<Self, Error> {
+    pub async fn start(
+        mut options: Options,
+        store: Arc<dyn Store>,
+        solver: Solver,
+        encode: ResultEncoder,
+    ) -> Result<Self, Error> {
         options.lease = options.lease.clamp(Options::MIN_LEASE, Options::MAX_LEASE);
         let recovered = store.recover(SystemTime::now(), options.max_attempts).await?;
         let inner = Arc::new(Inner {
@@ -219,7 +227,7 @@ impl Engine {
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
         observe::store_state(StoreState::Sound);
         inner.taken_back(&recovered);
-        inner.hire(solver)?;
+        inner.hire(&solver, encode)?;
         inner.queue_changed();
         Ok(Self { inner })
     }
@@ -315,19 +323,21 @@ impl Engine {
         &self.inner.options
     }
 
-    /// The result of a succeeded job.
+    /// The encoded result of a succeeded job.
     ///
     /// # Errors
-    /// [`Error::NotFound`], [`Error::NotReady`] for a job in any other state.
-    pub async fn result(&self, name: &JobName) -> Result<Solution, Error> {
+    /// [`Error::NotFound`], [`Error::NotReady`] for a job in any other state, [`Error::Internal`] for one that is not
+    /// what was stored.
+    pub async fn result(&self, name: &JobName) -> Result<EncodedResult, Error> {
         let state = self.inner.store.job(name).await?.state;
         if state != JobState::Succeeded {
             return Err(Error::NotReady(state));
         }
-        let bytes = self.inner.store.result(name).await?.ok_or_else(|| Error::NotFound(name.clone()))?;
-        // Megabytes of arrays: not on a thread that serves others.
-        let decoded = tokio::task::spawn_blocking(move || payload::decode(&bytes, "a result"));
-        finished(decoded).await
+        let result = self.inner.store.result(name).await?.ok_or_else(|| Error::NotFound(name.clone()))?;
+        let corrupt = store::Error::Corrupt(format!("the result of {name} is not what was stored"));
+        // Megabytes to hash: not on a thread that serves others.
+        let checked = move || if result.is_intact() { Ok(result) } else { Err(corrupt) };
+        finished(tokio::task::spawn_blocking(checked)).await
     }
 
     /// What waits and what runs.

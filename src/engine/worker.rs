@@ -11,14 +11,14 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 use tracing::Span;
 
-use super::Solver;
 use super::ahead::Reserved;
 use super::hub::Subscription;
 use super::observe::Attempt;
+use super::{ResultEncoder, Solver};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, Summary};
 use crate::domain::{Input, Observer, Progress, Solution, SolveSettings, Stage, StopReason, StopToken};
 use crate::solver;
-use crate::store::payload;
+use crate::store::{EncodedResult, payload};
 
 /// Stack of a worker: the numerics recurse little, but keep small matrices on it; the main thread's usual size.
 const STACK_BYTES: usize = 8 << 20;
@@ -90,8 +90,7 @@ pub(super) struct Report {
 pub(super) enum Verdict {
     Solved {
         summary: Summary,
-        /// Encoded solution.
-        result: Vec<u8>,
+        result: EncodedResult,
     },
     Stopped(StopReason),
     /// A defect: the solver's error, a panic, an input that cannot be read.
@@ -112,6 +111,7 @@ impl Worker {
     pub(super) fn start(
         index: usize,
         solver: Solver,
+        encode: ResultEncoder,
         alive: mpsc::Sender<()>,
     ) -> std::io::Result<(Self, thread::JoinHandle<()>)> {
         let (assignments, mut inbox) = mpsc::channel::<Assignment>(1);
@@ -119,7 +119,7 @@ impl Worker {
             thread::Builder::new().name(format!("solver-{index}")).stack_size(STACK_BYTES).spawn(move || {
                 let _alive = alive;
                 while let Some(assignment) = inbox.blocking_recv() {
-                    work(assignment, &solver);
+                    work(assignment, &solver, encode);
                 }
             })?;
         Ok((Self { assignments }, handle))
@@ -154,14 +154,14 @@ impl Opening {
     }
 }
 
-fn work(assignment: Assignment, solver: &Solver) {
+fn work(assignment: Assignment, solver: &Solver, encode: ResultEncoder) {
     let Assignment { name, number, opening, input, settings, stop, progress, subscription, reply } = assignment;
     let Some(mut attempt) = opening.open(&name, number) else { return };
     attempt.at_work();
     let span = attempt.span().clone();
     let _entered = span.enter();
     let mut reporter = Reporter { name, number, progress, subscription, attempt };
-    let verdict = catch_unwind(AssertUnwindSafe(|| solve(input, &settings, &mut reporter, &stop, solver)))
+    let verdict = catch_unwind(AssertUnwindSafe(|| solve(input, &settings, &mut reporter, &stop, solver, encode)))
         .unwrap_or_else(|panic| Verdict::Broken(format!("the solver panicked: {}", panic_message(panic.as_ref()))));
     reporter.attempt.at_rest();
     // Nobody listens any more when the engine went down with its runtime; the store then tells the next start.
@@ -174,6 +174,7 @@ fn solve(
     reporter: &mut Reporter,
     stop: &StopToken,
     solver: &Solver,
+    encode: ResultEncoder,
 ) -> Verdict {
     let decoded: Input = match payload::decode(&input, "the job's input") {
         Ok(decoded) => decoded,
@@ -181,10 +182,10 @@ fn solve(
     };
     drop(input);
     match solver(&decoded, settings, reporter, stop) {
-        Ok(solution) => match payload::encode(&solution) {
-            Ok(result) => Verdict::Solved { summary: summarise(&solution, result.len() as u64), result },
-            Err(error) => Verdict::Broken(error.to_string()),
-        },
+        Ok(solution) => {
+            let result = EncodedResult::new(encode(&reporter.name, &solution));
+            Verdict::Solved { summary: summarise(&solution, result.bytes.len() as u64), result }
+        }
         Err(solver::Error::Stopped(reason)) => Verdict::Stopped(reason),
         Err(solver::Error::Internal(message)) => Verdict::Broken(message),
     }
@@ -201,7 +202,7 @@ fn summarise(solution: &Solution, result_bytes: u64) -> Summary {
         inlier_tracks: count(solution.inlier_track_count()),
         registered_views: count(solution.registered_views().len()),
         reprojection_rms_px: solution.reprojection_rms_px,
-        winning_prior: solution.winning_prior,
+        winning_proposal: solution.winning_proposal,
         iterations: solution.iterations,
         seconds: solution.seconds,
         result_bytes,

@@ -34,7 +34,7 @@ pub struct Measures {
     pub warnings: Vec<WarningCode>,
     pub seconds: f64,
     /// Of AUTO and GEOMETRY: what stood first, by prior.
-    pub winning_prior: Option<crate::domain::Proposal>,
+    pub winning_proposal: Option<crate::domain::Proposal>,
     /// Network iterations spent.
     pub iterations: u32,
 }
@@ -93,7 +93,7 @@ impl Measures {
             grade: solution.grade,
             warnings: solution.warnings.iter().map(|warning| warning.code).collect(),
             seconds: solution.seconds,
-            winning_prior: solution.winning_prior,
+            winning_proposal: solution.winning_proposal,
             iterations: solution.iterations,
         }
     }

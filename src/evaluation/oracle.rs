@@ -48,7 +48,7 @@ pub fn measure(scene: &Scene) -> Measures {
         grade: None,
         warnings: Vec::new(),
         seconds: begun.elapsed().as_secs_f64(),
-        winning_prior: None,
+        winning_proposal: None,
         iterations: 0,
     }
 }

@@ -153,9 +153,9 @@ impl Run {
 
     /// The settings that the contestant solves with; `None` for the oracle, which does not solve.
     pub fn settings(&self) -> Option<SolveSettings> {
-        let (_, method, use_daq, excluded_priors) = self.contestant.definition();
+        let (_, method, use_daq, excluded_proposals) = self.contestant.definition();
         Some(SolveSettings {
-            excluded_priors,
+            excluded_proposals,
             use_daq,
             seed: self.scene.seed,
             epipolar_depths: self.epipolar_depths,

@@ -84,7 +84,7 @@ impl CamerasJson {
             let calibration =
                 groups.get(index).and_then(|&group| solution.calibrations.get(group)).filter(|_| is_metric);
             CameraJson {
-                view: view_label(input, index),
+                view: view_label(solution, input, index),
                 registered: view.projection.is_some(),
                 part: view.projection.map(|_| view.part),
                 P: view.projection,

@@ -4,10 +4,10 @@ use nalgebra::{Matrix3, Matrix3x4, Matrix4, Vector3};
 use std::path::Path;
 
 use super::{Label, LabelledInput};
-use crate::domain::result::{ObservationResults, PriorTime, StageTime, TrackResults, TrackSplit, ViewResult};
+use crate::domain::result::{ObservationResults, ProposalTime, StageTime, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{
-    Calibration, Course, Grade, HeadProgress, LeftOut, LensProjection, Losses, Method, Phase, Progress, Proposal,
-    Solution, Stage, Status, Warning, WarningCode,
+    Calibration, Grade, HeadProgress, LeftOut, LensProjection, Losses, Method, Phase, Progress, Proposal,
+    ReconstructionProgress, Solution, Stage, Status, Warning, WarningCode,
 };
 use crate::synthetic::{Scene, SceneOptions, Sequence, SequenceOptions};
 
@@ -178,7 +178,7 @@ fn solution(scene: &Scene) -> Solution {
         status: Status::Solved,
         grade: Some(Grade::Metric),
         method: Method::Auto,
-        winning_prior: Some(Proposal::Network),
+        winning_proposal: Some(Proposal::Network),
         iterations: 150,
         seed: scene.options.seed,
         calibrations: vec![Calibration {
@@ -225,7 +225,7 @@ fn solution(scene: &Scene) -> Solution {
         warnings: vec![Warning::new(WarningCode::FewInliers, "<b>hostile</b> & \"quoted\" detail")],
         seconds: 1.5,
         stages: Stage::ALL.iter().map(|&stage| StageTime { stage, seconds: 0.3 }).collect(),
-        prior_times: vec![PriorTime { prior: Proposal::Uniform, seconds: None, iterations: 600 }],
+        proposal_times: vec![ProposalTime { proposal: Proposal::Uniform, seconds: None, iterations: 600 }],
         history: history(truth.focal_px),
         trained_network: None,
         input_sha256: None,
@@ -251,7 +251,7 @@ fn history(focal_px: f64) -> Vec<Progress> {
                     .then(|| focal_px * (1.0 + 0.1 * (1.0 - share) * (f64::from(iteration)).sin())),
                 best_score: (iteration > 10).then_some(1.0 - 0.5 * share),
                 elapsed_seconds: share * 1.5,
-                course: Course::default(),
+                reconstruction: ReconstructionProgress::default(),
             }
         })
         .collect()

@@ -36,6 +36,15 @@ impl LabelledInput {
         }
     }
 
+    /// Has the names of images travel with the input, where the file has names for them.
+    pub(super) fn name_views(&mut self) {
+        for (view, label) in self.raw.views.iter_mut().zip(&self.view_labels) {
+            if let Label::Name(name) = label {
+                view.name = Some(name.clone());
+            }
+        }
+    }
+
     /// The file as sentences about it begin.
     pub fn display_path(&self) -> String {
         display_path(&self.path)
@@ -67,9 +76,17 @@ impl LabelledInput {
         }
     }
 
-    /// A violation's field is a path of the API (`track_set.x`); its last part is the file's column.
+    /// A violation's field is a path of the API, such as `track_set.xs`; its last part names the file's column.
     fn problem(&self, violation: &Violation) -> Problem {
-        let column = violation.field.rsplit('.').next().unwrap_or_default();
+        let column = match violation.field.rsplit('.').next().unwrap_or_default() {
+            "view_indices" => "view",
+            "track_indices" => "track",
+            "xs" => "x",
+            "ys" => "y",
+            "depths" => "depth",
+            "sigmas_px" => "sigma",
+            other => other,
+        };
         let place = violation.index.and_then(|index| match column {
             "view" | "track" | "x" | "y" | "depth" | "sigma" => self.place(index, column),
             "views" => self.view_labels.get(index).map(|label| (Place::File, format!("view {label}"))),

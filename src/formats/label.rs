@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-use super::text::quote;
+use crate::domain::View;
 
 /// The caller's own id of a view or a track. Numbers come before names.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
@@ -15,26 +15,15 @@ pub enum Label {
 }
 
 impl Label {
-    /// Longest name in bytes. Paths have at most 4,096 on the usual systems.
-    pub const MAX_NAME_BYTES: usize = 4096;
-
     /// Longest name that a page or a sentence shows, in characters: a page shows a name several times.
     pub const LONGEST_SHOWN: usize = 48;
 
     /// A name, as of an image.
     ///
     /// # Errors
-    /// Empty, too long, or with control characters, which would break the lines of result files.
+    /// As [`View::check_name`].
     pub fn name(text: &str) -> Result<Self, String> {
-        if text.is_empty() {
-            Err("has no name".into())
-        } else if text.len() > Self::MAX_NAME_BYTES {
-            Err(format!("the name {} is longer than {} bytes", quote(text), Self::MAX_NAME_BYTES))
-        } else if text.chars().any(char::is_control) {
-            Err(format!("the name {} holds control characters", quote(text)))
-        } else {
-            Ok(Label::Name(text.into()))
-        }
+        View::check_name(text).map(|()| Label::Name(text.into()))
     }
 
     /// An id that is a number or a name: a number where it is written as numbers are, so that no two ids become one.
@@ -111,7 +100,7 @@ mod tests {
             assert_eq!(Label::parse(name), Ok(Label::Name(name.into())), "{name}");
         }
         assert!(Label::parse("").is_err() && Label::name("a\nb").is_err());
-        assert!(Label::name(&"x".repeat(Label::MAX_NAME_BYTES + 1)).is_err());
+        assert!(Label::name(&"x".repeat(View::MAX_NAME_BYTES + 1)).is_err());
     }
 
     #[test]

@@ -161,7 +161,7 @@ fn images(solution: &Solution, input: &LabelledInput, part: u32) -> (Vec<Camera>
         images.push(Image {
             // Without ids of its own, an input's views are numbered from 1, as COLMAP does.
             id: input.image_ids.get(view).copied().unwrap_or(view as u32 + 1),
-            name: view_label(Some(input), view),
+            name: view_label(solution, Some(input), view),
             camera,
             rotation: quaternion(rotation),
             translation,

@@ -123,7 +123,7 @@ fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {
         };
         text.push_str(&format!(
             "{},{},{},{},{},{}\n",
-            view_label(Some(input), view as usize).csv(),
+            view_label(solution, Some(input), view as usize).csv(),
             track_label(Some(input), track as usize).csv(),
             u8::from(inlier),
             residual.map_or_else(String::new, |px| px.to_string()),

@@ -69,12 +69,12 @@ fn the_fields_of_result_json_are_a_contract() {
         "warnings",
         "method",
         "iterations",
-        "winning_prior",
+        "winning_proposal",
         "trained_network",
         "noise_px",
         "seconds",
         "stages",
-        "prior_times",
+        "proposal_times",
         "seed",
         "version",
     ];
@@ -83,7 +83,7 @@ fn the_fields_of_result_json_are_a_contract() {
     assert_eq!(result["status"], "SOLVED");
     assert_eq!(result["grade"], "METRIC");
     assert_eq!(result["method"], "AUTO");
-    assert_eq!(result["winning_prior"], "network");
+    assert_eq!(result["winning_proposal"], "network");
     assert_eq!(result["inlier_tracks"], 20);
     assert_eq!(result["inlier_observations"], 100);
     assert_eq!(result["registered_views"], 5);
@@ -94,8 +94,8 @@ fn the_fields_of_result_json_are_a_contract() {
     assert_eq!(result["warnings"][0]["code"], "FEW_INLIERS");
     assert_eq!(keys(&result["stages"][0]), ["name", "seconds"]);
     assert_eq!(result["stages"][0]["name"], "prepare");
-    assert_eq!(result["prior_times"][0]["prior"], "uniform");
-    assert_eq!(result["prior_times"][0]["seconds"], Value::Null);
+    assert_eq!(result["proposal_times"][0]["proposal"], "uniform");
+    assert_eq!(result["proposal_times"][0]["seconds"], Value::Null);
 }
 
 #[test]

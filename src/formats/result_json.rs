@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::domain::result::PriorTime;
+use crate::domain::result::ProposalTime;
 use crate::domain::{Calibration, Grade, LensProjection, Method, Solution, Status, Warning, WarningCode};
 
 use super::{Label, LabelledInput, warnings};
@@ -55,14 +55,14 @@ pub struct ResultJson {
     pub noise_px: Option<f64>,
     pub warnings: Vec<Warning>,
     pub method: Method,
-    pub winning_prior: Option<&'static str>,
+    pub winning_proposal: Option<&'static str>,
     /// SHA-256 of the trained network that AUTO had at hand.
     pub trained_network: Option<String>,
     pub iterations: u32,
     pub seed: u64,
     pub seconds: f64,
     pub stages: Vec<StageJson>,
-    pub prior_times: Vec<PriorTimeJson>,
+    pub proposal_times: Vec<ProposalTimeJson>,
     /// Version of the program that wrote the file.
     pub version: &'static str,
 }
@@ -109,10 +109,10 @@ pub struct StageJson {
     pub seconds: f64,
 }
 
-/// When a prior, verified alone, would have sufficed.
+/// When a proposal, verified alone, would have sufficed.
 #[derive(Debug, Clone, Serialize)]
-pub struct PriorTimeJson {
-    pub prior: &'static str,
+pub struct ProposalTimeJson {
+    pub proposal: &'static str,
     /// Null: it never did within the search.
     pub seconds: Option<f64>,
     pub iterations: u32,
@@ -162,9 +162,9 @@ pub fn camera_groups(solution: &Solution) -> Vec<CameraGroupJson> {
     solution.cameras().into_iter().map(entry).collect()
 }
 
-impl From<&PriorTime> for PriorTimeJson {
-    fn from(time: &PriorTime) -> Self {
-        Self { prior: time.prior.name(), seconds: time.seconds, iterations: time.iterations }
+impl From<&ProposalTime> for ProposalTimeJson {
+    fn from(time: &ProposalTime) -> Self {
+        Self { proposal: time.proposal.name(), seconds: time.seconds, iterations: time.iterations }
     }
 }
 
@@ -205,7 +205,7 @@ impl ResultJson {
             noise_px: solution.noise_px,
             warnings: warnings::named(solution, input),
             method: solution.method,
-            winning_prior: solution.winning_prior.map(|prior| prior.name()),
+            winning_proposal: solution.winning_proposal.map(|proposal| proposal.name()),
             trained_network: solution.trained_network.clone(),
             iterations: solution.iterations,
             seed: solution.seed,
@@ -215,16 +215,18 @@ impl ResultJson {
                 .iter()
                 .map(|time| StageJson { name: time.stage.name(), seconds: time.seconds })
                 .collect(),
-            prior_times: solution.prior_times.iter().map(PriorTimeJson::from).collect(),
+            proposal_times: solution.proposal_times.iter().map(ProposalTimeJson::from).collect(),
             version: env!("CARGO_PKG_VERSION"),
             cameras,
         }
     }
 }
 
-/// The caller's id of view `index`, or the index where the input is not at hand.
-pub fn view_label(input: Option<&LabelledInput>, index: usize) -> Label {
-    input.and_then(|input| input.view_labels.get(index).cloned()).unwrap_or(Label::Number(index as u64))
+/// The caller's id of view `index`; where the input is not at hand, the name that came with it, or the index.
+pub fn view_label(solution: &Solution, input: Option<&LabelledInput>, index: usize) -> Label {
+    let of_file = || input?.view_labels.get(index).cloned();
+    let of_result = || solution.views.get(index)?.name.clone().map(Label::Name);
+    of_file().or_else(of_result).unwrap_or(Label::Number(index as u64))
 }
 
 /// The caller's id of track `index`, or the index where the input is not at hand.

@@ -68,12 +68,14 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
     if reading.matches.is_some() && format != Format::ColmapDatabase {
         return Err(whole("is no COLMAP database; leave out --matches".into()));
     }
-    match format {
+    let mut labelled = match format {
         Format::Observations => observations::read(path, limits, reading.size),
         Format::OpenSfm => opensfm::tracks::read(path, limits, reading.size),
         Format::ColmapDatabase => colmap::database::read(path, limits, reading.matches),
         Format::ColmapModel => colmap::model::read(path, limits),
-    }
+    }?;
+    labelled.name_views();
+    Ok(labelled)
 }
 
 /// Tells a kind from names and first bytes; what is nothing else is taken for a table of observations, whose reader

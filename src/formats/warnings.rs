@@ -9,7 +9,7 @@ use crate::domain::{Limits, Solution, Warning, WarningCode, left_out};
 /// them.
 pub fn named(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Warning> {
     let Some(input) = input else { return solution.warnings.clone() };
-    let told = left_out::warnings(&solution.views, |view| view_label(Some(input), view).shown());
+    let told = left_out::warnings(&solution.views, |view| view_label(solution, Some(input), view).shown());
     let mut warnings: Vec<Warning> = solution.warnings.clone();
     if !told.is_empty() {
         warnings.retain(|warning| warning.code != WarningCode::ViewsLeftOut);

@@ -188,8 +188,8 @@ fn summary(solution: &Solution, input: &LabelledInput, of_tracks: &[Vec<u32>]) -
         let _ = writeln!(
             html,
             "<tr><td>{}</td><td>{}</td><td>{}</td></tr>",
-            escape(&labels::view(Some(input), link.from)),
-            escape(&labels::view(Some(input), link.to)),
+            escape(&labels::view(solution, Some(input), link.from)),
+            escape(&labels::view(solution, Some(input), link.to)),
             link.tracks
         );
     }

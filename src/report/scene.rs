@@ -155,7 +155,7 @@ fn views(
         let result = solution.views.get(view).filter(|view| view.projection.is_some());
         let worst: Vec<Value> = count.worst.iter().map(|&(px, track)| json!([name(track), short(px)])).collect();
         json!([
-            labels::view(Some(input), view),
+            labels::view(solution, Some(input), view),
             u8::from(result.is_some()),
             result.map_or(0, |view| view.part),
             rounded(*x0),

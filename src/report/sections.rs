@@ -5,7 +5,7 @@ use std::fmt::Write;
 use super::chart::{self, LineChart, Series};
 use super::html::{escape, short};
 use super::words;
-use crate::domain::result::PriorTime;
+use crate::domain::result::ProposalTime;
 use crate::domain::{Calibration, Grade, HeadProgress, LensProjection, Losses, Progress, Solution, Status};
 use crate::formats::LabelledInput;
 use crate::formats::warnings::named;
@@ -57,9 +57,10 @@ pub fn headline(solution: &Solution) -> String {
         let noise = solution.noise_px.map_or_else(String::new, |px| format!("RMS; noise {} px", short(px)));
         card("reprojection error", format!("{} px", short(rms_px)), noise);
     }
-    let prior =
-        solution.winning_prior.map_or_else(String::new, |prior| format!(", found by the prior {}", prior.name()));
-    card("method", solution.method.name().into(), format!("{} network iterations{prior}", solution.iterations));
+    let proposal = solution
+        .winning_proposal
+        .map_or_else(String::new, |proposal| format!(", found by the proposal {}", proposal.name()));
+    card("method", solution.method.name().into(), format!("{} network iterations{proposal}", solution.iterations));
     card("time", format!("{:.2} s", solution.seconds), stage_times(solution));
     html.push_str("</dl>\n</header>\n");
     html
@@ -176,7 +177,7 @@ pub fn convergence(solution: &Solution) -> String {
     format!(
         "<section id=\"convergence\">\n<h2>Convergence</h2>\n<div class=\"grid\">\n{}</div>\n{}</section>\n",
         figures.concat(),
-        prior_times(solution)
+        proposal_times(solution)
     )
 }
 
@@ -255,22 +256,22 @@ fn stage_starts(history: &[Progress]) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// What each prior alone would have needed, on one line: it holds times.
-fn prior_times(solution: &Solution) -> String {
-    if solution.prior_times.is_empty() {
+/// What each proposal alone would have needed, on one line: it holds times.
+fn proposal_times(solution: &Solution) -> String {
+    if solution.proposal_times.is_empty() {
         return String::new();
     }
-    let sentence = |time: &PriorTime| {
+    let sentence = |time: &ProposalTime| {
         let when = match time.seconds {
             Some(seconds) => format!("{seconds:.2} s ({} steps)", time.iterations),
             None if time.iterations == 0 => "not asked".to_owned(),
             None => format!("never ({} steps)", time.iterations),
         };
-        format!("{} {when}", time.prior.name())
+        format!("{} {when}", time.proposal.name())
     };
-    let times: Vec<String> = solution.prior_times.iter().map(sentence).collect();
+    let times: Vec<String> = solution.proposal_times.iter().map(sentence).collect();
     format!(
-        "<p class=\"note\" id=\"prior-times\">Until a consensus as good as the accepted one, each prior alone: {}.</p>\n",
+        "<p class=\"note\" id=\"proposal-times\">Until a consensus as good as the accepted one, each proposal alone: {}.</p>\n",
         escape(&times.join(", "))
     )
 }
@@ -365,12 +366,12 @@ mod tests {
     }
 
     #[test]
-    fn priors_that_never_sufficed_say_so() {
+    fn proposals_that_never_sufficed_say_so() {
         let (_, mut solution) = fixture::solved();
-        assert!(prior_times(&solution).contains("uniform never (600 steps)"));
-        solution.prior_times.iter_mut().for_each(|time| (time.seconds, time.iterations) = (None, 0));
-        assert!(prior_times(&solution).contains("uniform not asked"));
-        solution.prior_times.clear();
-        assert!(prior_times(&solution).is_empty());
+        assert!(proposal_times(&solution).contains("uniform never (600 steps)"));
+        solution.proposal_times.iter_mut().for_each(|time| (time.seconds, time.iterations) = (None, 0));
+        assert!(proposal_times(&solution).contains("uniform not asked"));
+        solution.proposal_times.clear();
+        assert!(proposal_times(&solution).is_empty());
     }
 }

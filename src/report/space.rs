@@ -63,7 +63,7 @@ pub fn parts(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Part> {
             size.map_or((2.0 * k[0][2], 2.0 * k[1][2]), |size| (f64::from(size.width_px), f64::from(size.height_px)));
         let (x, y) = (|px: f64| (px - k[0][2]) / k[0][0], |px: f64| (px - k[1][2]) / k[1][1]);
         let borders = [x(0.0), x(width), y(0.0), y(height)];
-        parts[at].cameras.push(Camera { label: labels::view(input, index), centre, rotation: r, borders });
+        parts[at].cameras.push(Camera { label: labels::view(solution, input, index), centre, rotation: r, borders });
     }
     parts.retain(|part| !part.cameras.is_empty());
     add_points(&mut parts, solution);

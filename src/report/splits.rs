@@ -34,9 +34,9 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
     );
     for &track in tracks.iter().take(MAX_TRACKS) {
         let weight = solution.tracks.weight.get(track as usize).copied().unwrap_or(0.0);
-        html.push_str(&row((track, 0), weight, &seen, input));
+        html.push_str(&row(solution, (track, 0), weight, &seen, input));
         for split in solution.splits.iter().filter(|split| split.track == track) {
-            html.push_str(&row((track, split.number), split.weight, &seen, input));
+            html.push_str(&row(solution, (track, split.number), split.weight, &seen, input));
         }
     }
     html.push_str("</table></div>\n");
@@ -47,11 +47,13 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
     html
 }
 
-fn row(key: Key, weight: f32, seen: &Seen, input: Option<&LabelledInput>) -> String {
+fn row(solution: &Solution, key: Key, weight: f32, seen: &Seen, input: Option<&LabelledInput>) -> String {
     let (count, first, last) = match seen.get(&key) {
-        Some(&(count, first, last)) => {
-            (count.to_string(), labels::view(input, first as usize), labels::view(input, last as usize))
-        }
+        Some(&(count, first, last)) => (
+            count.to_string(),
+            labels::view(solution, input, first as usize),
+            labels::view(solution, input, last as usize),
+        ),
         None => ("-".to_owned(), "-".to_owned(), "-".to_owned()),
     };
     format!(

@@ -161,7 +161,7 @@ fn the_same_result_makes_the_same_page_but_for_two_lines() {
     assert_eq!(first, page(&solution, Some(&input)));
     solution.seconds *= 3.0;
     solution.stages.iter_mut().for_each(|stage| stage.seconds += 1.0);
-    solution.prior_times.iter_mut().for_each(|time| time.seconds = Some(0.25));
+    solution.proposal_times.iter_mut().for_each(|time| time.seconds = Some(0.25));
     solution.history.iter_mut().for_each(|record| record.elapsed_seconds += 1.0);
     let second = page(&solution, Some(&input));
     let differing = first.lines().zip(second.lines()).filter(|(a, b)| a != b).count();

@@ -45,7 +45,8 @@ fn part_table(solution: &Solution, input: Option<&LabelledInput>) -> String {
         "<div class=\"table\"><table>\n<tr><th>part</th><th>views</th><th>from</th><th>to</th><th>points</th></tr>\n",
     );
     for (part, views) in counts::parts(solution).iter().take(MAX_PARTS) {
-        let end = |view: Option<&usize>| view.map_or_else(String::new, |&view| escape(&labels::view(input, view)));
+        let end =
+            |view: Option<&usize>| view.map_or_else(String::new, |&view| escape(&labels::view(solution, input, view)));
         let placed = tracks.get(part).copied().unwrap_or(0);
         let _ = writeln!(
             html,
@@ -80,7 +81,7 @@ fn left_out(solution: &Solution, input: Option<&LabelledInput>, counts: &[ViewCo
         let _ = writeln!(
             html,
             "<tr><td>{}</td><td>{seen}</td><td>{}</td></tr>",
-            escape(&labels::view(input, view)),
+            escape(&labels::view(solution, input, view)),
             escape(&reason)
         );
     }
@@ -106,7 +107,7 @@ pub fn table(solution: &Solution, input: Option<&LabelledInput>, counts: &[ViewC
         let _ = writeln!(
             html,
             "<tr><td>{}</td><td>{registered}</td><td>{part}</td><td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
-            escape(&labels::view(input, index)),
+            escape(&labels::view(solution, input, index)),
             count.observations,
             count.inliers,
             px(count.mean_px()),

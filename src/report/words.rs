@@ -48,7 +48,6 @@ pub fn warning(code: WarningCode) -> &'static str {
         WarningCode::DuplicateTracks => {
             "Some tracks stand in the input several times; they count once, and all have the same answer."
         }
-        WarningCode::StoppedEarly => "Time ran out; this is the best that was found until then.",
     }
 }
 

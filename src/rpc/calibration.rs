@@ -155,7 +155,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
         // Counts above 32 bits cannot be asked for on the wire.
         let count = |limit: usize| u32::try_from(limit).unwrap_or(u32::MAX);
         Ok(Response::new(proto::Capabilities {
-            version: env!("CARGO_PKG_VERSION").to_owned(),
+            server_version: env!("CARGO_PKG_VERSION").to_owned(),
             limits: Some(proto::InputLimits {
                 max_views: count(self.limits.max_views),
                 max_tracks: count(self.limits.max_tracks),

@@ -52,12 +52,12 @@ impl Caller {
         self.trace_parent.as_deref()
     }
 
-    /// The tenant that `parent` names, which must be the caller's own.
+    /// The tenant that `parent` names, which must be the caller's own, as it is where that is left out.
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant, whether there is one of that name or not.
     pub fn parent(&self, parent: &str) -> Result<String, Status> {
-        let tenant = names::tenant(parent).map_err(|error| status::invalid(&error))?;
+        let tenant = names::tenant(parent, &self.tenant).map_err(|error| status::invalid(&error))?;
         if tenant == self.tenant { Ok(tenant) } else { Err(status::tenant_not_found(&tenant)) }
     }
 
@@ -66,7 +66,7 @@ impl Caller {
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
     pub fn job(&self, name: &str) -> Result<JobName, Status> {
-        let name = names::job(name).map_err(|error| status::invalid(&error))?;
+        let name = names::job(name, &self.tenant).map_err(|error| status::invalid(&error))?;
         if name.tenant == self.tenant { Ok(name) } else { Err(status::job_not_found(&name)) }
     }
 
@@ -75,7 +75,7 @@ impl Caller {
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
     pub fn input(&self, name: &str, field: &str) -> Result<InputName, Status> {
-        let name = names::input(name, field).map_err(|error| status::invalid(&error))?;
+        let name = names::input(name, field, &self.tenant).map_err(|error| status::invalid(&error))?;
         if name.tenant == self.tenant { Ok(name) } else { Err(status::input_not_found(&name)) }
     }
 }

@@ -9,13 +9,13 @@ use tonic::{Request, Response, Status};
 use tracing::Instrument;
 
 use super::caller::Caller;
-use super::convert::{job, list, result};
+use super::convert::{job, list};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::submission::{self, Submission};
 use super::{proto, status};
 use crate::domain::Limits;
 use crate::domain::job::JobName;
-use crate::engine::{Engine, NewJob};
+use crate::engine::{EncodedResult, Engine, NewJob};
 use crate::telemetry;
 
 /// Bytes of a result in one message: large enough that a hundred megabytes are some hundred messages, small enough for
@@ -30,11 +30,13 @@ pub const MAX_BATCH: usize = 1_000;
 pub struct Jobs {
     engine: Engine,
     limits: Limits,
+    /// Of a message of another caller's, and so of a result that is told in one.
+    max_message_bytes: u64,
 }
 
 impl Jobs {
-    pub fn new(engine: Engine, limits: Limits) -> Self {
-        Self { engine, limits }
+    pub fn new(engine: Engine, limits: Limits, max_message_bytes: u64) -> Self {
+        Self { engine, limits, max_message_bytes }
     }
 
     /// Checks every request of a batch before anything is stored.
@@ -52,17 +54,9 @@ impl Jobs {
             return Err(status::invalid(&super::violation("requests", text)));
         }
         let mut news = Vec::new();
-        for (index, mut request) in requests.into_iter().enumerate() {
-            if request.parent.is_empty() {
-                request.parent = parent.to_owned();
-            }
-            let read = async {
-                if request.parent != parent {
-                    let text = format!("is neither left out nor the batch's {parent}");
-                    return Err(status::invalid(&super::violation("parent", text)));
-                }
-                Submission::open(caller, request, &self.limits, permit)?.close(trace_parent.clone()).await
-            };
+        for (index, request) in requests.into_iter().enumerate() {
+            let read =
+                async { Submission::open(caller, request, &self.limits, permit)?.close(trace_parent.clone()).await };
             news.push(read.await.map_err(|found| status::of_request(index, &found))?);
         }
         Ok(news)
@@ -71,18 +65,19 @@ impl Jobs {
 
 impl Jobs {
     /// The encoded result of a job, charged to the permit.
-    async fn read_result(&self, name: JobName, permit: Permit) -> Result<Bytes, Status> {
+    ///
+    /// * `largest`: a result of more bytes is refused
+    async fn read_result(&self, name: JobName, permit: Permit, largest: u64) -> Result<EncodedResult, Status> {
         let engine = self.engine.clone();
-        // In a task of its own: what is read and encoded is held to its end, also when the call is dropped.
+        // In a task of its own: what is read is held to its end, also when the call is dropped.
         let reading = async move {
             let summary = engine.job(&name).await.map_err(status::from_engine)?.summary;
-            let stored_bytes = summary.map_or(0, |summary| summary.result_bytes);
-            permit.hold(WORKING_COPIES.saturating_mul(stored_bytes))?;
-            let solution = engine.result(&name).await.map_err(status::from_engine)?;
-            let encode = move || Bytes::from(result::to_wire(&name, &solution).encode_to_vec());
-            let encoded = super::blocking(encode).await?;
-            permit.hold(encoded.len() as u64)?;
-            Ok::<_, Status>(encoded)
+            let bytes = summary.map_or(0, |summary| summary.result_bytes);
+            if bytes > largest {
+                return Err(status::result_too_large(&name, bytes, largest));
+            }
+            permit.hold(WORKING_COPIES.saturating_mul(bytes))?;
+            engine.result(&name).await.map_err(status::from_engine)
         };
         let read = tokio::spawn(reading.in_current_span()).await;
         read.map_err(|error| status::internal(&error))?
@@ -180,6 +175,22 @@ impl proto::job_service_server::JobService for Jobs {
         Ok(Response::new(()))
     }
 
+    async fn get_job_result(
+        &self,
+        request: Request<proto::GetJobResultRequest>,
+    ) -> Result<Response<proto::JobResult>, Status> {
+        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
+        let permit = Permit::of(&request)?;
+        let result = self.read_result(name, permit.clone(), self.max_message_bytes).await?;
+        let decoded = super::blocking(move || {
+            // What is decoded is on its way to the transport: the permit is the call's.
+            let _permit = permit;
+            proto::JobResult::decode(result.bytes.as_slice())
+        });
+        let result = decoded.await?.map_err(|error| status::internal(&error))?;
+        Ok(Response::new(result))
+    }
+
     type ReadJobResultStream = Messages<proto::ResultChunk>;
 
     async fn read_job_result(
@@ -189,12 +200,14 @@ impl proto::job_service_server::JobService for Jobs {
         let name = Caller::of(&request)?.job(&request.get_ref().name)?;
         let offset = request.get_ref().offset;
         let permit = Permit::of(&request)?;
-        let encoded = self.read_result(name, permit.clone()).await?;
+        let EncodedResult { bytes, sha256 } = self.read_result(name, permit.clone(), u64::MAX).await?;
+        permit.hold(bytes.len() as u64)?;
+        let (encoded, sha256) = (Bytes::from(bytes), Bytes::copy_from_slice(&sha256));
         let Some(from) = usize::try_from(offset).ok().filter(|&from| from <= encoded.len()) else {
             let text = format!("{offset} is not within the {} bytes of the result", encoded.len());
             return Err(status::invalid(&super::violation("offset", text)));
         };
-        let chunks = result_chunks(encoded, from).map(move |chunk| {
+        let chunks = result_chunks(encoded, sha256, from).map(move |chunk| {
             // Held for as long as the stream lives.
             let _ = &permit;
             Ok(chunk)
@@ -204,14 +217,15 @@ impl proto::job_service_server::JobService for Jobs {
 }
 
 /// Cuts a result into messages without copying it. One message at least, so that every read learns the size.
-fn result_chunks(encoded: Bytes, from: usize) -> impl Iterator<Item = proto::ResultChunk> + Send {
+fn result_chunks(encoded: Bytes, sha256: Bytes, from: usize) -> impl Iterator<Item = proto::ResultChunk> + Send {
     let total = encoded.len();
     let mut at = Some(from);
     std::iter::from_fn(move || {
         let begin = at?;
         let end = total.min(begin + RESULT_CHUNK_BYTES);
         at = (end < total).then_some(end);
-        Some(proto::ResultChunk { data: encoded.slice(begin..end), offset: begin as i64, total_size: total as i64 })
+        let data = encoded.slice(begin..end);
+        Some(proto::ResultChunk { data, offset: begin as i64, total_size: total as i64, sha256: sha256.clone() })
     })
 }
 
@@ -223,12 +237,13 @@ mod tests {
     fn chunks_cover_a_result_from_any_offset() {
         let total = 2 * RESULT_CHUNK_BYTES + 10;
         let encoded = Bytes::from((0..total).map(|k| (k % 251) as u8).collect::<Vec<_>>());
+        let sha256 = Bytes::from_static(b"digest");
         for (from, count) in [(0, 3), (1, 3), (RESULT_CHUNK_BYTES, 2), (total - 10, 1), (total, 1)] {
-            let chunks: Vec<_> = result_chunks(encoded.clone(), from).collect();
+            let chunks: Vec<_> = result_chunks(encoded.clone(), sha256.clone(), from).collect();
             assert_eq!(chunks.len(), count, "from {from}");
             let mut at = from;
             for chunk in &chunks {
-                assert_eq!((chunk.offset, chunk.total_size), (at as i64, total as i64));
+                assert_eq!((chunk.offset, chunk.total_size, &chunk.sha256), (at as i64, total as i64, &sha256));
                 assert_eq!(chunk.data, encoded.slice(at..at + chunk.data.len()));
                 at += chunk.data.len();
             }

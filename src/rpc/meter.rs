@@ -14,7 +14,7 @@ use crate::telemetry::metrics::{RpcCall, UNKNOWN_METHOD};
 
 /// Every method that this server offers. The path of a request is only looked up here: taken as a label, it would let
 /// a client make series without end.
-const METHODS: [&str; 16] = [
+const METHODS: [&str; 17] = [
     "scpsfm.v1.CalibrationService/Solve",
     "scpsfm.v1.CalibrationService/GetCapabilities",
     "scpsfm.v1.JobService/CreateJob",
@@ -24,6 +24,7 @@ const METHODS: [&str; 16] = [
     "scpsfm.v1.JobService/WatchJob",
     "scpsfm.v1.JobService/CancelJob",
     "scpsfm.v1.JobService/DeleteJob",
+    "scpsfm.v1.JobService/GetJobResult",
     "scpsfm.v1.JobService/ReadJobResult",
     "scpsfm.v1.InputService/UploadInput",
     "scpsfm.v1.InputService/GetUploadStatus",

@@ -341,7 +341,7 @@ fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Resu
         .http2_keepalive_interval(Some(options.keepalive))
         .http2_keepalive_timeout(Some(options.keepalive_timeout))
         .add_service(with_limits!(CalibrationServiceServer::new(calibration)))
-        .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits))))
+        .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits, max_bytes as u64))))
         .add_service(
             with_limits!(InputServiceServer::new(inputs))
                 .max_decoding_message_size(max_bytes.min(inputs::MAX_MESSAGE_BYTES)),

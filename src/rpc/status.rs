@@ -82,6 +82,11 @@ fn status_with(
     Status::with_error_details(code, message, details)
 }
 
+/// A request that is refused before it becomes a call.
+pub fn refused(code: Code, reason: &str, message: impl Into<String>) -> Status {
+    status(code, reason, message, ErrorDetails::new())
+}
+
 /// A request that breaks rules.
 pub fn invalid(error: &InvalidInput) -> Status {
     let violations = error.violations();
@@ -110,7 +115,7 @@ fn too_large(reason: &str, field: &str, oversize: &Oversize) -> Status {
     status_with(Code::InvalidArgument, reason, metadata, format!("{field}: {message}"), details)
 }
 
-/// The refusal of one request of a batch: message and fields name it, as `requests[3].track_set.x[17]`.
+/// The refusal of one request of a batch: message and fields name it, as `requests[3].track_set.xs[17]`.
 pub fn of_request(index: usize, found: &Status) -> Status {
     let prefix = format!("requests[{index}]");
     let mut details = found.get_error_details();
@@ -126,6 +131,15 @@ pub fn job_not_found(name: &JobName) -> Status {
     let mut details = ErrorDetails::new();
     details.set_resource_info("scpsfm.v1.Job", name.to_string(), "", "there is no such job");
     status(Code::NotFound, "JOB_NOT_FOUND", format!("there is no job {name}"), details)
+}
+
+/// A result that does not fit one message.
+pub fn result_too_large(name: &JobName, bytes: u64, largest: u64) -> Status {
+    let message = format!(
+        "the result of {name} has {bytes} bytes, a message at most {largest}: read it by JobService.ReadJobResult"
+    );
+    let metadata = HashMap::from([("bytes".to_owned(), bytes.to_string()), ("max".to_owned(), largest.to_string())]);
+    status_with(Code::FailedPrecondition, "RESULT_TOO_LARGE", metadata, message, ErrorDetails::new())
 }
 
 /// A parent that is not the caller's tenant: a caller cannot tell whether there is such a tenant.
@@ -277,15 +291,15 @@ mod tests {
     fn violations_are_all_in_the_details_and_some_in_the_message() {
         let mut found = Violations::default();
         for k in 0..30 {
-            found.push(Violation::at("track_set.x", k, "NaN is not a finite number"));
+            found.push(Violation::at("track_set.xs", k, "NaN is not a finite number"));
         }
         let status = invalid(&found.into_result().expect_err("30 violations"));
         assert_eq!(status.code(), Code::InvalidArgument);
-        assert!(status.message().starts_with("track_set.x[0]: NaN is not a finite number; "), "{}", status.message());
+        assert!(status.message().starts_with("track_set.xs[0]: NaN is not a finite number; "), "{}", status.message());
         assert!(status.message().ends_with("; and 27 more"), "{}", status.message());
         let request = status.get_details_bad_request().expect("a BadRequest");
         assert_eq!(request.field_violations.len(), InvalidInput::MAX_LISTED);
-        assert_eq!(request.field_violations[17].field, "track_set.x[17]");
+        assert_eq!(request.field_violations[17].field, "track_set.xs[17]");
         let info = status.get_details_error_info().expect("an ErrorInfo");
         assert_eq!((info.reason.as_str(), info.domain.as_str()), ("INVALID_ARGUMENT", DOMAIN));
     }

@@ -13,7 +13,7 @@ use crate::domain::job::Job;
 use crate::domain::{InputName, InvalidInput, Limits};
 use crate::engine::{Engine, JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
-use proto::create_job_request::Input as Inline;
+use proto::create_job_request::Source as Inline;
 
 /// A job whose input may still be on its way.
 pub struct Submission {
@@ -46,8 +46,8 @@ impl Submission {
         let tenant = caller.parent(&request.parent)?;
         let description =
             create::from_wire(request.job_id, request.request_id, request.job).map_err(|error| invalid(&error))?;
-        let input = match request.input {
-            Some(Inline::InputName(name)) => Source::Uploaded(caller.input(&name, "input_name")?),
+        let input = match request.source {
+            Some(Inline::Input(name)) => Source::Uploaded(caller.input(&name, "input")?),
             input => Source::Draft(Draft::begin(input, limits).map_err(|error| invalid(&error))?),
         };
         let permit = permit.clone();

@@ -46,7 +46,7 @@ const OPTIONS: TrackScoreOptions = TrackScoreOptions::DEFAULT;
 
 /// Whether these settings let the search ask the network.
 pub fn may_be_asked(settings: &SolveSettings) -> bool {
-    settings.method == Method::Auto && !settings.excluded_priors.contains(&Proposal::Learned)
+    settings.method == Method::Auto && !settings.excluded_proposals.contains(&Proposal::Learned)
 }
 
 /// The network's scores of some tracks.

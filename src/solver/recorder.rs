@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use crate::domain::result::StageTime;
-use crate::domain::{Course, HeadProgress, Losses, Observer, Progress, Solution, Stage, Step, Task};
+use crate::domain::{HeadProgress, Losses, Observer, Progress, ReconstructionProgress, Solution, Stage, Step, Task};
 
 /// Share of the whole that is done when each stage begins; the rest of each interval fills as the stage goes on.
 /// From the measured shares of time at 10 views, 200 tracks, 90 % outliers.
@@ -70,7 +70,7 @@ pub struct Recorder<'a> {
     stride: usize,
     records: usize,
     pub standing: Standing,
-    course: Course,
+    reconstruction: ReconstructionProgress,
     last_report: Instant,
 }
 
@@ -96,15 +96,20 @@ impl<'a> Recorder<'a> {
             stride: 1,
             records: 0,
             standing: Standing::default(),
-            course: Course { views: views as u32, ..Course::default() },
+            reconstruction: ReconstructionProgress { views: views as u32, ..ReconstructionProgress::default() },
             last_report: now,
         }
     }
 
     /// Begins another block, `block` of at most `blocks`, counted from 0.
     pub fn begin_block(&mut self, block: usize, blocks: usize) {
-        let views = self.course.views;
-        self.course = Course { block: block as u32 + 1, blocks: blocks.max(1) as u32, views, ..Course::default() };
+        let views = self.reconstruction.views;
+        self.reconstruction = ReconstructionProgress {
+            block: block as u32 + 1,
+            blocks: blocks.max(1) as u32,
+            views,
+            ..ReconstructionProgress::default()
+        };
         self.block = block;
         self.extending = false;
         self.blocks = blocks.max(1);
@@ -129,7 +134,7 @@ impl<'a> Recorder<'a> {
 
     /// Begins the block of a further component: its course counts as work, and moves the share done no further.
     pub fn begin_component(&mut self, component: u32) {
-        self.course.part = component;
+        self.reconstruction.part = component;
         self.earlier_iterations += self.standing.iteration;
         self.before_component = Some(std::mem::take(&mut self.standing));
     }
@@ -145,7 +150,7 @@ impl<'a> Recorder<'a> {
 
     /// All components there are to be are built.
     pub fn end_components(&mut self) {
-        self.course.part = 0;
+        self.reconstruction.part = 0;
     }
 
     /// An iteration of the network is done; told with the next [`Self::report`].
@@ -168,14 +173,14 @@ impl<'a> Recorder<'a> {
     /// So many views have a camera. What a block of a further component has counts once it is among the others.
     pub fn registered(&mut self, views: usize) {
         if self.before_component.is_none() {
-            self.course.registered_views = views as u32;
+            self.reconstruction.registered_views = views as u32;
         }
     }
 
     /// Enters a stage, ending the one before.
     pub fn enter(&mut self, stage: Stage) {
         self.close_stage();
-        self.course.step = None;
+        self.reconstruction.step = None;
         self.stage = stage;
         self.observer.stage(stage);
         self.report(0.0);
@@ -199,7 +204,7 @@ impl<'a> Recorder<'a> {
 
     /// The same, reported with the next [`Self::report`].
     pub fn begin_step(&mut self, task: Task, step: usize, steps: usize) {
-        self.course.step = Some(Step { task, step: step as u32, steps: steps as u32 });
+        self.reconstruction.step = Some(Step { task, step: step as u32, steps: steps as u32 });
     }
 
     /// Tells how many verdicts there are; `tracks`: how many are judged.
@@ -234,7 +239,7 @@ impl<'a> Recorder<'a> {
             focal_px: self.standing.focal_px,
             best_score: self.standing.best_score,
             elapsed_seconds: self.seconds(),
-            course: self.course,
+            reconstruction: self.reconstruction,
         }
     }
 
@@ -271,7 +276,7 @@ impl<'a> Recorder<'a> {
     /// Ends the last stage and gives back times and curves.
     pub fn finish(mut self) -> (Vec<StageTime>, Vec<Progress>) {
         self.fraction = 1.0;
-        self.course.step = None;
+        self.reconstruction.step = None;
         self.report(1.0);
         self.close_stage();
         (self.stages, self.history)

@@ -27,8 +27,8 @@ use crate::domain::{InputName, Oversize};
 pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
-    Bound, CancelReply, Claimed, Created, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome, QueueBounds,
-    Request, Swept, Work,
+    Bound, CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
+    QueueBounds, Request, Swept, Work,
 };
 pub use upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
@@ -229,11 +229,12 @@ pub trait Store: Send + Sync + 'static {
     /// Takes back leases that ran out, as [`Store::recover`] does, and ends queued jobs that are past their deadline.
     async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error>;
 
-    /// The encoded result of a job; `None` where there is none.
+    /// The encoded result of a job; `None` where there is none. Whether it is intact is for the caller to ask: it takes
+    /// long.
     ///
     /// # Errors
     /// [`Error::NotFound`].
-    async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error>;
+    async fn result(&self, name: &JobName) -> Result<Option<EncodedResult>, Error>;
 
     /// Begins an upload, or goes on with one: from here on its earlier streams cannot write.
     ///

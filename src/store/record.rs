@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::time::SystemTime;
 
+use sha2::{Digest, Sha256};
+
 use crate::domain::job::{Failure, Job, JobName, Summary};
 use crate::domain::progress::Progress;
 use crate::domain::{Oversize, Quota, SolveSettings};
@@ -261,17 +263,32 @@ pub struct Ending {
     pub progress: Option<Progress>,
 }
 
+/// A result as it is read: encoded once, by the server that solved the job.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EncodedResult {
+    pub bytes: Vec<u8>,
+    pub sha256: [u8; 32],
+}
+
+impl EncodedResult {
+    /// Of these bytes, which are hashed here.
+    pub fn new(bytes: Vec<u8>) -> Self {
+        Self { sha256: Sha256::digest(&bytes).into(), bytes }
+    }
+
+    /// Whether the bytes are those of the digest.
+    pub fn is_intact(&self) -> bool {
+        <[u8; 32]>::from(Sha256::digest(&self.bytes)) == self.sha256
+    }
+}
+
 /// How a job ended.
 #[derive(Debug, Clone)]
 pub enum Outcome {
-    /// With its encoded result.
-    Succeeded {
-        summary: Summary,
-        result: Vec<u8>,
-    },
+    Succeeded { summary: Summary, result: EncodedResult },
     Failed(Failure),
     Cancelled,
-    Expired,
+    DeadlineExceeded,
 }
 
 /// What asking for a cancel came to.

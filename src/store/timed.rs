@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::{
-    BegunUpload, CancelReply, Claimed, Created, Ending, Error, Heartbeat, Hint, InputPage, InputQuery, JobPage,
-    JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, Store, StoredInput, Swept,
-    UploadBounds, UploadLease, UploadStatus, Work,
+    BegunUpload, CancelReply, Claimed, Created, EncodedResult, Ending, Error, Heartbeat, Hint, InputPage, InputQuery,
+    JobPage, JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, Store, StoredInput,
+    Swept, UploadBounds, UploadLease, UploadStatus, Work,
 };
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
@@ -135,7 +135,7 @@ impl<S: Store> Store for Timed<S> {
         self.0.sweep(now, max_attempts).await
     }
 
-    async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
+    async fn result(&self, name: &JobName) -> Result<Option<EncodedResult>, Error> {
         let _timer = store_operation("result");
         self.0.result(name).await
     }

@@ -91,8 +91,8 @@ fn create_known_series() {
     for grade in [None, Some(Grade::Metric), Some(Grade::Weak), Some(Grade::ProjectiveOnly)] {
         counter!(GRADES.name, "grade" => grade_name(grade)).absolute(0);
     }
-    for prior in Proposal::ALL {
-        counter!(WINNING_PRIOR.name, "prior" => prior.name()).absolute(0);
+    for proposal in Proposal::ALL {
+        counter!(WINNING_PROPOSAL.name, "proposal" => proposal.name()).absolute(0);
     }
     for refusal in Refusal::all() {
         counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
@@ -197,8 +197,8 @@ pub fn job_finished(job: &Job) {
     if summary.status == crate::domain::Status::Solved {
         histogram!(INLIER_RATIO.name).record(f64::from(summary.inlier_tracks) / f64::from(job.track_count.max(1)));
     }
-    if let Some(prior) = summary.winning_prior {
-        counter!(WINNING_PRIOR.name, "prior" => prior.name()).increment(1);
+    if let Some(proposal) = summary.winning_proposal {
+        counter!(WINNING_PROPOSAL.name, "proposal" => proposal.name()).increment(1);
     }
 }
 
@@ -235,8 +235,8 @@ pub fn connection_refused() {
 }
 
 /// A connection was closed because nobody who may call had called over it in time.
-pub fn stranger_closed() {
-    counter!(STRANGERS_CLOSED.name).increment(1);
+pub fn unauthenticated_closed() {
+    counter!(UNAUTHENTICATED_CLOSED.name).increment(1);
 }
 
 /// Tells how many bytes calls hold.

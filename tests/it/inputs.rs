@@ -2,7 +2,7 @@
 
 use std::process::Stdio;
 
-use scpsfm::rpc::proto::create_job_request::Input;
+use scpsfm::rpc::proto::create_job_request::Source;
 use scpsfm::rpc::proto::input_service_client::InputServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState};
@@ -53,20 +53,20 @@ async fn a_deleted_input_leaves_the_list_and_the_jobs_that_have_it_go_on() {
 
     // One job runs with it, one waits.
     let mut jobs = server.jobs().await;
-    let named = || create(Input::InputName(stored[0].name.clone()));
+    let named = || create(Source::Input(stored[0].name.clone()));
     let running = created(&mut jobs, named()).await;
     reaches(&mut jobs, &running, &[JobState::Running]).await;
     let waiting = created(&mut jobs, named()).await;
-    let inline = created(&mut jobs, create(Input::TrackSet(scpsfm::rpc::convert::input::to_wire(&raw(3, 40))))).await;
+    let inline = created(&mut jobs, create(Source::TrackSet(scpsfm::rpc::convert::input::to_wire(&raw(3, 40))))).await;
     inputs.delete_input(deletion(&stored[0].name)).await.expect("deleted");
     // Each tells what it was created with, also now.
     let listed = proto::ListJobsRequest { parent: DEFAULT.into(), ..Default::default() };
     let listed = jobs.list_jobs(listed).await.expect("a page").into_inner().jobs;
-    let told: Vec<_> = listed.iter().map(|job| (job.name.as_str(), job.input_name.as_str())).collect();
+    let told: Vec<_> = listed.iter().map(|job| (job.name.as_str(), job.input.as_str())).collect();
     let uploaded = stored[0].name.as_str();
     assert_eq!(told, [(inline.as_str(), ""), (waiting.as_str(), uploaded), (running.as_str(), uploaded)]);
     let got = jobs.get_job(proto::GetJobRequest { name: waiting.clone() }).await.expect("a job").into_inner();
-    assert_eq!(got.input_name, uploaded);
+    assert_eq!(got.input, uploaded);
     let gone = inputs.delete_input(deletion(&stored[0].name)).await.expect_err("gone");
     assert_eq!((gone.code(), reason(&gone).as_str()), (Code::NotFound, "INPUT_NOT_FOUND"));
     assert_eq!(fields(&inputs.delete_input(deletion("inputs/a")).await.expect_err("malformed")), ["name"]);
@@ -120,7 +120,7 @@ async fn of_another_tenants_inputs_nothing_is_seen_or_deleted() {
     assert_eq!(south.delete_input(deletion(&mine)).await.expect_err("none of theirs").code(), Code::NotFound);
     let all = north.list_inputs(list("tenants/north", 0, "")).await.expect("a page").into_inner();
     assert_eq!(all.inputs.len(), 2);
-    let job = proto::CreateJobRequest { parent: "tenants/north".into(), ..create(Input::InputName(names[0].clone())) };
+    let job = proto::CreateJobRequest { parent: "tenants/north".into(), ..create(Source::Input(names[0].clone())) };
     JobServiceClient::new(keyed(&channel, NORTH)).create_job(job).await.expect("its input is there");
 }
 

@@ -17,7 +17,9 @@ fn block(language: &str) -> &'static str {
 }
 
 fn generate_stubs(python: &str, into: &Path) {
-    let protos = fs::read_dir("proto/scpsfm/v1").expect("the API's files").map(|entry| entry.expect("a file").path());
+    let folders = ["proto/scpsfm/v1", "proto/google/api"];
+    let files = folders.into_iter().flat_map(|folder| fs::read_dir(folder).expect("the API's files"));
+    let protos = files.map(|entry| entry.expect("a file").path());
     let out = |flag: &str| format!("--{flag}={}", into.display());
     let mut command = Command::new(python);
     command.args(["-m", "grpc_tools.protoc", "-I", "proto"]).args([out("python_out"), out("grpc_python_out")]);

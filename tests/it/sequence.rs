@@ -94,7 +94,7 @@ fn threads_change_nothing_in_any_file_but_times() {
         let done = run(["solve", text(&input), "--out", text(&out), "--threads", threads].iter().chain(&size));
         assert_eq!(done.code, Some(0), "{done:?}");
         let mut result = json(&out.join("result.json"));
-        for timed in ["seconds", "stages", "prior_times"] {
+        for timed in ["seconds", "stages", "proposal_times"] {
             assert!(result[timed].take() != Value::Null, "{timed}");
         }
         let files = ["tracks.csv", "observations.csv", "cameras.json", "points.ply"];

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use rustix::process::Signal;
 use scpsfm::domain::Stage;
-use scpsfm::rpc::proto::{self, JobState, create_job_request::Input};
+use scpsfm::rpc::proto::{self, JobState, create_job_request::Source};
 use tonic::Code;
 
 use crate::support::collector::{Collector, attribute, hex, only};
@@ -106,7 +106,7 @@ async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
         ],
     );
     assert_eq!(solved.sum("scpsfm_results_total"), 1.0, "one grade");
-    assert_eq!(solved.sum("scpsfm_winning_prior_total"), 1.0, "one winner");
+    assert_eq!(solved.sum("scpsfm_winning_proposal_total"), 1.0, "one winner");
     for stage in block_stages() {
         let series = format!("scpsfm_stage_duration_seconds_count{{stage=\"{stage}\",state=\"SUCCEEDED\"}}");
         assert!(solved.value(&series) >= 1.0, "{series}");
@@ -114,8 +114,8 @@ async fn a_solved_a_refused_and_a_cancelled_job_each_leave_their_marks() {
     assert_idle(&solved);
 
     let mut bad = easy(1);
-    if let Some(Input::TrackSet(tracks)) = &mut bad.input {
-        tracks.x[0] = f64::NAN;
+    if let Some(Source::TrackSet(tracks)) = &mut bad.source {
+        tracks.xs[0] = f64::NAN;
     }
     assert_eq!(jobs.create_job(bad).await.expect_err("not a number").code(), Code::InvalidArgument);
     let refused = scrape_until(&server, |page| page.value_so_far(CREATED_BAD) > 0.0).await;

@@ -6,7 +6,7 @@ use super::{Client, Error};
 use crate::domain::job::Job;
 use crate::domain::{InputName, RawInput, SolveSettings};
 use crate::rpc::convert;
-use crate::rpc::proto::{self, create_job_request::Input as JobInput};
+use crate::rpc::proto::{self, create_job_request::Source as JobInput};
 
 impl Client {
     /// Creates a job of each input, then of each that was uploaded; in that order, all of them or none.
@@ -23,7 +23,7 @@ impl Client {
         options: &JobOptions,
     ) -> Result<Vec<Job>, Error> {
         let inline = inputs.map(|input| JobInput::TrackSet(convert::input::to_wire(input)));
-        let named = uploaded.iter().map(|name| JobInput::InputName(name.to_string()));
+        let named = uploaded.iter().map(|name| JobInput::Input(name.to_string()));
         let requests = (1..).zip(inline.chain(named)).map(|(number, input)| {
             let request_id = options.request_id.as_ref().map(|id| format!("{id}-{number}"));
             create_request(self.parent(), input, settings, JobOptions { request_id, ..options.clone() })

@@ -231,7 +231,7 @@ fn violations(status: &Status) -> Vec<Violation> {
     fields.into_iter().map(|found| violation(&found.field, found.description)).collect()
 }
 
-/// Number and field of `requests[3].track_set.x`.
+/// Number and field of `requests[3].track_set.xs`.
 fn within_request(field: &str) -> Option<(usize, &str)> {
     let (index, field) = field.strip_prefix("requests[")?.split_once("].")?;
     Some((index.parse().ok()?, field))
@@ -243,7 +243,7 @@ fn is_of_input(violation: &Violation) -> bool {
     INPUT_FIELDS.contains(&first)
 }
 
-/// Reads `track_set.x[17]` back into field and index.
+/// Reads `track_set.xs[17]` back into field and index.
 fn violation(path: &str, description: String) -> Violation {
     let indexed = path.strip_suffix(']').and_then(|path| path.rsplit_once('['));
     match indexed.and_then(|(field, index)| Some((field, index.parse().ok()?))) {
@@ -289,13 +289,13 @@ mod tests {
 
     #[test]
     fn violations_come_back_with_field_and_index() {
-        let sent = Violation::at("track_set.x", 17, "NaN is not a finite number");
+        let sent = Violation::at("track_set.xs", 17, "NaN is not a finite number");
         let status = status::invalid(&sent.clone().into());
         let Error::Invalid(violations, message) = Error::from_status("http://a", &status, true) else {
             panic!("not invalid: {status}");
         };
         assert_eq!(violations, [sent]);
-        assert_eq!(message, "track_set.x[17]: NaN is not a finite number");
+        assert_eq!(message, "track_set.xs[17]: NaN is not a finite number");
         let whole = violation("settings.alpha", "is wrong".into());
         assert_eq!(whole, Violation::of("settings.alpha", "is wrong"));
     }
@@ -362,7 +362,7 @@ mod tests {
         {
             assert_eq!(exit(flag), Exit::Usage, "{flag}");
         }
-        for input in ["track_set.x", "track_set.views", "measurement_matrix.values", "input"] {
+        for input in ["track_set.xs", "track_set.views", "measurement_matrix.values", "input"] {
             assert_eq!(exit(input), Exit::BadInput, "{input}");
         }
         let unnamed = Error::Invalid(Vec::new(), "a malformed message".into());

@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use prost::Message;
+use prost::bytes::Bytes;
+use sha2::{Digest, Sha256};
 use tonic::{Status, Streaming};
 
 use super::backoff::Backoff;
@@ -11,7 +13,7 @@ use super::{Client, Error};
 use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, RawInput, Solution, SolveSettings};
 use crate::rpc::convert;
-use crate::rpc::proto::{self, create_job_request::Input as JobInput};
+use crate::rpc::proto::{self, create_job_request::Source as JobInput};
 
 /// What a caller says of a job beside input and settings.
 #[derive(Debug, Clone, Default)]
@@ -56,7 +58,7 @@ impl Client {
         settings: &SolveSettings,
         options: JobOptions,
     ) -> Result<Job, Error> {
-        self.create_of(JobInput::InputName(input.to_string()), settings, options).await
+        self.create_of(JobInput::Input(input.to_string()), settings, options).await
     }
 
     async fn create_of(
@@ -151,31 +153,37 @@ impl Client {
     pub async fn read_result(&mut self, name: &JobName) -> Result<Solution, Error> {
         let mut bytes = Vec::new();
         let mut backoff = Backoff::default();
-        while let Err(status) = self.read_on(name, &mut bytes, &mut backoff).await? {
-            self.pause(&mut backoff, status).await?;
+        let sha256 = loop {
+            match self.read_on(name, &mut bytes, &mut backoff).await? {
+                Ok(sha256) => break sha256,
+                Err(status) => self.pause(&mut backoff, status).await?,
+            }
+        };
+        if Sha256::digest(&bytes)[..] != sha256[..] {
+            return Err(Error::Failed("the result is not what the server stored: read it again".into()));
         }
         let result = proto::JobResult::decode(bytes.as_slice())
             .map_err(|error| Error::Failed(format!("the server's result cannot be decoded: {error}")))?;
         Ok(convert::result::from_wire(result)?)
     }
 
-    /// Reads on from what is there; the inner error is worth another try.
+    /// Reads on from what is there to the end, and returns the digest of the whole; the inner error is worth another try.
     async fn read_on(
         &mut self,
         name: &JobName,
         bytes: &mut Vec<u8>,
         backoff: &mut Backoff,
-    ) -> Result<Result<(), Status>, Error> {
+    ) -> Result<Result<Bytes, Status>, Error> {
         let request = proto::ReadJobResultRequest { name: name.to_string(), offset: bytes.len() as i64 };
         let mut chunks = match backoff.within(self.jobs.read_job_result(request)).await {
             Ok(chunks) => chunks.into_inner(),
             Err(status) => return Ok(Err(status)),
         };
-        let mut total = 0;
+        let (mut total, mut sha256) = (0, Bytes::new());
         loop {
             match chunks.message().await {
                 Ok(Some(chunk)) if chunk.offset == bytes.len() as i64 => {
-                    total = chunk.total_size;
+                    (total, sha256) = (chunk.total_size, chunk.sha256);
                     bytes.extend_from_slice(&chunk.data);
                     backoff.reset();
                 }
@@ -183,7 +191,7 @@ impl Client {
                     let text = format!("a chunk begins at {} where {} was due", chunk.offset, bytes.len());
                     return Err(Error::Failed(text));
                 }
-                Ok(None) if total == bytes.len() as i64 => return Ok(Ok(())),
+                Ok(None) if total == bytes.len() as i64 => return Ok(Ok(sha256)),
                 Ok(None) => return Err(Error::Failed(format!("the result ended at {} of {total}", bytes.len()))),
                 Err(status) => return Ok(Err(status)),
             }
@@ -244,8 +252,8 @@ pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> R
     match (state, failure) {
         (JobState::Succeeded, _) => Ok(()),
         (JobState::Cancelled, _) => Err(Error::Cancelled),
-        (JobState::Expired, _) => {
-            Err(Error::Failed(format!("{name} expired: its deadline passed before a result stood")))
+        (JobState::DeadlineExceeded, _) => {
+            Err(Error::Failed(format!("{name} exceeded its deadline before a result stood")))
         }
         (_, Some(failure)) => Err(Error::Failed(format!("{name} failed: {} ({})", failure.message, failure.reason))),
         _ => Err(Error::Failed(format!("{name} did not succeed"))),
@@ -275,6 +283,6 @@ pub(super) fn create_request(
             deadline: time_limit.map(proto::job::Deadline::TimeLimit),
             ..proto::Job::default()
         }),
-        input: Some(input),
+        source: Some(input),
     }
 }

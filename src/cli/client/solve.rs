@@ -12,7 +12,7 @@ use crate::cli::args::ServerArgs;
 use crate::domain::job::JobEvent;
 use crate::domain::{RawInput, Solution, SolveSettings};
 use crate::rpc::convert;
-use crate::rpc::proto::{self, create_job_request::Input as JobInput};
+use crate::rpc::proto::{self, create_job_request::Source as JobInput};
 
 impl Client {
     /// Creates a job, follows it to its end and reads its result. When `stop` is cancelled, so is the job.

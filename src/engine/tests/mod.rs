@@ -17,8 +17,8 @@ use tempfile::TempDir;
 use super::{Engine, NewJob, Options, Solver};
 use crate::domain::job::{DEFAULT_TENANT, EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{
-    Course, Input, Limits, Method, Observer, Progress, RawInput, Solution, SolveSettings, Stage, Status, StopToken,
-    View,
+    Input, Limits, Method, Observer, Progress, RawInput, ReconstructionProgress, Solution, SolveSettings, Stage,
+    Status, StopToken, View,
 };
 use crate::solver;
 use crate::store::Store;
@@ -110,8 +110,19 @@ fn progress(iteration: u32) -> Progress {
         focal_px: None,
         best_score: None,
         elapsed_seconds: 0.0,
-        course: Course::default(),
+        reconstruction: ReconstructionProgress::default(),
     }
+}
+
+/// A result as these tests read it: which call of the solver made it.
+fn encode(_: &JobName, solution: &Solution) -> Vec<u8> {
+    solution.iterations.to_le_bytes().into()
+}
+
+/// Which call of the solver made a job's result.
+async fn call_of(engine: &Engine, name: &JobName) -> u32 {
+    let result = engine.result(name).await.expect("ready");
+    u32::from_le_bytes(result.bytes.try_into().expect("four bytes"))
 }
 
 /// A solution that tells which call of the solver made it, by its iterations.
@@ -120,7 +131,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         status: Status::NoReconstruction,
         grade: None,
         method: Method::Auto,
-        winning_prior: None,
+        winning_proposal: None,
         iterations: call as u32,
         seed: 0,
         calibrations: Vec::new(),
@@ -135,7 +146,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         warnings: Vec::new(),
         seconds: 0.0,
         stages: Vec::new(),
-        prior_times: Vec::new(),
+        proposal_times: Vec::new(),
         history: vec![progress(1)],
         trained_network: None,
         input_sha256: None,
@@ -190,7 +201,7 @@ async fn start(options: Options, directory: &TempDir, gate: &Arc<Gate>) -> (Engi
     // The engine before may still be letting go of the directory.
     let store = eventually(|| async { Sqlite::open(directory.path()).await.ok() }).await;
     let store = Arc::new(store);
-    let engine = Engine::start(options, store.clone(), gate.solver()).await.expect("starts");
+    let engine = Engine::start(options, store.clone(), gate.solver(), encode).await.expect("starts");
     (engine, store)
 }
 

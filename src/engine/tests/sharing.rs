@@ -14,7 +14,7 @@ async fn without_hints_a_job_is_watched_and_cancelled_from_elsewhere() {
     for _ in 0..2 {
         let mut store = Postgres::open(&url).await.expect("opens");
         store.deaf = true;
-        engines.push(Engine::start(options.clone(), Arc::new(store), gate.solver()).await.expect("starts"));
+        engines.push(Engine::start(options.clone(), Arc::new(store), gate.solver(), encode).await.expect("starts"));
     }
     let name = engines[0].submit(new_job(Script::Wait)).await.expect("admitted").name;
     gate.until_waiting(1).await;

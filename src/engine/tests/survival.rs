@@ -206,7 +206,7 @@ async fn a_worker_whose_lease_was_taken_over_changes_nothing() {
     bench.gate.open();
     let job = bench.ended(&name).await;
     assert_eq!((job.state, job.attempt), (JobState::Succeeded, 2));
-    assert_eq!(bench.engine.result(&name).await.expect("ready").iterations, 2, "the second call's");
+    assert_eq!(call_of(&bench.engine, &name).await, 2, "the second call's");
     bench.engine.drain(Duration::from_secs(120)).await;
     assert_eq!(bench.engine.job(&name).await, Ok(job), "also after the first worker has ended");
     let events = bench.store.events_after(&name, 0, 100).await.expect("events");

@@ -166,8 +166,8 @@ pub fn measure(run: &Run, stop: &StopToken) -> Result<Option<Measured>, String> 
     let scene = Scene::generate(&run.scene).map_err(|error| error.to_string())?;
     let truth = &scene.truth.inlier;
     let input = Input::new(scene.input.clone(), &Limits::default(), "scene").map_err(|error| error.to_string())?;
-    let answer = |excluded_priors: Vec<Proposal>| {
-        let settings = SolveSettings { excluded_priors, ..SolveSettings::default() };
+    let answer = |excluded_proposals: Vec<Proposal>| {
+        let settings = SolveSettings { excluded_proposals, ..SolveSettings::default() };
         match solver::solve(&input, &settings, &mut Silent, stop) {
             Ok(solution) => Ok(Some(answer(&solution, truth))),
             Err(solver::Error::Stopped(_)) => Ok(None),

@@ -119,6 +119,7 @@ impl Images {
         // Checked when the image was added.
         let camera = self.cameras.get(&id);
         View {
+            name: None,
             size: camera.map(|camera| camera.size),
             camera_group: id,
             focal_prior: camera.and_then(|camera| camera.focal_prior),

@@ -56,8 +56,8 @@ twins! {
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
     LensProjection = LensProjection { Perspective, Fisheye }
-    Proposal = Prior { Network, Irls, Consistency, Rigidity, Uniform, Learned }
-    JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, Expired }
+    Proposal = Proposal { Network, Irls, Consistency, Rigidity, Uniform, Learned }
+    JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, DeadlineExceeded }
     AttemptEnd = AttemptEnd { Ended, GivenBack, Lost }
     WarningCode = WarningCode {
         PlanarOrRotation,
@@ -76,7 +76,6 @@ twins! {
         AssumedImageSize,
         PointsOutsideImage,
         CameraGroupsMerged,
-        StoppedEarly,
         UnverifiedRanking,
         DuplicateTracks,
         StaticTracks,
@@ -115,7 +114,6 @@ mod tests {
             WarningCode::PureTranslation,
             WarningCode::PrincipalPointUnobservable,
             WarningCode::SecondStructure,
-            WarningCode::StoppedEarly,
             WarningCode::CameraGroupsMerged,
             WarningCode::UnverifiedRanking,
             WarningCode::DuplicateTracks,

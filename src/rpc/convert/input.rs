@@ -6,7 +6,7 @@ use super::matrix;
 use crate::domain::{FocalPrior, ImageSize, Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::engine::StoredInput;
 use crate::rpc::proto;
-use proto::create_job_request::Input as Inline;
+use proto::create_job_request::Source as Inline;
 
 /// Name of a track set in violations.
 const TRACK_SET: &str = "track_set";
@@ -34,13 +34,13 @@ impl Draft {
     /// Begins with what came with the job: a whole input or the head of one.
     ///
     /// # Errors
-    /// A violation of `input` where there is none; see [`Draft::check_size`].
+    /// A violation of `source` where there is none; see [`Draft::check_size`].
     pub fn begin(input: Option<Inline>, limits: &Limits) -> Result<Self, InvalidInput> {
         let body = match input {
             Some(Inline::TrackSet(set)) => Body::TrackSet(set),
             Some(Inline::MeasurementMatrix(matrix)) => Body::Matrix(matrix),
-            Some(Inline::InputName(_)) | None => {
-                return Err(Violation::of("input", "is not set; give a track_set or a measurement_matrix").into());
+            Some(Inline::Input(_)) | None => {
+                return Err(Violation::of("source", "is not set; give a track_set or a measurement_matrix").into());
             }
         };
         Ok(Self { body, limits: limits.clone() })
@@ -54,12 +54,12 @@ impl Draft {
         let Body::TrackSet(set) = &mut self.body else {
             return Err(Violation::of("track_set_chunk", "the config holds a measurement_matrix").into());
         };
-        set.view.append(&mut chunk.view);
-        set.track.append(&mut chunk.track);
-        set.x.append(&mut chunk.x);
-        set.y.append(&mut chunk.y);
-        set.sigma.append(&mut chunk.sigma);
-        set.depth.append(&mut chunk.depth);
+        set.view_indices.append(&mut chunk.view_indices);
+        set.track_indices.append(&mut chunk.track_indices);
+        set.xs.append(&mut chunk.xs);
+        set.ys.append(&mut chunk.ys);
+        set.sigmas_px.append(&mut chunk.sigmas_px);
+        set.depths.append(&mut chunk.depths);
         Ok(())
     }
 
@@ -95,8 +95,8 @@ impl Draft {
         }
         match &self.body {
             Body::TrackSet(set) => {
-                let reals = [&set.x, &set.y, &set.sigma, &set.depth].map(of).into_iter().sum::<u64>();
-                of(&set.views) + of(&set.view) + of(&set.track) + reals
+                let reals = [&set.xs, &set.ys, &set.sigmas_px, &set.depths].map(of).into_iter().sum::<u64>();
+                of(&set.views) + of(&set.view_indices) + of(&set.track_indices) + reals
             }
             Body::Matrix(matrix) => of(&matrix.views) + of(&matrix.values) + of(&matrix.visibility),
         }
@@ -118,12 +118,12 @@ fn check_track_set_size(set: &proto::TrackSet, limits: &Limits) -> Result<(), In
     let lengths = [
         ("views", set.views.len(), limits.max_views),
         ("track_count", set.track_count as usize, limits.max_tracks),
-        ("view", set.view.len(), limits.max_observations),
-        ("track", set.track.len(), limits.max_observations),
-        ("x", set.x.len(), limits.max_observations),
-        ("y", set.y.len(), limits.max_observations),
-        ("sigma", set.sigma.len(), limits.max_observations),
-        ("depth", set.depth.len(), limits.max_observations),
+        ("view_indices", set.view_indices.len(), limits.max_observations),
+        ("track_indices", set.track_indices.len(), limits.max_observations),
+        ("xs", set.xs.len(), limits.max_observations),
+        ("ys", set.ys.len(), limits.max_observations),
+        ("sigmas_px", set.sigmas_px.len(), limits.max_observations),
+        ("depths", set.depths.len(), limits.max_observations),
     ];
     within(TRACK_SET, &lengths)
 }
@@ -142,17 +142,18 @@ fn track_set_to_raw(set: proto::TrackSet) -> RawInput {
     RawInput {
         views: set.views.iter().map(view_from_wire).collect(),
         track_count: set.track_count as usize,
-        view: set.view,
-        track: set.track,
-        x: set.x,
-        y: set.y,
-        depth: set.depth,
-        sigma: set.sigma,
+        view: set.view_indices,
+        track: set.track_indices,
+        x: set.xs,
+        y: set.ys,
+        depth: set.depths,
+        sigma: set.sigmas_px,
     }
 }
 
 pub(super) fn view_from_wire(view: &proto::View) -> View {
     View {
+        name: (!view.name.is_empty()).then(|| view.name.as_str().into()),
         size: view.size.map(|proto::ImageSize { width_px, height_px }| ImageSize { width_px, height_px }),
         camera_group: view.camera_group,
         focal_prior: view
@@ -163,6 +164,7 @@ pub(super) fn view_from_wire(view: &proto::View) -> View {
 
 fn view_to_wire(view: &View) -> proto::View {
     proto::View {
+        name: view.name.as_deref().unwrap_or_default().to_owned(),
         size: view.size.map(|ImageSize { width_px, height_px }| proto::ImageSize { width_px, height_px }),
         camera_group: view.camera_group,
         focal_prior: view
@@ -184,12 +186,12 @@ pub fn head_to_wire(raw: &RawInput) -> proto::TrackSet {
 /// A whole input in one message.
 pub fn to_wire(raw: &RawInput) -> proto::TrackSet {
     proto::TrackSet {
-        view: raw.view.clone(),
-        track: raw.track.clone(),
-        x: raw.x.clone(),
-        y: raw.y.clone(),
-        depth: raw.depth.clone(),
-        sigma: raw.sigma.clone(),
+        view_indices: raw.view.clone(),
+        track_indices: raw.track.clone(),
+        xs: raw.x.clone(),
+        ys: raw.y.clone(),
+        depths: raw.depth.clone(),
+        sigmas_px: raw.sigma.clone(),
         ..head_to_wire(raw)
     }
 }
@@ -208,12 +210,12 @@ pub fn chunks<R: Borrow<RawInput>>(raw: R) -> impl Iterator<Item = proto::TrackS
     (0..longest).step_by(CHUNK_OBSERVATIONS).map(move |from| {
         let raw = raw.borrow();
         proto::TrackSetChunk {
-            view: slice(&raw.view, from),
-            track: slice(&raw.track, from),
-            x: slice(&raw.x, from),
-            y: slice(&raw.y, from),
-            sigma: slice(&raw.sigma, from),
-            depth: slice(&raw.depth, from),
+            view_indices: slice(&raw.view, from),
+            track_indices: slice(&raw.track, from),
+            xs: slice(&raw.x, from),
+            ys: slice(&raw.y, from),
+            sigmas_px: slice(&raw.sigma, from),
+            depths: slice(&raw.depth, from),
         }
     })
 }
@@ -245,7 +247,10 @@ mod tests {
         let size = ImageSize { width_px: 640, height_px: 480 };
         let focal_prior = FocalPrior { focal_px: 500.0, sigma_log: 0.1 };
         RawInput {
-            views: vec![View { size: Some(size), camera_group: 3, focal_prior: Some(focal_prior) }, View::default()],
+            views: vec![
+                View { name: Some("a.jpg".into()), size: Some(size), camera_group: 3, focal_prior: Some(focal_prior) },
+                View::default(),
+            ],
             track_count: tracks,
             view: (0..observations as u32).map(|k| k % 2).collect(),
             track: (0..observations as u32).map(|k| k / 2).collect(),
@@ -278,12 +283,12 @@ mod tests {
     fn an_endless_stream_is_refused_as_soon_as_it_is_above_the_limits() {
         let limits = Limits { max_observations: 10, ..Limits::default() };
         let mut draft = Draft::begin(Some(Inline::TrackSet(head_to_wire(&raw(4)))), &limits).expect("a head");
-        let chunk = proto::TrackSetChunk { y: vec![0.0; 6], ..Default::default() };
+        let chunk = proto::TrackSetChunk { ys: vec![0.0; 6], ..Default::default() };
         draft.append_track_set(chunk.clone()).expect("a chunk");
         assert_eq!(draft.check_size(), Ok(()));
         draft.append_track_set(chunk).expect("a chunk");
         let error = draft.check_size().expect_err("12 of 10");
-        assert_eq!(error.to_string(), "track_set.y: 12 are above the limit of 10");
+        assert_eq!(error.to_string(), "track_set.ys: 12 are above the limit of 10");
     }
 
     #[test]
@@ -296,11 +301,11 @@ mod tests {
     #[test]
     fn wrong_sigmas_name_their_index() {
         let mut set = to_wire(&raw(4));
-        set.sigma = vec![1.0, 0.5, f64::NAN, 1.0];
+        set.sigmas_px = vec![1.0, 0.5, f64::NAN, 1.0];
         let finish = |set| Draft::begin(Some(Inline::TrackSet(set)), &Limits::default()).expect("set").finish();
         let error = finish(set.clone()).expect_err("NaN");
-        assert_eq!(error.violations()[0].path(), "track_set.sigma[2]");
-        set.sigma = vec![1.0];
-        assert_eq!(finish(set).expect_err("short").violations()[0].path(), "track_set.sigma");
+        assert_eq!(error.violations()[0].path(), "track_set.sigmas_px[2]");
+        set.sigmas_px = vec![1.0];
+        assert_eq!(finish(set).expect_err("short").violations()[0].path(), "track_set.sigmas_px");
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::enums::{Twin, optional_to_wire};
+use super::time::{duration_to_wire, seconds_from_wire};
 use super::{optional_time, progress, required, result, settings, tellable, time_from_wire};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Grade, InputName, InvalidInput, Proposal, Status, Violation};
@@ -31,7 +32,7 @@ pub fn to_wire(job: &Job) -> proto::Job {
         cancel_requested: job.cancel_requested,
         expire_time: tellable(job.expire_time),
         etag: job.etag(),
-        input_name: job.input.as_ref().map(InputName::to_string).unwrap_or_default(),
+        input: job.input.as_ref().map(InputName::to_string).unwrap_or_default(),
     }
 }
 
@@ -50,7 +51,7 @@ pub fn from_wire(job: proto::Job) -> Result<Job, InvalidInput> {
         state: JobState::required(job.state, "state")?,
         attempt: job.attempt,
         settings: settings::from_wire(job.settings)?,
-        input: input_from_wire(&job.input_name)?,
+        input: input_from_wire(&job.input)?,
         view_count: job.view_count,
         track_count: job.track_count,
         observation_count: job.observation_count,
@@ -78,9 +79,7 @@ pub fn event_to_wire(event: JobEvent) -> proto::JobEvent {
             error: failure.as_ref().map(failure_to_wire),
         }),
         EventBody::Progress(record) => Body::Progress(progress::to_wire(&record)),
-        EventBody::Weights { iteration, weights } => {
-            Body::Weights(proto::InterimWeights { iteration, weight: weights })
-        }
+        EventBody::Weights { iteration, weights } => Body::Weights(proto::InterimWeights { iteration, weights }),
         EventBody::Result(summary) => Body::Result(summary_to_wire(&summary)),
     };
     proto::JobEvent {
@@ -101,7 +100,7 @@ pub fn event_from_wire(event: proto::JobEvent) -> Result<JobEvent, Violation> {
             failure: change.error.map(failure_from_wire).transpose()?,
         },
         Body::Progress(record) => EventBody::Progress(progress::from_wire(&record)?),
-        Body::Weights(interim) => EventBody::Weights { iteration: interim.iteration, weights: interim.weight },
+        Body::Weights(interim) => EventBody::Weights { iteration: interim.iteration, weights: interim.weights },
         Body::Result(summary) => EventBody::Result(summary_from_wire(&summary)?),
     };
     Ok(JobEvent {
@@ -122,7 +121,7 @@ fn input_from_wire(name: &str) -> Result<Option<InputName>, Violation> {
         return Ok(None);
     }
     let parsed = InputName::parse(name);
-    parsed.map(Some).ok_or_else(|| Violation::of("input_name", format!("{name:?} is not an input's name")))
+    parsed.map(Some).ok_or_else(|| Violation::of("input", format!("{name:?} is not an input's name")))
 }
 
 fn failure_to_wire(failure: &Failure) -> proto::JobError {
@@ -162,12 +161,12 @@ fn summary_to_wire(summary: &Summary) -> proto::JobSummary {
         grade: optional_to_wire(summary.grade),
         focal_px: summary.focal_px,
         sigma_log_focal: summary.sigma_log_focal,
-        inlier_tracks: summary.inlier_tracks,
-        registered_views: summary.registered_views,
+        inlier_track_count: summary.inlier_tracks,
+        registered_view_count: summary.registered_views,
         reprojection_rms_px: summary.reprojection_rms_px,
-        winning_prior: optional_to_wire(summary.winning_prior),
-        iterations: summary.iterations,
-        seconds: summary.seconds,
+        winning_proposal: optional_to_wire(summary.winning_proposal),
+        iteration_count: summary.iterations,
+        solve_duration: Some(duration_to_wire(summary.seconds)),
         result_bytes: summary.result_bytes,
         warnings: result::warnings_to_wire(&summary.warnings),
     }
@@ -179,12 +178,12 @@ fn summary_from_wire(summary: &proto::JobSummary) -> Result<Summary, Violation> 
         grade: Grade::from_wire(summary.grade, "summary.grade")?,
         focal_px: summary.focal_px,
         sigma_log_focal: summary.sigma_log_focal,
-        inlier_tracks: summary.inlier_tracks,
-        registered_views: summary.registered_views,
+        inlier_tracks: summary.inlier_track_count,
+        registered_views: summary.registered_view_count,
         reprojection_rms_px: summary.reprojection_rms_px,
-        winning_prior: Proposal::from_wire(summary.winning_prior, "summary.winning_prior")?,
-        iterations: summary.iterations,
-        seconds: summary.seconds,
+        winning_proposal: Proposal::from_wire(summary.winning_proposal, "summary.winning_proposal")?,
+        iterations: summary.iteration_count,
+        seconds: seconds_from_wire(summary.solve_duration, "summary.solve_duration")?,
         result_bytes: summary.result_bytes,
         warnings: result::warnings_from_wire(&summary.warnings, "summary.warnings.code")?,
     })
@@ -195,7 +194,7 @@ mod tests {
     use std::time::{Duration, SystemTime};
 
     use super::*;
-    use crate::domain::{Course, Progress, SolveSettings, Stage, Step, Task, Warning, WarningCode};
+    use crate::domain::{Progress, ReconstructionProgress, SolveSettings, Stage, Step, Task, Warning, WarningCode};
 
     fn name() -> JobName {
         JobName { tenant: "default".into(), job: "a-1".into() }
@@ -214,7 +213,7 @@ mod tests {
             inlier_tracks: 20,
             registered_views: 10,
             reprojection_rms_px: Some(0.4),
-            winning_prior: Some(Proposal::Network),
+            winning_proposal: Some(Proposal::Network),
             iterations: 60,
             seconds: 1.25,
             result_bytes: 12_345,
@@ -233,7 +232,7 @@ mod tests {
             focal_px: None,
             best_score: Some(0.0),
             elapsed_seconds: 2.0,
-            course: Course {
+            reconstruction: ReconstructionProgress {
                 block: 1,
                 blocks: 4,
                 part: 1,

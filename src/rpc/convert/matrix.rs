@@ -145,7 +145,7 @@ fn in_terms_of_the_matrix(error: InvalidInput) -> InvalidInput {
     for violation in error.violations() {
         let name = violation.field.strip_prefix(MATRIX).and_then(|rest| rest.strip_prefix('.'));
         match name {
-            Some("view" | "track" | "x" | "y" | "depth") => {
+            Some("view_indices" | "track_indices" | "xs" | "ys" | "depths") => {
                 found.push(Violation::of(field("values"), violation.description.clone()));
             }
             _ => found.push(violation.clone()),

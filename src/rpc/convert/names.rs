@@ -1,15 +1,21 @@
-//! Resource names in requests, against the tenant that calls.
+//! Resource names in requests, against the tenant that calls: `tenants/-` names that one.
+
+use std::borrow::Cow;
 
 use crate::domain::error::quoted;
 use crate::domain::job::JobName;
 use crate::domain::{InputName, InvalidInput, Violation};
 
-/// The tenant of `tenants/{tenant}`.
+/// The tenant of `tenants/{tenant}`; `own` where that is left out.
 ///
 /// # Errors
 /// A violation of `parent` where the name has another form.
-pub fn tenant(parent: &str) -> Result<String, InvalidInput> {
+pub fn tenant(parent: &str, own: &str) -> Result<String, InvalidInput> {
+    if parent.is_empty() {
+        return Ok(own.to_owned());
+    }
     match parent.strip_prefix("tenants/") {
+        Some("-") => Ok(own.to_owned()),
         Some(tenant) if JobName::is_id(tenant) => Ok(tenant.to_owned()),
         _ => Err(Violation::of(
             "parent",
@@ -23,8 +29,8 @@ pub fn tenant(parent: &str) -> Result<String, InvalidInput> {
 ///
 /// # Errors
 /// A violation of `name` where the name has another form.
-pub fn job(name: &str) -> Result<JobName, InvalidInput> {
-    JobName::parse(name).ok_or_else(|| {
+pub fn job(name: &str, own: &str) -> Result<JobName, InvalidInput> {
+    JobName::parse(&resolved(name, own)).ok_or_else(|| {
         Violation::of("name", format!("{} is not of the form tenants/{{tenant}}/jobs/{{job}}", quoted(name))).into()
     })
 }
@@ -33,21 +39,43 @@ pub fn job(name: &str) -> Result<JobName, InvalidInput> {
 ///
 /// # Errors
 /// A violation of `field` where the name has another form.
-pub fn input(name: &str, field: &str) -> Result<InputName, InvalidInput> {
-    InputName::parse(name).ok_or_else(|| {
+pub fn input(name: &str, field: &str, own: &str) -> Result<InputName, InvalidInput> {
+    InputName::parse(&resolved(name, own)).ok_or_else(|| {
         let text = format!("{} is not of the form tenants/{{tenant}}/inputs/{{input}}", quoted(name));
         Violation::of(field, text).into()
     })
+}
+
+/// A name with the tenant's id in the place of `-`.
+fn resolved<'a>(name: &'a str, own: &str) -> Cow<'a, str> {
+    match name.strip_prefix("tenants/-/") {
+        Some(rest) => format!("tenants/{own}/{rest}").into(),
+        None => name.into(),
+    }
 }
 
 #[cfg(test)]
 mod tests {
     #[test]
     fn reads_parents_and_refuses_other_forms() {
-        assert_eq!(super::tenant("tenants/default").as_deref(), Ok("default"));
-        for bad in ["", "default", "tenants/", "tenants/a/jobs/b", "tenants/A"] {
-            let error = super::tenant(bad).expect_err(bad);
+        assert_eq!(super::tenant("tenants/default", "own").as_deref(), Ok("default"));
+        for own in ["", "tenants/-"] {
+            assert_eq!(super::tenant(own, "own").as_deref(), Ok("own"));
+        }
+        for bad in ["default", "-", "tenants/", "tenants/a/jobs/b", "tenants/A"] {
+            let error = super::tenant(bad, "own").expect_err(bad);
             assert_eq!(error.violations()[0].field, "parent", "{bad}");
+        }
+    }
+
+    #[test]
+    fn a_dash_is_the_tenant_that_calls() {
+        let job = super::job("tenants/-/jobs/a", "own").expect("a name");
+        assert_eq!(job.to_string(), "tenants/own/jobs/a");
+        let input = super::input("tenants/-/inputs/b", "input", "own").expect("a name");
+        assert_eq!(input.to_string(), "tenants/own/inputs/b");
+        for bad in ["tenants/-", "tenants/-/jobs/-", "tenants/-/jobs/", "tenants/--/jobs/a", "-/jobs/a"] {
+            assert_eq!(super::job(bad, "own").expect_err(bad).violations()[0].field, "name", "{bad}");
         }
     }
 }

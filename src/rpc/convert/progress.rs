@@ -1,7 +1,8 @@
 //! Progress records.
 
-use super::enums::Twin;
-use crate::domain::{Course, HeadProgress, Losses, Phase, Progress, Stage, Step, Task, Violation};
+use super::enums::{Twin, optional_to_wire};
+use super::time::{duration_to_wire, seconds_from_wire};
+use crate::domain::{HeadProgress, Losses, Phase, Progress, ReconstructionProgress, Stage, Step, Task, Violation};
 use crate::rpc::proto;
 
 pub fn to_wire(progress: &Progress) -> proto::Progress {
@@ -10,11 +11,11 @@ pub fn to_wire(progress: &Progress) -> proto::Progress {
         fraction: progress.fraction,
         iteration: progress.iteration,
         losses: progress.losses.map(|Losses { num, proj, daq }| proto::Losses { num, proj, daq }),
-        inliers: progress.inliers,
+        inlier_track_count: progress.inliers,
         focal_px: progress.focal_px,
         best_score: progress.best_score,
-        elapsed_seconds: progress.elapsed_seconds,
-        course: Some(course_to_wire(&progress.course)),
+        elapsed_duration: Some(duration_to_wire(progress.elapsed_seconds)),
+        reconstruction: Some(reconstruction_to_wire(&progress.reconstruction)),
         head: progress.head.as_ref().map(head_to_wire),
     }
 }
@@ -27,11 +28,11 @@ pub fn from_wire(progress: &proto::Progress) -> Result<Progress, Violation> {
         fraction: progress.fraction,
         iteration: progress.iteration,
         losses: progress.losses.map(|proto::Losses { num, proj, daq }| Losses { num, proj, daq }),
-        inliers: progress.inliers,
+        inliers: progress.inlier_track_count,
         focal_px: progress.focal_px,
         best_score: progress.best_score,
-        elapsed_seconds: progress.elapsed_seconds,
-        course: progress.course.as_ref().map(course_from_wire).unwrap_or_default(),
+        elapsed_seconds: seconds_from_wire(progress.elapsed_duration, "progress.elapsed_duration")?,
+        reconstruction: progress.reconstruction.as_ref().map(reconstruction_from_wire).unwrap_or_default(),
         head: progress.head.as_ref().map(head_from_wire),
     })
 }
@@ -41,7 +42,7 @@ fn head_to_wire(progress: &HeadProgress) -> proto::HeadProgress {
     proto::HeadProgress {
         head,
         iteration,
-        phase: super::enums::optional_to_wire(phase),
+        phase: optional_to_wire(phase),
         weight_sum,
         weight_histogram: weight_histogram.to_vec(),
         tolerance,
@@ -49,7 +50,7 @@ fn head_to_wire(progress: &HeadProgress) -> proto::HeadProgress {
     }
 }
 
-/// As [`course_from_wire`], of phases.
+/// As [`reconstruction_from_wire`], of phases.
 fn head_from_wire(progress: &proto::HeadProgress) -> HeadProgress {
     let proto::HeadProgress { head, iteration, phase, weight_sum, tolerance, best_daq_residual, .. } = *progress;
     let phase = Phase::from_wire(phase, "progress.head.phase").ok().flatten();
@@ -58,25 +59,31 @@ fn head_from_wire(progress: &proto::HeadProgress) -> HeadProgress {
     HeadProgress { head, iteration, phase, weight_sum, weight_histogram, tolerance, best_daq_residual }
 }
 
-fn course_to_wire(course: &Course) -> proto::Course {
-    let Course { block, blocks, part, registered_views, views, step } = *course;
-    proto::Course {
+fn reconstruction_to_wire(reconstruction: &ReconstructionProgress) -> proto::ReconstructionProgress {
+    let ReconstructionProgress { block, blocks, part, registered_views, views, step } = *reconstruction;
+    proto::ReconstructionProgress {
         block,
-        blocks,
+        block_count: blocks,
         part,
-        registered_views,
-        views,
-        task: super::enums::optional_to_wire(step.map(|step| step.task)),
+        registered_view_count: registered_views,
+        view_count: views,
+        task: optional_to_wire(step.map(|step| step.task)),
         step: step.map_or(0, |step| step.step),
-        steps: step.map_or(0, |step| step.steps),
+        step_count: step.map_or(0, |step| step.steps),
     }
 }
 
 /// A task that only a later version knows is none: a stage that does something new is no reason not to watch it.
-fn course_from_wire(course: &proto::Course) -> Course {
-    let proto::Course { block, blocks, part, registered_views, views, task, step, steps } = *course;
-    let task = Task::from_wire(task, "progress.course.task").ok().flatten();
-    Course { block, blocks, part, registered_views, views, step: task.map(|task| Step { task, step, steps }) }
+fn reconstruction_from_wire(wire: &proto::ReconstructionProgress) -> ReconstructionProgress {
+    let task = Task::from_wire(wire.task, "progress.reconstruction.task").ok().flatten();
+    ReconstructionProgress {
+        block: wire.block,
+        blocks: wire.block_count,
+        part: wire.part,
+        registered_views: wire.registered_view_count,
+        views: wire.view_count,
+        step: task.map(|task| Step { task, step: wire.step, steps: wire.step_count }),
+    }
 }
 
 #[cfg(test)]
@@ -84,12 +91,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn servers_of_other_versions_are_understood() {
-        let stage = Stage::Extend.to_wire();
-        let older = from_wire(&proto::Progress { stage, fraction: 0.5, ..Default::default() }).expect("known");
-        assert_eq!(older.course, Course::default());
-        let course = proto::Course { registered_views: 3, task: 99, step: 1, steps: 2, ..Default::default() };
-        let newer = from_wire(&proto::Progress { stage, course: Some(course), ..Default::default() }).expect("known");
-        assert_eq!(newer.course, Course { registered_views: 3, ..Course::default() });
+    fn tasks_of_later_versions_are_none() {
+        let reconstruction = proto::ReconstructionProgress {
+            registered_view_count: 3,
+            task: 99,
+            step: 1,
+            step_count: 2,
+            ..Default::default()
+        };
+        let newer = from_wire(&proto::Progress {
+            stage: Stage::Extend.to_wire(),
+            elapsed_duration: Some(duration_to_wire(0.5)),
+            reconstruction: Some(reconstruction),
+            ..Default::default()
+        });
+        let expected = ReconstructionProgress { registered_views: 3, ..ReconstructionProgress::default() };
+        assert_eq!(newer.expect("known").reconstruction, expected);
     }
 }

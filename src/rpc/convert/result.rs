@@ -1,24 +1,34 @@
 //! Results, without loss: a client writes the same files from a [`proto::JobResult`] as a solve in process would.
 
+use prost::Message;
+
 use super::enums::{Twin, optional_to_wire};
+use super::time::{duration_to_wire, seconds_from_wire};
 use super::{progress, required};
 use crate::domain::job::JobName;
-use crate::domain::result::{ObservationResults, PriorTime, Sigmas, StageTime, TrackResults, TrackSplit, ViewResult};
+use crate::domain::result::{
+    ObservationResults, ProposalTime, Sigmas, StageTime, TrackResults, TrackSplit, ViewResult,
+};
 use crate::domain::{
     Calibration, Grade, LeftOut, LensProjection, Method, Proposal, Solution, Stage, Status, Violation, Warning,
     WarningCode,
 };
 use crate::rpc::proto;
 
-pub fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
+/// The bytes that every read of the result gives; see [`crate::engine::ResultEncoder`].
+pub fn encode(name: &JobName, solution: &Solution) -> Vec<u8> {
+    to_wire(name, solution).encode_to_vec()
+}
+
+fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
     proto::JobResult {
         job: name.to_string(),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
+        server_version: env!("CARGO_PKG_VERSION").to_owned(),
         status: solution.status.to_wire(),
         grade: optional_to_wire(solution.grade),
         method: solution.method.to_wire(),
-        winning_prior: optional_to_wire(solution.winning_prior),
-        iterations: solution.iterations,
+        winning_proposal: optional_to_wire(solution.winning_proposal),
+        iteration_count: solution.iterations,
         seed: solution.seed,
         calibrations: solution.calibrations.iter().map(calibration_to_wire).collect(),
         plane_at_infinity: solution.plane_at_infinity.map(|[x, y, z]| proto::PlaneAtInfinity { x, y, z }),
@@ -30,19 +40,22 @@ pub fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         reprojection_rms_px: solution.reprojection_rms_px,
         reprojection_mean_px: solution.reprojection_mean_px,
         warnings: warnings_to_wire(&solution.warnings),
-        seconds: solution.seconds,
-        stages: solution
+        solve_duration: Some(duration_to_wire(solution.seconds)),
+        stage_times: solution
             .stages
             .iter()
-            .map(|time| proto::StageTime { stage: time.stage.to_wire(), seconds: time.seconds })
+            .map(|time| proto::StageTime {
+                stage: time.stage.to_wire(),
+                duration: Some(duration_to_wire(time.seconds)),
+            })
             .collect(),
-        prior_times: solution
-            .prior_times
+        proposal_times: solution
+            .proposal_times
             .iter()
-            .map(|time| proto::PriorTime {
-                prior: time.prior.to_wire(),
-                seconds: time.seconds,
-                iterations: time.iterations,
+            .map(|time| proto::ProposalTime {
+                proposal: time.proposal.to_wire(),
+                duration: time.seconds.map(duration_to_wire),
+                iteration_count: time.iterations,
             })
             .collect(),
         history: solution.history.iter().map(progress::to_wire).collect(),
@@ -58,8 +71,8 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         status: Status::required(result.status, "status")?,
         grade: Grade::from_wire(result.grade, "grade")?,
         method: Method::required(result.method, "method")?,
-        winning_prior: Proposal::from_wire(result.winning_prior, "winning_prior")?,
-        iterations: result.iterations,
+        winning_proposal: Proposal::from_wire(result.winning_proposal, "winning_proposal")?,
+        iterations: result.iteration_count,
         seed: result.seed,
         calibrations: result.calibrations.iter().map(calibration_from_wire).collect::<Result<_, _>>()?,
         plane_at_infinity: result.plane_at_infinity.map(|plane| [plane.x, plane.y, plane.z]),
@@ -71,18 +84,25 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         reprojection_rms_px: result.reprojection_rms_px,
         reprojection_mean_px: result.reprojection_mean_px,
         warnings: warnings_from_wire(&result.warnings, "warnings.code")?,
-        seconds: result.seconds,
+        seconds: seconds_from_wire(result.solve_duration, "solve_duration")?,
         stages: result
-            .stages
-            .iter()
-            .map(|time| Ok(StageTime { stage: Stage::required(time.stage, "stages.stage")?, seconds: time.seconds }))
-            .collect::<Result<_, Violation>>()?,
-        prior_times: result
-            .prior_times
+            .stage_times
             .iter()
             .map(|time| {
-                let prior = Proposal::required(time.prior, "prior_times.prior")?;
-                Ok(PriorTime { prior, seconds: time.seconds, iterations: time.iterations })
+                let stage = Stage::required(time.stage, "stage_times.stage")?;
+                Ok(StageTime { stage, seconds: seconds_from_wire(time.duration, "stage_times.duration")? })
+            })
+            .collect::<Result<_, Violation>>()?,
+        proposal_times: result
+            .proposal_times
+            .iter()
+            .map(|time| {
+                let proposal = Proposal::required(time.proposal, "proposal_times.proposal")?;
+                let seconds = match time.duration {
+                    Some(duration) => Some(seconds_from_wire(Some(duration), "proposal_times.duration")?),
+                    None => None,
+                };
+                Ok(ProposalTime { proposal, seconds, iterations: time.iteration_count })
             })
             .collect::<Result<_, Violation>>()?,
         history: result.history.iter().map(progress::from_wire).collect::<Result<_, _>>()?,
@@ -119,17 +139,17 @@ fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
         principal_point_y_px: calibration.principal_point_px[1],
         aspect: calibration.aspect,
         lens_projection: calibration.lens_projection.to_wire(),
-        radial_k1: Some(calibration.radial_k1),
-        radial_k2: Some(calibration.radial_k2),
+        radial_k1: calibration.radial_k1,
+        radial_k2: calibration.radial_k2,
         grade: optional_to_wire(calibration.grade),
         sigma_principal_point_x_px: calibration.sigmas.principal_point_px.map(|[x, _]| x),
         sigma_principal_point_y_px: calibration.sigmas.principal_point_px.map(|[_, y]| y),
         sigma_aspect: calibration.sigmas.aspect,
         sigma_radial_k1: calibration.sigmas.radial_k1,
         sigma_radial_k2: calibration.sigmas.radial_k2,
-        radial_k3: Some(calibration.radial_k3),
-        tangential_p1: Some(calibration.tangential_p1),
-        tangential_p2: Some(calibration.tangential_p2),
+        radial_k3: calibration.radial_k3,
+        tangential_p1: calibration.tangential_p1,
+        tangential_p2: calibration.tangential_p2,
         sigma_radial_k3: calibration.sigmas.radial_k3,
         sigma_tangential_p1: calibration.sigmas.tangential_p1,
         sigma_tangential_p2: calibration.sigmas.tangential_p2,
@@ -144,11 +164,11 @@ fn calibration_from_wire(calibration: &proto::Calibration) -> Result<Calibration
         aspect: calibration.aspect,
         lens_projection: LensProjection::from_wire(calibration.lens_projection, "calibrations.lens_projection")?
             .unwrap_or_default(),
-        radial_k1: calibration.radial_k1.unwrap_or(0.0),
-        radial_k2: calibration.radial_k2.unwrap_or(0.0),
-        radial_k3: calibration.radial_k3.unwrap_or(0.0),
-        tangential_p1: calibration.tangential_p1.unwrap_or(0.0),
-        tangential_p2: calibration.tangential_p2.unwrap_or(0.0),
+        radial_k1: calibration.radial_k1,
+        radial_k2: calibration.radial_k2,
+        radial_k3: calibration.radial_k3,
+        tangential_p1: calibration.tangential_p1,
+        tangential_p2: calibration.tangential_p2,
         grade: Grade::from_wire(calibration.grade, "calibrations.grade")?,
         sigmas: Sigmas {
             principal_point_px: calibration
@@ -174,17 +194,18 @@ fn view_to_wire(view: &ViewResult) -> proto::ViewResult {
         part: view.part,
         camera_group: view.camera_group,
         left_out: view.left_out.map(left_out_to_wire),
+        name: view.name.as_deref().unwrap_or_default().to_owned(),
     }
 }
 
 fn left_out_to_wire(left_out: LeftOut) -> proto::LeftOut {
     use proto::LeftOutReason as Reason;
-    let (reason, points, agreeing) = match left_out {
+    let (reason, point_count, agreeing_count) = match left_out {
         LeftOut::NoObservations => (Reason::NoObservations, 0, 0),
         LeftOut::OutsideBlock => (Reason::OutsideBlock, 0, 0),
         LeftOut::NotRegistered { points, agreeing } => (Reason::NotRegistered, points, agreeing),
     };
-    proto::LeftOut { reason: reason.into(), points, agreeing }
+    proto::LeftOut { reason: reason.into(), point_count, agreeing_count }
 }
 
 fn left_out_from_wire(left_out: &proto::LeftOut, view: usize) -> Result<Option<LeftOut>, Violation> {
@@ -197,7 +218,9 @@ fn left_out_from_wire(left_out: &proto::LeftOut, view: usize) -> Result<Option<L
         Reason::Unspecified => None,
         Reason::NoObservations => Some(LeftOut::NoObservations),
         Reason::OutsideBlock => Some(LeftOut::OutsideBlock),
-        Reason::NotRegistered => Some(LeftOut::NotRegistered { points: left_out.points, agreeing: left_out.agreeing }),
+        Reason::NotRegistered => {
+            Some(LeftOut::NotRegistered { points: left_out.point_count, agreeing: left_out.agreeing_count })
+        }
     })
 }
 
@@ -206,6 +229,7 @@ fn view_from_wire((index, view): (usize, &proto::ViewResult)) -> Result<ViewResu
         Violation::at(format!("views.{name}"), index, format!("{} numbers, not 0 or {count}", numbers.len()))
     };
     Ok(ViewResult {
+        name: (!view.name.is_empty()).then(|| view.name.as_str().into()),
         projection: rows(&view.projection).map_err(|()| wrong("projection", 12, &view.projection))?,
         rotation: rows(&view.rotation).map_err(|()| wrong("rotation", 9, &view.rotation))?,
         translation: match view.translation.as_slice() {
@@ -238,12 +262,12 @@ fn rows<const N: usize>(numbers: &[f64]) -> Result<Option<[[f64; N]; 3]>, ()> {
 fn tracks_to_wire(tracks: &TrackResults) -> proto::TrackResults {
     let with_point = || tracks.point.iter().enumerate().filter_map(|(track, point)| Some((track, (*point)?)));
     proto::TrackResults {
-        weight: tracks.weight.clone(),
-        inlier: tracks.inlier.clone(),
-        network_weight: tracks.network_weight.clone(),
-        point_track: with_point().map(|(track, _)| track as u32).collect(),
-        point: with_point().flat_map(|(_, point)| point).collect(),
-        point_part: if tracks.part.is_empty() {
+        weights: tracks.weight.clone(),
+        inliers: tracks.inlier.clone(),
+        network_weights: tracks.network_weight.clone(),
+        point_tracks: with_point().map(|(track, _)| track as u32).collect(),
+        points: with_point().flat_map(|(_, point)| point).collect(),
+        point_parts: if tracks.part.is_empty() {
             Vec::new()
         } else {
             with_point().map(|(track, _)| tracks.part_of(track).unwrap_or(0)).collect()
@@ -252,43 +276,43 @@ fn tracks_to_wire(tracks: &TrackResults) -> proto::TrackResults {
 }
 
 fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violation> {
-    let count = tracks.weight.len();
-    if tracks.inlier.len() != count || !(tracks.network_weight.is_empty() || tracks.network_weight.len() == count) {
+    let count = tracks.weights.len();
+    if tracks.inliers.len() != count || !(tracks.network_weights.is_empty() || tracks.network_weights.len() == count) {
         return Err(Violation::of("tracks", format!("arrays of different lengths beside {count} weights")));
     }
-    if tracks.point.len() != 3 * tracks.point_track.len() {
+    if tracks.points.len() != 3 * tracks.point_tracks.len() {
         return Err(Violation::of(
-            "tracks.point",
-            format!("{} numbers for {} points", tracks.point.len(), tracks.point_track.len()),
+            "tracks.points",
+            format!("{} numbers for {} points", tracks.points.len(), tracks.point_tracks.len()),
         ));
     }
-    let part_count = tracks.point_part.len();
-    if part_count != 0 && part_count != tracks.point_track.len() {
-        let what = format!("{part_count} parts for {} points", tracks.point_track.len());
-        return Err(Violation::of("tracks.point_part", what));
+    let part_count = tracks.point_parts.len();
+    if part_count != 0 && part_count != tracks.point_tracks.len() {
+        let what = format!("{part_count} parts for {} points", tracks.point_tracks.len());
+        return Err(Violation::of("tracks.point_parts", what));
     }
     let mut point = vec![None; count];
     let mut part = if part_count == 0 { Vec::new() } else { vec![0; count] };
-    for (index, (&track, xyz)) in tracks.point_track.iter().zip(tracks.point.chunks_exact(3)).enumerate() {
+    for (index, (&track, xyz)) in tracks.point_tracks.iter().zip(tracks.points.chunks_exact(3)).enumerate() {
         let slot = point.get_mut(track as usize).ok_or_else(|| {
-            Violation::at("tracks.point_track", index, format!("track {track} is outside the {count} tracks"))
+            Violation::at("tracks.point_tracks", index, format!("track {track} is outside the {count} tracks"))
         })?;
         *slot = Some([xyz[0], xyz[1], xyz[2]]);
-        if let (Some(part), Some(&of)) = (part.get_mut(track as usize), tracks.point_part.get(index)) {
+        if let (Some(part), Some(&of)) = (part.get_mut(track as usize), tracks.point_parts.get(index)) {
             *part = of;
         }
     }
-    let proto::TrackResults { weight, inlier, network_weight, .. } = tracks;
-    Ok(TrackResults { weight, inlier, network_weight, point, part })
+    let proto::TrackResults { weights, inliers, network_weights, .. } = tracks;
+    Ok(TrackResults { weight: weights, inlier: inliers, network_weight: network_weights, point, part })
 }
 
 fn observations_to_wire(observations: &ObservationResults) -> proto::ObservationResults {
     proto::ObservationResults {
-        inlier: observations.inlier.clone(),
+        inliers: observations.inlier.clone(),
         judged: observations.residual_px.iter().map(Option::is_some).collect(),
-        residual_px: observations.residual_px.iter().map(|residual| residual.unwrap_or(0.0)).collect(),
-        weight: observations.weight.clone(),
-        split: if observations.split.iter().any(|&split| split > 0) { observations.split.clone() } else { Vec::new() },
+        residuals_px: observations.residual_px.iter().map(|residual| residual.unwrap_or(0.0)).collect(),
+        weights: observations.weight.clone(),
+        splits: if observations.split.iter().any(|&split| split > 0) { observations.split.clone() } else { Vec::new() },
     }
 }
 
@@ -307,26 +331,26 @@ fn split_from_wire((index, split): (usize, &proto::TrackSplit)) -> Result<TrackS
 }
 
 fn observations_from_wire(mut observations: proto::ObservationResults) -> Result<ObservationResults, Violation> {
-    let count = observations.inlier.len();
-    if observations.judged.len() != count || observations.residual_px.len() != count {
+    let count = observations.inliers.len();
+    if observations.judged.len() != count || observations.residuals_px.len() != count {
         return Err(Violation::of("observations", "arrays of different lengths"));
     }
-    let lengths = [("weight", observations.weight.len()), ("split", observations.split.len())];
+    let lengths = [("weights", observations.weights.len()), ("splits", observations.splits.len())];
     if let Some((name, length)) = lengths.into_iter().find(|(_, length)| ![0, count].contains(length)) {
         return Err(Violation::of(
             format!("observations.{name}"),
             format!("{length} entries for {count} observations"),
         ));
     }
-    let residual_px = observations.judged.iter().zip(&observations.residual_px);
+    let residual_px = observations.judged.iter().zip(&observations.residuals_px);
     // Both are left out where they say nothing.
-    observations.weight.resize(count, 0.0);
-    observations.split.resize(count, 0);
+    observations.weights.resize(count, 0.0);
+    observations.splits.resize(count, 0);
     Ok(ObservationResults {
         residual_px: residual_px.map(|(&judged, &residual)| judged.then_some(residual)).collect(),
-        weight: observations.weight,
-        split: observations.split,
-        inlier: observations.inlier,
+        weight: observations.weights,
+        split: observations.splits,
+        inlier: observations.inliers,
     })
 }
 

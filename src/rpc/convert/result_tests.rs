@@ -3,7 +3,7 @@
 use prost::Message;
 
 use super::*;
-use crate::domain::{Course, HeadProgress, LensProjection, Losses, Phase, Progress};
+use crate::domain::{HeadProgress, LensProjection, Losses, Phase, Progress, ReconstructionProgress};
 
 fn name() -> JobName {
     JobName { tenant: "default".into(), job: "a".into() }
@@ -31,13 +31,20 @@ pub(super) fn rich() -> Solution {
         focal_px: Some(1200.5),
         best_score: Some(0.9),
         elapsed_seconds: 0.25,
-        course: Course { block: 1, blocks: 4, part: 1, registered_views: 7, views: 9, step: None },
+        reconstruction: ReconstructionProgress {
+            block: 1,
+            blocks: 4,
+            part: 1,
+            registered_views: 7,
+            views: 9,
+            step: None,
+        },
     };
     Solution {
         status: Status::Solved,
         grade: Some(Grade::Weak),
         method: Method::Auto,
-        winning_prior: Some(Proposal::Irls),
+        winning_proposal: Some(Proposal::Irls),
         iterations: 150,
         seed: u64::MAX,
         calibrations: vec![
@@ -81,6 +88,7 @@ pub(super) fn rich() -> Solution {
         plane_at_infinity: Some([1e-4, -2e-4, 3e-300]),
         views: vec![
             ViewResult {
+                name: Some("a.jpg".into()),
                 projection,
                 rotation,
                 translation: Some([0.0, -1.0, 2.0]),
@@ -121,9 +129,9 @@ pub(super) fn rich() -> Solution {
         ],
         seconds: 1.5,
         stages: vec![StageTime { stage: Stage::Prepare, seconds: 0.1 }],
-        prior_times: vec![
-            PriorTime { prior: Proposal::Network, seconds: Some(0.5), iterations: 80 },
-            PriorTime { prior: Proposal::Uniform, seconds: None, iterations: 6000 },
+        proposal_times: vec![
+            ProposalTime { proposal: Proposal::Network, seconds: Some(0.5), iterations: 80 },
+            ProposalTime { proposal: Proposal::Uniform, seconds: None, iterations: 6000 },
         ],
         history: vec![progress, Progress { losses: None, head: None, focal_px: None, best_score: None, ..progress }],
         trained_network: Some("5ea1".into()),
@@ -146,7 +154,7 @@ fn a_solution_without_a_reconstruction_survives_too() {
     let bare = Solution {
         status: Status::NoReconstruction,
         grade: None,
-        winning_prior: None,
+        winning_proposal: None,
         calibrations: Vec::new(),
         plane_at_infinity: None,
         views: vec![ViewResult::default(); 2],
@@ -174,10 +182,10 @@ fn a_malformed_answer_names_its_field() {
     let tracks = |result: &mut proto::JobResult, change: &dyn Fn(&mut proto::TrackResults)| {
         change(result.tracks.as_mut().expect("set"));
     };
-    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.inlier.truncate(1))), "tracks");
-    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_track[0] = 3)), "tracks.point_track[0]");
-    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point.truncate(2))), "tracks.point");
-    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_part.push(1))), "tracks.point_part");
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.inliers.truncate(1))), "tracks");
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_tracks[0] = 3)), "tracks.point_tracks[0]");
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.points.truncate(2))), "tracks.points");
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_parts.push(1))), "tracks.point_parts");
     assert_eq!(with(&|result| result.calibrations[0].grade = 9), "calibrations.grade");
     let reason = |result: &mut proto::JobResult| result.views[3].left_out.as_mut().expect("set").reason = 9;
     assert_eq!(with(&reason), "views.left_out.reason[3]");

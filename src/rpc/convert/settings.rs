@@ -29,7 +29,7 @@ pub fn from_wire(settings: Option<proto::SolveSettings>) -> Result<SolveSettings
         weights_every: given.weights_every,
         backend: Backend::from_wire(given.backend, "settings.backend")?,
         // Ablations are no service to callers.
-        excluded_priors: Vec::new(),
+        excluded_proposals: Vec::new(),
     };
     settings.validate()?;
     Ok(settings)

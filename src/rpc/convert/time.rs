@@ -66,6 +66,25 @@ pub(crate) fn positive_duration(duration: prost_types::Duration, field: &str) ->
     Ok(Duration::from_secs(seconds.unsigned_abs()) + nanos)
 }
 
+/// Seconds for the wire, to the nanosecond; 0 for what is no duration.
+pub(crate) fn duration_to_wire(seconds: f64) -> prost_types::Duration {
+    let duration = Duration::try_from_secs_f64(seconds).unwrap_or_default();
+    let seconds = i64::try_from(duration.as_secs()).unwrap_or(i64::MAX);
+    prost_types::Duration { seconds, nanos: duration.subsec_nanos().cast_signed() }
+}
+
+/// Seconds from the wire.
+///
+/// # Errors
+/// A violation of `field` where it is missing, negative or no valid `Duration`.
+pub(crate) fn seconds_from_wire(duration: Option<prost_types::Duration>, field: &str) -> Result<f64, Violation> {
+    let duration = super::required(duration, field)?;
+    if duration.seconds < 0 {
+        return Err(Violation::of(field, "is negative"));
+    }
+    Ok((Duration::from_secs(duration.seconds.unsigned_abs()) + nanos(duration.nanos, field)?).as_secs_f64())
+}
+
 fn nanos(nanos: i32, field: &str) -> Result<Duration, Violation> {
     if !NANOS.contains(&nanos) {
         let text = format!("{nanos} nanoseconds are not in {}..={}", NANOS.start(), NANOS.end());

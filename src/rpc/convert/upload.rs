@@ -8,7 +8,7 @@ use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_f
 use super::input::{Draft, within};
 use crate::domain::{InvalidInput, Limits, Violation};
 use crate::rpc::proto;
-use proto::create_job_request::Input as Inline;
+use proto::create_job_request::Source as Inline;
 
 /// Field of violations that are not of a field of the input.
 const DATA: &str = "data";
@@ -87,22 +87,22 @@ fn track_set_field(
     let max = limits.max_observations;
     let packed = wire == WireType::LengthDelimited;
     match tag {
-        3 if packed => integers(buf, &mut set.view, "track_set.view", max),
-        4 if packed => integers(buf, &mut set.track, "track_set.track", max),
-        5 if packed => doubles(buf, &mut set.x, "track_set.x", max),
-        6 if packed => doubles(buf, &mut set.y, "track_set.y", max),
-        7 if packed => doubles(buf, &mut set.sigma, "track_set.sigma", max),
-        8 if packed => doubles(buf, &mut set.depth, "track_set.depth", max),
+        3 if packed => integers(buf, &mut set.view_indices, "track_set.view_indices", max),
+        4 if packed => integers(buf, &mut set.track_indices, "track_set.track_indices", max),
+        5 if packed => doubles(buf, &mut set.xs, "track_set.xs", max),
+        6 if packed => doubles(buf, &mut set.ys, "track_set.ys", max),
+        7 if packed => doubles(buf, &mut set.sigmas_px, "track_set.sigmas_px", max),
+        8 if packed => doubles(buf, &mut set.depths, "track_set.depths", max),
         _ => {
             set.merge_field(tag, wire, buf, DecodeContext::default()).map_err(malformed)?;
             let counts = [
                 ("views", set.views.len(), limits.max_views),
-                ("view", set.view.len(), max),
-                ("track", set.track.len(), max),
-                ("x", set.x.len(), max),
-                ("y", set.y.len(), max),
-                ("sigma", set.sigma.len(), max),
-                ("depth", set.depth.len(), max),
+                ("view_indices", set.view_indices.len(), max),
+                ("track_indices", set.track_indices.len(), max),
+                ("xs", set.xs.len(), max),
+                ("ys", set.ys.len(), max),
+                ("sigmas_px", set.sigmas_px.len(), max),
+                ("depths", set.depths.len(), max),
             ];
             within("track_set", &counts)
         }
@@ -230,7 +230,7 @@ mod tests {
         let twice = [&bytes[..], &unknown, &bytes[..]].concat();
         let mut merged = proto::InputData::decode(twice.as_slice()).expect("decodes");
         let Some(proto::input_data::Data::TrackSet(set)) = merged.data.take() else { panic!("no track set") };
-        assert_eq!((set.x.len(), set.views.len()), (8, 4));
+        assert_eq!((set.xs.len(), set.views.len()), (8, 4));
         let error = read(&mut twice.as_slice(), &limits()).expect_err("four views");
         assert_eq!(error.violations()[0].field, "track_set.views");
         // `x: 1.5` unpacked, tag 5 of wire type 1.
@@ -247,7 +247,7 @@ mod tests {
             let error = read(&mut { bytes }, &limits()).expect_err("too long");
             error.violations()[0].field.clone()
         };
-        assert_eq!(field(&track_set(11)), "track_set.view");
+        assert_eq!(field(&track_set(11)), "track_set.view_indices");
         // A million empty views in two megabytes; packed zeros, a byte each.
         let within = |tag: u8, body: &[u8]| {
             let mut inner = Vec::new();
@@ -258,11 +258,11 @@ mod tests {
         };
         let views = [2 << 3 | 2, 0].repeat(1_000_000);
         assert_eq!(field(&within(1, &views)), "track_set.views");
-        assert_eq!(field(&within(1, &within(4, &[0; 1000]))), "track_set.track");
+        assert_eq!(field(&within(1, &within(4, &[0; 1000]))), "track_set.track_indices");
         assert_eq!(field(&within(2, &within(5, &[1; 1000]))), "measurement_matrix.visibility");
         assert_eq!(field(&within(2, &within(3, &[0; 31 * 8]))), "measurement_matrix.values");
         let unpacked = [&[5 << 3 | 1][..], &[0; 8]].concat().repeat(11);
-        assert_eq!(field(&within(1, &unpacked)), "track_set.x");
+        assert_eq!(field(&within(1, &unpacked)), "track_set.xs");
     }
 
     #[test]

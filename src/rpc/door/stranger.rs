@@ -66,7 +66,7 @@ impl Drop for Patience {
     fn drop(&mut self) {
         let over = self.end.as_ref().is_some_and(|end| end.is_elapsed());
         if over && !self.introduction.is_made() {
-            metrics::stranger_closed();
+            metrics::unauthenticated_closed();
             tracing::debug!("a connection was closed: nobody who may call had called over it");
         }
     }

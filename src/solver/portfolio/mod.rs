@@ -23,7 +23,7 @@ use super::recorder::Recorder;
 use super::scpsfm::{HeadOptions, HeadSearch};
 use super::search::rigid::Rigid;
 use super::search::{affine, subspace};
-use crate::domain::result::PriorTime;
+use crate::domain::result::ProposalTime;
 use crate::domain::{Proposal, SolveSettings, StopToken};
 use crate::geometry::measurement::CompleteBlock;
 use crate::network::NetworkSettings;
@@ -43,7 +43,7 @@ pub struct Found {
     pub verified_by: VerifiedBy,
     /// The rigid consensus behind it or beside it, where depths were given and one is not chance.
     pub rigid: Option<Rigid>,
-    pub winning_prior: Option<Proposal>,
+    pub winning_proposal: Option<Proposal>,
     /// Inliers of a consensus that the trained network keeps from being accepted, and how many of them count.
     pub rejected_by_network: Option<(usize, usize)>,
     /// Inliers of the largest consensus of near-duplicates, and how many of them count.
@@ -53,7 +53,7 @@ pub struct Found {
     /// The weights of the network that was trained beforehand, or where it was not asked those of the best head of the
     /// paper's, one a track of the block; empty without a network.
     pub network_weights: Vec<f64>,
-    pub prior_times: Vec<PriorTime>,
+    pub proposal_times: Vec<ProposalTime>,
 }
 
 enum Search {
@@ -283,19 +283,19 @@ impl<'a> Portfolio<'a> {
         let rejected_by_network =
             best.as_ref().filter(|best| !best.is_acceptable()).and_then(Best::rejected_by_network);
         let accepted = best.filter(Best::is_acceptable);
-        let prior_times = stats
+        let proposal_times = stats
             .into_iter()
             .filter(|stats| with_network || !matches!(stats.proposal, Proposal::Network | Proposal::Learned))
             .filter(|stats| with_depths || stats.proposal != Proposal::Rigidity)
             .map(|stats| stats.time(accepted.as_ref()))
             .collect();
         let verified_by = accepted.as_ref().map_or(VerifiedBy::ImagePoints, |best| best.verified_by);
-        let (consensus, winning_prior) = accepted.map(|best| (best.consensus, best.proposal)).unzip();
+        let (consensus, winning_proposal) = accepted.map(|best| (best.consensus, best.proposal)).unzip();
         Found {
             consensus,
             verified_by,
             rigid,
-            winning_prior,
+            winning_proposal,
             rejected_by_network,
             near_duplicates,
             network_weights: match (&track_scores, heads) {
@@ -304,7 +304,7 @@ impl<'a> Portfolio<'a> {
                 (None, None) => Vec::new(),
             },
             track_scores,
-            prior_times,
+            proposal_times,
         }
     }
 }

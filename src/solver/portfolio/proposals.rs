@@ -16,7 +16,7 @@ use crate::solver::{depths, grow, priors};
 impl Portfolio<'_> {
     /// Whether this proposal may find anything yet.
     pub(super) fn is_wanted(&self, proposal: Proposal) -> bool {
-        !self.is_over() && !self.stop.is_stopped() && !self.settings.excluded_priors.contains(&proposal)
+        !self.is_over() && !self.stop.is_stopped() && !self.settings.excluded_proposals.contains(&proposal)
     }
 
     /// Tracks whose distances stay the same, once a noise level: where depths are given and true up to one scale.

@@ -3,7 +3,7 @@
 use super::OPTIONS;
 use super::best::Best;
 use crate::domain::Proposal;
-use crate::domain::result::PriorTime;
+use crate::domain::result::ProposalTime;
 
 /// What one proposal found, and its cost.
 pub struct ProposalStats {
@@ -42,15 +42,15 @@ impl ProposalStats {
     }
 
     /// When this proposal first stood at a consensus as good as the accepted one.
-    pub fn time(&self, accepted: Option<&Best>) -> PriorTime {
+    pub fn time(&self, accepted: Option<&Best>) -> ProposalTime {
         let sufficient = accepted.and_then(|accepted| {
             let inliers = OPTIONS.sufficient_share * accepted.consensus.inlier_count() as f64;
             let certainty = OPTIONS.sufficient_share * accepted.ln_false_alarms;
             let is_enough = |record: &&Record| record.inliers as f64 >= inliers && record.ln_false_alarms <= certainty;
             self.records.iter().find(is_enough)
         });
-        PriorTime {
-            prior: self.proposal,
+        ProposalTime {
+            proposal: self.proposal,
             seconds: sufficient.map(|record| record.seconds),
             iterations: sufficient.map_or(self.work, |record| record.work),
         }

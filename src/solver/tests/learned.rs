@@ -18,7 +18,7 @@ fn eight_right_tracks_of_two_hundred_are_found_at_once() {
         let (input, scene) = wrong(0.96, seed);
         let solution = solved(&input, &SolveSettings::default());
         assert_eq!(solution.status, Status::Solved, "seed {seed}");
-        assert_eq!(solution.winning_prior, Some(Proposal::Learned), "seed {seed}");
+        assert_eq!(solution.winning_proposal, Some(Proposal::Learned), "seed {seed}");
         let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
         assert!(f1 > 0.99, "seed {seed}: F1 {f1}");
         assert!(!warns_of_ranking(&solution), "what is verified needs no ranking");
@@ -55,10 +55,10 @@ fn nothing_is_claimed_of_entirely_wrong_tracks() {
 #[test]
 fn without_the_trained_network_the_search_stands_on_its_own() {
     let (input, scene) = wrong(0.9, 40);
-    let without = SolveSettings { excluded_priors: vec![Proposal::Learned], ..SolveSettings::default() };
+    let without = SolveSettings { excluded_proposals: vec![Proposal::Learned], ..SolveSettings::default() };
     for settings in [without, SolveSettings { method: Method::Geometry, ..SolveSettings::default() }] {
         let solution = solved(&input, &settings);
-        assert!(solution.winning_prior.is_some_and(|prior| prior != Proposal::Learned));
+        assert!(solution.winning_proposal.is_some_and(|prior| prior != Proposal::Learned));
         let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
         assert!(f1 > 0.99, "F1 {f1}");
         assert_eq!(solution.trained_network, None);

@@ -38,7 +38,7 @@ fn nine_in_ten_wrong_without_depths() {
         assert_eq!((solution.status, solution.grade), (Status::Solved, Some(Grade::Metric)), "seed {seed}");
         let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
         assert!(f1 > 0.99, "seed {seed}: F1 {f1}");
-        assert!(solution.winning_prior.is_some());
+        assert!(solution.winning_proposal.is_some());
         assert_eq!(solution.tracks.network_weight.len(), 200);
         errors.push(focal_error(&solution, &scene));
     }
@@ -65,7 +65,7 @@ fn an_orbit_where_priors_on_small_motion_fail() {
     let solution = solved(&input, &SolveSettings { method: Method::Geometry, ..SolveSettings::default() });
     let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
     assert!(f1 > 0.99, "F1 {f1}");
-    assert_ne!(solution.winning_prior, Some(Proposal::Consistency));
+    assert_ne!(solution.winning_proposal, Some(Proposal::Consistency));
     assert!(solution.tracks.network_weight.is_empty(), "GEOMETRY runs no network");
 }
 
@@ -76,7 +76,7 @@ fn one_seed_one_answer() {
         let mut solution = solved(&input, &SolveSettings::default());
         solution.seconds = 0.0;
         solution.stages.clear();
-        solution.prior_times.clear();
+        solution.proposal_times.clear();
         solution.history.clear();
         solution
     };
@@ -89,7 +89,7 @@ fn four_tracks_with_depths_are_found_and_never_metric() {
         let (input, scene) = scene(SceneOptions { outliers: 0.98, with_depths: true, seed, ..SceneOptions::default() });
         let solution = solved(&input, &SolveSettings { method: Method::Geometry, ..SolveSettings::default() });
         assert_eq!(solution.tracks.inlier, scene.truth.inlier, "seed {seed}");
-        assert_eq!(solution.winning_prior, Some(Proposal::Rigidity), "seed {seed}");
+        assert_eq!(solution.winning_proposal, Some(Proposal::Rigidity), "seed {seed}");
         assert!(matches!(solution.grade, Some(Grade::Weak | Grade::ProjectiveOnly)), "seed {seed}");
         assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::FewInliers), "seed {seed}");
         assert_eq!(solution.plane_at_infinity.is_some(), solution.is_metric(), "seed {seed}");

@@ -16,7 +16,8 @@ struct Heads {
 
 impl Observer for Heads {
     fn progress(&mut self, progress: &Progress) {
-        let step = progress.course.step.filter(|step| step.task == Task::Heads && progress.stage == Stage::Search);
+        let step =
+            progress.reconstruction.step.filter(|step| step.task == Task::Heads && progress.stage == Stage::Search);
         self.told.extend(step.map(|step| (step.step, progress.iteration)));
     }
 

@@ -1,7 +1,7 @@
 //! Inputs whose tracks live a few views.
 
 use super::*;
-use crate::domain::{Course, LeftOut, Step, Task};
+use crate::domain::{LeftOut, ReconstructionProgress, Step, Task};
 use crate::synthetic::{Sequence, SequenceOptions};
 
 fn input_of(sequence: &Sequence) -> Input {
@@ -348,7 +348,7 @@ fn the_answer_does_not_depend_on_the_threads() {
         let (settings, stop, mut heard) = (SolveSettings::default(), StopToken::default(), Heard::default());
         let threads = crate::parallel::Threads::new(threads);
         let mut solution = solve_on(threads, &input, &settings, &mut heard, &stop).expect("a solution");
-        (solution.seconds, solution.stages, solution.prior_times) = (0.0, Vec::new(), Vec::new());
+        (solution.seconds, solution.stages, solution.proposal_times) = (0.0, Vec::new(), Vec::new());
         solution.history.iter_mut().for_each(|record| record.elapsed_seconds = 0.0);
         assert!(heard.0.is_sorted_by_key(|progress| progress.fraction), "{threads:?}");
         solution
@@ -367,19 +367,20 @@ fn progress_tells_the_views_and_what_is_done_with_them() {
     let mut heard = Heard::default();
     let input = input_of(&sequence);
     let solution = solve(&input, &SolveSettings::default(), &mut heard, &StopToken::default()).expect("a solution");
-    let courses: Vec<Course> = heard.0.iter().map(|progress| progress.course).collect();
-    for (before, after) in courses.iter().zip(&courses[1..]) {
+    let records: Vec<ReconstructionProgress> = heard.0.iter().map(|progress| progress.reconstruction).collect();
+    for (before, after) in records.iter().zip(&records[1..]) {
         assert_eq!((after.views, after.blocks), (20, before.blocks), "{after:?}");
         let falls = after.block == before.block && after.registered_views < before.registered_views;
         assert!(!falls && after.block <= after.blocks, "{before:?} {after:?}");
     }
-    assert_eq!(courses[courses.len() - 1].registered_views as usize, solution.registered_views().len());
+    assert_eq!(records[records.len() - 1].registered_views as usize, solution.registered_views().len());
     // Records of each view that joins, and of each round; signs of life between them come and go with the machine.
     let extending = solution.history.iter().filter(|record| record.stage == Stage::Extend);
-    let told: std::collections::BTreeSet<u32> = extending.map(|record| record.course.registered_views).collect();
+    let told: std::collections::BTreeSet<u32> =
+        extending.map(|record| record.reconstruction.registered_views).collect();
     let block = *told.iter().next().expect("some");
     assert_eq!(told, (block..=20).collect());
-    let steps = solution.history.iter().filter_map(|record| record.course.step);
+    let steps = solution.history.iter().filter_map(|record| record.reconstruction.step);
     let rounds: Vec<Step> = steps.filter(|step| step.task == Task::Adjust).collect();
     assert_eq!(rounds, [1, 2, 3].map(|step| Step { task: Task::Adjust, step, steps: 3 }));
 }

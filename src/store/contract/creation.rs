@@ -44,7 +44,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
     assert_eq!(created.job, expected);
     assert_eq!(store.job(&new.name).await, Ok(expected));
     assert_eq!(store.work(&new.name).await.map(|work| work.input), Ok(input));
-    assert_eq!(store.result(&new.name).await, Ok(None));
+    assert_eq!(result_of(store, &new.name).await, Ok(None));
     assert_eq!(story(store, &new.name).await, told(&[(1, 0, "QUEUED")]));
     let claimed = claim(store, 1).await;
     assert_eq!(claimed.trace_parent, new.trace_parent);

@@ -96,11 +96,11 @@ pub(in crate::store) async fn a_lease_that_was_taken_over_writes_nothing(store: 
         assert_eq!(store.finish(&old, &success(vec![1]), time(61)).await, Err(fenced.clone()));
         assert_eq!(store.release(&old, time(61)).await, Err(fenced.clone()));
         assert_eq!((store.job(&name).await.expect("job"), story(store, &name).await), before);
-        assert_eq!(store.result(&name).await, Ok(None));
+        assert_eq!(result_of(store, &name).await, Ok(None));
     }
     let new = Lease { name: name.clone(), attempt: 2 };
     store.finish(&new, &success(vec![2]), time(62)).await.expect("the new lease holds");
-    assert_eq!(store.result(&name).await, Ok(Some(vec![2])));
+    assert_eq!(result_of(store, &name).await, Ok(Some(vec![2])));
     assert_eq!(store.finish(&new, &success(vec![3]), time(63)).await, Err(Error::Fenced(new)), "ended once");
     let expected = [
         (1, 0, "QUEUED"),
@@ -125,7 +125,7 @@ pub(in crate::store) async fn a_success_stores_its_result_then_its_state(store: 
     assert_eq!((job.state, job.end_time), (JobState::Succeeded, Some(time(2))));
     assert_eq!((job.summary.clone(), job.progress), (Some(summary()), Some(last)));
     assert_eq!(store.job(&name).await, Ok(job));
-    assert_eq!(store.result(&name).await, Ok(Some(result)));
+    assert_eq!(result_of(store, &name).await, Ok(Some(result)));
     let expected = [(1, 0, "QUEUED"), (2, 1, "RUNNING"), (3, 1, "result"), (4, 1, "SUCCEEDED")];
     assert_eq!(story(store, &name).await, told(&expected));
 }
@@ -150,7 +150,7 @@ pub(in crate::store) async fn every_outcome_ends_in_its_state(store: &dyn Store)
     let outcomes = [
         (Outcome::Failed(failure.clone()), JobState::Failed, "FAILED:INTERNAL"),
         (Outcome::Cancelled, JobState::Cancelled, "CANCELLED"),
-        (Outcome::Expired, JobState::Expired, "EXPIRED"),
+        (Outcome::DeadlineExceeded, JobState::DeadlineExceeded, "DEADLINE_EXCEEDED"),
     ];
     for (outcome, state, event) in outcomes {
         let name = create(store, record(&state.name().to_lowercase()), 0).await.name;
@@ -233,9 +233,9 @@ pub(in crate::store) async fn deadlines_end_what_waits(store: &dyn Store) {
     assert_eq!(claimed.job.name, later, "what is past its deadline is not begun");
     let swept = store.sweep(time(10), MAX_ATTEMPTS).await.expect("sweeps");
     assert_eq!(swept.expired.iter().map(|job| &job.name).collect::<Vec<_>>(), [&due]);
-    assert_eq!(swept.expired[0].state, JobState::Expired);
-    assert_eq!(story(store, &due).await, told(&[(1, 0, "QUEUED"), (2, 0, "EXPIRED")]));
+    assert_eq!(swept.expired[0].state, JobState::DeadlineExceeded);
+    assert_eq!(story(store, &due).await, told(&[(1, 0, "QUEUED"), (2, 0, "DEADLINE_EXCEEDED")]));
     assert_eq!(store.heartbeat(&claimed.lease, time(11), LEASE).await.expect("holds").deadline, Some(time(50)));
     let lost = store.sweep(time(50), MAX_ATTEMPTS).await.expect("sweeps").lost;
-    assert_eq!(lost[0].state, JobState::Expired, "no attempt is made after the deadline");
+    assert_eq!(lost[0].state, JobState::DeadlineExceeded, "no attempt is made after the deadline");
 }

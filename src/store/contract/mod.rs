@@ -11,9 +11,11 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt, Summary};
-use crate::domain::{Course, Progress, SolveSettings, Stage, Status, Step, Task};
+use crate::domain::{Progress, ReconstructionProgress, SolveSettings, Stage, Status, Step, Task};
 use crate::store::record::{Bound, NewRecord, QueueBounds, Request};
-use crate::store::{ATTEMPTS_EXHAUSTED, Claimed, Ending, Error, JobQuery, Lease, Order, Outcome, Store, payload};
+use crate::store::{
+    ATTEMPTS_EXHAUSTED, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order, Outcome, Store, payload,
+};
 
 /// Runs the contract: `$open` is an async function without arguments whose result, where the database is there, derefs
 /// to a store that is empty.
@@ -54,6 +56,7 @@ macro_rules! store_contract {
             uploads::what_nobody_goes_on_with_is_given_up_and_removed,
             uploads::an_input_lives_as_long_as_a_job_has_it,
             uploads::a_finished_upload_that_is_begun_again_is_kept_as_one_that_is_used,
+            uploads::jobs_know_their_uploaded_inputs,
             uploads::inputs_are_listed_page_by_page,
             uploads::a_deleted_input_is_kept_by_its_jobs_alone,
             uploads::many_that_begin_at_once_share_the_last_room,
@@ -125,11 +128,11 @@ fn progress(iteration: u32) -> Progress {
         focal_px: Some(1234.5),
         best_score: Some(f64::INFINITY),
         elapsed_seconds: 0.25,
-        course: Course {
+        reconstruction: ReconstructionProgress {
             registered_views: 7,
             views: 9,
             step: Some(Step { task: Task::Adjust, step: 2, steps: 3 }),
-            ..Course::default()
+            ..ReconstructionProgress::default()
         },
     }
 }
@@ -143,7 +146,7 @@ fn summary() -> Summary {
         inlier_tracks: 0,
         registered_views: 0,
         reprojection_rms_px: None,
-        winning_prior: None,
+        winning_proposal: None,
         iterations: 1,
         seconds: 0.5,
         result_bytes: 10,
@@ -152,7 +155,20 @@ fn summary() -> Summary {
 }
 
 fn success(result: Vec<u8>) -> Arc<Ending> {
+    let result = EncodedResult::new(result);
     Ending { outcome: Outcome::Succeeded { summary: summary(), result }, progress: None }.into()
+}
+
+/// The bytes of a job's result, which must be those that were stored.
+async fn result_of(store: &dyn Store, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
+    let result = store.result(name).await?;
+    assert!(result.as_ref().is_none_or(EncodedResult::is_intact));
+    Ok(result.map(|result| result.bytes))
+}
+
+/// A job with a label.
+pub(super) fn labelled(job: &str) -> NewRecord {
+    NewRecord { labels: BTreeMap::from([("site".into(), "north".into())]), ..record(job) }
 }
 
 /// The events of a job as `(sequence, attempt, what)`.

@@ -74,7 +74,7 @@ pub(in crate::store) async fn what_does_not_exist_is_not_found(store: &dyn Store
     let missing = Error::NotFound(name.clone());
     assert_eq!(store.job(&name).await, Err(missing.clone()));
     assert_eq!(store.work(&name).await.map(|work| work.input), Err(missing.clone()));
-    assert_eq!(store.result(&name).await, Err(missing.clone()));
+    assert_eq!(result_of(store, &name).await, Err(missing.clone()));
     assert_eq!(store.events_after(&name, 0, 1).await, Err(missing.clone()));
     assert_eq!(store.request_cancel(&name, None, time(0)).await, Err(missing));
     let lease = Lease { name, attempt: 1 };

@@ -28,18 +28,18 @@ pub(in crate::store) async fn an_ended_job_goes_with_all_that_it_had(store: &dyn
     assert_eq!(store.job(&name).await, Err(missing.clone()));
     assert_eq!(store.events_after(&name, 0, 10).await, Err(missing.clone()));
     assert_eq!(store.work(&name).await.map(|work| work.input), Err(missing.clone()));
-    assert_eq!(store.result(&name).await, Err(missing.clone()));
+    assert_eq!(result_of(store, &name).await, Err(missing.clone()));
     assert_eq!(store.delete_job(&name, None).await, Err(missing));
     let query = JobQuery { tenant: "t".into(), labels, ..JobQuery::default() };
     assert!(store.jobs(&query).await.expect("lists").jobs.is_empty());
     assert_eq!(store.job(&other.name).await, Ok(other.clone()), "others stay");
     assert_eq!(store.work(&other.name).await.map(|work| work.input), Ok(vec![7; 100]));
-    assert_eq!(store.result(&other.name).await, Ok(Some(vec![1, 2, 3])));
+    assert_eq!(result_of(store, &other.name).await, Ok(Some(vec![1, 2, 3])));
     // Name and request id are free again, and the new job has nothing of the old one.
     let created = store.create_job(new, &ROOM, time(5)).await.expect("created");
     assert!(created.new);
     assert_eq!(story(store, &name).await, told(&[(1, 0, "QUEUED")]));
-    assert_eq!(store.result(&name).await, Ok(None));
+    assert_eq!(result_of(store, &name).await, Ok(None));
 }
 
 pub(in crate::store) async fn what_waits_or_runs_is_not_deleted(store: &dyn Store) {

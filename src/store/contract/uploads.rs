@@ -37,16 +37,12 @@ pub(in crate::store) async fn finished(store: &dyn Store, id: &str, payload: Vec
     store.finish_upload(&lease, &input(payload), time(seconds)).await.expect("finishes")
 }
 
-/// Two jobs, one with an uploaded input; what [`know_their_inputs`] looks at.
-pub(in crate::store) async fn jobs_with_and_without(store: &dyn Store) {
+pub(in crate::store) async fn jobs_know_their_uploaded_inputs(store: &dyn Store) {
     finished(store, "a", vec![7; 10], 0).await;
     let with = NewRecord { input: JobInput::Uploaded { input: "a".into(), bytes: 10 }, ..record("with") };
     for new in [with, record("without")] {
         store.create_job(new, &ROOM, time(1)).await.expect("created");
     }
-}
-
-pub(in crate::store) async fn know_their_inputs(store: &dyn Store) {
     let known = async |job: &str| store.job(&record(job).name).await.expect("kept").input;
     assert_eq!(known("with").await, Some(name("a")));
     assert_eq!(known("without").await, None);

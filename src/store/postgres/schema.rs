@@ -11,17 +11,7 @@ use super::ACQUIRE_TIMEOUT;
 use crate::store::Error;
 use crate::store::sql::{self, Connection, Statement, Step};
 
-const MIGRATIONS: [Step; 9] = [
-    (1, "jobs", include_str!("../migrations/postgres/0001_jobs.sql")),
-    (2, "retention", include_str!("../migrations/postgres/0002_retention.sql")),
-    (3, "uploads", include_str!("../migrations/postgres/0003_uploads.sql")),
-    (4, "listing", include_str!("../migrations/postgres/0004_listing.sql")),
-    (5, "inputs", include_str!("../migrations/postgres/0005_inputs.sql")),
-    (6, "uploaded", include_str!("../migrations/postgres/0006_uploaded.sql")),
-    (7, "upload_bytes", include_str!("../migrations/postgres/0007_upload_bytes.sql")),
-    (8, "job_inputs", include_str!("../migrations/postgres/0008_job_inputs.sql")),
-    (9, "attached_calls", include_str!("../migrations/postgres/0009_attached_calls.sql")),
-];
+const MIGRATIONS: [Step; 1] = [(1, "schema", include_str!("../migrations/postgres/0001_schema.sql"))];
 
 /// How long a server waits for another one that is at the schema: a step that goes through some ten million jobs takes
 /// minutes. Then it ends, and whoever started it may start it again.

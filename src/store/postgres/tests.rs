@@ -9,6 +9,7 @@ use std::sync::Arc;
 
 use super::*;
 use crate::domain::job::JobState;
+use crate::store::sql::Row;
 use crate::store::{Store, contract};
 use cluster::Cluster;
 
@@ -55,17 +56,14 @@ async fn what_lives_elsewhere_is_not_taken_back_at_a_start() {
 }
 
 #[tokio::test]
-async fn jobs_of_before_learn_which_uploaded_input_they_have() {
+async fn people_see_times_and_labels() {
     let Some(fixture) = Fixture::open().await else { return };
-    // As a server left it that knew nothing of the column.
-    let former = ["ALTER TABLE jobs DROP COLUMN uploaded_input", "DELETE FROM _sqlx_migrations WHERE version = 8"];
-    contract::uploads::jobs_with_and_without(&*fixture).await;
-    for statement in former {
-        let mut connection = fixture.pool.acquire().await.expect("a connection");
-        Connection::execute(&mut *connection, Statement::new(statement)).await.expect("done");
-    }
-    let newer = Postgres::open(&fixture.url).await.expect("brings it up to date");
-    contract::uploads::know_their_inputs(&newer).await;
+    fixture.create_job(contract::labelled("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+    let select = "SELECT to_char(create_time AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS') || ' ' || (labels->>'site') \
+                  AS line FROM job_list";
+    let mut connection = fixture.pool.acquire().await.expect("a connection");
+    let rows = connection.rows(Statement::new(select)).await.expect("a row");
+    assert_eq!(rows[0].text("line"), Ok("2023-11-14 22:13:20 north".into()));
 }
 
 #[tokio::test]

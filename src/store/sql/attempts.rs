@@ -168,14 +168,18 @@ pub(super) async fn finish<C: Connection>(
     let job = held(connection, lease).await?;
     let mut departure = match &ending.outcome {
         Outcome::Succeeded { summary, result } => {
-            for chunk in result_chunks(job.id, result) {
+            for chunk in result_chunks(job.id, &result.bytes) {
                 connection.execute(chunk).await?;
             }
-            Departure { summary: Some(summary), ..Departure::to(JobState::Succeeded) }
+            Departure {
+                summary: Some(summary),
+                result_sha256: Some(&result.sha256),
+                ..Departure::to(JobState::Succeeded)
+            }
         }
         Outcome::Failed(failure) => Departure { failure: Some(failure.clone()), ..Departure::to(JobState::Failed) },
         Outcome::Cancelled => Departure::to(JobState::Cancelled),
-        Outcome::Expired => Departure::to(JobState::Expired),
+        Outcome::DeadlineExceeded => Departure::to(JobState::DeadlineExceeded),
     };
     departure.progress = ending.progress.as_ref();
     departure.attempt_end = Some(AttemptEnd::Ended);
@@ -252,7 +256,7 @@ fn after_loss(job: &Standing, lost_attempts: u32, now: SystemTime, max_attempts:
     if job.cancel_requested {
         JobState::Cancelled
     } else if job.deadline.is_some_and(|deadline| deadline <= now) {
-        JobState::Expired
+        JobState::DeadlineExceeded
     } else if lost_attempts >= max_attempts {
         JobState::Failed
     } else {
@@ -320,7 +324,7 @@ pub(super) async fn expire_queued<C: Connection>(connection: &mut C, now: System
     let mut changed = Vec::new();
     for row in connection.rows(select).await? {
         let job = Standing::from_row(&row)?;
-        changed.push(leave(connection, &job, Departure::to(JobState::Expired), now).await?);
+        changed.push(leave(connection, &job, Departure::to(JobState::DeadlineExceeded), now).await?);
     }
     Ok(changed)
 }

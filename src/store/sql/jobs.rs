@@ -7,7 +7,7 @@ use super::rows::{self, integer, micros, number, returning_job, select_jobs};
 use super::{Change, Connection, Row, Statement, uploads};
 use crate::domain::InputName;
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
-use crate::store::record::{Created, JobInput, Load, NewRecord, QueueBounds, Request, Work};
+use crate::store::record::{Created, EncodedResult, JobInput, Load, NewRecord, QueueBounds, Request, Work};
 use crate::store::{Error, JobPage, JobQuery, Order, payload};
 
 /// Number of a job's first event, which its row counts.
@@ -381,11 +381,15 @@ pub(super) async fn work<C: Connection>(connection: &mut C, name: &JobName) -> R
 }
 
 /// The encoded result of a job, if it has one.
-pub(super) async fn result<C: Connection>(connection: &mut C, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
-    let select = Statement::new("SELECT data FROM result_chunks WHERE job_id = $1 ORDER BY chunk")
-        .bind(id(connection, name).await?);
-    let chunks = connection.rows(select).await?;
-    if chunks.is_empty() { Ok(None) } else { joined(&chunks).map(Some) }
+pub(super) async fn result<C: Connection>(connection: &mut C, name: &JobName) -> Result<Option<EncodedResult>, Error> {
+    let select = Statement::new("SELECT id, result_sha256 FROM jobs WHERE tenant = $1 AND job = $2");
+    let row = connection.optional_row(select.bind(&name.tenant).bind(&name.job)).await?;
+    let row = row.ok_or_else(|| Error::NotFound(name.clone()))?;
+    let Some(sha256) = row.optional_bytes("result_sha256")? else { return Ok(None) };
+    let sha256 = sha256.try_into().map_err(|_| Error::Corrupt(format!("the digest of the result of {name}")))?;
+    let select = Statement::new("SELECT data FROM result_chunks WHERE job_id = $1 ORDER BY chunk");
+    let chunks = connection.rows(select.bind(row.integer("id")?)).await?;
+    Ok(Some(EncodedResult { bytes: joined(&chunks)?, sha256 }))
 }
 
 pub(super) fn joined(chunks: &[impl Row]) -> Result<Vec<u8>, Error> {

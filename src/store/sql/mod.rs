@@ -199,9 +199,13 @@ pub(super) fn migrator(steps: &[Step]) -> Migrator {
 
 /// Why the schema cannot be brought up to date.
 pub(super) fn migration_failed(error: sqlx::migrate::MigrateError) -> Error {
-    use sqlx::migrate::MigrateError::{Execute, ExecuteMigration};
+    use sqlx::migrate::MigrateError::{Execute, ExecuteMigration, VersionMismatch, VersionMissing};
     match error {
         Execute(error) | ExecuteMigration(error, _) => error.into(),
+        VersionMissing(step) | VersionMismatch(step) => Error::Corrupt(format!(
+            "step {step} of its schema is not of this version: it is the store of a newer server, or of one before 0.2. \
+             Of that let its own version end the jobs, and begin with a new data directory or database"
+        )),
         error => Error::Corrupt(format!("cannot bring the schema up to date: {error}")),
     }
 }

@@ -235,6 +235,7 @@ pub(super) struct Departure<'a> {
     pub failure: Option<Failure>,
     /// Of a success: it has an event of its own.
     pub summary: Option<&'a Summary>,
+    pub result_sha256: Option<&'a [u8; 32]>,
     /// The last progress, where it is newer than what is stored.
     pub progress: Option<&'a Progress>,
     /// How its attempt ended, where that is not noted yet.
@@ -244,7 +245,7 @@ pub(super) struct Departure<'a> {
 impl Departure<'_> {
     /// One that takes nothing along.
     pub(super) fn to(next: JobState) -> Self {
-        Self { next, failure: None, summary: None, progress: None, attempt_end: None }
+        Self { next, failure: None, summary: None, result_sha256: None, progress: None, attempt_end: None }
     }
 }
 
@@ -256,7 +257,7 @@ pub(super) async fn leave<C: Connection>(
     departure: Departure<'_>,
     now: SystemTime,
 ) -> Result<Job, Error> {
-    let Departure { next, failure, summary, progress, attempt_end } = departure;
+    let Departure { next, failure, summary, result_sha256, progress, attempt_end } = departure;
     if !job.state.may_become(next) || next == JobState::Running {
         let (from, to) = (job.state.name(), next.name());
         return Err(Error::Corrupt(format!("{} cannot go from {from} to {to} here", job.name)));
@@ -274,7 +275,7 @@ pub(super) async fn leave<C: Connection>(
     let update = Statement::new(returning_job!(
         "UPDATE jobs SET state = $1, lease_worker = NULL, lease_expires = NULL, cancel_requested = FALSE, \
          queue_time = COALESCE($2, queue_time), end_time = $3, failure = $4, summary = COALESCE($5, summary), \
-         progress = COALESCE($6, progress), last_sequence = $7 WHERE id = $8"
+         progress = COALESCE($6, progress), last_sequence = $7, result_sha256 = $8 WHERE id = $9"
     ))
     .bind(next.name())
     .bind((next == JobState::Queued).then(|| micros(now)))
@@ -283,6 +284,7 @@ pub(super) async fn leave<C: Connection>(
     .bind(summary.map(payload::encode).transpose()?)
     .bind(progress.map(payload::encode).transpose()?)
     .bind(integer(sequence))
+    .bind(result_sha256.map(|sha256| sha256.to_vec()))
     .bind(job.id);
     batch.push(update);
     let changed = one_job(&connection.batch(batch).await?)?;

@@ -11,8 +11,8 @@ use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
-    CancelReply, Claimed, Created, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome, QueueBounds, Swept,
-    Work,
+    CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
+    QueueBounds, Swept, Work,
 };
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
@@ -143,8 +143,8 @@ impl<D: Database> Store for D {
 
     async fn finish(&self, lease: &Lease, ending: &Arc<Ending>, now: SystemTime) -> Result<Job, Error> {
         let bytes = match &ending.outcome {
-            Outcome::Succeeded { result, .. } => result.len() as u64,
-            Outcome::Failed(_) | Outcome::Cancelled | Outcome::Expired => 0,
+            Outcome::Succeeded { result, .. } => result.bytes.len() as u64,
+            Outcome::Failed(_) | Outcome::Cancelled | Outcome::DeadlineExceeded => 0,
         };
         writes!(self, Size::Outcome, Moves::Ends(bytes), [lease, ending], |connection| {
             attempts::finish(connection, &lease, &ending, now)
@@ -211,7 +211,7 @@ impl<D: Database> Store for D {
         })
     }
 
-    async fn result(&self, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
+    async fn result(&self, name: &JobName) -> Result<Option<EncodedResult>, Error> {
         reads!(self, Size::Payload, |connection| jobs::result(connection, name))
     }
 

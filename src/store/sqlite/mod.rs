@@ -58,18 +58,7 @@ const SETTINGS: [(&str, &str); 4] = [
     ("wal_autocheckpoint", "0"),
 ];
 
-const MIGRATIONS: [Step; 10] = [
-    (1, "jobs", include_str!("../migrations/sqlite/0001_jobs.sql")),
-    (2, "attempts", include_str!("../migrations/sqlite/0002_attempts.sql")),
-    (3, "retention", include_str!("../migrations/sqlite/0003_retention.sql")),
-    (4, "uploads", include_str!("../migrations/sqlite/0004_uploads.sql")),
-    (5, "listing", include_str!("../migrations/sqlite/0005_listing.sql")),
-    (6, "inputs", include_str!("../migrations/sqlite/0006_inputs.sql")),
-    (7, "uploaded", include_str!("../migrations/sqlite/0007_uploaded.sql")),
-    (8, "upload_bytes", include_str!("../migrations/sqlite/0008_upload_bytes.sql")),
-    (9, "job_inputs", include_str!("../migrations/sqlite/0009_job_inputs.sql")),
-    (10, "attached_calls", include_str!("../migrations/sqlite/0010_attached_calls.sql")),
-];
+const MIGRATIONS: [Step; 1] = [(1, "schema", include_str!("../migrations/sqlite/0001_schema.sql"))];
 
 /// Store in a data directory.
 #[derive(Debug)]

@@ -110,33 +110,28 @@ async fn everything_is_there_after_a_reopen_and_every_lease_is_a_dead_one() {
 }
 
 #[tokio::test]
-async fn jobs_of_before_learn_which_uploaded_input_they_have() {
-    let directory = tempfile::tempdir().expect("a temporary directory");
-    let store = Sqlite::open(directory.path()).await.expect("opens");
-    contract::uploads::jobs_with_and_without(&store).await;
-    // As a server left it that knew nothing of the column.
-    store.execute("ALTER TABLE jobs DROP COLUMN uploaded_input").await;
-    store.execute("DELETE FROM _sqlx_migrations WHERE version = 9").await;
-    store.close().await;
-    drop(store);
-    let store = Sqlite::open(directory.path()).await.expect("brings it up to date");
-    contract::uploads::know_their_inputs(&store).await;
+async fn a_database_of_another_version_is_refused() {
+    let newer = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time) \
+                 VALUES (9999, 'from the future', 1, x'00', 0)";
+    let older = "UPDATE _sqlx_migrations SET checksum = x'00'";
+    for (statement, step) in [(newer, "step 9999"), (older, "step 1")] {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let store = Sqlite::open(directory.path()).await.expect("opens");
+        store.execute(statement).await;
+        store.close().await;
+        drop(store);
+        let error = Sqlite::open(directory.path()).await.expect_err("is of another version");
+        assert!(matches!(&error, Error::Corrupt(told) if told.contains(step)), "{error}");
+    }
 }
 
 #[tokio::test]
-async fn a_database_of_a_newer_version_is_refused() {
-    let directory = tempfile::tempdir().expect("a temporary directory");
-    let store = Sqlite::open(directory.path()).await.expect("opens");
-    store
-        .execute(
-            "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time) \
-             VALUES (9999, 'from the future', 1, x'00', 0)",
-        )
-        .await;
-    store.close().await;
-    drop(store);
-    let error = Sqlite::open(directory.path()).await.expect_err("is newer");
-    assert!(matches!(error, Error::Corrupt(_)), "{error}");
+async fn people_see_times_and_labels() {
+    let fixture = Fixture::open().await.expect("opens");
+    fixture.create_job(contract::labelled("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+    let select = "SELECT create_time || ' ' || labels AS line FROM job_list";
+    let line = fixture.on_writer(select, |row| row.text("line")).await;
+    assert_eq!(line, format!("{} {{\"site\":\"north\"}}", "2023-11-14T22:13:20.000Z"));
 }
 
 #[tokio::test]

@@ -127,11 +127,11 @@ pub const SOLVE_ITERATIONS: Metric = Metric {
     labels: &[],
     help: "Network iterations spent, one sample a succeeded job.",
 };
-pub const WINNING_PRIOR: Metric = Metric {
-    name: "scpsfm_winning_prior_total",
+pub const WINNING_PROPOSAL: Metric = Metric {
+    name: "scpsfm_winning_proposal_total",
     kind: Kind::Counter,
-    labels: &["prior"],
-    help: "Solved jobs by the prior whose sample led to the accepted consensus.",
+    labels: &["proposal"],
+    help: "Solved jobs by the proposal whose sample led to the accepted consensus.",
 };
 pub const REFUSALS: Metric = Metric {
     name: "scpsfm_admission_refusals_total",
@@ -225,8 +225,8 @@ pub const CONNECTIONS_REFUSED: Metric = Metric {
     labels: &[],
     help: "Connections refused because as many speak as may.",
 };
-pub const STRANGERS_CLOSED: Metric = Metric {
-    name: "scpsfm_strangers_closed_total",
+pub const UNAUTHENTICATED_CLOSED: Metric = Metric {
+    name: "scpsfm_unauthenticated_connections_closed_total",
     kind: Kind::Counter,
     labels: &[],
     help: "Connections closed because nobody who may call had called over them in time.",
@@ -274,7 +274,7 @@ pub const ALL: [Metric; 37] = [
     GRADES,
     INLIER_RATIO,
     SOLVE_ITERATIONS,
-    WINNING_PRIOR,
+    WINNING_PROPOSAL,
     REFUSALS,
     UPLOADED_BYTES,
     INPUTS_CREATED,
@@ -291,7 +291,7 @@ pub const ALL: [Metric; 37] = [
     WATCHERS,
     CONNECTIONS,
     CONNECTIONS_REFUSED,
-    STRANGERS_CLOSED,
+    UNAUTHENTICATED_CLOSED,
     INFLIGHT_BYTES,
     INFLIGHT_CAPACITY,
     RELOAD_FAILED,

@@ -72,7 +72,7 @@ fn methods(job: &str) -> Vec<Method> {
     let with_id = proto::CreateJobRequest { request_id: "r".into(), ..create_tracks() };
     let batch = proto::BatchCreateJobsRequest { parent: parent(), requests: vec![create_tracks(), with_id.clone()] };
     let list = proto::ListJobsRequest { parent: parent(), filter: "state = QUEUED".into(), ..Default::default() };
-    let points = proto::TrackSetChunk { x: track_set().x, y: track_set().y, ..Default::default() };
+    let points = proto::TrackSetChunk { xs: track_set().xs, ys: track_set().ys, ..Default::default() };
     let bytes = encoded(&raw(3, 4));
     let mut upload: Vec<Vec<u8>> = whole(DEFAULT, &id(1), &bytes, 50).iter().map(Message::encode_to_vec).collect();
     upload.push(request(proto::upload_input_request::Message::Start(start(DEFAULT, &id(2), 9))).encode_to_vec());

@@ -4,7 +4,7 @@ use prost::Message;
 use scpsfm::domain::{Input, InvalidInput, Limits};
 use scpsfm::rpc::convert::{create, input::Draft, list, names, upload};
 use scpsfm::rpc::proto;
-use scpsfm::rpc::proto::create_job_request::Input as Inline;
+use scpsfm::rpc::proto::create_job_request::Source as Inline;
 
 use crate::support::memory::peak_mb;
 use crate::support::mutation;
@@ -34,13 +34,13 @@ impl From<Result<Option<Input>, InvalidInput>> for Outcome {
 fn creation(bytes: &[u8]) -> Outcome {
     let Ok(request) = proto::CreateJobRequest::decode(bytes) else { return Outcome::Undecoded };
     let checked = || {
-        names::tenant(&request.parent)?;
+        names::tenant(&request.parent, "default")?;
         create::from_wire(request.job_id, request.request_id, request.job)?;
-        if let Some(Inline::InputName(name)) = &request.input {
-            names::input(name, "input_name")?;
+        if let Some(Inline::Input(name)) = &request.source {
+            names::input(name, "input", "default")?;
             return Ok(None);
         }
-        let draft = Draft::begin(request.input, &limits())?;
+        let draft = Draft::begin(request.source, &limits())?;
         draft.check_size()?;
         draft.finish().map(Some)
     };
@@ -55,14 +55,14 @@ fn uploaded(bytes: &[u8]) -> Outcome {
 /// As the service takes a page's query.
 fn listing(bytes: &[u8]) -> Outcome {
     let Ok(request) = proto::ListJobsRequest::decode(bytes) else { return Outcome::Undecoded };
-    let checked = names::tenant(&request.parent).and_then(|tenant| list::from_wire(tenant, request));
+    let checked = names::tenant(&request.parent, "default").and_then(|tenant| list::from_wire(tenant, request));
     checked.map(|_| None).into()
 }
 
 /// As the service takes a job's name.
 fn name(bytes: &[u8]) -> Outcome {
     let Ok(request) = proto::GetJobRequest::decode(bytes) else { return Outcome::Undecoded };
-    names::job(&request.name).map(|_| None).into()
+    names::job(&request.name, "default").map(|_| None).into()
 }
 
 /// A decoder with its checks, and good messages for it.
@@ -80,7 +80,7 @@ fn readers() -> [Reader; 4] {
         ..Default::default()
     });
     let with_matrix = create_request(Inline::MeasurementMatrix(matrix()));
-    let with_name = create_request(Inline::InputName("tenants/default/inputs/a".into()));
+    let with_name = create_request(Inline::Input("tenants/default/inputs/a".into()));
     let uploads = [
         encoded(&raw(3, 4)),
         proto::InputData { data: Some(proto::input_data::Data::MeasurementMatrix(matrix())) }.encode_to_vec(),

@@ -7,7 +7,7 @@ use std::time::Duration;
 use scpsfm::rpc::convert;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
-use scpsfm::rpc::proto::{self, JobState, create_job_request::Input, solve_request::Message};
+use scpsfm::rpc::proto::{self, JobState, create_job_request::Source, solve_request::Message};
 use scpsfm::rpc::server::Options;
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
@@ -48,7 +48,7 @@ fn scraped(server: &Serving) -> Page {
 async fn withholding(url: String, refused: mpsc::Sender<Status>) {
     let mut client = CalibrationServiceClient::connect(url).await.expect("a connection");
     let whole = raw(2, 20_000);
-    let head = Message::Config(create(Input::TrackSet(convert::input::head_to_wire(&whole))));
+    let head = Message::Config(create(Source::TrackSet(convert::input::head_to_wire(&whole))));
     let chunks = convert::input::chunks(whole).map(Message::TrackSetChunk);
     let (sender, messages) = mpsc::channel(8);
     for message in std::iter::once(head).chain(chunks) {
@@ -170,7 +170,7 @@ async fn a_hundred_inputs_of_millions_stay_within_the_budget_and_two_hundred_meg
         let (url, whole) = (server.grpc.clone(), Arc::clone(&whole));
         tokio::spawn(async move {
             let mut client = CalibrationServiceClient::connect(url).await.expect("a connection");
-            let head = Message::Config(create(Input::TrackSet(convert::input::head_to_wire(&whole))));
+            let head = Message::Config(create(Source::TrackSet(convert::input::head_to_wire(&whole))));
             let chunks = convert::input::chunks(whole).map(Message::TrackSetChunk);
             let messages = tokio_stream::iter(std::iter::once(head).chain(chunks).map(solve_request));
             // A minute without a message ends the input: the last one never comes.

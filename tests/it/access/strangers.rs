@@ -159,7 +159,7 @@ async fn strangers_in_every_place_make_room_for_a_caller() {
     soon(futures_util::future::join_all(strangers.into_iter().map(until_closed))).await;
     // One of the two, if the caller was in before the other.
     soon(async {
-        while page().value("scpsfm_strangers_closed_total") < 1.0 {
+        while page().value("scpsfm_unauthenticated_connections_closed_total") < 1.0 {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
     })

@@ -1,7 +1,7 @@
 //! What bad input gets: a status that names field and index, before anything is stored.
 
 use scpsfm::domain::Limits;
-use scpsfm::rpc::proto::{self, create_job_request::Input, job::Deadline, solve_request::Message};
+use scpsfm::rpc::proto::{self, create_job_request::Source, job::Deadline, solve_request::Message};
 use scpsfm::rpc::server::Options;
 use tonic::codec::CompressionEncoding::Gzip;
 use tonic::{Code, Status};
@@ -30,13 +30,13 @@ fn reason(status: &Status) -> String {
 fn tracks(change: impl FnOnce(&mut proto::TrackSet)) -> proto::CreateJobRequest {
     let mut set = track_set();
     change(&mut set);
-    create(Input::TrackSet(set))
+    create(Source::TrackSet(set))
 }
 
 fn matrices(change: impl FnOnce(&mut proto::MeasurementMatrix)) -> proto::CreateJobRequest {
     let mut matrix = matrix();
     change(&mut matrix);
-    create(Input::MeasurementMatrix(matrix))
+    create(Source::MeasurementMatrix(matrix))
 }
 
 fn described(change: impl FnOnce(&mut proto::Job)) -> proto::CreateJobRequest {
@@ -68,23 +68,26 @@ async fn every_kind_is_refused_by_field_and_index_and_nothing_is_stored() {
     let server = TestServer::start_with(quick(), options, one_worker()).await;
     let mut jobs = server.jobs().await;
     let cases = [
-        (tracks(|set| set.x[7] = f64::NAN), "track_set.x[7]"),
-        (tracks(|set| set.y[3] = f64::INFINITY), "track_set.y[3]"),
-        (tracks(|set| set.x[0] = 1e9), "track_set.x[0]"),
-        (tracks(|set| set.track[5] = 4), "track_set.track[5]"),
-        (tracks(|set| set.view[11] = 3), "track_set.view[11]"),
-        (tracks(|set| set.track[1] = 0), "track_set.track[1]"),
-        (tracks(|set| set.x.truncate(5)), "track_set.view"),
-        (tracks(|set| set.sigma = vec![0.0; 12]), "track_set.sigma[0]"),
-        (tracks(|set| set.depth = vec![1.0; 3]), "track_set.depth"),
+        (tracks(|set| set.xs[7] = f64::NAN), "track_set.xs[7]"),
+        (tracks(|set| set.ys[3] = f64::INFINITY), "track_set.ys[3]"),
+        (tracks(|set| set.xs[0] = 1e9), "track_set.xs[0]"),
+        (tracks(|set| set.track_indices[5] = 4), "track_set.track_indices[5]"),
+        (tracks(|set| set.view_indices[11] = 3), "track_set.view_indices[11]"),
+        (tracks(|set| set.track_indices[1] = 0), "track_set.track_indices[1]"),
+        (tracks(|set| set.xs.truncate(5)), "track_set.view_indices"),
+        (tracks(|set| set.sigmas_px = vec![0.0; 12]), "track_set.sigmas_px[0]"),
+        (tracks(|set| set.depths = vec![1.0; 3]), "track_set.depths"),
         (tracks(|set| set.views.clear()), "track_set.views"),
         (tracks(|set| set.views.truncate(1)), "track_set.views"),
         (tracks(|set| set.views[2].size = Some(proto::ImageSize { width_px: 10, height_px: 0 })), "track_set.views[2]"),
         (tracks(|set| set.track_count = 0), "track_set.track_count"),
         (tracks(|set| set.track_count = u32::MAX), "track_set.track_count"),
         (tracks(|set| set.views = vec![proto::View::default(); 5]), "track_set.views"),
-        (tracks(|set| set.x = vec![0.0; 13]), "track_set.x"),
-        (create(Input::TrackSet(proto::TrackSet::default())), "track_set.views"),
+        (tracks(|set| set.views[1].name = "a\nb".into()), "track_set.views[1]"),
+        (tracks(|set| set.views[2].name = "x".repeat(4097)), "track_set.views[2]"),
+        (tracks(|set| set.views.iter_mut().for_each(|view| view.name = "a".into())), "track_set.views[1]"),
+        (tracks(|set| set.xs = vec![0.0; 13]), "track_set.xs"),
+        (create(Source::TrackSet(proto::TrackSet::default())), "track_set.views"),
         (matrices(|matrix| matrix.values[4] = f64::NAN), "measurement_matrix.values[4]"),
         (matrices(|matrix| matrix.values.truncate(17)), "measurement_matrix.values"),
         (matrices(|matrix| matrix.visibility = vec![1; 5]), "measurement_matrix.visibility"),
@@ -100,7 +103,7 @@ async fn every_kind_is_refused_by_field_and_index_and_nothing_is_stored() {
         (described(|job| job.deadline = deadline_time(i64::MAX, 0)), "job.deadline_time"),
         (described(|job| job.deadline = time_limit(-1, 2_000_000_000)), "job.time_limit"),
         (described(|job| job.deadline = time_limit(i64::MAX, 0)), "job.time_limit"),
-        (proto::CreateJobRequest { input: None, ..create_tracks() }, "input"),
+        (proto::CreateJobRequest { source: None, ..create_tracks() }, "source"),
         (proto::CreateJobRequest { parent: "default".into(), ..create_tracks() }, "parent"),
         (proto::CreateJobRequest { job_id: "-".into(), ..create_tracks() }, "job_id"),
     ];
@@ -122,7 +125,7 @@ async fn a_stream_is_checked_as_it_arrives() {
     let server = TestServer::start_with(quick(), options, one_worker()).await;
     let mut calibration = server.calibration().await;
     let config = || Message::Config(create_tracks());
-    let chunk = |y| Message::TrackSetChunk(proto::TrackSetChunk { y, ..Default::default() });
+    let chunk = |y| Message::TrackSetChunk(proto::TrackSetChunk { ys: y, ..Default::default() });
     let mut refused = async |messages: Vec<Message>| {
         let requests: Vec<_> = messages.into_iter().map(solve_request).collect();
         let answer = calibration.solve(tokio_stream::iter(requests)).await;
@@ -131,7 +134,7 @@ async fn a_stream_is_checked_as_it_arrives() {
     assert_eq!(refused(vec![]).await, ["config"]);
     assert_eq!(refused(vec![chunk(vec![])]).await, ["config"]);
     assert_eq!(refused(vec![config(), config()]).await, ["config"]);
-    assert_eq!(refused(vec![config(), chunk(vec![0.0])]).await, ["track_set.y"]);
+    assert_eq!(refused(vec![config(), chunk(vec![0.0])]).await, ["track_set.ys"]);
     let matrix_chunk = Message::MeasurementMatrixChunk(proto::MeasurementMatrixChunk::default());
     assert_eq!(refused(vec![config(), matrix_chunk]).await, ["measurement_matrix_chunk"]);
 }
@@ -140,12 +143,12 @@ async fn a_stream_is_checked_as_it_arrives() {
 async fn an_endless_stream_is_cut_off() {
     let options = Options { limits: TIGHT, ..Options::default() };
     let server = TestServer::start_with(quick(), options, one_worker()).await;
-    let chunk = proto::TrackSetChunk { x: vec![0.0; 10_000], ..Default::default() };
+    let chunk = proto::TrackSetChunk { xs: vec![0.0; 10_000], ..Default::default() };
     let endless = std::iter::once(Message::Config(create_tracks()))
         .chain(std::iter::repeat(Message::TrackSetChunk(chunk)))
         .map(solve_request);
     let answer = server.calibration().await.solve(tokio_stream::iter(endless)).await;
-    assert_eq!(fields(&answer.expect_err("an endless stream")), ["track_set.x"]);
+    assert_eq!(fields(&answer.expect_err("an endless stream")), ["track_set.xs"]);
 }
 
 #[tokio::test]
@@ -153,7 +156,7 @@ async fn a_message_above_the_limit_is_refused_and_the_server_goes_on() {
     let options = Options { max_message_bytes: 2_000, ..Options::default() };
     let server = TestServer::start_with(quick(), options, one_worker()).await;
     let mut jobs = server.jobs().await;
-    let large = || tracks(|set| set.x = vec![0.5; 1_000]);
+    let large = || tracks(|set| set.xs = vec![0.5; 1_000]);
     let plain = jobs.create_job(large()).await.expect_err("8,000 bytes of 2,000");
     // A few dozen bytes on the wire.
     let packed = jobs.clone().send_compressed(Gzip).create_job(large()).await.expect_err("8,000 bytes of 2,000");

@@ -89,9 +89,9 @@ async fn errors_are_sentences() {
     let mut bad = raw(3, 4);
     bad.x[7] = f64::NAN;
     let error = client.create(&bad, &settings(), JobOptions::default()).await.expect_err("NaN");
-    assert_eq!(error.to_string(), "track_set.x[7]: NaN is not a finite number");
+    assert_eq!(error.to_string(), "track_set.xs[7]: NaN is not a finite number");
     let Error::Invalid(violations, _) = error else { panic!("{error:?}") };
-    assert_eq!((violations[0].field.as_str(), violations[0].index), ("track_set.x", Some(7)));
+    assert_eq!((violations[0].field.as_str(), violations[0].index), ("track_set.xs", Some(7)));
     let name = scpsfm::domain::job::JobName::parse("tenants/default/jobs/none").expect("a name");
     assert!(matches!(client.get(&name).await, Err(Error::Refused(_))));
     assert!(matches!(client.read_result(&name).await, Err(Error::Refused(_))));

@@ -109,7 +109,7 @@ async fn capabilities_tell_limits_and_defaults() {
         [Method::Auto, Method::Paper, Method::Geometry, Method::Psfm, Method::Scpsfm]
     );
     assert_eq!(convert::settings::from_wire(capabilities.default_settings), Ok(SolveSettings::default()));
-    assert_eq!(capabilities.version, env!("CARGO_PKG_VERSION"));
+    assert_eq!(capabilities.server_version, env!("CARGO_PKG_VERSION"));
     assert_eq!(capabilities.trained_network, solver::trained_network());
 }
 

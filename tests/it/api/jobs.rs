@@ -11,13 +11,14 @@ use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState, create_job_request, solve_request::Message};
 use scpsfm::rpc::server::Options;
+use sha2::{Digest, Sha256};
 use tonic::Code;
 use tonic::transport::Channel;
 use tonic_types::StatusExt;
 
 use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::{held, quick, solution};
-use crate::support::wire::{all, create, create_tracks, raw, solve_request, state_of};
+use crate::support::wire::{all, create, create_tracks, raw, solve_request, state_of, track_set};
 
 async fn created(jobs: &mut JobServiceClient<Channel>, request: proto::CreateJobRequest) -> proto::Job {
     jobs.create_job(request).await.expect("a job").into_inner()
@@ -63,7 +64,7 @@ async fn a_job_runs_to_its_result() {
     assert_eq!(done.state(), JobState::Succeeded);
     assert_eq!(done.labels["site"], "north");
     assert_eq!(done.attempt, 1);
-    assert_eq!(done.summary.expect("a summary").inlier_tracks, 2);
+    assert_eq!(done.summary.expect("a summary").inlier_track_count, 2);
     let request = proto::ReadJobResultRequest { name: job.name.clone(), offset: 0 };
     let (chunks, end) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
     end.expect("whole");
@@ -226,7 +227,7 @@ async fn a_request_id_stands_for_one_job() {
     let first = created(&mut jobs, request.clone()).await;
     let again = created(&mut jobs, request.clone()).await;
     assert_eq!(first.name, again.name);
-    let other = create_job_request::Input::TrackSet(convert::input::to_wire(&raw(3, 5)));
+    let other = create_job_request::Source::TrackSet(convert::input::to_wire(&raw(3, 5)));
     let other = proto::CreateJobRequest { request_id: "r-1".into(), ..create(other) };
     let status = jobs.create_job(other).await.expect_err("another body");
     assert_eq!(status.code(), Code::AlreadyExists);
@@ -281,7 +282,7 @@ async fn lists_are_filtered_ordered_and_paged() {
 async fn a_large_result_comes_in_chunks_from_any_offset() {
     let server = TestServer::start(quick()).await;
     let mut jobs = server.jobs().await;
-    let input = create_job_request::Input::TrackSet(convert::input::to_wire(&raw(2, 40_000)));
+    let input = create_job_request::Source::TrackSet(convert::input::to_wire(&raw(2, 40_000)));
     let name = created(&mut jobs, create(input)).await.name;
     events(&mut jobs, &name, 0).await;
     let mut read = async |offset| {
@@ -299,5 +300,87 @@ async fn a_large_result_comes_in_chunks_from_any_offset() {
     let (rest, _) = read(300_000).await;
     assert_eq!(rest, whole[300_000..]);
     let result = proto::JobResult::decode(whole.as_slice()).expect("a JobResult");
-    assert_eq!(result.tracks.expect("tracks").weight.len(), 40_000);
+    let whole_at_once = jobs.get_job_result(proto::GetJobResultRequest { name }).await.expect("a result").into_inner();
+    assert_eq!(whole_at_once, result);
+    assert_eq!(result.tracks.expect("tracks").weights.len(), 40_000);
+}
+
+#[tokio::test]
+async fn a_result_that_fits_no_message_is_refused_by_the_unary_call_alone() {
+    let options = Options { max_message_bytes: 100_000, ..Options::default() };
+    let server = TestServer::start_with(quick(), options, one_worker()).await;
+    let mut jobs = server.jobs().await;
+    // Tracks without observations: a small input with a large result.
+    let tracks = proto::TrackSet { track_count: 50_000, ..track_set() };
+    let name = created(&mut jobs, create(create_job_request::Source::TrackSet(tracks))).await.name;
+    events(&mut jobs, &name, 0).await;
+    let request = proto::GetJobResultRequest { name: name.clone() };
+    let refused = jobs.get_job_result(request).await.expect_err("too large");
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    let info = refused.get_details_error_info().expect("an ErrorInfo");
+    assert_eq!((info.reason.as_str(), info.metadata["max"].as_str()), ("RESULT_TOO_LARGE", "100000"));
+    let request = proto::ReadJobResultRequest { name, offset: 0 };
+    let (chunks, end) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
+    end.expect("whole");
+    let bytes: Vec<u8> = chunks.iter().flat_map(|chunk| chunk.data.clone()).collect();
+    assert_eq!(info.metadata["bytes"], bytes.len().to_string());
+    assert!(
+        chunks.iter().all(|chunk| chunk.sha256[..] == Sha256::digest(&bytes)[..]),
+        "each has the digest of the whole"
+    );
+}
+
+#[tokio::test]
+async fn a_result_is_the_same_bytes_after_a_restart_and_damage_is_found() {
+    let server = TestServer::start(quick()).await;
+    let name = created(&mut server.jobs().await, create_tracks()).await.name;
+    events(&mut server.jobs().await, &name, 0).await;
+    let read = async |server: &TestServer| {
+        let request = proto::ReadJobResultRequest { name: name.clone(), offset: 0 };
+        let (chunks, end) = all(server.jobs().await.read_job_result(request).await?.into_inner()).await;
+        end.map(|()| chunks)
+    };
+    let first = read(&server).await.expect("a result");
+    // Another solver, which makes other results: what was stored is what is read.
+    let server = server.restart(quick()).await;
+    assert_eq!(read(&server).await.expect("a result"), first);
+    let database = rusqlite::Connection::open(server.directory().join("scpsfm.db")).expect("the database");
+    let damaged = database.execute("UPDATE result_chunks SET data = substr(data, 1, length(data) - 1) || x'ff'", []);
+    assert_eq!(damaged.expect("damaged"), 1);
+    assert_eq!(read(&server).await.expect_err("not what was stored").code(), Code::Internal);
+}
+
+#[tokio::test]
+async fn a_dash_or_nothing_stands_for_the_callers_tenant() {
+    let server = TestServer::start(quick()).await;
+    let mut jobs = server.jobs().await;
+    let mut names = Vec::new();
+    for parent in ["", "tenants/-", "tenants/default"] {
+        let job = created(&mut jobs, proto::CreateJobRequest { parent: parent.into(), ..create_tracks() }).await;
+        assert!(job.name.starts_with("tenants/default/jobs/"), "{}", job.name);
+        names.push(job.name);
+        let listed = jobs.list_jobs(proto::ListJobsRequest { parent: parent.into(), ..Default::default() }).await;
+        assert_eq!(listed.expect("a page").into_inner().jobs.len(), names.len());
+    }
+    let dashed = names[0].replace("tenants/default/", "tenants/-/");
+    let got = jobs.get_job(proto::GetJobRequest { name: dashed }).await.expect("a job").into_inner();
+    assert_eq!(got.name, names[0]);
+    let requests = vec![create_tracks(), proto::CreateJobRequest { parent: String::new(), ..create_tracks() }];
+    let batch = proto::BatchCreateJobsRequest { parent: "tenants/-".into(), requests };
+    let batch = jobs.batch_create_jobs(batch).await.expect("created").into_inner();
+    assert!(batch.jobs.iter().all(|job| job.name.starts_with("tenants/default/")), "{batch:?}");
+}
+
+#[tokio::test]
+async fn the_names_of_images_come_back() {
+    let server = TestServer::start(scpsfm::engine::default_solver()).await;
+    let mut jobs = server.jobs().await;
+    let mut tracks = track_set();
+    tracks.views[0].name = "north/IMG_1.jpg".into();
+    tracks.views[2].name = "<b>é".into();
+    let name = created(&mut jobs, create(create_job_request::Source::TrackSet(tracks))).await.name;
+    events(&mut jobs, &name, 0).await;
+    let result = jobs.get_job_result(proto::GetJobResultRequest { name }).await.expect("a result").into_inner();
+    let names: Vec<&str> = result.views.iter().map(|view| view.name.as_str()).collect();
+    assert_eq!(names, ["north/IMG_1.jpg", "", "<b>é"]);
 }

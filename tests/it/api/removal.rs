@@ -98,10 +98,10 @@ async fn a_batch_is_all_or_none_and_names_what_is_wrong() {
     let field = |status: &Status| status.get_details_bad_request().expect("fields").field_violations[0].field.clone();
 
     let mut bad = named("b");
-    let Some(create_job_request::Input::TrackSet(tracks)) = &mut bad.input else { panic!("not a track set") };
-    tracks.x[5] = f64::NAN;
+    let Some(create_job_request::Source::TrackSet(tracks)) = &mut bad.source else { panic!("not a track set") };
+    tracks.xs[5] = f64::NAN;
     let status = jobs.batch_create_jobs(batch(vec![named("a"), bad])).await.expect_err("a NaN");
-    assert_eq!((status.code(), field(&status).as_str()), (Code::InvalidArgument, "requests[1].track_set.x[5]"));
+    assert_eq!((status.code(), field(&status).as_str()), (Code::InvalidArgument, "requests[1].track_set.xs[5]"));
     assert!(status.message().starts_with("requests[1]: "), "{}", status.message());
     let foreign = proto::CreateJobRequest { parent: "tenants/other".into(), ..named("b") };
     let status = jobs.batch_create_jobs(batch(vec![foreign])).await.expect_err("another parent");

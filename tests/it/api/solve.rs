@@ -6,8 +6,9 @@ use std::time::Duration;
 use scpsfm::domain::job::Job;
 use scpsfm::engine::Engine;
 use scpsfm::rpc::convert;
+use scpsfm::rpc::convert::result::encode as encode_result;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
-use scpsfm::rpc::proto::{self, JobState, create_job_request::Input, job_event::Body, solve_request::Message};
+use scpsfm::rpc::proto::{self, JobState, create_job_request::Source, job_event::Body, solve_request::Message};
 use scpsfm::rpc::server::{Options, Server};
 use scpsfm::store::postgres::{DatabaseUrl, Postgres};
 use tonic::Streaming;
@@ -36,13 +37,13 @@ async fn events_name_the_job_first_and_end_with_its_state() {
     let (solver, hold) = held();
     let server = TestServer::start(solver).await;
     let whole = raw(3, 50);
-    let head = Message::Config(create(Input::TrackSet(convert::input::head_to_wire(&whole))));
+    let head = Message::Config(create(Source::TrackSet(convert::input::head_to_wire(&whole))));
     let chunk = |range: std::ops::Range<usize>| {
         Message::TrackSetChunk(proto::TrackSetChunk {
-            view: whole.view[range.clone()].to_vec(),
-            track: whole.track[range.clone()].to_vec(),
-            x: whole.x[range.clone()].to_vec(),
-            y: whole.y[range].to_vec(),
+            view_indices: whole.view[range.clone()].to_vec(),
+            track_indices: whole.track[range.clone()].to_vec(),
+            xs: whole.x[range.clone()].to_vec(),
+            ys: whole.y[range].to_vec(),
             ..Default::default()
         })
     };
@@ -62,7 +63,7 @@ async fn events_name_the_job_first_and_end_with_its_state() {
     let result = events.iter().position(|event| matches!(event.body, Some(Body::Result(_)))).expect("a result");
     assert!(result < events.len() - 1, "the final state follows the result");
     assert_eq!(state_of(events.last().expect("events")), Some(JobState::Succeeded));
-    let job = server.engine.job(&convert::names::job(&first.name).expect("a name")).await.expect("a job");
+    let job = server.engine.job(&convert::names::job(&first.name, "default").expect("a name")).await.expect("a job");
     assert_eq!((job.view_count, job.track_count, job.observation_count), (3, 50, 150));
 }
 
@@ -71,7 +72,7 @@ async fn a_matrix_may_come_in_chunks_too() {
     let server = TestServer::start(quick()).await;
     let mut whole = matrix();
     let rest = whole.values.split_off(5);
-    let config = Message::Config(create(Input::MeasurementMatrix(whole)));
+    let config = Message::Config(create(Source::MeasurementMatrix(whole)));
     let chunk = Message::MeasurementMatrixChunk(proto::MeasurementMatrixChunk { values: rest, ..Default::default() });
     let (events, end) = soon(all(solve(&server, vec![config, chunk]).await)).await;
     end.expect("a solve ends well");
@@ -142,7 +143,7 @@ async fn two_calls_on_two_servers_of_one_database_are_attached_to_one_job() {
     let mut servers = Vec::new();
     for _ in 0..2 {
         let store = Arc::new(Postgres::open(&url).await.expect("a store"));
-        let engine = Engine::start(one_worker(), store, Arc::clone(&solver)).await.expect("an engine");
+        let engine = Engine::start(one_worker(), store, Arc::clone(&solver), encode_result).await.expect("an engine");
         let server = Server::bind(options.clone(), engine.clone()).await.expect("a server");
         servers.push((server, engine));
     }
@@ -153,7 +154,7 @@ async fn two_calls_on_two_servers_of_one_database_are_attached_to_one_job() {
         let messages = tokio_stream::once(solve_request(Message::Config(config)));
         let mut stream = client.solve(messages).await.expect("a solve").into_inner();
         let name = soon(stream.message()).await.expect("an event").expect("the first event").name;
-        (convert::names::job(&name).expect("a name"), stream)
+        (convert::names::job(&name, "default").expect("a name"), stream)
     };
     let (name, first) = attach(&servers[0].0).await;
     let (same, second) = attach(&servers[1].0).await;

@@ -5,7 +5,7 @@ use std::time::Duration;
 use scpsfm::domain::Limits;
 use scpsfm::engine::{self, UploadBounds, UploadOptions};
 use scpsfm::rpc::inputs::MAX_CHUNK_BYTES;
-use scpsfm::rpc::proto::create_job_request::Input;
+use scpsfm::rpc::proto::create_job_request::Source;
 use scpsfm::rpc::proto::input_service_client::InputServiceClient;
 use scpsfm::rpc::proto::{self, JobState, upload_input_request::Message};
 use scpsfm::rpc::server::Options;
@@ -47,7 +47,7 @@ fn fields(status: &Status) -> Vec<String> {
 }
 
 fn named(input: &proto::Input) -> proto::CreateJobRequest {
-    create(Input::InputName(input.name.clone()))
+    create(Source::Input(input.name.clone()))
 }
 
 #[tokio::test]
@@ -72,7 +72,7 @@ async fn an_upload_becomes_an_input_that_jobs_share() {
     let repeated = proto::CreateJobRequest { request_id: "r".into(), ..named(&input) };
     let second = created(&mut jobs, repeated.clone()).await;
     assert_eq!(created(&mut jobs, repeated).await, second);
-    let inline = create(Input::TrackSet(scpsfm::rpc::convert::input::to_wire(&raw(2, 60_000))));
+    let inline = create(Source::TrackSet(scpsfm::rpc::convert::input::to_wire(&raw(2, 60_000))));
     let third = created(&mut jobs, inline.clone()).await;
     let mut other_body = inline;
     other_body.request_id = "r".into();
@@ -112,12 +112,12 @@ async fn a_solve_takes_an_uploaded_input_too_and_no_chunks_beside_it() {
     assert_eq!(fields(&status), ["track_set_chunk"]);
 
     let mut jobs = server.jobs().await;
-    let absent = |name: &str| create(Input::InputName(name.into()));
+    let absent = |name: &str| create(Source::Input(name.into()));
     let status = jobs.create_job(absent(&format!("tenants/default/inputs/{}", id(2)))).await.expect_err("none");
     assert_eq!((status.code(), reason(&status).as_str()), (Code::NotFound, "INPUT_NOT_FOUND"));
     let theirs = jobs.create_job(absent(&format!("tenants/other/inputs/{}", id(1)))).await.expect_err("another's");
     assert_eq!((theirs.code(), reason(&theirs).as_str()), (Code::NotFound, "INPUT_NOT_FOUND"));
-    assert_eq!(fields(&jobs.create_job(absent("inputs/a")).await.expect_err("malformed")), ["input_name"]);
+    assert_eq!(fields(&jobs.create_job(absent("inputs/a")).await.expect_err("malformed")), ["input"]);
 }
 
 /// A stream that broke a rule at the third chunk: what came before is kept, and the upload goes on from there.
@@ -210,8 +210,8 @@ async fn bytes_that_are_no_valid_input_become_none_and_free_their_id() {
     let mut nan = raw(3, 40);
     nan.x[17] = f64::NAN;
     let invalid = [
-        (encoded(&nan), "track_set.x[17]"),
-        (encoded(&raw(3, 400)), "track_set.view"),
+        (encoded(&nan), "track_set.xs[17]"),
+        (encoded(&raw(3, 400)), "track_set.view_indices"),
         (vec![0xff; 5_000], "data"),
         (b"view,track,x,y\n".to_vec(), "data"),
         (bytes[..bytes.len() - 1].to_vec(), "data"),

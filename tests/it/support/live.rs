@@ -3,7 +3,7 @@
 use scpsfm::rpc::convert;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
-use scpsfm::rpc::proto::{self, JobState, create_job_request::Input};
+use scpsfm::rpc::proto::{self, JobState, create_job_request::Source};
 use scpsfm::synthetic::{Scene, SceneOptions};
 use tonic::transport::Channel;
 
@@ -28,7 +28,7 @@ pub async fn is_served(url: &str) {
 /// A request for that scene.
 pub fn scene_request(options: &SceneOptions) -> proto::CreateJobRequest {
     let scene = Scene::generate(options).expect("a scene");
-    create(Input::TrackSet(convert::input::to_wire(&scene.input)))
+    create(Source::TrackSet(convert::input::to_wire(&scene.input)))
 }
 
 /// A scene that is quickly solved.

@@ -7,6 +7,7 @@ use std::time::Duration;
 use scpsfm::cli::client::Client;
 use scpsfm::cli::client::access::AccessArgs;
 use scpsfm::engine::{self, Engine, Solver};
+use scpsfm::rpc::convert::result::encode as encode_result;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::server::{Options, Server};
@@ -48,6 +49,11 @@ impl TestServer {
         Self { server, engine, directory }
     }
 
+    /// Where the store is.
+    pub fn directory(&self) -> &Path {
+        self.directory.path()
+    }
+
     pub fn url(&self) -> String {
         format!("http://{}", self.server.address())
     }
@@ -75,7 +81,7 @@ pub fn one_worker() -> engine::Options {
 
 async fn serve(directory: &Path, solver: Solver, options: Options, engine: engine::Options) -> (Server, Engine) {
     let store = Sqlite::open(directory).await.expect("a store");
-    let engine = Engine::start(engine, Arc::new(store), solver).await.expect("an engine");
+    let engine = Engine::start(engine, Arc::new(store), solver, encode_result).await.expect("an engine");
     let server = Server::bind(options, engine.clone()).await.expect("a server");
     (server, engine)
 }

@@ -6,7 +6,8 @@ use std::time::Duration;
 
 use scpsfm::domain::result::{ObservationResults, TrackResults, ViewResult};
 use scpsfm::domain::{
-    Course, Grade, Input, Method, Observer, Progress, Proposal, Solution, SolveSettings, Stage, Status, StopToken,
+    Grade, Input, Method, Observer, Progress, Proposal, ReconstructionProgress, Solution, SolveSettings, Stage, Status,
+    StopToken,
 };
 use scpsfm::engine::Solver;
 use scpsfm::solver::Error;
@@ -70,7 +71,7 @@ fn progress(fraction: f64) -> Progress {
         focal_px: Some(1000.0),
         best_score: Some(0.5),
         elapsed_seconds: 0.0,
-        course: Course::default(),
+        reconstruction: ReconstructionProgress::default(),
     }
 }
 
@@ -81,7 +82,7 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         status: Status::Solved,
         grade: Some(Grade::ProjectiveOnly),
         method: Method::Auto,
-        winning_prior: Some(Proposal::Uniform),
+        winning_proposal: Some(Proposal::Uniform),
         iterations: 10,
         seed: settings.seed,
         calibrations: Vec::new(),
@@ -106,7 +107,7 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         warnings: Vec::new(),
         seconds: 0.0,
         stages: Vec::new(),
-        prior_times: Vec::new(),
+        proposal_times: Vec::new(),
         history: Vec::new(),
         trained_network: None,
         input_sha256: None,

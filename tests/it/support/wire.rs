@@ -2,7 +2,7 @@
 
 use scpsfm::domain::{RawInput, View};
 use scpsfm::rpc::convert;
-use scpsfm::rpc::proto::{self, create_job_request::Input, solve_request::Message};
+use scpsfm::rpc::proto::{self, create_job_request::Source, solve_request::Message};
 use tonic::{Status, Streaming};
 
 /// A complete input: every track in every view.
@@ -39,17 +39,17 @@ pub fn matrix() -> proto::MeasurementMatrix {
     proto::MeasurementMatrix { view_count: 2, track_count: 3, values, ..Default::default() }
 }
 
-pub fn create(input: Input) -> proto::CreateJobRequest {
-    proto::CreateJobRequest { parent: "tenants/default".into(), input: Some(input), ..Default::default() }
+pub fn create(source: Source) -> proto::CreateJobRequest {
+    proto::CreateJobRequest { parent: "tenants/default".into(), source: Some(source), ..Default::default() }
 }
 
 pub fn create_raw(raw: &RawInput) -> proto::CreateJobRequest {
-    create(Input::TrackSet(convert::input::to_wire(raw)))
+    create(Source::TrackSet(convert::input::to_wire(raw)))
 }
 
 /// A valid request.
 pub fn create_tracks() -> proto::CreateJobRequest {
-    create(Input::TrackSet(track_set()))
+    create(Source::TrackSet(track_set()))
 }
 
 pub fn solve_request(message: Message) -> proto::SolveRequest {

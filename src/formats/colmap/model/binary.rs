@@ -6,8 +6,8 @@ use super::super::cameras::{Camera, Model};
 use super::super::images::{Images, Observation};
 use super::{NO_POINT, Room};
 use crate::domain::Limits;
+use crate::domain::View;
 use crate::formats::error::{Error, Problem};
-use crate::formats::label::Label;
 
 /// Bytes of a camera without parameters, of an image without name and points, and of a keypoint.
 const CAMERA_BYTES: u64 = 24;
@@ -131,7 +131,7 @@ impl<R: BufRead> Bytes<'_, R> {
     fn name(&mut self) -> Result<String, Error> {
         let start = self.offset;
         let mut name = Vec::new();
-        let most = Label::MAX_NAME_BYTES as u64 + 1;
+        let most = View::MAX_NAME_BYTES as u64 + 1;
         let read = self.reader.by_ref().take(most).read_until(0, &mut name);
         self.offset += read.map_err(|error| self.wrong_at(start, format!("cannot be read: {error}")))? as u64;
         if name.pop() != Some(0) {

@@ -5,10 +5,25 @@ CREATE TABLE inputs (
     id          BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
     tenant      TEXT    NOT NULL,
     input       TEXT,
+    -- Of the payload, as it is stored.
     bytes       BIGINT NOT NULL,
     create_time BIGINT NOT NULL,
+    -- What an uploaded input says of itself; none of these for one that came inside a job.
+    upload_bytes      BIGINT,
+    sha256            BYTEA,
+    view_count        BIGINT,
+    track_count       BIGINT,
+    observation_count BIGINT,
+    -- When it was created, or a job was last created with it.
+    use_time          BIGINT,
     UNIQUE (tenant, input)
 );
+
+CREATE INDEX inputs_use ON inputs (use_time) WHERE input IS NOT NULL;
+-- The order of listings; inputs of jobs alone have no name and are in no listing.
+CREATE INDEX inputs_listing ON inputs (tenant, create_time, input) WHERE input IS NOT NULL;
+-- What a tenant's uploaded inputs count, also those whose name was taken away and that jobs still have.
+CREATE INDEX inputs_uploaded ON inputs (tenant, upload_bytes) WHERE upload_bytes IS NOT NULL;
 
 -- Payloads lie in rows of bounded size, so that no statement needs the whole in one buffer of the database.
 CREATE TABLE input_chunks (
@@ -23,7 +38,7 @@ CREATE TABLE jobs (
     tenant            TEXT    NOT NULL,
     job               TEXT    NOT NULL,
     state             TEXT    NOT NULL
-        CHECK (state IN ('QUEUED', 'RUNNING', 'SUCCEEDED', 'FAILED', 'CANCELLED', 'EXPIRED')),
+        CHECK (state IN ('QUEUED', 'RUNNING', 'SUCCEEDED', 'FAILED', 'CANCELLED', 'DEADLINE_EXCEEDED')),
     -- Attempts begun; of a running job the fencing token of its lease.
     attempt           BIGINT NOT NULL DEFAULT 0,
     -- Attempts whose worker vanished: what the cap on attempts counts.
@@ -50,6 +65,15 @@ CREATE TABLE jobs (
     summary           BYTEA,
     failure           BYTEA,
     last_sequence     BIGINT NOT NULL DEFAULT 0,
+    -- SHA-256 of the encoded result; none while there is none.
+    result_sha256     BYTEA,
+    -- The id of the uploaded input that the job was created with, also once that has lost its name; none where the input
+    -- came inside the job.
+    uploaded_input    TEXT,
+    -- The Solve calls that have attached to the job so far; NULL: the job does not depend on any caller.
+    attached_calls    BIGINT,
+    -- Those of them that were disconnected since.
+    detached_calls    BIGINT NOT NULL DEFAULT 0,
     UNIQUE (tenant, job),
     CHECK ((state = 'RUNNING') = (lease_expires IS NOT NULL))
 );
@@ -60,8 +84,14 @@ CREATE INDEX jobs_queue ON jobs (priority DESC, create_time, id) WHERE state = '
 CREATE INDEX jobs_load ON jobs (state, input_bytes, observation_count) WHERE state IN ('QUEUED', 'RUNNING');
 CREATE INDEX jobs_deadline ON jobs (deadline) WHERE state = 'QUEUED' AND deadline IS NOT NULL;
 CREATE INDEX jobs_lease ON jobs (lease_expires) WHERE state = 'RUNNING';
-CREATE INDEX jobs_listing ON jobs (tenant, create_time, id);
+-- The order of listings. Jobs of one microsecond go by their ids, which are their tenant's own: the number of the row
+-- would tell in a page token how many jobs all tenants have made.
+CREATE INDEX jobs_listing ON jobs (tenant, create_time, job);
 CREATE INDEX jobs_input ON jobs (input_id);
+-- What retention looks for: jobs that have ended, the oldest end first.
+CREATE INDEX jobs_end ON jobs (end_time) WHERE end_time IS NOT NULL;
+-- Covers what admission sums of one tenant.
+CREATE INDEX jobs_tenant_load ON jobs (tenant, input_bytes, observation_count) WHERE state = 'QUEUED';
 
 -- The labels once more, for filters.
 CREATE TABLE job_labels (
@@ -80,6 +110,7 @@ CREATE TABLE events (
     PRIMARY KEY (job_id, sequence)
 );
 
+-- Encoded JobResults of the API, as they are read.
 CREATE TABLE result_chunks (
     job_id BIGINT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
     chunk  BIGINT NOT NULL,
@@ -109,3 +140,45 @@ CREATE TABLE attempts (
     ending     TEXT CHECK (ending IN ('ENDED', 'GIVEN_BACK', 'LOST')),
     PRIMARY KEY (job_id, attempt)
 );
+
+-- Uploads: their bytes as they came, until they are an input or are given up.
+CREATE TABLE uploads (
+    id          BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+    tenant      TEXT    NOT NULL,
+    -- The caller's id; none once the upload was given up, so that the id is free again.
+    upload      TEXT,
+    -- Length that the caller declared, and SHA-256, where that was declared too.
+    bytes       BIGINT NOT NULL,
+    sha256      BYTEA,
+    -- Bytes that are stored.
+    committed   BIGINT NOT NULL DEFAULT 0,
+    -- Number of the stream that may write: the latest one.
+    writer      BIGINT NOT NULL DEFAULT 0,
+    update_time BIGINT NOT NULL,
+    -- The input that it became.
+    input_id    BIGINT REFERENCES inputs (id) ON DELETE CASCADE,
+    -- Its parts are of no use any more, and not all of them are removed.
+    leftover    BOOLEAN NOT NULL DEFAULT FALSE,
+    UNIQUE (tenant, upload)
+);
+CREATE INDEX uploads_open ON uploads (update_time) WHERE input_id IS NULL AND upload IS NOT NULL;
+CREATE INDEX uploads_leftover ON uploads (id) WHERE leftover;
+CREATE INDEX uploads_input ON uploads (input_id);
+
+CREATE TABLE upload_parts (
+    upload_id BIGINT NOT NULL REFERENCES uploads (id) ON DELETE CASCADE,
+    at_byte   BIGINT NOT NULL,
+    data      BYTEA    NOT NULL,
+    PRIMARY KEY (upload_id, at_byte)
+);
+
+-- Jobs for people who query: times as times, labels as JSON.
+CREATE VIEW job_list AS SELECT
+    tenant, job, state, priority, attempt, lost_attempts, lease_worker, view_count, track_count, observation_count,
+    input_bytes,
+    to_timestamp(create_time / 1e6) AS create_time,
+    to_timestamp(start_time / 1e6) AS start_time,
+    to_timestamp(end_time / 1e6) AS end_time,
+    to_timestamp(deadline / 1e6) AS deadline,
+    COALESCE((SELECT jsonb_object_agg(key, value) FROM job_labels WHERE job_id = jobs.id), '{}') AS labels
+FROM jobs;

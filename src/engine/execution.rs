@@ -1,4 +1,4 @@
-//! The course of an attempt, from its claim to its end: reads the input, feeds the worker, stores progress, keeps the
+//! One attempt at a job, from its claim to its end: reads the input, feeds the worker, stores progress, keeps the
 //! lease, commits what it came to.
 
 use std::collections::hash_map::Entry;
@@ -76,7 +76,7 @@ pub(super) struct Wait {
 }
 
 /// An attempt under way.
-pub(super) struct Course {
+pub(super) struct JobExecution {
     inner: Arc<Inner>,
     job: Job,
     lease: Lease,
@@ -142,14 +142,14 @@ pub(super) fn stop_token(job: &Job) -> StopToken {
     StopToken::with_deadline(left.and_then(|left| std::time::Instant::now().checked_add(left)))
 }
 
-impl Course {
+impl JobExecution {
     /// Of a job that is leased.
     pub(super) fn begin(inner: Arc<Inner>, job: Job, lease: Lease, wait: Wait) -> Self {
         let stop = stop_token(&job);
         let running = Running::list(inner.clone(), &lease, &stop);
-        let mut course = Self::new(inner, job, lease, wait, stop, running);
-        course.is_leased(Instant::now(), SystemTime::now());
-        course
+        let mut execution = Self::new(inner, job, lease, wait, stop, running);
+        execution.is_leased(Instant::now(), SystemTime::now());
+        execution
     }
 
     /// Of a job that a worker has begun and that is to be leased; `None` where another slot has it.
@@ -360,7 +360,7 @@ impl Course {
             Verdict::Solved { summary, result } => Some(Outcome::Succeeded { summary, result }),
             Verdict::Broken(message) => Some(Outcome::Failed(Failure::new(INTERNAL, message))),
             Verdict::Stopped(StopReason::Cancelled) => Some(Outcome::Cancelled),
-            Verdict::Stopped(StopReason::DeadlineExceeded) => Some(Outcome::Expired),
+            Verdict::Stopped(StopReason::DeadlineExceeded) => Some(Outcome::DeadlineExceeded),
             Verdict::Stopped(StopReason::Interrupted) => None,
         };
         let progress = latest.filter(|_| self.stored != latest);
@@ -403,7 +403,7 @@ impl Course {
             Outcome::Succeeded { .. } => (JobState::Succeeded, None),
             Outcome::Failed(failure) => (JobState::Failed, Some(failure)),
             Outcome::Cancelled => (JobState::Cancelled, None),
-            Outcome::Expired => (JobState::Expired, None),
+            Outcome::DeadlineExceeded => (JobState::DeadlineExceeded, None),
         };
         let ours = job.attempt == self.lease.attempt && job.state == state && job.failure.as_ref() == failure;
         ours.then_some(job)
