@@ -10,12 +10,12 @@
 //! Direction of dependence, top to bottom; nothing points upwards:
 //!
 //! ```text
-//! cli -> rpc -> engine -> { store, solver } -> { network, geometry } -> domain
+//! cli -> http -> rpc -> engine -> { store, solver } -> { network, geometry } -> domain
 //! ```
 //!
 //! Beside them `evaluation` holds the methods against the truth of [`synthetic`] scenes.
 //!
-//! Only [`rpc`] (and the client side of [`cli`]) sees prost and tonic, only [`store`] sees SQL
+//! Only [`rpc`], [`http`] and the client side of [`cli`] see prost and tonic, only [`store`] sees SQL
 //! (but for `formats`, which reads COLMAP's databases), only `network` sees burn; `geometry` is plain f64 linear
 //! algebra.
 
@@ -29,6 +29,7 @@ pub mod engine;
 pub(crate) mod evaluation;
 pub(crate) mod formats;
 pub(crate) mod geometry;
+pub mod http;
 pub(crate) mod network;
 pub(crate) mod parallel;
 pub(crate) mod report;

@@ -106,6 +106,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
 fn config(data_dir: &Path) -> Config {
     let mut config = Config::default();
     config.server.listen = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
+    config.http.listen = None;
     config.store.data_dir = data_dir.into();
     config.engine.workers = 1;
     config.engine.drain_seconds = DRAIN_SECONDS;

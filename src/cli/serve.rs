@@ -19,7 +19,8 @@ Configuration: defaults, then the file, then the environment, then flags; later 
 may stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__WORKERS=4. --print-config shows all \
 keys that have a value.
 
-When it serves, two lines on stdout say where: `grpc http://...` (or https) and `metrics http://...`. SIGTERM or Ctrl-C drains: \
+When it serves, lines on stdout say where: `grpc http://...` (or https), `metrics http://...` and `http http://...` (JSON; \
+/openapi.json describes it). SIGTERM or Ctrl-C drains: \
 new jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start; \
 a second signal gives them back now. That is a clean end (0); a third ends at once (130), and jobs that still run lose an \
 attempt, of which they have engine.max_attempts.
@@ -37,7 +38,7 @@ Examples:
 
 /// Run the server
 ///
-/// Takes jobs over gRPC (scpsfm.v1), keeps them in a data directory or a shared database and solves them on worker
+/// Takes jobs over gRPC (scpsfm.v1) and as JSON over HTTP, keeps them in a data directory or a shared database and solves them on worker
 /// threads. A restart knows every job and takes up those that were queued or running.
 #[derive(Debug, clap::Args)]
 #[command(after_help = HELP)]
@@ -49,6 +50,10 @@ pub struct Args {
     /// Address of the gRPC port; port 0 takes a free one [default: 127.0.0.1:50051]
     #[arg(long, value_name = "ADDRESS")]
     pub listen: Option<String>,
+
+    /// Address of the port for JSON over HTTP; `off`: none [default: 127.0.0.1:8080]
+    #[arg(long, value_name = "ADDRESS")]
+    pub http_listen: Option<String>,
 
     /// Address of /metrics, /healthz and /readyz [default: 127.0.0.1:9464]
     #[arg(long, value_name = "ADDRESS")]
@@ -161,6 +166,7 @@ impl Args {
             ("tls.key", path(&self.tls_key)),
             ("tls.client_ca", path(&self.tls_client_ca)),
             ("auth.keys_file", path(&self.keys_file)),
+            ("http.listen", self.http_listen.clone()),
             ("metrics.listen", self.metrics_listen.clone()),
             ("store.data_dir", path(&self.data_dir)),
             ("store.url", self.store.as_ref().map(|url| url.0.clone())),
@@ -226,12 +232,16 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         store,
         grpc = %service.address(),
         scheme,
+        http = service.http_address().map(|address| address.to_string()),
         metrics = %metrics.address(),
         recovered_jobs = service.recovered_jobs(),
         "serving"
     );
     print(&format!("grpc {scheme}://{}", service.address()))?;
     print(&format!("metrics http://{}/metrics", metrics.address()))?;
+    if let Some(address) = service.http_address() {
+        print(&format!("http {scheme}://{address}"))?;
+    }
     let failed = tokio::select! {
         ended = service.wait() => {
             Some(ended.err().unwrap_or_else(|| Failure::internal("the gRPC server ended without being asked to")))

@@ -11,6 +11,7 @@ use tokio::time::timeout;
 use super::exit::Failure;
 use crate::config::{self, Config};
 use crate::engine::{self, Engine};
+use crate::http;
 use crate::rpc::convert::result::encode as encode_result;
 use crate::rpc::keys::Sources;
 use crate::rpc::server::{self, Server};
@@ -30,6 +31,7 @@ pub struct Service {
     store: Arc<dyn Store>,
     engine: Engine,
     server: Server,
+    http: Option<http::Server>,
     drain_bound: Duration,
 }
 
@@ -66,15 +68,15 @@ impl Service {
                 return Err(Failure::internal(format_args!("cannot start the engine: {error}")));
             }
         };
-        match Server::bind(options, engine.clone()).await {
-            Ok(server) => {
+        match bind(options, config, engine.clone()).await {
+            Ok((server, http)) => {
                 let drain_bound = Duration::from_secs(config.engine.drain_seconds);
-                Ok(Some(Self { store, engine, server, drain_bound }))
+                Ok(Some(Self { store, engine, server, http, drain_bound }))
             }
-            Err(error) => {
+            Err(failure) => {
                 // Jobs that have begun by now are to lose no attempt by an address that is taken.
                 give_back(&engine, &*store).await;
-                Err(Failure::internal(error))
+                Err(failure)
             }
         }
     }
@@ -82,6 +84,11 @@ impl Service {
     /// Where it listens.
     pub fn address(&self) -> SocketAddr {
         self.server.address()
+    }
+
+    /// Where the port for HTTP listens, if there is one.
+    pub fn http_address(&self) -> Option<SocketAddr> {
+        self.http.as_ref().map(http::Server::address)
     }
 
     /// Jobs that dead processes had left running, which the start took back.
@@ -117,6 +124,9 @@ impl Service {
                 drain.await
             }
         };
+        if let Some(http) = self.http {
+            http.shutdown(CALLS_BOUND).await;
+        }
         let calls_ended = self.server.shutdown(CALLS_BOUND).await;
         close(&*self.store).await;
         calls_ended.map(|()| drained).map_err(Failure::internal)
@@ -126,6 +136,19 @@ impl Service {
     pub async fn abandon(self) {
         give_back(&self.engine, &*self.store).await;
     }
+}
+
+/// The ports.
+async fn bind(
+    options: server::Options,
+    config: &Config,
+    engine: Engine,
+) -> Result<(Server, Option<http::Server>), Failure> {
+    let server = Server::bind(options, engine).await.map_err(Failure::internal)?;
+    let Some(listen) = config.http.listen else { return Ok((server, None)) };
+    let options = http::Options { listen, max_body_bytes: config.http.max_body_bytes };
+    let http = http::Server::bind(options, server.gateway()).await.map_err(Failure::internal)?;
+    Ok((server, Some(http)))
 }
 
 async fn give_back(engine: &Engine, store: &dyn Store) {
@@ -187,7 +210,7 @@ fn server_options(config: &Config) -> server::Options {
         max_message_bytes: config.server.max_message_bytes,
         max_inflight_bytes: config.server.max_inflight_bytes,
         max_connections: config.server.max_connections,
-        first_call_timeout: match config.server.first_call_seconds {
+        auth_timeout: match config.server.auth_timeout_seconds {
             0 => None,
             seconds => Some(Duration::from_secs(seconds)),
         },
@@ -222,7 +245,7 @@ mod tests {
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));
         let of = |options: server::Options| {
             let keys = options.keys.is_on();
-            let connections = (options.max_connections, options.first_call_timeout);
+            let connections = (options.max_connections, options.auth_timeout);
             let bounds = (options.limits, options.max_message_bytes, options.max_inflight_bytes, connections);
             (bounds, options.solve_grace, options.tls, keys, options.reflection)
         };

@@ -2,24 +2,24 @@
 
 use std::net::SocketAddr;
 
-use super::sections::{Auth, Server, Tls};
+use super::sections::{Auth, Http, Server, Tls};
 
-/// A gRPC port that others than this machine could reach, without enough to keep them out; says what to do.
+/// A port that others than this machine could reach, without enough to keep them out; says what to do.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Exposed {
     #[error(
-        "server.listen: {0} is open to a network, and neither TLS nor keys keep strangers out; right would be \
+        "{0}: {1} is open to a network, and neither TLS nor keys keep strangers out; right would be \
          tls.certificate and tls.key (--tls-certificate, --tls-key) with auth.keys_file (--keys-file), a loopback address \
-         such as 127.0.0.1:50051, or, where the network itself lets in only whom you trust, server.insecure = true \
+         such as 127.0.0.1, or, where the network itself lets in only whom you trust, server.insecure = true \
          (--insecure)"
     )]
-    Open(SocketAddr),
+    Open(&'static str, SocketAddr),
     #[error(
-        "server.listen: {0} is open to a network, and without TLS the keys would travel readable; right would be \
-         tls.certificate and tls.key (--tls-certificate, --tls-key), a loopback address such as 127.0.0.1:50051, or, \
+        "{0}: {1} is open to a network, and without TLS the keys would travel readable; right would be \
+         tls.certificate and tls.key (--tls-certificate, --tls-key), a loopback address such as 127.0.0.1, or, \
          behind a proxy that ends TLS, server.plaintext_keys = true (--plaintext-keys)"
     )]
-    ReadableKeys(SocketAddr),
+    ReadableKeys(&'static str, SocketAddr),
 }
 
 /// Whether the server may listen where it is told to.
@@ -29,14 +29,18 @@ pub enum Exposed {
 ///
 /// # Errors
 /// [`Exposed`].
-pub fn check(server: &Server, tls: &Tls, auth: &Auth) -> Result<(), Exposed> {
-    let elsewhere = !server.listen.ip().to_canonical().is_loopback();
+pub fn check(server: &Server, http: &Http, tls: &Tls, auth: &Auth) -> Result<(), Exposed> {
+    let ports = [("server.listen", Some(server.listen)), ("http.listen", http.listen)];
     let plain = tls.certificate.is_none();
-    match auth.is_on() {
-        true if elsewhere && plain && !server.plaintext_keys => Err(Exposed::ReadableKeys(server.listen)),
-        false if elsewhere && plain && !server.insecure => Err(Exposed::Open(server.listen)),
-        _ => Ok(()),
+    for (key, listen) in ports {
+        let Some(listen) = listen.filter(|listen| !listen.ip().to_canonical().is_loopback()) else { continue };
+        match auth.is_on() {
+            true if plain && !server.plaintext_keys => return Err(Exposed::ReadableKeys(key, listen)),
+            false if plain && !server.insecure => return Err(Exposed::Open(key, listen)),
+            _ => {}
+        }
     }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -46,8 +50,9 @@ mod tests {
     #[test]
     fn only_loopback_is_open_to_anyone_unless_told_so_by_name() {
         let verdict = |listen: &str, tls: bool, keys: bool, word: &str| {
+            let listen = listen.parse().expect("an address");
             let server = Server {
-                listen: listen.parse().expect("an address"),
+                listen,
                 insecure: word == "insecure",
                 plaintext_keys: word == "plaintext_keys",
                 ..Server::default()
@@ -55,7 +60,14 @@ mod tests {
             let file = || Some("f".into());
             let tls = if tls { Tls { certificate: file(), key: file(), client_ca: None } } else { Tls::default() };
             let auth = Auth { keys_file: keys.then(|| "f".into()), keys: None };
-            check(&server, &tls, &auth).map_err(|error| matches!(error, Exposed::Open(_)))
+            let verdict = check(&server, &Http::default(), &tls, &auth);
+            // The port for HTTP is held to the same.
+            let http = Http { listen: Some(listen), ..Http::default() };
+            let local = Server { listen: Server::default().listen, ..server };
+            let of_http = check(&local, &http, &tls, &auth);
+            let is_open = |verdict: Result<(), Exposed>| verdict.map_err(|error| matches!(error, Exposed::Open(..)));
+            assert_eq!(is_open(of_http), is_open(verdict.clone()), "{listen}");
+            is_open(verdict)
         };
         for local in ["127.0.0.1:1", "127.9.9.9:0", "[::1]:1", "[::ffff:127.0.0.1]:1"] {
             for keys in [false, true] {

@@ -15,13 +15,14 @@ use serde::{Deserialize, Serialize};
 use crate::domain::Limits;
 use crate::store::postgres::DatabaseUrl;
 pub use retention::Retention;
-pub use sections::{Auth, Compute, Engine, Log, Metrics, Otlp, Server, Store, Tls, Upload};
+pub use sections::{Auth, Compute, Engine, Http, Log, Metrics, Otlp, Server, Store, Tls, Upload};
 
 /// Everything that the server can be told.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
     pub server: Server,
+    pub http: Http,
     pub tls: Tls,
     pub auth: Auth,
     pub metrics: Metrics,
@@ -158,6 +159,7 @@ impl Config {
                 right: "a number from server.max_message_bytes on",
             });
         }
+        at_least_one("http.max_body_bytes", self.http.max_body_bytes as u64)?;
         at_least_one("server.max_connections", self.server.max_connections as u64)?;
         at_least_one("engine.queue_capacity", self.engine.queue_capacity as u64)?;
         at_least_one("engine.queue_bytes", self.engine.queue_bytes)?;
@@ -203,15 +205,15 @@ impl Config {
             });
         }
         self.tls.validate()?;
-        Ok(exposure::check(&self.server, &self.tls, &self.auth)?)
+        Ok(exposure::check(&self.server, &self.http, &self.tls, &self.auth)?)
     }
 }
 
 /// The variables that name a key, i.e. have a section: `SCPSFM_ENGINE__WORKERS`. Others of our prefix, such as those
 /// that switch tests, are none of ours here; but `SCPSFM_ENGINE_WORKERS` is a slip that would go unseen.
 fn keys_among(variables: Vec<(String, String)>) -> Result<Vec<(String, String)>, Error> {
-    const SECTIONS: [&str; 11] =
-        ["SERVER", "TLS", "AUTH", "METRICS", "STORE", "ENGINE", "UPLOAD", "COMPUTE", "LIMITS", "LOG", "OTLP"];
+    const SECTIONS: [&str; 12] =
+        ["SERVER", "HTTP", "TLS", "AUTH", "METRICS", "STORE", "ENGINE", "UPLOAD", "COMPUTE", "LIMITS", "LOG", "OTLP"];
     let mut keys = Vec::new();
     for (name, value) in variables {
         let Some(rest) = name.strip_prefix(PREFIX) else { continue };

@@ -4,7 +4,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 
 use serde::de::IntoDeserializer;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::{Error, Retention};
 use crate::domain::Backend;
@@ -31,7 +31,7 @@ pub struct Server {
     pub max_connections: usize,
     /// Seconds that a connection may take to its first call with a key, or to its first call where none is asked for;
     /// then it is closed. Health checks need no key and do not count where others do. 0: for ever.
-    pub first_call_seconds: u64,
+    pub auth_timeout_seconds: u64,
     /// Whether callers may ask for the API's description (reflection). On, because it says what `proto/` says; with
     /// keys it asks for one, as every call but a health check does.
     pub reflection: bool,
@@ -56,7 +56,7 @@ impl Default for Server {
             max_message_bytes: rpc::server::Options::MAX_MESSAGE_BYTES,
             max_inflight_bytes: rpc::server::Options::MAX_INFLIGHT_BYTES,
             max_connections: rpc::server::Options::MAX_CONNECTIONS,
-            first_call_seconds: rpc::server::Options::FIRST_CALL_TIMEOUT.as_secs(),
+            auth_timeout_seconds: rpc::server::Options::AUTH_TIMEOUT.as_secs(),
             reflection: true,
             insecure: false,
             plaintext_keys: false,
@@ -64,7 +64,28 @@ impl Default for Server {
     }
 }
 
-/// Certificates of the gRPC port, PEM files that are read again when they change. None by default: there is no
+/// The port for JSON over HTTP, with the keys and certificates of the gRPC port.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Http {
+    /// Address and port to listen on, port 0 takes a free one; `off`: there is none.
+    #[serde(deserialize_with = "address_or_off", serialize_with = "or_off")]
+    pub listen: Option<SocketAddr>,
+    /// Largest body of JSON.
+    pub max_body_bytes: usize,
+}
+
+impl Default for Http {
+    fn default() -> Self {
+        Self {
+            // Loopback, as gRPC's; 8080 is the customary port for HTTP that needs no rights.
+            listen: Some(SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080)),
+            max_body_bytes: crate::http::MAX_BODY_BYTES,
+        }
+    }
+}
+
+/// Certificates of the gRPC and HTTP ports, PEM files that are read again when they change. None by default: there is no
 /// certificate that would be right everywhere.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -304,11 +325,29 @@ pub struct Otlp {
     pub endpoint: Option<String>,
 }
 
-fn address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<SocketAddr, D::Error> {
+/// What turns a port off.
+const OFF: &str = "off";
+
+fn address_or_off<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<SocketAddr>, D::Error> {
     let text = String::deserialize(deserializer)?;
+    if text == OFF { Ok(None) } else { parse_address(&text).map(Some) }
+}
+
+fn or_off<S: Serializer>(address: &Option<SocketAddr>, serializer: S) -> Result<S::Ok, S::Error> {
+    match address {
+        Some(address) => address.serialize(serializer),
+        None => serializer.serialize_str(OFF),
+    }
+}
+
+fn address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<SocketAddr, D::Error> {
+    parse_address(&String::deserialize(deserializer)?)
+}
+
+fn parse_address<E: serde::de::Error>(text: &str) -> Result<SocketAddr, E> {
     text.parse().map_err(|_| {
         let message = format!("`{text}` is not an IP address and port, such as 127.0.0.1:50051 or [::1]:50051");
-        serde::de::Error::custom(message)
+        E::custom(message)
     })
 }
 

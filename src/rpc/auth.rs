@@ -13,8 +13,8 @@ use tonic::codegen::http::{HeaderMap, Method, Request, Response};
 use tower::{Layer, Service};
 
 use super::caller::Tenant;
-use super::door::Introduction;
 use super::keys::{Hash, KeyRing};
+use super::listener::Introduction;
 use super::reload::Current;
 use super::status;
 
@@ -34,6 +34,14 @@ pub struct Authenticate {
 impl Authenticate {
     pub fn new(keys: Option<Current<KeyRing>>) -> Self {
         Self { keys }
+    }
+
+    /// Whether these headers hold a key, where one is asked for.
+    ///
+    /// # Errors
+    /// `UNAUTHENTICATED`.
+    pub fn check(&self, headers: &HeaderMap) -> Result<(), Status> {
+        self.admit(headers).map(drop)
     }
 
     /// Whose call it is, and what it hangs on.

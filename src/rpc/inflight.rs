@@ -84,7 +84,7 @@ impl Charge {
 }
 
 impl Permit {
-    fn new(budget: Arc<Budget>) -> Self {
+    pub fn new(budget: Arc<Budget>) -> Self {
         Self { shared: Arc::new(Shared { budget, charge: Mutex::default() }) }
     }
 

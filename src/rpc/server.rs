@@ -9,26 +9,29 @@ use tokio::sync::{Mutex, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio_rustls::rustls::ServerConfig;
 use tokio_util::sync::CancellationToken;
+use tonic::Status;
 use tonic::codec::CompressionEncoding::Gzip;
+use tonic::codegen::http::HeaderMap;
+use tonic::service::Routes;
 use tonic::transport::server::Router;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 use tower::layer::util::{Identity, Stack};
 
-use super::auth::Authenticate;
+use super::auth::{Authenticate, Authenticated};
 use super::calibration::{self, Calibration};
-use super::explain::Explain;
-use super::inflight::{Budget, Inflight};
+use super::explain::{Explain, Explained};
+use super::inflight::{Budget, Charged, Inflight, Permit};
 use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
-use super::meter::Meter;
+use super::meter::{Meter, Metered};
 use super::proto::FILE_DESCRIPTOR_SET;
 use super::proto::calibration_service_server::CalibrationServiceServer;
 use super::proto::input_service_server::InputServiceServer;
 use super::proto::job_service_server::JobServiceServer;
 use super::reload::{self, Current};
-use super::{door, tls};
+use super::{listener, tls};
 use crate::domain::Limits;
 use crate::engine::{Engine, StoreState};
 use crate::telemetry::metrics::{Reloaded, locked_out};
@@ -76,7 +79,7 @@ pub struct Options {
     pub max_connections: usize,
     /// How long a connection may take until someone calls over it who may: with a key, where keys are asked for.
     /// `None`: for ever.
-    pub first_call_timeout: Option<Duration>,
+    pub auth_timeout: Option<Duration>,
     /// How long a connection may be silent before it is asked whether it lives.
     pub keepalive: Duration,
     /// How long the answer to that may take.
@@ -97,11 +100,11 @@ impl Options {
     /// three times), or a thousand small ones, on a machine with a few gigabytes.
     pub const MAX_INFLIGHT_BYTES: u64 = 1 << 30;
 
-    /// See [`door::MAX_SPEAKING`].
-    pub const MAX_CONNECTIONS: usize = door::MAX_SPEAKING;
+    /// See [`listener::MAX_ESTABLISHED`].
+    pub const MAX_CONNECTIONS: usize = listener::MAX_ESTABLISHED;
 
-    /// See [`door::FIRST_CALL_TIMEOUT`].
-    pub const FIRST_CALL_TIMEOUT: Duration = door::FIRST_CALL_TIMEOUT;
+    /// See [`listener::AUTH_TIMEOUT`].
+    pub const AUTH_TIMEOUT: Duration = listener::AUTH_TIMEOUT;
 
     /// Whether the files of certificates and keys can be used, as they are now.
     ///
@@ -125,10 +128,10 @@ impl Default for Options {
             tls: None,
             keys: keys::Sources::default(),
             look_every: reload::LOOK_EVERY,
-            handshake_timeout: door::HANDSHAKE_TIMEOUT,
-            max_silent_connections: door::MAX_GREETED,
-            max_connections: door::MAX_SPEAKING,
-            first_call_timeout: Some(Self::FIRST_CALL_TIMEOUT),
+            handshake_timeout: listener::HANDSHAKE_TIMEOUT,
+            max_silent_connections: listener::MAX_HANDSHAKING,
+            max_connections: listener::MAX_ESTABLISHED,
+            auth_timeout: Some(Self::AUTH_TIMEOUT),
             keepalive: KEEPALIVE,
             keepalive_timeout: KEEPALIVE_TIMEOUT,
             reflection: true,
@@ -157,6 +160,7 @@ pub enum Error {
 #[derive(Debug)]
 pub struct Server {
     address: SocketAddr,
+    gateway: Gateway,
     health: Arc<Health>,
     /// Follows the store; ended with the server.
     follower: JoinHandle<()>,
@@ -172,7 +176,8 @@ impl Server {
     pub async fn bind(options: Options, engine: Engine) -> Result<Self, Error> {
         // First: an address that is bound takes connections.
         let certificates = certificates(&options).await?;
-        let keys = keys(&options).await?;
+        let authenticate = Authenticate::new(keys(&options).await?);
+        let budget = Budget::new(options.max_inflight_bytes);
         let listen_error = |source| Error::Listen { address: options.listen, source };
         let listener = TcpListener::bind(options.listen).await.map_err(listen_error)?;
         let address = listener.local_addr().map_err(listen_error)?;
@@ -180,25 +185,43 @@ impl Server {
         let health = Arc::new(Health { reporter, draining: Mutex::new(false) });
         let mut store = engine.store_state();
         health.tell(is_of_use(*store.borrow_and_update())).await;
-        let router = router(&options, engine, Authenticate::new(keys))?.add_service(health_service);
-        let stop = CancellationToken::new();
-        let stopped = stop.clone().cancelled_owned();
-        let entrance = door::Options {
+        let services = services(&options, engine)?;
+        let listener_options = listener::Options {
             certificates,
             timeout: options.handshake_timeout,
-            max_greeted: options.max_silent_connections,
-            max_speaking: options.max_connections,
-            first_call: options.first_call_timeout,
+            max_handshaking: options.max_silent_connections,
+            max_established: options.max_connections,
+            auth_timeout: options.auth_timeout,
+            protocol: None,
         };
-        let incoming = door::incoming(listener, entrance);
+        let gateway = Gateway {
+            service: tower::ServiceBuilder::new()
+                .layer(Meter)
+                .layer(Explain)
+                .layer(authenticate.clone())
+                .layer(Inflight::new(Arc::clone(&budget)))
+                .service(services.clone()),
+            listener: listener_options.clone(),
+            authenticate: authenticate.clone(),
+            budget: Arc::clone(&budget),
+        };
+        let router = router(&options, services, authenticate, budget).add_service(health_service);
+        let stop = CancellationToken::new();
+        let stopped = stop.clone().cancelled_owned();
+        let incoming = listener::incoming(listener, listener_options).into_stream();
         let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));
         let follower = tokio::spawn(follow_store(Arc::clone(&health), store));
-        Ok(Self { address, health, follower, stop, task })
+        Ok(Self { address, gateway, health, follower, stop, task })
     }
 
     /// Where the server listens.
     pub fn address(&self) -> SocketAddr {
         self.address
+    }
+
+    /// The API for another port of the same process.
+    pub fn gateway(&self) -> Gateway {
+        self.gateway.clone()
     }
 
     /// First phase of a drain: tells health checks NOT_SERVING, so that no new callers are sent here. Calls go on.
@@ -314,8 +337,35 @@ async fn keys(options: &Options) -> Result<Option<Current<KeyRing>>, Error> {
 /// What goes around every service; the first to be added, [`Meter`], is outermost.
 type Layers = Stack<Inflight, Stack<Authenticate, Stack<Explain, Stack<Meter, Identity>>>>;
 
+/// The API as another port of the same process serves it: the same services behind the same layers, and what it needs
+/// to treat its callers in the same way.
+#[derive(Debug, Clone)]
+pub struct Gateway {
+    /// Calls that never leave the process.
+    pub service: Metered<Explained<Authenticated<Charged<Routes>>>>,
+    /// How gRPC's own connections are let in.
+    pub listener: listener::Options,
+    authenticate: Authenticate,
+    budget: Arc<Budget>,
+}
+
+impl Gateway {
+    /// Whether the headers hold a key, where one is asked for: before a request is read that only a call will refuse.
+    ///
+    /// # Errors
+    /// `UNAUTHENTICATED`.
+    pub fn check_key(&self, headers: &HeaderMap) -> Result<(), Status> {
+        self.authenticate.check(headers)
+    }
+
+    /// A permit for what a request holds beside its call.
+    pub fn permit(&self) -> Permit {
+        Permit::new(Arc::clone(&self.budget))
+    }
+}
+
 /// Every service but health.
-fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Result<Router<Layers>, Error> {
+fn services(options: &Options, engine: Engine) -> Result<Routes, Error> {
     let limits = options.limits.clone();
     let max_bytes = options.max_message_bytes;
     let bounds = calibration::Bounds { max_message_bytes: max_bytes, max_connections: options.max_connections };
@@ -331,24 +381,29 @@ fn router(options: &Options, engine: Engine, authenticate: Authenticate) -> Resu
             $service.accept_compressed(Gzip).send_compressed(Gzip).max_decoding_message_size(max_bytes)
         };
     }
-    let router = tonic::transport::Server::builder()
-        .layer(Meter)
-        .layer(Explain)
-        .layer(authenticate)
-        .layer(Inflight::new(Budget::new(options.max_inflight_bytes)))
-        .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
-        .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
-        .http2_keepalive_interval(Some(options.keepalive))
-        .http2_keepalive_timeout(Some(options.keepalive_timeout))
-        .add_service(with_limits!(CalibrationServiceServer::new(calibration)))
+    let services = Routes::new(with_limits!(CalibrationServiceServer::new(calibration)))
         .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits, max_bytes as u64))))
         .add_service(
             with_limits!(InputServiceServer::new(inputs))
                 .max_decoding_message_size(max_bytes.min(inputs::MAX_MESSAGE_BYTES)),
         );
     if !options.reflection {
-        return Ok(router);
+        return Ok(services);
     }
     // Older clients, grpcurl and Python's among them, still ask for v1alpha.
-    Ok(router.add_service(reflection().build_v1()?).add_service(reflection().build_v1alpha()?))
+    Ok(services.add_service(reflection().build_v1()?).add_service(reflection().build_v1alpha()?))
+}
+
+/// The services behind their layers, as connections reach them.
+fn router(options: &Options, services: Routes, authenticate: Authenticate, budget: Arc<Budget>) -> Router<Layers> {
+    tonic::transport::Server::builder()
+        .layer(Meter)
+        .layer(Explain)
+        .layer(authenticate)
+        .layer(Inflight::new(budget))
+        .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
+        .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
+        .http2_keepalive_interval(Some(options.keepalive))
+        .http2_keepalive_timeout(Some(options.keepalive_timeout))
+        .add_routes(services)
 }

@@ -6,7 +6,7 @@
 pub mod attempt;
 pub mod metrics;
 pub mod server;
-mod silence;
+pub mod silence;
 pub mod tracing;
 
 pub use attempt::{Attempt, waited};

@@ -1,47 +1,52 @@
 //! A listener whose connections end when nothing moves on them for too long.
 
 use std::io;
-use std::net::SocketAddr;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::serve::Listener;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Instant, Sleep, sleep};
 
 /// Takes connections and bounds their silence.
-pub(super) struct Bounded {
-    pub listener: TcpListener,
+#[derive(Debug)]
+pub struct Bounded<L> {
+    pub listener: L,
     /// How long nothing may move, in either direction.
     pub silence: Duration,
 }
 
-impl Listener for Bounded {
-    type Io = Connection;
-    type Addr = SocketAddr;
+impl<L: Listener> Listener for Bounded<L> {
+    type Io = Connection<L::Io>;
+    type Addr = L::Addr;
 
-    async fn accept(&mut self) -> (Connection, SocketAddr) {
-        let (io, address) = Listener::accept(&mut self.listener).await;
+    async fn accept(&mut self) -> (Connection<L::Io>, L::Addr) {
+        let (io, address) = self.listener.accept().await;
         (Connection { io, silence: self.silence, end: Box::pin(sleep(self.silence)) }, address)
     }
 
-    fn local_addr(&self) -> io::Result<SocketAddr> {
+    fn local_addr(&self) -> io::Result<L::Addr> {
         self.listener.local_addr()
     }
 }
 
 /// A connection that fails when it was silent for too long.
-pub(super) struct Connection {
-    io: TcpStream,
+#[derive(Debug)]
+pub struct Connection<T> {
+    io: T,
     silence: Duration,
     end: Pin<Box<Sleep>>,
 }
 
-impl Connection {
+impl<T> Connection<T> {
+    /// What is bounded.
+    pub fn inner(&self) -> &T {
+        &self.io
+    }
+
     /// Passes on what an operation came to, unless it waits and has done so for too long.
-    fn bounded<T>(&mut self, outcome: Poll<io::Result<T>>, context: &mut Context<'_>) -> Poll<io::Result<T>> {
+    fn bounded<O>(&mut self, outcome: Poll<io::Result<O>>, context: &mut Context<'_>) -> Poll<io::Result<O>> {
         match outcome {
             Poll::Pending => self.end.as_mut().poll(context).map(|()| Err(io::ErrorKind::TimedOut.into())),
             moved => {
@@ -52,14 +57,14 @@ impl Connection {
     }
 }
 
-impl AsyncRead for Connection {
+impl<T: AsyncRead + Unpin> AsyncRead for Connection<T> {
     fn poll_read(mut self: Pin<&mut Self>, context: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let read = Pin::new(&mut self.io).poll_read(context, buf);
         self.bounded(read, context)
     }
 }
 
-impl AsyncWrite for Connection {
+impl<T: AsyncWrite + Unpin> AsyncWrite for Connection<T> {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.io).poll_write(context, buf);
         self.bounded(written, context)

@@ -11,6 +11,7 @@ mod crash;
 mod dashboards;
 mod disk;
 mod formats;
+mod http;
 mod inputs;
 mod load;
 mod lost;

@@ -28,7 +28,8 @@ pub fn program<S: AsRef<std::ffi::OsStr>>(arguments: impl IntoIterator<Item = S>
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SCPSFM_")) {
         command.env_remove(name);
     }
-    command.args(arguments);
+    // Of a fixed port, only one server on the machine could have it.
+    command.args(arguments).env("SCPSFM_HTTP__LISTEN", "127.0.0.1:0");
     command
 }
 
@@ -79,6 +80,8 @@ pub struct Serving {
     pub grpc: String,
     /// `127.0.0.1:...`
     pub metrics: String,
+    /// `http://127.0.0.1:...`
+    pub http: String,
     _stdout: BufReader<ChildStdout>,
 }
 
@@ -125,7 +128,8 @@ impl Serving {
         };
         let grpc = told("grpc ");
         let metrics = told("metrics http://").trim_end_matches("/metrics").to_owned();
-        Self { running, grpc, metrics, _stdout: stdout }
+        let http = told("http ");
+        Self { running, grpc, metrics, http, _stdout: stdout }
     }
 
     /// Body of a page of the metrics port.

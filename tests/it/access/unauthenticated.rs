@@ -30,7 +30,7 @@ fn options(keys: Option<&str>) -> Options {
     let hours = Duration::from_secs(3 * 3_600);
     Options {
         keys: Sources { file: None, fixed },
-        first_call_timeout: Some(BOUND),
+        auth_timeout: Some(BOUND),
         handshake_timeout: hours,
         keepalive: hours,
         ..Options::default()
@@ -138,7 +138,7 @@ async fn strangers_in_every_place_make_room_for_a_caller() {
     let variables = [
         ("SCPSFM_AUTH__KEYS", keys.as_str()),
         ("SCPSFM_SERVER__MAX_CONNECTIONS", "2"),
-        ("SCPSFM_SERVER__FIRST_CALL_SECONDS", "1"),
+        ("SCPSFM_SERVER__AUTH_TIMEOUT_SECONDS", "1"),
     ];
     let server = Serving::start_with(directory.path(), &variables, Stdio::null());
     let page = || Page::parse(&server.page("/metrics"));

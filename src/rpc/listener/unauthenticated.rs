@@ -13,7 +13,7 @@ use crate::telemetry::metrics;
 
 /// How long a connection may take to its first call by someone who may call. Clients connect in order to call; half a
 /// minute is one that reads a large input in between, on a machine that is busy.
-pub const FIRST_CALL_TIMEOUT: Duration = Duration::from_secs(30);
+pub const AUTH_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Whether someone who may call has called over a connection. Goes with each of its requests; clones are the same one.
 #[derive(Debug, Clone, Default)]
@@ -32,13 +32,13 @@ impl Introduction {
 }
 
 /// The time that a connection has for its introduction.
-pub(super) struct Patience {
+pub(super) struct AuthDeadline {
     pub(super) introduction: Introduction,
     /// `None`: it has been introduced, or may take for ever.
     end: Option<Pin<Box<Sleep>>>,
 }
 
-impl Patience {
+impl AuthDeadline {
     /// From now on; `None`: for ever.
     pub(super) fn begin(bound: Option<Duration>) -> Self {
         let end = bound.map(|bound| Box::pin(tokio::time::sleep(bound)));
@@ -62,7 +62,7 @@ impl Patience {
     }
 }
 
-impl Drop for Patience {
+impl Drop for AuthDeadline {
     fn drop(&mut self) {
         let over = self.end.as_ref().is_some_and(|end| end.is_elapsed());
         if over && !self.introduction.is_made() {

@@ -2,7 +2,7 @@
 //! have not yet are few enough to hold up nobody. Those that speak have a bound of time to call as someone who may.
 
 mod refusals;
-mod stranger;
+mod unauthenticated;
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -24,8 +24,8 @@ use tokio_rustls::rustls::ServerConfig;
 use tonic::transport::server::Connected;
 
 use self::refusals::Refusals;
-use self::stranger::Patience;
-pub use self::stranger::{FIRST_CALL_TIMEOUT, Introduction};
+use self::unauthenticated::AuthDeadline;
+pub use self::unauthenticated::{AUTH_TIMEOUT, Introduction};
 use super::reload::Current;
 use crate::telemetry::metrics;
 
@@ -35,11 +35,11 @@ pub const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Connections that have not come to their first words yet, at most; one more ends the oldest of them. Callers that
 /// mean it need milliseconds for it, so that a thousand are a thousand new ones a round trip.
-pub const MAX_GREETED: usize = 1_024;
+pub const MAX_HANDSHAKING: usize = 1_024;
 
 /// Connections that speak, at most: one for each of some thousand callers who watch. Each takes some ten kilobytes
 /// while it is idle, and a file descriptor.
-pub const MAX_SPEAKING: usize = 4_096;
+pub const MAX_ESTABLISHED: usize = 4_096;
 
 /// How long a connection that is refused may take to its first call, which is what is refused: a client that is told
 /// before may close while that call is on its way through it, and some then never answer the call.
@@ -49,7 +49,7 @@ const REFUSED_CALL_TIMEOUT: Duration = Duration::from_millis(500);
 const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Connections that are being refused, at most: as many as may be about to speak. One more is closed without a word.
-const MAX_REFUSALS: usize = MAX_GREETED;
+const MAX_REFUSALS: usize = MAX_HANDSHAKING;
 
 /// What every server says first: settings, here none (RFC 9113, section 6.5). Some clients wait for them before they
 /// call.
@@ -81,62 +81,76 @@ pub struct Options {
     /// How long a connection may take to its first words.
     pub timeout: Duration,
     /// Connections that have not come to them yet, at most.
-    pub max_greeted: usize,
+    pub max_handshaking: usize,
     /// Connections that have, at most; one more is refused.
-    pub max_speaking: usize,
+    pub max_established: usize,
     /// How long one that has may take until someone calls over it who may; `None`: for ever.
-    pub first_call: Option<Duration>,
+    pub auth_timeout: Option<Duration>,
+    /// Protocol that TLS offers in place of HTTP/2.
+    pub protocol: Option<&'static [u8]>,
 }
 
-/// Connections that speak, in the order in which they began to. Each handshake begins with the certificate that is in
-/// force then; those that fail or stall leave nothing but a line in the log.
-pub fn incoming(listener: TcpListener, options: Options) -> impl Stream<Item = Result<Connection, Infallible>> {
-    let seats = Arc::new(Semaphore::new(options.max_speaking.min(Semaphore::MAX_PERMITS)));
-    let refusing_seats = Arc::new(Semaphore::new(MAX_REFUSALS));
-    let door = Door {
+/// The connections of a listener, in the order in which they have shaken hands.
+pub struct Incoming(ConnectionListener);
+
+/// Takes connections. Each handshake begins with the certificate that is in force then; those that fail or stall leave
+/// nothing but a line in the log.
+pub fn incoming(listener: TcpListener, options: Options) -> Incoming {
+    Incoming(ConnectionListener {
         listener,
+        permits: Arc::new(Semaphore::new(options.max_established.min(Semaphore::MAX_PERMITS))),
+        refusal_permits: Arc::new(Semaphore::new(MAX_REFUSALS)),
         options,
-        seats,
-        refusing_seats,
         refusal_log: Refusals::default(),
-        greeted: JoinSet::new(),
+        handshaking: JoinSet::new(),
         oldest_first: VecDeque::new(),
-    };
-    stream::unfold(door, async |mut door| {
-        let connection = door.next().await;
-        Some((Ok(connection), door))
     })
 }
 
-struct Door {
+impl Incoming {
+    /// The next one; waits for ever where none comes.
+    pub async fn next(&mut self) -> Connection {
+        self.0.next().await
+    }
+
+    /// The same as a stream, which never ends.
+    pub fn into_stream(self) -> impl Stream<Item = Result<Connection, Infallible>> {
+        stream::unfold(self, async |mut incoming| {
+            let connection = incoming.next().await;
+            Some((Ok(connection), incoming))
+        })
+    }
+}
+
+struct ConnectionListener {
     listener: TcpListener,
     options: Options,
     /// One for each connection that may speak.
-    seats: Arc<Semaphore>,
+    permits: Arc<Semaphore>,
     /// One for each connection that is being refused.
-    refusing_seats: Arc<Semaphore>,
+    refusal_permits: Arc<Semaphore>,
     refusal_log: Refusals,
-    greeted: JoinSet<Result<Begun, String>>,
+    handshaking: JoinSet<Result<Begun, String>>,
     oldest_first: VecDeque<AbortHandle>,
 }
 
-impl Door {
+impl ConnectionListener {
     async fn next(&mut self) -> Connection {
         loop {
             tokio::select! {
                 accepted = self.listener.accept() => match accepted {
-                    Ok((connection, _)) => self.greet(connection),
+                    Ok((connection, _)) => self.shake_hands(connection),
                     Err(error) => {
                         tracing::warn!(%error, "a connection could not be taken");
                         tokio::time::sleep(ACCEPT_PAUSE).await;
                     }
                 },
-                Some(ended) = self.greeted.join_next() => match ended {
-                    Ok(Ok(begun)) => match self.seats.clone().try_acquire_owned() {
-                        Ok(seat) => {
+                Some(ended) = self.handshaking.join_next() => match ended {
+                    Ok(Ok(begun)) => match self.permits.clone().try_acquire_owned() {
+                        Ok(permit) => {
                             let Begun { io, early } = begun;
-                            let patience = Patience::begin(self.options.first_call);
-                            return Connection { io, early, patience, _held: (seat, metrics::connection()) };
+                            let auth_deadline = AuthDeadline::begin(self.options.auth_timeout);
+                            return Connection { io, early, auth_deadline, _held: (permit, metrics::connection()) };
                         }
                         Err(_) => self.refuse(begun),
                     },
@@ -149,26 +163,32 @@ impl Door {
         }
     }
 
-    fn greet(&mut self, connection: TcpStream) {
-        self.oldest_first.retain(|greeted| !greeted.is_finished());
-        while self.oldest_first.len() >= self.options.max_greeted.max(1) {
+    fn shake_hands(&mut self, connection: TcpStream) {
+        self.oldest_first.retain(|handshaking| !handshaking.is_finished());
+        while self.oldest_first.len() >= self.options.max_handshaking.max(1) {
             if let Some(oldest) = self.oldest_first.pop_front() {
                 oldest.abort();
             }
         }
-        let acceptor = self.options.certificates.as_ref().map(|current| TlsAcceptor::from(current.borrow().clone()));
+        let acceptor = self.options.certificates.as_ref().map(|current| {
+            let mut config = current.borrow().clone();
+            if let Some(protocol) = self.options.protocol {
+                Arc::make_mut(&mut config).alpn_protocols = vec![protocol.to_vec()];
+            }
+            TlsAcceptor::from(config)
+        });
         let bound = self.options.timeout;
-        let greeting = self.greeted.spawn(async move {
+        let handshake = self.handshaking.spawn(async move {
             match tokio::time::timeout(bound, begin(connection, acceptor)).await {
                 Ok(begun) => begun.map_err(|error| error.to_string()),
                 Err(_) => Err(format!("silent for {} s", bound.as_secs_f64())),
             }
         });
-        self.oldest_first.push_back(greeting);
+        self.oldest_first.push_back(handshake);
     }
 
     fn tell_refused(&self, count: u64) {
-        let max_connections = self.options.max_speaking;
+        let max_connections = self.options.max_established;
         tracing::warn!(count, max_connections, "connections were refused: as many speak as may");
     }
 
@@ -178,7 +198,7 @@ impl Door {
         if let Some(count) = self.refusal_log.add(Instant::now()) {
             self.tell_refused(count);
         }
-        let Ok(place) = self.refusing_seats.clone().try_acquire_owned() else { return };
+        let Ok(place) = self.refusal_permits.clone().try_acquire_owned() else { return };
         tokio::spawn(async move {
             let _place = place;
             let Begun { mut io, early } = begun;
@@ -250,9 +270,16 @@ impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
 pub struct Connection {
     io: Box<dyn Io>,
     early: Bytes,
-    patience: Patience,
+    auth_deadline: AuthDeadline,
     /// Its place, and its count among those that speak, for as long as it lives.
     _held: (OwnedSemaphorePermit, metrics::Held),
+}
+
+impl Connection {
+    /// For [`Authenticate`](super::auth::Authenticate), which knows who may call.
+    pub fn introduction(&self) -> Introduction {
+        self.auth_deadline.introduction.clone()
+    }
 }
 
 impl Connected for Connection {
@@ -260,13 +287,13 @@ impl Connected for Connection {
     type ConnectInfo = Introduction;
 
     fn connect_info(&self) -> Introduction {
-        self.patience.introduction.clone()
+        self.introduction()
     }
 }
 
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, context: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        self.patience.check(context)?;
+        self.auth_deadline.check(context)?;
         if self.early.is_empty() {
             return Pin::new(&mut self.io).poll_read(context, buf);
         }
@@ -280,7 +307,7 @@ impl AsyncRead for Connection {
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         // Also here: the transport does not read while it cannot write to one who does not read either.
-        self.patience.check(context)?;
+        self.auth_deadline.check(context)?;
         Pin::new(&mut self.io).poll_write(context, buf)
     }
 
@@ -289,7 +316,7 @@ impl AsyncWrite for Connection {
         context: &mut Context<'_>,
         bufs: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        self.patience.check(context)?;
+        self.auth_deadline.check(context)?;
         Pin::new(&mut self.io).poll_write_vectored(context, bufs)
     }
 
@@ -298,7 +325,7 @@ impl AsyncWrite for Connection {
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        self.patience.check(context)?;
+        self.auth_deadline.check(context)?;
         Pin::new(&mut self.io).poll_flush(context)
     }
 
@@ -309,7 +336,6 @@ impl AsyncWrite for Connection {
 
 #[cfg(test)]
 mod tests {
-    use futures_util::StreamExt;
     use tonic::Code;
 
     use super::*;
@@ -323,11 +349,12 @@ mod tests {
         let options = Options {
             certificates: None,
             timeout: HANDSHAKE_TIMEOUT,
-            max_greeted: MAX_GREETED,
-            max_speaking: 0,
-            first_call: None,
+            max_handshaking: MAX_HANDSHAKING,
+            max_established: 0,
+            auth_timeout: None,
+            protocol: None,
         };
-        let door = tokio::spawn(async move { Box::pin(incoming(listener, options)).next().await });
+        let connections = tokio::spawn(async move { incoming(listener, options).next().await });
         // A reset overtakes the answer in some of so many, and a client that is told too early loses its call.
         for attempt in 0..100 {
             let mut client = CalibrationServiceClient::connect(url.clone()).await.expect("a connection");
@@ -335,6 +362,6 @@ mod tests {
             let refused = tokio::time::timeout(HANDSHAKE_TIMEOUT, call).await.expect("an answer").expect_err("no room");
             assert_eq!(refused.code(), Code::Unavailable, "attempt {attempt}: {refused:?}");
         }
-        door.abort();
+        connections.abort();
     }
 }

@@ -1,0 +1,198 @@
+//! Answers: JSON, server-sent events, and errors in google.rpc's JSON form.
+
+use std::convert::Infallible;
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream::{self, Stream, StreamExt};
+use prost::bytes::Bytes;
+use prost_reflect::{DynamicMessage, MessageDescriptor};
+use serde_json::{Map, Value, json};
+use tonic::{Code, Status, Streaming};
+use tonic_types::StatusExt;
+
+/// An answer to a request.
+pub type Answer = Response<Body>;
+
+/// Field of an event that numbers it, for `Last-Event-ID`.
+const SEQUENCE: &str = "sequence";
+
+/// Field group of an event that tells what it is.
+const BODY: &str = "body";
+
+/// Pause after which a comment tells that a silent stream lives: below what proxies usually wait.
+const KEEP_ALIVE: Duration = Duration::from_secs(15);
+
+/// A message as JSON.
+///
+/// # Errors
+/// `INTERNAL` for bytes that are no such message: a defect of ours.
+pub fn message(descriptor: &MessageDescriptor, bytes: &[u8]) -> Result<Vec<u8>, Status> {
+    let internal = |error: String| Status::internal(format!("an answer cannot be told as JSON: {error}"));
+    let message = DynamicMessage::decode(descriptor.clone(), bytes).map_err(|error| internal(error.to_string()))?;
+    serde_json::to_vec(&message).map_err(|error| internal(error.to_string()))
+}
+
+/// An answer of that JSON.
+pub fn json(text: Vec<u8>) -> Answer {
+    secured((StatusCode::OK, [(header::CONTENT_TYPE, "application/json")], text).into_response())
+}
+
+/// A stream of messages as server-sent events; each has its number as id, and a stream that breaks off ends with an
+/// event `error`.
+pub fn events(descriptor: MessageDescriptor, messages: Streaming<Bytes>) -> Answer {
+    let told = stream::unfold(Some(messages), move |messages| {
+        let descriptor = descriptor.clone();
+        async move {
+            let mut messages = messages?;
+            let (event, rest) = match messages.message().await {
+                Ok(None) => return None,
+                Ok(Some(bytes)) => match event(&descriptor, &bytes) {
+                    Ok(event) => (event, Some(messages)),
+                    Err(status) => (failed(&status), None),
+                },
+                Err(status) => (failed(&status), None),
+            };
+            Some((Ok::<_, Infallible>(event), rest))
+        }
+    });
+    sse(told)
+}
+
+fn sse(events: impl Stream<Item = Result<Event, Infallible>> + Send + 'static) -> Answer {
+    let mut answer = Sse::new(events.boxed()).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response();
+    // Else proxies gather what is to be told at once.
+    answer.headers_mut().insert("x-accel-buffering", HeaderValue::from_static("no"));
+    secured(answer)
+}
+
+fn event(descriptor: &MessageDescriptor, bytes: &[u8]) -> Result<Event, Status> {
+    let internal = |error: String| Status::internal(format!("an event cannot be told as JSON: {error}"));
+    let message = DynamicMessage::decode(descriptor.clone(), bytes).map_err(|error| internal(error.to_string()))?;
+    let text = serde_json::to_string(&message).map_err(|error| internal(error.to_string()))?;
+    let mut event = Event::default().data(text);
+    let body = descriptor.oneofs().find(|group| group.name() == BODY);
+    if let Some(kind) = body.and_then(|group| group.fields().find(|field| message.has_field(field))) {
+        event = event.event(kind.name());
+    }
+    // What has no number is not told again.
+    match message.get_field_by_name(SEQUENCE).and_then(|number| number.as_u64()) {
+        Some(number) if number > 0 => Ok(event.id(number.to_string())),
+        _ => Ok(event),
+    }
+}
+
+fn failed(status: &Status) -> Event {
+    Event::default().event("error").data(error_body(status).to_string())
+}
+
+/// A refusal.
+pub fn error(status: &Status) -> Answer {
+    let mut answer = (http_code(status.code()), axum::Json(error_body(status))).into_response();
+    let headers = answer.headers_mut();
+    if status.code() == Code::Unauthenticated {
+        headers.insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
+    }
+    if let Some(delay) = status.get_details_retry_info().and_then(|retry| retry.retry_delay) {
+        // Whole seconds, and never too early (RFC 9110, section 10.2.3).
+        let seconds = delay.as_secs() + u64::from(delay.subsec_nanos() > 0);
+        headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+    }
+    secured(answer)
+}
+
+/// A refusal of the request itself, before any call.
+pub fn refused(code: StatusCode, status: &Status) -> Answer {
+    let mut answer = error(status);
+    *answer.status_mut() = code;
+    answer
+}
+
+/// Answers are data: no page runs or embeds them, and none is guessed to be another kind.
+fn secured(mut answer: Answer) -> Answer {
+    let headers = answer.headers_mut();
+    headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    headers.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static("default-src 'none'"));
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    answer
+}
+
+/// The code of HTTP that goes with one of gRPC (`google/rpc/code.proto`).
+fn http_code(code: Code) -> StatusCode {
+    match code {
+        Code::Ok => StatusCode::OK,
+        Code::InvalidArgument | Code::FailedPrecondition | Code::OutOfRange => StatusCode::BAD_REQUEST,
+        Code::Unauthenticated => StatusCode::UNAUTHORIZED,
+        Code::PermissionDenied => StatusCode::FORBIDDEN,
+        Code::NotFound => StatusCode::NOT_FOUND,
+        Code::AlreadyExists | Code::Aborted => StatusCode::CONFLICT,
+        Code::ResourceExhausted => StatusCode::TOO_MANY_REQUESTS,
+        Code::Unimplemented => StatusCode::NOT_IMPLEMENTED,
+        Code::Unavailable => StatusCode::SERVICE_UNAVAILABLE,
+        Code::DeadlineExceeded => StatusCode::GATEWAY_TIMEOUT,
+        // The client has gone away; nobody reads it.
+        Code::Cancelled => StatusCode::REQUEST_TIMEOUT,
+        Code::Unknown | Code::Internal | Code::DataLoss => StatusCode::INTERNAL_SERVER_ERROR,
+    }
+}
+
+/// The name of a code in `google.rpc.Code`.
+fn code_name(code: Code) -> &'static str {
+    match code {
+        Code::Ok => "OK",
+        Code::Cancelled => "CANCELLED",
+        Code::Unknown => "UNKNOWN",
+        Code::InvalidArgument => "INVALID_ARGUMENT",
+        Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
+        Code::NotFound => "NOT_FOUND",
+        Code::AlreadyExists => "ALREADY_EXISTS",
+        Code::PermissionDenied => "PERMISSION_DENIED",
+        Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
+        Code::FailedPrecondition => "FAILED_PRECONDITION",
+        Code::Aborted => "ABORTED",
+        Code::OutOfRange => "OUT_OF_RANGE",
+        Code::Unimplemented => "UNIMPLEMENTED",
+        Code::Internal => "INTERNAL",
+        Code::Unavailable => "UNAVAILABLE",
+        Code::DataLoss => "DATA_LOSS",
+        Code::Unauthenticated => "UNAUTHENTICATED",
+    }
+}
+
+/// `{"error": {...}}` with the code of HTTP, the message, the name of the code and the details (AIP-193).
+fn error_body(status: &Status) -> Value {
+    let details = status.get_error_details();
+    let mut told = Vec::new();
+    if let Some(info) = details.error_info() {
+        let metadata: Map<_, _> = info.metadata.iter().map(|(key, value)| (key.clone(), json!(value))).collect();
+        told.push(json!({
+            "@type": "type.googleapis.com/google.rpc.ErrorInfo",
+            "reason": info.reason, "domain": info.domain, "metadata": metadata,
+        }));
+    }
+    if let Some(request) = details.bad_request() {
+        let violation = |violation: &tonic_types::FieldViolation| json!({"field": violation.field, "description": violation.description});
+        let violations: Vec<_> = request.field_violations.iter().map(violation).collect();
+        told.push(json!({"@type": "type.googleapis.com/google.rpc.BadRequest", "fieldViolations": violations}));
+    }
+    if let Some(delay) = details.retry_info().and_then(|retry| retry.retry_delay) {
+        let delay = format!("{}s", delay.as_secs_f64());
+        told.push(json!({"@type": "type.googleapis.com/google.rpc.RetryInfo", "retryDelay": delay}));
+    }
+    if let Some(resource) = details.resource_info() {
+        told.push(json!({
+            "@type": "type.googleapis.com/google.rpc.ResourceInfo",
+            "resourceType": resource.resource_type, "resourceName": resource.resource_name,
+            "owner": resource.owner, "description": resource.description,
+        }));
+    }
+    json!({"error": {
+        "code": http_code(status.code()).as_u16(),
+        "message": status.message(),
+        "status": code_name(status.code()),
+        "details": told,
+    }})
+}

@@ -1,0 +1,242 @@
+//! From a request to its answer: finds the route, makes a message of the JSON, calls the method within the process.
+
+use std::sync::Arc;
+
+use axum::body::Body;
+use axum::extract::Request;
+use axum::http::{HeaderMap, Method, StatusCode, header};
+use axum::response::IntoResponse;
+use futures_util::StreamExt;
+use prost::Message;
+use prost::bytes::Bytes;
+use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor, ReflectMessage};
+use tonic::client::Grpc;
+use tonic::metadata::MetadataMap;
+use tonic::{Code, Status};
+
+use super::answer::{self, Answer};
+use super::codec::Encoded;
+use super::route::{self, Found, Route};
+use super::{openapi, upload};
+use crate::domain::Violation;
+use crate::rpc::inflight::Permit;
+use crate::rpc::listener::Introduction;
+use crate::rpc::server::Gateway;
+use crate::rpc::status;
+
+/// Where the description of the API is.
+const OPENAPI_PATH: &str = "/openapi.json";
+
+/// How often JSON is in memory, at most, as a multiple of its length: the text, a value of 40 bytes for a number of
+/// which the text has some 8 or more, in an array that has grown to twice its length, and the message encoded.
+const JSON_COPIES: u64 = 12;
+
+/// How long JSON may be that is read on a thread that serves others: a millisecond's work.
+const SMALL_BODY_BYTES: usize = 64 << 10;
+
+/// Headers that a call takes along.
+const PASSED_ON: [&str; 3] = ["authorization", "traceparent", "tracestate"];
+
+/// Where a browser goes on with events that broke off, and the field that it sets.
+const LAST_EVENT_ID: (&str, &str) = ("last-event-id", "after_sequence");
+
+/// The API over HTTP.
+pub struct Api {
+    routes: Vec<Route>,
+    openapi: Bytes,
+    pub(super) gateway: Gateway,
+    max_body_bytes: usize,
+    /// What an upload holds, and what it becomes.
+    pub(super) input_data: MessageDescriptor,
+    pub(super) input: MessageDescriptor,
+}
+
+impl Api {
+    /// # Errors
+    /// A defect of the proto.
+    pub fn new(pool: &DescriptorPool, gateway: Gateway, max_body_bytes: usize) -> Result<Self, String> {
+        let routes = route::routes(pool)?;
+        let openapi = openapi::document(&routes).to_string().into();
+        let message = |name: &str| pool.get_message_by_name(name).ok_or_else(|| format!("the proto lacks {name}"));
+        let (input_data, input) = (message("scpsfm.v1.InputData")?, message("scpsfm.v1.Input")?);
+        Ok(Self { routes, openapi, gateway, max_body_bytes, input_data, input })
+    }
+
+    /// The answer to a request; `introduction` is its connection's.
+    pub async fn answer(self: &Arc<Self>, introduction: Introduction, request: Request) -> Answer {
+        if is_of_another_site(request.headers()) {
+            let text = "a page of another site may not call this API";
+            return answer::error(&status::refused(Code::PermissionDenied, "ORIGIN_REFUSED", text));
+        }
+        let path = request.uri().path().to_owned();
+        if path == OPENAPI_PATH && request.method() == Method::GET {
+            return answer::json(self.openapi.to_vec());
+        }
+        if let Some(parent) = upload::parent(request.method(), &path) {
+            return upload::answer(self, introduction, parent, request).await.unwrap_or_else(|refused| *refused);
+        }
+        match route::find(&self.routes, request.method(), &path) {
+            Found::Route(route, fields) => {
+                self.call(route, fields, introduction, request).await.unwrap_or_else(|refused| *refused)
+            }
+            Found::OtherVerbs(verbs) => {
+                let allowed = verbs.iter().map(Method::as_str).collect::<Vec<_>>().join(", ");
+                let text = format!("{path} is for {allowed}");
+                let refusal = status::refused(Code::Unimplemented, "METHOD_NOT_ALLOWED", text);
+                let answer = answer::refused(StatusCode::METHOD_NOT_ALLOWED, &refusal);
+                ([(header::ALLOW, allowed)], answer).into_response()
+            }
+            Found::Nothing => {
+                let text = format!("there is nothing at {path}; {OPENAPI_PATH} describes what there is");
+                answer::error(&status::refused(Code::NotFound, "PATH_NOT_FOUND", text))
+            }
+        }
+    }
+
+    async fn call(
+        self: &Arc<Self>,
+        route: &Route,
+        fields: Vec<(&str, String)>,
+        introduction: Introduction,
+        request: Request,
+    ) -> Result<Answer, Box<Answer>> {
+        let (head, body) = request.into_parts();
+        self.gateway.check_key(&head.headers).map_err(failed)?;
+        let permit = self.gateway.permit();
+        let descriptor = route.method.input();
+        let mut message = if route.has_body {
+            self.read(&head.headers, body, descriptor, &permit).await?
+        } else {
+            let mut message = DynamicMessage::new(descriptor);
+            let query = head.uri.query().unwrap_or_default();
+            for (name, value) in form_urlencoded::parse(query.as_bytes()) {
+                let set = match route.template.holds(&name) {
+                    true => Err("is in the path".to_owned()),
+                    false => route::set_field(&mut message, &name, &value),
+                };
+                set.map_err(|text| failed(invalid(&name, text)))?;
+            }
+            message
+        };
+        let (last_id, after) = LAST_EVENT_ID;
+        if let Some(last_id) = head.headers.get(last_id).and_then(|id| id.to_str().ok())
+            && message.descriptor().get_field_by_name(after).is_some()
+        {
+            route::set_field(&mut message, after, last_id).map_err(|text| failed(invalid(after, text)))?;
+        }
+        for (name, value) in fields {
+            route::set_field(&mut message, name, &value).map_err(|text| failed(invalid(name, text)))?;
+        }
+        let call = call(&head.headers, introduction, Bytes::from(message.encode_to_vec()));
+        drop(message);
+        let mut grpc = Grpc::new(self.gateway.service.clone()).max_decoding_message_size(usize::MAX);
+        // Never fails: the services are always ready.
+        let _ = grpc.ready().await;
+        let (path, output) = (route.grpc_path.clone(), route.method.output());
+        if route.method.is_server_streaming() {
+            let events = grpc.server_streaming(call, path, Encoded).await.map_err(failed)?.into_inner();
+            return Ok(answer::events(output, events));
+        }
+        let bytes = grpc.unary(call, path, Encoded).await.map_err(failed)?.into_inner();
+        permit.hold(JSON_COPIES * bytes.len() as u64).map_err(failed)?;
+        let json = in_background(bytes.len(), move || answer::message(&output, &bytes)).await.map_err(failed)?;
+        Ok(answer::json(json))
+    }
+
+    /// The message of a body.
+    pub(super) async fn read(
+        &self,
+        headers: &HeaderMap,
+        body: Body,
+        descriptor: MessageDescriptor,
+        permit: &Permit,
+    ) -> Result<DynamicMessage, Box<Answer>> {
+        let text = self.collect(body, permit).await?;
+        if text.is_empty() {
+            return Ok(DynamicMessage::new(descriptor));
+        }
+        let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
+        if kind.split(';').next().unwrap_or_default().trim() != "application/json" {
+            let text = format!("the body is {kind:?}, not application/json");
+            let refusal = status::refused(Code::InvalidArgument, "UNSUPPORTED_MEDIA_TYPE", text);
+            return Err(Box::new(answer::refused(StatusCode::UNSUPPORTED_MEDIA_TYPE, &refusal)));
+        }
+        let parse = move || {
+            let mut json = serde_json::Deserializer::from_slice(&text);
+            let message = DynamicMessage::deserialize(descriptor, &mut json);
+            message.and_then(|message| json.end().map(|()| message)).map_err(|error| invalid("body", error.to_string()))
+        };
+        in_background(text_length(headers), parse).await.map_err(failed)
+    }
+
+    /// The bytes of a body, charged as the JSON that they are.
+    async fn collect(&self, body: Body, permit: &Permit) -> Result<Vec<u8>, Box<Answer>> {
+        let mut text = Vec::new();
+        let mut frames = body.into_data_stream();
+        while let Some(frame) = frames.next().await {
+            // The client has gone away; nobody reads the answer.
+            let frame = frame.map_err(|error| failed(Status::cancelled(error.to_string())))?;
+            let length = text.len() + frame.len();
+            if length > self.max_body_bytes {
+                let text = format!(
+                    "the body is larger than {} bytes; a larger input is uploaded as protobuf, or sent over gRPC",
+                    self.max_body_bytes
+                );
+                let refusal = status::refused(Code::OutOfRange, "MESSAGE_TOO_LARGE", text);
+                return Err(Box::new(answer::refused(StatusCode::PAYLOAD_TOO_LARGE, &refusal)));
+            }
+            permit.hold(JSON_COPIES * length as u64).map_err(failed)?;
+            text.extend_from_slice(&frame);
+        }
+        Ok(text)
+    }
+}
+
+/// A call with what the request says of its caller.
+pub(super) fn call<T>(headers: &HeaderMap, introduction: Introduction, message: T) -> tonic::Request<T> {
+    let mut passed = HeaderMap::new();
+    for name in PASSED_ON {
+        for value in headers.get_all(name) {
+            passed.append(name, value.clone());
+        }
+    }
+    let mut call = tonic::Request::new(message);
+    *call.metadata_mut() = MetadataMap::from_headers(passed);
+    call.extensions_mut().insert(introduction);
+    call
+}
+
+pub(super) fn failed(status: Status) -> Box<Answer> {
+    Box::new(answer::error(&status))
+}
+
+/// What is wrong with a field of a request.
+pub(super) fn invalid(field: &str, description: impl Into<String>) -> Status {
+    status::invalid(&Violation::of(field, description.into()).into())
+}
+
+/// How long a body says that it is; what does not say is taken for a long one.
+fn text_length(headers: &HeaderMap) -> usize {
+    let length = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+    length.unwrap_or(usize::MAX)
+}
+
+/// Does what takes long for so many bytes on a thread that serves nobody else.
+async fn in_background<T: Send + 'static>(
+    bytes: usize,
+    work: impl FnOnce() -> Result<T, Status> + Send + 'static,
+) -> Result<T, Status> {
+    if bytes <= SMALL_BODY_BYTES {
+        return work();
+    }
+    tokio::task::spawn_blocking(work).await.map_err(|error| status::internal(&error))?
+}
+
+/// Whether a browser sends the request for a page of another site: such a page must not use what the browser's machine
+/// may reach.
+fn is_of_another_site(headers: &HeaderMap) -> bool {
+    let text = |name| headers.get(name).and_then(|value: &axum::http::HeaderValue| value.to_str().ok());
+    let Some(origin) = headers.get(header::ORIGIN) else { return false };
+    let authority = origin.to_str().ok().and_then(|origin| origin.split_once("://")).map(|(_, authority)| authority);
+    authority.is_none() || authority != text(header::HOST)
+}

@@ -1,0 +1,133 @@
+//! Uploads as a body: `POST /v1/tenants/{tenant}/inputs`, an `InputData` in protobuf or JSON.
+
+use std::sync::Arc;
+
+use axum::body::{Body, BodyDataStream};
+use axum::extract::Request;
+use axum::http::{HeaderMap, Method, StatusCode, header};
+use futures_util::{Stream, StreamExt, stream};
+use prost::Message as _;
+use prost::bytes::{Buf, Bytes, BytesMut};
+use sha2::{Digest, Sha256};
+use tonic::Code;
+
+use super::answer::{self, Answer};
+use super::api::{Api, call, failed, invalid};
+use crate::rpc::inputs::MAX_CHUNK_BYTES;
+use crate::rpc::listener::Introduction;
+use crate::rpc::proto::input_service_client::InputServiceClient;
+use crate::rpc::proto::upload_input_request::Message;
+use crate::rpc::proto::{self, UploadInputRequest};
+use crate::rpc::status;
+
+/// The media type of protobuf.
+const PROTOBUF: &str = "application/x-protobuf";
+
+/// Parameter of the query that names the upload.
+const UPLOAD_ID: &str = "uploadId";
+
+/// The parent of an upload; `None` for another request.
+pub fn parent(verb: &Method, path: &str) -> Option<String> {
+    let parent = path.strip_prefix("/v1/")?.strip_suffix("/inputs")?;
+    let is_parent = parent.strip_prefix("tenants/").is_some_and(|tenant| !tenant.is_empty() && !tenant.contains('/'));
+    (verb == Method::POST && is_parent).then(|| parent.to_owned())
+}
+
+/// Passes a body on to `InputService.UploadInput`. Protobuf goes as it comes, without being held; its length is told
+/// beforehand.
+pub async fn answer(
+    api: &Arc<Api>,
+    introduction: Introduction,
+    parent: String,
+    request: Request,
+) -> Result<Answer, Box<Answer>> {
+    let (head, body) = request.into_parts();
+    api.gateway.check_key(&head.headers).map_err(failed)?;
+    let mut upload_id = None;
+    for (name, value) in form_urlencoded::parse(head.uri.query().unwrap_or_default().as_bytes()) {
+        if name != UPLOAD_ID {
+            return Err(failed(invalid(&name, format!("is no parameter; there is {UPLOAD_ID}"))));
+        }
+        upload_id = Some(value.into_owned());
+    }
+    let permit = api.gateway.permit();
+    let is_protobuf = head.headers.get(header::CONTENT_TYPE).is_some_and(|kind| kind == PROTOBUF);
+    let (size_bytes, body) = if is_protobuf {
+        (declared_length(&head.headers)?, body)
+    } else {
+        let message = api.read(&head.headers, body, api.input_data.clone(), &permit).await?;
+        let encoded = message.encode_to_vec();
+        (encoded.len() as u64, Body::from(encoded))
+    };
+    let start = proto::UploadStart {
+        parent,
+        upload_id: upload_id.unwrap_or_else(|| uuid::Uuid::now_v7().to_string()),
+        size_bytes: i64::try_from(size_bytes).unwrap_or(i64::MAX),
+        sha256: Vec::new(),
+    };
+    let messages = messages(start, body.into_data_stream());
+    let mut client = InputServiceClient::new(api.gateway.service.clone());
+    let uploaded = client.upload_input(call(&head.headers, introduction, messages)).await.map_err(failed)?;
+    let output = api.input.clone();
+    let json = answer::message(&output, &uploaded.into_inner().encode_to_vec()).map_err(failed)?;
+    Ok(answer::json(json))
+}
+
+fn declared_length(headers: &HeaderMap) -> Result<u64, Box<Answer>> {
+    let length = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+    length.ok_or_else(|| {
+        let text = "an upload says its length beforehand: Content-Length is missing";
+        let refusal = status::refused(Code::InvalidArgument, "LENGTH_REQUIRED", text);
+        Box::new(answer::refused(StatusCode::LENGTH_REQUIRED, &refusal))
+    })
+}
+
+/// Where a body is on its way.
+enum Stage {
+    Start(proto::UploadStart),
+    Data,
+    Ended,
+}
+
+/// The messages of an upload: its start, its chunks as the body comes, and its end. A body that breaks off ends them
+/// before the end, which refuses the upload and keeps what came.
+fn messages(start: proto::UploadStart, body: BodyDataStream) -> impl Stream<Item = UploadInputRequest> + Send {
+    struct State {
+        stage: Stage,
+        body: BodyDataStream,
+        /// Came and was not passed on.
+        pending: BytesMut,
+        offset: u64,
+        hash: Sha256,
+    }
+    let message = |message| UploadInputRequest { message: Some(message) };
+    let state = State { stage: Stage::Start(start), body, pending: BytesMut::new(), offset: 0, hash: Sha256::new() };
+    stream::unfold(state, move |mut state| async move {
+        match std::mem::replace(&mut state.stage, Stage::Data) {
+            Stage::Start(start) => return Some((message(Message::Start(start)), state)),
+            Stage::Ended => return None,
+            Stage::Data => {}
+        }
+        while state.pending.len() < MAX_CHUNK_BYTES {
+            match state.body.next().await {
+                Some(Ok(frame)) => state.pending.extend_from_slice(frame.chunk()),
+                Some(Err(_)) => return None,
+                None => break,
+            }
+        }
+        let data: Bytes = state.pending.split_to(state.pending.len().min(MAX_CHUNK_BYTES)).freeze();
+        if data.is_empty() {
+            state.stage = Stage::Ended;
+            let sha256 = state.hash.finalize_reset().to_vec();
+            return Some((message(Message::Finish(proto::UploadFinish { sha256 })), state));
+        }
+        state.hash.update(&data);
+        let chunk = proto::UploadChunk {
+            offset: i64::try_from(state.offset).unwrap_or(i64::MAX),
+            crc32c: crc32c::crc32c(&data),
+            data: data.to_vec(),
+        };
+        state.offset += chunk.data.len() as u64;
+        Some((message(Message::Chunk(chunk)), state))
+    })
+}

@@ -1,0 +1,277 @@
+//! JSON over HTTP, from outside: a real server, and a client that knows nothing but HTTP.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+
+use prost::Message as _;
+use scpsfm::rpc::proto;
+use serde_json::{Value, json};
+
+use crate::support::program::Serving;
+use crate::support::wire::{raw, track_set};
+
+/// A key of each of two tenants.
+const NORTH: &str = "north-0123456789abcdef0123456789abcdef";
+const SOUTH: &str = "south-0123456789abcdef0123456789abcdef";
+
+struct Answer {
+    code: u16,
+    head: String,
+    body: Vec<u8>,
+}
+
+impl Answer {
+    fn json(&self) -> Value {
+        serde_json::from_slice(&self.body)
+            .unwrap_or_else(|error| panic!("{error}: {}", String::from_utf8_lossy(&self.body)))
+    }
+
+    fn text(&self) -> String {
+        String::from_utf8(self.body.clone()).expect("text")
+    }
+
+    fn has(&self, header: &str) -> bool {
+        self.head.to_ascii_lowercase().contains(&format!("\r\n{header}"))
+    }
+
+    /// The reason of a refusal, and the first field that it names.
+    fn refusal(&self) -> (String, String) {
+        let error = &self.json()["error"];
+        assert_eq!(error["code"], self.code, "{error}");
+        let details = error["details"].as_array().expect("details").clone();
+        let of =
+            |kind: &str| details.iter().find(|detail| detail["@type"].as_str().is_some_and(|at| at.ends_with(kind)));
+        let reason = of("ErrorInfo").and_then(|info| info["reason"].as_str()).unwrap_or_default().to_owned();
+        let field = of("BadRequest").and_then(|bad| bad["fieldViolations"][0]["field"].as_str()).unwrap_or_default();
+        (reason, field.to_owned())
+    }
+}
+
+/// A request of HTTP/1.0, whose answer ends with the connection.
+fn request(server: &Serving, verb: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Answer {
+    let address = server.http.strip_prefix("http://").expect("an address");
+    let mut connection = TcpStream::connect(address).expect("the port answers");
+    let mut head = format!("{verb} {path} HTTP/1.0\r\nhost: {address}\r\ncontent-length: {}\r\n", body.len());
+    for (name, value) in headers {
+        head.push_str(&format!("{name}: {value}\r\n"));
+    }
+    connection.write_all(format!("{head}\r\n").as_bytes()).expect("sent");
+    // A server that refuses a body does not read it to its end.
+    let _ = connection.write_all(body);
+    let mut answer = Vec::new();
+    let _ = connection.read_to_end(&mut answer);
+    let end = answer.windows(4).position(|four| four == b"\r\n\r\n").expect("a head");
+    let head = String::from_utf8(answer[..end].to_vec()).expect("text");
+    let code = head.split(' ').nth(1).and_then(|code| code.parse().ok()).expect("a code");
+    Answer { code, head, body: answer[end + 4..].to_vec() }
+}
+
+fn get(server: &Serving, path: &str) -> Answer {
+    request(server, "GET", path, &[], &[])
+}
+
+fn post(server: &Serving, path: &str, body: &Value) -> Answer {
+    request(server, "POST", path, &[("content-type", "application/json")], body.to_string().as_bytes())
+}
+
+fn tracks() -> Value {
+    let raw = raw(3, 4);
+    json!({
+        "trackCount": raw.track_count,
+        "views": [{"name": "a.jpg"}, {}, {"size": {"widthPx": 640, "heightPx": 480}}],
+        "viewIndices": raw.view, "trackIndices": raw.track, "xs": raw.x, "ys": raw.y,
+    })
+}
+
+fn serving() -> (tempfile::TempDir, Serving) {
+    let data = tempfile::tempdir().expect("a temporary directory");
+    let server = Serving::start(data.path());
+    (data, server)
+}
+
+/// The path of a job, or of an input, by its name.
+fn path_of(resource: &Value) -> String {
+    format!("/v1/{}", resource["name"].as_str().expect("a name"))
+}
+
+#[test]
+fn a_job_is_created_watched_read_and_removed_by_http_alone() {
+    let (_data, server) = serving();
+    let job = json!({"trackSet": tracks(), "job": {"settings": {"seed": "7"}, "labels": {"site": "north"}}});
+    let created = post(&server, "/v1/tenants/-/jobs", &job);
+    assert_eq!(created.code, 200, "{}", created.text());
+    let (created, path) = (created.json(), path_of(&created.json()));
+    assert_eq!((created["observationCount"].as_u64(), created["settings"]["seed"].as_str()), (Some(12), Some("7")));
+    let watched = get(&server, &format!("{path}/events"));
+    assert!(watched.has("content-type: text/event-stream"), "{}", watched.head);
+    let events = watched.text();
+    let ids: Vec<u64> = events.lines().filter_map(|line| line.strip_prefix("id: ")?.parse().ok()).collect();
+    assert_eq!(ids, (1..=ids.len() as u64).collect::<Vec<_>>(), "{events}");
+    assert!(events.contains("event: state_change\n") && events.contains("JOB_STATE_SUCCEEDED"), "{events}");
+    let later = request(&server, "GET", &format!("{path}/events"), &[("last-event-id", "2")], &[]).text();
+    assert!(later.contains("id: 3\n") && !later.contains("id: 2\n"), "{later}");
+    let result = get(&server, &format!("{path}/result")).json();
+    assert_eq!((result["views"].as_array().map(Vec::len), &result["views"][0]["name"]), (Some(3), &json!("a.jpg")));
+    let listed = get(&server, "/v1/tenants/default/jobs?pageSize=5&filter=labels.site+%3D+%22north%22").json();
+    assert_eq!(listed["jobs"].as_array().map(Vec::len), Some(1), "{listed}");
+    let cancelled = request(&server, "POST", &format!("{path}:cancel"), &[], &[]);
+    assert_eq!(cancelled.json()["state"], "JOB_STATE_SUCCEEDED", "one that has ended is answered as it is");
+    assert_eq!(request(&server, "DELETE", &path, &[], &[]).code, 200);
+    let gone = get(&server, &path);
+    assert_eq!((gone.code, gone.refusal().0.as_str()), (404, "JOB_NOT_FOUND"));
+    let capabilities = get(&server, "/v1/capabilities").json();
+    assert_eq!(capabilities["serverVersion"], env!("CARGO_PKG_VERSION"));
+}
+
+#[test]
+fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
+    let (_data, server) = serving();
+    let jobs = "/v1/tenants/default/jobs";
+    let with = |change: &dyn Fn(&mut Value)| {
+        let mut set = tracks();
+        change(&mut set);
+        json!({"trackSet": set})
+    };
+    for (body, field) in [
+        (with(&|set| set["xs"][7] = json!("NaN")), "track_set.xs[7]"),
+        (with(&|set| set["trackCount"] = json!(4_294_967_295_u32)), "track_set.track_count"),
+        (with(&|set| set["views"][1]["name"] = json!("a.jpg")), "track_set.views[1]"),
+        (with(&|set| set["sigma"] = json!([])), "body"),
+        (with(&|set| set["xs"][0] = json!("five")), "body"),
+        (with(&|set| set["trackCount"] = json!(-1)), "body"),
+        (json!({"trackSet": tracks(), "job": {"settings": {"method": "METHOD_MAGIC"}}}), "body"),
+        (json!([1]), "body"),
+        (json!({}), "source"),
+    ] {
+        let refused = post(&server, jobs, &body);
+        assert_eq!((refused.code, refused.refusal()), (400, ("INVALID_ARGUMENT".into(), field.into())), "{body}");
+    }
+    let json = [("content-type", "application/json")];
+    let cut = request(&server, "POST", jobs, &json, b"{\"trackSet\": {");
+    assert_eq!((cut.code, cut.refusal().1.as_str()), (400, "body"));
+    let deep = request(&server, "POST", jobs, &json, "[".repeat(100_000).as_bytes());
+    assert_eq!((deep.code, deep.refusal().1.as_str()), (400, "body"));
+    let unread = get(&server, "/v1/tenants/default/jobs?pageSize=many");
+    assert_eq!((unread.code, unread.refusal().1.as_str()), (400, "pageSize"));
+    let unknown = get(&server, "/v1/tenants/default/jobs?page=1");
+    assert_eq!((unknown.code, unknown.refusal().1.as_str()), (400, "page"));
+    for (answer, code, reason) in [
+        (request(&server, "POST", jobs, &[("content-type", "text/plain")], b"{}"), 415, "UNSUPPORTED_MEDIA_TYPE"),
+        (request(&server, "PUT", jobs, &json, b"{}"), 405, "METHOD_NOT_ALLOWED"),
+        (get(&server, "/v1/nothing"), 404, "PATH_NOT_FOUND"),
+        (get(&server, "/v1/tenants/default/jobs/none"), 404, "JOB_NOT_FOUND"),
+        (get(&server, "/v1/tenants/A/jobs"), 400, "INVALID_ARGUMENT"),
+        (request(&server, "GET", jobs, &[("origin", "https://elsewhere.example")], &[]), 403, "ORIGIN_REFUSED"),
+    ] {
+        assert_eq!((answer.code, answer.refusal().0.as_str()), (code, reason), "{}", answer.text());
+    }
+    assert!(request(&server, "PUT", jobs, &json, b"{}").has("allow: "), "says which verbs there are");
+    assert_eq!(get(&server, jobs).json(), json!({}), "nothing was stored");
+}
+
+#[test]
+fn a_body_is_bounded_and_costs_its_own_connection() {
+    let data = tempfile::tempdir().expect("a temporary directory");
+    let bound = [("SCPSFM_HTTP__MAX_BODY_BYTES", "10000")];
+    let server = Serving::start_with(data.path(), &bound, std::process::Stdio::null());
+    let large = vec![b' '; 1 << 20];
+    let json = [("content-type", "application/json")];
+    let refused = request(&server, "POST", "/v1/tenants/-/jobs", &json, &large);
+    assert_eq!((refused.code, refused.refusal().0.as_str()), (413, "MESSAGE_TOO_LARGE"));
+    // One that says more than it sends, and one that says nothing, hold up nobody.
+    let address = server.http.strip_prefix("http://").expect("an address");
+    let mut silent: Vec<TcpStream> = (0..50).map(|_| TcpStream::connect(address).expect("connects")).collect();
+    for connection in &mut silent {
+        connection
+            .write_all(b"POST /v1/tenants/-/jobs HTTP/1.1\r\nhost: a\r\ncontent-length: 900\r\n\r\n{")
+            .expect("sent");
+    }
+    assert_eq!(post(&server, "/v1/tenants/-/jobs", &json!({"trackSet": tracks()})).code, 200);
+}
+
+#[test]
+fn an_input_is_uploaded_as_json_or_protobuf_and_solved() {
+    let (_data, server) = serving();
+    let by_json = post(
+        &server,
+        "/v1/tenants/-/inputs?uploadId=0195fa4c-0000-7000-8000-000000000001",
+        &json!({"trackSet": tracks()}),
+    );
+    assert_eq!(by_json.code, 200, "{}", by_json.text());
+    let data = Some(proto::input_data::Data::TrackSet(track_set()));
+    let bytes = proto::InputData { data }.encode_to_vec();
+    let protobuf = [("content-type", "application/x-protobuf")];
+    let by_protobuf = request(&server, "POST", "/v1/tenants/-/inputs", &protobuf, &bytes);
+    assert_eq!(by_protobuf.json()["sizeBytes"], bytes.len().to_string(), "{}", by_protobuf.text());
+    let damaged = request(&server, "POST", "/v1/tenants/-/inputs", &protobuf, &bytes[1..]);
+    assert_eq!((damaged.code, damaged.refusal().1.as_str()), (400, "data"));
+    let inputs = get(&server, "/v1/tenants/-/inputs").json();
+    assert_eq!(inputs["inputs"].as_array().map(Vec::len), Some(2));
+    for input in [by_json.json(), by_protobuf.json()] {
+        let job = post(&server, "/v1/tenants/-/jobs", &json!({"input": input["name"]})).json();
+        let events = get(&server, &format!("{}/events", path_of(&job))).text();
+        assert!(events.contains("JOB_STATE_SUCCEEDED"), "{events}");
+        assert_eq!(request(&server, "DELETE", &path_of(&input), &[], &[]).code, 200);
+    }
+}
+
+#[test]
+fn a_key_is_asked_for_and_says_whose_jobs_are_seen() {
+    let data = tempfile::tempdir().expect("a temporary directory");
+    let keys = format!("north:{NORTH},south:{SOUTH}");
+    let server = Serving::start_with(data.path(), &[("SCPSFM_AUTH__KEYS", &keys)], std::process::Stdio::null());
+    let body = json!({"trackSet": tracks()}).to_string();
+    let create = |key: Option<&str>| {
+        let bearer = key.map(|key| format!("Bearer {key}"));
+        let mut headers = vec![("content-type", "application/json")];
+        headers.extend(bearer.as_deref().map(|bearer| ("authorization", bearer)));
+        request(&server, "POST", "/v1/tenants/-/jobs", &headers, body.as_bytes())
+    };
+    for (key, reason) in [(None, "API_KEY_MISSING"), (Some("wrong"), "API_KEY_UNKNOWN")] {
+        let refused = create(key);
+        assert_eq!((refused.code, refused.refusal().0.as_str()), (401, reason));
+        assert!(refused.has("www-authenticate: bearer"), "{}", refused.head);
+    }
+    let job = create(Some(NORTH)).json();
+    assert!(job["name"].as_str().is_some_and(|name| name.starts_with("tenants/north/jobs/")), "{job}");
+    let read = |key: &str| {
+        let bearer = format!("Bearer {key}");
+        request(&server, "GET", &path_of(&job), &[("authorization", &bearer)], &[]).code
+    };
+    assert_eq!((read(NORTH), read(SOUTH)), (200, 404));
+}
+
+#[test]
+fn the_description_names_what_is_served_and_every_schema_that_it_refers_to() {
+    let (_data, server) = serving();
+    let document = get(&server, "/openapi.json").json();
+    assert_eq!(document["openapi"], "3.1.0");
+    let mut operations = 0;
+    for (path, verbs) in document["paths"].as_object().expect("paths") {
+        for verb in verbs.as_object().expect("verbs").keys() {
+            operations += 1;
+            let path = path.replace("{tenant}", "default").replace("{job}", "none").replace("{input}", "none");
+            let path = path.replace("{upload_id}", "0195fa4c-0000-7000-8000-000000000001");
+            let answer = request(&server, &verb.to_ascii_uppercase(), &path, &[], &[]);
+            assert!(
+                ![404, 405, 501].contains(&answer.code) || answer.refusal().0.ends_with("_NOT_FOUND"),
+                "{verb} {path}"
+            );
+            assert_ne!(answer.code, 405, "{verb} {path}");
+            if answer.code == 404 {
+                assert_ne!(answer.refusal().0, "PATH_NOT_FOUND", "{verb} {path}");
+            }
+        }
+    }
+    assert_eq!(operations, 13, "every method that the proto annotates, and the upload");
+    let text = document.to_string();
+    let schemas = document["components"]["schemas"].as_object().expect("schemas");
+    for reference in text.split("#/components/schemas/").skip(1) {
+        let name = reference.split('"').next().expect("a name");
+        assert!(schemas.contains_key(name), "{name}");
+    }
+    assert_eq!(schemas["TrackSet"]["properties"]["xs"]["type"], "array");
+    assert!(
+        schemas["TrackSet"]["properties"]["xs"]["description"].as_str().is_some_and(|words| words.contains("pixels"))
+    );
+}
