@@ -1,0 +1,587 @@
+"""What the clients do, without doing it: generators that ask for calls and pauses, and are told what came of them.
+
+The sync and the async client run the same flows, so that retries, resumption and request ids are written once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+import uuid
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import grpc
+from google.protobuf.message import DecodeError
+
+from . import jobs as views
+from ._crc32c import crc32c
+from ._retry import Backoff, RetryPolicy
+from ._stubs import (
+    calibration_service_pb2,
+    input_pb2,
+    input_service_pb2,
+    job_pb2,
+    job_service_pb2,
+    result_pb2,
+)
+from .errors import (
+    DataLoss,
+    DeadlineExceeded,
+    InternalError,
+    InvalidArgument,
+    JobCancelled,
+    JobDeadlineExceeded,
+    JobError,
+    JobFailed,
+    MessageTooLarge,
+    NotFound,
+    ScpsfmError,
+    Violation,
+)
+from .jobs import JobState, Settings, state_of
+from .result import Result
+from .tracks import Tracks
+
+CHUNK_BYTES = 512 * 1024
+"""Bytes of one chunk of an upload: what any server takes, and little to send again."""
+
+SMALL_OBSERVATIONS = 16384
+"""Up to so many observations a Solve has its input in its first message."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Call:
+    """Make a call with one answer; `request` is a message, or an iterator of messages for a streaming one."""
+
+    method: str
+    request: Any
+    timeout: float | None
+
+
+@dataclass(frozen=True)
+class Open:
+    """Begin a call that answers with a stream; comes to a `Stream`."""
+
+    method: str
+    request: Any
+    timeout: float | None
+
+
+@dataclass
+class Stream:
+    """A call that answers with a stream."""
+
+    call: Any
+    accepted: bool
+    """Whether the server has begun to answer."""
+
+
+@dataclass(frozen=True)
+class Read:
+    """Read the next message; `None` at the end."""
+
+    stream: Stream
+
+
+@dataclass(frozen=True)
+class Close:
+    """Give a stream up."""
+
+    stream: Stream
+
+
+@dataclass(frozen=True)
+class Sleep:
+    """Wait."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Emit:
+    """Hand something to the caller."""
+
+    value: Any
+
+
+Op = Call | Open | Read | Close | Sleep | Emit
+Flow = Generator[Op, Any, T]
+
+
+@dataclass(frozen=True)
+class Context:
+    """What all flows of a client share."""
+
+    parent: str
+    policy: RetryPolicy
+    upload_above_bytes: int
+    clock: Callable[[], float] = time.monotonic
+
+
+class Trouble:
+    """The tries of one operation, under the caller's timeout."""
+
+    def __init__(self, context: Context, timeout: float | None) -> None:
+        if timeout is not None and not timeout > 0.0:
+            raise InvalidArgument(
+                f"timeout: {timeout} is not positive",
+                reason="INVALID_ARGUMENT",
+                violations=[Violation("timeout", f"{timeout} is not positive")],
+            )
+        self._clock = context.clock
+        self._timeout = timeout
+        self._end = None if timeout is None else context.clock() + timeout
+        self.backoff = Backoff(context.policy, context.clock)
+
+    def left(self) -> float | None:
+        """Seconds that the caller still waits; `None`: for ever."""
+        return None if self._end is None else max(0.0, self._end - self._clock())
+
+    def limit(self) -> float | None:
+        """Seconds that the next try of a call may take: in times of trouble no longer than that is waited for."""
+        bounds = [bound for bound in (self.left(), self.backoff.left()) if bound is not None]
+        # Nothing comes of a call without any time.
+        return max(0.05, min(bounds)) if bounds else None
+
+    def failed(self, error: ScpsfmError) -> Sleep:
+        """The pause before another try.
+
+        Raises:
+            ScpsfmError: No other try is made.
+
+        """
+        left = self.left()
+        is_local = isinstance(error, DeadlineExceeded) and not error.reason
+        if is_local and (left is None or left > 0.0):
+            # The try was cut short, by the time that a trouble is waited for.
+            error = self.backoff.last() or error
+        elif is_local:
+            raise self._too_late(self.backoff.last()) from error
+        pause = self.backoff.failed(error)
+        if left is not None and pause >= left:
+            raise self._too_late(error) from error
+        return Sleep(pause)
+
+    def _too_late(self, last: ScpsfmError | None) -> DeadlineExceeded:
+        words = f"the timeout of {self._timeout:g} s passed"
+        if last is not None:
+            words += f"; before that: {last}"
+        return DeadlineExceeded(words, reason="CLIENT_TIMEOUT", code=grpc.StatusCode.DEADLINE_EXCEEDED)
+
+
+def call(context: Context, method: str, request: Any, timeout: float | None = None) -> Flow[Any]:
+    """A call that may be repeated."""
+    return (yield from _call(Trouble(context, timeout), method, request))
+
+
+def _call(trouble: Trouble, method: str, request: Any) -> Flow[Any]:
+    while True:
+        try:
+            answer = yield Call(method, request, trouble.limit())
+        except ScpsfmError as error:
+            yield trouble.failed(error)
+        else:
+            return answer
+
+
+@dataclass(frozen=True)
+class JobOptions:
+    """What is said of a job beside input and settings."""
+
+    settings: Settings | None = None
+    labels: Mapping[str, str] | None = None
+    priority: int = 0
+    time_limit: float | None = None
+    job_id: str | None = None
+    request_id: str | None = None
+
+
+def create_request(context: Context, options: JobOptions) -> job_service_pb2.CreateJobRequest:
+    """A request without its input, with a request id, so that it can be made again where the answer is lost."""
+    try:
+        job = job_pb2.Job(labels=dict(options.labels or {}), priority=options.priority)
+        if options.time_limit is not None:
+            job.time_limit.FromNanoseconds(round(options.time_limit * 1e9))
+        if options.settings is not None:
+            job.settings.CopyFrom(options.settings.to_proto())
+        return job_service_pb2.CreateJobRequest(
+            parent=context.parent,
+            job_id=options.job_id or "",
+            request_id=options.request_id or str(uuid.uuid4()),
+            job=job,
+        )
+    except InvalidArgument:
+        raise
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InvalidArgument(
+            f"job: {error}", reason="INVALID_ARGUMENT", violations=[Violation("job", str(error))]
+        ) from None
+
+
+def _named(error: ScpsfmError, request_id: str, tracks: Tracks | str | None) -> ScpsfmError:
+    """The error of a creation, with its request id, and the file and line of the input."""
+    if isinstance(error, InvalidArgument):
+        return tracks._locate(error) if isinstance(tracks, Tracks) else error
+    error.request_id = request_id
+    return error
+
+
+def submit(context: Context, tracks: Tracks | str, options: JobOptions, timeout: float | None) -> Flow[job_pb2.Job]:
+    """Creates a job; a large input is uploaded first. Emits how many of how many bytes the server has."""
+    trouble = Trouble(context, timeout)
+    request = create_request(context, options)
+    try:
+        if isinstance(tracks, str):
+            request.input = tracks
+            return (yield from _call(trouble, "CreateJob", request))
+        request.track_set.CopyFrom(tracks.to_proto())
+        if request.ByteSize() <= context.upload_above_bytes:
+            try:
+                return (yield from _call(trouble, "CreateJob", request))
+            except MessageTooLarge:
+                pass
+        stored = yield from _upload(context, trouble, Encoded(request.track_set))
+        request.input = stored.name
+        return (yield from _call(trouble, "CreateJob", request))
+    except ScpsfmError as error:
+        raise _named(error, request.request_id, tracks) from error.__cause__
+
+
+def submit_batch(
+    context: Context, inputs: Sequence[Tracks | str], options: JobOptions, timeout: float | None
+) -> Flow[list[job_pb2.Job]]:
+    """Creates a job of each input, all or none; large ones are uploaded first."""
+    trouble = Trouble(context, timeout)
+    batch = job_service_pb2.BatchCreateJobsRequest(parent=context.parent)
+    room = context.upload_above_bytes
+    for number, tracks in enumerate(inputs, start=1):
+        # One that is given stands, with the number of the job after it, for each of them.
+        request_id = None if options.request_id is None else f"{options.request_id}-{number}"
+        request = create_request(context, replace(options, request_id=request_id))
+        if isinstance(tracks, str):
+            request.input = tracks
+        else:
+            track_set = tracks.to_proto()
+            if track_set.ByteSize() <= room:
+                request.track_set.CopyFrom(track_set)
+                room -= track_set.ByteSize()
+            else:
+                try:
+                    stored = yield from _upload(context, trouble, Encoded(track_set))
+                except InvalidArgument as error:
+                    raise tracks._locate(error) from None
+                request.input = stored.name
+        batch.requests.append(request)
+    try:
+        answer = yield from _call(trouble, "BatchCreateJobs", batch)
+    except InvalidArgument as error:
+        raise _of_request(error, inputs) from None
+    jobs: list[job_pb2.Job] = list(answer.jobs)
+    return jobs
+
+
+def _of_request(error: InvalidArgument, inputs: Sequence[Tracks | str]) -> InvalidArgument:
+    """Says where in which file the first field stands that a batch was refused for."""
+    number, bracket, rest = (error.field or "").removeprefix("requests[").partition("].")
+    if not bracket or not number.isdigit() or int(number) >= len(inputs):
+        return error
+    tracks = inputs[int(number)]
+    if isinstance(tracks, Tracks):
+        field, error.field = error.field, rest
+        tracks._locate(error)
+        error.field = field
+    return error
+
+
+class Encoded:
+    """An input in the form in which it is uploaded."""
+
+    def __init__(self, track_set: input_pb2.TrackSet) -> None:
+        self.data: bytes = input_pb2.InputData(track_set=track_set).SerializeToString()
+        self.sha256 = hashlib.sha256(self.data).digest()
+
+    @property
+    def upload_id(self) -> str:
+        """A UUID of version 8 (RFC 9562): of the same bytes always the same.
+
+        So a program that is started again goes on where the first one was stopped.
+        """
+        value = bytearray(self.sha256[:16])
+        value[6] = (value[6] & 0x0F) | 0x80
+        value[8] = (value[8] & 0x3F) | 0x80
+        return str(uuid.UUID(bytes=bytes(value)))
+
+    def messages(self, parent: str, begin: int) -> Iterator[input_service_pb2.UploadInputRequest]:
+        """Every message of a stream that goes on from there."""
+        yield input_service_pb2.UploadInputRequest(
+            start=input_service_pb2.UploadStart(
+                parent=parent, upload_id=self.upload_id, size_bytes=len(self.data), sha256=self.sha256
+            )
+        )
+        for offset in range(begin, len(self.data), CHUNK_BYTES):
+            data = self.data[offset : offset + CHUNK_BYTES]
+            yield input_service_pb2.UploadInputRequest(
+                chunk=input_service_pb2.UploadChunk(offset=offset, data=data, crc32c=crc32c(data))
+            )
+        yield input_service_pb2.UploadInputRequest(finish=input_service_pb2.UploadFinish(sha256=self.sha256))
+
+
+_GOES_ON = ("CHUNK_CORRUPTED", "UPLOAD_TAKEN_OVER", "INPUT_STALLED")
+
+
+def _goes_on(error: ScpsfmError) -> bool:
+    """Whether an answer is about a stream and not about the input.
+
+    A chunk was damaged on its way, or another stream of the upload, perhaps an earlier one of this very client, wrote
+    after its state was asked.
+    """
+    return error.reason in _GOES_ON or any(violation.field == "chunk.offset" for violation in error.violations)
+
+
+def upload(context: Context, tracks: Tracks, timeout: float | None) -> Flow[input_pb2.Input]:
+    """Uploads an input, or what is missing of it. Emits how many of how many bytes the server has."""
+    try:
+        return (yield from _upload(context, Trouble(context, timeout), Encoded(tracks.to_proto())))
+    except InvalidArgument as error:
+        raise tracks._locate(error) from None
+
+
+def _upload(context: Context, trouble: Trouble, encoded: Encoded) -> Flow[input_pb2.Input]:
+    request = input_service_pb2.GetUploadStatusRequest(parent=context.parent, upload_id=encoded.upload_id)
+    best = 0
+    while True:
+        try:
+            try:
+                # A finished one is begun again all the same, which says that it is wanted, and sends no more of it.
+                committed = (yield Call("GetUploadStatus", request, trouble.limit())).committed_bytes
+            except NotFound as error:
+                if error.reason != "UPLOAD_NOT_FOUND":
+                    raise
+                committed = 0
+            if committed > best:
+                best = committed
+                trouble.backoff.reset()
+            committed = min(committed, len(encoded.data))
+            yield Emit((committed, len(encoded.data)))
+            stored = yield Call("UploadInput", encoded.messages(context.parent, committed), trouble.left())
+        except ScpsfmError as error:
+            if _goes_on(error):
+                error = DataLoss(error.message, reason="", code=grpc.StatusCode.UNAVAILABLE)
+            yield trouble.failed(error)
+        else:
+            yield Emit((len(encoded.data), len(encoded.data)))
+            return stored
+
+
+def _is_last(event: job_pb2.JobEvent) -> bool:
+    return event.WhichOneof("body") == "state_change" and state_of(event.state_change.state).is_final
+
+
+@dataclass
+class Told:
+    """Which of a job's events were handed on: each sequenced one once."""
+
+    sequence: int = 0
+    name: str = ""
+
+    def follow(self, stream: Stream, trouble: Trouble) -> Flow[job_pb2.JobEvent | None]:
+        """Emits the events of one stream to its end, and returns the last; `None`: it ended without a final state."""
+        if stream.accepted:
+            trouble.backoff.accepted()
+        while True:
+            event = yield Read(stream)
+            if event is None:
+                return None
+            if event.sequence and event.sequence <= self.sequence:
+                continue
+            trouble.backoff.reset()
+            self.sequence = event.sequence or self.sequence
+            self.name = event.name
+            yield Emit(event)
+            if _is_last(event):
+                yield Close(stream)
+                return event
+
+
+def watch(context: Context, name: str, after: int, timeout: float | None) -> Flow[job_pb2.JobEvent | None]:
+    """Emits a job's events after a sequence number until its end, over broken connections and restarts.
+
+    Returns the last; `None` where the job has ended and nothing came after that number.
+    """
+    return (yield from _watch(Trouble(context, timeout), name, after))
+
+
+def _watch(trouble: Trouble, name: str, after: int) -> Flow[job_pb2.JobEvent | None]:
+    told = Told(after)
+    while True:
+        try:
+            request = job_service_pb2.WatchJobRequest(name=name, after_sequence=told.sequence)
+            stream = yield Open("WatchJob", request, trouble.left())
+            return (yield from told.follow(stream, trouble))
+        except ScpsfmError as error:
+            yield trouble.failed(error)
+
+
+def wait(context: Context, name: str, timeout: float | None) -> Flow[job_pb2.Job]:
+    """Waits for a job's end and returns it as it ended. Emits its new events."""
+    return (yield from _wait(Trouble(context, timeout), name))
+
+
+def _wait(trouble: Trouble, name: str) -> Flow[job_pb2.Job]:
+    request = job_service_pb2.GetJobRequest(name=name)
+    while True:
+        job: job_pb2.Job = yield from _call(trouble, "GetJob", request)
+        if state_of(job.state).is_final:
+            return job
+        yield from _watch(trouble, name, job.last_sequence)
+
+
+def ended(name: str, state: JobState, reason: str, message: str) -> JobError | None:
+    """The exception of a job that ended without a result."""
+    if state is JobState.SUCCEEDED:
+        return None
+    if state is JobState.CANCELLED:
+        return JobCancelled(f"{name} was cancelled", job=name)
+    if state is JobState.DEADLINE_EXCEEDED:
+        return JobDeadlineExceeded(f"{name}: its deadline passed before a result stood", job=name)
+    return JobFailed(f"{name} failed: {message or state}", reason=reason, job=name)
+
+
+def result(context: Context, name: str, timeout: float | None) -> Flow[result_pb2.JobResult]:
+    """Waits for a job's end and reads its result. Emits its new events."""
+    trouble = Trouble(context, timeout)
+    job = yield from _wait(trouble, name)
+    failure = ended(name, state_of(job.state), job.error.reason, job.error.message)
+    if failure is not None:
+        raise failure
+    return (yield from _read_result(trouble, name))
+
+
+def _read_result(trouble: Trouble, name: str) -> Flow[result_pb2.JobResult]:
+    data = bytearray()
+    total: int | None = None
+    sha256 = b""
+    while True:
+        try:
+            request = job_service_pb2.ReadJobResultRequest(name=name, offset=len(data))
+            stream = yield Open("ReadJobResult", request, trouble.left())
+            while (chunk := (yield Read(stream))) is not None:
+                if chunk.offset != len(data):
+                    yield Close(stream)
+                    raise InternalError(f"a chunk begins at {chunk.offset} where {len(data)} was due", job=name)
+                data += chunk.data
+                total, sha256 = chunk.total_size, chunk.sha256
+                trouble.backoff.reset()
+        except ScpsfmError as error:
+            yield trouble.failed(error)
+        else:
+            break
+    if total != len(data):
+        raise InternalError(f"the result ended at {len(data)} of {total} bytes", job=name)
+    if sha256 and hashlib.sha256(data).digest() != sha256:
+        raise DataLoss("the result does not match its SHA-256", reason="RESULT_CORRUPTED", job=name)
+    try:
+        return result_pb2.JobResult.FromString(bytes(data))
+    except DecodeError as error:
+        raise InternalError(f"the result cannot be decoded: {error}", job=name) from None
+
+
+def solve(
+    context: Context, tracks: Tracks, options: JobOptions, told: Told, timeout: float | None
+) -> Flow[result_pb2.JobResult]:
+    """Creates a job, follows it to its end and reads its result. Emits its events.
+
+    A broken call is made again under the same request id, which takes up the job. `told` has the job's name, once it is
+    known, so that whoever gives up can cancel it.
+    """
+    trouble = Trouble(context, timeout)
+    config = create_request(context, options)
+    is_small = len(tracks) <= SMALL_OBSERVATIONS
+    config.track_set.CopyFrom(tracks.to_proto() if is_small else tracks._head())
+
+    def messages() -> Iterator[calibration_service_pb2.SolveRequest]:
+        yield calibration_service_pb2.SolveRequest(config=config)
+        if not is_small:
+            for chunk in tracks._chunks():
+                yield calibration_service_pb2.SolveRequest(track_set_chunk=chunk)
+
+    while True:
+        try:
+            stream = yield Open("Solve", messages(), trouble.left())
+            last = yield from told.follow(stream, trouble)
+        except ScpsfmError as error:
+            try:
+                yield trouble.failed(error)
+            except ScpsfmError as final:
+                final.job = told.name or None
+                raise _named(final, config.request_id, tracks) from final.__cause__
+        else:
+            break
+    if last is None:
+        raise InternalError("the server ended a solve without its last event", job=told.name or None)
+    change = last.state_change
+    failure = ended(told.name, state_of(change.state), change.error.reason, change.error.message)
+    if failure is not None:
+        raise failure
+    return (yield from _read_result(trouble, told.name))
+
+
+def delete(context: Context, name: str, etag: str, timeout: float | None) -> Flow[None]:
+    """Deletes a job; that it is gone after an answer was lost is no error."""
+    yield from _delete(context, "DeleteJob", job_service_pb2.DeleteJobRequest(name=name, etag=etag), timeout)
+
+
+def delete_input(context: Context, name: str, timeout: float | None) -> Flow[None]:
+    """Deletes an uploaded input; that it is gone after an answer was lost is no error."""
+    yield from _delete(context, "DeleteInput", input_service_pb2.DeleteInputRequest(name=name), timeout)
+
+
+def _delete(context: Context, method: str, request: Any, timeout: float | None) -> Flow[None]:
+    trouble = Trouble(context, timeout)
+    while True:
+        try:
+            yield Call(method, request, trouble.limit())
+            return
+        except NotFound:
+            if trouble.backoff.last() is None:
+                raise
+            return
+        except ScpsfmError as error:
+            yield trouble.failed(error)
+
+
+def list_jobs(context: Context, filter: str, order_by: str, page_size: int, timeout: float | None) -> Flow[None]:
+    """Emits the tenant's jobs, page by page."""
+    trouble = Trouble(context, timeout)
+    request = job_service_pb2.ListJobsRequest(
+        parent=context.parent, page_size=page_size, filter=filter, order_by=order_by
+    )
+    while True:
+        page = yield from _call(trouble, "ListJobs", request)
+        for job in page.jobs:
+            yield Emit(job)
+        if not page.next_page_token:
+            return
+        request.page_token = page.next_page_token
+
+
+def list_inputs(context: Context, page_size: int, timeout: float | None) -> Flow[None]:
+    """Emits the tenant's uploaded inputs, page by page."""
+    trouble = Trouble(context, timeout)
+    request = input_service_pb2.ListInputsRequest(parent=context.parent, page_size=page_size)
+    while True:
+        page = yield from _call(trouble, "ListInputs", request)
+        for stored in page.inputs:
+            yield Emit(views.InputInfo.of(stored))
+        if not page.next_page_token:
+            return
+        request.page_token = page.next_page_token
+
+
+def finished(message: result_pb2.JobResult, tracks: Tracks | str | None) -> Result:
+    """The result for the caller, with its input where that is at hand."""
+    return Result(message, tracks if isinstance(tracks, Tracks) else None)
