@@ -25,7 +25,9 @@ class Watcher:
                 from tqdm.auto import tqdm
             except ImportError:
                 raise ImportError("progress=True needs tqdm: pip install 'scpsfm[progress]'") from None
-            self._bar = tqdm(total=100.0, unit="%", bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}")
+            self._bar = tqdm(
+                total=100.0, desc="waiting", unit="%", bar_format="{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}"
+            )
 
     def __enter__(self) -> Watcher:
         return self

@@ -623,11 +623,11 @@ class Result:
 
         to_colmap_database(self._with_input(), path, self)
 
-    def to_nerfstudio(self, path: str | PathLike[str], *, part: int = 0) -> None:
+    def to_nerfstudio(self, path: str | PathLike[str], *, part: int = 0, images: str = "images") -> None:
         """Writes nerfstudio's `transforms.json` into a folder; see `scpsfm.to_nerfstudio`."""
         from .exports import to_nerfstudio
 
-        to_nerfstudio(self._with_input(), path, self, part=part)
+        to_nerfstudio(self._with_input(), path, self, part=part, images=images)
 
     def to_opensfm(self, path: str | PathLike[str]) -> None:
         """Writes OpenSfM's `reconstruction.json` into a folder; see `scpsfm.to_opensfm`."""

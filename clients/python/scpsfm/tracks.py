@@ -6,6 +6,7 @@ Pixels everywhere: the centre of the top-left pixel is (0, 0), x to the right, y
 from __future__ import annotations
 
 import unicodedata
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -574,7 +575,8 @@ def _check(tracks: Tracks) -> None:
     lengths = {field: len(row) for field, row in rows.items()}
     if len(set(lengths.values())) > 1:
         told = ", ".join(f"{field} has {length}" for field, length in lengths.items())
-        odd = next(field for field, length in lengths.items() if length != count) if count else "x"
+        usual = Counter(lengths.values()).most_common(1)[0][0]
+        odd = next(field for field, length in lengths.items() if length != usual)
         raise fail([(odd, f"arrays of observations have one entry an observation each: {told}")])
     problems = list(_view_problems(tracks.views))
     if problems:
