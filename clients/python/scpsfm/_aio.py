@@ -256,7 +256,7 @@ class AsyncClient:
 
     def job(self, name: str, tracks: Tracks | None = None) -> AsyncJob:
         """A job that is known by its name; no call is made. See `Client.job`."""
-        return AsyncJob(self, name, None, tracks)
+        return AsyncJob(self, flows.job_name(self._context, name), None, tracks)
 
     async def jobs(
         self, filter: str = "", *, order_by: str = "", page_size: int = 0, timeout: float | None = None

@@ -329,11 +329,11 @@ class Client:
         """A job that is known by its name; no call is made.
 
         Args:
-            name: `tenants/{tenant}/jobs/{job}`.
+            name: `tenants/{tenant}/jobs/{job}`, or the last part of it.
             tracks: Its input, which results need for exports.
 
         """
-        return Job(self, name, None, tracks)
+        return Job(self, flows.job_name(self._context, name), None, tracks)
 
     def jobs(
         self, filter: str = "", *, order_by: str = "", page_size: int = 0, timeout: float | None = None

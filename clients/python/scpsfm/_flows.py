@@ -582,6 +582,11 @@ def list_inputs(context: Context, page_size: int, timeout: float | None) -> Flow
         request.page_token = page.next_page_token
 
 
+def job_name(context: Context, name: str) -> str:
+    """The full name of a job of which the last part may be given; `-` stands for the tenant of the key."""
+    return name if "/" in name else f"{context.parent or 'tenants/-'}/jobs/{name}"
+
+
 def finished(message: result_pb2.JobResult, tracks: Tracks | str | None) -> Result:
     """The result for the caller, with its input where that is at hand."""
     return Result(message, tracks if isinstance(tracks, Tracks) else None)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,3 +90,52 @@ def true_result(scene: Scene, job: str = "tenants/default/jobs/true", **calibrat
     message.observations.weights.extend(of_observation.astype(float))
     message.warnings.add(code="WARNING_CODE_PRINCIPAL_POINT_UNOBSERVABLE", detail="taken to be the middle")
     return message
+
+
+def write_csv(tracks: scpsfm.Tracks, path: Path) -> Path:
+    """Writes tracks as `view,track,x,y`."""
+    rows = zip(tracks.view_index, tracks.track_index, tracks.x.tolist(), tracks.y.tolist(), strict=True)
+    path.write_text("view,track,x,y\n" + "".join(f"{view},{track},{x!r},{y!r}\n" for view, track, x, y in rows))
+    return path
+
+
+def write_opensfm(tracks: scpsfm.Tracks, folder: Path) -> Path:
+    """Writes tracks as an OpenSfM data set: `tracks.csv` of version 2, and a file in `exif/` for each image."""
+    (folder / "exif").mkdir(parents=True)
+    for name in tracks.names:
+        content = json.dumps({"width": WIDTH, "height": HEIGHT, "camera": "one"})
+        (folder / "exif" / f"{name}.exif").write_text(content)
+    side = max(WIDTH, HEIGHT)
+    lines = ["OPENSFM_TRACKS_VERSION_v2"]
+    for k in range(len(tracks)):
+        x, y = (tracks.x[k] - (WIDTH - 1) / 2) / side, (tracks.y[k] - (HEIGHT - 1) / 2) / side
+        name, track = tracks.names[int(tracks.view_index[k])], int(tracks.track_index[k])
+        lines.append("\t".join(map(str, (name, track, k, float(x), float(y), 0.001, 1, 2, 3, -1, -1))))
+    path = folder / "tracks.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def from_proto(message: Any) -> scpsfm.Tracks:
+    """Tracks of a message of the API, checked as any."""
+    views = [
+        scpsfm.View(
+            view.name,
+            (view.size.width_px, view.size.height_px) if view.HasField("size") else None,
+            view.camera_group,
+            scpsfm.FocalPrior(view.focal_prior.focal_px, view.focal_prior.sigma_log)
+            if view.HasField("focal_prior")
+            else None,
+        )
+        for view in message.views
+    ]
+    return scpsfm.Tracks.from_arrays(
+        list(message.view_indices),
+        list(message.track_indices),
+        list(message.xs),
+        list(message.ys),
+        views=views,
+        track_count=message.track_count,
+        sigma_px=list(message.sigmas_px) or None,
+        depth=list(message.depths) or None,
+    )

@@ -140,7 +140,7 @@ def test_what_is_not_finite_is_refused(field: str, value: float) -> None:
         ({"names": ["a"]}, "track_set.names", "has 1 entries, there are 2"),
         ({"names": ["a", "a"]}, "track_set.views[1].name", "is the name of view 0 already"),
         ({"names": ["a", "b\n"]}, "track_set.views[1].name", "control characters"),
-        ({"names": ["a", "\u00e9" * 513]}, "track_set.views[1].name", "longer than 1024 bytes"),
+        ({"names": ["a", "\u00e9" * 2049]}, "track_set.views[1].name", "longer than 4096 bytes"),
         ({"camera_groups": [0, -1]}, "track_set.views[1].camera_group", "-1"),
         ({"focal_prior": FocalPrior(-1.0)}, "track_set.views[0].focal_prior.focal_px", "-1.0"),
         ({"focal_prior": FocalPrior(1.0, np.inf)}, "track_set.views[0].focal_prior.sigma_log", "inf"),

@@ -13,6 +13,7 @@ from google.protobuf.internal import builder as _builder
 _sym_db = _symbol_database.Default()
 
 
+from google.api import annotations_pb2 as google_dot_api_dot_annotations__pb2
 from google.protobuf import duration_pb2 as google_dot_protobuf_dot_duration__pb2
 from . import input_pb2 as scpsfm_dot_v1_dot_input__pb2
 from . import job_pb2 as scpsfm_dot_v1_dot_job__pb2
@@ -20,25 +21,27 @@ from . import job_service_pb2 as scpsfm_dot_v1_dot_job__service__pb2
 from . import settings_pb2 as scpsfm_dot_v1_dot_settings__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n#scpsfm/v1/calibration_service.proto\x12\tscpsfm.v1\x1a\x1egoogle/protobuf/duration.proto\x1a\x15scpsfm/v1/input.proto\x1a\x13scpsfm/v1/job.proto\x1a\x1bscpsfm/v1/job_service.proto\x1a\x18scpsfm/v1/settings.proto\"\xc4\x01\n\x0cSolveRequest\x12-\n\x06\x63onfig\x18\x01 \x01(\x0b\x32\x1b.scpsfm.v1.CreateJobRequestH\x00\x12\x33\n\x0ftrack_set_chunk\x18\x02 \x01(\x0b\x32\x18.scpsfm.v1.TrackSetChunkH\x00\x12\x45\n\x18measurement_matrix_chunk\x18\x03 \x01(\x0b\x32!.scpsfm.v1.MeasurementMatrixChunkH\x00\x42\t\n\x07message\"\x18\n\x16GetCapabilitiesRequest\"\xa6\x03\n\x0c\x43\x61pabilities\x12\x16\n\x0eserver_version\x18\x01 \x01(\t\x12&\n\x06limits\x18\x02 \x01(\x0b\x32\x16.scpsfm.v1.InputLimits\x12\"\n\x07methods\x18\x03 \x03(\x0e\x32\x11.scpsfm.v1.Method\x12$\n\x08\x62\x61\x63kends\x18\x04 \x03(\x0e\x32\x12.scpsfm.v1.Backend\x12\x32\n\x10\x64\x65\x66\x61ult_settings\x18\x05 \x01(\x0b\x32\x18.scpsfm.v1.SolveSettings\x12,\n\tretention\x18\x06 \x01(\x0b\x32\x19.google.protobuf.Duration\x12\x1a\n\x12max_batch_requests\x18\x07 \x01(\r\x12,\n\x0cqueue_limits\x18\x08 \x01(\x0b\x32\x16.scpsfm.v1.QueueLimits\x12.\n\rupload_limits\x18\t \x01(\x0b\x32\x17.scpsfm.v1.UploadLimits\x12\x17\n\x0ftrained_network\x18\n \x01(\t\x12\x17\n\x0fmax_connections\x18\x0b \x01(\r\"\xa4\x01\n\x0cUploadLimits\x12\x11\n\tmax_bytes\x18\x01 \x01(\x04\x12\x17\n\x0fmax_chunk_bytes\x18\x02 \x01(\x04\x12\x1a\n\x12max_tenant_uploads\x18\x03 \x01(\x04\x12\x18\n\x10max_tenant_bytes\x18\x04 \x01(\x04\x12\x32\n\x0f\x61\x62\x61ndoned_after\x18\x05 \x01(\x0b\x32\x19.google.protobuf.Duration\"\xb2\x01\n\x0bQueueLimits\x12\x10\n\x08max_jobs\x18\x01 \x01(\x04\x12\x11\n\tmax_bytes\x18\x02 \x01(\x04\x12\x18\n\x10max_observations\x18\x03 \x01(\x04\x12\x1c\n\x0fmax_tenant_jobs\x18\x04 \x01(\x04H\x00\x88\x01\x01\x12\x1d\n\x10max_tenant_bytes\x18\x05 \x01(\x04H\x01\x88\x01\x01\x42\x12\n\x10_max_tenant_jobsB\x13\n\x11_max_tenant_bytes\"i\n\x0bInputLimits\x12\x11\n\tmax_views\x18\x01 \x01(\r\x12\x12\n\nmax_tracks\x18\x02 \x01(\r\x12\x18\n\x10max_observations\x18\x03 \x01(\r\x12\x19\n\x11max_message_bytes\x18\x04 \x01(\x04\x32\x9e\x01\n\x12\x43\x61librationService\x12\x39\n\x05Solve\x12\x17.scpsfm.v1.SolveRequest\x1a\x13.scpsfm.v1.JobEvent(\x01\x30\x01\x12M\n\x0fGetCapabilities\x12!.scpsfm.v1.GetCapabilitiesRequest\x1a\x17.scpsfm.v1.Capabilitiesb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n#scpsfm/v1/calibration_service.proto\x12\tscpsfm.v1\x1a\x1cgoogle/api/annotations.proto\x1a\x1egoogle/protobuf/duration.proto\x1a\x15scpsfm/v1/input.proto\x1a\x13scpsfm/v1/job.proto\x1a\x1bscpsfm/v1/job_service.proto\x1a\x18scpsfm/v1/settings.proto\"\xc4\x01\n\x0cSolveRequest\x12-\n\x06\x63onfig\x18\x01 \x01(\x0b\x32\x1b.scpsfm.v1.CreateJobRequestH\x00\x12\x33\n\x0ftrack_set_chunk\x18\x02 \x01(\x0b\x32\x18.scpsfm.v1.TrackSetChunkH\x00\x12\x45\n\x18measurement_matrix_chunk\x18\x03 \x01(\x0b\x32!.scpsfm.v1.MeasurementMatrixChunkH\x00\x42\t\n\x07message\"\x18\n\x16GetCapabilitiesRequest\"\xa6\x03\n\x0c\x43\x61pabilities\x12\x16\n\x0eserver_version\x18\x01 \x01(\t\x12&\n\x06limits\x18\x02 \x01(\x0b\x32\x16.scpsfm.v1.InputLimits\x12\"\n\x07methods\x18\x03 \x03(\x0e\x32\x11.scpsfm.v1.Method\x12$\n\x08\x62\x61\x63kends\x18\x04 \x03(\x0e\x32\x12.scpsfm.v1.Backend\x12\x32\n\x10\x64\x65\x66\x61ult_settings\x18\x05 \x01(\x0b\x32\x18.scpsfm.v1.SolveSettings\x12,\n\tretention\x18\x06 \x01(\x0b\x32\x19.google.protobuf.Duration\x12\x1a\n\x12max_batch_requests\x18\x07 \x01(\r\x12,\n\x0cqueue_limits\x18\x08 \x01(\x0b\x32\x16.scpsfm.v1.QueueLimits\x12.\n\rupload_limits\x18\t \x01(\x0b\x32\x17.scpsfm.v1.UploadLimits\x12\x17\n\x0ftrained_network\x18\n \x01(\t\x12\x17\n\x0fmax_connections\x18\x0b \x01(\r\"\xa4\x01\n\x0cUploadLimits\x12\x11\n\tmax_bytes\x18\x01 \x01(\x04\x12\x17\n\x0fmax_chunk_bytes\x18\x02 \x01(\x04\x12\x1a\n\x12max_tenant_uploads\x18\x03 \x01(\x04\x12\x18\n\x10max_tenant_bytes\x18\x04 \x01(\x04\x12\x32\n\x0f\x61\x62\x61ndoned_after\x18\x05 \x01(\x0b\x32\x19.google.protobuf.Duration\"\xb2\x01\n\x0bQueueLimits\x12\x10\n\x08max_jobs\x18\x01 \x01(\x04\x12\x11\n\tmax_bytes\x18\x02 \x01(\x04\x12\x18\n\x10max_observations\x18\x03 \x01(\x04\x12\x1c\n\x0fmax_tenant_jobs\x18\x04 \x01(\x04H\x00\x88\x01\x01\x12\x1d\n\x10max_tenant_bytes\x18\x05 \x01(\x04H\x01\x88\x01\x01\x42\x12\n\x10_max_tenant_jobsB\x13\n\x11_max_tenant_bytes\"i\n\x0bInputLimits\x12\x11\n\tmax_views\x18\x01 \x01(\r\x12\x12\n\nmax_tracks\x18\x02 \x01(\r\x12\x18\n\x10max_observations\x18\x03 \x01(\r\x12\x19\n\x11max_message_bytes\x18\x04 \x01(\x04\x32\xb8\x01\n\x12\x43\x61librationService\x12\x39\n\x05Solve\x12\x17.scpsfm.v1.SolveRequest\x1a\x13.scpsfm.v1.JobEvent(\x01\x30\x01\x12g\n\x0fGetCapabilities\x12!.scpsfm.v1.GetCapabilitiesRequest\x1a\x17.scpsfm.v1.Capabilities\"\x18\x82\xd3\xe4\x93\x02\x12\x12\x10/v1/capabilitiesb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'scpsfm.v1.calibration_service_pb2', _globals)
 if _descriptor._USE_C_DESCRIPTORS == False:
   DESCRIPTOR._options = None
-  _globals['_SOLVEREQUEST']._serialized_start=182
-  _globals['_SOLVEREQUEST']._serialized_end=378
-  _globals['_GETCAPABILITIESREQUEST']._serialized_start=380
-  _globals['_GETCAPABILITIESREQUEST']._serialized_end=404
-  _globals['_CAPABILITIES']._serialized_start=407
-  _globals['_CAPABILITIES']._serialized_end=829
-  _globals['_UPLOADLIMITS']._serialized_start=832
-  _globals['_UPLOADLIMITS']._serialized_end=996
-  _globals['_QUEUELIMITS']._serialized_start=999
-  _globals['_QUEUELIMITS']._serialized_end=1177
-  _globals['_INPUTLIMITS']._serialized_start=1179
-  _globals['_INPUTLIMITS']._serialized_end=1284
-  _globals['_CALIBRATIONSERVICE']._serialized_start=1287
-  _globals['_CALIBRATIONSERVICE']._serialized_end=1445
+  _globals['_CALIBRATIONSERVICE'].methods_by_name['GetCapabilities']._options = None
+  _globals['_CALIBRATIONSERVICE'].methods_by_name['GetCapabilities']._serialized_options = b'\202\323\344\223\002\022\022\020/v1/capabilities'
+  _globals['_SOLVEREQUEST']._serialized_start=212
+  _globals['_SOLVEREQUEST']._serialized_end=408
+  _globals['_GETCAPABILITIESREQUEST']._serialized_start=410
+  _globals['_GETCAPABILITIESREQUEST']._serialized_end=434
+  _globals['_CAPABILITIES']._serialized_start=437
+  _globals['_CAPABILITIES']._serialized_end=859
+  _globals['_UPLOADLIMITS']._serialized_start=862
+  _globals['_UPLOADLIMITS']._serialized_end=1026
+  _globals['_QUEUELIMITS']._serialized_start=1029
+  _globals['_QUEUELIMITS']._serialized_end=1207
+  _globals['_INPUTLIMITS']._serialized_start=1209
+  _globals['_INPUTLIMITS']._serialized_end=1314
+  _globals['_CALIBRATIONSERVICE']._serialized_start=1317
+  _globals['_CALIBRATIONSERVICE']._serialized_end=1501
 # @@protoc_insertion_point(module_scope)

@@ -13,12 +13,13 @@ from google.protobuf.internal import builder as _builder
 _sym_db = _symbol_database.Default()
 
 
+from google.api import annotations_pb2 as google_dot_api_dot_annotations__pb2
 from google.api import field_behavior_pb2 as google_dot_api_dot_field__behavior__pb2
 from google.protobuf import empty_pb2 as google_dot_protobuf_dot_empty__pb2
 from . import input_pb2 as scpsfm_dot_v1_dot_input__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1dscpsfm/v1/input_service.proto\x12\tscpsfm.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a\x1bgoogle/protobuf/empty.proto\x1a\x15scpsfm/v1/input.proto\"\x9c\x01\n\x12UploadInputRequest\x12\'\n\x05start\x18\x01 \x01(\x0b\x32\x16.scpsfm.v1.UploadStartH\x00\x12\'\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x16.scpsfm.v1.UploadChunkH\x00\x12)\n\x06\x66inish\x18\x03 \x01(\x0b\x32\x17.scpsfm.v1.UploadFinishH\x00\x42\t\n\x07message\"^\n\x0bUploadStart\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x16\n\tupload_id\x18\x02 \x01(\tB\x03\xe0\x41\x02\x12\x17\n\nsize_bytes\x18\x03 \x01(\x03\x42\x03\xe0\x41\x02\x12\x0e\n\x06sha256\x18\x04 \x01(\x0c\"E\n\x0bUploadChunk\x12\x0e\n\x06offset\x18\x01 \x01(\x03\x12\x11\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x42\x03\xe0\x41\x02\x12\x13\n\x06\x63rc32c\x18\x03 \x01(\x07\x42\x03\xe0\x41\x02\"#\n\x0cUploadFinish\x12\x13\n\x06sha256\x18\x01 \x01(\x0c\x42\x03\xe0\x41\x02\"@\n\x16GetUploadStatusRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x16\n\tupload_id\x18\x02 \x01(\tB\x03\xe0\x41\x02\"\\\n\x0cUploadStatus\x12\x17\n\x0f\x63ommitted_bytes\x18\x01 \x01(\x03\x12\x1f\n\x05input\x18\x02 \x01(\x0b\x32\x10.scpsfm.v1.Input\x12\x12\n\nsize_bytes\x18\x03 \x01(\x03\"J\n\x11ListInputsRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\x05\x12\x12\n\npage_token\x18\x03 \x01(\t\"O\n\x12ListInputsResponse\x12 \n\x06inputs\x18\x01 \x03(\x0b\x32\x10.scpsfm.v1.Input\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"\'\n\x12\x44\x65leteInputRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x32\xb0\x02\n\x0cInputService\x12@\n\x0bUploadInput\x12\x1d.scpsfm.v1.UploadInputRequest\x1a\x10.scpsfm.v1.Input(\x01\x12M\n\x0fGetUploadStatus\x12!.scpsfm.v1.GetUploadStatusRequest\x1a\x17.scpsfm.v1.UploadStatus\x12I\n\nListInputs\x12\x1c.scpsfm.v1.ListInputsRequest\x1a\x1d.scpsfm.v1.ListInputsResponse\x12\x44\n\x0b\x44\x65leteInput\x12\x1d.scpsfm.v1.DeleteInputRequest\x1a\x16.google.protobuf.Emptyb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1dscpsfm/v1/input_service.proto\x12\tscpsfm.v1\x1a\x1cgoogle/api/annotations.proto\x1a\x1fgoogle/api/field_behavior.proto\x1a\x1bgoogle/protobuf/empty.proto\x1a\x15scpsfm/v1/input.proto\"\x9c\x01\n\x12UploadInputRequest\x12\'\n\x05start\x18\x01 \x01(\x0b\x32\x16.scpsfm.v1.UploadStartH\x00\x12\'\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x16.scpsfm.v1.UploadChunkH\x00\x12)\n\x06\x66inish\x18\x03 \x01(\x0b\x32\x17.scpsfm.v1.UploadFinishH\x00\x42\t\n\x07message\"^\n\x0bUploadStart\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x16\n\tupload_id\x18\x02 \x01(\tB\x03\xe0\x41\x02\x12\x17\n\nsize_bytes\x18\x03 \x01(\x03\x42\x03\xe0\x41\x02\x12\x0e\n\x06sha256\x18\x04 \x01(\x0c\"E\n\x0bUploadChunk\x12\x0e\n\x06offset\x18\x01 \x01(\x03\x12\x11\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x42\x03\xe0\x41\x02\x12\x13\n\x06\x63rc32c\x18\x03 \x01(\x07\x42\x03\xe0\x41\x02\"#\n\x0cUploadFinish\x12\x13\n\x06sha256\x18\x01 \x01(\x0c\x42\x03\xe0\x41\x02\"@\n\x16GetUploadStatusRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x16\n\tupload_id\x18\x02 \x01(\tB\x03\xe0\x41\x02\"\\\n\x0cUploadStatus\x12\x17\n\x0f\x63ommitted_bytes\x18\x01 \x01(\x03\x12\x1f\n\x05input\x18\x02 \x01(\x0b\x32\x10.scpsfm.v1.Input\x12\x12\n\nsize_bytes\x18\x03 \x01(\x03\"J\n\x11ListInputsRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\x05\x12\x12\n\npage_token\x18\x03 \x01(\t\"O\n\x12ListInputsResponse\x12 \n\x06inputs\x18\x01 \x03(\x0b\x32\x10.scpsfm.v1.Input\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"\'\n\x12\x44\x65leteInputRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x32\xb3\x03\n\x0cInputService\x12@\n\x0bUploadInput\x12\x1d.scpsfm.v1.UploadInputRequest\x1a\x10.scpsfm.v1.Input(\x01\x12\x81\x01\n\x0fGetUploadStatus\x12!.scpsfm.v1.GetUploadStatusRequest\x1a\x17.scpsfm.v1.UploadStatus\"2\x82\xd3\xe4\x93\x02,\x12*/v1/{parent=tenants/*}/uploads/{upload_id}\x12p\n\nListInputs\x12\x1c.scpsfm.v1.ListInputsRequest\x1a\x1d.scpsfm.v1.ListInputsResponse\"%\x82\xd3\xe4\x93\x02\x1f\x12\x1d/v1/{parent=tenants/*}/inputs\x12k\n\x0b\x44\x65leteInput\x12\x1d.scpsfm.v1.DeleteInputRequest\x1a\x16.google.protobuf.Empty\"%\x82\xd3\xe4\x93\x02\x1f*\x1d/v1/{name=tenants/*/inputs/*}b\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -39,24 +40,30 @@ if _descriptor._USE_C_DESCRIPTORS == False:
   _globals['_GETUPLOADSTATUSREQUEST'].fields_by_name['upload_id']._serialized_options = b'\340A\002'
   _globals['_DELETEINPUTREQUEST'].fields_by_name['name']._options = None
   _globals['_DELETEINPUTREQUEST'].fields_by_name['name']._serialized_options = b'\340A\002'
-  _globals['_UPLOADINPUTREQUEST']._serialized_start=130
-  _globals['_UPLOADINPUTREQUEST']._serialized_end=286
-  _globals['_UPLOADSTART']._serialized_start=288
-  _globals['_UPLOADSTART']._serialized_end=382
-  _globals['_UPLOADCHUNK']._serialized_start=384
-  _globals['_UPLOADCHUNK']._serialized_end=453
-  _globals['_UPLOADFINISH']._serialized_start=455
-  _globals['_UPLOADFINISH']._serialized_end=490
-  _globals['_GETUPLOADSTATUSREQUEST']._serialized_start=492
-  _globals['_GETUPLOADSTATUSREQUEST']._serialized_end=556
-  _globals['_UPLOADSTATUS']._serialized_start=558
-  _globals['_UPLOADSTATUS']._serialized_end=650
-  _globals['_LISTINPUTSREQUEST']._serialized_start=652
-  _globals['_LISTINPUTSREQUEST']._serialized_end=726
-  _globals['_LISTINPUTSRESPONSE']._serialized_start=728
-  _globals['_LISTINPUTSRESPONSE']._serialized_end=807
-  _globals['_DELETEINPUTREQUEST']._serialized_start=809
-  _globals['_DELETEINPUTREQUEST']._serialized_end=848
-  _globals['_INPUTSERVICE']._serialized_start=851
-  _globals['_INPUTSERVICE']._serialized_end=1155
+  _globals['_INPUTSERVICE'].methods_by_name['GetUploadStatus']._options = None
+  _globals['_INPUTSERVICE'].methods_by_name['GetUploadStatus']._serialized_options = b'\202\323\344\223\002,\022*/v1/{parent=tenants/*}/uploads/{upload_id}'
+  _globals['_INPUTSERVICE'].methods_by_name['ListInputs']._options = None
+  _globals['_INPUTSERVICE'].methods_by_name['ListInputs']._serialized_options = b'\202\323\344\223\002\037\022\035/v1/{parent=tenants/*}/inputs'
+  _globals['_INPUTSERVICE'].methods_by_name['DeleteInput']._options = None
+  _globals['_INPUTSERVICE'].methods_by_name['DeleteInput']._serialized_options = b'\202\323\344\223\002\037*\035/v1/{name=tenants/*/inputs/*}'
+  _globals['_UPLOADINPUTREQUEST']._serialized_start=160
+  _globals['_UPLOADINPUTREQUEST']._serialized_end=316
+  _globals['_UPLOADSTART']._serialized_start=318
+  _globals['_UPLOADSTART']._serialized_end=412
+  _globals['_UPLOADCHUNK']._serialized_start=414
+  _globals['_UPLOADCHUNK']._serialized_end=483
+  _globals['_UPLOADFINISH']._serialized_start=485
+  _globals['_UPLOADFINISH']._serialized_end=520
+  _globals['_GETUPLOADSTATUSREQUEST']._serialized_start=522
+  _globals['_GETUPLOADSTATUSREQUEST']._serialized_end=586
+  _globals['_UPLOADSTATUS']._serialized_start=588
+  _globals['_UPLOADSTATUS']._serialized_end=680
+  _globals['_LISTINPUTSREQUEST']._serialized_start=682
+  _globals['_LISTINPUTSREQUEST']._serialized_end=756
+  _globals['_LISTINPUTSRESPONSE']._serialized_start=758
+  _globals['_LISTINPUTSRESPONSE']._serialized_end=837
+  _globals['_DELETEINPUTREQUEST']._serialized_start=839
+  _globals['_DELETEINPUTREQUEST']._serialized_end=878
+  _globals['_INPUTSERVICE']._serialized_start=881
+  _globals['_INPUTSERVICE']._serialized_end=1316
 # @@protoc_insertion_point(module_scope)

@@ -13,6 +13,7 @@ from google.protobuf.internal import builder as _builder
 _sym_db = _symbol_database.Default()
 
 
+from google.api import annotations_pb2 as google_dot_api_dot_annotations__pb2
 from google.api import field_behavior_pb2 as google_dot_api_dot_field__behavior__pb2
 from google.protobuf import empty_pb2 as google_dot_protobuf_dot_empty__pb2
 from . import input_pb2 as scpsfm_dot_v1_dot_input__pb2
@@ -20,7 +21,7 @@ from . import job_pb2 as scpsfm_dot_v1_dot_job__pb2
 from . import result_pb2 as scpsfm_dot_v1_dot_result__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bscpsfm/v1/job_service.proto\x12\tscpsfm.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a\x1bgoogle/protobuf/empty.proto\x1a\x15scpsfm/v1/input.proto\x1a\x13scpsfm/v1/job.proto\x1a\x16scpsfm/v1/result.proto\"\xe4\x01\n\x10\x43reateJobRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x0e\n\x06job_id\x18\x02 \x01(\t\x12\x1b\n\x03job\x18\x03 \x01(\x0b\x32\x0e.scpsfm.v1.Job\x12\x12\n\nrequest_id\x18\x04 \x01(\t\x12(\n\ttrack_set\x18\x05 \x01(\x0b\x32\x13.scpsfm.v1.TrackSetH\x00\x12:\n\x12measurement_matrix\x18\x06 \x01(\x0b\x32\x1c.scpsfm.v1.MeasurementMatrixH\x00\x12\x0f\n\x05input\x18\x07 \x01(\tH\x00\x42\x08\n\x06source\"\\\n\x16\x42\x61tchCreateJobsRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x32\n\x08requests\x18\x02 \x03(\x0b\x32\x1b.scpsfm.v1.CreateJobRequestB\x03\xe0\x41\x02\"7\n\x17\x42\x61tchCreateJobsResponse\x12\x1c\n\x04jobs\x18\x01 \x03(\x0b\x32\x0e.scpsfm.v1.Job\"\"\n\rGetJobRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\"j\n\x0fListJobsRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\x05\x12\x12\n\npage_token\x18\x03 \x01(\t\x12\x0e\n\x06\x66ilter\x18\x04 \x01(\t\x12\x10\n\x08order_by\x18\x05 \x01(\t\"I\n\x10ListJobsResponse\x12\x1c\n\x04jobs\x18\x01 \x03(\x0b\x32\x0e.scpsfm.v1.Job\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"<\n\x0fWatchJobRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x12\x16\n\x0e\x61\x66ter_sequence\x18\x02 \x01(\x04\"3\n\x10\x43\x61ncelJobRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x12\x0c\n\x04\x65tag\x18\x02 \x01(\t\"3\n\x10\x44\x65leteJobRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x12\x0c\n\x04\x65tag\x18\x02 \x01(\t\"(\n\x13GetJobResultRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\"9\n\x14ReadJobResultRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x12\x0e\n\x06offset\x18\x02 \x01(\x03\"O\n\x0bResultChunk\x12\x0c\n\x04\x64\x61ta\x18\x01 \x01(\x0c\x12\x0e\n\x06offset\x18\x02 \x01(\x03\x12\x12\n\ntotal_size\x18\x03 \x01(\x03\x12\x0e\n\x06sha256\x18\x04 \x01(\x0c\x32\xe6\x04\n\nJobService\x12\x38\n\tCreateJob\x12\x1b.scpsfm.v1.CreateJobRequest\x1a\x0e.scpsfm.v1.Job\x12X\n\x0f\x42\x61tchCreateJobs\x12!.scpsfm.v1.BatchCreateJobsRequest\x1a\".scpsfm.v1.BatchCreateJobsResponse\x12\x32\n\x06GetJob\x12\x18.scpsfm.v1.GetJobRequest\x1a\x0e.scpsfm.v1.Job\x12\x43\n\x08ListJobs\x12\x1a.scpsfm.v1.ListJobsRequest\x1a\x1b.scpsfm.v1.ListJobsResponse\x12=\n\x08WatchJob\x12\x1a.scpsfm.v1.WatchJobRequest\x1a\x13.scpsfm.v1.JobEvent0\x01\x12\x38\n\tCancelJob\x12\x1b.scpsfm.v1.CancelJobRequest\x1a\x0e.scpsfm.v1.Job\x12@\n\tDeleteJob\x12\x1b.scpsfm.v1.DeleteJobRequest\x1a\x16.google.protobuf.Empty\x12\x44\n\x0cGetJobResult\x12\x1e.scpsfm.v1.GetJobResultRequest\x1a\x14.scpsfm.v1.JobResult\x12J\n\rReadJobResult\x12\x1f.scpsfm.v1.ReadJobResultRequest\x1a\x16.scpsfm.v1.ResultChunk0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bscpsfm/v1/job_service.proto\x12\tscpsfm.v1\x1a\x1cgoogle/api/annotations.proto\x1a\x1fgoogle/api/field_behavior.proto\x1a\x1bgoogle/protobuf/empty.proto\x1a\x15scpsfm/v1/input.proto\x1a\x13scpsfm/v1/job.proto\x1a\x16scpsfm/v1/result.proto\"\xe4\x01\n\x10\x43reateJobRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x0e\n\x06job_id\x18\x02 \x01(\t\x12\x1b\n\x03job\x18\x03 \x01(\x0b\x32\x0e.scpsfm.v1.Job\x12\x12\n\nrequest_id\x18\x04 \x01(\t\x12(\n\ttrack_set\x18\x05 \x01(\x0b\x32\x13.scpsfm.v1.TrackSetH\x00\x12:\n\x12measurement_matrix\x18\x06 \x01(\x0b\x32\x1c.scpsfm.v1.MeasurementMatrixH\x00\x12\x0f\n\x05input\x18\x07 \x01(\tH\x00\x42\x08\n\x06source\"\\\n\x16\x42\x61tchCreateJobsRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x32\n\x08requests\x18\x02 \x03(\x0b\x32\x1b.scpsfm.v1.CreateJobRequestB\x03\xe0\x41\x02\"7\n\x17\x42\x61tchCreateJobsResponse\x12\x1c\n\x04jobs\x18\x01 \x03(\x0b\x32\x0e.scpsfm.v1.Job\"\"\n\rGetJobRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\"j\n\x0fListJobsRequest\x12\x0e\n\x06parent\x18\x01 \x01(\t\x12\x11\n\tpage_size\x18\x02 \x01(\x05\x12\x12\n\npage_token\x18\x03 \x01(\t\x12\x0e\n\x06\x66ilter\x18\x04 \x01(\t\x12\x10\n\x08order_by\x18\x05 \x01(\t\"I\n\x10ListJobsResponse\x12\x1c\n\x04jobs\x18\x01 \x03(\x0b\x32\x0e.scpsfm.v1.Job\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"<\n\x0fWatchJobRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x12\x16\n\x0e\x61\x66ter_sequence\x18\x02 \x01(\x04\"3\n\x10\x43\x61ncelJobRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x12\x0c\n\x04\x65tag\x18\x02 \x01(\t\"3\n\x10\x44\x65leteJobRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x12\x0c\n\x04\x65tag\x18\x02 \x01(\t\"(\n\x13GetJobResultRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\"9\n\x14ReadJobResultRequest\x12\x11\n\x04name\x18\x01 \x01(\tB\x03\xe0\x41\x02\x12\x0e\n\x06offset\x18\x02 \x01(\x03\"O\n\x0bResultChunk\x12\x0c\n\x04\x64\x61ta\x18\x01 \x01(\x0c\x12\x0e\n\x06offset\x18\x02 \x01(\x03\x12\x12\n\ntotal_size\x18\x03 \x01(\x03\x12\x0e\n\x06sha256\x18\x04 \x01(\x0c\x32\xb9\x07\n\nJobService\x12`\n\tCreateJob\x12\x1b.scpsfm.v1.CreateJobRequest\x1a\x0e.scpsfm.v1.Job\"&\x82\xd3\xe4\x93\x02 \"\x1b/v1/{parent=tenants/*}/jobs:\x01*\x12\x8c\x01\n\x0f\x42\x61tchCreateJobs\x12!.scpsfm.v1.BatchCreateJobsRequest\x1a\".scpsfm.v1.BatchCreateJobsResponse\"2\x82\xd3\xe4\x93\x02,\"\'/v1/{parent=tenants/*}/jobs:batchCreate:\x01*\x12W\n\x06GetJob\x12\x18.scpsfm.v1.GetJobRequest\x1a\x0e.scpsfm.v1.Job\"#\x82\xd3\xe4\x93\x02\x1d\x12\x1b/v1/{name=tenants/*/jobs/*}\x12h\n\x08ListJobs\x12\x1a.scpsfm.v1.ListJobsRequest\x1a\x1b.scpsfm.v1.ListJobsResponse\"#\x82\xd3\xe4\x93\x02\x1d\x12\x1b/v1/{parent=tenants/*}/jobs\x12i\n\x08WatchJob\x12\x1a.scpsfm.v1.WatchJobRequest\x1a\x13.scpsfm.v1.JobEvent\"*\x82\xd3\xe4\x93\x02$\x12\"/v1/{name=tenants/*/jobs/*}/events0\x01\x12g\n\tCancelJob\x12\x1b.scpsfm.v1.CancelJobRequest\x1a\x0e.scpsfm.v1.Job\"-\x82\xd3\xe4\x93\x02\'\"\"/v1/{name=tenants/*/jobs/*}:cancel:\x01*\x12\x65\n\tDeleteJob\x12\x1b.scpsfm.v1.DeleteJobRequest\x1a\x16.google.protobuf.Empty\"#\x82\xd3\xe4\x93\x02\x1d*\x1b/v1/{name=tenants/*/jobs/*}\x12p\n\x0cGetJobResult\x12\x1e.scpsfm.v1.GetJobResultRequest\x1a\x14.scpsfm.v1.JobResult\"*\x82\xd3\xe4\x93\x02$\x12\"/v1/{name=tenants/*/jobs/*}/result\x12J\n\rReadJobResult\x12\x1f.scpsfm.v1.ReadJobResultRequest\x1a\x16.scpsfm.v1.ResultChunk0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -41,30 +42,46 @@ if _descriptor._USE_C_DESCRIPTORS == False:
   _globals['_GETJOBRESULTREQUEST'].fields_by_name['name']._serialized_options = b'\340A\002'
   _globals['_READJOBRESULTREQUEST'].fields_by_name['name']._options = None
   _globals['_READJOBRESULTREQUEST'].fields_by_name['name']._serialized_options = b'\340A\002'
-  _globals['_CREATEJOBREQUEST']._serialized_start=173
-  _globals['_CREATEJOBREQUEST']._serialized_end=401
-  _globals['_BATCHCREATEJOBSREQUEST']._serialized_start=403
-  _globals['_BATCHCREATEJOBSREQUEST']._serialized_end=495
-  _globals['_BATCHCREATEJOBSRESPONSE']._serialized_start=497
-  _globals['_BATCHCREATEJOBSRESPONSE']._serialized_end=552
-  _globals['_GETJOBREQUEST']._serialized_start=554
-  _globals['_GETJOBREQUEST']._serialized_end=588
-  _globals['_LISTJOBSREQUEST']._serialized_start=590
-  _globals['_LISTJOBSREQUEST']._serialized_end=696
-  _globals['_LISTJOBSRESPONSE']._serialized_start=698
-  _globals['_LISTJOBSRESPONSE']._serialized_end=771
-  _globals['_WATCHJOBREQUEST']._serialized_start=773
-  _globals['_WATCHJOBREQUEST']._serialized_end=833
-  _globals['_CANCELJOBREQUEST']._serialized_start=835
-  _globals['_CANCELJOBREQUEST']._serialized_end=886
-  _globals['_DELETEJOBREQUEST']._serialized_start=888
-  _globals['_DELETEJOBREQUEST']._serialized_end=939
-  _globals['_GETJOBRESULTREQUEST']._serialized_start=941
-  _globals['_GETJOBRESULTREQUEST']._serialized_end=981
-  _globals['_READJOBRESULTREQUEST']._serialized_start=983
-  _globals['_READJOBRESULTREQUEST']._serialized_end=1040
-  _globals['_RESULTCHUNK']._serialized_start=1042
-  _globals['_RESULTCHUNK']._serialized_end=1121
-  _globals['_JOBSERVICE']._serialized_start=1124
-  _globals['_JOBSERVICE']._serialized_end=1738
+  _globals['_JOBSERVICE'].methods_by_name['CreateJob']._options = None
+  _globals['_JOBSERVICE'].methods_by_name['CreateJob']._serialized_options = b'\202\323\344\223\002 \"\033/v1/{parent=tenants/*}/jobs:\001*'
+  _globals['_JOBSERVICE'].methods_by_name['BatchCreateJobs']._options = None
+  _globals['_JOBSERVICE'].methods_by_name['BatchCreateJobs']._serialized_options = b'\202\323\344\223\002,\"\'/v1/{parent=tenants/*}/jobs:batchCreate:\001*'
+  _globals['_JOBSERVICE'].methods_by_name['GetJob']._options = None
+  _globals['_JOBSERVICE'].methods_by_name['GetJob']._serialized_options = b'\202\323\344\223\002\035\022\033/v1/{name=tenants/*/jobs/*}'
+  _globals['_JOBSERVICE'].methods_by_name['ListJobs']._options = None
+  _globals['_JOBSERVICE'].methods_by_name['ListJobs']._serialized_options = b'\202\323\344\223\002\035\022\033/v1/{parent=tenants/*}/jobs'
+  _globals['_JOBSERVICE'].methods_by_name['WatchJob']._options = None
+  _globals['_JOBSERVICE'].methods_by_name['WatchJob']._serialized_options = b'\202\323\344\223\002$\022\"/v1/{name=tenants/*/jobs/*}/events'
+  _globals['_JOBSERVICE'].methods_by_name['CancelJob']._options = None
+  _globals['_JOBSERVICE'].methods_by_name['CancelJob']._serialized_options = b'\202\323\344\223\002\'\"\"/v1/{name=tenants/*/jobs/*}:cancel:\001*'
+  _globals['_JOBSERVICE'].methods_by_name['DeleteJob']._options = None
+  _globals['_JOBSERVICE'].methods_by_name['DeleteJob']._serialized_options = b'\202\323\344\223\002\035*\033/v1/{name=tenants/*/jobs/*}'
+  _globals['_JOBSERVICE'].methods_by_name['GetJobResult']._options = None
+  _globals['_JOBSERVICE'].methods_by_name['GetJobResult']._serialized_options = b'\202\323\344\223\002$\022\"/v1/{name=tenants/*/jobs/*}/result'
+  _globals['_CREATEJOBREQUEST']._serialized_start=203
+  _globals['_CREATEJOBREQUEST']._serialized_end=431
+  _globals['_BATCHCREATEJOBSREQUEST']._serialized_start=433
+  _globals['_BATCHCREATEJOBSREQUEST']._serialized_end=525
+  _globals['_BATCHCREATEJOBSRESPONSE']._serialized_start=527
+  _globals['_BATCHCREATEJOBSRESPONSE']._serialized_end=582
+  _globals['_GETJOBREQUEST']._serialized_start=584
+  _globals['_GETJOBREQUEST']._serialized_end=618
+  _globals['_LISTJOBSREQUEST']._serialized_start=620
+  _globals['_LISTJOBSREQUEST']._serialized_end=726
+  _globals['_LISTJOBSRESPONSE']._serialized_start=728
+  _globals['_LISTJOBSRESPONSE']._serialized_end=801
+  _globals['_WATCHJOBREQUEST']._serialized_start=803
+  _globals['_WATCHJOBREQUEST']._serialized_end=863
+  _globals['_CANCELJOBREQUEST']._serialized_start=865
+  _globals['_CANCELJOBREQUEST']._serialized_end=916
+  _globals['_DELETEJOBREQUEST']._serialized_start=918
+  _globals['_DELETEJOBREQUEST']._serialized_end=969
+  _globals['_GETJOBRESULTREQUEST']._serialized_start=971
+  _globals['_GETJOBRESULTREQUEST']._serialized_end=1011
+  _globals['_READJOBRESULTREQUEST']._serialized_start=1013
+  _globals['_READJOBRESULTREQUEST']._serialized_end=1070
+  _globals['_RESULTCHUNK']._serialized_start=1072
+  _globals['_RESULTCHUNK']._serialized_end=1151
+  _globals['_JOBSERVICE']._serialized_start=1154
+  _globals['_JOBSERVICE']._serialized_end=2107
 # @@protoc_insertion_point(module_scope)
