@@ -79,12 +79,12 @@ def true_result(scene: Scene, job: str = "tenants/default/jobs/true", **calibrat
         message.views.add(projection=P.ravel(), rotation=R.ravel(), translation=t, name=scene.tracks.views[view].name)
     right = scene.right
     message.tracks.weights.extend(right.astype(float))
-    message.tracks.inliers.extend(right)
+    message.tracks.inliers.extend(right.tolist())
     message.tracks.point_tracks.extend(np.flatnonzero(right))
     message.tracks.points.extend(scene.points[right].ravel())
     of_observation = right[scene.tracks.track_index]
     count = len(scene.tracks)
-    message.observations.inliers.extend(of_observation)
+    message.observations.inliers.extend(of_observation.tolist())
     message.observations.judged.extend([True] * count)
     message.observations.residuals_px.extend(np.where(of_observation, 0.5, 99.0))
     message.observations.weights.extend(of_observation.astype(float))

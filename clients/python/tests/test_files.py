@@ -69,6 +69,33 @@ def test_tables_as_people_write_them(tmp_path: Path) -> None:
     assert tracks.lines.tolist() == [4, 5]
 
 
+@pytest.mark.parametrize("extra", ["", "\n", "0"])
+def test_a_plain_table_and_one_that_is_not_are_read_alike(tmp_path: Path, extra: str) -> None:
+    """Blank lines and columns of other names make the reader take the longer way."""
+    seed = 12
+    print(f"seed {seed}")
+    rng = np.random.default_rng(seed)
+    rows = [(v * 7 + 2**60, t * 3, *rng.normal(0, 1e3, 4).tolist()) for v in range(5) for t in range(40)]
+    order = rng.permutation(len(rows))
+    plain = "track,view,x,y,depth,sigma\n"
+    other = plain if extra != "0" else plain.replace("sigma", "sigma,note")
+    for k in order:
+        view, track, x, y, depth, sigma = rows[k]
+        line = f"{track},{view},{x!r},{y!r},{depth!r},{abs(sigma)!r}"
+        plain += line + "\n"
+        other += line + (f",{extra}\n" if extra == "0" else f"\n{extra}")
+    a = Tracks.from_csv(write(tmp_path, "a.csv", plain.removesuffix("\n")))
+    b = Tracks.from_csv(write(tmp_path, "b.csv", other))
+    assert a.to_proto() == b.to_proto()
+    assert (a.view_labels, a.track_labels) == (b.view_labels, b.track_labels)
+    assert a.view_labels == tuple(v * 7 + 2**60 for v in range(5))
+    assert a.lines is not None
+    assert b.lines is not None
+    assert a.lines.tolist() == list(range(2, 202))
+    assert b.lines.tolist() == list(range(2, 402 if extra == "\n" else 202, 2 if extra == "\n" else 1))
+    assert a.x.tolist() == [rows[k][2] for k in order]
+
+
 @pytest.mark.parametrize(
     ("text", "words", "line"),
     [

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import threading
 import uuid
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -424,6 +426,59 @@ def test_tls_and_client_certificates(
     with support.client_of(kind, server.address, retry=NO_PATIENCE, tls_ca=named["tls_ca"]) as client:
         with pytest.raises(scpsfm.Unavailable):
             client.capabilities()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("style", ["sync", "async"])
+def test_ctrl_c_cancels_a_solve(server: support.Server, style: str, tmp_path: Path) -> None:
+    tracks, settings = slow()
+    path = scene.write_csv(tracks, tmp_path / "o.csv")
+    label = str(uuid.uuid4())
+    call = (
+        f"tracks, scpsfm.Settings(method={settings.method!r}, iterations={settings.iterations}), "
+        f"labels={{'run': {label!r}}}, progress=lambda progress: print(progress.fraction, flush=True)"
+    )
+    program = f"import asyncio, scpsfm\ntracks = scpsfm.Tracks.from_csv({str(path)!r})\n"
+    if style == "sync":
+        program += f"scpsfm.Client({server.address!r}).solve({call})\n"
+    else:
+        program += (
+            "async def main():\n"
+            f"    async with scpsfm.AsyncClient({server.address!r}) as client:\n"
+            f"        await client.solve({call})\n"
+            "asyncio.run(main())\n"
+        )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(HERE)},
+    )
+    watchdog = threading.Timer(support.PATIENCE, process.kill)
+    watchdog.start()
+    assert process.stdout is not None
+    assert process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate()
+    watchdog.cancel()
+    assert "KeyboardInterrupt" in err
+    with scpsfm.Client(server.address) as client:
+        (job,) = client.jobs(f'labels.run = "{label}"')
+        assert job.known is not None
+        # Asked for by the program itself, before it ended.
+        assert job.known.cancel_requested or job.known.state == "CANCELLED"
+        assert job.wait().state == "CANCELLED"
+
+
+def test_threads_share_a_client(server: support.Server) -> None:
+    scenes = [scene.make(seed=40 + number, views=5, tracks=60) for number in range(8)]
+    settings = scpsfm.Settings(method="geometry")
+    with scpsfm.Client(server.address) as client, ThreadPoolExecutor(8) as pool:
+        results = list(pool.map(lambda one: client.solve(one.tracks, settings), scenes))
+    for one, result in zip(scenes, results, strict=True):
+        assert result.input is one.tracks
+        assert f1(result.tracks.inlier, one.right) > 0.9
 
 
 # Crashes.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..tracks import MAX_SIDE_PX, FocalPrior, Label, Tracks, View
 from .problems import Problems, dense, number, of_file, quote, whole
@@ -80,6 +82,11 @@ def read_csv(
             if text.startswith(_OPENSFM):
                 raise of_file(path, "is an OpenSfM tracks.csv; see Tracks.from_opensfm")
             header, places = _header(path, line, text)
+            quick = _quick(path, header, line)
+            if quick is not None:
+                return _labelled(
+                    kind, path, quick, np.arange(line + 1, line + 1 + len(quick["x"])), size, names, focal_prior
+                )
             columns = [(name, whole if name in ("view", "track") else number) for name in _REQUIRED]
             columns += [(name, number) for name in _OPTIONAL if name in header]
             rows = {name: [] for name, _ in columns}
@@ -104,27 +111,71 @@ def read_csv(
     problems.raise_any()
     if not lines:
         raise of_file(path, "has a header but no observations")
-    view_labels, view_of = dense(rows["view"])
-    track_labels, track_of = dense(rows["track"])
-    unknown = sorted(set(names or ()) - set(view_labels), key=str)
+    columns_of = {
+        name: np.array(row, np.uint64 if parse is whole else np.float64)
+        for (name, parse), row in zip(columns, rows.values(), strict=True)
+    }
+    return _labelled(kind, path, columns_of, np.array(lines, dtype=np.int64), size, names, focal_prior)
+
+
+def _quick(path: Path, header: list[str], line: int) -> dict[str, NDArray[Any]] | None:
+    """The columns of a table that is as plain as can be; `None` where it is not, or where anything is wrong.
+
+    What is wrong is then told by whoever reads line by line, which takes ten times as long.
+    """
+    if set(header) - {*_REQUIRED, *_OPTIONAL}:
+        return None
+    kinds = np.dtype([(name, np.uint64 if name in ("view", "track") else np.float64) for name in header])
+    try:
+        with path.open("rb") as file:
+            blocks = iter(lambda: file.read(1 << 20), b"")
+            ends = last = 0
+            for block in blocks:
+                ends += block.count(b"\n")
+                last = block[-1]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            table = np.loadtxt(path, kinds, comments=None, delimiter=",", skiprows=line, encoding="utf-8", ndmin=1)
+    except (ValueError, OverflowError, Warning):
+        return None
+    # Blank lines have been left out: then the lines of the observations are not known.
+    if len(table) == 0 or len(table) != ends - line + (last != ord("\n")):
+        return None
+    columns = {name: np.ascontiguousarray(table[name]) for name in header}
+    if any(not np.isfinite(column).all() for column in columns.values()):
+        return None
+    return columns
+
+
+def _labelled(
+    kind: type[Tracks],
+    path: Path,
+    columns: dict[str, NDArray[Any]],
+    lines: NDArray[np.int64],
+    size: tuple[int, int] | None,
+    names: Mapping[int, str] | None,
+    focal_prior: FocalPrior | None,
+) -> Tracks:
+    """The tracks of a table, views and tracks in the ascending order of their numbers."""
+    view_labels, view_index = np.unique(columns["view"], return_inverse=True)
+    track_labels, track_index = np.unique(columns["track"], return_inverse=True)
+    known = [int(label) for label in view_labels]
+    unknown = sorted(set(names or ()) - set(known), key=str)
     if unknown:
         raise of_file(path, f"has no view {unknown[0]}, of which a name is given", field="names")
-    views = tuple(
-        View(name=(names or {}).get(int(label), ""), size=size, focal_prior=focal_prior) for label in view_labels
-    )
     return kind(
-        views=views,
+        views=tuple(View(name=(names or {}).get(label, ""), size=size, focal_prior=focal_prior) for label in known),
         track_count=len(track_labels),
-        view_index=np.array([view_of[view] for view in rows["view"]], dtype=np.uint32),
-        track_index=np.array([track_of[track] for track in rows["track"]], dtype=np.uint32),
-        x=np.array(rows["x"], dtype=np.float64),
-        y=np.array(rows["y"], dtype=np.float64),
-        depth=np.array(rows["depth"], dtype=np.float64) if "depth" in rows else None,
-        sigma_px=np.array(rows["sigma"], dtype=np.float64) if "sigma" in rows else None,
-        view_labels=view_labels,
-        track_labels=track_labels,
+        view_index=view_index.astype(np.uint32),
+        track_index=track_index.astype(np.uint32),
+        x=columns["x"],
+        y=columns["y"],
+        depth=columns.get("depth"),
+        sigma_px=columns.get("sigma"),
+        view_labels=tuple(known),
+        track_labels=tuple(int(label) for label in track_labels),
         file=str(path),
-        lines=np.array(lines, dtype=np.int64),
+        lines=lines,
     )
 
 
