@@ -12,6 +12,15 @@ from . import scene, support
 from .fake import Fake, Running
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Says loudly what was left out."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    left_out = sum(support.NO_SERVER in str(report.longrepr) for report in skipped)
+    if left_out:
+        words = f"SKIPPED {left_out} tests against a real server: SCPSFM_BIN must name its program"
+        terminalreporter.write_sep("!", words, red=True, bold=True)
+
+
 @pytest.fixture(autouse=True)
 def _no_access_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     for variable in ("SCPSFM_API_KEY", "SCPSFM_TENANT"):

@@ -17,6 +17,8 @@ import pytest
 
 import scpsfm
 
+NO_SERVER = "needs a server"
+
 PATIENCE = 60.0
 """Seconds; nothing in these tests takes nearly so long, and what does hangs."""
 
@@ -29,9 +31,7 @@ def binary() -> Path:
     missing = "SCPSFM_BIN names no server" if not named else f"SCPSFM_BIN: there is no file {named}"
     if os.environ.get("SCPSFM_REQUIRE_SERVER") == "1":
         pytest.fail(missing)
-    # Past the capture of output.
-    os.write(2, f"\nSKIPPED {os.environ.get('PYTEST_CURRENT_TEST', '')}: {missing}\n".encode())
-    pytest.skip(missing)
+    pytest.skip(f"{NO_SERVER}: {missing}")
 
 
 class Server:

@@ -297,3 +297,44 @@ def test_colmap_opens_the_database_and_maps_it(small: scene.Scene, result: Resul
         own = back.names.index(image.name)
         keypoints = [point.xy - 0.5 for point in image.points2D if point.has_point3D()]
         assert back.xy[back.view_index == own] == pytest.approx(np.array(keypoints))
+
+
+def test_what_colmap_itself_makes_is_read(tmp_path: Path) -> None:
+    """Its database, of its newest tables, and its model, both of one scene that it synthesises."""
+    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap.set_random_seed(5)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 2, 1, 4, 100
+    database = pycolmap.Database.open(tmp_path / "database.db")
+    model = pycolmap.synthesize_dataset(options, database)
+    database.close()
+    tracks = Tracks.from_colmap_database(tmp_path / "database.db")
+    assert {view.name for view in tracks.views} == {image.name for image in model.images.values()}
+    assert len({view.camera_group for view in tracks.views}) == len(model.cameras) == 2
+    # Each track is one of the model's points, whole.
+    expected = {
+        frozenset((model.images[element.image_id].name, element.point2D_idx) for element in point.track.elements)
+        for point in model.points3D.values()
+    }
+    assert tracks.keypoint_index is not None
+    found: dict[int, set[tuple[str, int]]] = {}
+    for view, track, keypoint in zip(tracks.view_index, tracks.track_index, tracks.keypoint_index, strict=True):
+        found.setdefault(int(track), set()).add((tracks.views[int(view)].name, int(keypoint)))
+    assert {frozenset(members) for members in found.values()} == expected
+    for binary in (True, False):
+        folder = tmp_path / str(binary)
+        folder.mkdir()
+        if binary:
+            model.write_binary(folder)
+        else:
+            model.write_text(folder)
+        again = Tracks.from_colmap_model(folder)
+        assert again.track_count == len(expected)
+        assert again.names == tracks.names
+        by_keypoint = {
+            (int(view), int(keypoint)): tuple(xy)
+            for view, keypoint, xy in zip(again.view_index, again.keypoint_index, again.xy.tolist(), strict=True)
+        }
+        for view, keypoint, xy in zip(tracks.view_index, tracks.keypoint_index, tracks.xy.tolist(), strict=True):
+            # The database has four bytes a coordinate.
+            assert by_keypoint[(int(view), int(keypoint))] == pytest.approx(xy, abs=1e-3)

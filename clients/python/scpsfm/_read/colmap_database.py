@@ -45,7 +45,8 @@ def read_database(kind: type[Tracks], path: Path, matches: str | None, sigma_log
         with closing(sqlite3.connect(uri, uri=True)) as connection:
             connection.execute("PRAGMA trusted_schema = 0")
             return _read(connection, kind, path, matches, sigma_log)
-    except sqlite3.Error as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        # The words of an error may name what the damaged file calls its tables.
         raise of_file(path, f"cannot be read as a COLMAP database: {error}") from None
 
 
