@@ -21,7 +21,7 @@ class RetryPolicy:
 
     Pauses double from `first_pause_s` to `longest_pause_s`, each made longer or shorter by `jitter`. Where the server
     says when to come back (google.rpc.RetryInfo), no pause is shorter than that. Trouble that lasts longer than
-    `patience_s` without any progress is raised.
+    `patience_s` without any progress is raised, and at once where the server asks for a longer pause than is left.
     """
 
     patience_s: float = 35.0

@@ -19,7 +19,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from ._stubs import progress_pb2, result_pb2, settings_pb2
-from .errors import InvalidArgument
+from .errors import InternalError, InvalidArgument
 
 if TYPE_CHECKING:
     from .tracks import Tracks
@@ -99,7 +99,7 @@ def seconds(duration: Any) -> float:
 def _row(values: Any, kind: Any, expected: int | None = None, what: str = "") -> NDArray[Any]:
     array = np.array(values, dtype=kind)
     if expected is not None and len(array) != expected:
-        raise InvalidArgument(f"the result has {len(array)} {what} where {expected} are due", reason="INVALID_RESULT")
+        raise InternalError(f"the result has {len(array)} {what} where {expected} are due", reason="INVALID_RESULT")
     array.setflags(write=False)
     return array
 
@@ -497,7 +497,7 @@ class Result:
             named: Sequence[int | None] = (None,)
         elif len(groups) != len(self.message.calibrations) and not one and self.message.calibrations:
             count = len(self.message.calibrations)
-            raise InvalidArgument(
+            raise InternalError(
                 f"the result has {count} calibrations of {len(groups)} camera groups", reason="INVALID_RESULT"
             )
         else:
@@ -569,6 +569,8 @@ class Result:
         message = self.message.tracks
         inlier = _row(message.inliers, np.bool_)
         count = len(inlier)
+        if len(self.point_tracks) and int(self.point_tracks.max()) >= count:
+            raise InternalError(f"the result has a point of a track beyond its {count}", reason="INVALID_RESULT")
         points = np.full((count, 3), np.nan)
         part = np.full(count, -1, dtype=np.int64)
         points[self.point_tracks] = self.points
@@ -593,7 +595,7 @@ class Result:
         judged = _row(message.judged, np.bool_, count, "verdicts")
         residual = np.array(message.residuals_px, dtype=np.float64)
         if len(residual) != count:
-            raise InvalidArgument(f"the result has {len(residual)} residuals, {count} are due", reason="INVALID_RESULT")
+            raise InternalError(f"the result has {len(residual)} residuals, {count} are due", reason="INVALID_RESULT")
         residual[~judged] = np.nan
         residual.setflags(write=False)
         return ObservationResults(

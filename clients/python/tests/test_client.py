@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import sys
 import threading
 import uuid
 from typing import Any
@@ -563,3 +564,12 @@ def test_a_bar_is_shown(client: Any, small: scene.Scene, capsys: pytest.CaptureF
     shown = capsys.readouterr().err
     assert "search: 100%" in shown
     assert "inliers=5" in shown
+
+
+def test_a_bar_without_tqdm_says_what_to_install(
+    client: Any, fake: Fake, small: scene.Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "tqdm.auto", None)
+    with pytest.raises(ImportError, match=r"scpsfm\[progress\]"):
+        client.solve(small.tracks, progress=True)
+    assert not fake.jobs

@@ -153,6 +153,8 @@ def test_lengths_that_do_not_fit_are_told(small: scene.Scene) -> None:
     for change, words in (
         (lambda message: message.tracks.points.pop(), "coordinates of points"),
         (lambda message: message.tracks.weights.pop(), "weights of tracks"),
+        (lambda message: message.tracks.point_tracks.__setitem__(0, 120), "a track beyond its 120"),
+        (lambda message: message.calibrations.extend([message.calibrations[0]] * 2), "3 calibrations of 1"),
         (lambda message: message.observations.residuals_px.pop(), "residuals"),
         (lambda message: message.observations.judged.pop(), "verdicts"),
         (lambda message: message.views[1].rotation.pop(), "numbers in a rotation"),
@@ -160,7 +162,7 @@ def test_lengths_that_do_not_fit_are_told(small: scene.Scene) -> None:
         message = scene.true_result(small)
         change(message)
         result = Result(message)
-        with pytest.raises(scpsfm.InvalidArgument, match=words):
+        with pytest.raises(scpsfm.InternalError, match=words):
             _ = (result.tracks, result.observations, result.cameras)
 
 
