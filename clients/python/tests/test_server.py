@@ -22,6 +22,7 @@ import scpsfm
 from scpsfm import _flows as flows
 
 from . import scene, support
+from .flaky import Flaky
 
 HERE = Path(__file__).resolve().parent.parent
 NO_PATIENCE = scpsfm.RetryPolicy(patience_s=0.0)
@@ -504,7 +505,38 @@ def test_threads_share_a_client(server: support.Server) -> None:
         assert f1(result.tracks.inlier, one.right) > 0.9
 
 
-# Crashes.
+# Broken networks and crashes.
+
+
+def test_everything_comes_through_a_network_that_breaks(server: support.Server, kind: str) -> None:
+    seed = 30 if kind == "sync" else 31
+    print(f"seed {seed}")
+    rng = np.random.default_rng(seed)
+    host, port = server.address.rpartition("//")[2].split(":")
+    # What a connection may carry grows, so that the longest message gets through at last.
+    grown = iter(range(10_000))
+    flaky = Flaky((host, int(port)), lambda: int(rng.integers(2_000, 60_000) + 20_000 * next(grown)))
+    large = scene.make(seed=seed, views=12, tracks=3000, wrong=0.2)
+    small = scene.make(seed=seed + 10)
+    label = str(uuid.uuid4())
+    quick = scpsfm.RetryPolicy(patience_s=60.0, first_pause_s=0.01, longest_pause_s=0.1)
+    try:
+        with support.client_of(kind, flaky.address, retry=quick, upload_above_bytes=100_000) as client:
+            stored = client.upload(large.tracks)
+            assert stored.observation_count == len(large.tracks)
+            settings = scpsfm.Settings(method="geometry")
+            jobs = [client.submit(small.tracks, settings, labels={"run": label}) for _ in range(10)]
+            for job in jobs:
+                events = list(job.events())
+                assert [event.sequence for event in events] == list(range(1, len(events) + 1))
+                assert job.result().focal_px == pytest.approx(small.focal_px, rel=0.05)
+            solved = client.solve(small.tracks, settings, labels={"run": label})
+            assert solved.focal_px == pytest.approx(small.focal_px, rel=0.05)
+        assert flaky.cuts >= 5
+    finally:
+        flaky.stop()
+    with scpsfm.Client(server.address) as client:
+        assert sum(1 for _ in client.jobs(f'labels.run = "{label}"')) == 11
 
 
 def test_waits_and_uploads_survive_a_crash(kind: str, tmp_path: Path) -> None:
