@@ -170,7 +170,7 @@ class AsyncClient:
 
     async def solve(
         self,
-        tracks: Tracks,
+        tracks: Tracks | InputInfo | str,
         settings: Settings | None = None,
         *,
         labels: Mapping[str, str] | None = None,
@@ -182,10 +182,11 @@ class AsyncClient:
     ) -> Result:
         """Solves while the caller waits; see `Client.solve`. A task that is cancelled cancels the job."""
         options = JobOptions(settings, labels, priority, time_limit, None, request_id)
+        source = tracks.name if isinstance(tracks, InputInfo) else tracks
         told = flows.Told()
         with Watcher(progress) as watcher:
             try:
-                message = await self._run(flows.solve(self._context, tracks, options, told, timeout), watcher)
+                message = await self._run(flows.solve(self._context, source, options, told, timeout), watcher)
             except JobError:
                 raise
             except BaseException:
@@ -193,7 +194,7 @@ class AsyncClient:
                     with contextlib.suppress(Exception):
                         await asyncio.shield(asyncio.ensure_future(self.job(told.name).cancel(timeout=CANCEL_SECONDS)))
                 raise
-        return flows.finished(message, tracks)
+        return flows.finished(message, source)
 
     async def submit(
         self,

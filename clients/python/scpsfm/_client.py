@@ -191,7 +191,7 @@ class Client:
 
     def solve(
         self,
-        tracks: Tracks,
+        tracks: Tracks | InputInfo | str,
         settings: Settings | None = None,
         *,
         labels: Mapping[str, str] | None = None,
@@ -204,7 +204,7 @@ class Client:
         """Solves while the caller waits. A caller that is interrupted, or that gives up, cancels the job.
 
         Args:
-            tracks: The input.
+            tracks: The input; or an uploaded one, or its name.
             settings: How to solve. Left out: the server's defaults.
             labels: The caller's own marks of the job.
             priority: Of the queued jobs, those of larger priority run first. -1000 to 1000.
@@ -220,10 +220,11 @@ class Client:
 
         """
         options = JobOptions(settings, labels, priority, time_limit, None, request_id)
+        source = tracks.name if isinstance(tracks, InputInfo) else tracks
         told = flows.Told()
         with Watcher(progress) as watcher:
             try:
-                message = self._run(flows.solve(self._context, tracks, options, told, timeout), watcher)
+                message = self._run(flows.solve(self._context, source, options, told, timeout), watcher)
             except JobError:
                 raise
             except BaseException:
@@ -231,7 +232,7 @@ class Client:
                     with contextlib.suppress(Exception):
                         self.job(told.name).cancel(timeout=CANCEL_SECONDS)
                 raise
-        return flows.finished(message, tracks)
+        return flows.finished(message, source)
 
     def submit(
         self,

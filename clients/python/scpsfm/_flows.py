@@ -491,7 +491,7 @@ def _read_result(trouble: Trouble, name: str) -> Flow[result_pb2.JobResult]:
 
 
 def solve(
-    context: Context, tracks: Tracks, options: JobOptions, told: Told, timeout: float | None
+    context: Context, tracks: Tracks | str, options: JobOptions, told: Told, timeout: float | None
 ) -> Flow[result_pb2.JobResult]:
     """Creates a job, follows it to its end and reads its result. Emits its events.
 
@@ -500,13 +500,16 @@ def solve(
     """
     trouble = Trouble(context, timeout)
     config = create_request(context, options)
-    is_small = len(tracks) <= SMALL_OBSERVATIONS
-    config.track_set.CopyFrom(tracks.to_proto() if is_small else tracks._head())
+    chunked = tracks if isinstance(tracks, Tracks) and len(tracks) > SMALL_OBSERVATIONS else None
+    if isinstance(tracks, str):
+        config.input = tracks
+    else:
+        config.track_set.CopyFrom(tracks.to_proto() if chunked is None else tracks._head())
 
     def messages() -> Iterator[calibration_service_pb2.SolveRequest]:
         yield calibration_service_pb2.SolveRequest(config=config)
-        if not is_small:
-            for chunk in tracks._chunks():
+        if chunked is not None:
+            for chunk in chunked._chunks():
                 yield calibration_service_pb2.SolveRequest(track_set_chunk=chunk)
 
     while True:

@@ -285,6 +285,11 @@ def test_an_uploaded_input_is_shared_by_jobs(server: support.Server, kind: str, 
         second = client.submit(stored, scpsfm.Settings(method="geometry", seed=1))
         assert second.known.input == stored.name
         assert stored.name in [entry.name for entry in client.inputs()]
+        solved = client.solve(stored, scpsfm.Settings(method="geometry"))
+        assert np.array_equal(solved.tracks.inlier, job.result().tracks.inlier)
+        assert solved.input is None
+        with pytest.raises(scpsfm.InvalidArgument, match="with_tracks"):
+            solved.to_opensfm("nowhere")
         client.delete_input(stored)
         for one in (job, second):
             assert one.result().focal_px == pytest.approx(other.focal_px, rel=0.05)
