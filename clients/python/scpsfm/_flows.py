@@ -185,6 +185,7 @@ def _call(trouble: Trouble, method: str, request: Any) -> Flow[Any]:
         except ScpsfmError as error:
             yield trouble.failed(error)
         else:
+            trouble.backoff.reset()
             return answer
 
 
@@ -373,6 +374,7 @@ def _upload(context: Context, trouble: Trouble, encoded: Encoded) -> Flow[input_
                 error = DataLoss(error.message, reason="", code=grpc.StatusCode.UNAVAILABLE)
             yield trouble.failed(error)
         else:
+            trouble.backoff.reset()
             yield Emit((len(encoded.data), len(encoded.data)))
             return stored
 
