@@ -1,4 +1,4 @@
-//! The README's own client, run as it stands there.
+//! What the documentation shows, run as it stands there.
 
 use std::fs;
 use std::path::Path;
@@ -7,12 +7,12 @@ use std::process::Command;
 use crate::support::program::{Serving, run};
 use crate::support::python::{python, succeeds};
 
-const README: &str = include_str!("../../README.md");
+const API: &str = include_str!("../../docs/api.md");
 
-/// The README's block of this language.
+/// The first block of this language.
 fn block(language: &str) -> &'static str {
     let fence = format!("```{language}\n");
-    let (_, rest) = README.split_once(&fence).expect("the README has such a block");
+    let (_, rest) = API.split_once(&fence).expect("the page has such a block");
     rest.split_once("```").expect("the block ends").0
 }
 
@@ -61,4 +61,19 @@ fn the_python_client_submits_watches_and_reads_the_result() {
     assert!((45..=55).contains(&inliers), "{inliers} of 50 inliers");
     let focal_px: f64 = answer("focal").parse().expect("a focal length");
     assert!((focal_px / true_focal_px - 1.0).abs() < 0.05, "{focal_px} instead of {true_focal_px}");
+}
+
+#[test]
+fn the_files_of_a_solve_reproject_by_the_equations_of_their_page() {
+    let Some(python) = python("the equations of docs/results.md", "numpy") else { return };
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let (scene, out) = (directory.path().join("scene"), directory.path().join("out"));
+    let text = |path: &Path| path.to_str().expect("a text").to_owned();
+    let made = run(["synth", "--photographed", "--seed", "16", "--out", &text(&scene)]);
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let input = scene.join("observations.csv");
+    let size = ["--width", "1600", "--height", "1200"];
+    let solved = run(["solve", &text(&input), "--out", &text(&out)].into_iter().chain(size));
+    assert_eq!(solved.code, Some(0), "{solved:?}");
+    succeeds(Command::new(&python).arg("docs/examples/reproject.py").arg(&out).arg(&input));
 }
