@@ -124,10 +124,12 @@ impl Service {
                 drain.await
             }
         };
-        if let Some(http) = self.http {
-            http.shutdown(CALLS_BOUND).await;
-        }
-        let calls_ended = self.server.shutdown(CALLS_BOUND).await;
+        let http_ended = async {
+            if let Some(http) = self.http {
+                http.shutdown(CALLS_BOUND).await;
+            }
+        };
+        let (calls_ended, ()) = tokio::join!(self.server.shutdown(CALLS_BOUND), http_ended);
         close(&*self.store).await;
         calls_ended.map(|()| drained).map_err(Failure::internal)
     }
@@ -146,7 +148,8 @@ async fn bind(
 ) -> Result<(Server, Option<http::Server>), Failure> {
     let server = Server::bind(options, engine).await.map_err(Failure::internal)?;
     let Some(listen) = config.http.listen else { return Ok((server, None)) };
-    let options = http::Options { listen, max_body_bytes: config.http.max_body_bytes };
+    let hosts = config.http.hosts.split(',').map(|host| host.trim().to_owned()).filter(|host| !host.is_empty());
+    let options = http::Options { listen, max_body_bytes: config.http.max_body_bytes, hosts: hosts.collect() };
     let http = http::Server::bind(options, server.gateway()).await.map_err(Failure::internal)?;
     Ok((server, Some(http)))
 }

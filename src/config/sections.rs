@@ -73,6 +73,9 @@ pub struct Http {
     pub listen: Option<SocketAddr>,
     /// Largest body of JSON.
     pub max_body_bytes: usize,
+    /// Names of hosts under which the port is reached, separated by commas; of no use with keys. Without keys only
+    /// addresses and localhost are answered else: a page could have its own name point to this machine.
+    pub hosts: String,
 }
 
 impl Default for Http {
@@ -81,6 +84,7 @@ impl Default for Http {
             // Loopback, as gRPC's; 8080 is the customary port for HTTP that needs no rights.
             listen: Some(SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080)),
             max_body_bytes: crate::http::MAX_BODY_BYTES,
+            hosts: String::new(),
         }
     }
 }

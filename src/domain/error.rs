@@ -5,10 +5,12 @@ use std::fmt;
 /// One rule that one field breaks.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Violation {
-    /// Path of the field in the API's spelling, without an index: `track_set.xs`, `settings.alpha`.
+    /// Path of the field in the API's spelling, without an index: `track_set.xs`, `job.settings.alpha`.
     pub field: String,
     /// Element of a repeated field, counted from 0.
     pub index: Option<usize>,
+    /// Field of that element: `name`, `size.width_px`.
+    pub part: Option<String>,
     /// What is wrong and what would be right, in lower case.
     pub description: String,
 }
@@ -16,20 +18,24 @@ pub struct Violation {
 impl Violation {
     /// A violation of a field as a whole.
     pub fn of(field: impl Into<String>, description: impl Into<String>) -> Self {
-        Self { field: field.into(), index: None, description: description.into() }
+        Self { field: field.into(), index: None, part: None, description: description.into() }
     }
 
     /// A violation of one element of a repeated field.
     pub fn at(field: impl Into<String>, index: usize, description: impl Into<String>) -> Self {
-        Self { field: field.into(), index: Some(index), description: description.into() }
+        Self { field: field.into(), index: Some(index), part: None, description: description.into() }
     }
 
-    /// The field with its index, as it is shown to callers: `track_set.xs[17]`.
+    /// The same of a field of the element.
+    pub fn within(self, part: &str) -> Self {
+        Self { part: Some(part.to_owned()), ..self }
+    }
+
+    /// The field with its index, as it is shown to callers: `track_set.xs[17]`, `track_set.views[2].name`.
     pub fn path(&self) -> String {
-        match self.index {
-            Some(index) => format!("{}[{index}]", self.field),
-            None => self.field.clone(),
-        }
+        let index = self.index.map_or_else(String::new, |index| format!("[{index}]"));
+        let part = self.part.as_ref().map_or_else(String::new, |part| format!(".{part}"));
+        format!("{}{index}{part}", self.field)
     }
 }
 

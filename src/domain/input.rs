@@ -286,39 +286,31 @@ fn check_views(views: &[View], field: &impl Fn(&str) -> String, found: &mut Viol
     for (index, view) in views.iter().enumerate() {
         if let Some(name) = view.name.as_deref() {
             if let Err(description) = View::check_name(name) {
-                found.push(Violation::at(field("views"), index, description));
+                found.push(Violation::at(field("views"), index, description).within("name"));
             }
             if let Some(first) = names.insert(name, index) {
                 let description = format!("the name {} is that of view {first} too", quoted(name));
-                found.push(Violation::at(field("views"), index, description));
+                found.push(Violation::at(field("views"), index, description).within("name"));
             }
         }
-        if let Some(size) = view.size {
-            let sides = [size.width_px, size.height_px];
-            if sides.iter().any(|&side| side == 0 || side > ImageSize::MAX_SIDE_PX) {
-                found.push(Violation::at(
-                    field("views"),
-                    index,
-                    format!(
-                        "size {} x {} px is not within 1..={}; leave both out when unknown",
-                        size.width_px,
-                        size.height_px,
-                        ImageSize::MAX_SIDE_PX
-                    ),
-                ));
+        if let Some(ImageSize { width_px, height_px }) = view.size {
+            for (part, side) in [("size.width_px", width_px), ("size.height_px", height_px)] {
+                if side == 0 || side > ImageSize::MAX_SIDE_PX {
+                    let most = ImageSize::MAX_SIDE_PX;
+                    let description = format!(
+                        "size {width_px} x {height_px} px is not within 1..={most}; leave both out when unknown"
+                    );
+                    found.push(Violation::at(field("views"), index, description).within(part));
+                }
             }
         }
-        if let Some(prior) = view.focal_prior {
-            let positive = |value: f64| value.is_finite() && value > 0.0;
-            if !positive(prior.focal_px) || !positive(prior.sigma_log) {
-                found.push(Violation::at(
-                    field("views"),
-                    index,
-                    format!(
-                        "focal prior {} px with sigma {} is not positive and finite",
-                        prior.focal_px, prior.sigma_log
-                    ),
-                ));
+        if let Some(FocalPrior { focal_px, sigma_log }) = view.focal_prior {
+            for (part, value) in [("focal_prior.focal_px", focal_px), ("focal_prior.sigma_log", sigma_log)] {
+                if !(value.is_finite() && value > 0.0) {
+                    let description =
+                        format!("focal prior {focal_px} px with sigma {sigma_log} is not positive and finite");
+                    found.push(Violation::at(field("views"), index, description).within(part));
+                }
             }
         }
     }
@@ -457,7 +449,7 @@ pub(super) mod tests {
         assert_eq!(with(&|raw| raw.track_count = 0), ["track_set.track_count"]);
         assert_eq!(with(&|raw| raw.views.truncate(1)), ["track_set.views"]);
         let half_a_size = View { size: Some(ImageSize { width_px: 640, height_px: 0 }), ..View::default() };
-        assert_eq!(with(&|raw| raw.views[1] = half_a_size.clone()), ["track_set.views[1]"]);
+        assert_eq!(with(&|raw| raw.views[1] = half_a_size.clone()), ["track_set.views[1].size.height_px"]);
         assert_eq!(
             with(&|raw| raw.view = vec![0, 0, 0, 0]),
             ["track_set.track_indices[3]", "track_set.track_indices[1]", "track_set.view_indices"]

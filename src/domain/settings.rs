@@ -149,7 +149,7 @@ impl SolveSettings {
         let mut positive = |name: &str, value: f64| {
             if !(value.is_finite() && value > 0.0) {
                 found.push(Violation::of(
-                    format!("settings.{name}"),
+                    format!("job.settings.{name}"),
                     format!("{value} is not a positive finite number"),
                 ));
             }
@@ -163,29 +163,29 @@ impl SolveSettings {
             positive("noise_px", noise_px);
         }
         if !(self.beta.is_finite() && self.beta >= 0.0) {
-            found.push(Violation::of("settings.beta", format!("{} is not a finite number >= 0", self.beta)));
+            found.push(Violation::of("job.settings.beta", format!("{} is not a finite number >= 0", self.beta)));
         }
         if self.network_width > Self::MAX_NETWORK_WIDTH {
             found.push(Violation::of(
-                "settings.network_width",
+                "job.settings.network_width",
                 format!("{} is above the largest width {}", self.network_width, Self::MAX_NETWORK_WIDTH),
             ));
         }
         if self.learning_rate > Self::MAX_LEARNING_RATE {
             found.push(Violation::of(
-                "settings.learning_rate",
+                "job.settings.learning_rate",
                 format!("{} is above the largest rate {}", self.learning_rate, Self::MAX_LEARNING_RATE),
             ));
         }
         if let Some(noise_px) = self.noise_px.filter(|noise_px| *noise_px > Self::MAX_NOISE_PX) {
             found.push(Violation::of(
-                "settings.noise_px",
+                "job.settings.noise_px",
                 format!("{noise_px} is above the largest noise {}, in pixels", Self::MAX_NOISE_PX),
             ));
         }
         if self.iterations == 0 || self.iterations > Self::MAX_ITERATIONS {
             found.push(Violation::of(
-                "settings.iterations",
+                "job.settings.iterations",
                 format!("{} is not in 1..={}", self.iterations, Self::MAX_ITERATIONS),
             ));
         }

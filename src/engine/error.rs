@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::domain::job::{JobName, JobState};
 use crate::domain::{InputName, InvalidInput, Oversize, Violation};
-use crate::store;
+use crate::store::{self, TakenId};
 
 /// Why the engine refused or could not answer.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -26,7 +26,7 @@ pub enum Error {
     UploadTooLarge(Oversize),
     /// The job id is taken, or the request id or upload id stands for another body.
     #[error("{0}")]
-    AlreadyExists(String),
+    AlreadyExists(TakenId),
     /// Too much waits already; `bound` names for programs what there is too much of.
     #[error("{message}; try again in {} s", .retry_after.as_secs_f64())]
     QueueFull { retry_after: Duration, bound: &'static str, message: String },
@@ -70,7 +70,7 @@ impl From<store::Error> for Error {
             }
             store::Error::UploadTooLarge(oversize) => Error::UploadTooLarge(oversize),
             store::Error::BatchTooLarge(oversize) => Error::BatchTooLarge(oversize),
-            store::Error::AlreadyExists(message) => Error::AlreadyExists(message),
+            store::Error::AlreadyExists(taken) => Error::AlreadyExists(taken),
             store::Error::NotEnded(..) => Error::NotEnded(error.to_string()),
             store::Error::EtagMismatch(_) => Error::EtagMismatch(error.to_string()),
             store::Error::PageToken => Error::InvalidArgument(Violation::of("page_token", error.to_string()).into()),

@@ -27,7 +27,7 @@ use tokio::sync::{Notify, watch as channel};
 use tokio_util::sync::CancellationToken;
 
 pub use crate::store::{
-    EncodedResult, InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, StoredInput,
+    EncodedResult, InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, StoredInput, TakenId,
     UploadBounds, UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;

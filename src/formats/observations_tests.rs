@@ -210,7 +210,7 @@ fn violations_that_come_back_from_a_server_are_put_into_the_files_terms() {
     let sentence = |violation: Violation| input.explain_all(&[violation], 0).to_string();
     assert_eq!(sentence(Violation::at("track_set.xs", 2, "is odd")), "dir/observations.csv, line 4: x: is odd");
     assert_eq!(sentence(Violation::at("track_set.views", 1, "is odd")), "dir/observations.csv: view 9: is odd");
-    assert_eq!(sentence(Violation::of("settings.alpha", "is odd")), "dir/observations.csv: alpha: is odd");
+    assert_eq!(sentence(Violation::of("job.settings.alpha", "is odd")), "dir/observations.csv: alpha: is odd");
     assert_eq!(sentence(Violation::at("track_set.xs", 99, "is odd")), "dir/observations.csv: track_set.xs[99]: is odd");
 }
 

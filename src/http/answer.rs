@@ -14,6 +14,9 @@ use serde_json::{Map, Value, json};
 use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt;
 
+use crate::rpc::inflight::{HeldBody, Permit};
+use crate::rpc::meter::code_name;
+
 /// An answer to a request.
 pub type Answer = Response<Body>;
 
@@ -31,18 +34,19 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
 /// # Errors
 /// `INTERNAL` for bytes that are no such message: a defect of ours.
 pub fn message(descriptor: &MessageDescriptor, bytes: &[u8]) -> Result<Vec<u8>, Status> {
-    let internal = |error: String| Status::internal(format!("an answer cannot be told as JSON: {error}"));
+    let internal = |error: String| Status::internal(format!("an answer cannot be encoded as JSON: {error}"));
     let message = DynamicMessage::decode(descriptor.clone(), bytes).map_err(|error| internal(error.to_string()))?;
     serde_json::to_vec(&message).map_err(|error| internal(error.to_string()))
 }
 
-/// An answer of that JSON.
-pub fn json(text: Vec<u8>) -> Answer {
-    secured((StatusCode::OK, [(header::CONTENT_TYPE, "application/json")], text).into_response())
+/// An answer of that JSON; the permit is held until it is read.
+pub fn json(text: Vec<u8>, permit: Permit) -> Answer {
+    let body = Body::new(HeldBody { body: Body::from(text), permit });
+    secured((StatusCode::OK, [(header::CONTENT_TYPE, "application/json")], body).into_response())
 }
 
 /// A stream of messages as server-sent events; each has its number as id, and a stream that breaks off ends with an
-/// event `error`.
+/// event `status`.
 pub fn events(descriptor: MessageDescriptor, messages: Streaming<Bytes>) -> Answer {
     let told = stream::unfold(Some(messages), move |messages| {
         let descriptor = descriptor.clone();
@@ -64,19 +68,19 @@ pub fn events(descriptor: MessageDescriptor, messages: Streaming<Bytes>) -> Answ
 
 fn sse(events: impl Stream<Item = Result<Event, Infallible>> + Send + 'static) -> Answer {
     let mut answer = Sse::new(events.boxed()).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response();
-    // Else proxies gather what is to be told at once.
+    // Some proxies buffer the response otherwise.
     answer.headers_mut().insert("x-accel-buffering", HeaderValue::from_static("no"));
     secured(answer)
 }
 
 fn event(descriptor: &MessageDescriptor, bytes: &[u8]) -> Result<Event, Status> {
-    let internal = |error: String| Status::internal(format!("an event cannot be told as JSON: {error}"));
+    let internal = |error: String| Status::internal(format!("an event cannot be encoded as JSON: {error}"));
     let message = DynamicMessage::decode(descriptor.clone(), bytes).map_err(|error| internal(error.to_string()))?;
     let text = serde_json::to_string(&message).map_err(|error| internal(error.to_string()))?;
     let mut event = Event::default().data(text);
     let body = descriptor.oneofs().find(|group| group.name() == BODY);
     if let Some(kind) = body.and_then(|group| group.fields().find(|field| message.has_field(field))) {
-        event = event.event(kind.name());
+        event = event.event(kind.json_name());
     }
     // What has no number is not told again.
     match message.get_field_by_name(SEQUENCE).and_then(|number| number.as_u64()) {
@@ -86,12 +90,17 @@ fn event(descriptor: &MessageDescriptor, bytes: &[u8]) -> Result<Event, Status> 
 }
 
 fn failed(status: &Status) -> Event {
-    Event::default().event("error").data(error_body(status).to_string())
+    Event::default().event("status").data(error_body(status, http_code(status.code())).to_string())
 }
 
 /// A refusal.
 pub fn error(status: &Status) -> Answer {
-    let mut answer = (http_code(status.code()), axum::Json(error_body(status))).into_response();
+    refused(http_code(status.code()), status)
+}
+
+/// A refusal with another code than the one that goes with its status.
+pub fn refused(code: StatusCode, status: &Status) -> Answer {
+    let mut answer = (code, axum::Json(error_body(status, code))).into_response();
     let headers = answer.headers_mut();
     if status.code() == Code::Unauthenticated {
         headers.insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
@@ -102,13 +111,6 @@ pub fn error(status: &Status) -> Answer {
         headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
     }
     secured(answer)
-}
-
-/// A refusal of the request itself, before any call.
-pub fn refused(code: StatusCode, status: &Status) -> Answer {
-    let mut answer = error(status);
-    *answer.status_mut() = code;
-    answer
 }
 
 /// Answers are data: no page runs or embeds them, and none is guessed to be another kind.
@@ -139,31 +141,8 @@ fn http_code(code: Code) -> StatusCode {
     }
 }
 
-/// The name of a code in `google.rpc.Code`.
-fn code_name(code: Code) -> &'static str {
-    match code {
-        Code::Ok => "OK",
-        Code::Cancelled => "CANCELLED",
-        Code::Unknown => "UNKNOWN",
-        Code::InvalidArgument => "INVALID_ARGUMENT",
-        Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
-        Code::NotFound => "NOT_FOUND",
-        Code::AlreadyExists => "ALREADY_EXISTS",
-        Code::PermissionDenied => "PERMISSION_DENIED",
-        Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
-        Code::FailedPrecondition => "FAILED_PRECONDITION",
-        Code::Aborted => "ABORTED",
-        Code::OutOfRange => "OUT_OF_RANGE",
-        Code::Unimplemented => "UNIMPLEMENTED",
-        Code::Internal => "INTERNAL",
-        Code::Unavailable => "UNAVAILABLE",
-        Code::DataLoss => "DATA_LOSS",
-        Code::Unauthenticated => "UNAUTHENTICATED",
-    }
-}
-
 /// `{"error": {...}}` with the code of HTTP, the message, the name of the code and the details (AIP-193).
-fn error_body(status: &Status) -> Value {
+fn error_body(status: &Status, code: StatusCode) -> Value {
     let details = status.get_error_details();
     let mut told = Vec::new();
     if let Some(info) = details.error_info() {
@@ -190,7 +169,7 @@ fn error_body(status: &Status) -> Value {
         }));
     }
     json!({"error": {
-        "code": http_code(status.code()).as_u16(),
+        "code": code.as_u16(),
         "message": status.message(),
         "status": code_name(status.code()),
         "details": told,

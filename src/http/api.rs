@@ -1,9 +1,12 @@
 //! From a request to its answer: finds the route, makes a message of the JSON, calls the method within the process.
 
+use std::net::IpAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::Request;
+use axum::http::uri::Authority;
 use axum::http::{HeaderMap, Method, StatusCode, header};
 use axum::response::IntoResponse;
 use futures_util::StreamExt;
@@ -27,9 +30,15 @@ use crate::rpc::status;
 /// Where the description of the API is.
 const OPENAPI_PATH: &str = "/openapi.json";
 
-/// How often JSON is in memory, at most, as a multiple of its length: the text, a value of 40 bytes for a number of
-/// which the text has some 8 or more, in an array that has grown to twice its length, and the message encoded.
-const JSON_COPIES: u64 = 12;
+/// Bytes that a byte of JSON takes in memory at most: of `0,` it is a value of 56 bytes in an array that has grown to
+/// twice its length, and of a small message as much.
+const JSON_COPIES: u64 = 60;
+
+/// How long a body may not move: as long as a `Solve`.
+const BODY_PATIENCE: Duration = Duration::from_secs(60);
+
+/// Longest description of what is wrong with a body: a parser repeats what it was given.
+const MAX_DESCRIPTION: usize = 300;
 
 /// How long JSON may be that is read on a thread that serves others: a millisecond's work.
 const SMALL_BODY_BYTES: usize = 64 << 10;
@@ -46,6 +55,8 @@ pub struct Api {
     openapi: Bytes,
     pub(super) gateway: Gateway,
     max_body_bytes: usize,
+    /// Names under which the port is reached.
+    hosts: Vec<String>,
     /// What an upload holds, and what it becomes.
     pub(super) input_data: MessageDescriptor,
     pub(super) input: MessageDescriptor,
@@ -54,12 +65,17 @@ pub struct Api {
 impl Api {
     /// # Errors
     /// A defect of the proto.
-    pub fn new(pool: &DescriptorPool, gateway: Gateway, max_body_bytes: usize) -> Result<Self, String> {
+    pub fn new(
+        pool: &DescriptorPool,
+        gateway: Gateway,
+        max_body_bytes: usize,
+        hosts: Vec<String>,
+    ) -> Result<Self, String> {
         let routes = route::routes(pool)?;
         let openapi = openapi::document(&routes).to_string().into();
         let message = |name: &str| pool.get_message_by_name(name).ok_or_else(|| format!("the proto lacks {name}"));
         let (input_data, input) = (message("scpsfm.v1.InputData")?, message("scpsfm.v1.Input")?);
-        Ok(Self { routes, openapi, gateway, max_body_bytes, input_data, input })
+        Ok(Self { routes, openapi, gateway, max_body_bytes, hosts, input_data, input })
     }
 
     /// The answer to a request; `introduction` is its connection's.
@@ -68,9 +84,16 @@ impl Api {
             let text = "a page of another site may not call this API";
             return answer::error(&status::refused(Code::PermissionDenied, "ORIGIN_REFUSED", text));
         }
+        if !self.gateway.asks_for_keys() && !self.is_own_host(request.headers()) {
+            let text = "the request is for a host that this server does not know: http.hosts names those that it has";
+            return answer::error(&status::refused(Code::PermissionDenied, "HOST_REFUSED", text));
+        }
         let path = request.uri().path().to_owned();
-        if path == OPENAPI_PATH && request.method() == Method::GET {
-            return answer::json(self.openapi.to_vec());
+        if path == OPENAPI_PATH && request.method() == Method::GET && self.gateway.describes {
+            return match self.gateway.check_key(request.headers(), &introduction) {
+                Ok(()) => answer::json(self.openapi.to_vec(), self.gateway.permit()),
+                Err(status) => answer::error(&status),
+            };
         }
         if let Some(parent) = upload::parent(request.method(), &path) {
             return upload::answer(self, introduction, parent, request).await.unwrap_or_else(|refused| *refused);
@@ -101,14 +124,17 @@ impl Api {
         request: Request,
     ) -> Result<Answer, Box<Answer>> {
         let (head, body) = request.into_parts();
-        self.gateway.check_key(&head.headers).map_err(failed)?;
+        self.gateway.check_key(&head.headers, &introduction).map_err(failed)?;
         let permit = self.gateway.permit();
         let descriptor = route.method.input();
+        let query = head.uri.query().unwrap_or_default();
         let mut message = if route.has_body {
+            if let Some((name, _)) = form_urlencoded::parse(query.as_bytes()).next() {
+                return Err(failed(invalid(&name, "is in the query; this call takes everything in its body")));
+            }
             self.read(&head.headers, body, descriptor, &permit).await?
         } else {
             let mut message = DynamicMessage::new(descriptor);
-            let query = head.uri.query().unwrap_or_default();
             for (name, value) in form_urlencoded::parse(query.as_bytes()) {
                 let set = match route.template.holds(&name) {
                     true => Err("is in the path".to_owned()),
@@ -127,8 +153,11 @@ impl Api {
         for (name, value) in fields {
             route::set_field(&mut message, name, &value).map_err(|text| failed(invalid(name, text)))?;
         }
-        let call = call(&head.headers, introduction, Bytes::from(message.encode_to_vec()));
-        drop(message);
+        let encode = move || Ok(Bytes::from(message.encode_to_vec()));
+        let encoded = in_background(text_length(&head.headers), encode).await.map_err(failed)?;
+        // From here on it is the call's message, which is charged as it is read.
+        permit.hold(0).map_err(failed)?;
+        let call = call(&head.headers, introduction, permit.clone(), encoded);
         let mut grpc = Grpc::new(self.gateway.service.clone()).max_decoding_message_size(usize::MAX);
         // Never fails: the services are always ready.
         let _ = grpc.ready().await;
@@ -140,7 +169,17 @@ impl Api {
         let bytes = grpc.unary(call, path, Encoded).await.map_err(failed)?.into_inner();
         permit.hold(JSON_COPIES * bytes.len() as u64).map_err(failed)?;
         let json = in_background(bytes.len(), move || answer::message(&output, &bytes)).await.map_err(failed)?;
-        Ok(answer::json(json))
+        Ok(answer::json(json, permit))
+    }
+
+    /// Whether a request is for an address of this machine, or one of the names that it is known under.
+    fn is_own_host(&self, headers: &HeaderMap) -> bool {
+        let host = headers.get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
+        let name = host.parse::<Authority>().map(|authority| authority.host().trim_matches(['[', ']']).to_owned());
+        let Ok(name) = name else { return false };
+        name.parse::<IpAddr>().is_ok()
+            || name.eq_ignore_ascii_case("localhost")
+            || self.hosts.iter().any(|known| known.eq_ignore_ascii_case(&name))
     }
 
     /// The message of a body.
@@ -152,6 +191,7 @@ impl Api {
         permit: &Permit,
     ) -> Result<DynamicMessage, Box<Answer>> {
         let text = self.collect(body, permit).await?;
+        let length = text.len();
         if text.is_empty() {
             return Ok(DynamicMessage::new(descriptor));
         }
@@ -164,16 +204,22 @@ impl Api {
         let parse = move || {
             let mut json = serde_json::Deserializer::from_slice(&text);
             let message = DynamicMessage::deserialize(descriptor, &mut json);
-            message.and_then(|message| json.end().map(|()| message)).map_err(|error| invalid("body", error.to_string()))
+            let message = message.and_then(|message| json.end().map(|()| message));
+            message.map_err(|error| {
+                let description: String = error.to_string().chars().take(MAX_DESCRIPTION).collect();
+                invalid("body", description)
+            })
         };
-        in_background(text_length(headers), parse).await.map_err(failed)
+        in_background(length, parse).await.map_err(failed)
     }
 
     /// The bytes of a body, charged as the JSON that they are.
     async fn collect(&self, body: Body, permit: &Permit) -> Result<Vec<u8>, Box<Answer>> {
         let mut text = Vec::new();
         let mut frames = body.into_data_stream();
-        while let Some(frame) = frames.next().await {
+        loop {
+            let frame = tokio::time::timeout(BODY_PATIENCE, frames.next()).await;
+            let Some(frame) = frame.map_err(|_| failed(status::input_stalled(BODY_PATIENCE)))? else { break };
             // The client has gone away; nobody reads the answer.
             let frame = frame.map_err(|error| failed(Status::cancelled(error.to_string())))?;
             let length = text.len() + frame.len();
@@ -193,7 +239,12 @@ impl Api {
 }
 
 /// A call with what the request says of its caller.
-pub(super) fn call<T>(headers: &HeaderMap, introduction: Introduction, message: T) -> tonic::Request<T> {
+pub(super) fn call<T>(
+    headers: &HeaderMap,
+    introduction: Introduction,
+    permit: Permit,
+    message: T,
+) -> tonic::Request<T> {
     let mut passed = HeaderMap::new();
     for name in PASSED_ON {
         for value in headers.get_all(name) {
@@ -203,6 +254,7 @@ pub(super) fn call<T>(headers: &HeaderMap, introduction: Introduction, message: 
     let mut call = tonic::Request::new(message);
     *call.metadata_mut() = MetadataMap::from_headers(passed);
     call.extensions_mut().insert(introduction);
+    call.extensions_mut().insert(permit);
     call
 }
 
@@ -233,7 +285,7 @@ async fn in_background<T: Send + 'static>(
 }
 
 /// Whether a browser sends the request for a page of another site: such a page must not use what the browser's machine
-/// may reach.
+/// may reach. One whose name was made to point here is refused by its host.
 fn is_of_another_site(headers: &HeaderMap) -> bool {
     let text = |name| headers.get(name).and_then(|value: &axum::http::HeaderValue| value.to_str().ok());
     let Some(origin) = headers.get(header::ORIGIN) else { return false };

@@ -16,32 +16,37 @@ mod openapi;
 mod route;
 mod upload;
 
+use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::Router;
-use axum::extract::connect_info::Connected;
-use axum::extract::{ConnectInfo, Request, State};
-use axum::serve::{IncomingStream, Listener};
+use axum::body::Body;
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::server::graceful::GracefulShutdown;
 use prost_reflect::DescriptorPool;
 use tokio::net::TcpListener;
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 
-use crate::rpc::listener::{self, Connection, Incoming, Introduction};
+use crate::rpc::listener::{self, Incoming};
 use crate::rpc::proto::FILE_DESCRIPTOR_SET;
 use crate::rpc::server::Gateway;
-use crate::telemetry::silence::Bounded;
+use crate::telemetry::silence;
 use api::Api;
 
 /// Protocol that clients over TLS are offered.
 const HTTP_1: &[u8] = b"http/1.1";
 
-/// Largest body of JSON: a number takes about twice the bytes that it has in protobuf, so that this holds an input of
-/// about a million observations. Larger ones are uploaded as protobuf.
-pub const MAX_BODY_BYTES: usize = 64 << 20;
+/// Largest body of JSON: an input of some 300,000 observations, and at 60 bytes a byte, which the worst JSON takes in
+/// memory, what all calls may hold by default. Larger inputs are uploaded as protobuf.
+pub const MAX_BODY_BYTES: usize = 16 << 20;
+
+/// How long a request's head may take, and a connection may wait for the next one.
+const HEAD_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// How long nothing may move on a connection: events are told apart by a comment every 15 s.
 const SILENCE: Duration = Duration::from_secs(120);
@@ -53,12 +58,14 @@ pub struct Options {
     pub listen: SocketAddr,
     /// Largest body of JSON.
     pub max_body_bytes: usize,
+    /// Names under which the port is reached; without keys no others are answered but addresses and localhost.
+    pub hosts: Vec<String>,
 }
 
 impl Default for Options {
     /// A free port of the loopback interface.
     fn default() -> Self {
-        Self { listen: SocketAddr::from(([127, 0, 0, 1], 0)), max_body_bytes: MAX_BODY_BYTES }
+        Self { listen: SocketAddr::from(([127, 0, 0, 1], 0)), max_body_bytes: MAX_BODY_BYTES, hosts: Vec::new() }
     }
 }
 
@@ -76,7 +83,7 @@ pub enum Error {
 pub struct Server {
     address: SocketAddr,
     stop: CancellationToken,
-    task: JoinHandle<io::Result<()>>,
+    task: JoinHandle<()>,
 }
 
 impl Server {
@@ -91,14 +98,9 @@ impl Server {
         let pool = DescriptorPool::decode(FILE_DESCRIPTOR_SET).map_err(|error| Error::Api(error.to_string()))?;
         let incoming = listener::Options { protocol: Some(HTTP_1), ..gateway.listener.clone() };
         let incoming = listener::incoming(listener, incoming);
-        let api = Api::new(&pool, gateway, options.max_body_bytes).map_err(Error::Api)?;
-        let router = Router::new().fallback(answer_to).with_state(Arc::new(api));
+        let api = Api::new(&pool, gateway, options.max_body_bytes, options.hosts).map_err(Error::Api)?;
         let stop = CancellationToken::new();
-        let serve = axum::serve(
-            Bounded { listener: Entrance { incoming, address }, silence: SILENCE },
-            router.into_make_service_with_connect_info::<Caller>(),
-        );
-        let task = tokio::spawn(serve.with_graceful_shutdown(stop.clone().cancelled_owned()).into_future());
+        let task = tokio::spawn(serve(incoming, Arc::new(api), stop.clone()));
         Ok(Self { address, stop, task })
     }
 
@@ -122,35 +124,33 @@ impl Drop for Server {
     }
 }
 
-async fn answer_to(State(api): State<Arc<Api>>, caller: ConnectInfo<Caller>, request: Request) -> answer::Answer {
-    api.answer(caller.0.0, request).await
-}
-
-/// Whether anyone who may call has called over the connection: see [`Introduction`].
-#[derive(Debug, Clone)]
-struct Caller(Introduction);
-
-impl Connected<IncomingStream<'_, Bounded<Entrance>>> for Caller {
-    fn connect_info(stream: IncomingStream<'_, Bounded<Entrance>>) -> Self {
-        Self(stream.io().inner().introduction())
+/// Serves connections until it is told to stop, and then until their requests have been answered. Dropped, it cuts them
+/// off.
+async fn serve(mut incoming: Incoming, api: Arc<Api>, stop: CancellationToken) {
+    let graceful = GracefulShutdown::new();
+    let mut connections = JoinSet::new();
+    loop {
+        let connection = tokio::select! {
+            connection = incoming.next() => connection,
+            Some(_) = connections.join_next() => continue,
+            () = stop.cancelled() => break,
+        };
+        let (introduction, api) = (connection.introduction(), api.clone());
+        let answer = service_fn(move |request: hyper::Request<hyper::body::Incoming>| {
+            let (introduction, api) = (introduction.clone(), api.clone());
+            async move { Ok::<_, Infallible>(api.answer(introduction, request.map(Body::new)).await) }
+        });
+        let io = TokioIo::new(silence::Connection::new(connection, SILENCE));
+        let served = http1::Builder::new()
+            .timer(TokioTimer::new())
+            .header_read_timeout(HEAD_TIMEOUT)
+            .serve_connection(io, answer);
+        let served = graceful.watch(served);
+        connections.spawn(async move {
+            if let Err(error) = served.await {
+                tracing::debug!(%error, "an HTTP connection ended");
+            }
+        });
     }
-}
-
-/// The connections of gRPC's listener, for axum.
-struct Entrance {
-    incoming: Incoming,
-    address: SocketAddr,
-}
-
-impl Listener for Entrance {
-    type Io = Connection;
-    type Addr = SocketAddr;
-
-    async fn accept(&mut self) -> (Connection, SocketAddr) {
-        (self.incoming.next().await, self.address)
-    }
-
-    fn local_addr(&self) -> io::Result<SocketAddr> {
-        Ok(self.address)
-    }
+    graceful.shutdown().await;
 }

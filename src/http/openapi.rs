@@ -20,7 +20,11 @@ const ERROR: &str = "Error";
 /// The whole document.
 pub fn document(routes: &[Route]) -> Value {
     let mut paths = Map::new();
-    let mut schemas = Schemas::default();
+    let held = routes.iter().filter(|route| route.has_body).flat_map(|route| {
+        let message = route.method.input().name().to_owned();
+        route.template.held().map(move |field| (message.clone(), field.to_owned()))
+    });
+    let mut schemas = Schemas { in_path: held.collect(), ..Schemas::default() };
     for route in routes {
         let (path, parameters) = route.template.parameters();
         let operation = operation(route, &parameters, &mut schemas);
@@ -119,7 +123,7 @@ fn upload(data: &MessageDescriptor, input: &MessageDescriptor, schemas: &mut Sch
 
 fn refusal() -> Value {
     let schema = json!({"$ref": format!("#/components/schemas/{ERROR}")});
-    json!({"description": "Why not.", "content": {"application/json": {"schema": schema}}})
+    json!({"description": "An error.", "content": {"application/json": {"schema": schema}}})
 }
 
 fn error_schema() -> Value {
@@ -160,6 +164,8 @@ fn query_parameter(field: &FieldDescriptor, schemas: &mut Schemas) -> Value {
 /// The schemas that are referred to.
 #[derive(Default)]
 struct Schemas {
+    /// Messages and those of their fields that are in the path.
+    in_path: BTreeSet<(String, String)>,
     known: BTreeSet<String>,
     /// Referred to and not described yet.
     pending: Vec<MessageDescriptor>,
@@ -206,7 +212,8 @@ impl Schemas {
             if behavior.contains(&INPUT_ONLY) {
                 schema["writeOnly"] = json!(true);
             }
-            if behavior.contains(&REQUIRED) {
+            let is_in_path = self.in_path.contains(&(message.name().to_owned(), field.name().to_owned()));
+            if behavior.contains(&REQUIRED) && !is_in_path {
                 required.push(field.json_name().to_owned());
             }
             properties.insert(field.json_name().to_owned(), schema);
@@ -242,9 +249,8 @@ impl Schemas {
             ]}),
             Kind::Int32 | Kind::Sint32 | Kind::Sfixed32 => json!({"type": "integer", "format": "int32"}),
             Kind::Uint32 | Kind::Fixed32 => json!({"type": "integer", "minimum": 0}),
-            Kind::Int64 | Kind::Sint64 | Kind::Sfixed64 | Kind::Uint64 | Kind::Fixed64 => {
-                json!({"type": "string", "format": "int64"})
-            }
+            Kind::Int64 | Kind::Sint64 | Kind::Sfixed64 => json!({"type": "string", "format": "int64"}),
+            Kind::Uint64 | Kind::Fixed64 => json!({"type": "string", "format": "uint64"}),
             Kind::Bool => json!({"type": "boolean"}),
             Kind::String => json!({"type": "string"}),
             Kind::Bytes => json!({"type": "string", "contentEncoding": "base64"}),
@@ -255,8 +261,9 @@ impl Schemas {
 }
 
 fn of_enum(values: &EnumDescriptor) -> Value {
+    // Examples and not all there are: later versions may know more.
     let names: Vec<_> = values.values().map(|value| value.name().to_owned()).collect();
-    json!({"type": "string", "enum": names})
+    json!({"type": "string", "examples": names})
 }
 
 fn behavior(field: &FieldDescriptor) -> Vec<i32> {

@@ -174,9 +174,14 @@ impl Template {
         (path, names)
     }
 
+    /// The fields of the request that the path holds.
+    pub fn held(&self) -> impl Iterator<Item = &str> {
+        self.fields.iter().map(|(field, _)| field.as_str())
+    }
+
     /// Whether the path holds this field of the request.
     pub fn holds(&self, field: &str) -> bool {
-        self.fields.iter().any(|(held, _)| held == field)
+        self.held().any(|held| held == field)
     }
 }
 

@@ -42,7 +42,7 @@ pub async fn answer(
     request: Request,
 ) -> Result<Answer, Box<Answer>> {
     let (head, body) = request.into_parts();
-    api.gateway.check_key(&head.headers).map_err(failed)?;
+    api.gateway.check_key(&head.headers, &introduction).map_err(failed)?;
     let mut upload_id = None;
     for (name, value) in form_urlencoded::parse(head.uri.query().unwrap_or_default().as_bytes()) {
         if name != UPLOAD_ID {
@@ -51,12 +51,14 @@ pub async fn answer(
         upload_id = Some(value.into_owned());
     }
     let permit = api.gateway.permit();
-    let is_protobuf = head.headers.get(header::CONTENT_TYPE).is_some_and(|kind| kind == PROTOBUF);
+    let kind = head.headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
+    let is_protobuf = kind.split(';').next().unwrap_or_default().trim() == PROTOBUF;
     let (size_bytes, body) = if is_protobuf {
         (declared_length(&head.headers)?, body)
     } else {
         let message = api.read(&head.headers, body, api.input_data.clone(), &permit).await?;
         let encoded = message.encode_to_vec();
+        permit.hold(encoded.len() as u64).map_err(failed)?;
         (encoded.len() as u64, Body::from(encoded))
     };
     let start = proto::UploadStart {
@@ -65,12 +67,20 @@ pub async fn answer(
         size_bytes: i64::try_from(size_bytes).unwrap_or(i64::MAX),
         sha256: Vec::new(),
     };
-    let messages = messages(start, body.into_data_stream());
     let mut client = InputServiceClient::new(api.gateway.service.clone());
-    let uploaded = client.upload_input(call(&head.headers, introduction, messages)).await.map_err(failed)?;
-    let output = api.input.clone();
-    let json = answer::message(&output, &uploaded.into_inner().encode_to_vec()).map_err(failed)?;
-    Ok(answer::json(json))
+    let asked = proto::GetUploadStatusRequest { parent: start.parent.clone(), upload_id: start.upload_id.clone() };
+    let asked = call(&head.headers, introduction.clone(), permit.clone(), asked);
+    // What an upload that broke off has left is kept: the body is passed over that far.
+    let committed = match client.get_upload_status(asked).await {
+        Ok(status) => u64::try_from(status.into_inner().committed_bytes).unwrap_or(0),
+        Err(status) if status.code() == Code::NotFound => 0,
+        Err(status) => return Err(failed(status)),
+    };
+    let messages = messages(start, committed, body.into_data_stream());
+    let uploaded =
+        client.upload_input(call(&head.headers, introduction, permit.clone(), messages)).await.map_err(failed)?;
+    let json = answer::message(&api.input, &uploaded.into_inner().encode_to_vec()).map_err(failed)?;
+    Ok(answer::json(json, permit))
 }
 
 fn declared_length(headers: &HeaderMap) -> Result<u64, Box<Answer>> {
@@ -89,9 +99,13 @@ enum Stage {
     Ended,
 }
 
-/// The messages of an upload: its start, its chunks as the body comes, and its end. A body that breaks off ends them
+/// The messages of an upload: its start, its chunks as the body comes from `committed` on, and its end. A body that breaks off ends them
 /// before the end, which refuses the upload and keeps what came.
-fn messages(start: proto::UploadStart, body: BodyDataStream) -> impl Stream<Item = UploadInputRequest> + Send {
+fn messages(
+    start: proto::UploadStart,
+    committed: u64,
+    body: BodyDataStream,
+) -> impl Stream<Item = UploadInputRequest> + Send {
     struct State {
         stage: Stage,
         body: BodyDataStream,
@@ -110,7 +124,13 @@ fn messages(start: proto::UploadStart, body: BodyDataStream) -> impl Stream<Item
         }
         while state.pending.len() < MAX_CHUNK_BYTES {
             match state.body.next().await {
-                Some(Ok(frame)) => state.pending.extend_from_slice(frame.chunk()),
+                Some(Ok(mut frame)) => {
+                    state.hash.update(frame.chunk());
+                    let passed = committed.saturating_sub(state.offset).min(frame.len() as u64);
+                    state.offset += passed;
+                    frame.advance(usize::try_from(passed).unwrap_or(usize::MAX));
+                    state.pending.extend_from_slice(frame.chunk());
+                }
                 Some(Err(_)) => return None,
                 None => break,
             }
@@ -121,7 +141,6 @@ fn messages(start: proto::UploadStart, body: BodyDataStream) -> impl Stream<Item
             let sha256 = state.hash.finalize_reset().to_vec();
             return Some((message(Message::Finish(proto::UploadFinish { sha256 })), state));
         }
-        state.hash.update(&data);
         let chunk = proto::UploadChunk {
             offset: i64::try_from(state.offset).unwrap_or(i64::MAX),
             crc32c: crc32c::crc32c(&data),

@@ -36,6 +36,11 @@ impl Authenticate {
         Self { keys }
     }
 
+    /// Whether keys are asked for.
+    pub fn is_on(&self) -> bool {
+        self.keys.is_some()
+    }
+
     /// Whether these headers hold a key, where one is asked for.
     ///
     /// # Errors

@@ -10,7 +10,7 @@ use http_body::{Body as HttpBody, Frame, SizeHint};
 use prost::bytes::Bytes;
 use tonic::Status;
 use tonic::body::Body;
-use tonic::codegen::http::Request;
+use tonic::codegen::http::{Request, Response};
 use tower::{Layer, Service};
 
 use super::status;
@@ -176,19 +176,56 @@ pub struct Charged<S> {
     budget: Arc<Budget>,
 }
 
-impl<S: Service<Request<Body>>> Service<Request<Body>> for Charged<S> {
-    type Response = S::Response;
+impl<S> Service<Request<Body>> for Charged<S>
+where
+    S: Service<Request<Body>, Response = Response<Body>>,
+    S::Future: Send + 'static,
+{
+    type Response = Response<Body>;
     type Error = S::Error;
-    type Future = S::Future;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, S::Error>> + Send>>;
 
     fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
         self.inner.poll_ready(context)
     }
 
-    fn call(&mut self, mut request: Request<Body>) -> S::Future {
-        let permit = Permit::new(Arc::clone(&self.budget));
+    fn call(&mut self, mut request: Request<Body>) -> Self::Future {
+        // A port that reads requests in another form has charged them already.
+        let permit = match request.extensions().get::<Permit>() {
+            Some(permit) => permit.clone(),
+            None => Permit::new(Arc::clone(&self.budget)),
+        };
         request.extensions_mut().insert(permit.clone());
-        self.inner.call(request.map(|body| Body::new(ChargedBody { body, permit })))
+        let answer_permit = permit.clone();
+        let answer = self.inner.call(request.map(|body| Body::new(ChargedBody { body, permit })));
+        Box::pin(async move { Ok(answer.await?.map(|body| Body::new(HeldBody { body, permit: answer_permit }))) })
+    }
+}
+
+/// An answer's body, with the permit of what it is made of: a reader that is slow holds it.
+#[derive(Debug)]
+pub struct HeldBody<B> {
+    pub body: B,
+    pub permit: Permit,
+}
+
+impl<B: HttpBody + Unpin> HttpBody for HeldBody<B> {
+    type Data = B::Data;
+    type Error = B::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<B::Data>, B::Error>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
     }
 }
 

@@ -183,7 +183,7 @@ impl proto::job_service_server::JobService for Jobs {
         let permit = Permit::of(&request)?;
         let result = self.read_result(name, permit.clone(), self.max_message_bytes).await?;
         let decoded = super::blocking(move || {
-            // What is decoded is on its way to the transport: the permit is the call's.
+            // Held here as well: what computes goes on when the call is dropped.
             let _permit = permit;
             proto::JobResult::decode(result.bytes.as_slice())
         });

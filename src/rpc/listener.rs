@@ -60,6 +60,10 @@ const NO_SETTINGS: &[u8] = b"\0\0\0\x04\0\0\0\0\0";
 /// ENHANCE_YOUR_CALM would be RESOURCE_EXHAUSTED.
 const NO_ROOM: &[u8] = b"\0\0\x1c\x07\0\0\0\0\0\0\0\0\0\0\0\0\x07too many connections";
 
+/// The same where the connection is for HTTP/1.1.
+const NO_ROOM_HTTP_1: &[u8] =
+    b"HTTP/1.1 503 Service Unavailable\r\nretry-after: 1\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
+
 /// Pause after a connection could not be taken, which is usually a lack of file descriptors: some free up meanwhile.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 
@@ -199,9 +203,19 @@ impl ConnectionListener {
             self.tell_refused(count);
         }
         let Ok(place) = self.refusal_permits.clone().try_acquire_owned() else { return };
+        let is_http_1 = self.options.protocol.is_some();
         tokio::spawn(async move {
             let _place = place;
             let Begun { mut io, early } = begun;
+            if is_http_1 {
+                let told = async {
+                    io.write_all(NO_ROOM_HTTP_1).await?;
+                    io.shutdown().await?;
+                    tokio::io::copy(&mut io, &mut tokio::io::sink()).await
+                };
+                let _ = tokio::time::timeout(REFUSAL_TIMEOUT, told).await;
+                return;
+            }
             let called = async {
                 io.write_all(NO_SETTINGS).await?;
                 io.flush().await?;

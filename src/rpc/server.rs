@@ -25,13 +25,14 @@ use super::inflight::{Budget, Charged, Inflight, Permit};
 use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
+use super::listener::{self, Introduction};
 use super::meter::{Meter, Metered};
 use super::proto::FILE_DESCRIPTOR_SET;
 use super::proto::calibration_service_server::CalibrationServiceServer;
 use super::proto::input_service_server::InputServiceServer;
 use super::proto::job_service_server::JobServiceServer;
 use super::reload::{self, Current};
-use super::{listener, tls};
+use super::tls;
 use crate::domain::Limits;
 use crate::engine::{Engine, StoreState};
 use crate::telemetry::metrics::{Reloaded, locked_out};
@@ -202,6 +203,7 @@ impl Server {
                 .layer(Inflight::new(Arc::clone(&budget)))
                 .service(services.clone()),
             listener: listener_options.clone(),
+            describes: options.reflection,
             authenticate: authenticate.clone(),
             budget: Arc::clone(&budget),
         };
@@ -345,17 +347,27 @@ pub struct Gateway {
     pub service: Metered<Explained<Authenticated<Charged<Routes>>>>,
     /// How gRPC's own connections are let in.
     pub listener: listener::Options,
+    /// Whether callers may ask for the API's description.
+    pub describes: bool,
     authenticate: Authenticate,
     budget: Arc<Budget>,
 }
 
 impl Gateway {
     /// Whether the headers hold a key, where one is asked for: before a request is read that only a call will refuse.
+    /// Its connection may stay then.
     ///
     /// # Errors
     /// `UNAUTHENTICATED`.
-    pub fn check_key(&self, headers: &HeaderMap) -> Result<(), Status> {
-        self.authenticate.check(headers)
+    pub fn check_key(&self, headers: &HeaderMap, introduction: &Introduction) -> Result<(), Status> {
+        self.authenticate.check(headers)?;
+        introduction.make();
+        Ok(())
+    }
+
+    /// Whether callers need keys.
+    pub fn asks_for_keys(&self) -> bool {
+        self.authenticate.is_on()
     }
 
     /// A permit for what a request holds beside its call.

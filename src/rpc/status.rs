@@ -8,7 +8,9 @@
 //! | `UNAUTHENTICATED` | `API_KEY_MISSING` | the server asks for a key, and the call carries none |
 //! | `UNAUTHENTICATED` | `API_KEY_UNKNOWN` | the call carries a key that stands for no tenant |
 //! | `UNAUTHENTICATED` | `API_KEY_WITHDRAWN` | the key was withdrawn while the call lasted, within seconds |
-//! | `ALREADY_EXISTS` | `ALREADY_EXISTS` | a job id is taken, or a request id came with another body |
+//! | `ALREADY_EXISTS` | `JOB_ID_TAKEN` | the tenant has a job of that id |
+//! | | `REQUEST_ID_REUSED` | the request id came before with another body |
+//! | | `UPLOAD_ID_REUSED` | the upload id came before with another length or hash |
 //! | `NOT_FOUND` | `INPUT_NOT_FOUND` | no such uploaded input, or another tenant's |
 //! | `NOT_FOUND` | `UPLOAD_NOT_FOUND` | no such upload, or it was given up |
 //! | `DATA_LOSS` | `CHUNK_CORRUPTED` | a chunk of an upload does not match its CRC-32C; `metadata["offset"]` says which |
@@ -42,7 +44,7 @@ use tonic_types::{ErrorDetails, FieldViolation, StatusExt};
 
 use crate::domain::job::{JobName, JobState};
 use crate::domain::{InputName, InvalidInput, Oversize, Violation};
-use crate::engine;
+use crate::engine::{self, TakenId};
 
 /// Domain of every `ErrorInfo`.
 pub const DOMAIN: &str = "scpsfm";
@@ -241,8 +243,13 @@ pub fn from_engine(error: engine::Error) -> Status {
         }
         engine::Error::UploadTooLarge(oversize) => too_large("UPLOAD_TOO_LARGE", "start.size_bytes", &oversize),
         engine::Error::BatchTooLarge(oversize) => too_large("BATCH_TOO_LARGE", "requests", &oversize),
-        engine::Error::AlreadyExists(sentence) => {
-            status(Code::AlreadyExists, "ALREADY_EXISTS", sentence, ErrorDetails::new())
+        engine::Error::AlreadyExists(taken) => {
+            let reason = match taken {
+                TakenId::Job(_) => "JOB_ID_TAKEN",
+                TakenId::Request(_) => "REQUEST_ID_REUSED",
+                TakenId::Upload(..) => "UPLOAD_ID_REUSED",
+            };
+            status(Code::AlreadyExists, reason, taken.to_string(), ErrorDetails::new())
         }
         engine::Error::QueueFull { retry_after, bound, message } => {
             let metadata = HashMap::from([("bound".to_owned(), bound.to_owned())]);

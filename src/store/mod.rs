@@ -52,9 +52,9 @@ pub enum Error {
     /// The upload alone is more than the tenant may ever have.
     #[error("{0}")]
     UploadTooLarge(Oversize),
-    /// The job id is taken, or the request id or upload id stands for another body.
+    /// An id stands for something else already.
     #[error("{0}")]
-    AlreadyExists(String),
+    AlreadyExists(TakenId),
     /// Only ended jobs can be removed.
     #[error("{0} is {name}; only a job that has ended can be deleted: cancel it first", name = .1.name())]
     NotEnded(JobName, JobState),
@@ -85,6 +85,18 @@ pub enum Error {
     /// What was read is not what was written.
     #[error("store corrupt: {0}")]
     Corrupt(String),
+}
+
+/// An id that cannot be used again.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum TakenId {
+    #[error("{0} already exists")]
+    Job(JobName),
+    #[error("request id {0:?} was used before with another body; a new request needs a new id")]
+    Request(String),
+    /// With what the bytes differ in.
+    #[error("upload {id} was begun with another {what}; other bytes need a new upload id", id = .0.input, what = .1)]
+    Upload(InputName, &'static str),
 }
 
 /// What another process may have changed.

@@ -23,7 +23,7 @@ impl<L: Listener> Listener for Bounded<L> {
 
     async fn accept(&mut self) -> (Connection<L::Io>, L::Addr) {
         let (io, address) = self.listener.accept().await;
-        (Connection { io, silence: self.silence, end: Box::pin(sleep(self.silence)) }, address)
+        (Connection::new(io, self.silence), address)
     }
 
     fn local_addr(&self) -> io::Result<L::Addr> {
@@ -40,9 +40,9 @@ pub struct Connection<T> {
 }
 
 impl<T> Connection<T> {
-    /// What is bounded.
-    pub fn inner(&self) -> &T {
-        &self.io
+    /// Ends what is silent for so long.
+    pub fn new(io: T, silence: Duration) -> Self {
+        Self { io, silence, end: Box::pin(sleep(silence)) }
     }
 
     /// Passes on what an operation came to, unless it waits and has done so for too long.

@@ -50,8 +50,14 @@ impl Answer {
 /// A request of HTTP/1.0, whose answer ends with the connection.
 fn request(server: &Serving, verb: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Answer {
     let address = server.http.strip_prefix("http://").expect("an address");
+    request_for(server, address, verb, path, headers, body)
+}
+
+/// The same for a host of this name.
+fn request_for(server: &Serving, host: &str, verb: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Answer {
+    let address = server.http.strip_prefix("http://").expect("an address");
     let mut connection = TcpStream::connect(address).expect("the port answers");
-    let mut head = format!("{verb} {path} HTTP/1.0\r\nhost: {address}\r\ncontent-length: {}\r\n", body.len());
+    let mut head = format!("{verb} {path} HTTP/1.0\r\nhost: {host}\r\ncontent-length: {}\r\n", body.len());
     for (name, value) in headers {
         head.push_str(&format!("{name}: {value}\r\n"));
     }
@@ -107,7 +113,7 @@ fn a_job_is_created_watched_read_and_removed_by_http_alone() {
     let events = watched.text();
     let ids: Vec<u64> = events.lines().filter_map(|line| line.strip_prefix("id: ")?.parse().ok()).collect();
     assert_eq!(ids, (1..=ids.len() as u64).collect::<Vec<_>>(), "{events}");
-    assert!(events.contains("event: state_change\n") && events.contains("JOB_STATE_SUCCEEDED"), "{events}");
+    assert!(events.contains("event: stateChange\n") && events.contains("JOB_STATE_SUCCEEDED"), "{events}");
     let later = request(&server, "GET", &format!("{path}/events"), &[("last-event-id", "2")], &[]).text();
     assert!(later.contains("id: 3\n") && !later.contains("id: 2\n"), "{later}");
     let result = get(&server, &format!("{path}/result")).json();
@@ -135,7 +141,7 @@ fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
     for (body, field) in [
         (with(&|set| set["xs"][7] = json!("NaN")), "track_set.xs[7]"),
         (with(&|set| set["trackCount"] = json!(4_294_967_295_u32)), "track_set.track_count"),
-        (with(&|set| set["views"][1]["name"] = json!("a.jpg")), "track_set.views[1]"),
+        (with(&|set| set["views"][1]["name"] = json!("a.jpg")), "track_set.views[1].name"),
         (with(&|set| set["sigma"] = json!([])), "body"),
         (with(&|set| set["xs"][0] = json!("five")), "body"),
         (with(&|set| set["trackCount"] = json!(-1)), "body"),
@@ -149,12 +155,15 @@ fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
     let json = [("content-type", "application/json")];
     let cut = request(&server, "POST", jobs, &json, b"{\"trackSet\": {");
     assert_eq!((cut.code, cut.refusal().1.as_str()), (400, "body"));
-    let deep = request(&server, "POST", jobs, &json, "[".repeat(100_000).as_bytes());
+    let deep = format!("{{\"job\": {{\"labels\": {}", "[".repeat(100_000));
+    let deep = request(&server, "POST", jobs, &json, deep.as_bytes());
     assert_eq!((deep.code, deep.refusal().1.as_str()), (400, "body"));
     let unread = get(&server, "/v1/tenants/default/jobs?pageSize=many");
     assert_eq!((unread.code, unread.refusal().1.as_str()), (400, "pageSize"));
     let unknown = get(&server, "/v1/tenants/default/jobs?page=1");
     assert_eq!((unknown.code, unknown.refusal().1.as_str()), (400, "page"));
+    let rebound = request_for(&server, "evil.example", "GET", jobs, &[("origin", "http://evil.example")], &[]);
+    assert_eq!((rebound.code, rebound.refusal().0.as_str()), (403, "HOST_REFUSED"));
     for (answer, code, reason) in [
         (request(&server, "POST", jobs, &[("content-type", "text/plain")], b"{}"), 415, "UNSUPPORTED_MEDIA_TYPE"),
         (request(&server, "PUT", jobs, &json, b"{}"), 405, "METHOD_NOT_ALLOWED"),
@@ -162,6 +171,11 @@ fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
         (get(&server, "/v1/tenants/default/jobs/none"), 404, "JOB_NOT_FOUND"),
         (get(&server, "/v1/tenants/A/jobs"), 400, "INVALID_ARGUMENT"),
         (request(&server, "GET", jobs, &[("origin", "https://elsewhere.example")], &[]), 403, "ORIGIN_REFUSED"),
+        (
+            post(&server, "/v1/tenants/default/jobs?requestId=r", &json!({"trackSet": tracks()})),
+            400,
+            "INVALID_ARGUMENT",
+        ),
     ] {
         assert_eq!((answer.code, answer.refusal().0.as_str()), (code, reason), "{}", answer.text());
     }
@@ -203,6 +217,13 @@ fn an_input_is_uploaded_as_json_or_protobuf_and_solved() {
     let protobuf = [("content-type", "application/x-protobuf")];
     let by_protobuf = request(&server, "POST", "/v1/tenants/-/inputs", &protobuf, &bytes);
     assert_eq!(by_protobuf.json()["sizeBytes"], bytes.len().to_string(), "{}", by_protobuf.text());
+    // Sent again, as after an answer that was lost: it is the same input, and nothing is sent twice.
+    let named = format!(
+        "/v1/tenants/-/inputs?uploadId={}",
+        by_protobuf.json()["name"].as_str().expect("a name").rsplit('/').next().expect("an id")
+    );
+    let again = request(&server, "POST", &named, &protobuf, &bytes);
+    assert_eq!(again.json(), by_protobuf.json(), "{}", again.text());
     let damaged = request(&server, "POST", "/v1/tenants/-/inputs", &protobuf, &bytes[1..]);
     assert_eq!((damaged.code, damaged.refusal().1.as_str()), (400, "data"));
     let inputs = get(&server, "/v1/tenants/-/inputs").json();

@@ -243,11 +243,16 @@ fn is_of_input(violation: &Violation) -> bool {
     INPUT_FIELDS.contains(&first)
 }
 
-/// Reads `track_set.xs[17]` back into field and index.
+/// Reads `track_set.xs[17]` or `track_set.views[2].name` back into its parts.
 fn violation(path: &str, description: String) -> Violation {
-    let indexed = path.strip_suffix(']').and_then(|path| path.rsplit_once('['));
-    match indexed.and_then(|(field, index)| Some((field, index.parse().ok()?))) {
-        Some((field, index)) => Violation::at(field, index, description),
+    let parts = || {
+        let (field, rest) = path.split_once('[')?;
+        let (index, part) = rest.split_once(']')?;
+        Some((field, index.parse().ok()?, part.strip_prefix('.')))
+    };
+    match parts() {
+        Some((field, index, Some(part))) => Violation::at(field, index, description).within(part),
+        Some((field, index, None)) => Violation::at(field, index, description),
         None => Violation::of(path, description),
     }
 }
@@ -296,8 +301,10 @@ mod tests {
         };
         assert_eq!(violations, [sent]);
         assert_eq!(message, "track_set.xs[17]: NaN is not a finite number");
-        let whole = violation("settings.alpha", "is wrong".into());
-        assert_eq!(whole, Violation::of("settings.alpha", "is wrong"));
+        let of_view = Violation::at("track_set.views", 2, "is odd").within("size.width_px");
+        assert_eq!(violation(&of_view.path(), "is odd".into()), of_view);
+        let whole = violation("job.settings.alpha", "is wrong".into());
+        assert_eq!(whole, Violation::of("job.settings.alpha", "is wrong"));
     }
 
     #[test]
@@ -357,9 +364,15 @@ mod tests {
             let status = status::invalid(&Violation::of(field, "is wrong").into());
             Failure::from(Error::from_status("http://a", &status, true)).exit
         };
-        for flag in
-            ["settings.alpha", "settings.backend", "job.labels", "job.time_limit", "job_id", "filter", "after_sequence"]
-        {
+        for flag in [
+            "job.settings.alpha",
+            "job.settings.backend",
+            "job.labels",
+            "job.time_limit",
+            "job_id",
+            "filter",
+            "after_sequence",
+        ] {
             assert_eq!(exit(flag), Exit::Usage, "{flag}");
         }
         for input in ["track_set.xs", "track_set.views", "measurement_matrix.values", "input"] {

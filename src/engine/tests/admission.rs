@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::engine::{Error, JobQuery};
+use crate::store::TakenId;
 
 #[tokio::test]
 async fn a_full_queue_refuses_at_once_and_takes_on_again() {
@@ -67,7 +68,7 @@ async fn bad_arguments_name_their_field() {
     assert_eq!(fields(error), ["tenant", "job_id", "request_id"]);
     let mut bad = new_job(Script::Succeed);
     bad.settings.alpha = f64::NAN;
-    assert_eq!(fields(bench.engine.submit(bad).await.expect_err("refused")), ["settings.alpha"]);
+    assert_eq!(fields(bench.engine.submit(bad).await.expect_err("refused")), ["job.settings.alpha"]);
     let query = JobQuery { page_token: Some("x".into()), ..JobQuery::default() };
     assert_eq!(fields(bench.engine.list(&query).await.expect_err("refused")), ["page_token"]);
     let name = bench.submit(Script::Succeed).await;
@@ -82,7 +83,7 @@ async fn job_ids_are_the_callers_or_made() {
     let job = bench.engine.submit(mine()).await.expect("admitted");
     assert_eq!(job.name.to_string(), "tenants/default/jobs/mine");
     let taken = bench.engine.submit(mine()).await.expect_err("taken");
-    assert_eq!(taken, Error::AlreadyExists("tenants/default/jobs/mine already exists".into()));
+    assert_eq!(taken, Error::AlreadyExists(TakenId::Job(JobName { tenant: "default".into(), job: "mine".into() })));
     let made = bench.submit(Script::Succeed).await;
     assert!(JobName::parse(&made.to_string()).is_some(), "{made}");
     let missing = JobName { tenant: "other".into(), job: "mine".into() };

@@ -101,8 +101,8 @@ mod tests {
         }
         assert_eq!(Method::from_wire(0, "method"), Ok(None));
         assert!(JobState::required(0, "state").is_err());
-        let violation = Method::from_wire(99, "settings.method").expect_err("unknown");
-        assert_eq!(violation.to_string(), "settings.method: 99 is not a known Method");
+        let violation = Method::from_wire(99, "job.settings.method").expect_err("unknown");
+        assert_eq!(violation.to_string(), "job.settings.method: 99 is not a known Method");
     }
 
     #[test]

@@ -40,7 +40,11 @@ impl Draft {
             Some(Inline::TrackSet(set)) => Body::TrackSet(set),
             Some(Inline::MeasurementMatrix(matrix)) => Body::Matrix(matrix),
             Some(Inline::Input(_)) | None => {
-                return Err(Violation::of("source", "is not set; give a track_set or a measurement_matrix").into());
+                return Err(Violation::of(
+                    "source",
+                    "is not set; give a track_set, a measurement_matrix or the name of an uploaded input",
+                )
+                .into());
             }
         };
         Ok(Self { body, limits: limits.clone() })

@@ -7,10 +7,10 @@ use crate::rpc::proto;
 /// Fills in the defaults, then checks every field.
 ///
 /// # Errors
-/// Violations of `settings.<field>`.
+/// Violations of `job.settings.<field>`.
 pub fn from_wire(settings: Option<proto::SolveSettings>) -> Result<SolveSettings, InvalidInput> {
     let given = settings.unwrap_or_default();
-    let method = Method::from_wire(given.method, "settings.method")?.unwrap_or_default();
+    let method = Method::from_wire(given.method, "job.settings.method")?.unwrap_or_default();
     let default = SolveSettings::of_method(method);
     let settings = SolveSettings {
         method,
@@ -27,7 +27,7 @@ pub fn from_wire(settings: Option<proto::SolveSettings>) -> Result<SolveSettings
         noise_px: given.noise_px,
         focal_per_view: given.focal_per_view,
         weights_every: given.weights_every,
-        backend: Backend::from_wire(given.backend, "settings.backend")?,
+        backend: Backend::from_wire(given.backend, "job.settings.backend")?,
         // Ablations are no service to callers.
         excluded_proposals: Vec::new(),
     };
@@ -87,9 +87,9 @@ mod tests {
             error.violations().iter().map(|violation| violation.field.clone()).collect::<Vec<_>>()
         };
         let empty = proto::SolveSettings::default();
-        assert_eq!(wrong(proto::SolveSettings { method: 77, ..empty }), ["settings.method"]);
-        assert_eq!(wrong(proto::SolveSettings { backend: -1, ..empty }), ["settings.backend"]);
-        assert_eq!(wrong(proto::SolveSettings { alpha: Some(f64::NAN), ..empty }), ["settings.alpha"]);
-        assert_eq!(wrong(proto::SolveSettings { iterations: Some(0), ..empty }), ["settings.iterations"]);
+        assert_eq!(wrong(proto::SolveSettings { method: 77, ..empty }), ["job.settings.method"]);
+        assert_eq!(wrong(proto::SolveSettings { backend: -1, ..empty }), ["job.settings.backend"]);
+        assert_eq!(wrong(proto::SolveSettings { alpha: Some(f64::NAN), ..empty }), ["job.settings.alpha"]);
+        assert_eq!(wrong(proto::SolveSettings { iterations: Some(0), ..empty }), ["job.settings.iterations"]);
     }
 }

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::domain::{Oversize, Quota};
+use crate::store::TakenId;
 
 pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
     let now = time(0) + Duration::from_micros(1);
@@ -86,7 +87,7 @@ pub(in crate::store) async fn one_request_id_from_many_callers_is_one_job(store:
 pub(in crate::store) async fn a_taken_job_id_is_refused(store: &dyn Store) {
     create(store, record("a"), 0).await;
     let error = store.create_job(record("a"), &ROOM, time(1)).await.expect_err("taken");
-    assert_eq!(error, Error::AlreadyExists("tenants/t/jobs/a already exists".into()));
+    assert_eq!(error, Error::AlreadyExists(TakenId::Job(JobName { tenant: "t".into(), job: "a".into() })));
 }
 
 pub(in crate::store) async fn admission_bounds_what_waits(store: &dyn Store) {
@@ -141,10 +142,10 @@ pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &dyn 
     let names = ["a", "b", "taken"];
     let batch: Vec<_> = names.map(record).to_vec();
     let error = store.create_jobs(batch.clone(), &ROOM, time(1)).await.expect_err("a taken id");
-    assert_eq!(error, Error::AlreadyExists("tenants/t/jobs/taken already exists".into()));
+    assert_eq!(error, Error::AlreadyExists(TakenId::Job(JobName { tenant: "t".into(), job: "taken".into() })));
     let twice = vec![record("a"), record("a")];
     let error = store.create_jobs(twice, &ROOM, time(1)).await.expect_err("an id twice");
-    assert_eq!(error, Error::AlreadyExists("tenants/t/jobs/a already exists".into()));
+    assert_eq!(error, Error::AlreadyExists(TakenId::Job(JobName { tenant: "t".into(), job: "a".into() })));
     // One of the two has room, both have not.
     let bounds = QueueBounds { max_jobs: 2, ..ROOM };
     let error = store.create_jobs(batch[..2].to_vec(), &bounds, time(1)).await.expect_err("full");

@@ -8,7 +8,7 @@ use super::{Change, Connection, Row, Statement, uploads};
 use crate::domain::InputName;
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::store::record::{Created, EncodedResult, JobInput, Load, NewRecord, QueueBounds, Request, Work};
-use crate::store::{Error, JobPage, JobQuery, Order, payload};
+use crate::store::{Error, JobPage, JobQuery, Order, TakenId, payload};
 
 /// Number of a job's first event, which its row counts.
 const FIRST_EVENT: u64 = 1;
@@ -169,7 +169,7 @@ async fn admit<C: Connection>(
         .bind(&new.name.tenant)
         .bind(&new.name.job);
     if connection.row(taken).await?.flag("taken")? {
-        return Err(Error::AlreadyExists(format!("{} already exists", new.name)));
+        return Err(Error::AlreadyExists(TakenId::Job(new.name.clone())));
     }
     let (whole, tenant) = waiting.look(connection, &new.name.tenant, bounds).await?;
     match bounds.refuses(&whole, &tenant, new.input.bytes(), u64::from(new.observation_count)) {
@@ -185,10 +185,7 @@ async fn earlier<C: Connection>(connection: &mut C, tenant: &str, request: &Requ
         .bind(&request.id);
     let Some(known) = connection.optional_row(select).await? else { return Ok(None) };
     if known.bytes("digest")? != request.digest {
-        return Err(Error::AlreadyExists(format!(
-            "request id {:?} was used before with another body; a new request needs a new id",
-            request.id
-        )));
+        return Err(Error::AlreadyExists(TakenId::Request(request.id.clone())));
     }
     let select = Statement::new(select_jobs!("WHERE id = $1")).bind(known.integer("job_id")?);
     // None where the job was deleted between the two looks: its request id is free again.
@@ -382,13 +379,15 @@ pub(super) async fn work<C: Connection>(connection: &mut C, name: &JobName) -> R
 
 /// The encoded result of a job, if it has one.
 pub(super) async fn result<C: Connection>(connection: &mut C, name: &JobName) -> Result<Option<EncodedResult>, Error> {
-    let select = Statement::new("SELECT id, result_sha256 FROM jobs WHERE tenant = $1 AND job = $2");
-    let row = connection.optional_row(select.bind(&name.tenant).bind(&name.job)).await?;
-    let row = row.ok_or_else(|| Error::NotFound(name.clone()))?;
-    let Some(sha256) = row.optional_bytes("result_sha256")? else { return Ok(None) };
+    // In one look: between two the job may be deleted.
+    let select = Statement::new(
+        "SELECT result_sha256, data FROM jobs LEFT JOIN result_chunks ON result_chunks.job_id = jobs.id \
+         WHERE tenant = $1 AND job = $2 ORDER BY chunk",
+    );
+    let chunks = connection.rows(select.bind(&name.tenant).bind(&name.job)).await?;
+    let first = chunks.first().ok_or_else(|| Error::NotFound(name.clone()))?;
+    let Some(sha256) = first.optional_bytes("result_sha256")? else { return Ok(None) };
     let sha256 = sha256.try_into().map_err(|_| Error::Corrupt(format!("the digest of the result of {name}")))?;
-    let select = Statement::new("SELECT data FROM result_chunks WHERE job_id = $1 ORDER BY chunk");
-    let chunks = connection.rows(select.bind(row.integer("id")?)).await?;
     Ok(Some(EncodedResult { bytes: joined(&chunks)?, sha256 }))
 }
 

@@ -203,8 +203,8 @@ pub(super) fn migration_failed(error: sqlx::migrate::MigrateError) -> Error {
     match error {
         Execute(error) | ExecuteMigration(error, _) => error.into(),
         VersionMissing(step) | VersionMismatch(step) => Error::Corrupt(format!(
-            "step {step} of its schema is not of this version: it is the store of a newer server, or of one before 0.2. \
-             Of that let its own version end the jobs, and begin with a new data directory or database"
+            "step {step} of its schema is not of this version: it is the store of a newer server, or of an \
+             earlier build. Let that build end its jobs, and begin with a new data directory or database"
         )),
         error => Error::Corrupt(format!("cannot bring the schema up to date: {error}")),
     }

@@ -9,7 +9,7 @@ use crate::domain::input_name::InputName;
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
 };
-use crate::store::{Error, InputPage, InputQuery, payload};
+use crate::store::{Error, InputPage, InputQuery, TakenId, payload};
 
 /// Rows of parts that one look removes at most, 32 MB of them: writers wait meanwhile.
 const PURGE_PARTS: u32 = 128;
@@ -135,10 +135,7 @@ fn check_same(new: &NewUpload, bytes: u64, sha256: Option<[u8; 32]>) -> Result<(
         return Ok(());
     }
     let what = if other_hash { "SHA-256" } else { "length" };
-    Err(Error::AlreadyExists(format!(
-        "upload {} was begun with another {what}; other bytes need a new upload id",
-        new.name.input
-    )))
+    Err(Error::AlreadyExists(TakenId::Upload(new.name.clone(), what)))
 }
 
 async fn open<C: Connection>(

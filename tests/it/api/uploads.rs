@@ -253,7 +253,7 @@ async fn an_upload_id_stands_for_one_length_and_hash() {
         }
         for other in [declared(bytes.len() + 1, &right), declared(bytes.len(), &[1; 32])] {
             let status = send(&mut inputs, other).await.expect_err("other bytes");
-            assert_eq!((status.code(), reason(&status).as_str()), (Code::AlreadyExists, "ALREADY_EXISTS"));
+            assert_eq!((status.code(), reason(&status).as_str()), (Code::AlreadyExists, "UPLOAD_ID_REUSED"));
         }
     }
     assert!(send(&mut inputs, declared(bytes.len(), &right)).await.is_ok());
