@@ -185,9 +185,9 @@ pub fn tell_notes(input: &LabelledInput) {
 /// Files for other programs.
 #[derive(Debug, Clone, Args)]
 pub struct ExportArgs {
-    /// Also write a metric result for these programs, below the output directory: colmap/ and colmap-text/ hold a
-    /// sparse model, opensfm/ a reconstruction.json; of several parts, folders 1/ and on hold COLMAP's models of the
-    /// smaller ones
+    /// Also write the result for these programs, each below the output directory in a folder of its name: colmap/ and
+    /// colmap-text/ hold a sparse model (of several parts, folders 1/ and on those of the smaller ones), colmap-db/ a
+    /// database.db, opensfm/ a reconstruction.json. All but colmap-db need a metric result
     #[arg(long, value_name = "KIND", value_enum, value_delimiter = ',')]
     pub export: Vec<ExportArg>,
 }
@@ -209,14 +209,14 @@ impl ExportArgs {
         }
     }
 
-    /// Writes the result files and, where there is the input, what is asked for other programs. A result that is not
-    /// metric is no failure: it is told on stderr.
+    /// Writes the result files and, where there is the input, what is asked for other programs. What cannot be written,
+    /// as of a result that is not metric, is no failure: it is told on stderr.
     ///
     /// # Errors
     /// A file that cannot be written or removed.
     pub fn write(&self, directory: &Path, solution: &Solution, input: Option<&LabelledInput>) -> Result<(), Failure> {
         if let Some(refused) = result_files::write(directory, solution, input, &self.exports())? {
-            tell!("warning: nothing was exported: {refused}");
+            tell!("warning: {refused}");
         }
         Ok(())
     }
@@ -416,6 +416,9 @@ pub enum ExportArg {
     Colmap,
     /// A COLMAP sparse model, text
     ColmapText,
+    /// A copy of the COLMAP database that is solved, with the matches that are right as verified two-view geometries
+    /// and the estimated cameras: for COLMAP's mapper
+    ColmapDb,
     /// OpenSfM's reconstruction.json
     Opensfm,
 }
@@ -425,6 +428,7 @@ impl From<ExportArg> for Export {
         match export {
             ExportArg::Colmap => Export::Colmap,
             ExportArg::ColmapText => Export::ColmapText,
+            ExportArg::ColmapDb => Export::ColmapDatabase,
             ExportArg::Opensfm => Export::OpenSfm,
         }
     }

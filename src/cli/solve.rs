@@ -26,7 +26,7 @@ Examples:
   scpsfm solve observations.csv --width 3072 --height 2048 --out answer
   scpsfm solve observations.csv --out answer --json | jq .focal_px
   scpsfm solve observations.csv --out answer --server http://127.0.0.1:50051
-  scpsfm solve database.db --out answer --export colmap,opensfm
+  scpsfm solve database.db --out answer --export colmap-db,colmap   # COLMAP's mapper goes on from either
   scpsfm solve tracks.csv --width 3072 --height 2048 --out answer
   scpsfm solve kitti.csv --width 1242 --height 375 --window 11 --out windows   # the paper's KITTI protocol
 

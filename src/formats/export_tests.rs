@@ -4,7 +4,8 @@ use nalgebra::{Rotation3, Vector3};
 use serde_json::Value;
 
 use super::*;
-use crate::domain::{Calibration, ImageSize, LensProjection};
+use crate::domain::ImageSize;
+use crate::formats::lens_fixture::{fisheye, lens, scene_of};
 use crate::formats::{Label, fixture, result_files};
 
 /// The model of a result in one part.
@@ -12,10 +13,20 @@ fn model_of(solution: &Solution, input: &LabelledInput) -> Model {
     Model::of_parts(solution, input).expect("metric").remove(0)
 }
 
-const ALL: [Export; 3] = Export::ALL;
+const ALL: [Export; 3] = [Export::Colmap, Export::ColmapText, Export::OpenSfm];
+
+/// Every file of an export of a result in one part.
+fn files(export: Export) -> &'static [&'static str] {
+    match export {
+        Export::Colmap => &["cameras.bin", "images.bin", "points3D.bin"],
+        Export::ColmapText => &["cameras.txt", "images.txt", "points3D.txt"],
+        Export::ColmapDatabase => &["database.db"],
+        Export::OpenSfm => &["reconstruction.json"],
+    }
+}
 
 /// Writes a result and these exports of it; returns why there are none.
-fn write(directory: &Path, exports: &[Export], solution: &Solution, input: &LabelledInput) -> Option<metric::Error> {
+fn write(directory: &Path, exports: &[Export], solution: &Solution, input: &LabelledInput) -> Option<NotExported> {
     result_files::write(directory, solution, Some(input), exports).expect("written")
 }
 
@@ -27,7 +38,7 @@ fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
     write(directory, &ALL, &solution, &input);
     let paths: Vec<_> = ALL
         .iter()
-        .flat_map(|export| export.files().1.iter().map(|file| directory.join(export.files().0).join(file)))
+        .flat_map(|export| files(*export).iter().map(|file| directory.join(export.folder()).join(file)))
         .collect();
     assert_eq!(paths.len(), 7);
     assert!(paths.iter().all(|path| path.metadata().is_ok_and(|metadata| metadata.len() > 0)));
@@ -35,8 +46,34 @@ fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
     fs::write(&mine, "x").expect("written");
     let (input, projective) = fixture::projective_only();
     let refused = write(directory, &ALL, &projective, &input).expect("not metric");
-    assert!(refused.to_string().contains("not metric"), "{refused}");
+    assert!(refused.to_string().starts_with("nothing was exported: the result is not metric"), "{refused}");
     assert!(paths.iter().all(|path| !path.exists()) && mine.exists());
+}
+
+#[test]
+fn an_export_that_is_not_written_does_not_keep_the_others() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let (mut input, solution) = fixture::solved();
+    let asked = [Export::ColmapDatabase, Export::OpenSfm, Export::OpenSfm];
+    let refused = write(directory.path(), &asked, &solution, &input).expect("no database").to_string();
+    assert_eq!(refused, "not exported: colmap-db: the input is no COLMAP database: there is none to copy");
+    assert!(!directory.path().join("colmap-db").exists() && directory.path().join("opensfm").exists());
+    colmap::database_fixture::dress(&mut input);
+    input.path = directory.path().join("none.db");
+    let refused = write(directory.path(), &asked, &solution, &input).expect("no file").to_string();
+    assert!(refused.contains("colmap-db: the database cannot be copied"), "{refused}");
+    assert!(!directory.path().join("colmap-db").exists());
+    colmap::database_fixture::write(&input.path, &input, "");
+    assert_eq!(write(directory.path(), &asked, &solution, &input), None);
+    assert!(directory.path().join("colmap-db/database.db").is_file());
+    // The next run takes it away, as it takes every file of a former one.
+    assert_eq!(write(directory.path(), &[], &solution, &input), None);
+    assert!(!directory.path().join("colmap-db").exists());
+    assert_eq!(write(directory.path(), &[Export::ColmapDatabase], &fixture::projective_only().1, &input), None);
+    let mut nothing = solution;
+    nothing.views.iter_mut().for_each(|view| *view = Default::default());
+    let refused = write(directory.path(), &[Export::ColmapDatabase], &nothing, &input).expect("nothing").to_string();
+    assert_eq!(refused, "nothing was exported: no view of the result has a camera");
 }
 
 /// Where OpenSfM's formulas put every point of the file in every shot, against the observations (its `perspective`,
@@ -92,51 +129,6 @@ fn worst_of_opensfm(json: &Value, input: &LabelledInput, solution: &Solution) ->
     }
     assert!(seen > 50);
     worst
-}
-
-/// The solved scene of the fixture under another lens: the observations are exactly those of the result.
-fn scene_of(calibration: Calibration, size: ImageSize) -> (LabelledInput, Solution) {
-    let (mut input, mut solution) = fixture::solved();
-    solution.calibrations = vec![calibration];
-    input.raw.views.iter_mut().for_each(|view| view.size = Some(size));
-    for k in (0..input.raw.x.len()).filter(|&k| solution.observations.inlier[k]) {
-        let view = &solution.views[input.raw.view[k] as usize];
-        let point = solution.tracks.point[input.raw.track[k] as usize].expect("an inlier");
-        let (rotation, translation) = (view.rotation.expect("a pose"), view.translation.expect("a pose"));
-        let seen: [f64; 3] = std::array::from_fn(|row| {
-            (0..3).map(|axis| rotation[row][axis] * point[axis]).sum::<f64>() + translation[row]
-        });
-        let [x, y] = calibration.distort(seen[0] / seen[2], seen[1] / seen[2]);
-        let [px, py] = calibration.principal_point_px;
-        input.raw.x[k] = calibration.focal_px * x + px;
-        input.raw.y[k] = calibration.aspect * calibration.focal_px * y + py;
-    }
-    (input, solution)
-}
-
-/// Under a fisheye, which has no tangential distortion.
-fn fisheye(aspect: f64, radial: [f64; 3], principal_point_px: [f64; 2]) -> Calibration {
-    let [k1, k2, k3] = radial;
-    Calibration { lens_projection: LensProjection::Fisheye, ..lens(aspect, [k1, k2, k3, 0.0, 0.0], principal_point_px) }
-}
-
-/// * `coefficients`: `k1`, `k2`, `k3`, `p1`, `p2`
-fn lens(aspect: f64, coefficients: [f64; 5], principal_point_px: [f64; 2]) -> Calibration {
-    let [radial_k1, radial_k2, radial_k3, tangential_p1, tangential_p2] = coefficients;
-    Calibration {
-        focal_px: 900.0,
-        sigma_log_focal: Some(0.01),
-        principal_point_px,
-        aspect,
-        lens_projection: LensProjection::Perspective,
-        radial_k1,
-        radial_k2,
-        radial_k3,
-        tangential_p1,
-        tangential_p2,
-        grade: None,
-        sigmas: Default::default(),
-    }
 }
 
 #[test]
@@ -228,9 +220,12 @@ fn cameras_are_apart_where_sizes_groups_or_focal_lengths_are() {
     solution.views.iter_mut().enumerate().for_each(|(view, result)| result.focal_px = Some(500.0 + view as f64));
     assert_eq!(ids(&input, &solution), [1, 2, 3, 4, 5]);
     let (mut input, solution) = fixture::solved();
-    input.image_ids = vec![11, 12, 13, 14, 15];
+    input.colmap_images = (11..16).map(|id| colmap::ColmapImage { id, ..Default::default() }).collect();
     input.raw.views.iter_mut().enumerate().for_each(|(view, of)| of.camera_group = 20 + view as u32 / 3);
     assert_eq!(ids(&input, &solution), [20, 20, 20, 21, 21]);
+    let (input, mut solution) = (input, solution);
+    solution.views.iter_mut().enumerate().for_each(|(view, result)| result.focal_px = Some(500.0 + view as f64));
+    assert_eq!(ids(&input, &solution), [20, 1, 2, 21, 3]);
 }
 
 #[test]
@@ -335,15 +330,16 @@ fn models_of_other_programs_stay() {
     assert!(write(directory, &[], &solution, &input).is_none());
     assert!(folders[0].join("cameras.bin").is_file());
     write(directory, &ALL, &solution, &input);
-    for (folder, file) in folders.iter().zip(["points3D.bin", "images.txt", "reconstruction.json"]) {
+    for (export, folder) in ALL.iter().zip(&folders) {
+        let file = files(*export)[0];
         let mut bytes = fs::read(folder.join(file)).expect("a file");
         *bytes.last_mut().expect("bytes") ^= 1;
         fs::write(folder.join(file), bytes).expect("written");
     }
     write(directory, &[], &solution, &input);
     for export in ALL {
-        let (folder, files) = export.files();
-        assert!(files.iter().all(|file| directory.join(folder).join(file).is_file()), "{export:?}");
+        let folder = directory.join(export.folder());
+        assert!(files(export).iter().all(|file| folder.join(file).is_file()), "{export:?}");
     }
 }
 

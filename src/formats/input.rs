@@ -2,8 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use super::colmap::ColmapImage;
 use super::error::{Error, Place, Problem, Problems};
 use super::label::Label;
+use super::source::Format;
 use crate::domain::{Input, InvalidInput, Limits, RawInput, Violation};
 
 /// What a file says: dense indices for the solver, the file's own ids for the answers.
@@ -16,11 +18,15 @@ pub struct LabelledInput {
     pub track_labels: Vec<Label>,
     /// Line of each observation, counted from 1; empty where the file has no lines.
     pub lines: Vec<u64>,
-    /// COLMAP's id of each view's image, kept for what is exported to COLMAP; empty for other files.
-    pub image_ids: Vec<u32>,
+    /// What COLMAP's files say of each view's image, kept for what is exported to COLMAP; empty for other files.
+    pub colmap_images: Vec<ColmapImage>,
+    /// Index of each observation's keypoint in its image; empty where the file has no such indices.
+    pub keypoints: Vec<u32>,
     /// What reading changed or left out, a sentence each.
     pub notes: Vec<String>,
     pub path: PathBuf,
+    /// Kind of the file; `None`: none was read.
+    pub format: Option<Format>,
 }
 
 impl LabelledInput {

@@ -37,6 +37,15 @@ impl Written {
         Self { path: parts.join("/"), bytes: bytes.len() as u64, sha256: format!("{:x}", Sha256::digest(bytes)) }
     }
 
+    /// Of a file that stands at `place` and is to be at `path` below the directory.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub fn of_file(path: &Path, place: &Path) -> io::Result<Self> {
+        let bytes = place.symlink_metadata()?.len();
+        Ok(Self { bytes, sha256: sha256(place)?, ..Self::new(path, &[]) })
+    }
+
     /// Below the directory, parts separated by `/`.
     pub fn path(&self) -> &str {
         &self.path
@@ -59,12 +68,17 @@ impl Written {
         if !metadata.is_file() || metadata.len() != self.bytes {
             return Ok(false);
         }
-        let (mut file, mut sum, mut chunk) = (File::open(place)?, Sha256::new(), vec![0; CHUNK_BYTES]);
-        loop {
-            match file.read(&mut chunk)? {
-                0 => return Ok(format!("{:x}", sum.finalize()) == self.sha256),
-                count => sum.update(&chunk[..count]),
-            }
+        Ok(sha256(place)? == self.sha256)
+    }
+}
+
+/// In hexadecimal digits.
+fn sha256(place: &Path) -> io::Result<String> {
+    let (mut file, mut sum, mut chunk) = (File::open(place)?, Sha256::new(), vec![0; CHUNK_BYTES]);
+    loop {
+        match file.read(&mut chunk)? {
+            0 => return Ok(format!("{:x}", sum.finalize())),
+            count => sum.update(&chunk[..count]),
         }
     }
 }

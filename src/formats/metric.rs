@@ -6,6 +6,7 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use super::LabelledInput;
 use super::cameras_json::groups_of_views;
+use super::colmap::{FIRST_PIXEL, Frame};
 use super::label::Label;
 use super::ply::colour;
 use super::result_json::{track_label, view_label};
@@ -39,6 +40,8 @@ pub struct Camera {
     pub id: u32,
     pub size: ImageSize,
     pub intrinsics: Calibration,
+    /// COLMAP's model that the input gave the camera.
+    pub colmap_model: Option<&'static str>,
 }
 
 /// A view with a pose, `x ~ K (R X + t)`.
@@ -46,15 +49,18 @@ pub struct Camera {
 pub struct Image {
     pub id: u32,
     pub name: Label,
+    /// COLMAP's frame of the image, where the input has one of its own for each.
+    pub colmap_frame: Option<Frame>,
     /// Position among the cameras.
     pub camera: usize,
     pub rotation: UnitQuaternion<f64>,
     pub translation: [f64; 3],
-    /// Every observation of the view in the order of the input, with the position of its point where it is right.
+    /// Every observation of the view in the order of the input, with the position of its point where it is right; where
+    /// the input knows all keypoints of the image ([`LabelledInput::colmap_images`]), these, in their order.
     pub keypoints: Vec<Keypoint>,
 }
 
-/// An observation: pixels, and the position of its point.
+/// An observation or another keypoint: pixels, and the position of its point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Keypoint {
     pub x: f64,
@@ -153,27 +159,59 @@ fn images(solution: &Solution, input: &LabelledInput, part: u32) -> (Vec<Camera>
         let sides = size.map(|size| (size.width_px, size.height_px));
         let key = (group, own_group, sides, result.focal_px.map(|_| view));
         let camera = *known.entry(key).or_insert_with(|| {
-            cameras.push(camera(cameras.len(), size, calibration, result));
+            cameras.push(Camera {
+                colmap_model: input.colmap_images.get(view).and_then(|image| image.camera_model),
+                ..camera(cameras.len(), size, calibration, result)
+            });
             own_groups.push(own_group);
             cameras.len() - 1
         });
         image_of_view[view] = Some(images.len());
+        let of_colmap = input.colmap_images.get(view);
         images.push(Image {
             // Without ids of its own, an input's views are numbered from 1, as COLMAP does.
-            id: input.image_ids.get(view).copied().unwrap_or(view as u32 + 1),
+            id: of_colmap.map_or(view as u32 + 1, |image| image.id),
             name: view_label(solution, Some(input), view),
+            colmap_frame: of_colmap.and_then(|image| image.frame),
             camera,
             rotation: quaternion(rotation),
             translation,
-            keypoints: Vec::new(),
+            keypoints: known_keypoints(input, view),
         });
     }
-    let distinct: BTreeSet<u32> = own_groups.iter().copied().collect();
-    // What came from COLMAP goes back under its own ids, unless a camera became several.
-    if !input.image_ids.is_empty() && distinct.len() == cameras.len() {
-        cameras.iter_mut().zip(own_groups).for_each(|(camera, group)| camera.id = group);
+    if !input.colmap_images.is_empty() {
+        take_back_ids(&mut cameras, &own_groups, input);
     }
     (cameras, images, image_of_view)
+}
+
+/// Cameras of COLMAP go back under their own ids; of one that became several, as many focal lengths do, the first does,
+/// and the others get ids that are free.
+fn take_back_ids(cameras: &mut [Camera], own_groups: &[u32], input: &LabelledInput) {
+    let mut taken: BTreeSet<u32> = input.raw.views.iter().map(|view| view.camera_group).collect();
+    let mut given = BTreeSet::new();
+    let mut next = 1;
+    for (camera, group) in cameras.iter_mut().zip(own_groups) {
+        camera.id = match given.insert(*group) {
+            true => *group,
+            false => {
+                while !taken.insert(next) {
+                    next += 1;
+                }
+                next
+            }
+        };
+    }
+}
+
+/// Every keypoint that the input knows of a view's image, of no point yet.
+fn known_keypoints(input: &LabelledInput, view: usize) -> Vec<Keypoint> {
+    let known = input.colmap_images.get(view).map(|image| image.keypoints.as_slice()).unwrap_or_default();
+    let keypoint = |at: &[f32; 2]| {
+        let [x, y] = at.map(|px| f64::from(px) - FIRST_PIXEL);
+        Keypoint { x, y, point: None }
+    };
+    known.iter().map(keypoint).collect()
 }
 
 /// Camera `position`; without a size, the principal point is taken as the middle.
@@ -185,6 +223,7 @@ fn camera(position: usize, size: Option<ImageSize>, calibration: &Calibration, v
         id: position as u32 + 1,
         size: size.unwrap_or(ImageSize { width_px: side(x), height_px: side(y) }),
         intrinsics: Calibration { focal_px: view.focal_px.unwrap_or(calibration.focal_px), ..*calibration },
+        colmap_model: None,
     }
 }
 
@@ -220,18 +259,35 @@ fn points(
     for k in 0..raw.x.len() {
         let Some(image) = image_of(k) else { continue };
         let point = shown(solution, input, k).and_then(|place| position_of[place]);
+        let keypoint = place(&mut images[image].keypoints, input, k, point);
         if let Some(point) = point {
-            points[point].seen.push((image, images[image].keypoints.len()));
+            points[point].seen.push((image, keypoint));
         }
-        images[image].keypoints.push(Keypoint { x: raw.x[k], y: raw.y[k], point });
     }
     number(&mut points, input);
     points
 }
 
+/// Puts an observation among the keypoints of its image: at its own place where the input knows all of them, else at
+/// the end. Returns the place.
+fn place(keypoints: &mut Vec<Keypoint>, input: &LabelledInput, k: usize, point: Option<usize>) -> usize {
+    let observation = Keypoint { x: input.raw.x[k], y: input.raw.y[k], point };
+    let own = input.keypoints.get(k).map(|&own| own as usize).filter(|_| !input.colmap_images.is_empty());
+    match own.filter(|&own| own < keypoints.len()) {
+        Some(own) => {
+            keypoints[own] = observation;
+            own
+        }
+        None => {
+            keypoints.push(observation);
+            keypoints.len() - 1
+        }
+    }
+}
+
 /// Which point an observation shows: the index of its track for the track's own, behind all tracks the position among
 /// the splits for another; `None`: none.
-fn shown(solution: &Solution, input: &LabelledInput, k: usize) -> Option<usize> {
+pub(super) fn shown(solution: &Solution, input: &LabelledInput, k: usize) -> Option<usize> {
     let track = input.raw.track[k];
     if solution.observations.inlier.get(k) == Some(&true) {
         return Some(track as usize);

@@ -1,7 +1,8 @@
 //! Files in and out: tables of observations, OpenSfM's and COLMAP's files, and the result files, whose fields are a
 //! contract.
 //!
-//! May depend on `domain`, and on `report` for the page among the result files; knows nothing of transport.
+//! May depend on `domain` and `geometry`, and on `report` for the page among the result files; knows nothing of
+//! transport.
 
 pub mod cameras_json;
 pub mod colmap;
@@ -24,6 +25,8 @@ pub mod windows;
 
 #[cfg(test)]
 pub(crate) mod fixture;
+#[cfg(test)]
+pub(crate) mod lens_fixture;
 #[cfg(test)]
 pub(crate) mod mutation;
 

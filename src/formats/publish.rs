@@ -67,6 +67,35 @@ impl<'a> Draft<'a> {
         Ok(())
     }
 
+    /// Lets `write` make a file under a temporary name, as a program does that needs a file to work on; `path` is below
+    /// the directory. What it says is wrong is returned, and then there is no file.
+    ///
+    /// # Errors
+    /// The file cannot be read back or brought to the disk; the message names it.
+    pub fn add_with<E>(
+        &mut self,
+        path: impl AsRef<Path>,
+        write: impl FnOnce(&Path) -> Result<(), E>,
+    ) -> io::Result<Result<(), E>> {
+        let target = self.directory.join(&path);
+        if let Some(folder) = target.parent() {
+            create_directory(folder)?;
+        }
+        let file = TemporaryFile::of(&target);
+        if let Err(what) = write(&file.temporary) {
+            drop(file);
+            self.remove_empty_folders(&target);
+            return Ok(Err(what));
+        }
+        let finished = || {
+            File::open(&file.temporary)?.sync_all()?;
+            Written::of_file(path.as_ref(), &file.temporary)
+        };
+        let written = finished().map_err(|error| file.failed(&error))?;
+        self.files.push((written, file));
+        Ok(Ok(()))
+    }
+
     /// Gives the files their names and takes away what a former run left beside them, as far as it still is what that
     /// run wrote. The file that says that the others are there, `last`, goes before any other changes, and comes last.
     ///
@@ -124,13 +153,17 @@ impl<'a> Draft<'a> {
     /// Removes a file, and the folders below the directory that are empty then.
     fn take_away(&self, place: &Path) -> io::Result<()> {
         remove(place)?;
+        self.remove_empty_folders(place);
+        Ok(())
+    }
+
+    fn remove_empty_folders(&self, place: &Path) {
         for folder in place.ancestors().skip(1).take_while(|folder| *folder != self.directory) {
             // What is not empty holds files that are not ours.
             if fs::remove_dir(folder).is_err() {
                 break;
             }
         }
-        Ok(())
     }
 }
 
@@ -142,10 +175,15 @@ struct TemporaryFile {
 }
 
 impl TemporaryFile {
-    fn write(target: &Path, bytes: &[u8]) -> io::Result<Self> {
+    /// One that is still to be written.
+    fn of(target: &Path) -> Self {
         let name = target.file_name().unwrap_or_default().to_string_lossy();
         let temporary = target.with_file_name(format!(".{name}.{}", std::process::id()));
-        let file = Self { temporary, target: target.to_owned() };
+        Self { temporary, target: target.to_owned() }
+    }
+
+    fn write(target: &Path, bytes: &[u8]) -> io::Result<Self> {
+        let file = Self::of(target);
         let attempt = || {
             let mut open = File::create(&file.temporary)?;
             open.write_all(bytes)?;

@@ -4,9 +4,10 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::cameras_json::CamerasJson;
+use super::export::NotExported;
 use super::publish::{Draft, pretty};
 use super::result_json::{ResultJson, track_label, view_label};
-use super::{Export, LabelledInput, export, manifest, metric, ply};
+use super::{Export, LabelledInput, export, manifest, ply};
 use crate::domain::{Solution, Status};
 use crate::report;
 
@@ -32,7 +33,7 @@ pub fn result_json(solution: &Solution, input: Option<&LabelledInput>) -> io::Re
 /// nothing is written for other programs. What a former run left there and this one does not make goes: see
 /// [`manifest`].
 ///
-/// Returns why nothing was written for other programs though it was asked for; that is no failure.
+/// Returns what was not written for other programs though it was asked for; that is no failure.
 ///
 /// # Errors
 /// The first file that cannot be written, named; until every file is on the disk the former ones stand.
@@ -41,7 +42,7 @@ pub fn write(
     solution: &Solution,
     input: Option<&LabelledInput>,
     exports: &[Export],
-) -> io::Result<Option<metric::Error>> {
+) -> io::Result<Option<NotExported>> {
     let mut draft = Draft::new(directory, input.map(|input| input.path.as_path()))?;
     draft.add(TRACKS, tracks_csv(solution, input).as_bytes())?;
     if let Some(input) = input {
@@ -65,7 +66,11 @@ pub fn write(
 pub fn replaced(directory: &Path, exports: &[Export], input: &Path) -> Option<PathBuf> {
     let input = input.canonicalize().ok()?;
     let names = [TRACKS, OBSERVATIONS, CAMERAS, POINTS, REPORT, RESULT, manifest::NAME].map(PathBuf::from);
-    let folders = exports.iter().map(|export| export.folder().into());
+    let folders = exports.iter().flat_map(|export| {
+        let folder = PathBuf::from(export.folder());
+        let files: Vec<PathBuf> = export.inputs().iter().map(|file| folder.join(file)).collect();
+        files.into_iter().chain([folder])
+    });
     names.into_iter().chain(folders).map(|name| directory.join(name)).find(|place| {
         let here = place.canonicalize();
         here.is_ok_and(|here| here == input)
@@ -106,13 +111,14 @@ fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
     text
 }
 
-/// `view,track,inlier,residual_px,weight,split` in the order of the caller's file; an observation that was not judged
-/// has an empty residual, one that shows no other point of its track an empty split.
+/// `view,track,inlier,residual_px,weight,split,x_px,y_px,keypoint` in the order of the caller's file; an observation
+/// that was not judged has an empty residual, one that shows no other point of its track an empty split, one of a file
+/// that has no keypoints (features) an empty keypoint. Pixels are the input's, (0, 0) the centre of the top-left one.
 ///
 /// Where nothing was reconstructed there is no point that an observation could show: its weight is that of its track.
 fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {
     let judged = &solution.observations;
-    let mut text = String::from("view,track,inlier,residual_px,weight,split\n");
+    let mut text = String::from("view,track,inlier,residual_px,weight,split,x_px,y_px,keypoint\n");
     for (k, (&view, &track)) in input.raw.view.iter().zip(&input.raw.track).enumerate() {
         let inlier = judged.inlier.get(k).copied().unwrap_or(false);
         let residual = judged.residual_px.get(k).copied().flatten();
@@ -121,14 +127,18 @@ fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {
             Status::Solved => judged.weight.get(k),
             Status::NoReconstruction => solution.tracks.weight.get(track as usize),
         };
+        let keypoint = input.keypoints.get(k);
         text.push_str(&format!(
-            "{},{},{},{},{},{}\n",
+            "{},{},{},{},{},{},{},{},{}\n",
             view_label(solution, Some(input), view as usize).csv(),
             track_label(Some(input), track as usize).csv(),
             u8::from(inlier),
             residual.map_or_else(String::new, |px| px.to_string()),
             weight.copied().unwrap_or(0.0),
             if split > 0 { split.to_string() } else { String::new() },
+            input.raw.x[k],
+            input.raw.y[k],
+            keypoint.map_or_else(String::new, u32::to_string),
         ));
     }
     text

@@ -282,12 +282,16 @@ fn answers_carry_the_callers_ids_in_the_callers_order() {
     let expected = if solution.tracks.inlier[1] { "102,0.98,1,0.8,0" } else { "102,0.03,0,0.2," };
     assert_eq!(tracks[2], expected);
     let observations: Vec<&str> = files[OBSERVATIONS].lines().collect();
-    assert_eq!(observations[0], "view,track,inlier,residual_px,weight,split");
+    assert_eq!(observations[0], "view,track,inlier,residual_px,weight,split,x_px,y_px,keypoint");
     assert_eq!(observations.len(), 201);
     assert!(observations[1].starts_with("3,102,"), "{}", observations[1]);
-    assert!(observations[4].ends_with(",0.25,2"), "{}", observations[4]);
+    let pixels = |k: usize| format!("{},{}", input.raw.x[k], input.raw.y[k]);
+    assert!(observations[4].ends_with(&format!(",0.25,2,{},", pixels(3))), "{}", observations[4]);
     let outlier = solution.observations.inlier.iter().position(|&inlier| !inlier).expect("an outlier");
-    assert!(observations[outlier + 1].ends_with(",0,,0,"), "{}", observations[outlier + 1]);
+    let wanted = format!(",0,,0,,{},", pixels(outlier));
+    assert!(observations[outlier + 1].ends_with(&wanted), "{}", observations[outlier + 1]);
+    input.keypoints = (0..200).map(|k| 1000 + k).collect();
+    assert!(observations_csv(&solution, &input).lines().nth(4).is_some_and(|line| line.ends_with(",1003")));
 }
 
 #[test]
@@ -459,6 +463,11 @@ fn the_input_is_not_replaced() {
     assert_eq!(replaced(directory.path(), &[], &model), None);
     assert_eq!(replaced(directory.path(), &[Export::Colmap], &model), Some(model.clone()));
     assert_eq!(replaced(&directory.path().join("new"), &Export::ALL, &inside), None);
+    let database = directory.path().join("colmap-db/database.db");
+    fs::create_dir_all(directory.path().join("colmap-db")).expect("created");
+    fs::write(&database, "x").expect("written");
+    assert_eq!(replaced(directory.path(), &Export::ALL, &database), Some(database.clone()));
+    assert_eq!(replaced(directory.path(), &[Export::Colmap], &database), None);
 }
 
 /// Ranked and not verified: the ranking is in every table, and cameras.json says why there are no cameras.

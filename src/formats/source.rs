@@ -74,6 +74,7 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
         Format::ColmapDatabase => colmap::database::read(path, limits, reading.matches),
         Format::ColmapModel => colmap::model::read(path, limits),
     }?;
+    labelled.format = Some(format);
     labelled.name_views();
     Ok(labelled)
 }

@@ -30,7 +30,7 @@ pub fn cut(input: &LabelledInput, range: &Range<usize>) -> LabelledInput {
         raw: RawInput { views: raw.views[range.clone()].to_vec(), track_count: kept.len(), ..RawInput::default() },
         view_labels: input.view_labels[range.clone()].to_vec(),
         track_labels: kept.iter().map(|&track| input.track_labels[track].clone()).collect(),
-        image_ids: input.image_ids.get(range.clone()).unwrap_or_default().to_vec(),
+        colmap_images: input.colmap_images.get(range.clone()).unwrap_or_default().to_vec(),
         path: input.path.clone(),
         ..LabelledInput::default()
     };
@@ -43,6 +43,7 @@ pub fn cut(input: &LabelledInput, range: &Range<usize>) -> LabelledInput {
         cut.raw.depth.extend(raw.depth.get(k));
         cut.raw.sigma.extend(raw.sigma.get(k));
         cut.lines.extend(input.lines.get(k));
+        cut.keypoints.extend(input.keypoints.get(k));
     }
     cut
 }

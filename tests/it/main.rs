@@ -7,6 +7,7 @@ mod batch;
 mod chaos;
 mod chart;
 mod cli;
+mod colmap;
 mod crash;
 mod dashboards;
 mod disk;

@@ -1,8 +1,9 @@
 //! Reading a COLMAP database (SQLite): keypoints, and matches joined into tracks.
 //!
-//! The only SQL outside `store`, and of another kind: it reads a file of someone else's, and never writes.
+//! The only SQL outside `store` beside that of `write_database`, and of another kind: it reads a file of someone
+//! else's, and never writes.
 
-mod rows;
+pub(super) mod rows;
 
 use std::path::{Path, PathBuf};
 
@@ -10,6 +11,7 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{ConnectOptions, Connection};
 
 use self::rows::Keypoints;
+pub(super) use self::rows::MAX_MATCHES;
 use super::images::{Images, Observation};
 use super::tracks::{self, Match};
 use crate::domain::Limits;
@@ -30,11 +32,15 @@ pub fn read(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<La
     let file = display_path(path);
     let one = |problem: Problem| Error::one(&file, problem);
     refuse_unfinished(path).map_err(|what| Error::whole(&file, what))?;
-    let contents = on_a_runtime_of_its_own(path, limits, matches).map_err(one)?;
+    let contents = run_apart(async || contents(path, limits, matches).await).map_err(one)?;
     let labelled = contents.into_labelled(path, limits).map_err(one)?;
     labelled.check(limits)?;
     Ok(labelled)
 }
+
+/// What is said of a database whose rigs have several cameras.
+const SHARED_FRAMES: &str = "frames of several images (rigs of several cameras) are solved as images on their own; a \
+    model that is exported is not one that COLMAP goes on from with this database";
 
 /// What a database holds of use here.
 struct Contents {
@@ -44,10 +50,11 @@ struct Contents {
     matches: Vec<Match>,
     pairs: usize,
     kind: Matches,
+    notes: Vec<String>,
 }
 
 impl Contents {
-    fn into_labelled(self, path: &Path, limits: &Limits) -> Result<LabelledInput, Problem> {
+    fn into_labelled(mut self, path: &Path, limits: &Limits) -> Result<LabelledInput, Problem> {
         let count = self.matches.len();
         let keypoints = self.keypoints;
         let joined = tracks::join(self.matches, |keypoint| keypoints.image_of(keypoint));
@@ -69,10 +76,15 @@ impl Contents {
         );
         let observation = |&(keypoint, track): &(u32, u32)| {
             let [x, y] = keypoints.point(keypoint);
-            Observation { image: keypoints.image_of(keypoint), track: u64::from(track), x, y, line: 0 }
+            let [image, keypoint] = keypoints.place(keypoint);
+            Observation { image, keypoint, track: u64::from(track), x, y, line: 0 }
         };
         let observations = joined.observations.iter().map(observation).collect();
-        Ok(self.images.into_labelled(observations, path, vec![note]))
+        for (image, keypoints) in keypoints.into_images() {
+            self.images.set_keypoints(image, keypoints);
+        }
+        let notes = [vec![note], self.notes].concat();
+        Ok(self.images.into_labelled(observations, path, notes))
     }
 }
 
@@ -84,7 +96,7 @@ fn kind_name(kind: Matches) -> &'static str {
 }
 
 /// Refuses a database with a journal: what stands in there alone would be missed, or half a change be read.
-fn refuse_unfinished(path: &Path) -> Result<(), String> {
+pub(super) fn refuse_unfinished(path: &Path) -> Result<(), String> {
     for suffix in ["-wal", "-journal"] {
         let mut journal = path.as_os_str().to_owned();
         journal.push(suffix);
@@ -103,16 +115,16 @@ fn refuse_unfinished(path: &Path) -> Result<(), String> {
 
 /// Runs the queries on a thread and a runtime of their own: this module is synchronous, its callers may be on a
 /// runtime, which must not be blocked on from within.
-fn on_a_runtime_of_its_own(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<Contents, Problem> {
+pub(super) fn run_apart<T: Send>(work: impl AsyncFnOnce() -> Result<T, Problem> + Send) -> Result<T, Problem> {
     let work = || {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_time()
             .build()
             .map_err(|error| Problem::unreadable(format_args!("no runtime: {error}")))?;
-        runtime.block_on(contents(path, limits, matches))
+        runtime.block_on(work())
     };
     std::thread::scope(|scope| scope.spawn(work).join())
-        .unwrap_or_else(|_| Err(Problem::unreadable("reading it failed within this program")))
+        .unwrap_or_else(|_| Err(Problem::of_file("cannot be used: its queries failed within this program")))
 }
 
 async fn contents(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<Contents, Problem> {
@@ -144,10 +156,16 @@ async fn read_tables(
         false => Err(Problem::of_file(format!("is no COLMAP database: it has no table `{table}`"))),
     };
     ["cameras", "images", "keypoints"].into_iter().try_for_each(require)?;
-    let mut images = Images::default();
+    let (mut images, mut notes) = (Images::default(), Vec::new());
     rows::cameras(connection, &mut images).await?;
     rows::images(connection, limits.max_views, &mut images).await?;
     let keypoints = rows::keypoints(connection, &images).await?;
+    if ["frames", "frame_data"].iter().all(|table| tables.contains(*table)) {
+        match rows::frames(connection, &images).await? {
+            Some(frames) => images.set_frames(frames),
+            None => notes.push(SHARED_FRAMES.into()),
+        }
+    }
     let kinds: &[Matches] = match matches {
         Some(Matches::Verified) => &[Matches::Verified],
         Some(Matches::Raw) => &[Matches::Raw],
@@ -157,7 +175,7 @@ async fn read_tables(
         require(rows::table(kind))?;
         let (matches, pairs) = rows::matches(connection, kind, &images, &keypoints).await?;
         if !matches.is_empty() {
-            return Ok(Contents { images, keypoints, matches, pairs, kind });
+            return Ok(Contents { images, keypoints, matches, pairs, kind, notes });
         }
     }
     Err(Problem::of_file(match matches {

@@ -115,7 +115,8 @@ fn matches_become_tracks_of_images_by_name_in_our_pixels() {
     let (_directory, path) = with_matches("two_view_geometries", &CHAIN);
     let input = read(&path, &Limits::default(), None).expect("a valid database");
     let names: Vec<String> = input.view_labels.iter().map(Label::to_string).collect();
-    assert_eq!((names, &input.image_ids[..]), (["a.jpg", "b.jpg", "c.jpg"].map(String::from).to_vec(), &[5, 2, 1][..]));
+    let ids: Vec<u32> = input.colmap_images.iter().map(|image| image.id).collect();
+    assert_eq!((names, ids), (["a.jpg", "b.jpg", "c.jpg"].map(String::from).to_vec(), vec![5, 2, 1]));
     assert_eq!(input.track_labels, [Label::Number(0), Label::Number(1)]);
     assert_eq!((&input.raw.view[..], &input.raw.track[..]), (&[2, 1, 0, 2, 1, 0][..], &[0, 0, 0, 1, 1, 1][..]));
     assert_eq!(input.raw.x, [10.0, 21.0, 50.0, 12.0, 22.0, 51.0]);

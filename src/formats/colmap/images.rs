@@ -9,6 +9,25 @@ use crate::domain::{RawInput, View};
 use crate::formats::input::LabelledInput;
 use crate::formats::label::{Label, dense};
 
+/// What COLMAP's files say of an image beside its tracks.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ColmapImage {
+    pub id: u32,
+    /// Name of its camera's model; `None`: one that the solver does not fit.
+    pub camera_model: Option<&'static str>,
+    /// Of a database whose every frame is one image; `None`: of other files, and where a rig takes several.
+    pub frame: Option<Frame>,
+    /// Every keypoint in COLMAP's order and pixels, of a track or not.
+    pub keypoints: Vec<[f32; 2]>,
+}
+
+/// Ids of the frame and the rig of an image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Frame {
+    pub id: u32,
+    pub rig: u32,
+}
+
 /// Cameras by id, and images in the order of the file.
 #[derive(Debug, Default)]
 pub(super) struct Images {
@@ -16,6 +35,8 @@ pub(super) struct Images {
     images: Vec<Image>,
     by_id: HashMap<u32, u32>,
     names: HashSet<Label>,
+    /// By image id.
+    frames: HashMap<u32, Frame>,
 }
 
 #[derive(Debug)]
@@ -23,6 +44,7 @@ struct Image {
     id: u32,
     name: Label,
     camera: u32,
+    keypoints: Vec<[f32; 2]>,
 }
 
 /// One keypoint of a track.
@@ -30,6 +52,8 @@ struct Image {
 pub(super) struct Observation {
     /// Position of the image in the file.
     pub image: u32,
+    /// Position of the keypoint in the image.
+    pub keypoint: u32,
     pub track: u64,
     /// In COLMAP's pixels.
     pub x: f64,
@@ -60,8 +84,26 @@ impl Images {
         if self.by_id.insert(id, position).is_some() {
             return Err("is there a second time".into());
         }
-        self.images.push(Image { id, name, camera });
+        self.images.push(Image { id, name, camera, keypoints: Vec::new() });
         Ok(position)
+    }
+
+    /// Adds the next keypoint of an image, of a track or not; returns its index.
+    pub fn add_keypoint(&mut self, image: u32, x: f64, y: f64) -> u32 {
+        let keypoints = &mut self.images[image as usize].keypoints;
+        keypoints.push([x as f32, y as f32]);
+        // A keypoint takes some bytes of a file, more than 2^32 of them no image.
+        (keypoints.len() - 1) as u32
+    }
+
+    /// Every keypoint of an image.
+    pub fn set_keypoints(&mut self, image: u32, keypoints: Vec<[f32; 2]>) {
+        self.images[image as usize].keypoints = keypoints;
+    }
+
+    /// The frame of each image, by image id.
+    pub fn set_frames(&mut self, frames: HashMap<u32, Frame>) {
+        self.frames = frames;
     }
 
     pub fn len(&self) -> usize {
@@ -76,7 +118,12 @@ impl Images {
     /// The input; its views are the images in the order of their names, each with its camera as group.
     ///
     /// A track keeps one observation of each image, the one that comes first; a note counts the others.
-    pub fn into_labelled(self, mut observations: Vec<Observation>, path: &Path, notes: Vec<String>) -> LabelledInput {
+    pub fn into_labelled(
+        mut self,
+        mut observations: Vec<Observation>,
+        path: &Path,
+        notes: Vec<String>,
+    ) -> LabelledInput {
         let mut notes = notes;
         let repeated = drop_repeated(&mut observations);
         if repeated > 0 {
@@ -108,9 +155,11 @@ impl Images {
             } else {
                 Vec::new()
             },
-            image_ids: order.iter().map(|&image| self.images[image].id).collect(),
+            colmap_images: order.iter().map(|&image| self.colmap_image(image)).collect(),
+            keypoints: observations.iter().map(|observation| observation.keypoint).collect(),
             notes,
             path: path.into(),
+            ..LabelledInput::default()
         }
     }
 
@@ -123,6 +172,18 @@ impl Images {
             size: camera.map(|camera| camera.size),
             camera_group: id,
             focal_prior: camera.and_then(|camera| camera.focal_prior),
+        }
+    }
+
+    /// Takes what is kept of an image.
+    fn colmap_image(&mut self, image: usize) -> ColmapImage {
+        let Image { id, camera, ref mut keypoints, .. } = self.images[image];
+        let model = self.cameras.get(&camera).filter(|camera| !camera.is_foreign()).and_then(|camera| camera.model);
+        ColmapImage {
+            id,
+            camera_model: model.map(|model| model.name),
+            frame: self.frames.get(&id).copied(),
+            keypoints: std::mem::take(keypoints),
         }
     }
 
@@ -173,12 +234,20 @@ mod tests {
         assert_eq!(images.add_image(3, "a", 2), Ok(1));
         assert!(images.add_image(3, "c", 2).is_err() && images.add_image(9, "a", 2).is_err());
         assert!(images.add_image(9, "d", 1).expect_err("no camera 1").contains("camera 1"));
-        let at = |image, track, x| Observation { image, track, x, y: 1.5, line: 0 };
-        let seen = vec![at(0, 11, 1.0), at(1, 11, 2.0), at(0, 11, 3.0), at(0, 5, 4.0)];
+        for (image, x) in [(0, 1.0), (1, 9.0), (1, 2.0), (0, 3.0), (0, 4.0)] {
+            images.add_keypoint(image, x, 1.5);
+        }
+        let at = |image, keypoint, track, x| Observation { image, keypoint, track, x, y: 1.5, line: 0 };
+        let seen = vec![at(0, 0, 11, 1.0), at(1, 1, 11, 2.0), at(0, 1, 11, 3.0), at(0, 2, 5, 4.0)];
         let input = images.into_labelled(seen, Path::new("m"), Vec::new());
         assert_eq!(input.view_labels, [Label::Name("a".into()), Label::Name("b".into())]);
-        assert_eq!((&input.image_ids[..], &input.raw.view[..]), (&[3, 7][..], &[1, 0, 1][..]));
+        assert_eq!((input.colmap_images[0].id, input.colmap_images[1].id, &input.raw.view[..]), (3, 7, &[1, 0, 1][..]));
         assert_eq!((&input.raw.x[..], input.raw.y[0]), (&[0.5, 1.5, 3.5][..], 1.0));
+        assert_eq!(input.keypoints, [0, 1, 2]);
+        let images = &input.colmap_images;
+        assert_eq!(images[0].keypoints, [[9.0, 1.5], [2.0, 1.5]]);
+        assert_eq!(images[1].keypoints, [[1.0, 1.5], [3.0, 1.5], [4.0, 1.5]]);
+        assert_eq!((images[0].camera_model, images[0].frame), (Some("PINHOLE"), None));
         let view = &input.raw.views[0];
         assert_eq!((view.camera_group, view.size.map(|size| size.width_px)), (2, Some(320)));
         assert_eq!(view.focal_prior.map(|prior| prior.focal_px), Some(500.0));

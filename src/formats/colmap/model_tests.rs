@@ -2,7 +2,7 @@ use std::fs;
 use std::io::Cursor;
 
 use super::*;
-use crate::formats::colmap::write;
+use crate::formats::colmap::{ColmapImage, write};
 use crate::formats::metric::Model;
 use crate::formats::{Label, fixture, mutation};
 
@@ -11,7 +11,7 @@ fn exported() -> (LabelledInput, [Vec<u8>; 3], [String; 3]) {
     let (mut input, solution) = fixture::solved();
     // As COLMAP names them; the ids descend, so that positions and ids differ.
     input.view_labels = (0..5).map(|view| Label::Name(format!("image {view}.jpg").into())).collect();
-    input.image_ids = (0..5).map(|view| 9 - view).collect();
+    input.colmap_images = (0..5).map(|view| ColmapImage { id: 9 - view, ..ColmapImage::default() }).collect();
     input.raw.views.iter_mut().for_each(|view| view.camera_group = 4);
     let model = Model::of_parts(&solution, &input).expect("a metric result").remove(0);
     (input, write::binary(&model), write::text(&model))
@@ -56,7 +56,8 @@ fn what_is_written_comes_back_from_text_and_binary() {
     let solution = fixture::solved().1;
     for back in [from_text, from_binary] {
         assert_eq!(back.view_labels, input.view_labels);
-        assert_eq!(back.image_ids, input.image_ids);
+        let ids = |input: &LabelledInput| input.colmap_images.iter().map(|image| image.id).collect::<Vec<_>>();
+        assert_eq!(ids(&back), ids(&input));
         assert_eq!(back.raw.views, input.raw.views);
         // The wrong tracks have no point, so they are not among the model's.
         let kept = |k: &usize| solution.observations.inlier[*k];

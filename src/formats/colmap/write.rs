@@ -1,14 +1,14 @@
 //! Writing a COLMAP sparse model, text and binary (COLMAP, `reconstruction_io_{text,binary}.cc`).
 //!
-//! An image's keypoints are the input's observations of it, outliers too, in the order of the input; a point's colour
-//! is that of its weight. Rigs and frames are left out: COLMAP makes trivial ones of the cameras and images.
+//! An image's keypoints are those of the database or the model that was read, all of them and under their indices, or
+//! else the input's observations of it, outliers too, in the order of the input; a point's colour is that of its
+//! weight. Rigs and frames are in [`super::write_frames`].
 
 use std::fmt::Write;
 
-use super::FIRST_PIXEL;
 use super::cameras::Model as CameraModel;
-use crate::domain::LensProjection;
-use crate::formats::metric::{Camera, Image, Model, Point};
+use super::{FIRST_PIXEL, intrinsics};
+use crate::formats::metric::{Image, Model, Point};
 
 /// What the text files begin with; other programs write other comments.
 const CAMERAS_TXT: &str = "# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n";
@@ -21,7 +21,7 @@ const NO_POINT: u64 = u64::MAX;
 pub fn binary(model: &Model) -> [Vec<u8>; 3] {
     let mut cameras = count(model.cameras.len());
     for camera in &model.cameras {
-        let (name, parameters) = parameters(camera);
+        let (name, parameters) = intrinsics::parameters(&camera.intrinsics, camera.colmap_model);
         // The table has every name that `parameters` gives.
         let id = CameraModel::of_name(name).map_or(-1, |model| model.id) as i32;
         cameras.extend(camera.id.to_le_bytes());
@@ -57,7 +57,7 @@ pub fn binary(model: &Model) -> [Vec<u8>; 3] {
     [cameras, images, points]
 }
 
-fn count(count: usize) -> Vec<u8> {
+pub(super) fn count(count: usize) -> Vec<u8> {
     (count as u64).to_le_bytes().to_vec()
 }
 
@@ -66,7 +66,7 @@ pub fn text(model: &Model) -> [String; 3] {
     // Writing to a String cannot fail. A number is written with as many digits as bring it back.
     let mut cameras = String::from(CAMERAS_TXT);
     for camera in &model.cameras {
-        let (name, parameters) = parameters(camera);
+        let (name, parameters) = intrinsics::parameters(&camera.intrinsics, camera.colmap_model);
         let _ = write!(cameras, "{} {name} {} {}", camera.id, camera.size.width_px, camera.size.height_px);
         parameters.iter().for_each(|value| _ = write!(cameras, " {value}"));
         cameras.push('\n');
@@ -96,34 +96,8 @@ pub fn text(model: &Model) -> [String; 3] {
     [cameras, images, points]
 }
 
-/// Model and parameters of a camera: the model with the fewest that says the same. COLMAP's coefficients are those of
-/// our model (`src/colmap/sensor/models.h`).
-fn parameters(camera: &Camera) -> (&'static str, Vec<f64>) {
-    let intrinsics = &camera.intrinsics;
-    let (fx, fy) = (intrinsics.focal_px, intrinsics.aspect * intrinsics.focal_px);
-    let [cx, cy] = intrinsics.principal_point_px.map(|centre| centre + FIRST_PIXEL);
-    let radial = [intrinsics.radial_k1, intrinsics.radial_k2, intrinsics.radial_k3];
-    let ([k1, k2, k3], p1, p2) = (radial, intrinsics.tangential_p1, intrinsics.tangential_p2);
-    let is_fisheye = intrinsics.lens_projection == LensProjection::Fisheye;
-    let radial_terms = radial.iter().rposition(|term| *term != 0.0).map_or(0, |last| last + 1);
-    let (is_square, is_centred) = (intrinsics.aspect == 1.0, p1 == 0.0 && p2 == 0.0);
-    match radial_terms {
-        0 | 1 if is_fisheye && is_square => ("SIMPLE_RADIAL_FISHEYE", vec![fx, cx, cy, k1]),
-        2 if is_fisheye && is_square => ("RADIAL_FISHEYE", vec![fx, cx, cy, k1, k2]),
-        // The last is a fourth term, which our model does not have.
-        _ if is_fisheye => ("OPENCV_FISHEYE", vec![fx, fy, cx, cy, k1, k2, k3, 0.0]),
-        0 if is_centred && is_square => ("SIMPLE_PINHOLE", vec![fx, cx, cy]),
-        0 if is_centred => ("PINHOLE", vec![fx, fy, cx, cy]),
-        1 if is_centred && is_square => ("SIMPLE_RADIAL", vec![fx, cx, cy, k1]),
-        2 if is_centred && is_square => ("RADIAL", vec![fx, cx, cy, k1, k2]),
-        0..=2 => ("OPENCV", vec![fx, fy, cx, cy, k1, k2, p1, p2]),
-        // The last three are those of a denominator that our model does not have.
-        _ => ("FULL_OPENCV", vec![fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]),
-    }
-}
-
 /// Rotation `w x y z` and translation, world to camera.
-fn pose(image: &Image) -> [f64; 7] {
+pub(super) fn pose(image: &Image) -> [f64; 7] {
     let (q, [x, y, z]) = (&image.rotation, image.translation);
     [q.w, q.i, q.j, q.k, x, y, z]
 }

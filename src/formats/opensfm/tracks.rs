@@ -2,7 +2,7 @@
 //!
 //! Version 0 has no header and the columns `image track feature x y r g b`; version 1 adds `scale` after `y`, version 2
 //! `segmentation instance` at the end (mapillary/OpenSfM, `opensfm/src/map/src/tracks_manager.cc`). Only image, track,
-//! x and y are used. x and y are relative to the image size, which the file does not hold.
+//! feature, x and y are used. x and y are relative to the image size, which the file does not hold.
 
 use std::collections::{BTreeSet, HashMap};
 use std::io::BufRead;
@@ -87,6 +87,8 @@ struct Table {
     tracks: Names,
     view: Vec<u32>,
     track: Vec<u32>,
+    /// OpenSfM's number of the feature in its image; `None`: it is no such number.
+    feature: Vec<Option<u32>>,
     x: Vec<f64>,
     y: Vec<f64>,
     lines: Vec<u64>,
@@ -110,6 +112,7 @@ impl Table {
             tracks: Names::default(),
             view: Vec::new(),
             track: Vec::new(),
+            feature: Vec::new(),
             x: Vec::new(),
             y: Vec::new(),
             lines: Vec::new(),
@@ -143,6 +146,7 @@ impl Table {
         let (middle_px, side_px) = frame(shot.size);
         self.view.push(view);
         self.track.push(track);
+        self.feature.push(fields[2].trim().parse().ok());
         self.x.push(x * side_px + middle_px[0]);
         self.y.push(y * side_px + middle_px[1]);
         self.lines.push(number_of_line);
@@ -205,6 +209,8 @@ impl Table {
             view_labels,
             track_labels,
             lines: self.lines,
+            // One that is no index is none of OpenSfM's, and then the others say nothing either.
+            keypoints: self.feature.into_iter().collect::<Option<_>>().unwrap_or_default(),
             notes,
             path: path.into(),
             ..LabelledInput::default()

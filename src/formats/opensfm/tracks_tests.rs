@@ -44,6 +44,7 @@ fn every_version_gives_the_same_pixels_under_names_and_ids_in_order() {
         assert!(input.raw.views.iter().all(|view| view.size == Some(SIZE)));
         let header = u64::from(number > 0);
         assert_eq!(input.lines, [1 + header, 2 + header, 3 + header]);
+        assert_eq!(input.keypoints, [5, 6, 7]);
     }
 }
 
@@ -51,6 +52,8 @@ fn every_version_gives_the_same_pixels_under_names_and_ids_in_order() {
 fn ids_that_are_no_numbers_are_names() {
     let input = parsed(VERSION_0.replace("\t10\t", "\t0x\t")).expect("valid");
     assert_eq!(input.track_labels, [Label::Number(9), Label::Name("0x".into())]);
+    let without_features = parsed(VERSION_0.replace("\t5\t", "\t-1\t")).expect("valid");
+    assert!(without_features.keypoints.is_empty());
 }
 
 #[test]

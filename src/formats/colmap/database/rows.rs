@@ -1,23 +1,23 @@
 //! The tables of a COLMAP database, row by row, every blob measured against what its row announces.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap, HashSet};
 
 use futures_util::TryStreamExt;
 use sqlx::sqlite::{SqliteConnection, SqliteRow};
 use sqlx::{Either, Executor, Row};
 
 use super::super::cameras::{Camera, Model};
-use super::super::images::Images;
+use super::super::images::{Frame, Images};
 use super::super::tracks::Match;
 use crate::formats::error::Problem;
 use crate::formats::source::Matches;
 
 /// COLMAP's numbering of pairs: `first * MAX_IMAGES + second`, first < second (`kMaxNumImages`, `types.h`).
-const MAX_IMAGES: u64 = 2_147_483_647;
+pub(in super::super) const MAX_IMAGES: u64 = 2_147_483_647;
 /// Keypoints in all: 2,000 images of 25,000, twice what COLMAP extracts at most by default. 8 bytes each are held.
 const MAX_KEYPOINTS: usize = 50_000_000;
 /// Matches in all: 2,000 images, each matched with 20 others, 800 matches a pair. Some 50 bytes each are held.
-const MAX_MATCHES: usize = 32_000_000;
+pub(in super::super) const MAX_MATCHES: usize = 32_000_000;
 
 /// The table with the matches of a kind.
 pub(super) fn table(kind: Matches) -> &'static str {
@@ -38,7 +38,7 @@ fn damaged(error: sqlx::Error) -> Problem {
 /// and its thread panics where a damaged schema has such that are not UTF-8. A stream of rows then just ends, and who asks
 /// that connection for more may wait for ever. So a stream that ends without its summary is an error, after which the
 /// connection must not be used.
-async fn for_each_row(
+pub(in super::super) async fn for_each_row(
     connection: &mut SqliteConnection,
     query: &'static str,
     mut each: impl FnMut(&SqliteRow) -> Result<(), Problem>,
@@ -55,7 +55,7 @@ async fn for_each_row(
 }
 
 /// The tables that a query may go to. Views and virtual tables are none: a query of one runs its maker's program.
-pub(super) async fn tables(connection: &mut SqliteConnection) -> Result<BTreeSet<String>, Problem> {
+pub(in super::super) async fn tables(connection: &mut SqliteConnection) -> Result<BTreeSet<String>, Problem> {
     let query = "SELECT +name AS name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'";
     let mut tables = BTreeSet::new();
     for_each_row(connection, query, |row| {
@@ -99,6 +99,29 @@ pub(super) async fn images(connection: &mut SqliteConnection, most: usize, image
     .await
 }
 
+/// The frame of each image, where it has one of its own; `None`: a frame has several images.
+pub(super) async fn frames(
+    connection: &mut SqliteConnection,
+    images: &Images,
+) -> Result<Option<HashMap<u32, Frame>>, Problem> {
+    let query = "SELECT +data.data_id AS image_id, +frames.frame_id AS frame_id, +frames.rig_id AS rig_id
+        FROM frame_data AS data JOIN frames ON frames.frame_id = data.frame_id WHERE data.sensor_type = 0
+        ORDER BY data.data_id";
+    let (mut frames, mut taken, mut is_trivial) = (HashMap::new(), HashSet::new(), true);
+    for_each_row(connection, query, |row| {
+        let id: u32 = integer(row, "frame_data", "image_id", 0)?;
+        if images.position(id).is_none() {
+            return Ok(());
+        }
+        let number = |column: &str| integer::<u32>(row, "frames", column, id.into());
+        let frame = Frame { id: number("frame_id")?, rig: number("rig_id")? };
+        is_trivial &= taken.insert(frame.id) && frames.insert(id, frame).is_none();
+        Ok(())
+    })
+    .await?;
+    Ok(is_trivial.then_some(frames))
+}
+
 /// Keypoints of all images, numbered image after image.
 #[derive(Debug)]
 pub(super) struct Keypoints {
@@ -112,6 +135,21 @@ impl Keypoints {
     /// Position of the image that a keypoint is of.
     pub fn image_of(&self, keypoint: u32) -> u32 {
         (self.starts.partition_point(|&start| start <= keypoint) - 1) as u32
+    }
+
+    /// Position of the image that a keypoint is of, and of the keypoint in that.
+    pub fn place(&self, keypoint: u32) -> [u32; 2] {
+        let image = self.image_of(keypoint);
+        [image, keypoint - self.starts[image as usize]]
+    }
+
+    /// The keypoints of each image, the last image first.
+    pub fn into_images(mut self) -> impl Iterator<Item = (u32, Vec<[f32; 2]>)> {
+        self.starts.pop();
+        std::iter::from_fn(move || {
+            let start = self.starts.pop()?;
+            Some((self.starts.len() as u32, self.points.split_off(start as usize)))
+        })
     }
 
     pub fn point(&self, keypoint: u32) -> [f64; 2] {
@@ -219,7 +257,12 @@ fn pair(row: &[u8]) -> [[u8; 4]; 2] {
 }
 
 /// An integer of a row. `id` names the row in errors.
-fn integer<T: TryFrom<i64>>(row: &SqliteRow, table: &str, column: &str, id: u64) -> Result<T, Problem> {
+pub(in super::super) fn integer<T: TryFrom<i64>>(
+    row: &SqliteRow,
+    table: &str,
+    column: &str,
+    id: u64,
+) -> Result<T, Problem> {
     let wrong = |what: String| Problem::of_record(format!("table {table}, row {id}: {column}"), what);
     let value: i64 = row.try_get(column).map_err(|error| wrong(unwrapped(error)))?;
     T::try_from(value).map_err(|_| wrong(format!("{value} is out of range")))

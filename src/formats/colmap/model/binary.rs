@@ -62,8 +62,9 @@ pub(super) fn images(
         let image = images.add_image(id, &name, camera).map_err(|what| bytes.wrong_at(start, what))?;
         for _ in 0..bytes.count("keypoints", POINT_BYTES)? {
             let (x, y, track) = (bytes.f64()?, bytes.f64()?, bytes.u64()?);
+            let keypoint = images.add_keypoint(image, x, y);
             if track != NO_POINT {
-                observations.push(Observation { image, track, x, y, line: 0 });
+                observations.push(Observation { image, keypoint, track, x, y, line: 0 });
             }
             room.check(images, &observations).map_err(|what| bytes.wrong_at(bytes.offset, what))?;
         }

@@ -74,7 +74,7 @@ pub(super) fn images(
         }
         let line = lines.expect_text().map_err(one)?;
         let second = lines.number();
-        keypoints(line, image, second, room.most_observations, &mut observations)
+        keypoints(line, image, second, room.most_observations, images, &mut observations)
             .and_then(|()| room.check(images, &observations))
             .map_err(|what| wrong(second, what))?;
     }
@@ -104,6 +104,7 @@ fn keypoints(
     image: u32,
     line_number: u64,
     most: usize,
+    images: &mut Images,
     observations: &mut Vec<Observation>,
 ) -> Result<(), String> {
     let mut fields = line.split_whitespace();
@@ -114,9 +115,10 @@ fn keypoints(
         };
         let named = |what: String| format!("keypoint {position}: {what}");
         let (x, y) = (number(x).map_err(named)?, number(y).map_err(named)?);
+        let keypoint = images.add_keypoint(image, x, y);
         if track != "-1" {
             let track = whole(track).map_err(named)?;
-            observations.push(Observation { image, track, x, y, line: line_number });
+            observations.push(Observation { image, keypoint, track, x, y, line: line_number });
             if observations.len() > most {
                 break;
             }
