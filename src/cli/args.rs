@@ -187,7 +187,8 @@ pub fn tell_notes(input: &LabelledInput) {
 pub struct ExportArgs {
     /// Also write the result for these programs, each below the output directory in a folder of its name: colmap/ and
     /// colmap-text/ hold a sparse model (of several parts, folders 1/ and on those of the smaller ones), colmap-db/ a
-    /// database.db, opensfm/ a reconstruction.json. All but colmap-db need a metric result
+    /// database.db, opensfm/ reconstruction.json, tracks.csv and camera_models.json. All but colmap-db need a metric
+    /// result
     #[arg(long, value_name = "KIND", value_enum, value_delimiter = ',')]
     pub export: Vec<ExportArg>,
 }
@@ -419,7 +420,7 @@ pub enum ExportArg {
     /// A copy of the COLMAP database that is solved, with the matches that are right as verified two-view geometries
     /// and the estimated cameras: for COLMAP's mapper
     ColmapDb,
-    /// OpenSfM's reconstruction.json
+    /// OpenSfM's reconstruction.json, with its tracks and its cameras
     Opensfm,
 }
 

@@ -21,7 +21,8 @@ pub enum Export {
     /// `colmap-db/database.db`, a copy of the COLMAP database that was solved with two-view geometries of the matches
     /// that are right and the cameras that were estimated.
     ColmapDatabase,
-    /// `opensfm/reconstruction.json`, a list with one reconstruction a part.
+    /// `opensfm/reconstruction.json`, a list with one reconstruction a part, `opensfm/tracks.csv` with the observations
+    /// of its points, and `opensfm/camera_models.json`.
     OpenSfm,
 }
 
@@ -80,7 +81,8 @@ impl Export {
     pub(super) fn inputs(self) -> &'static [&'static str] {
         match self {
             Export::ColmapDatabase => &[DATABASE],
-            Export::Colmap | Export::ColmapText | Export::OpenSfm => &[],
+            Export::OpenSfm => &[TRACKS],
+            Export::Colmap | Export::ColmapText => &[],
         }
     }
 
@@ -99,7 +101,7 @@ impl Export {
             Ok(models) => models,
             Err(refused) => return Ok(Err((*refused).into())),
         };
-        let files = match self.files(models)? {
+        let files = match self.files(models, solution)? {
             Ok(files) => files,
             Err(refused) => return Ok(Err(refused)),
         };
@@ -110,7 +112,7 @@ impl Export {
     }
 
     /// The files of an export that is made of models, the largest first.
-    fn files(self, models: &[Model]) -> io::Result<Result<Vec<File>, Refusal>> {
+    fn files(self, models: &[Model], solution: &Solution) -> io::Result<Result<Vec<File>, Refusal>> {
         let of_parts = |write: fn(&Model) -> Result<Vec<File>, Refusal>| -> Result<Vec<File>, Refusal> {
             let files = models.iter().map(|model| Ok(in_folder(model, write(model)?)));
             files.collect::<Result<Vec<_>, _>>().map(|parts| parts.into_iter().flatten().collect())
@@ -120,10 +122,11 @@ impl Export {
             Export::ColmapText => of_parts(|model| Ok(colmap_model(model, true))),
             // Its own file, see `database`.
             Export::ColmapDatabase => Ok(Vec::new()),
-            Export::OpenSfm => {
-                let json = pretty(&opensfm::reconstruction::json(models))?;
-                Ok(vec![("reconstruction.json".into(), json.into_bytes())])
-            }
+            Export::OpenSfm => Ok(vec![
+                ("reconstruction.json".into(), pretty(&opensfm::reconstruction::json(models))?.into()),
+                (TRACKS.into(), opensfm::write_tracks::csv(models, solution.noise_px).into()),
+                ("camera_models.json".into(), pretty(&opensfm::reconstruction::camera_models(models))?.into()),
+            ]),
         })
     }
 }
@@ -132,6 +135,7 @@ impl Export {
 type File = (PathBuf, Vec<u8>);
 
 const DATABASE: &str = "database.db";
+const TRACKS: &str = "tracks.csv";
 
 /// The files of a part; those of all but the largest are in a folder of its number.
 fn in_folder(model: &Model, files: Vec<File>) -> Vec<File> {

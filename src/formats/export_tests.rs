@@ -21,7 +21,7 @@ fn files(export: Export) -> &'static [&'static str] {
         Export::Colmap => &["cameras.bin", "images.bin", "points3D.bin"],
         Export::ColmapText => &["cameras.txt", "images.txt", "points3D.txt"],
         Export::ColmapDatabase => &["database.db"],
-        Export::OpenSfm => &["reconstruction.json"],
+        Export::OpenSfm => &["reconstruction.json", "tracks.csv", "camera_models.json"],
     }
 }
 
@@ -40,7 +40,7 @@ fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
         .iter()
         .flat_map(|export| files(*export).iter().map(|file| directory.join(export.folder()).join(file)))
         .collect();
-    assert_eq!(paths.len(), 7);
+    assert_eq!(paths.len(), 9);
     assert!(paths.iter().all(|path| path.metadata().is_ok_and(|metadata| metadata.len() > 0)));
     let mine = directory.join("colmap/mine.txt");
     fs::write(&mine, "x").expect("written");

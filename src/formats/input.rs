@@ -20,6 +20,8 @@ pub struct LabelledInput {
     pub lines: Vec<u64>,
     /// What COLMAP's files say of each view's image, kept for what is exported to COLMAP; empty for other files.
     pub colmap_images: Vec<ColmapImage>,
+    /// OpenSfM's name of each view's camera, where its data set has one; empty for other files.
+    pub opensfm_cameras: Vec<Option<Box<str>>>,
     /// Index of each observation's keypoint in its image; empty where the file has no such indices.
     pub keypoints: Vec<u32>,
     /// What reading changed or left out, a sentence each.

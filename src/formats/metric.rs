@@ -42,6 +42,8 @@ pub struct Camera {
     pub intrinsics: Calibration,
     /// COLMAP's model that the input gave the camera.
     pub colmap_model: Option<&'static str>,
+    /// OpenSfM's name that the input gave the camera.
+    pub opensfm_name: Option<Box<str>>,
 }
 
 /// A view with a pose, `x ~ K (R X + t)`.
@@ -65,6 +67,8 @@ pub struct Image {
 pub struct Keypoint {
     pub x: f64,
     pub y: f64,
+    /// The input's own index of it in the image; else its position.
+    pub index: u32,
     pub point: Option<usize>,
 }
 
@@ -161,6 +165,7 @@ fn images(solution: &Solution, input: &LabelledInput, part: u32) -> (Vec<Camera>
         let camera = *known.entry(key).or_insert_with(|| {
             cameras.push(Camera {
                 colmap_model: input.colmap_images.get(view).and_then(|image| image.camera_model),
+                opensfm_name: input.opensfm_cameras.get(view).cloned().flatten(),
                 ..camera(cameras.len(), size, calibration, result)
             });
             own_groups.push(own_group);
@@ -207,11 +212,11 @@ fn take_back_ids(cameras: &mut [Camera], own_groups: &[u32], input: &LabelledInp
 /// Every keypoint that the input knows of a view's image, of no point yet.
 fn known_keypoints(input: &LabelledInput, view: usize) -> Vec<Keypoint> {
     let known = input.colmap_images.get(view).map(|image| image.keypoints.as_slice()).unwrap_or_default();
-    let keypoint = |at: &[f32; 2]| {
+    let keypoint = |(index, at): (u32, &[f32; 2])| {
         let [x, y] = at.map(|px| f64::from(px) - FIRST_PIXEL);
-        Keypoint { x, y, point: None }
+        Keypoint { x, y, index, point: None }
     };
-    known.iter().map(keypoint).collect()
+    (0..).zip(known).map(keypoint).collect()
 }
 
 /// Camera `position`; without a size, the principal point is taken as the middle.
@@ -224,6 +229,7 @@ fn camera(position: usize, size: Option<ImageSize>, calibration: &Calibration, v
         size: size.unwrap_or(ImageSize { width_px: side(x), height_px: side(y) }),
         intrinsics: Calibration { focal_px: view.focal_px.unwrap_or(calibration.focal_px), ..*calibration },
         colmap_model: None,
+        opensfm_name: None,
     }
 }
 
@@ -271,7 +277,8 @@ fn points(
 /// Puts an observation among the keypoints of its image: at its own place where the input knows all of them, else at
 /// the end. Returns the place.
 fn place(keypoints: &mut Vec<Keypoint>, input: &LabelledInput, k: usize, point: Option<usize>) -> usize {
-    let observation = Keypoint { x: input.raw.x[k], y: input.raw.y[k], point };
+    let index = input.keypoints.get(k).copied().unwrap_or(keypoints.len() as u32);
+    let observation = Keypoint { x: input.raw.x[k], y: input.raw.y[k], index, point };
     let own = input.keypoints.get(k).map(|&own| own as usize).filter(|_| !input.colmap_images.is_empty());
     match own.filter(|&own| own < keypoints.len()) {
         Some(own) => {

@@ -1,4 +1,4 @@
-//! OpenSfM's files: tracks in, reconstructions out.
+//! OpenSfM's files: tracks in, tracks and reconstructions out.
 //!
 //! Coordinates are normalised there: the origin in the middle of the image, its larger side 1 (mapillary/OpenSfM,
 //! `doc/source/geometry.rst` and `opensfm/features.py`).
@@ -6,6 +6,7 @@
 pub mod reconstruction;
 mod sizes;
 pub mod tracks;
+pub mod write_tracks;
 
 use crate::domain::ImageSize;
 

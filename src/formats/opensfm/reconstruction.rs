@@ -1,4 +1,7 @@
-//! Writing OpenSfM's reconstruction.json (mapillary/OpenSfM, `doc/source/dataset.rst`, `opensfm/io.py`).
+//! Writing OpenSfM's reconstruction.json and camera_models.json (mapillary/OpenSfM, `doc/source/dataset.rst`,
+//! `opensfm/io.py`).
+
+use std::collections::{HashMap, HashSet};
 
 use serde_json::{Map, Value, json};
 
@@ -15,28 +18,74 @@ const MIDDLE_PX: f64 = 1e-6;
 /// Lengths of cameras are in units of the larger image side, the origin is the middle of the image; a shot's rotation
 /// is an angle-axis vector, world to camera.
 pub fn json(models: &[Model]) -> Value {
-    models.iter().map(reconstruction).collect()
+    let names = CameraNames::of(models);
+    models.iter().map(|model| reconstruction(model, &names)).collect()
 }
 
-fn reconstruction(model: &Model) -> Value {
+/// `camera_models.json`: every camera of the reconstructions under its name in these.
+pub fn camera_models(models: &[Model]) -> Value {
+    Value::Object(CameraNames::of(models).cameras)
+}
+
+fn reconstruction(model: &Model, names: &CameraNames) -> Value {
+    let names = names.of_model(model);
     let cameras: Map<String, Value> =
-        model.cameras.iter().map(|camera| (camera_name(camera), self::camera(camera))).collect();
+        names.iter().zip(&model.cameras).map(|(name, camera)| ((*name).to_owned(), self::camera(camera))).collect();
     let shots: Map<String, Value> =
-        model.images.iter().map(|image| (image.name.to_string(), shot(image, model))).collect();
-    let mut points = Map::new();
-    // Those of the tracks come first: no name of another point may be that of a track.
-    for point in &model.points {
-        let mut name = point.label.to_string();
-        while points.contains_key(&name) {
-            name.push('+');
-        }
-        points.insert(name, self::point(point));
-    }
+        model.images.iter().map(|image| (image.name.to_string(), shot(image, names[image.camera]))).collect();
+    let points: Map<String, Value> = point_names(model).into_iter().zip(model.points.iter().map(point)).collect();
     json!({ "cameras": cameras, "shots": shots, "points": points })
 }
 
-fn camera_name(camera: &Camera) -> String {
-    format!("scpsfm camera {}", camera.id)
+/// What the points of a model are called: those of the tracks, which come first, like these.
+pub(super) fn point_names(model: &Model) -> Vec<String> {
+    let mut taken = HashSet::with_capacity(model.points.len());
+    let name = |point: &Point| {
+        let mut name = point.label.to_string();
+        while !taken.insert(name.clone()) {
+            name.push('+');
+        }
+        name
+    };
+    model.points.iter().map(name).collect()
+}
+
+/// Cameras of all parts by name: the data set's own where it is that of one camera, else numbered from 1.
+#[derive(Default)]
+struct CameraNames {
+    cameras: Map<String, Value>,
+    /// By the camera as the file has it and the data set's name of it.
+    names: HashMap<(String, Option<Box<str>>), String>,
+}
+
+impl CameraNames {
+    fn of(models: &[Model]) -> Self {
+        let mut names = Self::default();
+        let mut numbered = (1..).map(|number| format!("scpsfm camera {number}"));
+        for of in models.iter().flat_map(|model| &model.cameras) {
+            let json = camera(of);
+            let key = (json.to_string(), of.opensfm_name.clone());
+            if names.names.contains_key(&key) {
+                continue;
+            }
+            let own = of.opensfm_name.as_deref().map(str::to_owned);
+            let mut candidates = own.into_iter().chain(numbered.by_ref());
+            // The numbers do not end.
+            let name = candidates.find(|name| !names.cameras.contains_key(name)).unwrap_or_default();
+            names.cameras.insert(name.clone(), json);
+            names.names.insert(key, name);
+        }
+        names
+    }
+
+    /// The names of a model's cameras.
+    fn of_model(&self, model: &Model) -> Vec<&str> {
+        let name = |of: &Camera| {
+            // Every camera was given a name.
+            self.names.get(&(camera(of).to_string(), of.opensfm_name.clone())).map_or("", String::as_str)
+        };
+        model.cameras.iter().map(name).collect()
+    }
 }
 
 /// `perspective` or `fisheye` where the principal point is the middle, pixels are square and two radial coefficients
@@ -72,10 +121,10 @@ fn camera(camera: &Camera) -> Value {
     camera
 }
 
-fn shot(image: &Image, model: &Model) -> Value {
+fn shot(image: &Image, camera: &str) -> Value {
     let rotation: [f64; 3] = image.rotation.scaled_axis().into();
     json!({
-        "camera": camera_name(&model.cameras[image.camera]),
+        "camera": camera,
         "rotation": rotation,
         "translation": image.translation,
     })

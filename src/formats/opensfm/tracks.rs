@@ -177,6 +177,17 @@ impl Table {
         views
     }
 
+    /// The name of each view's camera, in the order of their labels.
+    fn cameras(&self, positions: &[u32]) -> Vec<Option<Box<str>>> {
+        let mut cameras = vec![None; positions.len()];
+        for (shot, &position) in self.shots.iter().zip(positions) {
+            // A name that would break a line is none.
+            let name = shot.as_ref().and_then(|shot| shot.camera.as_deref());
+            cameras[position as usize] = name.filter(|name| Label::name(name).is_ok()).map(Box::from);
+        }
+        cameras
+    }
+
     /// That a size that was given is not that of every image.
     fn note(&self) -> Option<String> {
         let own = self.shots.iter().flatten().filter(|shot| shot.is_own).count();
@@ -193,6 +204,7 @@ impl Table {
         let (view_labels, view_positions) = dense(&self.images.labels);
         let (track_labels, track_positions) = dense(&self.tracks.labels);
         let views = self.views(&view_positions);
+        let cameras = self.cameras(&view_positions);
         let notes = self.note().into_iter().collect();
         let moved = |ids: &[u32], positions: &[u32]| ids.iter().map(|&id| positions[id as usize]).collect();
         LabelledInput {
@@ -208,6 +220,7 @@ impl Table {
             },
             view_labels,
             track_labels,
+            opensfm_cameras: cameras,
             lines: self.lines,
             // One that is no index is none of OpenSfM's, and then the others say nothing either.
             keypoints: self.feature.into_iter().collect::<Option<_>>().unwrap_or_default(),
