@@ -187,8 +187,8 @@ pub fn tell_notes(input: &LabelledInput) {
 pub struct ExportArgs {
     /// Also write the result for these programs, each below the output directory in a folder of its name: colmap/ and
     /// colmap-text/ hold a sparse model (of several parts, folders 1/ and on those of the smaller ones), colmap-db/ a
-    /// database.db, opensfm/ reconstruction.json, tracks.csv and camera_models.json. All but colmap-db need a metric
-    /// result
+    /// database.db, opensfm/ reconstruction.json, tracks.csv and camera_models.json, nerfstudio/ transforms.json and
+    /// points.ply of the largest part. All but colmap-db need a metric result
     #[arg(long, value_name = "KIND", value_enum, value_delimiter = ',')]
     pub export: Vec<ExportArg>,
 }
@@ -422,6 +422,8 @@ pub enum ExportArg {
     ColmapDb,
     /// OpenSfM's reconstruction.json, with its tracks and its cameras
     Opensfm,
+    /// nerfstudio's transforms.json and the points: OpenCV's cameras, poses in OpenGL's axes
+    Nerfstudio,
 }
 
 impl From<ExportArg> for Export {
@@ -431,6 +433,7 @@ impl From<ExportArg> for Export {
             ExportArg::ColmapText => Export::ColmapText,
             ExportArg::ColmapDb => Export::ColmapDatabase,
             ExportArg::Opensfm => Export::OpenSfm,
+            ExportArg::Nerfstudio => Export::Nerfstudio,
         }
     }
 }

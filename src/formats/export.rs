@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::metric::{self, Model};
 use super::publish::{Draft, pretty};
-use super::{Format, LabelledInput, colmap, opensfm};
+use super::{Format, LabelledInput, colmap, nerfstudio, opensfm, ply};
 use crate::domain::Solution;
 
 /// What another program reads.
@@ -24,6 +24,8 @@ pub enum Export {
     /// `opensfm/reconstruction.json`, a list with one reconstruction a part, `opensfm/tracks.csv` with the observations
     /// of its points, and `opensfm/camera_models.json`.
     OpenSfm,
+    /// `nerfstudio/transforms.json` and `nerfstudio/points.ply` of the largest part.
+    Nerfstudio,
 }
 
 /// Why an export was not written.
@@ -31,6 +33,8 @@ pub enum Export {
 pub enum Refusal {
     #[error(transparent)]
     Model(#[from] metric::Error),
+    #[error(transparent)]
+    Nerfstudio(#[from] nerfstudio::Error),
     #[error("the input is no COLMAP database: there is none to copy")]
     NoDatabase,
     #[error("no view of the result has a camera")]
@@ -65,7 +69,8 @@ impl fmt::Display for NotExported {
 
 impl Export {
     #[cfg(test)]
-    pub const ALL: [Export; 4] = [Export::Colmap, Export::ColmapText, Export::ColmapDatabase, Export::OpenSfm];
+    pub const ALL: [Export; 5] =
+        [Export::Colmap, Export::ColmapText, Export::ColmapDatabase, Export::OpenSfm, Export::Nerfstudio];
 
     /// Directory below that of the result files.
     pub fn folder(self) -> &'static str {
@@ -74,6 +79,7 @@ impl Export {
             Export::ColmapText => "colmap-text",
             Export::ColmapDatabase => "colmap-db",
             Export::OpenSfm => "opensfm",
+            Export::Nerfstudio => "nerfstudio",
         }
     }
 
@@ -82,7 +88,7 @@ impl Export {
         match self {
             Export::ColmapDatabase => &[DATABASE],
             Export::OpenSfm => &[TRACKS],
-            Export::Colmap | Export::ColmapText => &[],
+            Export::Colmap | Export::ColmapText | Export::Nerfstudio => &[],
         }
     }
 
@@ -127,6 +133,14 @@ impl Export {
                 (TRACKS.into(), opensfm::write_tracks::csv(models, solution.noise_px).into()),
                 ("camera_models.json".into(), pretty(&opensfm::reconstruction::camera_models(models))?.into()),
             ]),
+            Export::Nerfstudio => match models.first().map(nerfstudio::transforms) {
+                Some(Ok(transforms)) => Ok(vec![
+                    ("transforms.json".into(), pretty(&transforms)?.into()),
+                    (nerfstudio::POINTS.into(), ply::of_model(&models[0]).into()),
+                ]),
+                Some(Err(refused)) => Err(refused.into()),
+                None => Err(metric::Error::NoPose.into()),
+            },
         })
     }
 }

@@ -13,7 +13,7 @@ fn model_of(solution: &Solution, input: &LabelledInput) -> Model {
     Model::of_parts(solution, input).expect("metric").remove(0)
 }
 
-const ALL: [Export; 3] = [Export::Colmap, Export::ColmapText, Export::OpenSfm];
+const ALL: [Export; 4] = [Export::Colmap, Export::ColmapText, Export::OpenSfm, Export::Nerfstudio];
 
 /// Every file of an export of a result in one part.
 fn files(export: Export) -> &'static [&'static str] {
@@ -22,6 +22,7 @@ fn files(export: Export) -> &'static [&'static str] {
         Export::ColmapText => &["cameras.txt", "images.txt", "points3D.txt"],
         Export::ColmapDatabase => &["database.db"],
         Export::OpenSfm => &["reconstruction.json", "tracks.csv", "camera_models.json"],
+        Export::Nerfstudio => &["transforms.json", "points.ply"],
     }
 }
 
@@ -40,7 +41,7 @@ fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
         .iter()
         .flat_map(|export| files(*export).iter().map(|file| directory.join(export.folder()).join(file)))
         .collect();
-    assert_eq!(paths.len(), 9);
+    assert_eq!(paths.len(), 11);
     assert!(paths.iter().all(|path| path.metadata().is_ok_and(|metadata| metadata.len() > 0)));
     let mine = directory.join("colmap/mine.txt");
     fs::write(&mine, "x").expect("written");

@@ -12,6 +12,7 @@ pub mod input;
 pub mod label;
 pub mod manifest;
 pub mod metric;
+pub mod nerfstudio;
 pub mod observations;
 pub mod opensfm;
 pub mod ply;

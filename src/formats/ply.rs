@@ -1,8 +1,9 @@
-//! `points.ply`: the points of the inlier tracks of one part, coloured by weight.
+//! Points as PLY: those of the inlier tracks of one part in `points.ply`, coloured by weight, and those of a model.
 
 use std::fmt::Write;
 
 use super::LabelledInput;
+use super::metric::Model;
 use super::result_json::track_label;
 use crate::domain::Solution;
 
@@ -43,6 +44,21 @@ pub fn points(solution: &Solution, input: Option<&LabelledInput>, part: u32) -> 
         let label = track_label(input, track).number().unwrap_or(track as u64);
         // Writing to a String cannot fail.
         let _ = writeln!(text, "{x} {y} {z} {red} {green} {blue} {weight} {label} {number}");
+    }
+    text
+}
+
+/// The points of a model as an ASCII PLY that other programs read: position and colour.
+pub fn of_model(model: &Model) -> String {
+    let mut text = format!(
+        "ply\nformat ascii 1.0\nelement vertex {}\nproperty double x\nproperty double y\nproperty double z\n\
+         property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
+        model.points.len()
+    );
+    for point in &model.points {
+        let ([x, y, z], [red, green, blue]) = (point.position, point.colour);
+        // Writing to a String cannot fail.
+        let _ = writeln!(text, "{x} {y} {z} {red} {green} {blue}");
     }
     text
 }

@@ -58,13 +58,16 @@ fn opensfm_tracks_become_a_colmap_model_that_is_read_again() {
     assert!(nothing.stderr.contains("--width and --height"), "{nothing:?}");
 
     let size = ["--width", "1000", "--height", "1000"];
-    let export = ["--export", "colmap,colmap-text,colmap-db", "--export", "opensfm"];
+    let export = ["--export", "colmap,colmap-text,colmap-db", "--export", "opensfm,nerfstudio"];
     let flags = [&size[..], &export[..]].concat();
     let solved = solve(&tracks, &path("local"), &flags);
     assert_eq!(solved.code, Some(0), "{solved:?}");
     assert_eq!(json(&solved.stdout)["inlier_tracks"], 30);
     let refused = "warning: not exported: colmap-db: the input is no COLMAP database";
     assert!(solved.stderr.contains(refused) && !path("local/colmap-db").exists(), "{solved:?}");
+    for file in ["nerfstudio/transforms.json", "nerfstudio/points.ply"] {
+        assert!(path("local").join(file).is_file(), "{file}");
+    }
     let observations = fs::read_to_string(path("local/observations.csv")).expect("observations.csv");
     assert!(observations.lines().any(|line| line.starts_with("\"0, west.jpg\",0,")), "{observations}");
     let cameras = json(&fs::read_to_string(path("local/cameras.json")).expect("cameras.json"));
