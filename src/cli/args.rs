@@ -188,7 +188,8 @@ pub struct ExportArgs {
     /// Also write the result for these programs, each below the output directory in a folder of its name: colmap/ and
     /// colmap-text/ hold a sparse model (of several parts, folders 1/ and on those of the smaller ones), colmap-db/ a
     /// database.db, opensfm/ reconstruction.json, tracks.csv and camera_models.json, nerfstudio/ transforms.json and
-    /// points.ply of the largest part. All but colmap-db need a metric result
+    /// points.ply of the largest part, bundler/ bundle.out and list.txt, bal/ problem.txt. All but colmap-db need a
+    /// metric result
     #[arg(long, value_name = "KIND", value_enum, value_delimiter = ',')]
     pub export: Vec<ExportArg>,
 }
@@ -424,6 +425,10 @@ pub enum ExportArg {
     Opensfm,
     /// nerfstudio's transforms.json and the points: OpenCV's cameras, poses in OpenGL's axes
     Nerfstudio,
+    /// Bundler's bundle.out and list.txt, of perspective cameras with square pixels and at most two radial coefficients
+    Bundler,
+    /// A problem of BAL (Bundle Adjustment in the Large), of the same cameras
+    Bal,
 }
 
 impl From<ExportArg> for Export {
@@ -434,6 +439,8 @@ impl From<ExportArg> for Export {
             ExportArg::ColmapDb => Export::ColmapDatabase,
             ExportArg::Opensfm => Export::OpenSfm,
             ExportArg::Nerfstudio => Export::Nerfstudio,
+            ExportArg::Bundler => Export::Bundler,
+            ExportArg::Bal => Export::Bal,
         }
     }
 }

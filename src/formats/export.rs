@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::metric::{self, Model};
 use super::publish::{Draft, pretty};
-use super::{Format, LabelledInput, colmap, nerfstudio, opensfm, ply};
+use super::{Format, LabelledInput, bundler, colmap, nerfstudio, opensfm, ply};
 use crate::domain::Solution;
 
 /// What another program reads.
@@ -26,6 +26,10 @@ pub enum Export {
     OpenSfm,
     /// `nerfstudio/transforms.json` and `nerfstudio/points.ply` of the largest part.
     Nerfstudio,
+    /// `bundler/bundle.out` and `bundler/list.txt`; the parts in folders as with [`Export::Colmap`].
+    Bundler,
+    /// `bal/problem.txt`; the parts in folders as with [`Export::Colmap`].
+    Bal,
 }
 
 /// Why an export was not written.
@@ -35,6 +39,8 @@ pub enum Refusal {
     Model(#[from] metric::Error),
     #[error(transparent)]
     Nerfstudio(#[from] nerfstudio::Error),
+    #[error(transparent)]
+    Bundler(#[from] bundler::Error),
     #[error("the input is no COLMAP database: there is none to copy")]
     NoDatabase,
     #[error("no view of the result has a camera")]
@@ -69,8 +75,15 @@ impl fmt::Display for NotExported {
 
 impl Export {
     #[cfg(test)]
-    pub const ALL: [Export; 5] =
-        [Export::Colmap, Export::ColmapText, Export::ColmapDatabase, Export::OpenSfm, Export::Nerfstudio];
+    pub const ALL: [Export; 7] = [
+        Export::Colmap,
+        Export::ColmapText,
+        Export::ColmapDatabase,
+        Export::OpenSfm,
+        Export::Nerfstudio,
+        Export::Bundler,
+        Export::Bal,
+    ];
 
     /// Directory below that of the result files.
     pub fn folder(self) -> &'static str {
@@ -80,6 +93,8 @@ impl Export {
             Export::ColmapDatabase => "colmap-db",
             Export::OpenSfm => "opensfm",
             Export::Nerfstudio => "nerfstudio",
+            Export::Bundler => "bundler",
+            Export::Bal => "bal",
         }
     }
 
@@ -88,7 +103,7 @@ impl Export {
         match self {
             Export::ColmapDatabase => &[DATABASE],
             Export::OpenSfm => &[TRACKS],
-            Export::Colmap | Export::ColmapText | Export::Nerfstudio => &[],
+            Export::Colmap | Export::ColmapText | Export::Nerfstudio | Export::Bundler | Export::Bal => &[],
         }
     }
 
@@ -141,6 +156,11 @@ impl Export {
                 Some(Err(refused)) => Err(refused.into()),
                 None => Err(metric::Error::NoPose.into()),
             },
+            Export::Bundler => of_parts(|model| {
+                let out = bundler::bundle::out(model)?;
+                Ok(vec![("bundle.out".into(), out.into()), ("list.txt".into(), bundler::bundle::list(model).into())])
+            }),
+            Export::Bal => of_parts(|model| Ok(vec![("problem.txt".into(), bundler::bal::problem(model)?.into())])),
         })
     }
 }

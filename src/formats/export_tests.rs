@@ -13,7 +13,8 @@ fn model_of(solution: &Solution, input: &LabelledInput) -> Model {
     Model::of_parts(solution, input).expect("metric").remove(0)
 }
 
-const ALL: [Export; 4] = [Export::Colmap, Export::ColmapText, Export::OpenSfm, Export::Nerfstudio];
+const ALL: [Export; 6] =
+    [Export::Colmap, Export::ColmapText, Export::OpenSfm, Export::Nerfstudio, Export::Bundler, Export::Bal];
 
 /// Every file of an export of a result in one part.
 fn files(export: Export) -> &'static [&'static str] {
@@ -23,6 +24,8 @@ fn files(export: Export) -> &'static [&'static str] {
         Export::ColmapDatabase => &["database.db"],
         Export::OpenSfm => &["reconstruction.json", "tracks.csv", "camera_models.json"],
         Export::Nerfstudio => &["transforms.json", "points.ply"],
+        Export::Bundler => &["bundle.out", "list.txt"],
+        Export::Bal => &["problem.txt"],
     }
 }
 
@@ -41,7 +44,7 @@ fn a_result_that_is_not_metric_says_so_and_takes_former_files_away() {
         .iter()
         .flat_map(|export| files(*export).iter().map(|file| directory.join(export.folder()).join(file)))
         .collect();
-    assert_eq!(paths.len(), 11);
+    assert_eq!(paths.len(), 14);
     assert!(paths.iter().all(|path| path.metadata().is_ok_and(|metadata| metadata.len() > 0)));
     let mine = directory.join("colmap/mine.txt");
     fs::write(&mine, "x").expect("written");

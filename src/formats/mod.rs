@@ -4,6 +4,7 @@
 //! May depend on `domain` and `geometry`, and on `report` for the page among the result files; knows nothing of
 //! transport.
 
+pub mod bundler;
 pub mod cameras_json;
 pub mod colmap;
 pub mod error;

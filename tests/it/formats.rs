@@ -58,14 +58,14 @@ fn opensfm_tracks_become_a_colmap_model_that_is_read_again() {
     assert!(nothing.stderr.contains("--width and --height"), "{nothing:?}");
 
     let size = ["--width", "1000", "--height", "1000"];
-    let export = ["--export", "colmap,colmap-text,colmap-db", "--export", "opensfm,nerfstudio"];
+    let export = ["--export", "colmap,colmap-text,colmap-db", "--export", "opensfm,nerfstudio,bundler,bal"];
     let flags = [&size[..], &export[..]].concat();
     let solved = solve(&tracks, &path("local"), &flags);
     assert_eq!(solved.code, Some(0), "{solved:?}");
     assert_eq!(json(&solved.stdout)["inlier_tracks"], 30);
     let refused = "warning: not exported: colmap-db: the input is no COLMAP database";
     assert!(solved.stderr.contains(refused) && !path("local/colmap-db").exists(), "{solved:?}");
-    for file in ["nerfstudio/transforms.json", "nerfstudio/points.ply"] {
+    for file in ["nerfstudio/transforms.json", "nerfstudio/points.ply", "bundler/bundle.out", "bal/problem.txt"] {
         assert!(path("local").join(file).is_file(), "{file}");
     }
     let observations = fs::read_to_string(path("local/observations.csv")).expect("observations.csv");
