@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 use super::client::access::AccessArgs;
 use super::client::{self, Client};
 use super::exit::Failure;
-use crate::domain::{Backend, ImageSize, Limits, Method, Solution, SolveSettings};
+use crate::domain::{Backend, FocalPrior, ImageSize, Limits, Method, Solution, SolveSettings};
 use crate::formats::{self, Export, Format, LabelledInput, Matches, Reading, result_files};
 use crate::parallel::Threads;
 
@@ -138,6 +138,25 @@ pub struct ReadingArgs {
     /// Which matches of a COLMAP database to join into tracks [default: verified, or raw where none is]
     #[arg(long, help_heading = READING, value_enum)]
     pub matches: Option<MatchesArg>,
+
+    /// Focal length of every view in pixels, known beforehand (EXIF, the lens): it counts as one more observation, and
+    /// replaces what a COLMAP database knows
+    #[arg(long, help_heading = READING, value_name = "PX", value_parser = parse_positive)]
+    pub focal_px: Option<f64>,
+
+    #[arg(long, help_heading = READING, value_name = "SIGMA", requires = "focal_px", value_parser = parse_positive,
+        help = format!("One standard deviation of log(--focal-px), a relative error: .1 is 10 % \
+        [default: {FOCAL_SIGMA_LOG}]"))]
+    pub focal_sigma: Option<f64>,
+}
+
+/// Standard deviation of the logarithm of a focal length that is given without one: that of EXIF.
+const FOCAL_SIGMA_LOG: f64 = formats::colmap::cameras::PRIOR_SIGMA_LOG;
+
+/// A number above 0.
+fn parse_positive(text: &str) -> Result<f64, String> {
+    let number = text.parse::<f64>().map_err(|_| "is not a number".to_owned())?;
+    if number.is_finite() && number > 0.0 { Ok(number) } else { Err("is not positive and finite".into()) }
 }
 
 impl ReadingArgs {
@@ -153,6 +172,12 @@ impl ReadingArgs {
         if let Some(matches) = self.matches.and_then(|matches| matches.to_possible_value()) {
             flags.push_str(&format!(" --matches {}", matches.get_name()));
         }
+        if let Some(focal_px) = self.focal_px {
+            flags.push_str(&format!(" --focal-px {focal_px}"));
+        }
+        if let Some(sigma) = self.focal_sigma {
+            flags.push_str(&format!(" --focal-sigma {sigma}"));
+        }
         flags
     }
 
@@ -165,6 +190,9 @@ impl ReadingArgs {
             format: self.format.map(Format::from),
             size: self.width.zip(self.height).map(|(width_px, height_px)| ImageSize { width_px, height_px }),
             matches: self.matches.map(Matches::from),
+            focal_prior: self
+                .focal_px
+                .map(|focal_px| FocalPrior { focal_px, sigma_log: self.focal_sigma.unwrap_or(FOCAL_SIGMA_LOG) }),
         };
         Ok(formats::read(path, &Limits::default(), &reading)?)
     }

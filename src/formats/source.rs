@@ -7,7 +7,7 @@ use std::path::Path;
 use super::error::Error;
 use super::input::{LabelledInput, display_path};
 use super::{colmap, observations, opensfm};
-use crate::domain::{ImageSize, Limits};
+use crate::domain::{FocalPrior, ImageSize, Limits};
 
 /// How SQLite files, and so COLMAP databases, begin.
 pub(super) const SQLITE_MAGIC: &[u8] = b"SQLite format 3\0";
@@ -50,6 +50,8 @@ pub struct Reading {
     pub size: Option<ImageSize>,
     /// `None`: verified where there are any, else raw.
     pub matches: Option<Matches>,
+    /// What is known of the focal length of every view beforehand, in place of what the file says of it.
+    pub focal_prior: Option<FocalPrior>,
 }
 
 /// Reads an input of any kind; an `Ok` is an input the solver takes.
@@ -76,6 +78,10 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
     }?;
     labelled.format = Some(format);
     labelled.name_views();
+    if reading.focal_prior.is_some() {
+        labelled.raw.views.iter_mut().for_each(|view| view.focal_prior = reading.focal_prior);
+        labelled.check(limits)?;
+    }
     Ok(labelled)
 }
 
@@ -157,6 +163,21 @@ mod tests {
     }
 
     #[test]
+    fn a_focal_length_that_is_given_is_that_of_every_view() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("o.csv");
+        fs::write(&path, "view,track,x,y\n0,0,1,2\n1,0,3,4\n").expect("written");
+        let prior = |focal_px| FocalPrior { focal_px, sigma_log: 0.1 };
+        let with = |focal_px| {
+            let reading = Reading { focal_prior: Some(prior(focal_px)), ..Reading::default() };
+            read(&path, &Limits::default(), &reading)
+        };
+        let input = with(800.0).expect("valid");
+        assert!(input.raw.views.iter().all(|view| view.focal_prior == Some(prior(800.0))));
+        assert!(with(-1.0).expect_err("no focal length").to_string().contains("focal prior -1 px"));
+    }
+
+    #[test]
     fn flags_that_do_not_fit_the_file_are_named() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let path = directory.path().join("tracks.csv");
@@ -169,7 +190,7 @@ mod tests {
         let matches = Some(Matches::Raw);
         assert!(refused(Reading { matches, ..Reading::default() }).contains("leave out --matches"));
         let size = Some(ImageSize { width_px: 4, height_px: 3 });
-        let database = Reading { size, format: Some(Format::ColmapDatabase), matches: None };
+        let database = Reading { size, format: Some(Format::ColmapDatabase), ..Reading::default() };
         assert!(refused(database).contains("leave out --width and --height"));
         let table = Reading { format: Some(Format::Observations), ..Reading::default() };
         assert!(refused(table).contains("is an OpenSfM tracks.csv"));

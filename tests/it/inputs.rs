@@ -163,6 +163,11 @@ fn commands_list_and_delete_inputs() {
     assert_eq!(sized.code, Some(2), "{sized:?}");
     assert!(sized.stderr.contains("--width 10 --height 10") && sized.stderr.contains("scpsfm upload"), "{sized:?}");
 
+    let known = ["--focal-px", "800", "--focal-sigma", "0.05"];
+    let known = run(["submit", "--input", &names[0]].iter().chain(&known).chain(&to));
+    assert_eq!(known.code, Some(2), "{known:?}");
+    assert!(known.stderr.contains("--focal-px 800 --focal-sigma 0.05"), "{known:?}");
+
     let last = names[1].rsplit('/').next().expect("an id");
     let deleted = run(["delete", "--input", last, "--input", &names[0]].iter().chain(&to));
     assert_eq!((deleted.code, deleted.stdout.as_str()), (Some(0), format!("{}\n{}\n", names[1], names[0]).as_str()));
