@@ -1314,9 +1314,11 @@ function times(a, b) {
 const turnY = (angle) => [Math.cos(angle), 0, Math.sin(angle), 0, 1, 0, -Math.sin(angle), 0, Math.cos(angle)];
 const turnX = (angle) => [1, 0, 0, 0, Math.cos(angle), -Math.sin(angle), 0, Math.sin(angle), Math.cos(angle)];
 
-function median(values) {
+/** Extent of all but the farthest values: a few far points would shrink all others to a dot. */
+function extent(values, share) {
   const sorted = [...values].sort((a, b) => a - b);
-  return sorted.length ? sorted[Math.floor(sorted.length / 2)] : 0;
+  const last = sorted.length - 1;
+  return last < 0 ? [] : [sorted[Math.floor(share * last)], sorted[Math.ceil((1 - share) * last)]];
 }
 
 /** Points and cameras of one part; the parts have no common frame. */
@@ -1346,24 +1348,24 @@ class Scene {
 
   reset() {
     // From above and beside the first camera.
-    [this.yaw, this.pitch, this.zoom] = [0.5, -0.35, 1];
+    [this.yaw, this.pitch, this.zoom] = [0.5, -0.35, 1.2];
   }
 
   show(part) {
     this.part = part;
-    const places = [...part.points, ...part.cameras.map((camera) => camera.centre)];
-    const axis = (list, k) => list.map((place) => place[k]);
-    this.middle = [0, 1, 2].map((k) => median(axis(places, k)));
-    // Nine tenths of the points decide the scale: a few far ones would shrink all others to a dot.
-    const distances = part.points.map((place) => this.distance(place)).sort((a, b) => a - b);
-    const near = distances[Math.floor(0.9 * distances.length)] || 0;
-    this.radius = Math.max(near, ...part.cameras.map((camera) => this.distance(camera.centre)), 1e-12);
+    const centres = part.cameras.map((camera) => camera.centre);
+    const [lows, highs] = [[], []];
+    for (let k = 0; k < 3; k += 1) {
+      const along = (places) => places.map((place) => place[k]);
+      const ends = [...extent(along(part.points), 0.05), ...along(centres)];
+      lows.push(ends.reduce((least, end) => Math.min(least, end), Infinity));
+      highs.push(ends.reduce((most, end) => Math.max(most, end), -Infinity));
+    }
+    this.middle = lows.map((low, k) => (low + highs[k]) / 2);
+    // Where all centres are one, a camera that only turned, nothing gives a scale.
+    this.radius = Math.hypot(...highs.map((high, k) => (high - lows[k]) / 2)) || 1;
     this.base = part.cameras.length ? part.cameras[0].rotation : [1, 0, 0, 0, 1, 0, 0, 0, 1];
     this.draw();
-  }
-
-  distance(place) {
-    return Math.hypot(...place.map((value, k) => value - this.middle[k]));
   }
 
   turn(yaw, pitch) {
