@@ -63,6 +63,8 @@ const POLL_SECONDS = 3;
 const LONGEST_PAUSE_SECONDS = 30;
 /** The server sends a comment every 15 s: a stream that is silent for three of these is dead. */
 const SILENCE_SECONDS = 45;
+/** Calls answer within this time, or the server is taken to be away; results and events may take longer. */
+const CALL_SECONDS = 60;
 /** Larger results are read when asked for: their JSON takes several times these bytes in the browser. */
 const AUTOMATIC_RESULT_BYTES = 8 << 20;
 const MOST_ROWS = 100;
@@ -329,16 +331,18 @@ function refusal(body, code, retryAfter) {
 }
 
 /** One request, which asks for a key as often as it needs one; the answer is not read yet. */
-async function request(method, path, { body, signal, headers = {} } = {}) {
+async function request(method, path, { body, signal, headers = {}, limit = CALL_SECONDS } = {}) {
   for (;;) {
     const sent = sessionStorage.getItem(KEY_STORE);
     const all = { ...headers };
     if (sent) all.authorization = `Bearer ${sent}`;
     if (body !== undefined) all["content-type"] = "application/json";
+    const signals = [signal, limit ? AbortSignal.timeout(limit * 1000) : null].filter(Boolean);
     let answer;
     try {
       answer = await fetch(path, {
-        method, signal, headers: all, body: body === undefined ? undefined : JSON.stringify(body),
+        method, signal: AbortSignal.any(signals), headers: all,
+        body: body === undefined ? undefined : JSON.stringify(body),
         cache: "no-store", credentials: "omit", redirect: "error", referrerPolicy: "no-referrer",
       });
     } catch (error) {
@@ -409,11 +413,13 @@ async function readEvents(path, lastId, signal, onEvent) {
   const either = AbortSignal.any([signal, silent.signal]);
   const headers = { accept: "text/event-stream" };
   if (lastId) headers["last-event-id"] = lastId;
-  const answer = await request("GET", path, { signal: either, headers });
+  const answer = await request("GET", path, { signal: either, headers, limit: 0 });
   let failure = null;
   const parser = new EventParser((event) => {
-    if (event.type === "error") failure = refusal(JSON.parse(event.data), 0, null);
-    else onEvent(JSON.parse(event.data), event.id);
+    const content = JSON.parse(event.data);
+    // How a stream ends that breaks off; no event of a job has this field.
+    if (content.error) failure = refusal(content, 0, null);
+    else onEvent(content, event.id);
   });
   const reader = answer.body.getReader();
   const decoder = new TextDecoder();
@@ -1111,7 +1117,8 @@ class JobPage {
   }
 
   async remove() {
-    const text = `${this.id} is removed with its input, events and result. This cannot be undone.`;
+    const input = this.job.input ? "events and result; the uploaded input stays" : "input, events and result";
+    const text = `${this.id} is removed with its ${input}. This cannot be undone.`;
     if (!(await confirmed("Delete this job?", text, "Delete job"))) return;
     try {
       const query = new URLSearchParams({ etag: this.job.etag || "" });
@@ -1158,7 +1165,7 @@ class JobPage {
     const loading = make("p", { className: "empty" }, "Loading.");
     this.result.replaceChildren(make("section", {}, make("h3", {}, "Result"), loading));
     try {
-      const result = await call("GET", `/v1/${this.name}/result`, { signal: this.signal });
+      const result = await call("GET", `/v1/${this.name}/result`, { signal: this.signal, limit: 0 });
       this.result.replaceChildren(...resultSections(result, this.job));
       announce("The result is shown.");
     } catch (error) {
@@ -1342,13 +1349,27 @@ function partOf(result, views, part) {
 class Scene {
   constructor(canvas) {
     this.canvas = canvas;
-    this.reset();
+    this.part = null;
     this.listen();
   }
 
   reset() {
     // From above and beside the first camera.
-    [this.yaw, this.pitch, this.zoom] = [0.5, -0.35, 1.2];
+    [this.yaw, this.pitch, this.zoom] = [0.5, -0.35, 1];
+    if (this.part) this.fit();
+  }
+
+  /** As large as the picture has room for. */
+  fit() {
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
+    const project = this.projector(width, height);
+    const used = (place) => {
+      const seen = project(place);
+      return seen ? Math.max(Math.abs(2 * seen[0] / width - 1), Math.abs(2 * seen[1] / height - 1)) : 0;
+    };
+    const ends = extent(this.part.points.map(used), 0.03).slice(1);
+    const most = Math.max(...ends, ...this.part.cameras.map((camera) => used(camera.centre)), 0.05);
+    this.zoom = 0.85 / most;
   }
 
   show(part) {
@@ -1365,6 +1386,7 @@ class Scene {
     // Where all centres are one, a camera that only turned, nothing gives a scale.
     this.radius = Math.hypot(...highs.map((high, k) => (high - lows[k]) / 2)) || 1;
     this.base = part.cameras.length ? part.cameras[0].rotation : [1, 0, 0, 0, 1, 0, 0, 0, 1];
+    this.reset();
     this.draw();
   }
 
@@ -1454,13 +1476,13 @@ class Scene {
 
   drawPoints(context, project, colour) {
     const { points } = this.part;
-    const size = points.length > 4000 ? 1.5 : 3;
+    const size = points.length > 4000 ? 1.5 : 3.5;
     context.fillStyle = colour;
     for (const point of points) {
       const seen = project(point);
       if (!seen) continue;
       // Far points are fainter.
-      context.globalAlpha = Math.min(1, Math.max(0.3, 1.6 - seen[2] / 3.4));
+      context.globalAlpha = Math.min(1, Math.max(0.45, 1.7 - seen[2] / 3.4));
       context.fillRect(seen[0] - size / 2, seen[1] - size / 2, size, size);
     }
     context.globalAlpha = 1;
