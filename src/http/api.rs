@@ -20,7 +20,7 @@ use tonic::{Code, Status};
 use super::answer::{self, Answer};
 use super::codec::Encoded;
 use super::route::{self, Found, Route};
-use super::{openapi, upload};
+use super::{console, openapi, upload};
 use crate::domain::Violation;
 use crate::rpc::inflight::Permit;
 use crate::rpc::listener::Introduction;
@@ -94,6 +94,9 @@ impl Api {
                 Ok(()) => answer::json(self.openapi.to_vec(), self.gateway.permit()),
                 Err(status) => answer::error(&status),
             };
+        }
+        if let Some(file) = console::file(&path).filter(|_| request.method() == Method::GET) {
+            return file;
         }
         if let Some(parent) = upload::parent(request.method(), &path) {
             return upload::answer(self, introduction, parent, request).await.unwrap_or_else(|refused| *refused);

@@ -12,6 +12,7 @@
 mod answer;
 mod api;
 mod codec;
+mod console;
 mod openapi;
 mod route;
 mod upload;
