@@ -21,10 +21,11 @@ VOLUME /var/lib/scpsfm
 #   docker run -p 50051:50051 -v /etc/scpsfm:/etc/scpsfm:ro -e SCPSFM_TLS__CERTIFICATE=/etc/scpsfm/server.pem \
 #     -e SCPSFM_TLS__KEY=/etc/scpsfm/server.key -e SCPSFM_AUTH__KEYS_FILE=/etc/scpsfm/keys.txt IMAGE
 ENV SCPSFM_SERVER__LISTEN=0.0.0.0:50051 \
+    SCPSFM_HTTP__LISTEN=0.0.0.0:8080 \
     SCPSFM_METRICS__LISTEN=0.0.0.0:9464 \
     SCPSFM_STORE__DATA_DIR=/var/lib/scpsfm \
     SCPSFM_LOG__FORMAT=json
-EXPOSE 50051 9464
+EXPOSE 50051 8080 9464
 # bash opens the connection itself: the image needs no client for its own check.
 HEALTHCHECK --interval=10s --timeout=3s --start-period=20s --retries=3 \
     CMD ["bash", "-c", "exec 3<>/dev/tcp/127.0.0.1/9464 && \

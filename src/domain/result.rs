@@ -408,9 +408,20 @@ mod tests {
 
     #[test]
     fn the_lens_is_browns() {
-        let pinhole: Calibration =
-            serde_json::from_str(r#"{"focal_px": 900, "sigma_log_focal": null, "principal_point_px": [450, 600]}"#)
-                .expect("a calibration of the first version");
+        let pinhole = Calibration {
+            focal_px: 900.0,
+            sigma_log_focal: None,
+            principal_point_px: [450.0, 600.0],
+            aspect: 1.0,
+            lens_projection: LensProjection::Perspective,
+            radial_k1: 0.0,
+            radial_k2: 0.0,
+            radial_k3: 0.0,
+            tangential_p1: 0.0,
+            tangential_p2: 0.0,
+            grade: None,
+            sigmas: Sigmas::default(),
+        };
         assert_eq!(pinhole.distort(0.5, -0.25), [0.5, -0.25]);
         let lens = Calibration {
             radial_k1: 0.5,

@@ -9,7 +9,7 @@ use tonic::{Request, Response, Status};
 use tracing::Instrument;
 
 use super::caller::Caller;
-use super::convert::{job, list};
+use super::convert::{job, list, names};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::submission::{self, Submission};
 use super::{proto, status};
@@ -48,15 +48,20 @@ impl Jobs {
         trace_parent: Option<String>,
         permit: &Permit,
     ) -> Result<Vec<NewJob>, Status> {
-        caller.parent(parent)?;
+        let tenant = caller.parent(parent)?;
         if requests.is_empty() || requests.len() > MAX_BATCH {
             let text = format!("{} requests are not 1 to {MAX_BATCH}", requests.len());
             return Err(status::invalid(&super::violation("requests", text)));
         }
         let mut news = Vec::new();
         for (index, request) in requests.into_iter().enumerate() {
-            let read =
-                async { Submission::open(caller, request, &self.limits, permit)?.close(trace_parent.clone()).await };
+            let read = async {
+                if names::tenant(&request.parent, &tenant).is_ok_and(|of| of != tenant) {
+                    let text = format!("is neither left out nor the batch's tenants/{tenant}");
+                    return Err(status::invalid(&super::violation("parent", text)));
+                }
+                Submission::open(caller, request, &self.limits, permit)?.close(trace_parent.clone()).await
+            };
             news.push(read.await.map_err(|found| status::of_request(index, &found))?);
         }
         Ok(news)

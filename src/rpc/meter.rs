@@ -236,7 +236,7 @@ mod tests {
                 }
             }
         }
-        assert_eq!(count, 14);
+        assert_eq!(count, 15);
         assert_eq!(method_of("/scpsfm.v1.JobService/Invented"), UNKNOWN_METHOD);
     }
 }

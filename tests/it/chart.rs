@@ -14,9 +14,10 @@ const SCHEMA: &str = include_str!("../../deploy/helm/scpsfm/values.schema.json")
 const EXAMPLE: &str = include_str!("../../deploy/scpsfm.toml");
 
 /// What the chart sets itself, from values of its own or from secrets, by section; empty: the whole section.
-const OWN: [(&str, &[&str]); 5] = [
+const OWN: [(&str, &[&str]); 6] = [
     ("server", &["listen", "insecure", "plaintext_keys"]),
     ("tls", &[]),
+    ("http", &["listen"]),
     ("auth", &[]),
     ("metrics", &[]),
     ("store", &["data_dir", "url"]),
@@ -60,6 +61,7 @@ fn sample(section: &str, key: &str, schema: &Value) -> String {
     let text = match (section, key) {
         ("store", "retention") | ("upload", "abandoned_after") => "12h",
         ("otlp", "endpoint") => "http://collector.monitoring:4317",
+        ("http", "hosts") => "solver.example",
         ("compute", "prior") => "/models/my.prior",
         ("log", "filter") => "info,scpsfm::engine=debug",
         _ => match (schema["enum"][0].as_str(), schema["type"].as_str()) {

@@ -62,7 +62,7 @@ fn what_is_wrong_is_named_by_line() {
     assert_eq!(second("b\t2\t0\tabc\t0\t1\t2\t3"), "dir/tracks.csv, line 2: x: `abc` is not a number");
     assert_eq!(second("b\t2\t0\tnan\t0\t1\t2\t3"), "dir/tracks.csv, line 2: x: NaN is not a finite number");
     assert_eq!(second("\t2\t0\t0\t0\t1\t2\t3"), "dir/tracks.csv, line 2: image: has no name");
-    assert!(second("b\x1b[31m\t2\t0\t0\t0\t1\t2\t3").starts_with("dir/tracks.csv, line 2: image: the name `b\\u{1b}"));
+    assert!(second("b\x1b[31m\t2\t0\t0\t0\t1\t2\t3").starts_with("dir/tracks.csv, line 2: image: the name \"b\\u{1b}"));
     assert!(
         second("b\t2\t0").ends_with("3 fields where this version has 8, separated by tabs; the file may be truncated")
     );

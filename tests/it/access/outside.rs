@@ -28,7 +28,7 @@ fn an_open_address_is_refused_and_the_error_says_what_to_do() {
     let keys = written(directory.path(), "keys.txt", &format!("north:{NORTH}\n"));
     let keys = keys.to_str().expect("a path of ours");
     let cases: [(&[&str], &[&str]); 3] = [
-        (&["--listen", "0.0.0.0:0"], &["--tls-certificate", "--keys-file", "127.0.0.1:50051", "--insecure"]),
+        (&["--listen", "0.0.0.0:0"], &["--tls-certificate", "--keys-file", "127.0.0.1", "--insecure"]),
         (&["--listen", "[::]:0", "--plaintext-keys"], &["--tls-certificate", "--insecure"]),
         (&["--listen", "0.0.0.0:0", "--keys-file", keys, "--insecure"], &["--tls-certificate", "--plaintext-keys"]),
     ];

@@ -62,7 +62,7 @@ async fn without_a_key_of_this_server_nothing_but_health_answers() {
     let server = TestServer::start_with(quick(), two_tenants(), one_worker()).await;
     let channel = server.channel().await;
     let mut paths = methods();
-    assert_eq!(paths.len(), 14);
+    assert_eq!(paths.len(), 15);
     paths.push("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo".into());
     paths.push("/scpsfm.v1.JobService/Invented".into());
     let cases = [
@@ -153,6 +153,7 @@ impl Tenant {
                 "WatchJob",
                 self.jobs.watch_job(proto::WatchJobRequest { name: name(), after_sequence: 0 }).await.map(drop),
             ),
+            ("GetJobResult", self.jobs.get_job_result(proto::GetJobResultRequest { name: name() }).await.map(drop)),
             (
                 "ReadJobResult",
                 self.jobs.read_job_result(proto::ReadJobResultRequest { name: name(), offset: 0 }).await.map(drop),
