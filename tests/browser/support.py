@@ -212,7 +212,11 @@ class Network:
         events = 0
         while chunk := answer.read1(65536):
             for line in chunk.splitlines(keepends=True):
-                handler.wfile.write(line)
+                # In two pieces: events come cut anywhere.
+                middle = len(line) // 2 if is_stream else 0
+                handler.wfile.write(line[:middle])
+                handler.wfile.flush()
+                handler.wfile.write(line[middle:])
                 # The blank line that ends an event.
                 events += line == b"\n"
                 if limit is not None and events >= limit:

@@ -213,12 +213,14 @@ def test_what_ends_without_a_result_says_why(
     late = server.create(scene, settings=LONG, timeLimit="0.5s")
     open_job(browser, site, late)
     browser.sees("Deadline exceeded", ".failure")
-    # A camera that only translates: solved, and without a calibration; the warnings say so in words.
-    few = {key: value[:16] if isinstance(value, list) and key != "views" else value for key, value in scene.items()}
-    none = server.create({**few, "views": scene["views"]})
+    # Too few tracks: nothing is reconstructed, and the warnings say so in words.
+    few = [k for k, track in enumerate(scene["trackIndices"]) if track < 4]
+    arrays = {name: [scene[name][k] for k in few] for name in ("viewIndices", "trackIndices", "xs", "ys")}
+    none = server.create({**scene, **arrays})
     browser.driver.get(f"{site}/#/{none}")
     browser.sees("No reconstruction", "dl.large")
     assert browser.all(".warnings li")
+    browser.sees("There is no metric reconstruction to draw")
     browser.driver.get(f"{site}/#/tenants/default/jobs/none")
     browser.sees("JOB_NOT_FOUND", "#notices")
     browser.sees("There is no such job.")

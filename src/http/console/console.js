@@ -131,6 +131,7 @@ function bytes(value) {
 
 function seconds(value) {
   const all = Math.max(0, value);
+  if (all > 0 && all < 1) return `${figure(1000 * all, 3)} ms`;
   if (all < 60) return `${figure(all, 3)} s`;
   const whole = Math.round(all);
   const [hours, minutes] = [Math.floor(whole / 3600), Math.floor((whole % 3600) / 60)];
@@ -548,8 +549,9 @@ function outcome(job) {
       return make("span", { className: "bad-ink" }, "No reconstruction");
     }
     const grade = bare(summary.grade, "GRADE") || "-";
-    const focal = summary.focalPx === undefined ? "" : `, f ${figure(summary.focalPx)} px`;
-    return make("span", {}, make("b", { className: GRADES[grade] || "" }, grade), focal);
+    const focal = summary.focalPx === undefined ? "" : `${figure(summary.focalPx)} px`;
+    return make("span", {}, make("b", { className: GRADES[grade] || "" }, grade), " ",
+      make("span", { className: "focal" }, focal));
   }
   if (job.error) return make("span", { className: "bad-ink" }, foreign(job.error.reason || "Failed"));
   if (stateOf(job) === "JOB_STATE_RUNNING") return `${Math.round(100 * ((job.progress || {}).fraction || 0))} %`;
@@ -557,7 +559,7 @@ function outcome(job) {
 }
 
 const JOB_COLUMNS = [
-  column("Job", (job) => make("a", { href: `#/${job.name}` }, job.name.split("/").pop()), "name"),
+  column("Job", (job) => make("a", { href: `#/${job.name}` }, job.name.split("/").pop()), "name job"),
   column("State", stateBadge, "state"),
   column("Result", outcome),
   column("Method", (job) => bare((job.settings || {}).method, "METHOD")),
@@ -809,6 +811,8 @@ class Live {
     this.attempt = 0;
     this.stage = "";
     this.asked = false;
+    this.isLive = true;
+    this.isDone = false;
     this.bar = make("progress", { max: 1, "aria-label": "Share of the work done" });
     this.bar.value = 0;
     this.steps = make("p", { className: "steps" }, "No progress yet.");
@@ -848,8 +852,9 @@ class Live {
 
   /** Where the job is now, without the curves. */
   told(progress) {
-    this.bar.value = progress.fraction || 0;
-    say(this.steps, this.words(progress));
+    this.bar.value = this.isDone ? 1 : progress.fraction || 0;
+    // The last event comes before the end: what it says is not how the job ended.
+    say(this.steps, `${this.isLive ? "" : "Last progress: "}${this.words(progress)}`);
     this.tell(progress);
   }
 
@@ -868,7 +873,9 @@ class Live {
     const head = progress.head;
     if (head) {
       const phase = PHASES[bare(head.phase, "PHASE")];
-      parts.push(`head ${head.head || 1}${phase ? `, ${phase}` : ""}, sum of weights ${figure(head.weightSum || 0)}`);
+      if (task !== "HEADS") parts.push(`network head ${head.head || 1}`);
+      if (phase) parts.push(`phase ${phase}`);
+      parts.push(`sum of weights ${figure(head.weightSum || 0)}`);
     }
     if (progress.bestScore !== undefined) parts.push(`cost ${figure(progress.bestScore, 3)} of all-outlier cost`);
     parts.push(seconds(duration(progress.elapsedDuration)));
@@ -893,7 +900,9 @@ class Live {
   }
 
   end(succeeded) {
+    this.isDone = succeeded;
     if (succeeded) this.bar.value = 1;
+    say(this.steps, this.steps.textContent.replace(/^(?=\d)/, "Last progress: "));
     if (this.attempt === 0) say(this.steps, "No progress is known of this job.");
     say(this.noLosses, "No losses: the paper's network did not run.");
   }
