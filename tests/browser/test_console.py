@@ -77,7 +77,7 @@ def test_a_job_is_seen_from_queued_to_its_result(
     assert f"{summary['inlierTrackCount']}\nof 120" in shown
     browser.sees("Cameras, one row for each camera group")
     browser.sees("960")
-    assert browser.all("figure:not([hidden]) svg polyline"), "curves of the events"
+    until("there are curves of the events", lambda: browser.all("figure:not([hidden]) svg polyline"))
     scene_is_drawn(browser)
     assert browser.errors() == []
 

@@ -1175,6 +1175,10 @@ class JobPage {
     this.result.replaceChildren(make("section", {}, make("h3", {}, "Result"), loading));
     try {
       const result = await call("GET", `/v1/${this.name}/result`, { signal: this.signal, limit: 0 });
+      // A job of less than half a second may have told no progress: its result has the curves.
+      if (!this.live.attempt) {
+        for (const progress of result.history || []) this.live.add(progress, this.job.attempt || 1);
+      }
       this.result.replaceChildren(...resultSections(result, this.job));
       announce("The result is shown.");
     } catch (error) {
