@@ -345,7 +345,8 @@ async fn a_result_is_the_same_bytes_after_a_restart_and_damage_is_found() {
     let server = server.restart(scpsfm::engine::default_solver()).await;
     assert_eq!(read(&server).await.expect("a result"), first);
     let database = rusqlite::Connection::open(server.directory().join("scpsfm.db")).expect("the database");
-    let damaged = database.execute("UPDATE result_chunks SET data = CAST(substr(data, 1, length(data) - 1) || x'ff' AS BLOB)", []);
+    let damaged = database
+        .execute("UPDATE result_chunks SET data = CAST(substr(data, 1, length(data) - 1) || x'ff' AS BLOB)", []);
     assert_eq!(damaged.expect("damaged"), 1);
     assert_eq!(read(&server).await.expect_err("not what was stored").code(), Code::Internal);
 }

@@ -67,8 +67,8 @@ CREATE TABLE jobs (
     last_sequence     BIGINT NOT NULL DEFAULT 0,
     -- SHA-256 of the encoded result; none while there is none.
     result_sha256     BYTEA,
-    -- The id of the uploaded input that the job was created with, also once that has lost its name; none where the input
-    -- came inside the job.
+    -- The id of the uploaded input that the job was created with, also once that has lost its name; none where the
+    -- input came inside the job.
     uploaded_input    TEXT,
     -- The Solve calls that have attached to the job so far; NULL: the job does not depend on any caller.
     attached_calls    BIGINT,
