@@ -220,7 +220,7 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
     assert!(ended["state"] == "SUCCEEDED" && ended["grade"].is_string() && ended["seconds"].is_f64(), "{ended}");
     let log = std::fs::read_to_string(&log).expect("a log");
     let lines = log.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON"));
-    let of_attempt: Vec<_> = lines.filter(|line| line["target"] == "scpsfm::engine::course").collect();
+    let of_attempt: Vec<_> = lines.filter(|line| line["target"] == "scpsfm::engine::execution").collect();
     assert!(of_attempt.len() >= 2, "an attempt's begin and end are logged:\n{log}");
     for line in of_attempt {
         assert_eq!(line["span"]["job"], name.as_str(), "{line}");
