@@ -47,7 +47,15 @@ class Server:
     def start(self) -> None:
         """Starts it; after the first time on the same port."""
         command = [str(binary()), "serve", "--listen", self.address.rpartition("//")[2]]
-        command += ["--http-listen", "off", "--metrics-listen", "127.0.0.1:0", "--data-dir", str(self._data), *self._flags]
+        command += [
+            "--http-listen",
+            "off",
+            "--metrics-listen",
+            "127.0.0.1:0",
+            "--data-dir",
+            str(self._data),
+            *self._flags,
+        ]
         log = (self._data.parent / f"{self._data.name}.log").open("ab")
         with log:
             self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, env=self._environment)
