@@ -227,8 +227,9 @@ fn without_a_server_commands_end_with_69() {
 /// The files of a directory, times blanked; without the list of them, whose sums know the times.
 fn files_but_for_times(directory: &Path) -> BTreeMap<String, String> {
     let entries = fs::read_dir(directory).expect("a directory");
-    let timeless =
-        |line: &&str| !line.contains("seconds\":") && !line.contains("<dt>time</dt>") && !line.contains("proposal-times");
+    let timeless = |line: &&str| {
+        !line.contains("seconds\":") && !line.contains("<dt>time</dt>") && !line.contains("proposal-times")
+    };
     entries
         .map(|entry| entry.expect("an entry").path())
         .filter(|path| !path.ends_with("scpsfm-files.json"))

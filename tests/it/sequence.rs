@@ -66,7 +66,8 @@ fn whoever_watches_sees_the_views_rise() {
 
     let events: Vec<Value> = watched.stdout.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
     let progress: Vec<&Value> = events.iter().map(|event| &event["progress"]).filter(|told| told.is_object()).collect();
-    let course = |told: &Value, key: &str| told["reconstruction"][key].as_u64().unwrap_or_else(|| panic!("{key} in {told}"));
+    let course =
+        |told: &Value, key: &str| told["reconstruction"][key].as_u64().unwrap_or_else(|| panic!("{key} in {told}"));
     // What a block had that was given up for the next counts no more.
     for pair in progress.windows(2).filter(|pair| course(pair[0], "block") == course(pair[1], "block")) {
         let registered = [0, 1].map(|k| course(pair[k], "registered_views"));
