@@ -226,6 +226,19 @@ fn an_input_is_uploaded_as_json_or_protobuf_and_solved() {
     assert_eq!(again.json(), by_protobuf.json(), "{}", again.text());
     let damaged = request(&server, "POST", "/v1/tenants/-/inputs", &protobuf, &bytes[1..]);
     assert_eq!((damaged.code, damaged.refusal().1.as_str()), (400, "data"));
+    // The same numbers to the last bit, also those that decimals of 16 and 17 digits stand for.
+    let mut set = track_set();
+    set.xs.iter_mut().enumerate().for_each(|(k, x)| *x = 1206.941_123_647_384_5 + 0.1 * k as f64);
+    let mut as_json = tracks();
+    (as_json["xs"], as_json["views"]) = (json!(set.xs), json!([{}, {}, {}]));
+    let bytes = proto::InputData { data: Some(proto::input_data::Data::TrackSet(set)) }.encode_to_vec();
+    let digest = |answer: Answer| (answer.json()["sha256"].clone(), path_of(&answer.json()));
+    let (exact, first) = digest(request(&server, "POST", "/v1/tenants/-/inputs", &protobuf, &bytes));
+    let (read, second) = digest(post(&server, "/v1/tenants/-/inputs", &json!({"trackSet": as_json})));
+    assert_eq!(read, exact);
+    for path in [first, second] {
+        assert_eq!(request(&server, "DELETE", &path, &[], &[]).code, 200);
+    }
     let inputs = get(&server, "/v1/tenants/-/inputs").json();
     assert_eq!(inputs["inputs"].as_array().map(Vec::len), Some(2));
     for input in [by_json.json(), by_protobuf.json()] {
