@@ -131,7 +131,7 @@ impl Api {
         let permit = self.gateway.permit();
         let descriptor = route.method.input();
         let query = head.uri.query().unwrap_or_default();
-        let mut message = if route.has_body {
+        let (mut message, length) = if route.has_body {
             if let Some((name, _)) = form_urlencoded::parse(query.as_bytes()).next() {
                 return Err(failed(invalid(&name, "is in the query; this call takes everything in its body")));
             }
@@ -145,7 +145,7 @@ impl Api {
                 };
                 set.map_err(|text| failed(invalid(&name, text)))?;
             }
-            message
+            (message, 0)
         };
         let (last_id, after) = LAST_EVENT_ID;
         if let Some(last_id) = head.headers.get(last_id).and_then(|id| id.to_str().ok())
@@ -157,7 +157,7 @@ impl Api {
             route::set_field(&mut message, name, &value).map_err(|text| failed(invalid(name, text)))?;
         }
         let encode = move || Ok(Bytes::from(message.encode_to_vec()));
-        let encoded = in_background(text_length(&head.headers), encode).await.map_err(failed)?;
+        let encoded = in_background(length, encode).await.map_err(failed)?;
         // From here on it is the call's message, which is charged as it is read.
         permit.hold(0).map_err(failed)?;
         let call = call(&head.headers, introduction, permit.clone(), encoded);
@@ -185,18 +185,18 @@ impl Api {
             || self.hosts.iter().any(|known| known.eq_ignore_ascii_case(&name))
     }
 
-    /// The message of a body.
+    /// The message of a body, and the length of the body.
     pub(super) async fn read(
         &self,
         headers: &HeaderMap,
         body: Body,
         descriptor: MessageDescriptor,
         permit: &Permit,
-    ) -> Result<DynamicMessage, Box<Answer>> {
+    ) -> Result<(DynamicMessage, usize), Box<Answer>> {
         let text = self.collect(body, permit).await?;
         let length = text.len();
         if text.is_empty() {
-            return Ok(DynamicMessage::new(descriptor));
+            return Ok((DynamicMessage::new(descriptor), 0));
         }
         let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
         if kind.split(';').next().unwrap_or_default().trim() != "application/json" {
@@ -213,7 +213,8 @@ impl Api {
                 invalid("body", description)
             })
         };
-        in_background(length, parse).await.map_err(failed)
+        let message = in_background(length, parse).await.map_err(failed)?;
+        Ok((message, length))
     }
 
     /// The bytes of a body, charged as the JSON that they are.
@@ -270,14 +271,8 @@ pub(super) fn invalid(field: &str, description: impl Into<String>) -> Status {
     status::invalid(&Violation::of(field, description.into()).into())
 }
 
-/// How long a body says that it is; what does not say is taken for a long one.
-fn text_length(headers: &HeaderMap) -> usize {
-    let length = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
-    length.unwrap_or(usize::MAX)
-}
-
 /// Does what takes long for so many bytes on a thread that serves nobody else.
-async fn in_background<T: Send + 'static>(
+pub(super) async fn in_background<T: Send + 'static>(
     bytes: usize,
     work: impl FnOnce() -> Result<T, Status> + Send + 'static,
 ) -> Result<T, Status> {

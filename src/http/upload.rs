@@ -12,7 +12,7 @@ use sha2::{Digest, Sha256};
 use tonic::Code;
 
 use super::answer::{self, Answer};
-use super::api::{Api, call, failed, invalid};
+use super::api::{Api, call, failed, in_background, invalid};
 use crate::rpc::inputs::MAX_CHUNK_BYTES;
 use crate::rpc::listener::Introduction;
 use crate::rpc::proto::input_service_client::InputServiceClient;
@@ -56,8 +56,8 @@ pub async fn answer(
     let (size_bytes, body) = if is_protobuf {
         (declared_length(&head.headers)?, body)
     } else {
-        let message = api.read(&head.headers, body, api.input_data.clone(), &permit).await?;
-        let encoded = message.encode_to_vec();
+        let (message, length) = api.read(&head.headers, body, api.input_data.clone(), &permit).await?;
+        let encoded = in_background(length, move || Ok(message.encode_to_vec())).await.map_err(failed)?;
         permit.hold(encoded.len() as u64).map_err(failed)?;
         (encoded.len() as u64, Body::from(encoded))
     };
