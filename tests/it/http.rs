@@ -228,7 +228,7 @@ fn an_input_is_uploaded_as_json_or_protobuf_and_solved() {
     assert_eq!((damaged.code, damaged.refusal().1.as_str()), (400, "data"));
     // The same numbers to the last bit, also those that decimals of 16 and 17 digits stand for.
     let mut set = track_set();
-    set.xs.iter_mut().enumerate().for_each(|(k, x)| *x = 1206.941_123_647_384_5 + 0.1 * k as f64);
+    set.xs.iter_mut().enumerate().for_each(|(k, x)| *x = 1_206.941_123_647_384_5 + 0.1 * k as f64);
     let mut as_json = tracks();
     (as_json["xs"], as_json["views"]) = (json!(set.xs), json!([{}, {}, {}]));
     let bytes = proto::InputData { data: Some(proto::input_data::Data::TrackSet(set)) }.encode_to_vec();
