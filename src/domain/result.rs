@@ -155,6 +155,25 @@ pub struct Sigmas {
 }
 
 impl Calibration {
+    /// Square pixels, no distortion and no uncertainty.
+    #[cfg(test)]
+    pub(crate) fn pinhole(focal_px: f64, principal_point_px: [f64; 2]) -> Self {
+        Self {
+            focal_px,
+            sigma_log_focal: None,
+            principal_point_px,
+            aspect: 1.0,
+            lens_projection: LensProjection::Perspective,
+            radial_k1: 0.0,
+            radial_k2: 0.0,
+            radial_k3: 0.0,
+            tangential_p1: 0.0,
+            tangential_p2: 0.0,
+            grade: None,
+            sigmas: Sigmas::default(),
+        }
+    }
+
     /// Where the lens puts a point at `(u, v, 1)` in camera coordinates: the distorted point at unit depth, which focal
     /// length, aspect and principal point then take to pixels.
     pub fn distort(&self, u: f64, v: f64) -> [f64; 2] {
@@ -408,20 +427,7 @@ mod tests {
 
     #[test]
     fn the_lens_is_browns() {
-        let pinhole = Calibration {
-            focal_px: 900.0,
-            sigma_log_focal: None,
-            principal_point_px: [450.0, 600.0],
-            aspect: 1.0,
-            lens_projection: LensProjection::Perspective,
-            radial_k1: 0.0,
-            radial_k2: 0.0,
-            radial_k3: 0.0,
-            tangential_p1: 0.0,
-            tangential_p2: 0.0,
-            grade: None,
-            sigmas: Sigmas::default(),
-        };
+        let pinhole = Calibration::pinhole(900.0, [450.0, 600.0]);
         assert_eq!(pinhole.distort(0.5, -0.25), [0.5, -0.25]);
         let lens = Calibration {
             radial_k1: 0.5,
