@@ -7,7 +7,6 @@
 
 use std::collections::hash_map::Entry;
 use std::sync::Arc;
-use std::time::SystemTime;
 
 use tokio::sync::oneshot;
 
@@ -41,7 +40,7 @@ impl Ahead {
     pub(super) async fn look(inner: &Arc<Inner>, worker: &Worker) -> Option<Self> {
         let passed: Vec<JobName> = locked(&inner.foreseen).keys().cloned().collect();
         let Claimed { job, lease, trace_parent, queue_time } =
-            inner.store.foresee(&passed, SystemTime::now()).await.ok()??;
+            inner.store.foresee(&passed, inner.now()).await.ok()??;
         if job.observation_count > MOST_AHEAD {
             return None;
         }
@@ -50,7 +49,7 @@ impl Ahead {
         let (tell, begun) = oneshot::channel();
         let opening =
             Opening::Foreseen { reserved: Arc::downgrade(&reserved), trace_parent: trace_parent.clone(), tell };
-        let stop = stop_token(&job);
+        let stop = stop_token(&job, inner.now());
         let subscription = inner.hub.subscribe(&job.name);
         let (assignment, heard) = Assignment::new(&job, lease.attempt, opening, work.input, stop.clone(), subscription);
         worker.assign(assignment).await;

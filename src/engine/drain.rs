@@ -37,25 +37,38 @@ pub(super) struct WorkerPool {
     drained: Drained,
 }
 
+/// Worker threads that nobody feeds yet.
+pub(super) struct Threads {
+    pub workers: Vec<Worker>,
+    pub threads: Vec<thread::JoinHandle<()>>,
+    /// Closes when the last thread has ended.
+    pub ended: mpsc::Receiver<()>,
+}
+
+impl Threads {
+    /// So many, each with the solver.
+    pub(super) fn start(count: usize, solver: &Solver, encode: ResultEncoder) -> Result<Self, Error> {
+        let (alive, ended) = mpsc::channel(1);
+        let start = |index| {
+            Worker::start(index, solver.clone(), encode, alive.clone())
+                .map_err(|error| Error::Internal(format!("cannot start worker thread {index}: {error}")))
+        };
+        let (workers, threads) = (0..count).map(start).collect::<Result<Vec<_>, _>>()?.into_iter().unzip();
+        Ok(Self { workers, threads, ended })
+    }
+}
+
 impl Inner {
-    /// Starts worker threads, their slots and the sweeper.
-    pub(super) fn hire(self: &Arc<Self>, solver: &Solver, encode: ResultEncoder) -> Result<(), Error> {
-        let (alive, threads_ended) = mpsc::channel(1);
-        let mut pool = WorkerPool { threads_ended: Some(threads_ended), ..WorkerPool::default() };
-        let mut workers = Vec::new();
-        for index in 0..self.options.workers.max(1) {
-            let (worker, thread) = Worker::start(index, solver.clone(), encode, alive.clone())
-                .map_err(|error| Error::Internal(format!("cannot start worker thread {index}: {error}")))?;
-            workers.push(worker);
-            pool.threads.push(thread);
-        }
+    /// Starts the slots of these workers and the sweeper.
+    pub(super) fn hire(self: &Arc<Self>, threads: Threads) {
+        let Threads { workers, threads, ended } = threads;
+        let mut pool = WorkerPool { threads, threads_ended: Some(ended), ..WorkerPool::default() };
         pool.slots = workers.into_iter().map(|worker| tokio::spawn(slot::run(self.clone(), worker))).collect();
         pool.sweeper = Some(tokio::spawn(slot::sweep(self.clone())));
         if self.store.is_shared() {
             pool.hints = Some(tokio::spawn(super::hints::run(self.clone())));
         }
         *locked(&self.pool) = pool;
-        Ok(())
     }
 
     pub(super) fn crew_finished_one(&self) {

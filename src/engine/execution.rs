@@ -136,8 +136,8 @@ impl Drop for Running {
 }
 
 /// How a job is told to stop, which it does by itself at its deadline.
-pub(super) fn stop_token(job: &Job) -> StopToken {
-    let left = job.deadline.map(|deadline| deadline.duration_since(SystemTime::now()).unwrap_or_default());
+pub(super) fn stop_token(job: &Job, now: SystemTime) -> StopToken {
+    let left = job.deadline.map(|deadline| deadline.duration_since(now).unwrap_or_default());
     // A deadline beyond what the clock can express is none.
     StopToken::with_deadline(left.and_then(|left| std::time::Instant::now().checked_add(left)))
 }
@@ -145,10 +145,11 @@ pub(super) fn stop_token(job: &Job) -> StopToken {
 impl JobExecution {
     /// Of a job that is leased.
     pub(super) fn begin(inner: Arc<Inner>, job: Job, lease: Lease, wait: Wait) -> Self {
-        let stop = stop_token(&job);
+        let stop = stop_token(&job, inner.now());
         let running = Running::list(inner.clone(), &lease, &stop);
         let mut execution = Self::new(inner, job, lease, wait, stop, running);
-        execution.is_leased(Instant::now(), SystemTime::now());
+        let now = execution.inner.now();
+        execution.is_leased(Instant::now(), now);
         execution
     }
 
@@ -304,7 +305,7 @@ impl JobExecution {
 
     async fn store_progress(&mut self, progress: Option<Progress>) {
         let Some(progress) = progress else { return };
-        let written = self.inner.store.record(&self.lease, &progress, SystemTime::now());
+        let written = self.inner.store.record(&self.lease, &progress, self.inner.now());
         match in_time(self.leased_until, written).await {
             Ok(_) => {
                 self.stored = Some(progress);
@@ -318,7 +319,7 @@ impl JobExecution {
     async fn heartbeat(&mut self) -> bool {
         let sent = Instant::now();
         let until = if sent < self.leased_until { self.leased_until } else { sent + LATE_HEARTBEAT };
-        let written = self.inner.store.heartbeat(&self.lease, SystemTime::now(), self.inner.options.lease);
+        let written = self.inner.store.heartbeat(&self.lease, self.inner.now(), self.inner.options.lease);
         match in_time(until, written).await {
             Ok(heartbeat) => {
                 self.leased_until = sent + self.inner.options.lease;
@@ -326,7 +327,7 @@ impl JobExecution {
                     self.stop.stop(StopReason::Cancelled);
                 }
                 // The wall clock is what was promised; the token's own deadline runs on the other one.
-                if heartbeat.deadline.is_some_and(|deadline| deadline <= SystemTime::now()) {
+                if heartbeat.deadline.is_some_and(|deadline| deadline <= self.inner.now()) {
                     self.stop.stop(StopReason::DeadlineExceeded);
                 }
                 true
@@ -376,8 +377,8 @@ impl JobExecution {
         let mut unsure = false;
         while !self.lost {
             let written = match ending {
-                Some(ending) => store.finish(&self.lease, ending, SystemTime::now()).await,
-                None => store.release(&self.lease, SystemTime::now()).await,
+                Some(ending) => store.finish(&self.lease, ending, self.inner.now()).await,
+                None => store.release(&self.lease, self.inner.now()).await,
             };
             match written {
                 Ok(job) => return Some(job),

@@ -4,6 +4,7 @@
 
 mod ahead;
 mod attempt;
+mod clock;
 mod drain;
 mod error;
 mod execution;
@@ -31,6 +32,7 @@ pub use crate::store::{
     UploadBounds, UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;
+pub use clock::Clock;
 pub use drain::Drained;
 pub use error::Error;
 pub use submit::{Deadline, JobInput, NewJob};
@@ -85,6 +87,8 @@ pub struct Options {
     pub worker_name: String,
     /// Backend of jobs that name none; stored with the job, so that a restart under another one changes nothing.
     pub backend: Backend,
+    /// What tells the time of all that is stored.
+    pub clock: Clock,
 }
 
 impl Options {
@@ -133,6 +137,7 @@ impl Default for Options {
             short_job: Self::DEFAULT_SHORT_JOB,
             worker_name: worker_name(),
             backend: Backend::default(),
+            clock: Clock::default(),
         }
     }
 }
@@ -203,13 +208,18 @@ impl Engine {
     /// # Errors
     /// [`Error::Internal`] when the store or a thread refuses.
     pub async fn start(
-        mut options: Options,
+        options: Options,
         store: Arc<dyn Store>,
         solver: Solver,
         encode: ResultEncoder,
     ) -> Result<Self, Error> {
+        let threads = drain::Threads::start(options.workers.max(1), &solver, encode)?;
+        Self::start_with(options, store, threads).await
+    }
+
+    async fn start_with(mut options: Options, store: Arc<dyn Store>, threads: drain::Threads) -> Result<Self, Error> {
         options.lease = options.lease.clamp(Options::MIN_LEASE, Options::MAX_LEASE);
-        let recovered = store.recover(SystemTime::now(), options.max_attempts).await?;
+        let recovered = store.recover(options.clock.now(), options.max_attempts).await?;
         let inner = Arc::new(Inner {
             store,
             hub: Arc::default(),
@@ -227,7 +237,7 @@ impl Engine {
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
         observe::store_state(StoreState::Sound);
         inner.taken_back(&recovered);
-        inner.hire(&solver, encode)?;
+        inner.hire(threads);
         inner.queue_changed();
         Ok(Self { inner })
     }
@@ -381,6 +391,10 @@ impl Inner {
         *self.phase.borrow()
     }
 
+    fn now(&self) -> SystemTime {
+        self.options.clock.now()
+    }
+
     /// Tells the slots that a job may be waiting.
     fn work_waits(&self) {
         self.work.send_modify(|count| *count = count.wrapping_add(1));
@@ -398,7 +412,7 @@ impl Inner {
     }
 
     async fn cancel(&self, name: &JobName, etag: Option<&str>) -> Result<Job, Error> {
-        let reply = self.store.request_cancel(name, etag, SystemTime::now()).await?;
+        let reply = self.store.request_cancel(name, etag, self.now()).await?;
         self.stop_attempts(name);
         if reply.ended_now {
             locked(&self.foreseen).remove(name);

@@ -2,7 +2,7 @@
 
 use std::pin::pin;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout, timeout_at};
@@ -80,7 +80,7 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
 /// The next job, leased; `None` where none waits.
 async fn claim(inner: &Arc<Inner>) -> Option<Ready> {
     let options = &inner.options;
-    match inner.store.claim(&options.worker_name, SystemTime::now(), options.lease).await {
+    match inner.store.claim(&options.worker_name, inner.now(), options.lease).await {
         Ok(claimed) => {
             let claimed = claimed?;
             // Whoever has foreseen it need not begin it.
@@ -169,7 +169,7 @@ async fn due(inner: &Inner, counted: Instant) {
 impl Inner {
     /// Removes jobs that have been kept long enough, and gives back the space of what was removed.
     async fn tidy(&self) {
-        if let Some(ended_by) = self.options.retention.and_then(|kept| SystemTime::now().checked_sub(kept)) {
+        if let Some(ended_by) = self.options.retention.and_then(|kept| self.now().checked_sub(kept)) {
             match self.store.purge(ended_by, PURGE_BATCH).await {
                 Ok(0) => {}
                 Ok(removed) => {
@@ -215,7 +215,7 @@ impl Inner {
     }
 
     pub(super) async fn sweep(&self) {
-        let swept = self.store.sweep(SystemTime::now(), self.options.max_attempts).await;
+        let swept = self.store.sweep(self.now(), self.options.max_attempts).await;
         self.store_is(match &swept {
             Err(store::Error::Unavailable(_)) => StoreState::Away,
             _ if self.store.has_room() => StoreState::Sound,

@@ -177,7 +177,7 @@ impl Inner {
             observe::refused(observe::Refusal::Draining);
             return Err(Error::Draining);
         }
-        let now = SystemTime::now();
+        let now = self.now();
         let backend = self.options.backend;
         let mut uploaded = Vec::new();
         for new in &news {

@@ -1,7 +1,7 @@
 //! Uploads: streams of bytes that become inputs, kept where the jobs are.
 
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use super::{Engine, Error, Inner, Phase, finished, observe};
 use crate::domain::{Input, InputName};
@@ -70,7 +70,7 @@ impl Engine {
     pub async fn begin_upload(&self, new: NewUpload) -> Result<Begun, Error> {
         self.inner.check_open()?;
         let bounds = &self.inner.options.uploads.bounds;
-        match self.inner.store.begin_upload(&new, bounds, SystemTime::now()).await {
+        match self.inner.store.begin_upload(&new, bounds, self.inner.now()).await {
             Ok(BegunUpload::Finished(input)) => Ok(Begun::Finished(input)),
             Ok(BegunUpload::Open { lease, committed, sha256 }) => {
                 Ok(Begun::Open(Upload { engine: self.clone(), lease, committed, bytes: new.bytes, sha256 }))
@@ -123,7 +123,7 @@ impl Inner {
 
     /// Gives up what nobody goes on with, and removes what is of no use any more.
     pub(super) async fn tidy_uploads(&self) {
-        let before = |kept: Option<Duration>| kept.and_then(|kept| SystemTime::now().checked_sub(kept));
+        let before = |kept: Option<Duration>| kept.and_then(|kept| self.now().checked_sub(kept));
         let abandoned_by = before(self.options.uploads.abandoned_after);
         match self.store.purge_uploads(abandoned_by, before(self.options.retention)).await {
             Ok(purged) => {
@@ -163,7 +163,7 @@ impl Upload {
     /// up, [`Error::Draining`] once they are stored.
     pub async fn append(&mut self, data: &[u8]) -> Result<(), Error> {
         let store = &self.engine.inner.store;
-        store.append_upload(&self.lease, self.committed, data, SystemTime::now()).await?;
+        store.append_upload(&self.lease, self.committed, data, self.engine.inner.now()).await?;
         self.committed += data.len() as u64;
         observe::uploaded(data.len() as u64);
         self.engine.inner.check_open()
@@ -195,7 +195,7 @@ impl Upload {
         };
         let new = Arc::new(finished(tokio::task::spawn_blocking(encode)).await?);
         let store = Arc::clone(&self.engine.inner.store);
-        let input = store.finish_upload(&self.lease, &new, SystemTime::now()).await?;
+        let input = store.finish_upload(&self.lease, &new, self.engine.inner.now()).await?;
         observe::input_created();
         tracing::info!(input = %input.name, bytes = input.upload_bytes, "input uploaded");
         Ok(input)

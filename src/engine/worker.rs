@@ -125,6 +125,13 @@ impl Worker {
         Ok((Self { assignments }, handle))
     }
 
+    /// Feeds who reads from the inbox.
+    #[cfg(test)]
+    pub(super) fn with_inbox() -> (Self, mpsc::Receiver<Assignment>) {
+        let (assignments, inbox) = mpsc::channel(1);
+        (Self { assignments }, inbox)
+    }
+
     /// Hands over work, which is begun once what was handed over before is done; waits where that is not begun either.
     pub(super) async fn assign(&self, assignment: Assignment) {
         // A send that fails drops the assignment and its reply, which is the answer.
@@ -245,5 +252,60 @@ impl Observer for Reporter {
             time: SystemTime::now(),
             body: EventBody::Weights { iteration, weights: weights.to_vec() },
         })));
+    }
+}
+
+/// What a worker's thread does, step by step.
+#[cfg(test)]
+pub(super) struct Simulated {
+    reporter: Reporter,
+    stop: StopToken,
+    reply: oneshot::Sender<Report>,
+}
+
+#[cfg(test)]
+impl Assignment {
+    pub(super) fn settings(&self) -> &SolveSettings {
+        &self.settings
+    }
+
+    /// Begins with it; `None` where nobody wants it any more.
+    pub(super) fn begin(self) -> Option<Simulated> {
+        let Self { name, number, opening, stop, progress, subscription, reply, .. } = self;
+        let attempt = opening.open(&name, number)?;
+        Some(Simulated { reporter: Reporter { name, number, progress, subscription, attempt }, stop, reply })
+    }
+}
+
+#[cfg(test)]
+impl Simulated {
+    pub(super) fn name(&self) -> &JobName {
+        &self.reporter.name
+    }
+
+    pub(super) fn is_stopped(&self) -> bool {
+        self.stop.reason().is_some()
+    }
+
+    pub(super) fn report(&mut self, progress: &Progress) {
+        self.reporter.progress(progress);
+    }
+
+    /// Ends with a solution, unless it was stopped.
+    pub(super) fn succeed(self, solution: &Solution, result: Vec<u8>) {
+        let result = EncodedResult::new(result);
+        let summary = summarise(solution, result.bytes.len() as u64);
+        self.end(Verdict::Solved { summary, result });
+    }
+
+    /// Ends with a defect, unless it was stopped.
+    pub(super) fn fail(self) {
+        self.end(Verdict::Broken("told to fail".into()));
+    }
+
+    fn end(self, verdict: Verdict) {
+        let verdict = self.stop.reason().map_or(verdict, Verdict::Stopped);
+        // Nobody listens any more where the engine went down.
+        let _ = self.reply.send(Report { verdict, attempt: self.reporter.attempt });
     }
 }

@@ -8,6 +8,8 @@ pub mod payload;
 pub mod postgres;
 pub mod query;
 pub mod record;
+#[cfg(test)]
+pub(crate) mod simulated;
 mod sql;
 pub mod sqlite;
 pub mod timed;

@@ -4,6 +4,7 @@ mod admission;
 mod ahead;
 mod lifecycle;
 mod sharing;
+mod simulation;
 mod survival;
 mod watching;
 

@@ -49,6 +49,12 @@ impl Statement {
         Self { sql: sqlx::AssertSqlSafe(text).into_sql_str(), ..self }
     }
 
+    /// The same with other words in it, as a defect would have it.
+    #[cfg(test)]
+    pub(in crate::store) fn replaced(self, from: &str, to: &str) -> Self {
+        Self { sql: sqlx::AssertSqlSafe(self.sql.as_str().replace(from, to)).into_sql_str(), ..self }
+    }
+
     /// A parameter at the end of the SQL, with its value.
     pub(in crate::store) fn then_bind(self, value: impl Into<Value>) -> Self {
         let mut statement = self.bind(value);

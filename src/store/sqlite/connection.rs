@@ -53,7 +53,7 @@ impl WriteConnection {
     }
 
     /// Runs one without parameters or rows.
-    pub(super) fn control(&mut self, statement: &'static str) -> Result<(), Error> {
+    pub(in crate::store) fn control(&mut self, statement: &'static str) -> Result<(), Error> {
         Ok(self.inner.prepare_cached(statement)?.raw_execute().map(drop)?)
     }
 
@@ -85,13 +85,23 @@ impl WriteConnection {
     }
 
     /// Rows that were changed over it.
-    pub(super) fn changes(&self) -> u64 {
+    pub(in crate::store) fn changes(&self) -> u64 {
         self.inner.total_changes()
     }
 
     #[cfg(test)]
     pub(super) fn inner(&mut self) -> &mut rusqlite::Connection {
         &mut self.inner
+    }
+
+    /// An empty database in memory.
+    #[cfg(test)]
+    pub(in crate::store) fn in_memory() -> Result<Self, Error> {
+        let connection = rusqlite::Connection::open_in_memory()?;
+        connection.set_prepared_statement_cache_capacity(PREPARED);
+        connection.pragma_update(None, "foreign_keys", "ON")?;
+        connection.execute_batch(super::SCHEMA)?;
+        Ok(Self { inner: connection, database: PathBuf::new() })
     }
 
     fn run(&mut self, statement: &Statement) -> Result<Vec<WrittenRow>, Error> {

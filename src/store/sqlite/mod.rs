@@ -26,7 +26,9 @@ use sqlx::sqlite::{
 
 use super::sql::{self, Connection, Database, Moves, Operation, Size, Statement, Step};
 use super::{Error, Hint};
-use connection::WriteConnection;
+pub(super) use connection::WriteConnection;
+#[cfg(test)]
+pub(super) use connection::WrittenRow;
 use reserve::{Reserve, Room};
 use vacuum::{VACUUM, VACUUM_BYTES, VACUUMS};
 use writer::Writer;
@@ -58,7 +60,9 @@ const SETTINGS: [(&str, &str); 4] = [
     ("wal_autocheckpoint", "0"),
 ];
 
-const MIGRATIONS: [Step; 1] = [(1, "schema", include_str!("../migrations/sqlite/0001_schema.sql"))];
+const SCHEMA: &str = include_str!("../migrations/sqlite/0001_schema.sql");
+
+const MIGRATIONS: [Step; 1] = [(1, "schema", SCHEMA)];
 
 /// Store in a data directory.
 #[derive(Debug)]

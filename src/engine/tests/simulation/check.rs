@@ -1,0 +1,115 @@
+//! What must hold, whatever happens.
+
+use std::hash::{DefaultHasher, Hash, Hasher};
+
+use tokio::runtime::Builder;
+
+use super::client::{Clients, Known, request};
+use super::server::Behavior;
+use super::{MAX_ATTEMPTS, MAX_JOBS};
+use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
+use crate::store::simulated::Cluster;
+use crate::store::{ATTEMPTS_EXHAUSTED, Error, Store};
+
+macro_rules! ensure {
+    ($holds:expr, $($what:tt)+) => {
+        if !$holds {
+            return Err(format!($($what)+));
+        }
+    };
+}
+
+/// The bound on what waits, which holds at all times.
+pub(super) fn at_each_step(cluster: &Cluster) -> Result<(), String> {
+    let new = cluster.numbers("SELECT COUNT(*) AS number FROM jobs WHERE state = 'QUEUED' AND attempt = 0")[0];
+    ensure!(new <= MAX_JOBS as i64, "{new} new jobs wait, {MAX_JOBS} may");
+    Ok(())
+}
+
+/// Jobs that have not ended.
+pub(super) fn open_jobs(cluster: &Cluster) -> i64 {
+    cluster.numbers("SELECT COUNT(*) AS number FROM jobs WHERE state IN ('QUEUED', 'RUNNING')")[0]
+}
+
+/// What is stored once everything has come to rest. Returns a digest of it.
+pub(super) fn at_the_end(cluster: &Cluster, clients: &Clients) -> Result<u64, String> {
+    let store = cluster.connect::<true>(0);
+    let mut digest = DefaultHasher::new();
+    let runtime = Builder::new_current_thread().enable_time().start_paused(true).build().expect("a runtime");
+    runtime.block_on(async {
+        let ledger = clients.ledger();
+        for (name, known) in &ledger.jobs {
+            let job = match store.job(name).await {
+                Err(Error::NotFound(_)) if known.deleted => continue,
+                // It was deleted and made anew: none of those who call knows it.
+                Ok(_) if known.deleted => continue,
+                job => job.map_err(|error| format!("{name} was acknowledged: {error}"))?,
+            };
+            let events = store.events_after(name, 0, u32::MAX).await.map_err(|error| error.to_string())?;
+            told_once(&job, &events, known).map_err(|what| format!("{name}: {what}"))?;
+            came_right(&store, &job).await.map_err(|what| format!("{name}: {what}"))?;
+            for event in &events {
+                (name.to_string(), event.attempt, event.sequence, format!("{:?}", event.body)).hash(&mut digest);
+            }
+        }
+        // Of requests without an answer there may be jobs, one each.
+        let jobs = cluster.numbers("SELECT COUNT(*) AS number FROM jobs")[0];
+        ensure!(jobs <= ledger.sent as i64, "{jobs} jobs of {} requests", ledger.sent);
+        let open = open_jobs(cluster);
+        ensure!(open == 0, "{open} jobs have not ended");
+        let left = "SELECT COUNT(*) AS number FROM attempts WHERE ending IS NULL";
+        let left = cluster.numbers(left)[0];
+        ensure!(left == 0, "{left} attempts have no end");
+        Ok(digest.finish())
+    })
+}
+
+/// Events without gap or repeat, one end, and nothing of an attempt once another has begun.
+fn told_once(job: &Job, events: &[JobEvent], known: &Known) -> Result<(), String> {
+    let sequences: Vec<u64> = events.iter().filter_map(|event| event.sequence).collect();
+    ensure!(sequences.iter().copied().eq(1..=job.last_sequence), "events {sequences:?} of {}", job.last_sequence);
+    let ends = events.iter().filter_map(terminal).collect::<Vec<_>>();
+    ensure!(ends == [job.state], "{} after the ends {ends:?}", job.state.name());
+    ensure!(events.last().and_then(terminal) == Some(job.state), "something follows the end");
+    ensure!(events.is_sorted_by_key(|event| event.attempt), "an attempt writes after the next has begun");
+    let began = |event: &&JobEvent| matches!(event.body, EventBody::State { state: JobState::Running, .. });
+    let begun: Vec<u32> = events.iter().filter(began).map(|event| event.attempt).collect();
+    ensure!(begun.iter().copied().eq(1..=job.attempt), "attempts {begun:?} of {}", job.attempt);
+    ensure!(known.end == Some(job.state), "it is {}, seen was {:?}", job.state.name(), known.end);
+    Ok(())
+}
+
+fn terminal(event: &JobEvent) -> Option<JobState> {
+    match event.body {
+        EventBody::State { state, .. } => Some(state).filter(|state| state.is_terminal()),
+        _ => None,
+    }
+}
+
+/// The end is one that the job can come to, and a result is its own.
+async fn came_right(store: &dyn Store, job: &Job) -> Result<(), String> {
+    let number = job.name.job.trim_start_matches("job-").parse().map_err(|_| "a foreign job".to_owned())?;
+    let behavior = Behavior::of(request(number).settings.seed);
+    let reason = job.failure.as_ref().map(|failure| failure.reason.as_str());
+    match job.state {
+        JobState::Succeeded => {
+            ensure!(behavior == Behavior::Succeed, "a job that cannot succeed has");
+            let result = store.result(&job.name).await.map_err(|error| error.to_string())?;
+            let result = result.ok_or("no result")?;
+            ensure!(result.is_intact() && result.bytes == result_of(&job.name), "another job's result");
+        }
+        JobState::Failed if reason == Some(ATTEMPTS_EXHAUSTED) => {
+            let lost = job.failure.as_ref().map_or(0, |failure| failure.attempts.len());
+            ensure!(lost >= MAX_ATTEMPTS as usize, "given up after {lost} attempts");
+        }
+        JobState::Failed => ensure!(behavior == Behavior::Fail, "it failed by {reason:?}"),
+        JobState::Cancelled => {}
+        state => return Err(format!("it is {}", state.name())),
+    }
+    Ok(())
+}
+
+/// The encoded result of a job.
+pub(super) fn result_of(name: &JobName) -> Vec<u8> {
+    name.to_string().into_bytes()
+}

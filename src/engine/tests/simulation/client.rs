@@ -1,0 +1,219 @@
+//! Those who call the servers, and what they were told.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use rand::seq::IteratorRandom;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::server::Server;
+use crate::domain::SolveSettings;
+use crate::domain::job::{EventBody, JobName, JobState};
+use crate::engine::tests::input;
+use crate::engine::{Engine, Error, NewJob};
+
+/// Jobs that clients ask for in one simulation at most.
+const MOST_REQUESTS: u64 = 24;
+
+/// What a client knows of a job.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Known {
+    /// Sequence number of the last event that it saw.
+    pub after: u64,
+    /// The job's end, once it saw it.
+    pub end: Option<JobState>,
+    /// Somebody follows it now.
+    watched: bool,
+    /// Its deletion was asked for: it may be gone.
+    pub deleted: bool,
+}
+
+/// What all clients together know.
+#[derive(Debug, Default)]
+pub(super) struct Ledger {
+    /// Requests that were sent; the answer may be lost.
+    pub sent: u64,
+    /// The jobs that were acknowledged.
+    pub jobs: BTreeMap<JobName, Known>,
+    violation: Option<String>,
+}
+
+impl Ledger {
+    fn violated(&mut self, what: String) {
+        self.violation.get_or_insert(what);
+    }
+}
+
+/// All clients.
+pub(super) struct Clients {
+    rng: ChaCha8Rng,
+    ledger: Arc<Mutex<Ledger>>,
+}
+
+fn locked(ledger: &Mutex<Ledger>) -> MutexGuard<'_, Ledger> {
+    ledger.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Clients {
+    pub(super) fn new(seed: u64) -> Self {
+        Self { rng: ChaCha8Rng::seed_from_u64(seed), ledger: Arc::default() }
+    }
+
+    pub(super) fn ledger(&self) -> MutexGuard<'_, Ledger> {
+        locked(&self.ledger)
+    }
+
+    /// What a client was told that must not be.
+    pub(super) fn violation(&self) -> Option<String> {
+        self.ledger().violation.clone()
+    }
+
+    /// Whether the end of every job was seen.
+    pub(super) fn all_is_seen(&self) -> bool {
+        self.ledger().jobs.values().all(|known| known.end.is_some())
+    }
+
+    /// Someone calls a server.
+    pub(super) fn call(&mut self, server: &Server) {
+        let ledger = self.ledger.clone();
+        let known = locked(&ledger).jobs.keys().cloned().choose(&mut self.rng);
+        match (self.rng.random_range(0..10), known) {
+            (0..=1, Some(name)) => server.spawn(|engine| watch(engine, name, ledger)),
+            (2, Some(name)) => server.spawn(|engine| cancel(engine, name, ledger)),
+            (3, Some(name)) => server.spawn(|engine| delete(engine, name, ledger)),
+            _ => {
+                let sent = self.ledger().sent;
+                // A new request, or one that was sent before.
+                let number = self.rng.random_range(0..=sent).min(MOST_REQUESTS - 1);
+                let number = if self.rng.random_bool(0.7) { sent.min(MOST_REQUESTS - 1) } else { number };
+                let mut known = self.ledger();
+                known.sent = sent.max(number + 1);
+                // One whose job is deleted would be another job.
+                if known.jobs.iter().any(|(name, known)| known.deleted && name.job == format!("job-{number}")) {
+                    return;
+                }
+                drop(known);
+                server.spawn(|engine| submit(engine, number, ledger));
+            }
+        }
+    }
+
+    /// Everyone who waits for the end of a job goes on with that.
+    pub(super) fn watch_all(&mut self, server: &Server) {
+        let open: Vec<JobName> =
+            self.ledger().jobs.iter().filter(|(_, known)| known.end.is_none()).map(|(name, _)| name.clone()).collect();
+        for name in open {
+            let ledger = self.ledger.clone();
+            server.spawn(|engine| watch(engine, name, ledger));
+        }
+    }
+}
+
+/// What request of this number asks for: the same each time.
+pub(super) fn request(number: u64) -> NewJob {
+    let seed = ChaCha8Rng::seed_from_u64(number).random_range(0..1_000_000);
+    let settings = SolveSettings { seed, ..SolveSettings::default() };
+    let mut new = NewJob::new(format!("tenant-{}", number % 3), input(), settings);
+    new.request_id = Some(format!("request-{number}"));
+    new.job_id = Some(format!("job-{number}"));
+    new.priority = (seed / 1_000 % 3) as i32;
+    new
+}
+
+/// What may be answered by a server whose store misbehaves.
+fn is_failure(error: &Error) -> bool {
+    matches!(error, Error::Unavailable(_) | Error::NoSpace(_) | Error::Draining)
+}
+
+async fn submit(engine: Engine, number: u64, ledger: Arc<Mutex<Ledger>>) {
+    let answer = engine.submit(request(number)).await;
+    let mut ledger = locked(&ledger);
+    match answer {
+        Ok(job) => {
+            if job.name.job != format!("job-{number}") {
+                ledger.violated(format!("request {number} is {}", job.name));
+            }
+            ledger.jobs.entry(job.name).or_default();
+        }
+        Err(Error::QueueFull { .. }) => {}
+        Err(error) if is_failure(&error) => {}
+        Err(error) => ledger.violated(format!("request {number}: {error}")),
+    }
+}
+
+async fn cancel(engine: Engine, name: JobName, ledger: Arc<Mutex<Ledger>>) {
+    match engine.cancel(&name).await {
+        Ok(_) => {}
+        Err(error) if is_failure(&error) => {}
+        Err(Error::NotFound(_)) if locked(&ledger).jobs.get(&name).is_none_or(|known| known.deleted) => {}
+        Err(error) => locked(&ledger).violated(format!("cancel of {name}: {error}")),
+    }
+}
+
+async fn delete(engine: Engine, name: JobName, ledger: Arc<Mutex<Ledger>>) {
+    // Before: whether an answer that is lost was a yes is not known.
+    let Some(known) = locked(&ledger).jobs.get(&name).cloned() else { return };
+    if known.end.is_none() {
+        return;
+    }
+    if let Some(known) = locked(&ledger).jobs.get_mut(&name) {
+        known.deleted = true;
+    }
+    match engine.delete(&name, None).await {
+        // A request that was on its way for long has made the job anew.
+        Ok(()) | Err(Error::NotFound(_) | Error::NotEnded(_)) => {}
+        Err(error) if is_failure(&error) => {}
+        Err(error) => locked(&ledger).violated(format!("delete of {name}: {error}")),
+    }
+}
+
+/// Follows a job from the last event that was seen.
+async fn watch(engine: Engine, name: JobName, ledger: Arc<Mutex<Ledger>>) {
+    let after = match locked(&ledger).jobs.get_mut(&name) {
+        Some(known) if !known.watched && known.end.is_none() => {
+            known.watched = true;
+            known.after
+        }
+        _ => return,
+    };
+    // Also where the server dies in between.
+    let _watched = Watched { name: name.clone(), ledger: ledger.clone() };
+    let mut watch = match engine.watch(&name, after).await {
+        Ok(watch) => watch,
+        Err(error) if is_failure(&error) => return,
+        Err(error) => return locked(&ledger).violated(format!("watch of {name} after {after}: {error}")),
+    };
+    while let Some(event) = watch.next().await {
+        let mut ledger = locked(&ledger);
+        let event = match event {
+            Ok(event) => event,
+            Err(error) if is_failure(&error) => return,
+            Err(error) => return ledger.violated(format!("events of {name}: {error}")),
+        };
+        let Some(sequence) = event.sequence else { continue };
+        let Some(known) = ledger.jobs.get_mut(&name) else { return };
+        let (before, end) = (known.after, known.end);
+        known.after = sequence;
+        if let EventBody::State { state, .. } = event.body {
+            known.end = Some(state).filter(|state| state.is_terminal());
+        }
+        if sequence != before + 1 || end.is_some() {
+            ledger.violated(format!("{name}: event {sequence} came after {before} and the end {end:?}"));
+        }
+    }
+}
+
+/// Notes when nobody follows a job any more.
+struct Watched {
+    name: JobName,
+    ledger: Arc<Mutex<Ledger>>,
+}
+
+impl Drop for Watched {
+    fn drop(&mut self) {
+        if let Some(known) = locked(&self.ledger).jobs.get_mut(&self.name) {
+            known.watched = false;
+        }
+    }
+}

@@ -1,0 +1,334 @@
+//! A database for simulations: the SQL that ships, on one SQLite in memory that all simulated servers share, each of
+//! them behind a network of its own whose faults are drawn by seed.
+//!
+//! Nothing here waits for a thread: all time that passes is that of tokio's paused clock.
+
+use std::ops::{Deref, DerefMut};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, SystemTime};
+
+use futures_util::FutureExt;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tokio::sync::{OwnedMutexGuard, broadcast};
+use tokio::time::sleep;
+
+use super::sql::{Change, Connection, Database, Moves, Operation, Row, Size, Statement};
+use super::sqlite::{WriteConnection, WrittenRow};
+use super::{Error, Hint};
+use crate::domain::job::JobName;
+
+/// Notifications that a server may be behind before it is told that some are lost.
+const NOTIFICATIONS: usize = 16;
+
+/// How long an operation may take, as for PostgreSQL.
+const BOUND: Duration = Duration::from_secs(10);
+
+/// A defect that is built in on purpose, for the simulation to find.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Bug {
+    /// A claim takes a job that another worker has.
+    DoubleClaim,
+    /// A write whose lease is lost is made all the same.
+    LateWrite,
+    /// A reader of events passes one over now and then.
+    MissedEvent,
+}
+
+/// What happens to the operations of one server from now on.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Faults {
+    /// The longest that a request or an answer is on its way.
+    pub delay: Duration,
+    /// Share of the requests that do not reach the database, and of the answers that do not come back.
+    pub lost: f64,
+    /// Share of the requests and answers that hang until the caller gives up.
+    pub hanging: f64,
+    /// Share of the notifications that are lost.
+    pub lost_notifications: f64,
+    /// The database is out of reach.
+    pub partitioned: bool,
+    /// Nothing that begins something can be stored.
+    pub full: bool,
+    /// How far the server's clock is ahead of the database's, in seconds.
+    pub clock_ahead: i32,
+}
+
+/// The way of one server to the database.
+#[derive(Debug)]
+pub(crate) struct Link {
+    faults: Faults,
+    rng: ChaCha8Rng,
+    /// What the server takes for the distance of the clocks.
+    known_clock_ahead: i32,
+}
+
+impl Link {
+    /// Sets the faults from now on.
+    pub(crate) fn set(&mut self, faults: Faults) {
+        self.faults = faults;
+    }
+
+    pub(crate) fn faults(&self) -> Faults {
+        self.faults
+    }
+}
+
+/// Where everything is stored.
+#[derive(Clone)]
+pub(crate) struct Cluster {
+    connection: Arc<tokio::sync::Mutex<SimulatedConnection>>,
+    notifications: broadcast::Sender<Hint>,
+}
+
+impl Cluster {
+    /// An empty database.
+    pub(crate) fn new(bug: Option<Bug>) -> Self {
+        let inner = WriteConnection::in_memory().expect("a database in memory");
+        let connection = SimulatedConnection { inner, committing: Vec::new(), bug, reads: 0 };
+        Self {
+            connection: Arc::new(tokio::sync::Mutex::new(connection)),
+            notifications: broadcast::Sender::new(NOTIFICATIONS),
+        }
+    }
+
+    /// A server's connection. `SHARED`: whether there may be others.
+    pub(crate) fn connect<const SHARED: bool>(&self, seed: u64) -> Simulated<SHARED> {
+        let link = Link { faults: Faults::default(), rng: ChaCha8Rng::seed_from_u64(seed), known_clock_ahead: 0 };
+        Simulated {
+            cluster: self.clone(),
+            link: Arc::new(Mutex::new(link)),
+            notifications: tokio::sync::Mutex::new(self.notifications.subscribe()),
+        }
+    }
+
+    /// The column `number` of what a query finds, past every fault.
+    pub(crate) fn numbers(&self, query: &'static str) -> Vec<i64> {
+        let mut connection = self.connection.try_lock().expect("between two steps no transaction is open");
+        let rows = connection.inner.rows(Statement::new(query)).now_or_never().expect("it waits for nothing");
+        let rows = rows.expect("a valid query");
+        rows.iter().map(|row| row.integer("number").expect("a number")).collect()
+    }
+}
+
+/// The store of one simulated server.
+pub(crate) struct Simulated<const SHARED: bool> {
+    cluster: Cluster,
+    link: Arc<Mutex<Link>>,
+    notifications: tokio::sync::Mutex<broadcast::Receiver<Hint>>,
+}
+
+/// Which way something is on the link.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Way {
+    There,
+    Back,
+}
+
+impl<const SHARED: bool> Simulated<SHARED> {
+    /// The way to the database, for its faults to be set.
+    pub(crate) fn link(&self) -> Arc<Mutex<Link>> {
+        self.link.clone()
+    }
+
+    fn locked(&self) -> MutexGuard<'_, Link> {
+        self.link.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Passes a request or an answer, or not.
+    async fn pass(&self, way: Way) -> Result<(), Error> {
+        let (delay, hangs, is_lost) = {
+            let Link { faults, rng, .. } = &mut *self.locked();
+            let delay = faults.delay.mul_f64(rng.random::<f64>());
+            let hangs = rng.random_bool(faults.hanging);
+            // What is committed while the network breaks is committed, and its answer is lost.
+            (delay, hangs, rng.random_bool(faults.lost) || faults.partitioned)
+        };
+        sleep(delay).await;
+        if hangs {
+            std::future::pending::<()>().await;
+        }
+        match is_lost {
+            true => Err(Error::Unavailable(format!("the connection broke ({way:?})"))),
+            false => Ok(()),
+        }
+    }
+}
+
+impl<const SHARED: bool> Database for Simulated<SHARED> {
+    type Writing = SimulatedConnection;
+    type Reading = ReadConnection;
+
+    const SHARED: bool = SHARED;
+
+    async fn reader(&self, _size: Size) -> Result<ReadConnection, Error> {
+        self.pass(Way::There).await?;
+        Ok(ReadConnection(self.cluster.connection.clone().lock_owned().await))
+    }
+
+    async fn write<T: Send + 'static>(
+        &self,
+        _size: Size,
+        moves: Moves,
+        operation: Operation<SimulatedConnection, T>,
+    ) -> Result<T, Error> {
+        self.pass(Way::There).await?;
+        let is_full = self.locked().faults.full;
+        let outcome = {
+            let mut connection = self.cluster.connection.lock().await;
+            let outcome = connection.transaction(&operation, is_full && matches!(moves, Moves::Begins(_))).await;
+            for change in std::mem::take(&mut connection.committing) {
+                // Without a server that listens there is nobody to tell.
+                let _ = self.cluster.notifications.send(change);
+            }
+            outcome
+        };
+        self.pass(Way::Back).await?;
+        outcome
+    }
+
+    fn bound(&self, _size: Size) -> Option<Duration> {
+        Some(BOUND)
+    }
+
+    fn lease_clock(&self, now: SystemTime) -> SystemTime {
+        if !SHARED {
+            return now;
+        }
+        let ahead = self.locked().known_clock_ahead;
+        let distance = Duration::from_secs(ahead.unsigned_abs().into());
+        if ahead < 0 { now + distance } else { now - distance }
+    }
+
+    async fn set_lease_clock(&self) -> Result<(), Error> {
+        self.pass(Way::There).await?;
+        let mut link = self.locked();
+        link.known_clock_ahead = link.faults.clock_ahead;
+        Ok(())
+    }
+
+    fn has_room(&self) -> bool {
+        !self.locked().faults.full
+    }
+
+    async fn heard(&self) -> Hint {
+        if !SHARED {
+            return std::future::pending().await;
+        }
+        loop {
+            let heard = self.notifications.lock().await.recv().await;
+            let Link { faults, rng, .. } = &mut *self.locked();
+            if rng.random_bool(faults.lost_notifications) || faults.partitioned {
+                continue;
+            }
+            return heard.unwrap_or(Hint::Missed);
+        }
+    }
+
+    async fn disconnect(&self) {}
+}
+
+/// The one connection, lent to a reader.
+pub(crate) struct ReadConnection(OwnedMutexGuard<SimulatedConnection>);
+
+impl Deref for ReadConnection {
+    type Target = SimulatedConnection;
+
+    fn deref(&self) -> &SimulatedConnection {
+        &self.0
+    }
+}
+
+impl DerefMut for ReadConnection {
+    fn deref_mut(&mut self) -> &mut SimulatedConnection {
+        &mut self.0
+    }
+}
+
+/// The connection that all servers share.
+pub(crate) struct SimulatedConnection {
+    inner: WriteConnection,
+    /// What others are told once the transaction is committed.
+    committing: Vec<Hint>,
+    bug: Option<Bug>,
+    /// Reads of events so far.
+    reads: u32,
+}
+
+impl SimulatedConnection {
+    /// Runs an operation in a transaction. On a full disk one that is to begin something may write nothing.
+    async fn transaction<T: 'static>(&mut self, operation: &Operation<Self, T>, is_full: bool) -> Result<T, Error> {
+        self.inner.control("BEGIN IMMEDIATE")?;
+        let before = self.inner.changes();
+        let mut outcome = operation(self).await;
+        if let (Err(Error::Fenced(lease)), Some(Bug::LateWrite)) = (&outcome, self.bug) {
+            let late = Statement::new(
+                "UPDATE jobs SET last_sequence = last_sequence + 1 WHERE tenant = $1 AND job = $2 \
+                 RETURNING id, last_sequence",
+            );
+            let late = late.bind(&lease.name.tenant).bind(&lease.name.job);
+            if let Some(job) = self.inner.optional_row(late).await? {
+                let (id, sequence) = (job.integer("id")?, job.integer("last_sequence")?);
+                let insert = "INSERT INTO events SELECT job_id, $1, $2, time, body FROM events \
+                              WHERE job_id = $3 AND sequence = 1";
+                let insert = Statement::new(insert).bind(sequence).bind(lease.attempt).bind(id);
+                self.inner.execute(insert).await?;
+            }
+            self.inner.control("COMMIT")?;
+            return outcome;
+        }
+        if outcome.is_ok() && is_full && self.inner.changes() != before {
+            outcome = Err(Error::NoSpace("the simulated disk is full".into()));
+        }
+        if outcome.is_ok() {
+            self.inner.control("COMMIT")?;
+        } else {
+            self.committing.clear();
+            self.inner.control("ROLLBACK")?;
+        }
+        outcome
+    }
+}
+
+impl Connection for SimulatedConnection {
+    type Row = WrittenRow;
+
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<WrittenRow>, Error> {
+        let bug = self.bug;
+        let is_claim = bug == Some(Bug::DoubleClaim) && statement.sql().contains("ORDER BY priority");
+        let statement = match is_claim {
+            true => statement.replaced("state = 'QUEUED'", "state IN ('QUEUED', 'RUNNING')"),
+            false => statement,
+        };
+        let reads_events = statement.sql().contains("FROM events");
+        let mut rows = self.inner.rows(statement).await?;
+        if bug == Some(Bug::MissedEvent) && reads_events && rows.len() > 1 {
+            self.reads += 1;
+            if self.reads.is_multiple_of(7) {
+                rows.remove(0);
+            }
+        }
+        Ok(rows)
+    }
+
+    async fn tell(&mut self, change: Change, job: &JobName) -> Result<(), Error> {
+        self.committing.push(match change {
+            Change::Events => Hint::Events(job.clone()),
+            Change::Queued => Hint::Queued,
+            Change::Cancel => Hint::Cancel(job.clone()),
+        });
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::contract::store_contract;
+
+    async fn open() -> Option<Arc<Simulated<true>>> {
+        Some(Arc::new(Cluster::new(None).connect(0)))
+    }
+
+    store_contract!(open);
+}
