@@ -117,7 +117,7 @@ pub fn job_json(job: &Job) -> Value {
     json!({
         "name": job.name.to_string(),
         "state": job.state,
-        "attempt": job.attempt,
+        "attempt_count": job.attempt,
         "settings": job.settings,
         "input": job.input.as_ref().map(InputName::to_string),
         "views": job.view_count,
@@ -147,10 +147,10 @@ pub fn event_json(event: &JobEvent) -> Value {
         }
         EventBody::Progress(progress) => ("progress", json!(progress)),
         EventBody::Weights { iteration, weights } => ("weights", json!({ "iteration": iteration, "weight": weights })),
-        EventBody::Result(summary) => ("result", json!(summary)),
+        EventBody::Summary(summary) => ("summary", json!(summary)),
     };
     json!({
-        "name": event.name.to_string(),
+        "job": event.job.to_string(),
         "attempt": event.attempt,
         "sequence": event.sequence,
         "time": time(event.time),
@@ -165,13 +165,13 @@ fn time(time: SystemTime) -> String {
 /// Shows an event on the progress view.
 pub fn show_event(view: &mut ProgressView, event: &JobEvent) {
     match &event.body {
-        EventBody::State { state, failure: None } => view.state(&format!("{} {}", event.name, state.name())),
+        EventBody::State { state, failure: None } => view.state(&format!("{} {}", event.job, state.name())),
         EventBody::State { state, failure: Some(failure) } => {
-            view.state(&format!("{} {}: {}", event.name, state.name(), failure.message));
+            view.state(&format!("{} {}: {}", event.job, state.name(), failure.message));
         }
         EventBody::Progress(progress) => view.show(progress),
         EventBody::Weights { .. } => {}
-        EventBody::Result(summary) => view.state(&summary_words(summary)),
+        EventBody::Summary(summary) => view.state(&summary_words(summary)),
     }
 }
 
@@ -182,12 +182,12 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
     let mut status = None;
     let mut unprinted = Ok(());
     let mut on_event = |event: &JobEvent| {
-        if let EventBody::Result(summary) = &event.body {
+        if let EventBody::Summary(summary) = &event.body {
             status = Some(summary.status);
         }
         if !json {
             show_event(&mut view, event);
-            if let EventBody::Result(summary) = &event.body {
+            if let EventBody::Summary(summary) = &event.body {
                 warning_lines(summary).iter().for_each(|line| view.state(line));
             }
         } else if unprinted.is_ok() {
@@ -301,7 +301,7 @@ mod tests {
     #[test]
     fn an_event_is_json_under_its_kind() {
         let event = JobEvent {
-            name: JobName { tenant: "default".into(), job: "a".into() },
+            job: JobName { tenant: "default".into(), job: "a".into() },
             attempt: 1,
             sequence: Some(3),
             time: SystemTime::UNIX_EPOCH,

@@ -145,7 +145,7 @@ async fn on_server(
     let interrupt = Interrupt::listen()?;
     let mut seen = None;
     let mut on_event = |event: &JobEvent| {
-        seen.get_or_insert_with(|| event.name.clone());
+        seen.get_or_insert_with(|| event.job.clone());
         job_view::show_event(progress, event);
     };
     let outcome = client::solve(&server, &input.raw, settings, &mut on_event, interrupt.token()).await;

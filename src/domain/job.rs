@@ -128,7 +128,7 @@ pub struct Summary {
     pub iterations: u32,
     pub seconds: f64,
     /// Size of the stored result in bytes; `ReadJobResult` streams about as much.
-    pub result_bytes: u64,
+    pub result_size_bytes: u64,
     /// The result's first warnings, see [`Summary::warnings_of`]; of one without a reconstruction, why there is none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<Warning>,
@@ -278,7 +278,7 @@ impl Job {
 /// Something that happened to a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct JobEvent {
-    pub name: JobName,
+    pub job: JobName,
     /// 0 before the first attempt.
     pub attempt: u32,
     /// Strictly increasing within a job, from 1. `None` for interim weights, which are latest-only and not replayed.
@@ -302,7 +302,7 @@ pub enum EventBody {
         weights: Vec<f32>,
     },
     /// The result stands and can be read; always followed by the terminal state.
-    Result(Summary),
+    Summary(Summary),
 }
 
 #[cfg(test)]

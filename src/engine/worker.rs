@@ -198,7 +198,7 @@ fn solve(
     }
 }
 
-fn summarise(solution: &Solution, result_bytes: u64) -> Summary {
+fn summarise(solution: &Solution, result_size_bytes: u64) -> Summary {
     let calibration = solution.calibrations.first();
     let count = |number: usize| u32::try_from(number).unwrap_or(u32::MAX);
     Summary {
@@ -212,7 +212,7 @@ fn summarise(solution: &Solution, result_bytes: u64) -> Summary {
         winning_proposal: solution.winning_proposal,
         iterations: solution.iterations,
         seconds: solution.seconds,
-        result_bytes,
+        result_size_bytes,
         warnings: Summary::warnings_of(&solution.warnings),
     }
 }
@@ -246,7 +246,7 @@ impl Observer for Reporter {
             return;
         }
         topic.weights.send_replace(Some(Arc::new(JobEvent {
-            name: self.name.clone(),
+            job: self.name.clone(),
             attempt: self.number,
             sequence: None,
             time: SystemTime::now(),

@@ -92,7 +92,7 @@ async fn next(messages: &mut Streaming<proto::SolveRequest>) -> Result<Option<pr
 
 fn upload_limits(options: &UploadOptions) -> proto::UploadLimits {
     proto::UploadLimits {
-        max_bytes: options.bounds.max_bytes,
+        max_upload_bytes: options.bounds.max_bytes,
         max_chunk_bytes: MAX_CHUNK_BYTES as u64,
         max_tenant_uploads: options.bounds.max_tenant_uploads,
         max_tenant_bytes: options.bounds.max_tenant_bytes,
@@ -156,7 +156,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
         let count = |limit: usize| u32::try_from(limit).unwrap_or(u32::MAX);
         Ok(Response::new(proto::Capabilities {
             server_version: env!("CARGO_PKG_VERSION").to_owned(),
-            limits: Some(proto::InputLimits {
+            input_limits: Some(proto::InputLimits {
                 max_views: count(self.limits.max_views),
                 max_tracks: count(self.limits.max_tracks),
                 max_observations: count(self.limits.max_observations),

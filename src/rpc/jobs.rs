@@ -77,7 +77,7 @@ impl Jobs {
         // In a task of its own: what is read is held to its end, also when the call is dropped.
         let reading = async move {
             let summary = engine.job(&name).await.map_err(status::from_engine)?.summary;
-            let bytes = summary.map_or(0, |summary| summary.result_bytes);
+            let bytes = summary.map_or(0, |summary| summary.result_size_bytes);
             if bytes > largest {
                 return Err(status::result_too_large(&name, bytes, largest));
             }
@@ -230,7 +230,7 @@ fn result_chunks(encoded: Bytes, sha256: Bytes, from: usize) -> impl Iterator<It
         let end = total.min(begin + RESULT_CHUNK_BYTES);
         at = (end < total).then_some(end);
         let data = encoded.slice(begin..end);
-        Some(proto::ResultChunk { data, offset: begin as i64, total_size: total as i64, sha256: sha256.clone() })
+        Some(proto::ResultChunk { data, offset: begin as i64, size_bytes: total as i64, sha256: sha256.clone() })
     })
 }
 
@@ -248,7 +248,7 @@ mod tests {
             assert_eq!(chunks.len(), count, "from {from}");
             let mut at = from;
             for chunk in &chunks {
-                assert_eq!((chunk.offset, chunk.total_size, &chunk.sha256), (at as i64, total as i64, &sha256));
+                assert_eq!((chunk.offset, chunk.size_bytes, &chunk.sha256), (at as i64, total as i64, &sha256));
                 assert_eq!(chunk.data, encoded.slice(at..at + chunk.data.len()));
                 at += chunk.data.len();
             }

@@ -24,7 +24,7 @@ async fn until_optimising(mut events: Streaming<proto::JobEvent>) -> Vec<proto::
     let mut seen = Vec::new();
     loop {
         let event = soon(events.message()).await.expect("an event").expect("the job has not ended");
-        let optimising = matches!(&event.body, Some(Body::Progress(progress)) if progress.iteration > 0);
+        let optimising = matches!(&event.body, Some(Body::Progress(progress)) if progress.iteration_count > 0);
         seen.push(event);
         if optimising {
             return seen;
@@ -51,16 +51,16 @@ async fn assert_exactly_once(jobs: &mut JobServiceClient<Channel>, name: &str, b
     assert_eq!(replayed, sequenced, "what was seen live is what is kept");
 
     let ends = sequenced.iter().filter_map(state_of).filter(|&state| state == JobState::Succeeded).count();
-    let results = sequenced.iter().filter(|event| matches!(event.body, Some(Body::Result(_)))).count();
+    let results = sequenced.iter().filter(|event| matches!(event.body, Some(Body::Summary(_)))).count();
     assert_eq!((ends, results), (1, 1));
     let job = jobs.get_job(proto::GetJobRequest { name: name.into() }).await.expect("the job").into_inner();
-    assert_eq!((job.state(), job.attempt), (JobState::Succeeded, 2));
+    assert_eq!((job.state(), job.attempt_count), (JobState::Succeeded, 2));
     assert_eq!(job.last_sequence, *numbers.last().expect("events"));
     let request = proto::ReadJobResultRequest { name: name.into(), offset: 0 };
     let (chunks, end) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
     end.expect("a whole result");
     let bytes: usize = chunks.iter().map(|chunk| chunk.data.len()).sum();
-    assert_eq!(bytes as i64, chunks[0].total_size);
+    assert_eq!(bytes as i64, chunks[0].size_bytes);
 }
 
 /// Iterations that leave seconds between the first progress and the end, whatever the machine.

@@ -239,10 +239,10 @@ async fn a_result_that_needs_the_reserve_has_it() {
     let states = [JobState::Succeeded, JobState::Failed];
     assert_eq!(reaches(&mut jobs, &name, &states).await, JobState::Succeeded);
     let job = jobs.get_job(proto::GetJobRequest { name: name.clone() }).await.expect("the job").into_inner();
-    assert_eq!(job.attempt, 2, "the one that was given back, and the one that solved it");
+    assert_eq!(job.attempt_count, 2, "the one that was given back, and the one that solved it");
     let request = proto::ReadJobResultRequest { name, offset: 0 };
     let (chunks, _) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
-    assert!(chunks[0].total_size > BESIDE as i64, "{} bytes", chunks[0].total_size);
+    assert!(chunks[0].size_bytes > BESIDE as i64, "{} bytes", chunks[0].size_bytes);
 }
 
 /// Waits until a page, which is there all the time, holds these words.

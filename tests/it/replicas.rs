@@ -58,7 +58,7 @@ fn assert_ended_once(events: &[proto::JobEvent]) {
     let terminal = |state: &JobState| !matches!(state, JobState::Queued | JobState::Running);
     let ends: Vec<JobState> = events.iter().filter_map(state_of).filter(terminal).collect();
     assert_eq!(ends, [JobState::Succeeded]);
-    let results = events.iter().filter(|event| matches!(event.body, Some(Body::Result(_)))).count();
+    let results = events.iter().filter(|event| matches!(event.body, Some(Body::Summary(_)))).count();
     assert_eq!(results, 1);
     assert!(
         events.iter().map(|event| event.attempt).is_sorted(),
@@ -166,7 +166,7 @@ async fn a_job_is_watched_and_cancelled_through_a_server_that_does_not_run_it() 
     let mut watch = elsewhere.watch_job(request).await.expect("a watch").into_inner();
     loop {
         let event = soon(watch.message()).await.expect("an event").expect("the job has not ended");
-        if matches!(&event.body, Some(Body::Progress(progress)) if progress.iteration > 0) {
+        if matches!(&event.body, Some(Body::Progress(progress)) if progress.iteration_count > 0) {
             break;
         }
     }

@@ -75,7 +75,7 @@ fn whoever_watches_sees_the_views_rise() {
     }
     let last = progress.last().expect("progress at the end at least");
     assert!(progress.iter().all(|told| course(told, "views") == 60), "{progress:?}");
-    let summary = events.iter().map(|event| &event["result"]).find(|result| result.is_object()).expect("a result");
+    let summary = events.iter().map(|event| &event["summary"]).find(|told| told.is_object()).expect("a summary");
     assert_eq!(Some(course(last, "registered_views")), summary["registered_views"].as_u64(), "{last} {summary}");
     assert!(course(last, "registered_views") > 50, "{last}");
 }

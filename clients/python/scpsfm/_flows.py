@@ -402,7 +402,7 @@ class Told:
                 continue
             trouble.backoff.reset()
             self.sequence = event.sequence or self.sequence
-            self.name = event.name
+            self.name = event.job
             yield Emit(event)
             if _is_last(event):
                 yield Close(stream)
@@ -476,7 +476,7 @@ def _read_result(trouble: Trouble, name: str) -> Flow[result_pb2.JobResult]:
                     yield Close(stream)
                     raise InternalError(f"a chunk begins at {chunk.offset} where {len(data)} was due", job=name)
                 data += chunk.data
-                total, sha256 = chunk.total_size, chunk.sha256
+                total, sha256 = chunk.size_bytes, chunk.sha256
                 trouble.backoff.reset()
         except ScpsfmError as error:
             yield trouble.failed(error)

@@ -118,7 +118,7 @@ class Progress:
     fraction: float
     """Share of the work done, 0 to 1, never decreasing within an attempt."""
 
-    iteration: int
+    iteration_count: int
     """Iterations of the paper's network done so far."""
 
     inlier_track_count: int
@@ -152,7 +152,7 @@ class Progress:
         return cls(
             stage=word(progress_pb2.Stage, message.stage, "STAGE_"),
             fraction=message.fraction,
-            iteration=message.iteration,
+            iteration_count=message.iteration_count,
             inlier_track_count=message.inlier_track_count,
             focal_px=optional(message, "focal_px"),
             best_score=optional(message, "best_score"),
@@ -177,7 +177,7 @@ class JobSummary:
     registered_view_count: int
     reprojection_rms_px: float | None
     solve_seconds: float
-    result_bytes: int
+    result_size_bytes: int
     warnings: tuple[tuple[str, str], ...]
     """Code and detail of the first warnings."""
 
@@ -193,7 +193,7 @@ class JobSummary:
             registered_view_count=message.registered_view_count,
             reprojection_rms_px=optional(message, "reprojection_rms_px"),
             solve_seconds=seconds(message.solve_duration),
-            result_bytes=message.result_bytes,
+            result_size_bytes=message.result_size_bytes,
             warnings=tuple(
                 (word(result_pb2.WarningCode, found.code, "WARNING_CODE_"), found.detail) for found in message.warnings
             ),
@@ -234,14 +234,14 @@ class Event:
         body = message.WhichOneof("body")
         change = message.state_change
         return cls(
-            job=message.name,
+            job=message.job,
             sequence=message.sequence,
             attempt=message.attempt,
             time=_time(message.time),
             state=state_of(change.state) if body == "state_change" else None,
             progress=Progress.of(message.progress, message.attempt, message.sequence) if body == "progress" else None,
             weights=np.array(message.weights.weights, dtype=np.float32) if body == "weights" else None,
-            summary=JobSummary.of(message.result) if body == "result" else None,
+            summary=JobSummary.of(message.summary) if body == "summary" else None,
             error_reason=change.error.reason if body == "state_change" else "",
             error_message=change.error.message if body == "state_change" else "",
         )
@@ -262,7 +262,7 @@ class JobInfo:
     state: JobState
     labels: dict[str, str]
     priority: int
-    attempt: int
+    attempt_count: int
     view_count: int
     track_count: int
     observation_count: int
@@ -297,7 +297,7 @@ class JobInfo:
             state=state_of(message.state),
             labels=dict(message.labels),
             priority=message.priority,
-            attempt=message.attempt,
+            attempt_count=message.attempt_count,
             view_count=message.view_count,
             track_count=message.track_count,
             observation_count=message.observation_count,
@@ -305,7 +305,7 @@ class JobInfo:
             end_time=time("end_time"),
             deadline_time=time("deadline_time"),
             expire_time=time("expire_time"),
-            progress=Progress.of(message.progress, message.attempt) if message.HasField("progress") else None,
+            progress=Progress.of(message.progress, message.attempt_count) if message.HasField("progress") else None,
             summary=JobSummary.of(message.summary) if message.HasField("summary") else None,
             error_reason=message.error.reason,
             error_message=message.error.message,
@@ -365,14 +365,14 @@ class Capabilities:
     @classmethod
     def of(cls, message: Any) -> Capabilities:
         """From the message of the API."""
-        limits = message.limits
+        limits = message.input_limits
         return cls(
             server_version=message.server_version,
             max_views=limits.max_views,
             max_tracks=limits.max_tracks,
             max_observations=limits.max_observations,
             max_message_bytes=limits.max_message_bytes,
-            max_upload_bytes=message.upload_limits.max_bytes,
+            max_upload_bytes=message.upload_limits.max_upload_bytes,
             max_chunk_bytes=message.upload_limits.max_chunk_bytes,
             max_batch_requests=message.max_batch_requests,
             methods=tuple(word(settings_pb2.Method, method, "METHOD_") for method in message.methods),

@@ -209,7 +209,7 @@ class LeftOut:
     point_count: int
     """Of a view that was not registered: points of the reconstruction that it sees, 0 for too few to try."""
 
-    agreeing_count: int
+    agreeing_point_count: int
     """How many of them agreed on a pose."""
 
 
@@ -525,7 +525,7 @@ class Result:
             left_out = None
             if view.HasField("left_out"):
                 reason = word(result_pb2.LeftOutReason, view.left_out.reason, "LEFT_OUT_REASON_")
-                left_out = LeftOut(reason, view.left_out.point_count, view.left_out.agreeing_count)
+                left_out = LeftOut(reason, view.left_out.point_count, view.left_out.agreeing_point_count)
             cameras.append(
                 Camera(
                     view=index,
@@ -546,21 +546,21 @@ class Result:
         return tuple(cameras)
 
     @cached_property
-    def point_tracks(self) -> NDArray[np.int64]:
+    def point_track_indices(self) -> NDArray[np.int64]:
         """The tracks that have a point, in rising order. (points,)."""
-        return _row(self.message.tracks.point_tracks, np.int64)
+        return _row(self.message.tracks.point_track_indices, np.int64)
 
     @cached_property
     def points(self) -> Floats:
-        """X, Y, Z of each of `point_tracks`, metric where the result is metric. (points, 3)."""
-        count = len(self.point_tracks)
+        """X, Y, Z of each of `point_track_indices`, metric where the result is metric. (points, 3)."""
+        count = len(self.point_track_indices)
         return _row(self.message.tracks.points, np.float64, 3 * count, "coordinates of points").reshape(count, 3)
 
     @cached_property
     def point_parts(self) -> NDArray[np.int64]:
         """In the frame of which part each of `points` is. (points,)."""
         parts = self.message.tracks.point_parts
-        count = len(self.point_tracks)
+        count = len(self.point_track_indices)
         return _row(parts, np.int64, count, "parts of points") if parts else _row([0] * count, np.int64)
 
     @cached_property
@@ -569,12 +569,12 @@ class Result:
         message = self.message.tracks
         inlier = _row(message.inliers, np.bool_)
         count = len(inlier)
-        if len(self.point_tracks) and int(self.point_tracks.max()) >= count:
+        if len(self.point_track_indices) and int(self.point_track_indices.max()) >= count:
             raise InternalError(f"the result has a point of a track beyond its {count}", reason="INVALID_RESULT")
         points = np.full((count, 3), np.nan)
         part = np.full(count, -1, dtype=np.int64)
-        points[self.point_tracks] = self.points
-        part[self.point_tracks] = self.point_parts
+        points[self.point_track_indices] = self.points
+        part[self.point_track_indices] = self.point_parts
         for row in (points, part):
             row.setflags(write=False)
         network = message.network_weights
@@ -603,7 +603,7 @@ class Result:
             judged=judged,
             residual_px=residual,
             weight=_row(message.weights, np.float32, count, "weights of observations"),
-            split=_row(message.splits if message.splits else [0] * count, np.int64, count, "splits"),
+            split=_row(message.split_numbers if message.split_numbers else [0] * count, np.int64, count, "splits"),
         )
 
     @cached_property
@@ -611,12 +611,12 @@ class Result:
         """The other points of tracks that join several, by track and number."""
         return tuple(
             Split(
-                found.track,
+                found.track_index,
                 found.number,
                 found.weight,
                 _row(found.point, np.float64, 3, "coordinates of a point") if found.point else None,
             )
-            for found in self.message.splits
+            for found in self.message.track_splits
         )
 
     def to_colmap_database(self, path: str | PathLike[str]) -> None:

@@ -202,7 +202,7 @@ class Fake(
             return fill
 
         def summary(event: job_pb2.JobEvent) -> None:
-            event.result.status = result_pb2.RESULT_STATUS_SOLVED
+            event.summary.status = result_pb2.RESULT_STATUS_SOLVED
 
         bodies.append(state(job_pb2.JOB_STATE_RUNNING))
         bodies += [progress(number + 1) for number in range(self.events)]
@@ -210,12 +210,12 @@ class Fake(
             bodies += [summary, state(self.final_state)]
         for sequence, fill in enumerate(bodies, start=1):
             if sequence > after:
-                event = job_pb2.JobEvent(name=name, attempt=1, sequence=sequence)
+                event = job_pb2.JobEvent(job=name, attempt=1, sequence=sequence)
                 fill(event)
                 yield event
         while self.never_ends and context.is_active():
             if name in self.cancelled:
-                event = job_pb2.JobEvent(name=name, attempt=1, sequence=len(bodies) + 1)
+                event = job_pb2.JobEvent(job=name, attempt=1, sequence=len(bodies) + 1)
                 event.state_change.state = job_pb2.JOB_STATE_CANCELLED
                 yield event
                 return
@@ -253,7 +253,7 @@ class Fake(
             for offset in range(request.offset, len(data), self.chunk_bytes):
                 piece = data[offset : offset + self.chunk_bytes]
                 yield job_service_pb2.ResultChunk(
-                    data=piece, offset=offset, total_size=len(data), sha256=hashlib.sha256(data).digest()
+                    data=piece, offset=offset, size_bytes=len(data), sha256=hashlib.sha256(data).digest()
                 )
 
         yield from self._stream("ReadJobResult", chunks(), context)
@@ -276,7 +276,7 @@ class Fake(
     def GetCapabilities(self, request: Any, context: Any) -> Any:
         self._begin("GetCapabilities", request, context)
         answer = calibration_service_pb2.Capabilities(server_version="9.9", methods=[1, 3], backends=[1])
-        answer.limits.max_views = 2000
+        answer.input_limits.max_views = 2000
         return answer
 
     # InputService.

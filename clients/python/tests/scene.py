@@ -80,7 +80,7 @@ def true_result(scene: Scene, job: str = "tenants/default/jobs/true", **calibrat
     right = scene.right
     message.tracks.weights.extend(right.astype(float))
     message.tracks.inliers.extend(right.tolist())
-    message.tracks.point_tracks.extend(np.flatnonzero(right))
+    message.tracks.point_track_indices.extend(np.flatnonzero(right))
     message.tracks.points.extend(scene.points[right].ravel())
     of_observation = right[scene.tracks.track_index]
     count = len(scene.tracks)

@@ -230,7 +230,7 @@ def test_opensfm_projects_to_the_same_pixels(small: scene.Scene, tmp_path: Path,
     result = Result(scene.true_result(small, **lens), small.tracks)
     result.to_opensfm(tmp_path)
     (content,) = json.loads((tmp_path / "reconstruction.json").read_text())
-    assert set(content["points"]) == {str(track) for track in result.point_tracks}
+    assert set(content["points"]) == {str(track) for track in result.point_track_indices}
     assert len(content["shots"]) == 8
     side = max(scene.WIDTH, scene.HEIGHT)
     for view, name in enumerate(small.tracks.names):

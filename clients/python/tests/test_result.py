@@ -29,7 +29,7 @@ def test_a_result_is_arrays(small: scene.Scene) -> None:
     assert np.isnan(result.tracks.points[~small.right]).all()
     assert result.tracks.part.tolist() == np.where(small.right, 0, -1).tolist()
     assert np.array_equal(result.points, small.points[small.right])
-    assert result.point_tracks.tolist() == np.flatnonzero(small.right).tolist()
+    assert result.point_track_indices.tolist() == np.flatnonzero(small.right).tolist()
     assert result.tracks.network_weight is None
     assert result.observations.inlier.shape == (len(small.tracks),)
     for array in (result.points, result.tracks.inlier, result.tracks.points, result.observations.residual_px):
@@ -153,7 +153,7 @@ def test_lengths_that_do_not_fit_are_told(small: scene.Scene) -> None:
     for change, words in (
         (lambda message: message.tracks.points.pop(), "coordinates of points"),
         (lambda message: message.tracks.weights.pop(), "weights of tracks"),
-        (lambda message: message.tracks.point_tracks.__setitem__(0, 120), "a track beyond its 120"),
+        (lambda message: message.tracks.point_track_indices.__setitem__(0, 120), "a track beyond its 120"),
         (lambda message: message.calibrations.extend([message.calibrations[0]] * 2), "3 calibrations of 1"),
         (lambda message: message.observations.residuals_px.pop(), "residuals"),
         (lambda message: message.observations.judged.pop(), "verdicts"),
@@ -168,10 +168,10 @@ def test_lengths_that_do_not_fit_are_told(small: scene.Scene) -> None:
 
 def test_splits_and_parts_are_told(small: scene.Scene) -> None:
     message = scene.true_result(small)
-    message.splits.add(track=3, number=1, weight=0.75, point=[1.0, 2.0, 3.0])
-    message.splits.add(track=3, number=2, weight=0.5)
-    message.tracks.point_parts.extend([0] * (len(message.tracks.point_tracks) - 1) + [1])
-    message.observations.splits.extend([0] * (len(small.tracks) - 1) + [2])
+    message.track_splits.add(track_index=3, number=1, weight=0.75, point=[1.0, 2.0, 3.0])
+    message.track_splits.add(track_index=3, number=2, weight=0.5)
+    message.tracks.point_parts.extend([0] * (len(message.tracks.point_track_indices) - 1) + [1])
+    message.observations.split_numbers.extend([0] * (len(small.tracks) - 1) + [2])
     result = Result(message)
     assert [(split.track, split.number, split.weight) for split in result.splits] == [(3, 1, 0.75), (3, 2, 0.5)]
     assert result.splits[0].point is not None

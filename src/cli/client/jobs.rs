@@ -183,7 +183,7 @@ impl Client {
         loop {
             match chunks.message().await {
                 Ok(Some(chunk)) if chunk.offset == bytes.len() as i64 => {
-                    (total, sha256) = (chunk.total_size, chunk.sha256);
+                    (total, sha256) = (chunk.size_bytes, chunk.sha256);
                     bytes.extend_from_slice(&chunk.data);
                     backoff.reset();
                 }
@@ -239,8 +239,8 @@ impl Told<'_> {
 /// [`Error::Cancelled`], or [`Error::Failed`] with the reason.
 pub fn ended(last: &JobEvent) -> Result<(), Error> {
     match &last.body {
-        EventBody::State { state, failure } => ended_as(&last.name, *state, failure.as_ref()),
-        _ => Err(Error::Failed(format!("{} did not succeed", last.name))),
+        EventBody::State { state, failure } => ended_as(&last.job, *state, failure.as_ref()),
+        _ => Err(Error::Failed(format!("{} did not succeed", last.job))),
     }
 }
 

@@ -28,7 +28,7 @@ impl Client {
     ) -> Result<Solution, Error> {
         let mut name = None;
         let mut on_named_event = |event: &JobEvent| {
-            name.get_or_insert_with(|| event.name.clone());
+            name.get_or_insert_with(|| event.job.clone());
             on_event(event);
         };
         let mut solving = self.clone();
@@ -42,7 +42,7 @@ impl Client {
             }
         };
         ended(&last)?;
-        self.read_result(&last.name).await
+        self.read_result(&last.job).await
     }
 
     /// A broken call is made again under the same request id: it takes up the job within the server's grace period, and

@@ -18,7 +18,7 @@ async fn a_job_runs_to_its_result() {
     let entered = |state| EventBody::State { state, failure: None };
     assert_eq!(*bodies[0], entered(JobState::Queued));
     assert_eq!(*bodies[1], entered(JobState::Running));
-    assert!(matches!(bodies[bodies.len() - 2], EventBody::Result(summary) if summary.iterations == 1), "{bodies:?}");
+    assert!(matches!(bodies[bodies.len() - 2], EventBody::Summary(summary) if summary.iterations == 1), "{bodies:?}");
     assert_eq!(**bodies.last().expect("events"), entered(JobState::Succeeded));
     let ended = bench.engine.job(&job.name).await.expect("exists");
     assert_eq!((ended.state, ended.attempt), (JobState::Succeeded, 1));

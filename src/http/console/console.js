@@ -869,7 +869,7 @@ class Live {
     if (views.viewCount) parts.push(`${registered} of ${plural(views.viewCount, "view")} registered`);
     const task = bare(views.task, "TASK");
     if (task && views.stepCount) parts.push(`${TASKS[task] || task} ${views.step || 0} of at most ${views.stepCount}`);
-    if (progress.iteration) parts.push(`network iteration ${count(progress.iteration)}`);
+    if (progress.iterationCount) parts.push(`network iteration ${count(progress.iterationCount)}`);
     const head = progress.head;
     if (head) {
       const phase = PHASES[bare(head.phase, "PHASE")];
@@ -981,7 +981,7 @@ function jobFacts(job) {
       ["Created", timeOf(job.createTime)],
       ["Started", timeOf(job.startTime), job.startTime && job.endTime ? `ran for ${seconds(ranSeconds(job))}` : null],
       ["Ended", timeOf(job.endTime)],
-      ["Attempts", count(job.attempt)],
+      ["Attempts", count(job.attemptCount)],
       ["Views", count(job.viewCount)],
       ["Tracks", count(job.trackCount), plural(job.observationCount, "observation")],
       ["Method", bare((job.settings || {}).method, "METHOD") || "-"],
@@ -1160,7 +1160,7 @@ class JobPage {
 
   offerResult() {
     this.resultAsked = true;
-    const size = Number((this.job.summary || {}).resultBytes || 0);
+    const size = Number((this.job.summary || {}).resultSizeBytes || 0);
     if (size <= AUTOMATIC_RESULT_BYTES) {
       this.loadResult();
       return;
@@ -1177,7 +1177,7 @@ class JobPage {
       const result = await call("GET", `/v1/${this.name}/result`, { signal: this.signal, limit: 0 });
       // A job of less than half a second may have told no progress: its result has the curves.
       if (!this.live.attempt) {
-        for (const progress of result.history || []) this.live.add(progress, this.job.attempt || 1);
+        for (const progress of result.progressRecords || []) this.live.add(progress, this.job.attemptCount || 1);
       }
       this.result.replaceChildren(...resultSections(result, this.job));
       announce("The result is shown.");
@@ -1263,7 +1263,7 @@ function viewTable(views) {
   const leftOut = (row) => {
     if (!row.leftOut) return "";
     const reason = bare(row.leftOut.reason, "LEFT_OUT_REASON");
-    const counts = row.leftOut.pointCount ? ` (${row.leftOut.agreeingCount || 0} of ${row.leftOut.pointCount})` : "";
+    const counts = row.leftOut.pointCount ? ` (${row.leftOut.agreeingPointCount || 0} of ${row.leftOut.pointCount})` : "";
     return `${LEFT_OUT[reason] || reason}${counts}`;
   };
   const isRegistered = (row) => Boolean(row.projection && row.projection.length);
@@ -1298,8 +1298,8 @@ function resultSections(result, job) {
     ["Observations", count((observations.inliers || []).length),
       `${count(right(observations.inliers))} inliers, ${count(right(observations.judged))} judged`],
     ["Views", count(views.length), `${count(registered)} registered`],
-    ["Points", count((tracks.pointTracks || []).length),
-      (result.splits || []).length ? `${count(result.splits.length)} more of tracks that join several` : null],
+    ["Points", count((tracks.pointTrackIndices || []).length),
+      (result.trackSplits || []).length ? `${count(result.trackSplits.length)} more of tracks that join several` : null],
     ["Reprojection error, RMS", pixels(result.reprojectionRmsPx), `mean ${pixels(result.reprojectionMeanPx)}`],
     ["Noise σ", pixels(result.noisePx)],
     ["Method", bare(result.method, "METHOD"), `seed ${result.seed || 0}, version ${result.serverVersion || "-"}`],
@@ -1346,7 +1346,7 @@ function partOf(result, views, part) {
   const tracks = result.tracks || {};
   const parts = tracks.pointParts || [];
   const all = [];
-  for (let k = 0; k < (tracks.pointTracks || []).length; k += 1) {
+  for (let k = 0; k < (tracks.pointTrackIndices || []).length; k += 1) {
     const point = (tracks.points || []).slice(3 * k, 3 * k + 3).map(Number);
     if ((parts[k] || 0) === part && point.every(Number.isFinite)) all.push(point);
   }

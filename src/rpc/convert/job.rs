@@ -18,7 +18,7 @@ pub fn to_wire(job: &Job) -> proto::Job {
         labels: job.labels.clone(),
         priority: job.priority,
         deadline: job.deadline.map(|time| proto::job::Deadline::DeadlineTime(time.into())),
-        attempt: job.attempt,
+        attempt_count: job.attempt,
         view_count: job.view_count,
         track_count: job.track_count,
         observation_count: job.observation_count,
@@ -49,7 +49,7 @@ pub fn from_wire(job: proto::Job) -> Result<Job, InvalidInput> {
     Ok(Job {
         name: name_from_wire(&job.name)?,
         state: JobState::required(job.state, "state")?,
-        attempt: job.attempt,
+        attempt: job.attempt_count,
         settings: settings::from_wire(job.settings)?,
         input: input_from_wire(&job.input)?,
         view_count: job.view_count,
@@ -80,10 +80,10 @@ pub fn event_to_wire(event: JobEvent) -> proto::JobEvent {
         }),
         EventBody::Progress(record) => Body::Progress(progress::to_wire(&record)),
         EventBody::Weights { iteration, weights } => Body::Weights(proto::InterimWeights { iteration, weights }),
-        EventBody::Result(summary) => Body::Result(summary_to_wire(&summary)),
+        EventBody::Summary(summary) => Body::Summary(summary_to_wire(&summary)),
     };
     proto::JobEvent {
-        name: event.name.to_string(),
+        job: event.job.to_string(),
         attempt: event.attempt,
         sequence: event.sequence.unwrap_or(0),
         time: Some(event.time.into()),
@@ -101,10 +101,10 @@ pub fn event_from_wire(event: proto::JobEvent) -> Result<JobEvent, Violation> {
         },
         Body::Progress(record) => EventBody::Progress(progress::from_wire(&record)?),
         Body::Weights(interim) => EventBody::Weights { iteration: interim.iteration, weights: interim.weights },
-        Body::Result(summary) => EventBody::Result(summary_from_wire(&summary)?),
+        Body::Summary(summary) => EventBody::Summary(summary_from_wire(&summary)?),
     };
     Ok(JobEvent {
-        name: name_from_wire(&event.name)?,
+        job: name_from_wire(&event.job)?,
         attempt: event.attempt,
         sequence: (event.sequence > 0).then_some(event.sequence),
         time: time_from_wire(required(event.time, "time")?, "time")?,
@@ -167,7 +167,7 @@ fn summary_to_wire(summary: &Summary) -> proto::JobSummary {
         winning_proposal: optional_to_wire(summary.winning_proposal),
         iteration_count: summary.iterations,
         solve_duration: Some(duration_to_wire(summary.seconds)),
-        result_bytes: summary.result_bytes,
+        result_size_bytes: summary.result_size_bytes as i64,
         warnings: result::warnings_to_wire(&summary.warnings),
     }
 }
@@ -184,7 +184,7 @@ fn summary_from_wire(summary: &proto::JobSummary) -> Result<Summary, Violation> 
         winning_proposal: Proposal::from_wire(summary.winning_proposal, "summary.winning_proposal")?,
         iterations: summary.iteration_count,
         seconds: seconds_from_wire(summary.solve_duration, "summary.solve_duration")?,
-        result_bytes: summary.result_bytes,
+        result_size_bytes: summary.result_size_bytes as u64,
         warnings: result::warnings_from_wire(&summary.warnings, "summary.warnings.code")?,
     })
 }
@@ -216,7 +216,7 @@ mod tests {
             winning_proposal: Some(Proposal::Network),
             iterations: 60,
             seconds: 1.25,
-            result_bytes: 12_345,
+            result_size_bytes: 12_345,
             warnings: vec![Warning::new(WarningCode::FewInliers, "three").of_group(2)],
         }
     }
@@ -304,11 +304,11 @@ mod tests {
             (Some(1), EventBody::State { state: JobState::Queued, failure: None }),
             (Some(2), EventBody::Progress(progress())),
             (None, EventBody::Weights { iteration: 5, weights: vec![0.5, 1.0] }),
-            (Some(3), EventBody::Result(summary())),
+            (Some(3), EventBody::Summary(summary())),
             (Some(u64::MAX), EventBody::State { state: JobState::Failed, failure }),
         ];
         for (sequence, body) in bodies {
-            let event = JobEvent { name: name(), attempt: 1, sequence, time: time(0), body };
+            let event = JobEvent { job: name(), attempt: 1, sequence, time: time(0), body };
             assert_eq!(event_from_wire(event_to_wire(event.clone())), Ok(event));
         }
     }

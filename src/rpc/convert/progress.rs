@@ -9,7 +9,7 @@ pub fn to_wire(progress: &Progress) -> proto::Progress {
     proto::Progress {
         stage: progress.stage.to_wire(),
         fraction: progress.fraction,
-        iteration: progress.iteration,
+        iteration_count: progress.iteration,
         losses: progress.losses.map(|Losses { num, proj, daq }| proto::Losses { num, proj, daq }),
         inlier_track_count: progress.inliers,
         focal_px: progress.focal_px,
@@ -26,7 +26,7 @@ pub fn from_wire(progress: &proto::Progress) -> Result<Progress, Violation> {
     Ok(Progress {
         stage: Stage::required(progress.stage, "progress.stage")?,
         fraction: progress.fraction,
-        iteration: progress.iteration,
+        iteration: progress.iteration_count,
         losses: progress.losses.map(|proto::Losses { num, proj, daq }| Losses { num, proj, daq }),
         inliers: progress.inlier_track_count,
         focal_px: progress.focal_px,

@@ -35,7 +35,7 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         views: solution.views.iter().map(view_to_wire).collect(),
         tracks: Some(tracks_to_wire(&solution.tracks)),
         observations: Some(observations_to_wire(&solution.observations)),
-        splits: solution.splits.iter().map(split_to_wire).collect(),
+        track_splits: solution.splits.iter().map(split_to_wire).collect(),
         noise_px: solution.noise_px,
         reprojection_rms_px: solution.reprojection_rms_px,
         reprojection_mean_px: solution.reprojection_mean_px,
@@ -58,7 +58,7 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
                 iteration_count: time.iterations,
             })
             .collect(),
-        history: solution.history.iter().map(progress::to_wire).collect(),
+        progress_records: solution.history.iter().map(progress::to_wire).collect(),
         trained_network: solution.trained_network.clone().unwrap_or_default(),
         input_sha256: solution.input_sha256.clone().unwrap_or_default(),
     }
@@ -79,7 +79,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         views: result.views.iter().enumerate().map(view_from_wire).collect::<Result<_, _>>()?,
         tracks: tracks_from_wire(required(result.tracks, "tracks")?)?,
         observations: observations_from_wire(required(result.observations, "observations")?)?,
-        splits: result.splits.iter().enumerate().map(split_from_wire).collect::<Result<_, _>>()?,
+        splits: result.track_splits.iter().enumerate().map(split_from_wire).collect::<Result<_, _>>()?,
         noise_px: result.noise_px,
         reprojection_rms_px: result.reprojection_rms_px,
         reprojection_mean_px: result.reprojection_mean_px,
@@ -105,7 +105,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
                 Ok(ProposalTime { proposal, seconds, iterations: time.iteration_count })
             })
             .collect::<Result<_, Violation>>()?,
-        history: result.history.iter().map(progress::from_wire).collect::<Result<_, _>>()?,
+        history: result.progress_records.iter().map(progress::from_wire).collect::<Result<_, _>>()?,
         trained_network: Some(result.trained_network).filter(|sha256| !sha256.is_empty()),
         input_sha256: Some(result.input_sha256).filter(|sha256| !sha256.is_empty()),
     })
@@ -200,12 +200,12 @@ fn view_to_wire(view: &ViewResult) -> proto::ViewResult {
 
 fn left_out_to_wire(left_out: LeftOut) -> proto::LeftOut {
     use proto::LeftOutReason as Reason;
-    let (reason, point_count, agreeing_count) = match left_out {
+    let (reason, point_count, agreeing_point_count) = match left_out {
         LeftOut::NoObservations => (Reason::NoObservations, 0, 0),
         LeftOut::OutsideBlock => (Reason::OutsideBlock, 0, 0),
         LeftOut::NotRegistered { points, agreeing } => (Reason::NotRegistered, points, agreeing),
     };
-    proto::LeftOut { reason: reason.into(), point_count, agreeing_count }
+    proto::LeftOut { reason: reason.into(), point_count, agreeing_point_count }
 }
 
 fn left_out_from_wire(left_out: &proto::LeftOut, view: usize) -> Result<Option<LeftOut>, Violation> {
@@ -219,7 +219,7 @@ fn left_out_from_wire(left_out: &proto::LeftOut, view: usize) -> Result<Option<L
         Reason::NoObservations => Some(LeftOut::NoObservations),
         Reason::OutsideBlock => Some(LeftOut::OutsideBlock),
         Reason::NotRegistered => {
-            Some(LeftOut::NotRegistered { points: left_out.point_count, agreeing: left_out.agreeing_count })
+            Some(LeftOut::NotRegistered { points: left_out.point_count, agreeing: left_out.agreeing_point_count })
         }
     })
 }
@@ -265,7 +265,7 @@ fn tracks_to_wire(tracks: &TrackResults) -> proto::TrackResults {
         weights: tracks.weight.clone(),
         inliers: tracks.inlier.clone(),
         network_weights: tracks.network_weight.clone(),
-        point_tracks: with_point().map(|(track, _)| track as u32).collect(),
+        point_track_indices: with_point().map(|(track, _)| track as u32).collect(),
         points: with_point().flat_map(|(_, point)| point).collect(),
         point_parts: if tracks.part.is_empty() {
             Vec::new()
@@ -280,22 +280,22 @@ fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violati
     if tracks.inliers.len() != count || !(tracks.network_weights.is_empty() || tracks.network_weights.len() == count) {
         return Err(Violation::of("tracks", format!("arrays of different lengths beside {count} weights")));
     }
-    if tracks.points.len() != 3 * tracks.point_tracks.len() {
+    if tracks.points.len() != 3 * tracks.point_track_indices.len() {
         return Err(Violation::of(
             "tracks.points",
-            format!("{} numbers for {} points", tracks.points.len(), tracks.point_tracks.len()),
+            format!("{} numbers for {} points", tracks.points.len(), tracks.point_track_indices.len()),
         ));
     }
     let part_count = tracks.point_parts.len();
-    if part_count != 0 && part_count != tracks.point_tracks.len() {
-        let what = format!("{part_count} parts for {} points", tracks.point_tracks.len());
+    if part_count != 0 && part_count != tracks.point_track_indices.len() {
+        let what = format!("{part_count} parts for {} points", tracks.point_track_indices.len());
         return Err(Violation::of("tracks.point_parts", what));
     }
     let mut point = vec![None; count];
     let mut part = if part_count == 0 { Vec::new() } else { vec![0; count] };
-    for (index, (&track, xyz)) in tracks.point_tracks.iter().zip(tracks.points.chunks_exact(3)).enumerate() {
+    for (index, (&track, xyz)) in tracks.point_track_indices.iter().zip(tracks.points.chunks_exact(3)).enumerate() {
         let slot = point.get_mut(track as usize).ok_or_else(|| {
-            Violation::at("tracks.point_tracks", index, format!("track {track} is outside the {count} tracks"))
+            Violation::at("tracks.point_track_indices", index, format!("track {track} is outside the {count} tracks"))
         })?;
         *slot = Some([xyz[0], xyz[1], xyz[2]]);
         if let (Some(part), Some(&of)) = (part.get_mut(track as usize), tracks.point_parts.get(index)) {
@@ -312,22 +312,28 @@ fn observations_to_wire(observations: &ObservationResults) -> proto::Observation
         judged: observations.residual_px.iter().map(Option::is_some).collect(),
         residuals_px: observations.residual_px.iter().map(|residual| residual.unwrap_or(0.0)).collect(),
         weights: observations.weight.clone(),
-        splits: if observations.split.iter().any(|&split| split > 0) { observations.split.clone() } else { Vec::new() },
+        split_numbers: if observations.split.iter().any(|&split| split > 0) {
+            observations.split.clone()
+        } else {
+            Vec::new()
+        },
     }
 }
 
 fn split_to_wire(split: &TrackSplit) -> proto::TrackSplit {
     let TrackSplit { track, number, weight, point } = *split;
-    proto::TrackSplit { track, number, weight, point: point.map_or_else(Vec::new, Vec::from) }
+    proto::TrackSplit { track_index: track, number, weight, point: point.map_or_else(Vec::new, Vec::from) }
 }
 
 fn split_from_wire((index, split): (usize, &proto::TrackSplit)) -> Result<TrackSplit, Violation> {
     let point = match split.point.as_slice() {
         [] => None,
         &[x, y, z] => Some([x, y, z]),
-        other => return Err(Violation::at("splits.point", index, format!("{} numbers instead of three", other.len()))),
+        other => {
+            return Err(Violation::at("track_splits.point", index, format!("{} numbers instead of three", other.len())));
+        }
     };
-    Ok(TrackSplit { track: split.track, number: split.number, weight: split.weight, point })
+    Ok(TrackSplit { track: split.track_index, number: split.number, weight: split.weight, point })
 }
 
 fn observations_from_wire(mut observations: proto::ObservationResults) -> Result<ObservationResults, Violation> {
@@ -335,7 +341,7 @@ fn observations_from_wire(mut observations: proto::ObservationResults) -> Result
     if observations.judged.len() != count || observations.residuals_px.len() != count {
         return Err(Violation::of("observations", "arrays of different lengths"));
     }
-    let lengths = [("weights", observations.weights.len()), ("splits", observations.splits.len())];
+    let lengths = [("weights", observations.weights.len()), ("split_numbers", observations.split_numbers.len())];
     if let Some((name, length)) = lengths.into_iter().find(|(_, length)| ![0, count].contains(length)) {
         return Err(Violation::of(
             format!("observations.{name}"),
@@ -345,11 +351,11 @@ fn observations_from_wire(mut observations: proto::ObservationResults) -> Result
     let residual_px = observations.judged.iter().zip(&observations.residuals_px);
     // Both are left out where they say nothing.
     observations.weights.resize(count, 0.0);
-    observations.splits.resize(count, 0);
+    observations.split_numbers.resize(count, 0);
     Ok(ObservationResults {
         residual_px: residual_px.map(|(&judged, &residual)| judged.then_some(residual)).collect(),
         weight: observations.weights,
-        split: observations.splits,
+        split: observations.split_numbers,
         inlier: observations.inliers,
     })
 }

@@ -170,7 +170,10 @@ fn a_malformed_answer_names_its_field() {
         change(result.tracks.as_mut().expect("set"));
     };
     assert_eq!(with(&|result| tracks(result, &|tracks| tracks.inliers.truncate(1))), "tracks");
-    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_tracks[0] = 3)), "tracks.point_tracks[0]");
+    assert_eq!(
+        with(&|result| tracks(result, &|tracks| tracks.point_track_indices[0] = 3)),
+        "tracks.point_track_indices[0]"
+    );
     assert_eq!(with(&|result| tracks(result, &|tracks| tracks.points.truncate(2))), "tracks.points");
     assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_parts.push(1))), "tracks.point_parts");
     assert_eq!(with(&|result| result.calibrations[0].grade = 9), "calibrations.grade");

@@ -108,7 +108,7 @@ pub(in crate::store) async fn a_lease_that_was_taken_over_writes_nothing(store: 
         (3, 1, "progress 1"),
         (4, 1, "QUEUED"),
         (5, 2, "RUNNING"),
-        (6, 2, "result"),
+        (6, 2, "summary"),
         (7, 2, "SUCCEEDED"),
     ];
     assert_eq!(story(store, &name).await, told(&expected));
@@ -126,7 +126,7 @@ pub(in crate::store) async fn a_success_stores_its_result_then_its_state(store: 
     assert_eq!((job.summary.clone(), job.progress), (Some(summary()), Some(last)));
     assert_eq!(store.job(&name).await, Ok(job));
     assert_eq!(result_of(store, &name).await, Ok(Some(result)));
-    let expected = [(1, 0, "QUEUED"), (2, 1, "RUNNING"), (3, 1, "result"), (4, 1, "SUCCEEDED")];
+    let expected = [(1, 0, "QUEUED"), (2, 1, "RUNNING"), (3, 1, "summary"), (4, 1, "SUCCEEDED")];
     assert_eq!(story(store, &name).await, told(&expected));
 }
 

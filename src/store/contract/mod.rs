@@ -149,7 +149,7 @@ fn summary() -> Summary {
         winning_proposal: None,
         iterations: 1,
         seconds: 0.5,
-        result_bytes: 10,
+        result_size_bytes: 10,
         warnings: Vec::new(),
     }
 }
@@ -177,13 +177,13 @@ async fn story(store: &dyn Store, name: &JobName) -> Vec<(u64, u32, String)> {
     events
         .into_iter()
         .map(|event| {
-            assert_eq!(&event.name, name);
+            assert_eq!(&event.job, name);
             let what = match event.body {
                 EventBody::State { state, failure } => {
                     failure.map_or(state.name().into(), |failure| format!("{}:{}", state.name(), failure.reason))
                 }
                 EventBody::Progress(progress) => format!("progress {}", progress.iteration),
-                EventBody::Result(_) => "result".into(),
+                EventBody::Summary(_) => "summary".into(),
                 EventBody::Weights { .. } => "weights".into(),
             };
             (event.sequence.expect("stored events are numbered"), event.attempt, what)

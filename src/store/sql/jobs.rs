@@ -350,7 +350,7 @@ pub(super) async fn events_after<C: Connection>(
     .bind(limit);
     let event = |row: &C::Row| {
         Ok(JobEvent {
-            name: name.clone(),
+            job: name.clone(),
             attempt: number(row, "attempt")?,
             sequence: Some(number(row, "sequence")?),
             time: rows::time(row.integer("time")?),

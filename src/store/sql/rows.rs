@@ -267,7 +267,7 @@ pub(super) async fn leave<C: Connection>(
     let mut sequence = job.last_sequence;
     if let Some(summary) = summary {
         sequence += 1;
-        batch.push(insert_event(job.id, sequence, job.attempt, &EventBody::Result(summary.clone()), now)?);
+        batch.push(insert_event(job.id, sequence, job.attempt, &EventBody::Summary(summary.clone()), now)?);
     }
     sequence += 1;
     let encoded_failure = failure.as_ref().map(payload::encode).transpose()?;

@@ -37,7 +37,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
         winning_proposal: grade.map(|_| Proposal::Network),
         iterations: 120,
         seconds: 2.5,
-        result_bytes: 1,
+        result_size_bytes: 1,
         warnings: Vec::new(),
     };
     Job {

@@ -113,7 +113,7 @@ async fn inputs_that_never_end_hold_no_more_than_the_budget_and_harm_nobody() {
     .await;
     created(&mut jobs, large()).await;
     let job = jobs.get_job(proto::GetJobRequest { name: running }).await.expect("a job").into_inner();
-    assert!(job.attempt == 1 && matches!(job.state(), JobState::Running | JobState::Succeeded), "{job:?}");
+    assert!(job.attempt_count == 1 && matches!(job.state(), JobState::Running | JobState::Succeeded), "{job:?}");
 }
 
 #[tokio::test]
@@ -191,5 +191,5 @@ async fn a_hundred_inputs_of_millions_stay_within_the_budget_and_two_hundred_meg
     println!("{refused} refused, {stalled} held their input; at most {peak} MB in memory");
     assert!(stalled > 0 && peak <= BUDGET_MB + 200, "{peak} MB");
     let job = jobs.get_job(proto::GetJobRequest { name: running }).await.expect("a job").into_inner();
-    assert!(job.attempt == 1 && matches!(job.state(), JobState::Running | JobState::Succeeded), "{job:?}");
+    assert!(job.attempt_count == 1 && matches!(job.state(), JobState::Running | JobState::Succeeded), "{job:?}");
 }

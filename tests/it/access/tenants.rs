@@ -240,7 +240,7 @@ async fn ids_and_page_tokens_are_each_tenants_own() {
     }
     // The same ids, and the same request id by another call: jobs of their own.
     assert_eq!(north.create(request("north", "a")).await.expect("a job").name, "tenants/north/jobs/a");
-    assert_eq!(north.solve(request("north", "b")).await.expect("a job").name, "tenants/north/jobs/b");
+    assert_eq!(north.solve(request("north", "b")).await.expect("a job").job, "tenants/north/jobs/b");
 
     let theirs = south.list("tenants/south", "").await.expect("a page").next_page_token;
     assert!(!theirs.is_empty());

@@ -40,7 +40,7 @@ async fn stopping_a_solve_cancels_its_job() {
     let (on_running, mut name) = (stop.clone(), None);
     let mut on_event = |event: &JobEvent| {
         if matches!(event.body, EventBody::State { state: JobState::Running, .. }) {
-            name = Some(event.name.clone());
+            name = Some(event.job.clone());
             on_running.cancel();
         }
     };

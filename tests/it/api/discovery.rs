@@ -100,7 +100,7 @@ async fn capabilities_tell_limits_and_defaults() {
     let mut calibration = server.calibration().await;
     let answer = calibration.get_capabilities(proto::GetCapabilitiesRequest {}).await.expect("capabilities");
     let capabilities = answer.into_inner();
-    let limits = capabilities.limits.expect("limits");
+    let limits = capabilities.input_limits.expect("limits");
     assert_eq!((limits.max_views, limits.max_tracks, limits.max_observations), (10, 20, 30));
     assert_eq!(limits.max_message_bytes, 12_345);
     assert_eq!(capabilities.max_connections, 77);

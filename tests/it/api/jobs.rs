@@ -63,7 +63,7 @@ async fn a_job_runs_to_its_result() {
     let done = jobs.get_job(proto::GetJobRequest { name: job.name.clone() }).await.expect("a job").into_inner();
     assert_eq!(done.state(), JobState::Succeeded);
     assert_eq!(done.labels["site"], "north");
-    assert_eq!(done.attempt, 1);
+    assert_eq!(done.attempt_count, 1);
     assert_eq!(done.summary.expect("a summary").inlier_track_count, 2);
     let request = proto::ReadJobResultRequest { name: job.name.clone(), offset: 0 };
     let (chunks, end) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
@@ -104,7 +104,7 @@ async fn dropping_a_watch_leaves_the_job_alone() {
     let request = solve_request(Message::Config(create_tracks()));
     let mut solve = CalibrationServiceClient::new(channel);
     let mut stream = solve.solve(tokio_stream::iter([request])).await.expect("a solve").into_inner();
-    let solved = soon(stream.message()).await.expect("an event").expect("the first event").name;
+    let solved = soon(stream.message()).await.expect("an event").expect("the first event").job;
     drop(stream);
     let states: Vec<_> = events(&mut jobs, &solved, 0).await.iter().filter_map(state_of).collect();
     assert_eq!(states.last(), Some(&JobState::Cancelled));
@@ -290,7 +290,7 @@ async fn a_large_result_comes_in_chunks_from_any_offset() {
         let (chunks, end) = all(jobs.read_job_result(request).await.expect("a result").into_inner()).await;
         end.expect("whole");
         assert_eq!(chunks[0].offset, offset);
-        let total = chunks[0].total_size;
+        let total = chunks[0].size_bytes;
         let bytes: Vec<u8> = chunks.iter().flat_map(|chunk| chunk.data.clone()).collect();
         assert_eq!(bytes.len() as i64, total - offset);
         (bytes, chunks.len())

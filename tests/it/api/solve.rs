@@ -51,19 +51,19 @@ async fn events_name_the_job_first_and_end_with_its_state() {
     let mut events = Vec::new();
     while let Some(event) = soon(stream.message()).await.expect("a solve ends well") {
         if let Some(Body::Progress(progress)) = &event.body {
-            assert_eq!((progress.iteration, progress.focal_px), (10, Some(1000.0)));
+            assert_eq!((progress.iteration_count, progress.focal_px), (10, Some(1000.0)));
             hold.let_go();
         }
         events.push(event);
     }
     let first = &events[0];
-    assert!(first.name.starts_with("tenants/default/jobs/"), "{}", first.name);
+    assert!(first.job.starts_with("tenants/default/jobs/"), "{}", first.job);
     assert_eq!((first.sequence, state_of(first)), (1, Some(JobState::Queued)));
-    assert!(events.iter().all(|event| event.name == first.name));
-    let result = events.iter().position(|event| matches!(event.body, Some(Body::Result(_)))).expect("a result");
+    assert!(events.iter().all(|event| event.job == first.job));
+    let result = events.iter().position(|event| matches!(event.body, Some(Body::Summary(_)))).expect("a result");
     assert!(result < events.len() - 1, "the final state follows the result");
     assert_eq!(state_of(events.last().expect("events")), Some(JobState::Succeeded));
-    let job = server.engine.job(&convert::names::job(&first.name, "default").expect("a name")).await.expect("a job");
+    let job = server.engine.job(&convert::names::job(&first.job, "default").expect("a name")).await.expect("a job");
     assert_eq!((job.view_count, job.track_count, job.observation_count), (3, 50, 150));
 }
 
@@ -85,7 +85,7 @@ async fn dropping_the_call_cancels_the_job_after_the_grace_period() {
     let options = Options { solve_grace: Duration::from_millis(1), ..Options::default() };
     let server = TestServer::start_with(solver, options, one_worker()).await;
     let mut stream = solve(&server, vec![Message::Config(create_tracks())]).await;
-    let name = soon(stream.message()).await.expect("an event").expect("the first event").name;
+    let name = soon(stream.message()).await.expect("an event").expect("the first event").job;
     drop(stream);
     assert_eq!(states(&server, &name).await.last(), Some(&JobState::Cancelled));
 }
@@ -97,13 +97,13 @@ async fn two_calls_with_one_request_id_follow_one_job() {
     let server = TestServer::start_with(solver, options, one_worker()).await;
     let config = || Message::Config(proto::CreateJobRequest { request_id: "again".into(), ..create_tracks() });
     let mut first = solve(&server, vec![config()]).await;
-    let name = soon(first.message()).await.expect("an event").expect("the first event").name;
+    let name = soon(first.message()).await.expect("an event").expect("the first event").job;
     let second = solve(&server, vec![config()]).await;
     drop(first);
     hold.let_go();
     let (events, end) = soon(all(second)).await;
     end.expect("a solve ends well");
-    assert!(events.iter().all(|event| event.name == name));
+    assert!(events.iter().all(|event| event.job == name));
     assert_eq!(state_of(events.last().expect("events")), Some(JobState::Succeeded));
 }
 
@@ -120,7 +120,7 @@ async fn only_a_job_that_solve_created_is_cancelled_by_a_disconnect() {
     for id in ["created", "kept", "solved"] {
         let messages = tokio_stream::once(solve_request(Message::Config(request(id))));
         let mut stream = calibration.solve(messages).await.expect("a solve").into_inner();
-        let name = soon(stream.message()).await.expect("an event").expect("the first event").name;
+        let name = soon(stream.message()).await.expect("an event").expect("the first event").job;
         streams.push((name, stream));
     }
     assert_eq!(jobs.create_job(request("kept")).await.expect("a job").into_inner().name, streams[1].0);
@@ -153,7 +153,7 @@ async fn two_calls_on_two_servers_of_one_database_are_attached_to_one_job() {
         let config = proto::CreateJobRequest { request_id: "again".into(), ..create_tracks() };
         let messages = tokio_stream::once(solve_request(Message::Config(config)));
         let mut stream = client.solve(messages).await.expect("a solve").into_inner();
-        let name = soon(stream.message()).await.expect("an event").expect("the first event").name;
+        let name = soon(stream.message()).await.expect("an event").expect("the first event").job;
         (convert::names::job(&name, "default").expect("a name"), stream)
     };
     let (name, first) = attach(&servers[0].0).await;
@@ -187,5 +187,5 @@ async fn a_solve_that_ended_is_not_cancelled_by_the_end_of_its_call() {
     let server = TestServer::start_with(quick(), options, one_worker()).await;
     let (events, end) = soon(all(solve(&server, vec![Message::Config(create_tracks())]).await)).await;
     end.expect("a solve ends well");
-    assert_eq!(states(&server, &events[0].name).await.last(), Some(&JobState::Succeeded));
+    assert_eq!(states(&server, &events[0].job).await.last(), Some(&JobState::Succeeded));
 }
