@@ -178,7 +178,7 @@ def test_a_label_and_a_state_filter_the_list(
 ) -> None:
     ahead = server.create(scene, settings=LONG, labels={"site": "south 3"})
     until("a worker has it", lambda: server.state(ahead) == "JOB_STATE_RUNNING")
-    jobs = [server.create(scene, labels={"site": "north"} if place % 2 else {}) for place in range(60)]
+    jobs = [server.create(scene, labels={"site": "north"} if place % 2 else {"site": 'a"\\'}) for place in range(60)]
     browser.open(site)
     until("all are counted", lambda: states(browser)["Queued"] == "60" and states(browser)["Running"] == "1")
     until("a page of them is listed", lambda: len(browser.all("tbody tr")) == 50)
@@ -191,7 +191,7 @@ def test_a_label_and_a_state_filter_the_list(
     until("one is listed", lambda: [row.get_attribute("href") for row in browser.all("td a[href*=jobs]")]
           == [f"{site}/#/{ahead}"])
     browser.button("Running").click()
-    for text, count in (("site=north", 30), ("site=south 3", 1), ("site=nowhere", 0)):
+    for text, count in (("site=north", 30), ("site=south 3", 1), ('site=a"\\', 30), ("site=nowhere", 0)):
         field = browser.waits_for("#label")
         field.clear()
         field.send_keys(text)
@@ -201,7 +201,7 @@ def test_a_label_and_a_state_filter_the_list(
     browser.sees("No job matches the filter.")
     field = browser.waits_for("#label")
     field.clear()
-    field.send_keys('site="')
+    field.send_keys('si"te=north')
     browser.button("Filter").click()
     browser.sees("cannot be filtered by", "#notices")
     assert browser.errors() == []

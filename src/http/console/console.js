@@ -523,10 +523,10 @@ function labelFilter(text) {
   const equals = text.indexOf("=");
   if (equals < 1) throw new Error("A label filter is KEY=VALUE.");
   const [key, value] = [text.slice(0, equals).trim(), text.slice(equals + 1).trim()];
-  if (/[\s="]/.test(key) || value.includes('"')) {
-    throw new Error('A label whose key holds spaces or quotes, or whose value holds ", cannot be filtered by.');
+  if (/[\s="]/.test(key)) {
+    throw new Error("A label whose key holds spaces, = or quotes cannot be filtered by.");
   }
-  return `labels.${key} = "${value}"`;
+  return `labels.${key} = "${value.replace(/["\\]/g, "\\$&")}"`;
 }
 
 function listHash(states, label) {

@@ -67,17 +67,17 @@ pub fn parse_filter(text: &str) -> Result<Filter, Violation> {
         let mut states = Vec::new();
         for comparison in term.split(|token| *token == Token::Word("OR")) {
             match *comparison {
-                [Token::Word("state"), Token::Equals, Token::Word(name) | Token::Quoted(name)] => {
+                [Token::Word("state"), Token::Equals, name @ (Token::Word(_) | Token::Quoted(_))] => {
                     // Once each: a repeated state says nothing more, and a filter has room for hundreds.
-                    let state = state(name)?;
+                    let state = state(&name.text())?;
                     if !states.contains(&state) {
                         states.push(state);
                     }
                 }
-                [Token::Word(field), Token::Equals, Token::Word(value) | Token::Quoted(value)]
+                [Token::Word(field), Token::Equals, value @ (Token::Word(_) | Token::Quoted(_))]
                     if field.starts_with("labels.") && !term.contains(&Token::Word("OR")) =>
                 {
-                    add_label(&mut filter, &field["labels.".len()..], value)?;
+                    add_label(&mut filter, &field["labels.".len()..], value.text())?;
                 }
                 _ => return Err(not_understood(text)),
             }
@@ -100,16 +100,19 @@ fn state(name: &str) -> Result<JobState, Violation> {
     })
 }
 
-fn add_label(filter: &mut Filter, key: &str, value: &str) -> Result<(), Violation> {
+fn add_label(filter: &mut Filter, key: &str, value: String) -> Result<(), Violation> {
     if key.contains('\0') || value.contains('\0') {
         return Err(Violation::of("filter", "a label holds no NUL characters"));
     }
-    match filter.labels.insert(key.to_owned(), value.to_owned()) {
-        Some(other) if other != value => {
-            let (key, other, value) = (quoted(key), quoted(&other), quoted(value));
+    match filter.labels.get(key) {
+        Some(other) if *other != value => {
+            let (key, other, value) = (quoted(key), quoted(other), quoted(&value));
             Err(Violation::of("filter", format!("the label {key} cannot be both {other} and {value}")))
         }
-        _ => Ok(()),
+        _ => {
+            filter.labels.insert(key.to_owned(), value);
+            Ok(())
+        }
     }
 }
 
@@ -121,8 +124,23 @@ fn not_understood(text: &str) -> Violation {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Token<'a> {
     Word(&'a str),
+    /// What is between the quotes, escapes included.
     Quoted(&'a str),
     Equals,
+}
+
+impl Token<'_> {
+    fn text(self) -> String {
+        match self {
+            Token::Word(text) => text.to_owned(),
+            Token::Quoted(text) => {
+                let mut chars = text.chars();
+                let unescaped = || chars.next().and_then(|c| if c == '\\' { chars.next() } else { Some(c) });
+                std::iter::from_fn(unescaped).collect()
+            }
+            Token::Equals => "=".to_owned(),
+        }
+    }
 }
 
 fn tokens(text: &str) -> Result<Vec<Token<'_>>, Violation> {
@@ -132,7 +150,7 @@ fn tokens(text: &str) -> Result<Vec<Token<'_>>, Violation> {
         let (token, after) = match first {
             '=' => (Token::Equals, &rest[1..]),
             '"' => {
-                let end = rest[1..].find('"').ok_or_else(|| Violation::of("filter", "a quote is not closed"))?;
+                let end = closing_quote(&rest[1..])?;
                 (Token::Quoted(&rest[1..=end]), &rest[end + 2..])
             }
             _ => {
@@ -144,6 +162,22 @@ fn tokens(text: &str) -> Result<Vec<Token<'_>>, Violation> {
         rest = after.trim_start();
     }
     Ok(tokens)
+}
+
+/// Where the quote is that closes a text; within, a backslash escapes a quote or a backslash (AIP-160).
+fn closing_quote(text: &str) -> Result<usize, Violation> {
+    let mut chars = text.char_indices();
+    while let Some((place, char)) = chars.next() {
+        match char {
+            '"' => return Ok(place),
+            '\\' => match chars.next() {
+                Some((_, '"' | '\\')) => {}
+                _ => return Err(Violation::of("filter", r#"in quotes \ is written \\ and " is written \""#)),
+            },
+            _ => {}
+        }
+    }
+    Err(Violation::of("filter", "a quote is not closed"))
 }
 
 #[cfg(test)]
@@ -172,6 +206,13 @@ mod tests {
             ("state = RUNNING OR state = QUEUED OR state = RUNNING", filter(Some(&[Running, Queued]), &[])),
             ("state = QUEUED OR state = QUEUED AND state = QUEUED", filter(Some(&[Queued]), &[])),
             ("labels.a = \"\"", filter(None, &[("a", "")])),
+            (r#"labels.a = "say \"é\"""#, filter(None, &[("a", "say \"é\"")])),
+            (r#"labels.a = "C:\\" AND labels.b = "\\\"""#, filter(None, &[("a", "C:\\"), ("b", "\\\"")])),
+            (r"labels.a = C:\new", filter(None, &[("a", r"C:\new")])),
+            (
+                r#"state = "RUNNING" AND labels.a = "\" OR state = QUEUED""#,
+                filter(Some(&[Running]), &[("a", "\" OR state = QUEUED")]),
+            ),
         ];
         for (text, expected) in cases {
             assert_eq!(parse_filter(text), Ok(expected), "{text}");
@@ -189,6 +230,10 @@ mod tests {
             "labels.a = b OR labels.c = d",
             "labels.a = b AND labels.a = c",
             "labels.a = \"b",
+            r#"labels.a = "b\""#,
+            r#"labels.a = "b\"#,
+            r#"labels.a = "b\n""#,
+            r#"labels.a = "b\\"c""#,
             "AND",
             "state = QUEUED state = RUNNING",
             "é",
