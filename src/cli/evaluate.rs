@@ -18,7 +18,7 @@ use super::exit::{self, Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
 use super::prior_file::PriorFileArgs;
-use crate::domain::{SolveSettings, StopToken};
+use crate::domain::{Sha256Digest, SolveSettings, StopToken};
 use crate::evaluation::plan::{Contestant, Depths, Plan};
 use crate::evaluation::records;
 use crate::evaluation::runner::{self, Records};
@@ -307,11 +307,10 @@ fn table(cells: &[Cell]) -> String {
 /// that of the network it asks.
 pub(super) fn build() -> Result<String, Failure> {
     let program = std::fs::read(std::env::current_exe()?)?;
-    let digest = Sha256::digest(&program);
-    let short: String = digest.iter().take(8).map(|byte| format!("{byte:02x}")).collect();
+    let program = Sha256Digest(Sha256::digest(&program).into());
     // Another network gives other figures.
-    let network = &crate::network::subspace::current_checksum()[..16];
-    Ok(format!("{} {short} {network}", env!("CARGO_PKG_VERSION")))
+    let network = crate::network::subspace::current_sha256();
+    Ok(format!("{} {program:.16} {network:.16}", env!("CARGO_PKG_VERSION")))
 }
 
 pub(super) fn progress_bar(quiet: bool, total: usize, done: usize) -> ProgressBar {

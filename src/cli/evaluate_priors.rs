@@ -128,7 +128,7 @@ impl Work<'_> {
 pub fn written(out: &Path, name: &str, mut rows: serde_json::Value) -> Result<String, Failure> {
     let network = subspace::current();
     rows["version"] = json!(env!("CARGO_PKG_VERSION"));
-    rows["network"] = json!({ "origin": network.origin, "sha256": subspace::current_checksum() });
+    rows["network"] = json!({ "origin": network.origin, "sha256": subspace::current_sha256().to_string() });
     let text = pretty(&rows)?;
     write_atomically(out, name, text.as_bytes())?;
     Ok(text)

@@ -95,10 +95,10 @@ fn belongs_together(input: &LabelledInput, solution: &Solution) -> Result<(), Fa
         return Err(Failure { exit: Exit::BadInput, message });
     }
     // Servers of older versions do not tell.
-    if solution.input_sha256.as_ref().is_none_or(|sha256| *sha256 == input.raw.sha256()) {
+    if solution.input_sha256.is_none_or(|sha256| sha256 == input.raw.sha256()) {
         return Ok(());
     }
-    let message = "the file is not the job's input: its points, their order or the sizes of the images (--width, \
-                   --height) are others, and verdicts would go to the wrong observations";
+    let message = "the file is not the job's input: its observations, their order, or what is known of its views \
+                   (--width, --height, --focal-px, --focal-sigma) are others, and verdicts go by place";
     Err(Failure { exit: Exit::BadInput, message: message.to_owned() })
 }

@@ -139,7 +139,7 @@ fn train(args: &Args, is_stopped: &dyn Fn() -> bool) -> Result<Exit, Failure> {
     {
         return Err(Failure::internal(format_args!("cannot remove {}: {error}", files.state().display())));
     }
-    view.note(&format!("{}: a network with sha256 {}, by which results name it", args.out.display(), file.checksum()));
+    view.note(&format!("{}: a network with sha256 {}, by which results name it", args.out.display(), file.sha256()));
     Ok(Exit::Done)
 }
 

@@ -3,6 +3,7 @@
 //! Pure data and rules: no I/O, no async, no linear algebra. Everything else may depend on this module; it depends
 //! on nothing of ours.
 
+pub mod digest;
 pub mod duplicates;
 pub mod error;
 pub mod input;
@@ -18,6 +19,7 @@ pub mod settings;
 pub mod stop;
 pub mod warning;
 
+pub use digest::Sha256Digest;
 pub use error::{InvalidInput, Violation};
 pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
 pub use input_name::InputName;

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
+use super::digest::Sha256Digest;
 use super::left_out::LeftOut;
 use super::progress::{Progress, Stage};
 use super::settings::Method;
@@ -346,10 +347,10 @@ pub struct Solution {
     pub proposal_times: Vec<ProposalTime>,
     /// Curves for the report: progress records thinned to at most [`Solution::MAX_HISTORY`].
     pub history: Vec<Progress>,
-    /// SHA-256 of the trained network that AUTO had at hand, hexadecimal; `None` where it was not to be asked.
-    pub trained_network: Option<String>,
+    /// Of the trained network that AUTO had at hand; `None` where it was not to be asked.
+    pub trained_network_sha256: Option<Sha256Digest>,
     /// [`RawInput::sha256`](super::RawInput::sha256) of the input; `None` before it was hashed.
-    pub input_sha256: Option<String>,
+    pub input_sha256: Option<Sha256Digest>,
 }
 
 impl Solution {

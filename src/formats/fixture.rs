@@ -227,7 +227,7 @@ fn solution(scene: &Scene) -> Solution {
         stages: Stage::ALL.iter().map(|&stage| StageTime { stage, seconds: 0.3 }).collect(),
         proposal_times: vec![ProposalTime { proposal: Proposal::Uniform, seconds: None, iterations: 600 }],
         history: history(truth.focal_px),
-        trained_network: None,
+        trained_network_sha256: None,
         input_sha256: None,
     }
 }

@@ -70,7 +70,7 @@ fn the_fields_of_result_json_are_a_contract() {
         "method",
         "iterations",
         "winning_proposal",
-        "trained_network",
+        "trained_network_sha256",
         "noise_px",
         "seconds",
         "stages",

@@ -57,7 +57,7 @@ pub struct ResultJson {
     pub method: Method,
     pub winning_proposal: Option<&'static str>,
     /// SHA-256 of the trained network that AUTO had at hand.
-    pub trained_network: Option<String>,
+    pub trained_network_sha256: Option<String>,
     pub iterations: u32,
     pub seed: u64,
     pub seconds: f64,
@@ -206,7 +206,7 @@ impl ResultJson {
             warnings: warnings::named(solution, input),
             method: solution.method,
             winning_proposal: solution.winning_proposal.map(|proposal| proposal.name()),
-            trained_network: solution.trained_network.clone(),
+            trained_network_sha256: solution.trained_network_sha256.map(|digest| digest.to_string()),
             iterations: solution.iterations,
             seed: solution.seed,
             seconds: solution.seconds,

@@ -291,3 +291,45 @@ fn comment(file: &FileDescriptor, path: &[i32]) -> String {
     });
     paragraphs.filter(|paragraph| !paragraph.is_empty()).collect::<Vec<_>>().join("\n\n")
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use prost_reflect::{DescriptorPool, Kind};
+
+    use super::{OUTPUT_ONLY, behavior};
+    use crate::rpc::proto::FILE_DESCRIPTOR_SET;
+
+    #[test]
+    fn every_field_of_a_request_says_whether_it_must_be_set() {
+        let pool = DescriptorPool::decode(FILE_DESCRIPTOR_SET).expect("the API");
+        let inputs = |service: prost_reflect::ServiceDescriptor| {
+            service.methods().map(|method| method.input()).collect::<Vec<_>>()
+        };
+        let mut pending: Vec<_> = pool.services().flat_map(inputs).collect();
+        // What is uploaded, and a resource that no request holds.
+        pending.extend(
+            ["InputData", "Input"].iter().filter_map(|name| pool.get_message_by_name(&format!("scpsfm.v1.{name}"))),
+        );
+        let mut seen = BTreeSet::new();
+        while let Some(message) = pending.pop() {
+            if !message.full_name().starts_with("scpsfm.v1.") || !seen.insert(message.name().to_owned()) {
+                continue;
+            }
+            for field in message.fields() {
+                let behavior = behavior(&field);
+                assert!(!behavior.is_empty(), "{} lacks a field_behavior", field.full_name());
+                if let Kind::Message(inner) = field.kind()
+                    && !field.is_map()
+                    && !behavior.contains(&OUTPUT_ONLY)
+                {
+                    pending.push(inner);
+                }
+            }
+        }
+        for reached in ["SolveSettings", "FocalPrior", "MeasurementMatrixChunk", "UploadFinish", "InputData", "Input"] {
+            assert!(seen.contains(reached), "{reached}");
+        }
+    }
+}

@@ -9,7 +9,7 @@ use tracing::Instrument;
 
 use super::caller::Caller;
 use super::convert::enums::Twin;
-use super::convert::{job, settings};
+use super::convert::{count_to_wire, job, settings, size_to_wire};
 use super::disconnect::{AttachedCall, DisconnectTracker};
 use super::inflight::Permit;
 use super::inputs::MAX_CHUNK_BYTES;
@@ -92,10 +92,10 @@ async fn next(messages: &mut Streaming<proto::SolveRequest>) -> Result<Option<pr
 
 fn upload_limits(options: &UploadOptions) -> proto::UploadLimits {
     proto::UploadLimits {
-        max_upload_bytes: options.bounds.max_bytes,
-        max_chunk_bytes: MAX_CHUNK_BYTES as u64,
-        max_tenant_uploads: options.bounds.max_tenant_uploads,
-        max_tenant_bytes: options.bounds.max_tenant_bytes,
+        max_upload_bytes: size_to_wire(options.bounds.max_bytes),
+        max_chunk_bytes: size_to_wire(MAX_CHUNK_BYTES as u64),
+        max_tenant_uploads: count_to_wire(options.bounds.max_tenant_uploads),
+        max_tenant_bytes: size_to_wire(options.bounds.max_tenant_bytes),
         abandoned_after: options.abandoned_after.and_then(|kept| kept.try_into().ok()),
     }
 }
@@ -103,11 +103,11 @@ fn upload_limits(options: &UploadOptions) -> proto::UploadLimits {
 fn queue_limits(bounds: &QueueBounds) -> proto::QueueLimits {
     let given = |bound: u64| (bound < u64::MAX).then_some(bound);
     proto::QueueLimits {
-        max_jobs: bounds.max_jobs,
-        max_bytes: bounds.max_bytes,
+        max_jobs: count_to_wire(bounds.max_jobs),
+        max_bytes: size_to_wire(bounds.max_bytes),
         max_observations: bounds.max_observations,
-        max_tenant_jobs: given(bounds.max_tenant_jobs),
-        max_tenant_bytes: given(bounds.max_tenant_bytes),
+        max_tenant_jobs: given(bounds.max_tenant_jobs).map(count_to_wire),
+        max_tenant_bytes: given(bounds.max_tenant_bytes).map(size_to_wire),
     }
 }
 
@@ -152,15 +152,14 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
         _request: Request<proto::GetCapabilitiesRequest>,
     ) -> Result<Response<proto::Capabilities>, Status> {
         let options = self.engine.options();
-        // Counts above 32 bits cannot be asked for on the wire.
-        let count = |limit: usize| u32::try_from(limit).unwrap_or(u32::MAX);
+        let count = |limit: usize| count_to_wire(limit as u64);
         Ok(Response::new(proto::Capabilities {
             server_version: env!("CARGO_PKG_VERSION").to_owned(),
             input_limits: Some(proto::InputLimits {
                 max_views: count(self.limits.max_views),
                 max_tracks: count(self.limits.max_tracks),
                 max_observations: count(self.limits.max_observations),
-                max_message_bytes: self.bounds.max_message_bytes as u64,
+                max_message_bytes: size_to_wire(self.bounds.max_message_bytes as u64),
             }),
             methods: Method::ALL.map(Twin::to_wire).to_vec(),
             backends: [Backend::Flex, Backend::Ndarray].map(Twin::to_wire).to_vec(),
@@ -169,7 +168,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             max_batch_requests: count(MAX_BATCH),
             queue_limits: Some(queue_limits(&options.queue)),
             upload_limits: Some(upload_limits(&options.uploads)),
-            trained_network: solver::trained_network(),
+            trained_network_sha256: solver::trained_network_sha256().0.to_vec(),
             max_connections: count(self.bounds.max_connections),
         }))
     }

@@ -8,7 +8,7 @@ use tonic::{Request, Response, Status, Streaming};
 use tracing::Instrument;
 
 use super::caller::Caller;
-use super::convert::{self, input};
+use super::convert::{self, input, size_to_wire};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::parts::{self, Parts};
 use super::{proto, status, violation};
@@ -108,7 +108,7 @@ impl Inputs {
         match outcome?.map_err(status::from_engine)? {
             (found, None) => {
                 upload.give_up(GivenUp::WrongHash).await.map_err(status::from_engine)?;
-                Err(status::hash_mismatch(&sha256, &found))
+                Err(status::hash_mismatch(sha256, found))
             }
             (_, Some(Err(invalid))) => {
                 upload.give_up(GivenUp::Invalid).await.map_err(status::from_engine)?;
@@ -263,9 +263,9 @@ impl proto::input_service_server::InputService for Inputs {
         let name = name(&caller, &request.parent, &request.upload_id, "upload_id")?;
         let found = self.engine.upload_status(&name).await.map_err(status::from_engine)?;
         Ok(Response::new(proto::UploadStatus {
-            committed_bytes: input::wire_size(found.committed),
+            committed_bytes: size_to_wire(found.committed),
             input: found.input.as_ref().map(input::uploaded_to_wire),
-            size_bytes: input::wire_size(found.bytes),
+            size_bytes: size_to_wire(found.bytes),
         }))
     }
 

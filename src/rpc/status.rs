@@ -43,7 +43,7 @@ use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt};
 
 use crate::domain::job::{JobName, JobState};
-use crate::domain::{InputName, InvalidInput, Oversize, Violation};
+use crate::domain::{InputName, InvalidInput, Oversize, Sha256Digest, Violation};
 use crate::engine::{self, TakenId};
 
 /// Domain of every `ErrorInfo`.
@@ -188,10 +188,9 @@ pub fn chunk_corrupted(offset: u64, told: u32, found: u32) -> Status {
 }
 
 /// An upload whose bytes are others than those that were meant.
-pub fn hash_mismatch(told: &[u8; 32], found: &[u8; 32]) -> Status {
-    let hex = |digest: &[u8; 32]| digest.map(|byte| format!("{byte:02x}")).concat();
-    let message =
-        format!("finish.sha256: the bytes have the SHA-256 {}, not {}; the upload is given up", hex(found), hex(told));
+pub fn hash_mismatch(told: [u8; 32], found: [u8; 32]) -> Status {
+    let (told, found) = (Sha256Digest(told), Sha256Digest(found));
+    let message = format!("finish.sha256: the bytes have the SHA-256 {found}, not {told}; the upload is given up");
     status(Code::DataLoss, "HASH_MISMATCH", message, ErrorDetails::new())
 }
 

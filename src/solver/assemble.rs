@@ -255,7 +255,7 @@ fn nothing(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>,
         stages,
         proposal_times: attempt.map_or_else(Vec::new, |attempt| attempt.found.proposal_times.clone()),
         history,
-        trained_network: None,
+        trained_network_sha256: None,
         input_sha256: None,
     }
 }

@@ -44,7 +44,7 @@ mod view_selection;
 mod views;
 
 use crate::domain::duplicates::Duplicates;
-use crate::domain::{Input, Observer, Solution, SolveSettings, StopReason, StopToken};
+use crate::domain::{Input, Observer, Sha256Digest, Solution, SolveSettings, StopReason, StopToken};
 use crate::parallel::Threads;
 use problem::Problem;
 use recorder::Recorder;
@@ -111,13 +111,13 @@ pub fn solve_on(
     };
     views::complete(&mut solution, input);
     solution.input_sha256 = Some(input.to_raw().sha256());
-    solution.trained_network = learned::may_be_asked(settings).then(trained_network);
+    solution.trained_network_sha256 = learned::may_be_asked(settings).then(trained_network_sha256);
     Ok(solution)
 }
 
-/// SHA-256, hexadecimal, of the trained network that AUTO asks in this process.
-pub fn trained_network() -> String {
-    crate::network::subspace::current_checksum().to_owned()
+/// Of the trained network that AUTO asks in this process.
+pub fn trained_network_sha256() -> Sha256Digest {
+    crate::network::subspace::current_sha256()
 }
 
 /// The solution but for what [`views::complete`] says of the views.

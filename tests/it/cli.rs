@@ -302,6 +302,9 @@ fn a_result_goes_with_its_own_input_alone(name: &str, server: &str, input: &Path
     for refused in [with(&shuffled, "1000"), with(input, "500")] {
         assert!(refused.code == Some(65) && refused.stderr.contains("not the job's input"), "{refused:?}");
     }
+    let known = ["--width", "1000", "--height", "1000", "--focal-px", "900", "--out", text(&out)];
+    let known = run(["result", name, "--server", server, "--input", text(input)].iter().chain(&known));
+    assert!(known.code == Some(65) && known.stderr.contains("--focal-px"), "{known:?}");
     let no_input = run(["result", name, "--json", "--server", server, "--width", "1000", "--height", "1000"]);
     assert!(no_input.code == Some(2) && no_input.stderr.contains("--width 1000"), "{no_input:?}");
 }

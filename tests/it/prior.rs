@@ -75,7 +75,7 @@ fn a_network_that_asks_pairs_is_trained_and_asked() {
     assert_eq!(solved.code, Some(0), "{solved:?}");
     let result: Value = serde_json::from_str(&solved.stdout).expect("JSON");
     assert_eq!(result["status"], "SOLVED", "{result}");
-    let checksum = result["trained_network"].as_str().expect("the network that was asked");
+    let checksum = result["trained_network_sha256"].as_str().expect("the network that was asked");
     assert!(trained.stderr.contains(checksum) || header.contains(checksum), "{checksum}: {header}");
 }
 

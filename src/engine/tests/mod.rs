@@ -149,7 +149,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         stages: Vec::new(),
         proposal_times: Vec::new(),
         history: vec![progress(1)],
-        trained_network: None,
+        trained_network_sha256: None,
         input_sha256: None,
     }
 }

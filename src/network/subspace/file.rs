@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::arrays::{Shape, SubspaceNet};
+use crate::domain::Sha256Digest;
 
 /// First line of the format, which ends with the version of its layout.
 const MAGIC: &str = "scpsfm-prior 1";
@@ -40,10 +41,14 @@ struct Header {
 impl Header {
     /// The same with the checksum of itself and the numbers.
     fn sealed(mut self, numbers: &[u8]) -> Self {
-        self.sha256.clear();
-        let digest = Sha256::new_with_prefix(self.line()).chain_update(b"\n").chain_update(numbers).finalize();
-        self.sha256 = digest.iter().map(|byte| format!("{byte:02x}")).collect();
+        self.sha256 = self.digest(numbers).to_string();
         self
+    }
+
+    fn digest(&mut self, numbers: &[u8]) -> Sha256Digest {
+        self.sha256.clear();
+        let hash = Sha256::new_with_prefix(self.line()).chain_update(b"\n").chain_update(numbers);
+        Sha256Digest(hash.finalize().into())
     }
 
     fn line(&self) -> String {
@@ -134,20 +139,20 @@ impl PriorFile {
     /// The file's bytes.
     pub fn bytes(&self) -> Vec<u8> {
         let numbers = self.numbers();
-        [MAGIC.as_bytes(), b"\n", self.header(&numbers).line().as_bytes(), b"\n", &numbers].concat()
+        [MAGIC.as_bytes(), b"\n", self.header().sealed(&numbers).line().as_bytes(), b"\n", &numbers].concat()
     }
 
     /// The checksum that the file's header carries: what tells one network from another.
-    pub fn checksum(&self) -> String {
-        self.header(&self.numbers()).sha256
+    pub fn sha256(&self) -> Sha256Digest {
+        self.header().digest(&self.numbers())
     }
 
     fn numbers(&self) -> Vec<u8> {
         self.network.arrays().into_iter().flatten().flat_map(|value| value.to_le_bytes()).collect()
     }
 
-    fn header(&self, numbers: &[u8]) -> Header {
-        Header { origin: self.origin.clone(), shape: self.shape, sha256: String::new() }.sealed(numbers)
+    fn header(&self) -> Header {
+        Header { origin: self.origin.clone(), shape: self.shape, sha256: String::new() }
     }
 }
 
@@ -195,6 +200,7 @@ mod tests {
         assert_eq!(PriorFile::read(&damaged), Err(FileError::Checksum));
         let forged = replaced("\"seed\":7", "\"seed\":8");
         assert_eq!(PriorFile::read(&forged), Err(FileError::Checksum), "the origin is under the checksum, too");
+        assert!(String::from_utf8_lossy(&bytes).contains(&format!("{:?}", file().sha256().to_string())));
         let mut infinite = file();
         infinite.network.first_encoder.bias[0] = f32::INFINITY;
         assert!(matches!(PriorFile::read(&infinite.bytes()), Err(FileError::NotFinite(_))));

@@ -45,7 +45,7 @@ pub use cloud::Cloud;
 pub use file::{Origin, PriorFile};
 #[cfg(test)]
 use shipped::shipped;
-pub use shipped::{current, current_checksum, install};
+pub use shipped::{current, current_sha256, install};
 
 /// Added to a squared residual before its logarithm is taken: residuals below .3 % of a view's spread are noise.
 pub const RESIDUAL_FLOOR: f32 = 1e-5;

@@ -3,6 +3,7 @@
 use std::sync::{LazyLock, OnceLock};
 
 use super::PriorFile;
+use crate::domain::Sha256Digest;
 
 /// Made by `scpsfm train-prior`; its header has the command.
 static SHIPPED: &[u8] = include_bytes!("shipped.prior");
@@ -15,13 +16,13 @@ pub fn current() -> &'static PriorFile {
     INSTALLED.get().unwrap_or_else(|| shipped())
 }
 
-/// [`PriorFile::checksum`] of the network that this process asks, summed up once: every result has it.
-pub fn current_checksum() -> &'static str {
-    static OF_INSTALLED: OnceLock<String> = OnceLock::new();
-    static OF_SHIPPED: LazyLock<String> = LazyLock::new(|| shipped().checksum());
+/// [`PriorFile::sha256`] of the network that this process asks, summed up once: every result has it.
+pub fn current_sha256() -> Sha256Digest {
+    static OF_INSTALLED: OnceLock<Sha256Digest> = OnceLock::new();
+    static OF_SHIPPED: LazyLock<Sha256Digest> = LazyLock::new(|| shipped().sha256());
     match INSTALLED.get() {
-        Some(installed) => OF_INSTALLED.get_or_init(|| installed.checksum()),
-        None => &OF_SHIPPED,
+        Some(installed) => *OF_INSTALLED.get_or_init(|| installed.sha256()),
+        None => *OF_SHIPPED,
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::borrow::Borrow;
 
-use super::matrix;
+use super::{matrix, size_to_wire};
 use crate::domain::{FocalPrior, ImageSize, Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::engine::StoredInput;
 use crate::rpc::proto;
@@ -229,17 +229,12 @@ pub fn uploaded_to_wire(input: &StoredInput) -> proto::Input {
     proto::Input {
         name: input.name.to_string(),
         create_time: Some(input.create_time.into()),
-        size_bytes: wire_size(input.upload_bytes),
+        size_bytes: size_to_wire(input.upload_bytes),
         sha256: input.sha256.to_vec(),
         view_count: input.view_count,
         track_count: input.track_count,
         observation_count: input.observation_count,
     }
-}
-
-/// A length on the wire, which has no unsigned one for it; nothing that is stored comes near the largest.
-pub fn wire_size(bytes: u64) -> i64 {
-    i64::try_from(bytes).unwrap_or(i64::MAX)
 }
 
 #[cfg(test)]

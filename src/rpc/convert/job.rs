@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 
 use super::enums::{Twin, optional_to_wire};
 use super::time::{duration_to_wire, seconds_from_wire};
-use super::{optional_time, progress, required, result, settings, tellable, time_from_wire};
+use super::{
+    optional_time, progress, required, result, settings, size_from_wire, size_to_wire, tellable, time_from_wire,
+};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Grade, InputName, InvalidInput, Proposal, Status, Violation};
 use crate::rpc::proto;
@@ -167,7 +169,7 @@ fn summary_to_wire(summary: &Summary) -> proto::JobSummary {
         winning_proposal: optional_to_wire(summary.winning_proposal),
         iteration_count: summary.iterations,
         solve_duration: Some(duration_to_wire(summary.seconds)),
-        result_size_bytes: summary.result_size_bytes as i64,
+        result_size_bytes: size_to_wire(summary.result_size_bytes),
         warnings: result::warnings_to_wire(&summary.warnings),
     }
 }
@@ -184,7 +186,7 @@ fn summary_from_wire(summary: &proto::JobSummary) -> Result<Summary, Violation> 
         winning_proposal: Proposal::from_wire(summary.winning_proposal, "summary.winning_proposal")?,
         iterations: summary.iteration_count,
         seconds: seconds_from_wire(summary.solve_duration, "summary.solve_duration")?,
-        result_size_bytes: summary.result_size_bytes as u64,
+        result_size_bytes: size_from_wire(summary.result_size_bytes, "summary.result_size_bytes")?,
         warnings: result::warnings_from_wire(&summary.warnings, "summary.warnings.code")?,
     })
 }

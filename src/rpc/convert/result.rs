@@ -10,8 +10,8 @@ use crate::domain::result::{
     ObservationResults, ProposalTime, Sigmas, StageTime, TrackResults, TrackSplit, ViewResult,
 };
 use crate::domain::{
-    Calibration, Grade, LeftOut, LensProjection, Method, Proposal, Solution, Stage, Status, Violation, Warning,
-    WarningCode,
+    Calibration, Grade, LeftOut, LensProjection, Method, Proposal, Sha256Digest, Solution, Stage, Status, Violation,
+    Warning, WarningCode,
 };
 use crate::rpc::proto;
 
@@ -59,8 +59,8 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
             })
             .collect(),
         progress_records: solution.history.iter().map(progress::to_wire).collect(),
-        trained_network: solution.trained_network.clone().unwrap_or_default(),
-        input_sha256: solution.input_sha256.clone().unwrap_or_default(),
+        trained_network_sha256: digest_to_wire(solution.trained_network_sha256),
+        input_sha256: digest_to_wire(solution.input_sha256),
     }
 }
 
@@ -106,9 +106,21 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
             })
             .collect::<Result<_, Violation>>()?,
         history: result.progress_records.iter().map(progress::from_wire).collect::<Result<_, _>>()?,
-        trained_network: Some(result.trained_network).filter(|sha256| !sha256.is_empty()),
-        input_sha256: Some(result.input_sha256).filter(|sha256| !sha256.is_empty()),
+        trained_network_sha256: digest_from_wire(&result.trained_network_sha256, "trained_network_sha256")?,
+        input_sha256: digest_from_wire(&result.input_sha256, "input_sha256")?,
     })
+}
+
+fn digest_to_wire(digest: Option<Sha256Digest>) -> Vec<u8> {
+    digest.map_or_else(Vec::new, |digest| digest.0.to_vec())
+}
+
+fn digest_from_wire(bytes: &[u8], field: &str) -> Result<Option<Sha256Digest>, Violation> {
+    if bytes.is_empty() {
+        return Ok(None);
+    }
+    let wrong = |_| Violation::of(field, format!("{} bytes are not the 32 of a SHA-256", bytes.len()));
+    bytes.try_into().map(|digest| Some(Sha256Digest(digest))).map_err(wrong)
 }
 
 /// Warnings of a result or of its summary.
@@ -330,7 +342,11 @@ fn split_from_wire((index, split): (usize, &proto::TrackSplit)) -> Result<TrackS
         [] => None,
         &[x, y, z] => Some([x, y, z]),
         other => {
-            return Err(Violation::at("track_splits.point", index, format!("{} numbers instead of three", other.len())));
+            return Err(Violation::at(
+                "track_splits.point",
+                index,
+                format!("{} numbers instead of three", other.len()),
+            ));
         }
     };
     Ok(TrackSplit { track: split.track_index, number: split.number, weight: split.weight, point })

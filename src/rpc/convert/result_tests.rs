@@ -121,8 +121,8 @@ pub(super) fn rich() -> Solution {
             ProposalTime { proposal: Proposal::Uniform, seconds: None, iterations: 6000 },
         ],
         history: vec![progress, Progress { losses: None, head: None, focal_px: None, best_score: None, ..progress }],
-        trained_network: Some("5ea1".into()),
-        input_sha256: Some("d16e57".into()),
+        trained_network_sha256: Some(Sha256Digest([0x5e; 32])),
+        input_sha256: Some(Sha256Digest([0xd1; 32])),
     }
 }
 
@@ -147,6 +147,7 @@ fn a_solution_without_a_reconstruction_survives_too() {
         views: vec![ViewResult::default(); 2],
         tracks: TrackResults::default(),
         observations: ObservationResults::default(),
+        trained_network_sha256: None,
         noise_px: None,
         reprojection_rms_px: None,
         reprojection_mean_px: None,
@@ -165,6 +166,7 @@ fn a_malformed_answer_names_its_field() {
     assert_eq!(with(&|result| result.status = 0), "status");
     assert_eq!(with(&|result| result.grade = 9), "grade");
     assert_eq!(with(&|result| result.tracks = None), "tracks");
+    assert_eq!(with(&|result| result.input_sha256.truncate(31)), "input_sha256");
     assert_eq!(with(&|result| result.views[1].projection.truncate(5)), "views.projection[1]");
     let tracks = |result: &mut proto::JobResult, change: &dyn Fn(&mut proto::TrackResults)| {
         change(result.tracks.as_mut().expect("set"));

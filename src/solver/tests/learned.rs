@@ -22,7 +22,7 @@ fn eight_right_tracks_of_two_hundred_are_found_at_once() {
         let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
         assert!(f1 > 0.99, "seed {seed}: F1 {f1}");
         assert!(!warns_of_ranking(&solution), "what is verified needs no ranking");
-        assert_eq!(solution.trained_network, Some(trained_network()), "two networks, two answers");
+        assert_eq!(solution.trained_network_sha256, Some(trained_network_sha256()), "two networks, two answers");
         assert_eq!(solution.iterations, 0, "decided before the paper's network");
     }
 }
@@ -61,7 +61,7 @@ fn without_the_trained_network_the_search_stands_on_its_own() {
         assert!(solution.winning_proposal.is_some_and(|prior| prior != Proposal::Learned));
         let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
         assert!(f1 > 0.99, "F1 {f1}");
-        assert_eq!(solution.trained_network, None);
+        assert_eq!(solution.trained_network_sha256, None);
     }
 }
 

@@ -110,7 +110,7 @@ async fn capabilities_tell_limits_and_defaults() {
     );
     assert_eq!(convert::settings::from_wire(capabilities.default_settings), Ok(SolveSettings::default()));
     assert_eq!(capabilities.server_version, env!("CARGO_PKG_VERSION"));
-    assert_eq!(capabilities.trained_network, solver::trained_network());
+    assert_eq!(capabilities.trained_network_sha256, solver::trained_network_sha256().0);
 }
 
 #[tokio::test]

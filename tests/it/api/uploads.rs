@@ -350,7 +350,7 @@ async fn bounds_are_advertised_and_hold() {
     let server = TestServer::start_with(quick(), Options::default(), bounded(uploads)).await;
     let answer = server.calibration().await.get_capabilities(proto::GetCapabilitiesRequest {}).await;
     let limits = answer.expect("capabilities").into_inner().upload_limits.expect("limits");
-    assert_eq!((limits.max_upload_bytes, limits.max_chunk_bytes), (10_000, MAX_CHUNK_BYTES as u64));
+    assert_eq!((limits.max_upload_bytes, limits.max_chunk_bytes), (10_000, MAX_CHUNK_BYTES as i64));
     assert_eq!((limits.max_tenant_uploads, limits.max_tenant_bytes), (2, 15_000));
     assert_eq!(limits.abandoned_after.expect("a time").seconds, 3_600);
 

@@ -109,7 +109,7 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         stages: Vec::new(),
         proposal_times: Vec::new(),
         history: Vec::new(),
-        trained_network: None,
+        trained_network_sha256: None,
         input_sha256: None,
     }
 }
