@@ -16,6 +16,8 @@ use tonic_types::StatusExt;
 
 use crate::rpc::inflight::{HeldBody, Permit};
 use crate::rpc::meter::code_name;
+use crate::rpc::status;
+use crate::telemetry::metrics::{HttpRefusal, http_refused};
 
 /// An answer to a request.
 pub type Answer = Response<Body>;
@@ -93,13 +95,42 @@ fn failed(status: &Status) -> Event {
     Event::default().event("status").data(error_body(status, http_code(status.code())).to_string())
 }
 
-/// A refusal.
+/// That there is nothing to tell and never will be: a browser's `EventSource` does not ask again.
+pub fn nothing_more() -> Answer {
+    secured(StatusCode::NO_CONTENT.into_response())
+}
+
+/// A refusal by a call.
 pub fn error(status: &Status) -> Answer {
     refused(http_code(status.code()), status)
 }
 
-/// A refusal with another code than the one that goes with its status.
-pub fn refused(code: StatusCode, status: &Status) -> Answer {
+/// A refusal before any call, which is counted here: those of calls are counted with them.
+pub fn uncalled(refusal: HttpRefusal, status: &Status) -> Box<Answer> {
+    http_refused(refusal);
+    let code = match refusal {
+        HttpRefusal::Method => StatusCode::METHOD_NOT_ALLOWED,
+        HttpRefusal::MediaType => StatusCode::UNSUPPORTED_MEDIA_TYPE,
+        HttpRefusal::Length => StatusCode::LENGTH_REQUIRED,
+        HttpRefusal::TooLarge => StatusCode::PAYLOAD_TOO_LARGE,
+        _ => http_code(status.code()),
+    };
+    Box::new(refused(code, status))
+}
+
+/// A refusal before any call, of a kind that gRPC does not have.
+pub fn refuse(refusal: HttpRefusal, text: impl Into<String>) -> Box<Answer> {
+    let code = match refusal {
+        HttpRefusal::Origin | HttpRefusal::Host => Code::PermissionDenied,
+        HttpRefusal::Path => Code::NotFound,
+        HttpRefusal::Method => Code::Unimplemented,
+        HttpRefusal::TooLarge => Code::OutOfRange,
+        _ => Code::InvalidArgument,
+    };
+    uncalled(refusal, &status::refused(code, refusal.reason(), text))
+}
+
+fn refused(code: StatusCode, status: &Status) -> Answer {
     let mut answer = (code, axum::Json(error_body(status, code))).into_response();
     let headers = answer.headers_mut();
     if status.code() == Code::Unauthenticated {

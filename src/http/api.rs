@@ -7,25 +7,29 @@ use std::time::Duration;
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::uri::Authority;
-use axum::http::{HeaderMap, Method, StatusCode, header};
+use axum::http::{HeaderMap, Method, header};
 use axum::response::IntoResponse;
 use futures_util::StreamExt;
 use prost::Message;
 use prost::bytes::Bytes;
 use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor, ReflectMessage};
+use tonic::Status;
 use tonic::client::Grpc;
 use tonic::metadata::MetadataMap;
-use tonic::{Code, Status};
 
 use super::answer::{self, Answer};
 use super::codec::Encoded;
 use super::route::{self, Found, Route};
 use super::{console, openapi, upload};
 use crate::domain::Violation;
+use crate::domain::job::JobState;
+use crate::rpc::convert::enums::Twin;
 use crate::rpc::inflight::Permit;
 use crate::rpc::listener::Introduction;
+use crate::rpc::proto::job_service_client::JobServiceClient;
 use crate::rpc::server::Gateway;
-use crate::rpc::status;
+use crate::rpc::{proto, status};
+use crate::telemetry::metrics::HttpRefusal;
 
 /// Where the description of the API is.
 const OPENAPI_PATH: &str = "/openapi.json";
@@ -78,45 +82,67 @@ impl Api {
         Ok(Self { routes, openapi, gateway, max_body_bytes, hosts, input_data, input })
     }
 
-    /// The answer to a request; `introduction` is its connection's.
+    /// The answer to a request; `introduction` is its connection's. That to HEAD is that to GET: hyper leaves out the
+    /// body.
     pub async fn answer(self: &Arc<Self>, introduction: Introduction, request: Request) -> Answer {
+        self.answer_or_refuse(introduction, request).await.unwrap_or_else(|refused| *refused)
+    }
+
+    async fn answer_or_refuse(
+        self: &Arc<Self>,
+        introduction: Introduction,
+        request: Request,
+    ) -> Result<Answer, Box<Answer>> {
         if is_of_another_site(request.headers()) {
-            let text = "a page of another site may not call this API";
-            return answer::error(&status::refused(Code::PermissionDenied, "ORIGIN_REFUSED", text));
+            return Err(answer::refuse(HttpRefusal::Origin, "a page of another site may not call this API"));
         }
         if !self.gateway.asks_for_keys() && !self.is_own_host(request.headers()) {
             let text = "the request is for a host that this server does not know: http.hosts names those that it has";
-            return answer::error(&status::refused(Code::PermissionDenied, "HOST_REFUSED", text));
+            return Err(answer::refuse(HttpRefusal::Host, text));
         }
         let path = request.uri().path().to_owned();
-        if path == OPENAPI_PATH && request.method() == Method::GET && self.gateway.describes {
-            return match self.gateway.check_key(request.headers(), &introduction) {
-                Ok(()) => answer::json(self.openapi.to_vec(), self.gateway.permit()),
-                Err(status) => answer::error(&status),
-            };
-        }
-        if let Some(file) = console::file(&path).filter(|_| request.method() == Method::GET) {
-            return file;
-        }
-        if let Some(parent) = upload::parent(request.method(), &path) {
-            return upload::answer(self, introduction, parent, request).await.unwrap_or_else(|refused| *refused);
-        }
-        match route::find(&self.routes, request.method(), &path) {
-            Found::Route(route, fields) => {
-                self.call(route, fields, introduction, request).await.unwrap_or_else(|refused| *refused)
+        let verb = if request.method() == Method::HEAD { Method::GET } else { request.method().clone() };
+        let mut allowed = Vec::new();
+        if path == OPENAPI_PATH && self.gateway.describes {
+            if verb == Method::GET {
+                self.check_key(request.headers(), &introduction)?;
+                return Ok(answer::json(self.openapi.to_vec(), self.gateway.permit()));
             }
-            Found::OtherVerbs(verbs) => {
-                let allowed = verbs.iter().map(Method::as_str).collect::<Vec<_>>().join(", ");
-                let text = format!("{path} is for {allowed}");
-                let refusal = status::refused(Code::Unimplemented, "METHOD_NOT_ALLOWED", text);
-                let answer = answer::refused(StatusCode::METHOD_NOT_ALLOWED, &refusal);
-                ([(header::ALLOW, allowed)], answer).into_response()
-            }
-            Found::Nothing => {
-                let text = format!("there is nothing at {path}; {OPENAPI_PATH} describes what there is");
-                answer::error(&status::refused(Code::NotFound, "PATH_NOT_FOUND", text))
-            }
+            allowed.push(Method::GET);
         }
+        if let Some(file) = console::file(&path) {
+            if verb == Method::GET {
+                return Ok(file);
+            }
+            allowed.push(Method::GET);
+        }
+        if let Some(parent) = upload::parent(&path) {
+            if verb == Method::POST {
+                return upload::answer(self, introduction, parent, request).await;
+            }
+            allowed.push(Method::POST);
+        }
+        match route::find(&self.routes, &verb, &path) {
+            Found::Route(route, fields) => return self.call(route, fields, introduction, request).await,
+            Found::OtherVerbs(verbs) => allowed.extend(verbs),
+            Found::Nothing => {}
+        }
+        if allowed.is_empty() {
+            let text = format!("there is nothing at {path}; {OPENAPI_PATH} describes what there is");
+            return Err(answer::refuse(HttpRefusal::Path, text));
+        }
+        if allowed.contains(&Method::GET) {
+            allowed.push(Method::HEAD);
+        }
+        let allowed = allowed.iter().map(Method::as_str).collect::<Vec<_>>().join(", ");
+        let refused = answer::refuse(HttpRefusal::Method, format!("{path} is for {allowed}"));
+        Err(Box::new(([(header::ALLOW, allowed)], *refused).into_response()))
+    }
+
+    /// Whether the request has a key, where one is asked for.
+    pub(super) fn check_key(&self, headers: &HeaderMap, introduction: &Introduction) -> Result<(), Box<Answer>> {
+        let checked = self.gateway.check_key(headers, introduction);
+        checked.map_err(|status| answer::uncalled(HttpRefusal::Unauthenticated, &status))
     }
 
     async fn call(
@@ -127,13 +153,13 @@ impl Api {
         request: Request,
     ) -> Result<Answer, Box<Answer>> {
         let (head, body) = request.into_parts();
-        self.gateway.check_key(&head.headers, &introduction).map_err(failed)?;
+        self.check_key(&head.headers, &introduction)?;
         let permit = self.gateway.permit();
         let descriptor = route.method.input();
         let query = head.uri.query().unwrap_or_default();
         let (mut message, length) = if route.has_body {
             if let Some((name, _)) = form_urlencoded::parse(query.as_bytes()).next() {
-                return Err(failed(invalid(&name, "is in the query; this call takes everything in its body")));
+                return Err(invalid(&name, "is in the query; this call takes everything in its body"));
             }
             self.read(&head.headers, body, descriptor, &permit).await?
         } else {
@@ -143,7 +169,7 @@ impl Api {
                     true => Err("is in the path".to_owned()),
                     false => route::set_field(&mut message, &name, &value),
                 };
-                set.map_err(|text| failed(invalid(&name, text)))?;
+                set.map_err(|text| invalid(&name, text))?;
             }
             (message, 0)
         };
@@ -151,10 +177,19 @@ impl Api {
         if let Some(last_id) = head.headers.get(last_id).and_then(|id| id.to_str().ok())
             && message.descriptor().get_field_by_name(after).is_some()
         {
-            route::set_field(&mut message, after, last_id).map_err(|text| failed(invalid(after, text)))?;
+            route::set_field(&mut message, after, last_id).map_err(|text| invalid(after, text))?;
         }
         for (name, value) in fields {
-            route::set_field(&mut message, name, &value).map_err(|text| failed(invalid(name, text)))?;
+            route::set_field(&mut message, name, &value).map_err(|text| invalid(name, text))?;
+        }
+        if let Some(after) = message.get_field_by_name(after).and_then(|number| number.as_u64()).filter(|&n| n > 0)
+            && let Some(name) = message.get_field_by_name("name").and_then(|name| name.as_str().map(str::to_owned))
+        {
+            let asked = call(&head.headers, introduction.clone(), permit.clone(), proto::GetJobRequest { name });
+            let job = JobServiceClient::new(self.gateway.service.clone()).get_job(asked).await.map_err(failed)?;
+            if is_told(job.get_ref(), after) {
+                return Ok(answer::nothing_more());
+            }
         }
         let encode = move || Ok(Bytes::from(message.encode_to_vec()));
         let encoded = in_background(length, encode).await.map_err(failed)?;
@@ -201,20 +236,16 @@ impl Api {
         let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
         if kind.split(';').next().unwrap_or_default().trim() != "application/json" {
             let text = format!("the body is {kind:?}, not application/json");
-            let refusal = status::refused(Code::InvalidArgument, "UNSUPPORTED_MEDIA_TYPE", text);
-            return Err(Box::new(answer::refused(StatusCode::UNSUPPORTED_MEDIA_TYPE, &refusal)));
+            return Err(answer::refuse(HttpRefusal::MediaType, text));
         }
         let parse = move || {
             let mut json = serde_json::Deserializer::from_slice(&text);
             let message = DynamicMessage::deserialize(descriptor, &mut json);
             let message = message.and_then(|message| json.end().map(|()| message));
-            message.map_err(|error| {
-                let description: String = error.to_string().chars().take(MAX_DESCRIPTION).collect();
-                invalid("body", description)
-            })
+            Ok(message.map_err(|error| error.to_string().chars().take(MAX_DESCRIPTION).collect::<String>()))
         };
         let message = in_background(length, parse).await.map_err(failed)?;
-        Ok((message, length))
+        Ok((message.map_err(|description| invalid("body", description))?, length))
     }
 
     /// The bytes of a body, charged as the JSON that they are.
@@ -223,7 +254,8 @@ impl Api {
         let mut frames = body.into_data_stream();
         loop {
             let frame = tokio::time::timeout(BODY_PATIENCE, frames.next()).await;
-            let Some(frame) = frame.map_err(|_| failed(status::input_stalled(BODY_PATIENCE)))? else { break };
+            let stalled = |_| answer::uncalled(HttpRefusal::Stalled, &status::input_stalled(BODY_PATIENCE));
+            let Some(frame) = frame.map_err(stalled)? else { break };
             // The client has gone away; nobody reads the answer.
             let frame = frame.map_err(|error| failed(Status::cancelled(error.to_string())))?;
             let length = text.len() + frame.len();
@@ -232,8 +264,7 @@ impl Api {
                     "the body is larger than {} bytes; a larger input is uploaded as protobuf, or sent over gRPC",
                     self.max_body_bytes
                 );
-                let refusal = status::refused(Code::OutOfRange, "MESSAGE_TOO_LARGE", text);
-                return Err(Box::new(answer::refused(StatusCode::PAYLOAD_TOO_LARGE, &refusal)));
+                return Err(answer::refuse(HttpRefusal::TooLarge, text));
             }
             permit.hold(JSON_COPIES * length as u64).map_err(failed)?;
             text.extend_from_slice(&frame);
@@ -266,9 +297,15 @@ pub(super) fn failed(status: Status) -> Box<Answer> {
     Box::new(answer::error(&status))
 }
 
-/// What is wrong with a field of a request.
-pub(super) fn invalid(field: &str, description: impl Into<String>) -> Status {
-    status::invalid(&Violation::of(field, description.into()).into())
+/// What is wrong with a request that is no call yet.
+pub(super) fn invalid(field: &str, description: impl Into<String>) -> Box<Answer> {
+    answer::uncalled(HttpRefusal::Invalid, &status::invalid(&Violation::of(field, description.into()).into()))
+}
+
+/// Whether a job has ended and had its last event by then. A browser's `EventSource` asks again whenever its stream
+/// ends, until it is told that there is nothing more.
+fn is_told(job: &proto::Job, after_sequence: u64) -> bool {
+    JobState::required(job.state, "state").is_ok_and(JobState::is_terminal) && job.last_sequence <= after_sequence
 }
 
 /// Does what takes long for so many bytes on a thread that serves nobody else.

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use axum::body::{Body, BodyDataStream};
 use axum::extract::Request;
-use axum::http::{HeaderMap, Method, StatusCode, header};
+use axum::http::{HeaderMap, header};
 use futures_util::{Stream, StreamExt, stream};
 use prost::Message as _;
 use prost::bytes::{Buf, Bytes, BytesMut};
@@ -13,12 +13,13 @@ use tonic::Code;
 
 use super::answer::{self, Answer};
 use super::api::{Api, call, failed, in_background, invalid};
+use crate::rpc::convert::size_to_wire;
 use crate::rpc::inputs::MAX_CHUNK_BYTES;
 use crate::rpc::listener::Introduction;
 use crate::rpc::proto::input_service_client::InputServiceClient;
 use crate::rpc::proto::upload_input_request::Message;
 use crate::rpc::proto::{self, UploadInputRequest};
-use crate::rpc::status;
+use crate::telemetry::metrics::HttpRefusal;
 
 /// The media type of protobuf.
 const PROTOBUF: &str = "application/x-protobuf";
@@ -26,11 +27,11 @@ const PROTOBUF: &str = "application/x-protobuf";
 /// Parameter of the query that names the upload.
 const UPLOAD_ID: &str = "uploadId";
 
-/// The parent of an upload; `None` for another request.
-pub fn parent(verb: &Method, path: &str) -> Option<String> {
+/// The parent of an upload; `None` for another path.
+pub fn parent(path: &str) -> Option<String> {
     let parent = path.strip_prefix("/v1/")?.strip_suffix("/inputs")?;
     let is_parent = parent.strip_prefix("tenants/").is_some_and(|tenant| !tenant.is_empty() && !tenant.contains('/'));
-    (verb == Method::POST && is_parent).then(|| parent.to_owned())
+    is_parent.then(|| parent.to_owned())
 }
 
 /// Passes a body on to `InputService.UploadInput`. Protobuf goes as it comes, without being held; its length is told
@@ -42,11 +43,11 @@ pub async fn answer(
     request: Request,
 ) -> Result<Answer, Box<Answer>> {
     let (head, body) = request.into_parts();
-    api.gateway.check_key(&head.headers, &introduction).map_err(failed)?;
+    api.check_key(&head.headers, &introduction)?;
     let mut upload_id = None;
     for (name, value) in form_urlencoded::parse(head.uri.query().unwrap_or_default().as_bytes()) {
         if name != UPLOAD_ID {
-            return Err(failed(invalid(&name, format!("is no parameter; there is {UPLOAD_ID}"))));
+            return Err(invalid(&name, format!("is no parameter; there is {UPLOAD_ID}")));
         }
         upload_id = Some(value.into_owned());
     }
@@ -64,7 +65,7 @@ pub async fn answer(
     let start = proto::UploadStart {
         parent,
         upload_id: upload_id.unwrap_or_else(|| uuid::Uuid::now_v7().to_string()),
-        size_bytes: i64::try_from(size_bytes).unwrap_or(i64::MAX),
+        size_bytes: size_to_wire(size_bytes),
         sha256: Vec::new(),
     };
     let mut client = InputServiceClient::new(api.gateway.service.clone());
@@ -85,11 +86,8 @@ pub async fn answer(
 
 fn declared_length(headers: &HeaderMap) -> Result<u64, Box<Answer>> {
     let length = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
-    length.ok_or_else(|| {
-        let text = "an upload says its length beforehand: Content-Length is missing";
-        let refusal = status::refused(Code::InvalidArgument, "LENGTH_REQUIRED", text);
-        Box::new(answer::refused(StatusCode::LENGTH_REQUIRED, &refusal))
-    })
+    let text = "an upload says its length beforehand: Content-Length is missing";
+    length.ok_or_else(|| answer::refuse(HttpRefusal::Length, text))
 }
 
 /// Where a body is on its way.
@@ -142,7 +140,7 @@ fn messages(
             return Some((message(Message::Finish(proto::UploadFinish { sha256 })), state));
         }
         let chunk = proto::UploadChunk {
-            offset: i64::try_from(state.offset).unwrap_or(i64::MAX),
+            offset: size_to_wire(state.offset),
             crc32c: crc32c::crc32c(&data),
             data: data.to_vec(),
         };

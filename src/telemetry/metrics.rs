@@ -18,7 +18,7 @@ use crate::domain::{Grade, Proposal, Stage};
 
 pub use catalogue::*;
 pub use guards::{Held, RpcCall, StoreTimer};
-pub use labels::{AttemptLost, Deletion, GivenUp, Refusal, Reloaded, UploadRefusal};
+pub use labels::{AttemptLost, Deletion, GivenUp, HttpRefusal, Refusal, Reloaded, UploadRefusal};
 use labels::{NONE, grade_name};
 
 /// Installs the process-wide recorder, once; later calls return the same handle.
@@ -109,6 +109,9 @@ fn create_known_series() {
     for refusal in UploadRefusal::ALL {
         counter!(UPLOAD_REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
     }
+    for refusal in HttpRefusal::ALL {
+        counter!(HTTP_REFUSED.name, "reason" => refusal.reason()).absolute(0);
+    }
     for files in Reloaded::ALL {
         gauge!(RELOAD_FAILED.name, "files" => files.name()).set(0.0);
     }
@@ -181,6 +184,11 @@ pub fn uploads_given_up(reason: GivenUp, count: u32) {
 /// An upload was refused.
 pub fn upload_refused(refusal: UploadRefusal) {
     counter!(UPLOAD_REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).increment(1);
+}
+
+/// A request over HTTP was refused before it became a call.
+pub fn http_refused(refusal: HttpRefusal) {
+    counter!(HTTP_REFUSED.name, "reason" => refusal.reason()).increment(1);
 }
 
 /// A job reached a terminal state, `job.state`; once a job, by whoever committed it.

@@ -1,5 +1,6 @@
 //! JSON over HTTP, from outside: a real server, and a client that knows nothing but HTTP.
 
+use std::collections::BTreeSet;
 use std::io::{Read, Write};
 use std::net::TcpStream;
 
@@ -8,6 +9,7 @@ use scpsfm::rpc::proto;
 use serde_json::{Value, json};
 
 use crate::support::program::Serving;
+use crate::support::scrape::Page;
 use crate::support::wire::{raw, track_set};
 
 /// A key of each of two tenants.
@@ -32,6 +34,12 @@ impl Answer {
 
     fn has(&self, header: &str) -> bool {
         self.head.to_ascii_lowercase().contains(&format!("\r\n{header}"))
+    }
+
+    fn header(&self, name: &str) -> String {
+        let line =
+            self.head.lines().filter_map(|line| line.split_once(": ")).find(|(key, _)| key.eq_ignore_ascii_case(name));
+        line.unwrap_or_else(|| panic!("no {name} in {}", self.head)).1.to_owned()
     }
 
     /// The reason of a refusal, and the first field that it names.
@@ -116,6 +124,8 @@ fn a_job_is_created_watched_read_and_removed_by_http_alone() {
     assert!(events.contains("event: stateChange\n") && events.contains("JOB_STATE_SUCCEEDED"), "{events}");
     let later = request(&server, "GET", &format!("{path}/events"), &[("last-event-id", "2")], &[]).text();
     assert!(later.contains("id: 3\n") && !later.contains("id: 2\n"), "{later}");
+    assert!(events.contains("event: summary\n"), "{events}");
+    a_browser_that_has_every_event_is_told_to_stop(&server, &path, ids.len());
     let result = get(&server, &format!("{path}/result")).json();
     assert_eq!((result["views"].as_array().map(Vec::len), &result["views"][0]["name"]), (Some(3), &json!("a.jpg")));
     let listed = get(&server, "/v1/tenants/default/jobs?pageSize=5&filter=labels.site+%3D+%22north%22").json();
@@ -127,6 +137,61 @@ fn a_job_is_created_watched_read_and_removed_by_http_alone() {
     assert_eq!((gone.code, gone.refusal().0.as_str()), (404, "JOB_NOT_FOUND"));
     let capabilities = get(&server, "/v1/capabilities").json();
     assert_eq!(capabilities["serverVersion"], env!("CARGO_PKG_VERSION"));
+}
+
+/// An `EventSource` reconnects whenever a stream ends; 204 ends that.
+fn a_browser_that_has_every_event_is_told_to_stop(server: &Serving, path: &str, last: usize) {
+    let after = |id: usize| {
+        let id = id.to_string();
+        request(server, "GET", &format!("{path}/events"), &[("last-event-id", id.as_str())], &[])
+    };
+    let (told, more) = (after(last), after(last - 1));
+    assert_eq!((told.code, told.body.len()), (204, 0), "{}", told.head);
+    assert!(more.code == 200 && more.text().contains(&format!("id: {last}\n")), "{}", more.text());
+    assert_eq!(get(server, &format!("{path}/events?afterSequence={last}")).code, 204);
+    let unknown = request(server, "GET", "/v1/tenants/-/jobs/none/events", &[("last-event-id", "3")], &[]);
+    assert_eq!((unknown.code, unknown.refusal().0.as_str()), (404, "JOB_NOT_FOUND"));
+}
+
+/// The count of a reason on the page of metrics.
+fn refused(server: &Serving, reason: &str) -> f64 {
+    Page::parse(&server.page("/metrics")).value(&format!("scpsfm_http_refused_total{{reason=\"{reason}\"}}"))
+}
+
+#[test]
+fn head_is_answered_as_get_and_other_methods_name_those_that_are_allowed() {
+    let (_data, server) = serving();
+    let job = post(&server, "/v1/tenants/-/jobs", &json!({"trackSet": tracks()})).json();
+    get(&server, &format!("{}/events", path_of(&job)));
+    let (jobs, inputs) = ("/v1/tenants/-/jobs", "/v1/tenants/-/inputs");
+    let (job, result) = (path_of(&job), format!("{}/result", path_of(&job)));
+    let cancel = format!("{job}:cancel");
+    let read_only = ["/", "/console.js", "/openapi.json", "/v1/capabilities", result.as_str()];
+    for path in read_only.into_iter().chain([jobs, inputs, job.as_str()]) {
+        let (whole, head) = (get(&server, path), request(&server, "HEAD", path, &[], &[]));
+        assert_eq!((whole.code, head.code, head.body.len()), (200, 200, 0), "{path}: {}", head.head);
+        assert_eq!(head.header("content-length"), whole.body.len().to_string(), "{path}");
+        assert_eq!(head.header("content-type"), whole.header("content-type"), "{path}");
+    }
+    let events = request(&server, "HEAD", &format!("{job}/events"), &[], &[]);
+    assert!((events.code, events.body.len()) == (200, 0) && events.has("content-type: text/event-stream"));
+    let before = refused(&server, "METHOD_NOT_ALLOWED");
+    let others = [
+        (jobs, "POST, GET, HEAD"),
+        (inputs, "POST, GET, HEAD"),
+        (job.as_str(), "GET, DELETE, HEAD"),
+        (cancel.as_str(), "POST"),
+    ];
+    let refusals: Vec<_> = others.into_iter().chain(read_only.map(|path| (path, "GET, HEAD"))).collect();
+    for &(path, allowed) in &refusals {
+        let answer = request(&server, "PATCH", path, &[], &[]);
+        assert_eq!((answer.code, answer.refusal().0.as_str()), (405, "METHOD_NOT_ALLOWED"), "{path}");
+        let told = answer.header("allow");
+        let methods = |text: &str| text.split(", ").map(str::to_owned).collect::<BTreeSet<_>>();
+        assert_eq!(methods(&told), methods(allowed), "{path}");
+    }
+    assert_eq!(request(&server, "HEAD", &cancel, &[], &[]).code, 405, "no GET, no HEAD");
+    assert_eq!(refused(&server, "METHOD_NOT_ALLOWED") - before, 1.0 + refusals.len() as f64);
 }
 
 #[test]
@@ -149,8 +214,11 @@ fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
         (json!([1]), "body"),
         (json!({}), "source"),
     ] {
-        let refused = post(&server, jobs, &body);
-        assert_eq!((refused.code, refused.refusal()), (400, ("INVALID_ARGUMENT".into(), field.into())), "{body}");
+        let before = refused(&server, "INVALID_ARGUMENT");
+        let answer = post(&server, jobs, &body);
+        assert_eq!((answer.code, answer.refusal()), (400, ("INVALID_ARGUMENT".into(), field.into())), "{body}");
+        let counted = refused(&server, "INVALID_ARGUMENT") - before;
+        assert_eq!(counted, f64::from(u8::from(field == "body")), "calls count what they refuse: {body}");
     }
     let json = [("content-type", "application/json")];
     let cut = request(&server, "POST", jobs, &json, b"{\"trackSet\": {");
@@ -179,6 +247,9 @@ fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
     ] {
         assert_eq!((answer.code, answer.refusal().0.as_str()), (code, reason), "{}", answer.text());
     }
+    for reason in ["HOST_REFUSED", "ORIGIN_REFUSED", "UNSUPPORTED_MEDIA_TYPE", "METHOD_NOT_ALLOWED", "PATH_NOT_FOUND"] {
+        assert_eq!(refused(&server, reason), 1.0, "{reason}");
+    }
     assert!(request(&server, "PUT", jobs, &json, b"{}").has("allow: "), "says which verbs there are");
     assert_eq!(get(&server, jobs).json(), json!({}), "nothing was stored");
 }
@@ -192,6 +263,7 @@ fn a_body_is_bounded_and_costs_its_own_connection() {
     let json = [("content-type", "application/json")];
     let refused = request(&server, "POST", "/v1/tenants/-/jobs", &json, &large);
     assert_eq!((refused.code, refused.refusal().0.as_str()), (413, "MESSAGE_TOO_LARGE"));
+    assert_eq!(self::refused(&server, "MESSAGE_TOO_LARGE"), 1.0);
     // One that says more than it sends, and one that says nothing, hold up nobody.
     let address = server.http.strip_prefix("http://").expect("an address");
     let mut silent: Vec<TcpStream> = (0..50).map(|_| TcpStream::connect(address).expect("connects")).collect();
@@ -241,6 +313,21 @@ fn an_input_is_uploaded_as_json_or_protobuf_and_solved() {
     }
     let inputs = get(&server, "/v1/tenants/-/inputs").json();
     assert_eq!(inputs["inputs"].as_array().map(Vec::len), Some(2));
+    // However an input comes, its job's result has the same digest; another input has another.
+    let digest_of = |source: Value| {
+        let job = post(&server, "/v1/tenants/-/jobs", &source).json();
+        get(&server, &format!("{}/events", path_of(&job)));
+        get(&server, &format!("{}/result", path_of(&job))).json()["inputSha256"].as_str().expect("a digest").to_owned()
+    };
+    let unnamed = |mut set: Value| {
+        set["views"] = json!([{}, {}, {}]);
+        set
+    };
+    let uploaded = digest_of(json!({"input": by_protobuf.json()["name"]}));
+    assert_eq!(uploaded, digest_of(json!({"trackSet": unnamed(tracks())})));
+    let named = digest_of(json!({"trackSet": tracks()}));
+    assert_eq!(named, digest_of(json!({"input": by_json.json()["name"]})));
+    assert_ne!(named, uploaded, "names and sizes count");
     for input in [by_json.json(), by_protobuf.json()] {
         let job = post(&server, "/v1/tenants/-/jobs", &json!({"input": input["name"]})).json();
         let events = get(&server, &format!("{}/events", path_of(&job))).text();
@@ -266,6 +353,7 @@ fn a_key_is_asked_for_and_says_whose_jobs_are_seen() {
         assert_eq!((refused.code, refused.refusal().0.as_str()), (401, reason));
         assert!(refused.has("www-authenticate: bearer"), "{}", refused.head);
     }
+    assert_eq!(refused(&server, "UNAUTHENTICATED"), 2.0);
     let job = create(Some(NORTH)).json();
     assert!(job["name"].as_str().is_some_and(|name| name.starts_with("tenants/north/jobs/")), "{job}");
     let read = |key: &str| {

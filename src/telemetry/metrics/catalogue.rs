@@ -181,6 +181,12 @@ pub const RPC_IN_FLIGHT: Metric = Metric {
     labels: &[],
     help: "gRPC calls that have begun and not ended.",
 };
+pub const HTTP_REFUSED: Metric = Metric {
+    name: "scpsfm_http_refused_total",
+    kind: Kind::Counter,
+    labels: &["reason"],
+    help: "HTTP requests refused before they became a call, by reason; what calls refuse is counted with the calls.",
+};
 pub const STORE_DURATION: Metric = Metric {
     name: "scpsfm_store_operation_duration_seconds",
     kind: STORE_SECONDS,
@@ -258,7 +264,7 @@ pub const LOCKED_OUT: Metric = Metric {
 };
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 37] = [
+pub const ALL: [Metric; 38] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
@@ -283,6 +289,7 @@ pub const ALL: [Metric; 37] = [
     RPC_REQUESTS,
     RPC_DURATION,
     RPC_IN_FLIGHT,
+    HTTP_REFUSED,
     STORE_DURATION,
     STORE_COMMIT_OPERATIONS,
     STORE_REACHABLE,

@@ -80,6 +80,63 @@ impl UploadRefusal {
     }
 }
 
+/// Why a request over HTTP was refused before it became a call of the API. Requests that find no memory are counted
+/// by [`Refusal::Memory`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum HttpRefusal {
+    /// A page of another site sends it.
+    Origin,
+    /// It is for a host that the server does not know.
+    Host,
+    /// There is nothing at its path.
+    Path,
+    /// What is at its path is not for this method.
+    Method,
+    /// It has no key, or an unknown one.
+    Unauthenticated,
+    /// Its body is of another kind than JSON.
+    MediaType,
+    /// An upload that does not tell its length.
+    Length,
+    /// Its body is longer than it may be.
+    TooLarge,
+    /// Its body did not come in time.
+    Stalled,
+    /// Its JSON, its query or its path breaks a rule.
+    Invalid,
+}
+
+impl HttpRefusal {
+    pub(super) const ALL: [HttpRefusal; 10] = [
+        HttpRefusal::Origin,
+        HttpRefusal::Host,
+        HttpRefusal::Path,
+        HttpRefusal::Method,
+        HttpRefusal::Unauthenticated,
+        HttpRefusal::MediaType,
+        HttpRefusal::Length,
+        HttpRefusal::TooLarge,
+        HttpRefusal::Stalled,
+        HttpRefusal::Invalid,
+    ];
+
+    /// The label, and the reason that its caller is told but for keys, which have two.
+    pub fn reason(self) -> &'static str {
+        match self {
+            HttpRefusal::Origin => "ORIGIN_REFUSED",
+            HttpRefusal::Host => "HOST_REFUSED",
+            HttpRefusal::Path => "PATH_NOT_FOUND",
+            HttpRefusal::Method => "METHOD_NOT_ALLOWED",
+            HttpRefusal::Unauthenticated => "UNAUTHENTICATED",
+            HttpRefusal::MediaType => "UNSUPPORTED_MEDIA_TYPE",
+            HttpRefusal::Length => "LENGTH_REQUIRED",
+            HttpRefusal::TooLarge => "MESSAGE_TOO_LARGE",
+            HttpRefusal::Stalled => "INPUT_STALLED",
+            HttpRefusal::Invalid => "INVALID_ARGUMENT",
+        }
+    }
+}
+
 /// Why a job was deleted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Deletion {

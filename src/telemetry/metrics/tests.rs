@@ -111,6 +111,7 @@ fn what_is_known_beforehand_is_zero_before_the_first_job() {
         "scpsfm_admission_refusals_total{reason=\"BATCH_TOO_LARGE\",bound=\"tenant_bytes\"}",
         "scpsfm_upload_refusals_total{reason=\"UPLOAD_TOO_LARGE\",bound=\"upload_bytes\"}",
         "scpsfm_jobs_deleted_total{reason=\"RETENTION\"}",
+        "scpsfm_http_refused_total{reason=\"HOST_REFUSED\"}",
         "scpsfm_admission_refusals_total{reason=\"DRAINING\",bound=\"NONE\"}",
         "scpsfm_job_duration_seconds_count{state=\"SUCCEEDED\"}",
         "scpsfm_queue_wait_seconds_count",
