@@ -15,11 +15,22 @@ fn main() -> Result<(), Box<dyn Error>> {
     // What reflection and JSON over HTTP answer from; encoded by protox, since prost forgets the annotations.
     let descriptors = PathBuf::from(env::var("OUT_DIR")?).join("scpsfm_descriptors.bin");
     fs::write(descriptors, compiler.encode_file_descriptor_set())?;
+    // Messages and clients.
     tonic_prost_build::configure()
+        .build_server(false)
         // Maps in key order, so that the same message has the same bytes.
         .btree_map(".")
         // A result is cut into chunks without copying it.
         .bytes(".scpsfm.v1.ResultChunk")
+        .compile_fds(compiler.file_descriptor_set())?;
+    // Servers apart: they send a result as it is stored, and decode none.
+    let servers = PathBuf::from(env::var("OUT_DIR")?).join("servers");
+    fs::create_dir_all(&servers)?;
+    tonic_prost_build::configure()
+        .build_client(false)
+        .extern_path(".scpsfm.v1", "crate::rpc::proto")
+        .extern_path(".scpsfm.v1.JobResult", "crate::rpc::jobs::EncodedJobResult")
+        .out_dir(servers)
         .compile_fds(compiler.file_descriptor_set())?;
     Ok(())
 }

@@ -17,7 +17,7 @@ use super::status;
 use crate::telemetry::metrics::{Refusal, inflight_bytes, inflight_capacity, refused};
 
 /// How often an input is in memory while it is checked and stored: as it came, sorted, and encoded. A result likewise
-/// while it is read: as it is stored, decoded, and encoded.
+/// while it is read: in the chunks of the store, whole, and in the transport's buffer.
 pub const WORKING_COPIES: u64 = 3;
 
 /// How often a message is in memory: decoded, and as it came, in a buffer that the transport keeps for the next one.

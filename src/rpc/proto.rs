@@ -5,5 +5,7 @@
 
 tonic::include_proto!("scpsfm.v1");
 
+include!(concat!(env!("OUT_DIR"), "/servers/scpsfm.v1.rs"));
+
 /// The encoded `FileDescriptorSet` of the API, for reflection.
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/scpsfm_descriptors.bin"));

@@ -1,19 +1,23 @@
 //! `JobService`: creation, watching, cancelling, listing, results.
 
 use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
 use std::time::Duration;
 
 use prost::Message as _;
-use scpsfm::domain::{Input, Limits, SolveSettings};
-use scpsfm::engine::{self, QueueBounds};
+use scpsfm::domain::job::JobName;
+use scpsfm::domain::{Input, Limits, Solution, SolveSettings};
+use scpsfm::engine::{self, Engine, QueueBounds};
 use scpsfm::rpc::convert;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState, create_job_request, solve_request::Message};
-use scpsfm::rpc::server::Options;
+use scpsfm::rpc::server::{Options, Server};
+use scpsfm::store::sqlite::Sqlite;
 use sha2::{Digest, Sha256};
 use tonic::Code;
 use tonic::transport::Channel;
+use tonic_prost::ProstCodec;
 use tonic_types::StatusExt;
 
 use crate::support::server::{TestServer, one_worker, soon};
@@ -242,7 +246,8 @@ async fn lists_are_filtered_ordered_and_paged() {
     let mut jobs = server.jobs().await;
     let mut names = Vec::new();
     for k in 0..5 {
-        let labels = BTreeMap::from([("parity".to_owned(), (k % 2).to_string())]);
+        let labels = [("parity", (k % 2).to_string()), ("quoted", format!(r#""{k}" \"#))];
+        let labels = labels.map(|(key, value)| (key.to_owned(), value)).into();
         let job = Some(proto::Job { labels, ..Default::default() });
         let name = created(&mut jobs, proto::CreateJobRequest { job, ..create_tracks() }).await.name;
         events(&mut jobs, &name, 0).await;
@@ -276,6 +281,7 @@ async fn lists_are_filtered_ordered_and_paged() {
     assert_eq!(list("labels.parity = 1", "create_time", 1).await, [names[1].clone(), names[3].clone()]);
     assert_eq!(list("state = SUCCEEDED AND labels.parity = \"0\"", "", 0).await.len(), 3);
     assert_eq!(list("state = QUEUED OR state = RUNNING", "", 0).await, [""; 0]);
+    assert_eq!(list(r#"labels.quoted = "\"2\" \\""#, "", 0).await, names[2..3]);
 }
 
 #[tokio::test]
@@ -349,6 +355,37 @@ async fn a_result_is_the_same_bytes_after_a_restart_and_damage_is_found() {
         .execute("UPDATE result_chunks SET data = CAST(substr(data, 1, length(data) - 1) || x'ff' AS BLOB)", []);
     assert_eq!(damaged.expect("damaged"), 1);
     assert_eq!(read(&server).await.expect_err("not what was stored").code(), Code::Internal);
+}
+
+/// A field that this version of `JobResult` does not have.
+#[derive(Clone, PartialEq, prost::Message)]
+struct Later {
+    #[prost(uint32, tag = "1000")]
+    later: u32,
+}
+
+#[tokio::test]
+async fn what_a_later_version_put_into_a_result_is_sent_by_this_one() {
+    fn encode(name: &JobName, solution: &Solution) -> Vec<u8> {
+        [convert::result::encode(name, solution), Later { later: 7 }.encode_to_vec()].concat()
+    }
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let store = Arc::new(Sqlite::open(directory.path()).await.expect("a store"));
+    let engine = Engine::start(one_worker(), store, quick(), encode).await.expect("an engine");
+    let server = Server::bind(Options::default(), engine).await.expect("a server");
+    let channel = Channel::from_shared(format!("http://{}", server.address())).expect("a URL").connect().await;
+    let channel = channel.expect("a connection");
+    let mut jobs = JobServiceClient::new(channel.clone());
+    let name = created(&mut jobs, create_tracks()).await.name;
+    events(&mut jobs, &name, 0).await;
+    let mut grpc = tonic::client::Grpc::new(channel);
+    grpc.ready().await.expect("a connection");
+    let request = tonic::Request::new(proto::GetJobResultRequest { name: name.clone() });
+    let path = "/scpsfm.v1.JobService/GetJobResult".parse().expect("a path");
+    let result: Later = grpc.unary(request, path, ProstCodec::default()).await.expect("a result").into_inner();
+    assert_eq!(result.later, 7);
+    let known = jobs.get_job_result(proto::GetJobResultRequest { name: name.clone() }).await.expect("a result");
+    assert_eq!(known.into_inner().job, name);
 }
 
 #[tokio::test]
