@@ -16,7 +16,8 @@ Exit codes:
    64  bad configuration
    65  bad input data, or more than the server ever takes; no such job
    69  server unavailable or its queue full: try again
-   77  not let in: no API key, an unknown one, or a certificate that one side does not trust
+   77  not let in: no API key, an unknown one, one whose scope does not allow the call, or a certificate that one side
+       does not trust
   130  interrupted or cancelled";
 
 /// How a command ended. 2 is clap's own; 64, 65, 69 and 77 are `EX_USAGE`, `EX_DATAERR`, `EX_UNAVAILABLE`

@@ -26,8 +26,9 @@ a second signal gives them back now. That is a clean end (0); a third ends at on
 attempt, of which they have engine.max_attempts.
 
 Without TLS and keys it listens on loopback only. A key is 32 or more random characters (`openssl rand -hex 32`) and \
-stands for a tenant; the file of keys has lines TENANT:KEY or TENANT:sha256:HEX. Certificates and keys are read again \
-when their files change, within a few seconds; connections that are open stay open.
+stands for a tenant; the file of keys has lines TENANT:KEY or TENANT:sha256:HEX. With TENANT:read-only:KEY the key \
+allows calls that change nothing, with TENANT:admin:KEY also the administration, over all tenants. Certificates and \
+keys are read again when their files change, within a few seconds; connections that are open stay open.
 
 Examples:
   scpsfm serve

@@ -128,7 +128,8 @@ impl Tls {
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Auth {
-    /// File of keys, read again when it changes: lines `TENANT:KEY` or `TENANT:sha256:HEX`, `#` begins a comment.
+    /// File of keys, read again when it changes: lines `TENANT:[SCOPE:]KEY` or `TENANT:[SCOPE:]sha256:HEX`, `#` begins
+    /// a comment.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keys_file: Option<PathBuf>,
     /// More keys, in the same form, separated by commas or lines; for the environment. Only their hashes are kept, and

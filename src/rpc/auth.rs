@@ -1,5 +1,6 @@
-//! The layer that finds out whose call it is: before any service sees a request, its key becomes a tenant. A call whose
-//! key is withdrawn while it lasts ends, in both directions.
+//! The layer that finds out whose call it is: before any service sees a request, its key becomes a tenant, and a call
+//! that the key's scope does not allow is refused. A call whose key is withdrawn while it lasts ends, in both
+//! directions.
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
@@ -13,10 +14,10 @@ use tonic::codegen::http::{HeaderMap, Method, Request, Response};
 use tower::{Layer, Service};
 
 use super::caller::Tenant;
-use super::keys::{Hash, KeyRing};
+use super::keys::{Grant, Hash, KeyRing};
 use super::listener::Introduction;
 use super::reload::Current;
-use super::status;
+use super::{meter, status};
 
 /// What needs no key: whoever spreads calls over servers asks for their health, and has no tenant.
 const OPEN: &str = "/grpc.health.v1.Health/";
@@ -54,25 +55,25 @@ impl Authenticate {
         let Some(keys) = &self.keys else { return Ok((Tenant::default(), None)) };
         let key = Hash::of(bearer(headers)?);
         let mut keys = keys.clone();
-        let tenant = keys.borrow_and_update().tenant_of_hash(&key).map(str::to_owned);
-        let tenant = tenant.ok_or_else(status::unknown_key)?;
-        Ok((Tenant::new(&tenant), Some(Standing { keys, key, tenant })))
+        let grant = keys.borrow_and_update().grant_of_hash(&key).cloned();
+        let grant = grant.ok_or_else(status::unknown_key)?;
+        Ok((Tenant::of(&grant), Some(Standing { keys, key, grant })))
     }
 }
 
-/// A key that was accepted, and the tenant that it stood for then.
+/// A key that was accepted, and what it stood for then.
 #[derive(Clone)]
 struct Standing {
     keys: Current<KeyRing>,
     key: Hash,
-    tenant: String,
+    grant: Grant,
 }
 
 impl Standing {
-    /// Ends when the key does not stand for the tenant any more; keys that cannot change never end.
+    /// Ends when the key does not stand for the same any more; keys that cannot change never end.
     async fn lost(mut self) {
         while self.keys.changed().await.is_ok() {
-            if self.keys.borrow_and_update().tenant_of_hash(&self.key) != Some(&self.tenant) {
+            if self.keys.borrow_and_update().grant_of_hash(&self.key) != Some(&self.grant) {
                 return;
             }
         }
@@ -191,6 +192,12 @@ where
             }
         };
         introduce(&request);
+        // Without keys everyone may do everything.
+        let needed = meter::scope_of(request.uri().path());
+        if standing.as_ref().is_some_and(|standing| standing.grant.scope < needed) {
+            let refusal = status::scope_missing(needed).into_http();
+            return Box::pin(async { Ok(refusal) });
+        }
         request.extensions_mut().insert(tenant);
         // No service needs it any more, and none can let it slip.
         request.headers_mut().remove(AUTHORIZATION);

@@ -3,6 +3,7 @@
 use tonic::Request;
 
 use super::convert::names;
+use super::keys::{Grant, Scope};
 use super::status;
 use crate::domain::InputName;
 use crate::domain::job::{DEFAULT_TENANT, JobName};
@@ -13,11 +14,20 @@ const TRACE_PARENT: &str = "traceparent";
 
 /// The tenant of a call, as [`Authenticate`](super::auth::Authenticate) puts it into a request's extensions.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Tenant(String);
+pub struct Tenant {
+    id: String,
+    /// Whether the caller may name what other tenants have, as an administrator.
+    reaches_all: bool,
+}
 
 impl Tenant {
     pub fn new(id: impl Into<String>) -> Self {
-        Self(id.into())
+        Self { id: id.into(), reaches_all: false }
+    }
+
+    /// The tenant of a key.
+    pub fn of(grant: &Grant) -> Self {
+        Self { id: grant.tenant.clone(), reaches_all: grant.scope == Scope::Admin }
     }
 }
 
@@ -31,7 +41,7 @@ impl Default for Tenant {
 /// The caller of one call: the one place where a service learns whose it is.
 #[derive(Debug, Clone)]
 pub struct Caller {
-    tenant: String,
+    tenant: Tenant,
     trace_parent: Option<String>,
 }
 
@@ -40,7 +50,7 @@ impl Caller {
     /// `INTERNAL` for a request that did not come through the layer that finds the tenant: a service that was put
     /// outside of it must not answer as if everyone were the default tenant.
     pub fn of<T>(request: &Request<T>) -> Result<Self, Status> {
-        let Some(Tenant(tenant)) = request.extensions().get().cloned() else {
+        let Some(tenant) = request.extensions().get().cloned() else {
             return Err(status::internal(&"a request reached a service without a tenant"));
         };
         let trace_parent = request.metadata().get(TRACE_PARENT).and_then(|value| value.to_str().ok());
@@ -52,31 +62,38 @@ impl Caller {
         self.trace_parent.as_deref()
     }
 
-    /// The tenant that `parent` names, which must be the caller's own, as it is where that is left out.
+    /// Whether the caller may name what this tenant has.
+    fn reaches(&self, tenant: &str) -> bool {
+        self.tenant.reaches_all || tenant == self.tenant.id
+    }
+
+    /// The tenant that `parent` names, which is the caller's own where that is left out, and must be for all but
+    /// administrators.
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant, whether there is one of that name or not.
     pub fn parent(&self, parent: &str) -> Result<String, Status> {
-        let tenant = names::tenant(parent, &self.tenant).map_err(|error| status::invalid(&error))?;
-        if tenant == self.tenant { Ok(tenant) } else { Err(status::tenant_not_found(&tenant)) }
+        let tenant = names::tenant(parent, &self.tenant.id).map_err(|error| status::invalid(&error))?;
+        if self.reaches(&tenant) { Ok(tenant) } else { Err(status::tenant_not_found(&tenant)) }
     }
 
-    /// The job that `name` names; another tenant's is as one that never was.
+    /// The job that `name` names; another tenant's is as one that never was, but for an administrator.
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
     pub fn job(&self, name: &str) -> Result<JobName, Status> {
-        let name = names::job(name, &self.tenant).map_err(|error| status::invalid(&error))?;
-        if name.tenant == self.tenant { Ok(name) } else { Err(status::job_not_found(&name)) }
+        let name = names::job(name, &self.tenant.id).map_err(|error| status::invalid(&error))?;
+        if self.reaches(&name.tenant) { Ok(name) } else { Err(status::job_not_found(&name)) }
     }
 
-    /// The uploaded input that `name`, of that field, names; another tenant's is as one that never was.
+    /// The uploaded input that `name`, of that field, names; another tenant's is as one that never was, but for an
+    /// administrator.
     ///
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
     pub fn input(&self, name: &str, field: &str) -> Result<InputName, Status> {
-        let name = names::input(name, field, &self.tenant).map_err(|error| status::invalid(&error))?;
-        if name.tenant == self.tenant { Ok(name) } else { Err(status::input_not_found(&name)) }
+        let name = names::input(name, field, &self.tenant.id).map_err(|error| status::invalid(&error))?;
+        if self.reaches(&name.tenant) { Ok(name) } else { Err(status::input_not_found(&name)) }
     }
 }
 
@@ -98,5 +115,11 @@ mod tests {
         assert!(caller.job("tenants/default/jobs/a").is_ok());
         assert_eq!(caller.job("tenants/other/jobs/a").expect_err("another's").code(), Code::NotFound);
         assert_eq!(caller.job("jobs/a").expect_err("malformed").code(), Code::InvalidArgument);
+        let of = |scope| {
+            let mut request = Request::new(());
+            request.extensions_mut().insert(Tenant::of(&Grant { tenant: "north".into(), scope }));
+            Caller::of(&request).expect("a tenant").job("tenants/other/jobs/a").is_ok()
+        };
+        assert_eq!(Scope::ALL.map(of), [false, false, true], "an administrator names every tenant's");
     }
 }

@@ -57,10 +57,14 @@ impl Jobs {
         let mut news = Vec::new();
         for (index, request) in requests.into_iter().enumerate() {
             let read = async {
-                if names::tenant(&request.parent, &tenant).is_ok_and(|of| of != tenant) {
+                let of = names::tenant(&request.parent, &tenant);
+                if of.as_ref().is_ok_and(|of| *of != tenant) {
                     let text = format!("is neither left out nor the batch's tenants/{tenant}");
                     return Err(status::invalid(&super::violation("parent", text)));
                 }
+                // In full: what is left out would be the caller's own tenant, and an administrator's may be another.
+                let parent = of.map_or(request.parent, |of| format!("tenants/{of}"));
+                let request = proto::CreateJobRequest { parent, ..request };
                 Submission::open(caller, request, &self.limits, permit)?.close(trace_parent.clone()).await
             };
             news.push(read.await.map_err(|found| status::of_request(index, &found))?);

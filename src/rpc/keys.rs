@@ -1,4 +1,4 @@
-//! API keys: which tenant a key stands for. Only hashes are kept.
+//! API keys: which tenant a key stands for, and what it allows. Only hashes are kept.
 //!
 //! A key is random and long, so that its plain SHA-256 gives nothing away and needs neither salt nor stretching.
 
@@ -22,6 +22,9 @@ const MAX_KEY_CHARS: usize = 256;
 /// Before the hash of a key that is not written itself.
 const HASHED: &str = "sha256:";
 
+/// What an entry looks like, for errors.
+const FORM: &str = "TENANT:[SCOPE:]KEY or TENANT:[SCOPE:]sha256:HEX";
+
 type Digest = [u8; 32];
 
 /// What is kept of a key that a caller presented, to see later whether it still stands.
@@ -34,20 +37,56 @@ impl Hash {
     }
 }
 
-/// Keys and the tenants they stand for.
+/// What a key allows. Each scope allows what those before it do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Scope {
+    /// Calls that change nothing.
+    ReadOnly,
+    /// Every call on the tenant's own jobs and inputs.
+    Ordinary,
+    /// The administration, and every call on the jobs and inputs of all tenants.
+    Admin,
+}
+
+impl Scope {
+    /// Every scope.
+    pub const ALL: [Scope; 3] = [Scope::ReadOnly, Scope::Ordinary, Scope::Admin];
+
+    /// The scope's name in files of keys and in refusals.
+    pub fn name(self) -> &'static str {
+        match self {
+            Scope::ReadOnly => "read-only",
+            Scope::Ordinary => "ordinary",
+            Scope::Admin => "admin",
+        }
+    }
+
+    fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|scope| scope.name() == name)
+    }
+}
+
+/// What a key stands for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Grant {
+    pub tenant: String,
+    pub scope: Scope,
+}
+
+/// Keys and what they stand for.
 #[derive(Clone, Default, PartialEq, Eq)]
 pub struct KeyRing {
-    keys: Vec<(Digest, String)>,
+    keys: Vec<(Digest, Grant)>,
 }
 
 /// An entry that is none. Says where it stands and what would be right, and nothing of what it holds.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Error {
-    #[error("entry {entry} {problem}; right would be TENANT:KEY or TENANT:sha256:HEX")]
+    #[error("entry {entry} {problem}; right would be {FORM}")]
     Entry { entry: usize, problem: &'static str },
-    #[error("entries {first} and {second} have the same key: a key stands for one tenant")]
+    #[error("entries {first} and {second} have the same key: a key stands for one tenant and one scope")]
     Repeated { first: usize, second: usize },
-    #[error("there is no key in it; right would be lines TENANT:KEY or TENANT:sha256:HEX")]
+    #[error("there is no key in it; right would be lines {FORM}")]
     Empty,
 }
 
@@ -65,7 +104,7 @@ impl KeyRing {
     fn parse(text: &str) -> Result<Self, Error> {
         let lines = text.lines().map(|line| line.split_once('#').map_or(line, |(entry, _)| entry));
         let entries = lines.flat_map(|line| line.split(',')).map(str::trim).filter(|entry| !entry.is_empty());
-        let mut keys: Vec<(Digest, String)> = Vec::new();
+        let mut keys: Vec<(Digest, Grant)> = Vec::new();
         for (k, entry) in entries.enumerate() {
             let parsed = parse(entry).map_err(|problem| Error::Entry { entry: k + 1, problem })?;
             if let Some(first) = keys.iter().position(|(known, _)| *known == parsed.0) {
@@ -84,16 +123,16 @@ impl KeyRing {
 
     /// The tenant that a key stands for.
     pub fn tenant_of(&self, key: &str) -> Option<&str> {
-        self.tenant_of_hash(&Hash::of(key))
+        self.grant_of_hash(&Hash::of(key)).map(|grant| grant.tenant.as_str())
     }
 
-    /// The tenant that the key of this hash stands for. Compares with every key, each to its last byte, so that the
-    /// time tells nothing.
-    pub fn tenant_of_hash(&self, key: &Hash) -> Option<&str> {
+    /// What the key of this hash stands for. Compares with every key, each to its last byte, so that the time tells
+    /// nothing.
+    pub fn grant_of_hash(&self, key: &Hash) -> Option<&Grant> {
         let mut found = None;
-        for (known, tenant) in &self.keys {
+        for (known, grant) in &self.keys {
             if bool::from(known.ct_eq(&key.0)) {
-                found = Some(tenant.as_str());
+                found = Some(grant);
             }
         }
         found
@@ -123,8 +162,15 @@ impl FromStr for KeyRing {
     }
 }
 
-fn parse(entry: &str) -> Result<(Digest, String), &'static str> {
+fn parse(entry: &str) -> Result<(Digest, Grant), &'static str> {
     let (tenant, key) = entry.split_once(':').ok_or("has no tenant")?;
+    // No key contains a colon.
+    let (scope, key) = match key.split_once(':') {
+        Some((word, rest)) if format!("{word}:") != HASHED => {
+            (Scope::from_name(word).ok_or("has a scope that is not read-only, ordinary or admin")?, rest)
+        }
+        _ => (Scope::Ordinary, key),
+    };
     if !JobName::is_id(tenant) {
         return Err("has a tenant that is not 1 to 63 of a-z, 0-9 and -, or begins or ends with -");
     }
@@ -132,7 +178,7 @@ fn parse(entry: &str) -> Result<(Digest, String), &'static str> {
         Some(hex) => from_hex(hex).ok_or("has a hash that is not 64 hexadecimal digits")?,
         None => digest(checked(key)?.as_bytes()),
     };
-    Ok((digest, tenant.to_owned()))
+    Ok((digest, Grant { tenant: tenant.to_owned(), scope }))
 }
 
 /// A key, if it is one: what a bearer token may hold (RFC 6750, section 2.1).
@@ -164,7 +210,7 @@ fn from_hex(text: &str) -> Option<Digest> {
 impl fmt::Debug for KeyRing {
     /// Tenants, no hashes.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let tenants: BTreeSet<_> = self.keys.iter().map(|(_, tenant)| tenant.as_str()).collect();
+        let tenants: BTreeSet<_> = self.keys.iter().map(|(_, grant)| grant.tenant.as_str()).collect();
         write!(f, "KeyRing({} keys of {tenants:?})", self.keys.len())
     }
 }
@@ -192,14 +238,14 @@ impl Sources {
     /// Every key there is now: none where the file lost its last one, which locks everyone out.
     ///
     /// # Errors
-    /// See [`KeyRing::read`]; a key that the two give to different tenants.
+    /// See [`KeyRing::read`]; a key that the two give to different tenants or scopes.
     pub fn load(&self) -> Result<KeyRing, String> {
         let ring = self.file.as_deref().map(KeyRing::read).transpose()?.unwrap_or_default();
         let Some(fixed) = &self.fixed else { return Ok(ring) };
         let disputed =
-            |(digest, tenant): &(Digest, String)| fixed.keys.iter().any(|(other, of)| other == digest && of != tenant);
+            |(digest, grant): &(Digest, Grant)| fixed.keys.iter().any(|(other, of)| other == digest && of != grant);
         match ring.keys.iter().any(disputed) {
-            true => Err("auth.keys and auth.keys_file give one key to two tenants".into()),
+            true => Err("auth.keys and auth.keys_file give one key to two tenants or two scopes".into()),
             false => Ok(ring.with(fixed)),
         }
     }
@@ -239,6 +285,22 @@ mod tests {
     }
 
     #[test]
+    fn a_scope_stands_between_tenant_and_key() {
+        let hash = digest(B.as_bytes()).map(|byte| format!("{byte:02x}")).concat();
+        let scope = |entry: &str, key: &str| {
+            let ring: KeyRing = entry.parse().expect(entry);
+            ring.grant_of_hash(&Hash::of(key)).map(|grant| (grant.tenant.clone(), grant.scope))
+        };
+        let north = |scope| Some(("north".to_owned(), scope));
+        assert_eq!(scope(&format!("north:{A}"), A), north(Scope::Ordinary));
+        for of in Scope::ALL {
+            assert_eq!(scope(&format!("north:{}:{A}", of.name()), A), north(of));
+            assert_eq!(scope(&format!("north:{}:sha256:{hash}", of.name()), B), north(of));
+        }
+        assert!(Scope::ALL.is_sorted(), "each allows what those before it do");
+    }
+
+    #[test]
     fn file_and_environment_add_up_and_do_not_dispute_a_key() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let path = directory.path().join("keys.txt");
@@ -249,8 +311,10 @@ mod tests {
         };
         let both = load(&format!("south:{B},north:{A}")).expect("no dispute");
         assert_eq!((both.tenant_of(A), both.tenant_of(B)), (Some("north"), Some("south")));
-        let error = load(&format!("south:{A}")).expect_err("disputed");
-        assert!(error.contains("two tenants") && !error.contains(A), "{error}");
+        for other in [format!("south:{A}"), format!("north:admin:{A}")] {
+            let error = load(&other).expect_err("disputed");
+            assert!(error.contains("two tenants") && !error.contains(A), "{error}");
+        }
         // A file without keys adds none, and is no beginning where there is nothing else.
         std::fs::write(&path, "# none\n").expect("written");
         assert_eq!(load(&format!("south:{B}")).expect("one key").tenant_of(B), Some("south"));
@@ -277,6 +341,9 @@ mod tests {
             (format!("north:{}", short.repeat(30)), "more than 256"),
             (format!("north:{A} {short}"), "other characters"),
             (format!("north:sha256:{A}"), "64 hexadecimal digits"),
+            (format!("north:root:{A}"), "has a scope"),
+            (format!("north:admin:{short}"), "fewer than 32"),
+            (format!("north:admin:{A},north:{A}"), "entries 1 and 2"),
             (format!("north:{A},south:{B},west:{A}"), "entries 1 and 3"),
             ("# none\n".to_owned(), "no key"),
         ];

@@ -10,33 +10,44 @@ use tonic::codegen::http::{HeaderMap, Request, Response};
 use tonic::{Code, Status};
 use tower::{Layer, Service};
 
+use super::keys::Scope::{self, Ordinary, ReadOnly};
 use crate::telemetry::metrics::{RpcCall, UNKNOWN_METHOD};
 
-/// Every method that this server offers. The path of a request is only looked up here: taken as a label, it would let
-/// a client make series without end.
-const METHODS: [&str; 17] = [
-    "scpsfm.v1.CalibrationService/Solve",
-    "scpsfm.v1.CalibrationService/GetCapabilities",
-    "scpsfm.v1.JobService/CreateJob",
-    "scpsfm.v1.JobService/BatchCreateJobs",
-    "scpsfm.v1.JobService/GetJob",
-    "scpsfm.v1.JobService/ListJobs",
-    "scpsfm.v1.JobService/WatchJob",
-    "scpsfm.v1.JobService/CancelJob",
-    "scpsfm.v1.JobService/DeleteJob",
-    "scpsfm.v1.JobService/GetJobResult",
-    "scpsfm.v1.JobService/ReadJobResult",
-    "scpsfm.v1.InputService/UploadInput",
-    "scpsfm.v1.InputService/GetUploadStatus",
-    "scpsfm.v1.InputService/ListInputs",
-    "scpsfm.v1.InputService/DeleteInput",
-    "grpc.health.v1.Health/Check",
-    "grpc.health.v1.Health/Watch",
+/// Every method that this server offers, with the scope that a key needs for it. The path of a request is only looked
+/// up here: taken as a label, it would let a client make series without end.
+const METHODS: [(&str, Scope); 17] = [
+    ("scpsfm.v1.CalibrationService/Solve", Ordinary),
+    ("scpsfm.v1.CalibrationService/GetCapabilities", ReadOnly),
+    ("scpsfm.v1.JobService/CreateJob", Ordinary),
+    ("scpsfm.v1.JobService/BatchCreateJobs", Ordinary),
+    ("scpsfm.v1.JobService/GetJob", ReadOnly),
+    ("scpsfm.v1.JobService/ListJobs", ReadOnly),
+    ("scpsfm.v1.JobService/WatchJob", ReadOnly),
+    ("scpsfm.v1.JobService/CancelJob", Ordinary),
+    ("scpsfm.v1.JobService/DeleteJob", Ordinary),
+    ("scpsfm.v1.JobService/GetJobResult", ReadOnly),
+    ("scpsfm.v1.JobService/ReadJobResult", ReadOnly),
+    ("scpsfm.v1.InputService/UploadInput", Ordinary),
+    ("scpsfm.v1.InputService/GetUploadStatus", ReadOnly),
+    ("scpsfm.v1.InputService/ListInputs", ReadOnly),
+    ("scpsfm.v1.InputService/DeleteInput", Ordinary),
+    ("grpc.health.v1.Health/Check", ReadOnly),
+    ("grpc.health.v1.Health/Watch", ReadOnly),
 ];
 
-fn method_of(path: &str) -> &'static str {
+fn find(path: &str) -> Option<(&'static str, Scope)> {
     let name = path.strip_prefix('/').unwrap_or(path);
-    METHODS.into_iter().find(|method| *method == name).unwrap_or(UNKNOWN_METHOD)
+    METHODS.into_iter().find(|(method, _)| *method == name)
+}
+
+fn method_of(path: &str) -> &'static str {
+    find(path).map_or(UNKNOWN_METHOD, |(method, _)| method)
+}
+
+/// The scope that a key needs for the method at this path. What is not listed is reflection, or is not there, which its
+/// caller is told by `UNIMPLEMENTED`.
+pub fn scope_of(path: &str) -> Scope {
+    find(path).map_or(Scope::ReadOnly, |(_, scope)| scope)
 }
 
 /// The layer; goes around everything else.
@@ -232,11 +243,15 @@ mod tests {
                 for method in &service.method {
                     let name = format!("{}.{}/{}", file.package(), service.name(), method.name());
                     assert_eq!(method_of(&format!("/{name}")), name);
+                    // Methods whose names begin with these words change nothing.
+                    let reads = ["Get", "List", "Watch", "Read"].iter().any(|verb| method.name().starts_with(verb));
+                    let expected = if reads { Scope::ReadOnly } else { Scope::Ordinary };
+                    assert_eq!(scope_of(&format!("/{name}")), expected, "{name}");
                     count += 1;
                 }
             }
         }
-        assert_eq!(count, 15);
+        assert_eq!((count, METHODS.len()), (15, 17), "health has two");
         assert_eq!(method_of("/scpsfm.v1.JobService/Invented"), UNKNOWN_METHOD);
     }
 }

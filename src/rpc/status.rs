@@ -8,6 +8,7 @@
 //! | `UNAUTHENTICATED` | `API_KEY_MISSING` | the server asks for a key, and the call carries none |
 //! | `UNAUTHENTICATED` | `API_KEY_UNKNOWN` | the call carries a key that stands for no tenant |
 //! | `UNAUTHENTICATED` | `API_KEY_WITHDRAWN` | the key was withdrawn while the call lasted, within seconds |
+//! | `PERMISSION_DENIED` | `SCOPE` | the key's scope does not allow the call; `metadata["scope"]` is the least one that does |
 //! | `ALREADY_EXISTS` | `JOB_ID_TAKEN` | the tenant has a job of that id |
 //! | | `REQUEST_ID_REUSED` | the request id came before with another body |
 //! | | `UPLOAD_ID_REUSED` | the upload id came before with another length or hash |
@@ -42,6 +43,7 @@ use std::time::Duration;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt};
 
+use super::keys::Scope;
 use crate::domain::job::{JobName, JobState};
 use crate::domain::{InputName, InvalidInput, Oversize, Sha256Digest, Violation};
 use crate::engine::{self, TakenId};
@@ -169,6 +171,13 @@ pub fn unknown_key() -> Status {
 pub fn withdrawn_key() -> Status {
     let message = "the API key was withdrawn while the call lasted";
     status(Code::Unauthenticated, "API_KEY_WITHDRAWN", message, ErrorDetails::new())
+}
+
+/// A call that the scope of its key does not allow.
+pub fn scope_missing(needed: Scope) -> Status {
+    let message = format!("the API key does not allow this call: it needs the scope {}", needed.name());
+    let metadata = HashMap::from([("scope".to_owned(), needed.name().to_owned())]);
+    status_with(Code::PermissionDenied, "SCOPE", metadata, message, ErrorDetails::new())
 }
 
 /// No such uploaded input, or another tenant's: a caller cannot tell them apart.

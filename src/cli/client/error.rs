@@ -27,7 +27,7 @@ pub enum Error {
     /// The server will not do it: no such job, no result yet, an id that is taken, more than it ever has room for.
     #[error("{0}")]
     Refused(String),
-    /// One of the two does not trust the other: a certificate, or a key.
+    /// One of the two does not trust the other: a certificate, or a key, which may also lack a scope.
     #[error("{0}")]
     NotLetIn(String),
     #[error("the job was cancelled")]
@@ -108,11 +108,8 @@ impl Error {
             Code::OutOfRange => {
                 Error::Refused(format!("{message}; `solve --server` and `upload` send a large input in parts"))
             }
-            Code::NotFound
-            | Code::AlreadyExists
-            | Code::PermissionDenied
-            | Code::FailedPrecondition
-            | Code::Aborted => Error::Refused(message),
+            Code::NotFound | Code::AlreadyExists | Code::FailedPrecondition | Code::Aborted => Error::Refused(message),
+            Code::PermissionDenied => Error::NotLetIn(format!("{server}: {message}")),
             Code::Unauthenticated => {
                 Error::NotLetIn(format!("{server}: {message}; here: --api-key-file, or the variable SCPSFM_API_KEY"))
             }
