@@ -5,8 +5,12 @@ use std::path::PathBuf;
 use std::{env, fs};
 
 /// The files that nothing else imports; the others follow from them.
-const ROOTS: [&str; 3] =
-    ["scpsfm/v1/calibration_service.proto", "scpsfm/v1/input_service.proto", "scpsfm/v1/job_service.proto"];
+const ROOTS: [&str; 4] = [
+    "scpsfm/v1/admin_service.proto",
+    "scpsfm/v1/calibration_service.proto",
+    "scpsfm/v1/input_service.proto",
+    "scpsfm/v1/job_service.proto",
+];
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-changed=proto");

@@ -11,6 +11,7 @@ macro_rules! tell {
     }};
 }
 
+pub mod admin;
 pub mod args;
 pub mod cancel;
 pub mod client;
@@ -29,8 +30,10 @@ pub mod interrupt;
 pub mod job_view;
 pub mod list;
 pub mod prior_file;
+pub mod priority;
 pub mod progress;
 pub mod result;
+pub mod retry;
 pub mod scene_args;
 pub mod serve;
 pub mod service;
@@ -75,8 +78,11 @@ pub enum Command {
     Get(get::Args),
     List(list::Args),
     Cancel(cancel::Args),
+    Retry(retry::Args),
+    Priority(priority::Args),
     Delete(delete::Args),
     Result(result::Args),
+    Admin(admin::Args),
     Synth(synth::Args),
     Evaluate(evaluate::Args),
     TrainPrior(train_prior::Args),
@@ -122,8 +128,11 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         Command::Get(args) => runtime.block_on(get::run(args)),
         Command::List(args) => runtime.block_on(list::run(args)),
         Command::Cancel(args) => runtime.block_on(cancel::run(args)),
+        Command::Retry(args) => runtime.block_on(retry::run(args)),
+        Command::Priority(args) => runtime.block_on(priority::run(args)),
         Command::Delete(args) => runtime.block_on(delete::run(args)),
         Command::Result(args) => runtime.block_on(result::run(args)),
+        Command::Admin(args) => runtime.block_on(admin::run(args)),
         Command::Synth(args) => synth::run(args),
         Command::Evaluate(args) => runtime.block_on(evaluate::run(args)),
         Command::TrainPrior(args) => runtime.block_on(train_prior::run(args)),

@@ -20,7 +20,7 @@ may stand in the environment as SCPSFM_<SECTION>__<KEY>, such as SCPSFM_ENGINE__
 keys that have a value.
 
 When it serves, lines on stdout say where: `grpc http://...` (or https), `metrics http://...` and `http http://...` (JSON; \
-/openapi.json describes it). SIGTERM or Ctrl-C drains: \
+/openapi.json describes it). SIGTERM, Ctrl-C or `scpsfm admin drain` drains: \
 new jobs are refused, running ones get engine.drain_seconds to finish and then go back to the queue for the next start; \
 a second signal gives them back now. That is a clean end (0); a third ends at once (130), and jobs that still run lose an \
 attempt, of which they have engine.max_attempts.
@@ -243,11 +243,16 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if let Some(address) = service.http_address() {
         print(&format!("http {scheme}://{address}"))?;
     }
+    let drain_asked = service.drain_asked();
     let failed = tokio::select! {
         ended = service.wait() => {
             Some(ended.err().unwrap_or_else(|| Failure::internal("the gRPC server ended without being asked to")))
         }
         () = signals.next() => None,
+        () = drain_asked => {
+            tracing::info!("a caller asked this server to drain");
+            None
+        }
     };
     ready.set(false);
     if let Some(failure) = failed {

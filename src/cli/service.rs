@@ -101,6 +101,11 @@ impl Service {
         self.engine.store_state()
     }
 
+    /// Waits until a caller asks the server to drain.
+    pub fn drain_asked(&self) -> impl Future<Output = ()> + use<> {
+        self.engine.drain_asked()
+    }
+
     /// Ends only when the server fails; [`abandon`](Self::abandon) is what is left to do then.
     ///
     /// # Errors

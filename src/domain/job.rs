@@ -98,18 +98,19 @@ impl JobState {
         Self::ALL.into_iter().find(|state| state.name() == name)
     }
 
-    /// Whether the job has ended for good.
+    /// Whether the job has ended: it changes no more, unless it is retried.
     pub fn is_terminal(self) -> bool {
         !matches!(self, JobState::Queued | JobState::Running)
     }
 
     /// Whether a job may go from this state to `next`. A running job returns to the queue when its worker gives the
-    /// lease back or loses it.
+    /// lease back or loses it, an ended one that has no result when it is retried.
     pub fn may_become(self, next: JobState) -> bool {
         match self {
             JobState::Queued => !matches!(next, JobState::Queued | JobState::Succeeded),
             JobState::Running => next != JobState::Running,
-            _ => false,
+            JobState::Succeeded => false,
+            JobState::Failed | JobState::Cancelled | JobState::DeadlineExceeded => next == JobState::Queued,
         }
     }
 }
@@ -243,7 +244,7 @@ pub struct Job {
     /// Larger is sooner; 0 is the default.
     pub priority: i32,
     pub create_time: SystemTime,
-    /// When the first attempt began.
+    /// When the first attempt began, of those since the last retry.
     pub start_time: Option<SystemTime>,
     pub end_time: Option<SystemTime>,
     /// A job without a result at this time expires.
@@ -264,10 +265,12 @@ pub struct Job {
 
 impl Job {
     /// Changes whenever the job does, but for its latest progress: another one after each event and each change of
-    /// `attached_calls`, and another job's of the same name, which was created at another time, is another.
+    /// `attached_calls` or of the priority, and another job's of the same name, which was created at another time, is
+    /// another.
     pub fn etag(&self) -> String {
         let created = self.create_time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_micros();
-        let mut etag = format!("{created:x}-{:x}-{}", self.last_sequence, u8::from(self.cancel_requested));
+        let cancels = u8::from(self.cancel_requested);
+        let mut etag = format!("{created:x}-{:x}-{cancels}-{}", self.last_sequence, self.priority);
         if let Some(AttachedCalls { attached, detached }) = self.attached_calls {
             etag.push_str(&format!("-{attached:x}-{detached:x}"));
         }
@@ -319,11 +322,15 @@ mod tests {
     }
 
     #[test]
-    fn terminal_states_are_final_and_names_round_trip() {
+    fn an_ended_job_goes_on_by_a_retry_alone_and_names_round_trip() {
         for state in JobState::ALL {
             assert_eq!(JobState::from_name(state.name()), Some(state));
-            let goes_on = JobState::ALL.iter().any(|&next| state.may_become(next));
-            assert_eq!(goes_on, !state.is_terminal(), "{}", state.name());
+            let next: Vec<_> = JobState::ALL.into_iter().filter(|&next| state.may_become(next)).collect();
+            match state {
+                JobState::Succeeded => assert_eq!(next, []),
+                _ if state.is_terminal() => assert_eq!(next, [JobState::Queued], "{}", state.name()),
+                _ => assert!(next.len() > 1, "{}", state.name()),
+            }
         }
     }
 }

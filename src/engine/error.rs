@@ -38,6 +38,12 @@ pub enum Error {
     /// Only ended jobs can be deleted.
     #[error("{0}")]
     NotEnded(String),
+    /// A job that has succeeded is not retried.
+    #[error("{0}")]
+    Succeeded(String),
+    /// Only waiting jobs get another priority.
+    #[error("{0}")]
+    NotQueued(String),
     /// The job has changed since the caller read it.
     #[error("{0}")]
     EtagMismatch(String),
@@ -72,6 +78,8 @@ impl From<store::Error> for Error {
             store::Error::BatchTooLarge(oversize) => Error::BatchTooLarge(oversize),
             store::Error::AlreadyExists(taken) => Error::AlreadyExists(taken),
             store::Error::NotEnded(..) => Error::NotEnded(error.to_string()),
+            store::Error::Succeeded(_) => Error::Succeeded(error.to_string()),
+            store::Error::NotQueued(..) => Error::NotQueued(error.to_string()),
             store::Error::EtagMismatch(_) => Error::EtagMismatch(error.to_string()),
             store::Error::PageToken => Error::InvalidArgument(Violation::of("page_token", error.to_string()).into()),
             store::Error::QueueFull(bound) => Error::QueueFull {

@@ -2,6 +2,7 @@
 //!
 //! Knows nothing of transport. Depends on `store`, `solver`, `telemetry` and `domain`; its channels never leave it.
 
+mod admin;
 mod ahead;
 mod attempt;
 mod clock;
@@ -28,8 +29,8 @@ use tokio::sync::{Notify, watch as channel};
 use tokio_util::sync::CancellationToken;
 
 pub use crate::store::{
-    EncodedResult, InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, StoredInput, TakenId,
-    UploadBounds, UploadStatus,
+    EncodedResult, InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, QueueReport,
+    StoredInput, TakenId, TenantQueue, UploadBounds, UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;
 pub use clock::Clock;
@@ -194,6 +195,8 @@ struct Inner {
     phase: channel::Sender<Phase>,
     /// Cancelled once what runs is to go back to the queue: at the end of a drain's bound, or before by a hurry.
     hurried: CancellationToken,
+    /// Cancelled once this server was asked to drain, which is for whoever runs the engine to do.
+    drain_asked: CancellationToken,
     /// What the last sweep found.
     store_state: channel::Sender<StoreState>,
     pool: Mutex<drain::WorkerPool>,
@@ -229,6 +232,7 @@ impl Engine {
             queue_changed: Notify::new(),
             phase: channel::Sender::new(Phase::Open),
             hurried: CancellationToken::new(),
+            drain_asked: CancellationToken::new(),
             store_state: channel::Sender::new(StoreState::Sound),
             pool: Mutex::default(),
             recovered_jobs: recovered.len(),

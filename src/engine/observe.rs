@@ -2,7 +2,8 @@
 
 pub(super) use crate::telemetry::metrics::{
     AttemptLost, Deletion, GivenUp, Refusal, UploadRefusal, attempt_lost, engine_size, input_created, job_created,
-    job_finished as job_ended, jobs_deleted, queue_depth, refused, upload_refused, uploaded, uploads_given_up,
+    job_finished as job_ended, jobs_deleted, queue_depth, queue_paused, refused, upload_refused, uploaded,
+    uploads_given_up,
 };
 pub(super) use crate::telemetry::{Attempt, waited};
 

@@ -138,6 +138,7 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
     let mut phase = inner.phase.subscribe();
     let mut ticks = tokio::time::interval(SWEEP_PERIOD);
     let mut counted = Instant::now();
+    let mut paused = false;
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     while *phase.borrow_and_update() != Phase::Closed {
         tokio::select! {
@@ -154,9 +155,24 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
         }
         counted = Instant::now();
         match inner.store.load().await {
-            Ok(load) => observe::queue_depth(load.queued),
+            Ok(load) => {
+                observe::queue_depth(load.queued);
+                if std::mem::replace(&mut paused, load.paused) != load.paused {
+                    pause_changed(load.paused);
+                }
+            }
             Err(error) => tracing::warn!(%error, "cannot count the queue"),
         }
+    }
+}
+
+/// Says that the queue was paused or resumed, on whichever server, or is paused at the start.
+fn pause_changed(paused: bool) {
+    observe::queue_paused(paused);
+    if paused {
+        tracing::warn!("the queue is paused: no server of the store begins a job until it is resumed");
+    } else {
+        tracing::info!("the queue is resumed");
     }
 }
 

@@ -16,9 +16,10 @@ use crate::domain::job::{EventBody, JobEvent, JobName};
 const WATCH_POLL: Duration = Duration::from_secs(1);
 
 /// Events read from the store at once: a job has some dozens; a reader of thousands holds no more than this.
-const READ_AHEAD: u32 = 128;
+pub(super) const READ_AHEAD: u32 = 128;
 
-/// The events of a job, in order, without gap or repeat, up to the event of its terminal state.
+/// The events of a job, in order, without gap or repeat, up to the event of its end: the last one where it was retried
+/// after an earlier one.
 ///
 /// Durable events are read from the store when they are asked for: a slow watcher holds nothing and delays nobody.
 /// Interim weights arrive between them, only the latest.
@@ -60,7 +61,7 @@ impl Watch {
                 format!("{after} is beyond the job's latest event {}; start from one received", job.last_sequence);
             return Err(Error::InvalidArgument(Violation::of("after_sequence", description).into()));
         }
-        // The terminal event is the last: nothing after it, nothing to wait for.
+        // An end is the last event as long as the job is not retried: nothing to wait for.
         let ended = job.state.is_terminal() && after == job.last_sequence;
         let phase = inner.phase.subscribe();
         Ok(Self {
@@ -77,7 +78,7 @@ impl Watch {
         })
     }
 
-    /// The next event; `None` after the terminal state's. After an error nothing follows.
+    /// The next event; `None` after the job's end. After an error nothing follows.
     ///
     /// Dropping the future loses nothing.
     ///
@@ -89,8 +90,7 @@ impl Watch {
         }
         let event = self.advance().await;
         self.ended = match &event {
-            Ok(JobEvent { body: EventBody::State { state, .. }, .. }) => state.is_terminal(),
-            Ok(_) => false,
+            Ok(event) => is_end(event) && self.ahead.is_empty(),
             Err(_) => true,
         };
         Some(event)
@@ -103,14 +103,17 @@ impl Watch {
 
     async fn advance(&mut self) -> Result<JobEvent, Error> {
         loop {
-            if let Some(event) = self.ahead.pop_front() {
+            // Where an end is the last event that was read, and not all were, a retry may follow it.
+            let may_go_on = self.ahead.len() == 1 && !self.caught_up && self.ahead.front().is_some_and(is_end);
+            if !may_go_on && let Some(event) = self.ahead.pop_front() {
                 return Ok(event);
             }
             if !self.caught_up || self.version.has_changed().unwrap_or(true) {
                 self.version.mark_unchanged();
                 self.caught_up = false;
-                self.ahead = self.inner.store.events_after(&self.name, self.after, READ_AHEAD).await?.into();
-                self.caught_up = self.ahead.len() < READ_AHEAD as usize;
+                let read = self.inner.store.events_after(&self.name, self.after, READ_AHEAD).await?;
+                self.caught_up = read.len() < READ_AHEAD as usize;
+                self.ahead.extend(read);
                 self.after = self.ahead.back().and_then(|event| event.sequence).unwrap_or(self.after);
                 continue;
             }
@@ -132,4 +135,9 @@ impl Watch {
             }
         }
     }
+}
+
+/// Whether an event tells that the job ended.
+fn is_end(event: &JobEvent) -> bool {
+    matches!(event.body, EventBody::State { state, .. } if state.is_terminal())
 }

@@ -10,7 +10,7 @@ use tonic::{Request, Response, Status};
 use tracing::Instrument;
 
 use super::caller::Caller;
-use super::convert::{job, list, names};
+use super::convert::{create, job, list, names};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::submission::{self, Submission};
 use super::{proto, status};
@@ -213,6 +213,25 @@ impl proto::job_service_server::JobService for Jobs {
         let etag = Some(request.get_ref().etag.as_str()).filter(|etag| !etag.is_empty());
         self.engine.delete(&name, etag).await.map_err(status::from_engine)?;
         Ok(Response::new(()))
+    }
+
+    async fn retry_job(&self, request: Request<proto::RetryJobRequest>) -> Result<Response<proto::Job>, Status> {
+        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
+        let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
+        let retried = self.engine.retry(&name, etag).await.map_err(status::from_engine)?;
+        Ok(Response::new(job::to_wire(&retried)))
+    }
+
+    async fn set_job_priority(
+        &self,
+        request: Request<proto::SetJobPriorityRequest>,
+    ) -> Result<Response<proto::Job>, Status> {
+        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
+        let proto::SetJobPriorityRequest { priority, etag, .. } = request.into_inner();
+        create::check_priority(priority, "priority").map_err(|found| status::invalid(&found.into()))?;
+        let etag = Some(etag.as_str()).filter(|etag| !etag.is_empty());
+        let changed = self.engine.set_priority(&name, etag, priority).await.map_err(status::from_engine)?;
+        Ok(Response::new(job::to_wire(&changed)))
     }
 
     async fn get_job_result(

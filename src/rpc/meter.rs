@@ -10,12 +10,12 @@ use tonic::codegen::http::{HeaderMap, Request, Response};
 use tonic::{Code, Status};
 use tower::{Layer, Service};
 
-use super::keys::Scope::{self, Ordinary, ReadOnly};
+use super::keys::Scope::{self, Admin, Ordinary, ReadOnly};
 use crate::telemetry::metrics::{RpcCall, UNKNOWN_METHOD};
 
 /// Every method that this server offers, with the scope that a key needs for it. The path of a request is only looked
 /// up here: taken as a label, it would let a client make series without end.
-const METHODS: [(&str, Scope); 17] = [
+const METHODS: [(&str, Scope); 23] = [
     ("scpsfm.v1.CalibrationService/Solve", Ordinary),
     ("scpsfm.v1.CalibrationService/GetCapabilities", ReadOnly),
     ("scpsfm.v1.JobService/CreateJob", Ordinary),
@@ -25,12 +25,18 @@ const METHODS: [(&str, Scope); 17] = [
     ("scpsfm.v1.JobService/WatchJob", ReadOnly),
     ("scpsfm.v1.JobService/CancelJob", Ordinary),
     ("scpsfm.v1.JobService/DeleteJob", Ordinary),
+    ("scpsfm.v1.JobService/RetryJob", Ordinary),
+    ("scpsfm.v1.JobService/SetJobPriority", Ordinary),
     ("scpsfm.v1.JobService/GetJobResult", ReadOnly),
     ("scpsfm.v1.JobService/ReadJobResult", ReadOnly),
     ("scpsfm.v1.InputService/UploadInput", Ordinary),
     ("scpsfm.v1.InputService/GetUploadStatus", ReadOnly),
     ("scpsfm.v1.InputService/ListInputs", ReadOnly),
     ("scpsfm.v1.InputService/DeleteInput", Ordinary),
+    ("scpsfm.v1.AdminService/GetQueue", Admin),
+    ("scpsfm.v1.AdminService/PauseQueue", Admin),
+    ("scpsfm.v1.AdminService/ResumeQueue", Admin),
+    ("scpsfm.v1.AdminService/DrainServer", Admin),
     ("grpc.health.v1.Health/Check", ReadOnly),
     ("grpc.health.v1.Health/Watch", ReadOnly),
 ];
@@ -245,13 +251,17 @@ mod tests {
                     assert_eq!(method_of(&format!("/{name}")), name);
                     // Methods whose names begin with these words change nothing.
                     let reads = ["Get", "List", "Watch", "Read"].iter().any(|verb| method.name().starts_with(verb));
-                    let expected = if reads { Scope::ReadOnly } else { Scope::Ordinary };
+                    let expected = match (service.name(), reads) {
+                        ("AdminService", _) => Scope::Admin,
+                        (_, true) => Scope::ReadOnly,
+                        (_, false) => Scope::Ordinary,
+                    };
                     assert_eq!(scope_of(&format!("/{name}")), expected, "{name}");
                     count += 1;
                 }
             }
         }
-        assert_eq!((count, METHODS.len()), (15, 17), "health has two");
+        assert_eq!((count, METHODS.len()), (21, 23), "health has two");
         assert_eq!(method_of("/scpsfm.v1.JobService/Invented"), UNKNOWN_METHOD);
     }
 }

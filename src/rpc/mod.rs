@@ -2,6 +2,7 @@
 //!
 //! Depends on `engine`, `telemetry` and `domain`; this module, `http` and the client side of `cli` see prost and tonic.
 
+pub mod admin;
 pub mod auth;
 pub mod calibration;
 pub mod caller;

@@ -18,6 +18,7 @@ use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 use tower::layer::util::{Identity, Stack};
 
+use super::admin::Admin;
 use super::auth::{Authenticate, Authenticated};
 use super::calibration::{self, Calibration};
 use super::explain::{Explain, Explained};
@@ -28,6 +29,7 @@ use super::keys::{self, KeyRing};
 use super::listener::{self, Introduction};
 use super::meter::{Meter, Metered};
 use super::proto::FILE_DESCRIPTOR_SET;
+use super::proto::admin_service_server::AdminServiceServer;
 use super::proto::calibration_service_server::CalibrationServiceServer;
 use super::proto::input_service_server::InputServiceServer;
 use super::proto::job_service_server::JobServiceServer;
@@ -38,7 +40,8 @@ use crate::engine::{Engine, StoreState};
 use crate::telemetry::metrics::{Reloaded, locked_out};
 
 /// Services whose health is told one by one; the empty name is the server's own.
-const HEALTH_NAMES: [&str; 4] = ["", "scpsfm.v1.CalibrationService", "scpsfm.v1.JobService", "scpsfm.v1.InputService"];
+const HEALTH_NAMES: [&str; 5] =
+    ["", "scpsfm.v1.CalibrationService", "scpsfm.v1.JobService", "scpsfm.v1.InputService", "scpsfm.v1.AdminService"];
 
 /// Calls open at once on one connection: some hundred watchers and room for the rest. More wait on the client's side.
 const MAX_STREAMS_PER_CONNECTION: u32 = 1_024;
@@ -394,6 +397,7 @@ fn services(options: &Options, engine: Engine) -> Result<Routes, Error> {
         };
     }
     let services = Routes::new(with_limits!(CalibrationServiceServer::new(calibration)))
+        .add_service(with_limits!(AdminServiceServer::new(Admin::new(engine.clone()))))
         .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits, max_bytes as u64))))
         .add_service(
             with_limits!(InputServiceServer::new(inputs))

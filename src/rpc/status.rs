@@ -26,6 +26,8 @@
 //! | `RESOURCE_EXHAUSTED` | `MEMORY` | the calls under way hold as many bytes as they may together; `RetryInfo`. Nothing was stored but the chunks of an upload |
 //! | `RESOURCE_EXHAUSTED` | `STORE_FULL` | the server's disk is full and nothing was stored; `RetryInfo`. What was acknowledged before is there |
 //! | `FAILED_PRECONDITION` | `JOB_NOT_ENDED` | a job that waits or runs is not deleted; cancel it first |
+//! | `FAILED_PRECONDITION` | `JOB_SUCCEEDED` | a job that has succeeded is not retried |
+//! | `FAILED_PRECONDITION` | `JOB_NOT_QUEUED` | only a job that waits gets another priority |
 //! | `ABORTED` | `ETAG_MISMATCH` | the job changed since its etag was read |
 //! | `FAILED_PRECONDITION` | `RESULT_NOT_READY` | there is no result, yet or for good |
 //! | `UNAVAILABLE` | `DRAINING` | the server is going down; `RetryInfo` |
@@ -266,6 +268,12 @@ pub fn from_engine(error: engine::Error) -> Status {
         }
         engine::Error::NotEnded(sentence) => {
             status(Code::FailedPrecondition, "JOB_NOT_ENDED", sentence, ErrorDetails::new())
+        }
+        engine::Error::Succeeded(sentence) => {
+            status(Code::FailedPrecondition, "JOB_SUCCEEDED", sentence, ErrorDetails::new())
+        }
+        engine::Error::NotQueued(sentence) => {
+            status(Code::FailedPrecondition, "JOB_NOT_QUEUED", sentence, ErrorDetails::new())
         }
         engine::Error::EtagMismatch(sentence) => status(Code::Aborted, "ETAG_MISMATCH", sentence, ErrorDetails::new()),
         engine::Error::InvalidArgument(error) => invalid(&error),

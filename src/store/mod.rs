@@ -30,7 +30,7 @@ pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
     Bound, CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
-    QueueBounds, Request, Swept, Work,
+    QueueBounds, QueueReport, Request, RetryReply, Swept, TenantQueue, Work,
 };
 pub use upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
@@ -60,6 +60,12 @@ pub enum Error {
     /// Only ended jobs can be removed.
     #[error("{0} is {name}; only a job that has ended can be deleted: cancel it first", name = .1.name())]
     NotEnded(JobName, JobState),
+    /// There is nothing to retry of a job that has its result.
+    #[error("{0} has succeeded; only a job that ended without a result is retried")]
+    Succeeded(JobName),
+    /// Only waiting jobs are put in another order.
+    #[error("{0} is {name}; only the priority of a job that waits can be changed", name = .1.name())]
+    NotQueued(JobName, JobState),
     /// The job has changed since the caller read it.
     #[error("{0} has changed since its etag was read")]
     EtagMismatch(JobName),
@@ -157,8 +163,8 @@ pub trait Store: Send + Sync + 'static {
     /// [`Error::NotFound`].
     async fn events_after(&self, name: &JobName, after: u64, limit: u32) -> Result<Vec<JobEvent>, Error>;
 
-    /// Leases the queued job that is next by priority, then age; `None` when nothing is queued. Jobs past their
-    /// deadline are left to [`Store::sweep`].
+    /// Leases the queued job that is next by priority, then age; `None` when nothing is queued, or the queue is paused.
+    /// Jobs past their deadline are left to [`Store::sweep`].
     async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error>;
 
     /// The job that a claim would lease, but for those that are `passed` over, as its claim would return it. It is not
@@ -213,6 +219,33 @@ pub trait Store: Send + Sync + 'static {
     /// # Errors
     /// [`Error::NotFound`], [`Error::EtagMismatch`].
     async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error>;
+
+    /// Puts a job that ended without a result into the queue again, as far as the bounds allow it: with its attempts
+    /// counted anew, without a deadline that has passed, and without a caller that it depends on. One that waits or
+    /// runs is left as it is. With an `etag`, only where it is the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::Succeeded`], [`Error::QueueFull`].
+    async fn retry_job(
+        &self,
+        name: &JobName,
+        etag: Option<&str>,
+        bounds: &QueueBounds,
+        now: SystemTime,
+    ) -> Result<RetryReply, Error>;
+
+    /// Changes the priority of a queued job. With an `etag`, only where it is the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::NotQueued`].
+    async fn set_priority(&self, name: &JobName, etag: Option<&str>, priority: i32) -> Result<Job, Error>;
+
+    /// Pauses the queue, in which no claim finds a job from then on, or resumes it; for every process and over
+    /// restarts. What is so already stays as it is.
+    async fn set_paused(&self, paused: bool, now: SystemTime) -> Result<(), Error>;
+
+    /// The queue as its administrator sees it, with at most `tenants` tenants.
+    async fn queue(&self, tenants: u32) -> Result<QueueReport, Error>;
 
     /// Counts that a call was disconnected that had attached to the job, unless it no longer depends on its calls or is
     /// another one of the same name, which was not `created` then. Returns the job as it stands then.

@@ -6,7 +6,7 @@ use std::time::SystemTime;
 
 use sha2::{Digest, Sha256};
 
-use crate::domain::job::{Failure, Job, JobName, Summary};
+use crate::domain::job::{Failure, Job, JobName, JobState, Summary};
 use crate::domain::progress::Progress;
 use crate::domain::{Oversize, Quota, SolveSettings};
 
@@ -206,6 +206,8 @@ pub struct Load {
     pub queued_bytes: u64,
     pub queued_observations: u64,
     pub running: u64,
+    /// Whether claims find nothing of it.
+    pub paused: bool,
 }
 
 impl Load {
@@ -298,6 +300,36 @@ pub struct CancelReply {
     pub job: Job,
     /// Whether this call ended it.
     pub ended_now: bool,
+}
+
+/// What asking for a retry came to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RetryReply {
+    /// The job as it stands now.
+    pub job: Job,
+    /// Whether this call put it into the queue.
+    pub queued_now: bool,
+}
+
+/// The queue as its administrator sees it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct QueueReport {
+    /// Since when it is paused; `None`: it is not.
+    pub pause_time: Option<SystemTime>,
+    /// How many jobs are in each state.
+    pub jobs: [(JobState, u64); JobState::ALL.len()],
+    /// The job that has waited longest, and since when.
+    pub oldest: Option<(JobName, SystemTime)>,
+    /// Tenants with jobs that wait or run: those with the most waiting jobs first.
+    pub tenants: Vec<TenantQueue>,
+}
+
+/// What one tenant has in the queue.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TenantQueue {
+    pub tenant: String,
+    pub queued: u64,
+    pub running: u64,
 }
 
 /// What a sweep changed; the jobs as they stand now.

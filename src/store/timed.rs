@@ -5,8 +5,8 @@ use std::time::{Duration, SystemTime};
 
 use super::{
     BegunUpload, CancelReply, Claimed, Created, EncodedResult, Ending, Error, Heartbeat, Hint, InputPage, InputQuery,
-    JobPage, JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, Store, StoredInput,
-    Swept, UploadBounds, UploadLease, UploadStatus, Work,
+    JobPage, JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, QueueReport,
+    RetryReply, Store, StoredInput, Swept, UploadBounds, UploadLease, UploadStatus, Work,
 };
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
@@ -103,6 +103,32 @@ impl<S: Store> Store for Timed<S> {
     async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error> {
         let _timer = store_operation("request_cancel");
         self.0.request_cancel(name, etag, now).await
+    }
+
+    async fn retry_job(
+        &self,
+        name: &JobName,
+        etag: Option<&str>,
+        bounds: &QueueBounds,
+        now: SystemTime,
+    ) -> Result<RetryReply, Error> {
+        let _timer = store_operation("retry_job");
+        self.0.retry_job(name, etag, bounds, now).await
+    }
+
+    async fn set_priority(&self, name: &JobName, etag: Option<&str>, priority: i32) -> Result<Job, Error> {
+        let _timer = store_operation("set_priority");
+        self.0.set_priority(name, etag, priority).await
+    }
+
+    async fn set_paused(&self, paused: bool, now: SystemTime) -> Result<(), Error> {
+        let _timer = store_operation("set_paused");
+        self.0.set_paused(paused, now).await
+    }
+
+    async fn queue(&self, tenants: u32) -> Result<QueueReport, Error> {
+        let _timer = store_operation("queue");
+        self.0.queue(tenants).await
     }
 
     async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error> {

@@ -130,6 +130,11 @@ pub fn queue_depth(jobs: u64) {
     gauge!(QUEUE_DEPTH.name).set(jobs as f64);
 }
 
+/// Tells whether the queue is paused.
+pub fn queue_paused(paused: bool) {
+    gauge!(QUEUE_PAUSED.name).set(f64::from(u8::from(paused)));
+}
+
 /// Tells how many jobs may wait and how many threads work; once, at the start of the engine.
 pub fn engine_size(queue_capacity: u64, workers: usize) {
     gauge!(QUEUE_CAPACITY.name).set(queue_capacity as f64);

@@ -123,6 +123,12 @@ def test_losses_and_progress_are_seen_while_a_job_runs_and_it_is_cancelled_and_d
     browser.sees("Cancelled", ".head .badge")
     assert server.state(job) == "JOB_STATE_CANCELLED"
     browser.sees("Cancelled", "#live")
+    browser.button("Retry job").click()
+    browser.sees("waits again", "#notices")
+    browser.sees("Running", ".head .badge")
+    browser.button("Cancel job").click()
+    confirm(browser, "Cancel job")
+    browser.sees("Cancelled", ".head .badge")
     browser.button("Delete job").click()
     confirm(browser, "Delete job")
     browser.sees("is deleted", "#notices")

@@ -2,6 +2,7 @@
 
 mod abuse;
 mod access;
+mod admin;
 mod api;
 mod batch;
 mod chaos;

@@ -379,7 +379,7 @@ def _upload(context: Context, trouble: Trouble, encoded: Encoded) -> Flow[input_
             return stored
 
 
-def _is_last(event: job_pb2.JobEvent) -> bool:
+def _is_end(event: job_pb2.JobEvent) -> bool:
     return event.WhichOneof("body") == "state_change" and state_of(event.state_change.state).is_final
 
 
@@ -394,19 +394,24 @@ class Told:
         """Emits the events of one stream to its end, and returns the last; `None`: it ended without a final state."""
         if stream.accepted:
             trouble.backoff.accepted()
+        # The end of the job, unless more comes: it may have been retried since.
+        last = None
         while True:
-            event = yield Read(stream)
+            try:
+                event = yield Read(stream)
+            except ScpsfmError:
+                if last is None:
+                    raise
+                return last
             if event is None:
-                return None
+                return last
             if event.sequence and event.sequence <= self.sequence:
                 continue
             trouble.backoff.reset()
             self.sequence = event.sequence or self.sequence
             self.name = event.job
             yield Emit(event)
-            if _is_last(event):
-                yield Close(stream)
-                return event
+            last = event if _is_end(event) else None
 
 
 def watch(context: Context, name: str, after: int, timeout: float | None) -> Flow[job_pb2.JobEvent | None]:

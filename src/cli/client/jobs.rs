@@ -109,6 +109,26 @@ impl Client {
         Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
     }
 
+    /// Puts a job that ended without a result into the queue again.
+    ///
+    /// # Errors
+    /// See [`Error`]; [`Error::Refused`] for one that has succeeded.
+    pub async fn retry(&mut self, name: &JobName) -> Result<Job, Error> {
+        let request = proto::RetryJobRequest { name: name.to_string(), etag: String::new() };
+        let answer = self.jobs.retry_job(request).await;
+        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+    }
+
+    /// Changes the priority of a job that waits.
+    ///
+    /// # Errors
+    /// See [`Error`]; [`Error::Refused`] for one that does not wait.
+    pub async fn set_priority(&mut self, name: &JobName, priority: i32) -> Result<Job, Error> {
+        let request = proto::SetJobPriorityRequest { name: name.to_string(), priority, etag: String::new() };
+        let answer = self.jobs.set_job_priority(request).await;
+        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+    }
+
     /// Removes a job that has ended.
     ///
     /// # Errors
@@ -214,12 +234,16 @@ impl Told<'_> {
         backoff: &mut Backoff,
     ) -> Result<Result<Option<JobEvent>, Status>, Error> {
         backoff.accepted();
+        // The end of the job, unless more comes: it may have been retried since.
+        let mut end = None;
         loop {
-            let event = match events.message().await {
-                Ok(Some(event)) => convert::job::event_from_wire(event)?,
-                Ok(None) => return Ok(Ok(None)),
-                Err(status) => return Ok(Err(status)),
+            let event = match (events.message().await, end) {
+                (Ok(Some(event)), _) => convert::job::event_from_wire(event)?,
+                (Ok(None) | Err(_), Some(end)) => return Ok(Ok(Some(end))),
+                (Ok(None), None) => return Ok(Ok(None)),
+                (Err(status), None) => return Ok(Err(status)),
             };
+            end = None;
             if event.sequence.is_some_and(|sequence| sequence <= self.last_sequence) {
                 continue;
             }
@@ -227,7 +251,7 @@ impl Told<'_> {
             self.last_sequence = event.sequence.unwrap_or(self.last_sequence);
             (self.on_event)(&event);
             if matches!(event.body, EventBody::State { state, .. } if state.is_terminal()) {
-                return Ok(Ok(Some(event)));
+                end = Some(event);
             }
         }
     }

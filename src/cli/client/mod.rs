@@ -6,6 +6,7 @@
 //! Here is the connection; its calls are in files of their own.
 
 pub mod access;
+mod admin;
 mod answered;
 mod backoff;
 mod batch;
@@ -32,6 +33,7 @@ pub use solve::solve;
 use self::access::{AccessArgs, Bearer};
 use self::answered::Answered;
 use self::backoff::Backoff;
+use crate::rpc::proto::admin_service_client::AdminServiceClient;
 use crate::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use crate::rpc::proto::input_service_client::InputServiceClient;
 use crate::rpc::proto::job_service_client::JobServiceClient;
@@ -54,6 +56,7 @@ pub struct Client {
     jobs: JobServiceClient<Keyed>,
     calibration: CalibrationServiceClient<Keyed>,
     inputs: InputServiceClient<Keyed>,
+    admin: AdminServiceClient<Keyed>,
     server: String,
     /// Whether a call was ever answered.
     answered: Arc<AtomicBool>,
@@ -103,7 +106,8 @@ impl Client {
                 .send_compressed(Gzip)
                 .max_decoding_message_size(MAX_MESSAGE_BYTES),
             // Coordinates hardly become shorter by compression.
-            inputs: InputServiceClient::new(channel),
+            inputs: InputServiceClient::new(channel.clone()),
+            admin: AdminServiceClient::new(channel),
             server: server.to_owned(),
             answered,
             tenant,

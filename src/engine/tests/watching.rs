@@ -71,6 +71,32 @@ async fn a_watch_of_an_ended_job_replays_and_ends() {
     }
 }
 
+#[tokio::test]
+async fn a_watch_goes_on_after_an_earlier_end_and_ends_with_the_last() {
+    let bench = TrackClassifier::start(workers(1)).await;
+    let name = bench.submit(Script::Fail).await;
+    let batch = u64::from(crate::engine::watch::READ_AHEAD);
+    let mut ends = vec![bench.ended(&name).await.last_sequence];
+    while ends[ends.len() - 1] < batch + 10 {
+        assert_eq!(bench.engine.retry(&name, None).await.expect("has failed").state, JobState::Queued);
+        ends.push(bench.ended(&name).await.last_sequence);
+    }
+    let last = ends[ends.len() - 1];
+    // From the first, and so that each end in turn is the last event that is read at once.
+    for after in ends.iter().filter_map(|end| end.checked_sub(batch)).chain([0]) {
+        let mut watch = bench.engine.watch(&name, after).await.expect("exists");
+        let events = rest(&mut watch).await;
+        assert_contiguous(&events, after + 1);
+        assert_eq!(events.len() as u64, last - after);
+    }
+    let told = rest(&mut bench.engine.watch(&name, 0).await.expect("exists")).await;
+    assert_eq!(told.iter().filter(|event| terminal(event).is_some()).count(), ends.len());
+    // One that was opened at the last end sees nothing of a retry that comes later.
+    let mut ended = bench.engine.watch(&name, last).await.expect("exists");
+    bench.engine.retry(&name, None).await.expect("has failed");
+    assert!(ended.next().await.is_none());
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn watchers_that_come_and_go_miss_and_repeat_nothing() {
     const EVENTS: u32 = 300;

@@ -447,8 +447,8 @@ async function readEvents(path, lastId, signal, onEvent) {
 }
 
 /**
- * Follows a job's events to its final state, over broken connections: goes on after the last event that it has, and
- * waits longer each time that nothing came.
+ * Follows a job's events to its end, over broken connections: goes on after the last event that it has, and waits
+ * longer each time that nothing came. A final state is the end unless more follows: the job may have been retried.
  */
 async function follow(name, signal, onEvent, onTrouble) {
   let lastId = null;
@@ -463,7 +463,7 @@ async function follow(name, signal, onEvent, onTrouble) {
         wait = 1;
         onTrouble(null, 0);
         const state = event.stateChange && event.stateChange.state;
-        if (state && !ACTIVE.includes(state)) ended = true;
+        if (state) ended = !ACTIVE.includes(state);
         onEvent(event);
       });
     } catch (error) {
@@ -1005,6 +1005,7 @@ class JobPage {
     const button = (words, work, className) =>
       make("button", { type: "button", className, hidden: true, onclick: work }, words);
     this.cancelButton = button("Cancel job", () => this.cancel());
+    this.retryButton = button("Retry job", () => this.retry());
     this.againButton = button("Create again", () => this.createAgain());
     this.deleteButton = button("Delete job", () => this.remove(), "danger");
     this.againNote = make("p", { className: "note", hidden: true },
@@ -1017,11 +1018,15 @@ class JobPage {
     main.replaceChildren(
       make("div", { className: "head" },
         make("h2", { tabindex: -1 }, `Job ${this.id}`, this.badge),
-        make("div", { className: "buttons" }, this.cancelButton, this.againButton, this.deleteButton)),
+        make("div", { className: "buttons" }, ...this.buttons())),
       this.failure, this.summary, this.live.element, this.result,
       make("section", { "aria-labelledby": "details-title" }, make("h3", { id: "details-title" }, "Job"),
         this.details, this.againNote));
     this.run();
+  }
+
+  buttons() {
+    return [this.cancelButton, this.retryButton, this.againButton, this.deleteButton];
   }
 
   async run() {
@@ -1066,7 +1071,7 @@ class JobPage {
     const words = error.code === 404 ? "The job does not exist, or is of another tenant" : "The job cannot be read";
     tellError(error, words);
     if (error.code !== 404) return;
-    for (const button of [this.cancelButton, this.againButton, this.deleteButton]) button.hidden = true;
+    for (const button of this.buttons()) button.hidden = true;
     this.live.element.hidden = true;
     this.details.replaceChildren(make("p", { className: "empty" }, "There is no such job. ",
       make("a", { href: "#/" }, "Show the jobs")));
@@ -1108,6 +1113,7 @@ class JobPage {
     this.cancelButton.hidden = isEnded;
     this.cancelButton.disabled = Boolean(job.cancelRequested);
     this.deleteButton.hidden = !isEnded;
+    this.retryButton.hidden = !isEnded || stateOf(job) === "JOB_STATE_SUCCEEDED";
     this.againButton.hidden = !isEnded || !job.input;
     this.againNote.hidden = !isEnded || Boolean(job.input);
     // A hidden button loses the focus to nothing; the keyboard would begin at the top again.
@@ -1122,6 +1128,17 @@ class JobPage {
       announce(`Job ${this.id}: cancel asked for`);
     } catch (error) {
       tellError(error, "The job was not cancelled");
+    }
+  }
+
+  async retry() {
+    try {
+      await call("POST", `/v1/${this.name}:retry`, { body: { etag: this.job.etag || "" }, signal: this.signal });
+      // The page begins anew: the events of both runs follow.
+      told = `The job ${this.id} waits again.`;
+      show();
+    } catch (error) {
+      tellError(error, "The job was not retried");
     }
   }
 

@@ -40,9 +40,8 @@ pub fn from_wire(job_id: String, request_id: String, job: Option<proto::Job>) ->
     let deadline = job.deadline.map(deadline_from_wire).transpose()?;
     let mut found = Violations::default();
     check_labels(&job.labels, &mut found);
-    if !(-MAX_PRIORITY..=MAX_PRIORITY).contains(&job.priority) {
-        let text = format!("{} is not in -{MAX_PRIORITY}..={MAX_PRIORITY}", job.priority);
-        found.push(Violation::of("job.priority", text));
+    if let Err(violation) = check_priority(job.priority, "job.priority") {
+        found.push(violation);
     }
     if request_id.len() > MAX_REQUEST_ID || !request_id.bytes().all(|byte| byte.is_ascii_graphic()) {
         let text = format!("is not 1 to {MAX_REQUEST_ID} visible ASCII characters; a UUID is");
@@ -58,6 +57,17 @@ pub fn from_wire(job_id: String, request_id: String, job: Option<proto::Job>) ->
         priority: job.priority,
         deadline,
     })
+}
+
+/// Whether a job may have this priority, which stands in that field.
+///
+/// # Errors
+/// That it is out of range.
+pub fn check_priority(priority: i32, field: &str) -> Result<(), Violation> {
+    match (-MAX_PRIORITY..=MAX_PRIORITY).contains(&priority) {
+        true => Ok(()),
+        false => Err(Violation::of(field, format!("{priority} is not in -{MAX_PRIORITY}..={MAX_PRIORITY}"))),
+    }
 }
 
 fn check_labels(labels: &BTreeMap<String, String>, found: &mut Violations) {

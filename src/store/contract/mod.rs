@@ -1,5 +1,6 @@
 //! What every store must do, as tests that each implementation runs through [`store_contract!`].
 
+pub(super) mod admin;
 pub(super) mod creation;
 pub(super) mod leases;
 pub(super) mod reading;
@@ -49,6 +50,11 @@ macro_rules! store_contract {
             removal::what_waits_or_runs_is_not_deleted,
             removal::an_etag_is_honoured_and_changes_with_the_job,
             removal::what_ended_long_ago_goes_oldest_first_and_in_portions,
+            admin::a_retried_job_begins_anew_and_its_events_go_on,
+            admin::a_retry_is_refused_where_there_is_nothing_to_do_or_no_room,
+            admin::only_waiting_jobs_get_another_priority,
+            admin::a_paused_queue_gives_out_no_job,
+            admin::a_report_counts_jobs_by_state_and_tenant,
             uploads::an_upload_goes_on_where_it_ended_and_becomes_an_input,
             uploads::the_latest_stream_has_the_upload,
             uploads::an_upload_id_stands_for_one_length_and_hash,

@@ -16,9 +16,11 @@ use crate::store::{ATTEMPTS_EXHAUSTED, Error, payload};
 /// there is no bound on them.
 const MOST_PAST_ATTEMPTS: u32 = 16;
 
-/// Whether anything is queued.
+/// Whether anything is queued that may be claimed.
 pub(super) async fn may_claim<C: Connection>(connection: &mut C) -> Result<bool, Error> {
-    let select = Statement::new("SELECT EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED') AS found");
+    let select = Statement::new(
+        "SELECT EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED' AND (SELECT pause_time FROM queue) IS NULL) AS found",
+    );
     connection.row(select).await?.flag("found")
 }
 
@@ -30,7 +32,8 @@ pub(super) async fn claim<C: Connection>(
     expires: SystemTime,
 ) -> Result<Option<Claimed>, Error> {
     let next = Statement::new(select_standing!(
-        "WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) ORDER BY priority DESC, create_time, id LIMIT 1"
+        "WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) AND (SELECT pause_time FROM queue) IS NULL \
+         ORDER BY priority DESC, create_time, id LIMIT 1"
     ))
     .bind(micros(now))
     .then(C::SKIP_LOCKED);
@@ -44,7 +47,7 @@ pub(super) async fn foresee<C: Connection>(
     now: SystemTime,
 ) -> Result<Option<Claimed>, Error> {
     let next = Statement::new(select_jobs!(
-        "WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) \
+        "WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) AND (SELECT pause_time FROM queue) IS NULL \
          ORDER BY priority DESC, create_time, id LIMIT $2"
     ))
     .bind(micros(now))
@@ -71,7 +74,7 @@ pub(super) async fn claim_foreseen<C: Connection>(
 ) -> Result<Option<Claimed>, Error> {
     let same = Statement::new(select_standing!(
         "WHERE tenant = $1 AND job = $2 AND attempt = $3 AND create_time = $4 AND state = 'QUEUED' \
-         AND (deadline IS NULL OR deadline > $5)"
+         AND (deadline IS NULL OR deadline > $5) AND (SELECT pause_time FROM queue) IS NULL"
     ))
     .bind(&foreseen.name.tenant)
     .bind(&foreseen.name.job)

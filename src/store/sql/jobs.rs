@@ -84,14 +84,14 @@ async fn check_size<C: Connection>(connection: &mut C, news: &[NewRecord], bound
 
 /// What waits, as admission needs it: summed up once a batch, since a sum goes through the whole queue.
 #[derive(Default)]
-struct Waiting {
+pub(super) struct Waiting {
     whole: Option<Load>,
     tenants: HashMap<String, Load>,
 }
 
 impl Waiting {
     /// What waits of all tenants, and of this one where it has bounds of its own.
-    async fn look<C: Connection>(
+    pub(super) async fn look<C: Connection>(
         &mut self,
         connection: &mut C,
         tenant: &str,
@@ -405,7 +405,8 @@ pub(super) async fn load<C: Connection>(connection: &mut C) -> Result<Load, Erro
     let select = Statement::new(
         "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
          CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, \
-         (SELECT COUNT(*) FROM jobs WHERE state = 'RUNNING') AS running FROM jobs WHERE state = 'QUEUED'",
+         (SELECT COUNT(*) FROM jobs WHERE state = 'RUNNING') AS running, \
+         (SELECT pause_time IS NOT NULL FROM queue) AS paused FROM jobs WHERE state = 'QUEUED'",
     );
     measured(&connection.row(select).await?)
 }
@@ -414,8 +415,8 @@ pub(super) async fn load<C: Connection>(connection: &mut C) -> Result<Load, Erro
 async fn load_of<C: Connection>(connection: &mut C, tenant: &str) -> Result<Load, Error> {
     let select = Statement::new(
         "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
-         CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, CAST(0 AS BIGINT) AS running \
-         FROM jobs WHERE state = 'QUEUED' AND tenant = $1",
+         CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, CAST(0 AS BIGINT) AS running, \
+         FALSE AS paused FROM jobs WHERE state = 'QUEUED' AND tenant = $1",
     );
     measured(&connection.row(select.bind(tenant)).await?)
 }
@@ -426,5 +427,6 @@ fn measured(row: &impl Row) -> Result<Load, Error> {
         queued_bytes: number(row, "bytes")?,
         queued_observations: number(row, "observations")?,
         running: number(row, "running")?,
+        paused: row.flag("paused")?,
     })
 }

@@ -2,6 +2,7 @@
 //! changes. A database adds how it is opened, its schema and the few words that are its own, through [`Connection`] and
 //! [`Database`]; whatever implements [`Database`] is a [`crate::store::Store`].
 
+mod admin;
 mod attempts;
 mod jobs;
 mod removal;

@@ -75,12 +75,12 @@ fn optional_record<T: serde::de::DeserializeOwned>(row: &impl Row, column: &str)
     row.optional_bytes(column)?.map(|bytes| payload::decode(&bytes, column)).transpose()
 }
 
-fn state(row: &impl Row) -> Result<JobState, Error> {
+pub(super) fn state(row: &impl Row) -> Result<JobState, Error> {
     let name = row.text("state")?;
     JobState::from_name(&name).ok_or_else(|| Error::Corrupt(format!("unknown state {name:?}")))
 }
 
-fn name(row: &impl Row) -> Result<JobName, Error> {
+pub(super) fn name(row: &impl Row) -> Result<JobName, Error> {
     Ok(JobName { tenant: row.text("tenant")?, job: row.text("job")? })
 }
 

@@ -6,13 +6,13 @@ use std::time::{Duration, SystemTime};
 
 use futures_util::FutureExt;
 
-use super::{Database, Moves, Size, attempts, jobs, operation, removal, uploads};
+use super::{Database, Moves, Size, admin, attempts, jobs, operation, removal, uploads};
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
     CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
-    QueueBounds, Swept, Work,
+    QueueBounds, QueueReport, RetryReply, Swept, Work,
 };
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
@@ -160,6 +160,35 @@ impl<D: Database> Store for D {
         writes!(self, Size::Small, Moves::Ends(0), [name, etag], |connection| {
             attempts::request_cancel(connection, &name, etag.as_deref(), now)
         })
+    }
+
+    async fn retry_job(
+        &self,
+        name: &JobName,
+        etag: Option<&str>,
+        bounds: &QueueBounds,
+        now: SystemTime,
+    ) -> Result<RetryReply, Error> {
+        let etag = etag.map(str::to_owned);
+        writes!(self, Size::Small, Moves::Begins(0), [name, etag, bounds], |connection| {
+            admin::retry(connection, &name, etag.as_deref(), &bounds, now)
+        })
+    }
+
+    async fn set_priority(&self, name: &JobName, etag: Option<&str>, priority: i32) -> Result<Job, Error> {
+        let etag = etag.map(str::to_owned);
+        writes!(self, Size::Small, Moves::Little, [name, etag], |connection| {
+            admin::set_priority(connection, &name, etag.as_deref(), priority)
+        })
+    }
+
+    async fn set_paused(&self, paused: bool, now: SystemTime) -> Result<(), Error> {
+        writes!(self, Size::Small, Moves::Ends(0), [], |connection| admin::set_paused(connection, paused, now))
+    }
+
+    async fn queue(&self, tenants: u32) -> Result<QueueReport, Error> {
+        // Counts every job that is kept.
+        reads!(self, Size::Payload, |connection| admin::queue(connection, tenants))
     }
 
     async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error> {

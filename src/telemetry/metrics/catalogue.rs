@@ -63,6 +63,12 @@ pub const QUEUE_CAPACITY: Metric = Metric {
     labels: &[],
     help: "Waiting jobs at which new ones are refused.",
 };
+pub const QUEUE_PAUSED: Metric = Metric {
+    name: "scpsfm_queue_paused",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "1 while the queue is paused: no server of the store begins a job.",
+};
 pub const QUEUE_WAIT: Metric = Metric {
     name: "scpsfm_queue_wait_seconds",
     kind: JOB_SECONDS,
@@ -268,6 +274,7 @@ pub const ALL: [Metric; 38] = [
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
+    QUEUE_PAUSED,
     QUEUE_WAIT,
     WORKERS,
     WORKERS_BUSY,

@@ -30,7 +30,7 @@ fn two_tenants() -> Options {
 }
 
 /// Every method of the API, as `/package.Service/Method`.
-fn methods() -> Vec<String> {
+pub fn methods() -> Vec<String> {
     let files = prost_types::FileDescriptorSet::decode(FILE_DESCRIPTOR_SET).expect("decodes");
     let paths = files.file.iter().flat_map(|file| {
         file.service.iter().flat_map(move |service| {
@@ -42,7 +42,7 @@ fn methods() -> Vec<String> {
 }
 
 /// Calls a method with one empty message.
-async fn call(channel: &Channel, path: &str, authorization: Option<&str>) -> Result<(), Status> {
+pub async fn call(channel: &Channel, path: &str, authorization: Option<&str>) -> Result<(), Status> {
     let mut grpc = tonic::client::Grpc::new(channel.clone());
     grpc.ready().await.expect("a connection");
     let mut request = Request::new(());
@@ -53,7 +53,7 @@ async fn call(channel: &Channel, path: &str, authorization: Option<&str>) -> Res
     grpc.unary(request, path, tonic_prost::ProstCodec::<(), ()>::default()).await.map(drop)
 }
 
-fn reason(status: &Status) -> String {
+pub fn reason(status: &Status) -> String {
     status.get_details_error_info().map(|info| info.reason).unwrap_or_default()
 }
 
@@ -62,7 +62,7 @@ async fn without_a_key_of_this_server_nothing_but_health_answers() {
     let server = TestServer::start_with(quick(), two_tenants(), one_worker()).await;
     let channel = server.channel().await;
     let mut paths = methods();
-    assert_eq!(paths.len(), 15);
+    assert_eq!(paths.len(), 21);
     paths.push("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo".into());
     paths.push("/scpsfm.v1.JobService/Invented".into());
     let cases = [
@@ -150,6 +150,17 @@ impl Tenant {
                 self.jobs.delete_job(proto::DeleteJobRequest { name: name(), ..Default::default() }).await.map(drop),
             ),
             (
+                "RetryJob",
+                self.jobs.retry_job(proto::RetryJobRequest { name: name(), ..Default::default() }).await.map(drop),
+            ),
+            (
+                "SetJobPriority",
+                self.jobs
+                    .set_job_priority(proto::SetJobPriorityRequest { name: name(), ..Default::default() })
+                    .await
+                    .map(drop),
+            ),
+            (
                 "WatchJob",
                 self.jobs.watch_job(proto::WatchJobRequest { name: name(), after_sequence: 0 }).await.map(drop),
             ),
@@ -218,8 +229,8 @@ async fn of_another_tenants_job_nothing_can_be_learned_or_done() {
         for (method, status) in &of_theirs {
             assert_eq!(status.code(), Code::NotFound, "{method}");
         }
-        // Every method was tried; GetCapabilities names nothing.
-        assert_eq!(of_theirs.len() + 1, methods().len());
+        // Every method was tried; GetCapabilities and the four of AdminService name nothing.
+        assert_eq!(of_theirs.len() + 5, methods().len());
     }
     let job = south.jobs.get_job(proto::GetJobRequest { name: theirs }).await.expect("theirs").into_inner();
     assert_eq!(job.state(), JobState::Succeeded);

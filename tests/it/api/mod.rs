@@ -5,5 +5,6 @@ mod client;
 mod discovery;
 mod jobs;
 mod removal;
+mod retry;
 mod solve;
 mod uploads;

@@ -88,10 +88,17 @@ CREATE INDEX jobs_lease ON jobs (lease_expires) WHERE state = 'RUNNING';
 -- would tell in a page token how many jobs all tenants have made.
 CREATE INDEX jobs_listing ON jobs (tenant, create_time, job);
 CREATE INDEX jobs_input ON jobs (input_id);
--- What retention looks for: jobs that have ended, the oldest end first.
-CREATE INDEX jobs_end ON jobs (end_time) WHERE end_time IS NOT NULL;
+-- What retention looks for: jobs that have ended, the oldest end first. Covers what is counted of them.
+CREATE INDEX jobs_end ON jobs (end_time, state) WHERE end_time IS NOT NULL;
 -- Covers what admission sums of one tenant.
 CREATE INDEX jobs_tenant_load ON jobs (tenant, input_bytes, observation_count) WHERE state = 'QUEUED';
+
+-- One row: since when the queue is paused; NULL: it is not.
+CREATE TABLE queue (
+    id         INTEGER PRIMARY KEY CHECK (id = 1),
+    pause_time INTEGER
+) STRICT;
+INSERT INTO queue (id) VALUES (1);
 
 -- The labels once more, for filters.
 CREATE TABLE job_labels (

@@ -1,0 +1,92 @@
+//! What operators ask for: retries, priorities, pauses of the queue, a drain.
+
+use std::time::SystemTime;
+
+use super::{Engine, Error, Inner, Phase, QueueReport, finished, observe};
+use crate::domain::job::{Job, JobName};
+use crate::store;
+
+impl Engine {
+    /// Puts a job that ended without a result into the queue again, with its attempts counted anew; one that waits or
+    /// runs is left as it is. With an etag, only where it is the job's. Returns the job as it stands then.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::Succeeded`], [`Error::QueueFull`], [`Error::Draining`].
+    pub async fn retry(&self, name: &JobName, etag: Option<String>) -> Result<Job, Error> {
+        let (inner, name) = (self.inner.clone(), name.clone());
+        // On its own task: a caller that goes away must not leave a queued job untold.
+        finished(tokio::spawn(async move { inner.retry(&name, etag.as_deref()).await })).await
+    }
+
+    /// Changes the priority of a queued job; with an etag, only where it is the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::NotQueued`].
+    pub async fn set_priority(&self, name: &JobName, etag: Option<&str>, priority: i32) -> Result<Job, Error> {
+        Ok(self.inner.dated(self.inner.store.set_priority(name, etag, priority).await?))
+    }
+
+    /// Pauses the queue: no server of the store begins a job until [`Engine::resume`], also after a restart. What runs
+    /// goes on.
+    ///
+    /// # Errors
+    /// [`Error::Unavailable`].
+    pub async fn pause(&self) -> Result<(), Error> {
+        self.set_paused(true).await
+    }
+
+    /// Ends a pause of the queue.
+    ///
+    /// # Errors
+    /// [`Error::Unavailable`].
+    pub async fn resume(&self) -> Result<(), Error> {
+        self.set_paused(false).await
+    }
+
+    async fn set_paused(&self, paused: bool) -> Result<(), Error> {
+        self.inner.store.set_paused(paused, SystemTime::now()).await?;
+        self.inner.work_waits();
+        // The count of the queue tells of the change.
+        self.inner.queue_changed();
+        Ok(())
+    }
+
+    /// The queue over all servers of the store, with at most `tenants` tenants.
+    ///
+    /// # Errors
+    /// [`Error::Unavailable`].
+    pub async fn queue(&self, tenants: u32) -> Result<QueueReport, Error> {
+        Ok(self.inner.store.queue(tenants).await?)
+    }
+
+    /// Asks whoever runs the engine to drain it and to end the process.
+    pub fn ask_for_drain(&self) {
+        self.inner.drain_asked.cancel();
+    }
+
+    /// Waits until a drain is asked for.
+    pub fn drain_asked(&self) -> impl Future<Output = ()> + Send + use<> {
+        self.inner.drain_asked.clone().cancelled_owned()
+    }
+}
+
+impl Inner {
+    async fn retry(&self, name: &JobName, etag: Option<&str>) -> Result<Job, Error> {
+        if self.phase() != Phase::Open {
+            observe::refused(observe::Refusal::Draining);
+            return Err(Error::Draining);
+        }
+        let retried = self.store.retry_job(name, etag, &self.options.queue, SystemTime::now()).await;
+        if let Err(store::Error::QueueFull(bound)) = &retried {
+            observe::refused(observe::Refusal::QueueFull(bound.quota()));
+        }
+        let reply = retried?;
+        if reply.queued_now {
+            tracing::info!(job = %name, "retried");
+            self.hub.wake(name);
+            self.work_waits();
+            self.queue_changed();
+        }
+        Ok(self.dated(reply.job))
+    }
+}

@@ -1,0 +1,76 @@
+//! `AdminService`. Who may call it is decided before, by the scope of the key.
+
+use tonic::{Request, Response, Status};
+
+use super::convert::enums::Twin;
+use super::{proto, status};
+use crate::engine::{Engine, QueueReport, TenantQueue};
+
+/// Tenants that the queue is told of, as the API says: those that crowd it.
+const MAX_TENANTS: u32 = 20;
+
+/// The service.
+#[derive(Clone)]
+pub struct Admin {
+    engine: Engine,
+}
+
+impl Admin {
+    pub fn new(engine: Engine) -> Self {
+        Self { engine }
+    }
+
+    async fn queue(&self) -> Result<Response<proto::Queue>, Status> {
+        let report = self.engine.queue(MAX_TENANTS).await.map_err(status::from_engine)?;
+        Ok(Response::new(to_wire(report)))
+    }
+}
+
+#[tonic::async_trait]
+impl proto::admin_service_server::AdminService for Admin {
+    async fn get_queue(&self, _request: Request<proto::GetQueueRequest>) -> Result<Response<proto::Queue>, Status> {
+        self.queue().await
+    }
+
+    async fn pause_queue(&self, _request: Request<proto::PauseQueueRequest>) -> Result<Response<proto::Queue>, Status> {
+        self.engine.pause().await.map_err(status::from_engine)?;
+        self.queue().await
+    }
+
+    async fn resume_queue(
+        &self,
+        _request: Request<proto::ResumeQueueRequest>,
+    ) -> Result<Response<proto::Queue>, Status> {
+        self.engine.resume().await.map_err(status::from_engine)?;
+        self.queue().await
+    }
+
+    async fn drain_server(
+        &self,
+        _request: Request<proto::DrainServerRequest>,
+    ) -> Result<Response<proto::DrainServerResponse>, Status> {
+        self.engine.ask_for_drain();
+        Ok(Response::new(proto::DrainServerResponse { worker: self.engine.options().worker_name.clone() }))
+    }
+}
+
+fn to_wire(report: QueueReport) -> proto::Queue {
+    let (oldest_job, oldest_queue_time) = report.oldest.unzip();
+    let tenant = |of: TenantQueue| proto::TenantQueue {
+        tenant: format!("tenants/{}", of.tenant),
+        queued_job_count: of.queued,
+        running_job_count: of.running,
+    };
+    proto::Queue {
+        paused: report.pause_time.is_some(),
+        pause_time: report.pause_time.map(Into::into),
+        job_counts: report
+            .jobs
+            .iter()
+            .map(|&(state, count)| proto::JobCount { state: state.to_wire(), count })
+            .collect(),
+        oldest_job: oldest_job.map(|name| name.to_string()).unwrap_or_default(),
+        oldest_queue_time: oldest_queue_time.map(Into::into),
+        tenants: report.tenants.into_iter().map(tenant).collect(),
+    }
+}

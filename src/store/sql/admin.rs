@@ -1,0 +1,117 @@
+//! What an operator does to jobs and to the queue: retries, priorities, pauses, and a look at the whole.
+
+use std::time::SystemTime;
+
+use super::jobs::{self, Waiting};
+use super::removal::check_etag;
+use super::rows::{self, Departure, leave, micros, number, returning_job, standing};
+use super::{Change, Connection, Row, Statement};
+use crate::domain::job::{Job, JobName, JobState};
+use crate::store::Error;
+use crate::store::record::{QueueBounds, QueueReport, RetryReply, TenantQueue};
+
+/// Puts a job that ended without a result into the queue again; see [`crate::store::Store::retry_job`].
+pub(super) async fn retry<C: Connection>(
+    connection: &mut C,
+    name: &JobName,
+    etag: Option<&str>,
+    bounds: &QueueBounds,
+    now: SystemTime,
+) -> Result<RetryReply, Error> {
+    // Before the job's row, as whoever creates jobs takes them: two in the other order would wait for each other.
+    connection.lock_admission().await?;
+    let job = standing(connection, name).await?;
+    check_etag(connection, name, etag).await?;
+    match job.state {
+        JobState::Queued | JobState::Running => {
+            return Ok(RetryReply { job: jobs::get(connection, name).await?, queued_now: false });
+        }
+        JobState::Succeeded => return Err(Error::Succeeded(name.clone())),
+        JobState::Failed | JobState::Cancelled | JobState::DeadlineExceeded => {}
+    }
+    let size = Statement::new("SELECT input_bytes, observation_count FROM jobs WHERE id = $1").bind(job.id);
+    let size = connection.row(size).await?;
+    let (whole, tenant) = Waiting::default().look(connection, &name.tenant, bounds).await?;
+    if let Some(bound) =
+        bounds.refuses(&whole, &tenant, number(&size, "input_bytes")?, number(&size, "observation_count")?)
+    {
+        return Err(Error::QueueFull(bound));
+    }
+    // The number of its attempt goes on: it is the fencing token.
+    connection.execute(Statement::new("DELETE FROM attempts WHERE job_id = $1").bind(job.id)).await?;
+    let anew = Statement::new(
+        "UPDATE jobs SET lost_attempts = 0, start_time = NULL, progress = NULL, attached_calls = NULL, \
+         detached_calls = 0, deadline = CASE WHEN deadline > $1 THEN deadline END WHERE id = $2",
+    );
+    connection.execute(anew.bind(micros(now)).bind(job.id)).await?;
+    let job = leave(connection, &job, Departure::to(JobState::Queued), now).await?;
+    Ok(RetryReply { job, queued_now: true })
+}
+
+/// Changes the priority of a queued job.
+pub(super) async fn set_priority<C: Connection>(
+    connection: &mut C,
+    name: &JobName,
+    etag: Option<&str>,
+    priority: i32,
+) -> Result<Job, Error> {
+    let job = standing(connection, name).await?;
+    check_etag(connection, name, etag).await?;
+    if job.state != JobState::Queued {
+        return Err(Error::NotQueued(name.clone(), job.state));
+    }
+    let update = Statement::new(returning_job!("UPDATE jobs SET priority = $1 WHERE id = $2"));
+    rows::job(&connection.row(update.bind(priority).bind(job.id)).await?)
+}
+
+/// Pauses or resumes the queue.
+pub(super) async fn set_paused<C: Connection>(connection: &mut C, paused: bool, now: SystemTime) -> Result<(), Error> {
+    if paused {
+        let pause = Statement::new("UPDATE queue SET pause_time = COALESCE(pause_time, $1)").bind(micros(now));
+        return connection.execute(pause).await;
+    }
+    connection.execute(Statement::new("UPDATE queue SET pause_time = NULL")).await?;
+    // Only where a job waits is there anything to tell of.
+    let waiting = Statement::new("SELECT tenant, job FROM jobs WHERE state = 'QUEUED' LIMIT 1");
+    match connection.optional_row(waiting).await? {
+        Some(row) => connection.tell(Change::Queued, &rows::name(&row)?).await,
+        None => Ok(()),
+    }
+}
+
+/// The queue as its administrator sees it.
+pub(super) async fn queue<C: Connection>(connection: &mut C, tenants: u32) -> Result<QueueReport, Error> {
+    let pause = connection.row(Statement::new("SELECT pause_time FROM queue")).await?;
+    // Each half is answered by an index alone.
+    let counts = Statement::new(
+        "SELECT state, COUNT(*) AS jobs FROM jobs WHERE state IN ('QUEUED', 'RUNNING') GROUP BY state \
+         UNION ALL SELECT state, COUNT(*) AS jobs FROM jobs WHERE end_time IS NOT NULL GROUP BY state",
+    );
+    let mut jobs = JobState::ALL.map(|state| (state, 0));
+    for row in connection.rows(counts).await? {
+        let state = rows::state(&row)?;
+        if let Some((_, count)) = jobs.iter_mut().find(|(known, _)| *known == state) {
+            *count = number(&row, "jobs")?;
+        }
+    }
+    let oldest = Statement::new(
+        "SELECT tenant, job, queue_time FROM jobs WHERE state = 'QUEUED' ORDER BY queue_time, id LIMIT 1",
+    );
+    let oldest = connection.optional_row(oldest).await?;
+    let oldest = oldest.map(|row| Ok::<_, Error>((rows::name(&row)?, rows::time(row.integer("queue_time")?))));
+    let by_tenant = Statement::new(
+        "SELECT tenant, SUM(CASE WHEN state = 'QUEUED' THEN 1 ELSE 0 END) AS queued, \
+         SUM(CASE WHEN state = 'RUNNING' THEN 1 ELSE 0 END) AS running FROM jobs \
+         WHERE state IN ('QUEUED', 'RUNNING') GROUP BY tenant ORDER BY queued DESC, running DESC, tenant LIMIT $1",
+    );
+    let tenant = |row: &C::Row| {
+        Ok(TenantQueue {
+            tenant: row.text("tenant")?,
+            queued: number(row, "queued")?,
+            running: number(row, "running")?,
+        })
+    };
+    let tenants = connection.rows(by_tenant.bind(tenants)).await?.iter().map(tenant).collect::<Result<_, Error>>()?;
+    let pause_time = pause.optional_integer("pause_time")?.map(rows::time);
+    Ok(QueueReport { pause_time, jobs, oldest: oldest.transpose()?, tenants })
+}
