@@ -48,7 +48,7 @@ async fn a_paused_queue_begins_nothing_over_a_restart_until_it_is_resumed() {
     until_paused_is(&server, 1.0).await;
     let mut jobs = connected(&server).await;
     let job = jobs.get_job(proto::GetJobRequest { name: name.clone() }).await.expect("a job").into_inner();
-    assert_eq!((job.state(), job.last_sequence, job.attempt), (JobState::Queued, 1, 0));
+    assert_eq!((job.state(), job.last_sequence, job.attempt_count), (JobState::Queued, 1, 0));
     let report = queue(&server);
     assert_eq!((&report["paused"], &report["jobs"]["QUEUED"]), (&true.into(), &1.into()), "{report}");
     assert_eq!(report["oldest_job"], name.as_str());

@@ -270,7 +270,7 @@ pub const LOCKED_OUT: Metric = Metric {
 };
 
 /// Every metric that this program exposes.
-pub const ALL: [Metric; 38] = [
+pub const ALL: &[Metric] = &[
     BUILD_INFO,
     QUEUE_DEPTH,
     QUEUE_CAPACITY,
