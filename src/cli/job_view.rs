@@ -11,7 +11,7 @@ use super::interrupt::Signals;
 use super::print;
 use super::progress::ProgressView;
 use crate::domain::job::{EventBody, Failure as JobFailure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
-use crate::domain::{Grade, InputName, Status, Warning};
+use crate::domain::{Grade, InputName, Status, Warning, Webhook};
 
 /// A job's name as it was given: whole, or its last part alone.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -83,13 +83,14 @@ fn warning_lines(summary: &Summary) -> Vec<String> {
     summary.warnings.iter().map(line).collect()
 }
 
-/// Prints a job: a line, one more for its uploaded input and for each of its warnings; or everything as JSON.
+/// Prints a job: a line, one more for its uploaded input, its webhook and each of its warnings; or everything as JSON.
 pub fn print_job(job: &Job, json: bool) -> Result<(), Failure> {
     if json {
         return print(&format!("{:#}", job_json(job)));
     }
     let mut lines = vec![job_line(job)];
     lines.extend(job.input.as_ref().map(|input| format!("  input: {input}")));
+    lines.extend(job.webhook.as_ref().map(webhook_line));
     lines.extend(job.summary.iter().flat_map(warning_lines));
     print(&lines.join("\n"))
 }
@@ -110,6 +111,27 @@ fn failure_json(failure: &JobFailure) -> Value {
         value["attempts"] = failure.attempts.iter().map(past).collect();
     }
     value
+}
+
+fn webhook_json(webhook: &Webhook) -> Value {
+    json!({
+        "url": webhook.url,
+        "state": webhook.state,
+        "attempt_count": webhook.attempts,
+        "last_error": webhook.last_error,
+    })
+}
+
+/// A webhook in a line.
+fn webhook_line(webhook: &Webhook) -> String {
+    let mut line = format!("  webhook: {}  {}", webhook.url, webhook.state.name());
+    if webhook.attempts > 0 {
+        line.push_str(&format!("  attempts: {}", webhook.attempts));
+    }
+    if let Some(error) = &webhook.last_error {
+        line.push_str(&format!("  {error}"));
+    }
+    line
 }
 
 /// A job for programs; times as RFC 3339.
@@ -135,6 +157,7 @@ pub fn job_json(job: &Job) -> Value {
         "error": job.failure.as_ref().map(failure_json),
         "cancel_requested": job.cancel_requested,
         "expire_time": job.expire_time.map(time),
+        "webhook": job.webhook.as_ref().map(webhook_json),
         "etag": job.etag(),
     })
 }

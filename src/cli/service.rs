@@ -46,6 +46,8 @@ impl Service {
         let options = server_options(config);
         // Before the store is opened and its jobs begin: who cannot be let in is no reason to take them up.
         options.check_access().map_err(Failure::bad_config)?;
+        let webhooks = config.webhooks.options(http::encode_job).map_err(Failure::bad_config)?;
+        let engine_options = engine::Options { webhooks, ..engine_options(config) };
         let mut ended = pin!(ended);
         let store = tokio::select! {
             store = open_store(&config.store) => store?,
@@ -54,7 +56,7 @@ impl Service {
         let solver = engine::solver_on(config.compute.threads());
         let started = tokio::select! {
             biased;
-            started = Engine::start(engine_options(config), store.clone(), solver, encode_result) => started,
+            started = Engine::start(engine_options, store.clone(), solver, encode_result) => started,
             // It waits for the store, and for nothing once jobs begin.
             () = ended => {
                 close(&*store).await;

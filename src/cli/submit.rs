@@ -11,8 +11,8 @@ use super::client::access::AccessArgs;
 use super::client::{self, JobOptions};
 use super::exit::{Exit, Failure};
 use super::{job_view, print};
-use crate::domain::InputName;
 use crate::domain::job::JobName;
+use crate::domain::{InputName, Webhook};
 use crate::rpc::convert::create::MAX_PRIORITY;
 
 const EXAMPLES: &str = "\
@@ -62,6 +62,10 @@ pub struct Args {
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     pub time_limit: Option<Duration>,
 
+    /// Send the job's end to this URL, where the server's webhooks are on
+    #[arg(long = "webhook", value_name = "URL", value_parser = parse_url)]
+    pub webhook_url: Option<String>,
+
     /// Last part of the job's name, for one input; the server chooses one otherwise
     #[arg(long, value_name = "ID", value_parser = NonEmptyStringValueParser::new())]
     pub job_id: Option<String>,
@@ -106,6 +110,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         labels,
         priority: args.priority,
         time_limit: args.time_limit,
+        webhook_url: args.webhook_url,
     };
     if several {
         let inputs = read.iter().map(|input| &input.raw);
@@ -177,6 +182,10 @@ fn labels(given: Vec<(String, String)>) -> Result<BTreeMap<String, String>, Fail
         }
     }
     Ok(labels)
+}
+
+fn parse_url(text: &str) -> Result<String, String> {
+    Webhook::parse_url(text).map(|_| text.to_owned())
 }
 
 fn parse_seconds(text: &str) -> Result<Duration, String> {

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::domain::Limits;
 use crate::store::postgres::DatabaseUrl;
 pub use retention::Retention;
-pub use sections::{Auth, Compute, Engine, Http, Log, Metrics, Otlp, Server, Store, Tls, Upload};
+pub use sections::{Auth, Compute, Engine, Http, Log, Metrics, Otlp, Server, Store, Tls, Upload, Webhooks};
 
 /// Everything that the server can be told.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -33,6 +33,7 @@ pub struct Config {
     pub limits: Limits,
     pub log: Log,
     pub otlp: Otlp,
+    pub webhooks: Webhooks,
 }
 
 /// What is wrong with a configuration.
@@ -135,6 +136,11 @@ impl Config {
         if self.auth.keys.is_some() {
             text.push_str("# auth.keys are set and not shown: this file needs SCPSFM_AUTH__KEYS beside it.\n\n");
         }
+        if self.webhooks.secret.is_some() {
+            text.push_str(
+                "# webhooks.secret is set and not shown: this file needs SCPSFM_WEBHOOKS__SECRET beside it.\n\n",
+            );
+        }
         text.push_str(&toml::to_string(self)?);
         Ok(text)
     }
@@ -212,8 +218,10 @@ impl Config {
 /// The variables that name a key, i.e. have a section: `SCPSFM_ENGINE__WORKERS`. Others of our prefix, such as those
 /// that switch tests, are none of ours here; but `SCPSFM_ENGINE_WORKERS` is a slip that would go unseen.
 fn keys_among(variables: Vec<(String, String)>) -> Result<Vec<(String, String)>, Error> {
-    const SECTIONS: [&str; 12] =
-        ["SERVER", "HTTP", "TLS", "AUTH", "METRICS", "STORE", "ENGINE", "UPLOAD", "COMPUTE", "LIMITS", "LOG", "OTLP"];
+    const SECTIONS: [&str; 13] = [
+        "SERVER", "HTTP", "TLS", "AUTH", "METRICS", "STORE", "ENGINE", "UPLOAD", "COMPUTE", "LIMITS", "LOG", "OTLP",
+        "WEBHOOKS",
+    ];
     let mut keys = Vec::new();
     for (name, value) in variables {
         let Some(rest) = name.strip_prefix(PREFIX) else { continue };

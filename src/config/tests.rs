@@ -111,10 +111,38 @@ fn keys_are_kept_as_hashes_and_shown_nowhere() {
 }
 
 #[test]
+fn secrets_of_webhooks_are_shown_nowhere_and_those_of_the_file_are_added() {
+    let secret = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw";
+    let given = variables(&[("SCPSFM_WEBHOOKS__SECRET", secret), ("SCPSFM_WEBHOOKS__RETRY_FOR", "90m")]);
+    let mut config = Config::from_sources(None, given, &[]).expect("valid");
+    for shown in [format!("{config:?}"), config.to_toml().expect("TOML")] {
+        assert!(!shown.contains("MfKQ"), "{shown}");
+    }
+    assert!(config.to_toml().expect("TOML").contains("# webhooks.secret is set and not shown"));
+    let options = |config: &Config| config.webhooks.options(|_| Ok(Vec::new()));
+    assert!(options(&Config::default()).expect("off").is_none());
+    let own = file(&format!("# one tenant's\nnorth:{secret}\n{secret}\n"));
+    config.webhooks.secret_file = Some(own.path().to_owned());
+    let both = options(&config).expect("readable").expect("on");
+    assert_eq!((both.secrets.of("north").len(), both.secrets.of("south").len()), (1, 2));
+    assert_eq!(both.retry_for, Some(std::time::Duration::from_secs(90 * 60)));
+    config.webhooks.secret_file = Some(file("north:hunter2").path().to_owned());
+    let error = options(&config).expect_err("the file is gone").to_string();
+    assert!(error.contains("webhooks.secret_file"), "{error}");
+    let wrong = file("north:hunter2");
+    config.webhooks.secret_file = Some(wrong.path().to_owned());
+    let error = options(&config).expect_err("no secret").to_string();
+    assert!(
+        error.contains("webhooks.secret_file") && error.contains("entry 1") && !error.contains("hunter2"),
+        "{error}"
+    );
+}
+
+#[test]
 fn errors_name_the_key_and_what_would_be_right() {
     let from_file = |text: &str| Config::from_sources(Some(file(text).path()), vec![], &[]);
     let from_variable = |name: &str, value: &str| Config::from_sources(None, variables(&[(name, value)]), &[]);
-    let cases: [(Result<Config, Error>, &[&str]); 17] = [
+    let cases: [(Result<Config, Error>, &[&str]); 19] = [
         (from_file("[engine]\nwrokers = 1\n"), &["wrokers", "workers"]),
         (from_file("[engine]\nqueue_capacity = 0\n"), &["engine.queue_capacity", "from 1 on"]),
         (from_file("[server]\nlisten = \"localhost\"\n"), &["server.listen", "127.0.0.1:50051"]),
@@ -126,6 +154,8 @@ fn errors_name_the_key_and_what_would_be_right() {
         (from_variable("SCPSFM_OTLP__ENDPOINT", "https://x:4317"), &["otlp.endpoint", "http://127.0.0.1:4317"]),
         (from_variable("SCPSFM_AUTH__KEYS", "north:hunter2"), &["auth.keys", "entry 1", "32"]),
         (from_variable("SCPSFM_AUTH_KEYS", "north:hunter2"), &["SCPSFM_AUTH_KEYS", "SCPSFM_AUTH__KEYS"]),
+        (from_variable("SCPSFM_WEBHOOKS__SECRET", "whsec_hunter2"), &["webhooks.secret", "entry 1", "whsec_"]),
+        (from_variable("SCPSFM_WEBHOOKS_SECRET", "hunter2"), &["SCPSFM_WEBHOOKS_SECRET", "SCPSFM_WEBHOOKS__SECRET"]),
         (from_file("[tls]\ncertificate = \"c\"\n"), &["tls.certificate", "tls.key"]),
         (from_file("[tls]\nclient_ca = \"c\"\n"), &["tls.client_ca", "tls.certificate"]),
         (from_file("[server]\nlisten = \"0.0.0.0:1\"\n"), &["server.listen", "--tls-certificate", "--insecure"]),

@@ -11,6 +11,7 @@ use super::progress::Progress;
 use super::result::{Grade, Proposal, Status};
 use super::settings::SolveSettings;
 use super::warning::Warning;
+use super::webhook::Webhook;
 
 /// Tenant of callers without an API key.
 pub const DEFAULT_TENANT: &str = "default";
@@ -261,12 +262,14 @@ pub struct Job {
     pub attached_calls: Option<AttachedCalls>,
     /// When an ended job is removed; `None` while it has not ended, or where it is kept for good.
     pub expire_time: Option<SystemTime>,
+    /// Where its end is sent.
+    pub webhook: Option<Webhook>,
 }
 
 impl Job {
-    /// Changes whenever the job does, but for its latest progress: another one after each event and each change of
-    /// `attached_calls` or of the priority, and another job's of the same name, which was created at another time, is
-    /// another.
+    /// Changes whenever the job does, but for its latest progress and its webhook: another one after each event and
+    /// each change of `attached_calls` or of the priority, and another job's of the same name, which was created at
+    /// another time, is another.
     pub fn etag(&self) -> String {
         let created = self.create_time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_micros();
         let cancels = u8::from(self.cancel_requested);

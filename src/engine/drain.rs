@@ -9,7 +9,7 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use super::worker::Worker;
-use super::{Error, Inner, Phase, ResultEncoder, Solver, locked, slot};
+use super::{Error, Inner, Phase, ResultEncoder, Solver, locked, slot, webhooks};
 use crate::domain::StopReason;
 
 /// How long a job that was asked to stop may take to do so: ten times the solver's promise of 200 ms, and a slow disk.
@@ -31,6 +31,8 @@ pub(super) struct WorkerPool {
     sweeper: Option<JoinHandle<()>>,
     /// Heeds what other processes tell, where there are any.
     hints: Option<JoinHandle<()>>,
+    /// Delivers webhooks, where they are on.
+    webhooks: Option<JoinHandle<()>>,
     threads: Vec<thread::JoinHandle<()>>,
     /// Closes when the last thread has ended.
     threads_ended: Option<mpsc::Receiver<()>>,
@@ -68,6 +70,9 @@ impl Inner {
         if self.store.is_shared() {
             pool.hints = Some(tokio::spawn(super::hints::run(self.clone())));
         }
+        if let Some(options) = &self.options.webhooks {
+            pool.webhooks = Some(webhooks::start(self, options).map_err(Error::Internal)?);
+        }
         *locked(&self.pool) = pool;
     }
 
@@ -97,7 +102,7 @@ impl Inner {
         let (mut slots, others, threads, threads_ended) = {
             let mut pool = locked(&self.pool);
             let slots = std::mem::take(&mut pool.slots);
-            let others = [pool.sweeper.take(), pool.hints.take()];
+            let others = [pool.sweeper.take(), pool.hints.take(), pool.webhooks.take()];
             (slots, others, std::mem::take(&mut pool.threads), pool.threads_ended.take())
         };
         let in_time = timeout(bound, all_ended(&mut slots));
@@ -118,7 +123,8 @@ impl Inner {
         let (others_ended, ()) =
             tokio::join!(timeout(GIVE_BACK_GRACE, all_ended(&mut others)), join(threads, threads_ended));
         if others_ended.is_err() {
-            // They wait for a store that hangs, and have nothing that another server or the next start would miss.
+            // They wait for a store or a receiver that hangs, and have nothing that another server or the next start
+            // would miss.
             others.iter().for_each(JoinHandle::abort);
         }
         locked(&self.pool).drained

@@ -16,6 +16,7 @@ mod slot;
 mod submit;
 mod upload;
 mod watch;
+mod webhooks;
 mod worker;
 
 #[cfg(test)]
@@ -39,6 +40,7 @@ pub use error::Error;
 pub use submit::{Deadline, JobInput, NewJob};
 pub use upload::{Begun, Upload, UploadOptions};
 pub use watch::Watch;
+pub use webhooks::{JobEncoder, Options as WebhookOptions, Secrets as WebhookSecrets};
 
 use crate::domain::job::{Job, JobName, JobState};
 use crate::domain::{Backend, Input, Observer, Solution, SolveSettings, StopToken};
@@ -90,6 +92,8 @@ pub struct Options {
     pub backend: Backend,
     /// What tells the time of all that is stored.
     pub clock: Clock,
+    /// `None`: a job that names a webhook is refused, and none is sent.
+    pub webhooks: Option<WebhookOptions>,
 }
 
 impl Options {
@@ -139,6 +143,7 @@ impl Default for Options {
             worker_name: worker_name(),
             backend: Backend::default(),
             clock: Clock::default(),
+            webhooks: None,
         }
     }
 }
@@ -192,6 +197,8 @@ struct Inner {
     work: channel::Sender<u64>,
     /// Wakes the task that counts the queue.
     queue_changed: Notify,
+    /// Wakes the task that delivers webhooks.
+    webhook_due: Notify,
     phase: channel::Sender<Phase>,
     /// Cancelled once what runs is to go back to the queue: at the end of a drain's bound, or before by a hurry.
     hurried: CancellationToken,
@@ -230,6 +237,7 @@ impl Engine {
             foreseen: Mutex::default(),
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
+            webhook_due: Notify::new(),
             phase: channel::Sender::new(Phase::Open),
             hurried: CancellationToken::new(),
             drain_asked: CancellationToken::new(),
@@ -317,7 +325,8 @@ impl Engine {
         Ok(self.inner.store.detach(name, created).await?)
     }
 
-    /// Removes an ended job with its events, input, result and request ids; with an etag, only where it is the job's.
+    /// Removes an ended job with its events, input, result, request ids and webhook; with an etag, only where it is the
+    /// job's.
     ///
     /// # Errors
     /// [`Error::NotFound`], [`Error::NotEnded`], [`Error::EtagMismatch`].
@@ -430,6 +439,9 @@ impl Inner {
         observe::job_ended(job);
         self.hub.wake(&job.name);
         self.queue_changed();
+        if job.webhook.is_some() {
+            self.webhook_due.notify_one();
+        }
     }
 
     /// Tells everyone of jobs whose workers vanished.

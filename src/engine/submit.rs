@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
 
-use super::{Error, Inner, Phase, finished, observe};
+use super::{Error, Inner, Phase, WebhookOptions, finished, observe, webhooks};
 use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::job::{Job, JobName};
 use crate::domain::{Backend, Input, InputName, SolveSettings};
@@ -56,6 +56,8 @@ pub struct NewJob {
     /// Whether the call attaches to the job, see [`Engine::detach`](super::Engine::detach). No part of what makes two
     /// requests the same.
     pub cancel_on_disconnect: bool,
+    /// Where the job's end is to be sent.
+    pub webhook_url: Option<String>,
 }
 
 impl NewJob {
@@ -72,10 +74,11 @@ impl NewJob {
             labels: BTreeMap::new(),
             trace_parent: None,
             cancel_on_disconnect: false,
+            webhook_url: None,
         }
     }
 
-    fn validate(&self) -> Result<(), Error> {
+    fn validate(&self, webhooks: Option<&WebhookOptions>) -> Result<(), Error> {
         let mut found = Violations::default();
         let id_rule = "1 to 63 of a-z, 0-9 and -, not beginning or ending with -";
         if !JobName::is_id(&self.tenant) {
@@ -94,6 +97,9 @@ impl NewJob {
             return Err(Error::InputNotFound(name.clone()));
         }
         found.into_result()?;
+        if let Some(url) = &self.webhook_url {
+            webhooks::check(webhooks, &self.tenant, url)?;
+        }
         Ok(self.settings.validate()?)
     }
 
@@ -145,6 +151,7 @@ impl NewJob {
             labels: self.labels,
             trace_parent: self.trace_parent,
             cancel_on_disconnect: self.cancel_on_disconnect,
+            webhook_url: self.webhook_url,
         })
     }
 
@@ -156,7 +163,8 @@ impl NewJob {
             Some(Deadline::At(time)) => Some(("at", time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default())),
             Some(Deadline::After(duration)) => Some(("after", duration)),
         };
-        let rest = payload::encode(&(&self.job_id, &self.settings, deadline, self.priority, &self.labels))?;
+        let rest = (&self.job_id, &self.settings, deadline, self.priority, &self.labels, &self.webhook_url);
+        let rest = payload::encode(&rest)?;
         let mut hash = Sha256::new();
         hash.update((rest.len() as u64).to_le_bytes());
         hash.update(rest);
@@ -172,7 +180,7 @@ impl Inner {
     }
 
     pub(super) async fn submit_batch(self: Arc<Self>, news: Vec<NewJob>) -> Result<Vec<Job>, Error> {
-        news.iter().try_for_each(NewJob::validate)?;
+        news.iter().try_for_each(|new| new.validate(self.options.webhooks.as_ref()))?;
         if self.phase() != Phase::Open {
             observe::refused(observe::Refusal::Draining);
             return Err(Error::Draining);

@@ -20,7 +20,7 @@ mod upload;
 use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
 use axum::body::Body;
@@ -28,11 +28,14 @@ use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::server::graceful::GracefulShutdown;
-use prost_reflect::DescriptorPool;
+use prost::Message as _;
+use prost_reflect::{DescriptorPool, MessageDescriptor};
 use tokio::net::TcpListener;
 use tokio::task::{JoinHandle, JoinSet};
 use tokio_util::sync::CancellationToken;
 
+use crate::domain::job::Job;
+use crate::rpc::convert;
 use crate::rpc::listener::{self, Incoming};
 use crate::rpc::proto::FILE_DESCRIPTOR_SET;
 use crate::rpc::server::Gateway;
@@ -51,6 +54,19 @@ const HEAD_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// How long nothing may move on a connection: events are told apart by a comment every 15 s.
 const SILENCE: Duration = Duration::from_secs(120);
+
+/// A job as `GET /v1/{name}` answers it: what webhooks are sent.
+///
+/// # Errors
+/// A defect of ours.
+pub fn encode_job(job: &Job) -> Result<Vec<u8>, String> {
+    static DESCRIPTOR: LazyLock<Result<MessageDescriptor, String>> = LazyLock::new(|| {
+        let pool = DescriptorPool::decode(FILE_DESCRIPTOR_SET).map_err(|error| error.to_string())?;
+        pool.get_message_by_name("scpsfm.v1.Job").ok_or_else(|| "the proto lacks Job".into())
+    });
+    let bytes = convert::job::to_wire(job).encode_to_vec();
+    answer::message(DESCRIPTOR.as_ref().map_err(Clone::clone)?, &bytes).map_err(|status| status.message().to_owned())
+}
 
 /// How the port is served.
 #[derive(Debug, Clone)]

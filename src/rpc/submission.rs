@@ -108,6 +108,7 @@ impl Submission {
         job.labels = description.labels;
         job.priority = description.priority;
         job.deadline = description.deadline;
+        job.webhook_url = description.webhook_url;
         job.trace_parent = trace_parent;
         Ok(job)
     }

@@ -30,7 +30,7 @@ pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
     Bound, CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
-    QueueBounds, QueueReport, Request, RetryReply, Swept, TenantQueue, Work,
+    QueueBounds, QueueReport, Request, RetryReply, Swept, TenantQueue, WebhookOutcome, WebhookQueue, Work,
 };
 pub use upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
@@ -254,8 +254,8 @@ pub trait Store: Send + Sync + 'static {
     /// [`Error::NotFound`].
     async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error>;
 
-    /// Removes an ended job with its events, attempts, input, result and request ids. With an `etag`, only where it is
-    /// the job's.
+    /// Removes an ended job with its events, attempts, input, result, request ids and webhook. With an `etag`, only
+    /// where it is the job's.
     ///
     /// # Errors
     /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::NotEnded`].
@@ -357,6 +357,23 @@ pub trait Store: Send + Sync + 'static {
 
     /// What waits and what runs.
     async fn load(&self) -> Result<Load, Error>;
+
+    /// What is to be sent to the webhooks of jobs that have ended.
+    async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error>;
+
+    /// Leases the delivery of a job's end that is due the longest, to another receiver than those that are `passed`
+    /// over, and counts an attempt at it. Returns the job as it stands then; `None` where nothing is due. A delivery
+    /// whose lease runs out is due again.
+    async fn claim_webhook(
+        &self,
+        passed: &[String],
+        now: SystemTime,
+        lease_for: Duration,
+    ) -> Result<Option<Job>, Error>;
+
+    /// Notes what the attempt at the delivery of a `claimed` job came to. `false` where the job is gone, or another
+    /// attempt has begun since: nothing is noted then.
+    async fn settle_webhook(&self, claimed: &Job, outcome: &WebhookOutcome, now: SystemTime) -> Result<bool, Error>;
 
     /// Whether other processes may be at work on the same jobs.
     fn is_shared(&self) -> bool;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
 
@@ -27,6 +27,8 @@ pub struct NewRecord {
     pub trace_parent: Option<String>,
     /// Whether the job depends on the call that creates it; see [`crate::store::Store::create_jobs`].
     pub cancel_on_disconnect: bool,
+    /// Where the job's end is to be sent.
+    pub webhook_url: Option<String>,
 }
 
 /// What a job works on.
@@ -339,4 +341,28 @@ pub struct Swept {
     pub lost: Vec<Job>,
     /// They had waited past their deadline.
     pub expired: Vec<Job>,
+}
+
+/// What is to be sent to webhooks.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct WebhookQueue {
+    /// Ends of jobs that were neither accepted nor given up.
+    pub pending: u64,
+    /// Whether an attempt at one of them is due.
+    pub is_due: bool,
+}
+
+/// What an attempt at a webhook came to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum WebhookOutcome {
+    Delivered,
+    /// It failed, and the next attempt is due after that time.
+    Retry {
+        error: String,
+        after: Duration,
+    },
+    /// It failed, and was the last one.
+    GivenUp {
+        error: String,
+    },
 }

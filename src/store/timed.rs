@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 use super::{
     BegunUpload, CancelReply, Claimed, Created, EncodedResult, Ending, Error, Heartbeat, Hint, InputPage, InputQuery,
     JobPage, JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, QueueReport,
-    RetryReply, Store, StoredInput, Swept, UploadBounds, UploadLease, UploadStatus, Work,
+    RetryReply, Store, StoredInput, Swept, UploadBounds, UploadLease, UploadStatus, WebhookOutcome, WebhookQueue, Work,
 };
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
@@ -239,6 +239,26 @@ impl<S: Store> Store for Timed<S> {
     async fn load(&self) -> Result<Load, Error> {
         let _timer = store_operation("load");
         self.0.load().await
+    }
+
+    async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error> {
+        let _timer = store_operation("webhook_queue");
+        self.0.webhook_queue(now).await
+    }
+
+    async fn claim_webhook(
+        &self,
+        passed: &[String],
+        now: SystemTime,
+        lease_for: Duration,
+    ) -> Result<Option<Job>, Error> {
+        let _timer = store_operation("claim_webhook");
+        self.0.claim_webhook(passed, now, lease_for).await
+    }
+
+    async fn settle_webhook(&self, claimed: &Job, outcome: &WebhookOutcome, now: SystemTime) -> Result<bool, Error> {
+        let _timer = store_operation("settle_webhook");
+        self.0.settle_webhook(claimed, outcome, now).await
     }
 
     fn is_shared(&self) -> bool {

@@ -18,7 +18,7 @@ use crate::domain::{Grade, Proposal, Stage};
 
 pub use catalogue::*;
 pub use guards::{Held, RpcCall, StoreTimer};
-pub use labels::{AttemptLost, Deletion, GivenUp, HttpRefusal, Refusal, Reloaded, UploadRefusal};
+pub use labels::{AttemptLost, Deletion, GivenUp, HttpRefusal, Refusal, Reloaded, UploadRefusal, WebhookAttempt};
 use labels::{NONE, grade_name};
 
 /// Installs the process-wide recorder, once; later calls return the same handle.
@@ -115,6 +115,9 @@ fn create_known_series() {
     for files in Reloaded::ALL {
         gauge!(RELOAD_FAILED.name, "files" => files.name()).set(0.0);
     }
+    for outcome in WebhookAttempt::ALL {
+        counter!(WEBHOOK_ATTEMPTS.name, "outcome" => outcome.name()).absolute(0);
+    }
     for reason in AttemptLost::ALL {
         counter!(ATTEMPTS_LOST.name, "reason" => reason.name()).absolute(0);
     }
@@ -194,6 +197,16 @@ pub fn upload_refused(refusal: UploadRefusal) {
 /// A request over HTTP was refused before it became a call.
 pub fn http_refused(refusal: HttpRefusal) {
     counter!(HTTP_REFUSED.name, "reason" => refusal.reason()).increment(1);
+}
+
+/// Tells how many webhooks are to be delivered. As [`queue_depth`].
+pub fn webhooks_pending(webhooks: u64) {
+    gauge!(WEBHOOKS_PENDING.name).set(webhooks as f64);
+}
+
+/// An attempt at a webhook ended.
+pub fn webhook_attempt(outcome: WebhookAttempt) {
+    counter!(WEBHOOK_ATTEMPTS.name, "outcome" => outcome.name()).increment(1);
 }
 
 /// A job reached a terminal state, `job.state`; once a job, by whoever committed it.

@@ -14,13 +14,14 @@ const SCHEMA: &str = include_str!("../../deploy/helm/scpsfm/values.schema.json")
 const EXAMPLE: &str = include_str!("../../deploy/scpsfm.toml");
 
 /// What the chart sets itself, from values of its own or from secrets, by section; empty: the whole section.
-const OWN: [(&str, &[&str]); 6] = [
+const OWN: [(&str, &[&str]); 7] = [
     ("server", &["listen", "insecure", "plaintext_keys"]),
     ("tls", &[]),
     ("http", &["listen"]),
     ("auth", &[]),
     ("metrics", &[]),
     ("store", &["data_dir", "url"]),
+    ("webhooks", &["secret_file"]),
 ];
 
 fn chart() -> PathBuf {
@@ -59,7 +60,7 @@ fn sections() -> Vec<(String, Vec<(String, Value)>)> {
 /// A value that the schema of a key allows, as TOML.
 fn sample(section: &str, key: &str, schema: &Value) -> String {
     let text = match (section, key) {
-        ("store", "retention") | ("upload", "abandoned_after") => "12h",
+        ("store", "retention") | ("upload", "abandoned_after") | ("webhooks", "retry_for") => "12h",
         ("otlp", "endpoint") => "http://collector.monitoring:4317",
         ("http", "hosts") => "solver.example",
         ("compute", "prior") => "/models/my.prior",

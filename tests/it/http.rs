@@ -17,19 +17,19 @@ const NORTH: &str = "north-0123456789abcdef0123456789abcdef";
 const SOUTH: &str = "south-0123456789abcdef0123456789abcdef";
 const OPS: &str = "ops-0123456789abcdef0123456789abcdef";
 
-struct Answer {
-    code: u16,
+pub struct Answer {
+    pub code: u16,
     head: String,
-    body: Vec<u8>,
+    pub body: Vec<u8>,
 }
 
 impl Answer {
-    fn json(&self) -> Value {
+    pub fn json(&self) -> Value {
         serde_json::from_slice(&self.body)
             .unwrap_or_else(|error| panic!("{error}: {}", String::from_utf8_lossy(&self.body)))
     }
 
-    fn text(&self) -> String {
+    pub fn text(&self) -> String {
         String::from_utf8(self.body.clone()).expect("text")
     }
 
@@ -44,7 +44,7 @@ impl Answer {
     }
 
     /// The reason of a refusal, and the first field that it names.
-    fn refusal(&self) -> (String, String) {
+    pub fn refusal(&self) -> (String, String) {
         let error = &self.json()["error"];
         assert_eq!(error["code"], self.code, "{error}");
         let details = error["details"].as_array().expect("details").clone();
@@ -57,7 +57,7 @@ impl Answer {
 }
 
 /// A request of HTTP/1.0, whose answer ends with the connection.
-fn request(server: &Serving, verb: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Answer {
+pub fn request(server: &Serving, verb: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Answer {
     let address = server.http.strip_prefix("http://").expect("an address");
     request_for(server, address, verb, path, headers, body)
 }
@@ -81,15 +81,15 @@ fn request_for(server: &Serving, host: &str, verb: &str, path: &str, headers: &[
     Answer { code, head, body: answer[end + 4..].to_vec() }
 }
 
-fn get(server: &Serving, path: &str) -> Answer {
+pub fn get(server: &Serving, path: &str) -> Answer {
     request(server, "GET", path, &[], &[])
 }
 
-fn post(server: &Serving, path: &str, body: &Value) -> Answer {
+pub fn post(server: &Serving, path: &str, body: &Value) -> Answer {
     request(server, "POST", path, &[("content-type", "application/json")], body.to_string().as_bytes())
 }
 
-fn tracks() -> Value {
+pub fn tracks() -> Value {
     let raw = raw(3, 4);
     json!({
         "trackCount": raw.track_count,
@@ -105,7 +105,7 @@ fn serving() -> (tempfile::TempDir, Serving) {
 }
 
 /// The path of a job, or of an input, by its name.
-fn path_of(resource: &Value) -> String {
+pub fn path_of(resource: &Value) -> String {
     format!("/v1/{}", resource["name"].as_str().expect("a name"))
 }
 

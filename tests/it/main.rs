@@ -27,3 +27,4 @@ mod silence;
 mod support;
 mod telemetry;
 mod upload;
+mod webhooks;

@@ -24,6 +24,7 @@ pub struct JobOptions {
     pub labels: BTreeMap<String, String>,
     pub priority: i32,
     pub time_limit: Option<Duration>,
+    pub webhook_url: Option<String>,
 }
 
 /// One page of a list.
@@ -305,6 +306,7 @@ pub(super) fn create_request(
             labels: options.labels,
             priority: options.priority,
             deadline: time_limit.map(proto::job::Deadline::TimeLimit),
+            webhook: options.webhook_url.map(|url| proto::Webhook { url, ..proto::Webhook::default() }),
             ..proto::Job::default()
         }),
         source: Some(input),

@@ -58,6 +58,7 @@ async fn an_input_that_cannot_be_read_fails_its_job() {
         labels: Default::default(),
         trace_parent: None,
         cancel_on_disconnect: false,
+        webhook_url: None,
     };
     let name = broken.name.clone();
     let room = &bench.engine.inner.options.queue;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::{positive_duration, settings, time_from_wire};
 use crate::domain::error::Violations;
-use crate::domain::{InvalidInput, SolveSettings, Violation};
+use crate::domain::{InvalidInput, SolveSettings, Violation, Webhook};
 use crate::engine::Deadline;
 use crate::rpc::proto;
 use proto::job::Deadline as WireDeadline;
@@ -28,6 +28,7 @@ pub struct Description {
     pub labels: BTreeMap<String, String>,
     pub priority: i32,
     pub deadline: Option<Deadline>,
+    pub webhook_url: Option<String>,
 }
 
 /// Reads and checks everything but parent and input. Fields of the job that are the server's are ignored.
@@ -47,6 +48,10 @@ pub fn from_wire(job_id: String, request_id: String, job: Option<proto::Job>) ->
         let text = format!("is not 1 to {MAX_REQUEST_ID} visible ASCII characters; a UUID is");
         found.push(Violation::of("request_id", text));
     }
+    let webhook_url = job.webhook.map(|webhook| webhook.url);
+    if let Some(Err(error)) = webhook_url.as_deref().map(Webhook::parse_url) {
+        found.push(Violation::of("job.webhook.url", error));
+    }
     found.into_result()?;
     let given = |id: String| (!id.is_empty()).then_some(id);
     Ok(Description {
@@ -56,6 +61,7 @@ pub fn from_wire(job_id: String, request_id: String, job: Option<proto::Job>) ->
         labels: BTreeMap::from_iter(job.labels),
         priority: job.priority,
         deadline,
+        webhook_url,
     })
 }
 
@@ -148,6 +154,10 @@ mod tests {
         assert_eq!(wrong(proto::Job { labels, ..Default::default() }), ["job.labels", "job.labels"]);
         let many = (0..65).map(|k| (k.to_string(), String::new())).collect();
         assert_eq!(wrong(proto::Job { labels: many, ..Default::default() }), ["job.labels"]);
+        for url in ["", "ftp://a", "https://a/#b"] {
+            let webhook = Some(proto::Webhook { url: url.into(), ..Default::default() });
+            assert_eq!(wrong(proto::Job { webhook, ..Default::default() }), ["job.webhook.url"]);
+        }
         let error = from_wire(String::new(), "a b".into(), None).expect_err("a space");
         assert_eq!(error.violations()[0].field, "request_id");
     }

@@ -2,7 +2,7 @@
 
 use crate::domain::job::{AttemptEnd, JobState};
 use crate::domain::{
-    Backend, Grade, LensProjection, Method, Phase, Proposal, Stage, Status, Task, Violation, WarningCode,
+    Backend, Grade, LensProjection, Method, Phase, Proposal, Stage, Status, Task, Violation, WarningCode, WebhookState,
 };
 use crate::rpc::proto;
 
@@ -59,6 +59,7 @@ twins! {
     Proposal = Proposal { Network, Irls, Consistency, Rigidity, Uniform, Learned }
     JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, DeadlineExceeded }
     AttemptEnd = AttemptEnd { Ended, GivenBack, Lost }
+    WebhookState = WebhookState { Pending, Delivered, GivenUp }
     WarningCode = WarningCode {
         PlanarOrRotation,
         PlanarScene,
@@ -125,6 +126,10 @@ mod tests {
         for state in JobState::ALL {
             let wire = proto::JobState::try_from(state.to_wire()).expect("known");
             assert_eq!(wire.as_str_name(), format!("JOB_STATE_{}", state.name()));
+        }
+        for state in WebhookState::ALL {
+            let wire = proto::WebhookState::try_from(state.to_wire()).expect("known");
+            assert_eq!(wire.as_str_name(), format!("WEBHOOK_STATE_{}", state.name()));
         }
     }
 }

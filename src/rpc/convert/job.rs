@@ -8,7 +8,7 @@ use super::{
     optional_time, progress, required, result, settings, size_from_wire, size_to_wire, tellable, time_from_wire,
 };
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
-use crate::domain::{Grade, InputName, InvalidInput, Proposal, Status, Violation};
+use crate::domain::{Grade, InputName, InvalidInput, Proposal, Status, Violation, Webhook, WebhookState};
 use crate::rpc::proto;
 use proto::job_event::Body;
 
@@ -35,6 +35,7 @@ pub fn to_wire(job: &Job) -> proto::Job {
         expire_time: tellable(job.expire_time),
         etag: job.etag(),
         input: job.input.as_ref().map(InputName::to_string).unwrap_or_default(),
+        webhook: job.webhook.as_ref().map(webhook_to_wire),
     }
 }
 
@@ -71,6 +72,7 @@ pub fn from_wire(job: proto::Job) -> Result<Job, InvalidInput> {
         // Not told: only servers need it.
         attached_calls: None,
         expire_time: optional_time(job.expire_time, "expire_time")?,
+        webhook: job.webhook.map(webhook_from_wire).transpose()?,
     })
 }
 
@@ -124,6 +126,24 @@ fn input_from_wire(name: &str) -> Result<Option<InputName>, Violation> {
     }
     let parsed = InputName::parse(name);
     parsed.map(Some).ok_or_else(|| Violation::of("input", format!("{name:?} is not an input's name")))
+}
+
+fn webhook_to_wire(webhook: &Webhook) -> proto::Webhook {
+    proto::Webhook {
+        url: webhook.url.clone(),
+        state: webhook.state.to_wire(),
+        attempt_count: webhook.attempts,
+        last_error: webhook.last_error.clone().unwrap_or_default(),
+    }
+}
+
+fn webhook_from_wire(webhook: proto::Webhook) -> Result<Webhook, Violation> {
+    Ok(Webhook {
+        url: webhook.url,
+        state: WebhookState::required(webhook.state, "webhook.state")?,
+        attempts: webhook.attempt_count,
+        last_error: Some(webhook.last_error).filter(|error| !error.is_empty()),
+    })
 }
 
 fn failure_to_wire(failure: &Failure) -> proto::JobError {
@@ -269,6 +289,12 @@ mod tests {
             cancel_requested: true,
             attached_calls: None,
             expire_time: Some(time(4)),
+            webhook: Some(Webhook {
+                url: "https://hooks.example/a".into(),
+                state: WebhookState::GivenUp,
+                attempts: 7,
+                last_error: Some("the receiver answered 410 Gone".into()),
+            }),
         };
         assert_eq!(from_wire(to_wire(&job)), Ok(job.clone()));
         let bare = Job {
@@ -283,6 +309,7 @@ mod tests {
             failure: None,
             cancel_requested: false,
             expire_time: None,
+            webhook: Some(Webhook::pending("http://a")),
             ..job
         };
         assert_eq!(from_wire(to_wire(&bare)), Ok(bare.clone()));

@@ -41,6 +41,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
         cancel_requested: false,
         attached_calls: None,
         expire_time: None,
+        webhook: None,
     };
     assert_eq!(created.job, expected);
     assert_eq!(store.job(&new.name).await, Ok(expected));

@@ -6,6 +6,7 @@ pub(super) mod leases;
 pub(super) mod reading;
 pub(super) mod removal;
 pub(super) mod uploads;
+pub(super) mod webhooks;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -66,6 +67,12 @@ macro_rules! store_contract {
             uploads::inputs_are_listed_page_by_page,
             uploads::a_deleted_input_is_kept_by_its_jobs_alone,
             uploads::many_that_begin_at_once_share_the_last_room,
+            webhooks::every_end_of_a_job_makes_its_webhook_due,
+            webhooks::an_attempt_is_leased_and_settled_once,
+            webhooks::a_failed_attempt_is_due_again_later_and_a_last_one_never,
+            webhooks::busy_receivers_are_passed_over,
+            webhooks::no_delivery_is_claimed_twice,
+            webhooks::a_deleted_job_takes_its_webhook_along,
         );
     };
     (@each $open:path; $($part:ident :: $test:ident,)*) => {
@@ -112,6 +119,7 @@ pub(super) fn record(job: &str) -> NewRecord {
         labels: BTreeMap::new(),
         trace_parent: None,
         cancel_on_disconnect: false,
+        webhook_url: None,
     }
 }
 

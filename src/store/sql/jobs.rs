@@ -4,9 +4,9 @@ use std::collections::{HashMap, HashSet};
 use std::time::SystemTime;
 
 use super::rows::{self, integer, micros, number, returning_job, select_jobs};
-use super::{Change, Connection, Row, Statement, uploads};
-use crate::domain::InputName;
+use super::{Change, Connection, Row, Statement, uploads, webhooks};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
+use crate::domain::{InputName, Webhook};
 use crate::store::record::{Created, EncodedResult, JobInput, Load, NewRecord, QueueBounds, Request, Work};
 use crate::store::{Error, JobPage, JobQuery, Order, TakenId, payload};
 
@@ -147,7 +147,12 @@ async fn enqueue<C: Connection>(
     }
     let event = EventBody::State { state: JobState::Queued, failure: None };
     connection.execute(rows::insert_event(id, FIRST_EVENT, 0, &event, now)?).await?;
-    let job = rows::job(&row)?;
+    let mut job = rows::job(&row)?;
+    if let Some(url) = &new.webhook_url {
+        let webhook = Webhook::pending(url);
+        connection.execute(webhooks::insert(id, &webhook)?).await?;
+        job.webhook = Some(webhook);
+    }
     connection.tell(Change::Events, &new.name).await?;
     connection.tell(Change::Queued, &new.name).await?;
     Ok(job)

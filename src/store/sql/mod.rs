@@ -10,6 +10,7 @@ mod rows;
 mod statement;
 mod store;
 mod uploads;
+mod webhooks;
 
 use std::future::Future;
 use std::ops::DerefMut;

@@ -51,8 +51,8 @@ pub(super) async fn purge<C: Connection>(connection: &mut C, ended_by: SystemTim
     Ok(removed)
 }
 
-/// Removes a job's row, and with it events, attempts, labels, result and request ids; and its input, unless that was
-/// uploaded by itself.
+/// Removes a job's row, and with it events, attempts, labels, result, request ids and webhook; and its input, unless
+/// that was uploaded by itself.
 async fn remove<C: Connection>(connection: &mut C, id: i64) -> Result<(), Error> {
     let delete = Statement::new("DELETE FROM jobs WHERE id = $1 RETURNING input_id").bind(id);
     let input = connection.row(delete).await?.integer("input_id")?;

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, SystemTime};
 
-use super::{Change, Connection, Row, Statement};
+use super::{Change, Connection, Row, Statement, webhooks};
 use crate::domain::InputName;
 use crate::domain::job::{AttachedCalls, AttemptEnd, EventBody, Failure, Job, JobName, JobState, Summary};
 use crate::domain::progress::Progress;
@@ -15,7 +15,8 @@ macro_rules! job_columns {
     () => {
         "id, tenant, job, state, attempt, settings, view_count, track_count, observation_count, labels, priority, \
          create_time, start_time, end_time, deadline, progress, last_sequence, summary, failure, cancel_requested, \
-         trace_parent, queue_time, uploaded_input, attached_calls, detached_calls"
+         trace_parent, queue_time, uploaded_input, attached_calls, detached_calls, \
+         (SELECT webhook FROM webhooks WHERE job_id = jobs.id) AS webhook"
     };
 }
 pub(super) use job_columns;
@@ -116,6 +117,7 @@ pub(super) fn job(row: &impl Row) -> Result<Job, Error> {
         attached_calls: attached_calls(row)?,
         // Retention is the engine's; it says until when.
         expire_time: None,
+        webhook: optional_record(row, "webhook")?,
     })
 }
 
@@ -288,6 +290,9 @@ pub(super) async fn leave<C: Connection>(
     .bind(job.id);
     batch.push(update);
     let changed = one_job(&connection.batch(batch).await?)?;
+    if changed.webhook.is_some() && next.is_terminal() {
+        connection.execute(webhooks::due(job.id, now)).await?;
+    }
     connection.tell(Change::Events, &job.name).await?;
     if next == JobState::Queued {
         connection.tell(Change::Queued, &job.name).await?;

@@ -6,13 +6,13 @@ use std::time::{Duration, SystemTime};
 
 use futures_util::FutureExt;
 
-use super::{Database, Moves, Size, admin, attempts, jobs, operation, removal, uploads};
+use super::{Database, Moves, Size, admin, attempts, jobs, operation, removal, uploads, webhooks};
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
     CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
-    QueueBounds, QueueReport, RetryReply, Swept, Work,
+    QueueBounds, QueueReport, RetryReply, Swept, WebhookOutcome, WebhookQueue, Work,
 };
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
@@ -318,6 +318,35 @@ impl<D: Database> Store for D {
 
     async fn load(&self) -> Result<Load, Error> {
         reads!(self, Size::Small, |connection| jobs::load(connection))
+    }
+
+    async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error> {
+        let due_by = self.lease_clock(now);
+        reads!(self, Size::Small, |connection| webhooks::queue(connection, due_by))
+    }
+
+    async fn claim_webhook(
+        &self,
+        passed: &[String],
+        now: SystemTime,
+        lease_for: Duration,
+    ) -> Result<Option<Job>, Error> {
+        let due_by = self.lease_clock(now);
+        let passed: Arc<[String]> = passed.into();
+        writes!(self, Size::Small, Moves::Begins(0), [passed], |connection| webhooks::claim(
+            connection,
+            &passed,
+            due_by,
+            due_by + lease_for
+        ))
+    }
+
+    async fn settle_webhook(&self, claimed: &Job, outcome: &WebhookOutcome, now: SystemTime) -> Result<bool, Error> {
+        let now = self.lease_clock(now);
+        let claimed = Arc::new(claimed.clone());
+        writes!(self, Size::Small, Moves::Ends(0), [claimed, outcome], |connection| webhooks::settle(
+            connection, &claimed, &outcome, now
+        ))
     }
 
     fn is_shared(&self) -> bool {

@@ -169,6 +169,18 @@ pub const UPLOAD_REFUSALS: Metric = Metric {
     labels: &["reason", "bound"],
     help: "Uploads refused before anything was stored, by reason and by the bound that was hit.",
 };
+pub const WEBHOOKS_PENDING: Metric = Metric {
+    name: "scpsfm_webhooks_pending",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Ended jobs whose webhook was neither delivered nor given up.",
+};
+pub const WEBHOOK_ATTEMPTS: Metric = Metric {
+    name: "scpsfm_webhook_attempts_total",
+    kind: Kind::Counter,
+    labels: &["outcome"],
+    help: "Attempts at a webhook: delivered, failed and made again, or failed as the last one.",
+};
 pub const RPC_REQUESTS: Metric = Metric {
     name: "scpsfm_grpc_requests_total",
     kind: Kind::Counter,
@@ -293,6 +305,8 @@ pub const ALL: &[Metric] = &[
     INPUTS_CREATED,
     UPLOADS_GIVEN_UP,
     UPLOAD_REFUSALS,
+    WEBHOOKS_PENDING,
+    WEBHOOK_ATTEMPTS,
     RPC_REQUESTS,
     RPC_DURATION,
     RPC_IN_FLIGHT,

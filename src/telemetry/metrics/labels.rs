@@ -209,6 +209,30 @@ impl GivenUp {
     }
 }
 
+/// What an attempt at a webhook came to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WebhookAttempt {
+    /// The receiver accepted it.
+    Delivered,
+    /// It is made again.
+    Failed,
+    /// It failed, and was the last one.
+    GivenUp,
+}
+
+impl WebhookAttempt {
+    pub(super) const ALL: [WebhookAttempt; 3] =
+        [WebhookAttempt::Delivered, WebhookAttempt::Failed, WebhookAttempt::GivenUp];
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            WebhookAttempt::Delivered => "DELIVERED",
+            WebhookAttempt::Failed => "FAILED",
+            WebhookAttempt::GivenUp => "GIVEN_UP",
+        }
+    }
+}
+
 /// How an attempt ended that did not end its job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AttemptLost {

@@ -62,6 +62,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
         cancel_requested: false,
         attached_calls: None,
         expire_time: None,
+        webhook: None,
     }
 }
 

@@ -148,6 +148,19 @@ CREATE TABLE attempts (
     PRIMARY KEY (job_id, attempt)
 ) STRICT, WITHOUT ROWID;
 
+-- The outbox of webhooks: a job's end that is to be sent, or was.
+CREATE TABLE webhooks (
+    job_id   INTEGER PRIMARY KEY REFERENCES jobs (id) ON DELETE CASCADE,
+    -- Scheme, host and port of the URL: attempts at one receiver are bounded.
+    receiver TEXT    NOT NULL,
+    -- URL, state, attempts and last error.
+    webhook  BLOB    NOT NULL,
+    -- When the next attempt is due, or the lease of the present one ends. None before the job has ended, and after the
+    -- last attempt.
+    due_time INTEGER
+) STRICT;
+CREATE INDEX webhooks_due ON webhooks (due_time) WHERE due_time IS NOT NULL;
+
 -- Uploads: their bytes as they came, until they are an input or are given up.
 CREATE TABLE uploads (
     id          INTEGER PRIMARY KEY AUTOINCREMENT,

@@ -1,0 +1,89 @@
+//! The outbox of webhooks: what is to be sent of jobs that have ended, and what became of it.
+
+use std::time::SystemTime;
+
+use super::rows::{self, micros, number, select_jobs};
+use super::{Connection, Row, Statement};
+use crate::domain::job::Job;
+use crate::domain::{Webhook, WebhookState};
+use crate::store::record::{WebhookOutcome, WebhookQueue};
+use crate::store::{Error, payload};
+
+/// Stores the webhook of a job of this row. It is not due before the job ends.
+pub(super) fn insert(id: i64, webhook: &Webhook) -> Result<Statement, Error> {
+    let insert = Statement::new("INSERT INTO webhooks (job_id, receiver, webhook) VALUES ($1, $2, $3)").bind(id);
+    Ok(insert.bind(&webhook.receiver()).bind(payload::encode(webhook)?))
+}
+
+/// Makes the webhook of a job due that ends now.
+pub(super) fn due(id: i64, now: SystemTime) -> Statement {
+    Statement::new("UPDATE webhooks SET due_time = $1 WHERE job_id = $2").bind(micros(now)).bind(id)
+}
+
+/// What is to be sent; see [`crate::store::Store::webhook_queue`].
+pub(super) async fn queue<C: Connection>(connection: &mut C, due_by: SystemTime) -> Result<WebhookQueue, Error> {
+    let select = "SELECT COUNT(*) AS pending, MIN(due_time) AS first_due FROM webhooks WHERE due_time IS NOT NULL";
+    let row = connection.row(Statement::new(select)).await?;
+    let first_due = row.optional_integer("first_due")?;
+    Ok(WebhookQueue { pending: number(&row, "pending")?, is_due: first_due.is_some_and(|due| due <= micros(due_by)) })
+}
+
+/// Leases what is due until `expires`; see [`crate::store::Store::claim_webhook`].
+pub(super) async fn claim<C: Connection>(
+    connection: &mut C,
+    passed: &[String],
+    due_by: SystemTime,
+    expires: SystemTime,
+) -> Result<Option<Job>, Error> {
+    let mut next = Statement::new("SELECT job_id, webhook FROM webhooks WHERE due_time <= $1").bind(micros(due_by));
+    for receiver in passed {
+        next = next.then(" AND receiver <> ").then_bind(receiver);
+    }
+    let next = next.then(" ORDER BY due_time, job_id LIMIT 1").then(C::SKIP_LOCKED);
+    let Some(row) = connection.optional_row(next).await? else { return Ok(None) };
+    let (id, webhook) = read(&row)?;
+    let webhook = Webhook { attempts: webhook.attempts.saturating_add(1), ..webhook };
+    connection.execute(update(id, &webhook, Some(expires))?).await?;
+    let job = connection.row(Statement::new(select_jobs!("WHERE id = $1")).bind(id)).await?;
+    rows::job(&job).map(Some)
+}
+
+/// Notes what an attempt came to; see [`crate::store::Store::settle_webhook`].
+pub(super) async fn settle<C: Connection>(
+    connection: &mut C,
+    claimed: &Job,
+    outcome: &WebhookOutcome,
+    now: SystemTime,
+) -> Result<bool, Error> {
+    let select = Statement::new(
+        "SELECT job_id, webhook FROM webhooks \
+         WHERE job_id = (SELECT id FROM jobs WHERE tenant = $1 AND job = $2 AND create_time = $3)",
+    )
+    .bind(&claimed.name.tenant)
+    .bind(&claimed.name.job)
+    .bind(micros(claimed.create_time))
+    .then(C::FOR_UPDATE);
+    let Some(row) = connection.optional_row(select).await? else { return Ok(false) };
+    let (id, webhook) = read(&row)?;
+    // As long as it is pending, the number of attempts is the fencing token.
+    if Some(&webhook) != claimed.webhook.as_ref() {
+        return Ok(false);
+    }
+    let (state, last_error, due) = match outcome {
+        WebhookOutcome::Delivered => (WebhookState::Delivered, None, None),
+        WebhookOutcome::Retry { error, after } => (WebhookState::Pending, Some(error), Some(now + *after)),
+        WebhookOutcome::GivenUp { error } => (WebhookState::GivenUp, Some(error), None),
+    };
+    let webhook = Webhook { state, last_error: last_error.cloned(), ..webhook };
+    connection.execute(update(id, &webhook, due)?).await?;
+    Ok(true)
+}
+
+fn read(row: &impl Row) -> Result<(i64, Webhook), Error> {
+    Ok((row.integer("job_id")?, payload::decode(&row.bytes("webhook")?, "a webhook")?))
+}
+
+fn update(id: i64, webhook: &Webhook, due: Option<SystemTime>) -> Result<Statement, Error> {
+    let update = Statement::new("UPDATE webhooks SET webhook = $1, due_time = $2 WHERE job_id = $3");
+    Ok(update.bind(payload::encode(webhook)?).bind(due.map(micros)).bind(id))
+}
