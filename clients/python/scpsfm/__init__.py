@@ -41,7 +41,18 @@ from .errors import (
     Violation,
 )
 from .exports import to_colmap_database, to_nerfstudio, to_opensfm
-from .jobs import Capabilities, Event, InputInfo, JobInfo, JobState, JobSummary, Progress, Settings
+from .jobs import (
+    Capabilities,
+    Event,
+    InputInfo,
+    JobInfo,
+    JobState,
+    JobSummary,
+    Progress,
+    Settings,
+    Webhook,
+    WebhookState,
+)
 from .result import (
     Calibration,
     Camera,
@@ -113,6 +124,8 @@ __all__ = [
     "UploadsFull",
     "View",
     "Violation",
+    "Webhook",
+    "WebhookState",
     "__version__",
     "errors",
     "to_colmap_database",

@@ -206,11 +206,12 @@ class AsyncClient:
         time_limit: float | None = None,
         job_id: str | None = None,
         request_id: str | None = None,
+        webhook: str | None = None,
         timeout: float | None = None,
         on_upload: Callable[[int, int], None] | None = None,
     ) -> AsyncJob:
         """Leaves a job with the server, which survives this program and the server; see `Client.submit`."""
-        options = JobOptions(settings, labels, priority, time_limit, job_id, request_id)
+        options = JobOptions(settings, labels, priority, time_limit, job_id, request_id, webhook)
         source = tracks.name if isinstance(tracks, InputInfo) else tracks
         emit = None if on_upload is None else lambda value: on_upload(*value)
         job = await self._run(flows.submit(self._context, source, options, timeout), emit)
@@ -225,10 +226,11 @@ class AsyncClient:
         priority: int = 0,
         time_limit: float | None = None,
         request_id: str | None = None,
+        webhook: str | None = None,
         timeout: float | None = None,
     ) -> list[AsyncJob]:
         """Leaves a job of each input with the server, all or none; see `Client.submit_batch`."""
-        options = JobOptions(settings, labels, priority, time_limit, None, request_id)
+        options = JobOptions(settings, labels, priority, time_limit, None, request_id, webhook)
         sources = [tracks.name if isinstance(tracks, InputInfo) else tracks for tracks in inputs]
         jobs = await self._run(flows.submit_batch(self._context, sources, options, timeout))
         return [

@@ -244,6 +244,7 @@ class Client:
         time_limit: float | None = None,
         job_id: str | None = None,
         request_id: str | None = None,
+        webhook: str | None = None,
         timeout: float | None = None,
         on_upload: Callable[[int, int], None] | None = None,
     ) -> Job:
@@ -258,11 +259,12 @@ class Client:
             job_id: Last part of the job's name: 1 to 63 of a-z, 0-9 and `-`. Left out: the server chooses.
             request_id: Makes the call safe to repeat: the same id with the same input answers with the same job. Left
                 out: one is made, so that this call's own repetitions are safe.
+            webhook: URL that the server sends the job's end to, where its webhooks are on.
             timeout: Seconds for the call, with its repetitions.
             on_upload: Called with the bytes that the server has and those of the whole, where the input is uploaded.
 
         """
-        options = JobOptions(settings, labels, priority, time_limit, job_id, request_id)
+        options = JobOptions(settings, labels, priority, time_limit, job_id, request_id, webhook)
         source = tracks.name if isinstance(tracks, InputInfo) else tracks
         emit = None if on_upload is None else lambda value: on_upload(*value)
         job = self._run(flows.submit(self._context, source, options, timeout), emit)
@@ -277,6 +279,7 @@ class Client:
         priority: int = 0,
         time_limit: float | None = None,
         request_id: str | None = None,
+        webhook: str | None = None,
         timeout: float | None = None,
     ) -> list[Job]:
         """Leaves a job of each input with the server, all or none.
@@ -288,10 +291,11 @@ class Client:
             priority: Of each job.
             time_limit: Seconds after which the server gives each job up.
             request_id: With the number of the job after it, the request id of each. Left out: each gets one.
+            webhook: URL that the server sends the end of each job to, where its webhooks are on.
             timeout: Seconds for the call, with its repetitions.
 
         """
-        options = JobOptions(settings, labels, priority, time_limit, None, request_id)
+        options = JobOptions(settings, labels, priority, time_limit, None, request_id, webhook)
         sources = [tracks.name if isinstance(tracks, InputInfo) else tracks for tracks in inputs]
         jobs = self._run(flows.submit_batch(self._context, sources, options, timeout))
         return [

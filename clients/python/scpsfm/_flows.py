@@ -199,6 +199,7 @@ class JobOptions:
     time_limit: float | None = None
     job_id: str | None = None
     request_id: str | None = None
+    webhook: str | None = None
 
 
 def create_request(context: Context, options: JobOptions) -> job_service_pb2.CreateJobRequest:
@@ -209,6 +210,8 @@ def create_request(context: Context, options: JobOptions) -> job_service_pb2.Cre
             job.time_limit.FromNanoseconds(round(options.time_limit * 1e9))
         if options.settings is not None:
             job.settings.CopyFrom(options.settings.to_proto())
+        if options.webhook is not None:
+            job.webhook.url = options.webhook
         return job_service_pb2.CreateJobRequest(
             parent=context.parent,
             job_id=options.job_id or "",

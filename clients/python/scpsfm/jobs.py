@@ -13,7 +13,18 @@ from ._stubs import job_pb2, progress_pb2, result_pb2, settings_pb2
 from .errors import InvalidArgument, Violation
 from .result import Grade, ResultStatus, _grade, _member, _Word, optional, seconds, word
 
-__all__ = ["Capabilities", "Event", "InputInfo", "JobInfo", "JobState", "JobSummary", "Progress", "Settings"]
+__all__ = [
+    "Capabilities",
+    "Event",
+    "InputInfo",
+    "JobInfo",
+    "JobState",
+    "JobSummary",
+    "Progress",
+    "Settings",
+    "Webhook",
+    "WebhookState",
+]
 
 
 class JobState(_Word):
@@ -31,6 +42,15 @@ class JobState(_Word):
     def is_final(self) -> bool:
         """Whether the job has ended."""
         return self not in (JobState.UNSPECIFIED, JobState.QUEUED, JobState.RUNNING)
+
+
+class WebhookState(_Word):
+    """How far the delivery of a webhook has come."""
+
+    UNSPECIFIED = "UNSPECIFIED"
+    PENDING = "PENDING"
+    DELIVERED = "DELIVERED"
+    GIVEN_UP = "GIVEN_UP"
 
 
 def state_of(number: int) -> JobState:
@@ -253,6 +273,29 @@ def _time(message: Any) -> datetime:
 
 
 @dataclass(frozen=True)
+class Webhook:
+    """Where the end of a job is sent, and how far that has come."""
+
+    url: str
+    state: WebhookState
+    attempt_count: int
+    """Attempts begun so far."""
+
+    last_error: str
+    """Why the latest attempt that ended failed; empty: it did not."""
+
+    @classmethod
+    def of(cls, message: job_pb2.Webhook) -> Webhook:
+        """From the message of the API."""
+        return cls(
+            url=message.url,
+            state=_member(WebhookState, job_pb2.WebhookState, message.state, "WEBHOOK_STATE_"),
+            attempt_count=message.attempt_count,
+            last_error=message.last_error,
+        )
+
+
+@dataclass(frozen=True)
 class JobInfo:
     """A job as it stood when it was asked for."""
 
@@ -282,6 +325,7 @@ class JobInfo:
     input: str
     """The uploaded input that it was created with; empty: the input came with the job."""
 
+    webhook: Webhook | None
     message: job_pb2.Job
     """All that the server said."""
 
@@ -313,6 +357,7 @@ class JobInfo:
             last_sequence=message.last_sequence,
             etag=message.etag,
             input=message.input,
+            webhook=Webhook.of(message.webhook) if message.HasField("webhook") else None,
             message=message,
         )
 

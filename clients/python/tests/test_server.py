@@ -59,6 +59,13 @@ def test_a_solve_finds_the_truth(real: Any, small: scene.Scene) -> None:
     assert [progress.sequence for progress in told] == sorted({progress.sequence for progress in told})
 
 
+def test_a_webhook_is_sent_along_and_refused_by_a_server_without_a_secret(real: Any, small: scene.Scene) -> None:
+    for wrong, field in (("https://hooks.example/jobs", "job.webhook"), ("ftp://hooks.example/", "job.webhook.url")):
+        with pytest.raises(scpsfm.InvalidArgument) as refused:
+            real.submit(small.tracks, webhook=wrong)
+        assert refused.value.field == field
+
+
 def test_a_job_gives_the_same_as_a_solve_and_its_events_are_resumed(real: Any, small: scene.Scene) -> None:
     settings = scpsfm.Settings(method="geometry", seed=5)
     job = real.submit(small.tracks, settings, labels={"kind": "same"}, priority=3)

@@ -972,6 +972,12 @@ function failureBox(job) {
     attempts.length ? table("Attempts at the job", columns, attempts) : null);
 }
 
+/** How far the delivery of a webhook has come. */
+function webhookWords(webhook) {
+  const words = [bare(webhook.state, "WEBHOOK_STATE"), plural(webhook.attemptCount, "attempt")];
+  return words.concat(webhook.lastError ? [webhook.lastError] : []).join(", ");
+}
+
 function jobFacts(job) {
   const labels = labelLinks(job.labels);
   const settings = Object.entries(job.settings || {});
@@ -989,6 +995,7 @@ function jobFacts(job) {
       ["Deadline", job.deadlineTime ? timeOf(job.deadlineTime) : null],
       ["Removed at", job.expireTime ? timeOf(job.expireTime) : null],
       ["Uploaded input", job.input ? foreign(job.input) : null],
+      ["Webhook", job.webhook ? foreign(job.webhook.url) : null, job.webhook ? webhookWords(job.webhook) : null],
       ["Labels", labels.length ? labels : "-"],
     ]),
     make("details", {}, make("summary", {}, "Settings"), table("Settings that were used", columns, settings)),
@@ -1156,10 +1163,11 @@ class JobPage {
     }
   }
 
-  /** A new job of the same input and settings; a deadline is not taken over, since it has mostly passed. */
+  /** A new job of the same input, settings and webhook; a deadline is not taken over, since it has mostly passed. */
   async createAgain() {
     const { settings, labels, priority, input, name } = this.job;
-    const body = { job: { settings, labels, priority }, input, requestId: this.requestId };
+    const webhook = this.job.webhook && { url: this.job.webhook.url };
+    const body = { job: { settings, labels, priority, webhook }, input, requestId: this.requestId };
     this.againButton.disabled = true;
     try {
       const parent = name.split("/").slice(0, 2).join("/");
