@@ -62,7 +62,7 @@ impl Threads {
 
 impl Inner {
     /// Starts the slots of these workers and the sweeper.
-    pub(super) fn hire(self: &Arc<Self>, threads: Threads) {
+    pub(super) fn hire(self: &Arc<Self>, threads: Threads) -> Result<(), Error> {
         let Threads { workers, threads, ended } = threads;
         let mut pool = WorkerPool { threads, threads_ended: Some(ended), ..WorkerPool::default() };
         pool.slots = workers.into_iter().map(|worker| tokio::spawn(slot::run(self.clone(), worker))).collect();
@@ -74,6 +74,7 @@ impl Inner {
             pool.webhooks = Some(webhooks::start(self, options).map_err(Error::Internal)?);
         }
         *locked(&self.pool) = pool;
+        Ok(())
     }
 
     pub(super) fn crew_finished_one(&self) {

@@ -249,7 +249,7 @@ impl Engine {
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
         observe::store_state(StoreState::Sound);
         inner.taken_back(&recovered);
-        inner.hire(threads);
+        inner.hire(threads)?;
         inner.queue_changed();
         Ok(Self { inner })
     }

@@ -5,7 +5,7 @@ use std::time::SystemTime;
 use super::jobs::{self, Waiting};
 use super::removal::check_etag;
 use super::rows::{self, Departure, leave, micros, number, returning_job, standing};
-use super::{Change, Connection, Row, Statement};
+use super::{Change, Connection, Row, Statement, webhooks};
 use crate::domain::job::{Job, JobName, JobState};
 use crate::store::Error;
 use crate::store::record::{QueueBounds, QueueReport, RetryReply, TenantQueue};
@@ -44,6 +44,7 @@ pub(super) async fn retry<C: Connection>(
          detached_calls = 0, deadline = CASE WHEN deadline > $1 THEN deadline END WHERE id = $2",
     );
     connection.execute(anew.bind(micros(now)).bind(job.id)).await?;
+    webhooks::renew(connection, job.id).await?;
     let job = leave(connection, &job, Departure::to(JobState::Queued), now).await?;
     Ok(RetryReply { job, queued_now: true })
 }

@@ -20,6 +20,14 @@ pub(super) fn due(id: i64, now: SystemTime) -> Statement {
     Statement::new("UPDATE webhooks SET due_time = $1 WHERE job_id = $2").bind(micros(now)).bind(id)
 }
 
+/// Has the end of a job sent that is still to come, as if none had been.
+pub(super) async fn renew<C: Connection>(connection: &mut C, id: i64) -> Result<(), Error> {
+    let select = Statement::new("SELECT job_id, webhook FROM webhooks WHERE job_id = $1").bind(id).then(C::FOR_UPDATE);
+    let Some(row) = connection.optional_row(select).await? else { return Ok(()) };
+    let (id, webhook) = read(&row)?;
+    connection.execute(update(id, &Webhook::pending(webhook.url), None)?).await
+}
+
 /// What is to be sent; see [`crate::store::Store::webhook_queue`].
 pub(super) async fn queue<C: Connection>(connection: &mut C, due_by: SystemTime) -> Result<WebhookQueue, Error> {
     let select = "SELECT COUNT(*) AS pending, MIN(due_time) AS first_due FROM webhooks WHERE due_time IS NOT NULL";
