@@ -15,6 +15,7 @@ pub mod admin;
 pub mod args;
 pub mod cancel;
 pub mod client;
+pub mod completions;
 pub mod delete;
 pub mod demo;
 pub mod evaluate;
@@ -29,6 +30,7 @@ pub mod inputs;
 pub mod interrupt;
 pub mod job_view;
 pub mod list;
+pub mod man;
 pub mod prior_file;
 pub mod priority;
 pub mod progress;
@@ -53,13 +55,16 @@ use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use exit::{Exit, Failure};
 
+/// Name of the program.
+const NAME: &str = "scpsfm";
+
 /// Threads of the runtime that drives a command's I/O; solving never runs on them.
 const RUNTIME_THREADS: usize = 2;
 
 /// Robust, self-calibrating projective structure from motion: which tracks of uncalibrated images are right, the
 /// camera's focal length with its uncertainty, and the projective and metric reconstruction.
 #[derive(Debug, Parser)]
-#[command(name = "scpsfm", version, after_help = exit::HELP)]
+#[command(name = NAME, version, after_help = exit::HELP)]
 pub struct Cli {
     #[command(subcommand)]
     pub command: Command,
@@ -86,6 +91,8 @@ pub enum Command {
     Synth(synth::Args),
     Evaluate(evaluate::Args),
     TrainPrior(train_prior::Args),
+    Completions(completions::Args),
+    Man(man::Args),
 }
 
 impl Cli {
@@ -136,6 +143,8 @@ fn dispatch(command: Command) -> Result<Exit, Failure> {
         Command::Synth(args) => synth::run(args),
         Command::Evaluate(args) => runtime.block_on(evaluate::run(args)),
         Command::TrainPrior(args) => runtime.block_on(train_prior::run(args)),
+        Command::Completions(args) => completions::run(args),
+        Command::Man(args) => man::run(args),
     }
 }
 

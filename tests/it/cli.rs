@@ -58,6 +58,8 @@ fn every_command_explains_itself() {
         "synth",
         "evaluate",
         "train-prior",
+        "completions",
+        "man",
     ]
     .map(Some);
     for command in commands.into_iter().chain([None]) {
