@@ -25,6 +25,7 @@ mod replicas;
 mod sequence;
 mod silence;
 mod support;
+mod systemd;
 mod telemetry;
 mod upload;
 mod webhooks;
