@@ -239,16 +239,23 @@ impl ExportArgs {
         }
     }
 
-    /// Writes the result files and, where there is the input, what is asked for other programs. What cannot be written,
-    /// as of a result that is not metric, is no failure: it is told on stderr.
+    /// Writes the result files and, where there is the input, what is asked for other programs, which it returns. What
+    /// cannot be written, as of a result that is not metric, is no failure: it is told on stderr.
     ///
     /// # Errors
     /// A file that cannot be written or removed.
-    pub fn write(&self, directory: &Path, solution: &Solution, input: Option<&LabelledInput>) -> Result<(), Failure> {
-        if let Some(refused) = result_files::write(directory, solution, input, &self.exports())? {
+    pub fn write(
+        &self,
+        directory: &Path,
+        solution: &Solution,
+        input: Option<&LabelledInput>,
+    ) -> Result<Vec<Export>, Failure> {
+        let mut exports = self.exports();
+        if let Some(refused) = result_files::write(directory, solution, input, &exports)? {
             tell!("warning: {refused}");
+            exports.retain(|&export| !refused.has(export));
         }
-        Ok(())
+        Ok(exports)
     }
 }
 

@@ -9,6 +9,7 @@ use super::args::ServerArgs;
 use super::client::access::AccessArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
+use super::next_steps::Files;
 use super::progress::ProgressView;
 use super::service::Service;
 use super::synth::{self, SceneArgs};
@@ -160,7 +161,8 @@ impl Comparison {
         let noise_px = scene.options.noise * f64::from(synth::IMAGE_SIDE_PX) * std::f64::consts::SQRT_2;
         let rms = solution.reprojection_rms_px.map_or_else(|| "-".into(), |px| format!("{px:.2} px"));
         lines.push(format!("  {:<16}{rms:>12}{:>12}", "reprojection RMS", format!("{noise_px:.2} px")));
-        lines.push(format!("\n  report: {}", args.out.join(result_files::REPORT).display()));
+        let files = Files { directory: &args.out, exports: &[], format: None };
+        lines.push(format!("\n{}", summary::next(solution, &files)));
         lines.join("\n")
     }
 

@@ -8,6 +8,7 @@ use super::client::access::AccessArgs;
 use super::client::{self, Client};
 use super::exit::{Exit, Failure};
 use super::interrupt::Signals;
+use super::next_steps;
 use super::print;
 use super::progress::ProgressView;
 use crate::domain::job::{EventBody, Failure as JobFailure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
@@ -202,11 +203,11 @@ pub fn show_event(view: &mut ProgressView, event: &JobEvent) {
 /// `after` any more, it says so.
 pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json: bool) -> Result<Exit, Failure> {
     let mut view = ProgressView::new(json);
-    let mut status = None;
+    let mut result = None;
     let mut unprinted = Ok(());
     let mut on_event = |event: &JobEvent| {
         if let EventBody::Summary(summary) = &event.body {
-            status = Some(summary.status);
+            result = Some(summary.clone());
         }
         if !json {
             show_event(&mut view, event);
@@ -237,8 +238,11 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
     unprinted?;
     if let Some(last) = &last {
         client::ended(last)?;
-        if let Some(status) = status {
-            return Ok(Exit::of_status(status));
+        if let Some(summary) = &result {
+            if !json {
+                tell_next(&job, summary);
+            }
+            return Ok(Exit::of_status(summary.status));
         }
     }
     // The event that tells the result, or the end, came before.
@@ -248,6 +252,15 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
     }
     client::ended_as(&job.name, job.state, job.failure.as_ref())?;
     Ok(job.summary.map_or(Exit::Done, |summary| Exit::of_status(summary.status)))
+}
+
+/// Tells on stderr how to get the files of a result, and what would make it better.
+fn tell_next(job: &Lost, summary: &Summary) {
+    let Lost { name, server, files, .. } = job;
+    tell!("next: scpsfm result {name} --server {}{files}", quoted(server));
+    if let Some(advice) = next_steps::advice(summary.into()) {
+        tell!("      {advice}");
+    }
 }
 
 /// A job whose server was lost, and what its result is to be read with.

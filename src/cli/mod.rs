@@ -31,6 +31,7 @@ pub mod interrupt;
 pub mod job_view;
 pub mod list;
 pub mod man;
+pub mod next_steps;
 pub mod prior_file;
 pub mod priority;
 pub mod progress;

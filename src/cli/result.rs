@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use super::args::{ExportArgs, ReadingArgs, ServerArgs};
 use super::exit::{Exit, Failure};
 use super::job_view::GivenName;
+use super::next_steps::Files;
 use super::{print, summary};
 use crate::domain::Solution;
 use crate::formats::{LabelledInput, result_files};
@@ -70,16 +71,16 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if let Some(input) = &input {
         belongs_together(input, &solution)?;
     }
-    if let Some(out) = &args.out {
-        args.export.write(out, &solution, input.as_ref())?;
-    }
+    let exports = match &args.out {
+        Some(out) => args.export.write(out, &solution, input.as_ref())?,
+        None => Vec::new(),
+    };
     if args.json {
         print(result_files::result_json(&solution, input.as_ref())?.trim_end())?;
-    } else {
-        print(&summary::text(&solution, input.as_ref()))?;
-        if let Some(out) = &args.out {
-            print(&format!("  files        {}", result_files::said(out, &solution)))?;
-        }
+    } else if let Some(out) = &args.out {
+        let format = input.as_ref().and_then(|input| input.format);
+        let files = Files { directory: out, exports: &exports, format };
+        print(&summary::text_with_files(&solution, input.as_ref(), &files))?;
     }
     Ok(Exit::of(&solution))
 }

@@ -7,6 +7,7 @@ use super::client::access::AccessArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::job_view::{Lost, quoted};
+use super::next_steps::Files;
 use super::prior_file::PriorFileArgs;
 use super::progress::ProgressView;
 use super::windows::{self, Show, WindowArgs};
@@ -166,12 +167,12 @@ async fn on_server(
 
 /// Writes the files and tells what they hold.
 fn deliver(args: &Args, solution: &Solution, input: &LabelledInput) -> Result<Exit, Failure> {
-    args.export.write(&args.out, solution, Some(input))?;
+    let exports = args.export.write(&args.out, solution, Some(input))?;
     if args.json {
         print(result_files::result_json(solution, Some(input))?.trim_end())?;
     } else if !args.quiet {
-        print(&summary::text(solution, Some(input)))?;
-        print(&format!("  files        {}", result_files::said(&args.out, solution)))?;
+        let files = Files { directory: &args.out, exports: &exports, format: input.format };
+        print(&summary::text_with_files(solution, Some(input), &files))?;
     }
     Ok(Exit::of(solution))
 }

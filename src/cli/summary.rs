@@ -1,8 +1,9 @@
 //! A result in a few lines for people.
 
+use super::next_steps::{self, Files};
 use crate::domain::{Grade, Solution, Status};
 use crate::formats::result_json::{CameraGroupJson, camera_groups};
-use crate::formats::{LabelledInput, warnings};
+use crate::formats::{LabelledInput, result_files, warnings};
 
 /// Cameras told one by one; a photo collection may have one an image, and result.json has them all.
 const MOST_CAMERAS: usize = 20;
@@ -66,6 +67,20 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
     lines.join("\n")
 }
 
+/// The same with where the files are and what to do next.
+pub fn text_with_files(solution: &Solution, input: Option<&LabelledInput>, files: &Files) -> String {
+    let mut lines = vec![text(solution, input)];
+    lines.push(format!("  {:<13}{}", "files", result_files::said(files.directory, solution)));
+    lines.push(next(solution, files));
+    lines.join("\n")
+}
+
+/// What to do next.
+pub fn next(solution: &Solution, files: &Files) -> String {
+    let steps = next_steps::steps(solution.into(), files);
+    format!("  {:<13}{}", "next", steps.join(&format!("\n  {:<13}", "")))
+}
+
 fn headline(solution: &Solution) -> String {
     match (solution.status, solution.grade) {
         (Status::NoReconstruction, _) => "NO_RECONSTRUCTION".into(),
@@ -115,7 +130,7 @@ fn focal(focal_px: f64, sigma_log: Option<f64>) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::text;
+    use super::{Files, text, text_with_files};
     use crate::domain::{Calibration, Grade};
     use crate::formats::fixture;
 
@@ -130,6 +145,16 @@ mod tests {
         assert!(lines.contains("warning: FEW_INLIERS: "), "{lines}");
         solution.calibrations[0].sigma_log_focal = None;
         assert!(text(&solution, None).contains("unobservable"));
+    }
+
+    #[test]
+    fn ends_with_what_to_do_next() {
+        let (input, solution) = fixture::projective_only();
+        let files = Files { directory: "answer".as_ref(), exports: &[], format: None };
+        let lines = text_with_files(&solution, Some(&input), &files);
+        let last: Vec<&str> = lines.lines().rev().take(3).collect();
+        assert!(last[2] == "  files        answer" && last[1].starts_with("  next         open answer/"), "{lines}");
+        assert!(last[0].starts_with("               PROJECTIVE_ONLY by UNOBSERVABLE_FOCAL: "), "{lines}");
     }
 
     #[test]

@@ -57,6 +57,13 @@ pub struct NotExported {
     is_part: bool,
 }
 
+impl NotExported {
+    /// Whether this one was not written.
+    pub fn has(&self, export: Export) -> bool {
+        self.refused.iter().any(|(refused, _)| *refused == export)
+    }
+}
+
 /// `nothing was exported: WHY`, or where some were `not exported: FOLDER: WHY; ...`.
 impl fmt::Display for NotExported {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -227,8 +234,9 @@ pub fn add(
             refused.push((export, why));
         }
     }
-    let is_part = exports.iter().any(|export| refused.iter().all(|(of, _)| of != export));
-    Ok((!refused.is_empty()).then_some(NotExported { refused, is_part }))
+    let mut refused = NotExported { refused, is_part: false };
+    refused.is_part = exports.iter().any(|&export| !refused.has(export));
+    Ok((!refused.refused.is_empty()).then_some(refused))
 }
 
 #[cfg(test)]

@@ -343,6 +343,13 @@ fn what_cannot_be_solved_ends_with_3_and_says_why() {
         }
         assert!(got.stdout.contains("no reconstruction: ") && got.stdout.contains(code), "{got:?}");
     }
+    for told in [&submitted.stderr, &watched.stderr] {
+        assert!(
+            told.contains(&format!("\nnext: scpsfm result {name} --server {} --out DIR\n", serving.grpc)),
+            "{told}"
+        );
+        assert!(told.contains("\n      NO_RECONSTRUCTION by "), "{told}");
+    }
     let all = json(&run(["get", name, "--json"].iter().chain(&server)).stdout);
     assert_eq!(all["summary"]["warnings"], result["warnings"]);
 }

@@ -1,0 +1,224 @@
+//! What to do with a result, in one to three sentences. What the summary and the warnings say is not repeated.
+
+use std::path::Path;
+
+use super::job_view::quoted;
+use crate::domain::job::Summary;
+use crate::domain::{Grade, Solution, Status, Warning, WarningCode};
+use crate::formats::{Export, Format, result_files};
+
+/// Warnings that can be why a result is less than METRIC, the likeliest cause first, each with what would help. A wrong
+/// size or a wrong model comes before what the views show under it.
+const REMEDIES: [(WarningCode, &str); 14] = [
+    (WarningCode::PointsOutsideImage, "give the size of the images whose pixels these are (--width, --height)"),
+    (
+        WarningCode::ModelMismatch,
+        "if the camera zoomed, use --focal-per-view; if there were several cameras, make each a camera group; else \
+         check the tracks",
+    ),
+    (WarningCode::Cheirality, "check the order of the views and the size of the images"),
+    (WarningCode::PlanarOrRotation, "add views from other places, and objects off the plane"),
+    (WarningCode::PureRotation, "add views that the camera has moved and turned for"),
+    (
+        WarningCode::PureTranslation,
+        "add views that are turned against each other, or give the focal length (--focal-px)",
+    ),
+    (WarningCode::PlanarScene, "add views that are tilted against the plane, or objects off it"),
+    (
+        WarningCode::UnobservableFocal,
+        "add views that are turned or tilted against each other, or give the focal length (--focal-px)",
+    ),
+    (WarningCode::SecondMinimum, "add views, or give the focal length (--focal-px)"),
+    (
+        WarningCode::UnverifiedRanking,
+        "add views or longer tracks; until then the weights of tracks.csv are a ranking only",
+    ),
+    (WarningCode::FewInliers, "add tracks that three views or more share: more features, or photos with more overlap"),
+    (WarningCode::NoConsensus, "check the matches and the order of the views; add longer tracks"),
+    (WarningCode::CameraGroupsMerged, "make each camera a group of its own, and use --method auto or geometry"),
+    (WarningCode::AssumedImageSize, "give the size of the images (--width, --height)"),
+];
+
+/// What helps where no warning says why the focal length is not known better.
+const MORE_VIEWS: &str =
+    "add views, turned and tilted against each other, or give the focal length (--focal-px, --focal-sigma)";
+
+/// What of a result the sentences depend on.
+#[derive(Debug, Clone, Copy)]
+pub struct Outcome<'a> {
+    status: Status,
+    grade: Option<Grade>,
+    warnings: &'a [Warning],
+    /// Whether every view has a focal length of its own.
+    has_own_focals: bool,
+}
+
+impl<'a> From<&'a Solution> for Outcome<'a> {
+    fn from(solution: &'a Solution) -> Self {
+        let Solution { status, grade, ref warnings, .. } = *solution;
+        Self { status, grade, warnings, has_own_focals: solution.view_focals_px().is_some() }
+    }
+}
+
+impl<'a> From<&'a Summary> for Outcome<'a> {
+    fn from(summary: &'a Summary) -> Self {
+        let Summary { status, grade, ref warnings, .. } = *summary;
+        Self { status, grade, warnings, has_own_focals: false }
+    }
+}
+
+/// The files of a result.
+#[derive(Debug, Clone, Copy)]
+pub struct Files<'a> {
+    pub directory: &'a Path,
+    /// What was written for other programs.
+    pub exports: &'a [Export],
+    /// Kind of the input; `None`: nothing more can be exported of it.
+    pub format: Option<Format>,
+}
+
+/// The sentences: what to look at, where to go on, and what would make the result better.
+pub fn steps(outcome: Outcome, files: &Files) -> Vec<String> {
+    let report = files.directory.join(result_files::REPORT);
+    let holds = match (outcome.status, outcome.grade) {
+        (Status::NoReconstruction, _) => "; there are no cameras and no points",
+        (_, Some(Grade::ProjectiveOnly)) => "; tracks.csv and observations.csv say what is right, without K, R and t",
+        _ => "",
+    };
+    let look = format!("open {}{holds}", report.display());
+    [Some(look), elsewhere(outcome, files), advice(outcome)].into_iter().flatten().collect()
+}
+
+/// What would make the result better, and why it is not; `None` where it is good.
+pub fn advice(outcome: Outcome) -> Option<String> {
+    let found = match (outcome.status, outcome.grade) {
+        (Status::NoReconstruction, _) => "NO_RECONSTRUCTION",
+        (_, Some(grade @ (Grade::Weak | Grade::ProjectiveOnly))) => grade.name(),
+        _ => return None,
+    };
+    let has = |code| outcome.warnings.iter().any(|warning| warning.code == code);
+    Some(match REMEDIES.iter().find(|(code, _)| has(*code)) {
+        Some((code, remedy)) => format!("{found} by {}: {remedy}", code.name()),
+        None if outcome.has_own_focals => format!("{found} is the best grade where each view has its own focal length"),
+        None => format!("{found}: {MORE_VIEWS}"),
+    })
+}
+
+/// Where another program goes on: with what was exported, or with what can be.
+fn elsewhere(outcome: Outcome, files: &Files) -> Option<String> {
+    if outcome.status == Status::NoReconstruction {
+        return None;
+    }
+    let is_metric = matches!(outcome.grade, Some(Grade::Metric | Grade::Weak));
+    let folder = |export: Export| {
+        let path = files.directory.join(export.folder());
+        files.exports.contains(&export).then(|| quoted(&path.to_string_lossy()))
+    };
+    if let Some(folder) = folder(Export::ColmapDatabase) {
+        return Some(format!(
+            "COLMAP goes on: colmap mapper --database_path {folder}/database.db --image_path PHOTOS --output_path \
+             sparse"
+        ));
+    }
+    if let Some(folder) = folder(Export::Colmap).or_else(|| folder(Export::ColmapText)) {
+        return Some(format!(
+            "COLMAP goes on: colmap image_undistorter --image_path PHOTOS --input_path {folder} --output_path dense"
+        ));
+    }
+    if let Some(folder) = folder(Export::Nerfstudio) {
+        return Some(format!("with the photos in {folder}: ns-train nerfacto --data {folder}"));
+    }
+    if !files.exports.is_empty() {
+        return None;
+    }
+    match (files.format?, is_metric) {
+        (Format::ColmapDatabase, true) => Some(
+            "--export colmap-db writes a database for COLMAP's mapper; colmap, nerfstudio or opensfm a model".into(),
+        ),
+        (Format::ColmapDatabase, false) => {
+            Some("--export colmap-db writes a database with the right matches, for COLMAP's mapper".into())
+        }
+        (_, true) => Some("--export colmap, nerfstudio or opensfm writes the result for these programs".into()),
+        (_, false) => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn outcome(grade: Option<Grade>, warnings: &[Warning]) -> Outcome<'_> {
+        let status = if grade.is_some() { Status::Solved } else { Status::NoReconstruction };
+        Outcome { status, grade, warnings, has_own_focals: false }
+    }
+
+    fn files<'a>(exports: &'a [Export], format: Option<Format>) -> Files<'a> {
+        Files { directory: Path::new("an answer"), exports, format }
+    }
+
+    #[test]
+    fn a_metric_result_is_looked_at_and_goes_on_elsewhere() {
+        let told = |exports: &[Export], format| steps(outcome(Some(Grade::Metric), &[]), &files(exports, format));
+        assert_eq!(told(&[], None), ["open an answer/report.html"]);
+        let table = told(&[], Some(Format::Observations));
+        assert_eq!(table.len(), 2);
+        assert!(table[1].starts_with("--export colmap, nerfstudio"), "{table:?}");
+        assert!(told(&[], Some(Format::ColmapDatabase))[1].starts_with("--export colmap-db "));
+        let second = |export| told(&[export], Some(Format::ColmapDatabase))[1].clone();
+        assert!(second(Export::ColmapDatabase).contains("mapper --database_path 'an answer/colmap-db'/database.db "));
+        assert!(second(Export::Colmap).contains("--input_path 'an answer/colmap' "));
+        assert!(second(Export::ColmapText).contains("--input_path 'an answer/colmap-text' "));
+        assert!(second(Export::Nerfstudio).ends_with("ns-train nerfacto --data 'an answer/nerfstudio'"));
+        assert_eq!(told(&[Export::Bal], Some(Format::Observations)).len(), 1, "nothing is said of its readers");
+    }
+
+    #[test]
+    fn every_cause_of_a_lower_grade_has_its_remedy() {
+        for grade in [Some(Grade::Weak), Some(Grade::ProjectiveOnly), None] {
+            let name = grade.map_or("NO_RECONSTRUCTION", Grade::name);
+            for (code, remedy) in REMEDIES {
+                let warnings = [Warning::new(WarningCode::DuplicateTracks, ""), Warning::new(code, "a detail")];
+                let advice = advice(outcome(grade, &warnings)).expect("advice");
+                assert_eq!(advice, format!("{name} by {}: {remedy}", code.name()));
+            }
+            let unexplained = advice(outcome(grade, &[])).expect("advice");
+            assert_eq!(unexplained, format!("{name}: {MORE_VIEWS}"));
+        }
+        let warnings = [Warning::new(WarningCode::PlanarScene, "")];
+        assert_eq!(advice(outcome(Some(Grade::Metric), &warnings)), None);
+        let own = Outcome { has_own_focals: true, ..outcome(Some(Grade::Weak), &[]) };
+        assert!(advice(own).expect("advice").contains("is the best grade"));
+    }
+
+    #[test]
+    fn every_warning_that_refuses_a_focal_length_is_a_cause() {
+        let codes = [
+            WarningCode::PureTranslation,
+            WarningCode::UnobservableFocal,
+            WarningCode::SecondMinimum,
+            WarningCode::ModelMismatch,
+            WarningCode::FewInliers,
+            WarningCode::Cheirality,
+            WarningCode::NoConsensus,
+        ];
+        for code in codes {
+            assert!(code.refuses() && REMEDIES.iter().any(|(cause, _)| *cause == code), "{}", code.name());
+        }
+    }
+
+    #[test]
+    fn a_lower_grade_says_what_it_holds_and_at_most_three_things() {
+        let turned = [Warning::new(WarningCode::UnobservableFocal, "")];
+        let told = steps(outcome(Some(Grade::ProjectiveOnly), &turned), &files(&[], Some(Format::ColmapDatabase)));
+        assert_eq!(told.len(), 3);
+        assert!(told[0].ends_with("without K, R and t") && told[1].contains("right matches"), "{told:?}");
+        let table = steps(outcome(Some(Grade::ProjectiveOnly), &turned), &files(&[], Some(Format::Observations)));
+        assert_eq!(table.len(), 2, "only a database takes a result that is not metric: {table:?}");
+        let exported = [Export::Colmap];
+        let weak = steps(outcome(Some(Grade::Weak), &[]), &files(&exported, Some(Format::Observations)));
+        assert_eq!(weak.len(), 3, "{weak:?}");
+        let nothing = [Warning::new(WarningCode::NoConsensus, "")];
+        let told = steps(outcome(None, &nothing), &files(&[], Some(Format::ColmapDatabase)));
+        assert!(told.len() == 2 && told[0].ends_with("no cameras and no points"), "{told:?}");
+    }
+}
