@@ -64,6 +64,9 @@ const SCHEMA: &str = include_str!("../migrations/sqlite/0001_schema.sql");
 
 const MIGRATIONS: [Step; 1] = [(1, "schema", SCHEMA)];
 
+/// Counts two tables that every store has, those of earlier builds too.
+const OWN_TABLES: &str = "SELECT COUNT(*) FROM sqlite_schema WHERE name IN ('_sqlx_migrations', 'jobs')";
+
 /// Store in a data directory.
 #[derive(Debug)]
 pub struct Sqlite {
@@ -79,7 +82,7 @@ impl Sqlite {
     ///
     /// # Errors
     /// [`Error::InUse`] while another server holds the directory, [`Error::Unavailable`] where it cannot be written,
-    /// [`Error::Corrupt`] where its schema is of a newer version, or its file is there and empty.
+    /// [`Error::Corrupt`] where its schema is of a newer version, or its file is there and empty, or another program's.
     pub async fn open(directory: &Path) -> Result<Self, Error> {
         Self::open_with(directory, writer::GROUP_TIME).await
     }
@@ -134,9 +137,22 @@ async fn migrate(options: &SqliteConnectOptions) -> Result<(), Error> {
 async fn bring_up_to_date(options: &SqliteConnectOptions, database: &Path) -> Result<WriteConnection, Error> {
     // First, and there until the other one is closed, also by an error: the last one to go writes the log back, which a
     // full disk has no room for.
-    let connection = WriteConnection::open(database)?;
+    let mut connection = WriteConnection::open(database)?;
+    refuse_foreign(&mut connection)?;
     migrate(options).await?;
     Ok(connection)
+}
+
+/// Refuses a database of another program before anything is written to it.
+fn refuse_foreign(connection: &mut WriteConnection) -> Result<(), Error> {
+    let own = connection.first_row(OWN_TABLES, |row| row.get::<_, i64>(0))?;
+    if own == 2 {
+        return Ok(());
+    }
+    Err(Error::Corrupt(format!(
+        "{} is the database of another program; give another data directory (store.data_dir)",
+        connection.database().display()
+    )))
 }
 
 /// Whether the database's file is there. One of no bytes is refused: no server leaves one behind, so that it is what is

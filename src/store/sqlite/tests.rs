@@ -126,6 +126,21 @@ async fn a_database_of_another_version_is_refused() {
 }
 
 #[tokio::test]
+async fn a_database_of_another_program_is_refused_and_left_as_it_is() {
+    // A program that keeps its own migrations in the same way is another one too.
+    for schema in ["CREATE TABLE keypoints (image_id)", "CREATE TABLE _sqlx_migrations (version)"] {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let database = directory.path().join(DATABASE_FILE);
+        rusqlite::Connection::open(&database).and_then(|made| made.execute_batch(schema)).expect("made");
+        let before = std::fs::read(&database).expect("is there");
+        let error = Sqlite::open(directory.path()).await.expect_err("is foreign");
+        assert!(matches!(&error, Error::Corrupt(told) if told.contains("of another program")), "{error}");
+        assert_eq!(std::fs::read(&database).expect("is there"), before);
+        assert!(!directory.path().join(format!("{DATABASE_FILE}-wal")).exists());
+    }
+}
+
+#[tokio::test]
 async fn people_see_times_and_labels() {
     let fixture = Fixture::open().await.expect("opens");
     fixture.create_job(contract::labelled("a"), &contract::ROOM, contract::time(0)).await.expect("created");
