@@ -91,7 +91,7 @@ pub struct InputArgs {
     /// Tracks: a CSV with a header `view,track,x,y[,depth][,sigma]`, OpenSfM's tracks.csv, COLMAP's database.db, or the
     /// directory of a COLMAP sparse model (.bin or .txt)
     ///
-    /// The kind is told from the name and the first bytes; --format overrides.
+    /// The kind is told from the name and the first bytes; --format overrides. `-` is a table on standard input.
     ///
     /// In the CSV, a line is an observation, in pixels; the centre of the top-left pixel is (0, 0); sigma is one
     /// standard deviation of a coordinate. Ids are whole numbers from 0, other columns are ignored. OpenSfM's

@@ -48,6 +48,10 @@ pub struct Args {
     /// Print what result.json holds on stdout, instead of words
     #[arg(long)]
     pub json: bool,
+
+    /// Show no words
+    #[arg(long, short)]
+    pub quiet: bool,
 }
 
 /// Runs the command.
@@ -70,6 +74,9 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let solution = args.server.connect().await?.read_result(&name).await?;
     if let Some(input) = &input {
         belongs_together(input, &solution)?;
+        if let Some(note) = other_names(input, &solution).filter(|_| !args.quiet) {
+            tell!("{note}");
+        }
     }
     let exports = match &args.out {
         Some(out) => args.export.write(out, &solution, input.as_ref())?,
@@ -77,12 +84,33 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     };
     if args.json {
         print(result_files::result_json(&solution, input.as_ref())?.trim_end())?;
-    } else if let Some(out) = &args.out {
+    } else if let Some(out) = args.out.as_deref().filter(|_| !args.quiet) {
         let format = input.as_ref().and_then(|input| input.format);
         let files = Files { directory: out, exports: &exports, format };
         print(&summary::text_with_files(&solution, input.as_ref(), &files))?;
     }
     Ok(Exit::of(&solution))
+}
+
+/// Where the file calls views otherwise than the job's input did: which, and whose names the result files have.
+fn other_names(input: &LabelledInput, solution: &Solution) -> Option<String> {
+    // Servers of older versions tell no names.
+    let pairs = input
+        .raw
+        .views
+        .iter()
+        .zip(&solution.views)
+        .filter_map(|(view, result)| Some((view, &result.name.as_ref()?[..])));
+    let others: Vec<_> = pairs.filter(|(view, name)| view.name.as_deref() != Some(name)).collect();
+    let &(view, name) = others.first()?;
+    let here = view.name.as_deref().map_or_else(|| "no name".to_owned(), |name| format!("{name:?}"));
+    Some(format!(
+        "{}: {} of {} views have other names than in the job's input (the first {here} for {name:?}); the result files \
+         have those of this file",
+        input.display_path(),
+        others.len(),
+        solution.views.len()
+    ))
 }
 
 /// Refuses a file that is not the job's input: its verdicts are listed by place alone.
@@ -102,4 +130,25 @@ fn belongs_together(input: &LabelledInput, solution: &Solution) -> Result<(), Fa
     let message = "the file is not the job's input: its observations, their order, or what is known of its views \
                    (--width, --height, --focal-px, --focal-sigma) are others, and verdicts go by place";
     Err(Failure { exit: Exit::BadInput, message: message.to_owned() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::formats::fixture;
+
+    #[test]
+    fn other_names_of_views_are_told() {
+        let (mut input, mut solution) = fixture::solved();
+        assert_eq!(other_names(&input, &solution), None, "neither has names");
+        input.raw.views[1].name = Some("a.jpg".into());
+        assert_eq!(other_names(&input, &solution), None, "an older server tells none");
+        solution.views[1].name = Some("a.jpg".into());
+        assert_eq!(other_names(&input, &solution), None, "the same");
+        solution.views[1].name = Some("b.jpg".into());
+        solution.views[2].name = Some("c.jpg".into());
+        let told = other_names(&input, &solution).expect("two");
+        assert!(told.starts_with("observations.csv: 2 of 5 views have other names"), "{told}");
+        assert!(told.contains("(the first \"a.jpg\" for \"b.jpg\")"), "{told}");
+    }
 }

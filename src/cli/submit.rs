@@ -30,7 +30,7 @@ Examples:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
-    /// Tracks, as `scpsfm solve` takes them
+    /// Tracks, as `scpsfm solve` takes them; `-`: standard input
     #[arg(value_name = "INPUT", conflicts_with = "uploaded")]
     pub inputs: Vec<PathBuf>,
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::colmap::ColmapImage;
 use super::error::{Error, Place, Problem, Problems};
 use super::label::Label;
-use super::source::Format;
+use super::source::{Format, STANDARD_INPUT};
 use crate::domain::{Input, InvalidInput, Limits, RawInput, Violation};
 
 /// What a file says: dense indices for the solver, the file's own ids for the answers.
@@ -149,5 +149,5 @@ impl LabelledInput {
 
 /// Name of a file in sentences: as the caller gave it, so that of several files it tells the one.
 pub(super) fn display_path(path: &Path) -> String {
-    path.display().to_string()
+    if path == Path::new(STANDARD_INPUT) { "standard input".into() } else { path.display().to_string() }
 }

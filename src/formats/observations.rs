@@ -18,13 +18,18 @@ const SIGMA: &str = "sigma";
 
 /// Reads the observations of a file and checks what only the file can tell: syntax, ids, duplicates.
 ///
-/// `size` is put on every view. What depends on values is checked by [`LabelledInput::check`], which this calls, so
-/// that an `Ok` is an input the solver takes.
+/// `size` is put on every view; `path` is for sentences. What depends on values is checked by [`LabelledInput::check`],
+/// which this calls, so that an `Ok` is an input the solver takes.
 ///
 /// # Errors
-/// A file that cannot be opened, is no such table, is above `limits` or has wrong values; by line.
-pub fn read(path: &Path, limits: &Limits, size: Option<ImageSize>) -> Result<LabelledInput, Error> {
-    let labelled = parse(text::open_table(path, limits)?, path, limits, size)?;
+/// A file that is no such table, is above `limits` or has wrong values; by line.
+pub fn read(
+    reader: impl BufRead,
+    path: &Path,
+    limits: &Limits,
+    size: Option<ImageSize>,
+) -> Result<LabelledInput, Error> {
+    let labelled = parse(reader, path, limits, size)?;
     labelled.check(limits)?;
     Ok(labelled)
 }

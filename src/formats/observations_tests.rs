@@ -194,11 +194,13 @@ fn foreign_bytes_do_not_reach_the_terminal() {
 fn files_on_disk() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let path = directory.path().join("observations.csv");
-    let refusal = |path: &Path, limits: &Limits| read(path, limits, None).expect_err("refused").to_string();
+    let read =
+        |path: &Path, limits: &Limits| text::open_table(path, limits).and_then(|file| read(file, path, limits, None));
+    let refusal = |path: &Path, limits: &Limits| read(path, limits).expect_err("refused").to_string();
     let limits = Limits::default();
     assert!(refusal(&path, &limits).starts_with(&format!("{}: cannot be read: ", path.display())));
     std::fs::write(&path, GOOD).expect("written");
-    assert_eq!(read(&path, &limits, None).expect("valid").lines.len(), 4);
+    assert_eq!(read(&path, &limits).expect("valid").lines.len(), 4);
     let tiny = Limits { max_observations: 0, ..limits.clone() };
     assert!(refusal(&path, &tiny).contains("more than the limit of 0 observations"));
     assert!(refusal(directory.path(), &limits).contains("is a directory"));

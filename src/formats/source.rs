@@ -1,14 +1,16 @@
 //! What kind of input a path holds, and reading it.
 
 use std::fs::File;
-use std::io::Read;
+use std::io::{BufRead, BufReader, Cursor, Read};
 use std::path::Path;
 
 use super::error::Error;
 use super::input::{LabelledInput, display_path};
-use super::{colmap, observations, opensfm};
+use super::{colmap, observations, opensfm, text};
 use crate::domain::{FocalPrior, ImageSize, Limits};
 
+/// The path that stands for standard input, as with most programs.
+pub(super) const STANDARD_INPUT: &str = "-";
 /// How SQLite files, and so COLMAP databases, begin.
 pub(super) const SQLITE_MAGIC: &[u8] = b"SQLite format 3\0";
 /// How OpenSfM's tracks.csv begins, from its version 1 on.
@@ -54,25 +56,62 @@ pub struct Reading {
     pub focal_prior: Option<FocalPrior>,
 }
 
-/// Reads an input of any kind; an `Ok` is an input the solver takes.
+/// Standard input or a pipe: it can be read once.
+struct Stream {
+    /// What was read of it to tell its kind.
+    beginning: Vec<u8>,
+    rest: Box<dyn Read>,
+}
+
+impl Stream {
+    /// `None` for a file or a directory.
+    fn open(path: &Path) -> std::io::Result<Option<Self>> {
+        let mut rest: Box<dyn Read> = if path == Path::new(STANDARD_INPUT) {
+            Box::new(std::io::stdin())
+        } else {
+            let metadata = std::fs::metadata(path)?;
+            if metadata.is_file() || metadata.is_dir() {
+                return Ok(None);
+            }
+            Box::new(File::open(path)?)
+        };
+        let mut beginning = Vec::new();
+        rest.by_ref().take(BEGINNING_BYTES).read_to_end(&mut beginning)?;
+        Ok(Some(Self { beginning, rest }))
+    }
+}
+
+/// Reads an input of any kind, `-` from standard input; an `Ok` is an input the solver takes.
 ///
 /// # Errors
 /// What is wrong with the file, by line, byte or row; a flag that the file needs or contradicts.
 pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledInput, Error> {
     let whole = |description: String| Error::whole(&display_path(path), description);
-    let format = match reading.format {
-        Some(format) => format,
-        None => detect(path).map_err(whole)?,
+    let stream = Stream::open(path).map_err(|error| whole(cannot_read(error)))?;
+    let format = match (reading.format, &stream) {
+        (Some(format), _) => format,
+        (None, Some(stream)) => told_from(&stream.beginning),
+        (None, None) => detect(path).map_err(whole)?,
     };
-    if matches!(format, Format::ColmapDatabase | Format::ColmapModel) && reading.size.is_some() {
+    let is_colmap = matches!(format, Format::ColmapDatabase | Format::ColmapModel);
+    if is_colmap && stream.is_some() {
+        return Err(whole("is a stream; COLMAP's files are read by their paths".into()));
+    }
+    if is_colmap && reading.size.is_some() {
         return Err(whole("carries the sizes of its images; leave out --width and --height".into()));
     }
     if reading.matches.is_some() && format != Format::ColmapDatabase {
         return Err(whole("is no COLMAP database; leave out --matches".into()));
     }
+    let table = || -> Result<Box<dyn BufRead>, Error> {
+        Ok(match stream {
+            Some(Stream { beginning, rest }) => Box::new(BufReader::new(Cursor::new(beginning).chain(rest))),
+            None => Box::new(text::open_table(path, limits)?),
+        })
+    };
     let mut labelled = match format {
-        Format::Observations => observations::read(path, limits, reading.size),
-        Format::OpenSfm => opensfm::tracks::read(path, limits, reading.size),
+        Format::Observations => observations::read(table()?, path, limits, reading.size),
+        Format::OpenSfm => opensfm::tracks::read(table()?, path, limits, reading.size),
         Format::ColmapDatabase => colmap::database::read(path, limits, reading.matches),
         Format::ColmapModel => colmap::model::read(path, limits),
     }?;
@@ -85,10 +124,12 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
     Ok(labelled)
 }
 
-/// Tells a kind from names and first bytes; what is nothing else is taken for a table of observations, whose reader
-/// says best what is wrong with it. Of a pipe nothing is read, it could not be read again.
+fn cannot_read(error: std::io::Error) -> String {
+    format!("cannot be read: {error}")
+}
+
+/// Tells the kind of a file or a directory from names and first bytes.
 fn detect(path: &Path) -> Result<Format, String> {
-    let cannot_read = |error: std::io::Error| format!("cannot be read: {error}");
     let metadata = std::fs::metadata(path).map_err(cannot_read)?;
     if metadata.is_dir() {
         return if colmap::model::is_model(path) { Ok(Format::ColmapModel) } else { Err(what_a_directory_lacks(path)) };
@@ -97,21 +138,24 @@ fn detect(path: &Path) -> Result<Format, String> {
     if colmap::model::is_part(&name) {
         return Err("is one file of a COLMAP model; give the directory that holds it".into());
     }
-    if !metadata.is_file() {
-        return Ok(Format::Observations);
-    }
     let mut beginning = Vec::new();
     File::open(path).and_then(|file| file.take(BEGINNING_BYTES).read_to_end(&mut beginning)).map_err(cannot_read)?;
-    let text = beginning.strip_prefix(UTF8_BOM).unwrap_or(&beginning);
+    Ok(if name.ends_with(".db") { Format::ColmapDatabase } else { told_from(&beginning) })
+}
+
+/// Tells a kind from first bytes; what is nothing else is taken for a table of observations, whose reader says best
+/// what is wrong with it.
+fn told_from(beginning: &[u8]) -> Format {
+    let text = beginning.strip_prefix(UTF8_BOM).unwrap_or(beginning);
     let first_line = text.split(|&byte| byte == b'\n').next().unwrap_or_default();
     let tabs = first_line.iter().filter(|&&byte| byte == b'\t').count();
-    Ok(if beginning.starts_with(SQLITE_MAGIC) || name.ends_with(".db") {
+    if beginning.starts_with(SQLITE_MAGIC) {
         Format::ColmapDatabase
     } else if text.starts_with(OPENSFM_TRACKS) || tabs >= OPENSFM_TABS {
         Format::OpenSfm
     } else {
         Format::Observations
-    })
+    }
 }
 
 /// What to give instead of this directory.

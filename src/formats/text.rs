@@ -37,7 +37,6 @@ pub(super) fn open_table(path: &Path, limits: &Limits) -> Result<BufReader<File>
             format!("has {bytes} bytes, more than the limit of {most} observations can take"),
         ));
     }
-    // A pipe has no size beforehand; the count of lines kept and the length of each are bounded while it is read.
     Ok(BufReader::new(File::open(path).map_err(cannot_read)?))
 }
 

@@ -169,6 +169,34 @@ fn a_bad_input_ends_with_65_and_names_file_and_line() {
 }
 
 #[test]
+fn a_table_may_come_on_standard_input() {
+    let directory = directory();
+    let input = scene(directory.path());
+    let out = |name: &str| directory.path().join(name);
+    let from = |file: &Path, more: &[&str]| {
+        let size = ["--width", "1000", "--height", "1000", "--json", "--quiet"];
+        let mut command = program(["solve", "-", "--out", text(&out("piped"))].iter().chain(&size).chain(more));
+        let output = command.stdin(fs::File::open(file).expect("a file")).output().expect("the program runs");
+        let words = |bytes: Vec<u8>| String::from_utf8(bytes).expect("UTF-8");
+        (output.status.code(), words(output.stdout), words(output.stderr))
+    };
+    let (code, piped, _) = from(&input, &[]);
+    assert_eq!(code, Some(0));
+    let size = ["--width", "1000", "--height", "1000", "--json", "--quiet"];
+    let read = run(["solve", text(&input), "--out", text(&out("read"))].iter().chain(&size));
+    assert_eq!(json(&piped)["focal_px"], json(&read.stdout)["focal_px"]);
+
+    // The kind is told from the first bytes.
+    let other = directory.path().join("other");
+    fs::write(&other, "OPENSFM_TRACKS_VERSION_v1\na.jpg\t0\t0\n").expect("written");
+    let (code, _, told) = from(&other, &[]);
+    assert!(code == Some(65) && told.starts_with("error: standard input, line 2: "), "{told}");
+    fs::write(&other, b"SQLite format 3\0").expect("written");
+    let (code, _, told) = from(&other, &[]);
+    assert!(code == Some(65) && told.contains("standard input: is a stream; COLMAP's files"), "{told}");
+}
+
+#[test]
 fn a_bad_configuration_ends_with_64_and_a_printed_one_reads_back() {
     let directory = directory();
     let file = directory.path().join("scpsfm.toml");
@@ -277,6 +305,9 @@ fn a_server_gives_the_same_files_as_the_program_itself_and_drains_on_sigterm() {
     let name = listed.stdout.split_whitespace().find(|word| word.starts_with("tenants/")).expect("a job's name");
     let result = run(["result", name, "--json", "--server", &serving.grpc]);
     assert_eq!(json(&result.stdout)["inlier_tracks"], 30);
+    let quiet = run(["result", name, "-q", "--out", text(&path("quiet")), "--server", &serving.grpc]);
+    assert_eq!((quiet.code, quiet.stdout.as_str(), quiet.stderr.as_str()), (Some(0), "", ""), "{quiet:?}");
+    assert!(path("quiet").join("report.html").exists());
     a_result_goes_with_its_own_input_alone(name, &serving.grpc, &input);
     let deleted = run(["delete", name, "--server", &serving.grpc]);
     assert_eq!((deleted.code, deleted.stdout.trim()), (Some(0), name), "{deleted:?}");

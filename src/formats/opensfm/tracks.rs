@@ -23,17 +23,17 @@ const COLUMNS: [usize; 3] = [8, 9, 11];
 
 /// Reads the tracks; views are image names, in ascending order.
 ///
+/// * `path`: of the file, for sentences and for what stands beside it
 /// * `size`: of the images that the data set around the file knows none of; see [`Sizes`]
 ///
 /// # Errors
-/// A file that cannot be opened, is no such table, is above `limits` or has wrong values; an image without a size; by
-/// line.
-pub fn read(path: &Path, limits: &Limits, size: Option<ImageSize>) -> Result<LabelledInput, Error> {
-    parse(text::open_table(path, limits)?, path, limits, size)
-}
-
-/// Reads the tracks from anything.
-fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: Option<ImageSize>) -> Result<LabelledInput, Error> {
+/// A file that is no such table, is above `limits` or has wrong values; an image without a size; by line.
+pub fn read(
+    reader: impl BufRead,
+    path: &Path,
+    limits: &Limits,
+    size: Option<ImageSize>,
+) -> Result<LabelledInput, Error> {
     let file = display_path(path);
     let one = |problem: Problem| Error::one(&file, problem);
     let mut lines = Lines::new(reader, text::MAX_TABLE_LINE_BYTES);

@@ -8,7 +8,7 @@ const VERSION_0: &str =
     "b.jpg\t10\t5\t0.25\t-0.125\t1\t2\t3\na.jpg\t10\t6\t0\t0\t1\t2\t3\na.jpg\t9\t7\t-0.5\t0.375\t1\t2\t3\n";
 
 fn parsed(text: impl AsRef<[u8]>) -> Result<LabelledInput, Error> {
-    parse(Cursor::new(text.as_ref()), Path::new("dir/tracks.csv"), &Limits::default(), Some(SIZE))
+    read(Cursor::new(text.as_ref()), Path::new("dir/tracks.csv"), &Limits::default(), Some(SIZE))
 }
 
 fn bad(text: impl AsRef<[u8]>) -> String {
@@ -83,7 +83,7 @@ fn no_mutation_makes_the_reader_panic() {
     let seeds = [VERSION_0.as_bytes().to_vec(), as_version(1).into_bytes(), as_version(2).into_bytes()];
     let limits = Limits { max_observations: 100, ..Limits::default() };
     let accepted = mutation::survives(&seeds, |bytes| {
-        parse(Cursor::new(bytes), Path::new("tracks.csv"), &limits, Some(SIZE))
+        read(Cursor::new(bytes), Path::new("tracks.csv"), &limits, Some(SIZE))
             .map(|_| ())
             .map_err(|error| error.to_string())
     });
@@ -96,7 +96,8 @@ fn every_image_has_the_size_and_the_camera_that_the_data_set_gives_it() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let path = directory.path().join("tracks.csv");
     std::fs::write(&path, VERSION_0).expect("written");
-    let read = |size| read(&path, &Limits::default(), size);
+    let limits = Limits::default();
+    let read = |size| read(text::open_table(&path, &limits)?, &path, &limits, size);
     let refused = read(None).expect_err("no size").to_string();
     assert!(
         refused.starts_with(&format!("{}, line 1: image: no size is known of `b.jpg`", path.display())),

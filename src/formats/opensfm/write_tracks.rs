@@ -63,8 +63,7 @@ mod tests {
         let text = csv(&models, Some(1.5));
         let directory = tempfile::tempdir().expect("a temporary directory");
         let path = directory.path().join("tracks.csv");
-        std::fs::write(&path, &text).expect("written");
-        let again = tracks::read(&path, &Limits::default(), Some(size)).expect("our own reader reads it");
+        let again = tracks::read(text.as_bytes(), &path, &Limits::default(), Some(size)).expect("we read it ourselves");
         let key = |input: &LabelledInput, k: usize| {
             let labels =
                 [&input.view_labels[input.raw.view[k] as usize], &input.track_labels[input.raw.track[k] as usize]];
