@@ -64,7 +64,7 @@ pub struct InvalidInput {
 }
 
 impl InvalidInput {
-    /// Violations that are listed one by one; a file with a million wrong lines needs no million sentences.
+    /// Violations that are listed at most; a file with a million wrong lines needs no million sentences.
     pub const MAX_LISTED: usize = 20;
 
     /// The violations, grouped by rule.
@@ -72,7 +72,7 @@ impl InvalidInput {
         &self.violations
     }
 
-    /// How many more there were than are listed.
+    /// How many more there were of kinds that are not listed.
     pub fn unlisted(&self) -> usize {
         self.unlisted
     }
@@ -86,29 +86,105 @@ impl InvalidInput {
     }
 }
 
-/// Collects violations; an empty collection is a pass.
-#[derive(Debug, Default)]
-pub struct Violations {
-    listed: Vec<Violation>,
+/// What is collected in a [`Listing`].
+pub trait Complaint {
+    /// Whether both say the same of other values.
+    fn is_like(&self, other: &Self) -> bool;
+
+    /// Adds to the description.
+    fn append(&mut self, text: &str);
+}
+
+impl Complaint for Violation {
+    fn is_like(&self, other: &Self) -> bool {
+        self.field == other.field && are_alike(&self.description, &other.description)
+    }
+
+    fn append(&mut self, text: &str) {
+        self.description.push_str(text);
+    }
+}
+
+/// Whether two sentences differ in their values alone: in numbers and in quoted words.
+pub fn are_alike(one: &str, other: &str) -> bool {
+    let is_value = |word: &&str| {
+        word.contains(|sign: char| sign.is_ascii_digit() || sign == '"' || sign == '`')
+            || ["NaN", "inf", "-inf"].contains(word)
+    };
+    let words = |text| str::split_whitespace(text).filter(|word| !is_value(word));
+    words(one).eq(words(other))
+}
+
+/// Lists complaints: of each kind the first few and a count, so that a thousand of one kind hide none of another.
+#[derive(Debug)]
+pub struct Listing<T> {
+    listed: Vec<T>,
+    kinds: Vec<Kind>,
+    /// Of kinds that have no place any more.
     unlisted: usize,
 }
 
-impl Violations {
-    /// Adds one; past [`InvalidInput::MAX_LISTED`] it is only counted.
-    pub fn push(&mut self, violation: Violation) {
-        if self.listed.len() < InvalidInput::MAX_LISTED {
-            self.listed.push(violation);
-        } else {
-            self.unlisted += 1;
+/// Complaints of one kind: places in the list, and how many there were.
+#[derive(Debug)]
+struct Kind {
+    first: usize,
+    last: usize,
+    count: usize,
+    unlisted: usize,
+}
+
+impl<T> Default for Listing<T> {
+    fn default() -> Self {
+        Self { listed: Vec::new(), kinds: Vec::new(), unlisted: 0 }
+    }
+}
+
+impl<T: Complaint> Listing<T> {
+    /// Complaints of one kind that are listed one by one: enough to see what they have in common.
+    pub const MAX_ALIKE: usize = 3;
+
+    /// Adds one.
+    pub fn push(&mut self, complaint: T) {
+        let is_full = self.listed.len() >= InvalidInput::MAX_LISTED;
+        let place = self.listed.len();
+        match self.kinds.iter_mut().find(|kind| self.listed[kind.first].is_like(&complaint)) {
+            Some(kind) if is_full || kind.count >= Self::MAX_ALIKE => {
+                kind.unlisted += 1;
+                return;
+            }
+            Some(kind) => (kind.last, kind.count) = (place, kind.count + 1),
+            None if is_full => {
+                self.unlisted += 1;
+                return;
+            }
+            None => self.kinds.push(Kind { first: place, last: place, count: 1, unlisted: 0 }),
         }
+        self.listed.push(complaint);
     }
 
+    /// Counts some that someone else already left unlisted.
+    pub fn add_unlisted(&mut self, count: usize) {
+        self.unlisted += count;
+    }
+
+    /// What is listed, the last of each kind with how many more there were, and how many there were of other kinds.
+    pub fn into_parts(mut self) -> (Vec<T>, usize) {
+        for kind in self.kinds.iter().filter(|kind| kind.unlisted > 0) {
+            self.listed[kind.last].append(&format!("; and {} more like this", kind.unlisted));
+        }
+        (self.listed, self.unlisted)
+    }
+}
+
+/// Collects violations; an empty collection is a pass.
+pub type Violations = Listing<Violation>;
+
+impl Violations {
     /// `Err` with everything found, `Ok` when there is nothing.
     pub fn into_result(self) -> Result<(), InvalidInput> {
-        if self.listed.is_empty() {
-            Ok(())
-        } else {
-            Err(InvalidInput { violations: self.listed, unlisted: self.unlisted })
+        match self.into_parts() {
+            (violations, _) if violations.is_empty() => Ok(()),
+            (violations, unlisted) => Err(InvalidInput { violations, unlisted }),
         }
     }
 }
@@ -121,10 +197,51 @@ impl From<Violation> for InvalidInput {
 
 #[cfg(test)]
 mod tests {
+    use super::*;
+
+    #[test]
+    fn many_of_one_kind_hide_none_of_another() {
+        let mut found = Violations::default();
+        for k in 0..1000 {
+            found.push(Violation::at(
+                "xs",
+                k,
+                format!("{} is not a finite number", if k == 1 { "NaN" } else { "inf" }),
+            ));
+        }
+        found.push(Violation::at("ys", 7, "inf is not a finite number"));
+        found.push(Violation::at("xs", 9, "1e9 px is beyond 1e7 px"));
+        let error = found.into_result().expect_err("violations");
+        let told: Vec<String> = error.violations().iter().map(Violation::to_string).collect();
+        assert_eq!(
+            told,
+            [
+                "xs[0]: inf is not a finite number",
+                "xs[1]: NaN is not a finite number",
+                "xs[2]: inf is not a finite number; and 997 more like this",
+                "ys[7]: inf is not a finite number",
+                "xs[9]: 1e9 px is beyond 1e7 px",
+            ]
+        );
+        assert_eq!(error.unlisted(), 0);
+    }
+
+    #[test]
+    fn kinds_without_end_are_counted() {
+        let mut found = Violations::default();
+        for k in 0..50 {
+            found.push(Violation::of(format!("field_{k}"), "is wrong"));
+        }
+        found.push(Violation::of("field_3", "is wrong"));
+        let error = found.into_result().expect_err("violations");
+        assert_eq!((error.violations().len(), error.unlisted()), (InvalidInput::MAX_LISTED, 30));
+        assert_eq!(error.violations()[3].description, "is wrong; and 1 more like this");
+    }
+
     #[test]
     fn long_texts_are_cut_at_a_character() {
-        assert_eq!(super::quoted("a\n"), "\"a\\n\"");
-        let long = super::quoted(&"\u{e9}".repeat(5000));
+        assert_eq!(quoted("a\n"), "\"a\\n\"");
+        let long = quoted(&"\u{e9}".repeat(5000));
         assert!(long.len() < 300 && long.ends_with("... (10000 bytes)"), "{long}");
     }
 }

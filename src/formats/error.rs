@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::domain::InvalidInput;
+use crate::domain::error::{Complaint, Listing, are_alike};
 
 /// Where in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -80,12 +80,12 @@ impl Error {
         Self::one(file, Problem::of_file(description))
     }
 
-    /// The problems, in the order in which they were found, at most [`InvalidInput::MAX_LISTED`].
+    /// The problems, in the order in which they were found, a bounded number.
     pub fn problems(&self) -> &[Problem] {
         &self.problems
     }
 
-    /// How many more there were than are listed.
+    /// How many more there were of kinds that are not listed.
     pub fn unlisted(&self) -> usize {
         self.unlisted
     }
@@ -112,38 +112,30 @@ impl fmt::Display for Error {
             write!(f, ": {}", problem.description)?;
         }
         if self.unlisted > 0 {
-            write!(f, "\n{}: and {} more problems like these", self.file, self.unlisted)?;
+            write!(f, "\n{}: and {} more problems", self.file, self.unlisted)?;
         }
         Ok(())
     }
 }
 
-/// Collects problems; a file with a million wrong lines needs no million sentences.
-#[derive(Debug, Default)]
-pub(super) struct Problems {
-    listed: Vec<Problem>,
-    unlisted: usize,
+impl Complaint for Problem {
+    fn is_like(&self, other: &Self) -> bool {
+        are_alike(&self.column, &other.column) && are_alike(&self.description, &other.description)
+    }
+
+    fn append(&mut self, text: &str) {
+        self.description.push_str(text);
+    }
 }
 
+/// Collects problems; a file with a million wrong lines needs no million sentences.
+pub(super) type Problems = Listing<Problem>;
+
 impl Problems {
-    pub(super) fn push(&mut self, problem: Problem) {
-        if self.listed.len() < InvalidInput::MAX_LISTED {
-            self.listed.push(problem);
-        } else {
-            self.unlisted += 1;
-        }
-    }
-
-    /// Counts problems that someone else already left unlisted.
-    pub(super) fn add_unlisted(&mut self, count: usize) {
-        self.unlisted += count;
-    }
-
     pub(super) fn into_result(self, file: &str) -> Result<(), Error> {
-        if self.listed.is_empty() {
-            Ok(())
-        } else {
-            Err(Error { file: file.into(), problems: self.listed, unlisted: self.unlisted })
+        match self.into_parts() {
+            (problems, _) if problems.is_empty() => Ok(()),
+            (problems, unlisted) => Err(Error { file: file.into(), problems, unlisted }),
         }
     }
 }

@@ -178,8 +178,11 @@ fn the_count_is_bounded_while_reading() {
 fn lists_a_bounded_number_of_problems() {
     let text = format!("view,track,x,y\n{}", "0,0,?,2\n".repeat(1000));
     let error = parsed(text, &Limits::default()).expect_err("a thousand bad lines");
-    assert_eq!((error.problems().len(), error.unlisted()), (20, 980));
-    assert!(error.to_string().ends_with("and 980 more problems like these"), "{error}");
+    assert_eq!((error.problems().len(), error.unlisted()), (3, 0));
+    assert!(error.to_string().ends_with("line 4: x: `?` is not a number; and 997 more like this"), "{error}");
+    let text = format!("view,track,x,y\n{}0,0,1\n", "0,0,?,2\n".repeat(1000));
+    let told = bad(text);
+    assert!(told.len() == 4 && told[3].contains("line 1002: 3 fields where"), "{told:?}");
 }
 
 #[test]

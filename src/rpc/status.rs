@@ -319,10 +319,10 @@ mod tests {
         let status = invalid(&found.into_result().expect_err("30 violations"));
         assert_eq!(status.code(), Code::InvalidArgument);
         assert!(status.message().starts_with("track_set.xs[0]: NaN is not a finite number; "), "{}", status.message());
-        assert!(status.message().ends_with("; and 27 more"), "{}", status.message());
+        assert!(status.message().ends_with("; and 27 more like this"), "{}", status.message());
         let request = status.get_details_bad_request().expect("a BadRequest");
-        assert_eq!(request.field_violations.len(), InvalidInput::MAX_LISTED);
-        assert_eq!(request.field_violations[17].field, "track_set.xs[17]");
+        assert_eq!(request.field_violations.len(), Violations::MAX_ALIKE);
+        assert_eq!(request.field_violations[2].field, "track_set.xs[2]");
         let info = status.get_details_error_info().expect("an ErrorInfo");
         assert_eq!((info.reason.as_str(), info.domain.as_str()), ("INVALID_ARGUMENT", DOMAIN));
     }

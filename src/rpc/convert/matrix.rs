@@ -151,6 +151,7 @@ fn in_terms_of_the_matrix(error: InvalidInput) -> InvalidInput {
             _ => found.push(violation.clone()),
         }
     }
+    found.add_unlisted(error.unlisted());
     // Never empty: the error had at least one.
     found.into_result().err().unwrap_or(error)
 }
