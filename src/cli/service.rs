@@ -155,8 +155,12 @@ async fn bind(
 ) -> Result<(Server, Option<http::Server>), Failure> {
     let server = Server::bind(options, engine).await.map_err(Failure::internal)?;
     let Some(listen) = config.http.listen else { return Ok((server, None)) };
-    let hosts = config.http.hosts.split(',').map(|host| host.trim().to_owned()).filter(|host| !host.is_empty());
-    let options = http::Options { listen, max_body_bytes: config.http.max_body_bytes, hosts: hosts.collect() };
+    let options = http::Options {
+        listen,
+        max_body_bytes: config.http.max_body_bytes,
+        hosts: config.http.hosts(),
+        allowed_origins: config.http.allowed_origins(),
+    };
     let http = http::Server::bind(options, server.gateway()).await.map_err(Failure::internal)?;
     Ok((server, Some(http)))
 }

@@ -210,6 +210,7 @@ impl Config {
                 right: "a collector's http:// address, such as http://127.0.0.1:4317 (TLS is not built in)",
             });
         }
+        self.http.validate()?;
         self.tls.validate()?;
         Ok(exposure::check(&self.server, &self.http, &self.tls, &self.auth)?)
     }

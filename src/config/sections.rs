@@ -3,6 +3,7 @@
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 
+use axum::http::uri::Authority;
 use serde::de::IntoDeserializer;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -77,6 +78,42 @@ pub struct Http {
     /// Names of hosts under which the port is reached, separated by commas; of no use with keys. Without keys only
     /// addresses and localhost are answered else: a page could have its own name point to this machine.
     pub hosts: String,
+    /// Origins of pages that may call the API from a browser, separated by commas; none by default: whoever opens such
+    /// a page lends it what the browser's machine may reach.
+    pub allowed_origins: String,
+}
+
+impl Http {
+    /// The names of hosts, one by one.
+    pub fn hosts(&self) -> Vec<String> {
+        words(&self.hosts)
+    }
+
+    /// The origins, one by one.
+    pub fn allowed_origins(&self) -> Vec<String> {
+        words(&self.allowed_origins)
+    }
+
+    /// Whether the origins are what a browser calls a page's.
+    pub(super) fn validate(&self) -> Result<(), Error> {
+        let is_origin = |text: &str| {
+            let authority = text.strip_prefix("https://").or_else(|| text.strip_prefix("http://"));
+            authority.is_some_and(|authority| !authority.contains(['*', '@']) && authority.parse::<Authority>().is_ok())
+        };
+        match self.allowed_origins().into_iter().find(|origin| !is_origin(origin)) {
+            Some(wrong) => Err(Error::Value {
+                key: "http.allowed_origins",
+                found: format!("`{wrong}`"),
+                right: "origins of pages without a path, such as `https://app.example`, separated by commas",
+            }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// What stands between the commas of a text.
+fn words(text: &str) -> Vec<String> {
+    text.split(',').map(|word| word.trim().to_owned()).filter(|word| !word.is_empty()).collect()
 }
 
 impl Default for Http {
@@ -86,6 +123,7 @@ impl Default for Http {
             listen: Some(SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080)),
             max_body_bytes: crate::http::MAX_BODY_BYTES,
             hosts: String::new(),
+            allowed_origins: String::new(),
         }
     }
 }

@@ -19,8 +19,9 @@ use tonic::metadata::MetadataMap;
 
 use super::answer::{self, Answer};
 use super::codec::Encoded;
+use super::origin::{self, Origin};
 use super::route::{self, Found, Route};
-use super::{console, openapi, upload};
+use super::{Options, console, grpc_web, openapi, upload};
 use crate::domain::Violation;
 use crate::domain::job::JobState;
 use crate::rpc::convert::enums::Twin;
@@ -58,9 +59,7 @@ pub struct Api {
     routes: Vec<Route>,
     openapi: Bytes,
     pub(super) gateway: Gateway,
-    max_body_bytes: usize,
-    /// Names under which the port is reached.
-    hosts: Vec<String>,
+    options: Options,
     /// What an upload holds, and what it becomes.
     pub(super) input_data: MessageDescriptor,
     pub(super) input: MessageDescriptor,
@@ -69,36 +68,45 @@ pub struct Api {
 impl Api {
     /// # Errors
     /// A defect of the proto.
-    pub fn new(
-        pool: &DescriptorPool,
-        gateway: Gateway,
-        max_body_bytes: usize,
-        hosts: Vec<String>,
-    ) -> Result<Self, String> {
+    pub fn new(pool: &DescriptorPool, gateway: Gateway, options: Options) -> Result<Self, String> {
         let routes = route::routes(pool)?;
         let openapi = openapi::document(&routes).to_string().into();
         let message = |name: &str| pool.get_message_by_name(name).ok_or_else(|| format!("the proto lacks {name}"));
         let (input_data, input) = (message("scpsfm.v1.InputData")?, message("scpsfm.v1.Input")?);
-        Ok(Self { routes, openapi, gateway, max_body_bytes, hosts, input_data, input })
+        Ok(Self { routes, openapi, gateway, options, input_data, input })
     }
 
     /// The answer to a request; `introduction` is its connection's. That to HEAD is that to GET: hyper leaves out the
     /// body.
     pub async fn answer(self: &Arc<Self>, introduction: Introduction, request: Request) -> Answer {
-        self.answer_or_refuse(introduction, request).await.unwrap_or_else(|refused| *refused)
+        let origin = Origin::of(request.headers(), &self.options.allowed_origins);
+        let answer = self.answer_or_refuse(&origin, introduction, request).await;
+        let mut answer = answer.unwrap_or_else(|refused| *refused);
+        if let Origin::Allowed(origin) = origin {
+            origin::admit(&mut answer, origin);
+        }
+        answer
     }
 
     async fn answer_or_refuse(
         self: &Arc<Self>,
+        origin: &Origin,
         introduction: Introduction,
         request: Request,
     ) -> Result<Answer, Box<Answer>> {
-        if is_of_another_site(request.headers()) {
-            return Err(answer::refuse(HttpRefusal::Origin, "a page of another site may not call this API"));
+        if *origin == Origin::Other {
+            let text = "a page of another site may not call this API: http.allowed_origins names those that may";
+            return Err(answer::refuse(HttpRefusal::Origin, text));
         }
         if !self.gateway.asks_for_keys() && !self.is_own_host(request.headers()) {
             let text = "the request is for a host that this server does not know: http.hosts names those that it has";
             return Err(answer::refuse(HttpRefusal::Host, text));
+        }
+        if *origin != Origin::Own && request.method() == Method::OPTIONS {
+            return Ok(origin::preflight());
+        }
+        if grpc_web::is_call(request.headers()) {
+            return Ok(grpc_web::answer(&self.gateway, introduction, request).await);
         }
         let path = request.uri().path().to_owned();
         let verb = if request.method() == Method::HEAD { Method::GET } else { request.method().clone() };
@@ -217,7 +225,7 @@ impl Api {
         let Ok(name) = name else { return false };
         name.parse::<IpAddr>().is_ok()
             || name.eq_ignore_ascii_case("localhost")
-            || self.hosts.iter().any(|known| known.eq_ignore_ascii_case(&name))
+            || self.options.hosts.iter().any(|known| known.eq_ignore_ascii_case(&name))
     }
 
     /// The message of a body, and the length of the body.
@@ -259,10 +267,10 @@ impl Api {
             // The client has gone away; nobody reads the answer.
             let frame = frame.map_err(|error| failed(Status::cancelled(error.to_string())))?;
             let length = text.len() + frame.len();
-            if length > self.max_body_bytes {
+            if length > self.options.max_body_bytes {
                 let text = format!(
                     "the body is larger than {} bytes; a larger input is uploaded as protobuf, or sent over gRPC",
-                    self.max_body_bytes
+                    self.options.max_body_bytes
                 );
                 return Err(answer::refuse(HttpRefusal::TooLarge, text));
             }
@@ -317,13 +325,4 @@ pub(super) async fn in_background<T: Send + 'static>(
         return work();
     }
     tokio::task::spawn_blocking(work).await.map_err(|error| status::internal(&error))?
-}
-
-/// Whether a browser sends the request for a page of another site: such a page must not use what the browser's machine
-/// may reach. One whose name was made to point here is refused by its host.
-fn is_of_another_site(headers: &HeaderMap) -> bool {
-    let text = |name| headers.get(name).and_then(|value: &axum::http::HeaderValue| value.to_str().ok());
-    let Some(origin) = headers.get(header::ORIGIN) else { return false };
-    let authority = origin.to_str().ok().and_then(|origin| origin.split_once("://")).map(|(_, authority)| authority);
-    authority.is_none() || authority != text(header::HOST)
 }

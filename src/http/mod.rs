@@ -6,6 +6,9 @@
 //!                                              answer <- message to JSON, or server-sent events <-
 //! ```
 //!
+//! Beside them the same methods as gRPC-Web, and a console for people ([`console`]). Pages of other sites are refused,
+//! unless their origins are configured.
+//!
 //! Every request becomes a call of gRPC that never leaves the process: keys, bounds, metrics and errors are those of
 //! [`crate::rpc`], and a method that the proto adds is served without a line here.
 
@@ -13,7 +16,9 @@ mod answer;
 mod api;
 mod codec;
 mod console;
+mod grpc_web;
 mod openapi;
+mod origin;
 mod route;
 mod upload;
 
@@ -77,12 +82,19 @@ pub struct Options {
     pub max_body_bytes: usize,
     /// Names under which the port is reached; without keys no others are answered but addresses and localhost.
     pub hosts: Vec<String>,
+    /// Origins of pages of other sites that may call.
+    pub allowed_origins: Vec<String>,
 }
 
 impl Default for Options {
     /// A free port of the loopback interface.
     fn default() -> Self {
-        Self { listen: SocketAddr::from(([127, 0, 0, 1], 0)), max_body_bytes: MAX_BODY_BYTES, hosts: Vec::new() }
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+            max_body_bytes: MAX_BODY_BYTES,
+            hosts: Vec::new(),
+            allowed_origins: Vec::new(),
+        }
     }
 }
 
@@ -115,7 +127,7 @@ impl Server {
         let pool = DescriptorPool::decode(FILE_DESCRIPTOR_SET).map_err(|error| Error::Api(error.to_string()))?;
         let incoming = listener::Options { protocol: Some(HTTP_1), ..gateway.listener.clone() };
         let incoming = listener::incoming(listener, incoming);
-        let api = Api::new(&pool, gateway, options.max_body_bytes, options.hosts).map_err(Error::Api)?;
+        let api = Api::new(&pool, gateway, options).map_err(Error::Api)?;
         let stop = CancellationToken::new();
         let task = tokio::spawn(serve(incoming, Arc::new(api), stop.clone()));
         Ok(Self { address, stop, task })

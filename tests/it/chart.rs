@@ -63,6 +63,7 @@ fn sample(section: &str, key: &str, schema: &Value) -> String {
         ("store", "retention") | ("upload", "abandoned_after") | ("webhooks", "retry_for") => "12h",
         ("otlp", "endpoint") => "http://collector.monitoring:4317",
         ("http", "hosts") => "solver.example",
+        ("http", "allowed_origins") => "https://app.example",
         ("compute", "prior") => "/models/my.prior",
         ("log", "filter") => "info,scpsfm::engine=debug",
         _ => match (schema["enum"][0].as_str(), schema["type"].as_str()) {

@@ -13,6 +13,7 @@ mod crash;
 mod dashboards;
 mod disk;
 mod formats;
+mod grpc_web;
 mod http;
 mod inputs;
 mod load;
