@@ -74,9 +74,6 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let solution = args.server.connect().await?.read_result(&name).await?;
     if let Some(input) = &input {
         belongs_together(input, &solution)?;
-        if let Some(note) = other_names(input, &solution).filter(|_| !args.quiet) {
-            tell!("{note}");
-        }
     }
     let exports = match &args.out {
         Some(out) => args.export.write(out, &solution, input.as_ref())?,
@@ -92,7 +89,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     Ok(Exit::of(&solution))
 }
 
-/// Where the file calls views otherwise than the job's input did: which, and whose names the result files have.
+/// What of the views' names differs from those of the job's input.
 fn other_names(input: &LabelledInput, solution: &Solution) -> Option<String> {
     // Servers of older versions tell no names.
     let pairs = input
@@ -104,13 +101,8 @@ fn other_names(input: &LabelledInput, solution: &Solution) -> Option<String> {
     let others: Vec<_> = pairs.filter(|(view, name)| view.name.as_deref() != Some(name)).collect();
     let &(view, name) = others.first()?;
     let here = view.name.as_deref().map_or_else(|| "no name".to_owned(), |name| format!("{name:?}"));
-    Some(format!(
-        "{}: {} of {} views have other names than in the job's input (the first {here} for {name:?}); the result files \
-         have those of this file",
-        input.display_path(),
-        others.len(),
-        solution.views.len()
-    ))
+    let (others, views) = (others.len(), solution.views.len());
+    Some(format!("{others} of {views} views have other names, the first {here} for {name:?}"))
 }
 
 /// Refuses a file that is not the job's input: its verdicts are listed by place alone.
@@ -127,9 +119,13 @@ fn belongs_together(input: &LabelledInput, solution: &Solution) -> Result<(), Fa
     if solution.input_sha256.is_none_or(|sha256| sha256 == input.raw.sha256()) {
         return Ok(());
     }
-    let message = "the file is not the job's input: its observations, their order, or what is known of its views \
-                   (--width, --height, --focal-px, --focal-sigma) are others, and verdicts go by place";
-    Err(Failure { exit: Exit::BadInput, message: message.to_owned() })
+    let differs = other_names(input, solution).unwrap_or_else(|| {
+        "its observations, their order, or what is known of its views (--width, --height, --focal-px, --focal-sigma) \
+         are others"
+            .into()
+    });
+    let message = format!("the file is not the job's input: {differs}, and verdicts go by place");
+    Err(Failure { exit: Exit::BadInput, message })
 }
 
 #[cfg(test)]
@@ -138,7 +134,7 @@ mod tests {
     use crate::formats::fixture;
 
     #[test]
-    fn other_names_of_views_are_told() {
+    fn views_of_other_names_are_why_a_file_is_refused() {
         let (mut input, mut solution) = fixture::solved();
         assert_eq!(other_names(&input, &solution), None, "neither has names");
         input.raw.views[1].name = Some("a.jpg".into());
@@ -148,7 +144,6 @@ mod tests {
         solution.views[1].name = Some("b.jpg".into());
         solution.views[2].name = Some("c.jpg".into());
         let told = other_names(&input, &solution).expect("two");
-        assert!(told.starts_with("observations.csv: 2 of 5 views have other names"), "{told}");
-        assert!(told.contains("(the first \"a.jpg\" for \"b.jpg\")"), "{told}");
+        assert_eq!(told, "2 of 5 views have other names, the first \"a.jpg\" for \"b.jpg\"");
     }
 }
