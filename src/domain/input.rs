@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::error::{InvalidInput, Violation, Violations, quoted};
 use super::limits::Limits;
+use super::matches::{JoinedTracks, Joining};
 
 /// Width and height of an image in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -96,6 +97,9 @@ pub struct Input {
     /// Position of each observation in the caller's order.
     caller_order: Vec<u32>,
     sigma: Option<Vec<f64>>,
+    /// Of an input that was joined from matches.
+    #[serde(default)]
+    joining: Option<Joining>,
 }
 
 impl Input {
@@ -137,7 +141,20 @@ impl Input {
             views: raw.views,
             track_count: raw.track_count,
             caller_order: order,
+            joining: None,
         })
+    }
+
+    /// The same input, joined from matches in this way.
+    pub(super) fn joined_by(self, joining: Joining) -> Self {
+        Self { joining: Some(joining), ..self }
+    }
+
+    /// Observations and keypoints of an input that was joined from matches, in the caller's order; `None` for others.
+    pub fn joined_tracks(&self) -> Option<JoinedTracks> {
+        let joining = self.joining.clone()?;
+        let RawInput { view, track, .. } = self.to_raw();
+        Some(JoinedTracks { view, track, joining })
     }
 
     pub fn views(&self) -> &[View] {
@@ -333,14 +350,8 @@ fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &m
             ));
         }
         for (name, value) in [("xs", raw.x[k]), ("ys", raw.y[k])] {
-            if !value.is_finite() {
-                found.push(Violation::at(field(name), k, format!("{value} is not a finite number")));
-            } else if value.abs() > Input::MAX_COORDINATE_PX {
-                found.push(Violation::at(
-                    field(name),
-                    k,
-                    format!("{value:e} px is beyond {:e} px; coordinates are in pixels", Input::MAX_COORDINATE_PX),
-                ));
+            if let Err(what) = check_position(value) {
+                found.push(Violation::at(field(name), k, what));
             }
         }
         let (least, most) = Input::DEPTH_RANGE;
@@ -360,6 +371,18 @@ fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &m
             let what = format!("{sigma} px is no standard deviation within {least:e}..={most:e} px");
             found.push(Violation::at(field("sigmas_px"), k, what));
         }
+    }
+}
+
+/// Whether a number can be a coordinate of a point in pixels.
+pub(super) fn check_position(value: f64) -> Result<(), String> {
+    let most = Input::MAX_COORDINATE_PX;
+    if !value.is_finite() {
+        Err(format!("{value} is not a finite number"))
+    } else if value.abs() > most {
+        Err(format!("{value:e} px is beyond {most:e} px; coordinates are in pixels"))
+    } else {
+        Ok(())
     }
 }
 

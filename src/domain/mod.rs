@@ -10,8 +10,10 @@ pub mod input;
 mod input_digest;
 pub mod input_name;
 pub mod job;
+pub mod joining;
 pub mod left_out;
 pub mod limits;
+pub mod matches;
 pub mod progress;
 pub mod quota;
 pub mod result;
@@ -26,6 +28,7 @@ pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
 pub use input_name::InputName;
 pub use left_out::LeftOut;
 pub use limits::Limits;
+pub use matches::{JoinedTracks, Joining, PairMatches, RawMatches};
 pub use progress::{
     HeadProgress, Losses, Observer, Phase, Progress, ReconstructionProgress, Silent, Stage, Step, Task,
 };

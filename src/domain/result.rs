@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::digest::Sha256Digest;
 use super::left_out::LeftOut;
+use super::matches::JoinedTracks;
 use super::progress::{Progress, Stage};
 use super::settings::Method;
 use super::warning::Warning;
@@ -351,6 +352,8 @@ pub struct Solution {
     pub trained_network_sha256: Option<Sha256Digest>,
     /// [`RawInput::sha256`](super::RawInput::sha256) of the input; `None` before it was hashed.
     pub input_sha256: Option<Sha256Digest>,
+    /// Which keypoint each observation is, of an input that was joined from matches; `None` for others.
+    pub joined_tracks: Option<JoinedTracks>,
 }
 
 impl Solution {

@@ -229,6 +229,7 @@ fn solution(scene: &Scene) -> Solution {
         history: history(truth.focal_px),
         trained_network_sha256: None,
         input_sha256: None,
+        joined_tracks: None,
     }
 }
 

@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use super::colmap::ColmapImage;
+use super::colmap::{ColmapImage, FIRST_PIXEL};
 use super::error::{Error, Place, Problem, Problems};
 use super::label::Label;
 use super::source::{Format, STANDARD_INPUT};
-use crate::domain::{Input, InvalidInput, Limits, RawInput, Violation};
+use crate::domain::{Input, InvalidInput, Limits, PairMatches, RawInput, RawMatches, Violation};
 
 /// What a file says: dense indices for the solver, the file's own ids for the answers.
 #[derive(Debug, Clone, Default)]
@@ -24,6 +24,8 @@ pub struct LabelledInput {
     pub opensfm_cameras: Vec<Option<Box<str>>>,
     /// Index of each observation's keypoint in its image; empty where the file has no such indices.
     pub keypoints: Vec<u32>,
+    /// The matches that the tracks were joined from, where they were; keypoints are those of `colmap_images`.
+    pub matches: Option<PairMatches>,
     /// What reading changed or left out, a sentence each.
     pub notes: Vec<String>,
     pub path: PathBuf,
@@ -51,6 +53,19 @@ impl LabelledInput {
                 view.name = Some(name.clone());
             }
         }
+    }
+
+    /// The keypoints and the matches that the tracks were joined from, where they were.
+    pub fn raw_matches(&self) -> Option<RawMatches> {
+        let pairs = self.matches.clone()?;
+        let points = || self.colmap_images.iter().flat_map(|image| &image.keypoints);
+        Some(RawMatches {
+            views: self.raw.views.clone(),
+            keypoint_counts: self.colmap_images.iter().map(|image| image.keypoints.len() as u32).collect(),
+            x: points().map(|&[x, _]| f64::from(x) - FIRST_PIXEL).collect(),
+            y: points().map(|&[_, y]| f64::from(y) - FIRST_PIXEL).collect(),
+            pairs,
+        })
     }
 
     /// The file as sentences about it begin.
@@ -86,6 +101,14 @@ impl LabelledInput {
 
     /// A violation's field is a path of the API, such as `track_set.xs`; its last part names the file's column.
     fn problem(&self, violation: &Violation) -> Problem {
+        if violation.field.starts_with("match_set.") && !violation.field.ends_with(".views") {
+            // Of keypoints and matches, which no column of a file has.
+            return Problem {
+                place: Place::File,
+                column: violation.path(),
+                description: violation.description.clone(),
+            };
+        }
         let column = match violation.field.rsplit('.').next().unwrap_or_default() {
             "view_indices" => "view",
             "track_indices" => "track",

@@ -101,20 +101,28 @@ impl Inputs {
             let draft = convert::upload::read(&mut reader, &limits);
             let found = reader.into_hash()?;
             // Of bytes that are not those that were meant, nothing else is worth telling.
-            let input = if found == sha256 { Some(draft.and_then(input::Draft::finish)) } else { None };
-            Ok((found, input))
+            Ok((found, (found == sha256).then_some(draft)))
         });
         let (outcome, ()) = tokio::join!(decode, parts::feed(&upload, sender));
-        match outcome?.map_err(status::from_engine)? {
-            (found, None) => {
-                upload.give_up(GivenUp::WrongHash).await.map_err(status::from_engine)?;
-                Err(status::hash_mismatch(sha256, found))
+        let (found, draft) = outcome?.map_err(status::from_engine)?;
+        let Some(draft) = draft else {
+            upload.give_up(GivenUp::WrongHash).await.map_err(status::from_engine)?;
+            return Err(status::hash_mismatch(sha256, found));
+        };
+        let input = match draft {
+            Ok(draft) => {
+                // Matches take more while they are joined than their bytes told.
+                permit.hold(WORKING_COPIES * draft.bytes().max(upload.bytes().min(largest)))?;
+                super::blocking(move || draft.finish()).await?
             }
-            (_, Some(Err(invalid))) => {
+            Err(invalid) => Err(invalid),
+        };
+        match input {
+            Err(invalid) => {
                 upload.give_up(GivenUp::Invalid).await.map_err(status::from_engine)?;
                 Err(status::invalid(&invalid))
             }
-            (found, Some(Ok(input))) => {
+            Ok(input) => {
                 let stored = upload.finish(input, found).await.map_err(status::from_engine)?;
                 Ok(input::uploaded_to_wire(&stored))
             }

@@ -69,11 +69,14 @@ impl Submission {
             (None, _) => Err(super::violation("message", "is not set")),
             (Some(Message::TrackSetChunk(chunk)), Source::Draft(draft)) => draft.append_track_set(chunk),
             (Some(Message::MeasurementMatrixChunk(chunk)), Source::Draft(draft)) => draft.append_matrix(chunk),
-            (Some(Message::TrackSetChunk(_)), Source::Uploaded(_)) => {
-                Err(super::violation("track_set_chunk", "the config names an uploaded input"))
-            }
-            (Some(Message::MeasurementMatrixChunk(_)), Source::Uploaded(_)) => {
-                Err(super::violation("measurement_matrix_chunk", "the config names an uploaded input"))
+            (Some(Message::MatchSetChunk(chunk)), Source::Draft(draft)) => draft.append_match_set(chunk),
+            (Some(message), Source::Uploaded(_)) => {
+                let field = match message {
+                    Message::TrackSetChunk(_) => "track_set_chunk",
+                    Message::MeasurementMatrixChunk(_) => "measurement_matrix_chunk",
+                    Message::MatchSetChunk(_) | Message::Config(_) => "match_set_chunk",
+                };
+                Err(super::violation(field, "the config names an uploaded input"))
             }
         }
         .map_err(|error| invalid(&error))?;

@@ -257,6 +257,7 @@ fn nothing(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>,
         history,
         trained_network_sha256: None,
         input_sha256: None,
+        joined_tracks: None,
     }
 }
 

@@ -151,6 +151,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         history: vec![progress(1)],
         trained_network_sha256: None,
         input_sha256: None,
+        joined_tracks: None,
     }
 }
 

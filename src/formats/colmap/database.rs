@@ -13,8 +13,8 @@ use sqlx::{ConnectOptions, Connection};
 use self::rows::Keypoints;
 pub(super) use self::rows::MAX_MATCHES;
 use super::images::{Images, Observation};
-use super::tracks::{self, Match};
-use crate::domain::Limits;
+use crate::domain::matches::{keypoint_starts, view_of};
+use crate::domain::{Limits, PairMatches};
 use crate::formats::error::{Error, Problem};
 use crate::formats::input::{LabelledInput, display_path};
 use crate::formats::source::Matches;
@@ -47,17 +47,23 @@ struct Contents {
     images: Images,
     /// Keypoints of each image, in the order of the images.
     keypoints: Keypoints,
-    matches: Vec<Match>,
-    pairs: usize,
+    /// Views are the positions of the images.
+    matches: PairMatches,
     kind: Matches,
     notes: Vec<String>,
 }
 
 impl Contents {
     fn into_labelled(mut self, path: &Path, limits: &Limits) -> Result<LabelledInput, Problem> {
-        let count = self.matches.len();
         let keypoints = self.keypoints;
-        let joined = tracks::join(self.matches, |keypoint| keypoints.image_of(keypoint));
+        // Views are in another order than the images, and tracks are numbered by the views' keypoints.
+        let (view_of_image, image_of_view) = self.images.views();
+        let mut matches = self.matches;
+        for view in matches.first_view.iter_mut().chain(&mut matches.second_view) {
+            *view = view_of_image[*view as usize];
+        }
+        let starts = keypoint_starts(image_of_view.iter().map(|&image| keypoints.count(image)));
+        let joined = matches.join(&starts);
         if joined.observations.len() > limits.max_observations {
             let what = format!(
                 "{} observations are above the limit of {}",
@@ -67,16 +73,18 @@ impl Contents {
             return Err(Problem::of_file(what));
         }
         let note = format!(
-            "{} tracks were joined from {count} {} matches of {} image pairs; {} matches were cut, which would have put two \
+            "{} tracks were joined from {} {} matches of {} image pairs; {} matches were cut, which would have put two \
              keypoints of one image into one track",
             joined.tracks,
+            matches.len(),
             kind_name(self.kind),
-            self.pairs,
+            matches.pair_count(),
             joined.cut
         );
         let observation = |&(keypoint, track): &(u32, u32)| {
-            let [x, y] = keypoints.point(keypoint);
-            let [image, keypoint] = keypoints.place(keypoint);
+            let view = view_of(&starts, keypoint);
+            let (image, keypoint) = (image_of_view[view as usize], keypoint - starts[view as usize]);
+            let [x, y] = keypoints.point(image, keypoint);
             Observation { image, keypoint, track: u64::from(track), x, y, line: 0 }
         };
         let observations = joined.observations.iter().map(observation).collect();
@@ -84,7 +92,8 @@ impl Contents {
             self.images.set_keypoints(image, keypoints);
         }
         let notes = [vec![note], self.notes].concat();
-        Ok(self.images.into_labelled(observations, path, notes))
+        let labelled = self.images.into_labelled(observations, path, notes);
+        Ok(LabelledInput { matches: Some(matches), ..labelled })
     }
 }
 
@@ -173,9 +182,9 @@ async fn read_tables(
     };
     for &kind in kinds {
         require(rows::table(kind))?;
-        let (matches, pairs) = rows::matches(connection, kind, &images, &keypoints).await?;
+        let matches = rows::matches(connection, kind, &images, &keypoints).await?;
         if !matches.is_empty() {
-            return Ok(Contents { images, keypoints, matches, pairs, kind, notes });
+            return Ok(Contents { images, keypoints, matches, kind, notes });
         }
     }
     Err(Problem::of_file(match matches {

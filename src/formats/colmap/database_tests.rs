@@ -118,8 +118,8 @@ fn matches_become_tracks_of_images_by_name_in_our_pixels() {
     let ids: Vec<u32> = input.colmap_images.iter().map(|image| image.id).collect();
     assert_eq!((names, ids), (["a.jpg", "b.jpg", "c.jpg"].map(String::from).to_vec(), vec![5, 2, 1]));
     assert_eq!(input.track_labels, [Label::Number(0), Label::Number(1)]);
-    assert_eq!((&input.raw.view[..], &input.raw.track[..]), (&[2, 1, 0, 2, 1, 0][..], &[0, 0, 0, 1, 1, 1][..]));
-    assert_eq!(input.raw.x, [10.0, 21.0, 50.0, 12.0, 22.0, 51.0]);
+    assert_eq!((&input.raw.view[..], &input.raw.track[..]), (&[0, 1, 2, 0, 1, 2][..], &[0, 0, 0, 1, 1, 1][..]));
+    assert_eq!(input.raw.x, [50.0, 21.0, 10.0, 51.0, 22.0, 12.0]);
     assert_eq!(input.raw.y, [100.0; 6]);
     let groups: Vec<u32> = input.raw.views.iter().map(|view| view.camera_group).collect();
     let priors: Vec<bool> = input.raw.views.iter().map(|view| view.focal_prior.is_some()).collect();
@@ -134,6 +134,21 @@ fn matches_become_tracks_of_images_by_name_in_our_pixels() {
           keypoints of one image into one track"
         ]
     );
+}
+
+/// What is sent to a server, which joins it again.
+#[test]
+fn keypoints_and_matches_give_the_same_input_as_the_tracks() {
+    // A match that is listed twice counts once.
+    let wrong: [Pair; 3] = [CHAIN[0], (1, 5, &[(0, 0), (2, 1)]), (2, 5, &[(1, 0), (2, 1), (1, 1), (2, 1)])];
+    let (_directory, path) = with_matches("matches", &wrong);
+    let labelled = read(&path, &Limits::default(), None).expect("valid");
+    let matches = labelled.raw_matches().expect("matches");
+    assert_eq!((matches.keypoint_counts.as_slice(), matches.pairs.len()), (&[3, 3, 3][..], 7));
+    let joined = matches.into_input(&Limits::default(), "match_set").expect("valid");
+    assert_eq!(joined.to_raw().sha256(), labelled.raw.sha256());
+    let tracks = joined.joined_tracks().expect("joined");
+    assert_eq!((tracks.joining.keypoint, tracks.joining.cut_match_count), (labelled.keypoints, 1));
 }
 
 #[test]

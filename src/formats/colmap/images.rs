@@ -115,6 +115,15 @@ impl Images {
         self.by_id.get(&id).copied()
     }
 
+    /// The view of each image, and the image of each view: views are images in the order of their names.
+    pub fn views(&self) -> (Vec<u32>, Vec<u32>) {
+        let names: Vec<Label> = self.images.iter().map(|image| image.name.clone()).collect();
+        let (_, view_of) = dense(&names);
+        let mut order: Vec<u32> = (0..self.images.len() as u32).collect();
+        order.sort_unstable_by_key(|&image| view_of[image as usize]);
+        (view_of, order)
+    }
+
     /// The input; its views are the images in the order of their names, each with its camera as group.
     ///
     /// A track keeps one observation of each image, the one that comes first; a note counts the others.
@@ -130,10 +139,9 @@ impl Images {
             notes.push(format!("{repeated} observations were left out, each the second of a track in one image"));
         }
         notes.extend(self.foreign_cameras());
-        let names: Vec<Label> = self.images.iter().map(|image| image.name.clone()).collect();
-        let (view_labels, view_of) = dense(&names);
-        let mut order: Vec<usize> = (0..self.images.len()).collect();
-        order.sort_unstable_by_key(|&image| view_of[image]);
+        let (view_of, order) = self.views();
+        let order: Vec<usize> = order.into_iter().map(|image| image as usize).collect();
+        let view_labels = order.iter().map(|&image| self.images[image].name.clone()).collect();
         let track_ids: Vec<u64> = observations.iter().map(|observation| observation.track).collect();
         let (track_labels, track) = dense(&track_ids);
         let has_lines = observations.iter().any(|observation| observation.line > 0);

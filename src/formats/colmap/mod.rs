@@ -10,7 +10,6 @@ pub(crate) mod database_fixture;
 mod images;
 mod intrinsics;
 pub mod model;
-mod tracks;
 mod two_view;
 pub mod write;
 pub mod write_database;

@@ -2,7 +2,7 @@
 
 use std::borrow::Borrow;
 
-use super::{matrix, size_to_wire};
+use super::{matches, matrix, size_to_wire};
 use crate::domain::{FocalPrior, ImageSize, Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::engine::StoredInput;
 use crate::rpc::proto;
@@ -28,6 +28,23 @@ pub struct Draft {
 enum Body {
     TrackSet(proto::TrackSet),
     Matrix(proto::MeasurementMatrix),
+    Matches(proto::MatchSet),
+}
+
+impl Body {
+    /// Its name in a request.
+    fn name(&self) -> &'static str {
+        match self {
+            Body::TrackSet(_) => TRACK_SET,
+            Body::Matrix(_) => matrix::MATRIX,
+            Body::Matches(_) => matches::MATCH_SET,
+        }
+    }
+
+    /// The refusal of a chunk of another kind.
+    fn is_no(&self, chunk: &str) -> InvalidInput {
+        Violation::of(chunk, format!("the config holds a {}", self.name())).into()
+    }
 }
 
 impl Draft {
@@ -39,10 +56,11 @@ impl Draft {
         let body = match input {
             Some(Inline::TrackSet(set)) => Body::TrackSet(set),
             Some(Inline::MeasurementMatrix(matrix)) => Body::Matrix(matrix),
+            Some(Inline::MatchSet(set)) => Body::Matches(set),
             Some(Inline::Input(_)) | None => {
                 return Err(Violation::of(
                     "source",
-                    "is not set; give a track_set, a measurement_matrix or the name of an uploaded input",
+                    "is not set; give a track_set, a measurement_matrix, a match_set or the name of an uploaded input",
                 )
                 .into());
             }
@@ -53,10 +71,10 @@ impl Draft {
     /// Appends observations.
     ///
     /// # Errors
-    /// A violation where the input is a matrix; see [`Draft::check_size`].
+    /// A violation where the input is of another kind; see [`Draft::check_size`].
     pub fn append_track_set(&mut self, mut chunk: proto::TrackSetChunk) -> Result<(), InvalidInput> {
         let Body::TrackSet(set) = &mut self.body else {
-            return Err(Violation::of("track_set_chunk", "the config holds a measurement_matrix").into());
+            return Err(self.body.is_no("track_set_chunk"));
         };
         set.view_indices.append(&mut chunk.view_indices);
         set.track_indices.append(&mut chunk.track_indices);
@@ -70,13 +88,23 @@ impl Draft {
     /// Appends numbers and visibility.
     ///
     /// # Errors
-    /// A violation where the input is a track set; see [`Draft::check_size`].
+    /// A violation where the input is of another kind; see [`Draft::check_size`].
     pub fn append_matrix(&mut self, mut chunk: proto::MeasurementMatrixChunk) -> Result<(), InvalidInput> {
         let Body::Matrix(matrix) = &mut self.body else {
-            return Err(Violation::of("measurement_matrix_chunk", "the config holds a track_set").into());
+            return Err(self.body.is_no("measurement_matrix_chunk"));
         };
         matrix.values.append(&mut chunk.values);
         matrix.visibility.append(&mut chunk.visibility);
+        Ok(())
+    }
+
+    /// Appends keypoints, pairs and matches.
+    ///
+    /// # Errors
+    /// A violation where the input is of another kind; see [`Draft::check_size`].
+    pub fn append_match_set(&mut self, chunk: proto::MatchSetChunk) -> Result<(), InvalidInput> {
+        let Body::Matches(set) = &mut self.body else { return Err(self.body.is_no("match_set_chunk")) };
+        matches::append(set, chunk);
         Ok(())
     }
 
@@ -89,10 +117,11 @@ impl Draft {
         match &self.body {
             Body::TrackSet(set) => check_track_set_size(set, &self.limits),
             Body::Matrix(matrix) => matrix::check_size(matrix, &self.limits),
+            Body::Matches(set) => matches::check_size(set, &self.limits),
         }
     }
 
-    /// Bytes that its arrays take in memory.
+    /// Bytes that its arrays take in memory; those of matches count as often as joining needs them.
     pub fn bytes(&self) -> u64 {
         fn of<T>(array: &Vec<T>) -> u64 {
             (array.capacity() * size_of::<T>()) as u64
@@ -103,6 +132,17 @@ impl Draft {
                 of(&set.views) + of(&set.view_indices) + of(&set.track_indices) + reals
             }
             Body::Matrix(matrix) => of(&matrix.views) + of(&matrix.values) + of(&matrix.visibility),
+            Body::Matches(set) => {
+                let pairs = [&set.first_view_indices, &set.second_view_indices, &set.match_counts];
+                let matches =
+                    [&set.first_keypoint_indices, &set.second_keypoint_indices].map(of).into_iter().sum::<u64>();
+                of(&set.views)
+                    + of(&set.keypoint_counts)
+                    + of(&set.xs)
+                    + of(&set.ys)
+                    + pairs.map(of).into_iter().sum::<u64>()
+                    + matches::JOINING_COPIES * matches
+            }
         }
     }
 
@@ -114,6 +154,7 @@ impl Draft {
         match self.body {
             Body::TrackSet(set) => Input::new(track_set_to_raw(set), &self.limits, TRACK_SET),
             Body::Matrix(matrix) => matrix::to_input(matrix, &self.limits),
+            Body::Matches(set) => matches::to_raw(set).into_input(&self.limits, matches::MATCH_SET),
         }
     }
 }
@@ -166,7 +207,7 @@ pub(super) fn view_from_wire(view: &proto::View) -> View {
     }
 }
 
-fn view_to_wire(view: &View) -> proto::View {
+pub(super) fn view_to_wire(view: &View) -> proto::View {
     proto::View {
         name: view.name.as_deref().unwrap_or_default().to_owned(),
         size: view.size.map(|ImageSize { width_px, height_px }| proto::ImageSize { width_px, height_px }),
@@ -294,7 +335,8 @@ mod tests {
     fn a_chunk_of_the_other_kind_is_refused() {
         let limits = Limits::default();
         let mut draft = Draft::begin(Some(Inline::TrackSet(head_to_wire(&raw(4)))), &limits).expect("a head");
-        assert!(draft.append_matrix(proto::MeasurementMatrixChunk::default()).is_err());
+        let error = draft.append_matrix(proto::MeasurementMatrixChunk::default()).expect_err("another kind");
+        assert_eq!(error.to_string(), "measurement_matrix_chunk: the config holds a track_set");
     }
 
     #[test]

@@ -7,7 +7,7 @@ use crate::domain::{Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::rpc::proto;
 
 /// Name of a matrix in violations.
-const MATRIX: &str = "measurement_matrix";
+pub(super) const MATRIX: &str = "measurement_matrix";
 
 fn field(name: &str) -> String {
     format!("{MATRIX}.{name}")

@@ -9,6 +9,7 @@ pub mod enums;
 pub mod input;
 pub mod job;
 pub mod list;
+pub mod matches;
 pub mod matrix;
 pub mod names;
 pub mod progress;

@@ -10,8 +10,8 @@ use crate::domain::result::{
     ObservationResults, ProposalTime, Sigmas, StageTime, TrackResults, TrackSplit, ViewResult,
 };
 use crate::domain::{
-    Calibration, Grade, LeftOut, LensProjection, Method, Proposal, Sha256Digest, Solution, Stage, Status, Violation,
-    Warning, WarningCode,
+    Calibration, Grade, JoinedTracks, Joining, LeftOut, LensProjection, Method, Proposal, Sha256Digest, Solution,
+    Stage, Status, Violation, Warning, WarningCode,
 };
 use crate::rpc::proto;
 
@@ -61,6 +61,7 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         progress_records: solution.history.iter().map(progress::to_wire).collect(),
         trained_network_sha256: digest_to_wire(solution.trained_network_sha256),
         input_sha256: digest_to_wire(solution.input_sha256),
+        joined_tracks: solution.joined_tracks.as_ref().map(joined_tracks_to_wire),
     }
 }
 
@@ -108,6 +109,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         history: result.progress_records.iter().map(progress::from_wire).collect::<Result<_, _>>()?,
         trained_network_sha256: digest_from_wire(&result.trained_network_sha256, "trained_network_sha256")?,
         input_sha256: digest_from_wire(&result.input_sha256, "input_sha256")?,
+        joined_tracks: result.joined_tracks.map(joined_tracks_from_wire).transpose()?,
     })
 }
 
@@ -374,6 +376,25 @@ fn observations_from_wire(mut observations: proto::ObservationResults) -> Result
         split: observations.split_numbers,
         inlier: observations.inliers,
     })
+}
+
+fn joined_tracks_to_wire(joined: &JoinedTracks) -> proto::JoinedTracks {
+    proto::JoinedTracks {
+        view_indices: joined.view.clone(),
+        track_indices: joined.track.clone(),
+        keypoint_indices: joined.joining.keypoint.clone(),
+        match_count: joined.joining.match_count,
+        cut_match_count: joined.joining.cut_match_count,
+    }
+}
+
+fn joined_tracks_from_wire(joined: proto::JoinedTracks) -> Result<JoinedTracks, Violation> {
+    let proto::JoinedTracks { view_indices, track_indices, keypoint_indices, match_count, cut_match_count } = joined;
+    if view_indices.len() != keypoint_indices.len() || track_indices.len() != keypoint_indices.len() {
+        return Err(Violation::of("joined_tracks", "arrays of different lengths"));
+    }
+    let joining = Joining { keypoint: keypoint_indices, match_count, cut_match_count };
+    Ok(JoinedTracks { view: view_indices, track: track_indices, joining })
 }
 
 #[cfg(test)]

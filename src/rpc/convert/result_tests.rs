@@ -123,6 +123,11 @@ pub(super) fn rich() -> Solution {
         history: vec![progress, Progress { losses: None, head: None, focal_px: None, best_score: None, ..progress }],
         trained_network_sha256: Some(Sha256Digest([0x5e; 32])),
         input_sha256: Some(Sha256Digest([0xd1; 32])),
+        joined_tracks: Some(JoinedTracks {
+            view: vec![0, 1, 0],
+            track: vec![0, 0, 1],
+            joining: Joining { keypoint: vec![7, 0, 9], match_count: 5, cut_match_count: 2 },
+        }),
     }
 }
 

@@ -6,6 +6,7 @@ use prost::bytes::Buf;
 use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
 
 use super::input::{Draft, within};
+use super::matches;
 use crate::domain::{InvalidInput, Limits, Violation};
 use crate::rpc::proto;
 use proto::create_job_request::Source as Inline;
@@ -38,6 +39,11 @@ pub fn read(buf: &mut impl Buf, limits: &Limits) -> Result<Draft, InvalidInput> 
                 };
                 nested(buf, |buf, tag, wire| matrix_field(buf, tag, wire, &mut matrix, limits))?;
                 body = Some(Inline::MeasurementMatrix(matrix));
+            }
+            (3, WireType::LengthDelimited, before) => {
+                let mut set = if let Some(Inline::MatchSet(set)) = before { set } else { proto::MatchSet::default() };
+                nested(buf, |buf, tag, wire| match_set_field(buf, tag, wire, &mut set, limits))?;
+                body = Some(Inline::MatchSet(set));
             }
             (_, _, before) => {
                 body = before;
@@ -139,6 +145,31 @@ fn matrix_field(
     }
 }
 
+fn match_set_field(
+    buf: &mut impl Buf,
+    tag: u32,
+    wire: WireType,
+    set: &mut proto::MatchSet,
+    limits: &Limits,
+) -> Result<(), InvalidInput> {
+    let most = limits.max_observations;
+    let packed = wire == WireType::LengthDelimited;
+    match tag {
+        2 if packed => integers(buf, &mut set.keypoint_counts, "match_set.keypoint_counts", limits.max_views),
+        3 if packed => doubles(buf, &mut set.xs, "match_set.xs", most),
+        4 if packed => doubles(buf, &mut set.ys, "match_set.ys", most),
+        5 if packed => integers(buf, &mut set.first_view_indices, "match_set.first_view_indices", most),
+        6 if packed => integers(buf, &mut set.second_view_indices, "match_set.second_view_indices", most),
+        7 if packed => integers(buf, &mut set.match_counts, "match_set.match_counts", most),
+        8 if packed => integers(buf, &mut set.first_keypoint_indices, "match_set.first_keypoint_indices", most),
+        9 if packed => integers(buf, &mut set.second_keypoint_indices, "match_set.second_keypoint_indices", most),
+        _ => {
+            set.merge_field(tag, wire, buf, DecodeContext::default()).map_err(malformed)?;
+            matches::check_size(set, limits)
+        }
+    }
+}
+
 fn check(field: &str, count: usize, max: usize) -> Result<(), InvalidInput> {
     if count <= max {
         return Ok(());
@@ -168,6 +199,8 @@ fn integers(buf: &mut impl Buf, values: &mut Vec<u32>, field: &str, max: usize) 
         // Protobuf cuts what is longer than the type.
         values.push(decode_varint(buf).map_err(malformed)? as u32);
     }
+    // How many there are is known only now.
+    values.shrink_to_fit();
     if buf.remaining() == end { Ok(()) } else { Err(malformed(format_args!("{field} is longer than it says"))) }
 }
 
@@ -190,6 +223,21 @@ mod tests {
             y: (0..observations).map(|k| -f64::from(k)).collect(),
             depth: Vec::new(),
             sigma: Vec::new(),
+        }
+    }
+
+    /// Two keypoints in each of three views, and a match between every two views.
+    fn match_set() -> proto::MatchSet {
+        proto::MatchSet {
+            views: vec![Default::default(); 3],
+            keypoint_counts: vec![2; 3],
+            xs: (0..6).map(f64::from).collect(),
+            ys: vec![300.0; 6],
+            first_view_indices: vec![0, 0, 1],
+            second_view_indices: vec![1, 2, 2],
+            match_counts: vec![1; 3],
+            first_keypoint_indices: vec![1; 3],
+            second_keypoint_indices: vec![1; 3],
         }
     }
 
@@ -221,6 +269,15 @@ mod tests {
         let bytes = encoded(proto::input_data::Data::MeasurementMatrix(matrix));
         let draft = read(&mut bytes.as_slice(), &limits()).expect("within the limits");
         assert_eq!(draft.finish().expect("valid"), whole.finish().expect("valid"));
+        let whole = Draft::begin(Some(Inline::MatchSet(match_set())), &limits()).expect("matches").finish();
+        let expected = whole.expect("valid");
+        assert_eq!((expected.track_count(), expected.observation_count()), (1, 3));
+        let bytes = encoded(proto::input_data::Data::MatchSet(match_set()));
+        for cut in 1..bytes.len() {
+            let mut buf = bytes[..cut].chain(&bytes[cut..]);
+            let draft = read(&mut buf, &limits()).expect("within the limits");
+            assert_eq!(draft.finish().expect("valid"), expected, "cut at {cut}");
+        }
     }
 
     #[test]
@@ -261,23 +318,28 @@ mod tests {
         assert_eq!(field(&within(1, &within(4, &[0; 1000]))), "track_set.track_indices");
         assert_eq!(field(&within(2, &within(5, &[1; 1000]))), "measurement_matrix.visibility");
         assert_eq!(field(&within(2, &within(3, &[0; 31 * 8]))), "measurement_matrix.values");
+        assert_eq!(field(&within(3, &within(2, &[1; 4]))), "match_set.keypoint_counts");
+        assert_eq!(field(&within(3, &within(3, &[0; 11 * 8]))), "match_set.xs");
+        assert_eq!(field(&within(3, &within(8, &[0; 1000]))), "match_set.first_keypoint_indices");
+        assert_eq!(field(&within(3, &[9 << 3, 0].repeat(11))), "match_set.second_keypoint_indices");
         let unpacked = [&[5 << 3 | 1][..], &[0; 8]].concat().repeat(11);
         assert_eq!(field(&within(1, &unpacked)), "track_set.xs");
     }
 
     #[test]
     fn what_is_no_input_is_told_and_panics_nowhere() {
-        let bytes = track_set(10);
-        for cut in 0..bytes.len() {
-            let outcome = read(&mut &bytes[..cut], &limits());
-            assert!(outcome.is_err(), "cut at {cut}");
-        }
-        // Every byte of a valid message changed in turn.
-        for at in 0..bytes.len() {
-            for change in [0x01, 0x80, 0xff] {
-                let mut changed = bytes.clone();
-                changed[at] ^= change;
-                let _ = read(&mut changed.as_slice(), &limits()).and_then(Draft::finish);
+        for bytes in [track_set(10), encoded(proto::input_data::Data::MatchSet(match_set()))] {
+            for cut in 0..bytes.len() {
+                let outcome = read(&mut &bytes[..cut], &limits());
+                assert!(outcome.is_err(), "cut at {cut}");
+            }
+            // Every byte of a valid message changed in turn.
+            for at in 0..bytes.len() {
+                for change in [0x01, 0x80, 0xff] {
+                    let mut changed = bytes.clone();
+                    changed[at] ^= change;
+                    let _ = read(&mut changed.as_slice(), &limits()).and_then(Draft::finish);
+                }
             }
         }
         for garbage in [&[0xff; 64][..], &[0; 64], b"track_set", &[1 << 3 | 2, 0xff, 0xff, 0xff, 0xff, 0x0f]] {

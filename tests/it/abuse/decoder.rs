@@ -9,7 +9,7 @@ use scpsfm::rpc::proto::create_job_request::Source as Inline;
 use crate::support::memory::peak_mb;
 use crate::support::mutation;
 use crate::support::uploads::encoded;
-use crate::support::wire::{create as create_request, create_tracks, matrix, raw};
+use crate::support::wire::{create as create_request, create_tracks, match_set, matrix, raw};
 
 /// Tight enough that damaged counts go beyond them.
 fn limits() -> Limits {
@@ -80,10 +80,12 @@ fn readers() -> [Reader; 4] {
         ..Default::default()
     });
     let with_matrix = create_request(Inline::MeasurementMatrix(matrix()));
+    let with_matches = create_request(Inline::MatchSet(match_set()));
     let with_name = create_request(Inline::Input("tenants/default/inputs/a".into()));
     let uploads = [
         encoded(&raw(3, 4)),
         proto::InputData { data: Some(proto::input_data::Data::MeasurementMatrix(matrix())) }.encode_to_vec(),
+        proto::InputData { data: Some(proto::input_data::Data::MatchSet(match_set())) }.encode_to_vec(),
     ];
     let query = proto::ListJobsRequest {
         parent: "tenants/default".into(),
@@ -94,7 +96,7 @@ fn readers() -> [Reader; 4] {
     };
     let get = proto::GetJobRequest { name: "tenants/default/jobs/a-b".into() };
     [
-        (creation, [described, with_matrix, with_name].map(|request| request.encode_to_vec()).to_vec()),
+        (creation, [described, with_matrix, with_matches, with_name].map(|request| request.encode_to_vec()).to_vec()),
         (uploaded, uploads.to_vec()),
         (listing, vec![query.encode_to_vec()]),
         (name, vec![get.encode_to_vec()]),

@@ -9,7 +9,7 @@ use tonic_types::StatusExt;
 
 use crate::support::server::{TestServer, one_worker};
 use crate::support::solvers::quick;
-use crate::support::wire::{all, create, create_tracks, matrix, solve_request, track_set};
+use crate::support::wire::{all, create, create_tracks, match_set, matrix, solve_request, track_set};
 
 /// The fields that an `INVALID_ARGUMENT` names.
 fn fields(status: &Status) -> Vec<String> {
@@ -37,6 +37,12 @@ fn matrices(change: impl FnOnce(&mut proto::MeasurementMatrix)) -> proto::Create
     let mut matrix = matrix();
     change(&mut matrix);
     create(Source::MeasurementMatrix(matrix))
+}
+
+fn matches(change: impl FnOnce(&mut proto::MatchSet)) -> proto::CreateJobRequest {
+    let mut set = match_set();
+    change(&mut set);
+    create(Source::MatchSet(set))
 }
 
 fn described(change: impl FnOnce(&mut proto::Job)) -> proto::CreateJobRequest {
@@ -96,6 +102,26 @@ async fn every_kind_is_refused_by_field_and_index_and_nothing_is_stored() {
         (matrices(|matrix| matrix.visibility = vec![1; 5]), "measurement_matrix.visibility"),
         (matrices(|matrix| matrix.view_count = u32::MAX), "measurement_matrix.view_count"),
         (matrices(|matrix| (matrix.view_count, matrix.track_count) = (4, 4)), "measurement_matrix.track_count"),
+        (matches(|set| set.xs[4] = f64::NAN), "match_set.xs[4]"),
+        (matches(|set| set.ys[6] = -1e9), "match_set.ys[6]"),
+        (matches(|set| set.xs = vec![0.0; 13]), "match_set.xs"),
+        (matches(|set| set.keypoint_counts[0] = 2), "match_set.xs"),
+        (matches(|set| set.keypoint_counts = vec![1; 5]), "match_set.keypoint_counts"),
+        (matches(|set| set.first_view_indices[1] = 3), "match_set.first_view_indices[1]"),
+        (matches(|set| set.second_view_indices[0] = 0), "match_set.second_view_indices[0]"),
+        (
+            matches(|set| (set.first_view_indices[1], set.second_view_indices[1]) = (1, 0)),
+            "match_set.first_view_indices[1]",
+        ),
+        (matches(|set| set.match_counts[0] = 3), "match_set.first_keypoint_indices"),
+        (matches(|set| set.second_keypoint_indices[2] = 2), "match_set.second_keypoint_indices[2]"),
+        (matches(|set| set.second_keypoint_indices = vec![0; 13]), "match_set.second_keypoint_indices"),
+        (
+            matches(|set| (set.first_keypoint_indices[1], set.second_keypoint_indices[1]) = (0, 1)),
+            "match_set.first_keypoint_indices[1]",
+        ),
+        (matches(|set| set.views[2].name = "a\nb".into()), "match_set.views[2].name"),
+        (create(Source::MatchSet(proto::MatchSet::default())), "match_set.first_keypoint_indices"),
         (set_up(|settings| settings.method = 42), "job.settings.method"),
         (set_up(|settings| settings.alpha = Some(f64::NAN)), "job.settings.alpha"),
         (set_up(|settings| settings.iterations = Some(0)), "job.settings.iterations"),
@@ -140,6 +166,11 @@ async fn a_stream_is_checked_as_it_arrives() {
     assert_eq!(refused(vec![config(), chunk(vec![0.0])]).await, ["track_set.ys"]);
     let matrix_chunk = Message::MeasurementMatrixChunk(proto::MeasurementMatrixChunk::default());
     assert_eq!(refused(vec![config(), matrix_chunk]).await, ["measurement_matrix_chunk"]);
+    let matches_chunk = |xs| Message::MatchSetChunk(proto::MatchSetChunk { xs, ..Default::default() });
+    assert_eq!(refused(vec![config(), matches_chunk(vec![])]).await, ["match_set_chunk"]);
+    let matches = || Message::Config(create(Source::MatchSet(match_set())));
+    assert_eq!(refused(vec![matches(), chunk(vec![])]).await, ["track_set_chunk"]);
+    assert_eq!(refused(vec![matches(), matches_chunk(vec![0.0; 6])]).await, ["match_set.xs"]);
 }
 
 #[tokio::test]

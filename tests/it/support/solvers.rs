@@ -111,5 +111,6 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         history: Vec::new(),
         trained_network_sha256: None,
         input_sha256: None,
+        joined_tracks: input.joined_tracks(),
     }
 }

@@ -39,6 +39,21 @@ pub fn matrix() -> proto::MeasurementMatrix {
     proto::MeasurementMatrix { view_count: 2, track_count: 3, values, ..Default::default() }
 }
 
+/// The example of the proto: a track of three views and one of two.
+pub fn match_set() -> proto::MatchSet {
+    proto::MatchSet {
+        views: vec![proto::View::default(); 3],
+        keypoint_counts: vec![3, 2, 2],
+        xs: vec![10.0, 20.0, 30.0, 12.0, 22.0, 14.0, 24.0],
+        ys: vec![50.0, 60.0, 70.0, 51.0, 61.0, 52.0, 62.0],
+        first_view_indices: vec![0, 1],
+        second_view_indices: vec![1, 2],
+        match_counts: vec![2, 1],
+        first_keypoint_indices: vec![0, 1, 1],
+        second_keypoint_indices: vec![1, 0, 0],
+    }
+}
+
 pub fn create(source: Source) -> proto::CreateJobRequest {
     proto::CreateJobRequest { parent: "tenants/default".into(), source: Some(source), ..Default::default() }
 }

@@ -8,7 +8,7 @@ use sqlx::{Either, Executor, Row};
 
 use super::super::cameras::{Camera, Model};
 use super::super::images::{Frame, Images};
-use super::super::tracks::Match;
+use crate::domain::PairMatches;
 use crate::formats::error::Problem;
 use crate::formats::source::Matches;
 
@@ -132,17 +132,6 @@ pub(super) struct Keypoints {
 }
 
 impl Keypoints {
-    /// Position of the image that a keypoint is of.
-    pub fn image_of(&self, keypoint: u32) -> u32 {
-        (self.starts.partition_point(|&start| start <= keypoint) - 1) as u32
-    }
-
-    /// Position of the image that a keypoint is of, and of the keypoint in that.
-    pub fn place(&self, keypoint: u32) -> [u32; 2] {
-        let image = self.image_of(keypoint);
-        [image, keypoint - self.starts[image as usize]]
-    }
-
     /// The keypoints of each image, the last image first.
     pub fn into_images(mut self) -> impl Iterator<Item = (u32, Vec<[f32; 2]>)> {
         self.starts.pop();
@@ -152,14 +141,15 @@ impl Keypoints {
         })
     }
 
-    pub fn point(&self, keypoint: u32) -> [f64; 2] {
-        self.points[keypoint as usize].map(f64::from)
+    /// Number of keypoints of the image at a position.
+    pub fn count(&self, image: u32) -> u32 {
+        let image = image as usize;
+        self.starts[image + 1] - self.starts[image]
     }
 
-    /// Number of keypoint `index` of an image, if it has so many.
-    fn number(&self, image: u32, index: u32) -> Option<u32> {
-        let [start, end] = *self.starts.get(image as usize..)?.first_chunk()?;
-        start.checked_add(index).filter(|&keypoint| keypoint < end)
+    /// Where a keypoint of an image is.
+    pub fn point(&self, image: u32, keypoint: u32) -> [f64; 2] {
+        self.points[(self.starts[image as usize] + keypoint) as usize].map(f64::from)
     }
 }
 
@@ -190,13 +180,13 @@ pub(super) async fn keypoints(connection: &mut SqliteConnection, images: &Images
     Ok(Keypoints { starts, points })
 }
 
-/// The matches of a kind, and the number of image pairs that have some.
+/// The matches of a kind. Views are the positions of the images.
 pub(super) async fn matches(
     connection: &mut SqliteConnection,
     kind: Matches,
     images: &Images,
     keypoints: &Keypoints,
-) -> Result<(Vec<Match>, usize), Problem> {
+) -> Result<PairMatches, Problem> {
     let query = match kind {
         Matches::Verified => {
             "SELECT +pair_id AS pair_id, +rows AS rows, +cols AS cols, +data AS data FROM two_view_geometries AS pairs
@@ -207,23 +197,18 @@ pub(super) async fn matches(
              WHERE pairs.rows <> 0 ORDER BY pairs.pair_id"
         }
     };
-    let mut matches = Vec::new();
-    let mut pairs = 0;
-    for_each_row(connection, query, |row| {
-        pairs += 1;
-        of_pair(row, table(kind), images, keypoints, &mut matches)
-    })
-    .await?;
-    Ok((matches, pairs))
+    let mut matches = PairMatches::default();
+    for_each_row(connection, query, |row| of_pair(row, table(kind), images, keypoints, &mut matches)).await?;
+    Ok(matches)
 }
 
-/// Takes the matches of one image pair.
+/// Takes the matches of one image pair, each once.
 fn of_pair(
     row: &SqliteRow,
     table: &str,
     images: &Images,
     keypoints: &Keypoints,
-    matches: &mut Vec<Match>,
+    matches: &mut PairMatches,
 ) -> Result<(), Problem> {
     let pair_id: u64 = integer(row, table, "pair_id", 0)?;
     let wrong = |what: String| Problem::of_record(format!("table {table}, row {pair_id}"), what);
@@ -238,16 +223,18 @@ fn of_pair(
         return Err(wrong(format!("matches image {first_id} with itself")));
     }
     let (columns, data) = matrix(row, table, pair_id)?;
-    let rows = data.chunks_exact(4 * columns);
-    // A blob of SQLite has less than 2^31 bytes.
-    let pair_size = rows.len() as u32;
-    for (k, row) in rows.enumerate() {
+    let counts = [first, second].map(|image| keypoints.count(image));
+    let mut of_pair = Vec::with_capacity(data.len() / (4 * columns));
+    for (k, row) in data.chunks_exact(4 * columns).enumerate() {
         let [in_first, in_second] = pair(row).map(u32::from_le_bytes);
-        let (Some(a), Some(b)) = (keypoints.number(first, in_first), keypoints.number(second, in_second)) else {
+        if in_first >= counts[0] || in_second >= counts[1] {
             return Err(wrong(format!("match {k} joins keypoints {in_first} and {in_second}; one is not there")));
-        };
-        matches.push(Match { a, b, pair_size });
+        }
+        of_pair.push([in_first, in_second]);
     }
+    of_pair.sort_unstable();
+    of_pair.dedup();
+    matches.push([first, second], of_pair);
     if matches.len() > MAX_MATCHES { Err(wrong(format!("more matches than {MAX_MATCHES} in all"))) } else { Ok(()) }
 }
 
