@@ -149,7 +149,7 @@ async fn on_server(
         seen.get_or_insert_with(|| event.job.clone());
         job_view::show_event(progress, event);
     };
-    let outcome = client::solve(&server, &input.raw, settings, &mut on_event, interrupt.token()).await;
+    let outcome = client::solve(&server, input, settings, &mut on_event, interrupt.token()).await;
     outcome.map_err(|error| match (error, seen) {
         (client::Error::Cancelled, _) if interrupt.token().is_cancelled() => Failure::interrupted(),
         (error @ client::Error::Unavailable(_), Some(name)) => {

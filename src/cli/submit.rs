@@ -113,15 +113,14 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         webhook_url: args.webhook_url,
     };
     if several {
+        // Tracks, which are less than keypoints and matches: all inputs share one message.
         let inputs = read.iter().map(|input| &input.raw);
         let created = client.create_batch(inputs, &named, &settings, &options).await;
         let jobs = created.map_err(|error| error.at_lines_of(&read))?;
         return jobs.iter().try_for_each(|job| print(&job.name.to_string())).map(|()| Exit::Done);
     }
     let job = match (read.first(), named.first()) {
-        (Some(input), _) => {
-            client.create(&input.raw, &settings, options).await.map_err(|error| error.at_lines(input))?
-        }
+        (Some(input), _) => client.create(input, &settings, options).await.map_err(|error| error.at_lines(input))?,
         (None, Some(name)) => client.create_with(name, &settings, options).await?,
         (None, None) => return Err(nothing()),
     };

@@ -34,7 +34,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let input = args.input.read()?;
     tell_notes(&input);
     let mut client = args.server.connect().await?;
-    let encoded = Encoded::new(&input.raw);
+    let encoded = Encoded::new(&input);
     let mut view = TransferView::new(args.quiet, encoded.len());
     let uploaded = client.upload(&encoded, &mut |bytes| view.show(bytes)).await;
     view.finish();

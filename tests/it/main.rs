@@ -18,6 +18,7 @@ mod http;
 mod inputs;
 mod load;
 mod lost;
+mod matches;
 mod observations;
 mod prior;
 mod readme;

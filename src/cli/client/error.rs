@@ -38,7 +38,7 @@ pub enum Error {
 }
 
 /// First parts of the fields that come from a file of tracks. All others come from flags.
-const INPUT_FIELDS: [&str; 3] = ["track_set", "measurement_matrix", "input"];
+const INPUT_FIELDS: [&str; 4] = ["track_set", "measurement_matrix", "match_set", "input"];
 
 impl Error {
     /// The violations that are the input's; empty for any other error.
@@ -372,7 +372,7 @@ mod tests {
         ] {
             assert_eq!(exit(flag), Exit::Usage, "{flag}");
         }
-        for input in ["track_set.xs", "track_set.views", "measurement_matrix.values", "input"] {
+        for input in ["track_set.xs", "track_set.views", "measurement_matrix.values", "match_set.xs", "input"] {
             assert_eq!(exit(input), Exit::BadInput, "{input}");
         }
         let unnamed = Error::Invalid(Vec::new(), "a malformed message".into());

@@ -9,9 +9,9 @@ use sha2::{Digest, Sha256};
 use tonic::{Status, Streaming};
 
 use super::backoff::Backoff;
-use super::{Client, Error};
+use super::{Client, Error, Outgoing};
 use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState};
-use crate::domain::{InputName, RawInput, Solution, SolveSettings};
+use crate::domain::{InputName, Solution, SolveSettings};
 use crate::rpc::convert;
 use crate::rpc::proto::{self, create_job_request::Source as JobInput};
 
@@ -42,11 +42,11 @@ impl Client {
     /// See [`Error`].
     pub async fn create(
         &mut self,
-        input: &RawInput,
+        input: impl Into<Outgoing>,
         settings: &SolveSettings,
         options: JobOptions,
     ) -> Result<Job, Error> {
-        self.create_of(JobInput::TrackSet(convert::input::to_wire(input)), settings, options).await
+        self.create_of(input.into().into_source(), settings, options).await
     }
 
     /// The same with an input that was uploaded.

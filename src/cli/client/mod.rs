@@ -13,6 +13,7 @@ mod batch;
 mod error;
 mod handshake;
 mod jobs;
+mod outgoing;
 mod solve;
 pub mod upload;
 mod uploaded_inputs;
@@ -28,6 +29,7 @@ use tonic::transport::{Channel, Endpoint};
 
 pub use error::Error;
 pub use jobs::{JobOptions, Page, ended, ended_as};
+pub use outgoing::Outgoing;
 pub use solve::solve;
 
 use self::access::{AccessArgs, Bearer};

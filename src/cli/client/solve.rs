@@ -1,18 +1,15 @@
 //! One job from its input to its result, over one connection after another.
 
-use std::sync::Arc;
-
 use tokio_util::sync::CancellationToken;
 use tonic::Request;
 
 use super::backoff::Backoff;
 use super::jobs::{JobOptions, Told, create_request, ended};
-use super::{Client, Error};
+use super::{Client, Error, Outgoing};
 use crate::cli::args::ServerArgs;
 use crate::domain::job::JobEvent;
-use crate::domain::{RawInput, Solution, SolveSettings};
-use crate::rpc::convert;
-use crate::rpc::proto::{self, create_job_request::Source as JobInput};
+use crate::domain::{Solution, SolveSettings};
+use crate::rpc::proto;
 
 impl Client {
     /// Creates a job, follows it to its end and reads its result. When `stop` is cancelled, so is the job.
@@ -21,11 +18,12 @@ impl Client {
     /// See [`Error`]; a job that ended without a result is an error here.
     pub async fn solve(
         &mut self,
-        input: &RawInput,
+        input: impl Into<Outgoing>,
         settings: &SolveSettings,
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
         stop: CancellationToken,
     ) -> Result<Solution, Error> {
+        let input = input.into();
         let mut name = None;
         let mut on_named_event = |event: &JobEvent| {
             name.get_or_insert_with(|| event.job.clone());
@@ -33,7 +31,7 @@ impl Client {
         };
         let mut solving = self.clone();
         let last = tokio::select! {
-            last = solving.follow_solve(input, settings, &mut on_named_event) => last?,
+            last = solving.follow_solve(&input, settings, &mut on_named_event) => last?,
             () = stop.cancelled() => {
                 if let Some(name) = &name {
                     self.cancel(name).await?;
@@ -49,23 +47,16 @@ impl Client {
     /// tells its events anew, of which only new ones are passed on.
     async fn follow_solve(
         &mut self,
-        input: &RawInput,
+        input: &Outgoing,
         settings: &SolveSettings,
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
     ) -> Result<JobEvent, Error> {
-        let input = Arc::new(input.clone());
-        let config = create_request(
-            self.parent(),
-            JobInput::TrackSet(convert::input::head_to_wire(&input)),
-            settings,
-            JobOptions::default(),
-        );
+        let config = create_request(self.parent(), input.head(), settings, JobOptions::default());
         let mut told = Told { last_sequence: 0, on_event };
         let mut backoff = Backoff::default();
         loop {
             use proto::solve_request::Message;
-            let chunks = convert::input::chunks(Arc::clone(&input)).map(Message::TrackSetChunk);
-            let messages = std::iter::once(Message::Config(config.clone())).chain(chunks);
+            let messages = std::iter::once(Message::Config(config.clone())).chain(input.chunks());
             let messages = messages.map(|message| proto::SolveRequest { message: Some(message) });
             let outcome = match self.calibration.solve(Request::new(tokio_stream::iter(messages))).await {
                 Ok(events) => told.follow(events.into_inner(), &mut backoff).await?,
@@ -86,7 +77,7 @@ impl Client {
 /// See [`Error`].
 pub async fn solve(
     server: &ServerArgs,
-    input: &RawInput,
+    input: impl Into<Outgoing>,
     settings: &SolveSettings,
     on_event: &mut (dyn FnMut(&JobEvent) + Send),
     stop: CancellationToken,

@@ -10,9 +10,8 @@ use tonic::{Request, Status};
 use tonic_types::StatusExt as _;
 
 use super::backoff::Backoff;
-use super::{Client, Error, error};
-use crate::domain::{InputName, RawInput};
-use crate::rpc::convert;
+use super::{Client, Error, Outgoing, error};
+use crate::domain::InputName;
 use crate::rpc::proto::{self, upload_input_request::Message};
 
 /// Bytes of one chunk: what any server takes, and little to send again.
@@ -29,8 +28,8 @@ pub struct Encoded {
 }
 
 impl Encoded {
-    pub fn new(input: &RawInput) -> Self {
-        let data = proto::input_data::Data::TrackSet(convert::input::to_wire(input));
+    pub fn new(input: impl Into<Outgoing>) -> Self {
+        let data = input.into().into_data();
         let bytes: Bytes = proto::InputData { data: Some(data) }.encode_to_vec().into();
         let sha256 = Sha256::digest(&bytes).into();
         Self { bytes, sha256 }
@@ -156,6 +155,7 @@ fn goes_on(status: &Status) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::RawInput;
 
     #[test]
     fn one_input_has_one_id_and_another_has_another() {
