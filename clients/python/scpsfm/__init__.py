@@ -53,6 +53,7 @@ from .jobs import (
     Webhook,
     WebhookState,
 )
+from .matches import Matches
 from .result import (
     Calibration,
     Camera,
@@ -100,6 +101,7 @@ __all__ = [
     "JobState",
     "JobSummary",
     "LeftOut",
+    "Matches",
     "MemoryFull",
     "MessageTooLarge",
     "NotFound",

@@ -22,6 +22,7 @@ from ._stubs import calibration_service_pb2, job_service_pb2
 from ._stubs_of import methods
 from .errors import JobError, ScpsfmError, from_rpc
 from .jobs import Capabilities, Event, InputInfo, JobInfo, JobState, Progress, Settings
+from .matches import Matches
 from .result import Result
 from .tracks import Tracks
 
@@ -170,7 +171,7 @@ class AsyncClient:
 
     async def solve(
         self,
-        tracks: Tracks | InputInfo | str,
+        tracks: Tracks | Matches | InputInfo | str,
         settings: Settings | None = None,
         *,
         labels: Mapping[str, str] | None = None,
@@ -198,7 +199,7 @@ class AsyncClient:
 
     async def submit(
         self,
-        tracks: Tracks | InputInfo | str,
+        tracks: Tracks | Matches | InputInfo | str,
         settings: Settings | None = None,
         *,
         labels: Mapping[str, str] | None = None,
@@ -215,11 +216,11 @@ class AsyncClient:
         source = tracks.name if isinstance(tracks, InputInfo) else tracks
         emit = None if on_upload is None else lambda value: on_upload(*value)
         job = await self._run(flows.submit(self._context, source, options, timeout), emit)
-        return AsyncJob(self, job.name, JobInfo.of(job), source if isinstance(source, Tracks) else None)
+        return AsyncJob(self, job.name, JobInfo.of(job), None if isinstance(source, str) else source)
 
     async def submit_batch(
         self,
-        inputs: Sequence[Tracks | InputInfo | str],
+        inputs: Sequence[Tracks | Matches | InputInfo | str],
         settings: Settings | None = None,
         *,
         labels: Mapping[str, str] | None = None,
@@ -234,13 +235,13 @@ class AsyncClient:
         sources = [tracks.name if isinstance(tracks, InputInfo) else tracks for tracks in inputs]
         jobs = await self._run(flows.submit_batch(self._context, sources, options, timeout))
         return [
-            AsyncJob(self, job.name, JobInfo.of(job), source if isinstance(source, Tracks) else None)
+            AsyncJob(self, job.name, JobInfo.of(job), None if isinstance(source, str) else source)
             for job, source in zip(jobs, sources, strict=True)
         ]
 
     async def upload(
         self,
-        tracks: Tracks,
+        tracks: Tracks | Matches,
         *,
         timeout: float | None = None,
         on_upload: Callable[[int, int], None] | None = None,
@@ -258,7 +259,7 @@ class AsyncClient:
         name = tracks.name if isinstance(tracks, InputInfo) else tracks
         await self._run(flows.delete_input(self._context, name, timeout))
 
-    def job(self, name: str, tracks: Tracks | None = None) -> AsyncJob:
+    def job(self, name: str, tracks: Tracks | Matches | None = None) -> AsyncJob:
         """A job that is known by its name; no call is made. See `Client.job`."""
         return AsyncJob(self, flows.job_name(self._context, name), None, tracks)
 
@@ -273,7 +274,9 @@ class AsyncClient:
 class AsyncJob:
     """A job of a server. Its names are those of `Job`."""
 
-    def __init__(self, client: AsyncClient, name: str, info: JobInfo | None, tracks: Tracks | None = None) -> None:
+    def __init__(
+        self, client: AsyncClient, name: str, info: JobInfo | None, tracks: Tracks | Matches | None = None
+    ) -> None:
         self._client = client
         self.name = name
         """`tenants/{tenant}/jobs/{job}`."""

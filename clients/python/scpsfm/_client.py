@@ -20,6 +20,7 @@ from ._stubs import calibration_service_pb2, job_service_pb2
 from ._stubs_of import methods
 from .errors import JobError, ScpsfmError, from_rpc
 from .jobs import Capabilities, Event, InputInfo, JobInfo, JobState, Progress, Settings
+from .matches import Matches
 from .result import Result
 from .tracks import Tracks
 
@@ -191,7 +192,7 @@ class Client:
 
     def solve(
         self,
-        tracks: Tracks | InputInfo | str,
+        tracks: Tracks | Matches | InputInfo | str,
         settings: Settings | None = None,
         *,
         labels: Mapping[str, str] | None = None,
@@ -236,7 +237,7 @@ class Client:
 
     def submit(
         self,
-        tracks: Tracks | InputInfo | str,
+        tracks: Tracks | Matches | InputInfo | str,
         settings: Settings | None = None,
         *,
         labels: Mapping[str, str] | None = None,
@@ -268,11 +269,11 @@ class Client:
         source = tracks.name if isinstance(tracks, InputInfo) else tracks
         emit = None if on_upload is None else lambda value: on_upload(*value)
         job = self._run(flows.submit(self._context, source, options, timeout), emit)
-        return Job(self, job.name, JobInfo.of(job), source if isinstance(source, Tracks) else None)
+        return Job(self, job.name, JobInfo.of(job), None if isinstance(source, str) else source)
 
     def submit_batch(
         self,
-        inputs: Sequence[Tracks | InputInfo | str],
+        inputs: Sequence[Tracks | Matches | InputInfo | str],
         settings: Settings | None = None,
         *,
         labels: Mapping[str, str] | None = None,
@@ -299,13 +300,13 @@ class Client:
         sources = [tracks.name if isinstance(tracks, InputInfo) else tracks for tracks in inputs]
         jobs = self._run(flows.submit_batch(self._context, sources, options, timeout))
         return [
-            Job(self, job.name, JobInfo.of(job), source if isinstance(source, Tracks) else None)
+            Job(self, job.name, JobInfo.of(job), None if isinstance(source, str) else source)
             for job, source in zip(jobs, sources, strict=True)
         ]
 
     def upload(
         self,
-        tracks: Tracks,
+        tracks: Tracks | Matches,
         *,
         timeout: float | None = None,
         on_upload: Callable[[int, int], None] | None = None,
@@ -330,7 +331,7 @@ class Client:
         name = tracks.name if isinstance(tracks, InputInfo) else tracks
         self._run(flows.delete_input(self._context, name, timeout))
 
-    def job(self, name: str, tracks: Tracks | None = None) -> Job:
+    def job(self, name: str, tracks: Tracks | Matches | None = None) -> Job:
         """A job that is known by its name; no call is made.
 
         Args:
@@ -359,7 +360,7 @@ class Client:
 class Job:
     """A job of a server."""
 
-    def __init__(self, client: Client, name: str, info: JobInfo | None, tracks: Tracks | None = None) -> None:
+    def __init__(self, client: Client, name: str, info: JobInfo | None, tracks: Tracks | Matches | None = None) -> None:
         self._client = client
         self.name = name
         """`tenants/{tenant}/jobs/{job}`."""

@@ -41,6 +41,7 @@ from .errors import (
     Violation,
 )
 from .jobs import JobState, Settings, state_of
+from .matches import Matches
 from .result import Result
 from .tracks import Tracks
 
@@ -51,6 +52,9 @@ SMALL_OBSERVATIONS = 16384
 """Up to so many observations a Solve has its input in its first message."""
 
 T = TypeVar("T")
+
+Source = Tracks | Matches
+"""An input that is at hand."""
 
 
 @dataclass(frozen=True)
@@ -226,15 +230,15 @@ def create_request(context: Context, options: JobOptions) -> job_service_pb2.Cre
         ) from None
 
 
-def _named(error: ScpsfmError, request_id: str, tracks: Tracks | str | None) -> ScpsfmError:
+def _named(error: ScpsfmError, request_id: str, tracks: Source | str | None) -> ScpsfmError:
     """The error of a creation, with its request id, and the file and line of the input."""
     if isinstance(error, InvalidArgument):
-        return tracks._locate(error) if isinstance(tracks, Tracks) else error
+        return error if tracks is None or isinstance(tracks, str) else tracks._locate(error)
     error.request_id = request_id
     return error
 
 
-def submit(context: Context, tracks: Tracks | str, options: JobOptions, timeout: float | None) -> Flow[job_pb2.Job]:
+def submit(context: Context, tracks: Source | str, options: JobOptions, timeout: float | None) -> Flow[job_pb2.Job]:
     """Creates a job; a large input is uploaded first. Emits how many of how many bytes the server has."""
     trouble = Trouble(context, timeout)
     request = create_request(context, options)
@@ -242,13 +246,14 @@ def submit(context: Context, tracks: Tracks | str, options: JobOptions, timeout:
         if isinstance(tracks, str):
             request.input = tracks
             return (yield from _call(trouble, "CreateJob", request))
-        request.track_set.CopyFrom(tracks.to_proto())
+        whole = tracks.to_proto()
+        getattr(request, tracks._FIELD).CopyFrom(whole)
         if request.ByteSize() <= context.upload_above_bytes:
             try:
                 return (yield from _call(trouble, "CreateJob", request))
             except MessageTooLarge:
                 pass
-        stored = yield from _upload(context, trouble, Encoded(request.track_set))
+        stored = yield from _upload(context, trouble, Encoded(tracks._FIELD, whole))
         request.input = stored.name
         return (yield from _call(trouble, "CreateJob", request))
     except ScpsfmError as error:
@@ -256,7 +261,7 @@ def submit(context: Context, tracks: Tracks | str, options: JobOptions, timeout:
 
 
 def submit_batch(
-    context: Context, inputs: Sequence[Tracks | str], options: JobOptions, timeout: float | None
+    context: Context, inputs: Sequence[Source | str], options: JobOptions, timeout: float | None
 ) -> Flow[list[job_pb2.Job]]:
     """Creates a job of each input, all or none; large ones are uploaded first."""
     trouble = Trouble(context, timeout)
@@ -269,13 +274,13 @@ def submit_batch(
         if isinstance(tracks, str):
             request.input = tracks
         else:
-            track_set = tracks.to_proto()
-            if track_set.ByteSize() <= room:
-                request.track_set.CopyFrom(track_set)
-                room -= track_set.ByteSize()
+            whole = tracks.to_proto()
+            if whole.ByteSize() <= room:
+                getattr(request, tracks._FIELD).CopyFrom(whole)
+                room -= whole.ByteSize()
             else:
                 try:
-                    stored = yield from _upload(context, trouble, Encoded(track_set))
+                    stored = yield from _upload(context, trouble, Encoded(tracks._FIELD, whole))
                 except InvalidArgument as error:
                     raise tracks._locate(error) from None
                 request.input = stored.name
@@ -288,13 +293,13 @@ def submit_batch(
     return jobs
 
 
-def _of_request(error: InvalidArgument, inputs: Sequence[Tracks | str]) -> InvalidArgument:
+def _of_request(error: InvalidArgument, inputs: Sequence[Source | str]) -> InvalidArgument:
     """Says where in which file the first field stands that a batch was refused for."""
     number, bracket, rest = (error.field or "").removeprefix("requests[").partition("].")
     if not bracket or not number.isdigit() or int(number) >= len(inputs):
         return error
     tracks = inputs[int(number)]
-    if isinstance(tracks, Tracks):
+    if not isinstance(tracks, str):
         field, error.field = error.field, rest
         tracks._locate(error)
         error.field = field
@@ -304,8 +309,10 @@ def _of_request(error: InvalidArgument, inputs: Sequence[Tracks | str]) -> Inval
 class Encoded:
     """An input in the form in which it is uploaded."""
 
-    def __init__(self, track_set: input_pb2.TrackSet) -> None:
-        self.data: bytes = input_pb2.InputData(track_set=track_set).SerializeToString()
+    def __init__(self, field: str, whole: input_pb2.TrackSet | input_pb2.MatchSet) -> None:
+        data = input_pb2.InputData()
+        getattr(data, field).CopyFrom(whole)
+        self.data: bytes = data.SerializeToString()
         self.sha256 = hashlib.sha256(self.data).digest()
 
     @property
@@ -346,10 +353,10 @@ def _goes_on(error: ScpsfmError) -> bool:
     return error.reason in _GOES_ON or any(violation.field == "chunk.offset" for violation in error.violations)
 
 
-def upload(context: Context, tracks: Tracks, timeout: float | None) -> Flow[input_pb2.Input]:
+def upload(context: Context, tracks: Source, timeout: float | None) -> Flow[input_pb2.Input]:
     """Uploads an input, or what is missing of it. Emits how many of how many bytes the server has."""
     try:
-        return (yield from _upload(context, Trouble(context, timeout), Encoded(tracks.to_proto())))
+        return (yield from _upload(context, Trouble(context, timeout), Encoded(tracks._FIELD, tracks.to_proto())))
     except InvalidArgument as error:
         raise tracks._locate(error) from None
 
@@ -501,7 +508,7 @@ def _read_result(trouble: Trouble, name: str) -> Flow[result_pb2.JobResult]:
 
 
 def solve(
-    context: Context, tracks: Tracks | str, options: JobOptions, told: Told, timeout: float | None
+    context: Context, tracks: Source | str, options: JobOptions, told: Told, timeout: float | None
 ) -> Flow[result_pb2.JobResult]:
     """Creates a job, follows it to its end and reads its result. Emits its events.
 
@@ -510,17 +517,19 @@ def solve(
     """
     trouble = Trouble(context, timeout)
     config = create_request(context, options)
-    chunked = tracks if isinstance(tracks, Tracks) and len(tracks) > SMALL_OBSERVATIONS else None
+    chunked = None if isinstance(tracks, str) or tracks._longest <= SMALL_OBSERVATIONS else tracks
     if isinstance(tracks, str):
         config.input = tracks
     else:
-        config.track_set.CopyFrom(tracks.to_proto() if chunked is None else tracks._head())
+        getattr(config, tracks._FIELD).CopyFrom(tracks.to_proto() if chunked is None else tracks._head())
 
     def messages() -> Iterator[calibration_service_pb2.SolveRequest]:
         yield calibration_service_pb2.SolveRequest(config=config)
         if chunked is not None:
             for chunk in chunked._chunks():
-                yield calibration_service_pb2.SolveRequest(track_set_chunk=chunk)
+                message = calibration_service_pb2.SolveRequest()
+                getattr(message, f"{chunked._FIELD}_chunk").CopyFrom(chunk)
+                yield message
 
     while True:
         try:
@@ -600,6 +609,8 @@ def job_name(context: Context, name: str) -> str:
     return name if "/" in name else f"{context.parent or 'tenants/-'}/jobs/{name}"
 
 
-def finished(message: result_pb2.JobResult, tracks: Tracks | str | None) -> Result:
-    """The result for the caller, with its input where that is at hand."""
+def finished(message: result_pb2.JobResult, tracks: Source | str | None) -> Result:
+    """The result for the caller, with its input where that is at hand; of matches, with the tracks joined from them."""
+    if isinstance(tracks, Matches):
+        return Result(message, tracks._joined(message))
     return Result(message, tracks if isinstance(tracks, Tracks) else None)

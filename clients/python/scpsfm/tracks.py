@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -69,6 +69,8 @@ class Tracks:
     `read`, which checks everything; a defect is an `InvalidArgument` that names field, file and line. The arrays cannot
     be written to.
     """
+
+    _FIELD: ClassVar[str] = "track_set"
 
     views: tuple[View, ...]
     """One entry a view."""
@@ -385,13 +387,7 @@ class Tracks:
     def _head(self) -> input_pb2.TrackSet:
         """The message without the arrays of observations."""
         head = input_pb2.TrackSet(track_count=self.track_count)
-        for view in self.views:
-            message = head.views.add(name=view.name, camera_group=view.camera_group)
-            if view.size is not None:
-                message.size.width_px, message.size.height_px = view.size
-            if view.focal_prior is not None:
-                message.focal_prior.focal_px = view.focal_prior.focal_px
-                message.focal_prior.sigma_log = view.focal_prior.sigma_log
+        _append_views(head, self.views)
         return head
 
     def to_proto(self) -> input_pb2.TrackSet:
@@ -410,6 +406,11 @@ class Tracks:
             message.sigmas_px.extend(self.sigma_px[begin:end].tolist())
         if self.depth is not None:
             message.depths.extend(self.depth[begin:end].tolist())
+
+    @property
+    def _longest(self) -> int:
+        """Entries of the longest array of the message."""
+        return len(self)
 
     def _chunks(self) -> Iterator[input_pb2.TrackSetChunk]:
         """The observations in messages of less than a megabyte each."""
@@ -445,25 +446,41 @@ _ARRAYS = {
 """The arrays of observations here, and what the API calls them."""
 
 
-def _invalid(problems: Sequence[tuple[str, str]], file: str | None = None, line: int | None = None) -> InvalidArgument:
+def _append_views(head: Any, views: Sequence[View]) -> None:
+    """Appends views to a TrackSet or a MatchSet."""
+    for view in views:
+        message = head.views.add(name=view.name, camera_group=view.camera_group)
+        if view.size is not None:
+            message.size.width_px, message.size.height_px = view.size
+        if view.focal_prior is not None:
+            message.focal_prior.focal_px = view.focal_prior.focal_px
+            message.focal_prior.sigma_log = view.focal_prior.sigma_log
+
+
+def _invalid(
+    problems: Sequence[tuple[str, str]],
+    file: str | None = None,
+    line: int | None = None,
+    field: str = "track_set",
+) -> InvalidArgument:
     """An error of fields and what is wrong with them; the first has the line."""
-    words = [f"{field}: {what}" if field else what for field, what in problems[:_LISTED]]
+    words = [f"{path}: {what}" if path else what for path, what in problems[:_LISTED]]
     if len(problems) > _LISTED:
         words.append(f"and {len(problems) - _LISTED} more")
     place = "" if file is None else f"{file}: " if line is None else f"{file}: line {line}: "
     error = InvalidArgument(
         place + "; ".join(words),
         reason="INVALID_ARGUMENT",
-        violations=[Violation(_api_path(field), what) for field, what in problems if field],
+        violations=[Violation(f"{field}.{_api_path(path)}", what) for path, what in problems if path],
     )
     error.file, error.line = file, line
     return error
 
 
-def _api_path(field: str) -> str:
-    """`track_set.xs[17]` for `x[17]`: a field has one name, whoever finds fault with it."""
-    array, bracket, rest = field.partition("[")
-    return f"track_set.{_ARRAYS.get(array, array)}{bracket}{rest}"
+def _api_path(path: str) -> str:
+    """`xs[17]` for `x[17]`: a field has one name, whoever finds fault with it."""
+    array, bracket, rest = path.partition("[")
+    return f"{_ARRAYS.get(array, array)}{bracket}{rest}"
 
 
 def _size(width: int | None, height: int | None) -> tuple[int, int] | None:

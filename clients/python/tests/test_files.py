@@ -432,6 +432,12 @@ def test_a_match_that_would_join_two_keypoints_of_an_image_is_cut() -> None:
     assert joined([(1, 10, 5), (0, 10, 50)]) == ([(0, 0), (10, 0)], 1)
 
 
+def test_pieces_of_a_point_are_joined_before_a_match_that_stands_alone() -> None:
+    matches = [(0, 10, 1), (10, 20, 1), (0, 20, 1), (30, 40, 1), (40, 50, 1), (30, 50, 1)]
+    matches += [(0, 30, 1), (10, 40, 1), (20, 31, 9), (50, 1, 9)]
+    assert joined(matches) == ([(keypoint, 0) for keypoint in (0, 10, 20, 30, 40, 50)], 2)
+
+
 def test_no_track_has_two_keypoints_of_an_image_whatever_the_matches() -> None:
     for seed in range(20):
         print(f"seed {seed}")

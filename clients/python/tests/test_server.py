@@ -12,6 +12,7 @@ import threading
 import uuid
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,45 @@ def test_every_kind_of_input_is_taken(real: Any, small: scene.Scene, tmp_path: P
         assert result.focal_px == pytest.approx(small.focal_px, rel=0.05), tracks
         assert len(result.tracks.inlier) == tracks.track_count
         assert [camera.name for camera in result.cameras] == [view.name for view in tracks.views]
+
+
+def matched(tracks: scpsfm.Tracks) -> scpsfm.Matches:
+    """Every observation as a keypoint, in the order of the observations, and a match for every two of a track."""
+    of_view = [np.flatnonzero(tracks.view_index == view) for view in range(len(tracks.views))]
+    pairs = {}
+    for first, second in combinations(range(len(of_view)), 2):
+        tracks_of = [tracks.track_index[of_view[view]] for view in (first, second)]
+        _, in_first, in_second = np.intersect1d(*tracks_of, return_indices=True)
+        pairs[first, second] = np.stack([in_first, in_second], axis=1)
+    return scpsfm.Matches([tracks.xy[rows] for rows in of_view], pairs, views=tracks.views)
+
+
+def test_matches_are_joined_into_the_tracks_that_they_come_from(real: Any, small: scene.Scene) -> None:
+    matches = matched(small.tracks)
+    settings = scpsfm.Settings(method="geometry")
+    solved = real.solve(matches, settings)
+    stored = real.submit(real.upload(matches), settings).result(timeout=support.PATIENCE)
+    tracks = solved.input
+    assert isinstance(tracks, scpsfm.Tracks)
+    assert tracks.keypoint_index is not None
+    lengths = np.bincount(small.tracks.track_index)
+    assert len(tracks) == lengths[lengths >= 2].sum() == len(solved.observations.inlier)
+    of_keypoint = {}
+    for view in range(len(small.tracks.views)):
+        rows = np.flatnonzero(small.tracks.view_index == view)
+        of_keypoint.update({(view, k): int(small.tracks.track_index[row]) for k, row in enumerate(rows)})
+    names = {}
+    for view, keypoint, track in zip(tracks.view_index, tracks.keypoint_index, tracks.track_index, strict=True):
+        right = of_keypoint[int(view), int(keypoint)]
+        assert names.setdefault(int(track), right) == right
+    assert len(set(names.values())) == tracks.track_count == len(solved.tracks.inlier)
+    assert solved.focal_px == pytest.approx(small.focal_px, rel=0.05)
+    assert np.array_equal(solved.points, stored.points)
+    assert stored.message.joined_tracks == solved.message.joined_tracks
+    assert stored.message.joined_tracks.cut_match_count == 0
+    job = real.submit(matches, settings)
+    assert job.known.track_count == tracks.track_count
+    assert job.result(timeout=support.PATIENCE).input.track_count == tracks.track_count
 
 
 def test_sigmas_depths_groups_and_priors_are_taken(real: Any, small: scene.Scene) -> None:
@@ -284,7 +324,7 @@ def test_an_uploaded_input_is_shared_by_jobs(server: support.Server, kind: str, 
         told: list[tuple[int, int]] = []
         stored = client.upload(other.tracks, on_upload=lambda have, whole: told.append((have, whole)))
         assert stored.observation_count == len(other.tracks)
-        assert stored.sha256 == flows.Encoded(other.tracks.to_proto()).sha256
+        assert stored.sha256 == flows.Encoded("track_set", other.tracks.to_proto()).sha256
         assert told[0] == (0, stored.size_bytes)
         assert told[-1] == (stored.size_bytes, stored.size_bytes)
         job = client.submit(other.tracks, scpsfm.Settings(method="geometry"))

@@ -2,9 +2,12 @@
 
 A track is a connected component of the matches, but one wrong match joins two points for good. So matches are taken one
 by one, the best supported first, and one that would bring two keypoints of an image together is cut: Kruskal's
-algorithm under a constraint. A match is supported by every third keypoint that is matched with both of its ends; among
-equals, that of the image pair with more matches comes first, then that of the smaller numbers. The service's own
-command joins in the same way.
+algorithm under a constraint.
+
+A match is supported by every third keypoint that is matched with both of its ends. Supported matches come first; among
+equals, that of the image pair with more matches, then that of the smaller numbers. Then pieces are joined by the number
+of matches between them, those first that are each other's best, and then the other matches follow in the same order.
+The service itself joins in the same way.
 """
 
 from __future__ import annotations
@@ -18,6 +21,10 @@ __all__ = ["Joined", "join"]
 
 _MOST_NEIGHBOURS = 64
 """Neighbours that are looked at for the support of a match, so that one of thousands does not cost the square."""
+
+
+_PIECE_ROUNDS = 4
+"""Rounds in which pieces are joined by the number of matches between them, at most."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +51,7 @@ def join(matches: NDArray[np.int64], image_of: NDArray[np.int64]) -> Joined:
 
     """
     known, places = np.unique(matches[:, :2], return_inverse=True)
-    pairs = places.reshape(-1, 2)
+    pairs = np.sort(places.reshape(-1, 2), axis=1)
     support = _support(pairs, len(known))
     order = np.lexsort((pairs[:, 1], pairs[:, 0], -matches[:, 2], -support))
     parents = list(range(len(known)))
@@ -56,19 +63,45 @@ def join(matches: NDArray[np.int64], image_of: NDArray[np.int64]) -> Joined:
             keypoint = parents[keypoint]
         return keypoint
 
-    cut = 0
-    for a, b in pairs[order].tolist():
+    def link(a: int, b: int) -> bool:
         large, small = root(a), root(b)
         if large == small:
-            continue
+            return True
         if len(images[large]) < len(images[small]):
             large, small = small, large
-        if images[large].isdisjoint(images[small]):
-            parents[small] = large
-            images[large] |= images[small]
-            images[small] = set()
-        else:
-            cut += 1
+        if not images[large].isdisjoint(images[small]):
+            return False
+        parents[small] = large
+        images[large] |= images[small]
+        images[small] = set()
+        return True
+
+    def link_pieces() -> bool:
+        between: dict[tuple[int, int], tuple[int, int]] = {}
+        for (a, b), size in zip(ranked, sizes, strict=True):
+            ends = root(a), root(b)
+            if ends[0] != ends[1]:
+                ends = min(ends), max(ends)
+                count, largest = between.get(ends, (0, 0))
+                between[ends] = count + 1, max(largest, size)
+        links = [
+            (-count, -largest, a, b) for (a, b), (count, largest) in between.items() if images[a].isdisjoint(images[b])
+        ]
+        has_better: set[int] = set()
+        for *_, a, b in sorted(links):
+            is_best = a not in has_better and b not in has_better
+            has_better.update((a, b))
+            if is_best:
+                link(a, b)
+        return bool(links)
+
+    ranked, sizes = pairs[order].tolist(), matches[order, 2].tolist()
+    for a, b in ranked[: int((support > 0).sum())]:
+        link(a, b)
+    for _ in range(_PIECE_ROUNDS):
+        if not link_pieces():
+            break
+    cut = sum(not link(a, b) for a, b in ranked)
     numbers: dict[int, int] = {}
     keypoints, tracks = [], []
     for place, keypoint in enumerate(known.tolist()):
