@@ -142,7 +142,7 @@ fn secrets_of_webhooks_are_shown_nowhere_and_those_of_the_file_are_added() {
 fn errors_name_the_key_and_what_would_be_right() {
     let from_file = |text: &str| Config::from_sources(Some(file(text).path()), vec![], &[]);
     let from_variable = |name: &str, value: &str| Config::from_sources(None, variables(&[(name, value)]), &[]);
-    let cases: [(Result<Config, Error>, &[&str]); 19] = [
+    let cases: Vec<(Result<Config, Error>, &[&str])> = vec![
         (from_file("[engine]\nwrokers = 1\n"), &["wrokers", "workers"]),
         (from_file("[engine]\nqueue_capacity = 0\n"), &["engine.queue_capacity", "from 1 on"]),
         (from_file("[server]\nlisten = \"localhost\"\n"), &["server.listen", "127.0.0.1:50051"]),

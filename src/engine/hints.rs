@@ -12,6 +12,7 @@ pub(super) async fn run(inner: Arc<Inner>) {
     let mut phase = inner.phase.subscribe();
     while *phase.borrow_and_update() != Phase::Closed {
         tokio::select! {
+            biased;
             _ = phase.changed() => {}
             hint = inner.store.hint() => inner.heed(hint).await,
         }

@@ -1,6 +1,6 @@
 //! Who waits for which job: wake-ups and interim weights, kept only while someone holds on to the job's topic.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
 use tokio::sync::watch;
@@ -11,7 +11,7 @@ use crate::domain::job::{JobEvent, JobName};
 /// Topics by job.
 #[derive(Debug, Default)]
 pub(super) struct Hub {
-    topics: Mutex<HashMap<JobName, Held>>,
+    topics: Mutex<BTreeMap<JobName, Held>>,
 }
 
 /// A topic with the number of its subscriptions, both only touched under the lock.

@@ -43,6 +43,7 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
         };
         let Some(ready) = ready else {
             tokio::select! {
+                biased;
                 _ = work.changed() => {}
                 _ = phase.changed() => {}
                 () = sleep(CLAIM_POLL) => {}
@@ -142,6 +143,7 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     while *phase.borrow_and_update() != Phase::Closed {
         tokio::select! {
+            biased;
             _ = phase.changed() => {}
             () = due(&inner, counted) => {}
             _ = ticks.tick() => {

@@ -56,7 +56,7 @@ fn recorder() -> Result<PrometheusRecorder, BuildError> {
     let recorder = builder.build_recorder();
     metrics::with_local_recorder(&recorder, || {
         for metric in ALL {
-            describe(&metric);
+            describe(metric);
         }
         create_known_series();
     });

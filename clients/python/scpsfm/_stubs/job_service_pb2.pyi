@@ -8,12 +8,13 @@ from . import result_pb2 as _result_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from typing import ClassVar as _ClassVar, Iterable as _Iterable, Mapping as _Mapping, Optional as _Optional, Union as _Union
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class CreateJobRequest(_message.Message):
-    __slots__ = ("parent", "job_id", "job", "request_id", "track_set", "measurement_matrix", "input")
+    __slots__ = ("parent", "job_id", "job", "request_id", "track_set", "measurement_matrix", "input", "match_set")
     PARENT_FIELD_NUMBER: _ClassVar[int]
     JOB_ID_FIELD_NUMBER: _ClassVar[int]
     JOB_FIELD_NUMBER: _ClassVar[int]
@@ -21,6 +22,7 @@ class CreateJobRequest(_message.Message):
     TRACK_SET_FIELD_NUMBER: _ClassVar[int]
     MEASUREMENT_MATRIX_FIELD_NUMBER: _ClassVar[int]
     INPUT_FIELD_NUMBER: _ClassVar[int]
+    MATCH_SET_FIELD_NUMBER: _ClassVar[int]
     parent: str
     job_id: str
     job: _job_pb2.Job
@@ -28,7 +30,8 @@ class CreateJobRequest(_message.Message):
     track_set: _input_pb2.TrackSet
     measurement_matrix: _input_pb2.MeasurementMatrix
     input: str
-    def __init__(self, parent: _Optional[str] = ..., job_id: _Optional[str] = ..., job: _Optional[_Union[_job_pb2.Job, _Mapping]] = ..., request_id: _Optional[str] = ..., track_set: _Optional[_Union[_input_pb2.TrackSet, _Mapping]] = ..., measurement_matrix: _Optional[_Union[_input_pb2.MeasurementMatrix, _Mapping]] = ..., input: _Optional[str] = ...) -> None: ...
+    match_set: _input_pb2.MatchSet
+    def __init__(self, parent: _Optional[str] = ..., job_id: _Optional[str] = ..., job: _Optional[_Union[_job_pb2.Job, _Mapping]] = ..., request_id: _Optional[str] = ..., track_set: _Optional[_Union[_input_pb2.TrackSet, _Mapping]] = ..., measurement_matrix: _Optional[_Union[_input_pb2.MeasurementMatrix, _Mapping]] = ..., input: _Optional[str] = ..., match_set: _Optional[_Union[_input_pb2.MatchSet, _Mapping]] = ...) -> None: ...
 
 class BatchCreateJobsRequest(_message.Message):
     __slots__ = ("parent", "requests")
@@ -96,6 +99,24 @@ class DeleteJobRequest(_message.Message):
     etag: str
     def __init__(self, name: _Optional[str] = ..., etag: _Optional[str] = ...) -> None: ...
 
+class RetryJobRequest(_message.Message):
+    __slots__ = ("name", "etag")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    ETAG_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    etag: str
+    def __init__(self, name: _Optional[str] = ..., etag: _Optional[str] = ...) -> None: ...
+
+class SetJobPriorityRequest(_message.Message):
+    __slots__ = ("name", "priority", "etag")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    PRIORITY_FIELD_NUMBER: _ClassVar[int]
+    ETAG_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    priority: int
+    etag: str
+    def __init__(self, name: _Optional[str] = ..., priority: _Optional[int] = ..., etag: _Optional[str] = ...) -> None: ...
+
 class GetJobResultRequest(_message.Message):
     __slots__ = ("name",)
     NAME_FIELD_NUMBER: _ClassVar[int]
@@ -111,13 +132,13 @@ class ReadJobResultRequest(_message.Message):
     def __init__(self, name: _Optional[str] = ..., offset: _Optional[int] = ...) -> None: ...
 
 class ResultChunk(_message.Message):
-    __slots__ = ("data", "offset", "total_size", "sha256")
+    __slots__ = ("data", "offset", "size_bytes", "sha256")
     DATA_FIELD_NUMBER: _ClassVar[int]
     OFFSET_FIELD_NUMBER: _ClassVar[int]
-    TOTAL_SIZE_FIELD_NUMBER: _ClassVar[int]
+    SIZE_BYTES_FIELD_NUMBER: _ClassVar[int]
     SHA256_FIELD_NUMBER: _ClassVar[int]
     data: bytes
     offset: int
-    total_size: int
+    size_bytes: int
     sha256: bytes
-    def __init__(self, data: _Optional[bytes] = ..., offset: _Optional[int] = ..., total_size: _Optional[int] = ..., sha256: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, data: _Optional[bytes] = ..., offset: _Optional[int] = ..., size_bytes: _Optional[int] = ..., sha256: _Optional[bytes] = ...) -> None: ...

@@ -60,7 +60,13 @@ impl Clients {
         Self { rng: ChaCha8Rng::seed_from_u64(seed), ledger: Arc::default() }
     }
 
-    pub(super) fn ledger(&self) -> MutexGuard<'_, Ledger> {
+    /// The jobs that were acknowledged, and the number of requests that were sent.
+    pub(super) fn known(&self) -> (BTreeMap<JobName, Known>, u64) {
+        let ledger = self.ledger();
+        (ledger.jobs.clone(), ledger.sent)
+    }
+
+    fn ledger(&self) -> MutexGuard<'_, Ledger> {
         locked(&self.ledger)
     }
 

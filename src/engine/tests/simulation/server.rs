@@ -39,7 +39,7 @@ impl Behavior {
     pub(super) fn duration(seed: u64) -> Duration {
         // Many that are short, and some that outlast a lease.
         let milliseconds = seed / 10 % 8_000;
-        Duration::from_millis(if seed / 100_000 % 4 == 0 { milliseconds } else { milliseconds / 80 })
+        Duration::from_millis(if (seed / 100_000).is_multiple_of(4) { milliseconds } else { milliseconds / 80 })
     }
 }
 
